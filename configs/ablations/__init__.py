@@ -1,0 +1,1 @@
+"""The ablation tables that come with TurboGS, as package data."""

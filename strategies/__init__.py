@@ -1,0 +1,1 @@
+"""The interchangeable parts of TurboGS: samplers, schedules, losses, density control and optimizers."""

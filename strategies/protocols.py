@@ -1,0 +1,114 @@
+"""The protocols that strategies implement. A strategy gets tensors and small dataclasses, never a trainer.
+
+Every strategy is a dataclass whose init fields are its configuration, so that ``Strategy(**mapping)`` builds it from
+YAML and the fields' defaults are the only place where defaults live. Run-time state is kept in fields with
+``init=False``. Strategies with state give it by ``state_dict`` as plain tensors and numbers.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+from torch import Tensor
+
+from turbogs_plugin.error_maps import ErrorMaps
+from turbogs_plugin.rendering.rendered import ScreenGradients
+from turbogs_plugin.types import (
+    Cameras,
+    Gaussians,
+    GaussianStats,
+    LossOutput,
+    PixelSamples,
+    RowUpdate,
+    SamplingBudget,
+    Step,
+)
+
+
+@runtime_checkable
+class SamplingSchedule(Protocol):
+    """How many views and which share of their pixels an iteration looks at (appendix, adaptive scheduling)."""
+
+    def query(self, step: Step, mean_error: float, initial_error: float, num_views: int) -> SamplingBudget:
+        """The budget of this iteration; `views` never exceeds `num_views`."""
+        ...
+
+
+@runtime_checkable
+class ViewSampler(Protocol):
+    """Which training views an iteration looks at (section 3.4)."""
+
+    def setup(self, cameras: Cameras, scene_extent: float) -> None:
+        """Take the geometry of the V training cameras; called once before training."""
+        ...
+
+    def select(self, count: int, view_errors: np.ndarray, step: Step) -> tuple[int, ...]:
+        """`count` distinct view numbers. `view_errors`: [V] float64, mean error of each view."""
+        ...
+
+    def state_dict(self) -> dict[str, Any]: ...
+
+    def load_state_dict(self, state: dict[str, Any]) -> None: ...
+
+
+@runtime_checkable
+class PixelSampler(Protocol):
+    """Which pixels of the chosen views are rendered (section 3.5)."""
+
+    def sample(self, maps: ErrorMaps, view_ids: tuple[int, ...], rate: float, step: Step) -> PixelSamples:
+        """Draw the samples of an iteration from the maps of these views, on the maps' device."""
+        ...
+
+
+@runtime_checkable
+class SparseLoss(Protocol):
+    """A loss on sampled pixels with its own gradient (section 3.7)."""
+
+    def __call__(self, colors: Tensor, targets: Tensor, samples: PixelSamples) -> LossOutput:
+        """`colors`, `targets`: [P, 3], both 0 .. 1 in range for photos; `colors` may exceed it."""
+        ...
+
+
+@runtime_checkable
+class DensityController(Protocol):
+    """Where Gaussians are added and removed (section 3.8)."""
+
+    @property
+    def stats(self) -> GaussianStats | None:
+        """The window that backward passes add to, or None where nothing is needed now."""
+        ...
+
+    def setup(self, gaussians: Gaussians) -> None:
+        """Called once before training, and after a resume, before `load_state_dict`."""
+        ...
+
+    def update(self, gaussians: Gaussians, step: Step) -> RowUpdate | None:
+        """Called after every optimizer step; a change of the set of Gaussians, or None. Follows its own change
+        with its own statistics."""
+        ...
+
+    def state_dict(self) -> dict[str, Any]: ...
+
+    def load_state_dict(self, state: dict[str, Any]) -> None: ...
+
+
+@runtime_checkable
+class GaussianOptimizer(Protocol):
+    """Turns gradients into a step of the parameters, in place (section 3.9)."""
+
+    def setup(self, gaussians: Gaussians) -> None:
+        """Allocate state for these Gaussians; called once before training, and after a resume."""
+        ...
+
+    def step(self, gaussians: Gaussians, gradients: ScreenGradients, step: Step) -> None:
+        """Update `gaussians` in place. Takes the per-view or the summed gradients, as it needs."""
+        ...
+
+    def apply(self, update: RowUpdate) -> None:
+        """Follow a change of the set of Gaussians row by row."""
+        ...
+
+    def state_dict(self) -> dict[str, Any]: ...
+
+    def load_state_dict(self, state: dict[str, Any]) -> None: ...

@@ -1,0 +1,75 @@
+"""What a rasterizer gives back: colours at the samples, and a way from their gradients to the parameters'."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+from torch import Tensor
+
+from turbogs_plugin.types import GaussianGradients, GaussianStats
+
+
+class ScreenGradients(Protocol):
+    """Gradients on the screen, not yet taken back to the parameters.
+
+    The parameters' gradients are made when asked for, so that an optimizer with a kernel of its own can fuse that
+    step with its update and the gradients of the higher bands never reach memory. The window of statistics given to
+    `Rendered.backward` is added to exactly once, by whichever of the two happens.
+    """
+
+    def parameter_gradients(self, rows: bool) -> GaussianGradients:
+        """The gradients of the parameters: one row per view (`rows`), or their sum. May be called once."""
+        ...
+
+
+class Rendered(Protocol):
+    """One forward pass.
+
+    Attributes:
+        colors: [P, 3]; zero in empty slots.
+        alphas: [P]; zero in empty slots.
+        depths: [P] expected depth (sum of w * z over alpha), or None where not asked for.
+    """
+
+    colors: Tensor
+    alphas: Tensor
+    depths: Tensor | None
+
+    def backward(
+        self,
+        color_gradients: Tensor,
+        pixel_errors: Tensor | None = None,
+        stats: GaussianStats | None = None,
+        alpha_gradients: Tensor | None = None,
+        depth_gradients: Tensor | None = None,
+    ) -> ScreenGradients:
+        """Back-propagate to the screen.
+
+        Args:
+            color_gradients: [P, 3] d loss / d colors.
+            pixel_errors: [P] the errors that the density sums carry to the Gaussians; zeros where None.
+            stats: the window that receives this pass's statistics, where wanted.
+            alpha_gradients, depth_gradients: [P], where the loss has such terms.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class RasterSettings:
+    """The constants of gsplat's `rasterization`; a model trained with them is a normal gsplat model.
+
+    Args:
+        eps2d: added to the diagonal of the projected covariance, pixels squared.
+        near_plane, far_plane: depths outside are not drawn, world units.
+        alpha_min: a splat with less opacity at a pixel is skipped there.
+        alpha_max: opacity at a pixel is cut here (and has no gradient beyond).
+        transmittance_min: a pixel ends before the splat that would bring its transmittance to this or below.
+    """
+
+    eps2d: float = 0.3
+    near_plane: float = 0.01
+    far_plane: float = 1e10
+    alpha_min: float = 1.0 / 255.0
+    alpha_max: float = 0.999
+    transmittance_min: float = 1e-4

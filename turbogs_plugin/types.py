@@ -1,0 +1,351 @@
+"""What flows between the parts of TurboGS: small dataclasses of tensors, in the order in which they flow.
+
+Index spaces, which every shape below is written in:
+
+- ``V`` training views, ``K`` views of one iteration (a batch; ``k`` is the position in the batch);
+- ``N`` Gaussians;
+- ``P`` sample slots, ordered by (view of the batch, tile), ``T`` tiles that hold samples;
+- ``X`` pixels of all training views laid end to end ("flat pixels").
+
+Nothing here imports anything of the project, so strategies and framework can both rest on it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, fields
+
+import numpy as np
+import torch
+from torch import Tensor
+
+TILE_SIZE = 16
+"""Side of a square tile in pixels (S in the paper). The kernels are built for this value."""
+
+CELL_WIDTH, CELL_HEIGHT = 8, 4
+"""Samples of a tile are ordered by cells of this size, so that 32 neighbours of a dense tile are one warp's."""
+
+
+def cell_order(x: Tensor, y: Tensor) -> Tensor:
+    """Rank of a pixel within its tile: row-major over cells of 8x4, then row-major within the cell.
+
+    Args:
+        x, y: integer tensors of one shape, coordinates within the tile, 0 .. TILE_SIZE - 1.
+
+    Returns:
+        Integers 0 .. TILE_SIZE^2 - 1 of the same shape.
+    """
+    cell = (y // CELL_HEIGHT) * (TILE_SIZE // CELL_WIDTH) + x // CELL_WIDTH
+    return cell * (CELL_WIDTH * CELL_HEIGHT) + (y % CELL_HEIGHT) * CELL_WIDTH + x % CELL_WIDTH
+
+
+PARAMETER_NAMES = ("means", "quats", "scales", "opacities", "sh0", "shN")
+
+
+@dataclass
+class Gaussians:
+    """The model, in gsplat's parameter layout. All tensors share one device and one dtype.
+
+    Args:
+        means: [N, 3], world units.
+        quats: [N, 4], wxyz, not normalised.
+        scales: [N, 3], logarithms of the standard deviations.
+        opacities: [N], logits.
+        sh0: [N, 1, 3], spherical harmonics of band 0.
+        shN: [N, B, 3], the higher bands, B = (degree + 1)^2 - 1.
+    """
+
+    means: Tensor
+    quats: Tensor
+    scales: Tensor
+    opacities: Tensor
+    sh0: Tensor
+    shN: Tensor
+
+    def __len__(self) -> int:
+        return self.means.shape[0]
+
+    def items(self) -> Iterator[tuple[str, Tensor]]:
+        """(name, tensor) of each parameter, in the order of `PARAMETER_NAMES`."""
+        return ((name, getattr(self, name)) for name in PARAMETER_NAMES)
+
+    def map(self, function) -> Gaussians:
+        """A model whose every tensor is `function` of the present one."""
+        return Gaussians(**{name: function(value) for name, value in self.items()})
+
+    @property
+    def device(self) -> torch.device:
+        return self.means.device
+
+    @property
+    def sh_degree(self) -> int:
+        """The highest degree that `shN` can hold."""
+        return int(round((self.shN.shape[1] + 1) ** 0.5)) - 1
+
+
+@dataclass
+class Cameras:
+    """C pinhole cameras; their images may differ in size.
+
+    Args:
+        viewmats: [C, 4, 4] float, world to camera (x right, y down, z forward).
+        Ks: [C, 3, 3] float, intrinsics in pixels; the centre of the first pixel is (0.5, 0.5).
+        sizes: [C, 2] int64 numpy array (width, height), on the host so that shapes cost no synchronisation.
+    """
+
+    viewmats: Tensor
+    Ks: Tensor
+    sizes: np.ndarray
+
+    def __len__(self) -> int:
+        return self.viewmats.shape[0]
+
+    def select(self, view_ids: Sequence[int]) -> Cameras:
+        """The cameras of these views, in this order."""
+        index = torch.as_tensor(list(view_ids), dtype=torch.int64).to(self.viewmats.device, non_blocking=True)
+        return Cameras(self.viewmats[index], self.Ks[index], self.sizes[np.asarray(view_ids, dtype=np.int64)])
+
+    def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Cameras:
+        return Cameras(self.viewmats.to(device, dtype), self.Ks.to(device, dtype), self.sizes)
+
+    @property
+    def centers(self) -> Tensor:
+        """[C, 3] camera centres in the world."""
+        rotations, translations = self.viewmats[:, :3, :3], self.viewmats[:, :3, 3]
+        return -(rotations.transpose(1, 2) @ translations[:, :, None])[:, :, 0]
+
+    @property
+    def directions(self) -> Tensor:
+        """[C, 3] unit viewing directions in the world."""
+        return torch.nn.functional.normalize(self.viewmats[:, 2, :3], dim=-1)
+
+
+@dataclass
+class TileGrid:
+    """The tiles of a batch of K images, numbered through: view after view, row after row.
+
+    Args:
+        sizes: [K, 2] int64 numpy array (width, height).
+    """
+
+    sizes: np.ndarray
+
+    @property
+    def shapes(self) -> np.ndarray:
+        """[K, 2] int64: tiles in x and in y of each image."""
+        return -(-self.sizes // TILE_SIZE)
+
+    @property
+    def offsets(self) -> np.ndarray:
+        """[K + 1] int64: number of the first tile of each image, and the count of all at the end."""
+        return np.concatenate([[0], np.cumsum(self.shapes.prod(axis=1))])
+
+    def __len__(self) -> int:
+        return int(self.offsets[-1])
+
+
+@dataclass
+class PixelSamples:
+    """The pixels of one iteration, grouped by tile.
+
+    A slot whose pixel id is -1 is empty: it renders to nothing, costs nothing in a loss and touches no map. Empty
+    slots keep the number of slots known to the host where edge tiles are cut.
+
+    Args:
+        view_ids: K numbers of training views, on the host.
+        sizes: [K, 2] int64 numpy array (width, height) of those views.
+        pixel_ids: [P] int32, ``y * width + x`` in its own view, or -1 for an empty slot. Within a tile, ascending
+            in `cell_order`, empty slots last.
+        tile_ids: [T] int32, ascending, in the numbering of ``TileGrid(sizes)``.
+        tile_offsets: [T + 1] int32, the first slot of each tile; the last entry is P.
+        weights: [P] float32 importance weights with mean 1 over the filled slots, or None where all are 1.
+    """
+
+    view_ids: tuple[int, ...]
+    sizes: np.ndarray
+    pixel_ids: Tensor
+    tile_ids: Tensor
+    tile_offsets: Tensor
+    weights: Tensor | None = None
+
+    def __len__(self) -> int:
+        return self.pixel_ids.shape[0]
+
+    @property
+    def grid(self) -> TileGrid:
+        return TileGrid(self.sizes)
+
+    @property
+    def filled(self) -> Tensor:
+        """[P] bool: the slot holds a pixel."""
+        return self.pixel_ids >= 0
+
+    def tile_of_slot(self) -> Tensor:
+        """[P] int64: position in `tile_ids` of the tile of each slot."""
+        counts = (self.tile_offsets[1:] - self.tile_offsets[:-1]).long()
+        return torch.repeat_interleave(
+            torch.arange(len(counts), device=counts.device), counts, output_size=len(self)
+        )
+
+    def view_of_slot(self) -> Tensor:
+        """[P] int64: position in the batch (0 .. K-1) of the view of each slot."""
+        ends = torch.as_tensor(self.grid.offsets[1:], device=self.tile_ids.device)
+        return torch.searchsorted(ends, self.tile_ids.long(), right=True)[self.tile_of_slot()]
+
+    def coordinates(self) -> Tensor:
+        """[P, 2] int64 (x, y) of each slot in its view; (0, 0) for an empty slot."""
+        widths = torch.as_tensor(self.sizes[:, 0], device=self.pixel_ids.device)[self.view_of_slot()]
+        pixels = self.pixel_ids.long().clamp(min=0)
+        return torch.stack([pixels % widths, pixels // widths], dim=-1)
+
+
+@dataclass
+class LossOutput:
+    """What a loss says of the samples.
+
+    Args:
+        loss: scalar.
+        color_gradients: [P, 3], d loss / d rendered colour.
+        pixel_errors: [P] float32, L1 norm over RGB of the residual (0 .. 3); zero in empty slots.
+    """
+
+    loss: Tensor
+    color_gradients: Tensor
+    pixel_errors: Tensor
+
+
+@dataclass
+class GaussianGradients:
+    """Gradients of the parameters, in `Gaussians`' layout, with a leading view dimension where rows are asked for.
+
+    Args:
+        means, quats, scales, opacities, sh0: [K, N, ...] one row per view, or [1, N, ...] their sum.
+        shN: [N, B, 3], always summed.
+        touched: [N] bool, some sampled pixel had a contribution of this Gaussian.
+        view_losses: [K, N] (or [1, N]), the Gaussian's share of the loss in each view, ``sum over pixels of
+            e * w / P``; zero where the Gaussian has no part.
+    """
+
+    means: Tensor
+    quats: Tensor
+    scales: Tensor
+    opacities: Tensor
+    sh0: Tensor
+    shN: Tensor
+    touched: Tensor
+    view_losses: Tensor
+
+    def summed(self, name: str) -> Tensor:
+        """The gradient of one parameter in its own shape, summed over views."""
+        value = getattr(self, name)
+        return value if name == "shN" else value.sum(dim=0)
+
+
+@dataclass
+class GaussianStats:
+    """Per-Gaussian statistics of a window of iterations, added to by each backward pass (paper section 3.8).
+
+    Args:
+        error_sums: [N] float32, sum over views and samples of e * w, with w = T * alpha.
+        distance_sums: [N] float32, sum of D * w, D the Mahalanobis distance of the pixel in the projected conic.
+        weight_sums: [N] float32, sum of w.
+        grad_sums: [N] float32, sum over views of the norm of the screen gradient of the mean, in gsplat's units
+            (x scaled by K * width / 2, y by K * height / 2).
+        absgrad_sums: [N] float32, the same of the absolute gradients (AbsGS).
+        view_counts: [N] float32, views in which the Gaussian was on screen.
+        max_radii: [N] float32, largest screen radius over the larger side of the image.
+    """
+
+    error_sums: Tensor
+    distance_sums: Tensor
+    weight_sums: Tensor
+    grad_sums: Tensor
+    absgrad_sums: Tensor
+    view_counts: Tensor
+    max_radii: Tensor
+
+    @classmethod
+    def zeros(cls, count: int, device: torch.device | str) -> GaussianStats:
+        return cls(*(torch.zeros(count, device=device) for _ in fields(cls)))
+
+    def zero_(self) -> None:
+        for field in fields(self):
+            getattr(self, field.name).zero_()
+
+    def map(self, function) -> GaussianStats:
+        """Statistics whose every tensor is `function` of the present one."""
+        return GaussianStats(*(function(getattr(self, field.name)) for field in fields(self)))
+
+
+@dataclass
+class RowUpdate:
+    """A change of the set of Gaussians: clone, split, prune, relocate and reorder are all of this one form.
+
+    Row ``i`` of every array over Gaussians becomes a copy of old row ``source[i]``; where ``fresh[i]``, optimizer
+    state and statistics of the row start from zero instead; then ``values`` replace whole parameters.
+
+    Args:
+        source: [M] int64, the old row of each new row.
+        fresh: [M] bool.
+        values: name of a parameter -> its new tensor [M, ...]; parameters not named are copies.
+        num_cloned, num_split, num_pruned: for the report.
+    """
+
+    source: Tensor
+    fresh: Tensor
+    values: dict[str, Tensor]
+    num_cloned: int = 0
+    num_split: int = 0
+    num_pruned: int = 0
+
+    def apply(self, gaussians: Gaussians) -> Gaussians:
+        """The model after the change."""
+        return Gaussians(
+            **{
+                name: self.values[name] if name in self.values else value[self.source]
+                for name, value in gaussians.items()
+            }
+        )
+
+    def apply_state(self, state: Tensor) -> Tensor:
+        """A state tensor [N, ...] after the change: rows follow their Gaussian, fresh ones are zero."""
+        rows = state[self.source]
+        rows[self.fresh] = 0
+        return rows
+
+
+@dataclass(frozen=True)
+class Step:
+    """Where training stands. Algorithm 1's rho is `progress`; the scheduling appendix's rho is `anneal`.
+
+    Args:
+        iteration: t, from 0.
+        total: T, iterations of the whole run.
+        refine_until: tau_until, the last iteration of density control.
+        seed: of the run; all randomness is a function of (seed, iteration, place).
+        scene_extent: radius of the camera centres about their mean, world units.
+    """
+
+    iteration: int
+    total: int
+    refine_until: int
+    seed: int = 0
+    scene_extent: float = 1.0
+
+    @property
+    def progress(self) -> float:
+        """clip(t / tau_until, 0, 1): 0 at the start, 1 once density control is over."""
+        return min(1.0, self.iteration / max(1, self.refine_until))
+
+    @property
+    def anneal(self) -> float:
+        """1 - progress."""
+        return 1.0 - self.progress
+
+
+@dataclass(frozen=True)
+class SamplingBudget:
+    """How much one iteration looks at: `views` (K) views, and the fraction `rate` (r) of each tile's pixels."""
+
+    views: int
+    rate: float
