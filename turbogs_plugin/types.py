@@ -80,7 +80,7 @@ class Gaussians:
     @property
     def sh_degree(self) -> int:
         """The highest degree that `shN` can hold."""
-        return int(round((self.shN.shape[1] + 1) ** 0.5)) - 1
+        return round((self.shN.shape[1] + 1) ** 0.5) - 1
 
 
 @dataclass
@@ -183,9 +183,7 @@ class PixelSamples:
     def tile_of_slot(self) -> Tensor:
         """[P] int64: position in `tile_ids` of the tile of each slot."""
         counts = (self.tile_offsets[1:] - self.tile_offsets[:-1]).long()
-        return torch.repeat_interleave(
-            torch.arange(len(counts), device=counts.device), counts, output_size=len(self)
-        )
+        return torch.repeat_interleave(torch.arange(len(counts), device=counts.device), counts, output_size=len(self))
 
     def view_of_slot(self) -> Tensor:
         """[P] int64: position in the batch (0 .. K-1) of the view of each slot."""
