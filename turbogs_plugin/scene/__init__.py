@@ -1,1 +1,7 @@
+"""Captures: from files on disk to cameras, photos and points."""
 
+from turbogs_plugin.scene.frame import Frame
+from turbogs_plugin.scene.load import PosedImages, Scene, load_scene
+from turbogs_plugin.scene.photos import Photos
+
+__all__ = ["Frame", "Photos", "PosedImages", "Scene", "load_scene"]

@@ -1,0 +1,79 @@
+"""What a reader of one file format hands to `load_scene`: a capture in its own coordinates, checked, photos unread."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath, PureWindowsPath
+
+import numpy as np
+
+from turbogs_plugin.errors import InputError
+
+LARGEST_SIDE = 65535
+"""Photos wider or higher than this many pixels are refused (it is JPEG's own limit)."""
+
+
+@dataclass
+class Capture:
+    """V posed photos and M points, in the capture's own coordinates.
+
+    Args:
+        names: V distinct names, ascending.
+        photo_folder: photos of full size are ``photo_folder / name``; copies reduced by a factor may lie beside it, in
+            a folder of the same name with ``_2``, ``_4``, ... appended.
+        viewmats: [V, 4, 4] float64, world to camera (x right, y down, z forward).
+        Ks: [V, 3, 3] float64, intrinsics of the full-size photos.
+        sizes: [V, 2] int64 (width, height) of the full-size photos.
+        points: [M, 3] float64.
+        point_colors: [M, 3] uint8.
+    """
+
+    names: tuple[str, ...]
+    photo_folder: Path
+    viewmats: np.ndarray
+    Ks: np.ndarray
+    sizes: np.ndarray
+    points: np.ndarray
+    point_colors: np.ndarray
+
+    def check(self, source: Path) -> None:
+        """Raise `InputError` unless every number is finite and in range. `source` is named in messages."""
+        if not self.names:
+            raise InputError(f"{source} has no images with a pose: reconstruct the capture again")
+        if not len(self.points):
+            raise InputError(f"{source} has no 3D points: training starts from them, so reconstruct the capture again")
+        bad = ~np.isfinite(self.points).all(axis=1)
+        if bad.any():
+            raise InputError(f"{source}: {bad.sum()} of {len(bad)} 3D points are not finite")
+        orthogonality = self.viewmats[:, :3, :3] @ self.viewmats[:, :3, :3].transpose(0, 2, 1) - np.eye(3)
+        with np.errstate(invalid="ignore"):
+            posed = np.isfinite(self.viewmats).all(axis=(1, 2)) & (np.abs(orthogonality).max(axis=(1, 2)) < 1e-3)
+            posed &= np.linalg.det(np.nan_to_num(self.viewmats[:, :3, :3])) > 0
+        focal = self.Ks[:, [0, 1], [0, 1]]
+        lensed = np.isfinite(self.Ks).all(axis=(1, 2)) & (focal > 0).all(axis=1)
+        sized = ((self.sizes >= 1) & (self.sizes <= LARGEST_SIDE)).all(axis=1)
+        for ok, trouble in (
+            (posed, "a pose that is not a finite rotation and translation"),
+            (lensed, "intrinsics that are not finite with positive focal lengths"),
+            (sized, f"a size outside 1 .. {LARGEST_SIDE} pixels"),
+        ):
+            if not ok.all():
+                raise InputError(
+                    f"{source}: image '{self.names[int(np.argmin(ok))]}' has {trouble} ({(~ok).sum()} such images)"
+                )
+
+
+def check_photo_name(name: str, source: Path) -> str:
+    """The name, if it stays within the photo folder; else `InputError`."""
+    parts = PurePosixPath(name).parts
+    if (
+        not parts
+        or ".." in parts
+        or not name.isprintable()
+        or PurePosixPath(name).is_absolute()
+        or PureWindowsPath(name).is_absolute()
+        or PureWindowsPath(name).drive
+        or ".." in PureWindowsPath(name).parts
+    ):
+        raise InputError(f"{source}: image name {name!r} leaves the photo folder: names must be relative, without '..'")
+    return name

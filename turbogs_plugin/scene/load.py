@@ -1,0 +1,145 @@
+"""From a path to a scene that can be trained on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.scene.capture import Capture
+from turbogs_plugin.scene.colmap import find_model, read_colmap
+from turbogs_plugin.scene.frame import Frame
+from turbogs_plugin.scene.photos import Photos, load_photos, photo_size, reduced_sizes
+from turbogs_plugin.types import Cameras
+
+FEWEST_VIEWS = 3
+NAMED_AT_MOST = 3
+
+
+@dataclass
+class PosedImages:
+    """V photos with their cameras.
+
+    Args:
+        cameras: float32, in the scene's normalised frame.
+        names: of the photos, in name order.
+        photos: their pixels.
+    """
+
+    cameras: Cameras
+    names: tuple[str, ...]
+    photos: Photos
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def to(self, device: torch.device | str) -> PosedImages:
+        return PosedImages(self.cameras.to(device), self.names, self.photos.to(device))
+
+
+@dataclass
+class Scene:
+    """A capture ready for training, in its normalised frame.
+
+    Args:
+        name: of the scene's folder.
+        train, test: the two disjoint sets of views.
+        points: [M, 3] float32.
+        point_colors: [M, 3] uint8.
+        frame: back to the capture's own coordinates.
+        extent: 1.1 times the largest distance of a training camera from their mean, as in 3DGS; 1 by the choice of
+            frame, also where the cameras only turn on the spot.
+    """
+
+    name: str
+    train: PosedImages
+    test: PosedImages
+    points: Tensor
+    point_colors: Tensor
+    frame: Frame
+    extent: float
+
+
+def load_scene(path: str | Path, factor: int = 1, test_every: int = 8) -> Scene:
+    """Load a COLMAP reconstruction (binary or text) or a ``transforms.json`` with its photos.
+
+    Args:
+        path: the scene's folder. A reconstruction in ``sparse/0``, ``sparse`` or ``colmap/sparse/0`` goes before a
+            ``transforms.json``.
+        factor: photos and intrinsics are reduced by this. Copies in ``images_<factor>`` are used where all are there
+            in the right size; otherwise ``images`` are reduced by area averaging.
+        test_every: the first of each `test_every` photos in name order is a test view, the others are for training.
+
+    Raises:
+        InputError: anything wrong with the scene or the arguments, in one line.
+    """
+    scene = Path(path)
+    if not isinstance(factor, int) or factor < 1:
+        raise InputError(f"factor is {factor}: it must be an integer of at least 1")
+    if not isinstance(test_every, int) or test_every < 1:
+        raise InputError(f"test_every is {test_every}: it must be an integer of at least 2")
+    capture = _read(scene)
+    test = np.arange(len(capture.names)) % test_every == 0
+    if len(test) < FEWEST_VIEWS:
+        raise InputError(f"{scene} has {len(test)} images: at least {FEWEST_VIEWS} are needed")
+    if test.all():
+        raise InputError(f"test_every is {test_every}: every image of {scene} would be a test image; use 2 or more")
+
+    centers = -np.einsum("vji,vj->vi", capture.viewmats[:, :3, :3], capture.viewmats[:, :3, 3])
+    frame = Frame.around(centers[~test], capture.points)
+    viewmats = torch.from_numpy(frame.normalise_poses(capture.viewmats)).float()
+    paths, file_sizes, sizes = _find_photos(scene, capture, factor)
+    ratios = sizes / capture.sizes  # [V, 2]
+    intrinsics = capture.Ks.copy()
+    intrinsics[:, :2] *= ratios[:, :, None]
+
+    def select(views: np.ndarray) -> PosedImages:
+        cameras = Cameras(viewmats[views], torch.from_numpy(intrinsics[views]).float(), sizes[views])
+        names = tuple(capture.names[view] for view in views)
+        return PosedImages(
+            cameras, names, load_photos([paths[view] for view in views], file_sizes[views], sizes[views])
+        )
+
+    return Scene(
+        name=scene.resolve().name,
+        train=select(np.flatnonzero(~test)),
+        test=select(np.flatnonzero(test)),
+        points=torch.from_numpy(frame.normalise_points(capture.points)).float(),
+        point_colors=torch.from_numpy(capture.point_colors),
+        frame=frame,
+        extent=1.0,
+    )
+
+
+def _read(scene: Path) -> Capture:
+    if not scene.is_dir():
+        raise InputError(f"no such scene: {scene} is not a folder")
+    model = find_model(scene)
+    if model is not None:
+        return read_colmap(scene, *model)
+    raise InputError(f"{scene} has no COLMAP reconstruction (cameras, images and points3D as .bin or .txt in sparse/0)")
+
+
+def _find_photos(scene: Path, capture: Capture, factor: int) -> tuple[list[Path], np.ndarray, np.ndarray]:
+    """The files to read, [V, 2] their sizes, and [V, 2] the sizes to give them."""
+    targets = reduced_sizes(capture.sizes, factor)
+    if factor > 1 and capture.photo_folder != scene:
+        folder = capture.photo_folder.with_name(f"{capture.photo_folder.name}_{factor}")
+        paths = [folder / name for name in capture.names]
+        if all(path.is_file() for path in paths):
+            sizes = np.array([photo_size(path) for path in paths], dtype=np.int64)
+            if (np.abs(sizes - capture.sizes / factor) <= 1.0).all():
+                return paths, sizes, sizes
+    paths = [capture.photo_folder / name for name in capture.names]
+    missing = [name for name, path in zip(capture.names, paths, strict=True) if not path.is_file()]
+    if missing:
+        more = ", ..." if len(missing) > NAMED_AT_MOST else ""
+        raise InputError(
+            f"{len(missing)} of {len(paths)} photos are missing in {capture.photo_folder}: "
+            f"{', '.join(missing[:NAMED_AT_MOST])}{more}"
+        )
+    return paths, capture.sizes, targets

@@ -1,0 +1,142 @@
+"""Photos in memory: uint8, the pixels of all views laid end to end."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+from torch import Tensor
+
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.types import PixelSamples
+
+MEMORY_SHARE = 0.8
+"""Photos may take this share of the machine's memory."""
+
+
+@dataclass
+class Photos:
+    """The photos of V views.
+
+    Args:
+        colors: [X, 3] uint8, row-major pixels of one view after the other.
+        sizes: [V, 2] int64 numpy array (width, height).
+    """
+
+    colors: Tensor
+    sizes: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.sizes)
+
+    @property
+    def offsets(self) -> np.ndarray:
+        """[V + 1] int64: the first flat pixel of each view, and the count of all at the end."""
+        return pixel_offsets(self.sizes)
+
+    def gather(self, samples: PixelSamples) -> Tensor:
+        """[P, 3] float32, 0 .. 1: the colours at the samples, 0 in empty slots."""
+        starts = torch.as_tensor(self.offsets[list(samples.view_ids)], device=samples.pixel_ids.device)
+        flat = starts[samples.view_of_slot()] + samples.pixel_ids.long().clamp(min=0)
+        return self.colors[flat].float().div_(255.0).mul_(samples.filled[:, None])
+
+    def image(self, view_id: int) -> Tensor:
+        """[H, W, 3] float32, 0 .. 1: one whole photo."""
+        width, height = self.sizes[view_id].tolist()
+        start = int(self.offsets[view_id])
+        return self.colors[start : start + width * height].view(height, width, 3).float().div_(255.0)
+
+    def to(self, device: torch.device | str) -> Photos:
+        return Photos(self.colors.to(device), self.sizes)
+
+
+def pixel_offsets(sizes: np.ndarray) -> np.ndarray:
+    """[V + 1] int64: running count of the pixels of views of these `sizes` [V, 2]."""
+    return np.concatenate([[0], np.cumsum(sizes.prod(axis=1))]).astype(np.int64)
+
+
+def reduced_sizes(sizes: np.ndarray, factor: int) -> np.ndarray:
+    """[V, 2] int64: sizes divided by `factor`, to the nearest pixel and at least 1."""
+    return np.maximum(1, np.floor(sizes / factor + 0.5)).astype(np.int64)
+
+
+def photo_size(path: Path) -> tuple[int, int]:
+    """(width, height) from the file's header alone; `InputError` where it cannot be read."""
+    try:
+        with Image.open(path) as image:
+            return image.size
+    except Exception as error:  # a broken file can raise anything in its decoder
+        raise InputError(f"cannot read the photo {path}: {_reason(error)}") from error
+
+
+def load_photos(paths: Sequence[Path], sizes: np.ndarray, targets: np.ndarray) -> Photos:
+    """Decode photos in parallel, reduced to their target sizes by area averaging.
+
+    Transparent photos are composited over black, the background that renders have. Photos are taken as stored:
+    an orientation in EXIF is ignored, as COLMAP does.
+
+    Args:
+        paths: V files.
+        sizes: [V, 2] int64 (width, height) that the files must have.
+        targets: [V, 2] int64 (width, height) to give them.
+
+    Raises:
+        InputError: a photo that cannot be decoded, or is of another size (the first one in order is named); more
+            photos than fit in memory.
+    """
+    offsets = pixel_offsets(targets)
+    needed, present = 3 * int(offsets[-1]), os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    if needed > MEMORY_SHARE * present:
+        raise InputError(
+            f"{len(paths)} photos take {needed / 2**30:.1f} GiB of the machine's {present / 2**30:.1f} GiB: "
+            "use a larger --factor"
+        )
+    colors = torch.empty(int(offsets[-1]), 3, dtype=torch.uint8)
+    pixels = colors.numpy()
+
+    def load(view: int) -> None:
+        target = tuple(targets[view].tolist())
+        photo = _decode(paths[view], tuple(sizes[view].tolist()))
+        if photo.size != target:
+            photo = photo.resize(target, Image.Resampling.BOX)
+        pixels[offsets[view] : offsets[view + 1]] = np.asarray(photo).reshape(-1, 3)
+
+    with ThreadPoolExecutor(min(8, os.cpu_count() or 1)) as pool:
+        for job in [pool.submit(load, view) for view in range(len(paths))]:
+            try:
+                job.result()
+            except BaseException:
+                pool.shutdown(wait=True, cancel_futures=True)
+                raise
+    return Photos(colors, targets)
+
+
+def _decode(path: Path, size: tuple[int, int]) -> Image.Image:
+    """An RGB image of exactly this size, or `InputError`. The size is checked before any pixel is decoded."""
+    try:
+        with Image.open(path) as image:
+            if image.size != size:
+                raise InputError(
+                    f"photo {path} is {image.size[0]}x{image.size[1]} but its camera is {size[0]}x{size[1]}: "
+                    "use the photos that the cameras were reconstructed from"
+                )
+            if image.mode.startswith(("I", "F")):
+                raise InputError(f"photo {path} has more than 8 bits a channel: convert it to 8-bit RGB")
+            if "A" in image.getbands() or "transparency" in image.info:
+                image = image.convert("RGBA")
+                return Image.alpha_composite(Image.new("RGBA", size, (0, 0, 0, 255)), image).convert("RGB")
+            return image.convert("RGB")
+    except InputError:
+        raise
+    except Exception as error:  # a broken file can raise anything in its decoder
+        raise InputError(f"cannot read the photo {path}: {_reason(error)}") from error
+
+
+def _reason(error: Exception) -> str:
+    return " ".join((str(error) or type(error).__name__).split())
