@@ -1,0 +1,69 @@
+// Parameters of the training kernels: plain structs of raw pointers, one per launch, passed by value. No torch here.
+//
+// Index spaces as in turbogs_plugin/types.py: K views of the batch, N Gaussians, P sample slots, T tiles with samples,
+// X flat pixels of all training views.
+#pragma once
+
+#include <cuda_runtime.h>
+
+#include <cstdint>
+
+namespace turbogs {
+
+constexpr int kTrainingMaxViews = 32;      // views of one batch: a Gaussian's touched views are one 32-bit mask
+constexpr int kTrainingMaxBands = 15;      // harmonics above band 0: degree 3
+constexpr int kRowSize = 14;               // mean 3, scale 3, quaternion 4, sh0 3, opacity 1
+constexpr int kRecordQuads = 4;            // a screen-gradient record is 16 floats
+
+// The screen gradients of a batch, the parameters that they belong to, and what the backward pass adds up.
+//
+// Record of (view, Gaussian): 0-1 d/dmean2d, 2-4 d/dconic, 5-7 d/dcolor behind the clamp at 0, 8 d/dopacity,
+// 9-10 absolute sums of d/dmean2d, 11 sum e*w, 12 sum D*w, 13 sum w, 14 d/ddepth, 15 unused.
+struct ScreenBackwardParams {
+    int num_views;      // K
+    int num_gaussians;  // N
+    int sh_degree;      // active degree
+    int bands;          // B, harmonics above band 0 that `shN` stores; B >= (sh_degree + 1)^2 - 1
+    float eps2d;        // added to the diagonal of the screen covariance
+
+    const float* means;      // [N, 3]
+    const float* quats;      // [N, 4], not normalised
+    const float* scales;     // [N, 3], logarithms
+    const float* opacities;  // [N], logits
+    const float* sh0;        // [N, 3]
+    const float* shN;        // [N, B, 3]
+
+    const float* viewmats;    // [K, 4, 4]
+    const float* intrinsics;  // [K, 3, 3]
+    int widths[kTrainingMaxViews];
+    int heights[kTrainingMaxViews];
+
+    const float4* records;       // [K, N, 4]
+    const int2* radii;           // [K, N]; read only where `stats` are wanted
+    const int32_t* num_filled;   // [1] filled samples of the batch, or null: then `sample_count` holds
+    int sample_count;
+    const int32_t* overflow;     // [1], or null; where set, the launch does nothing
+
+    // GaussianStats, added to in place; all null where not wanted.
+    float* error_sums;     // [N]
+    float* distance_sums;  // [N]
+    float* weight_sums;    // [N]
+    float* grad_sums;      // [N]
+    float* absgrad_sums;   // [N]
+    float* view_counts;    // [N]
+    float* max_radii;      // [N]
+};
+
+// Outputs of the unfused backward pass. Every entry is written, zeros included.
+struct ProjectionBackwardOutputs {
+    bool per_view;       // rows of each view, or their sum
+    float* rows;         // [K, N, 14] or [1, N, 14]
+    float* shN;          // [N, B, 3]
+    bool* touched;       // [N]
+    float* view_losses;  // [K, N] or [1, N]
+};
+
+cudaError_t launch_projection_backward(const ScreenBackwardParams& params, const ProjectionBackwardOutputs& outputs,
+                                       cudaStream_t stream);
+
+}  // namespace turbogs
