@@ -8,7 +8,7 @@ import warnings
 from torch import Tensor
 
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.nearest import mean_neighbor_distances
+from turbogs_plugin.scene.nearest import mean_neighbor_distances
 from turbogs_plugin.types import Gaussians
 
 SH_C0 = 0.28209479177387814

@@ -1,7 +1,8 @@
 """Captures: from files on disk to cameras, photos and points."""
 
+from turbogs_plugin.scene.demo import write_demo_capture
 from turbogs_plugin.scene.frame import Frame
 from turbogs_plugin.scene.load import PosedImages, Scene, load_scene
 from turbogs_plugin.scene.photos import Photos
 
-__all__ = ["Frame", "Photos", "PosedImages", "Scene", "load_scene"]
+__all__ = ["Frame", "Photos", "PosedImages", "Scene", "load_scene", "write_demo_capture"]

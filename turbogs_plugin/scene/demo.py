@@ -1,0 +1,268 @@
+"""A small capture to try things on: textured solids, photographed from an orbit and written as a COLMAP dataset.
+
+The photos come from a ray caster below, several rays a pixel; the reconstruction holds the true cameras and surface
+points that are seen in at least two photos, displaced by a little noise, with their tracks.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from PIL import Image
+
+from turbogs_plugin.errors import InputError
+
+Texture = Callable[[np.ndarray], np.ndarray]
+"""[R, 3] points in the solid's own coordinates -> [R, 3] colours, 0 .. 1."""
+
+RAYS_PER_SIDE = 3
+"""Each pixel is the mean of this many rays squared. Odd, so that one goes through its centre."""
+LIGHT = np.array([0.45, -0.25, 0.86], dtype=np.float32)
+AMBIENT = 0.55
+ORBIT_RADIUS, ORBIT_HEIGHT, ORBIT_SWING = 3.6, 1.9, 0.5
+FOCAL = 1.15
+"""Focal length in image widths: 47 degrees across."""
+POINT_NOISE = 0.004
+"""Standard deviation of the noise on the reconstruction's points; solids are about 1 across."""
+POINTS_PER_VIEW = 150
+
+
+@dataclass
+class Solid:
+    """A sphere, box or disc, placed by a turn about the vertical and a translation.
+
+    Args:
+        intersect: (origins [3], directions [R, 3]) in own coordinates -> [R] distances, inf where missed.
+        normal: [R, 3] surface points -> [R, 3] outward unit normals, in own coordinates.
+        texture: colours of surface points.
+        position: [3].
+        turn: radians.
+    """
+
+    intersect: Callable[[np.ndarray, np.ndarray], np.ndarray]
+    normal: Callable[[np.ndarray], np.ndarray]
+    texture: Texture
+    position: np.ndarray
+    turn: float = 0.0
+
+    @property
+    def rotation(self) -> np.ndarray:
+        """[3, 3] own to world."""
+        cos, sin = np.cos(self.turn), np.sin(self.turn)
+        return np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]], dtype=np.float32)
+
+
+def sphere(radius: float, **placed) -> Solid:
+    def intersect(origin: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        along = directions @ origin
+        under_root = along**2 - (origin @ origin - radius**2)
+        with np.errstate(invalid="ignore"):
+            return np.where(under_root > 0, -along - np.sqrt(under_root), np.inf)
+
+    return Solid(intersect, lambda points: points / radius, **placed)
+
+
+def box(half: tuple[float, float, float], **placed) -> Solid:
+    half_sides = np.array(half, dtype=np.float32)
+
+    def intersect(origin: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        with np.errstate(divide="ignore"):
+            inverse = 1.0 / directions
+        first, second = (-half_sides - origin) * inverse, (half_sides - origin) * inverse
+        enter, leave = np.minimum(first, second).max(axis=1), np.maximum(first, second).min(axis=1)
+        return np.where((enter < leave) & (enter > 0), enter, np.inf)
+
+    def normal(points: np.ndarray) -> np.ndarray:
+        relative = points / half_sides
+        return np.sign(relative) * (np.abs(relative) == np.abs(relative).max(axis=1, keepdims=True))
+
+    return Solid(intersect, normal, **placed)
+
+
+def disc(radius: float, **placed) -> Solid:
+    def intersect(origin: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        distances = -origin[2] / directions[:, 2]
+        hits = origin + distances[:, None] * directions
+        return np.where((distances > 0) & (hits[:, 0] ** 2 + hits[:, 1] ** 2 < radius**2), distances, np.inf)
+
+    return Solid(intersect, lambda points: np.broadcast_to(np.float32([0, 0, 1]), points.shape), **placed)
+
+
+def checker(size: float, first: np.ndarray, second: np.ndarray) -> Texture:
+    def colors(points: np.ndarray) -> np.ndarray:
+        odd = np.floor(points / size + 0.25).sum(axis=1) % 2 > 0.5
+        return np.where(odd[:, None], first, second)
+
+    return colors
+
+
+def noise(size: float, first: np.ndarray, second: np.ndarray, random: np.random.Generator) -> Texture:
+    """A smooth random mix of two colours: the mean of plane waves of wavelengths about `size`."""
+    waves = random.normal(size=(3, 12)).astype(np.float32) * (4.0 / size)
+    phases = random.uniform(0, 2 * np.pi, 12).astype(np.float32)
+
+    def colors(points: np.ndarray) -> np.ndarray:
+        share = 0.5 + 0.5 * np.tanh(2.5 * np.sin(points @ waves + phases).mean(axis=1))
+        return first + share[:, None] * (second - first)
+
+    return colors
+
+
+def demo_solids(random: np.random.Generator) -> list[Solid]:
+    """Five solids on a round table; colours, textures and turns are drawn from `random`."""
+
+    def color() -> np.ndarray:
+        return random.uniform(0.1, 0.95, 3).astype(np.float32)
+
+    def turn() -> float:
+        return float(random.uniform(0, np.pi))
+
+    def at(x: float, y: float, z: float) -> np.ndarray:
+        return np.array([x, y, z], dtype=np.float32)
+
+    return [
+        disc(1.7, texture=noise(0.8, color(), color(), random), position=at(0, 0, 0), turn=turn()),
+        box((0.35, 0.35, 0.45), texture=checker(0.23, color(), color()), position=at(0.1, 0.0, 0.45), turn=turn()),
+        sphere(0.36, texture=noise(0.5, color(), color(), random), position=at(-0.85, 0.35, 0.36), turn=turn()),
+        sphere(0.28, texture=checker(0.2, color(), color()), position=at(0.55, -0.85, 0.28), turn=turn()),
+        box(
+            (0.4, 0.18, 0.15), texture=noise(0.4, color(), color(), random), position=at(-0.5, -0.75, 0.15), turn=turn()
+        ),
+        box((0.15, 0.15, 0.3), texture=noise(0.3, color(), color(), random), position=at(0.8, 0.65, 0.3), turn=turn()),
+    ]
+
+
+def cast(solids: list[Solid], origin: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """[R, 3] colours and [R] distances of what rays see; black at infinity where they see nothing."""
+    nearest = np.full(len(directions), np.inf, dtype=np.float32)
+    owner = np.full(len(directions), -1)
+    for number, solid in enumerate(solids):
+        distances = solid.intersect((origin - solid.position) @ solid.rotation, directions @ solid.rotation)
+        closer = distances < nearest
+        nearest[closer], owner[closer] = distances[closer], number
+    colors = np.zeros((len(directions), 3), dtype=np.float32)
+    for number, solid in enumerate(solids):
+        rays = np.flatnonzero(owner == number)
+        points = (origin + nearest[rays, None] * directions[rays] - solid.position) @ solid.rotation
+        light = np.maximum(solid.normal(points) @ solid.rotation.T @ LIGHT, 0.0)
+        colors[rays] = solid.texture(points) * (AMBIENT + (1.0 - AMBIENT) * light)[:, None]
+    return colors, nearest
+
+
+def orbit_pose(angle: float) -> np.ndarray:
+    """[3, 4] float64 world to camera, on a ring about the table that swings in height, looking at the middle."""
+    center = np.array(
+        [ORBIT_RADIUS * np.cos(angle), ORBIT_RADIUS * np.sin(angle), ORBIT_HEIGHT + ORBIT_SWING * np.sin(3 * angle)]
+    )
+    forward = np.array([0.0, 0.0, 0.25]) - center
+    forward /= np.linalg.norm(forward)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    return np.concatenate([rotation, -rotation @ center[:, None]], axis=1)
+
+
+def write_demo_capture(path: str | Path, seed: int = 0, views: int = 32, width: int = 160, height: int = 120) -> Path:
+    """Write the demo capture to the new folder `path`: ``images/*.png`` and ``sparse/0``.
+
+    The same arguments give the same pixels, cameras and points.
+
+    Raises:
+        InputError: `path` is there already, or fewer than 3 views or an image without area are asked for.
+    """
+    target = Path(path)
+    if target.exists():
+        raise InputError(f"{target} is there already: choose a new folder for the demo capture")
+    if views < 3 or width < 1 or height < 1:
+        raise InputError(f"the demo capture was asked for {views} views of {width}x{height}: at least 3 of 1x1 needed")
+    partial = target.with_name(f"{target.name}.partial-{os.getpid()}")
+    try:
+        _write(partial, np.random.default_rng(seed), views, width, height)
+        os.replace(partial, target)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+    return target
+
+
+def _write(folder: Path, random: np.random.Generator, views: int, width: int, height: int) -> None:
+    solids = demo_solids(random)
+    (folder / "images").mkdir(parents=True)
+    (folder / "sparse" / "0").mkdir(parents=True)
+    focal = FOCAL * width
+    poses = np.stack([orbit_pose(2 * np.pi * view / views) for view in range(views)])  # [V, 3, 4]
+    side = RAYS_PER_SIDE
+    x, y = np.meshgrid((np.arange(width * side) + 0.5) / side, (np.arange(height * side) + 0.5) / side)
+    rays = np.stack([(x - width / 2) / focal, (y - height / 2) / focal, np.ones_like(x)], axis=-1)
+
+    depths = np.empty((views, height, width), dtype=np.float32)
+    points, point_colors = [], []
+    for view, pose in enumerate(poses):
+        origin = (-pose[:, :3].T @ pose[:, 3]).astype(np.float32)
+        directions = (rays.reshape(-1, 3) @ pose[:, :3]).astype(np.float32)
+        lengths = np.linalg.norm(directions, axis=1, keepdims=True)
+        directions /= lengths
+        colors, distances = cast(solids, origin, directions)
+        pixels = colors.reshape(height, side, width, side, 3).mean(axis=(1, 3))
+        Image.fromarray(np.round(pixels * 255).astype(np.uint8)).save(folder / "images" / photo_name(view))
+        centers = np.s_[side // 2 :: side, side // 2 :: side]
+        depths[view] = (distances[:, None] / lengths).reshape(height * side, width * side)[centers]
+        hits = np.flatnonzero(np.isfinite(distances))
+        chosen = random.choice(hits, min(POINTS_PER_VIEW, len(hits)), replace=False)
+        points.append(origin + distances[chosen, None] * directions[chosen])
+        point_colors.append(colors[chosen])
+    reconstruction = _reconstruct(poses, np.concatenate(points), np.concatenate(point_colors), depths, focal, random)
+    reconstruction.write_binary(folder / "sparse" / "0")
+
+
+def photo_name(view: int) -> str:
+    return f"view_{view:03d}.png"
+
+
+def _reconstruct(
+    poses: np.ndarray,
+    points: np.ndarray,
+    colors: np.ndarray,
+    depths: np.ndarray,
+    focal: float,
+    random: np.random.Generator,
+) -> pycolmap.Reconstruction:
+    """A reconstruction as COLMAP would have made it.
+
+    Args:
+        poses: [V, 3, 4] world to camera.
+        points, colors: [M, 3] on surfaces; colours 0 .. 1.
+        depths: [V, H, W] of the pixels' centres, inf where there is nothing.
+        focal: pixels.
+    """
+    views, height, width = depths.shape
+    local = np.einsum("vij,mj->vmi", poses[:, :, :3], points) + poses[:, None, :, 3]  # [V, M, 3]
+    pixels = local[..., :2] / local[..., 2:] * focal + [width / 2, height / 2]  # [V, M, 2]
+    columns, rows = np.floor(pixels).astype(int).transpose(2, 0, 1)
+    inside = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
+    seen_depths = depths[np.arange(views)[:, None], rows.clip(0, height - 1), columns.clip(0, width - 1)]
+    visible = inside & (np.abs(local[..., 2] - seen_depths) < 0.02 * seen_depths)  # [V, M]
+    visible &= visible.sum(axis=0) >= 2
+
+    reconstruction = pycolmap.Reconstruction()
+    camera = pycolmap.Camera(
+        camera_id=1, model="PINHOLE", width=width, height=height, params=[focal, focal, width / 2, height / 2]
+    )
+    reconstruction.add_camera_with_trivial_rig(camera)
+    positions = np.cumsum(visible, axis=1) - 1  # [V, M] number of a point among those of its view
+    for view in range(views):
+        image = pycolmap.Image(photo_name(view), keypoints=pixels[view, visible[view]], camera_id=1, image_id=view + 1)
+        reconstruction.add_image_with_trivial_frame(image, pycolmap.Rigid3d(poses[view]))
+    displaced = points + random.normal(scale=POINT_NOISE, size=points.shape)
+    for point in np.flatnonzero(visible.any(axis=0)):
+        track = pycolmap.Track(
+            [pycolmap.TrackElement(view + 1, positions[view, point]) for view in np.flatnonzero(visible[:, point])]
+        )
+        reconstruction.add_point3D(displaced[point], track, np.round(colors[point] * 255).astype(np.uint8))
+    reconstruction.update_point_3d_errors()
+    return reconstruction
