@@ -1,49 +1,87 @@
 """Persistent error and age of every pixel of every training view (paper section 3.3).
 
 The maps of all views lie end to end in one array ("flat pixels"), so views may differ in size. Ages are kept as
-the iteration of the last visit ("stamps"): the same ages as the paper's counters at the cost of the sampled pixels
-alone. The mean error of a view is kept incrementally; as errors are stored in half precision and their sums in double,
-those sums are exact and do not drift.
+the iteration of the last visit ("stamps"): the same ages as the paper's counters, plus one, at the cost of the sampled
+pixels alone. The mean error of a view is kept incrementally; as errors are stored in half precision and their sums in
+double, those sums are exact (below 2^29 a view) and do not drift.
+
+Without Gaussians, from plain error images::
+
+    maps = ErrorMaps.from_images(errors)                                 # [V, H, W], or a list of [H, W]
+    step = Step(iteration=t, total=1000, refine_until=1000)
+    samples = ErrorGuidedPixelSampler().sample(maps, (4, 2), 0.1, step)  # a tenth of views 4 and 2
+    maps.update(samples, new_errors, step)                               # [P]
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from turbogs_plugin.errors import require
 from turbogs_plugin.types import PixelSamples, Step
 
 AGE_MAX = 32767
 """Ages saturate here, in iterations."""
+
+ERROR_MAX = 65504.0
+"""Errors saturate here: the largest finite number in half precision."""
 
 
 @dataclass
 class ErrorMaps:
     """Error and age of X flat pixels in V views.
 
+    The age of a pixel at iteration t is ``min(t - stamp, AGE_MAX)``, where the stamp of a pixel never sampled is -1.
+    Stamps are stored relative to `stamp_base`, which moves on (one sweep of the map) every `AGE_MAX` iterations.
+
     Args:
         sizes: [V, 2] int64 numpy array (width, height).
         device: where the maps live.
         beta: EMA weight of a new error.
+        refresh: on a device other than the CPU, `view_means` is brought up to date every so many calls.
     """
 
     sizes: np.ndarray
     device: torch.device | str = "cpu"
     beta: float = 0.4
+    refresh: int = 16
     errors: Tensor = field(init=False)  # [X] float16
     stamps: Tensor = field(init=False)  # [X] int16, iteration of the last visit minus `stamp_base`
     view_sums: Tensor = field(init=False)  # [V] float64, sum of `errors` in each view
     stamp_base: int = field(init=False, default=0)
 
     def __post_init__(self) -> None:
+        require(0 < self.beta <= 1, "beta", self.beta, "above 0, at most 1")
+        require(self.refresh >= 1, "refresh", self.refresh, "1 or more")
+        self.sizes = np.asarray(self.sizes, dtype=np.int64)
         self.offsets = np.concatenate([[0], np.cumsum(self.sizes.prod(axis=1))])  # [V + 1]
         pixels = int(self.offsets[-1])
-        self.errors = torch.zeros(pixels, dtype=torch.float16, device=self.device)
-        self.stamps = torch.zeros(pixels, dtype=torch.int16, device=self.device)
+        # One pixel more than the maps: empty slots write there, so that no device has to count them first.
+        self._errors = torch.zeros(pixels + 1, dtype=torch.float16, device=self.device)
+        self._stamps = torch.full((pixels + 1,), -1, dtype=torch.int16, device=self.device)
+        self.errors, self.stamps = self._errors[:-1], self._stamps[:-1]
         self.view_sums = torch.zeros(len(self.sizes), dtype=torch.float64, device=self.device)
+        self._means = _LaggedCopy(self.view_sums, self.refresh)
+
+    @classmethod
+    def from_images(cls, errors: Tensor | Sequence[Tensor], **options: Any) -> ErrorMaps:
+        """Maps that start from given error images.
+
+        Args:
+            errors: [V, H, W] float, or V tensors [H, W] whose sizes may differ; the maps live on their device.
+            options: further arguments of `ErrorMaps`.
+        """
+        sizes = np.array([(image.shape[1], image.shape[0]) for image in errors], dtype=np.int64)
+        maps = cls(sizes, device=errors[0].device, **options)
+        for view_id, image in enumerate(errors):
+            maps.initialise(view_id, image.reshape(-1))
+        return maps
 
     def flat_pixels(self, samples: PixelSamples) -> Tensor:
         """[P] int64: flat pixel of each slot; an empty slot gets the first pixel of its view."""
@@ -52,17 +90,132 @@ class ErrorMaps:
 
     def initialise(self, view_id: int, errors: Tensor) -> None:
         """Set the errors of one whole view. `errors`: [H * W] float; non-finite ones count as zero."""
-        raise NotImplementedError
+        width, height = self.sizes[view_id]
+        if errors.shape != (width * height,):
+            raise ValueError(f"errors of view {view_id} have shape {tuple(errors.shape)}, expected ({width * height},)")
+        start, end = self.offsets[view_id : view_id + 2]
+        errors = torch.nan_to_num(errors.float(), nan=0.0, posinf=0.0, neginf=0.0).clamp(0.0, ERROR_MAX)
+        self.errors[start:end] = errors.to(torch.float16)
+        self.view_sums[view_id] = self.errors[start:end].sum(dtype=torch.float64)
+        self._means.restart()
 
     def update(self, samples: PixelSamples, pixel_errors: Tensor, step: Step) -> None:
-        """EMA of the errors, stamps and view sums at the samples; non-finite errors change nothing.
-        `pixel_errors`: [P] float."""
-        raise NotImplementedError
+        """EMA of the errors, stamps and view sums at the samples.
+
+        A non-finite error changes nothing of its pixel: not its error, its stamp, nor its view's sum. Finite errors
+        saturate at `ERROR_MAX`. The new error is ``half(min((1 - beta) * old + beta * new, ERROR_MAX))`` with
+        both factors and every operation rounded to single precision.
+
+        Args:
+            pixel_errors: [P] float, 0 or more; what stands in empty slots is ignored.
+            step: gives the stamp.
+        """
+        self._rebase(step.iteration)
+        views = samples.view_of_slot()
+        errors = pixel_errors.float()
+        starts = torch.as_tensor(self.offsets[list(samples.view_ids)], device=errors.device)
+        changed = samples.filled & torch.isfinite(errors)
+        flat = torch.where(changed, starts[views] + samples.pixel_ids, len(self.errors))
+        old = self._errors[flat]
+        new = (old.float() * (1.0 - self.beta) + errors * self.beta).clamp(max=ERROR_MAX).to(torch.float16)
+        self._errors[flat] = new
+        self._stamps[flat] = step.iteration - self.stamp_base
+        deltas = torch.where(changed, new.double() - old.double(), 0.0)
+        batch_sums = deltas.new_zeros(len(samples.view_ids)).index_add_(0, views, deltas)
+        view_ids = torch.as_tensor(samples.view_ids, device=errors.device)
+        self.view_sums.index_add_(0, view_ids, batch_sums)
 
     def ages(self, view_id: int, step: Step) -> Tensor:
         """[H * W] int32: iterations since each pixel of a view was last sampled, saturated at `AGE_MAX`."""
-        raise NotImplementedError
+        start, end = self.offsets[view_id : view_id + 2]
+        now = step.iteration - self.stamp_base
+        return (now - self.stamps[start:end].int()).clamp(0, AGE_MAX)
 
     def view_means(self) -> np.ndarray:
-        """[V] float64 on the host: mean error of each view."""
-        return self.view_sums.cpu().numpy() / self.sizes.prod(axis=1)
+        """[V] float64 on the host: mean error of each view.
+
+        On the CPU they are exact. Elsewhere reading them at every call would stall the device, so a copy is started
+        at every `refresh`-th call and read at the next such call: the means are between `refresh` and
+        ``2 * refresh - 1`` calls old (between 0 and ``2 * refresh - 1`` after the first call or `initialise`, which
+        wait for the device), and depend on the number of calls alone, never on timing.
+        """
+        return np.maximum(self._means.read(), 0.0) / self.sizes.prod(axis=1)
+
+    def mean(self) -> float:
+        """Mean over the views of their mean error, the schedule's E_mean: counts as a call of `view_means`."""
+        return float(self.view_means().mean())
+
+    def state_dict(self) -> dict[str, Any]:
+        """Plain tensors and numbers; resuming from them is bit-identical."""
+        return {
+            "errors": self.errors.clone(),
+            "stamps": self.stamps.clone(),
+            "stamp_base": self.stamp_base,
+            "view_sums": self.view_sums.clone(),
+            **self._means.state_dict(),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        if state["errors"].shape != self.errors.shape or state["view_sums"].shape != self.view_sums.shape:
+            raise ValueError("the state's error maps are of other views than these")
+        self.errors.copy_(state["errors"])
+        self.stamps.copy_(state["stamps"])
+        self.stamp_base = int(state["stamp_base"])
+        self.view_sums.copy_(state["view_sums"])
+        self._means.load_state_dict(state)
+
+    def _rebase(self, iteration: int) -> None:
+        """Keep ``iteration - stamp_base`` within the stamps' range; stamps too old to matter saturate."""
+        shift = iteration - self.stamp_base
+        if shift > AGE_MAX:
+            self._stamps.copy_((self._stamps.int() - shift).clamp(min=-AGE_MAX))
+            self.stamp_base = iteration
+
+
+class _LaggedCopy:
+    """The values of a small device tensor on the host, a fixed number of reads late; see `ErrorMaps.view_means`."""
+
+    def __init__(self, source: Tensor, refresh: int) -> None:
+        self.source, self.refresh = source, refresh
+        self.restart()
+
+    def restart(self) -> None:
+        """The next read waits for the device and is exact."""
+        self.reads = 0
+        self.values = self.pending = np.zeros(len(self.source))
+        self.copy: tuple[Tensor, torch.cuda.Event] | None = None
+
+    def read(self) -> np.ndarray:
+        """[V] float64."""
+        if not self.source.is_cuda:
+            return self.source.numpy().copy()
+        if self.reads % self.refresh == 0:
+            self._collect()
+            self.values = self.source.cpu().numpy() if self.reads == 0 else self.pending
+            buffer = self.copy[0] if self.copy else torch.empty(self.source.shape, dtype=torch.float64, pin_memory=True)
+            buffer.copy_(self.source, non_blocking=True)
+            event = torch.cuda.Event()
+            event.record()
+            self.copy = (buffer, event)
+        self.reads += 1
+        return self.values.copy()
+
+    def _collect(self) -> None:
+        """Take the copy that is under way; by now it has long arrived."""
+        if self.copy is not None:
+            buffer, event = self.copy
+            event.synchronize()
+            self.pending = buffer.numpy().copy()
+
+    def state_dict(self) -> dict[str, Any]:
+        self._collect()
+        return {
+            "mean_reads": self.reads,
+            "mean_values": torch.from_numpy(self.values.copy()),
+            "mean_pending": torch.from_numpy(self.pending.copy()),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self.reads, self.copy = int(state["mean_reads"]), None
+        self.values = state["mean_values"].cpu().numpy().copy()
+        self.pending = state["mean_pending"].cpu().numpy().copy()

@@ -1,0 +1,131 @@
+"""How many views and which share of their pixels an iteration looks at (paper, appendix, adaptive scheduling).
+
+All schedules but the fixed one share the appendix's two equations and differ in the modulation phi of the error
+ratio::
+
+    ratio = clip(E_mean / (E_init + eps), 0, 1)
+    x     = 1 - anneal * phi(ratio)
+    K     = round(K_min + (K_max - K_min) * exp(-alpha * x))
+    r     = r_min + (r_max - r_min) * x,    r_min = lambda / K_max,  r_max = lambda / K_min
+
+so that K * r stays at about lambda (`pixel_budget`): many views with few pixels each at first, then fewer views with
+more pixels. A scene with fewer views than K_min or K_max lowers those two, which keeps K * r at lambda there too;
+r never exceeds 1.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from turbogs_plugin.errors import require
+from turbogs_plugin.types import SamplingBudget, Step
+
+EPSILON = 1e-12
+"""Added to the initial error, which is zero where the initial model is already exact."""
+
+
+def error_ratio(mean_error: float, initial_error: float) -> float:
+    """clip(E_mean / (E_init + eps), 0, 1); 0 where the quotient is not a number."""
+    return min(1.0, max(0.0, mean_error / (initial_error + EPSILON)))
+
+
+def _check_budget(pixel_budget: float) -> None:
+    valid = math.isfinite(pixel_budget) and pixel_budget > 0
+    require(valid, "pixel_budget", pixel_budget, "a finite number above 0 (images per iteration)")
+
+
+@dataclass
+class _AdaptiveSchedule:
+    """The appendix's equations; subclasses give `phi`.
+
+    Args:
+        min_views, max_views: K_min and K_max.
+        pixel_budget: lambda, the pixels of one iteration in full images.
+        alpha: how fast K falls from K_max to K_min.
+    """
+
+    min_views: int = 3
+    max_views: int = 10
+    pixel_budget: float = 1.0
+    alpha: float = 3.0
+
+    def __post_init__(self) -> None:
+        require(self.min_views >= 1, "min_views", self.min_views, "1 or more")
+        allowed = f"min_views ({self.min_views}) or more"
+        require(self.max_views >= self.min_views, "max_views", self.max_views, allowed)
+        _check_budget(self.pixel_budget)
+        require(math.isfinite(self.alpha) and self.alpha >= 0, "alpha", self.alpha, "finite and 0 or more")
+
+    def phi(self, ratio: float) -> float:
+        """The modulation of the error ratio, from [0, 1] onto [0, 1]."""
+        raise NotImplementedError
+
+    def query(self, step: Step, mean_error: float, initial_error: float, num_views: int) -> SamplingBudget:
+        """The budget of this iteration.
+
+        Args:
+            step: gives `anneal`.
+            mean_error, initial_error: mean over the training views of their mean error, now and at the start.
+            num_views: V, an upper bound of K.
+        """
+        low, high = min(self.min_views, num_views), min(self.max_views, num_views)
+        x = 1.0 - step.anneal * self.phi(error_ratio(mean_error, initial_error))
+        views = math.floor(low + (high - low) * math.exp(-self.alpha * x) + 0.5)
+        rate_low, rate_high = self.pixel_budget / high, self.pixel_budget / low
+        return SamplingBudget(views, min(1.0, rate_low + (rate_high - rate_low) * x))
+
+
+@dataclass
+class SinusoidalSchedule(_AdaptiveSchedule):
+    """phi(ratio) = sin(pi/2 * sqrt(ratio)): the paper's, most sensitive where the error is low."""
+
+    def phi(self, ratio: float) -> float:
+        return math.sin(0.5 * math.pi * math.sqrt(ratio))
+
+
+@dataclass
+class LinearSchedule(_AdaptiveSchedule):
+    """phi(ratio) = ratio."""
+
+    def phi(self, ratio: float) -> float:
+        return ratio
+
+
+@dataclass
+class ExponentialSchedule(_AdaptiveSchedule):
+    """phi(ratio) = (1 - exp(-steepness * ratio)) / (1 - exp(-steepness)).
+
+    The paper names an exponential variant without an equation; this is the saturating one through (0, 0) and (1, 1).
+    """
+
+    steepness: float = 3.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        valid = math.isfinite(self.steepness) and self.steepness > 0
+        require(valid, "steepness", self.steepness, "a finite number above 0")
+
+    def phi(self, ratio: float) -> float:
+        return math.expm1(-self.steepness * ratio) / math.expm1(-self.steepness)
+
+
+@dataclass
+class FixedSchedule:
+    """The same K at every iteration, and r = lambda / K.
+
+    Args:
+        views: K.
+        pixel_budget: lambda, the pixels of one iteration in full images.
+    """
+
+    views: int = 3
+    pixel_budget: float = 1.0
+
+    def __post_init__(self) -> None:
+        require(self.views >= 1, "views", self.views, "1 or more")
+        _check_budget(self.pixel_budget)
+
+    def query(self, step: Step, mean_error: float, initial_error: float, num_views: int) -> SamplingBudget:
+        views = min(self.views, num_views)
+        return SamplingBudget(views, min(1.0, self.pixel_budget / views))

@@ -1,0 +1,135 @@
+"""Which training views an iteration looks at (paper section 3.4)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+from turbogs_plugin.strategies.philox import PURPOSE_STACK, PURPOSE_VIEWS, random_words
+
+from turbogs_plugin.errors import require
+from turbogs_plugin.types import Cameras, Step
+
+
+def _uniforms(purpose: int, num_views: int, step: Step) -> np.ndarray:
+    """[V] float64 in (0, 1) with 52 random bits, a function of (seed, iteration, view) alone."""
+    words = random_words(torch.arange(num_views), 0, purpose, step.seed, step.iteration)
+    high, low = (word.numpy().astype(np.float64) for word in words[:2])
+    return (high * 2**20 + np.floor(low / 2**12) + 0.5) / 2.0**52
+
+
+class ViewStack:
+    """A shuffled stack of views; what is drawn leaves it, and it is filled again when fewer than K are left.
+
+    Args:
+        num_views: V.
+    """
+
+    def __init__(self, num_views: int) -> None:
+        self.num_views = num_views
+        self.views = np.zeros(0, dtype=np.int64)
+
+    def prepare(self, count: int, step: Step) -> np.ndarray:
+        """The views on the stack, in its order: at least `count` of them, for `count` <= V."""
+        if len(self.views) < count:
+            self.views = np.argsort(_uniforms(PURPOSE_STACK, self.num_views, step), kind="stable")
+        return self.views
+
+    def take(self, positions: np.ndarray) -> tuple[int, ...]:
+        """Remove and return the views at these positions, in the positions' order."""
+        taken = tuple(int(view) for view in self.views[positions])
+        self.views = np.delete(self.views, positions)
+        return taken
+
+
+@dataclass
+class RandomViewSampler:
+    """Uniformly random views, none twice until nearly all have been seen (the shuffled stack of 3DGS)."""
+
+    stack: ViewStack | None = field(init=False, repr=False, default=None)
+
+    def setup(self, cameras: Cameras, scene_extent: float) -> None:
+        self.stack = ViewStack(len(cameras))
+
+    def select(self, count: int, view_errors: np.ndarray, step: Step) -> tuple[int, ...]:
+        """`count` distinct views, or all V where `count` is more."""
+        stack = _ready(self.stack)
+        count = min(count, stack.num_views)
+        stack.prepare(count, step)
+        return stack.take(np.arange(count))
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"stack": torch.from_numpy(_ready(self.stack).views.copy())}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        _ready(self.stack).views = state["stack"].cpu().numpy().copy()
+
+
+@dataclass
+class GeometryAwareViewSampler:
+    """The view with the largest mean error, and views near to it that look the same way (equation of section 3.4).
+
+    The anchor is the one with the largest mean error among the views on the stack (among all views it would be
+    the same one until its error falls). The K - 1 others are drawn from the stack without replacement, with
+    log-weights ``-distance_weight * |c_u - c_a| / extent - direction_weight * (1 - <d_u, d_a>)``, by adding Gumbel
+    noise and taking the largest: exactly the sequential draw, and no weight underflows. The drawn views leave the
+    stack.
+
+    Args:
+        distance_weight: lambda_d, per scene extent.
+        direction_weight: lambda_theta.
+    """
+
+    distance_weight: float = 2.0
+    direction_weight: float = 2.0
+    stack: ViewStack | None = field(init=False, repr=False, default=None)
+    centers: np.ndarray = field(init=False, repr=False)  # [V, 3] float64, scene extents
+    directions: np.ndarray = field(init=False, repr=False)  # [V, 3] float64
+
+    def __post_init__(self) -> None:
+        for name in ("distance_weight", "direction_weight"):
+            value = getattr(self, name)
+            require(math.isfinite(value) and value >= 0, name, value, "finite and 0 or more")
+
+    def setup(self, cameras: Cameras, scene_extent: float) -> None:
+        """Take the training cameras; an extent of 0 (all cameras in one place) leaves only the directions to count."""
+        require(math.isfinite(scene_extent) and scene_extent >= 0, "scene_extent", scene_extent, "finite and 0 or more")
+        self.stack = ViewStack(len(cameras))
+        self.centers = cameras.centers.double().cpu().numpy() / (scene_extent or 1.0)
+        self.directions = cameras.directions.double().cpu().numpy()
+
+    def log_weights(self, anchor: int) -> np.ndarray:
+        """[V] float64: logarithm of the weight of each view, given the anchor."""
+        distances = np.linalg.norm(self.centers - self.centers[anchor], axis=1)
+        turns = 1.0 - self.directions @ self.directions[anchor]
+        return -self.distance_weight * distances - self.direction_weight * turns
+
+    def select(self, count: int, view_errors: np.ndarray, step: Step) -> tuple[int, ...]:
+        """`count` distinct views (all V where `count` is more), the anchor first.
+
+        Args:
+            view_errors: [V] float64; equal ones leave the anchor to the stack's random order.
+        """
+        stack = _ready(self.stack)
+        count = min(count, stack.num_views)
+        candidates = stack.prepare(count, step)
+        anchor = int(np.argmax(view_errors[candidates]))
+        gumbel = -np.log(-np.log(_uniforms(PURPOSE_VIEWS, stack.num_views, step)))
+        scores = (self.log_weights(int(candidates[anchor])) + gumbel)[candidates]
+        scores[anchor] = np.inf
+        return stack.take(np.argsort(-scores, kind="stable")[:count])
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"stack": torch.from_numpy(_ready(self.stack).views.copy())}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        _ready(self.stack).views = state["stack"].cpu().numpy().copy()
+
+
+def _ready(stack: ViewStack | None) -> ViewStack:
+    if stack is None:
+        raise RuntimeError("a view sampler needs setup(cameras, scene_extent) before it is used")
+    return stack
