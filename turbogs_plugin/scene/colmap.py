@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
 
 import numpy as np
@@ -46,7 +47,7 @@ def read_colmap(scene: Path, model: Path, suffix: str) -> Capture:
 
     images = sorted((image for image in reconstruction.images.values() if image.has_pose), key=lambda image: image.name)
     names = tuple(check_photo_name(image.name, model) for image in images)
-    for name, following in zip(names, names[1:], strict=False):
+    for name, following in itertools.pairwise(names):
         if name == following:
             raise InputError(f"{model} has two images named '{name}'")
     viewmats = np.tile(np.eye(4), (len(images), 1, 1))
@@ -81,8 +82,8 @@ def pinhole_intrinsics(camera: pycolmap.Camera, scene: Path, model: Path) -> np.
         fy = fx
     else:
         raise InputError(
-            f"camera {camera.camera_id} of {model} is {camera.model.name}, a model with lens distortion: undistort with "
-            f"'colmap image_undistorter --image_path {scene / 'images'} --input_path {model} --output_path NEW' "
+            f"camera {camera.camera_id} of {model} is {camera.model.name}, a model with lens distortion: undistort "
+            f"with 'colmap image_undistorter --image_path {scene / 'images'} --input_path {model} --output_path NEW' "
             "and train on NEW"
         )
     return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])

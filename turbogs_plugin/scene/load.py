@@ -14,6 +14,7 @@ from turbogs_plugin.scene.capture import Capture
 from turbogs_plugin.scene.colmap import find_model, read_colmap
 from turbogs_plugin.scene.frame import Frame
 from turbogs_plugin.scene.photos import Photos, load_photos, photo_size, reduced_sizes
+from turbogs_plugin.scene.transforms import FILE, read_transforms
 from turbogs_plugin.types import Cameras
 
 FEWEST_VIEWS = 3
@@ -121,7 +122,12 @@ def _read(scene: Path) -> Capture:
     model = find_model(scene)
     if model is not None:
         return read_colmap(scene, *model)
-    raise InputError(f"{scene} has no COLMAP reconstruction (cameras, images and points3D as .bin or .txt in sparse/0)")
+    if (scene / FILE).is_file():
+        return read_transforms(scene)
+    raise InputError(
+        f"{scene} has neither a COLMAP reconstruction (cameras, images and points3D as .bin or .txt in sparse/0) nor a "
+        f"{FILE}"
+    )
 
 
 def _find_photos(scene: Path, capture: Capture, factor: int) -> tuple[list[Path], np.ndarray, np.ndarray]:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
+
 import torch
 from torch import Tensor
 
 BUCKET_SIZE = 64
-CANDIDATE_BLOCK = 8192
-"""Candidate points compared at a time with one bucket, so that memory is bounded."""
+BUCKETS_AT_ONCE = 32
+"""Buckets compared at a time with one, so that memory is bounded and near ones tighten the bound for the others."""
 
 
 def mean_neighbor_distances(points: Tensor, neighbors: int) -> Tensor:
@@ -23,23 +25,34 @@ def mean_neighbor_distances(points: Tensor, neighbors: int) -> Tensor:
     neighbors = min(neighbors, len(points) - 1)
     order, starts = _buckets(points, max(BUCKET_SIZE, neighbors + 1))
     ordered = points[order]
-    buckets = [ordered[start:end] for start, end in zip(starts, starts[1:], strict=False)]
+    buckets = [ordered[start:end] for start, end in itertools.pairwise(starts)]
     lows = torch.stack([bucket.amin(dim=0) for bucket in buckets])  # [B, 3]
     highs = torch.stack([bucket.amax(dim=0) for bucket in buckets])  # [B, 3]
     means = torch.empty_like(ordered[:, 0])
     for number, bucket in enumerate(buckets):
         nearest = _pairwise(bucket, bucket).fill_diagonal_(torch.inf).topk(neighbors, largest=False).values
-        gaps = (lows - highs[number]).clamp(min=0).maximum((lows[number] - highs).clamp(min=0))  # [B, 3]
-        near = gaps.square().sum(dim=1) <= nearest.max()
-        near[number] = False
-        candidates = torch.cat([bucket[:0], *(buckets[other] for other in near.nonzero()[:, 0].tolist())])
-        for block in candidates.split(CANDIDATE_BLOCK):
-            merged = torch.cat([nearest, _pairwise(bucket, block)], dim=1)
-            nearest = merged.topk(neighbors, largest=False).values
-        means[starts[number] : starts[number + 1]] = nearest.sqrt().mean(dim=1)
+        means[starts[number] : starts[number + 1]] = _search(bucket, nearest, number, buckets, lows, highs)
     result = torch.empty_like(means)
     result[order] = means
     return result
+
+
+def _search(bucket: Tensor, nearest: Tensor, number: int, buckets: list[Tensor], lows: Tensor, highs: Tensor) -> Tensor:
+    """[A]: mean of the nearest distances of a bucket's points, `nearest` [A, k] (squared) being those within it."""
+    gaps = (lows - highs[number]).maximum(lows[number] - highs).clamp(min=0).square().sum(dim=1)  # [B]
+    gaps[number] = torch.inf
+    near = (gaps < nearest.max()).nonzero()[:, 0]
+    near = near[gaps[near].argsort()]
+    for block in near.split(BUCKETS_AT_ONCE):
+        # Distances of points to boxes: most points of a bucket need none of the farther boxes.
+        outside = (lows[block] - bucket[:, None]).maximum(bucket[:, None] - highs[block]).clamp(min=0)  # [A, b, 3]
+        wanted = outside.square().sum(dim=2) < nearest[:, -1:]  # [A, b]
+        rows, members = wanted.any(dim=1).nonzero()[:, 0], block[wanted.any(dim=0)].tolist()
+        if members:
+            found = _pairwise(bucket[rows], torch.cat([buckets[member] for member in members]))
+            merged = torch.cat([nearest[rows], found], dim=1)
+            nearest[rows] = merged.topk(nearest.shape[1], largest=False).values
+    return nearest.sqrt().mean(dim=1)
 
 
 def _pairwise(a: Tensor, b: Tensor) -> Tensor:

@@ -1,0 +1,113 @@
+"""Reads the vertices of a .ply file: plain numbers, binary little-endian or ASCII."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from turbogs_plugin.errors import InputError
+
+LONGEST_HEADER = 1 << 16
+TYPES = {
+    "char": "<i1",
+    "int8": "<i1",
+    "uchar": "<u1",
+    "uint8": "<u1",
+    "short": "<i2",
+    "int16": "<i2",
+    "ushort": "<u2",
+    "uint16": "<u2",
+    "int": "<i4",
+    "int32": "<i4",
+    "uint": "<u4",
+    "uint32": "<u4",
+    "float": "<f4",
+    "float32": "<f4",
+    "double": "<f8",
+    "float64": "<f8",
+}
+
+
+def read_vertices(path: str | Path) -> np.ndarray:
+    """[N] structured array of the ``vertex`` element, a field a property, in the file's order and types.
+
+    Nothing is allocated before the file is known to be long enough for what its header announces.
+
+    Raises:
+        InputError: no such file, not a .ply, a header or a body that is not as announced, properties of varying
+            length ("list").
+    """
+    path = Path(path)
+    try:
+        with path.open("rb") as file:
+            head = file.read(LONGEST_HEADER)
+    except OSError as error:
+        raise InputError(f"cannot read {path}: {error.strerror}") from error
+    header, separator, _ = head.partition(b"end_header\n")
+    if not separator:
+        header, separator, _ = head.partition(b"end_header\r\n")
+    if not head.startswith(b"ply") or not separator or not header.isascii():
+        raise InputError(f"{path} is not a .ply file: it has no header")
+    binary, count, layout, alone = _parse_header(path, header.decode().splitlines()[1:])
+    body = path.stat().st_size - len(header) - len(separator)
+    # In ASCII a number takes a digit and a separator, though the last separator may be missing.
+    wanted = count * (layout.itemsize if binary else 2 * len(layout)) - (not binary)
+    if body < wanted or (binary and alone and body > wanted):
+        raise InputError(f"{path} announces {count} vertices, which its {body} bytes after the header do not match")
+    offset = len(header) + len(separator)
+    if binary:
+        return np.fromfile(path, dtype=layout, count=count, offset=offset)
+    return _read_ascii(path, offset, count, layout)
+
+
+def _parse_header(path: Path, lines: list[str]) -> tuple[bool, int, np.dtype, bool]:
+    """Whether the body is binary, the number of vertices, their layout, and whether nothing follows them."""
+
+    def fail(line: str, trouble: str) -> InputError:
+        return InputError(f"{path}: the line '{line[:80]}' of its header {trouble}")
+
+    formats = {"binary_little_endian": True, "ascii": False}
+    binary: bool | None = None
+    elements: list[str] = []
+    count, properties = 0, {}
+    for line in lines:
+        words = line.split()
+        if not words or words[0] in ("comment", "obj_info"):
+            continue
+        if words[0] == "format" and len(words) == 3 and binary is None:
+            if words[1] not in formats:
+                raise fail(line, "names a format that is not read here: binary_little_endian and ascii are")
+            binary = formats[words[1]]
+        elif words[0] == "element" and len(words) == 3 and words[2].isdecimal() and len(words[2]) < 19:
+            elements.append(words[1])
+            if elements == ["vertex"]:
+                count = int(words[2])
+            elif len(elements) == 1:
+                raise fail(line, "comes before the vertices: they must be the first element")
+        elif words[0] == "property" and elements:
+            if len(elements) > 1:
+                continue
+            if len(words) != 3 or words[1] not in TYPES:
+                raise fail(line, "is not a property that is a single number")
+            if words[2] in properties:
+                raise fail(line, "names a property for the second time")
+            properties[words[2]] = TYPES[words[1]]
+        else:
+            raise fail(line, "is not understood")
+    if binary is None or not properties:
+        raise InputError(f"{path}: its header has no {'format' if binary is None else 'vertex properties'}")
+    return binary, count, np.dtype(list(properties.items())), len(elements) == 1
+
+
+def _read_ascii(path: Path, offset: int, count: int, layout: np.dtype) -> np.ndarray:
+    vertices = np.empty(count, dtype=layout)
+    with path.open("rb") as file:
+        file.seek(offset)
+        for row in range(count):
+            words = file.readline(64 * len(layout)).split()
+            try:
+                vertices[row] = tuple(float(word) for word in words)
+            except (ValueError, OverflowError) as error:
+                raise InputError(f"{path}: vertex {row} is not {len(layout)} numbers in their types' ranges") from error
+    return vertices

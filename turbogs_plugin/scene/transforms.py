@@ -1,0 +1,184 @@
+"""``transforms.json`` of nerfstudio and instant-ngp: cameras in OpenGL's axes (x right, y up, z backward)."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.scene.capture import LARGEST_SIDE, Capture, check_photo_name
+from turbogs_plugin.scene.photos import photo_size
+from turbogs_plugin.scene.ply import read_vertices
+
+FILE = "transforms.json"
+DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+CAMERA_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE")
+PHOTO_SUFFIXES = (".png", ".jpg", ".jpeg")
+NUM_RANDOM_POINTS = 50_000
+RANDOM_POINTS_SIDE = 1.0
+"""Side of the cube of random points, in distances of the cameras from what they look at."""
+
+
+def read_transforms(scene: Path) -> Capture:
+    """Read ``scene/transforms.json``.
+
+    Intrinsics may stand in each frame or for all; ``camera_angle_x`` serves where there is no ``fl_x``. Points come
+    from ``ply_file_path`` where it is given, else they are drawn at random (seeded) in a cube about what the cameras
+    look at.
+
+    Raises:
+        InputError: a file that is not such JSON, lacks something, or describes a lens with distortion.
+    """
+    source = scene / FILE
+    try:
+        content = json.loads(source.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise InputError(f"{source} is not readable JSON: {' '.join(str(error).split())[:200]}") from error
+    frames = content.get("frames") if isinstance(content, dict) else None
+    if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
+        raise InputError(f"{source} has no list of frames")
+
+    views: dict[str, tuple[np.ndarray, np.ndarray, tuple[int, int]]] = {}
+    for frame in frames:
+        name = _photo_name(scene, frame.get("file_path"), source)
+        if name in views:
+            raise InputError(f"{source} has two frames for '{name}'")
+        views[name] = (_viewmat(frame, name, source), *_intrinsics({**content, **frame}, scene / name, source))
+    names = tuple(sorted(views))
+    viewmats = np.array([views[name][0] for name in names]).reshape(-1, 4, 4)
+    if "ply_file_path" in content:
+        points, colors = _read_points(scene, content["ply_file_path"], source)
+    else:
+        points, colors = random_points(viewmats)
+    # Reduced copies lie in images_2, images_4, ... beside images.
+    common = {PurePosixPath(name).parts[0] for name in names}
+    photo_folder = scene
+    if len(common) == 1 and all(len(PurePosixPath(name).parts) > 1 for name in names):
+        photo_folder = scene / common.pop()
+    capture = Capture(
+        names=tuple(str((scene / name).relative_to(photo_folder)) for name in names),
+        photo_folder=photo_folder,
+        viewmats=viewmats,
+        Ks=np.array([views[name][1] for name in names]).reshape(-1, 3, 3),
+        sizes=np.array([views[name][2] for name in names], dtype=np.int64).reshape(-1, 2),
+        points=points,
+        point_colors=colors,
+    )
+    capture.check(source)
+    return capture
+
+
+def random_points(viewmats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """([M, 3] float64 points, [M, 3] uint8 colours), the same for the same cameras.
+
+    The cube's centre is the point nearest to all viewing axes, its side the median distance of the cameras from it.
+
+    Args:
+        viewmats: [V, 4, 4] float64 world to camera.
+    """
+    centers = -np.einsum("vji,vj->vi", viewmats[:, :3, :3], viewmats[:, :3, 3])
+    axes = viewmats[:, 2, :3]
+    # A slight pull towards the cameras' mean settles the case of parallel axes.
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]  # [V, 3, 3]
+    mean = centers.mean(axis=0)
+    pull = 1e-3 * len(centers) * np.eye(3)
+    offsets = np.einsum("vij,vj->i", across, centers - mean)
+    focus = mean + np.linalg.solve(across.sum(axis=0) + pull, offsets)
+    side = RANDOM_POINTS_SIDE * float(np.median(np.linalg.norm(centers - focus, axis=1)))
+    random = np.random.default_rng(0)
+    points = focus + random.uniform(-0.5, 0.5, (NUM_RANDOM_POINTS, 3)) * (side or 1.0)
+    return points, random.integers(0, 256, (NUM_RANDOM_POINTS, 3), dtype=np.uint8)
+
+
+def _photo_name(scene: Path, name: Any, source: Path) -> str:
+    """The photo's path relative to the scene; blender's names come without a suffix."""
+    if not isinstance(name, str):
+        raise InputError(f"{source} has a frame without a file_path")
+    name = str(PurePosixPath(check_photo_name(name, source)))
+    if not (scene / name).is_file():
+        for suffix in PHOTO_SUFFIXES:
+            if (scene / f"{name}{suffix}").is_file():
+                return f"{name}{suffix}"
+    return name
+
+
+def _number(values: dict, key: str, source: Path) -> float | None:
+    """A finite number, or None where the key is absent."""
+    if key not in values:
+        return None
+    value = values[key]
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < 1e300:
+        raise InputError(f"{source}: {key} is {str(value)[:40]!r}: it must be a finite number")
+    return float(value)
+
+
+def _intrinsics(values: dict, photo: Path, source: Path) -> tuple[np.ndarray, tuple[int, int]]:
+    """[3, 3] float64 and (width, height) of one frame, whose `values` go before those for all frames."""
+    bent = {key: _number(values, key, source) for key in DISTORTION}
+    bent = {key: value for key, value in bent.items() if value}
+    model = values.get("camera_model", "PINHOLE")
+    if bent or model not in CAMERA_MODELS:
+        raise InputError(
+            f"{source}: the camera of {photo.name} ({str(model)[:40]}, {bent or 'no pinhole'}) has lens distortion: "
+            "undistort with 'colmap image_undistorter --image_path IMAGES --input_path MODEL --output_path NEW' and "
+            "train on NEW"
+        )
+    width, height = _number(values, "w", source), _number(values, "h", source)
+    if width is None or height is None:
+        if not photo.is_file():
+            raise InputError(f"{source} gives no w and h for {photo}, and the photo is missing")
+        width, height = photo_size(photo)
+    if not (1 <= width <= LARGEST_SIDE and 1 <= height <= LARGEST_SIDE):
+        raise InputError(f"{source}: the size of {photo.name} is {width:g}x{height:g} pixels")
+    focal_x, focal_y = _number(values, "fl_x", source), _number(values, "fl_y", source)
+    if focal_x is None:
+        angle = _number(values, "camera_angle_x", source)
+        if angle is None or not 0 < angle < math.pi:
+            raise InputError(f"{source}: the camera of {photo.name} has neither fl_x nor a camera_angle_x in 0 .. pi")
+        focal_x = 0.5 * width / math.tan(0.5 * angle)
+    if focal_y is None:
+        angle = _number(values, "camera_angle_y", source)
+        focal_y = 0.5 * height / math.tan(0.5 * angle) if angle and 0 < angle < math.pi else focal_x
+    center_x, center_y = _number(values, "cx", source), _number(values, "cy", source)
+    intrinsics = np.eye(3)
+    intrinsics[0, 0], intrinsics[1, 1] = focal_x, focal_y
+    intrinsics[0, 2] = 0.5 * width if center_x is None else center_x
+    intrinsics[1, 2] = 0.5 * height if center_y is None else center_y
+    return intrinsics, (round(width), round(height))
+
+
+def _viewmat(frame: dict, name: str, source: Path) -> np.ndarray:
+    """[4, 4] float64 world to camera, of a frame's camera-to-world matrix."""
+    try:
+        pose = np.array(frame.get("transform_matrix"), dtype=np.float64)
+    except (ValueError, TypeError, OverflowError):
+        pose = np.empty(0)
+    if pose.shape not in ((3, 4), (4, 4)) or not np.isfinite(pose).all():
+        raise InputError(f"{source}: frame '{name}' has no transform_matrix of 4x4 finite numbers")
+    rotation = pose[:3, :3] * [1.0, -1.0, -1.0]
+    if not np.abs(rotation.T @ rotation - np.eye(3)).max() < 1e-2 or np.linalg.det(rotation) < 0:
+        raise InputError(f"{source}: the transform_matrix of frame '{name}' is not a rotation and a translation")
+    left, _, right = np.linalg.svd(rotation)  # decimals are cut in JSON: back to an exact rotation
+    rotation = left @ right
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = rotation.T
+    viewmat[:3, 3] = -rotation.T @ pose[:3, 3]
+    return viewmat
+
+
+def _read_points(scene: Path, name: Any, source: Path) -> tuple[np.ndarray, np.ndarray]:
+    if not isinstance(name, str):
+        raise InputError(f"{source}: ply_file_path is not a path")
+    path = scene / check_photo_name(name, source)
+    vertices = read_vertices(path)
+    if not {"x", "y", "z"} <= set(vertices.dtype.names):
+        raise InputError(f"{path} has no x, y, z")
+    points = np.stack([vertices[axis].astype(np.float64) for axis in "xyz"], axis=1)
+    channels = ("red", "green", "blue")
+    if not set(channels) <= set(vertices.dtype.names):
+        return points, np.full(points.shape, 128, dtype=np.uint8)
+    return points, np.stack([vertices[channel].astype(np.uint8) for channel in channels], axis=1)
