@@ -1,1 +1,118 @@
+"""Rendering at sampled pixels: one function, `rasterize`, whose tensors' device decides what runs."""
 
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import lru_cache
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from turbogs_plugin.rendering.reference import (
+    DifferentiableRender,
+    rasterize_differentiable,
+    rasterize_reference,
+)
+from turbogs_plugin.rendering.rendered import RasterSettings, Rendered, ScreenGradients
+from turbogs_plugin.types import TILE_SIZE, Cameras, Gaussians, PixelSamples, TileGrid, cell_order
+
+__all__ = [
+    "DifferentiableRender",
+    "RasterSettings",
+    "Rendered",
+    "ScreenGradients",
+    "dense_samples",
+    "rasterize",
+    "rasterize_differentiable",
+    "rasterize_reference",
+    "render_images",
+]
+
+
+def rasterize(
+    gaussians: Gaussians,
+    cameras: Cameras,
+    samples: PixelSamples,
+    *,
+    sh_degree: int | None = None,
+    settings: RasterSettings = RasterSettings(),
+    with_depth: bool = False,
+) -> Rendered:
+    """Render samples of K views with gsplat's conventions, on a black background.
+
+    Args:
+        gaussians: the model. On a CUDA device the kernels run where they are compiled, else the torch reference.
+        cameras: the K views of the batch, in the order of `samples.view_ids`.
+        samples: the pixels.
+        sh_degree: highest degree of spherical harmonics used; all there are where None.
+        settings: thresholds and planes.
+        with_depth: also give expected depths.
+    """
+    if gaussians.device.type == "cuda":
+        from turbogs_plugin import kernels
+
+        if kernels.available():
+            from turbogs_plugin.rendering.cuda import rasterize_cuda
+
+            return rasterize_cuda(
+                gaussians, cameras, samples, sh_degree=sh_degree, settings=settings, with_depth=with_depth
+            )
+    return rasterize_reference(
+        gaussians, cameras, samples, sh_degree=sh_degree, settings=settings, with_depth=with_depth
+    )
+
+
+@lru_cache(maxsize=32)
+def _dense_view(width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
+    """Pixel ids [H * W] of one image in (tile, cell) order and the number of pixels of each of its tiles."""
+    y, x = np.divmod(np.arange(width * height), width)
+    columns = -(-width // TILE_SIZE)
+    tiles = (y // TILE_SIZE) * columns + x // TILE_SIZE
+    ranks = cell_order(torch.from_numpy(x % TILE_SIZE), torch.from_numpy(y % TILE_SIZE)).numpy()
+    order = np.argsort(tiles * TILE_SIZE**2 + ranks).astype(np.int32)
+    return order, np.bincount(tiles)
+
+
+def dense_samples(cameras: Cameras, view_ids: Sequence[int] | None = None) -> PixelSamples:
+    """Every pixel of every tile of some views, in cell order, without empty slots.
+
+    Args:
+        cameras: all V cameras.
+        view_ids: which of them; all where None.
+    """
+    view_ids = tuple(range(len(cameras)) if view_ids is None else view_ids)
+    sizes = cameras.sizes[list(view_ids)]
+    views = [_dense_view(int(width), int(height)) for width, height in sizes]
+    counts = np.concatenate([count for _, count in views])
+    device = cameras.viewmats.device
+    return PixelSamples(
+        view_ids=view_ids,
+        sizes=sizes,
+        pixel_ids=torch.from_numpy(np.concatenate([order for order, _ in views])).to(device),
+        tile_ids=torch.arange(len(TileGrid(sizes)), dtype=torch.int32, device=device),
+        tile_offsets=torch.from_numpy(np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)).to(device),
+    )
+
+
+@torch.no_grad()
+def render_images(
+    gaussians: Gaussians,
+    cameras: Cameras,
+    sh_degree: int | None = None,
+    settings: RasterSettings = RasterSettings(),
+) -> list[tuple[Tensor, Tensor]]:
+    """Whole images, view after view so that memory does not grow with their number.
+
+    Returns:
+        For each camera the colours [H, W, 3], not clamped above, and alphas [H, W].
+    """
+    images = []
+    for view, (width, height) in enumerate(cameras.sizes.tolist()):
+        samples = dense_samples(cameras, [view])
+        rendered = rasterize(gaussians, cameras.select([view]), samples, sh_degree=sh_degree, settings=settings)
+        places = samples.pixel_ids.long()
+        colors = torch.empty_like(rendered.colors).index_copy_(0, places, rendered.colors)
+        alphas = torch.empty_like(rendered.alphas).index_copy_(0, places, rendered.alphas)
+        images.append((colors.reshape(height, width, 3), alphas.reshape(height, width)))
+    return images
