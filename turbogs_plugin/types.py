@@ -286,12 +286,14 @@ class RowUpdate:
         source: [M] int64, the old row of each new row.
         fresh: [M] bool.
         values: name of a parameter -> its new tensor [M, ...]; parameters not named are copies.
+        reset: names of parameters whose optimizer state starts from zero in every row (a reset of opacities).
         num_cloned, num_split, num_pruned: for the report.
     """
 
     source: Tensor
     fresh: Tensor
     values: dict[str, Tensor]
+    reset: tuple[str, ...] = ()
     num_cloned: int = 0
     num_split: int = 0
     num_pruned: int = 0

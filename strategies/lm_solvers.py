@@ -1,0 +1,98 @@
+"""Small damped least-squares systems, many at once: ``(sum_k c_k g_k g_k^T + diag(d)) x = b``.
+
+All functions have one signature, ``solve(rows, weights, damping, rhs) -> x``:
+
+- rows: [K, n, D] the g_k; weights: [K, n] the c_k >= 0; damping: [n, D] the d > 0; rhs: [n, D] the b; x: [n, D].
+
+The optimizer uses `solve_scaled_cholesky` and `solve_low_rank`. They first scale the system by d^(-1/2) on both sides:
+it becomes I + (something positive semi-definite), whose eigenvalues and pivots are >= 1, so that neither can fail
+in any precision, however many orders of magnitude lie between the entries of d. `solve_raw_cholesky` is what happens
+without; `solve_float64` is the yardstick. Both are there for the table of docs/numerics.md.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+ROW_LIMIT = 100.0
+"""Longest scaled row. One row of length l shrinks the step along itself by 1 / (1 + l^2): at this limit to a ten
+thousandth, as good as none, while the condition number stays below 1 + K * 1e4, which float32 can carry."""
+
+
+def scaled_rows(rows: Tensor, weights: Tensor, damping: Tensor) -> Tensor:
+    """[K, n, D]: sqrt(c_k) g_k / sqrt(d), cut to length `ROW_LIMIT`. Neither overflows nor gives NaN for finite input:
+    the direction is divided by its largest entry before anything is squared."""
+    direction = rows * torch.rsqrt(damping)
+    largest = direction.abs().amax(dim=-1, keepdim=True)  # [K, n, 1]
+    unit = direction / largest.clamp(min=torch.finfo(rows.dtype).tiny)  # entries within -1 .. 1
+    unit_norm = unit.square().sum(dim=-1, keepdim=True).sqrt().clamp(min=torch.finfo(rows.dtype).tiny)
+    length = (largest * unit_norm * weights.sqrt().unsqueeze(-1)).clamp(max=ROW_LIMIT)  # an overflow ends at the limit
+    return unit * (length / unit_norm)
+
+
+def solve_scaled_cholesky(rows: Tensor, weights: Tensor, damping: Tensor, rhs: Tensor) -> Tensor:
+    """Cholesky of the scaled system, D x D. Exact pivots are >= 1, so computed ones are held there."""
+    scale = torch.rsqrt(damping)
+    scaled = scaled_rows(rows, weights, damping)
+    matrix = torch.einsum("kni,knj->ijn", scaled, scaled)
+    return scale * _solve_identity_plus(matrix, (rhs * scale).T).T
+
+
+def solve_low_rank(rows: Tensor, weights: Tensor, damping: Tensor, rhs: Tensor) -> Tensor:
+    """The same answer from a K x K system (Woodbury): cheaper where there are fewer rows than parameters."""
+    scale = torch.rsqrt(damping)
+    scaled = scaled_rows(rows, weights, damping)
+    scaled_rhs = rhs * scale
+    gram = torch.einsum("kni,lni->kln", scaled, scaled)
+    projected = torch.einsum("kni,ni->kn", scaled, scaled_rhs)
+    coefficients = _solve_identity_plus(gram, projected)  # [K, n]
+    return scale * (scaled_rhs - torch.einsum("kn,kni->ni", coefficients, scaled))
+
+
+def solve_raw_cholesky(rows: Tensor, weights: Tensor, damping: Tensor, rhs: Tensor) -> Tensor:
+    """Cholesky of the system as printed in the paper, unscaled. For comparison only: where a pivot fails, or the
+    products overflow, the result is NaN."""
+    matrix = torch.einsum("kn,kni,knj->nij", weights, rows, rows) + torch.diag_embed(damping)
+    factor, failed = torch.linalg.cholesky_ex(matrix)
+    solution = torch.cholesky_solve(rhs.unsqueeze(-1), factor).squeeze(-1)
+    return torch.where((failed == 0).unsqueeze(-1), solution, torch.nan)
+
+
+def solve_float64(rows: Tensor, weights: Tensor, damping: Tensor, rhs: Tensor) -> Tensor:
+    """`solve_scaled_cholesky` in float64 throughout. For comparison; the answer is float64."""
+    return solve_scaled_cholesky(rows.double(), weights.double(), damping.double(), rhs.double())
+
+
+def _solve_identity_plus(matrix: Tensor, rhs: Tensor) -> Tensor:
+    """Solve (I + matrix) x = rhs for n systems at once.
+
+    Args:
+        matrix: [D, D, n] positive semi-definite; the batch lies last, so that each of the D^3 / 6 steps below is one
+            pass over contiguous memory.
+        rhs: [D, n].
+    """
+    size = len(matrix)
+    inverse_diagonal: list[Tensor] = []
+    factor: list[list[Tensor]] = []  # factor[i][j], j < i, of L with I + matrix = L L^T
+    forward: list[Tensor] = []  # L y = rhs
+    for i in range(size):
+        row: list[Tensor] = []
+        for j in range(i):
+            value = matrix[i, j].clone()
+            for k in range(j):
+                value.addcmul_(row[k], factor[j][k], value=-1)
+            row.append(value.mul_(inverse_diagonal[j]))
+        pivot, target = matrix[i, i] + 1, rhs[i].clone()
+        for k in range(i):
+            pivot.addcmul_(row[k], row[k], value=-1)
+            target.addcmul_(row[k], forward[k], value=-1)
+        inverse_diagonal.append(pivot.clamp_(min=1).rsqrt_())
+        forward.append(target.mul_(inverse_diagonal[i]))
+        factor.append(row)
+    solution = forward  # L^T x = y, in place from the last entry
+    for i in reversed(range(size)):
+        for k in range(i + 1, size):
+            solution[i].addcmul_(factor[k][i], solution[k], value=-1)
+        solution[i].mul_(inverse_diagonal[i])
+    return torch.stack(solution)
