@@ -1,0 +1,139 @@
+"""Checkpoints: plain tensors and numbers in one file, never half-written, never executed.
+
+A run's folder ``checkpoints/`` holds ``iteration-NNNNNN.pt`` files and ``latest``, a text file with the name of the
+newest complete one. Each is put in place by one rename, the checkpoint before the pointer, and older checkpoints are
+removed only after that: at every moment `latest` names a complete file.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from turbogs_plugin.errors import InputError, TrainingStopped
+from turbogs_plugin.files import write_atomically, write_text_atomically
+
+FORMAT = 1
+KEPT = 2
+"""Checkpoints that stay on the disk: the newest and one before it."""
+
+_NAME = re.compile(r"iteration-\d{6,}\.pt")
+
+
+def save_checkpoint(folder: Path, iteration: int, state: dict[str, Any]) -> Path:
+    """Write the state of a run and make it the newest one.
+
+    Args:
+        folder: ``checkpoints/`` of the run; made where absent.
+        iteration: finished iterations.
+        state: nested dicts, lists and tuples of tensors, numbers, text, booleans and None.
+
+    Returns:
+        The file.
+
+    Raises:
+        TrainingStopped: the disk refused; the newest checkpoint is what it was before.
+        TypeError: something in `state` is not plain.
+    """
+    _require_plain(state, "state")
+    path = folder / f"iteration-{iteration:06d}.pt"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        write_atomically(path, lambda file: torch.save({"format": FORMAT, **state}, file))
+        write_text_atomically(folder / "latest", path.name)
+    except (OSError, RuntimeError) as error:  # torch reports a failed write as RuntimeError
+        reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error).splitlines()[0]
+        raise TrainingStopped(
+            f"iteration {iteration}: the checkpoint could not be written to '{folder}' ({reason}); {_kept(folder)}"
+        ) from error
+    for old in sorted(file for file in folder.iterdir() if _NAME.fullmatch(file.name))[:-KEPT]:
+        old.unlink(missing_ok=True)
+    return path
+
+
+def latest_checkpoint(folder: Path) -> Path | None:
+    """The newest complete checkpoint of a ``checkpoints/`` folder, or None where there is none.
+
+    Raises:
+        InputError: `latest` names no checkpoint of this folder.
+    """
+    try:
+        name = (folder / "latest").read_text(encoding="utf-8").strip()
+    except FileNotFoundError:
+        return None
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"cannot read '{folder / 'latest'}': {error}") from None
+    if not _NAME.fullmatch(name) or not (folder / name).is_file():
+        raise InputError(f"'{folder / 'latest'}' names no checkpoint of its folder: '{name[:60]}'")
+    return folder / name
+
+
+def load_checkpoint(path: Path) -> dict[str, Any]:
+    """The state in a checkpoint, on the CPU.
+
+    Only plain tensors and values are read (``weights_only``), stored uncompressed and no larger than the file, so a
+    file from an untrusted source can neither run code nor fill the memory.
+
+    Raises:
+        InputError: not a checkpoint of ours, truncated, or with anything else in it.
+    """
+    try:
+        _require_bounded(path)
+        state = torch.load(path, map_location="cpu", weights_only=True)
+        if not isinstance(state, dict) or state.pop("format", None) != FORMAT:
+            raise ValueError("not a checkpoint of this version of TurboGS")
+        _require_dense(state)
+    except OSError as error:
+        raise InputError(f"cannot read checkpoint '{path}': {error.strerror or error}") from None
+    except Exception as error:  # torch and zipfile raise a dozen kinds for malformed files
+        reason = str(error).splitlines()[0][:160] if str(error) else type(error).__name__
+        raise InputError(f"checkpoint '{path}' cannot be used: {reason}") from None
+    return state
+
+
+def _kept(folder: Path) -> str:
+    try:
+        kept = latest_checkpoint(folder)
+    except InputError:
+        kept = None
+    return f"the last one is '{kept}'" if kept else "no checkpoint was saved before"
+
+
+def _require_plain(value: Any, place: str) -> None:
+    if isinstance(value, dict):
+        for key, item in value.items():
+            if not isinstance(key, str | int):
+                raise TypeError(f"{place}: a checkpoint's keys are text or numbers, not {type(key).__name__}")
+            _require_plain(item, f"{place}.{key}")
+    elif isinstance(value, list | tuple):
+        for index, item in enumerate(value):
+            _require_plain(item, f"{place}[{index}]")
+    elif type(value) not in (Tensor, int, float, bool, str, type(None)):
+        raise TypeError(f"{place}: a checkpoint holds tensors and plain values, not {type(value).__name__}")
+
+
+def _require_bounded(path: Path) -> None:
+    """Refuse archives that unpack to more than they are."""
+    with zipfile.ZipFile(path) as archive:
+        entries = archive.infolist()
+    if any(entry.compress_type != zipfile.ZIP_STORED for entry in entries):
+        raise ValueError("its entries are compressed")
+    if sum(entry.file_size for entry in entries) > os.path.getsize(path):
+        raise ValueError("its entries overlap")
+
+
+def _require_dense(value: Any) -> None:
+    """Refuse tensors that claim more elements than are stored."""
+    if isinstance(value, dict):
+        value = list(value.values())
+    if isinstance(value, list | tuple):
+        for item in value:
+            _require_dense(item)
+    elif isinstance(value, Tensor) and not value.is_contiguous():
+        raise ValueError("it has a tensor that is not stored whole")

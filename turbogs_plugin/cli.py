@@ -1,0 +1,155 @@
+"""The command line: verbs only. What a verb does is in the module that it calls, imported when it is called."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+from tyro.conf import Positional, arg
+
+from turbogs_plugin.errors import InputError, TrainingStopped
+
+app = tyro.extras.SubcommandApp()
+
+Device = Literal["auto", "cpu", "cuda"]
+
+
+@app.command
+def train(
+    scene: Annotated[Positional[Path | None], arg(metavar="SCENE")] = None,
+    overrides: Annotated[Positional[tuple[str, ...]], arg(metavar="[section.key=value ...]")] = (),
+    /,
+    *,
+    out: Annotated[Path | None, arg(metavar="RUN")] = None,
+    resume: Annotated[Path | None, arg(metavar="RUN")] = None,
+    config: Annotated[str | None, arg(metavar="NAME_OR_FILE")] = None,
+    factor: Annotated[int | None, arg(metavar="N")] = None,
+    device: Annotated[Device | None, arg(metavar="auto|cpu|cuda")] = None,
+) -> int:
+    """Train on a capture, or go on with a stopped run.
+
+    Args:
+        scene: folder of a COLMAP reconstruction or a transforms.json, with its photos.
+        overrides: changes of the configuration, e.g. train.iterations=8000 density.type=none.
+        out: new folder for the run.
+        resume: folder of a stopped run to go on with, by its own configuration.
+        config: name of a packaged configuration or a .yaml file; turbogs where absent.
+        factor: scale photos down by this.
+        device: where to train; auto takes a GPU where there is one.
+    """
+    from turbogs_plugin import run
+
+    if resume is not None:
+        if scene or overrides or any(option is not None for option in (out, config, factor, device)):
+            raise InputError("--resume goes on by the run's own configuration: give it nothing else")
+        return _tell(run.resume(resume))
+    if scene is None or out is None:
+        raise InputError("train needs a SCENE and --out RUN, or --resume RUN")
+
+    from turbogs_plugin.config import DEFAULT_CONFIG, load_config
+
+    settings = load_config(DEFAULT_CONFIG if config is None else config, overrides)
+    settings.scene.path = str(scene)
+    if factor is not None:
+        settings.scene.factor = factor
+    if device is not None:
+        settings.train.device = device
+    return _tell(run.train(settings, out))
+
+
+@app.command(name="eval")
+def evaluate(run: Positional[Path], /, *, device: Device = "auto") -> int:
+    """Measure the newest model of a run on its test views.
+
+    Args:
+        run: folder of the run.
+        device: where to render.
+    """
+    from turbogs_plugin.outputs import evaluate_run
+
+    print(evaluate_run(run, device))
+    return 0
+
+
+@app.command
+def render(run: Positional[Path], /, *, split: Literal["test", "train"] = "test", device: Device = "auto") -> int:
+    """Render the newest model of a run from its cameras, as PNGs in the run's folder.
+
+    Args:
+        run: folder of the run.
+        split: which cameras.
+        device: where to render.
+    """
+    from turbogs_plugin.outputs import render_run
+
+    print(f"renders  {render_run(run, split, device)}")
+    return 0
+
+
+@app.command
+def export(run: Positional[Path], /, *, format: Literal["ply"] = "ply", out: Path | None = None) -> int:
+    """Write the newest model of a run for other programs, in the capture's own coordinates.
+
+    Args:
+        run: folder of the run.
+        format: ply: as the original 3DGS writes it, which viewers read.
+        out: new file; model.ply in the run's folder where absent.
+    """
+    from turbogs_plugin.outputs import export_run
+
+    print(f"model  {export_run(run, format, out)}")
+    return 0
+
+
+@app.command
+def demo(path: Positional[Path], /) -> int:
+    """Write a small synthetic capture to try things on: a textured scene as a COLMAP dataset.
+
+    Args:
+        path: new folder.
+    """
+    from turbogs_plugin.scene import write_demo_capture
+
+    print(f"capture  {write_demo_capture(path)}")
+    return 0
+
+
+@app.command
+def doctor() -> int:
+    """Print versions, devices and the state of the kernels, and what is missing."""
+    from turbogs_plugin.doctor import diagnosis
+
+    print(diagnosis())
+    return 0
+
+
+def _tell(outcome) -> int:
+    """Print how a training call ended; its exit code."""
+    from turbogs_plugin.outputs import history_table
+
+    folder = outcome.folder
+    if outcome.signal is not None:
+        print(f"stopped and saved: go on with  turbogs train --resume {folder.path}", file=sys.stderr)
+        return 128 + outcome.signal
+    print(history_table(outcome.history))
+    print(f"\nreport  {folder.report}\nmodel   {folder.model}\nrenders {folder.path / 'report'}")
+    return 0
+
+
+def main() -> None:
+    """The `turbogs` command. Exit codes: 2 bad input, 1 a run that could not go on, 128 + n stopped by signal n."""
+    try:
+        code = app.cli(prog="turbogs", description="TurboGS: train 3D Gaussian Splatting on few, well chosen pixels.")
+    except (InputError, TrainingStopped) as error:
+        print(f"turbogs: error: {' '.join(str(error).split())}", file=sys.stderr)
+        code = 2 if isinstance(error, InputError) else 1
+    except KeyboardInterrupt:
+        print("turbogs: interrupted", file=sys.stderr)
+        code = 130
+    sys.exit(code)
+
+
+if __name__ == "__main__":
+    main()

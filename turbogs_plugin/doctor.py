@@ -1,0 +1,56 @@
+"""What this installation has and lacks."""
+
+from __future__ import annotations
+
+import importlib.util
+import shutil
+import subprocess
+
+import torch
+
+from turbogs_plugin.report.pages import hardware, software
+
+
+def diagnosis() -> str:
+    """Versions, devices, kernels and what is missing, for a person to read."""
+    kernels, missing = _kernels()
+    lines = [f"{name:<16}{version}" for name, version in software()]
+    lines += [f"{'machine':<16}{hardware('cuda' if torch.cuda.is_available() else 'cpu')}"]
+    lines += [f"{'GPU':<16}{line}" for line in _gpus()]
+    lines += [f"{'nvcc':<16}{shutil.which('nvcc') or 'not found'}", f"{'kernels':<16}{kernels}"]
+    if torch.version.cuda is None:
+        missing.append("CUDA in PyTorch: training runs on the CPU, by the torch reference")
+    elif not torch.cuda.is_available():
+        missing.append("a GPU that answers: training runs on the CPU, by the torch reference")
+    if importlib.util.find_spec("torchvision") is None:
+        missing.append("torchvision: LPIPS is not computed")
+    return "\n".join([*lines, *(f"{'missing':<16}{line}" for line in missing)])
+
+
+def _gpus() -> list[str]:
+    if not torch.cuda.is_available():
+        return ["none"]
+    names = []
+    for index in range(torch.cuda.device_count()):
+        properties = torch.cuda.get_device_properties(index)
+        capability = f"sm_{properties.major}{properties.minor}"
+        memory = f"{properties.total_memory / 2**30:.0f} GiB"
+        names.append(f"{index}: {properties.name}, {capability}, {memory}, driver {_driver()}")
+    return names
+
+
+def _driver() -> str:
+    command = ["nvidia-smi", "--query-gpu=driver_version", "--format=csv,noheader"]
+    try:
+        answer = subprocess.run(command, capture_output=True, text=True, timeout=10, check=True)
+    except (OSError, subprocess.SubprocessError):
+        return "unknown"
+    return answer.stdout.split("\n")[0].strip()
+
+
+def _kernels() -> tuple[str, list[str]]:
+    from turbogs_plugin import kernels
+
+    if kernels.available():
+        return f"loaded from {kernels.library_path()}, for {', '.join(kernels.architectures())}", []
+    return "not loaded", [f"kernels: {kernels.unavailable_reason()}"]

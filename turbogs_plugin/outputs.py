@@ -1,0 +1,74 @@
+"""What one can get out of a finished or stopped run: its error, its views, its model."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from PIL import Image
+
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.evaluation import evaluate, load_lpips, render_view
+from turbogs_plugin.gaussians import save_ply
+from turbogs_plugin.report.history import Evaluation
+from turbogs_plugin.report.pages import ERRORS, number, table
+from turbogs_plugin.report.plots import to_uint8
+from turbogs_plugin.run import SavedModel, load_model, resolve_device
+from turbogs_plugin.scene import PosedImages, load_scene
+
+
+def history_table(history: list[Evaluation]) -> str:
+    """Error against seconds, for a terminal."""
+    lines = [f"{'iteration':>9}  {'seconds':>8}  {'PSNR':>6}  {'SSIM':>6}  {'L1':>6}  {'Gaussians':>9}"]
+    for evaluation in history:
+        lines.append(
+            f"{evaluation.iteration:>9}  {evaluation.train_seconds:>8.1f}  {evaluation.psnr:>6.2f}  "
+            f"{evaluation.ssim:>6.4f}  {evaluation.l1:>6.4f}  {evaluation.num_gaussians:>9}"
+        )
+    return "\n".join(lines)
+
+
+def evaluate_run(path: Path, device_name: str) -> str:
+    """Errors of a run's newest model on each test view, as a table."""
+    model, views = _open(path, device_name, "test")
+    lpips, reason = load_lpips(model.config.report.lpips_weights, model.gaussians.device)
+    metrics = evaluate(model.gaussians, views, model.sh_degree, model.config.raster, lpips)
+    rows = [
+        (view.name, number(view.psnr, 2), number(view.ssim, 4), number(view.l1, 4), number(view.lpips, 4))
+        for view in [*metrics.views]
+    ]
+    means = (f"mean of {len(rows)}", *(number(metrics.mean(name), 4) for name in ("psnr", "ssim", "l1", "lpips")))
+    note = f"\nLPIPS was not computed: {reason}" if reason else ""
+    return (
+        table(("view", *ERRORS, "LPIPS (VGG)"), [*rows, means])
+        + f"\n\niteration {model.iteration}, {len(model.gaussians)} Gaussians, {metrics.fps:.1f} views a second{note}"
+    )
+
+
+def render_run(path: Path, split: str, device_name: str) -> Path:
+    """Write the views of a split, rendered from a run's newest model, as PNGs; their folder."""
+    model, views = _open(path, device_name, split)
+    folder = model.folder.renders / split
+    folder.mkdir(parents=True, exist_ok=True)
+    for view_id, name in enumerate(views.names):
+        image = render_view(model.gaussians, views, view_id, model.sh_degree, model.config.raster)
+        flat_name = Path(name).with_suffix(".png").as_posix().replace("/", "__")
+        Image.fromarray(to_uint8(image)).save(folder / flat_name)
+    return folder
+
+
+def export_run(path: Path, file_format: str, out: Path | None) -> Path:
+    """Write a run's newest model; the file. `file_format`: ply, the only one yet."""
+    if out is not None and out.exists():
+        raise InputError(f"--out '{out}' exists: choose a new file")
+    model = load_model(path, resolve_device("cpu"))
+    target = model.folder.model if out is None else out
+    save_ply(model.gaussians, target, model.frame)
+    return target
+
+
+def _open(path: Path, device_name: str, split: str) -> tuple[SavedModel, PosedImages]:
+    device = resolve_device(device_name)
+    model = load_model(path, device)
+    scene = model.config.scene
+    loaded = load_scene(scene.path, scene.factor, scene.test_every)
+    return model, (loaded.test if split == "test" else loaded.train).to(device)

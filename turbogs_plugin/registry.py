@@ -1,0 +1,96 @@
+"""Names of strategies to classes: our own, and those that others register by entry point.
+
+A third party adds to its ``pyproject.toml``::
+
+    [project.entry-points."turbogs.pixel_sampler"]
+    my_sampler = "my_package.samplers:MySampler"
+
+and a YAML names it by ``pixel_sampler: {type: my_sampler, ...}``. Nothing is imported before it is named.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Mapping
+from importlib.metadata import entry_points
+from typing import Any
+
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.schema import build_dataclass, nearest
+
+BUILT_IN: dict[str, dict[str, str]] = {
+    "schedule": {
+        "sinusoidal": "turbogs_plugin.strategies.schedule:SinusoidalSchedule",
+        "linear": "turbogs_plugin.strategies.schedule:LinearSchedule",
+        "exponential": "turbogs_plugin.strategies.schedule:ExponentialSchedule",
+        "fixed": "turbogs_plugin.strategies.schedule:FixedSchedule",
+    },
+    "view_sampler": {
+        "geometry_aware": "turbogs_plugin.strategies.view_sampling:GeometryAwareViewSampler",
+        "random": "turbogs_plugin.strategies.view_sampling:RandomViewSampler",
+    },
+    "pixel_sampler": {
+        "error_guided": "turbogs_plugin.strategies.pixel_sampling:ErrorGuidedPixelSampler",
+        "random": "turbogs_plugin.strategies.pixel_sampling:RandomPixelSampler",
+        "dense": "turbogs_plugin.strategies.pixel_sampling:DensePixelSampler",
+    },
+    "loss": {
+        "charbonnier_ncc": "turbogs_plugin.strategies.loss:CharbonnierNccLoss",
+        "charbonnier": "turbogs_plugin.strategies.loss:CharbonnierLoss",
+        "sparse_ssim": "turbogs_plugin.strategies.loss:SparseSsimLoss",
+    },
+    "density": {
+        "error_driven": "turbogs_plugin.strategies.density:ErrorDrivenDensity",
+        "none": "turbogs_plugin.strategies.density:NoDensity",
+        "gsplat_default": "turbogs_plugin.strategies.density_gsplat:GsplatDefaultDensity",
+    },
+    "optimizer": {
+        "moment_lm": "turbogs_plugin.strategies.moment_lm:MomentLMOptimizer",
+        "sparse_adam": "turbogs_plugin.strategies.adam:SparseAdam",
+    },
+}
+"""Kind -> name -> "module:class". The first of a kind is the one that a config without that section gets."""
+
+KINDS = tuple(BUILT_IN)
+
+
+def known_types(kind: str) -> dict[str, str]:
+    """Every name of a kind -> "module:class". A name of ours cannot be taken over by an entry point."""
+    plugged_in = {point.name: point.value for point in entry_points(group=f"turbogs.{kind}")}
+    return {**plugged_in, **BUILT_IN[kind]}
+
+
+def default_type(kind: str) -> str:
+    """The name that a config without a section of this kind gets."""
+    return next(iter(BUILT_IN[kind]))
+
+
+def strategy_class(kind: str, name: str) -> type:
+    """The class behind a name.
+
+    Raises:
+        InputError: an unknown name (naming the nearest and all that are known), or one whose module cannot be imported.
+    """
+    known = known_types(kind)
+    if not isinstance(name, str) or name not in known:
+        raise InputError(f"unknown {kind}.type '{name}': {nearest(name, known)}")
+    module, _, attribute = known[name].partition(":")
+    try:
+        return getattr(importlib.import_module(module), attribute)
+    except (ImportError, AttributeError) as error:
+        raise InputError(f"{kind}.type '{name}' ({known[name]}) cannot be imported: {error}") from error
+
+
+def build(kind: str, mapping: Mapping[str, Any]) -> Any:
+    """A new strategy from ``{"type": name, **its init fields}``.
+
+    Raises:
+        InputError: an unknown kind, type or key, a wrong type of a value, or one out of range.
+    """
+    if kind not in BUILT_IN:
+        raise InputError(f"unknown kind of strategy '{kind}': {nearest(kind, KINDS)}")
+    if not isinstance(mapping, Mapping):
+        raise InputError(f"{kind}: expected a mapping with a 'type', got {mapping!r}")
+    options = dict(mapping)
+    name = options.pop("type", default_type(kind))
+    return build_dataclass(strategy_class(kind, name), options, kind)

@@ -1,0 +1,324 @@
+"""A run and its folder: training with a clock, evaluations, checkpoints and a report, from the start or from a stop."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import FrameType, TracebackType
+from typing import Any
+
+import numpy as np
+import torch
+
+from turbogs_plugin.checkpoint import latest_checkpoint, load_checkpoint, save_checkpoint
+from turbogs_plugin.config import Config, resolve
+from turbogs_plugin.errors import InputError, TrainingStopped
+from turbogs_plugin.evaluation import Metrics, evaluate, load_lpips, peak_memory_bytes, synchronize
+from turbogs_plugin.files import write_text_atomically
+from turbogs_plugin.gaussians import save_ply
+from turbogs_plugin.progress import TrainingProgress
+from turbogs_plugin.report.history import Evaluation, append_evaluation, read_history, rewind_history
+from turbogs_plugin.report.pages import RunRecord, write_report
+from turbogs_plugin.scene import Frame, PosedImages, Scene, load_scene
+from turbogs_plugin.trainer import Trainer, gaussians_of_state
+from turbogs_plugin.types import Gaussians
+from turbogs_plugin.yaml_text import read_yaml
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """Where the parts of a run are."""
+
+    path: Path
+
+    @property
+    def config(self) -> Path:
+        return self.path / "config.yaml"
+
+    @property
+    def history(self) -> Path:
+        return self.path / "history.jsonl"
+
+    @property
+    def checkpoints(self) -> Path:
+        return self.path / "checkpoints"
+
+    @property
+    def report(self) -> Path:
+        return self.path / "report.md"
+
+    @property
+    def model(self) -> Path:
+        return self.path / "model.ply"
+
+    @property
+    def renders(self) -> Path:
+        return self.path / "renders"
+
+    def require_new(self) -> None:
+        """Raises `InputError` where the folder holds anything, or cannot be made."""
+        if self.config.exists():
+            raise InputError(f"'{self.path}' holds another run: choose a new --out, or go on with --resume {self.path}")
+        if self.path.exists() and not self.path.is_dir():
+            raise InputError(f"--out '{self.path}' is a file: choose a folder")
+        if self.path.is_dir() and any(self.path.iterdir()):
+            raise InputError(f"--out '{self.path}' is not empty: choose a new folder")
+        parent = next(folder for folder in self.path.absolute().parents if folder.exists())
+        if not parent.is_dir() or not os.access(parent, os.W_OK):
+            raise InputError(f"--out '{self.path}' cannot be made: '{parent}' is not a folder one can write to")
+
+    def read_config(self) -> Config:
+        """The resolved configuration of the run. Raises `InputError` where this is no run."""
+        if not self.config.is_file():
+            raise InputError(f"'{self.path}' holds no run: there is no config.yaml")
+        return resolve(read_yaml(self.config))
+
+
+@dataclass
+class Outcome:
+    """How a call of `train` or `resume` ended. `signal`: the one that stopped it, or None at the end of the run."""
+
+    folder: RunFolder
+    history: list[Evaluation]
+    signal: int | None = None
+
+
+@dataclass
+class SavedModel:
+    """What is needed of a run to look at its model."""
+
+    folder: RunFolder
+    config: Config
+    gaussians: Gaussians
+    frame: Frame
+    iteration: int
+
+    @property
+    def sh_degree(self) -> int:
+        return self.config.train.sh_degree_at(self.iteration)
+
+
+def resolve_device(name: str) -> torch.device:
+    """The device of ``auto``, ``cpu`` or ``cuda``. Raises `InputError` where CUDA is asked for and absent."""
+    if name == "cuda" and not torch.cuda.is_available():
+        build = "this PyTorch is built without CUDA" if torch.version.cuda is None else "no GPU answers"
+        raise InputError(f"CUDA was asked for and is absent ({build}): use --device cpu, or see 'turbogs doctor'")
+    return torch.device("cuda" if name != "cpu" and torch.cuda.is_available() else "cpu")
+
+
+def train(config: Config, out: Path) -> Outcome:
+    """Train from the start into a new folder.
+
+    Raises:
+        InputError: anything wrong with the input; then nothing was written.
+        TrainingStopped: the run cannot go on; what it saved stays.
+    """
+    folder = RunFolder(out)
+    folder.require_new()
+    device = resolve_device(config.train.device)
+    scene = load_scene(config.scene.path, config.scene.factor, config.scene.test_every)
+    load_lpips(config.report.lpips_weights, device)
+    config.scene.path = str(Path(config.scene.path).resolve())
+    config.train.device = device.type
+    session = _Session(folder, config, scene, Trainer(config, scene, device))
+    folder.path.mkdir(parents=True, exist_ok=True)
+    write_text_atomically(folder.config, config.to_yaml())
+    return session.run()
+
+
+def resume(path: Path) -> Outcome:
+    """Go on with a stopped run from its newest checkpoint, by its own configuration.
+
+    On a CPU, the result is bit for bit that of a run never stopped.
+
+    Raises:
+        InputError: no run there, an unusable checkpoint, or a capture that is no longer what it was.
+        TrainingStopped: the run cannot go on.
+    """
+    folder = RunFolder(path)
+    config = folder.read_config()
+    checkpoint = latest_checkpoint(folder.checkpoints)
+    state = None if checkpoint is None else load_checkpoint(checkpoint)
+    device = resolve_device(config.train.device)
+    scene = load_scene(config.scene.path, config.scene.factor, config.scene.test_every)
+    session = _Session(folder, config, scene, Trainer(config, scene, device))
+    if state is not None:
+        session.load_state_dict(state, str(checkpoint))
+    session.history = rewind_history(folder.history, session.trainer.iteration if state is not None else -1)
+    return session.run()
+
+
+def load_model(path: Path, device: torch.device) -> SavedModel:
+    """The newest saved model of a run.
+
+    Raises:
+        InputError: no run there, no checkpoint, or an unusable one.
+    """
+    folder = RunFolder(path)
+    config = folder.read_config()
+    checkpoint = latest_checkpoint(folder.checkpoints)
+    if checkpoint is None:
+        raise InputError(f"'{path}' has no checkpoint yet")
+    state = load_checkpoint(checkpoint)
+    try:
+        frame = Frame(np.array(state["frame"]["center"]), state["frame"]["scale"])
+        trained = state["trainer"]
+        return SavedModel(folder, config, gaussians_of_state(trained, device), frame, trained["iteration"])
+    except (KeyError, TypeError, AttributeError) as error:
+        raise InputError(f"checkpoint '{checkpoint}' is not one of a run: {error}") from None
+
+
+class _Clock:
+    """Seconds of training. Entered for training alone; waits for the GPU at both ends."""
+
+    def __init__(self, device: torch.device) -> None:
+        self.device = device
+        self.seconds = 0.0
+
+    def __enter__(self) -> None:
+        synchronize(self.device)
+        self._started = time.perf_counter()
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        synchronize(self.device)
+        self.seconds += time.perf_counter() - self._started
+
+
+class _Interrupts:
+    """Turns SIGINT and SIGTERM into a wish to stop after this iteration; a second one stops at once."""
+
+    SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+    def __init__(self) -> None:
+        self.signal: int | None = None
+
+    def __enter__(self) -> _Interrupts:
+        self._previous = {number: signal.signal(number, self._handle) for number in self.SIGNALS}
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        for number, handler in self._previous.items():
+            signal.signal(number, handler)
+
+    def _handle(self, number: int, frame: FrameType | None) -> None:
+        if self.signal is not None:
+            raise KeyboardInterrupt
+        self.signal = number
+
+
+@dataclass
+class _Session:
+    """One process's share of a run."""
+
+    folder: RunFolder
+    config: Config
+    scene: Scene
+    trainer: Trainer
+    history: list[Evaluation] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.device = self.trainer.gaussians.device
+        self.test: PosedImages = self.scene.test.to(self.device)
+        self.clock = _Clock(self.device)
+
+    def run(self) -> Outcome:
+        """Train to the end, or until a signal; both end with a checkpoint."""
+        trainer, total = self.trainer, self.config.train.iterations
+        evaluations = self.config.train.evaluation_iterations()
+        saves = set(range(0, total, self.config.train.checkpoint_every or total)[1:]) | {total}
+        try:
+            with _Interrupts() as interrupts, TrainingProgress(total, trainer.iteration) as progress:
+                if not self.history:
+                    with self.clock:
+                        trainer.initialise_maps()
+                    self._evaluate(progress)
+                while trainer.iteration < total and interrupts.signal is None:
+                    mark = min(iteration for iteration in evaluations | saves if iteration > trainer.iteration)
+                    with self.clock:
+                        while trainer.iteration < mark and interrupts.signal is None:
+                            trainer.step()
+                            progress.advance(trainer.iteration, len(trainer.gaussians))
+                    if trainer.iteration in evaluations:
+                        self._evaluate(progress)
+                    if trainer.iteration in saves or interrupts.signal is not None:
+                        self._save()
+            if trainer.iteration == total:
+                self._finish()
+        except TrainingStopped as stop:
+            raise TrainingStopped(f"{stop}; {self._last_good()}") from stop
+        return Outcome(self.folder, self.history, None if trainer.iteration == total else interrupts.signal)
+
+    def state_dict(self) -> dict[str, Any]:
+        frame = self.scene.frame
+        return {
+            "trainer": self.trainer.state_dict(),
+            "train_seconds": self.clock.seconds,
+            "frame": {"center": frame.center.tolist(), "scale": frame.scale},
+        }
+
+    def load_state_dict(self, state: dict[str, Any], source: str) -> None:
+        try:
+            self.trainer.load_state_dict(state["trainer"])
+            self.clock.seconds = state["train_seconds"]
+        except (KeyError, TypeError, AttributeError, RuntimeError, ValueError) as error:
+            raise InputError(f"checkpoint '{source}' does not fit this run and its capture: {error}") from None
+
+    def _evaluate(self, progress: TrainingProgress) -> None:
+        trainer = self.trainer
+        trainer.require_finite()
+        metrics = evaluate(trainer.gaussians, self.test, trainer.sh_degree, self.config.raster)
+        evaluation = Evaluation(
+            iteration=trainer.iteration,
+            train_seconds=self.clock.seconds,
+            psnr=metrics.psnr,
+            ssim=metrics.ssim,
+            l1=metrics.l1,
+            num_gaussians=len(trainer.gaussians),
+            memory_bytes=peak_memory_bytes(self.device),
+            nonfinite_losses=int(trainer.nonfinite_losses),
+            skipped_updates=int(trainer.optimizer.skipped),
+        )
+        self.history.append(evaluation)
+        append_evaluation(self.folder.history, evaluation)
+        progress.evaluated(evaluation)
+
+    def _save(self) -> None:
+        self.trainer.require_finite()
+        save_checkpoint(self.folder.checkpoints, self.trainer.iteration, self.state_dict())
+
+    def _finish(self) -> None:
+        """The model as a .ply and the report."""
+        trainer = self.trainer
+        save_ply(trainer.gaussians, self.folder.model, self.scene.frame)
+        lpips, lpips_reason = load_lpips(self.config.report.lpips_weights, self.device)
+        final: Metrics = evaluate(trainer.gaussians, self.test, trainer.sh_degree, self.config.raster, lpips)
+        write_report(
+            RunRecord(
+                folder=self.folder.path,
+                scene=self.scene.name,
+                config=self.config,
+                history=self.history,
+                metrics=final,
+                lpips_reason=lpips_reason,
+                num_train_views=len(self.scene.train),
+            ),
+            trainer.gaussians,
+            self.test,
+            trainer.sh_degree,
+        )
+
+    def _last_good(self) -> str:
+        checkpoint = latest_checkpoint(self.folder.checkpoints)
+        return f"the last good checkpoint is '{checkpoint}'" if checkpoint else "no checkpoint was saved before"
+
+
+def finished_history(path: Path) -> list[Evaluation]:
+    """The history of a run, for showing it."""
+    return read_history(RunFolder(path).history)

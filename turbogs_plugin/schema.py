@@ -1,0 +1,130 @@
+"""Mappings (from YAML) to dataclasses, strictly: unknown keys and wrong types are errors that name the place."""
+
+from __future__ import annotations
+
+import difflib
+import math
+import types
+import typing
+from collections.abc import Iterable, Mapping
+from dataclasses import MISSING, fields, is_dataclass
+from typing import Any, TypeVar
+
+from turbogs_plugin.errors import InputError
+
+T = TypeVar("T")
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """A hint for an unknown name: the nearest known one, where one is near, and all of them."""
+    known = sorted(known)
+    close = difflib.get_close_matches(str(name), known, n=1, cutoff=0.5)
+    hint = f"did you mean '{close[0]}'? " if close else ""
+    return f"{hint}(known: {', '.join(known) or 'none'})"
+
+
+def build_dataclass(cls: type[T], mapping: Mapping[str, Any], where: str) -> T:
+    """An instance of dataclass `cls` from a mapping of its init fields; fields not named keep their defaults.
+
+    Args:
+        cls: a dataclass with resolvable type hints.
+        mapping: plain YAML values; nested dataclasses are nested mappings.
+        where: dotted place, for messages.
+
+    Raises:
+        InputError: an unknown key (naming the nearest), a missing one, a wrong type, or a value that the
+            dataclass itself refuses.
+    """
+    if not isinstance(mapping, Mapping):
+        raise InputError(f"{where}: expected a mapping of keys, got {mapping!r}")
+    hints = typing.get_type_hints(cls)
+    init_fields = {field.name: field for field in fields(cls) if field.init}
+    for key in mapping:
+        if key not in init_fields:
+            raise InputError(f"unknown key '{where}.{key}': {nearest(key, init_fields)}")
+    for name, field in init_fields.items():
+        if name not in mapping and field.default is MISSING and field.default_factory is MISSING:
+            raise InputError(f"{where}: key '{name}' is missing")
+    values = {key: convert(value, hints[key], f"{where}.{key}") for key, value in mapping.items()}
+    try:
+        return cls(**values)
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from None
+
+
+def dataclass_mapping(instance: Any) -> dict[str, Any]:
+    """The init fields of a dataclass as plain YAML values: the inverse of `build_dataclass`."""
+    return {field.name: _plain(getattr(instance, field.name)) for field in fields(instance) if field.init}
+
+
+def _plain(value: Any) -> Any:
+    if is_dataclass(value):
+        return dataclass_mapping(value)
+    if isinstance(value, tuple | list):
+        return [_plain(item) for item in value]
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    return value
+
+
+def convert(value: Any, hint: Any, where: str) -> Any:
+    """`value` as the type that a hint asks for.
+
+    A whole number is a float where one is asked for, and ``5e3`` is an integer; nothing else changes its type. Hints
+    that are none of YAML's types are not checked: the dataclass that has them has to.
+    """
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if is_dataclass(hint):
+        return build_dataclass(hint, value, where)
+    if origin in (typing.Union, types.UnionType):
+        return _convert_union(value, arguments, hint, where)
+    if origin is typing.Literal:
+        if value not in arguments:
+            raise InputError(f"{where}: {value!r} is not one of {', '.join(map(repr, arguments))}")
+        return value
+    if origin in (tuple, list):
+        return _convert_sequence(value, origin, arguments, where)
+    if origin is dict:
+        if not isinstance(value, Mapping):
+            raise InputError(f"{where}: expected a mapping of keys, got {value!r}")
+        return {key: convert(item, arguments[1], f"{where}.{key}") for key, item in value.items()}
+    return _convert_scalar(value, hint, where)
+
+
+def _convert_scalar(value: Any, hint: Any, where: str) -> Any:
+    number = isinstance(value, int | float) and not isinstance(value, bool)
+    if hint is float:
+        if not number or math.isnan(value):
+            raise InputError(f"{where}: expected a number, got {value!r}")
+        return float(value)
+    if hint is int:
+        if not number or not math.isfinite(value) or value != int(value):
+            raise InputError(f"{where}: expected a whole number, got {value!r}")
+        return int(value)
+    if hint in (bool, str, type(None)) and not isinstance(value, hint):
+        wanted = {bool: "true or false", str: "text", type(None): "null"}[hint]
+        raise InputError(f"{where}: expected {wanted}, got {value!r}")
+    return value
+
+
+def _convert_sequence(value: Any, origin: type, arguments: tuple, where: str) -> Any:
+    if not isinstance(value, list | tuple):
+        raise InputError(f"{where}: expected a list, got {value!r}")
+    if origin is tuple and not (len(arguments) == 2 and arguments[1] is Ellipsis):
+        if len(value) != len(arguments):
+            raise InputError(f"{where}: expected {len(arguments)} values, got {len(value)}")
+        items = zip(value, arguments, strict=True)
+    else:
+        items = ((item, arguments[0]) for item in value)
+    return origin(convert(item, hint, f"{where}[{index}]") for index, (item, hint) in enumerate(items))
+
+
+def _convert_union(value: Any, arguments: tuple, hint: Any, where: str) -> Any:
+    messages = []
+    for argument in arguments:
+        try:
+            return convert(value, argument, where)
+        except InputError as error:
+            messages.append(str(error))
+    concrete = [argument for argument in arguments if argument is not type(None)]
+    raise InputError(messages[arguments.index(concrete[0])] if len(concrete) == 1 else f"{where}: got {value!r}")

@@ -1,0 +1,162 @@
+"""Algorithm 1 of the paper: what one iteration of training is, and the state that iterations change.
+
+Everything around it (the clock, evaluation, checkpoints, interrupts, the report) is in `turbogs_plugin.run`.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+
+from turbogs_plugin.config import Config
+from turbogs_plugin.error_maps import ErrorMaps
+from turbogs_plugin.errors import TrainingStopped
+from turbogs_plugin.gaussians import gaussians_from_points
+from turbogs_plugin.rendering import rasterize, render_images
+from turbogs_plugin.scene import Scene
+from turbogs_plugin.types import PARAMETER_NAMES, Gaussians, RowUpdate, Step
+
+
+class Trainer:
+    """The Gaussians, the error maps and the strategies of one run.
+
+    Args:
+        config: of the run.
+        scene: on any device.
+        device: where everything is computed and kept.
+    """
+
+    def __init__(self, config: Config, scene: Scene, device: torch.device) -> None:
+        self.config = config
+        self.views = scene.train.to(device)
+        self.extent = scene.extent
+        self.schedule = config.build("schedule")
+        self.view_sampler = config.build("view_sampler")
+        self.pixel_sampler = config.build("pixel_sampler")
+        self.loss = config.build("loss")
+        self.optimizer = config.build("optimizer")
+        self.density = config.build("density")
+        self.maps = ErrorMaps(self.views.cameras.sizes, device, beta=config.maps.beta)
+        self.gaussians = gaussians_from_points(
+            scene.points, scene.point_colors, config.train.sh_degree, scene.extent
+        ).map(lambda tensor: tensor.to(device))
+        self.view_sampler.setup(self.views.cameras, scene.extent)
+        self.optimizer.setup(self.gaussians)
+        self.density.setup(self.gaussians)
+        self.iteration = 0
+        self.initial_error = 0.0
+        self.nonfinite_losses = torch.zeros((), dtype=torch.int64, device=device)
+
+    def initialise_maps(self) -> None:
+        """The errors of a dense render of the initial Gaussians, Algorithm 1's initialization."""
+        for view_id in range(len(self.views)):
+            camera = self.views.cameras.select([view_id])
+            image, _ = render_images(self.gaussians, camera, self.sh_degree, self.config.raster)[0]
+            errors = (image - self.views.photos.image(view_id)).abs().sum(dim=-1)  # [H, W]
+            self.maps.initialise(view_id, errors.reshape(-1))
+        self.initial_error = self.maps.mean()
+
+    def step(self) -> None:
+        """One iteration, in the paper's order."""
+        step = self.now
+        view_errors = self.maps.view_means()
+
+        # 1) Sampling parameters: how many views, and which share of their pixels
+        budget = self.schedule.query(step, view_errors.mean().item(), self.initial_error, len(self.views))
+
+        # 2) View selection
+        view_ids = self.view_sampler.select(budget.views, view_errors, step)
+
+        # 3) Pixel sampling
+        samples = self.pixel_sampler.sample(self.maps, view_ids, budget.rate, step)
+
+        # 4) Ground truth at the samples
+        targets = self.views.photos.gather(samples)
+
+        # 5) Sparse forward rendering
+        cameras = self.views.cameras.select(view_ids)
+        rendered = rasterize(self.gaussians, cameras, samples, sh_degree=self.sh_degree, settings=self.config.raster)
+
+        # 6) Sparse loss and its gradients
+        loss = self.loss(rendered.colors, targets, samples)
+
+        # 7) EMA update of the error maps
+        self.maps.update(samples, loss.pixel_errors, step)
+
+        # 8) Backward to the Gaussians; step 11's back-projection of errors happens in the same pass
+        gradients = rendered.backward(loss.color_gradients, loss.pixel_errors, self.density.stats)
+
+        # 9) and 10) Solve for the updates and apply them
+        self.optimizer.step(self.gaussians, gradients, step)
+
+        # 11) Error-driven density control
+        self.follow(self.density.update(self.gaussians, step))
+
+        self.nonfinite_losses += ~loss.loss.isfinite()
+        self.iteration += 1
+
+    def follow(self, update: RowUpdate | None) -> None:
+        """Let model and optimizer follow a change of the set of Gaussians."""
+        if update is None:
+            return
+        if len(update.source) == 0:
+            raise TrainingStopped(f"iteration {self.iteration}: density control removed every Gaussian")
+        self.gaussians = update.apply(self.gaussians)
+        self.optimizer.apply(update)
+
+    @property
+    def now(self) -> Step:
+        """Where training stands."""
+        train = self.config.train
+        return Step(self.iteration, train.iterations, train.refine_until, train.seed, self.extent)
+
+    @property
+    def sh_degree(self) -> int:
+        """Degree of the bands in use."""
+        return self.config.train.sh_degree_at(self.iteration)
+
+    def require_finite(self) -> None:
+        """Stop a run whose model is lost.
+
+        Raises:
+            TrainingStopped: a parameter is not finite, which no further iteration would repair.
+        """
+        for name, tensor in self.gaussians.items():
+            bad = int((~tensor.isfinite()).reshape(len(tensor), -1).any(dim=1).sum()) if tensor.numel() else 0
+            if bad:
+                raise TrainingStopped(
+                    f"iteration {self.iteration}: {name} of {bad} of {len(tensor)} Gaussians are not finite"
+                )
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that iterations change, as plain tensors and numbers."""
+        return {
+            "iteration": self.iteration,
+            "initial_error": self.initial_error,
+            "nonfinite_losses": int(self.nonfinite_losses),
+            "gaussians": {name: tensor.contiguous() for name, tensor in self.gaussians.items()},
+            "maps": self.maps.state_dict(),
+            "view_sampler": self.view_sampler.state_dict(),
+            "optimizer": self.optimizer.state_dict(),
+            "density": self.density.state_dict(),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Take over what `state_dict` gave, in a trainer of the same configuration and scene."""
+        device = self.gaussians.device
+        self.iteration = state["iteration"]
+        self.initial_error = state["initial_error"]
+        self.nonfinite_losses.fill_(state["nonfinite_losses"])
+        self.gaussians = gaussians_of_state(state, device)
+        self.maps.load_state_dict(state["maps"])
+        self.view_sampler.load_state_dict(state["view_sampler"])
+        self.optimizer.setup(self.gaussians)
+        self.optimizer.load_state_dict(state["optimizer"])
+        self.density.setup(self.gaussians)
+        self.density.load_state_dict(state["density"])
+
+
+def gaussians_of_state(state: dict[str, Any], device: torch.device) -> Gaussians:
+    """The model in a checkpoint's state."""
+    return Gaussians(**{name: state["gaussians"][name].to(device) for name in PARAMETER_NAMES})

@@ -1,0 +1,82 @@
+"""Reading YAML that nobody vouches for: plain values only, in bounded memory."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import yaml
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from turbogs_plugin.errors import InputError
+
+SIZE_LIMIT = 64 * 1024
+"""Bytes of a configuration file. Ours have about three thousand."""
+
+DEPTH_LIMIT = 16
+"""Levels of nesting, well above what any configuration has."""
+
+
+def read_yaml(path: Path) -> dict[str, Any]:
+    """The mapping in a YAML file.
+
+    Raises:
+        InputError: no such file, too large, not UTF-8, or refused by `parse_yaml`.
+    """
+    try:
+        with open(path, "rb") as file:
+            data = file.read(SIZE_LIMIT + 1)
+    except OSError as error:
+        raise InputError(f"cannot read config '{path}': {error.strerror}") from None
+    if len(data) > SIZE_LIMIT:
+        raise InputError(f"config '{path}' has more than {SIZE_LIMIT} bytes")
+    try:
+        return parse_yaml(data.decode("utf-8"), str(path))
+    except UnicodeDecodeError:
+        raise InputError(f"config '{path}' is not UTF-8 text") from None
+
+
+def parse_yaml(text: str, where: str) -> dict[str, Any]:
+    """The mapping in a YAML text, numbers as YAML 1.2 reads them (``1e-4`` is a float).
+
+    Tags, anchors and aliases are refused before anything is built: they can run code or grow without bound.
+    ``${...}`` stays text.
+
+    Raises:
+        InputError: not YAML, not one mapping, nested too deeply, or with tags, anchors or aliases.
+    """
+    try:
+        _refuse_unsafe(text, where)
+        return OmegaConf.to_container(OmegaConf.create(text), resolve=False)
+    except (yaml.YAMLError, OmegaConfBaseException, ValueError) as error:
+        if isinstance(error, InputError):
+            raise
+        problem = getattr(error, "problem", None) or str(error).splitlines()[0]
+        mark = getattr(error, "problem_mark", None)
+        place = f" (line {mark.line + 1})" if mark else ""
+        raise InputError(f"config '{where}' is not valid YAML{place}: {problem}") from None
+
+
+def _refuse_unsafe(text: str, where: str) -> None:
+    depth = documents = 0
+    for event in yaml.parse(text, Loader=yaml.SafeLoader):
+        place = f"config '{where}' (line {event.start_mark.line + 1})"
+        if isinstance(event, yaml.AliasEvent) or getattr(event, "anchor", None):
+            raise InputError(f"{place}: anchors and aliases are not allowed")
+        if getattr(event, "tag", None):
+            raise InputError(f"{place}: tags are not allowed: {event.tag}")
+        if isinstance(event, yaml.CollectionStartEvent):
+            depth += 1
+            if depth > DEPTH_LIMIT:
+                raise InputError(f"config '{where}' is nested more than {DEPTH_LIMIT} levels deep")
+        elif isinstance(event, yaml.CollectionEndEvent):
+            depth -= 1
+        elif isinstance(event, yaml.DocumentStartEvent):
+            documents += 1
+        elif depth == 0 and isinstance(event, yaml.ScalarEvent):
+            raise InputError(f"config '{where}': expected a mapping of sections, got the text '{event.value[:40]}'")
+        if depth == 1 and isinstance(event, yaml.SequenceStartEvent):
+            raise InputError(f"config '{where}': expected a mapping of sections, got a list")
+    if documents != 1:
+        raise InputError(f"config '{where}': expected one YAML document, found {documents}")
