@@ -1,0 +1,80 @@
+"""Tables of the pixels of tiles, and `PixelSamples` from them. Plain index arithmetic, on any device."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from turbogs_plugin.types import TILE_SIZE, PixelSamples, TileGrid, cell_order
+
+TILE_PIXELS = TILE_SIZE * TILE_SIZE
+
+
+def pixel_table(sizes: np.ndarray, device: torch.device | str) -> Tensor:
+    """[T, 256] int32: the pixel id of each place of each tile of ``TileGrid(sizes)``, in `cell_order`; -1 outside."""
+    side = torch.arange(TILE_SIZE, dtype=torch.int32, device=device)
+    y, x = (axis.reshape(-1) for axis in torch.meshgrid(side, side, indexing="ij"))
+    order = torch.argsort(cell_order(x, y))
+    x, y = x[order], y[order]
+    tables = []
+    for width, height in sizes.tolist():
+        xs = torch.arange(0, width, TILE_SIZE, dtype=torch.int32, device=device)[:, None] + x  # [tiles in x, 256]
+        ys = torch.arange(0, height, TILE_SIZE, dtype=torch.int32, device=device)[:, None, None] + y  # [in y, 1, 256]
+        ids = (ys * width + xs).masked_fill_((ys >= height) | (xs >= width), -1)
+        tables.append(ids.reshape(-1, TILE_PIXELS))
+    return torch.cat(tables)
+
+
+def tile_extents(sizes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Width and height, [T] int64 each, of the part of each tile of ``TileGrid(sizes)`` that lies in its image."""
+    widths, heights = [], []
+    for (width, height), (columns, rows) in zip(sizes, TileGrid(sizes).shapes, strict=True):
+        widths.append(np.tile(np.minimum(TILE_SIZE, width - TILE_SIZE * np.arange(columns)), rows))
+        heights.append(np.repeat(np.minimum(TILE_SIZE, height - TILE_SIZE * np.arange(rows)), columns))
+    return np.concatenate(widths), np.concatenate(heights)
+
+
+def compact(
+    view_ids: Sequence[int],
+    sizes: np.ndarray,
+    table: Tensor,
+    mask: Tensor,
+    tile_ids: Tensor,
+    slot_counts: np.ndarray,
+    weights: Tensor | None = None,
+) -> PixelSamples:
+    """Samples of the masked places of tiles, in the table's order, without counting on the device.
+
+    Args:
+        view_ids, sizes: of the batch, as in `PixelSamples`.
+        table: [T, 256] int32 pixel ids.
+        mask: [T, 256] bool, the places to keep: in each tile at most its count of slots; the others stay empty.
+        tile_ids: [T] int32.
+        slot_counts: [T] int64, on the host.
+        weights: [T, 256] float32 of the places, or None; they are divided by their mean over the filled slots.
+    """
+    device = table.device
+    offsets = np.concatenate([[0], np.cumsum(slot_counts)])
+    slots = int(offsets[-1])
+    tile_offsets = torch.as_tensor(offsets, dtype=torch.int32, device=device)
+    positions = tile_offsets[:-1, None] + mask.cumsum(dim=1) - 1
+    positions = torch.where(mask, positions, slots).reshape(-1)  # what is not kept goes behind the last slot
+    pixel_ids = torch.full((slots + 1,), -1, dtype=torch.int32, device=device)
+    pixel_ids[positions] = torch.where(mask, table, -1).reshape(-1)
+    pixel_ids = pixel_ids[:-1]
+    if weights is not None:
+        kept = torch.zeros(slots + 1, device=device)
+        kept[positions] = torch.where(mask, weights, 0.0).reshape(-1)
+        weights = kept[:-1] * ((pixel_ids >= 0).sum() / kept[:-1].sum())
+    return PixelSamples(tuple(view_ids), sizes, pixel_ids, tile_ids, tile_offsets, weights)
+
+
+def dense_pixels(view_ids: Sequence[int], sizes: np.ndarray, device: torch.device | str) -> PixelSamples:
+    """Every pixel of these views, in the order of samples. `sizes`: [K, 2] int64 (width, height)."""
+    table = pixel_table(sizes, device)
+    widths, heights = tile_extents(sizes)
+    tile_ids = torch.arange(len(table), dtype=torch.int32, device=device)
+    return compact(view_ids, sizes, table, table >= 0, tile_ids, widths * heights)
