@@ -30,7 +30,7 @@ struct ViewCamera {
     float fx, fy, cx, cy;
     float limit_x_low, limit_x_high, limit_y_low, limit_y_high;  // bounds of x/z and y/z in the Jacobian
     float grad_scale_x, grad_scale_y;                            // K * width / 2, K * height / 2
-    float inverse_side;                                          // 1 / larger image side
+    float side;                                                  // larger image side
 };
 
 // Gradient of the 14 parameters that a view's row holds, in the order of the blocks.
@@ -68,7 +68,7 @@ __device__ __forceinline__ ViewCamera load_camera(const float* __restrict__ view
     camera.limit_y_high = (height - camera.cy) / camera.fy + margin_y;
     camera.grad_scale_x = 0.5f * num_views * width;
     camera.grad_scale_y = 0.5f * num_views * height;
-    camera.inverse_side = 1.0f / (width > height ? width : height);
+    camera.side = static_cast<float>(width > height ? width : height);
     return camera;
 }
 
@@ -339,6 +339,7 @@ struct BackwardShared {
     float* coefficients;   // [threads, stride]
     float* gradients;      // [threads, stride]
     ViewCamera* cameras;   // [K]
+    float* corrections;    // [2, threads], for the optimizer: bias corrections of the two moments
     uint8_t* touched;      // [threads]
     int row;               // 3 B
     int stride;            // of a row: 3 B made odd
@@ -349,7 +350,8 @@ struct BackwardShared {
         coefficients = shared;
         gradients = coefficients + kBackwardThreads * stride;
         cameras = reinterpret_cast<ViewCamera*>(gradients + kBackwardThreads * stride);
-        touched = reinterpret_cast<uint8_t*>(cameras + params.num_views);
+        corrections = reinterpret_cast<float*>(cameras + params.num_views);
+        touched = reinterpret_cast<uint8_t*>(corrections + 2 * kBackwardThreads);
     }
 
     // The Gaussian of the block that element `index` of its harmonics belongs to.
@@ -361,7 +363,7 @@ struct BackwardShared {
 
     static size_t bytes(const ScreenBackwardParams& params) {
         return 2 * kBackwardThreads * row_stride(params) * sizeof(float) + params.num_views * sizeof(ViewCamera) +
-               kBackwardThreads;
+               2 * kBackwardThreads * sizeof(float) + kBackwardThreads;
     }
 };
 
@@ -424,8 +426,8 @@ __device__ __forceinline__ void backward_views(const ScreenBackwardParams& param
     const bool with_stats = params.error_sums != nullptr;
     float error_sum = 0.0f, distance_sum = 0.0f, weight_sum = 0.0f, grad_sum = 0.0f, absgrad_sum = 0.0f;
     if (mask != 0u) {
-        const float inverse_count =
-            1.0f / static_cast<float>(params.num_filled != nullptr ? *params.num_filled : params.sample_count);
+        const float count =
+            static_cast<float>(max(params.num_filled != nullptr ? *params.num_filled : params.sample_count, 1));
         float mean[3], log_scale[3], sh0[3];
 #pragma unroll
         for (int i = 0; i < 3; ++i) {
@@ -453,7 +455,7 @@ __device__ __forceinline__ void backward_views(const ScreenBackwardParams& param
             geometry_backward(shape, camera, params.eps2d, grad_mean2d, grad_conic, r3.z, row);
             color_backward(shape, camera, sh0, params.sh_degree, coefficients, gradients, grad_color, row);
             row.opacity = r2.x * opacity * (1.0f - opacity);
-            sink.add(view, row, r2.w * inverse_count);
+            sink.add(view, row, r2.w / count);
 
             error_sum += r2.w;
             distance_sum += r3.x;
@@ -476,9 +478,9 @@ __device__ __forceinline__ void backward_views(const ScreenBackwardParams& param
         float largest = 0.0f;
         for (int view = 0; view < params.num_views; ++view) {
             const int2 radius = params.radii[static_cast<size_t>(view) * params.num_gaussians + gaussian];
-            if (radius.x > 0 && radius.y > 0) {
+            if (radius.x > 0 || radius.y > 0) {
                 ++visible;
-                largest = fmaxf(largest, static_cast<float>(max(radius.x, radius.y)) * block.cameras[view].inverse_side);
+                largest = fmaxf(largest, static_cast<float>(max(radius.x, radius.y)) / block.cameras[view].side);
             }
         }
         if (visible > 0) {

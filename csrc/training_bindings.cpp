@@ -7,6 +7,7 @@
 #include <torch/headeronly/core/ScalarType.h>
 #include <torch/headeronly/util/Exception.h>
 
+#include <cmath>
 #include <cstdint>
 #include <optional>
 #include <string>
@@ -39,6 +40,11 @@ template <>
 struct DtypeOf<int32_t> {
     static constexpr ScalarType value = ScalarType::Int;
     static constexpr const char* name = "int32";
+};
+template <>
+struct DtypeOf<int64_t> {
+    static constexpr ScalarType value = ScalarType::Long;
+    static constexpr const char* name = "int64";
 };
 template <>
 struct DtypeOf<int16_t> {
@@ -116,7 +122,8 @@ ScreenBackwardParams screen_backward_params(const DeviceScope& device, const std
                                             const Tensor& viewmats, const Tensor& Ks, const std::vector<int64_t>& sizes,
                                             const Tensor& records, const std::optional<Tensor>& radii,
                                             const std::vector<Tensor>& stats, int64_t sh_degree, double eps2d,
-                                            int64_t sample_count, const std::optional<Tensor>& overflow) {
+                                            int64_t sample_count, const std::optional<Tensor>& num_filled,
+                          const std::optional<Tensor>& overflow) {
     STD_TORCH_CHECK(gaussians.size() == 6, "turbogs: gaussians must be means, quats, scales, opacities, sh0, shN");
     STD_TORCH_CHECK(gaussians[0].dim() == 2 && gaussians[5].dim() == 3, "turbogs: means must be [N, 3], shN [N, B, 3]");
     const int64_t num_views = static_cast<int64_t>(sizes.size()) / 2;
@@ -146,9 +153,10 @@ ScreenBackwardParams screen_backward_params(const DeviceScope& device, const std
         params.widths[view] = static_cast<int>(sizes[2 * view]);
         params.heights[view] = static_cast<int>(sizes[2 * view + 1]);
     }
-    params.records = reinterpret_cast<const float4*>(
+    params.records = reinterpret_cast<float4*>(
         device.data<float>(records, "screen gradients", num_views * num_gaussians * kRecordQuads * 4));
     params.sample_count = static_cast<int>(sample_count);
+    params.num_filled = device.data<int32_t>(num_filled, "num_filled", 1);
     params.overflow = device.data<int32_t>(overflow, "overflow", 1);
     if (!stats.empty()) {
         STD_TORCH_CHECK(stats.size() == 7, "turbogs: stats must be the seven tensors of GaussianStats");
@@ -173,7 +181,7 @@ void projection_backward(const std::vector<Tensor>& gaussians, const Tensor& vie
                          const Tensor& touched, const Tensor& view_losses) {
     const DeviceScope device(records);
     const ScreenBackwardParams params = screen_backward_params(device, gaussians, viewmats, Ks, sizes, records, radii, stats,
-                                                               sh_degree, eps2d, sample_count, overflow);
+                                                               sh_degree, eps2d, sample_count, num_filled, overflow);
     STD_TORCH_CHECK(rows.dim() == 3 && (rows.size(0) == 1 || rows.size(0) == params.num_views),
                     "turbogs: rows must be [1, N, 14] or [K, N, 14]");
     const int64_t num_rows = rows.size(0), count = params.num_gaussians;
@@ -186,15 +194,63 @@ void projection_backward(const std::vector<Tensor>& gaussians, const Tensor& vie
     DeviceScope::check(launch_projection_backward(params, outputs, device.stream()));
 }
 
+void fused_step(const std::vector<Tensor>& gaussians, const Tensor& viewmats, const Tensor& Ks,
+                const std::vector<int64_t>& sizes, const Tensor& records, const std::optional<Tensor>& radii,
+                const std::vector<Tensor>& stats, int64_t sh_degree, double eps2d, int64_t sample_count,
+                const std::optional<Tensor>& overflow, const std::vector<Tensor>& moments, int64_t kind,
+                bool rows_per_view, const std::vector<double>& rates, double beta1, double beta2, double eps,
+                double curvature, double max_step) {
+    const DeviceScope device(records);
+    const ScreenBackwardParams params = screen_backward_params(device, gaussians, viewmats, Ks, sizes, records, radii, stats,
+                                                               sh_degree, eps2d, sample_count, num_filled, overflow);
+    STD_TORCH_CHECK(moments.size() == 6, "turbogs: moments must be the six tensors of GaussianMoments");
+    STD_TORCH_CHECK(rates.size() == 6, "turbogs: rates must be of means, quats, scales, opacities, sh0, shN");
+    STD_TORCH_CHECK(kind >= 0 && kind <= 2, "turbogs: kind must be 0 (Adam), 1 (balanced LM) or 2 (paper's LM)");
+    const int64_t count = params.num_gaussians, harmonics = 3 * params.bands;
+    OptimizerParams optimizer = {};
+    optimizer.kind = static_cast<StepKind>(kind);
+    optimizer.rows_per_view = rows_per_view;
+    const double row_rates[kRowSize] = {rates[0], rates[0], rates[0], rates[2], rates[2], rates[2], rates[1],
+                                        rates[1], rates[1], rates[1], rates[4], rates[4], rates[4], rates[3]};
+    for (int i = 0; i < kRowSize; ++i) optimizer.rates[i] = static_cast<float>(row_rates[i]);
+    optimizer.rate_shN = static_cast<float>(rates[5]);
+    optimizer.beta1 = static_cast<float>(beta1);
+    optimizer.beta2 = static_cast<float>(beta2);
+    optimizer.log_beta1 = static_cast<float>(std::log(beta1));
+    optimizer.log_beta2 = static_cast<float>(std::log(beta2));
+    optimizer.eps = static_cast<float>(eps);
+    optimizer.curvature = static_cast<float>(curvature);
+    optimizer.max_step = static_cast<float>(max_step);
+    optimizer.means = const_cast<float*>(params.means);
+    optimizer.quats = const_cast<float*>(params.quats);
+    optimizer.scales = const_cast<float*>(params.scales);
+    optimizer.opacities = const_cast<float*>(params.opacities);
+    optimizer.sh0 = const_cast<float*>(params.sh0);
+    optimizer.shN = const_cast<float*>(params.shN);
+    optimizer.exp_avg = device.data<float>(moments[0], "exp_avg", count * kRowSize);
+    optimizer.exp_avg_sq = device.data<float>(moments[1], "exp_avg_sq", count * kRowSize);
+    optimizer.exp_avg_shN = device.data<float>(moments[2], "exp_avg_shN", count * harmonics);
+    optimizer.exp_avg_sq_shN = device.data<float>(moments[3], "exp_avg_sq_shN", count * harmonics);
+    optimizer.steps = device.data<int32_t>(moments[4], "steps", count);
+    optimizer.skipped = reinterpret_cast<unsigned long long*>(device.data<int64_t>(moments[5], "skipped", 1));
+    DeviceScope::check(launch_fused_step(params, optimizer, device.stream()));
+}
+
 }  // namespace
 
 #define TURBOGS_BACKWARD_INPUTS                                                                              \
-    "Tensor[] gaussians, Tensor viewmats, Tensor Ks, int[] sizes, Tensor records, Tensor? radii, "           \
-    "Tensor(s!)[] stats, int sh_degree, float eps2d, int sample_count, Tensor? overflow, "
+    "Tensor(p!)[] gaussians, Tensor viewmats, Tensor Ks, int[] sizes, Tensor(r!) records, Tensor? radii, "           \
+    "Tensor(s!)[] stats, int sh_degree, float eps2d, int sample_count, Tensor? num_filled, Tensor? overflow, "
 
 STABLE_TORCH_LIBRARY_FRAGMENT(turbogs, m) {
     m.def("projection_backward(" TURBOGS_BACKWARD_INPUTS
           "Tensor(a!) rows, Tensor(b!) shN, Tensor(c!) touched, Tensor(d!) view_losses) -> ()");
+    m.def("fused_step(" TURBOGS_BACKWARD_INPUTS
+          "Tensor(m!)[] moments, int kind, bool rows_per_view, float[] rates, float beta1, float beta2, float eps, "
+          "float curvature, float max_step) -> ()");
 }
 
-STABLE_TORCH_LIBRARY_IMPL(turbogs, CUDA, m) { m.impl("projection_backward", TORCH_BOX(&projection_backward)); }
+STABLE_TORCH_LIBRARY_IMPL(turbogs, CUDA, m) {
+    m.impl("projection_backward", TORCH_BOX(&projection_backward));
+    m.impl("fused_step", TORCH_BOX(&fused_step));
+}

@@ -38,9 +38,9 @@ struct ScreenBackwardParams {
     int widths[kTrainingMaxViews];
     int heights[kTrainingMaxViews];
 
-    const float4* records;       // [K, N, 4]
+    float4* records;             // [K, N, 4]; the fused step puts the rows of the parameters in their place
     const int2* radii;           // [K, N]; read only where `stats` are wanted
-    const int32_t* num_filled;   // [1] filled samples of the batch, or null: then `sample_count` holds
+    const int32_t* num_filled;   // [1] filled samples of the batch, or null where all `sample_count` slots are
     int sample_count;
     const int32_t* overflow;     // [1], or null; where set, the launch does nothing
 
@@ -63,7 +63,37 @@ struct ProjectionBackwardOutputs {
     float* view_losses;  // [K, N] or [1, N]
 };
 
+enum class StepKind : int { kAdam = 0, kBalancedLm = 1, kPaperLm = 2 };
+
+// One optimizer step, fused with the backward pass of the projection; the rule is strategies/update_rule.py's.
+struct OptimizerParams {
+    StepKind kind;
+    bool rows_per_view;      // LM: a row of J for each view, or one of their sum
+    float rates[kRowSize];   // learning rates in the order of a row
+    float rate_shN;
+    float beta1, beta2;
+    float log_beta1, log_beta2;  // natural logarithms, rounded once from double; -infinity where beta is 0
+    float eps;
+    float curvature;         // balanced LM
+    float max_step;          // balanced LM, 0 for no bound
+
+    float* means;            // [N, 3] updated in place, as are the rest; the same memory as ScreenBackwardParams'
+    float* quats;
+    float* scales;
+    float* opacities;
+    float* sh0;
+    float* shN;
+    float* exp_avg;          // [N, 14]
+    float* exp_avg_sq;       // [N, 14]
+    float* exp_avg_shN;      // [N, 3 B]
+    float* exp_avg_sq_shN;   // [N, 3 B]
+    int32_t* steps;          // [N]
+    unsigned long long* skipped;  // [1] Gaussians left out because of a non-finite gradient
+};
+
 cudaError_t launch_projection_backward(const ScreenBackwardParams& params, const ProjectionBackwardOutputs& outputs,
                                        cudaStream_t stream);
+cudaError_t launch_fused_step(const ScreenBackwardParams& params, const OptimizerParams& optimizer,
+                              cudaStream_t stream);
 
 }  // namespace turbogs
