@@ -122,8 +122,7 @@ ScreenBackwardParams screen_backward_params(const DeviceScope& device, const std
                                             const Tensor& viewmats, const Tensor& Ks, const std::vector<int64_t>& sizes,
                                             const Tensor& records, const std::optional<Tensor>& radii,
                                             const std::vector<Tensor>& stats, int64_t sh_degree, double eps2d,
-                                            int64_t sample_count, const std::optional<Tensor>& num_filled,
-                          const std::optional<Tensor>& overflow) {
+                                            int64_t sample_count, const std::optional<Tensor>& num_filled, const std::optional<Tensor>& overflow) {
     STD_TORCH_CHECK(gaussians.size() == 6, "turbogs: gaussians must be means, quats, scales, opacities, sh0, shN");
     STD_TORCH_CHECK(gaussians[0].dim() == 2 && gaussians[5].dim() == 3, "turbogs: means must be [N, 3], shN [N, B, 3]");
     const int64_t num_views = static_cast<int64_t>(sizes.size()) / 2;
@@ -177,7 +176,7 @@ ScreenBackwardParams screen_backward_params(const DeviceScope& device, const std
 void projection_backward(const std::vector<Tensor>& gaussians, const Tensor& viewmats, const Tensor& Ks,
                          const std::vector<int64_t>& sizes, const Tensor& records, const std::optional<Tensor>& radii,
                          const std::vector<Tensor>& stats, int64_t sh_degree, double eps2d, int64_t sample_count,
-                         const std::optional<Tensor>& overflow, const Tensor& rows, const Tensor& shN,
+                         const std::optional<Tensor>& num_filled, const std::optional<Tensor>& overflow, const Tensor& rows, const Tensor& shN,
                          const Tensor& touched, const Tensor& view_losses) {
     const DeviceScope device(records);
     const ScreenBackwardParams params = screen_backward_params(device, gaussians, viewmats, Ks, sizes, records, radii, stats,
@@ -197,7 +196,7 @@ void projection_backward(const std::vector<Tensor>& gaussians, const Tensor& vie
 void fused_step(const std::vector<Tensor>& gaussians, const Tensor& viewmats, const Tensor& Ks,
                 const std::vector<int64_t>& sizes, const Tensor& records, const std::optional<Tensor>& radii,
                 const std::vector<Tensor>& stats, int64_t sh_degree, double eps2d, int64_t sample_count,
-                const std::optional<Tensor>& overflow, const std::vector<Tensor>& moments, int64_t kind,
+                const std::optional<Tensor>& num_filled, const std::optional<Tensor>& overflow, const std::vector<Tensor>& moments, int64_t kind,
                 bool rows_per_view, const std::vector<double>& rates, double beta1, double beta2, double eps,
                 double curvature, double max_step) {
     const DeviceScope device(records);
