@@ -1,0 +1,332 @@
+"""Error-driven density control (paper section 3.8), and none."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, fields
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from gsplat.utils import normalized_quat_to_rotmat
+from torch import Tensor
+from torch.nn.functional import logsigmoid, normalize
+
+from turbogs_plugin.errors import InputError, require
+from turbogs_plugin.types import Gaussians, GaussianStats, RowUpdate, Step
+
+SPLIT_SHRINK = 1.6
+"""A split divides standard deviations by this (3DGS)."""
+
+EPS = 1e-12
+"""Keeps divisions defined; the least weight a drawn splat can have in a pixel is 1e-4 / 255."""
+
+
+@dataclass
+class NoDensity:
+    """The set of Gaussians stays as it is."""
+
+    @property
+    def stats(self) -> GaussianStats | None:
+        return None
+
+    def setup(self, gaussians: Gaussians) -> None:
+        pass
+
+    def update(self, gaussians: Gaussians, step: Step) -> RowUpdate | None:
+        return None
+
+    def state_dict(self) -> dict[str, Any]:
+        return {}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        pass
+
+
+@dataclass
+class ErrorDrivenDensity:
+    """Densify where the screen gradient is high and the sampled pixels say the Gaussian is difficult; prune where a
+    Gaussian is transparent, huge or easy. There is no reset of opacities.
+
+    Of the statistics of the window since the last event, with W the sum of weights of a Gaussian,
+
+        e = E / (W + eps),  d = D / (W + eps),  s = e + lambda_base * anneal * d
+
+    is its difficulty. A Gaussian with W = 0, or with non-finite statistics, was not seen: it has no score, and is
+    neither densified nor pruned by score. Equal scores stand or fall together, except where a budget must choose
+    (then the lower row goes first).
+
+    Until `Step.refine_until`, every `refine_every` iterations from `refine_from` on, one event clones, splits and
+    prunes. A Gaussian that is due for pruning is not densified; one that is too big but chosen to be split is not
+    pruned. Afterwards, every `final_every` iterations, one only prunes. At least one Gaussian is always left.
+
+    Args:
+        lambda_base: weight of the distance term.
+        score: as in the equation (`raw`), or with e and d each divided by its mean over the seen (`balanced`), so
+            that both count: d is of order 1 and e of order 0.1.
+        refine_from, refine_every: first iteration and interval of densification (tau_from, Delta_dens).
+        grad_threshold, absgrad_threshold: of the mean over views of the screen gradient and of its absolute variant
+            (tau_grad, tau_grad_abs), in gsplat's units. Either suffices.
+        top_fraction: share of the seen, the most difficult, that may be densified (eta_topk).
+        percent_dense: clone where 3 * largest standard deviation <= this * scene extent, else split (rho_dense).
+        split: two draws from the Gaussian, all axes divided by 1.6 as in 3DGS (`sample`); or two halves along its
+            longest axis, which is divided by 1.6, so placed that the pair has the parent's mean and covariance
+            (`long_axis`).
+        growth: every candidate is taken (`threshold`), or the number of Gaussians follows a straight line from the
+            initial one to `target_gaussians` at `refine_until`, the most difficult candidates first (`budget`).
+        target_gaussians: end of that line. `budget` only.
+        max_gaussians: never more than this; an initial model that has more is cut to it at the first event, easiest
+            first. 0: no cap.
+        prune_opacity: less opaque ones are pruned.
+        prune_world_size: pruned where the largest standard deviation exceeds this * scene extent. 0: off.
+        prune_screen_size: pruned where the screen radius exceeds this * the larger side of the image. 0: off, as in
+            3DGS in effect.
+        prune_size_from: both size rules begin at this progress; 3DGS has 3000 / 15000.
+        prune_score_fraction: share of the seen, the easiest, that each densification event prunes. Off by default: the
+            paper gives no value, and what has little error may be what is rendered well.
+        opacity_decay: share of its opacity that every Gaussian loses at each densification event. What the photos need
+            grows back, what they do not falls below `prune_opacity`; a gentle substitute for 3DGS's reset.
+        final_every, final_keep: interval of the final pruning, and the share of the seen that each one keeps, the
+            most difficult (Delta_prune, eta_final). 1 keeps all.
+    """
+
+    lambda_base: float = 0.8
+    score: Literal["balanced", "raw"] = "balanced"
+    refine_from: int = 200
+    refine_every: int = 100
+    grad_threshold: float = 2e-4
+    absgrad_threshold: float = 4e-4
+    top_fraction: float = 0.5
+    percent_dense: float = 0.01
+    split: Literal["sample", "long_axis"] = "sample"
+    growth: Literal["threshold", "budget"] = "threshold"
+    target_gaussians: int = 0
+    max_gaussians: int = 0
+    prune_opacity: float = 0.005
+    prune_world_size: float = 0.1
+    prune_screen_size: float = 0.0
+    prune_size_from: float = 0.2
+    prune_score_fraction: float = 0.0
+    opacity_decay: float = 0.0
+    final_every: int = 500
+    final_keep: float = 0.95
+    initial_count: int = field(init=False, default=0)
+    _stats: GaussianStats | None = field(init=False, repr=False, default=None)
+
+    def __post_init__(self) -> None:
+        choices = {"score": ("balanced", "raw"), "split": ("sample", "long_axis"), "growth": ("threshold", "budget")}
+        for name, allowed in choices.items():
+            require(getattr(self, name) in allowed, name, getattr(self, name), f"one of {', '.join(allowed)}")
+        for name in ("refine_every", "final_every"):
+            require(getattr(self, name) >= 1, name, getattr(self, name), "at least 1")
+        for name in ("top_fraction", "final_keep"):
+            require(0 < getattr(self, name) <= 1, name, getattr(self, name), "more than 0 and at most 1")
+        for name in ("prune_opacity", "prune_score_fraction", "opacity_decay"):
+            require(0 <= getattr(self, name) < 1, name, getattr(self, name), "at least 0 and less than 1")
+        for name in (
+            *("lambda_base", "refine_from", "grad_threshold", "absgrad_threshold", "percent_dense", "target_gaussians"),
+            *("max_gaussians", "prune_world_size", "prune_screen_size", "prune_size_from"),
+        ):
+            value = getattr(self, name)
+            require(math.isfinite(value) and value >= 0, name, value, "a finite number >= 0")
+        if (self.growth == "budget") != (self.target_gaussians > 0):
+            raise InputError(
+                f"growth = {self.growth!r} with target_gaussians = {self.target_gaussians}: "
+                "a budget needs a target above 0, and a target is only used by growth: budget"
+            )
+
+    @property
+    def stats(self) -> GaussianStats | None:
+        return self._stats
+
+    def setup(self, gaussians: Gaussians) -> None:
+        self.initial_count = len(gaussians)
+        self._stats = GaussianStats.zeros(len(gaussians), gaussians.device)
+
+    @torch.no_grad()
+    def update(self, gaussians: Gaussians, step: Step) -> RowUpdate | None:
+        densify, final = self._due(step)
+        update = None
+        if self._stats is not None and (densify or final) and len(gaussians) > 0:
+            score, seen = self.scores(step)
+            event = self._refine if densify else self._final_prune
+            update = event(gaussians, score, seen, step)
+            count = len(gaussians) if update is None else len(update.source)
+            self._stats = GaussianStats.zeros(count, gaussians.device)
+        if step.iteration >= self._last_event(step):
+            self._stats = None
+        return update
+
+    def state_dict(self) -> dict[str, Any]:
+        stats = None if self._stats is None else {f.name: getattr(self._stats, f.name) for f in fields(self._stats)}
+        return {"initial_count": self.initial_count, "stats": stats}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self.initial_count = state["initial_count"]
+        if state["stats"] is None:
+            self._stats = None
+        else:
+            saved = GaussianStats(**state["stats"])
+            require(
+                self._stats is not None and saved.weight_sums.shape == self._stats.weight_sums.shape,
+                "density statistics",
+                tuple(saved.weight_sums.shape),
+                "those of as many Gaussians as the model has",
+            )
+            device = self._stats.weight_sums.device
+            self._stats = saved.map(lambda value: value.to(device, copy=True))
+
+    def scores(self, step: Step) -> tuple[Tensor, Tensor]:
+        """([N] score, [N] bool seen) of the present window; the score of what was not seen is 0 and means nothing."""
+        stats = self._stats
+        weights = stats.weight_sums
+        seen = (weights > 0) & torch.isfinite(weights + stats.error_sums + stats.distance_sums)
+        errors, distances = (
+            torch.where(seen, sums / (weights + EPS), 0.0) for sums in (stats.error_sums, stats.distance_sums)
+        )
+        if self.score == "balanced":
+            count = seen.sum().clamp(min=1)
+            errors, distances = (value / (value.sum() / count + EPS) for value in (errors, distances))
+        return errors + self.lambda_base * step.anneal * distances, seen
+
+    def _due(self, step: Step) -> tuple[bool, bool]:
+        """Whether this iteration densifies, and whether it prunes finally."""
+        iteration, after = step.iteration, step.iteration - step.refine_until
+        densify = after <= 0 and iteration >= self.refine_from and iteration % self.refine_every == 0
+        return densify, self.final_keep < 1 and after > 0 and after % self.final_every == 0
+
+    def _last_event(self, step: Step) -> int:
+        """Iteration of the last event of the run, after which no statistics are needed."""
+        rest = max(0, step.total - 1 - step.refine_until)
+        if self.final_keep < 1 and rest >= self.final_every:
+            return step.refine_until + rest // self.final_every * self.final_every
+        return step.refine_until // self.refine_every * self.refine_every
+
+    def _refine(self, gaussians: Gaussians, score: Tensor, seen: Tensor, step: Step) -> RowUpdate | None:
+        stats, extent = self._stats, step.scene_extent
+        views = stats.view_counts.clamp(min=1)
+        passes = (stats.grad_sums / views > self.grad_threshold) | (stats.absgrad_sums / views > self.absgrad_threshold)
+        hopeless = ~_finite_rows(gaussians) | (torch.sigmoid(gaussians.opacities) < self.prune_opacity)
+        if self.prune_score_fraction > 0:
+            hopeless |= seen & (score < _quantile(score, seen, self.prune_score_fraction))
+        difficult = seen & (score >= _quantile(score, seen, 1 - self.top_fraction))
+        candidates = passes & difficult & ~hopeless
+
+        largest = gaussians.scales.amax(dim=-1).exp()  # [N]
+        small = 3 * largest <= self.percent_dense * extent
+        big = torch.zeros_like(seen)
+        if step.progress >= self.prune_size_from:
+            if self.prune_world_size > 0:
+                big |= largest > self.prune_world_size * extent
+            if self.prune_screen_size > 0:
+                big |= stats.max_radii > self.prune_screen_size
+        pruned = _leave_one(hopeless | (big & ~(candidates & ~small)), gaussians)
+        candidates &= ~pruned
+        if self.max_gaussians > 0:
+            excess = int((~pruned).sum()) - self.max_gaussians
+            if excess > 0:  # the unseen count as average: nothing says that they are easy
+                average = torch.where(seen, score, 0.0).sum() / seen.sum().clamp(min=1)
+                pruned = pruned | _first(-torch.where(seen, score, average), ~pruned, excess)
+                candidates &= ~pruned
+        allowed = self._allowed_growth(int((~pruned).sum()), step)
+        if allowed is not None:
+            candidates = _first(score, candidates, allowed)
+        return self._compose(gaussians, candidates & small, candidates & ~small, pruned, step)
+
+    def _allowed_growth(self, count: int, step: Step) -> int | None:
+        """How many Gaussians may be added to `count`, or None for any number."""
+        limits = []
+        if self.max_gaussians > 0:
+            limits.append(self.max_gaussians)
+        if self.growth == "budget":
+            ramp = (step.iteration - self.refine_from) / max(1, step.refine_until - self.refine_from)
+            line = self.initial_count + (self.target_gaussians - self.initial_count) * min(1.0, max(0.0, ramp))
+            limits.append(math.floor(line))
+        return max(0, min(limits) - count) if limits else None
+
+    def _final_prune(self, gaussians: Gaussians, score: Tensor, seen: Tensor, step: Step) -> RowUpdate | None:
+        pruned = ~_finite_rows(gaussians) | (seen & (score < _quantile(score, seen, 1 - self.final_keep)))
+        pruned = _leave_one(pruned, gaussians)
+        if not pruned.any():
+            return None
+        source = torch.nonzero(~pruned).squeeze(-1)
+        return RowUpdate(source, torch.zeros_like(source, dtype=torch.bool), {}, num_pruned=int(pruned.sum()))
+
+    def _compose(
+        self, gaussians: Gaussians, cloned: Tensor, split: Tensor, pruned: Tensor, step: Step
+    ) -> RowUpdate | None:
+        """One change out of three masks [N]: the rest in order, the clones, the first halves, the second halves."""
+        rest, copies, halves = (torch.nonzero(mask).squeeze(-1) for mask in (~(pruned | split), cloned, split))
+        if len(rest) == len(gaussians) and len(copies) == 0 and self.opacity_decay == 0:
+            return None
+        source = torch.cat([rest, copies, halves, halves])
+        fresh = torch.arange(len(source), device=source.device) >= len(rest)
+        values = {}
+        if len(halves):
+            values = {"means": gaussians.means[source], "scales": gaussians.scales[source]}
+            values["means"][-2 * len(halves) :], values["scales"][-2 * len(halves) :] = self._halves(
+                gaussians, halves, step
+            )
+        if self.opacity_decay > 0:
+            values["opacities"] = _decayed(gaussians.opacities[source], self.opacity_decay)
+        counts = {"num_cloned": len(copies), "num_split": len(halves), "num_pruned": int(pruned.sum())}
+        return RowUpdate(source, fresh, values, **counts)
+
+    def _halves(self, gaussians: Gaussians, index: Tensor, step: Step) -> tuple[Tensor, Tensor]:
+        """([2 n, 3] means, [2 n, 3] log scales) of what the Gaussians `index` [n] are split into."""
+        means, scales = gaussians.means[index], gaussians.scales[index]
+        rotations = normalized_quat_to_rotmat(normalize(gaussians.quats[index], dim=-1))  # [n, 3, 3]
+        if self.split == "sample":
+            generator = np.random.Generator(np.random.Philox(np.random.SeedSequence([step.seed, step.iteration])))
+            # Drawn on the host: the same numbers on every device.
+            draws = torch.from_numpy(generator.standard_normal((2, len(index), 3))).to(means)
+            offsets = torch.einsum("nij,bnj->bni", rotations, scales.exp() * draws)
+            shrink = torch.full_like(scales, math.log(SPLIT_SHRINK))
+        else:
+            axis = torch.nn.functional.one_hot(scales.argmax(dim=-1), 3).to(scales)  # [n, 3]
+            # A pair at +-a of deviation b has variance a^2 + b^2; b = sigma / 1.6, so a^2 = sigma^2 (1 - 1 / 1.6^2).
+            distance = math.sqrt(1 - SPLIT_SHRINK**-2)
+            offset = torch.einsum("nij,nj->ni", rotations, scales.exp() * axis * distance)
+            offsets = torch.stack([offset, -offset])
+            shrink = axis * math.log(SPLIT_SHRINK)
+        return (means + offsets).reshape(-1, 3), (scales - shrink).repeat(2, 1)
+
+
+def _finite_rows(gaussians: Gaussians) -> Tensor:
+    """[N] bool: every parameter of the Gaussian is finite."""
+    return torch.stack([torch.isfinite(v.reshape(len(v), -1)).all(dim=-1) for _, v in gaussians.items()]).all(dim=0)
+
+
+def _quantile(values: Tensor, mask: Tensor, fraction: float) -> Tensor:
+    """The value at rank ``floor(fraction * n)`` of the n masked values [N] in ascending order; 0 if there are none.
+
+    `value < it` then holds for that many, fewer where they tie with it.
+    """
+    chosen = values[mask]
+    if len(chosen) == 0:
+        return values.new_zeros(())
+    rank = min(len(chosen) - 1, math.floor(fraction * len(chosen) + 1e-6))  # 1 - 0.9 of 10 is 1
+    return chosen.sort().values[rank]
+
+
+def _first(keys: Tensor, mask: Tensor, count: int) -> Tensor:
+    """[N] bool: those `count` of the mask (or all, if fewer) with the largest keys; of equal ones the lower rows."""
+    order = torch.argsort(torch.where(mask, keys, -torch.inf), descending=True, stable=True)
+    chosen = torch.zeros_like(mask)
+    chosen[order[:count]] = True
+    return chosen & mask
+
+
+def _leave_one(pruned: Tensor, gaussians: Gaussians) -> Tensor:
+    """The mask [N], without the most opaque (finite) Gaussian where it would leave none."""
+    if not bool(pruned.all()):
+        return pruned
+    pruned = pruned.clone()
+    pruned[torch.where(_finite_rows(gaussians), gaussians.opacities, -torch.inf).argmax()] = False
+    return pruned
+
+
+def _decayed(logits: Tensor, decay: float) -> Tensor:
+    """Logits of opacities times (1 - decay), by logarithms, so that no opacity rounds to 0 or 1 on the way."""
+    log_opacity = logsigmoid(logits) + math.log1p(-decay)
+    return log_opacity - torch.log(-torch.expm1(log_opacity))
