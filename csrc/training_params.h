@@ -91,6 +91,50 @@ struct OptimizerParams {
     unsigned long long* skipped;  // [1] Gaussians left out because of a non-finite gradient
 };
 
+// One view of a batch, as the kernels over pixels see it.
+struct SampleView {
+    int64_t pixel_base;  // first flat pixel
+    int width, height;
+    int tiles_x, tiles_y;
+    int tile_base;       // first tile in the batch's numbering
+    int view_number;     // training view
+    int slot_base;       // first slot (units pixel and cell); first chosen tile (unit tile)
+    int wanted;          // unit tile: tiles to choose
+};
+
+enum class SampleUnit : int { kPixel = 0, kCell = 1, kTile = 2 };
+
+// The pixel sampler; strategies/pixel_sampling.py defines the draw, bit for bit.
+struct SamplePixelsParams {
+    SampleUnit unit;
+    int num_views;             // K
+    int num_tiles;             // of all views
+    int num_chosen;            // unit tile: chosen tiles of all views
+    SampleView views[kTrainingMaxViews];
+    int stages[kTrainingMaxViews][3];  // units of the hard, stable and mixed stage: [0] holds for all tiles, or one a view
+    int slots_per_tile;        // units pixel and cell: slots of a tile that is not cut; also the cap of a cut one
+    bool mixed_uniform;
+    float importance;          // a of the weights p^-a, 0 for none
+    uint32_t seed_low, seed_high, iteration;
+    int now;                   // a pixel's age is now - stamp, within 0 .. 32767
+
+    const void* errors;        // [X] half
+    const int16_t* stamps;     // [X]
+
+    int32_t* pixel_ids;        // [P] out
+    int32_t* tile_ids;         // [T] out
+    int32_t* tile_offsets;     // [T + 1] out
+    float* weights;            // [P] out, p^-a before normalisation; null where importance is 0
+
+    // Unit tile only, scratch over all tiles of the batch.
+    double* tile_errors;       // [tiles]
+    int32_t* tile_ages;        // [tiles]
+    int64_t* tile_keys;        // [tiles]
+    float* tile_missed;        // [tiles]
+};
+
+cudaError_t launch_sample_pixels(const SamplePixelsParams& params, cudaStream_t stream);
+
 cudaError_t launch_projection_backward(const ScreenBackwardParams& params, const ProjectionBackwardOutputs& outputs,
                                        cudaStream_t stream);
 cudaError_t launch_fused_step(const ScreenBackwardParams& params, const OptimizerParams& optimizer,

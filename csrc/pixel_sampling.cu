@@ -1,0 +1,596 @@
+// Error-guided sampling of pixels: every tile of K views in one launch, a warp per tile.
+//
+// A lane holds 8 pixels of its tile in registers, pixel (j, lane) being number 32 j + lane of `cell_order`. Each of the
+// three stages gives every unit not yet drawn an integer key and takes the largest, found by building the threshold bit
+// by bit from warp-wide counts. Slots of a tile follow from the image's size alone, so nothing is counted on the host.
+// Keys are made of single-precision operations that are rounded one by one, as strategies/philox.py prescribes: the
+// sets equal the torch twin's.
+//
+// With whole tiles as units three small kernels take over: sums of each tile, a block per view that draws tiles, and the
+// pixel ids of the chosen ones.
+#include <cuda_fp16.h>
+
+#include "training_params.h"
+
+namespace turbogs {
+namespace {
+
+constexpr uint32_t kFull = 0xFFFFFFFFu;
+constexpr int kTile = 16, kTilePixels = 256, kPerLane = kTilePixels / 32;
+constexpr int kSampleThreads = 128;
+constexpr int kChooseThreads = 1024;
+constexpr int kAgeMax = 32767;
+constexpr int kAgeTieBits = 24, kRankBits = 20;
+constexpr float kWeightFloor = 7.888609052210118e-31f;  // 2^-100
+constexpr uint32_t kPurposePixels = 0, kPurposeCells = 1, kPurposeTiles = 2;
+
+struct Words {
+    uint32_t x0, x1, x2, x3;
+};
+
+// Philox4x32-10 in the layout of strategies/philox.py.
+__device__ __forceinline__ Words random_words(const SamplePixelsParams& params, uint32_t place, uint32_t view,
+                                              uint32_t purpose) {
+    uint32_t c0 = place, c1 = view, c2 = purpose, c3 = params.seed_high;
+    uint32_t k0 = params.seed_low, k1 = params.iteration;
+#pragma unroll
+    for (int round = 0; round < 10; ++round) {
+        const uint32_t high0 = __umulhi(c0, 0xD2511F53u), low0 = c0 * 0xD2511F53u;
+        const uint32_t high1 = __umulhi(c2, 0xCD9E8D57u), low1 = c2 * 0xCD9E8D57u;
+        c0 = high1 ^ c1 ^ k0;
+        c1 = low1;
+        c2 = high0 ^ c3 ^ k1;
+        c3 = low0;
+        k0 += 0x9E3779B9u;
+        k1 += 0xBB67AE85u;
+    }
+    return {c0, c1, c2, c3};
+}
+
+// -log(u) of the word's uniform number, the same bits on every device.
+__device__ __forceinline__ float exponential(uint32_t word) {
+    const int bits = __float_as_int(__uint2float_rn(((word >> 9) << 1) | 1u));
+    const int exponent = (bits - 0x3F3504F3) >> 23;
+    const float f = __int_as_float(bits - (exponent << 23));
+    const float s = __fdiv_rn(__fsub_rn(f, 1.0f), __fadd_rn(f, 1.0f));
+    const float q = __fmul_rn(s, s);
+    float p = __fadd_rn(__fmul_rn(q, 2.0f / 9.0f), 2.0f / 7.0f);
+    p = __fadd_rn(__fmul_rn(p, q), 2.0f / 5.0f);
+    p = __fadd_rn(__fmul_rn(p, q), 2.0f / 3.0f);
+    const float tail = __fmul_rn(s, __fmul_rn(q, p));
+    const float log_f = __fadd_rn(__fadd_rn(s, s), tail);
+    return __fsub_rn(__fmul_rn(__int2float_rn(24 - exponent), __int_as_float(0x3F317218)), log_f);
+}
+
+__device__ __forceinline__ uint32_t race_key(float weight, uint32_t word) {
+    return __float_as_uint(__fdiv_rn(fmaxf(weight, kWeightFloor), exponential(word)));
+}
+
+__device__ __forceinline__ uint64_t age_key(int age, uint32_t word) {
+    return static_cast<uint64_t>(age) << kAgeTieBits | word >> (32 - kAgeTieBits);
+}
+
+// Error and age shares of a unit, for the mixed stage.
+__device__ __forceinline__ float mixed_weight(float error, int age, float error_sum, float age_sum) {
+    const float error_share = error_sum > 0.0f ? __fdiv_rn(error, error_sum) : 0.0f;
+    const float age_share = age_sum > 0.0f ? __fdiv_rn(__int2float_rn(age), age_sum) : 0.0f;
+    return __fadd_rn(error_share, age_share);
+}
+
+// Probability that a race, or the draw by age, takes a unit given the others' keys; see "rank conditioning" in the twin.
+__device__ __forceinline__ float race_chance(float weight, uint32_t tau) {
+    return -expm1f(-(fmaxf(weight, kWeightFloor) / __uint_as_float(tau)));
+}
+
+__device__ __forceinline__ float age_chance(int age, uint64_t tau) {
+    const int64_t beaten =
+        (static_cast<int64_t>(age + 1) << kAgeTieBits) - static_cast<int64_t>(tau);
+    const int64_t most = int64_t{1} << kAgeTieBits;
+    return static_cast<float>(beaten < 0 ? 0 : (beaten > most ? most : beaten)) * 5.9604644775390625e-8f;
+}
+
+__device__ __forceinline__ float importance_weight(float missed, float importance) {
+    return powf(fmaxf(1.0f - missed, 5.9604644775390625e-8f), -importance);
+}
+
+__device__ __forceinline__ uint32_t warp_or(uint32_t value) { return __reduce_or_sync(kFull, value); }
+__device__ __forceinline__ uint32_t warp_and(uint32_t value) { return __reduce_and_sync(kFull, value); }
+__device__ __forceinline__ uint64_t warp_or(uint64_t value) {
+    return static_cast<uint64_t>(warp_or(static_cast<uint32_t>(value >> 32))) << 32 | warp_or(static_cast<uint32_t>(value));
+}
+__device__ __forceinline__ uint64_t warp_and(uint64_t value) {
+    return static_cast<uint64_t>(warp_and(static_cast<uint32_t>(value >> 32))) << 32 |
+           warp_and(static_cast<uint32_t>(value));
+}
+__device__ __forceinline__ uint32_t warp_max(uint32_t value) { return __reduce_max_sync(kFull, value); }
+__device__ __forceinline__ uint64_t warp_max(uint64_t value) {
+    const uint32_t high = warp_max(static_cast<uint32_t>(value >> 32));
+    const uint32_t low = static_cast<uint32_t>(value >> 32) == high ? static_cast<uint32_t>(value) : 0u;
+    return static_cast<uint64_t>(high) << 32 | warp_max(low);
+}
+__device__ __forceinline__ int highest_bit(uint32_t value) { return 31 - __clz(static_cast<int>(value)); }
+__device__ __forceinline__ int highest_bit(uint64_t value) {
+    const uint32_t high = static_cast<uint32_t>(value >> 32);
+    return high != 0u ? 32 + highest_bit(high) : highest_bit(static_cast<uint32_t>(value));
+}
+
+__device__ __forceinline__ double warp_sum(double value) {
+#pragma unroll
+    for (int step = 16; step > 0; step >>= 1) value += __shfl_xor_sync(kFull, value, step);
+    return value;
+}
+
+// The `count` largest keys of a warp's units, unit (j, lane) having rank 32 j + lane: among equals the lower rank goes
+// first. `active` and the result hold bit j for the lane's j-th unit. `tau` becomes the largest key left, and the return
+// of `exhausted` true where none is.
+template <class Key, int kUnits>
+__device__ __forceinline__ uint32_t take_largest(const Key (&keys)[kUnits], uint32_t active, int count, bool with_tau,
+                                                 Key& tau, bool& exhausted) {
+    const int available = static_cast<int>(__reduce_add_sync(kFull, static_cast<uint32_t>(__popc(active))));
+    exhausted = available <= count;
+    tau = 0;
+    if (exhausted) return active;
+
+    Key any = 0, all = ~Key{0};
+#pragma unroll
+    for (int j = 0; j < kUnits; ++j) {
+        if (active >> j & 1u) {
+            any |= keys[j];
+            all &= keys[j];
+        }
+    }
+    any = warp_or(any);
+    all = warp_and(all);
+    // The bits above the highest that differs are common; below it the threshold is built bit by bit, as the largest
+    // number that at least `count` keys reach.
+    int bit = any == all ? -1 : highest_bit(any ^ all);
+    Key threshold = all & ~((Key{2} << (bit < 0 ? 0 : bit)) - 1);
+    if (bit < 0) threshold = all;
+    bool exact = false;
+    for (; bit >= 0 && !exact; --bit) {
+        const Key candidate = threshold | Key{1} << bit;
+        uint32_t reached = 0;
+#pragma unroll
+        for (int j = 0; j < kUnits; ++j) reached += (active >> j & 1u) != 0u && keys[j] >= candidate;
+        const int total = static_cast<int>(__reduce_add_sync(kFull, reached));
+        if (total >= count) {
+            threshold = candidate;
+            exact = total == count;
+        }
+    }
+    uint32_t taken = 0;
+    if (exact) {
+#pragma unroll
+        for (int j = 0; j < kUnits; ++j) taken |= static_cast<uint32_t>((active >> j & 1u) != 0u && keys[j] >= threshold) << j;
+    } else {
+        // More keys equal the threshold than there is room for.
+        uint32_t above = 0;
+#pragma unroll
+        for (int j = 0; j < kUnits; ++j) taken |= static_cast<uint32_t>((active >> j & 1u) != 0u && keys[j] > threshold) << j;
+        above = __reduce_add_sync(kFull, static_cast<uint32_t>(__popc(taken)));
+        int room = count - static_cast<int>(above);
+        const uint32_t lower_lanes = (1u << (threadIdx.x & 31u)) - 1u;
+#pragma unroll
+        for (int j = 0; j < kUnits; ++j) {
+            const bool tied = (active >> j & 1u) != 0u && keys[j] == threshold;
+            const uint32_t ties = __ballot_sync(kFull, tied);
+            if (tied && __popc(ties & lower_lanes) < room) taken |= 1u << j;
+            room -= __popc(ties);
+        }
+    }
+    if (with_tau) {
+        Key left = 0;
+#pragma unroll
+        for (int j = 0; j < kUnits; ++j) {
+            if (((active & ~taken) >> j & 1u) != 0u && keys[j] > left) left = keys[j];
+        }
+        tau = warp_max(left);
+    }
+    return taken;
+}
+
+// The three stages over a warp's units. Returns the drawn ones; `missed` the probability of not being drawn.
+template <int kUnits>
+__device__ __forceinline__ uint32_t draw(const SamplePixelsParams& params, const float (&errors)[kUnits],
+                                         const int (&ages)[kUnits], const uint32_t (&places)[kUnits], uint32_t exist,
+                                         uint32_t view, uint32_t purpose, double error_sum, int age_sum,
+                                         float (&missed)[kUnits]) {
+    const int hard = params.stages[0][0], stable = params.stages[0][1], mixed = params.stages[0][2];
+    const bool with_tau = params.weights != nullptr;
+    Words words[kUnits];
+#pragma unroll
+    for (int j = 0; j < kUnits; ++j) {
+        words[j] = random_words(params, places[j], view, purpose);
+        missed[j] = 1.0f;
+    }
+    uint32_t drawn = 0;
+    uint32_t keys[kUnits], tau;
+    bool exhausted;
+    if (hard > 0) {
+#pragma unroll
+        for (int j = 0; j < kUnits; ++j) keys[j] = race_key(errors[j], words[j].x0);
+        drawn |= take_largest(keys, exist, hard, with_tau, tau, exhausted);
+        if (with_tau) {
+#pragma unroll
+            for (int j = 0; j < kUnits; ++j) missed[j] *= exhausted ? 0.0f : 1.0f - race_chance(errors[j], tau);
+        }
+    }
+    if (stable > 0) {
+        uint64_t age_keys[kUnits], age_tau;
+#pragma unroll
+        for (int j = 0; j < kUnits; ++j) age_keys[j] = age_key(ages[j], words[j].x1);
+        drawn |= take_largest(age_keys, exist & ~drawn, stable, with_tau, age_tau, exhausted);
+        if (with_tau) {
+#pragma unroll
+            for (int j = 0; j < kUnits; ++j) missed[j] *= exhausted ? 0.0f : 1.0f - age_chance(ages[j], age_tau);
+        }
+    }
+    if (mixed > 0) {
+        const float error_total = __double2float_rn(error_sum), age_total = __int2float_rn(age_sum);
+        float weights[kUnits];
+#pragma unroll
+        for (int j = 0; j < kUnits; ++j) {
+            weights[j] = params.mixed_uniform ? 1.0f : mixed_weight(errors[j], ages[j], error_total, age_total);
+            keys[j] = race_key(weights[j], words[j].x2);
+        }
+        drawn |= take_largest(keys, exist & ~drawn, mixed, with_tau, tau, exhausted);
+        if (with_tau) {
+#pragma unroll
+            for (int j = 0; j < kUnits; ++j) missed[j] *= exhausted ? 0.0f : 1.0f - race_chance(weights[j], tau);
+        }
+    }
+    return drawn;
+}
+
+// The tile of this warp, and its 8 pixels a lane.
+struct TilePixels {
+    int view;                  // in the batch
+    int column, row;           // of the tile
+    int width, height;         // of the part inside the image
+    uint32_t inside;           // bit j: pixel (j, lane) exists
+    uint32_t ids[kPerLane];    // y * width + x, 0 outside
+};
+
+__device__ __forceinline__ TilePixels locate_tile(const SamplePixelsParams& params, int tile) {
+    TilePixels pixels;
+    pixels.view = 0;
+    while (pixels.view + 1 < params.num_views && tile >= params.views[pixels.view + 1].tile_base) ++pixels.view;
+    const SampleView& view = params.views[pixels.view];
+    const int number = tile - view.tile_base;
+    pixels.row = number / view.tiles_x;
+    pixels.column = number - pixels.row * view.tiles_x;
+    pixels.width = min(kTile, view.width - kTile * pixels.column);
+    pixels.height = min(kTile, view.height - kTile * pixels.row);
+    pixels.inside = 0;
+    const int lane = threadIdx.x & 31;
+#pragma unroll
+    for (int j = 0; j < kPerLane; ++j) {
+        const int x = (j & 1) * 8 + (lane & 7), y = (j >> 1) * 4 + (lane >> 3);
+        const bool exists = x < pixels.width && y < pixels.height;
+        pixels.inside |= static_cast<uint32_t>(exists) << j;
+        pixels.ids[j] = exists ? (kTile * pixels.row + y) * view.width + kTile * pixels.column + x : 0;
+    }
+    return pixels;
+}
+
+__device__ __forceinline__ void load_maps(const SamplePixelsParams& params, const TilePixels& pixels,
+                                          float (&errors)[kPerLane], int (&ages)[kPerLane]) {
+    const int64_t base = params.views[pixels.view].pixel_base;
+    const __half* half_errors = static_cast<const __half*>(params.errors);
+#pragma unroll
+    for (int j = 0; j < kPerLane; ++j) {
+        const bool exists = pixels.inside >> j & 1u;
+        errors[j] = exists ? __half2float(half_errors[base + pixels.ids[j]]) : 0.0f;
+        ages[j] = exists ? min(max(params.now - static_cast<int>(params.stamps[base + pixels.ids[j]]), 0), kAgeMax) : 0;
+    }
+}
+
+// Slots of a tile whose part inside the image has this size.
+template <SampleUnit kUnit>
+__device__ __forceinline__ int tile_slots(const SamplePixelsParams& params, int width, int height) {
+    const int cap = kUnit == SampleUnit::kPixel ? params.slots_per_tile
+                                                : min(params.slots_per_tile, 16 * ((width + 3) / 4) * ((height + 3) / 4));
+    return min(cap, width * height);
+}
+
+// First slot of a tile: within a view only the last column and the last row are cut.
+template <SampleUnit kUnit>
+__device__ __forceinline__ int first_slot(const SamplePixelsParams& params, const TilePixels& pixels) {
+    const SampleView& view = params.views[pixels.view];
+    const int last_width = view.width - kTile * (view.tiles_x - 1);
+    const int row_slots =
+        (view.tiles_x - 1) * tile_slots<kUnit>(params, kTile, kTile) + tile_slots<kUnit>(params, last_width, kTile);
+    return view.slot_base + pixels.row * row_slots + pixels.column * tile_slots<kUnit>(params, kTile, pixels.height);
+}
+
+template <SampleUnit kUnit>
+__global__ void __launch_bounds__(kSampleThreads) sample_tiles_kernel(
+    const __grid_constant__ SamplePixelsParams params) {
+    const int tile = (blockIdx.x * kSampleThreads + threadIdx.x) / 32;
+    if (tile >= params.num_tiles) return;  // a whole warp
+    const int lane = threadIdx.x & 31;
+    const TilePixels pixels = locate_tile(params, tile);
+    const uint32_t view_number = static_cast<uint32_t>(params.views[pixels.view].view_number);
+    float errors[kPerLane];
+    int ages[kPerLane];
+    load_maps(params, pixels, errors, ages);
+
+    // The sums of the mixed stage: half-precision errors add up exactly in double.
+    double error_sum = 0.0;
+    int age_sum = 0;
+    float missed[kPerLane];
+    uint32_t drawn = 0;
+    if (kUnit == SampleUnit::kPixel) {
+        if (params.stages[0][2] > 0 && !params.mixed_uniform) {
+#pragma unroll
+            for (int j = 0; j < kPerLane; ++j) {
+                error_sum += static_cast<double>(errors[j]);
+                age_sum += ages[j];
+            }
+            error_sum = warp_sum(error_sum);
+            age_sum = static_cast<int>(__reduce_add_sync(kFull, static_cast<uint32_t>(age_sum)));
+        }
+        drawn = draw(params, errors, ages, pixels.ids, pixels.inside, view_number, kPurposePixels, error_sum, age_sum,
+                     missed);
+    } else {
+        // Block j holds the 4x4 cells of its left (lane bit 2 clear) and right half; lane n < 16 takes over cell n.
+        const int source = (lane & 1) * 4, block = ((lane >> 2) & 3) * 2 + ((lane >> 1) & 1);
+        double cell_error = 0.0;
+        int cell_age[1] = {0};
+        uint32_t cell_place[1] = {0}, cell_exists = 0;
+#pragma unroll
+        for (int j = 0; j < kPerLane; ++j) {
+            double sum = static_cast<double>(errors[j]);
+            int oldest = ages[j];
+#pragma unroll
+            for (int bit = 0; bit < 5; ++bit) {
+                if (bit == 2) continue;
+                sum += __shfl_xor_sync(kFull, sum, 1 << bit);
+                oldest = max(oldest, __shfl_xor_sync(kFull, oldest, 1 << bit));
+            }
+            const double source_sum = __shfl_sync(kFull, sum, source);
+            const int source_age = __shfl_sync(kFull, oldest, source);
+            const uint32_t source_place = __shfl_sync(kFull, pixels.ids[j], source);
+            const uint32_t source_exists = __shfl_sync(kFull, pixels.inside >> j & 1u, source);
+            if (lane < 16 && block == j) {
+                cell_error = source_sum;
+                cell_age[0] = source_age;
+                cell_place[0] = source_place;
+                cell_exists = source_exists;
+            }
+        }
+        const float cell_errors[1] = {__double2float_rn(cell_error)};
+        error_sum = warp_sum(cell_error);
+        age_sum = static_cast<int>(__reduce_add_sync(kFull, static_cast<uint32_t>(cell_age[0])));
+        float cell_missed[1];
+        const uint32_t cell_drawn = draw(params, cell_errors, cell_age, cell_place, cell_exists, view_number, kPurposeCells,
+                                         error_sum, age_sum, cell_missed);
+        const uint32_t cells = __ballot_sync(kFull, cell_drawn != 0u);
+#pragma unroll
+        for (int j = 0; j < kPerLane; ++j) {
+            const int cell = (j >> 1) * 4 + (j & 1) * 2 + ((lane >> 2) & 1);
+            drawn |= (cells >> cell & 1u) << j;
+            missed[j] = __shfl_sync(kFull, cell_missed[0], cell);
+        }
+        drawn &= pixels.inside;
+    }
+
+    const int first = first_slot<kUnit>(params, pixels);
+    const int end = first + tile_slots<kUnit>(params, pixels.width, pixels.height);
+    const uint32_t lower_lanes = (1u << lane) - 1u;
+    int next = first;
+#pragma unroll
+    for (int j = 0; j < kPerLane; ++j) {
+        const bool mine = drawn >> j & 1u;
+        const uint32_t lanes = __ballot_sync(kFull, mine);
+        if (mine) {
+            const int slot = next + __popc(lanes & lower_lanes);
+            params.pixel_ids[slot] = static_cast<int32_t>(pixels.ids[j]);
+            if (params.weights != nullptr) params.weights[slot] = importance_weight(missed[j], params.importance);
+        }
+        next += __popc(lanes);
+    }
+    for (int slot = next + lane; slot < end; slot += 32) {
+        params.pixel_ids[slot] = -1;
+        if (params.weights != nullptr) params.weights[slot] = 0.0f;
+    }
+    if (lane == 0) {
+        params.tile_ids[tile] = tile;
+        params.tile_offsets[tile] = first;
+        if (tile == params.num_tiles - 1) params.tile_offsets[tile + 1] = end;
+    }
+}
+
+// ---- Whole tiles ---------------------------------------------------------------------------------------------------
+
+__global__ void __launch_bounds__(kSampleThreads) tile_sums_kernel(const __grid_constant__ SamplePixelsParams params) {
+    const int tile = (blockIdx.x * kSampleThreads + threadIdx.x) / 32;
+    if (tile >= params.num_tiles) return;
+    const TilePixels pixels = locate_tile(params, tile);
+    float errors[kPerLane];
+    int ages[kPerLane];
+    load_maps(params, pixels, errors, ages);
+    double error_sum = 0.0;
+    int oldest = 0;
+#pragma unroll
+    for (int j = 0; j < kPerLane; ++j) {
+        error_sum += static_cast<double>(errors[j]);
+        oldest = max(oldest, ages[j]);
+    }
+    error_sum = warp_sum(error_sum);
+    oldest = static_cast<int>(__reduce_max_sync(kFull, static_cast<uint32_t>(oldest)));
+    if ((threadIdx.x & 31) == 0) {
+        params.tile_errors[tile] = error_sum;
+        params.tile_ages[tile] = oldest;
+    }
+}
+
+// Sum over the block, the same in every thread. `scratch` holds one entry a warp.
+template <class T>
+__device__ __forceinline__ T block_sum(T value, T* scratch) {
+#pragma unroll
+    for (int step = 16; step > 0; step >>= 1) value += __shfl_xor_sync(kFull, value, step);
+    __syncthreads();  // the last use of `scratch` is over
+    if ((threadIdx.x & 31) == 0) scratch[threadIdx.x / 32] = value;
+    __syncthreads();
+    T total = 0;
+    for (int warp = 0; warp < kChooseThreads / 32; ++warp) total += scratch[warp];
+    return total;
+}
+
+// A block draws the tiles of one view. Keys hold the rank in their low bits, so no two are equal; -1 marks a tile that is
+// drawn already.
+__global__ void __launch_bounds__(kChooseThreads) choose_tiles_kernel(
+    const __grid_constant__ SamplePixelsParams params) {
+    __shared__ double double_scratch[kChooseThreads / 32];
+    __shared__ long long scratch[kChooseThreads / 32];
+    const int batch_view = blockIdx.x;
+    const SampleView& view = params.views[batch_view];
+    const int count = view.tiles_x * view.tiles_y;
+    const double* errors = params.tile_errors + view.tile_base;
+    const int32_t* ages = params.tile_ages + view.tile_base;
+    int64_t* keys = params.tile_keys + view.tile_base;
+    float* missed = params.tile_missed + view.tile_base;
+    const bool with_tau = params.weights != nullptr;
+
+    double error_part = 0.0;
+    long long age_part = 0;
+    for (int i = threadIdx.x; i < count; i += kChooseThreads) {
+        error_part += errors[i];
+        age_part += ages[i];
+        keys[i] = 0;
+        missed[i] = 1.0f;
+    }
+    const float error_sum = __double2float_rn(block_sum(error_part, double_scratch));
+    const float age_sum = __ll2float_rn(block_sum(age_part, scratch));
+
+    for (int stage = 0; stage < 3; ++stage) {
+        const int wanted = params.stages[batch_view][stage];
+        if (wanted == 0) continue;
+        const auto weight_of = [&](int i) {
+            const float error = __double2float_rn(errors[i]);
+            if (stage == 0) return error;
+            return params.mixed_uniform ? 1.0f : mixed_weight(error, ages[i], error_sum, age_sum);
+        };
+        long long open = 0;
+        for (int i = threadIdx.x; i < count; i += kChooseThreads) {
+            if (keys[i] < 0) continue;
+            ++open;
+            const Words words = random_words(params, static_cast<uint32_t>(i), static_cast<uint32_t>(view.view_number),
+                                             kPurposeTiles);
+            const uint64_t primary = stage == 1 ? age_key(ages[i], words.x1)
+                                                : race_key(weight_of(i), stage == 0 ? words.x0 : words.x2);
+            keys[i] = static_cast<int64_t>(primary << kRankBits | ((1u << kRankBits) - 1u - static_cast<uint32_t>(i)));
+        }
+        const bool exhausted = block_sum(open, scratch) <= wanted;
+        int64_t threshold = 0;
+        if (!exhausted) {
+            for (int bit = 58; bit >= 0; --bit) {
+                const int64_t candidate = threshold | int64_t{1} << bit;
+                long long reached = 0;
+                for (int i = threadIdx.x; i < count; i += kChooseThreads) reached += keys[i] >= candidate;
+                const long long total = block_sum(reached, scratch);
+                if (total >= wanted) threshold = candidate;
+                if (total == wanted) break;
+            }
+        }
+        // The largest key left, found the same way: the largest number that some remaining key reaches.
+        int64_t tau = 0;
+        if (with_tau && !exhausted) {
+            for (int bit = 58; bit >= 0; --bit) {
+                const int64_t candidate = tau | int64_t{1} << bit;
+                long long reached = 0;
+                for (int i = threadIdx.x; i < count; i += kChooseThreads) {
+                    reached += keys[i] < threshold && keys[i] >= candidate;
+                }
+                if (block_sum(reached, scratch) > 0) tau = candidate;
+            }
+            tau >>= kRankBits;
+        }
+        for (int i = threadIdx.x; i < count; i += kChooseThreads) {
+            if (with_tau) {
+                const float chance = stage == 1 ? age_chance(ages[i], static_cast<uint64_t>(tau))
+                                                : race_chance(weight_of(i), static_cast<uint32_t>(tau));
+                missed[i] *= exhausted ? 0.0f : 1.0f - chance;
+            }
+            if (keys[i] >= threshold) keys[i] = -1;
+        }
+    }
+
+    // The drawn tiles in their order.
+    int next = view.slot_base;
+    for (int start = 0; start < count; start += kChooseThreads) {
+        const int i = start + threadIdx.x;
+        const bool mine = i < count && keys[i] < 0;
+        const uint32_t lanes = __ballot_sync(kFull, mine);
+        __syncthreads();
+        if ((threadIdx.x & 31) == 0) scratch[threadIdx.x / 32] = __popc(lanes);
+        __syncthreads();
+        int before = 0, total = 0;
+        for (int warp = 0; warp < kChooseThreads / 32; ++warp) {
+            const int size = static_cast<int>(scratch[warp]);
+            before += warp < static_cast<int>(threadIdx.x / 32) ? size : 0;
+            total += size;
+        }
+        if (mine) params.tile_ids[next + before + __popc(lanes & ((1u << (threadIdx.x & 31u)) - 1u))] = view.tile_base + i;
+        next += total;
+    }
+}
+
+__global__ void __launch_bounds__(kSampleThreads) fill_tiles_kernel(const __grid_constant__ SamplePixelsParams params) {
+    const int chosen = (blockIdx.x * kSampleThreads + threadIdx.x) / 32;
+    if (chosen >= params.num_chosen) return;
+    const int lane = threadIdx.x & 31;
+    const int tile = params.tile_ids[chosen];
+    const TilePixels pixels = locate_tile(params, tile);
+    const float weight = params.weights != nullptr ? importance_weight(params.tile_missed[tile], params.importance) : 0.0f;
+    int next = chosen * kTilePixels;
+    const int end = next + kTilePixels;
+    const uint32_t lower_lanes = (1u << lane) - 1u;
+#pragma unroll
+    for (int j = 0; j < kPerLane; ++j) {
+        const bool mine = pixels.inside >> j & 1u;
+        const uint32_t lanes = __ballot_sync(kFull, mine);
+        if (mine) {
+            const int slot = next + __popc(lanes & lower_lanes);
+            params.pixel_ids[slot] = static_cast<int32_t>(pixels.ids[j]);
+            if (params.weights != nullptr) params.weights[slot] = weight;
+        }
+        next += __popc(lanes);
+    }
+    for (int slot = next + lane; slot < end; slot += 32) {
+        params.pixel_ids[slot] = -1;
+        if (params.weights != nullptr) params.weights[slot] = 0.0f;
+    }
+    if (lane == 0) {
+        params.tile_offsets[chosen] = chosen * kTilePixels;
+        if (chosen == params.num_chosen - 1) params.tile_offsets[chosen + 1] = end;
+    }
+}
+
+int warp_blocks(int warps) { return (warps * 32 + kSampleThreads - 1) / kSampleThreads; }
+
+}  // namespace
+
+cudaError_t launch_sample_pixels(const SamplePixelsParams& params, cudaStream_t stream) {
+    if (params.num_tiles == 0) return cudaSuccess;
+    const int blocks = warp_blocks(params.num_tiles);
+    if (params.unit == SampleUnit::kPixel) {
+        sample_tiles_kernel<SampleUnit::kPixel><<<blocks, kSampleThreads, 0, stream>>>(params);
+        return cudaGetLastError();
+    }
+    if (params.unit == SampleUnit::kCell) {
+        sample_tiles_kernel<SampleUnit::kCell><<<blocks, kSampleThreads, 0, stream>>>(params);
+        return cudaGetLastError();
+    }
+    tile_sums_kernel<<<blocks, kSampleThreads, 0, stream>>>(params);
+    cudaError_t status = cudaGetLastError();
+    if (status != cudaSuccess) return status;
+    choose_tiles_kernel<<<params.num_views, kChooseThreads, 0, stream>>>(params);
+    status = cudaGetLastError();
+    if (status != cudaSuccess) return status;
+    fill_tiles_kernel<<<warp_blocks(params.num_chosen), kSampleThreads, 0, stream>>>(params);
+    return cudaGetLastError();
+}
+
+}  // namespace turbogs
