@@ -22,6 +22,9 @@ and never 0 or 1. (24 random bits and a half would need 25 bits, and round to 1.
 
 from __future__ import annotations
 
+from typing import TypeVar
+
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -37,17 +40,18 @@ SQRT_HALF_BITS = 0x3F3504F3  # the float32 nearest to sqrt(1/2)
 LOG_COEFFICIENTS = (2 / 3, 2 / 5, 2 / 7, 2 / 9)  # of s^3, s^5, s^7, s^9 in 2 * atanh(s); each rounded to float32
 
 Words = tuple[Tensor, Tensor, Tensor, Tensor]
+Array = TypeVar("Array", Tensor, np.ndarray)
 
 
-def philox4x32(counter: Words, key: tuple[int, int]) -> Words:
+def philox4x32(counter: tuple[Array, Array, Array, Array], key: tuple[int, int]) -> tuple[Array, Array, Array, Array]:
     """Philox4x32-10.
 
     Args:
-        counter: four int64 tensors that broadcast together, each holding values 0 .. 2^32 - 1.
+        counter: four int64 tensors (or numpy arrays) that broadcast together, each holding values 0 .. 2^32 - 1.
         key: two such numbers.
 
     Returns:
-        Four int64 tensors of the broadcast shape, each holding values 0 .. 2^32 - 1.
+        Four int64 tensors (or arrays) of the broadcast shape, each holding values 0 .. 2^32 - 1.
     """
     c0, c1, c2, c3 = counter
     k0, k1 = key

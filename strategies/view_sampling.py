@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from turbogs_plugin.strategies.philox import PURPOSE_STACK, PURPOSE_VIEWS, random_words
+from turbogs_plugin.strategies.philox import MASK, PURPOSE_STACK, PURPOSE_VIEWS, philox4x32
 
 from turbogs_plugin.errors import require
 from turbogs_plugin.types import Cameras, Step
@@ -16,9 +16,9 @@ from turbogs_plugin.types import Cameras, Step
 
 def _uniforms(purpose: int, num_views: int, step: Step) -> np.ndarray:
     """[V] float64 in (0, 1) with 52 random bits, a function of (seed, iteration, view) alone."""
-    words = random_words(torch.arange(num_views), 0, purpose, step.seed, step.iteration)
-    high, low = (word.numpy().astype(np.float64) for word in words[:2])
-    return (high * 2**20 + np.floor(low / 2**12) + 0.5) / 2.0**52
+    constants = (np.array([value]) for value in (0, purpose, step.seed >> 32 & MASK))
+    high, low = philox4x32((np.arange(num_views), *constants), (step.seed & MASK, step.iteration & MASK))[:2]
+    return (high * 2.0**20 + (low >> 12) + 0.5) / 2.0**52
 
 
 class ViewStack:

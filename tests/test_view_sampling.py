@@ -1,0 +1,155 @@
+"""View selection: the anchor, the exact probabilities of the draw, and the stack."""
+
+import itertools
+
+import numpy as np
+import pytest
+import torch
+from turbogs_plugin.strategies.view_sampling import GeometryAwareViewSampler, RandomViewSampler
+
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.types import Cameras, Step
+
+SAMPLERS = [GeometryAwareViewSampler, RandomViewSampler]
+
+
+def step(iteration, seed=0):
+    return Step(iteration=iteration, total=1000, refine_until=1000, seed=seed)
+
+
+def orbit(num_views, radius=1.0):
+    """Cameras on a circle that look at its centre."""
+    viewmats = torch.eye(4).repeat(num_views, 1, 1)
+    for view, angle in enumerate(np.linspace(0, 2 * np.pi, num_views, endpoint=False)):
+        forward = torch.tensor([-np.cos(angle), -np.sin(angle), 0.0])
+        right = torch.tensor([np.sin(angle), -np.cos(angle), 0.0])
+        rotation = torch.stack([right, torch.linalg.cross(forward, right), forward]).float()
+        viewmats[view, :3, :3] = rotation
+        viewmats[view, :3, 3] = rotation @ (forward * radius).float()
+    return Cameras(viewmats, torch.eye(3).repeat(num_views, 1, 1), np.full((num_views, 2), 16))
+
+
+def ready(sampler, cameras, extent=1.1):
+    sampler.setup(cameras, extent)
+    return sampler
+
+
+def test_log_weights_follow_the_equation():
+    cameras = orbit(7, radius=3.0)
+    sampler = ready(GeometryAwareViewSampler(distance_weight=1.5, direction_weight=0.7), cameras, 2.0)
+    angles = 2 * np.pi * np.arange(7) / 7
+    centers = 3.0 * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    for anchor in range(7):
+        distances = np.linalg.norm(centers - centers[anchor], axis=1) / 2.0
+        expected = -1.5 * distances - 0.7 * (1 - np.cos(angles - angles[anchor]))
+        assert sampler.log_weights(anchor) == pytest.approx(expected, abs=1e-5)
+
+
+def exact_inclusion(weights, count):
+    """Probability of each index to be among `count` draws without replacement, by enumeration."""
+    inclusion = np.zeros(len(weights))
+    for order in itertools.permutations(range(len(weights)), count):
+        left, probability = weights.sum(), 1.0
+        for index in order:
+            probability *= weights[index] / left
+            left -= weights[index]
+        inclusion[list(order)] += probability
+    return inclusion
+
+
+def test_frequencies_are_those_of_draws_without_replacement():
+    """5,000 draws of the 3 others around the anchor; each frequency within 4.5 standard deviations."""
+    cameras, trials = orbit(7), 5000
+    errors = np.array([0.1, 0.2, 0.9, 0.3, 0.1, 0.1, 0.1])
+    counts = np.zeros(7)
+    for trial in range(trials):
+        views = ready(GeometryAwareViewSampler(2.0, 1.0), cameras).select(4, errors, step(trial))
+        assert views[0] == 2
+        counts[list(views)] += 1
+    others = np.delete(np.arange(7), 2)
+    weights = np.exp(ready(GeometryAwareViewSampler(2.0, 1.0), cameras).log_weights(2))[others]
+    expected = exact_inclusion(weights, 3)
+    spread = np.sqrt(expected * (1 - expected) / trials)
+    assert (np.abs(counts[others] / trials - expected) < 4.5 * spread).all()
+
+
+def test_anchor_is_the_worst_view_left_on_the_stack():
+    sampler = ready(GeometryAwareViewSampler(), orbit(9))
+    errors = np.array([0.3, 0.8, 0.1, 0.9, 0.2, 0.5, 0.4, 0.7, 0.6])
+    left = set(range(9))
+    for t in range(3):
+        views = sampler.select(3, errors, step(t))
+        assert views[0] == max(left, key=lambda view: errors[view])
+        left -= set(views)
+    assert not left
+
+
+@pytest.mark.parametrize("sampler", SAMPLERS)
+def test_stack_is_refilled_when_too_few_are_left(sampler):
+    sampler = ready(sampler(), orbit(8))
+    errors = np.linspace(0, 1, 8)
+    first, second = sampler.select(3, errors, step(0)), sampler.select(3, errors, step(1))
+    assert len(set(first + second)) == 6
+    third = sampler.select(3, errors, step(2))  # two are left: all eight come back
+    assert len(set(third)) == 3
+    assert len(sampler.stack.views) == 5
+
+
+@pytest.mark.parametrize("sampler", SAMPLERS)
+@pytest.mark.parametrize("num_views", [1, 2])
+def test_fewer_views_than_asked(sampler, num_views):
+    sampler = ready(sampler(), orbit(num_views))
+    for t in range(4):
+        assert sorted(sampler.select(10, np.zeros(num_views), step(t))) == list(range(num_views))
+
+
+@pytest.mark.parametrize("sampler", SAMPLERS)
+def test_draws_depend_on_seed_and_iteration_alone(sampler):
+    cameras, errors = orbit(30), np.zeros(30)
+    draws = [ready(sampler(), cameras).select(5, errors, step(t, seed)) for t, seed in [(4, 1), (4, 1), (5, 1), (4, 2)]]
+    assert draws[0] == draws[1]
+    assert len(set(draws)) == 3
+
+
+@pytest.mark.parametrize("sampler", SAMPLERS)
+def test_resume_goes_on_as_before(sampler):
+    cameras, errors = orbit(11), np.linspace(1, 2, 11)
+    whole = ready(sampler(), cameras)
+    for t in range(3):
+        whole.select(3, errors, step(t))
+    resumed = ready(sampler(), cameras)
+    resumed.load_state_dict(whole.state_dict())
+    for t in range(3, 12):
+        assert whole.select(3, errors, step(t)) == resumed.select(3, errors, step(t))
+
+
+def test_views_a_million_extents_away_do_not_underflow():
+    """exp(-2e6) is 0 for every candidate, yet the nearer ones win."""
+    cameras = orbit(6)
+    cameras.viewmats[1:4, 0, 3] += 1.0e6
+    cameras.viewmats[4:, 0, 3] += 3.0e6
+    sampler = ready(GeometryAwareViewSampler(), cameras)
+    views = sampler.select(4, np.array([1.0, 0, 0, 0, 0, 0]), step(0))
+    assert views[0] == 0
+    assert set(views[1:]) == {1, 2, 3}
+
+
+@pytest.mark.parametrize("extent", [0.0, 1.0])
+def test_identical_cameras_are_drawn_uniformly(extent):
+    cameras = orbit(1).select([0] * 5)
+    counts = np.zeros(5)
+    for t in range(2000):
+        views = ready(GeometryAwareViewSampler(), cameras, extent).select(2, np.zeros(5), step(t))
+        assert len(set(views)) == 2
+        counts[list(views)] += 1
+    assert (np.abs(counts / 2000 - 0.4) < 4.5 * np.sqrt(0.4 * 0.6 / 2000)).all()
+
+
+def test_misuse_is_named():
+    with pytest.raises(InputError, match="distance_weight"):
+        GeometryAwareViewSampler(distance_weight=-1.0)
+    with pytest.raises(InputError, match="scene_extent"):
+        GeometryAwareViewSampler().setup(orbit(3), float("nan"))
+    for sampler in SAMPLERS:
+        with pytest.raises(RuntimeError, match="setup"):
+            sampler().select(1, np.zeros(3), step(0))
