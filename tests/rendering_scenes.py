@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from turbogs_plugin.rendering import RasterSettings
+from turbogs_plugin.rendering import DEFAULT_SETTINGS, RasterSettings
 from turbogs_plugin.types import Cameras, Gaussians, PixelSamples
 
 
@@ -105,7 +105,7 @@ def loop_render(
     samples: PixelSamples,
     colors: np.ndarray,
     pixel_errors: np.ndarray,
-    settings: RasterSettings = RasterSettings(),
+    settings: RasterSettings = DEFAULT_SETTINGS,
 ) -> LoopRender:
     """Render pixel by pixel, splat by splat, in float64, straight from the definitions.
 

@@ -14,10 +14,11 @@ from turbogs_plugin.rendering.reference import (
     rasterize_differentiable,
     rasterize_reference,
 )
-from turbogs_plugin.rendering.rendered import RasterSettings, Rendered, ScreenGradients
+from turbogs_plugin.rendering.rendered import DEFAULT_SETTINGS, RasterSettings, Rendered, ScreenGradients
 from turbogs_plugin.types import TILE_SIZE, Cameras, Gaussians, PixelSamples, TileGrid, cell_order
 
 __all__ = [
+    "DEFAULT_SETTINGS",
     "DifferentiableRender",
     "RasterSettings",
     "Rendered",
@@ -36,7 +37,7 @@ def rasterize(
     samples: PixelSamples,
     *,
     sh_degree: int | None = None,
-    settings: RasterSettings = RasterSettings(),
+    settings: RasterSettings = DEFAULT_SETTINGS,
     with_depth: bool = False,
 ) -> Rendered:
     """Render samples of K views with gsplat's conventions, on a black background.
@@ -100,7 +101,7 @@ def render_images(
     gaussians: Gaussians,
     cameras: Cameras,
     sh_degree: int | None = None,
-    settings: RasterSettings = RasterSettings(),
+    settings: RasterSettings = DEFAULT_SETTINGS,
 ) -> list[tuple[Tensor, Tensor]]:
     """Whole images, view after view so that memory does not grow with their number.
 

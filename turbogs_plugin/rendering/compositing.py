@@ -32,8 +32,8 @@ RECORD_WIDTH = 16
 MEAN, CONIC, COLOR, OPACITY, ABSOLUTE, ERROR_SUM, DISTANCE_SUM, WEIGHT_SUM, DEPTH = (
     slice(0, 2), slice(2, 5), slice(5, 8), 8, slice(9, 11), 11, 12, 13, 14,
 )  # fmt: skip
-"""Columns of a screen-gradient record: the gradients of the projected mean, conic (a, b, c), colour and opacity, the sums
-of the absolute gradients of the mean at each pixel, sum of e * w, D * w and w, and the gradient of the depth."""
+"""Columns of a screen-gradient record: the gradients of the projected mean, conic (a, b, c), colour and opacity, the
+sums of the absolute gradients of the mean at each pixel, sum of e * w, D * w and w, and the gradient of the depth."""
 
 
 @dataclass

@@ -63,8 +63,8 @@ def spread(counts: Tensor) -> tuple[Tensor, Tensor]:
 def smallest_exponents(conics: Tensor, low: Tensor, high: Tensor) -> Tensor:
     """A lower bound, tight to rounding, of ``sigma = (a dx^2 + c dy^2) / 2 + b dx dy`` over rectangles.
 
-    A convex form that has its minimum outside a rectangle takes its smallest value on one of the two edges that face the
-    minimum; along an edge it is a parabola. Inside, both candidates below are zero.
+    A convex form that has its minimum outside a rectangle takes its smallest value on one of the two edges that face
+    the minimum; along an edge it is a parabola. Inside, both candidates below are zero.
 
     Args:
         conics: [C, 3].
@@ -108,9 +108,10 @@ def intersect_tiles(rows: Rows, splats: Splats, samples: PixelSamples, settings:
     order = torch.where(on_screen, splats.depths, torch.inf).sort(stable=True).indices  # [R]
     image = sizes[rows.views[order]]  # [R, 2]
     means2d, radii = splats.means2d[order], splats.radii[order]
-    # Pixel centres within the box of the radii, widened by a pixel against rounding, as tiles [first, last].
-    first = (means2d - radii - 1.5).clamp(min=0)
-    last = (means2d + radii + 0.5).clamp(min=-1)
+    # Pixel centres within the box of the radii, widened against rounding, as tiles [first, last].
+    slack = 1 + ROUNDING * torch.finfo(means2d.dtype).eps * (means2d.abs() + radii)
+    first = (means2d - radii - 0.5 - slack).clamp(min=0)
+    last = (means2d + radii - 0.5 + slack).clamp(min=-1)
     first = torch.minimum(first, image.to(first.dtype)).long() // TILE_SIZE
     last = torch.minimum(last, (image - 1).to(last.dtype)).floor().long() // TILE_SIZE
     spans = (last - first + 1).clamp(min=0) * on_screen[order, None]  # [R, 2] tiles in x and y

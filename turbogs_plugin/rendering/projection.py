@@ -20,7 +20,7 @@ EXTENT_MAX = 3.33
 """gsplat's cut of a splat's half-width, in standard deviations. At the default `alpha_min` it cuts nothing visible:
 an opaque splat fades to 1/255 at 3.329."""
 
-SPAN_MAX = 1e8
+SPAN_MAX = 1e7
 """Gaussians whose longest axis, seen face on, would span more pixels than this are not drawn: the determinant of their
 covariance would overflow in float32."""
 
@@ -60,8 +60,16 @@ class Rows:
 
 @dataclass
 class Splats:
-    """The projection of R rows. Shapes: means2d [R, 2] pixels, conics [R, 3] (upper triangle of the inverse covariance),
-    depths [R], opacities [R] 0 .. 1, colors [R, 3] after the clamp at 0, radii [R, 2] int32, zero where off screen."""
+    """The projection of R rows.
+
+    Args:
+        means2d: [R, 2] pixels.
+        conics: [R, 3] upper triangle of the inverse covariance, per pixel squared.
+        depths: [R].
+        opacities: [R] 0 .. 1.
+        colors: [R, 3] after the clamp at 0.
+        radii: [R, 2] int32 half-widths in x and y, pixels; both zero where off screen.
+    """
 
     means2d: Tensor
     conics: Tensor

@@ -12,7 +12,7 @@ from turbogs_plugin.rendering import compositing
 from turbogs_plugin.rendering.compositing import ALPHA_TINY, Composite, Compositor
 from turbogs_plugin.rendering.intersection import intersect_tiles
 from turbogs_plugin.rendering.projection import Rows, Splats, drawable_rows, project_rows
-from turbogs_plugin.rendering.rendered import RasterSettings
+from turbogs_plugin.rendering.rendered import DEFAULT_SETTINGS, Projected, RasterSettings
 from turbogs_plugin.types import Cameras, GaussianGradients, Gaussians, GaussianStats, PixelSamples
 
 ROW_PARAMETERS = ("means", "quats", "scales", "opacities", "sh0")
@@ -106,6 +106,12 @@ class ReferenceRendered:
     _leaves: list[Tensor] = field(repr=False)
 
     @torch.no_grad()
+    def projected(self) -> Projected:
+        """The projection that this pass drew."""
+        names = ("means2d", "conics", "depths", "opacities", "radii")
+        return Projected(**{name: self._rows.scatter(getattr(self._splats, name)) for name in names})
+
+    @torch.no_grad()
     def backward(
         self,
         color_gradients: Tensor,
@@ -137,7 +143,7 @@ def rasterize_reference(
     samples: PixelSamples,
     *,
     sh_degree: int | None = None,
-    settings: RasterSettings = RasterSettings(),
+    settings: RasterSettings = DEFAULT_SETTINGS,
     with_depth: bool = False,
 ) -> ReferenceRendered:
     """Render samples; see `turbogs_plugin.rendering.rasterize`. float32 or float64, CPU or CUDA."""
@@ -162,7 +168,8 @@ class DifferentiableRender:
 
     Args:
         colors: [P, 3], alphas: [P], depths: [P] or None; zero in empty slots.
-        means2d: [K, N, 2] pixels. Keeps its gradient; after backward `means2d.absgrad` [K, N, 2] holds the absolute one.
+        means2d: [K, N, 2] pixels. Keeps its gradient; after backward `means2d.absgrad` [K, N, 2] holds the absolute
+            one.
         conics: [K, N, 3], depths_per_gaussian: [K, N], opacities: [K, N].
         radii: [K, N, 2] int32, zero where a Gaussian is not drawn. So are the other arrays.
         sizes: [K, 2] int64 numpy array (width, height).
@@ -185,7 +192,7 @@ def rasterize_differentiable(
     samples: PixelSamples,
     *,
     sh_degree: int | None = None,
-    settings: RasterSettings = RasterSettings(),
+    settings: RasterSettings = DEFAULT_SETTINGS,
     with_depth: bool = False,
 ) -> DifferentiableRender:
     """Render samples with gradients to `gaussians` through autograd; the arguments are those of `rasterize`."""

@@ -10,6 +10,25 @@ from torch import Tensor
 from turbogs_plugin.types import GaussianGradients, GaussianStats
 
 
+@dataclass(frozen=True)
+class Projected:
+    """Where K views see the N Gaussians, as gsplat's `info` has it; zero where a Gaussian is not drawn.
+
+    Args:
+        means2d: [K, N, 2] pixels.
+        conics: [K, N, 3] upper triangle of the inverse covariance.
+        depths: [K, N].
+        opacities: [K, N] 0 .. 1.
+        radii: [K, N, 2] int32 half-widths in x and y, pixels.
+    """
+
+    means2d: Tensor
+    conics: Tensor
+    depths: Tensor
+    opacities: Tensor
+    radii: Tensor
+
+
 class ScreenGradients(Protocol):
     """Gradients on the screen, not yet taken back to the parameters.
 
@@ -20,6 +39,11 @@ class ScreenGradients(Protocol):
 
     def parameter_gradients(self, rows: bool) -> GaussianGradients:
         """The gradients of the parameters: one row per view (`rows`), or their sum. May be called once."""
+        ...
+
+    def full_records(self) -> Tensor:
+        """[K, N, 16] the gradients on the screen: of the projected mean in columns 0-1, of its absolute value per pixel
+        in 9-10; zero where a Gaussian is not drawn."""
         ...
 
 
@@ -35,6 +59,10 @@ class Rendered(Protocol):
     colors: Tensor
     alphas: Tensor
     depths: Tensor | None
+
+    def projected(self) -> Projected:
+        """The projection that this pass drew."""
+        ...
 
     def backward(
         self,
@@ -73,3 +101,6 @@ class RasterSettings:
     alpha_min: float = 1.0 / 255.0
     alpha_max: float = 0.999
     transmittance_min: float = 1e-4
+
+
+DEFAULT_SETTINGS = RasterSettings()
