@@ -1,0 +1,117 @@
+"""Models, gradients and statistics that the tests of optimizers and density control share."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import torch
+from torch import Tensor
+
+from turbogs_plugin.types import GaussianGradients, Gaussians, GaussianStats, Step
+
+STEP = Step(iteration=100, total=5000, refine_until=3500, seed=7, scene_extent=2.0)
+
+
+def make_gaussians(count: int, seed: int = 0, dtype=torch.float64, bands: int = 3) -> Gaussians:
+    """Random Gaussians; band 0's first entry is the row number, so that rows can be recognised later."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=generator, dtype=dtype)
+
+    gaussians = Gaussians(
+        means=normal(count, 3),
+        quats=normal(count, 4),
+        scales=0.5 * normal(count, 3) - 4,
+        opacities=normal(count),
+        sh0=normal(count, 1, 3),
+        shN=normal(count, bands, 3),
+    )
+    gaussians.sh0[:, 0, 0] = torch.arange(count, dtype=dtype)
+    return gaussians
+
+
+def clone(gaussians: Gaussians) -> Gaussians:
+    return gaussians.map(lambda value: value.clone())
+
+
+@dataclass
+class FixedGradients:
+    """`ScreenGradients` that were known before."""
+
+    gradients: GaussianGradients
+
+    def parameter_gradients(self, rows: bool) -> GaussianGradients:
+        if rows:
+            return self.gradients
+        summed = {}
+        for field in fields(self.gradients):
+            value = getattr(self.gradients, field.name)
+            summed[field.name] = value if field.name in ("shN", "touched") else value.sum(dim=0, keepdim=True)
+        return GaussianGradients(**summed)
+
+
+def make_gradients(
+    views: int, count: int, seed: int = 1, dtype=torch.float64, bands: int = 3, size: float = 1e-5
+) -> FixedGradients:
+    """Random gradients of about `size` in every view, all Gaussians touched, loss shares of about `size`."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def normal(*shape: int) -> Tensor:
+        return size * torch.randn(*shape, generator=generator, dtype=dtype)
+
+    return FixedGradients(
+        GaussianGradients(
+            means=100 * normal(views, count, 3),
+            quats=normal(views, count, 4),
+            scales=10 * normal(views, count, 3),
+            opacities=normal(views, count),
+            sh0=normal(views, count, 1, 3),
+            shN=normal(count, bands, 3),
+            touched=torch.ones(count, dtype=torch.bool),
+            view_losses=normal(views, count).abs() * 0.1,
+        )
+    )
+
+
+def scaled(gradients: FixedGradients, factor: float) -> FixedGradients:
+    """The gradients of a loss that is `factor` times as large."""
+    values = {field.name: getattr(gradients.gradients, field.name) for field in fields(GaussianGradients)}
+    return FixedGradients(
+        GaussianGradients(**{name: v if name == "touched" else v * factor for name, v in values.items()})
+    )
+
+
+def random_stats(count: int, seed: int, seen: float = 0.8) -> GaussianStats:
+    """Statistics of a window in which about a share `seen` of the Gaussians was seen, some of them not in all terms."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def uniform() -> Tensor:
+        return torch.rand(count, generator=generator)
+
+    weights = 5 * uniform() * (uniform() < seen)
+    views = torch.randint(1, 9, (count,), generator=generator).float() * (weights > 0)
+    return GaussianStats(
+        error_sums=0.3 * uniform() * weights,
+        distance_sums=(0.5 + uniform()) * weights,
+        weight_sums=weights,
+        grad_sums=4e-4 * uniform() * views,
+        absgrad_sums=8e-4 * uniform() * views,
+        view_counts=views,
+        max_radii=0.2 * uniform(),
+    )
+
+
+def fill(target: GaussianStats, source: GaussianStats) -> None:
+    """Write statistics into a controller's window."""
+    for field in fields(source):
+        getattr(target, field.name).copy_(getattr(source, field.name))
+
+
+def all_finite(gaussians: Gaussians) -> bool:
+    return all(bool(torch.isfinite(value).all()) for _, value in gaussians.items())
+
+
+def equal(one: Gaussians, other: Gaussians) -> bool:
+    """To the last bit."""
+    return all(torch.equal(value, getattr(other, name)) for name, value in one.items())
