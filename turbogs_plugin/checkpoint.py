@@ -135,5 +135,5 @@ def _require_dense(value: Any) -> None:
     if isinstance(value, list | tuple):
         for item in value:
             _require_dense(item)
-    elif isinstance(value, Tensor) and not value.is_contiguous():
+    elif isinstance(value, Tensor) and value.numel() * value.element_size() > value.untyped_storage().nbytes():
         raise ValueError("it has a tensor that is not stored whole")

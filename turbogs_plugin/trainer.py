@@ -135,7 +135,7 @@ class Trainer:
             "iteration": self.iteration,
             "initial_error": self.initial_error,
             "nonfinite_losses": int(self.nonfinite_losses),
-            "gaussians": {name: tensor.contiguous() for name, tensor in self.gaussians.items()},
+            "gaussians": dict(self.gaussians.items()),
             "maps": self.maps.state_dict(),
             "view_sampler": self.view_sampler.state_dict(),
             "optimizer": self.optimizer.state_dict(),

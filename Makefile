@@ -1,0 +1,40 @@
+# `make demo` and `make test` need nothing but Python 3.10 .. 3.13 with venv.
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+INSTALLED := $(VENV)/.installed
+
+.PHONY: demo test lint kernels install clean
+
+demo: $(INSTALLED)
+	test -d demo/capture || $(BIN)/turbogs demo demo/capture
+	rm -rf demo/run
+	$(BIN)/turbogs train demo/capture --out demo/run --config demo
+	$(BIN)/turbogs render demo/run
+
+test: $(INSTALLED)
+	$(BIN)/python -m pytest
+
+lint: $(INSTALLED)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+# The CUDA library, for development; wants nvcc but no GPU.
+kernels: $(INSTALLED)
+	TURBOGS_CUDA=require TURBOGS_CUDA_ARCH=$${TURBOGS_CUDA_ARCH:-90} $(BIN)/python setup.py build_ext --inplace
+
+install: $(INSTALLED)
+
+# torch first and by its exact version, so that nothing below picks another build of it. No build isolation: the
+# kernels' binding is compiled against this very torch.
+$(INSTALLED): pyproject.toml
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet "setuptools>=77" wheel
+	$(BIN)/python -m pip install --quiet torch==2.13.0
+	$(BIN)/python -m pip install --quiet --no-build-isolation --editable ".[dev]"
+	touch $@
+
+clean:
+	rm -rf build dist *.egg-info demo .pytest_cache .ruff_cache .hypothesis
+	find . -name __pycache__ -not -path "./$(VENV)/*" -prune -exec rm -rf {} +
