@@ -235,6 +235,147 @@ void fused_step(const std::vector<Tensor>& gaussians, const Tensor& viewmats, co
     DeviceScope::check(launch_fused_step(params, optimizer, device.stream()));
 }
 
+// `views` holds six numbers for each view: first flat pixel, width, height, number of the training view, first slot (or
+// chosen tile), tiles to choose; see `view_table` in training_kernels.py.
+constexpr int64_t kViewFields = 6;
+
+struct ViewTable {
+    SampleView views[kTrainingMaxViews] = {};
+    int num_views = 0;
+    int num_tiles = 0;
+};
+
+ViewTable view_table(const std::vector<int64_t>& fields) {
+    ViewTable table;
+    const int64_t count = static_cast<int64_t>(fields.size()) / kViewFields;
+    STD_TORCH_CHECK(count >= 1 && count <= kTrainingMaxViews, "turbogs: a batch has 1 to ", kTrainingMaxViews,
+                    " views, not ", count);
+    table.num_views = static_cast<int>(count);
+    for (int i = 0; i < table.num_views; ++i) {
+        const int64_t* field = fields.data() + i * kViewFields;
+        SampleView& view = table.views[i];
+        view.pixel_base = field[0];
+        view.width = static_cast<int>(field[1]);
+        view.height = static_cast<int>(field[2]);
+        view.view_number = static_cast<int>(field[3]);
+        view.slot_base = static_cast<int>(field[4]);
+        view.wanted = static_cast<int>(field[5]);
+        view.tiles_x = (view.width + 15) / 16;
+        view.tiles_y = (view.height + 15) / 16;
+        view.tile_base = table.num_tiles;
+        table.num_tiles += view.tiles_x * view.tiles_y;
+    }
+    return table;
+}
+
+void sample_pixels(const Tensor& errors, const Tensor& stamps, const std::vector<int64_t>& views, int64_t unit,
+                   const std::vector<int64_t>& stages, int64_t slots_per_tile, bool mixed_uniform, double importance,
+                   int64_t seed, int64_t iteration, int64_t now, const Tensor& pixel_ids, const Tensor& tile_ids,
+                   const Tensor& tile_offsets, const std::optional<Tensor>& weights, const std::vector<Tensor>& scratch) {
+    const DeviceScope device(errors);
+    const ViewTable table = view_table(views);
+    const int64_t pixels = errors.numel(), slots = pixel_ids.numel(), tiles = tile_ids.numel();
+    SamplePixelsParams params = {};
+    STD_TORCH_CHECK(unit >= 0 && unit <= 2, "turbogs: unit must be 0 (pixel), 1 (cell) or 2 (tile)");
+    params.unit = static_cast<SampleUnit>(unit);
+    const bool by_tile = params.unit == SampleUnit::kTile;
+    const size_t stage_rows = by_tile ? static_cast<size_t>(table.num_views) : 1;
+    STD_TORCH_CHECK(stages.size() == 3 * stage_rows, "turbogs: stages must hold ", 3 * stage_rows, " numbers");
+    STD_TORCH_CHECK(by_tile || tiles == table.num_tiles, "turbogs: tile_ids must have an entry for each tile");
+    params.num_views = table.num_views;
+    params.num_tiles = table.num_tiles;
+    params.num_chosen = static_cast<int>(tiles);
+    for (int i = 0; i < table.num_views; ++i) {
+        params.views[i] = table.views[i];
+        const SampleView& view = table.views[i];
+        STD_TORCH_CHECK(view.pixel_base >= 0 && view.pixel_base + int64_t{1} * view.width * view.height <= pixels,
+                        "turbogs: view ", view.view_number, " lies outside the maps");
+    }
+    for (size_t i = 0; i < stages.size(); ++i) params.stages[i / 3][i % 3] = static_cast<int>(stages[i]);
+    params.slots_per_tile = static_cast<int>(slots_per_tile);
+    params.mixed_uniform = mixed_uniform;
+    params.importance = static_cast<float>(importance);
+    params.seed_low = static_cast<uint32_t>(seed);
+    params.seed_high = static_cast<uint32_t>(static_cast<uint64_t>(seed) >> 32);
+    params.iteration = static_cast<uint32_t>(iteration);
+    params.now = static_cast<int>(now);
+    params.errors = device.data<Half>(errors, "errors", pixels);
+    params.stamps = device.data<int16_t>(stamps, "stamps", pixels);
+    params.pixel_ids = device.data<int32_t>(pixel_ids, "pixel_ids", slots);
+    params.tile_ids = device.data<int32_t>(tile_ids, "tile_ids", tiles);
+    params.tile_offsets = device.data<int32_t>(tile_offsets, "tile_offsets", tiles + 1);
+    params.weights = device.data<float>(weights, "weights", slots);
+    if (by_tile) {
+        STD_TORCH_CHECK(scratch.size() == 4, "turbogs: unit tile needs four scratch tensors");
+        params.tile_errors = device.data<double>(scratch[0], "tile_errors", table.num_tiles);
+        params.tile_ages = device.data<int32_t>(scratch[1], "tile_ages", table.num_tiles);
+        params.tile_keys = device.data<int64_t>(scratch[2], "tile_keys", table.num_tiles);
+        params.tile_missed = device.data<float>(scratch[3], "tile_missed", table.num_tiles);
+    }
+    DeviceScope::check(launch_sample_pixels(params, device.stream()));
+}
+
+void sparse_loss(const Tensor& colors, const std::optional<Tensor>& targets, const std::optional<Tensor>& photos,
+                 const Tensor& pixel_ids, const Tensor& tile_ids, const Tensor& tile_offsets,
+                 const std::optional<Tensor>& weights, const std::vector<int64_t>& views, int64_t structure, double epsilon,
+                 double l1_weight, double structure_weight, double variance_constant, bool balance, bool gate,
+                 const std::vector<Tensor>& maps, double beta, int64_t stamp, const Tensor& num_filled, const Tensor& loss,
+                 const Tensor& color_gradients, const Tensor& pixel_errors, const std::optional<Tensor>& num_nonfinite) {
+    const DeviceScope device(colors);
+    const ViewTable table = view_table(views);
+    const int64_t slots = pixel_ids.numel(), tiles = tile_ids.numel();
+    SparseLossParams params = {};
+    STD_TORCH_CHECK(structure >= 0 && structure <= 3, "turbogs: structure must be 0 (none), 1 (ncc), 2 (contrast) or 3 (ssim)");
+    STD_TORCH_CHECK(targets.has_value() != photos.has_value(), "turbogs: give either targets or photos");
+    params.num_views = table.num_views;
+    for (int i = 0; i < table.num_views; ++i) params.views[i] = table.views[i];
+    params.num_tiles = static_cast<int>(tiles);
+    params.num_slots = static_cast<int>(slots);
+    params.structure = static_cast<Structure>(structure);
+    params.epsilon = static_cast<float>(epsilon);
+    params.l1_weight = static_cast<float>(l1_weight);
+    params.structure_weight = static_cast<float>(structure_weight);
+    params.variance_constant = static_cast<float>(variance_constant);
+    params.balance = balance;
+    params.gate = gate;
+    params.tile_ids = device.data<int32_t>(tile_ids, "tile_ids", tiles);
+    params.tile_offsets = device.data<int32_t>(tile_offsets, "tile_offsets", tiles + 1);
+    params.pixel_ids = device.data<int32_t>(pixel_ids, "pixel_ids", slots);
+    params.weights = device.data<float>(weights, "weights", slots);
+    params.colors = device.data<float>(colors, "colors", 3 * slots);
+    params.targets = device.data<float>(targets, "targets", 3 * slots);
+    int64_t pixels = -1;
+    if (photos.has_value()) {
+        pixels = photos->numel() / 3;
+        params.photos = device.data<uint8_t>(*photos, "photos", 3 * pixels);
+    }
+    if (!maps.empty()) {
+        STD_TORCH_CHECK(maps.size() == 3, "turbogs: maps must be errors, stamps, view_sums");
+        const int64_t map_pixels = maps[0].numel();
+        STD_TORCH_CHECK(pixels < 0 || pixels == map_pixels, "turbogs: photos and maps must be of the same pixels");
+        pixels = map_pixels;
+        params.errors = device.data<Half>(maps[0], "errors", pixels);
+        params.stamps = device.data<int16_t>(maps[1], "stamps", pixels);
+        params.view_sums = device.data<double>(maps[2], "view_sums", maps[2].numel());
+        params.ema_old = static_cast<float>(1.0 - beta);
+        params.ema_new = static_cast<float>(beta);
+        params.stamp = static_cast<int16_t>(stamp);
+    }
+    for (int i = 0; pixels >= 0 && i < table.num_views; ++i) {
+        const SampleView& view = table.views[i];
+        STD_TORCH_CHECK(view.pixel_base >= 0 && view.pixel_base + int64_t{1} * view.width * view.height <= pixels &&
+                            (maps.empty() || view.view_number < maps[2].numel()),
+                        "turbogs: view ", view.view_number, " lies outside the photos or maps");
+    }
+    params.num_filled = device.data<int32_t>(num_filled, "num_filled", 1);
+    params.loss = device.data<double>(loss, "loss", 1);
+    params.color_gradients = device.data<float>(color_gradients, "color_gradients", 3 * slots);
+    params.pixel_errors = device.data<float>(pixel_errors, "pixel_errors", slots);
+    params.num_nonfinite =
+        reinterpret_cast<unsigned long long*>(device.data<int64_t>(num_nonfinite, "num_nonfinite", 1));
+    DeviceScope::check(launch_sparse_loss(params, device.stream()));
+}
+
 }  // namespace
 
 #define TURBOGS_BACKWARD_INPUTS                                                                              \
@@ -247,9 +388,21 @@ STABLE_TORCH_LIBRARY_FRAGMENT(turbogs, m) {
     m.def("fused_step(" TURBOGS_BACKWARD_INPUTS
           "Tensor(m!)[] moments, int kind, bool rows_per_view, float[] rates, float beta1, float beta2, float eps, "
           "float curvature, float max_step) -> ()");
+    m.def(
+        "sample_pixels(Tensor errors, Tensor stamps, int[] views, int unit, int[] stages, int slots_per_tile, "
+        "bool mixed_uniform, float importance, int seed, int iteration, int now, Tensor(a!) pixel_ids, "
+        "Tensor(b!) tile_ids, Tensor(c!) tile_offsets, Tensor(d!)? weights, Tensor(e!)[] scratch) -> ()");
+    m.def(
+        "sparse_loss(Tensor colors, Tensor? targets, Tensor? photos, Tensor pixel_ids, Tensor tile_ids, "
+        "Tensor tile_offsets, Tensor? weights, int[] views, int structure, float epsilon, float l1_weight, "
+        "float structure_weight, float variance_constant, bool balance, bool gate, Tensor(a!)[] maps, float beta, "
+        "int stamp, Tensor(b!) num_filled, Tensor(c!) loss, Tensor(d!) color_gradients, Tensor(e!) pixel_errors, "
+        "Tensor(f!)? num_nonfinite) -> ()");
 }
 
 STABLE_TORCH_LIBRARY_IMPL(turbogs, CUDA, m) {
     m.impl("projection_backward", TORCH_BOX(&projection_backward));
     m.impl("fused_step", TORCH_BOX(&fused_step));
+    m.impl("sample_pixels", TORCH_BOX(&sample_pixels));
+    m.impl("sparse_loss", TORCH_BOX(&sparse_loss));
 }

@@ -133,6 +133,46 @@ struct SamplePixelsParams {
     float* tile_missed;        // [tiles]
 };
 
+enum class Structure : int { kNone = 0, kNcc = 1, kContrast = 2, kSsim = 3 };
+
+// Loss on the samples with its gradient, and where maps are given their update; strategies/loss.py and error_maps.py
+// define both. A sample whose colour is not finite counts as an empty slot: no gradient, no error, no visit.
+struct SparseLossParams {
+    int num_views;             // K
+    int num_tiles;             // T, tiles with samples
+    int num_slots;             // P
+    SampleView views[kTrainingMaxViews];
+    Structure structure;
+    float epsilon;             // of the Charbonnier term
+    float l1_weight;
+    float structure_weight;    // factor of the mean over tiles and channels of 1 - S
+    float variance_constant;   // ncc, contrast
+    bool balance;              // lambda of the paper: structure gradients no larger than those of l1
+    bool gate;                 // by the truth's variance
+
+    const int32_t* tile_ids;      // [T]
+    const int32_t* tile_offsets;  // [T + 1]
+    const int32_t* pixel_ids;     // [P]
+    const float* weights;         // [P] or null
+    const float* colors;          // [P, 3]
+    const float* targets;         // [P, 3], or null: then `photos` are gathered
+    const uint8_t* photos;        // [X, 3]
+
+    int32_t* num_filled;          // [1], zero before the launch; filled slots
+    double* loss;                 // [1], zero before the launch
+    float* color_gradients;       // [P, 3] out
+    float* pixel_errors;          // [P] out
+    unsigned long long* num_nonfinite;  // [1] samples whose colour was not finite are added; or null
+
+    // Maps of all views; all null where they are not to be updated.
+    void* errors;                 // [X] half
+    int16_t* stamps;              // [X]
+    double* view_sums;            // [V]
+    float ema_old, ema_new;       // 1 - beta and beta, each rounded from double
+    int16_t stamp;
+};
+
+cudaError_t launch_sparse_loss(const SparseLossParams& params, cudaStream_t stream);
 cudaError_t launch_sample_pixels(const SamplePixelsParams& params, cudaStream_t stream);
 
 cudaError_t launch_projection_backward(const ScreenBackwardParams& params, const ProjectionBackwardOutputs& outputs,
