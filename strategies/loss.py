@@ -2,7 +2,8 @@
 
 Every loss here is a mean over all filled samples of the K views together, or over the tiles that hold them, so its
 gradients are as large as those of a dense mean loss. Half-precision colours are computed with in single precision, and
-get single-precision gradients. With autograd upstream: ``colors.backward(out.color_gradients)``.
+get single-precision gradients. A sample whose colour is not finite has no part but in the number of samples: its error
+and its gradient are 0. With autograd upstream: ``colors.backward(out.color_gradients)``.
 
 Notation, per tile and channel: n samples x (prediction) and y (truth) with importance weights w; their shares
 ``omega = w / sum(w)`` (1 / n without weights) define means, variances s_x^2, s_y^2 and covariance s_xy, all biased.
@@ -31,19 +32,19 @@ class TileGroups:
     """The samples of each tile, with their weights.
 
     Attributes:
-        weights: [P, 1], 0 in empty slots.
+        weights: [P, 1], 0 in slots without a part.
         shares: [P, 1], omega: the weights over their sum in the tile.
         tiles: T.
         filled: scalar tensor, the number of filled slots, at least 1.
     """
 
-    def __init__(self, samples: PixelSamples, like: Tensor) -> None:
+    def __init__(self, samples: PixelSamples, used: Tensor) -> None:
+        """`used`: [P], 1 for the slots that have a part, 0 for the others, in the dtype of the computation."""
         self.tile_of_slot = samples.tile_of_slot()
         self.tiles = len(samples.tile_ids)
         self.first_slots = samples.tile_offsets[:-1].long().clamp(max=max(0, len(samples) - 1))  # [T]
-        filled = samples.filled.to(like.dtype)
-        self.filled = filled.sum().clamp(min=1.0)
-        self.weights = (filled if samples.weights is None else filled * samples.weights)[:, None]
+        self.filled = samples.filled.sum().clamp(min=1).to(used.dtype)
+        self.weights = (used if samples.weights is None else used * samples.weights)[:, None]
         totals = self.sum(self.weights)
         self.shares = self.weights / torch.where(totals > 0, totals, 1.0)[self.tile_of_slot]
 
@@ -153,9 +154,11 @@ class _Problem:
             shapes = f"{tuple(colors.shape)} and {tuple(targets.shape)}"
             raise ValueError(f"colors and targets have shapes {shapes}, expected {expected} as there are slots")
         dtype = torch.promote_types(torch.promote_types(colors.dtype, targets.dtype), torch.float32)
-        self.colors, self.targets = colors.detach().to(dtype), targets.detach().to(dtype)
-        self.groups = groups = TileGroups(samples, self.colors)
-        differences = torch.where(samples.filled[:, None], self.colors - self.targets, 0.0)
+        used = samples.filled & torch.isfinite(colors).all(dim=1)
+        self.colors = torch.where(used[:, None], colors.detach().to(dtype), 0.0)
+        self.targets = torch.where(used[:, None], targets.detach().to(dtype), 0.0)
+        self.groups = groups = TileGroups(samples, used.to(dtype))
+        differences = self.colors - self.targets
         self.pixel_errors = differences.abs().sum(dim=1).float()
         roots = torch.sqrt(differences * differences + epsilon * epsilon)
         self.slopes = differences / roots
@@ -207,8 +210,8 @@ class CharbonnierNccLoss:
     The gate ``s_y^2 / (s_y^2 + c)`` of the truth's own variance comes after the balance, which would undo it.
 
     However the tile looks, each entry of the gradient is at most ``w / (3 n) + ncc_weight / T`` (n filled samples, T
-    tiles): the balance keeps the structure term's gradients in a tile, in sum, below those of l1. Colours must be
-    finite. Where x = y, and for the structure term in tiles of one sample or constant in both, it is exactly 0.
+    tiles): the balance keeps the structure term's gradients in a tile, in sum, below those of l1. Where x = y, and for
+    the structure term in tiles of one sample or constant in both, it is exactly 0.
 
     Args:
         epsilon: of the Charbonnier term.

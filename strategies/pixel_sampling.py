@@ -24,10 +24,12 @@ The draw is defined down to the bit, so that `draw_pixels` here and its CUDA twi
      whether drawn or not, rounded to float32; a quotient by zero counts as 0. For `mixed` = uniform, M = 1.
 
 Importance weights are ``w = p^-a`` over their mean, with p the probability that a unit is drawn given the keys of the
-others ("rank conditioning", Cohen and Kaplan 2007; with it the hard stage alone is an exactly unbiased estimator).
-With tau the largest key *not* taken by a stage, as the number it stands for: ``1 - exp(-weight / tau)`` for the two
-races, the share of words ``x1`` that beat tau for the ages, and 1 where a stage takes all; the stages combine as
-``p = 1 - (1 - p_hard)(1 - p_stable)(1 - p_mixed)``.
+others ("rank conditioning", Cohen and Kaplan 2007: dividing by it makes a single stage exactly unbiased). In a stage,
+tau is the least key with which the unit would have been taken: for a unit that the stage takes, the largest key it
+leaves (none where it takes all there are); for any other, drawn before or not at all, the smallest key it takes. With
+the high bits of tau as what they stand for, the chance of a race is ``1 - exp(-max(E or M, 2^-100) / tau)``, of the
+stable stage ``clamp(((A + 1) << 24) - tau, 0, 2^24) / 2^24``, and 1 without a tau; a stage that takes nothing has none.
+Together, ``p = 1 - (1 - p_hard) (1 - p_stable) (1 - p_mixed)``, and 1 where all units of a row are drawn.
 """
 
 from __future__ import annotations
@@ -143,32 +145,30 @@ def draw_units(units: Units, rule: DrawRule) -> tuple[Tensor, Tensor | None]:
             weights = weights.clamp(min=WEIGHT_FLOOR)
             primary = (weights / exponentials(words)).view(torch.int32).long()
         keys = torch.where(units.exist & ~drawn, (primary << RANK_BITS) | ranks, -1)
-        takes = torch.as_tensor(counts, device=device)[:, None]
-        beaten = _key_after(keys, takes, int(counts.max()))
-        drawn |= keys > beaten
+        takes = torch.as_tensor(counts, device=device)[:, None].expand(len(keys), 1)
+        largest = keys.topk(min(int(counts.max()) + 1, keys.shape[1]), dim=1).values
+        largest = torch.nn.functional.pad(largest, (0, 1), value=-1)  # a stage may take all there are
+        largest_left = largest.gather(1, takes)
+        taken = keys > largest_left
+        drawn |= taken
         if rule.importance:
-            tau = beaten >> RANK_BITS  # -1 where the stage takes all
+            smallest_taken = largest.gather(1, (takes - 1).clamp(min=0))
+            tau = torch.where(taken, largest_left, smallest_taken) >> RANK_BITS  # -1 for none
             if weights is None:
                 chance = (((ages + 1) << AGE_TIE_BITS) - tau).clamp(0, 1 << AGE_TIE_BITS) * 2.0**-AGE_TIE_BITS
             else:
                 threshold = tau.to(torch.int32).view(torch.float32)
                 chance = torch.where(tau < 0, 1.0, -torch.expm1(-weights / threshold))
             missed = missed * (1.0 - chance * (takes > 0))
-    return drawn, (1.0 - missed if rule.importance else None)
+    if not rule.importance:
+        return drawn, None
+    complete = (drawn | ~units.exist).all(dim=1, keepdim=True)
+    return drawn, torch.where(complete, 1.0, 1.0 - missed)
 
 
 def _share(values: Tensor, sums: Tensor) -> Tensor:
     """``values / sums``, 0 where the sum is 0."""
     return torch.where(sums > 0, values / sums, 0.0)
-
-
-def _key_after(keys: Tensor, takes: Tensor, most: int) -> Tensor:
-    """[R, 1]: the largest key of each row once its `takes` ([R, 1] or [1, 1], at most `most`) largest are gone."""
-    columns = keys.shape[1]
-    top = keys.topk(min(most + 1, columns), dim=1).values
-    if most >= columns:
-        top = torch.nn.functional.pad(top, (0, most + 1 - columns), value=-1)
-    return top.gather(1, takes.expand(keys.shape[0], 1))
 
 
 def draw_pixels(
