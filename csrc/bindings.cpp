@@ -1,0 +1,270 @@
+// The raster kernels as torch operators (turbogs::raster_*), on torch's stable ABI: one build loads on torch >= 2.10, with
+// or without CUDA. Checks every tensor, then hands raw pointers and torch's current stream to the launchers in the .cu
+// files. Buffers are allocated by the callers (turbogs_plugin/rendering/cuda.py).
+#include <torch/csrc/stable/library.h>
+#include <torch/csrc/stable/tensor.h>
+#include <torch/headeronly/core/ScalarType.h>
+
+#include "binding_checks.h"
+#include "params.h"
+
+namespace turbogs {
+namespace {
+
+// Slots, tiles and buffers that stages 4 and 5 have in common.
+struct SampleBuffers {
+    Tensor cameras, tile_offsets, pixel_ids, tile_starts, pair_ids, instances;
+    std::optional<Tensor> tile_ids;
+    Tensor colors, alphas, transmittances, last_pairs, masks, bucket_counts;
+    std::optional<Tensor> depths;
+    int64_t chunks, samples_per_lane;
+    double alpha_min, alpha_max, transmittance_min;
+
+    ForwardParams params(const Checker& check) const {
+        ForwardParams out = {};
+        const int64_t num_views = cameras.size(0), num_active = tile_offsets.numel() - 1, num_slots = pixel_ids.numel();
+        STD_TORCH_CHECK(chunks > 0, "chunks must be positive, got ", chunks);
+        STD_TORCH_CHECK(samples_per_lane >= 1 && samples_per_lane <= kMaxSamplesPerLane, "samples_per_lane must be 1 .. ",
+                        kMaxSamplesPerLane, ", got ", samples_per_lane);
+        STD_TORCH_CHECK(pair_ids.numel() / kBucket + num_active + 1 <= masks.numel() / chunks, "masks is too small");
+        out.num_views = static_cast<int>(num_views);
+        out.num_active = static_cast<int>(num_active);
+        out.chunks = static_cast<int>(chunks);
+        out.samples_per_lane = static_cast<int>(samples_per_lane);
+        out.with_depth = depths.has_value();
+        out.alpha_min = static_cast<float>(alpha_min);
+        out.alpha_max = static_cast<float>(alpha_max);
+        out.transmittance_min = static_cast<float>(transmittance_min);
+        out.cameras = check.bytes_of<RasterCamera>(cameras, "cameras", ScalarType::Float, num_views);
+        out.tile_ids = check.optional<int32_t>(tile_ids, "tile_ids", ScalarType::Int, {num_active});
+        out.tile_offsets = check.pointer<int32_t>(tile_offsets, "tile_offsets", ScalarType::Int, {num_active + 1});
+        out.pixel_ids = check.pointer<int32_t>(pixel_ids, "pixel_ids", ScalarType::Int, {num_slots});
+        out.tile_starts = check.pointer<uint32_t>(tile_starts, "tile_starts", ScalarType::Int, {num_active + 1});
+        out.pair_ids = check.pointer<uint32_t>(pair_ids, "pair_ids", ScalarType::Int, {pair_ids.numel()});
+        out.instances = check.bytes_of<Instance>(instances, "instances", ScalarType::Float, instances.size(0));
+        out.colors = check.pointer<float>(colors, "colors", ScalarType::Float, {num_slots, 3});
+        out.alphas = check.pointer<float>(alphas, "alphas", ScalarType::Float, {num_slots});
+        out.transmittances = check.pointer<float>(transmittances, "transmittances", ScalarType::Float, {num_slots});
+        out.depths = check.optional<float>(depths, "depths", ScalarType::Float, {num_slots});
+        out.last_pairs = check.pointer<int32_t>(last_pairs, "last_pairs", ScalarType::Int, {num_slots});
+        out.masks = check.pointer<uint32_t>(masks, "masks", ScalarType::Int, {masks.numel()});
+        out.bucket_counts = check.pointer<int32_t>(bucket_counts, "bucket_counts", ScalarType::Int, {num_active * chunks});
+        return out;
+    }
+};
+
+void raster_project(Tensor means, Tensor quats, Tensor scales, Tensor opacities, Tensor sh0, Tensor shN, Tensor viewmats,
+                    Tensor Ks, Tensor sizes, std::optional<Tensor> tile_ids, Tensor cameras,
+                    std::optional<Tensor> active_prefix, Tensor instances, Tensor radii, Tensor depth_keys,
+                    Tensor instance_ids, Tensor tile_counts, int64_t sh_degree, double eps2d, double near_plane,
+                    double far_plane, double alpha_min) {
+    Checker check(means);
+    const int64_t count = means.size(0), views = viewmats.size(0), bands = shN.size(1), total = views * count;
+    STD_TORCH_CHECK(views >= 1 && views <= kRasterMaxViews, "viewmats: 1 .. ", kRasterMaxViews, " views a launch, got ", views);
+    STD_TORCH_CHECK(total <= INT32_MAX, "views * Gaussians must stay below 2^31, got ", views, " * ", count);
+    STD_TORCH_CHECK(sh_degree >= 0 && sh_degree <= kRasterMaxDegree, "sh_degree must be 0 .. ", kRasterMaxDegree, ", got ",
+                    sh_degree);
+    STD_TORCH_CHECK(bands >= (sh_degree + 1) * (sh_degree + 1) - 1, "shN holds ", bands, " bands, too few for sh_degree ",
+                    sh_degree);
+    STD_TORCH_CHECK(sizes.is_cpu() && sizes.scalar_type() == ScalarType::Long && sizes.is_contiguous() && sizes.dim() == 2 &&
+                        sizes.size(0) == views && sizes.size(1) == 2,
+                    "sizes must be a contiguous int64 [", views, ", 2] tensor on the CPU");
+    STD_TORCH_CHECK(tile_ids.has_value() == active_prefix.has_value(), "tile_ids and active_prefix go together");
+
+    ProjectionParams params = {};
+    params.num_views = static_cast<int>(views);
+    params.num_gaussians = static_cast<int>(count);
+    params.sh_degree = static_cast<int>(sh_degree);
+    params.bands = static_cast<int>(bands);
+    params.eps2d = static_cast<float>(eps2d);
+    params.near_plane = static_cast<float>(near_plane);
+    params.far_plane = static_cast<float>(far_plane);
+    params.alpha_min = static_cast<float>(alpha_min);
+    const int64_t* size = static_cast<const int64_t*>(sizes.const_data_ptr());
+    int64_t tiles = 0;
+    for (int64_t view = 0; view < views; ++view) {
+        const int64_t width = size[2 * view], height = size[2 * view + 1];
+        STD_TORCH_CHECK(width > 0 && height > 0 && width * height <= INT32_MAX, "sizes: view ", view, " is ", width, " x ", height);
+        params.widths[view] = static_cast<int>(width);
+        params.heights[view] = static_cast<int>(height);
+        tiles += ((width + kTileSize - 1) / kTileSize) * ((height + kTileSize - 1) / kTileSize);
+    }
+    STD_TORCH_CHECK(tiles < INT32_MAX, "sizes: too many tiles");
+    params.num_tiles = static_cast<int>(tiles);
+    params.num_active = static_cast<int>(tile_ids.has_value() ? tile_ids->size(0) : tiles);
+
+    params.means = check.pointer<float>(means, "means", ScalarType::Float, {count, 3});
+    params.quats = check.pointer<float>(quats, "quats", ScalarType::Float, {count, 4});
+    params.scales = check.pointer<float>(scales, "scales", ScalarType::Float, {count, 3});
+    params.opacities = check.pointer<float>(opacities, "opacities", ScalarType::Float, {count});
+    params.sh0 = check.pointer<float>(sh0, "sh0", ScalarType::Float, {count, 1, 3});
+    params.shN = check.pointer<float>(shN, "shN", ScalarType::Float, {count, bands, 3});
+    check.aligned(params.quats, "quats");
+    check.aligned(params.shN, "shN");
+    params.viewmats = check.pointer<float>(viewmats, "viewmats", ScalarType::Float, {views, 4, 4});
+    params.intrinsics = check.pointer<float>(Ks, "Ks", ScalarType::Float, {views, 3, 3});
+    params.tile_ids = check.optional<int32_t>(tile_ids, "tile_ids", ScalarType::Int, {params.num_active});
+    params.cameras = check.bytes_of<RasterCamera>(cameras, "cameras", ScalarType::Float, views);
+    params.active_prefix = check.optional<int32_t>(active_prefix, "active_prefix", ScalarType::Int, {tiles + 1});
+    params.instances = check.bytes_of<Instance>(instances, "instances", ScalarType::Float, total);
+    params.radii = reinterpret_cast<int2*>(check.pointer<int32_t>(radii, "radii", ScalarType::Int, {views, count, 2}));
+    params.depth_keys = check.pointer<uint32_t>(depth_keys, "depth_keys", ScalarType::Int, {2, total});
+    params.instance_ids = check.pointer<uint32_t>(instance_ids, "instance_ids", ScalarType::Int, {2, total});
+    params.tile_counts = check.pointer<uint32_t>(tile_counts, "tile_counts", ScalarType::Int, {total});
+    check.launched(launch_projection(params, check.stream()), "projection");
+}
+
+// What the library was built for, such as "sm_90".
+std::string architectures() { return TURBOGS_ARCHITECTURES; }
+
+int64_t raster_sort_instances_scratch(int64_t num_instances) {
+    size_t bytes = 0;
+    check_cuda(sort_instances_scratch(static_cast<int>(num_instances), &bytes), "size of the instance sort");
+    return static_cast<int64_t>(bytes);
+}
+
+int64_t raster_sort_pairs_scratch(int64_t capacity, int64_t num_active, bool narrow_keys) {
+    size_t bytes = 0;
+    check_cuda(sort_pairs_scratch(static_cast<uint32_t>(capacity), static_cast<int>(num_active), narrow_keys, &bytes),
+               "size of the pair sort");
+    return static_cast<int64_t>(bytes);
+}
+
+int64_t raster_sort_instances(Tensor depth_keys, Tensor instance_ids, Tensor tile_counts, Tensor pair_ends, Tensor status,
+                              Tensor scratch) {
+    Checker check(depth_keys);
+    const int64_t total = tile_counts.numel();
+    SortInstancesParams params = {};
+    params.num_instances = static_cast<int>(total);
+    params.depth_keys[0] = check.pointer<uint32_t>(depth_keys, "depth_keys", ScalarType::Int, {2, total});
+    params.depth_keys[1] = params.depth_keys[0] + total;
+    params.instance_ids[0] = check.pointer<uint32_t>(instance_ids, "instance_ids", ScalarType::Int, {2, total});
+    params.instance_ids[1] = params.instance_ids[0] + total;
+    params.tile_counts = check.pointer<uint32_t>(tile_counts, "tile_counts", ScalarType::Int, {total});
+    params.pair_ends = check.pointer<uint32_t>(pair_ends, "pair_ends", ScalarType::Int, {total});
+    params.status = check.pointer<uint32_t>(status, "status", ScalarType::Int, {2});
+    params.scratch = check.pointer<uint8_t>(scratch, "scratch", ScalarType::Byte, {scratch.numel()});
+    params.scratch_bytes = static_cast<size_t>(scratch.numel());
+    check.launched(launch_sort_instances(params, check.stream()), "instance sort");
+    return params.current;
+}
+
+int64_t raster_sort_pairs(Tensor instances, Tensor depth_keys, Tensor instance_ids, Tensor pair_ends, Tensor cameras,
+                          std::optional<Tensor> active_prefix, Tensor tile_keys, Tensor pair_ids, Tensor status,
+                          Tensor tile_starts, Tensor scratch, int64_t num_gaussians) {
+    Checker check(instances);
+    const int64_t total = pair_ends.numel(), capacity = pair_ids.size(1), num_active = tile_starts.numel() - 1;
+    SortPairsParams params = {};
+    params.narrow_keys = tile_keys.scalar_type() == ScalarType::Short;
+    STD_TORCH_CHECK(!params.narrow_keys || num_active <= UINT16_MAX, "16-bit tile keys hold 65535 tiles, got ", num_active);
+    STD_TORCH_CHECK(capacity < kMaxPairs, "capacity must stay below 2^31 - 1, got ", capacity);
+    params.num_instances = static_cast<int>(total);
+    params.num_gaussians = static_cast<int>(num_gaussians);
+    params.num_active = static_cast<int>(num_active);
+    params.capacity = static_cast<uint32_t>(capacity);
+    params.instances = check.bytes_of<Instance>(instances, "instances", ScalarType::Float, total);
+    params.depth_keys = check.pointer<uint32_t>(depth_keys, "depth_keys", ScalarType::Int, {total});
+    params.instance_ids = check.pointer<uint32_t>(instance_ids, "instance_ids", ScalarType::Int, {total});
+    params.pair_ends = check.pointer<uint32_t>(pair_ends, "pair_ends", ScalarType::Int, {total});
+    params.cameras = check.bytes_of<RasterCamera>(cameras, "cameras", ScalarType::Float, cameras.size(0));
+    params.active_prefix =
+        active_prefix.has_value()
+            ? check.pointer<int32_t>(*active_prefix, "active_prefix", ScalarType::Int, {active_prefix->numel()})
+            : nullptr;
+    char* keys = static_cast<char*>(
+        check.pointer<void>(tile_keys, "tile_keys", params.narrow_keys ? ScalarType::Short : ScalarType::Int, {2, capacity}));
+    params.tile_keys[0] = keys;
+    params.tile_keys[1] = keys + capacity * (params.narrow_keys ? sizeof(uint16_t) : sizeof(uint32_t));
+    params.pair_ids[0] = check.pointer<uint32_t>(pair_ids, "pair_ids", ScalarType::Int, {2, capacity});
+    params.pair_ids[1] = params.pair_ids[0] + capacity;
+    params.status = check.pointer<uint32_t>(status, "status", ScalarType::Int, {2});
+    params.tile_starts = check.pointer<uint32_t>(tile_starts, "tile_starts", ScalarType::Int, {num_active + 1});
+    params.scratch = check.pointer<uint8_t>(scratch, "scratch", ScalarType::Byte, {scratch.numel()});
+    params.scratch_bytes = static_cast<size_t>(scratch.numel());
+    check.launched(launch_sort_pairs(params, check.stream()), "pair sort");
+    return params.current;
+}
+
+void raster_forward(Tensor cameras, std::optional<Tensor> tile_ids, Tensor tile_offsets, Tensor pixel_ids,
+                    Tensor tile_starts, Tensor pair_ids, Tensor instances, Tensor colors, Tensor alphas,
+                    Tensor transmittances, std::optional<Tensor> depths, Tensor last_pairs, Tensor masks,
+                    Tensor bucket_counts, int64_t chunks, int64_t samples_per_lane, double alpha_min, double alpha_max,
+                    double transmittance_min) {
+    const SampleBuffers buffers{cameras, tile_offsets, pixel_ids, tile_starts, pair_ids, instances, tile_ids,
+                                colors, alphas, transmittances, last_pairs, masks, bucket_counts, depths,
+                                chunks, samples_per_lane, alpha_min, alpha_max, transmittance_min};
+    Checker check(cameras);
+    check.launched(launch_rasterize_forward(buffers.params(check), check.stream()), "forward");
+}
+
+void raster_backward(Tensor cameras, std::optional<Tensor> tile_ids, Tensor tile_offsets, Tensor pixel_ids,
+                     Tensor tile_starts, Tensor pair_ids, Tensor instances, Tensor colors, Tensor alphas,
+                     Tensor transmittances, std::optional<Tensor> depths, Tensor last_pairs, Tensor masks,
+                     Tensor bucket_counts, int64_t chunks, int64_t samples_per_lane, double alpha_min, double alpha_max,
+                     double transmittance_min, Tensor color_gradients, std::optional<Tensor> alpha_gradients,
+                     std::optional<Tensor> depth_gradients, std::optional<Tensor> pixel_errors, Tensor screen_gradients,
+                     bool with_distances) {
+    const SampleBuffers buffers{cameras, tile_offsets, pixel_ids, tile_starts, pair_ids, instances, tile_ids,
+                                colors, alphas, transmittances, last_pairs, masks, bucket_counts, depths,
+                                chunks, samples_per_lane, alpha_min, alpha_max, transmittance_min};
+    Checker check(cameras);
+    const int64_t num_slots = pixel_ids.numel(), total = instances.size(0);
+    STD_TORCH_CHECK(!depth_gradients.has_value() || depths.has_value(), "depth gradients without depths");
+    BackwardParams params = {};
+    params.forward = buffers.params(check);
+    params.num_instances = static_cast<int>(total);
+    params.with_distances = with_distances;
+    params.color_gradients = check.pointer<float>(color_gradients, "color_gradients", ScalarType::Float, {num_slots, 3});
+    params.alpha_gradients = check.optional<float>(alpha_gradients, "alpha_gradients", ScalarType::Float, {num_slots});
+    params.depth_gradients = check.optional<float>(depth_gradients, "depth_gradients", ScalarType::Float, {num_slots});
+    params.pixel_errors = check.optional<float>(pixel_errors, "pixel_errors", ScalarType::Float, {num_slots});
+    params.screen_gradients =
+        check.pointer<float>(screen_gradients, "screen_gradients", ScalarType::Float, {total, kGradientFloats});
+    check.launched(launch_rasterize_backward(params, check.stream()), "backward");
+}
+
+}  // namespace
+}  // namespace turbogs
+
+STABLE_TORCH_LIBRARY_FRAGMENT(turbogs, m) {
+    m.def(
+        "raster_project(Tensor means, Tensor quats, Tensor scales, Tensor opacities, Tensor sh0, Tensor shN, Tensor viewmats, "
+        "Tensor Ks, Tensor sizes, Tensor? tile_ids, Tensor(a!) cameras, Tensor(b!)? active_prefix, Tensor(c!) instances, "
+        "Tensor(d!) radii, Tensor(e!) depth_keys, Tensor(f!) instance_ids, Tensor(g!) tile_counts, int sh_degree, "
+        "float eps2d, float near_plane, float far_plane, float alpha_min) -> ()");
+    m.def("architectures() -> str");
+    m.def("raster_sort_instances_scratch(int num_instances) -> int");
+    m.def("raster_sort_pairs_scratch(int capacity, int num_active, bool narrow_keys) -> int");
+    m.def(
+        "raster_sort_instances(Tensor(a!) depth_keys, Tensor(b!) instance_ids, Tensor tile_counts, Tensor(c!) pair_ends, "
+        "Tensor(d!) status, Tensor(e!) scratch) -> int");
+    m.def(
+        "raster_sort_pairs(Tensor instances, Tensor depth_keys, Tensor instance_ids, Tensor pair_ends, Tensor cameras, "
+        "Tensor? active_prefix, Tensor(a!) tile_keys, Tensor(b!) pair_ids, Tensor(c!) status, Tensor(d!) tile_starts, "
+        "Tensor(e!) scratch, int num_gaussians) -> int");
+    m.def(
+        "raster_forward(Tensor cameras, Tensor? tile_ids, Tensor tile_offsets, Tensor pixel_ids, Tensor tile_starts, "
+        "Tensor pair_ids, Tensor instances, Tensor(a!) colors, Tensor(b!) alphas, Tensor(c!) transmittances, "
+        "Tensor(d!)? depths, Tensor(e!) last_pairs, Tensor(f!) masks, Tensor(g!) bucket_counts, int chunks, "
+        "int samples_per_lane, float alpha_min, float alpha_max, float transmittance_min) -> ()");
+    m.def(
+        "raster_backward(Tensor cameras, Tensor? tile_ids, Tensor tile_offsets, Tensor pixel_ids, Tensor tile_starts, "
+        "Tensor pair_ids, Tensor instances, Tensor colors, Tensor alphas, Tensor transmittances, Tensor? depths, "
+        "Tensor last_pairs, Tensor masks, Tensor bucket_counts, int chunks, int samples_per_lane, float alpha_min, "
+        "float alpha_max, float transmittance_min, Tensor color_gradients, Tensor? alpha_gradients, "
+        "Tensor? depth_gradients, Tensor? pixel_errors, Tensor(a!) screen_gradients, bool with_distances) -> ()");
+}
+
+STABLE_TORCH_LIBRARY_IMPL(turbogs, CUDA, m) {
+    m.impl("raster_project", TORCH_BOX(&turbogs::raster_project));
+    m.impl("raster_sort_instances", TORCH_BOX(&turbogs::raster_sort_instances));
+    m.impl("raster_sort_pairs", TORCH_BOX(&turbogs::raster_sort_pairs));
+    m.impl("raster_forward", TORCH_BOX(&turbogs::raster_forward));
+    m.impl("raster_backward", TORCH_BOX(&turbogs::raster_backward));
+}
+
+STABLE_TORCH_LIBRARY_IMPL(turbogs, CompositeExplicitAutograd, m) {
+    m.impl("architectures", TORCH_BOX(&turbogs::architectures));
+    m.impl("raster_sort_instances_scratch", TORCH_BOX(&turbogs::raster_sort_instances_scratch));
+    m.impl("raster_sort_pairs_scratch", TORCH_BOX(&turbogs::raster_sort_pairs_scratch));
+}

@@ -1,0 +1,151 @@
+// What several raster kernels share: the arithmetic of a splat at a pixel, and which tiles a splat reaches.
+//
+// The forward and the backward pass must agree to the bit on which splats a pixel sees, and the projection and the
+// emission on how many tiles a splat reaches. So both pairs call the same functions here, written with intrinsics that
+// the compiler neither contracts nor reorders.
+#pragma once
+
+#include "params.h"
+
+namespace turbogs {
+
+constexpr uint32_t kFullWarp = 0xFFFFFFFFu;
+constexpr int kWarpSize = 32;
+constexpr float kAlphaTiny = 1e-10f;  // smallest alpha by which a depth is divided, as in gsplat
+
+// ---- The one place where precision is chosen -------------------------------------------------------------------
+// Per (splat, pixel) the blending kernels need exp, a reciprocal and, for the density sums, a square root. By default
+// these are the approximations of the special function unit (relative error about 2^-22, denormals flushed: alpha below
+// 1/255 is dropped anyway). Build with TURBOGS_EXACT_MATH=1 for the correctly rounded ones.
+#ifndef TURBOGS_EXACT_MATH
+#define TURBOGS_EXACT_MATH 0
+#endif
+
+__device__ __forceinline__ float blend_exp(float x) {
+#if TURBOGS_EXACT_MATH
+    return expf(x);
+#else
+    float result;
+    asm("ex2.approx.ftz.f32 %0, %1;" : "=f"(result) : "f"(__fmul_rn(x, 1.4426950408889634f)));
+    return result;
+#endif
+}
+
+__device__ __forceinline__ float blend_reciprocal(float x) {
+#if TURBOGS_EXACT_MATH
+    return __frcp_rn(x);
+#else
+    float result;
+    asm("rcp.approx.ftz.f32 %0, %1;" : "=f"(result) : "f"(x));
+    return result;
+#endif
+}
+
+__device__ __forceinline__ float blend_sqrt(float x) {
+#if TURBOGS_EXACT_MATH
+    return __fsqrt_rn(x);
+#else
+    float result;
+    asm("sqrt.approx.ftz.f32 %0, %1;" : "=f"(result) : "f"(x));
+    return result;
+#endif
+}
+
+// ---- A splat at a pixel ----------------------------------------------------------------------------------------
+
+// sigma = 0.5 * (a dx^2 + c dy^2) + b dx dy, from half a and half c.
+__device__ __forceinline__ float splat_sigma(float half_a, float b, float half_c, float dx, float dy) {
+    const float inner = __fmaf_rn(half_a, dx, __fmul_rn(b, dy));
+    return __fmaf_rn(inner, dx, __fmul_rn(__fmul_rn(half_c, dy), dy));
+}
+
+// opacity * exp(-sigma), before the clamp at alpha_max.
+__device__ __forceinline__ float splat_alpha(float opacity, float sigma) {
+    return __fmul_rn(opacity, blend_exp(-sigma));
+}
+
+// ---- The tiles that a splat reaches ----------------------------------------------------------------------------
+
+// The ellipse sigma <= log_reach, a little enlarged: by 0.001 for the rounding of exp, sigma and pixel coordinates, and by the cancellation of
+// a thin splat's conic, so that no pixel is lost. A pair too many costs time only.
+struct Reach {
+    float x, y;
+    float half_x, half_y;    // half width and height of the ellipse's box
+    float extreme_y;         // y - mean.y of the rightmost point; its negative for the leftmost
+    float slope;             // of the axis of horizontal chords, dx / dy
+    float half_chord;        // half length of the chord through the mean
+    float inverse_half_y;
+};
+
+__device__ __forceinline__ Reach make_reach(float x, float y, float a, float b, float c, float log_reach) {
+    // a c - b^2 by Kahan's difference of products: one rounding.
+    const float bb = __fmul_rn(b, b);
+    const float bb_error = __fmaf_rn(-b, b, bb);
+    const float ac = __fmul_rn(a, c);
+    const float det = fmaxf(__fadd_rn(__fmaf_rn(a, c, -bb), bb_error), __fmul_rn(ac, 1e-7f));
+    const float thinness = __fdiv_rn(ac, det);  // 1 / (1 - correlation^2)
+    const float slack = __fmaf_rn(4e-7f, thinness, 1.001f);
+    const float bound = __fmaf_rn(__fmul_rn(2.0f, log_reach), slack, 2e-3f);  // dx' conic dx <= bound
+
+    Reach reach;
+    reach.x = x;
+    reach.y = y;
+    reach.half_x = __fsqrt_rn(__fmul_rn(bound, __fdiv_rn(c, det)));
+    reach.half_y = __fsqrt_rn(__fmul_rn(bound, __fdiv_rn(a, det)));
+    reach.extreme_y = __fmul_rn(-__fdiv_rn(b, c), reach.half_x);
+    reach.slope = -__fdiv_rn(b, a);
+    reach.half_chord = __fsqrt_rn(__fdiv_rn(bound, a));
+    reach.inverse_half_y = __frcp_rn(reach.half_y);
+    return reach;
+}
+
+// First and last + 1 of the tiles whose pixel centres an interval of pixel coordinates reaches, within [0, count).
+__device__ __forceinline__ int2 tile_span(float low, float high, int count) {
+    const float inverse = 1.0f / kTileSize;  // a power of two: exact
+    const float first = ceilf(__fmul_rn(__fadd_rn(low, 0.5f - kTileSize), inverse));
+    const float last = floorf(__fmul_rn(__fadd_rn(high, -0.5f), inverse));
+    const int begin = static_cast<int>(fminf(fmaxf(first, 0.0f), static_cast<float>(count)));
+    const int end = static_cast<int>(fminf(fmaxf(last, -1.0f), static_cast<float>(count - 1))) + 1;
+    return make_int2(begin, max(begin, end));
+}
+
+// Tile rows that the splat reaches.
+__device__ __forceinline__ int2 tile_rows(const Reach& reach, int tiles_y) {
+    return tile_span(__fsub_rn(reach.y, reach.half_y), __fadd_rn(reach.y, reach.half_y), tiles_y);
+}
+
+// Tile columns that the splat reaches within a tile row. The ellipse cut by the row's band of pixel centres is convex, so
+// the columns that it reaches are those between its leftmost and its rightmost point.
+__device__ __forceinline__ int2 tile_columns(const Reach& reach, int row, int tiles_x) {
+    const float top = __fsub_rn(static_cast<float>(row * kTileSize) + 0.5f, reach.y);
+    const float bottom = __fadd_rn(top, static_cast<float>(kTileSize - 1));
+    const float dy_right = fminf(fmaxf(reach.extreme_y, top), bottom);
+    const float dy_left = fminf(fmaxf(-reach.extreme_y, top), bottom);
+    const float v_right = __fmul_rn(dy_right, reach.inverse_half_y), v_left = __fmul_rn(dy_left, reach.inverse_half_y);
+    const float chord_right = __fsqrt_rn(fmaxf(0.0f, __fmaf_rn(-v_right, v_right, 1.0f)));
+    const float chord_left = __fsqrt_rn(fmaxf(0.0f, __fmaf_rn(-v_left, v_left, 1.0f)));
+    const float right = __fmaf_rn(reach.slope, dy_right, __fmul_rn(reach.half_chord, chord_right));
+    const float left = __fmaf_rn(reach.slope, dy_left, -__fmul_rn(reach.half_chord, chord_left));
+    return tile_span(__fadd_rn(reach.x, left), __fadd_rn(reach.x, right), tiles_x);
+}
+
+// Positions of the active tiles among the columns of a row: they are consecutive, as active tiles are numbered by id.
+__device__ __forceinline__ int2 active_tiles(const RasterCamera& camera, const int32_t* __restrict__ active_prefix, int row,
+                                             int2 columns) {
+    const int base = camera.tile_base + row * camera.tiles_x;
+    if (active_prefix == nullptr) return make_int2(base + columns.x, base + columns.y);
+    return make_int2(active_prefix[base + columns.x], active_prefix[base + columns.y]);
+}
+
+// The view that a tile belongs to.
+__device__ __forceinline__ int view_of_tile(const RasterCamera* __restrict__ cameras, int num_views, int tile_id) {
+    int low = 0, high = num_views;  // the last view whose first tile is not beyond `tile_id`
+    while (high - low > 1) {
+        const int middle = (low + high) / 2;
+        if (cameras[middle].tile_base <= tile_id) low = middle;
+        else high = middle;
+    }
+    return low;
+}
+
+}  // namespace turbogs

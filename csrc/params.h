@@ -1,0 +1,163 @@
+// Parameters of the raster kernels: plain structs of raw pointers, one per launcher, passed by value. No torch here.
+//
+// Index spaces: K views of the batch, N Gaussians, instance = view * N + Gaussian (K * N of them, not compacted);
+// T active tiles (those that hold samples), "tile position" = index into them, "tile id" = number in the batch's
+// TileGrid; P sample slots; pair = (tile position, instance), M of them at most ("capacity").
+#pragma once
+
+#include <cuda_runtime.h>
+
+#include <cstddef>
+#include <cstdint>
+
+namespace turbogs {
+
+constexpr int kTileSize = 16;               // side of a tile, pixels (TILE_SIZE in types.py)
+constexpr int kRasterMaxViews = 128;        // views of one launch: their sizes travel as a kernel argument
+constexpr int kRasterMaxDegree = 3;         // of the spherical harmonics
+constexpr int kInstanceFloats = 12;         // one projected splat, three float4
+constexpr int kGradientFloats = 16;         // one screen-gradient record, four float4
+constexpr int kBucket = 32;                 // splats staged at once; one contribution mask holds one bucket
+constexpr int kMaxSamplesPerLane = 4;       // of the forward kernel's register tile
+constexpr uint32_t kInvisible = 0xFFFFFFFFu;  // depth key of an instance without pairs
+constexpr uint32_t kMaxPairs = 0x7FFFFFFFu;   // the pair count saturates here instead of wrapping
+
+// One view as the kernels read it, 96 bytes. Written by the projection launcher.
+struct RasterCamera {
+    float rotation[9];     // row-major, world to camera
+    float translation[3];
+    float fx, fy, cx, cy;  // pixels
+    float center[3];       // of the camera in the world
+    int tiles_y;
+    int width, height;     // pixels
+    int tiles_x;
+    int tile_base;         // id of the view's first tile
+};
+
+// A splat on the screen, 48 bytes: what the tile stages gather.
+struct alignas(16) Instance {
+    float x, y;          // pixels
+    float conic_a, conic_b;
+    float conic_c;
+    float opacity;       // after the sigmoid
+    float depth;
+    float log_reach;     // log(opacity / alpha_min): sigma beyond which the splat is invisible
+    float red, green, blue;  // after the clamp at 0
+    float unused;
+};
+
+// Stage 1. K views of every Gaussian; parameters are read once.
+struct ProjectionParams {
+    int num_views;      // K
+    int num_gaussians;  // N
+    int num_tiles;      // tiles of all views
+    int num_active;     // T
+    int sh_degree;      // degree to evaluate
+    int bands;          // B, harmonics above band 0 that `shN` stores
+    float eps2d, near_plane, far_plane, alpha_min;
+    int widths[kRasterMaxViews];
+    int heights[kRasterMaxViews];
+
+    const float* means;      // [N, 3]
+    const float* quats;      // [N, 4], not normalised
+    const float* scales;     // [N, 3], logarithms
+    const float* opacities;  // [N], logits
+    const float* sh0;        // [N, 3]
+    const float* shN;        // [N, B, 3]
+    const float* viewmats;   // [K, 4, 4]
+    const float* intrinsics; // [K, 3, 3]
+    const int32_t* tile_ids; // [T] ascending, or null where every tile is active
+
+    RasterCamera* cameras;    // [K] out
+    int32_t* active_prefix;   // [num_tiles + 1] out: active tiles with a smaller id; null where every tile is active
+    Instance* instances;      // [K, N] out, where the radius is not 0
+    int2* radii;              // [K, N] out, 0 where off screen
+    uint32_t* depth_keys;     // [K, N] out, bits of the depth, kInvisible where the instance has no pairs
+    uint32_t* instance_ids;   // [K, N] out, 0 .. K * N - 1
+    uint32_t* tile_counts;    // [K, N] out, active tiles that the splat reaches; written where the key is not kInvisible
+};
+
+// Stage 2. Instances in order of depth, and the running sum of their pairs.
+struct SortInstancesParams {
+    int num_instances;            // K * N
+    uint32_t* depth_keys[2];      // [K * N] in (0) and scratch
+    uint32_t* instance_ids[2];    // [K * N] in (0) and scratch
+    const uint32_t* tile_counts;  // [K * N]
+    uint32_t* pair_ends;          // [K * N] out: pairs of the instances up to and including this one, in depth order
+    uint32_t* status;             // [2] out: [0] pairs of this pass; [1] sticky overflow flag, left alone
+    void* scratch;
+    size_t scratch_bytes;
+    int current;                  // out, host: which of the two buffers holds the sorted arrays
+};
+
+// Stage 3. Pairs in depth order, then stably by tile; ranges of the tiles.
+struct SortPairsParams {
+    int num_instances;
+    int num_gaussians;
+    int num_active;               // T
+    uint32_t capacity;            // M
+    const Instance* instances;
+    const uint32_t* depth_keys;   // [K * N] sorted
+    const uint32_t* instance_ids; // [K * N] sorted
+    const uint32_t* pair_ends;    // [K * N]
+    const RasterCamera* cameras;
+    const int32_t* active_prefix; // or null
+    void* tile_keys[2];           // [M] uint16 where `narrow_keys`, else uint32
+    uint32_t* pair_ids[2];        // [M] instance of each pair
+    bool narrow_keys;
+    uint32_t* status;             // [2]: [1] is set where the pairs exceed the capacity; no pair is made then, nor while it is set
+    uint32_t* tile_starts;        // [T + 1] out: first pair of each active tile
+    void* scratch;
+    size_t scratch_bytes;
+    int current;                  // out, host: which buffer holds the sorted pairs
+};
+
+// Stage 4. One warp for each work item = (tile position, chunk): slots chunk * 32 * samples_per_lane ... of the tile.
+// Further slots of a tile follow with a stride of `chunks` chunks, so any number of slots is rendered.
+struct ForwardParams {
+    int num_views;
+    int num_active;         // T
+    int chunks;             // C, work items of a tile
+    int samples_per_lane;   // 1 .. kMaxSamplesPerLane
+    bool with_depth;
+    float alpha_min, alpha_max, transmittance_min;
+    const RasterCamera* cameras;
+    const int32_t* tile_ids;      // [T], or null where every tile is active
+    const int32_t* tile_offsets;  // [T + 1] first slot of each tile
+    const int32_t* pixel_ids;     // [P], -1 empty
+    const uint32_t* tile_starts;  // [T + 1]
+    const uint32_t* pair_ids;     // [M]
+    const Instance* instances;    // [K, N]
+
+    float* colors;          // [P, 3] out
+    float* alphas;          // [P] out
+    float* transmittances;  // [P] out, 1 - alpha without the cancellation
+    float* depths;          // [P] out, or null
+    int32_t* last_pairs;    // [P] out, the last pair that contributed, counted from the tile's first; -1 none
+    uint32_t* masks;        // [(M / 32 + T + 1) * C] out: bit of each splat of a bucket that contributed to the item.
+                            // Bucket j of item (t, c) is word ((tile_starts[t] / 32 + t) + j) * C + c.
+    int32_t* bucket_counts; // [T, C] out, buckets that the item walked
+};
+
+// Stage 5. Same work items; gradients on the screen.
+struct BackwardParams {
+    ForwardParams forward;            // as given to stage 4; its outputs are inputs here
+    int num_instances;
+    bool with_distances;              // fill sum D * w
+    const float* color_gradients;     // [P, 3]
+    const float* alpha_gradients;     // [P] or null
+    const float* depth_gradients;     // [P] or null
+    const float* pixel_errors;        // [P] or null
+    float* screen_gradients;          // [K, N, 16] out, all of it written
+};
+
+// Every launcher returns the first CUDA error, and only enqueues work on `stream`.
+cudaError_t launch_projection(const ProjectionParams& params, cudaStream_t stream);
+cudaError_t sort_instances_scratch(int num_instances, size_t* bytes);
+cudaError_t launch_sort_instances(SortInstancesParams& params, cudaStream_t stream);
+cudaError_t sort_pairs_scratch(uint32_t capacity, int num_active, bool narrow_keys, size_t* bytes);
+cudaError_t launch_sort_pairs(SortPairsParams& params, cudaStream_t stream);
+cudaError_t launch_rasterize_forward(const ForwardParams& params, cudaStream_t stream);
+cudaError_t launch_rasterize_backward(const BackwardParams& params, cudaStream_t stream);
+
+}  // namespace turbogs

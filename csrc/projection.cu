@@ -1,0 +1,289 @@
+// Stage 1: projection, colour and tile counts of every Gaussian in the K views of a batch.
+//
+// One thread holds one Gaussian and walks the views, so parameters are read once. Rows of `shN` are not 16-byte aligned,
+// but a block's rows together are: the block copies them to shared memory with 16-byte loads. Active tiles are found by
+// their prefix counts, so counting a row of tiles costs two loads whatever its length.
+#include "common.cuh"
+
+namespace turbogs {
+namespace {
+
+constexpr int kProjectionThreads = 128;
+constexpr float kExtentMax = 3.33f;        // gsplat's cut of a splat's half width, standard deviations
+constexpr float kCovarianceMax = 1e18f;    // beyond, the determinant would overflow
+constexpr float kQuaternionMin = 1e-30f;   // largest component of a quaternion that still has a direction
+constexpr float kClampMargin = 0.15f;      // of the image's width, as in gsplat: where the Jacobian is taken
+constexpr int kRadiusMax = 1 << 24;
+
+__global__ void pack_cameras_kernel(const __grid_constant__ ProjectionParams params) {
+    const int view = threadIdx.x;
+    if (view >= params.num_views) return;
+    const float* matrix = params.viewmats + 16 * view;
+    const float* intrinsics = params.intrinsics + 9 * view;
+    RasterCamera camera;
+#pragma unroll
+    for (int i = 0; i < 3; ++i) {
+#pragma unroll
+        for (int j = 0; j < 3; ++j) camera.rotation[3 * i + j] = matrix[4 * i + j];
+        camera.translation[i] = matrix[4 * i + 3];
+    }
+#pragma unroll
+    for (int j = 0; j < 3; ++j) {
+        camera.center[j] = -(camera.rotation[j] * camera.translation[0] + camera.rotation[3 + j] * camera.translation[1] +
+                             camera.rotation[6 + j] * camera.translation[2]);
+    }
+    camera.fx = intrinsics[0];
+    camera.fy = intrinsics[4];
+    camera.cx = intrinsics[2];
+    camera.cy = intrinsics[5];
+    camera.tile_base = 0;
+    for (int i = 0; i <= view; ++i) {
+        camera.width = params.widths[i];
+        camera.height = params.heights[i];
+        camera.tiles_x = (camera.width + kTileSize - 1) / kTileSize;
+        camera.tiles_y = (camera.height + kTileSize - 1) / kTileSize;
+        if (i < view) camera.tile_base += camera.tiles_x * camera.tiles_y;
+    }
+    params.cameras[view] = camera;
+}
+
+// active_prefix[t] = number of active tiles with an id below t.
+__global__ void active_prefix_kernel(const __grid_constant__ ProjectionParams params) {
+    const int tile_id = blockIdx.x * blockDim.x + threadIdx.x;
+    if (tile_id > params.num_tiles) return;
+    int low = 0, high = params.num_active;
+    while (low < high) {
+        const int middle = (low + high) / 2;
+        if (params.tile_ids[middle] < tile_id) low = middle + 1;
+        else high = middle;
+    }
+    params.active_prefix[tile_id] = low;
+}
+
+// Colour in a unit direction, without offset and clamp: gsplat's order and signs (Sloan, JCGT 2013).
+// `coefficients`: [bands, 3].
+__device__ __forceinline__ float3 evaluate_harmonics(int degree, const float sh0[3], const float* coefficients, float x,
+                                                     float y, float z) {
+    float3 color = make_float3(0.28209479177387814f * sh0[0], 0.28209479177387814f * sh0[1], 0.28209479177387814f * sh0[2]);
+    const auto add = [&](int band, float basis) {
+        color.x += basis * coefficients[3 * band];
+        color.y += basis * coefficients[3 * band + 1];
+        color.z += basis * coefficients[3 * band + 2];
+    };
+    if (degree < 1) return color;
+    add(0, -0.48860251190292f * y);
+    add(1, 0.48860251190292f * z);
+    add(2, -0.48860251190292f * x);
+    if (degree < 2) return color;
+    const float z2 = z * z, c1 = x * x - y * y, s1 = 2.0f * x * y;
+    add(3, 0.5462742152960395f * s1);
+    add(4, -1.092548430592079f * z * y);
+    add(5, 0.9461746957575601f * z2 - 0.3153915652525201f);
+    add(6, -1.092548430592079f * z * x);
+    add(7, 0.5462742152960395f * c1);
+    if (degree < 3) return color;
+    const float c2 = x * c1 - y * s1, s2 = x * s1 + y * c1;
+    const float ring = -2.285228997322329f * z2 + 0.4570457994644658f, axis = 1.445305721320277f * z;
+    add(8, -0.5900435899266435f * s2);
+    add(9, axis * s1);
+    add(10, ring * y);
+    add(11, z * (1.865881662950577f * z2 - 1.119528997770346f));
+    add(12, ring * x);
+    add(13, axis * c1);
+    add(14, -0.5900435899266435f * c2);
+    return color;
+}
+
+// Columns of rotation times standard deviation, row-major.
+__device__ __forceinline__ void axes_of(const float4 raw, const float log_scale[3], float axes[9]) {
+    // Divided by the largest component first, so that the squares of tiny and huge quaternions stay in range; one without
+    // a direction is the identity.
+    const float size = fmaxf(fmaxf(fabsf(raw.x), fabsf(raw.y)), fmaxf(fabsf(raw.z), fabsf(raw.w)));
+    const bool directed = size > kQuaternionMin;
+    const float inverse_size = directed ? 1.0f / size : 0.0f;
+    float w = directed ? raw.x * inverse_size : 1.0f, x = raw.y * inverse_size, y = raw.z * inverse_size, z = raw.w * inverse_size;
+    const float inverse_norm = 1.0f / sqrtf(w * w + x * x + y * y + z * z);
+    w *= inverse_norm, x *= inverse_norm, y *= inverse_norm, z *= inverse_norm;
+    const float rotation[9] = {1.0f - 2.0f * (y * y + z * z), 2.0f * (x * y - w * z),        2.0f * (x * z + w * y),
+                               2.0f * (x * y + w * z),        1.0f - 2.0f * (x * x + z * z), 2.0f * (y * z - w * x),
+                               2.0f * (x * z - w * y),        2.0f * (y * z + w * x),        1.0f - 2.0f * (x * x + y * y)};
+#pragma unroll
+    for (int j = 0; j < 3; ++j) {
+        const float scale = expf(log_scale[j]);
+#pragma unroll
+        for (int i = 0; i < 3; ++i) axes[3 * i + j] = rotation[3 * i + j] * scale;
+    }
+}
+
+// The geometry of one Gaussian in one view. False where the splat is off screen; comparisons are written so that NaN is.
+__device__ __forceinline__ bool project(const ProjectionParams& params, const RasterCamera& camera, const float mean[3],
+                                        const float axes[9], float extent, Instance& splat, int2& radius) {
+    const float* W = camera.rotation;
+    float point[3];
+#pragma unroll
+    for (int i = 0; i < 3; ++i) {
+        point[i] = W[3 * i] * mean[0] + W[3 * i + 1] * mean[1] + W[3 * i + 2] * mean[2] + camera.translation[i];
+    }
+    if (!(point[2] >= params.near_plane && point[2] <= params.far_plane)) return false;
+
+    const float inverse_depth = 1.0f / point[2];
+    const float slope_x = point[0] * inverse_depth, slope_y = point[1] * inverse_depth;
+    const float margin_x = kClampMargin * camera.width / camera.fx, margin_y = kClampMargin * camera.height / camera.fy;
+    const float clamped_x =
+        fminf((camera.width - camera.cx) / camera.fx + margin_x, fmaxf(-(camera.cx / camera.fx + margin_x), slope_x));
+    const float clamped_y =
+        fminf((camera.height - camera.cy) / camera.fy + margin_y, fmaxf(-(camera.cy / camera.fy + margin_y), slope_y));
+    const float j00 = camera.fx * inverse_depth, j11 = camera.fy * inverse_depth;
+
+    float u[3], v[3];  // Jacobian * rotation * axes, row by row
+    {
+        float t0[3], t1[3];
+#pragma unroll
+        for (int l = 0; l < 3; ++l) {
+            t0[l] = j00 * (W[l] - clamped_x * W[6 + l]);
+            t1[l] = j11 * (W[3 + l] - clamped_y * W[6 + l]);
+        }
+#pragma unroll
+        for (int j = 0; j < 3; ++j) {
+            u[j] = t0[0] * axes[j] + t0[1] * axes[3 + j] + t0[2] * axes[6 + j];
+            v[j] = t1[0] * axes[j] + t1[1] * axes[3 + j] + t1[2] * axes[6 + j];
+        }
+    }
+    float variance_x = u[0] * u[0] + u[1] * u[1] + u[2] * u[2];
+    float variance_y = v[0] * v[0] + v[1] * v[1] + v[2] * v[2];
+    const float covariance = u[0] * v[0] + u[1] * v[1] + u[2] * v[2];
+    if (!(variance_x <= kCovarianceMax && variance_y <= kCovarianceMax)) return false;
+    // Lagrange's identity: the determinant as a sum of squares does not cancel, however thin the splat.
+    const float n0 = u[1] * v[2] - u[2] * v[1], n1 = u[2] * v[0] - u[0] * v[2], n2 = u[0] * v[1] - u[1] * v[0];
+    const float det = n0 * n0 + n1 * n1 + n2 * n2 + params.eps2d * (variance_x + variance_y + params.eps2d);
+    if (!(det > 0.0f)) return false;
+    variance_x += params.eps2d;
+    variance_y += params.eps2d;
+    const float inverse_det = 1.0f / det;
+
+    splat.x = camera.fx * slope_x + camera.cx;
+    splat.y = camera.fy * slope_y + camera.cy;
+    splat.conic_a = variance_y * inverse_det;
+    splat.conic_b = -covariance * inverse_det;
+    splat.conic_c = variance_x * inverse_det;
+    splat.depth = point[2];
+
+    const float radius_x = ceilf(extent * sqrtf(variance_x)), radius_y = ceilf(extent * sqrtf(variance_y));
+    if (!(radius_x > 0.0f || radius_y > 0.0f)) return false;
+    if (!(splat.x + radius_x > 0.0f && splat.x - radius_x < camera.width)) return false;
+    if (!(splat.y + radius_y > 0.0f && splat.y - radius_y < camera.height)) return false;
+    radius = make_int2(static_cast<int>(fminf(radius_x, kRadiusMax)), static_cast<int>(fminf(radius_y, kRadiusMax)));
+    return true;
+}
+
+__device__ __forceinline__ uint32_t count_tiles(const RasterCamera& camera, const int32_t* active_prefix,
+                                                const Instance& splat) {
+    const Reach reach = make_reach(splat.x, splat.y, splat.conic_a, splat.conic_b, splat.conic_c, splat.log_reach);
+    const int2 rows = tile_rows(reach, camera.tiles_y);
+    uint32_t count = 0;
+    for (int row = rows.x; row < rows.y; ++row) {
+        const int2 tiles = active_tiles(camera, active_prefix, row, tile_columns(reach, row, camera.tiles_x));
+        count += static_cast<uint32_t>(tiles.y - tiles.x);
+    }
+    return count;
+}
+
+__global__ void __launch_bounds__(kProjectionThreads) projection_kernel(const __grid_constant__ ProjectionParams params) {
+    extern __shared__ float4 shared_quads[];
+    RasterCamera* cameras = reinterpret_cast<RasterCamera*>(shared_quads);
+    float* coefficients = reinterpret_cast<float*>(cameras + params.num_views);
+    const int row = 3 * params.bands;
+
+    {
+        const int words = params.num_views * static_cast<int>(sizeof(RasterCamera) / sizeof(float4));
+        const float4* in = reinterpret_cast<const float4*>(params.cameras);
+        for (int i = threadIdx.x; i < words; i += kProjectionThreads) shared_quads[i] = in[i];
+    }
+    const int first = blockIdx.x * kProjectionThreads;
+    if (params.sh_degree > 0) {
+        const int count = min(kProjectionThreads, params.num_gaussians - first) * row;
+        const float* in = params.shN + static_cast<size_t>(first) * row;  // 16-byte aligned: 128 rows
+        for (int i = 4 * threadIdx.x; i < count; i += 4 * kProjectionThreads) {
+            if (i + 3 < count) {
+                *reinterpret_cast<float4*>(coefficients + i) = *reinterpret_cast<const float4*>(in + i);
+            } else {
+                for (int j = i; j < count; ++j) coefficients[j] = in[j];
+            }
+        }
+    }
+    __syncthreads();
+
+    const int gaussian = first + threadIdx.x;
+    if (gaussian >= params.num_gaussians) return;
+    coefficients += threadIdx.x * row;
+
+    float mean[3], axes[9], sh0[3];
+    {
+        float log_scale[3];
+#pragma unroll
+        for (int i = 0; i < 3; ++i) {
+            mean[i] = params.means[3 * static_cast<size_t>(gaussian) + i];
+            log_scale[i] = params.scales[3 * static_cast<size_t>(gaussian) + i];
+            sh0[i] = params.sh0[3 * static_cast<size_t>(gaussian) + i];
+        }
+        axes_of(reinterpret_cast<const float4*>(params.quats)[gaussian], log_scale, axes);
+    }
+    Instance splat;
+    splat.opacity = 1.0f / (1.0f + expf(-params.opacities[gaussian]));
+    splat.unused = 0.0f;
+    const bool opaque = splat.opacity >= params.alpha_min;  // false for NaN
+    splat.log_reach = logf(fmaxf(splat.opacity, params.alpha_min) / params.alpha_min);
+    const float extent = fminf(kExtentMax, sqrtf(2.0f * splat.log_reach));
+
+    for (int view = 0; view < params.num_views; ++view) {
+        const RasterCamera& camera = cameras[view];
+        const size_t instance = static_cast<size_t>(view) * params.num_gaussians + gaussian;
+        int2 radius = make_int2(0, 0);
+        uint32_t key = kInvisible;
+        if (opaque && project(params, camera, mean, axes, extent, splat, radius)) {
+            float dx = mean[0] - camera.center[0], dy = mean[1] - camera.center[1], dz = mean[2] - camera.center[2];
+            const float length2 = dx * dx + dy * dy + dz * dz;
+            const float inverse_length = length2 > 0.0f ? 1.0f / sqrtf(length2) : 0.0f;
+            const float3 color = evaluate_harmonics(params.sh_degree, sh0, coefficients, dx * inverse_length,
+                                                    dy * inverse_length, dz * inverse_length);
+            if (isfinite(color.x) && isfinite(color.y) && isfinite(color.z)) {
+                splat.red = fmaxf(color.x + 0.5f, 0.0f);
+                splat.green = fmaxf(color.y + 0.5f, 0.0f);
+                splat.blue = fmaxf(color.z + 0.5f, 0.0f);
+                float4* out = reinterpret_cast<float4*>(params.instances + instance);
+                out[0] = make_float4(splat.x, splat.y, splat.conic_a, splat.conic_b);
+                out[1] = make_float4(splat.conic_c, splat.opacity, splat.depth, splat.log_reach);
+                out[2] = make_float4(splat.red, splat.green, splat.blue, splat.unused);
+                const uint32_t count = count_tiles(camera, params.active_prefix, splat);
+                if (count > 0) {
+                    params.tile_counts[instance] = count;
+                    key = __float_as_uint(splat.depth);
+                }
+            } else {
+                radius = make_int2(0, 0);
+            }
+        }
+        params.radii[instance] = radius;
+        params.depth_keys[instance] = key;
+        params.instance_ids[instance] = static_cast<uint32_t>(instance);
+    }
+}
+
+}  // namespace
+
+cudaError_t launch_projection(const ProjectionParams& params, cudaStream_t stream) {
+    pack_cameras_kernel<<<1, kRasterMaxViews, 0, stream>>>(params);
+    if (const cudaError_t error = cudaGetLastError()) return error;
+    if (params.active_prefix != nullptr) {
+        active_prefix_kernel<<<params.num_tiles / 256 + 1, 256, 0, stream>>>(params);
+        if (const cudaError_t error = cudaGetLastError()) return error;
+    }
+    if (params.num_gaussians == 0) return cudaSuccess;
+    const size_t shared = params.num_views * sizeof(RasterCamera) +
+                          (params.sh_degree > 0 ? kProjectionThreads * 3 * params.bands * sizeof(float) : 0);
+    const int blocks = (params.num_gaussians + kProjectionThreads - 1) / kProjectionThreads;
+    projection_kernel<<<blocks, kProjectionThreads, shared, stream>>>(params);
+    return cudaGetLastError();
+}
+
+}  // namespace turbogs

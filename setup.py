@@ -1,0 +1,164 @@
+"""Builds the CUDA library, where there is something to build it with and for. Everything else is in pyproject.toml.
+
+Environment:
+    TURBOGS_CUDA: ``auto`` (default) builds where nvcc, torch's headers and a GPU are found, and else ends CPU-only,
+        saying why in one line; ``require`` makes a missing library an error; ``off`` builds nothing.
+    TURBOGS_CUDA_ARCH: compute capabilities to build for, such as ``90`` or ``80;90``, in place of the GPUs found here.
+    TURBOGS_EXACT_MATH: ``1`` builds the blending kernels with correctly rounded functions (csrc/common.cuh).
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+import sysconfig
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+
+from setuptools import Extension, setup
+from setuptools.command.build_ext import build_ext
+
+ROOT = Path(__file__).resolve().parent
+SOURCES = ROOT / "csrc"
+BUILD_COMMANDS = {"build", "build_ext", "bdist_wheel", "editable_wheel", "develop", "install"}
+TORCH_TARGET = "0x020A000000000000ULL"  # the library loads on torch 2.10 and later
+
+
+class CannotBuildError(Exception):
+    """Why there will be no CUDA library, in one line."""
+
+
+@dataclass
+class Toolchain:
+    nvcc: Path
+    torch: Path
+    architectures: list[str]
+
+    @property
+    def code_flags(self) -> list[str]:
+        """Machine code for every architecture, and PTX of the newest for what comes after it."""
+        flags = [f"-gencode=arch=compute_{a},code=sm_{a}" for a in self.architectures]
+        if len(self.architectures) > 1:
+            newest = self.architectures[-1]
+            flags.append(f"-gencode=arch=compute_{newest},code=compute_{newest}")
+        return flags
+
+
+def find_nvcc() -> Path:
+    for variable in ("CUDA_HOME", "CUDA_PATH"):
+        if os.environ.get(variable) and (path := Path(os.environ[variable], "bin", "nvcc")).is_file():
+            return path
+    for candidate in (shutil.which("nvcc"), "/usr/local/cuda/bin/nvcc"):
+        if candidate and Path(candidate).is_file():
+            return Path(candidate)
+    raise CannotBuildError("no nvcc (set CUDA_HOME to a CUDA toolkit)")
+
+
+def find_torch() -> Path:
+    """The folder of the torch package. Build isolation hides it from imports, but not from the file system."""
+    spec = find_spec("torch")
+    candidates = [Path(spec.origin).parent] if spec and spec.origin else []
+    candidates += [Path(sysconfig.get_path(key), "torch") for key in ("purelib", "platlib")]
+    for path in candidates:
+        if (path / "include/torch/csrc/stable/library.h").is_file():
+            return path
+    raise CannotBuildError("torch's headers are not in the build environment (install with --no-build-isolation)")
+
+
+def find_architectures() -> list[str]:
+    named = os.environ.get("TURBOGS_CUDA_ARCH", "")
+    if named:
+        found = [part.replace(".", "") for part in re.split(r"[;,\s]+", named) if part]
+        if not found or not all(re.fullmatch(r"\d{2,3}[af]?", part) for part in found):
+            raise SystemExit(f"TURBOGS_CUDA_ARCH={named!r}: expected compute capabilities such as 90 or 80;90")
+    else:
+        query = ["nvidia-smi", "--query-gpu=compute_cap", "--format=csv,noheader"]
+        try:
+            lines = subprocess.run(query, capture_output=True, text=True, check=True).stdout.split()
+        except (OSError, subprocess.CalledProcessError):
+            lines = []
+        found = [line.replace(".", "") for line in lines if re.fullmatch(r"\d+\.\d", line)]
+        if not found:
+            raise CannotBuildError("nvcc is here but no GPU, and TURBOGS_CUDA_ARCH names none")
+    return sorted(set(found), key=lambda part: int(re.match(r"\d+", part)[0]))
+
+
+def plan() -> tuple[str, Toolchain | None]:
+    """The mode asked for, and what to build with (None: nothing is built)."""
+    mode = os.environ.get("TURBOGS_CUDA", "auto")
+    if mode not in ("auto", "require", "off"):
+        raise SystemExit(f"TURBOGS_CUDA={mode!r}: expected auto, require or off")
+    building = bool(BUILD_COMMANDS.intersection(sys.argv))
+    if mode == "off" or not building:
+        return mode, None
+    try:
+        return mode, Toolchain(find_nvcc(), find_torch(), find_architectures())
+    except CannotBuildError as reason:
+        if mode == "require":
+            raise SystemExit(f"turbogs: TURBOGS_CUDA=require, but {reason}") from None
+        print(f"turbogs: CPU only, no CUDA library: {reason}", flush=True)
+        return mode, None
+
+
+class BuildCuda(build_ext):
+    """Compiles every csrc/*.cu and csrc/*.cpp with nvcc and links them into one library."""
+
+    def build_extension(self, extension: Extension) -> None:
+        objects_dir = Path(self.build_temp, "csrc").resolve()
+        objects_dir.mkdir(parents=True, exist_ok=True)
+        headers = [*SOURCES.glob("*.h"), *SOURCES.glob("*.cuh"), Path(__file__)]
+        newest_header = max(path.stat().st_mtime for path in headers)
+        sources = sorted(SOURCES.glob("*.cu"), key=lambda path: -path.stat().st_size) + sorted(SOURCES.glob("*.cpp"))
+
+        def compile_one(source: Path) -> Path:
+            target = objects_dir / (source.name + ".o")
+            command = [*(self.cuda_command() if source.suffix == ".cu" else self.cpp_command()), "-c", str(source)]
+            stamp = target.with_suffix(".command")
+            text = " ".join(command)
+            fresh = target.exists() and target.stat().st_mtime > max(newest_header, source.stat().st_mtime)
+            if not (fresh and stamp.exists() and stamp.read_text() == text):
+                subprocess.run([*command, "-o", str(target)], check=True)
+                stamp.write_text(text)
+            return target
+
+        with ThreadPoolExecutor(os.cpu_count()) as pool:
+            objects = list(pool.map(compile_one, sources))
+        library = Path(self.get_ext_fullpath(extension.name))
+        library.parent.mkdir(parents=True, exist_ok=True)
+        link = [str(toolchain.nvcc), *toolchain.code_flags, "-shared", f"-L{toolchain.torch / 'lib'}"]
+        link += ["-Xlinker", "--no-as-needed,-ltorch", "-o", str(library), *map(str, objects)]
+        subprocess.run(link, check=True)
+        print(f"turbogs: built {library.name} with {toolchain.nvcc} {' '.join(toolchain.code_flags)}", flush=True)
+
+    def cuda_command(self) -> list[str]:
+        exact = int(os.environ.get("TURBOGS_EXACT_MATH", "0"))
+        flags = [
+            "-O3",
+            "-std=c++17",
+            "-lineinfo",
+            "-Xcompiler",
+            "-fPIC,-fvisibility=hidden",
+            f"-DTURBOGS_EXACT_MATH={exact}",
+        ]
+        return [str(toolchain.nvcc), *toolchain.code_flags, *flags]
+
+    def cpp_command(self) -> list[str]:
+        # nvcc hands .cpp files to the host compiler, and knows where the toolkit's headers are.
+        flags = ["-O2", "-std=c++17", "-Xcompiler", "-fPIC,-fvisibility=hidden", f"-I{toolchain.torch / 'include'}"]
+        names = " ".join(f"sm_{a}" for a in toolchain.architectures)
+        flags += ["-DUSE_CUDA", f"-DTORCH_TARGET_VERSION={TORCH_TARGET}", f'-DTURBOGS_ARCHITECTURES="{names}"']
+        return [str(toolchain.nvcc), *flags]
+
+
+mode, toolchain = plan()
+library = Extension("turbogs_plugin._C", sources=[], py_limited_api=True, optional=mode == "auto")
+setup(
+    ext_modules=[library] if toolchain else [],
+    cmdclass={"build_ext": BuildCuda},
+    options={"bdist_wheel": {"py_limited_api": "cp310"}} if toolchain else {},
+)

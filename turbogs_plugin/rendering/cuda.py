@@ -1,0 +1,437 @@
+"""The rasterizer in CUDA (csrc/), twin of `reference.py`: projection, two sorts, forward and backward pass.
+
+Everything is float32. Without a `Workspace` a pass waits once for the GPU, to learn the number of (tile, splat) pairs;
+with one it never waits (see `workspace.py`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import lru_cache
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from turbogs_plugin import kernels
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.rendering.reference import DifferentiableRender
+from turbogs_plugin.rendering.rendered import DEFAULT_SETTINGS, Projected, RasterSettings
+from turbogs_plugin.rendering.workspace import Workspace, round_capacity
+from turbogs_plugin.types import Cameras, GaussianGradients, Gaussians, GaussianStats, PixelSamples
+
+MAX_VIEWS = 128
+MAX_DEGREE = 3
+INSTANCE_FLOATS = 12
+CAMERA_FLOATS = 24
+RECORD_FLOATS = 16
+WARP = 32
+NARROW_TILES = 1 << 16
+"""Fewer active tiles than this sort on 16-bit keys."""
+
+WORK_SHAPES = ((1, 1), (2, 1), (3, 1), (4, 1), (3, 2), (3, 2), (4, 2), (4, 2))
+"""Samples per lane, and warps that share a tile, for tiles of up to 32, 64, ... 256 samples."""
+
+
+class _FreshBuffers:
+    """Buffers of a pass without a workspace."""
+
+    def __init__(self, device: torch.device) -> None:
+        self.device = device
+
+    def buffer(self, name: str, shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
+        return torch.empty(shape, dtype=dtype, device=self.device)
+
+
+def _prepared(tensor: Tensor) -> Tensor:
+    """Detached, contiguous and aligned for 16-byte loads; itself where it already is."""
+    tensor = tensor.detach().contiguous()
+    return tensor if tensor.data_ptr() % 16 == 0 else tensor.clone()
+
+
+def _check(gaussians: Gaussians, cameras: Cameras, samples: PixelSamples, degree: int) -> None:
+    device = gaussians.device
+    if device.type != "cuda":
+        raise InputError(f"rasterize_cuda: the Gaussians are on {device}; move them to a CUDA device")
+    floats = [*gaussians.items(), ("cameras.viewmats", cameras.viewmats), ("cameras.Ks", cameras.Ks)]
+    integers = [(f"samples.{name}", getattr(samples, name)) for name in ("pixel_ids", "tile_ids", "tile_offsets")]
+    for dtype, tensors in ((torch.float32, floats), (torch.int32, integers)):
+        for name, tensor in tensors:
+            if tensor.dtype != dtype or tensor.device != device:
+                raise InputError(f"{name} must be {dtype} on {device}, got {tensor.dtype} on {tensor.device}")
+    if not 0 <= degree <= min(MAX_DEGREE, gaussians.sh_degree):
+        raise InputError(f"sh_degree must be 0 .. {min(MAX_DEGREE, gaussians.sh_degree)} for this model, got {degree}")
+    if not 1 <= len(cameras) <= MAX_VIEWS:
+        raise InputError(f"a pass takes 1 .. {MAX_VIEWS} views, got {len(cameras)}")
+    if not np.array_equal(cameras.sizes, samples.sizes):
+        raise InputError("cameras and samples differ in their image sizes: select the cameras of samples.view_ids")
+
+
+@lru_cache(maxsize=1024)
+def _instance_scratch(device: int, instances: int) -> int:
+    with torch.cuda.device(device):
+        return torch.ops.turbogs.raster_sort_instances_scratch(instances)
+
+
+@lru_cache(maxsize=1024)
+def _pair_scratch(device: int, capacity: int, tiles: int, narrow: bool) -> int:
+    with torch.cuda.device(device):
+        return torch.ops.turbogs.raster_sort_pairs_scratch(capacity, tiles, narrow)
+
+
+def work_shape(slots: int, tiles: int) -> tuple[int, int]:
+    """Samples per lane and warps per tile for tiles of this many slots on average."""
+    groups = max(1, -(-slots // (max(1, tiles) * WARP)))
+    return WORK_SHAPES[min(groups, len(WORK_SHAPES)) - 1]
+
+
+@dataclass
+class CudaScreenGradients:
+    """Gradients on the screen (see `ScreenGradients`), and what takes them to the parameters.
+
+    Args:
+        gaussians: the model that was drawn, raw parameters.
+        cameras: the K views.
+        samples: of the pass.
+        sh_degree: bands that were used.
+        settings: of the pass.
+        records: [K, N, 16] float32: 0-1 d/dmean2d, 2-4 d/dconic (b's entry counts both off-diagonal ones), 5-7 d/dcolor
+            after the clamp at 0, 8 d/dopacity after the sigmoid, 9-10 sums of |d/dmean2d| per pixel, 11 sum e * w,
+            12 sum D * w (0 without `stats`), 13 sum w, 14 d/ddepth. Zero where a Gaussian is not drawn.
+        radii: [K, N, 2] int32, zero where off screen.
+        stats: the window to add to, if any.
+        overflow: [1] int32 on the device, or None; where not 0 the pass drew nothing and nothing may change.
+    """
+
+    gaussians: Gaussians
+    cameras: Cameras
+    samples: PixelSamples
+    sh_degree: int
+    settings: RasterSettings
+    records: Tensor
+    radii: Tensor
+    stats: GaussianStats | None
+    overflow: Tensor | None
+
+    def full_records(self) -> Tensor:
+        """[K, N, 16]."""
+        return self.records
+
+    def parameter_gradients(self, rows: bool) -> GaussianGradients:
+        """The gradients of the parameters: one row per view (`rows`), or their sum. May be called once."""
+        from turbogs_plugin import training_kernels
+
+        return training_kernels.projection_backward(self, rows=rows)
+
+
+@dataclass
+class CudaRendered:
+    """One forward pass (see `Rendered`). With a workspace, valid until the next pass."""
+
+    colors: Tensor
+    alphas: Tensor
+    depths: Tensor | None
+    num_pairs: Tensor
+    """[1] int32 on the device: the (tile, splat) pairs of this pass."""
+    _gaussians: Gaussians = field(repr=False)
+    _cameras: Cameras = field(repr=False)
+    _samples: PixelSamples = field(repr=False)
+    _sh_degree: int = field(repr=False)
+    _settings: RasterSettings = field(repr=False)
+    _buffers: _FreshBuffers | Workspace = field(repr=False)
+    _instances: Tensor = field(repr=False)  # [K * N, 12]
+    _radii: Tensor = field(repr=False)  # [K, N, 2]
+    _forward: tuple = field(repr=False)  # the forward operator's arguments
+
+    @torch.no_grad()
+    def projected(self) -> Projected:
+        """The projection that this pass drew."""
+        splats = self._instances.view(*self._radii.shape[:2], INSTANCE_FLOATS)
+        splats = torch.where((self._radii > 0).any(dim=-1, keepdim=True), splats, 0.0)
+        return Projected(
+            means2d=splats[..., :2],
+            conics=splats[..., 2:5],
+            depths=splats[..., 6],
+            opacities=splats[..., 5],
+            radii=self._radii.clone(),
+        )
+
+    @torch.no_grad()
+    def backward(
+        self,
+        color_gradients: Tensor,
+        pixel_errors: Tensor | None = None,
+        stats: GaussianStats | None = None,
+        alpha_gradients: Tensor | None = None,
+        depth_gradients: Tensor | None = None,
+    ) -> CudaScreenGradients:
+        """Back-propagate to the screen; the arguments are those of `Rendered.backward`.
+
+        Raises:
+            InputError: depth gradients of a pass without depths; a tensor of wrong shape, dtype or device.
+        """
+        if depth_gradients is not None and self.depths is None:
+            raise InputError("depth_gradients need a pass with depths: rasterize(..., with_depth=True)")
+        slots = len(self._samples)
+        optional = {
+            "alpha_gradients": alpha_gradients,
+            "depth_gradients": depth_gradients,
+            "pixel_errors": pixel_errors,
+        }
+        given = {"color_gradients": (color_gradients, (slots, 3))}
+        given |= {name: (value, (slots,)) for name, value in optional.items() if value is not None}
+        ready = {}
+        for name, (value, shape) in given.items():
+            if value.shape != shape or value.dtype != torch.float32 or value.device != self.colors.device:
+                wanted = f"float32 {list(shape)} on {self.colors.device}"
+                raise InputError(f"{name} must be {wanted}, got {value.dtype} {list(value.shape)} on {value.device}")
+            ready[name] = value.contiguous()
+        records = self._buffers.buffer("records", (len(self._instances), RECORD_FLOATS), torch.float32)
+        torch.ops.turbogs.raster_backward(
+            *self._forward,
+            ready["color_gradients"],
+            ready.get("alpha_gradients"),
+            ready.get("depth_gradients"),
+            ready.get("pixel_errors"),
+            records,
+            stats is not None,
+        )
+        return CudaScreenGradients(
+            gaussians=self._gaussians,
+            cameras=self._cameras,
+            samples=self._samples,
+            sh_degree=self._sh_degree,
+            settings=self._settings,
+            records=records.view(*self._radii.shape[:2], RECORD_FLOATS),
+            radii=self._radii,
+            stats=stats,
+            overflow=self._buffers.overflow if isinstance(self._buffers, Workspace) else None,
+        )
+
+
+@torch.no_grad()
+def rasterize_cuda(
+    gaussians: Gaussians,
+    cameras: Cameras,
+    samples: PixelSamples,
+    *,
+    sh_degree: int | None = None,
+    settings: RasterSettings = DEFAULT_SETTINGS,
+    with_depth: bool = False,
+    workspace: Workspace | None = None,
+) -> CudaRendered:
+    """Render samples; see `turbogs_plugin.rendering.rasterize`. On torch's current stream of the Gaussians' device.
+
+    Args:
+        workspace: memory to use again, and no waiting for the GPU; see `Workspace` for what the caller then owes.
+
+    Raises:
+        InputError: no kernels here, or a tensor of wrong dtype or device.
+    """
+    kernels.require()
+    degree = gaussians.sh_degree if sh_degree is None else sh_degree
+    _check(gaussians, cameras, samples, degree)
+    device = gaussians.device
+    buffers = workspace if workspace is not None else _FreshBuffers(device)
+    views, count, slots = len(cameras), len(gaussians), len(samples)
+    total, num_tiles, num_active = views * count, len(samples.grid), len(samples.tile_ids)
+
+    def integers(name: str, *shape: int, dtype: torch.dtype = torch.int32) -> Tensor:
+        return buffers.buffer(name, shape, dtype)
+
+    def floats(name: str, *shape: int) -> Tensor:
+        return buffers.buffer(name, shape, torch.float32)
+
+    # A pass over every tile needs no table of the active ones.
+    everywhere = num_active == num_tiles
+    tile_ids = None if everywhere else samples.tile_ids.contiguous()
+    active_prefix = None if everywhere else integers("active_prefix", num_tiles + 1)
+    packed_cameras = floats("cameras", views, CAMERA_FLOATS)
+    instances = floats("instances", total, INSTANCE_FLOATS)
+    radii = integers("radii", views, count, 2)
+    depth_keys, instance_ids = integers("depth_keys", 2, total), integers("instance_ids", 2, total)
+    tile_counts = integers("tile_counts", total)
+    torch.ops.turbogs.raster_project(
+        *(_prepared(value) for _, value in gaussians.items()),
+        cameras.viewmats.detach().contiguous(),
+        cameras.Ks.detach().contiguous(),
+        torch.from_numpy(np.ascontiguousarray(samples.sizes, dtype=np.int64)),
+        tile_ids,
+        packed_cameras,
+        active_prefix,
+        instances,
+        radii,
+        depth_keys,
+        instance_ids,
+        tile_counts,
+        degree,
+        settings.eps2d,
+        settings.near_plane,
+        settings.far_plane,
+        settings.alpha_min,
+    )
+
+    pair_ends = integers("pair_ends", total)
+    status = workspace.status if workspace is not None else torch.zeros(2, dtype=torch.int32, device=device)
+    capacity = workspace.capacity(count, num_active) if workspace is not None else None
+    scratch = integers("scratch", _instance_scratch(device.index, total), dtype=torch.uint8)
+    current = torch.ops.turbogs.raster_sort_instances(depth_keys, instance_ids, tile_counts, pair_ends, status, scratch)
+    if capacity is None:
+        pairs = int(status[0])
+        capacity = round_capacity(pairs)
+        if workspace is not None:
+            workspace.learn(pairs, num_active)
+
+    narrow = num_active < NARROW_TILES
+    tile_keys = integers("tile_keys", 2, capacity, dtype=torch.int16 if narrow else torch.int32)
+    pair_ids = integers("pair_ids", 2, capacity)
+    tile_starts = integers("tile_starts", num_active + 1)
+    scratch = integers("scratch", _pair_scratch(device.index, capacity, num_active, narrow), dtype=torch.uint8)
+    current = torch.ops.turbogs.raster_sort_pairs(
+        instances,
+        depth_keys[current],
+        instance_ids[current],
+        pair_ends,
+        packed_cameras,
+        active_prefix,
+        tile_keys,
+        pair_ids,
+        status,
+        tile_starts,
+        scratch,
+        count,
+    )
+    if workspace is not None:
+        workspace.send_count(num_active)
+
+    samples_per_lane, chunks = work_shape(slots, num_active)
+    colors = torch.empty(slots, 3, device=device)
+    alphas = torch.empty(slots, device=device)
+    depths = torch.empty(slots, device=device) if with_depth else None
+    forward = (
+        packed_cameras,
+        tile_ids,
+        samples.tile_offsets.contiguous(),
+        samples.pixel_ids.contiguous(),
+        tile_starts,
+        pair_ids[current],
+        instances,
+        colors,
+        alphas,
+        floats("transmittances", slots),
+        depths,
+        integers("last_pairs", slots),
+        integers("masks", (capacity // WARP + num_active + 1) * chunks),
+        integers("bucket_counts", num_active * chunks),
+        chunks,
+        samples_per_lane,
+        settings.alpha_min,
+        settings.alpha_max,
+        settings.transmittance_min,
+    )
+    torch.ops.turbogs.raster_forward(*forward)
+    return CudaRendered(
+        colors=colors,
+        alphas=alphas,
+        depths=depths,
+        num_pairs=status[:1],
+        _gaussians=gaussians,
+        _cameras=cameras,
+        _samples=samples,
+        _sh_degree=degree,
+        _settings=settings,
+        _buffers=buffers,
+        _instances=instances,
+        _radii=radii,
+        _forward=forward,
+    )
+
+
+@dataclass
+class _Pass:
+    """What the two autograd nodes of a pass share."""
+
+    rendered: CudaRendered
+    screen: CudaScreenGradients | None = None
+
+
+class _Project(torch.autograd.Function):
+    """Parameters -> projected means. Its backward takes the whole screen record to the parameters."""
+
+    @staticmethod
+    def forward(ctx, shared: _Pass, means2d: Tensor, *parameters: Tensor) -> Tensor:
+        ctx.shared = shared
+        return means2d.clone()
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, mean_gradients: Tensor) -> tuple:
+        shared = ctx.shared
+        screen = shared.screen
+        if screen is None:  # only the means were used
+            screen = shared.rendered.backward(torch.zeros_like(shared.rendered.colors))
+        screen.records[..., :2] = mean_gradients
+        gradients = screen.parameter_gradients(rows=False)
+        shared.screen = None
+        names = (name for name, _ in screen.gaussians.items())
+        return None, None, *(gradients.summed(name) for name in names)
+
+
+class _Composite(torch.autograd.Function):
+    """Projected means -> samples. Its backward leaves the screen record for `_Project`, and `absgrad` on the means."""
+
+    @staticmethod
+    def forward(ctx, shared: _Pass, means2d: Tensor) -> tuple:
+        ctx.shared = shared
+        ctx.save_for_backward(means2d)
+        rendered = shared.rendered
+        ctx.set_materialize_grads(False)
+        # Aliases: the tensors of `rendered` must not point back at this node.
+        outputs = (rendered.colors, rendered.alphas, rendered.depths)
+        return tuple(value if value is None else value.detach() for value in outputs)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, color_gradients, alpha_gradients, depth_gradients) -> tuple:
+        (means2d,) = ctx.saved_tensors
+        rendered = ctx.shared.rendered
+        if color_gradients is None:
+            color_gradients = torch.zeros_like(rendered.colors)
+        screen = rendered.backward(color_gradients, alpha_gradients=alpha_gradients, depth_gradients=depth_gradients)
+        ctx.shared.screen = screen
+        means2d.absgrad = screen.records[..., 9:11].clone()
+        return None, screen.records[..., :2].clone()
+
+
+def rasterize_differentiable_cuda(
+    gaussians: Gaussians,
+    cameras: Cameras,
+    samples: PixelSamples,
+    *,
+    sh_degree: int | None = None,
+    settings: RasterSettings = DEFAULT_SETTINGS,
+    with_depth: bool = False,
+) -> DifferentiableRender:
+    """`turbogs_plugin.rendering.rasterize_differentiable` in CUDA. Gradients reach the parameters through `colors`,
+    `alphas`, `depths` and, for Gaussians that some sample sees, `means2d`; the other arrays are constants."""
+    rendered = rasterize_cuda(
+        gaussians, cameras, samples, sh_degree=sh_degree, settings=settings, with_depth=with_depth
+    )
+    projected = rendered.projected()
+    shared = _Pass(rendered)
+    means2d = _Project.apply(shared, projected.means2d.contiguous(), *(value for _, value in gaussians.items()))
+    if means2d.requires_grad:
+        means2d.retain_grad()
+    colors, alphas, depths = _Composite.apply(shared, means2d)
+    return DifferentiableRender(
+        colors=colors,
+        alphas=alphas,
+        depths=depths,
+        means2d=means2d,
+        conics=projected.conics,
+        depths_per_gaussian=projected.depths,
+        opacities=projected.opacities,
+        radii=projected.radii,
+        sizes=samples.sizes,
+    )
