@@ -1,128 +1,27 @@
 // The training kernels as torch operators, on the stable ABI. Tensors become checked pointers here; outputs are made by
 // the caller. Every launch goes to torch's current stream of the tensors' device.
-#include <cuda_runtime.h>
-#include <torch/csrc/inductor/aoti_torch/c/shim.h>
 #include <torch/csrc/stable/library.h>
 #include <torch/csrc/stable/tensor.h>
 #include <torch/headeronly/core/ScalarType.h>
-#include <torch/headeronly/util/Exception.h>
 
 #include <cmath>
 #include <cstdint>
 #include <optional>
-#include <string>
 #include <vector>
 
+#include "binding_checks.h"
 #include "training_params.h"
 
-// A CPU-only torch has no such symbol; the library must load there too.
-#pragma weak aoti_torch_get_current_cuda_stream
-
+namespace turbogs {
 namespace {
 
-using torch::headeronly::ScalarType;
-using torch::stable::Tensor;
-using namespace turbogs;
-
-template <class T>
-struct DtypeOf;
-template <>
-struct DtypeOf<float> {
-    static constexpr ScalarType value = ScalarType::Float;
-    static constexpr const char* name = "float32";
-};
-template <>
-struct DtypeOf<double> {
-    static constexpr ScalarType value = ScalarType::Double;
-    static constexpr const char* name = "float64";
-};
-template <>
-struct DtypeOf<int32_t> {
-    static constexpr ScalarType value = ScalarType::Int;
-    static constexpr const char* name = "int32";
-};
-template <>
-struct DtypeOf<int64_t> {
-    static constexpr ScalarType value = ScalarType::Long;
-    static constexpr const char* name = "int64";
-};
-template <>
-struct DtypeOf<int16_t> {
-    static constexpr ScalarType value = ScalarType::Short;
-    static constexpr const char* name = "int16";
-};
-template <>
-struct DtypeOf<uint8_t> {
-    static constexpr ScalarType value = ScalarType::Byte;
-    static constexpr const char* name = "uint8";
-};
-template <>
-struct DtypeOf<bool> {
-    static constexpr ScalarType value = ScalarType::Bool;
-    static constexpr const char* name = "bool";
-};
-struct Half {};  // storage only: kernels read it as __half
-template <>
-struct DtypeOf<Half> {
-    static constexpr ScalarType value = ScalarType::Half;
-    static constexpr const char* name = "float16";
-};
-
-// Makes a device current for the launches of one operator, and gives torch's current stream there.
-class DeviceScope {
-   public:
-    explicit DeviceScope(const Tensor& tensor) : device_(tensor.get_device_index()) {
-        STD_TORCH_CHECK(tensor.is_cuda(), "turbogs: the training kernels need tensors on a CUDA device");
-        check(cudaGetDevice(&previous_));
-        if (previous_ != device_) check(cudaSetDevice(device_));
-        void* stream = nullptr;
-        STABLE_TORCH_ERROR_CODE_CHECK(aoti_torch_get_current_cuda_stream(device_, &stream));
-        stream_ = static_cast<cudaStream_t>(stream);
-    }
-    ~DeviceScope() {
-        if (previous_ != device_) cudaSetDevice(previous_);
-    }
-    DeviceScope(const DeviceScope&) = delete;
-    DeviceScope& operator=(const DeviceScope&) = delete;
-
-    cudaStream_t stream() const { return stream_; }
-
-    // The data of a contiguous tensor of this device, dtype T and `count` elements, aligned to 16 bytes.
-    template <class T>
-    T* data(const Tensor& tensor, const char* name, int64_t count) const {
-        STD_TORCH_CHECK(tensor.is_cuda() && tensor.get_device_index() == device_, "turbogs: ", name,
-                        " must be on cuda:", device_);
-        STD_TORCH_CHECK(tensor.scalar_type() == DtypeOf<T>::value, "turbogs: ", name, " must be ", DtypeOf<T>::name);
-        STD_TORCH_CHECK(tensor.is_contiguous(), "turbogs: ", name, " must be contiguous");
-        STD_TORCH_CHECK(tensor.numel() == count, "turbogs: ", name, " must have ", count, " elements, not ",
-                        tensor.numel());
-        T* pointer = static_cast<T*>(tensor.data_ptr());
-        STD_TORCH_CHECK(reinterpret_cast<uintptr_t>(pointer) % 16 == 0, "turbogs: ", name,
-                        " must start at a multiple of 16 bytes; clone it");
-        return pointer;
-    }
-
-    template <class T>
-    T* data(const std::optional<Tensor>& tensor, const char* name, int64_t count) const {
-        return tensor.has_value() ? data<T>(*tensor, name, count) : nullptr;
-    }
-
-    static void check(cudaError_t status) {
-        STD_TORCH_CHECK(status == cudaSuccess, "turbogs: CUDA error: ", cudaGetErrorString(status));
-    }
-
-   private:
-    int device_ = 0;
-    int previous_ = 0;
-    cudaStream_t stream_ = nullptr;
-};
-
 // The batch that a backward pass works on; see `BackwardInputs` in training_kernels.py.
-ScreenBackwardParams screen_backward_params(const DeviceScope& device, const std::vector<Tensor>& gaussians,
+ScreenBackwardParams screen_backward_params(const Checker& check, const std::vector<Tensor>& gaussians,
                                             const Tensor& viewmats, const Tensor& Ks, const std::vector<int64_t>& sizes,
                                             const Tensor& records, const std::optional<Tensor>& radii,
                                             const std::vector<Tensor>& stats, int64_t sh_degree, double eps2d,
-                                            int64_t sample_count, const std::optional<Tensor>& num_filled, const std::optional<Tensor>& overflow) {
+                                            int64_t sample_count, const std::optional<Tensor>& num_filled,
+                                            const std::optional<Tensor>& overflow) {
     STD_TORCH_CHECK(gaussians.size() == 6, "turbogs: gaussians must be means, quats, scales, opacities, sh0, shN");
     STD_TORCH_CHECK(gaussians[0].dim() == 2 && gaussians[5].dim() == 3, "turbogs: means must be [N, 3], shN [N, B, 3]");
     const int64_t num_views = static_cast<int64_t>(sizes.size()) / 2;
@@ -140,35 +39,39 @@ ScreenBackwardParams screen_backward_params(const DeviceScope& device, const std
     params.sh_degree = static_cast<int>(sh_degree);
     params.bands = static_cast<int>(bands);
     params.eps2d = static_cast<float>(eps2d);
-    params.means = device.data<float>(gaussians[0], "means", num_gaussians * 3);
-    params.quats = device.data<float>(gaussians[1], "quats", num_gaussians * 4);
-    params.scales = device.data<float>(gaussians[2], "scales", num_gaussians * 3);
-    params.opacities = device.data<float>(gaussians[3], "opacities", num_gaussians);
-    params.sh0 = device.data<float>(gaussians[4], "sh0", num_gaussians * 3);
-    params.shN = device.data<float>(gaussians[5], "shN", num_gaussians * bands * 3);
-    params.viewmats = device.data<float>(viewmats, "viewmats", num_views * 16);
-    params.intrinsics = device.data<float>(Ks, "Ks", num_views * 9);
+    params.means = check.pointer<float>(gaussians[0], "means", ScalarType::Float, {num_gaussians, 3});
+    params.quats = check.pointer<float>(gaussians[1], "quats", ScalarType::Float, {num_gaussians, 4});
+    params.scales = check.pointer<float>(gaussians[2], "scales", ScalarType::Float, {num_gaussians, 3});
+    params.opacities = check.pointer<float>(gaussians[3], "opacities", ScalarType::Float, {num_gaussians});
+    params.sh0 = check.pointer<float>(gaussians[4], "sh0", ScalarType::Float, {num_gaussians, 1, 3});
+    params.shN = check.pointer<float>(gaussians[5], "shN", ScalarType::Float, {num_gaussians, bands, 3});
+    params.viewmats = check.pointer<float>(viewmats, "viewmats", ScalarType::Float, {num_views, 4, 4});
+    params.intrinsics = check.pointer<float>(Ks, "Ks", ScalarType::Float, {num_views, 3, 3});
     for (int64_t view = 0; view < num_views; ++view) {
         params.widths[view] = static_cast<int>(sizes[2 * view]);
         params.heights[view] = static_cast<int>(sizes[2 * view + 1]);
     }
     params.records = reinterpret_cast<float4*>(
-        device.data<float>(records, "screen gradients", num_views * num_gaussians * kRecordQuads * 4));
+        check.pointer<float>(records, "screen gradients", ScalarType::Float, {num_views, num_gaussians, kRecordQuads * 4}));
+    check.aligned(params.quats, "quats");
+    check.aligned(params.shN, "shN");
+    check.aligned(params.records, "screen gradients");
     params.sample_count = static_cast<int>(sample_count);
-    params.num_filled = device.data<int32_t>(num_filled, "num_filled", 1);
-    params.overflow = device.data<int32_t>(overflow, "overflow", 1);
+    params.num_filled = check.optional<int32_t>(num_filled, "num_filled", ScalarType::Int, {1});
+    params.overflow = check.optional<int32_t>(overflow, "overflow", ScalarType::Int, {1});
     if (!stats.empty()) {
         STD_TORCH_CHECK(stats.size() == 7, "turbogs: stats must be the seven tensors of GaussianStats");
         STD_TORCH_CHECK(radii.has_value(), "turbogs: statistics need the radii");
         params.radii = reinterpret_cast<const int2*>(
-            device.data<int32_t>(*radii, "radii", num_views * num_gaussians * 2));
-        params.error_sums = device.data<float>(stats[0], "error_sums", num_gaussians);
-        params.distance_sums = device.data<float>(stats[1], "distance_sums", num_gaussians);
-        params.weight_sums = device.data<float>(stats[2], "weight_sums", num_gaussians);
-        params.grad_sums = device.data<float>(stats[3], "grad_sums", num_gaussians);
-        params.absgrad_sums = device.data<float>(stats[4], "absgrad_sums", num_gaussians);
-        params.view_counts = device.data<float>(stats[5], "view_counts", num_gaussians);
-        params.max_radii = device.data<float>(stats[6], "max_radii", num_gaussians);
+            check.pointer<int32_t>(*radii, "radii", ScalarType::Int, {num_views, num_gaussians, 2}));
+        check.aligned(params.radii, "radii");
+        params.error_sums = check.pointer<float>(stats[0], "error_sums", ScalarType::Float, {num_gaussians});
+        params.distance_sums = check.pointer<float>(stats[1], "distance_sums", ScalarType::Float, {num_gaussians});
+        params.weight_sums = check.pointer<float>(stats[2], "weight_sums", ScalarType::Float, {num_gaussians});
+        params.grad_sums = check.pointer<float>(stats[3], "grad_sums", ScalarType::Float, {num_gaussians});
+        params.absgrad_sums = check.pointer<float>(stats[4], "absgrad_sums", ScalarType::Float, {num_gaussians});
+        params.view_counts = check.pointer<float>(stats[5], "view_counts", ScalarType::Float, {num_gaussians});
+        params.max_radii = check.pointer<float>(stats[6], "max_radii", ScalarType::Float, {num_gaussians});
     }
     return params;
 }
@@ -176,31 +79,32 @@ ScreenBackwardParams screen_backward_params(const DeviceScope& device, const std
 void projection_backward(const std::vector<Tensor>& gaussians, const Tensor& viewmats, const Tensor& Ks,
                          const std::vector<int64_t>& sizes, const Tensor& records, const std::optional<Tensor>& radii,
                          const std::vector<Tensor>& stats, int64_t sh_degree, double eps2d, int64_t sample_count,
-                         const std::optional<Tensor>& num_filled, const std::optional<Tensor>& overflow, const Tensor& rows, const Tensor& shN,
-                         const Tensor& touched, const Tensor& view_losses) {
-    const DeviceScope device(records);
-    const ScreenBackwardParams params = screen_backward_params(device, gaussians, viewmats, Ks, sizes, records, radii, stats,
+                         const std::optional<Tensor>& num_filled, const std::optional<Tensor>& overflow, const Tensor& rows,
+                         const Tensor& shN, const Tensor& touched, const Tensor& view_losses) {
+    const Checker check(records);
+    const ScreenBackwardParams params = screen_backward_params(check, gaussians, viewmats, Ks, sizes, records, radii, stats,
                                                                sh_degree, eps2d, sample_count, num_filled, overflow);
     STD_TORCH_CHECK(rows.dim() == 3 && (rows.size(0) == 1 || rows.size(0) == params.num_views),
                     "turbogs: rows must be [1, N, 14] or [K, N, 14]");
     const int64_t num_rows = rows.size(0), count = params.num_gaussians;
     ProjectionBackwardOutputs outputs = {};
     outputs.per_view = num_rows == params.num_views;
-    outputs.rows = device.data<float>(rows, "rows", num_rows * count * kRowSize);
-    outputs.shN = device.data<float>(shN, "shN's gradient", count * params.bands * 3);
-    outputs.touched = device.data<bool>(touched, "touched", count);
-    outputs.view_losses = device.data<float>(view_losses, "view_losses", num_rows * count);
-    DeviceScope::check(launch_projection_backward(params, outputs, device.stream()));
+    outputs.rows = check.pointer<float>(rows, "rows", ScalarType::Float, {num_rows, count, kRowSize});
+    outputs.shN = check.pointer<float>(shN, "shN's gradient", ScalarType::Float, {count, params.bands, 3});
+    outputs.touched = check.pointer<bool>(touched, "touched", ScalarType::Bool, {count});
+    outputs.view_losses = check.pointer<float>(view_losses, "view_losses", ScalarType::Float, {num_rows, count});
+    check.launched(launch_projection_backward(params, outputs, check.stream()), "projection backward");
 }
 
 void fused_step(const std::vector<Tensor>& gaussians, const Tensor& viewmats, const Tensor& Ks,
                 const std::vector<int64_t>& sizes, const Tensor& records, const std::optional<Tensor>& radii,
                 const std::vector<Tensor>& stats, int64_t sh_degree, double eps2d, int64_t sample_count,
-                const std::optional<Tensor>& num_filled, const std::optional<Tensor>& overflow, const std::vector<Tensor>& moments, int64_t kind,
-                bool rows_per_view, const std::vector<double>& rates, double beta1, double beta2, double eps,
+                const std::optional<Tensor>& num_filled, const std::optional<Tensor>& overflow,
+                const std::vector<Tensor>& moments, int64_t kind, bool rows_per_view,
+                const std::vector<double>& rates, double beta1, double beta2, double eps,
                 double curvature, double max_step) {
-    const DeviceScope device(records);
-    const ScreenBackwardParams params = screen_backward_params(device, gaussians, viewmats, Ks, sizes, records, radii, stats,
+    const Checker check(records);
+    const ScreenBackwardParams params = screen_backward_params(check, gaussians, viewmats, Ks, sizes, records, radii, stats,
                                                                sh_degree, eps2d, sample_count, num_filled, overflow);
     STD_TORCH_CHECK(moments.size() == 6, "turbogs: moments must be the six tensors of GaussianMoments");
     STD_TORCH_CHECK(rates.size() == 6, "turbogs: rates must be of means, quats, scales, opacities, sh0, shN");
@@ -226,13 +130,18 @@ void fused_step(const std::vector<Tensor>& gaussians, const Tensor& viewmats, co
     optimizer.opacities = const_cast<float*>(params.opacities);
     optimizer.sh0 = const_cast<float*>(params.sh0);
     optimizer.shN = const_cast<float*>(params.shN);
-    optimizer.exp_avg = device.data<float>(moments[0], "exp_avg", count * kRowSize);
-    optimizer.exp_avg_sq = device.data<float>(moments[1], "exp_avg_sq", count * kRowSize);
-    optimizer.exp_avg_shN = device.data<float>(moments[2], "exp_avg_shN", count * harmonics);
-    optimizer.exp_avg_sq_shN = device.data<float>(moments[3], "exp_avg_sq_shN", count * harmonics);
-    optimizer.steps = device.data<int32_t>(moments[4], "steps", count);
-    optimizer.skipped = reinterpret_cast<unsigned long long*>(device.data<int64_t>(moments[5], "skipped", 1));
-    DeviceScope::check(launch_fused_step(params, optimizer, device.stream()));
+    optimizer.exp_avg = check.pointer<float>(moments[0], "exp_avg", ScalarType::Float, {count, kRowSize});
+    optimizer.exp_avg_sq = check.pointer<float>(moments[1], "exp_avg_sq", ScalarType::Float, {count, kRowSize});
+    optimizer.exp_avg_shN = check.pointer<float>(moments[2], "exp_avg_shN", ScalarType::Float, {count, harmonics});
+    optimizer.exp_avg_sq_shN = check.pointer<float>(moments[3], "exp_avg_sq_shN", ScalarType::Float, {count, harmonics});
+    check.aligned(optimizer.exp_avg, "exp_avg");
+    check.aligned(optimizer.exp_avg_sq, "exp_avg_sq");
+    check.aligned(optimizer.exp_avg_shN, "exp_avg_shN");
+    check.aligned(optimizer.exp_avg_sq_shN, "exp_avg_sq_shN");
+    optimizer.steps = check.pointer<int32_t>(moments[4], "steps", ScalarType::Int, {count});
+    optimizer.skipped =
+        reinterpret_cast<unsigned long long*>(check.pointer<int64_t>(moments[5], "skipped", ScalarType::Long, {}));
+    check.launched(launch_fused_step(params, optimizer, check.stream()), "fused step");
 }
 
 // `views` holds six numbers for each view: first flat pixel, width, height, number of the training view, first slot (or
@@ -272,7 +181,7 @@ void sample_pixels(const Tensor& errors, const Tensor& stamps, const std::vector
                    const std::vector<int64_t>& stages, int64_t slots_per_tile, bool mixed_uniform, double importance,
                    int64_t seed, int64_t iteration, int64_t now, const Tensor& pixel_ids, const Tensor& tile_ids,
                    const Tensor& tile_offsets, const std::optional<Tensor>& weights, const std::vector<Tensor>& scratch) {
-    const DeviceScope device(errors);
+    const Checker check(errors);
     const ViewTable table = view_table(views);
     const int64_t pixels = errors.numel(), slots = pixel_ids.numel(), tiles = tile_ids.numel();
     SamplePixelsParams params = {};
@@ -299,20 +208,20 @@ void sample_pixels(const Tensor& errors, const Tensor& stamps, const std::vector
     params.seed_high = static_cast<uint32_t>(static_cast<uint64_t>(seed) >> 32);
     params.iteration = static_cast<uint32_t>(iteration);
     params.now = static_cast<int>(now);
-    params.errors = device.data<Half>(errors, "errors", pixels);
-    params.stamps = device.data<int16_t>(stamps, "stamps", pixels);
-    params.pixel_ids = device.data<int32_t>(pixel_ids, "pixel_ids", slots);
-    params.tile_ids = device.data<int32_t>(tile_ids, "tile_ids", tiles);
-    params.tile_offsets = device.data<int32_t>(tile_offsets, "tile_offsets", tiles + 1);
-    params.weights = device.data<float>(weights, "weights", slots);
+    params.errors = check.pointer<void>(errors, "errors", ScalarType::Half, {pixels});
+    params.stamps = check.pointer<int16_t>(stamps, "stamps", ScalarType::Short, {pixels});
+    params.pixel_ids = check.pointer<int32_t>(pixel_ids, "pixel_ids", ScalarType::Int, {slots});
+    params.tile_ids = check.pointer<int32_t>(tile_ids, "tile_ids", ScalarType::Int, {tiles});
+    params.tile_offsets = check.pointer<int32_t>(tile_offsets, "tile_offsets", ScalarType::Int, {tiles + 1});
+    params.weights = check.optional<float>(weights, "weights", ScalarType::Float, {slots});
     if (by_tile) {
         STD_TORCH_CHECK(scratch.size() == 4, "turbogs: unit tile needs four scratch tensors");
-        params.tile_errors = device.data<double>(scratch[0], "tile_errors", table.num_tiles);
-        params.tile_ages = device.data<int32_t>(scratch[1], "tile_ages", table.num_tiles);
-        params.tile_keys = device.data<int64_t>(scratch[2], "tile_keys", table.num_tiles);
-        params.tile_missed = device.data<float>(scratch[3], "tile_missed", table.num_tiles);
+        params.tile_errors = check.pointer<double>(scratch[0], "tile_errors", ScalarType::Double, {table.num_tiles});
+        params.tile_ages = check.pointer<int32_t>(scratch[1], "tile_ages", ScalarType::Int, {table.num_tiles});
+        params.tile_keys = check.pointer<int64_t>(scratch[2], "tile_keys", ScalarType::Long, {table.num_tiles});
+        params.tile_missed = check.pointer<float>(scratch[3], "tile_missed", ScalarType::Float, {table.num_tiles});
     }
-    DeviceScope::check(launch_sample_pixels(params, device.stream()));
+    check.launched(launch_sample_pixels(params, check.stream()), "pixel sampler");
 }
 
 void sparse_loss(const Tensor& colors, const std::optional<Tensor>& targets, const std::optional<Tensor>& photos,
@@ -321,7 +230,7 @@ void sparse_loss(const Tensor& colors, const std::optional<Tensor>& targets, con
                  double l1_weight, double structure_weight, double variance_constant, bool balance, bool gate,
                  const std::vector<Tensor>& maps, double beta, int64_t stamp, const Tensor& num_filled, const Tensor& loss,
                  const Tensor& color_gradients, const Tensor& pixel_errors, const std::optional<Tensor>& num_nonfinite) {
-    const DeviceScope device(colors);
+    const Checker check(colors);
     const ViewTable table = view_table(views);
     const int64_t slots = pixel_ids.numel(), tiles = tile_ids.numel();
     SparseLossParams params = {};
@@ -338,25 +247,25 @@ void sparse_loss(const Tensor& colors, const std::optional<Tensor>& targets, con
     params.variance_constant = static_cast<float>(variance_constant);
     params.balance = balance;
     params.gate = gate;
-    params.tile_ids = device.data<int32_t>(tile_ids, "tile_ids", tiles);
-    params.tile_offsets = device.data<int32_t>(tile_offsets, "tile_offsets", tiles + 1);
-    params.pixel_ids = device.data<int32_t>(pixel_ids, "pixel_ids", slots);
-    params.weights = device.data<float>(weights, "weights", slots);
-    params.colors = device.data<float>(colors, "colors", 3 * slots);
-    params.targets = device.data<float>(targets, "targets", 3 * slots);
+    params.tile_ids = check.pointer<int32_t>(tile_ids, "tile_ids", ScalarType::Int, {tiles});
+    params.tile_offsets = check.pointer<int32_t>(tile_offsets, "tile_offsets", ScalarType::Int, {tiles + 1});
+    params.pixel_ids = check.pointer<int32_t>(pixel_ids, "pixel_ids", ScalarType::Int, {slots});
+    params.weights = check.optional<float>(weights, "weights", ScalarType::Float, {slots});
+    params.colors = check.pointer<float>(colors, "colors", ScalarType::Float, {slots, 3});
+    params.targets = check.optional<float>(targets, "targets", ScalarType::Float, {slots, 3});
     int64_t pixels = -1;
     if (photos.has_value()) {
         pixels = photos->numel() / 3;
-        params.photos = device.data<uint8_t>(*photos, "photos", 3 * pixels);
+        params.photos = check.pointer<uint8_t>(*photos, "photos", ScalarType::Byte, {pixels, 3});
     }
     if (!maps.empty()) {
         STD_TORCH_CHECK(maps.size() == 3, "turbogs: maps must be errors, stamps, view_sums");
         const int64_t map_pixels = maps[0].numel();
         STD_TORCH_CHECK(pixels < 0 || pixels == map_pixels, "turbogs: photos and maps must be of the same pixels");
         pixels = map_pixels;
-        params.errors = device.data<Half>(maps[0], "errors", pixels);
-        params.stamps = device.data<int16_t>(maps[1], "stamps", pixels);
-        params.view_sums = device.data<double>(maps[2], "view_sums", maps[2].numel());
+        params.errors = check.pointer<void>(maps[0], "errors", ScalarType::Half, {pixels});
+        params.stamps = check.pointer<int16_t>(maps[1], "stamps", ScalarType::Short, {pixels});
+        params.view_sums = check.pointer<double>(maps[2], "view_sums", ScalarType::Double, {maps[2].numel()});
         params.ema_old = static_cast<float>(1.0 - beta);
         params.ema_new = static_cast<float>(beta);
         params.stamp = static_cast<int16_t>(stamp);
@@ -367,16 +276,17 @@ void sparse_loss(const Tensor& colors, const std::optional<Tensor>& targets, con
                             (maps.empty() || view.view_number < maps[2].numel()),
                         "turbogs: view ", view.view_number, " lies outside the photos or maps");
     }
-    params.num_filled = device.data<int32_t>(num_filled, "num_filled", 1);
-    params.loss = device.data<double>(loss, "loss", 1);
-    params.color_gradients = device.data<float>(color_gradients, "color_gradients", 3 * slots);
-    params.pixel_errors = device.data<float>(pixel_errors, "pixel_errors", slots);
+    params.num_filled = check.pointer<int32_t>(num_filled, "num_filled", ScalarType::Int, {1});
+    params.loss = check.pointer<double>(loss, "loss", ScalarType::Double, {});
+    params.color_gradients = check.pointer<float>(color_gradients, "color_gradients", ScalarType::Float, {slots, 3});
+    params.pixel_errors = check.pointer<float>(pixel_errors, "pixel_errors", ScalarType::Float, {slots});
     params.num_nonfinite =
-        reinterpret_cast<unsigned long long*>(device.data<int64_t>(num_nonfinite, "num_nonfinite", 1));
-    DeviceScope::check(launch_sparse_loss(params, device.stream()));
+        reinterpret_cast<unsigned long long*>(check.optional<int64_t>(num_nonfinite, "num_nonfinite", ScalarType::Long, {}));
+    check.launched(launch_sparse_loss(params, check.stream()), "sparse loss");
 }
 
 }  // namespace
+}  // namespace turbogs
 
 #define TURBOGS_BACKWARD_INPUTS                                                                              \
     "Tensor(p!)[] gaussians, Tensor viewmats, Tensor Ks, int[] sizes, Tensor(r!) records, Tensor? radii, "           \
@@ -401,8 +311,8 @@ STABLE_TORCH_LIBRARY_FRAGMENT(turbogs, m) {
 }
 
 STABLE_TORCH_LIBRARY_IMPL(turbogs, CUDA, m) {
-    m.impl("projection_backward", TORCH_BOX(&projection_backward));
-    m.impl("fused_step", TORCH_BOX(&fused_step));
-    m.impl("sample_pixels", TORCH_BOX(&sample_pixels));
-    m.impl("sparse_loss", TORCH_BOX(&sparse_loss));
+    m.impl("projection_backward", TORCH_BOX(&turbogs::projection_backward));
+    m.impl("fused_step", TORCH_BOX(&turbogs::fused_step));
+    m.impl("sample_pixels", TORCH_BOX(&turbogs::sample_pixels));
+    m.impl("sparse_loss", TORCH_BOX(&turbogs::sparse_loss));
 }
