@@ -93,6 +93,10 @@ def load_scene(path: str | Path, factor: int = 1, test_every: int = 8) -> Scene:
     centers = -np.einsum("vji,vj->vi", capture.viewmats[:, :3, :3], capture.viewmats[:, :3, 3])
     frame = Frame.around(centers[~test], capture.points)
     viewmats = torch.from_numpy(frame.normalise_poses(capture.viewmats)).float()
+    points = torch.from_numpy(frame.normalise_points(capture.points)).float()
+    far = ~points.isfinite().all(dim=1)
+    if far.any():
+        raise InputError(f"{scene}: {int(far.sum())} of {len(far)} 3D points lie too far from the cameras for float32")
     paths, file_sizes, sizes = _find_photos(scene, capture, factor)
     ratios = sizes / capture.sizes  # [V, 2]
     intrinsics = capture.Ks.copy()
@@ -109,7 +113,7 @@ def load_scene(path: str | Path, factor: int = 1, test_every: int = 8) -> Scene:
         name=scene.resolve().name,
         train=select(np.flatnonzero(~test)),
         test=select(np.flatnonzero(test)),
-        points=torch.from_numpy(frame.normalise_points(capture.points)).float(),
+        points=points,
         point_colors=torch.from_numpy(capture.point_colors),
         frame=frame,
         extent=1.0,

@@ -79,7 +79,7 @@ def _parse_header(path: Path, lines: list[str]) -> tuple[bool, int, np.dtype, bo
             if words[1] not in formats:
                 raise fail(line, "names a format that is not read here: binary_little_endian and ascii are")
             binary = formats[words[1]]
-        elif words[0] == "element" and len(words) == 3 and words[2].isdecimal() and len(words[2]) < 19:
+        elif words[0] == "element" and len(words) == 3 and words[2].isdecimal() and len(words[2]) <= 20:
             elements.append(words[1])
             if elements == ["vertex"]:
                 count = int(words[2])

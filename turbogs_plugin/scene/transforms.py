@@ -39,7 +39,7 @@ def read_transforms(scene: Path) -> Capture:
     except (OSError, ValueError, RecursionError) as error:
         raise InputError(f"{source} is not readable JSON: {' '.join(str(error).split())[:200]}") from error
     frames = content.get("frames") if isinstance(content, dict) else None
-    if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
+    if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
         raise InputError(f"{source} has no list of frames")
 
     views: dict[str, tuple[np.ndarray, np.ndarray, tuple[int, int]]] = {}
@@ -49,7 +49,7 @@ def read_transforms(scene: Path) -> Capture:
             raise InputError(f"{source} has two frames for '{name}'")
         views[name] = (_viewmat(frame, name, source), *_intrinsics({**content, **frame}, scene / name, source))
     names = tuple(sorted(views))
-    viewmats = np.array([views[name][0] for name in names]).reshape(-1, 4, 4)
+    viewmats = np.stack([views[name][0] for name in names])
     if "ply_file_path" in content:
         points, colors = _read_points(scene, content["ply_file_path"], source)
     else:
@@ -63,8 +63,8 @@ def read_transforms(scene: Path) -> Capture:
         names=tuple(str((scene / name).relative_to(photo_folder)) for name in names),
         photo_folder=photo_folder,
         viewmats=viewmats,
-        Ks=np.array([views[name][1] for name in names]).reshape(-1, 3, 3),
-        sizes=np.array([views[name][2] for name in names], dtype=np.int64).reshape(-1, 2),
+        Ks=np.stack([views[name][1] for name in names]),
+        sizes=np.array([views[name][2] for name in names], dtype=np.int64),
         points=points,
         point_colors=colors,
     )

@@ -1,0 +1,185 @@
+"""transforms.json of nerfstudio and instant-ngp."""
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.scene import load_scene
+from turbogs_plugin.scene.transforms import random_points
+
+TARGET = np.array([3.0, -1.0, 2.0])
+
+
+def camera_to_world(angle: float) -> np.ndarray:
+    """OpenGL's: x right, y up, z backward; on a ring of radius 4 about the target, looking at it, z up."""
+    center = TARGET + np.array([4 * math.cos(angle), 4 * math.sin(angle), 1.0])
+    backward = (center - TARGET) / np.linalg.norm(center - TARGET)
+    right = np.cross([0.0, 0.0, 1.0], backward)
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3] = np.stack([right, np.cross(backward, right), backward, center], axis=1)
+    return pose
+
+
+def write_transforms(folder: Path, views: int = 9, mode: str = "RGB", **content) -> Path:
+    """Photos images/f0.png .. of 20x10 pixels of a colour each, and a transforms.json; None in `content` drops a key."""
+    (folder / "images").mkdir(parents=True)
+    frames = []
+    for view in range(views):
+        color = (10 * view, 200, 30, 128) if mode == "RGBA" else (10 * view, 200, 30)
+        Image.new(mode, (20, 10), color).save(folder / "images" / f"f{view}.png")
+        pose = np.round(camera_to_world(0.5 * view), 7).tolist()
+        frames.append({"file_path": f"./images/f{view}.png", "transform_matrix": pose})
+    everything = {"w": 20, "h": 10, "fl_x": 25.0, "fl_y": 26.0, "cx": 9.5, "cy": 5.5, "frames": frames} | content
+    kept = {key: value for key, value in everything.items() if value is not None}
+    (folder / "transforms.json").write_text(json.dumps(kept))
+    return folder
+
+
+def edit(folder: Path, function) -> None:
+    content = json.loads((folder / "transforms.json").read_text())
+    function(content)
+    (folder / "transforms.json").write_text(json.dumps(content))
+
+
+def test_axes_intrinsics_and_photos(tmp_path):
+    scene = load_scene(write_transforms(tmp_path / "cup"))
+    assert scene.test.names == ("f0.png", "f8.png") and len(scene.train) == 7
+    np.testing.assert_allclose(scene.train.cameras.Ks[0], [[25, 0, 9.5], [0, 26, 5.5], [0, 0, 1]])
+    expected = [camera_to_world(0.5 * view)[:3, 3] for view in range(1, 8)]
+    np.testing.assert_allclose(scene.frame.restore_points(scene.train.cameras.centers.numpy()), expected, atol=1e-5)
+    # The target is straight ahead; a point above it (z is up) is above in the image, at smaller y.
+    target, above = scene.frame.normalise_points(np.stack([TARGET, TARGET + np.array([0, 0, 0.5])]))
+    for viewmat in scene.train.cameras.viewmats.double().numpy():
+        ahead = viewmat[:3, :3] @ target + viewmat[:3, 3]
+        np.testing.assert_allclose(ahead[:2], 0, atol=1e-6)
+        assert ahead[2] * scene.frame.scale == pytest.approx(math.sqrt(17), rel=1e-5)
+        assert (viewmat[:3, :3] @ above + viewmat[:3, 3])[1] < -0.05
+        assert np.linalg.det(viewmat[:3, :3]) == pytest.approx(1)
+    assert scene.train.photos.colors[0].tolist() == [10, 200, 30]
+
+
+def test_camera_angle_and_sizes_from_the_photos(tmp_path):
+    """As instant-ngp and blender write them: no w, h, fl_x; names without a suffix."""
+    missing = dict.fromkeys(["w", "h", "fl_x", "fl_y", "cx", "cy"])
+    folder = write_transforms(tmp_path / "cup", camera_angle_x=0.8, **missing)
+    edit(folder, lambda content: [frame.update(file_path=frame["file_path"][:-4]) for frame in content["frames"]])
+    scene = load_scene(folder, factor=2)
+    assert scene.train.names[0] == "f1.png"
+    focal = 0.5 * 10 / math.tan(0.4)
+    np.testing.assert_allclose(scene.train.cameras.Ks[0], [[focal, 0, 5], [0, focal, 2.5], [0, 0, 1]], rtol=1e-6)
+
+
+def test_a_frame_overrides_what_stands_for_all(tmp_path):
+    folder = write_transforms(tmp_path / "cup")
+    edit(folder, lambda content: content["frames"][3].update(fl_x=99.0, w=12, h=10, cx=6.0))
+    Image.new("RGB", (12, 10)).save(folder / "images" / "f3.png")
+    scene = load_scene(folder)
+    np.testing.assert_allclose(scene.train.cameras.Ks[2], [[99, 0, 6], [0, 26, 5.5], [0, 0, 1]])
+    assert scene.train.cameras.sizes[1:4].tolist() == [[20, 10], [12, 10], [20, 10]]
+
+
+def test_reduced_copies(tmp_path):
+    folder = write_transforms(tmp_path / "cup")
+    (folder / "images_2").mkdir()
+    for view in range(9):
+        Image.new("RGB", (10, 5), (1, 2, 3)).save(folder / "images_2" / f"f{view}.png")
+    assert load_scene(folder, factor=2).train.photos.colors[0].tolist() == [1, 2, 3]
+
+
+def test_transparency_is_composited_over_black(tmp_path):
+    scene = load_scene(write_transforms(tmp_path / "cup", mode="RGBA"))
+    np.testing.assert_allclose(scene.train.photos.colors[0], [5, 100, 15], atol=1)
+
+
+def test_random_points_are_seeded_and_about_what_the_cameras_see(tmp_path):
+    folder = write_transforms(tmp_path / "cup")
+    scene, again = load_scene(folder), load_scene(folder)
+    assert np.array_equal(scene.points, again.points) and len(scene.points) == 50_000
+    points = scene.frame.restore_points(scene.points.numpy())
+    np.testing.assert_allclose(points.mean(axis=0), TARGET, atol=0.05)
+    assert np.ptp(points, axis=0) == pytest.approx([math.sqrt(17)] * 3, rel=1e-2)
+
+
+def test_random_points_of_parallel_cameras():
+    viewmats = np.tile(np.eye(4), (5, 1, 1))
+    viewmats[:, 0, 3] = np.arange(5)
+    points, _ = random_points(viewmats)
+    assert np.isfinite(points).all()
+
+
+@pytest.mark.parametrize("body", ["ascii", "binary"])
+def test_points_from_a_ply(tmp_path, body):
+    folder = write_transforms(tmp_path / "cup", ply_file_path="sparse_pc.ply")
+    table = np.array(
+        [(1.5, 2, 3, 10, 20, 30), (4, 5, -6, 40, 50, 60)],
+        dtype=[("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")],
+    )
+    kind = {"ascii": "ascii", "binary": "binary_little_endian"}[body]
+    header = f"ply\nformat {kind} 1.0\ncomment made by a test\nelement vertex 2\n"
+    header += "".join(f"property {kind} {name}\n" for kind, names in (("float", "xyz"),) for name in names)
+    header += "property uint8 red\nproperty uint8 green\nproperty uint8 blue\nend_header\n"
+    text = "\n".join(" ".join(str(value) for value in row) for row in table.tolist()).encode()
+    (folder / "sparse_pc.ply").write_bytes(header.encode() + (text if body == "ascii" else table.tobytes()))
+    scene = load_scene(folder)
+    np.testing.assert_allclose(scene.frame.restore_points(scene.points.numpy()), [[1.5, 2, 3], [4, 5, -6]], atol=1e-5)
+    assert scene.point_colors.tolist() == [[10, 20, 30], [40, 50, 60]]
+    if body == "ascii":
+        (folder / "sparse_pc.ply").write_bytes(header.encode() + text.replace(b"40", b"400"))
+        with pytest.raises(InputError, match="vertex 1 is not 6 numbers"):
+            load_scene(folder)
+
+
+def set_pose(value):
+    return lambda content: content["frames"][2].update(transform_matrix=value)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda content: content.update(k1=0.01), "lens distortion: undistort"),
+        (lambda content: content["frames"][4].update(p2=-1e-3), "lens distortion: undistort"),
+        (lambda content: content.update(camera_model="OPENCV_FISHEYE"), "lens distortion: undistort"),
+        (lambda content: content.update(fl_x="wide"), "fl_x is 'wide'"),
+        (lambda content: content.update(fl_x=math.nan), "fl_x is 'nan'"),
+        (lambda content: content.update(fl_x=10**400), "fl_x is"),
+        (lambda content: content.update(fl_x=-1.0), "positive focal lengths"),
+        (lambda content: content.pop("fl_x"), "neither fl_x nor a camera_angle_x"),
+        (lambda content: content.update(w=21), "f1.png is 20x10 but its camera is 21x10"),
+        (lambda content: content.update(w=2**60), "size of f0.png"),
+        (lambda content: content.update(frames=[]), "no list of frames"),
+        (lambda content: content.update(frames=3), "no list of frames"),
+        (lambda content: content.update(frames=content["frames"][:2]), "has 2 images"),
+        (lambda content: content["frames"].append(content["frames"][0]), "two frames for 'images/f0.png'"),
+        (lambda content: content["frames"][0].pop("file_path"), "a frame without a file_path"),
+        (lambda content: content["frames"][0].update(file_path="../other/f0.png"), "leaves the photo folder"),
+        (lambda content: content["frames"][0].update(file_path="/etc/passwd"), "leaves the photo folder"),
+        (lambda content: content["frames"][0].update(file_path="images/none.png"), "1 of 9 photos are missing"),
+        (lambda content: content.update(ply_file_path="../points.ply"), "leaves the photo folder"),
+        (lambda content: content.update(ply_file_path="points.ply"), "cannot read .*points.ply"),
+        (set_pose(None), "f2.png' has no transform_matrix"),
+        (set_pose([[1, 2], [3]]), "f2.png' has no transform_matrix"),
+        (set_pose((np.eye(4) * math.nan).tolist()), "f2.png' has no transform_matrix"),
+        (set_pose((np.eye(4) * 2).tolist()), "f2.png' is not a rotation"),
+        (set_pose(np.diag([1, 1, -1, 1]).tolist()), "f2.png' is not a rotation"),
+    ],
+)
+def test_what_is_refused(tmp_path, change, words):
+    folder = write_transforms(tmp_path / "cup")
+    edit(folder, change)
+    with pytest.raises(InputError, match=words) as caught:
+        load_scene(folder)
+    assert "\n" not in str(caught.value) and len(str(caught.value)) < 500
+
+
+@pytest.mark.parametrize("text", ["", "[1, 2", "[" * 100_000, "\x00\xff", "3"])
+def test_files_that_are_not_such_json(tmp_path, text):
+    folder = write_transforms(tmp_path / "cup")
+    (folder / "transforms.json").write_text(text, encoding="latin-1")
+    with pytest.raises(InputError, match=r"readable JSON|no list of frames"):
+        load_scene(folder)
