@@ -22,7 +22,7 @@ from turbogs_plugin.types import PixelSamples
 BLOCK_ELEMENTS = {"cpu": 1 << 18, "cuda": 1 << 24}
 """Elements of one intermediate array of a block."""
 
-SLICE_SPLATS = 256
+SLICE_SPLATS = 128
 """Splats of a tile that are composited at a time."""
 
 ALPHA_TINY = 1e-10
