@@ -7,6 +7,8 @@ INSTALLED := $(VENV)/.installed
 
 .PHONY: demo test lint kernels install clean
 
+# One thread: the demo's tensors are small, and a second thread gains nothing but waits where the machine is shared.
+demo: export OMP_NUM_THREADS := 1
 demo: $(INSTALLED)
 	test -d demo/capture || $(BIN)/turbogs demo demo/capture
 	rm -rf demo/run

@@ -205,7 +205,7 @@ def add_packed(gaussians: Gaussians, index: Tensor, delta: Tensor) -> None:
 
 def add_shN(gaussians: Gaussians, index: Tensor, delta: Tensor) -> None:
     """Add [n, B * 3] changes to the higher bands of the Gaussians `index`, in place."""
-    gaussians.shN.index_add_(0, index, delta.reshape(-1, *gaussians.shN.shape[1:]))
+    gaussians.shN.index_add_(0, index, delta.reshape(len(index), *gaussians.shN.shape[1:]))
 
 
 def check_moments_config(beta1: float, beta2: float, eps: float) -> None:

@@ -1,0 +1,33 @@
+"""A tiny capture and a tiny configuration for tests of whole runs."""
+
+from pathlib import Path
+
+from turbogs_plugin.config import Config, load_config
+from turbogs_plugin.scene import write_demo_capture
+
+TINY = (
+    "train.iterations=14",
+    "train.refine_until=9",
+    "train.sh_degree=2",
+    "train.sh_interval=4",
+    "train.evaluate_at=[0.5]",
+    "train.checkpoint_every=5",
+    "schedule.min_views=2",
+    "schedule.max_views=4",
+    "density.refine_from=2",
+    "density.refine_every=3",
+    "density.final_every=2",
+    "density.grad_threshold=1e-6",
+)
+
+
+def tiny_capture(folder: Path) -> Path:
+    """8 photos of 48x40, of which 7 train."""
+    return write_demo_capture(folder / "capture", views=8, width=48, height=40)
+
+
+def tiny_config(capture: Path, *overrides: str) -> Config:
+    """14 iterations with three densifications, two final prunings and three SH degrees."""
+    config = load_config("turbogs", [*TINY, "train.device=cpu", *overrides])
+    config.scene.path = str(capture)
+    return config

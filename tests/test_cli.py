@@ -1,0 +1,278 @@
+"""The command line: bad input is one line on stderr, exit code 2, and nothing written."""
+
+import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+import torch
+from framework_runs import TINY, tiny_capture
+from PIL import Image
+
+from turbogs_plugin import cli
+from turbogs_plugin.trainer import Trainer
+
+QUICK = ("train.iterations=2", "train.sh_degree=0", "train.evaluate_at=[]")
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory) -> Path:
+    return tiny_capture(tmp_path_factory.mktemp("cli"))
+
+
+@pytest.fixture
+def copy(capture, tmp_path) -> Path:
+    """A capture to break."""
+    return Path(shutil.copytree(capture, tmp_path / "copy"))
+
+
+@pytest.fixture
+def turbogs(monkeypatch, capsys):
+    """Run the command in this process: (exit code, stdout, stderr)."""
+
+    def turbogs(*arguments) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["turbogs", *map(str, arguments)])
+        with pytest.raises(SystemExit) as end:
+            cli.main()
+        captured = capsys.readouterr()
+        return end.value.code or 0, captured.out, captured.err
+
+    return turbogs
+
+
+@pytest.fixture(scope="module")
+def finished(capture, tmp_path_factory) -> Path:
+    """A finished run, made by the command itself."""
+    folder = tmp_path_factory.mktemp("cli-runs") / "run"
+    command = [sys.executable, "-m", "turbogs_plugin.cli", "train", capture, "--out", folder, "--device", "cpu", *QUICK]
+    subprocess.run(list(map(str, command)), check=True, capture_output=True)
+    return folder
+
+
+def assert_refused(result: tuple[int, str, str], *words: str) -> None:
+    code, out, err = result
+    assert code == 2 and out == ""
+    assert err.startswith("turbogs: error: ") and err.count("\n") == 1 and err.endswith("\n"), err
+    for word in words:
+        assert str(word) in err
+
+
+def tree(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def model_of(capture: Path) -> pycolmap.Reconstruction:
+    return pycolmap.Reconstruction(str(capture / "sparse" / "0"))
+
+
+def without_model(capture: Path) -> None:
+    shutil.rmtree(capture / "sparse")
+
+
+def without_images(capture: Path) -> None:
+    empty = pycolmap.Reconstruction()
+    for camera in model_of(capture).cameras.values():
+        empty.add_camera_with_trivial_rig(camera)
+    _replace_model(capture, empty)
+
+
+def without_points(capture: Path) -> None:
+    model = model_of(capture)
+    for point in list(model.points3D):
+        model.delete_point3D(point)
+    _replace_model(capture, model)
+
+
+def _replace_model(capture: Path, model: pycolmap.Reconstruction) -> None:
+    for file in (capture / "sparse" / "0").iterdir():
+        file.unlink()
+    model.write_binary(str(capture / "sparse" / "0"))
+
+
+def without_two_photos(capture: Path) -> None:
+    for path in sorted((capture / "images").iterdir())[2:4]:
+        path.unlink()
+
+
+def truncated_photo(capture: Path) -> None:
+    path = sorted((capture / "images").iterdir())[1]
+    path.write_bytes(path.read_bytes()[:-200])
+
+
+def photo_of_another_size(capture: Path) -> None:
+    path = sorted((capture / "images").iterdir())[1]
+    Image.fromarray(np.zeros((20, 20, 3), dtype=np.uint8)).save(path)
+
+
+def distorted_camera(capture: Path) -> None:
+    model = model_of(capture)
+    for camera in model.cameras.values():
+        focal = camera.mean_focal_length()
+        camera.model = pycolmap.CameraModelId.OPENCV
+        camera.params = [focal, focal, camera.width / 2, camera.height / 2, 0.1, 0.01, 0.0, 0.0]
+    _replace_model(capture, model)
+
+
+def two_views(capture: Path) -> None:
+    folder = capture.with_name("few")
+    shutil.rmtree(capture)
+    from turbogs_plugin.scene import write_demo_capture
+
+    write_demo_capture(folder, views=3, width=32, height=32)
+    model = model_of(folder)
+    model.deregister_frame(max(model.frames))
+    folder.rename(capture)
+    _replace_model(capture, model)
+
+
+BROKEN = [
+    (without_model, ["copy"]),
+    (without_images, ["no images"]),
+    (without_points, ["no 3D points"]),
+    (without_two_photos, ["2 of 8", "view_002.png", "view_003.png"]),
+    (truncated_photo, ["view_001.png"]),
+    (photo_of_another_size, ["view_001.png", "20x20", "48x40"]),
+    (distorted_camera, ["OPENCV", "undistort"]),
+    (two_views, ["3"]),
+]
+
+
+@pytest.mark.parametrize(("damage", "words"), BROKEN, ids=[damage.__name__ for damage, _ in BROKEN])
+def test_a_broken_capture_is_refused(turbogs, copy, tmp_path, damage, words):
+    damage(copy)
+    assert_refused(turbogs("train", copy, "--out", tmp_path / "run", "--device", "cpu", *QUICK), *words)
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--config", "turbo"], ["'turbo'", "turbogs-big", "did you mean 'turbogs'"]),
+        (["--config", "absent.yaml"], ["absent.yaml"]),
+        (["schedule.min_views=9", "schedule.max_views=4"], ["max_views", "9", "4"]),
+        (["optimizer.learning_rates.means=-1"], ["means", "-1"]),
+        (["train.iteration=1"], ["did you mean 'iterations'"]),
+        (["nonsense"], ["section.key=value"]),
+        (["scene.test_every=1"], ["test_every"]),
+        (["--factor", "0"], ["factor"]),
+        (["report.lpips_weights=absent.pth"], ["absent.pth"]),
+    ],
+    ids=lambda value: value[-1] if isinstance(value, list) else None,
+)
+def test_a_bad_setting_is_refused(turbogs, capture, tmp_path, arguments, words):
+    options = [argument for argument in arguments if argument.startswith("--")]
+    flags = arguments if options else []
+    overrides = [] if options else arguments
+    result = turbogs("train", capture, "--out", tmp_path / "run", "--device", "cpu", *flags, *overrides)
+    assert_refused(result, *words)
+    assert not (tmp_path / "run").exists()
+
+
+def test_no_such_scene(turbogs, tmp_path):
+    assert_refused(turbogs("train", tmp_path / "absent", "--out", tmp_path / "run"), "no such scene", "absent")
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has CUDA")
+@pytest.mark.parametrize("verb", ["train", "eval", "render"])
+def test_cuda_asked_for_and_absent(turbogs, capture, finished, tmp_path, verb):
+    arguments = [capture, "--out", tmp_path / "run"] if verb == "train" else [finished]
+    assert_refused(turbogs(verb, *arguments, "--device", "cuda"), "CUDA", "--device cpu")
+    assert not (tmp_path / "run").exists()
+
+
+def test_an_output_folder_with_another_run_is_left_alone(turbogs, capture, finished):
+    before = tree(finished)
+    assert_refused(turbogs("train", capture, "--out", finished, "--device", "cpu", *QUICK), "another run", "--resume")
+    assert tree(finished) == before
+
+
+def test_an_output_folder_with_other_files_is_left_alone(turbogs, capture, tmp_path):
+    (tmp_path / "thesis.tex").write_text("mine")
+    assert_refused(turbogs("train", capture, "--out", tmp_path, "--device", "cpu", *QUICK), "not empty")
+    assert_refused(turbogs("train", capture, "--out", tmp_path / "thesis.tex", *QUICK), "is a file")
+    assert_refused(turbogs("train", capture, "--out", tmp_path / "thesis.tex" / "run", *QUICK), "cannot be made")
+    assert tree(tmp_path) == {"thesis.tex": b"mine"}
+
+
+def test_incomplete_and_contradictory_calls(turbogs, capture, tmp_path):
+    assert_refused(turbogs("train"), "SCENE")
+    assert_refused(turbogs("train", capture), "--out")
+    assert_refused(turbogs("train", capture, "--resume", tmp_path), "nothing else")
+    assert_refused(turbogs("train", "--resume", tmp_path, "--device", "cpu"), "nothing else")
+
+
+@pytest.mark.parametrize("verb", ["eval", "render", "export"])
+def test_verbs_without_a_run(turbogs, tmp_path, verb):
+    assert_refused(turbogs(verb, tmp_path), "holds no run")
+    assert_refused(turbogs("train", "--resume", tmp_path), "holds no run")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_run_without_or_with_a_broken_checkpoint(turbogs, finished, tmp_path):
+    broken = Path(shutil.copytree(finished, tmp_path / "broken"))
+    checkpoint = next((broken / "checkpoints").glob("*.pt"))
+    checkpoint.write_bytes(checkpoint.read_bytes()[:1000])
+    for arguments in (["eval", broken], ["export", broken], ["train", "--resume", broken]):
+        assert_refused(turbogs(*arguments), "cannot be used", checkpoint.name)
+    shutil.rmtree(broken / "checkpoints")
+    assert_refused(turbogs("eval", broken), "no checkpoint yet")
+
+
+def test_a_finished_run_is_evaluated_rendered_and_exported(turbogs, finished, tmp_path):
+    code, out, _ = turbogs("eval", finished, "--device", "cpu")
+    assert code == 0 and "view_000.png" in out and "not computed" in out and "iteration 2" in out
+    code, out, _ = turbogs("render", finished, "--device", "cpu", "--split", "train")
+    images = sorted((finished / "renders" / "train").iterdir())
+    assert code == 0 and len(images) == 7 and Image.open(images[0]).size == (48, 40)
+    code, out, _ = turbogs("export", finished, "--format", "ply", "--out", tmp_path / "mine.ply")
+    assert code == 0 and (tmp_path / "mine.ply").read_bytes() == (finished / "model.ply").read_bytes()
+    assert_refused(turbogs("export", finished, "--out", tmp_path / "mine.ply"), "exists")
+
+
+def test_an_exported_file_that_cannot_be_written_is_refused(turbogs, finished, tmp_path):
+    assert_refused(turbogs("export", finished, "--out", tmp_path / "absent" / "mine.ply"), "absent")
+
+
+def test_the_demo_capture_is_not_written_over(turbogs, tmp_path):
+    (tmp_path / "capture").mkdir()
+    assert_refused(turbogs("demo", tmp_path / "capture"), "capture")
+
+
+def test_doctor(turbogs):
+    code, out, _ = turbogs("doctor")
+    assert code == 0
+    for word in ("torch", "gsplat", "Python", "GPU", "kernels", "nvcc"):
+        assert word in out
+
+
+def test_ctrl_c_saves_and_says_how_to_go_on(turbogs, capture, tmp_path, monkeypatch):
+    step = Trainer.step
+
+    def interrupted(trainer):
+        step(trainer)
+        if trainer.iteration == 3:
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(Trainer, "step", interrupted)
+    code, out, err = turbogs("train", capture, "--out", tmp_path / "run", "--device", "cpu", *TINY)
+    assert code == 130 and out == ""
+    assert f"turbogs train --resume {tmp_path / 'run'}" in err
+    assert (tmp_path / "run" / "checkpoints" / "latest").read_text() == "iteration-000003.pt"
+    monkeypatch.undo()
+
+
+def test_a_run_that_cannot_go_on_is_one_line_and_exit_code_1(turbogs, capture, tmp_path, monkeypatch):
+    step = Trainer.step
+
+    def spoiled(trainer):
+        step(trainer)
+        trainer.gaussians.opacities[:] = torch.inf
+
+    monkeypatch.setattr(Trainer, "step", spoiled)
+    code, out, err = turbogs("train", capture, "--out", tmp_path / "run", "--device", "cpu", *QUICK)
+    errors = [line for line in err.splitlines() if line.startswith("turbogs: error:")]
+    assert code == 1 and out == "" and len(errors) == 1 and "not finite" in errors[0]
