@@ -1,0 +1,19 @@
+"""Parts of TurboGS for a gsplat trainer: each is taken by naming it in the place of gsplat's own.
+
+- `TurboDensityStrategy` for `gsplat.DefaultStrategy`;
+- `SharedOptimizer` for the optimizer class, with `SparseAdam` or `MomentLMOptimizer` in it;
+- `sparse_rasterization`, `gather_pixels` and `sparse_loss` for the render call, the ground truth and the loss.
+"""
+
+from turbogs_plugin.gsplat_bridge.density_swap import TurboDensityStrategy, apply_row_update
+from turbogs_plugin.gsplat_bridge.optimizer_swap import SharedOptimizer
+from turbogs_plugin.gsplat_bridge.sparse_rasterization import gather_pixels, sparse_loss, sparse_rasterization
+
+__all__ = [
+    "SharedOptimizer",
+    "TurboDensityStrategy",
+    "apply_row_update",
+    "gather_pixels",
+    "sparse_loss",
+    "sparse_rasterization",
+]

@@ -1,0 +1,236 @@
+"""Error-driven density control as a gsplat `Strategy`: named in the place of `DefaultStrategy`, nothing else edited."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any
+
+import torch
+from gsplat.strategy import DefaultStrategy
+from gsplat.strategy.ops import _update_param_with_optimizer
+from torch import Tensor
+
+from turbogs_plugin.errors import InputError, require
+from turbogs_plugin.gsplat_bridge.gaussian_errors import iteration_stats
+from turbogs_plugin.gsplat_bridge.host import GEOMETRY, GROUND_TRUTH, PREDICTION, host_gaussians, require_keys
+from turbogs_plugin.strategies.density import ErrorDrivenDensity
+from turbogs_plugin.types import GaussianStats, RowUpdate, Step
+
+_STATS = tuple(field.name for field in fields(GaussianStats))
+_DRIVEN_BY = "driven_by"
+_STATE_KEYS = ("scene_scale", _DRIVEN_BY, *_STATS)
+
+_ANNOUNCEMENTS = {
+    "error": f"error-driven, by info['{PREDICTION}'] and info['{GROUND_TRUTH}']",
+    "gradient": f"info has no '{PREDICTION}' and '{GROUND_TRUTH}', so Gaussians are ranked by screen gradients; "
+    "to rank them by error, add before loss.backward(): info.update(prediction=colors, ground_truth=pixels)",
+}
+
+
+@dataclass
+class TurboDensityStrategy(DefaultStrategy):
+    """`ErrorDrivenDensity` behind the protocol of gsplat's strategies.
+
+    A subclass of `DefaultStrategy`, since trainers branch on that. Its fields keep their meaning there:
+    refine_start_iter, refine_stop_iter, refine_every, prune_opa, grow_grad2d, grow_scale3d, prune_scale3d, and
+    prune_scale2d where refine_scale2d_stop_iter is above 0; any of them may change at any time. Opacities are never
+    reset; reset_every only says when pruning by size begins. grow_scale2d has no effect. The fields below are those of
+    `ErrorDrivenDensity` of the same name, with its defaults, except that final pruning is off.
+
+    Once a line ``info.update(prediction=colors, ground_truth=pixels)`` stands before ``loss.backward()``, Gaussians are
+    ranked by the error they carry (see `gaussian_errors`); without it, by their screen gradients. Which of the two
+    it is, is printed at the first step, and must stay so.
+
+    Args:
+        absgrad: also densify by absolute gradients above grow_absgrad2d; render with ``absgrad=True`` then.
+        grow_absgrad2d: absgrad_threshold of `ErrorDrivenDensity`.
+        final_every, final_keep: final pruning after refine_stop_iter. `ErrorDrivenDensity` is made for few such events;
+            gsplat's schedule has room for 30.
+        seed: of the positions of split Gaussians.
+    """
+
+    absgrad: bool = True
+    grow_absgrad2d: float = ErrorDrivenDensity.absgrad_threshold
+    lambda_base: float = ErrorDrivenDensity.lambda_base
+    score: str = ErrorDrivenDensity.score
+    top_fraction: float = ErrorDrivenDensity.top_fraction
+    split: str = ErrorDrivenDensity.split
+    max_gaussians: int = ErrorDrivenDensity.max_gaussians
+    prune_score_fraction: float = ErrorDrivenDensity.prune_score_fraction
+    opacity_decay: float = ErrorDrivenDensity.opacity_decay
+    final_every: int = ErrorDrivenDensity.final_every
+    final_keep: float = 1.0
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        require(not self.revised_opacity, "revised_opacity", self.revised_opacity, "False: splits copy the opacity")
+        allowed = "0: opacities are never reset"
+        require(self.pause_refine_after_reset == 0, "pause_refine_after_reset", self.pause_refine_after_reset, allowed)
+        allowed = "'means2d': the error sums are those of 3D Gaussians"
+        require(self.key_for_gradient == "means2d", "key_for_gradient", self.key_for_gradient, allowed)
+        self._controller(0)  # checks the rest
+
+    def initialize_state(self, scene_scale: float = 1.0) -> dict[str, Any]:
+        """The running state, to be passed to both hooks: `GaussianStats`' tensors by name, once the first step made
+        them, so that gsplat's own operations carry them along."""
+        return {"scene_scale": scene_scale, _DRIVEN_BY: None, **dict.fromkeys(_STATS)}
+
+    def step_pre_backward(
+        self,
+        params: Mapping[str, torch.nn.Parameter],
+        optimizers: Mapping[str, torch.optim.Optimizer],
+        state: dict[str, Any],
+        step: int,
+        info: dict[str, Any],
+    ) -> None:
+        """To be called before ``loss.backward()``. Shows `info` to optimizers that want the errors, too."""
+        require_keys(info, ("means2d",), "info", "pass what the rasterization returned")
+        super().step_pre_backward(params, optimizers, state, step, info)
+        for optimizer in optimizers.values():
+            observe = getattr(optimizer, "observe", None)
+            if observe is not None:
+                observe(info)
+
+    @torch.no_grad()
+    def step_post_backward(
+        self,
+        params: dict[str, torch.nn.Parameter] | torch.nn.ParameterDict,
+        optimizers: Mapping[str, torch.optim.Optimizer],
+        state: dict[str, Any],
+        step: int,
+        info: dict[str, Any],
+        packed: bool = False,
+        scene: Any = None,
+        **host_options: Any,
+    ) -> None:
+        """To be called after the optimizers' steps. Changes `params`, `optimizers` and `state` in place.
+
+        Args:
+            packed, scene, host_options: what hosts hand to their own strategies; not used. Whether `info` is packed, it
+                says itself.
+
+        Raises:
+            InputError: `state` is not one of `initialize_state`, or was not carried along when rows changed; `info`
+                lacks a key; or it changed between having errors and having none.
+        """
+        if step >= self.refine_stop_iter and self.final_keep == 1:
+            return
+        gaussians = host_gaussians(params, GEOMETRY)
+        self._accumulate(state, info, len(gaussians))
+        if not self._due(step):
+            return
+        controller = self._controller(step)
+        controller.setup(gaussians)
+        controller.load_state_dict({"initial_count": len(gaussians), "stats": {name: state[name] for name in _STATS}})
+        # The end of the run is not known here; the controller needs it only to stop taking statistics.
+        now = Step(step, sys.maxsize, self.refine_stop_iter - 1, self.seed, state["scene_scale"])
+        update = controller.update(gaussians, now)
+        if update is not None:
+            apply_row_update(update, params, optimizers, state)
+        for name in _STATS:
+            state[name].zero_()
+        if self.verbose and update is not None:
+            print(
+                f"Step {step}: {update.num_cloned} GSs duplicated, {update.num_split} split, "
+                f"{update.num_pruned} pruned. Now having {len(params['means'])} GSs."
+            )
+
+    def _accumulate(self, state: dict[str, Any], info: dict[str, Any], count: int) -> None:
+        if state is None:
+            raise InputError("the strategy was called without its state: expected that of strategy.initialize_state()")
+        require_keys(state, _STATE_KEYS, "the state", "expected that of TurboDensityStrategy.initialize_state()")
+        stats, has_errors = iteration_stats(info, count)
+        driven_by = "error" if has_errors else "gradient"
+        if state[_DRIVEN_BY] is None:
+            print(f"TurboDensityStrategy: {_ANNOUNCEMENTS[driven_by]}.")
+            state[_DRIVEN_BY] = driven_by
+        if state[_DRIVEN_BY] != driven_by:
+            raise InputError(
+                f"density control was {state[_DRIVEN_BY]}-driven so far, this step's info is {driven_by}-driven: put "
+                f"'{PREDICTION}' and '{GROUND_TRUTH}' into info at every step, or at none"
+            )
+        if not has_errors:
+            # Ranked by what there is: the mean over views of the screen gradient takes the place of the mean error.
+            stats.error_sums, stats.weight_sums = stats.grad_sums, stats.view_counts
+            stats.distance_sums = torch.zeros_like(stats.grad_sums)
+        if not self.absgrad:
+            stats.absgrad_sums = torch.zeros_like(stats.absgrad_sums)
+        elif getattr(info["means2d"], "absgrad", None) is None:
+            raise InputError("info['means2d'] has no absgrad: render with absgrad=True, or use absgrad=False here")
+        for name in _STATS:
+            new = getattr(stats, name)
+            if state[name] is None:
+                state[name] = new.clone()
+            elif state[name].shape != new.shape:
+                raise InputError(
+                    f"state['{name}'] has {len(state[name])} rows, the parameters {count}: rows were added or removed "
+                    "without passing this state along"
+                )
+            elif name == "max_radii":
+                torch.maximum(state[name], new, out=state[name])
+            else:
+                state[name] += new
+
+    def _due(self, step: int) -> bool:
+        """Whether a densification or a final pruning happens at this step, at gsplat's places in the schedule."""
+        if step < self.refine_stop_iter:
+            return step > self.refine_start_iter and step % self.refine_every == 0
+        return (step - self.refine_stop_iter + 1) % self.final_every == 0
+
+    def _controller(self, step: int) -> ErrorDrivenDensity:
+        """The controller with the present values of all fields."""
+        by_screen_size = step < self.refine_scale2d_stop_iter
+        return ErrorDrivenDensity(
+            lambda_base=self.lambda_base,
+            score=self.score,
+            refine_from=self.refine_start_iter + 1,
+            refine_every=self.refine_every,
+            grad_threshold=self.grow_grad2d,
+            absgrad_threshold=self.grow_absgrad2d,
+            top_fraction=self.top_fraction,
+            percent_dense=3 * self.grow_scale3d,  # gsplat compares the standard deviation, the controller three of them
+            split=self.split,
+            max_gaussians=self.max_gaussians,
+            prune_opacity=self.prune_opa,
+            prune_world_size=self.prune_scale3d,
+            prune_screen_size=self.prune_scale2d if by_screen_size else 0.0,
+            prune_size_from=self.reset_every / max(1, self.refine_stop_iter),
+            prune_score_fraction=self.prune_score_fraction,
+            opacity_decay=self.opacity_decay,
+            final_every=self.final_every,
+            final_keep=self.final_keep,
+        )
+
+
+@torch.no_grad()
+def apply_row_update(
+    update: RowUpdate,
+    params: dict[str, torch.nn.Parameter] | torch.nn.ParameterDict,
+    optimizers: Mapping[str, torch.optim.Optimizer],
+    state: dict[str, Any],
+) -> None:
+    """Carry a `RowUpdate` out on a gsplat host: its parameters, its optimizers' state and a strategy's running state.
+
+    Args:
+        update: new rows; parameters that it does not know are copied row by row.
+        params, optimizers, state: as in gsplat's operations; changed in place.
+    """
+
+    def new_parameter(name: str, parameter: Tensor) -> torch.nn.Parameter:
+        value = update.values[name] if name in update.values else parameter[update.source]
+        return torch.nn.Parameter(value, requires_grad=parameter.requires_grad)
+
+    _update_param_with_optimizer(new_parameter, lambda key, value: update.apply_state(value), params, optimizers)
+    if update.reset:
+        _update_param_with_optimizer(
+            lambda name, parameter: parameter,
+            lambda key, value: torch.zeros_like(value),
+            params,
+            optimizers,
+            names=list(update.reset),
+        )
+    for key, value in state.items():
+        if isinstance(value, Tensor):
+            state[key] = update.apply_state(value)

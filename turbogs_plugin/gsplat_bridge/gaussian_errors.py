@@ -1,0 +1,161 @@
+"""The error that each Gaussian carries, from what a host's `info` has (paper equation for the per-Gaussian sums).
+
+Three sources, best first:
+
+1. `sparse_rasterization` was given the prediction and the ground truth: its backward pass leaves all sums in `info`.
+2. gsplat's rasterizer, and prediction and ground truth in `info`: the *zero channel*. Colour channels that are zero
+   everywhere, with the pixel error as their upstream gradient, have the sum of e * w as the gradient of their values,
+   w = T * alpha the compositing weight; with 1 upstream, the sum of w. No other gradient is touched. It costs one
+   further pass over the tiles of two channels. The distance sums stay zero: no upstream gradient gives them.
+3. Neither: there is no error, only the gradient on the screen.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.gsplat_bridge.host import (
+    ERROR_SUMS,
+    GROUND_TRUTH,
+    LOSS_SHARES,
+    PREDICTION,
+    STATISTICS,
+    require_keys,
+)
+from turbogs_plugin.types import GaussianStats
+
+_INTERSECTION = ("gaussian_ids", "conics", "opacities", "width", "height", "tile_size", "isect_offsets", "flatten_ids")
+
+
+def residuals(info: dict[str, Any]) -> Tensor | None:
+    """[...] L1 norm over RGB of the residual at each pixel, or None where `info` has neither of its two parts.
+
+    Raises:
+        InputError: only one of them is there, or their shapes differ.
+    """
+    present = [key for key in (PREDICTION, GROUND_TRUTH) if key in info]
+    if not present:
+        return None
+    require_keys(info, (PREDICTION, GROUND_TRUTH), "info", f"'{present[0]}' is there, error-driven control needs both")
+    prediction, truth = info[PREDICTION].detach(), info[GROUND_TRUTH].detach()
+    if prediction.shape != truth.shape or prediction.shape[-1] != 3:
+        raise InputError(
+            f"info['{PREDICTION}'] has shape {tuple(prediction.shape)}, info['{GROUND_TRUTH}'] {tuple(truth.shape)}: "
+            "expected both [C, H, W, 3], or both [P, 3] with sparse pixels"
+        )
+    return (prediction - truth).abs().sum(dim=-1)
+
+
+def iteration_stats(info: dict[str, Any], count: int) -> tuple[GaussianStats, bool]:
+    """The statistics of the pass that `info` tells of, after its backward pass.
+
+    Args:
+        info: of a render whose ``means2d`` has its gradient; packed or not.
+        count: N.
+
+    Returns:
+        The statistics, and whether they have error sums (then also weight sums).
+    """
+    if info.get(STATISTICS) is not None:
+        return info[STATISTICS], True
+    stats = screen_statistics(info, count)
+    sums = _error_sums(info, count)
+    if sums is None:
+        return stats, False
+    stats.error_sums += sums[:, 0]
+    stats.weight_sums += sums[:, 1]
+    return stats, True
+
+
+def loss_shares(info: dict[str, Any], count: int) -> Tensor | None:
+    """[N] each Gaussian's share of the loss, sum of e * w over the number of pixels; None where `info` has no errors.
+
+    After backward, for renders of `sparse_rasterization`.
+    """
+    if info.get(LOSS_SHARES) is not None:
+        return info[LOSS_SHARES]
+    sums = _error_sums(info, count)
+    return None if sums is None else sums[:, 0] / info[PREDICTION][..., 0].numel()
+
+
+def _error_sums(info: dict[str, Any], count: int) -> Tensor | None:
+    """[N, 2] sums of e * w and of w by the zero channel, kept in `info` for whoever asks next; None without errors."""
+    if ERROR_SUMS in info:
+        return info[ERROR_SUMS]
+    errors = residuals(info)
+    if errors is None:
+        return None
+    if info.get("flatten_ids") is None:
+        raise InputError(
+            f"info has '{PREDICTION}' and '{GROUND_TRUTH}' but neither '{STATISTICS}' nor 'flatten_ids': put them in "
+            "before backward for sparse_rasterization; gsplat's rasterization leaves 'flatten_ids'"
+        )
+    sums = zero_channel_sums(info, torch.stack([errors, torch.ones_like(errors)], dim=-1))
+    ids = info["gaussian_ids"]
+    if ids is None:
+        info[ERROR_SUMS] = sums.reshape(-1, count, 2).sum(dim=0)
+    else:
+        info[ERROR_SUMS] = sums.new_zeros(count, 2).index_add(0, ids.long(), sums)
+    return info[ERROR_SUMS]
+
+
+def screen_statistics(info: dict[str, Any], count: int) -> GaussianStats:
+    """Sums of screen gradients, of views and largest radii, in gsplat's units; the sums over pixels stay zero."""
+    keys = ("means2d", "radii", "width", "height", "n_cameras", "gaussian_ids")
+    require_keys(info, keys, "info", "pass what the rasterization returned")
+    means2d, radii = info["means2d"], info["radii"]
+    if means2d.grad is None:
+        raise InputError("info['means2d'] has no gradient: call step_pre_backward before loss.backward()")
+    width, height, cameras = info["width"], info["height"], info["n_cameras"]
+    half = means2d.new_tensor([0.5 * width * cameras, 0.5 * height * cameras])
+    norms = [(means2d.grad * half).norm(dim=-1)]
+    absolute = getattr(means2d, "absgrad", None)
+    norms.append(torch.zeros_like(norms[0]) if absolute is None else (absolute * half).norm(dim=-1))
+    visible = (radii > 0).all(dim=-1)
+    if info["gaussian_ids"] is not None:  # packed
+        ids = info["gaussian_ids"].long()
+    else:
+        ids = torch.where(visible)[-1]
+        norms, radii = [norm[visible] for norm in norms], radii[visible]
+    stats = GaussianStats.zeros(count, means2d.device)
+    stats.grad_sums.index_add_(0, ids, norms[0])
+    stats.absgrad_sums.index_add_(0, ids, norms[1])
+    stats.view_counts.index_add_(0, ids, torch.ones_like(norms[0]))
+    largest = radii.amax(dim=-1).float() / max(width, height)
+    stats.max_radii.scatter_reduce_(0, ids, largest, "amax")
+    return stats
+
+
+def zero_channel_sums(info: dict[str, Any], upstream: Tensor) -> Tensor:
+    """Sum over pixels of ``upstream * w`` for each Gaussian, by gsplat's rasterizer.
+
+    Args:
+        info: of a pass of gsplat's `rasterization`.
+        upstream: [C, H, W, D].
+
+    Returns:
+        [C, N, D], or [nnz, D] where packed.
+    """
+    from gsplat import rasterize_to_pixels
+
+    require_keys(info, _INTERSECTION, "info", "pass what gsplat.rasterization returned")
+    means2d = info["means2d"].detach()
+    with torch.enable_grad():
+        channels = means2d.new_zeros(*means2d.shape[:-1], upstream.shape[-1]).requires_grad_()
+        image, _ = rasterize_to_pixels(
+            means2d,
+            info["conics"].detach(),
+            channels,
+            info["opacities"].detach(),
+            info["width"],
+            info["height"],
+            info["tile_size"],
+            info["isect_offsets"],
+            info["flatten_ids"],
+            packed=info["gaussian_ids"] is not None,
+        )
+    return torch.autograd.grad(image, channels, upstream.to(image.dtype))[0]

@@ -1,0 +1,73 @@
+"""What a gsplat trainer keeps and hands over (its parameters and `info`), checked, with errors that name what was
+expected."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from torch import Tensor
+
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.types import PARAMETER_NAMES, Gaussians
+
+PREDICTION, GROUND_TRUTH = "prediction", "ground_truth"
+"""Keys under which a host puts what it rendered and what it should have been into `info`."""
+
+STATISTICS = "gaussian_stats"
+"""Key under which `sparse_rasterization` leaves the pass's `GaussianStats` once backward has run."""
+
+LOSS_SHARES = "loss_shares"
+"""Key under which it leaves, beside them, [N] the Gaussians' shares of the loss."""
+
+ERROR_SUMS = "error_sums"
+"""Key under which the sums of the zero channel, [N, 2], stay for whoever asks for them second."""
+
+SHAPES = {
+    "means": "[N, 3]",
+    "quats": "[N, 4]",
+    "scales": "[N, 3]",
+    "opacities": "[N]",
+    "sh0": "[N, 1, 3]",
+    "shN": "[N, B, 3]",
+}
+"""gsplat's layout: N Gaussians, B harmonics above band 0."""
+
+GEOMETRY = ("means", "quats", "scales", "opacities")
+
+
+def require_keys(mapping: Mapping[str, Any], keys: Iterable[str], what: str, remedy: str) -> None:
+    """Raise `InputError` naming the `keys` that `mapping` (called `what`) lacks."""
+    missing = [key for key in keys if key not in mapping]
+    if missing:
+        raise InputError(f"{what} has no {', '.join(repr(key) for key in missing)}: {remedy}")
+
+
+def host_gaussians(params: Mapping[str, Tensor], names: Iterable[str] = PARAMETER_NAMES) -> Gaussians:
+    """A host's parameters as `Gaussians`. The tensors share memory with the parameters and have no gradient.
+
+    Args:
+        params: name -> tensor.
+        names: those that are needed; where one of the others is missing, as in a host with its own colour model,
+            zeros stand in for it.
+
+    Raises:
+        InputError: a parameter is missing, or has another shape than in gsplat's layout, or another number of rows.
+    """
+    require_keys(params, names, "the parameters", f"expected {', '.join(names)}")
+    count = params["means"].shape[0]
+    for name in PARAMETER_NAMES:
+        if name in params and not _fits(tuple(params[name].shape), SHAPES[name], count):
+            raise InputError(
+                f"parameter '{name}' has shape {tuple(params[name].shape)}: "
+                f"expected {SHAPES[name]} with N = {count} as in 'means'"
+            )
+    absent = params["means"].new_zeros(count, 1, 3)
+    return Gaussians(**{name: params[name].detach() if name in params else absent for name in PARAMETER_NAMES})
+
+
+def _fits(shape: tuple[int, ...], form: str, count: int) -> bool:
+    """Whether a shape is of a form as in `SHAPES`, with N = `count` and any B."""
+    sizes = form.strip("[]").split(", ")
+    expected = {"N": count, "B": shape[1] if len(shape) > 1 else None}
+    return shape == tuple(expected[size] if size in expected else int(size) for size in sizes)

@@ -1,0 +1,275 @@
+"""`SparseAdam` and `MomentLMOptimizer` behind gsplat's dict of optimizers, one for each parameter.
+
+A Gaussian's parameters are solved for together, but a gsplat trainer steps one optimizer after another and clears each
+gradient in between. So each member of the dict is a `torch.optim.Optimizer` that *hands over* its gradient when it is
+stepped, and whichever member comes last, in any order, carries out the update of all. Until then no parameter moves.
+
+What each member keeps for its parameter is in its own ``state``, as gsplat's operations on rows expect: every value is
+a tensor with one row a Gaussian. Learning rate, betas and eps are those of the member's own parameter group.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Iterable
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor
+
+from turbogs_plugin.errors import InputError, require
+from turbogs_plugin.gsplat_bridge.gaussian_errors import loss_shares
+from turbogs_plugin.gsplat_bridge.host import host_gaussians
+from turbogs_plugin.rendering import ScreenGradients
+from turbogs_plugin.strategies.learning_rates import ParameterRates
+from turbogs_plugin.strategies.update_rule import COLUMNS, GaussianMoments
+from turbogs_plugin.types import PARAMETER_NAMES, GaussianGradients, Gaussians, Step
+
+UPDATES = "updates"
+"""State of the means' member alone: [N] float, how many updates each Gaussian has had. Not "step", which gsplat's
+operations leave as it is."""
+
+MOMENTS = ("exp_avg", "exp_avg_sq")
+
+
+class BlockOptimizer(Protocol):
+    """What `SharedOptimizer` needs of an optimizer: `SparseAdam` and `MomentLMOptimizer` are such."""
+
+    learning_rates: Any
+    beta1: float
+    beta2: float
+    eps: float
+    moments: GaussianMoments
+
+    def step(self, gaussians: Gaussians, gradients: ScreenGradients, step: Step) -> None: ...
+
+
+class SharedOptimizer:
+    """Takes the place of an optimizer class: called once for each parameter, gives the members of one shared update.
+
+    Example::
+
+        optimizer_class = SharedOptimizer(MomentLMOptimizer())
+        optimizers = {
+            name: optimizer_class([{"params": splats[name], "lr": lr, "name": name}], eps=1e-15)
+            for name, lr in rates.items()
+        }
+
+    Args:
+        optimizer: the rule. Its learning rates, betas and eps are replaced by the members' parameter groups'. Autograd
+            gives the sum of the gradients over views, so J has one row, whatever `MomentLMOptimizer.rows` says.
+    """
+
+    def __init__(self, optimizer: BlockOptimizer) -> None:
+        self.optimizer = copy.copy(optimizer)
+        self.members: dict[str, MemberOptimizer] = {}
+        self.skipped: Tensor | None = None
+        self._info: dict[str, Any] | None = None
+        self._told = False
+
+    def __call__(
+        self,
+        params: Iterable[dict[str, Any]],
+        lr: float = 1e-3,
+        betas: tuple[float, float] | None = None,
+        eps: float | None = None,
+        fused: bool | None = None,
+    ) -> MemberOptimizer:
+        """The member of one parameter.
+
+        Args:
+            params: one group with "params", "name" (of the parameter) and "lr", as gsplat's trainers make them.
+            lr, betas, eps: where the group has none; those of the optimizer where None.
+            fused: taken for the sake of hosts that pass it; the update is one for all parameters in any case.
+        """
+        betas = (self.optimizer.beta1, self.optimizer.beta2) if betas is None else tuple(betas)
+        defaults = {"lr": lr, "betas": betas, "eps": self.optimizer.eps if eps is None else eps}
+        member = MemberOptimizer(self, list(params), defaults)
+        if member.name in self.members:
+            raise InputError(f"there is a member for parameter '{member.name}' already: each name is given once")
+        self.members[member.name] = member
+        return member
+
+    def observe(self, info: dict[str, Any]) -> None:
+        """Show this iteration's `info`, before or after backward. From "prediction" and "ground_truth" in it follow the
+        Gaussians' shares of the loss, which the damped system needs; without them the step is Adam's."""
+        self._info = info
+
+    def waiting(self) -> list[str]:
+        """Names of the parameters whose member has not been stepped in this iteration."""
+        return [name for name in PARAMETER_NAMES if name not in self.members or not self.members[name].is_stepped]
+
+    @torch.no_grad()
+    def update(self) -> None:
+        """Carry out the update of all parameters from the gradients handed over."""
+        members = self.members
+        gradients = {name: members[name].take_gradient() for name in PARAMETER_NAMES}
+        info, self._info = self._info, None
+        if all(gradient is None for gradient in gradients.values()):
+            return
+        gaussians = host_gaussians({name: members[name].parameter for name in PARAMETER_NAMES})
+        for name, value in gaussians.items():
+            if gradients[name] is None:
+                gradients[name] = torch.zeros_like(value)
+        self._take_options()
+        moments = self._pack(gaussians)
+        self.optimizer.moments = moments
+        self.optimizer.step(gaussians, _Summed(gradients, self._shares(gaussians, info)), Step(0, 1, 1))
+        self._unpack(moments)
+
+    def _take_options(self) -> None:
+        """Learning rates, betas and eps of the members' groups."""
+        groups = {name: member.param_groups[0] for name, member in self.members.items()}
+        for option in ("betas", "eps"):
+            values = {name: group[option] for name, group in groups.items()}
+            if len(set(values.values())) > 1:
+                raise InputError(
+                    f"{option} differ between the members of one shared update: {values}; expected one value"
+                )
+        rates = ParameterRates(**{name: float(group["lr"]) for name, group in groups.items()})
+        self.optimizer.learning_rates = _FixedRates(rates)
+        self.optimizer.beta1, self.optimizer.beta2 = groups["means"]["betas"]
+        self.optimizer.eps = groups["means"]["eps"]
+
+    def _pack(self, gaussians: Gaussians) -> GaussianMoments:
+        """The members' state in the form that the rule takes."""
+        packed = GaussianMoments.zeros(gaussians)
+        if self.skipped is None:
+            self.skipped = packed.skipped
+        packed.skipped = self.skipped
+        for name, member in self.members.items():
+            state = member.checked_state()
+            for moment in MOMENTS:
+                if name == "shN":
+                    getattr(packed, f"{moment}_shN").copy_(state[moment].flatten(1))
+                else:
+                    getattr(packed, moment)[:, COLUMNS[name]] = state[moment].reshape(len(packed), -1)
+        packed.steps.copy_(self.members["means"].checked_state()[UPDATES])
+        return packed
+
+    def _unpack(self, packed: GaussianMoments) -> None:
+        for name, member in self.members.items():
+            state = member.checked_state()
+            for moment in MOMENTS:
+                source = (
+                    getattr(packed, f"{moment}_shN") if name == "shN" else getattr(packed, moment)[:, COLUMNS[name]]
+                )
+                state[moment].copy_(source.reshape(state[moment].shape))
+        self.members["means"].checked_state()[UPDATES].copy_(packed.steps)
+
+    def _shares(self, gaussians: Gaussians, info: dict[str, Any] | None) -> Tensor:
+        """[1, N] the Gaussians' share of the loss, zero where nothing is known of it."""
+        shares = None if info is None else loss_shares(info, len(gaussians))
+        if shares is None:
+            if not self._told and hasattr(self.optimizer, "rows"):
+                print(
+                    f"{type(self.optimizer).__name__}: the Gaussians' shares of the loss are not known, so steps are "
+                    "Adam's; put prediction and ground_truth into info before loss.backward(), and call "
+                    "optimizers['means'].observe(info) after it (TurboDensityStrategy does that)."
+                )
+            self._told = True
+            return gaussians.means.new_zeros(1, len(gaussians))
+        return shares.to(gaussians.means.dtype)[None]
+
+
+class MemberOptimizer(torch.optim.Optimizer):
+    """The part of a `SharedOptimizer` that is one parameter's; made by calling that."""
+
+    def __init__(self, shared: SharedOptimizer, groups: list[Any], defaults: dict[str, Any]) -> None:
+        names = [group.get("name") if isinstance(group, dict) else None for group in groups]
+        if len(names) != 1 or names[0] not in PARAMETER_NAMES:
+            raise InputError(
+                f"a member of a shared update takes one group with a 'name' among {', '.join(PARAMETER_NAMES)}, got "
+                f"groups named {names}; give other parameters an optimizer of their own"
+            )
+        super().__init__(groups, defaults)
+        require(len(self.param_groups[0]["params"]) == 1, "params", self.param_groups[0]["params"], "one tensor")
+        self.shared = shared
+        self.name: str = groups[0]["name"]
+        self.is_stepped = False
+        self._gradient: Tensor | None = None
+
+    @property
+    def parameter(self) -> torch.nn.Parameter:
+        """The parameter, never kept: gsplat's operations replace it."""
+        return self.param_groups[0]["params"][0]
+
+    def observe(self, info: dict[str, Any]) -> None:
+        """See `SharedOptimizer.observe`; it is enough that one member is shown it."""
+        self.shared.observe(info)
+
+    @torch.no_grad()
+    def step(self, closure: Callable[[], float] | None = None) -> float | None:
+        """Hand the gradient over (``.grad`` is None afterwards); the last member to be stepped updates all.
+
+        Raises:
+            InputError: stepped twice before all the others were, or a gradient is sparse.
+        """
+        loss = None
+        if closure is not None:
+            with torch.enable_grad():
+                loss = closure()
+        if self.is_stepped:
+            raise InputError(
+                f"the optimizer of '{self.name}' was stepped twice: expected, as one update is shared by all, "
+                f"a step of {', '.join(self.shared.waiting())} in between"
+            )
+        gradient, self.parameter.grad = self.parameter.grad, None
+        if gradient is not None and gradient.is_sparse:
+            raise InputError(f"the gradient of '{self.name}' is sparse: expected a dense one (sparse_grad=False)")
+        self._gradient, self.is_stepped = gradient, True
+        if not self.shared.waiting():
+            self.shared.update()
+        return loss
+
+    def take_gradient(self) -> Tensor | None:
+        """The gradient handed over; a new iteration begins."""
+        gradient, self._gradient, self.is_stepped = self._gradient, None, False
+        return gradient
+
+    def checked_state(self) -> dict[str, Tensor]:
+        """The state of the parameter, zeros at first.
+
+        Raises:
+            InputError: its rows are not those of the parameter.
+        """
+        parameter, state = self.parameter, self.state[self.parameter]
+        if not state:
+            state.update({moment: torch.zeros_like(parameter) for moment in MOMENTS})
+            if self.name == "means":
+                state[UPDATES] = parameter.new_zeros(len(parameter))
+        for key, value in state.items():
+            expected = parameter.shape if key in MOMENTS else parameter.shape[:1]
+            if value.shape != expected:
+                raise InputError(
+                    f"optimizer state '{key}' of '{self.name}' has shape {tuple(value.shape)}, "
+                    f"expected {tuple(expected)}: rows were added or removed without the optimizer"
+                )
+        return state
+
+
+class _FixedRates:
+    """Learning rates that hosts' schedulers have set for this step."""
+
+    def __init__(self, rates: ParameterRates) -> None:
+        self.rates = rates
+
+    def at(self, step: Step) -> ParameterRates:
+        return self.rates
+
+
+class _Summed:
+    """Autograd's gradients as `ScreenGradients`: one row, the sum over views.
+
+    Args:
+        gradients: name -> [N, ...].
+        shares: [1, N].
+    """
+
+    def __init__(self, gradients: dict[str, Tensor], shares: Tensor) -> None:
+        self.gradients, self.shares = gradients, shares
+
+    def parameter_gradients(self, rows: bool) -> GaussianGradients:
+        touched = [(value.unsqueeze(-1).flatten(1) != 0).any(dim=1) for value in self.gradients.values()]
+        one_row = {name: value if name == "shN" else value[None] for name, value in self.gradients.items()}
+        return GaussianGradients(**one_row, touched=torch.stack(touched).any(dim=0), view_losses=self.shares)

@@ -1,0 +1,272 @@
+"""Sparse pixels behind gsplat's `rasterization`: the same arguments, rendered at samples only."""
+
+from __future__ import annotations
+
+import weakref
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.gaussians import SH_C0
+from turbogs_plugin.gsplat_bridge.gaussian_errors import residuals
+from turbogs_plugin.gsplat_bridge.host import GROUND_TRUTH, LOSS_SHARES, PREDICTION, STATISTICS
+from turbogs_plugin.rendering import RasterSettings, Rendered, rasterize
+from turbogs_plugin.rendering.compositing import ABSOLUTE, MEAN
+from turbogs_plugin.types import (
+    PARAMETER_NAMES,
+    TILE_SIZE,
+    Cameras,
+    Gaussians,
+    GaussianStats,
+    LossOutput,
+    PixelSamples,
+)
+
+LOGIT_MARGIN = 2.0**-23
+"""Opacities are kept this far from 0 and 1, where the logit is infinite. An alpha is cut at 0.999 in any case."""
+
+_ONLY = {
+    "packed": False,
+    "sparse_grad": False,
+    "radius_clip": 0.0,
+    "tile_size": TILE_SIZE,
+    "render_mode": "RGB",
+    "rasterize_mode": "classic",
+    "camera_model": "pinhole",
+    "distributed": False,
+    "segmented": False,
+    "with_ut": False,
+    "with_eval3d": False,
+    "covars": None,
+    "ftheta_coeffs": None,
+    "radial_coeffs": None,
+    "tangential_coeffs": None,
+    "thin_prism_coeffs": None,
+    "viewmats_rs": None,
+}
+"""Options of gsplat's `rasterization` that hosts pass, and the one value of each that there is here."""
+
+
+def sparse_rasterization(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    viewmats: Tensor,
+    Ks: Tensor,
+    width: int,
+    height: int,
+    samples: PixelSamples,
+    near_plane: float = RasterSettings.near_plane,
+    far_plane: float = RasterSettings.far_plane,
+    eps2d: float = RasterSettings.eps2d,
+    sh_degree: int | None = None,
+    backgrounds: Tensor | None = None,
+    absgrad: bool = False,
+    **gsplat_options: Any,
+) -> tuple[Tensor, Tensor, dict[str, Any]]:
+    """`gsplat.rasterization` at sampled pixels, connected to autograd.
+
+    Args:
+        means: [N, 3]. quats: [N, 4] wxyz, any norm. scales: [N, 3] after exp. opacities: [N] after sigmoid.
+        colors: [N, 3] colours, 0 or more, where `sh_degree` is None; else [N, B, 3] harmonics, band 0 first.
+        viewmats: [C, 4, 4] world to camera. Ks: [C, 3, 3].
+        width, height: of the images, all of one size.
+        samples: the pixels, of a batch of C views in the order of `viewmats`.
+        sh_degree: highest degree used.
+        backgrounds: [C, 3], or None for black.
+        absgrad: taken for gsplat's sake; ``info["means2d"].absgrad`` is there after backward either way.
+        gsplat_options: further options of gsplat's function, where they have the value that is supported.
+
+    Returns:
+        Colours [P, 3] and alphas [P, 1], in the samples' order and zero in empty slots, and gsplat's `info`, unpacked:
+        means2d [C, N, 2], radii [C, N, 2], depths, opacities [C, N], conics [C, N, 3], ids (None), width, height,
+        tile_size, tile_width, tile_height, n_batches, n_cameras. Gradients reach the five parameters and
+        ``info["means2d"]``, no other entry. The arrays of gsplat's tile intersection are not there: isect_ids,
+        isect_offsets, flatten_ids and tiles_per_gauss are None.
+
+        If "prediction" and "ground_truth" (both [P, 3] or both [C, H, W, 3]) are put into `info` before backward,
+        "gaussian_stats" is in it
+        after: the pass's `GaussianStats` with their error sums, and "loss_shares", [N].
+
+    Raises:
+        InputError: a wrong shape, or an option without support here.
+    """
+    _check_options(gsplat_options)
+    _check_shapes(means, quats, scales, opacities, colors, viewmats, Ks, sh_degree)
+    sizes = {(int(w), int(h)) for w, h in samples.sizes}
+    if sizes != {(width, height)} or len(samples.view_ids) != len(viewmats):
+        raise InputError(
+            f"samples are of {len(samples.view_ids)} views of (width, height) {sorted(sizes)}: expected "
+            f"{len(viewmats)}, one for each of viewmats, all of {(width, height)}"
+        )
+    if sh_degree is None:
+        colors, sh_degree = ((colors - 0.5) / SH_C0)[:, None], 0
+    parameters = {
+        "means": means,
+        "quats": quats,
+        "scales": scales.clamp(min=torch.finfo(scales.dtype).tiny).log(),
+        "opacities": opacities.clamp(LOGIT_MARGIN, 1.0 - LOGIT_MARGIN).logit(),
+        "sh0": colors[:, :1],
+        "shN": colors[:, 1:],
+    }
+    rendered = rasterize(
+        Gaussians(**{name: value.detach().contiguous() for name, value in parameters.items()}),
+        Cameras(viewmats.detach(), Ks.detach(), samples.sizes),
+        samples,
+        sh_degree=sh_degree,
+        settings=RasterSettings(eps2d=eps2d, near_plane=near_plane, far_plane=far_plane),
+    )
+    info = _info(rendered, len(viewmats), width, height)
+    rendered_colors, alphas = _Pass.apply(rendered, samples, info, info["means2d"], *parameters.values())
+    if backgrounds is not None:
+        behind = backgrounds[samples.view_of_slot()] * samples.filled[:, None]  # [P, 3]
+        rendered_colors = rendered_colors + (1.0 - alphas[:, None]) * behind
+    return rendered_colors, alphas[:, None], info
+
+
+def gather_pixels(images: Tensor, samples: PixelSamples) -> Tensor:
+    """The pixels of a batch of images at the samples.
+
+    Args:
+        images: [C, H, W, D], image after image as the views of the batch.
+
+    Returns:
+        [P, D]; zero in empty slots. Differentiable.
+    """
+    expected = [(int(height), int(width)) for width, height in samples.sizes]
+    if images.dim() != 4 or [tuple(images.shape[1:3])] * len(images) != expected:
+        raise InputError(f"images have shape {tuple(images.shape)}: expected [C, H, W, D] with H, W = {expected}")
+    flat = images.flatten(0, 2)  # [C * H * W, D]
+    pixels = samples.view_of_slot() * (images.shape[1] * images.shape[2]) + samples.pixel_ids.long().clamp(min=0)
+    return flat[pixels] * samples.filled[:, None]
+
+
+def sparse_loss(
+    loss: Callable[[Tensor, Tensor, PixelSamples], LossOutput], colors: Tensor, targets: Tensor, samples: PixelSamples
+) -> Tensor:
+    """A `SparseLoss` as a scalar that `backward` can be called on: its own gradient is handed to autograd."""
+    return _Loss.apply(colors, loss(colors.detach(), targets.detach(), samples))
+
+
+class _Loss(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, colors: Tensor, output: LossOutput) -> Tensor:
+        ctx.save_for_backward(output.color_gradients)
+        return output.loss.clone()
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, upstream: Tensor):
+        (gradients,) = ctx.saved_tensors
+        return upstream * gradients, None
+
+
+class _Info(dict):
+    """A dict that can be referred to weakly."""
+
+
+class _Pass(torch.autograd.Function):
+    """A `Rendered` pass in autograd. It was made before; here its outputs are tied to what they depend on."""
+
+    @staticmethod
+    def forward(ctx, rendered: Rendered, samples: PixelSamples, info: _Info, means2d: Tensor, *parameters: Tensor):
+        # Weakly, as the host puts what we return into `info`: the graph would keep itself alive.
+        ctx.rendered, ctx.samples, ctx.info = rendered, samples, weakref.ref(info)
+        ctx.count = means2d.shape[1]
+        return rendered.colors.clone(), rendered.alphas.clone()
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, color_gradients: Tensor, alpha_gradients: Tensor):
+        info = ctx.info()
+        errors = None if info is None else _sample_errors(info, ctx.samples)
+        stats = GaussianStats.zeros(ctx.count, color_gradients.device)
+        screen = ctx.rendered.backward(
+            color_gradients.contiguous(), errors, stats, alpha_gradients=alpha_gradients.contiguous()
+        )
+        records = screen.full_records()
+        gradients = screen.parameter_gradients(rows=False)
+        if info is not None:
+            info["means2d"].absgrad = records[..., ABSOLUTE].clone()
+            if errors is not None:
+                info[STATISTICS], info[LOSS_SHARES] = stats, gradients.view_losses[0]
+        parameter_gradients = (gradients.summed(name) for name in PARAMETER_NAMES)
+        return None, None, None, records[..., MEAN].clone(), *parameter_gradients
+
+
+def _sample_errors(info: dict[str, Any], samples: PixelSamples) -> Tensor | None:
+    """[P] L1 norms of the residuals at the samples, or None where `info` has no prediction and ground truth."""
+    errors = residuals(info)
+    if errors is not None and errors.dim() == 3:
+        errors = gather_pixels(errors[..., None], samples)[:, 0]
+    if errors is not None and errors.shape != (len(samples),):
+        raise InputError(
+            f"info['{PREDICTION}'] and info['{GROUND_TRUTH}'] are of shape {(*errors.shape, 3)}: expected "
+            f"{(len(samples), 3)}, as there are samples, or [C, H, W, 3]"
+        )
+    return errors
+
+
+def _info(rendered: Rendered, cameras: int, width: int, height: int) -> _Info:
+    projected = rendered.projected()
+    absent = ("batch_ids", "camera_ids", "gaussian_ids", "tiles_per_gauss", "isect_ids", "flatten_ids", "isect_offsets")
+    return _Info(
+        {
+            **dict.fromkeys(absent),
+            # A leaf: `retain_grad` of it is allowed and needless.
+            "means2d": projected.means2d.detach().requires_grad_(torch.is_grad_enabled()),
+            "radii": projected.radii,
+            "depths": projected.depths,
+            "conics": projected.conics,
+            "opacities": projected.opacities,
+            "width": width,
+            "height": height,
+            "tile_size": TILE_SIZE,
+            "tile_width": -(-width // TILE_SIZE),
+            "tile_height": -(-height // TILE_SIZE),
+            "n_batches": 1,
+            "n_cameras": cameras,
+        }
+    )
+
+
+def _check_options(options: dict[str, Any]) -> None:
+    for name, value in options.items():
+        if name not in _ONLY:
+            raise InputError(f"sparse_rasterization has no option '{name}'; of gsplat's it takes {', '.join(_ONLY)}")
+        if value != _ONLY[name]:
+            raise InputError(f"sparse_rasterization: {name}={value!r} is not supported, only {_ONLY[name]!r}")
+
+
+def _check_shapes(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    viewmats: Tensor,
+    Ks: Tensor,
+    sh_degree: int | None,
+) -> None:
+    count, cameras = means.shape[0], viewmats.shape[0]
+    expected = {
+        "means": (means, (count, 3)),
+        "quats": (quats, (count, 4)),
+        "scales": (scales, (count, 3)),
+        "opacities": (opacities, (count,)),
+        "viewmats": (viewmats, (cameras, 4, 4)),
+        "Ks": (Ks, (cameras, 3, 3)),
+        "colors": (colors, (count, 3) if sh_degree is None else (count, *colors.shape[1:2], 3)),
+    }
+    for name, (value, shape) in expected.items():
+        if tuple(value.shape) != shape:
+            form = "[N, 3] without sh_degree" if name == "colors" and sh_degree is None else str(list(shape))
+            raise InputError(f"{name} has shape {tuple(value.shape)}: expected {form} (N = {count}, C = {cameras})")
+    if sh_degree is not None and not 0 <= (sh_degree + 1) ** 2 <= colors.shape[1]:
+        raise InputError(f"sh_degree {sh_degree} needs {(sh_degree + 1) ** 2} bands: colors have {colors.shape[1]}")
