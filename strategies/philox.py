@@ -47,23 +47,27 @@ def philox4x32(counter: tuple[Array, Array, Array, Array], key: tuple[int, int])
     """Philox4x32-10.
 
     Args:
-        counter: four int64 tensors (or numpy arrays) that broadcast together, each holding values 0 .. 2^32 - 1.
+        counter: four int64 tensors (or numpy arrays), each holding values 0 .. 2^32 - 1; the first has the shape of the
+            result, the others broadcast to it.
         key: two such numbers.
 
     Returns:
-        Four int64 tensors (or arrays) of the broadcast shape, each holding values 0 .. 2^32 - 1.
+        Four int64 tensors (or arrays), each holding values 0 .. 2^32 - 1.
     """
     c0, c1, c2, c3 = counter
+    c2 = c2 + 0 * c0
     k0, k1 = key
     for _ in range(ROUNDS):
-        # A product of two 32-bit words wraps in int64, but keeps all of its 64 bits.
+        # A product of two 32-bit words wraps in int64, but keeps all of its 64 bits. In place, for speed on the CPU.
         product0, product1 = c0 * MULTIPLIERS[0], c2 * MULTIPLIERS[1]
-        c0, c1, c2, c3 = (
-            ((product1 >> 32) & MASK) ^ c1 ^ k0,
-            product1 & MASK,
-            ((product0 >> 32) & MASK) ^ c3 ^ k1,
-            product0 & MASK,
-        )
+        high0, high1 = product0 >> 32, product1 >> 32
+        for high, word, key_word in ((high1, c1, k0), (high0, c3, k1)):
+            high &= MASK
+            high ^= word
+            high ^= key_word
+        product0 &= MASK
+        product1 &= MASK
+        c0, c1, c2, c3 = high1, product1, high0, product0
         k0, k1 = (k0 + WEYL[0]) & MASK, (k1 + WEYL[1]) & MASK
     return c0, c1, c2, c3
 
@@ -73,7 +77,7 @@ def random_words(place: Tensor, view: Tensor | int, purpose: int, seed: int, ite
 
     Args:
         place: int64, any shape, values 0 .. 2^32 - 1.
-        view: int64 tensor that broadcasts with `place`, or a number.
+        view: int64 tensor that broadcasts to `place`, or a number.
     """
     constant = [torch.as_tensor(value, dtype=torch.int64, device=place.device) for value in (view, purpose, seed >> 32)]
     return philox4x32((place, constant[0], constant[1], constant[2] & MASK), (seed & MASK, iteration & MASK))
