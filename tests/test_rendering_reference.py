@@ -264,6 +264,25 @@ def test_lower_degrees_use_their_bands_alone(degree):
     assert (gradients.shN[:, bands:] == 0).all()
 
 
+@pytest.mark.parametrize("degree", [-1, 2])
+def test_a_degree_that_the_model_lacks_is_an_error(degree):
+    gaussians, cameras = make_gaussians(3, degree=1), make_cameras([(4, 4)])
+    with pytest.raises(ValueError, match="degrees 0 to 1"):
+        rasterize(gaussians, cameras, dense_samples(cameras), sh_degree=degree)
+
+
+def test_negative_exponents_are_skipped():
+    """A conic that rounding made indefinite draws nothing where its exponent is negative, as in gsplat."""
+    centers = torch.tensor([[[1.0, 1.0], [1.0, -1.0], [0.0, 0.0]]], dtype=torch.float64)
+    means, conic = torch.zeros(1, 2, dtype=torch.float64), torch.tensor([[1.0, 2.0, 1.0]], dtype=torch.float64)
+    ones = torch.ones(1, dtype=torch.float64)
+    table = compositing.splat_table(means, conic, ones.expand(1, 3), 0.5 * ones, ones)
+    row = torch.zeros(1, 1, dtype=torch.int64)
+    start = torch.ones(1, 3, 1, dtype=torch.float64)
+    piece = compositing.composite_slice(table, row, row == 0, centers, start, RasterSettings())
+    np.testing.assert_allclose(piece.weights[0, :, 0], [0.5 * np.exp(-3), 0, 0.5])
+
+
 def test_settings_are_used():
     gaussians, cameras = make_gaussians(40), make_cameras([(24, 24)])
     samples = dense_samples(cameras)

@@ -24,6 +24,15 @@ def expected_depths(sums: Tensor) -> Tensor:
     return sums[:, 4] / sums[:, 3].clamp(min=ALPHA_TINY)
 
 
+def used_degree(gaussians: Gaussians, sh_degree: int | None) -> int:
+    """The degree of spherical harmonics to evaluate; ValueError where the model does not hold it."""
+    if sh_degree is None:
+        return gaussians.sh_degree
+    if not 0 <= sh_degree <= gaussians.sh_degree:
+        raise ValueError(f"sh_degree is {sh_degree}, but these Gaussians hold degrees 0 to {gaussians.sh_degree}")
+    return sh_degree
+
+
 @dataclass
 class ReferenceScreenGradients:
     """Gradients on the screen (see `ScreenGradients`).
@@ -147,7 +156,7 @@ def rasterize_reference(
     with_depth: bool = False,
 ) -> ReferenceRendered:
     """Render samples; see `turbogs_plugin.rendering.rasterize`. float32 or float64, CPU or CUDA."""
-    degree = gaussians.sh_degree if sh_degree is None else sh_degree
+    degree = used_degree(gaussians, sh_degree)
     with torch.enable_grad():
         rows = drawable_rows(gaussians, cameras, settings)
         leaves = [getattr(gaussians, name).detach()[rows.gaussians].requires_grad_() for name in ROW_PARAMETERS]
@@ -196,7 +205,7 @@ def rasterize_differentiable(
     with_depth: bool = False,
 ) -> DifferentiableRender:
     """Render samples with gradients to `gaussians` through autograd; the arguments are those of `rasterize`."""
-    degree = gaussians.sh_degree if sh_degree is None else sh_degree
+    degree = used_degree(gaussians, sh_degree)
     rows = drawable_rows(gaussians, cameras, settings)
     parameters = [getattr(gaussians, name).index_select(0, rows.gaussians) for name in ROW_PARAMETERS]
     splats = project_rows(rows, *parameters, gaussians.shN, cameras, degree, settings)
