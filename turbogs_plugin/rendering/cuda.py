@@ -19,6 +19,7 @@ from turbogs_plugin.errors import InputError
 from turbogs_plugin.rendering.reference import DifferentiableRender
 from turbogs_plugin.rendering.rendered import DEFAULT_SETTINGS, Projected, RasterSettings
 from turbogs_plugin.rendering.workspace import Workspace, round_capacity
+from turbogs_plugin.training_kernels import BackwardInputs, projection_backward
 from turbogs_plugin.types import Cameras, GaussianGradients, Gaussians, GaussianStats, PixelSamples
 
 MAX_VIEWS = 128
@@ -118,11 +119,24 @@ class CudaScreenGradients:
         """[K, N, 16]."""
         return self.records
 
+    def backward_inputs(self) -> BackwardInputs:
+        """What the kernels that take these gradients on to the parameters want."""
+        return BackwardInputs(
+            gaussians=self.gaussians.map(_prepared),
+            cameras=self.cameras,
+            records=self.records,
+            sh_degree=self.sh_degree,
+            eps2d=self.settings.eps2d,
+            sample_count=len(self.samples),
+            num_filled=self.samples.filled.sum(dtype=torch.int32).reshape(1),
+            radii=self.radii,
+            stats=self.stats,
+            overflow=self.overflow,
+        )
+
     def parameter_gradients(self, rows: bool) -> GaussianGradients:
         """The gradients of the parameters: one row per view (`rows`), or their sum. May be called once."""
-        from turbogs_plugin import training_kernels
-
-        return training_kernels.projection_backward(self, rows=rows)
+        return projection_backward(self.backward_inputs(), rows)
 
 
 @dataclass

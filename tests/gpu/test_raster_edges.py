@@ -1,0 +1,196 @@
+"""Edges of the CUDA rasterizer: nothing to draw, streams, layouts, wrong input, and overflow with its retry."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from raster_cases import GPU_ONLY, make_case, on_gpu, samples_to, upstream
+
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.rendering import cuda, workspace
+from turbogs_plugin.rendering.workspace import Workspace
+
+pytestmark = GPU_ONLY
+
+
+@pytest.fixture
+def case():
+    return make_case([(70, 50), (33, 47)], count=200, rate=0.4, seed=11)
+
+
+def render(case, **options):
+    return cuda.rasterize_cuda(case.gpu_gaussians, case.gpu_cameras, case.gpu_samples, **options)
+
+
+def test_no_gaussians(case):
+    case.gpu_gaussians = case.gpu_gaussians.map(lambda value: value[:0])
+    rendered = render(case, with_depth=True)
+    assert (rendered.colors == 0).all() and (rendered.alphas == 0).all() and (rendered.depths == 0).all()
+    assert rendered.backward(torch.ones_like(rendered.colors)).full_records().shape == (2, 0, 16)
+
+
+def test_none_visible(case):
+    case.gpu_gaussians.means[:] = case.gpu_gaussians.means.new_tensor([0.0, 1e6, 0.0])
+    rendered = render(case)
+    assert int(rendered.num_pairs) == 0 and (rendered.colors == 0).all()
+    assert (rendered.backward(torch.ones_like(rendered.colors)).full_records() == 0).all()
+
+
+def test_no_samples(case):
+    none = {"pixel_ids": case.gpu_samples.pixel_ids[:0], "tile_ids": case.gpu_samples.tile_ids[:0]}
+    case.gpu_samples = replace(case.gpu_samples, **none, tile_offsets=case.gpu_samples.tile_offsets[:1])
+    rendered = render(case)
+    assert rendered.colors.shape == (0, 3)
+    assert (rendered.backward(rendered.colors).full_records() == 0).all()
+
+
+def test_one_pixel():
+    case = make_case([(1, 1)], count=50, seed=12)
+    from turbogs_plugin.rendering import rasterize_reference
+
+    wanted = rasterize_reference(case.gaussians, case.cameras, case.samples)
+    torch.testing.assert_close(render(case).colors.cpu().double(), wanted.colors, rtol=1e-4, atol=1e-4)
+
+
+def test_not_finite_parameters_are_not_drawn(case):
+    clean = render(case).colors
+    broken = case.gpu_gaussians.map(lambda value: torch.cat([value, value[:5]]))
+    broken.means[-5], broken.quats[-4, 1], broken.scales[-3] = float("nan"), float("inf"), float("inf")
+    broken.opacities[-2], broken.sh0[-1] = float("nan"), float("nan")
+    case.gpu_gaussians = broken
+    assert torch.equal(render(case).colors, clean)
+
+
+def test_side_stream(case):
+    wanted = render(case).colors
+    stream = torch.cuda.Stream()
+    stream.wait_stream(torch.cuda.current_stream())
+    with torch.cuda.stream(stream):
+        torch.cuda._sleep(50_000_000)  # work on the default stream would overtake this
+        delayed = case.gpu_gaussians.map(lambda value: value + 0)
+        case.gpu_gaussians = delayed
+        got = render(case).colors
+    stream.synchronize()
+    assert torch.equal(got, wanted)
+
+
+def test_forward_is_deterministic(case):
+    assert all(torch.equal(render(case).colors, render(case).colors) for _ in range(3))
+
+
+def test_second_device(case):
+    if torch.cuda.device_count() < 2:
+        pytest.skip("one GPU only")
+    wanted = render(case).colors
+    case.gpu_gaussians = case.gpu_gaussians.map(lambda value: value.to("cuda:1"))
+    case.gpu_cameras = case.gpu_cameras.to("cuda:1")
+    case.gpu_samples = samples_to(case.gpu_samples, "cuda:1")
+    assert torch.equal(render(case).colors.cpu(), wanted.cpu())
+
+
+def test_not_contiguous(case):
+    wanted = render(case).colors
+    case.gpu_gaussians = case.gpu_gaussians.map(
+        lambda value: (
+            torch.stack([value, value], dim=-1)[..., 0] if value.dim() > 1 else value.repeat_interleave(2)[::2]
+        )
+    )
+    assert not case.gpu_gaussians.means.is_contiguous()
+    got = render(case)
+    assert torch.equal(got.colors, wanted)
+    gradients = torch.ones(3, len(case.samples), device="cuda").T
+    records = got.backward(gradients).full_records()
+    torch.testing.assert_close(
+        records, render(case).backward(gradients.contiguous()).full_records(), rtol=1e-4, atol=1e-4
+    )
+
+
+def test_not_aligned(case):
+    """A slice of a model: rows of shN begin at any multiple of 4 bytes."""
+    wanted = render(case).colors
+    case.gpu_gaussians = case.gpu_gaussians.map(lambda value: torch.cat([value[:1], value])[1:])
+    assert torch.equal(render(case).colors, wanted)
+
+
+def test_wrong_input_says_what_was_wanted(case):
+    samples, good = case.gpu_samples, case.gpu_gaussians
+    wrong = {
+        "torch.float32": dict(gpu_gaussians=good.map(torch.Tensor.double)),
+        "torch.int32": dict(gpu_samples=replace(samples, pixel_ids=samples.pixel_ids.long())),
+        "means must be": dict(gpu_gaussians=replace(good, means=good.means.half())),
+        "on cpu": dict(gpu_samples=case.samples),
+        "image sizes": dict(gpu_cameras=case.gpu_cameras.select([1, 0])),
+    }
+    for message, change in wrong.items():
+        with pytest.raises(InputError, match=message):
+            render(replace(case, **change))
+    with pytest.raises(InputError, match="sh_degree"):
+        render(case, sh_degree=4)
+    rendered = render(case)
+    with pytest.raises(InputError, match="color_gradients"):
+        rendered.backward(torch.zeros(3, 3, device="cuda"))
+    with pytest.raises(InputError, match="with_depth"):
+        rendered.backward(torch.zeros_like(rendered.colors), depth_gradients=torch.zeros_like(rendered.alphas))
+    with pytest.raises(RuntimeError, match=r"pixel_ids must be a contiguous Int"):
+        forward = list(rendered._forward)
+        forward[3] = forward[3].long()
+        torch.ops.turbogs.raster_forward(*forward)
+
+
+def test_workspace_gives_the_same_and_does_not_wait(case):
+    wanted = render(case)
+    memory = Workspace("cuda")
+    values = on_gpu({name: value for name, value in upstream(case).items() if name != "depth_gradients"})
+    records = wanted.backward(**values).full_records()
+    for number in range(20):
+        if number:  # the first pass learns the count
+            torch.cuda.set_sync_debug_mode("error")
+        try:
+            got = render(case, workspace=memory)
+            got_records = got.backward(**values).full_records()
+        finally:
+            torch.cuda.set_sync_debug_mode("default")
+        assert torch.equal(got.colors, wanted.colors)
+        torch.testing.assert_close(got_records, records, rtol=1e-3, atol=1e-4)
+    assert memory.take_lost(wait=True) == 0
+
+
+def test_overflow_is_noticed_and_passes_are_repeated(case, monkeypatch):
+    """Too little room: nothing is drawn, the flag stays up for later passes, and the repetition is right."""
+    monkeypatch.setattr(workspace, "CAPACITY_STEP", 32)
+    wanted = render(case)
+    memory = Workspace("cuda")
+    render(case, workspace=memory)
+    assert memory.take_lost(wait=True) == 0
+    pairs_per_tile = memory._pairs_per_tile
+    memory._pairs_per_tile = 0.3 * pairs_per_tile
+    lost = render(case, workspace=memory)
+    assert (lost.colors == 0).all() and int(memory.overflow) == 1
+    records = lost.backward(torch.ones_like(lost.colors)).full_records()
+    assert (records == 0).all()
+    assert memory.overflowed is False  # the host has not looked yet
+    assert memory.take_lost(wait=True) == 1
+    assert int(memory.overflow) == 0 and memory.take_lost() == 0
+    assert torch.equal(render(case, workspace=memory).colors, wanted.colors)
+
+
+def test_a_pass_that_would_fit_stays_empty_while_the_flag_is_up(case):
+    memory = Workspace("cuda")
+    render(case, workspace=memory)
+    memory.overflow.fill_(1)
+    assert (render(case, workspace=memory).colors == 0).all()
+    torch.cuda.synchronize()
+    with pytest.raises(RuntimeError, match="take_lost"):
+        render(case, workspace=memory)
+    assert memory.take_lost() >= 1
+    assert (render(case, workspace=memory).colors != 0).any()
+
+
+def test_growing_model(case):
+    memory = Workspace("cuda")
+    for copies in (1, 3, 2):
+        grown = replace(case, gpu_gaussians=case.gpu_gaussians.map(lambda value, n=copies: torch.cat([value] * n)))
+        for _ in range(3):
+            got = render(grown, workspace=memory)
+        assert memory.take_lost(wait=True) == 0
+        assert torch.equal(got.colors, render(grown).colors)

@@ -1,0 +1,132 @@
+"""The CUDA rasterizer against the reference in float64: forward, screen records, parameter gradients, autograd."""
+
+import pytest
+import torch
+from raster_cases import (
+    GPU_ONLY,
+    RECORD_COLUMNS,
+    assert_forward_close,
+    assert_gradients_close,
+    make_case,
+    on_gpu,
+    upstream,
+)
+
+from turbogs_plugin.rendering import cuda, rasterize_reference
+from turbogs_plugin.rendering import rasterize_differentiable as differentiable_reference
+from turbogs_plugin.types import GaussianStats
+
+pytestmark = GPU_ONLY
+
+CASES = {
+    "one view dense": dict(sizes=[(96, 64)], count=300, seed=1),
+    "three views dense": dict(sizes=[(70, 50), (33, 47), (16, 16)], count=200, seed=2),
+    "rate 0.33": dict(sizes=[(130, 90)], count=400, rate=0.33, seed=3),
+    "rate 0.1 with empty slots": dict(
+        sizes=[(130, 90), (65, 97), (48, 48)], count=300, rate=0.1, seed=4, empty_slots=3
+    ),
+    "large splats": dict(sizes=[(200, 140)], count=60, rate=0.5, seed=5, log_scale=1.2),
+    "small splats": dict(sizes=[(160, 120), (90, 90)], count=3000, rate=0.2, seed=6, log_scale=-2.0),
+    "deep": dict(sizes=[(48, 48)], count=4000, rate=0.4, seed=7, log_scale=-0.5),
+    "one sample a tile": dict(sizes=[(100, 100)], count=200, rate=0.001, seed=8),
+}
+
+
+@pytest.fixture(params=CASES.values(), ids=CASES.keys())
+def case(request):
+    return make_case(**request.param)
+
+
+@pytest.fixture(params=[False, True], ids=["color", "depth"])
+def with_depth(request):
+    return request.param
+
+
+def render_both(case, with_depth=False):
+    got = cuda.rasterize_cuda(case.gpu_gaussians, case.gpu_cameras, case.gpu_samples, with_depth=with_depth)
+    return got, rasterize_reference(case.gaussians, case.cameras, case.samples, with_depth=with_depth)
+
+
+def test_forward(case, with_depth):
+    got, wanted = render_both(case, with_depth)
+    assert_forward_close(got.colors, wanted.colors, "colors")
+    assert_forward_close(got.alphas, wanted.alphas, "alphas")
+    if with_depth:
+        assert_forward_close(got.depths, wanted.depths, "depths")
+    empty = ~case.samples.filled
+    assert (got.colors.cpu()[empty] == 0).all() and (got.alphas.cpu()[empty] == 0).all()
+
+
+def test_projection(case):
+    got, wanted = (rendered.projected() for rendered in render_both(case))
+    assert (got.radii.cpu() != wanted.radii).double().mean() <= 1e-3  # a rounding to the next pixel
+    both = (got.radii.cpu() > 0).any(-1) & (wanted.radii > 0).any(-1)
+    for name in ("means2d", "conics", "depths", "opacities"):
+        torch.testing.assert_close(
+            getattr(got, name).cpu().double()[both], getattr(wanted, name)[both], rtol=2e-4, atol=2e-4
+        )
+
+
+def test_screen_records(case, with_depth):
+    got, wanted = render_both(case, with_depth)
+    values = upstream(case)
+    if not with_depth:
+        del values["depth_gradients"]
+    stats = GaussianStats.zeros(len(case.gaussians), "cuda")
+    records = got.backward(**on_gpu(values), stats=stats).full_records()
+    wanted_records = wanted.backward(**values).full_records()
+    for name, column in RECORD_COLUMNS.items():
+        assert_gradients_close(records[..., column], wanted_records[..., column], name)
+    assert (records[..., 15] == 0).all()
+
+
+def test_parameter_gradients(case):
+    got, wanted = render_both(case)
+    values = upstream(case)
+    del values["depth_gradients"]
+    stats = GaussianStats.zeros(len(case.gaussians), "cuda")
+    wanted_stats = GaussianStats.zeros(len(case.gaussians), "cpu").map(torch.Tensor.double)
+    gradients = got.backward(**on_gpu(values), stats=stats).parameter_gradients(rows=True)
+    wanted_gradients = wanted.backward(**values, stats=wanted_stats).parameter_gradients(rows=True)
+    for name, _ in case.gaussians.items():
+        ours, theirs = getattr(gradients, name), getattr(wanted_gradients, name)
+        assert_gradients_close(ours.reshape(*theirs.shape[:2], -1), theirs.reshape(*theirs.shape[:2], -1), name)
+    assert (gradients.touched.cpu() != wanted_gradients.touched).double().mean() <= 1e-2
+    for name in ("error_sums", "distance_sums", "weight_sums", "grad_sums", "absgrad_sums"):
+        assert_gradients_close(getattr(stats, name)[:, None], getattr(wanted_stats, name)[:, None], name)
+
+
+def test_autograd(case):
+    """A user's own loss in plain torch, with colours, alphas and depths."""
+    gpu = case.gpu_gaussians.map(lambda value: value.clone().requires_grad_())
+    cpu = case.gaussians.map(lambda value: value.clone().requires_grad_())
+    values = upstream(case)
+    renders = (
+        (cuda.rasterize_differentiable_cuda(gpu, case.gpu_cameras, case.gpu_samples, with_depth=True), on_gpu(values)),
+        (differentiable_reference(cpu, case.cameras, case.samples, with_depth=True), values),
+    )
+    for render, weights in renders:
+        loss = (render.colors.square() * weights["color_gradients"]).sum()
+        loss = loss + (render.alphas * weights["alpha_gradients"]).sum()
+        (loss + (render.depths * weights["depth_gradients"]).sum()).backward()
+    ours, theirs = renders[0][0], renders[1][0]
+    assert_gradients_close(ours.means2d.grad, theirs.means2d.grad, "means2d")
+    assert_gradients_close(ours.means2d.absgrad, theirs.means2d.absgrad, "absgrad")
+    for name, value in cpu.items():
+        got = getattr(gpu, name).grad
+        assert_gradients_close(got.reshape(len(case.gaussians), -1), value.grad.reshape(len(got), -1), name)
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 8), (2, 3), (3, 2), (4, 1), (4, 2)])
+def test_every_division_of_the_work_gives_the_same(shape, monkeypatch):
+    case = make_case([(70, 50), (33, 47)], count=250, rate=0.6, seed=9)
+    _, wanted = render_both(case)
+    values = upstream(case)
+    del values["depth_gradients"]
+    monkeypatch.setattr(cuda, "work_shape", lambda slots, tiles: shape)
+    got = cuda.rasterize_cuda(case.gpu_gaussians, case.gpu_cameras, case.gpu_samples)
+    assert_forward_close(got.colors, wanted.colors, "colors")
+    records, wanted_records = got.backward(**on_gpu(values)).full_records(), wanted.backward(**values).full_records()
+    for name, column in RECORD_COLUMNS.items():
+        if name != "distance_sum":
+            assert_gradients_close(records[..., column], wanted_records[..., column], name)
