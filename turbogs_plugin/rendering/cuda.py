@@ -19,7 +19,7 @@ from turbogs_plugin.errors import InputError
 from turbogs_plugin.rendering.reference import DifferentiableRender
 from turbogs_plugin.rendering.rendered import DEFAULT_SETTINGS, Projected, RasterSettings
 from turbogs_plugin.rendering.workspace import Workspace, round_capacity
-from turbogs_plugin.training_kernels import BackwardInputs, projection_backward
+from turbogs_plugin.training_kernels import projection_backward
 from turbogs_plugin.types import Cameras, GaussianGradients, Gaussians, GaussianStats, PixelSamples
 
 MAX_VIEWS = 128
@@ -92,7 +92,7 @@ class CudaScreenGradients:
     """Gradients on the screen (see `ScreenGradients`), and what takes them to the parameters.
 
     Args:
-        gaussians: the model that was drawn, raw parameters.
+        gaussians: the model that was drawn, raw parameters: contiguous, and the caller's own tensors where those were.
         cameras: the K views.
         samples: of the pass.
         sh_degree: bands that were used.
@@ -119,24 +119,9 @@ class CudaScreenGradients:
         """[K, N, 16]."""
         return self.records
 
-    def backward_inputs(self) -> BackwardInputs:
-        """What the kernels that take these gradients on to the parameters want."""
-        return BackwardInputs(
-            gaussians=self.gaussians.map(_prepared),
-            cameras=self.cameras,
-            records=self.records,
-            sh_degree=self.sh_degree,
-            eps2d=self.settings.eps2d,
-            sample_count=len(self.samples),
-            num_filled=self.samples.filled.sum(dtype=torch.int32).reshape(1),
-            radii=self.radii,
-            stats=self.stats,
-            overflow=self.overflow,
-        )
-
     def parameter_gradients(self, rows: bool) -> GaussianGradients:
         """The gradients of the parameters: one row per view (`rows`), or their sum. May be called once."""
-        return projection_backward(self.backward_inputs(), rows)
+        return projection_backward(self, rows)
 
 
 @dataclass
@@ -246,6 +231,7 @@ def rasterize_cuda(
     kernels.require()
     degree = gaussians.sh_degree if sh_degree is None else sh_degree
     _check(gaussians, cameras, samples, degree)
+    gaussians = gaussians.map(_prepared)
     device = gaussians.device
     buffers = workspace if workspace is not None else _FreshBuffers(device)
     views, count, slots = len(cameras), len(gaussians), len(samples)
@@ -267,7 +253,7 @@ def rasterize_cuda(
     depth_keys, instance_ids = integers("depth_keys", 2, total), integers("instance_ids", 2, total)
     tile_counts = integers("tile_counts", total)
     torch.ops.turbogs.raster_project(
-        *(_prepared(value) for _, value in gaussians.items()),
+        *(value for _, value in gaussians.items()),
         cameras.viewmats.detach().contiguous(),
         cameras.Ks.detach().contiguous(),
         torch.from_numpy(np.ascontiguousarray(samples.sizes, dtype=np.int64)),

@@ -1,10 +1,10 @@
 """Memory of the CUDA rasterizer from one pass to the next, and how it does without waiting for the GPU.
 
 The number of (tile, splat) pairs of a pass is known on the GPU only. A `Workspace` gives every pass room for as many
-pairs as earlier passes lead to expect. Each pass sends its true count to the host without waiting, and later passes look
-whether it has come. Where a count exceeds its room, the kernels raise a flag on the device: that pass and all that follow
-it draw nothing and change nothing, until the host learns of it, makes room and lowers the flag (`Workspace.take_lost`).
-So a splat is never dropped silently; the passes in between are done again.
+pairs as earlier passes lead to expect. Each pass sends its true count to the host without waiting, and later passes
+look whether it has come. Where a count exceeds its room, the kernels raise a flag on the device: that pass and all that
+follow it draw nothing and change nothing, until the host learns of it, makes room and lowers the flag
+(`Workspace.take_lost`). So a splat is never dropped silently; the passes in between are done again.
 """
 
 from __future__ import annotations
