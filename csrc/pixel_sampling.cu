@@ -120,16 +120,22 @@ __device__ __forceinline__ double warp_sum(double value) {
     return value;
 }
 
+// What a stage did, for importance weights: the largest key it left and the smallest it took; or `exhausted`, where it
+// took all there were.
+template <class Key>
+struct Taken {
+    uint32_t units;  // bit j: the lane's j-th unit
+    bool exhausted;
+    Key largest_left, smallest_taken;  // where asked for
+};
+
 // The `count` largest keys of a warp's units, unit (j, lane) having rank 32 j + lane: among equals the lower rank goes
-// first. `active` and the result hold bit j for the lane's j-th unit. `tau` becomes the largest key left, and the return
-// of `exhausted` true where none is.
+// first. `active` holds bit j for the lane's j-th unit.
 template <class Key, int kUnits>
-__device__ __forceinline__ uint32_t take_largest(const Key (&keys)[kUnits], uint32_t active, int count, bool with_tau,
-                                                 Key& tau, bool& exhausted) {
+__device__ __forceinline__ Taken<Key> take_largest(const Key (&keys)[kUnits], uint32_t active, int count,
+                                                   bool with_thresholds) {
     const int available = static_cast<int>(__reduce_add_sync(kFull, static_cast<uint32_t>(__popc(active))));
-    exhausted = available <= count;
-    tau = 0;
-    if (exhausted) return active;
+    if (available <= count) return {active, true, 0, 0};
 
     Key any = 0, all = ~Key{0};
 #pragma unroll
@@ -147,7 +153,7 @@ __device__ __forceinline__ uint32_t take_largest(const Key (&keys)[kUnits], uint
     Key threshold = all & ~((Key{2} << (bit < 0 ? 0 : bit)) - 1);
     if (bit < 0) threshold = all;
     bool exact = false;
-    for (; bit >= 0 && !exact; --bit) {
+    for (; bit >= 0 && (with_thresholds || !exact); --bit) {
         const Key candidate = threshold | Key{1} << bit;
         uint32_t reached = 0;
 #pragma unroll
@@ -155,7 +161,7 @@ __device__ __forceinline__ uint32_t take_largest(const Key (&keys)[kUnits], uint
         const int total = static_cast<int>(__reduce_add_sync(kFull, reached));
         if (total >= count) {
             threshold = candidate;
-            exact = total == count;
+            exact = exact || total == count;
         }
     }
     uint32_t taken = 0;
@@ -178,15 +184,26 @@ __device__ __forceinline__ uint32_t take_largest(const Key (&keys)[kUnits], uint
             room -= __popc(ties);
         }
     }
-    if (with_tau) {
-        Key left = 0;
+    Key left = 0;
+    if (with_thresholds) {
 #pragma unroll
         for (int j = 0; j < kUnits; ++j) {
             if (((active & ~taken) >> j & 1u) != 0u && keys[j] > left) left = keys[j];
         }
-        tau = warp_max(left);
+        left = warp_max(left);
     }
-    return taken;
+    return {taken, false, left, threshold};
+}
+
+// The chance of the lane's j-th unit to be taken by a stage, given the others' keys.
+__device__ __forceinline__ float race_chance(float weight, const Taken<uint32_t>& taken, int j) {
+    if (taken.exhausted) return 1.0f;
+    return race_chance(weight, (taken.units >> j & 1u) != 0u ? taken.largest_left : taken.smallest_taken);
+}
+
+__device__ __forceinline__ float age_chance(int age, const Taken<uint64_t>& taken, int j) {
+    if (taken.exhausted) return 1.0f;
+    return age_chance(age, (taken.units >> j & 1u) != 0u ? taken.largest_left : taken.smallest_taken);
 }
 
 // The three stages over a warp's units. Returns the drawn ones; `missed` the probability of not being drawn.
@@ -196,7 +213,7 @@ __device__ __forceinline__ uint32_t draw(const SamplePixelsParams& params, const
                                          uint32_t view, uint32_t purpose, double error_sum, int age_sum,
                                          float (&missed)[kUnits]) {
     const int hard = params.stages[0][0], stable = params.stages[0][1], mixed = params.stages[0][2];
-    const bool with_tau = params.weights != nullptr;
+    const bool weighted = params.weights != nullptr;
     Words words[kUnits];
 #pragma unroll
     for (int j = 0; j < kUnits; ++j) {
@@ -204,25 +221,26 @@ __device__ __forceinline__ uint32_t draw(const SamplePixelsParams& params, const
         missed[j] = 1.0f;
     }
     uint32_t drawn = 0;
-    uint32_t keys[kUnits], tau;
-    bool exhausted;
+    uint32_t keys[kUnits];
     if (hard > 0) {
 #pragma unroll
         for (int j = 0; j < kUnits; ++j) keys[j] = race_key(errors[j], words[j].x0);
-        drawn |= take_largest(keys, exist, hard, with_tau, tau, exhausted);
-        if (with_tau) {
+        const Taken<uint32_t> taken = take_largest(keys, exist, hard, weighted);
+        drawn |= taken.units;
+        if (weighted) {
 #pragma unroll
-            for (int j = 0; j < kUnits; ++j) missed[j] *= exhausted ? 0.0f : 1.0f - race_chance(errors[j], tau);
+            for (int j = 0; j < kUnits; ++j) missed[j] *= 1.0f - race_chance(errors[j], taken, j);
         }
     }
     if (stable > 0) {
-        uint64_t age_keys[kUnits], age_tau;
+        uint64_t age_keys[kUnits];
 #pragma unroll
         for (int j = 0; j < kUnits; ++j) age_keys[j] = age_key(ages[j], words[j].x1);
-        drawn |= take_largest(age_keys, exist & ~drawn, stable, with_tau, age_tau, exhausted);
-        if (with_tau) {
+        const Taken<uint64_t> taken = take_largest(age_keys, exist & ~drawn, stable, weighted);
+        drawn |= taken.units;
+        if (weighted) {
 #pragma unroll
-            for (int j = 0; j < kUnits; ++j) missed[j] *= exhausted ? 0.0f : 1.0f - age_chance(ages[j], age_tau);
+            for (int j = 0; j < kUnits; ++j) missed[j] *= 1.0f - age_chance(ages[j], taken, j);
         }
     }
     if (mixed > 0) {
@@ -233,10 +251,11 @@ __device__ __forceinline__ uint32_t draw(const SamplePixelsParams& params, const
             weights[j] = params.mixed_uniform ? 1.0f : mixed_weight(errors[j], ages[j], error_total, age_total);
             keys[j] = race_key(weights[j], words[j].x2);
         }
-        drawn |= take_largest(keys, exist & ~drawn, mixed, with_tau, tau, exhausted);
-        if (with_tau) {
+        const Taken<uint32_t> taken = take_largest(keys, exist & ~drawn, mixed, weighted);
+        drawn |= taken.units;
+        if (weighted) {
 #pragma unroll
-            for (int j = 0; j < kUnits; ++j) missed[j] *= exhausted ? 0.0f : 1.0f - race_chance(weights[j], tau);
+            for (int j = 0; j < kUnits; ++j) missed[j] *= 1.0f - race_chance(weights[j], taken, j);
         }
     }
     return drawn;
@@ -451,7 +470,7 @@ __global__ void __launch_bounds__(kChooseThreads) choose_tiles_kernel(
     const int32_t* ages = params.tile_ages + view.tile_base;
     int64_t* keys = params.tile_keys + view.tile_base;
     float* missed = params.tile_missed + view.tile_base;
-    const bool with_tau = params.weights != nullptr;
+    const bool weighted = params.weights != nullptr;
 
     double error_part = 0.0;
     long long age_part = 0;
@@ -491,24 +510,24 @@ __global__ void __launch_bounds__(kChooseThreads) choose_tiles_kernel(
                 for (int i = threadIdx.x; i < count; i += kChooseThreads) reached += keys[i] >= candidate;
                 const long long total = block_sum(reached, scratch);
                 if (total >= wanted) threshold = candidate;
-                if (total == wanted) break;
+                if (total == wanted && !weighted) break;  // to the last bit, `threshold` is the smallest key taken
             }
         }
         // The largest key left, found the same way: the largest number that some remaining key reaches.
-        int64_t tau = 0;
-        if (with_tau && !exhausted) {
+        int64_t largest_left = 0;
+        if (weighted && !exhausted) {
             for (int bit = 58; bit >= 0; --bit) {
-                const int64_t candidate = tau | int64_t{1} << bit;
+                const int64_t candidate = largest_left | int64_t{1} << bit;
                 long long reached = 0;
                 for (int i = threadIdx.x; i < count; i += kChooseThreads) {
                     reached += keys[i] < threshold && keys[i] >= candidate;
                 }
-                if (block_sum(reached, scratch) > 0) tau = candidate;
+                if (block_sum(reached, scratch) > 0) largest_left = candidate;
             }
-            tau >>= kRankBits;
         }
         for (int i = threadIdx.x; i < count; i += kChooseThreads) {
-            if (with_tau) {
+            if (weighted) {
+                const int64_t tau = (keys[i] >= threshold ? largest_left : threshold) >> kRankBits;
                 const float chance = stage == 1 ? age_chance(ages[i], static_cast<uint64_t>(tau))
                                                 : race_chance(weight_of(i), static_cast<uint32_t>(tau));
                 missed[i] *= exhausted ? 0.0f : 1.0f - chance;

@@ -39,6 +39,24 @@ struct RowSum {
     }
 };
 
+// Bit k: some gradient or sum of view k is not zero. Wider than `touched_views`: a loss of a user may put gradients on
+// projected means that no sample saw.
+__device__ __forceinline__ uint32_t views_with_gradient(const ScreenBackwardParams& params, int gaussian) {
+    uint32_t mask = 0u;
+    for (int view = 0; view < params.num_views; ++view) {
+        const float4* record =
+            params.records + (static_cast<size_t>(view) * params.num_gaussians + gaussian) * kRecordQuads;
+        bool any = false;
+#pragma unroll
+        for (int i = 0; i < kRecordQuads; ++i) {
+            const float4 quad = record[i];
+            any = any || quad.x != 0.0f || quad.y != 0.0f || quad.z != 0.0f || (i < 3 && quad.w != 0.0f);
+        }
+        if (any) mask |= 1u << view;
+    }
+    return mask;
+}
+
 template <bool kPerView>
 __global__ void __launch_bounds__(kBackwardThreads) projection_backward_kernel(
     const __grid_constant__ ScreenBackwardParams params, const ProjectionBackwardOutputs outputs) {
@@ -49,7 +67,7 @@ __global__ void __launch_bounds__(kBackwardThreads) projection_backward_kernel(
     const bool inside = gaussian < params.num_gaussians;
 
     load_cameras(params, block);
-    const uint32_t mask = inside ? touched_views(params, gaussian) : 0u;
+    const uint32_t mask = inside ? views_with_gradient(params, gaussian) : 0u;
     load_harmonics(params, block, mask != 0u);  // a barrier inside
 
     if (inside) {
@@ -65,7 +83,7 @@ __global__ void __launch_bounds__(kBackwardThreads) projection_backward_kernel(
             backward_views(params, block, gaussian, mask, total);
             writer.write(0, total.sum, total.loss);
         }
-        outputs.touched[gaussian] = mask != 0u;
+        outputs.touched[gaussian] = touched_views(params, gaussian) != 0u;
     }
     __syncthreads();
     const int row = 3 * params.bands;

@@ -426,8 +426,7 @@ __device__ __forceinline__ void backward_views(const ScreenBackwardParams& param
     const bool with_stats = params.error_sums != nullptr;
     float error_sum = 0.0f, distance_sum = 0.0f, weight_sum = 0.0f, grad_sum = 0.0f, absgrad_sum = 0.0f;
     if (mask != 0u) {
-        const float count =
-            static_cast<float>(max(params.num_filled != nullptr ? *params.num_filled : params.sample_count, 1));
+        const float count = static_cast<float>(max(*params.num_filled, 1));
         float mean[3], log_scale[3], sh0[3];
 #pragma unroll
         for (int i = 0; i < 3; ++i) {

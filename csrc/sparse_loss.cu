@@ -36,11 +36,15 @@ __device__ __forceinline__ double warp_sum(double value) {
 
 __device__ __forceinline__ bool is_finite(float value) { return fabsf(value) <= FLT_MAX; }
 
-__global__ void __launch_bounds__(256) count_filled_kernel(const int32_t* pixel_ids, int count, int32_t* filled) {
+constexpr int kCountThreads = 256;
+
+__global__ void __launch_bounds__(kCountThreads) count_filled_kernel(const CountFilledParams params) {
     int mine = 0;
-    for (int i = blockIdx.x * 256 + threadIdx.x; i < count; i += gridDim.x * 256) mine += pixel_ids[i] >= 0;
+    for (int i = blockIdx.x * kCountThreads + threadIdx.x; i < params.num_slots; i += gridDim.x * kCountThreads) {
+        mine += params.pixel_ids[i] >= 0;
+    }
     const uint32_t total = __reduce_add_sync(kFull, static_cast<uint32_t>(mine));
-    if ((threadIdx.x & 31) == 0 && total != 0u) atomicAdd(filled, static_cast<int32_t>(total));
+    if ((threadIdx.x & 31) == 0 && total != 0u) atomicAdd(params.num_filled, static_cast<int32_t>(total));
 }
 
 // What a warp adds up over its run of tiles.
@@ -294,12 +298,15 @@ __global__ void __launch_bounds__(kLossThreads) sparse_loss_kernel(const __grid_
 
 }  // namespace
 
+cudaError_t launch_count_filled(const CountFilledParams& params, cudaStream_t stream) {
+    if (params.num_slots == 0) return cudaSuccess;
+    const int blocks = min((params.num_slots + 4 * kCountThreads - 1) / (4 * kCountThreads), 512);
+    count_filled_kernel<<<blocks, kCountThreads, 0, stream>>>(params);
+    return cudaGetLastError();
+}
+
 cudaError_t launch_sparse_loss(const SparseLossParams& params, cudaStream_t stream) {
     if (params.num_slots == 0 || params.num_tiles == 0) return cudaSuccess;
-    const int count_blocks = min((params.num_slots + 1023) / 1024, 512);
-    count_filled_kernel<<<count_blocks, 256, 0, stream>>>(params.pixel_ids, params.num_slots, params.num_filled);
-    const cudaError_t status = cudaGetLastError();
-    if (status != cudaSuccess) return status;
     const int blocks = min((params.num_tiles + kLossWarps - 1) / kLossWarps, kMaxBlocks);
     sparse_loss_kernel<<<blocks, kLossThreads, 0, stream>>>(params);
     return cudaGetLastError();

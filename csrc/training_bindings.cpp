@@ -15,12 +15,12 @@
 namespace turbogs {
 namespace {
 
-// The batch that a backward pass works on; see `BackwardInputs` in training_kernels.py.
+// The batch that a backward pass works on: what `CudaScreenGradients` of rendering/cuda.py holds.
 ScreenBackwardParams screen_backward_params(const Checker& check, const std::vector<Tensor>& gaussians,
                                             const Tensor& viewmats, const Tensor& Ks, const std::vector<int64_t>& sizes,
                                             const Tensor& records, const std::optional<Tensor>& radii,
                                             const std::vector<Tensor>& stats, int64_t sh_degree, double eps2d,
-                                            int64_t sample_count, const std::optional<Tensor>& num_filled,
+                                            const Tensor& num_filled,
                                             const std::optional<Tensor>& overflow) {
     STD_TORCH_CHECK(gaussians.size() == 6, "turbogs: gaussians must be means, quats, scales, opacities, sh0, shN");
     STD_TORCH_CHECK(gaussians[0].dim() == 2 && gaussians[5].dim() == 3, "turbogs: means must be [N, 3], shN [N, B, 3]");
@@ -56,8 +56,7 @@ ScreenBackwardParams screen_backward_params(const Checker& check, const std::vec
     check.aligned(params.quats, "quats");
     check.aligned(params.shN, "shN");
     check.aligned(params.records, "screen gradients");
-    params.sample_count = static_cast<int>(sample_count);
-    params.num_filled = check.optional<int32_t>(num_filled, "num_filled", ScalarType::Int, {1});
+    params.num_filled = check.pointer<int32_t>(num_filled, "num_filled", ScalarType::Int, {1});
     params.overflow = check.optional<int32_t>(overflow, "overflow", ScalarType::Int, {1});
     if (!stats.empty()) {
         STD_TORCH_CHECK(stats.size() == 7, "turbogs: stats must be the seven tensors of GaussianStats");
@@ -78,12 +77,11 @@ ScreenBackwardParams screen_backward_params(const Checker& check, const std::vec
 
 void projection_backward(const std::vector<Tensor>& gaussians, const Tensor& viewmats, const Tensor& Ks,
                          const std::vector<int64_t>& sizes, const Tensor& records, const std::optional<Tensor>& radii,
-                         const std::vector<Tensor>& stats, int64_t sh_degree, double eps2d, int64_t sample_count,
-                         const std::optional<Tensor>& num_filled, const std::optional<Tensor>& overflow, const Tensor& rows,
+                         const std::vector<Tensor>& stats, int64_t sh_degree, double eps2d, const Tensor& num_filled, const std::optional<Tensor>& overflow, const Tensor& rows,
                          const Tensor& shN, const Tensor& touched, const Tensor& view_losses) {
     const Checker check(records);
     const ScreenBackwardParams params = screen_backward_params(check, gaussians, viewmats, Ks, sizes, records, radii, stats,
-                                                               sh_degree, eps2d, sample_count, num_filled, overflow);
+                                                               sh_degree, eps2d, num_filled, overflow);
     STD_TORCH_CHECK(rows.dim() == 3 && (rows.size(0) == 1 || rows.size(0) == params.num_views),
                     "turbogs: rows must be [1, N, 14] or [K, N, 14]");
     const int64_t num_rows = rows.size(0), count = params.num_gaussians;
@@ -98,14 +96,13 @@ void projection_backward(const std::vector<Tensor>& gaussians, const Tensor& vie
 
 void fused_step(const std::vector<Tensor>& gaussians, const Tensor& viewmats, const Tensor& Ks,
                 const std::vector<int64_t>& sizes, const Tensor& records, const std::optional<Tensor>& radii,
-                const std::vector<Tensor>& stats, int64_t sh_degree, double eps2d, int64_t sample_count,
-                const std::optional<Tensor>& num_filled, const std::optional<Tensor>& overflow,
+                const std::vector<Tensor>& stats, int64_t sh_degree, double eps2d, const Tensor& num_filled, const std::optional<Tensor>& overflow,
                 const std::vector<Tensor>& moments, int64_t kind, bool rows_per_view,
                 const std::vector<double>& rates, double beta1, double beta2, double eps,
                 double curvature, double max_step) {
     const Checker check(records);
     const ScreenBackwardParams params = screen_backward_params(check, gaussians, viewmats, Ks, sizes, records, radii, stats,
-                                                               sh_degree, eps2d, sample_count, num_filled, overflow);
+                                                               sh_degree, eps2d, num_filled, overflow);
     STD_TORCH_CHECK(moments.size() == 6, "turbogs: moments must be the six tensors of GaussianMoments");
     STD_TORCH_CHECK(rates.size() == 6, "turbogs: rates must be of means, quats, scales, opacities, sh0, shN");
     STD_TORCH_CHECK(kind >= 0 && kind <= 2, "turbogs: kind must be 0 (Adam), 1 (balanced LM) or 2 (paper's LM)");
@@ -224,6 +221,15 @@ void sample_pixels(const Tensor& errors, const Tensor& stamps, const std::vector
     check.launched(launch_sample_pixels(params, check.stream()), "pixel sampler");
 }
 
+void count_filled(const Tensor& pixel_ids, const Tensor& num_filled) {
+    const Checker check(pixel_ids);
+    CountFilledParams params = {};
+    params.num_slots = static_cast<int>(pixel_ids.numel());
+    params.pixel_ids = check.pointer<int32_t>(pixel_ids, "pixel_ids", ScalarType::Int, {params.num_slots});
+    params.num_filled = check.pointer<int32_t>(num_filled, "num_filled", ScalarType::Int, {1});
+    check.launched(launch_count_filled(params, check.stream()), "count of samples");
+}
+
 void sparse_loss(const Tensor& colors, const std::optional<Tensor>& targets, const std::optional<Tensor>& photos,
                  const Tensor& pixel_ids, const Tensor& tile_ids, const Tensor& tile_offsets,
                  const std::optional<Tensor>& weights, const std::vector<int64_t>& views, int64_t structure, double epsilon,
@@ -290,7 +296,7 @@ void sparse_loss(const Tensor& colors, const std::optional<Tensor>& targets, con
 
 #define TURBOGS_BACKWARD_INPUTS                                                                              \
     "Tensor(p!)[] gaussians, Tensor viewmats, Tensor Ks, int[] sizes, Tensor(r!) records, Tensor? radii, "           \
-    "Tensor(s!)[] stats, int sh_degree, float eps2d, int sample_count, Tensor? num_filled, Tensor? overflow, "
+    "Tensor(s!)[] stats, int sh_degree, float eps2d, Tensor num_filled, Tensor? overflow, "
 
 STABLE_TORCH_LIBRARY_FRAGMENT(turbogs, m) {
     m.def("projection_backward(" TURBOGS_BACKWARD_INPUTS
@@ -302,11 +308,12 @@ STABLE_TORCH_LIBRARY_FRAGMENT(turbogs, m) {
         "sample_pixels(Tensor errors, Tensor stamps, int[] views, int unit, int[] stages, int slots_per_tile, "
         "bool mixed_uniform, float importance, int seed, int iteration, int now, Tensor(a!) pixel_ids, "
         "Tensor(b!) tile_ids, Tensor(c!) tile_offsets, Tensor(d!)? weights, Tensor(e!)[] scratch) -> ()");
+    m.def("count_filled(Tensor pixel_ids, Tensor(a!) num_filled) -> ()");
     m.def(
         "sparse_loss(Tensor colors, Tensor? targets, Tensor? photos, Tensor pixel_ids, Tensor tile_ids, "
         "Tensor tile_offsets, Tensor? weights, int[] views, int structure, float epsilon, float l1_weight, "
         "float structure_weight, float variance_constant, bool balance, bool gate, Tensor(a!)[] maps, float beta, "
-        "int stamp, Tensor(b!) num_filled, Tensor(c!) loss, Tensor(d!) color_gradients, Tensor(e!) pixel_errors, "
+        "int stamp, Tensor num_filled, Tensor(c!) loss, Tensor(d!) color_gradients, Tensor(e!) pixel_errors, "
         "Tensor(f!)? num_nonfinite) -> ()");
 }
 
@@ -314,5 +321,6 @@ STABLE_TORCH_LIBRARY_IMPL(turbogs, CUDA, m) {
     m.impl("projection_backward", TORCH_BOX(&turbogs::projection_backward));
     m.impl("fused_step", TORCH_BOX(&turbogs::fused_step));
     m.impl("sample_pixels", TORCH_BOX(&turbogs::sample_pixels));
+    m.impl("count_filled", TORCH_BOX(&turbogs::count_filled));
     m.impl("sparse_loss", TORCH_BOX(&turbogs::sparse_loss));
 }

@@ -40,8 +40,7 @@ struct ScreenBackwardParams {
 
     float4* records;             // [K, N, 4]; the fused step puts the rows of the parameters in their place
     const int2* radii;           // [K, N]; read only where `stats` are wanted
-    const int32_t* num_filled;   // [1] filled samples of the batch, or null where all `sample_count` slots are
-    int sample_count;
+    const int32_t* num_filled;   // [1] filled samples of the batch
     const int32_t* overflow;     // [1], or null; where set, the launch does nothing
 
     // GaussianStats, added to in place; all null where not wanted.
@@ -59,7 +58,7 @@ struct ProjectionBackwardOutputs {
     bool per_view;       // rows of each view, or their sum
     float* rows;         // [K, N, 14] or [1, N, 14]
     float* shN;          // [N, B, 3]
-    bool* touched;       // [N]
+    bool* touched;       // [N] sum w > 0 in some view
     float* view_losses;  // [K, N] or [1, N]
 };
 
@@ -158,7 +157,7 @@ struct SparseLossParams {
     const float* targets;         // [P, 3], or null: then `photos` are gathered
     const uint8_t* photos;        // [X, 3]
 
-    int32_t* num_filled;          // [1], zero before the launch; filled slots
+    const int32_t* num_filled;    // [1] filled slots
     double* loss;                 // [1], zero before the launch
     float* color_gradients;       // [P, 3] out
     float* pixel_errors;          // [P] out
@@ -172,6 +171,14 @@ struct SparseLossParams {
     int16_t stamp;
 };
 
+// Adds the filled slots (id >= 0) to `num_filled`.
+struct CountFilledParams {
+    const int32_t* pixel_ids;  // [P]
+    int num_slots;
+    int32_t* num_filled;       // [1]
+};
+
+cudaError_t launch_count_filled(const CountFilledParams& params, cudaStream_t stream);
 cudaError_t launch_sparse_loss(const SparseLossParams& params, cudaStream_t stream);
 cudaError_t launch_sample_pixels(const SamplePixelsParams& params, cudaStream_t stream);
 

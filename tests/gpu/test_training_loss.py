@@ -1,0 +1,146 @@
+"""The CUDA loss equals its torch twins, updates the maps as `ErrorMaps.update` does, and keeps bad colours out."""
+
+import numpy as np
+import pytest
+import torch
+
+from turbogs_plugin import kernels, training_kernels
+from turbogs_plugin.error_maps import ErrorMaps
+from turbogs_plugin.strategies.loss import CharbonnierLoss, CharbonnierNccLoss, SparseSsimLoss
+from turbogs_plugin.strategies.pixel_sampling import DrawRule, draw_pixels
+from turbogs_plugin.training_kernels import LossTerms, MapUpdate
+from turbogs_plugin.types import PixelSamples, Step
+
+pytestmark = [
+    pytest.mark.gpu,
+    pytest.mark.skipif(not kernels.available(), reason=kernels.unavailable_reason() or "available"),
+]
+
+DEVICE = "cuda"
+SIZES = np.array([(40, 33), (20, 17), (64, 48)], dtype=np.int64)
+STEP = Step(iteration=12, total=100, refine_until=70, seed=3)
+
+CASES = {
+    "l1": (CharbonnierLoss(), LossTerms(1e-3)),
+    "ncc": (CharbonnierNccLoss(), LossTerms(1e-3, 1.0, "ncc", 0.2, 9e-4, True)),
+    "contrast": (
+        CharbonnierNccLoss(structure="contrast", gate=True, ncc_weight=1.0),
+        LossTerms(1e-3, 1.0, "contrast", 1.0, 9e-4, True, True),
+    ),
+    "ssim": (SparseSsimLoss(), LossTerms(1e-3, 0.8, "ssim", 0.2)),
+}
+
+
+def make_maps(device, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    images = [3 * torch.rand(int(h), int(w), generator=generator) ** 2 for w, h in SIZES]
+    return ErrorMaps.from_images([image.to(device) for image in images])
+
+
+def make_samples(rate, unit="cell", importance=0.0, views=(2, 0)):
+    maps = make_maps("cpu")
+    index = np.asarray(views)
+    rule = DrawRule(unit, 0.4, 0.3, False, importance)
+    return draw_pixels(maps.errors, maps.stamps, 0, maps.offsets[index], SIZES[index], views, rate, rule, 0, 0)
+
+
+def to_device(samples):
+    moved = {name: getattr(samples, name).to(DEVICE) for name in ("pixel_ids", "tile_ids", "tile_offsets")}
+    weights = None if samples.weights is None else samples.weights.to(DEVICE)
+    return PixelSamples(samples.view_ids, samples.sizes, **moved, weights=weights)
+
+
+def make_colors(samples, seed=0):
+    """Predictions and uint8 photos; some tiles constant in one or both, where NCC has no information."""
+    generator = torch.Generator().manual_seed(seed)
+    photos = torch.randint(0, 256, (int(SIZES.prod(axis=1).sum()), 3), generator=generator, dtype=torch.uint8)
+    photos[: 40 * 16] = 200
+    offsets = np.concatenate([[0], np.cumsum(SIZES.prod(axis=1))])
+    starts = offsets[list(samples.view_ids)]
+    flat = torch.as_tensor(starts)[samples.view_of_slot()] + samples.pixel_ids.long().clamp(min=0)
+    targets = photos[flat].float().div(255.0) * samples.filled[:, None]
+    colors = targets + 0.1 * torch.randn(targets.shape, generator=generator)
+    colors[:40] = targets[:40]
+    colors = colors * samples.filled[:, None]
+    return colors, targets, photos, starts
+
+
+def relative(found, expected):
+    return float((found.double().cpu() - expected.double()).norm() / expected.double().norm().clamp(min=1e-30))
+
+
+@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize(("rate", "unit", "importance"), [(0.1, "pixel", 0.5), (0.3, "cell", 0.0), (1.0, "tile", 1.0)])
+def test_equals_the_twin(name, rate, unit, importance):
+    loss, terms = CASES[name]
+    samples = make_samples(rate, unit, importance)
+    colors, targets, photos, starts = make_colors(samples)
+    expected = loss(colors.double(), targets.double(), samples)
+    for truth, extra in ((targets, {}), (photos, {"starts": starts})):
+        found = training_kernels.sparse_loss(colors.to(DEVICE), truth.to(DEVICE), to_device(samples), terms, **extra)
+        assert float(found.loss) == pytest.approx(float(expected.loss), rel=1e-5)
+        assert relative(found.color_gradients, expected.color_gradients) < 1e-5
+        assert not found.color_gradients.cpu()[~samples.filled].any()
+        torch.testing.assert_close(found.pixel_errors.cpu(), expected.pixel_errors, rtol=1e-5, atol=2e-7)
+
+
+@pytest.mark.parametrize("rate", [0.1, 1.0])
+def test_maps_follow(rate):
+    """Bit for bit: sums of three absolute values in one order, then single-precision products rounded one by one."""
+    samples = make_samples(rate, "cell")
+    colors, targets, _, _ = make_colors(samples)
+    maps, twin = make_maps(DEVICE), make_maps("cpu")
+    found = training_kernels.sparse_loss(
+        colors.to(DEVICE), targets.to(DEVICE), to_device(samples), CASES["ncc"][1], update=MapUpdate(maps, STEP)
+    )
+    twin.update(samples, found.pixel_errors.cpu(), STEP)
+    assert torch.equal(maps.errors.cpu(), twin.errors)
+    assert torch.equal(maps.stamps.cpu(), twin.stamps)
+    assert torch.equal(maps.view_sums.cpu(), twin.view_sums)
+    assert not torch.equal(maps.errors.cpu(), make_maps("cpu").errors)
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf")])
+def test_bad_colors_stay_out(bad):
+    samples = make_samples(0.3, "pixel")
+    colors, targets, _, _ = make_colors(samples)
+    slots = torch.tensor([0, 5, 300])
+    colors[slots, 1] = bad
+    maps, counter = make_maps(DEVICE), torch.zeros((), dtype=torch.int64, device=DEVICE)
+    found = training_kernels.sparse_loss(
+        colors.to(DEVICE),
+        targets.to(DEVICE),
+        to_device(samples),
+        CASES["ncc"][1],
+        update=MapUpdate(maps, STEP),
+        nonfinite=counter,
+    )
+    assert int(counter) == 3
+    assert torch.isfinite(found.loss)
+    gradients = found.color_gradients.cpu()
+    assert torch.isfinite(gradients).all() and not gradients[slots].any()
+    assert gradients[torch.arange(len(samples)) != 5].abs().sum() > 0
+    before = make_maps("cpu")
+    flat = before.flat_pixels(samples)
+    assert torch.equal(maps.errors.cpu()[flat[slots]], before.errors[flat[slots]])
+    assert (maps.stamps.cpu()[flat[slots]] == -1).all()
+    assert (maps.stamps.cpu()[flat] == STEP.iteration).sum() == len(samples) - 3
+    assert float(maps.view_sums.sum()) == pytest.approx(float(maps.errors.double().sum()), rel=1e-12)
+
+
+def test_side_stream_and_half_colors():
+    if DEVICE != "cuda":
+        pytest.skip("needs streams")
+    samples = make_samples(0.3, "cell")
+    colors, targets, _, _ = make_colors(samples)
+    expected = training_kernels.sparse_loss(
+        colors.half().to(DEVICE), targets.to(DEVICE), to_device(samples), CASES["ncc"][1]
+    )
+    torch.cuda.synchronize()
+    stream = torch.cuda.Stream()
+    with torch.cuda.stream(stream):
+        found = training_kernels.sparse_loss(
+            colors.half().to(DEVICE), targets.to(DEVICE), to_device(samples), CASES["ncc"][1]
+        )
+    stream.synchronize()
+    assert torch.equal(found.color_gradients, expected.color_gradients)

@@ -1,0 +1,279 @@
+"""The training kernels, typed: sampling, loss, projection backward and the optimizer's step on CUDA tensors.
+
+Each function does what its torch twin defines (`draw_pixels`, the losses of `strategies.loss` with `ErrorMaps.update`,
+`ReferenceScreenGradients.parameter_gradients`, the steps of `strategies.adam` and `strategies.moment_lm`). It is
+enqueued on torch's current stream and not waited for. Tensors must be contiguous; one of another device, dtype or shape
+raises `RuntimeError`, naming it and what was expected.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import astuple, dataclass, fields
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from turbogs_plugin import kernels
+from turbogs_plugin.error_maps import ErrorMaps
+from turbogs_plugin.tiles import TILE_PIXELS
+from turbogs_plugin.types import (
+    PARAMETER_NAMES,
+    TILE_SIZE,
+    GaussianGradients,
+    Gaussians,
+    LossOutput,
+    PixelSamples,
+    Step,
+    TileGrid,
+)
+
+if TYPE_CHECKING:
+    from turbogs_plugin.rendering.cuda import CudaScreenGradients
+    from turbogs_plugin.strategies.pixel_sampling import DrawRule
+    from turbogs_plugin.strategies.update_rule import GaussianMoments, UpdateRule
+
+MAX_VIEWS = 32
+"""Views of one batch that the kernels take."""
+
+ROW_WIDTH = 14
+"""Gradients of a view's row: means 3, scales 3, quats 4, sh0 3, opacities 1."""
+
+CELL_SIDE, TILE_CELLS = 4, 16
+UNITS = ("pixel", "cell", "tile")
+STRUCTURES = ("none", "ncc", "contrast", "ssim")
+
+
+def sample_pixels(
+    errors: Tensor,
+    stamps: Tensor,
+    now: int,
+    starts: np.ndarray,
+    sizes: np.ndarray,
+    view_ids: Sequence[int],
+    rate: float,
+    rule: DrawRule,
+    seed: int,
+    iteration: int,
+) -> PixelSamples:
+    """Draw the samples of K views; arguments and result are those of `draw_pixels`, whose sets these equal.
+
+    Args:
+        errors: [X] float16, stamps: [X] int16, on one CUDA device.
+        view_ids: at most `MAX_VIEWS` training views.
+    """
+    kernels.require()
+    shapes = TileGrid(sizes).shapes
+    tiles = shapes.prod(axis=1)  # [K]
+    wanted, stages, slots_per_tile = np.zeros(len(tiles), dtype=np.int64), [], 0
+    if rule.unit == "tile":
+        wanted = np.array([rule.wanted(rate, int(count)) for count in tiles])
+        stages = [number for count in wanted for number in rule.stages(int(count))]
+        bases = np.concatenate([[0], np.cumsum(wanted)])  # chosen tiles
+        chosen, slots = int(bases[-1]), int(bases[-1]) * TILE_PIXELS
+    else:
+        of_tile = rule.wanted(rate, TILE_PIXELS if rule.unit == "pixel" else TILE_CELLS)
+        stages = rule.stages(of_tile)
+        slots_per_tile = of_tile * (1 if rule.unit == "pixel" else CELL_SIDE**2)
+        bases = np.concatenate([[0], np.cumsum(_view_slots(sizes, shapes, slots_per_tile, rule.unit))])
+        chosen, slots = int(tiles.sum()), int(bases[-1])
+    device = errors.device
+    pixel_ids = torch.empty(slots, dtype=torch.int32, device=device)
+    tile_ids = torch.empty(chosen, dtype=torch.int32, device=device)
+    tile_offsets = torch.empty(chosen + 1, dtype=torch.int32, device=device)
+    weights = torch.empty(slots, device=device) if rule.importance else None
+    scratch = []
+    if rule.unit == "tile":
+        dtypes = (torch.float64, torch.int32, torch.int64, torch.float32)
+        scratch = [torch.empty(int(tiles.sum()), dtype=dtype, device=device) for dtype in dtypes]
+    torch.ops.turbogs.sample_pixels(
+        errors, stamps, _view_table(starts, sizes, view_ids, bases[:-1], wanted), UNITS.index(rule.unit), stages,
+        slots_per_tile, rule.mixed_uniform, rule.importance, seed, iteration, now,
+        pixel_ids, tile_ids, tile_offsets, weights, scratch,
+    )  # fmt: skip
+    if weights is not None:
+        weights = weights * ((pixel_ids >= 0).sum() / weights.sum())
+    return PixelSamples(tuple(view_ids), sizes, pixel_ids, tile_ids, tile_offsets, weights)
+
+
+def _view_slots(sizes: np.ndarray, shapes: np.ndarray, slots_per_tile: int, unit: str) -> np.ndarray:
+    """[K] int64: slots of each view; only its last column and last row of tiles are cut."""
+
+    def slots(width: np.ndarray, height: np.ndarray) -> np.ndarray:
+        cells = -(-width // CELL_SIDE) * -(-height // CELL_SIDE)
+        cap = slots_per_tile if unit == "pixel" else np.minimum(slots_per_tile, cells * CELL_SIDE**2)
+        return np.minimum(cap, width * height)
+
+    full = np.full(len(sizes), TILE_SIZE)
+    columns, rows = shapes[:, 0] - 1, shapes[:, 1] - 1
+    width, height = sizes[:, 0] - columns * TILE_SIZE, sizes[:, 1] - rows * TILE_SIZE
+    whole_rows = rows * (columns * slots(full, full) + slots(width, full))
+    return whole_rows + columns * slots(full, height) + slots(width, height)
+
+
+def _view_table(
+    starts: np.ndarray, sizes: np.ndarray, view_ids: Sequence[int], bases: np.ndarray, wanted: np.ndarray
+) -> list[int]:
+    """Six numbers for each view, as csrc/training_bindings.cpp reads them."""
+    return np.stack([starts, sizes[:, 0], sizes[:, 1], view_ids, bases, wanted], axis=1).reshape(-1).tolist()
+
+
+@dataclass(frozen=True)
+class LossTerms:
+    """A loss of `strategies.loss` as the kernel takes it.
+
+    Args:
+        epsilon: of the Charbonnier term.
+        l1_weight: factor of that term.
+        structure: one of `STRUCTURES`.
+        structure_weight: factor of the mean over tiles and channels of 1 - S.
+        variance_constant: of `ncc` and `contrast`.
+        balance: scale the structure term by the paper's lambda.
+        gate: scale it by the truth's variance.
+    """
+
+    epsilon: float
+    l1_weight: float = 1.0
+    structure: str = "none"
+    structure_weight: float = 0.0
+    variance_constant: float = 9e-4
+    balance: bool = False
+    gate: bool = False
+
+
+@dataclass
+class MapUpdate:
+    """The maps to update along with a loss.
+
+    Args:
+        maps: of all views, on the device of the colours.
+        step: gives the stamp.
+    """
+
+    maps: ErrorMaps
+    step: Step
+
+
+def sparse_loss(
+    colors: Tensor,
+    targets: Tensor,
+    samples: PixelSamples,
+    terms: LossTerms,
+    *,
+    starts: np.ndarray | None = None,
+    update: MapUpdate | None = None,
+    nonfinite: Tensor | None = None,
+) -> LossOutput:
+    """Loss, gradient and pixel errors, and with `update` what `ErrorMaps.update` does, in one launch.
+
+    Unlike in the twin a sample whose colour is not finite counts as an empty slot: its gradient and error are zero,
+    the maps keep what they have, and `nonfinite` counts it.
+
+    Args:
+        colors: [P, 3] float32 or float16.
+        targets: [P, 3] float32, the truth at the samples; or [X, 3] uint8, the photos of all views, gathered by the
+            kernel; then `starts` is needed.
+        samples: of at most `MAX_VIEWS` views.
+        starts: [K] int64, first flat pixel of each view.
+        update: the maps to update; their offsets give `starts`.
+        nonfinite: [] int64, added to.
+
+    Returns:
+        The loss (a float64 scalar on the device), gradients [P, 3] float32 and errors [P] float32.
+    """
+    kernels.require()
+    colors = colors.detach().float().contiguous()
+    device, slots = colors.device, len(samples)
+    photos = targets if targets.dtype == torch.uint8 else None
+    maps, beta, stamp = [], 0.0, 0
+    if update is not None:
+        update.maps._rebase(update.step.iteration)
+        maps = [update.maps.errors, update.maps.stamps, update.maps.view_sums]
+        beta, stamp = update.maps.beta, update.step.iteration - update.maps.stamp_base
+        starts = update.maps.offsets[list(samples.view_ids)]
+    if starts is None:
+        if photos is not None:
+            raise ValueError("photos are gathered from the first flat pixel of each view: give `starts`")
+        starts = np.zeros(len(samples.view_ids), dtype=np.int64)
+    unused = np.zeros(len(starts), dtype=np.int64)
+    loss = torch.zeros((), dtype=torch.float64, device=device)
+    color_gradients, pixel_errors = torch.empty_like(colors), torch.empty(slots, device=device)
+    torch.ops.turbogs.sparse_loss(
+        colors, None if photos is not None else targets.detach().float().contiguous(), photos,
+        samples.pixel_ids, samples.tile_ids, samples.tile_offsets, samples.weights,
+        _view_table(starts, samples.sizes, samples.view_ids, unused, unused), STRUCTURES.index(terms.structure),
+        terms.epsilon, terms.l1_weight, terms.structure_weight, terms.variance_constant, terms.balance, terms.gate,
+        maps, beta, stamp, count_filled(samples), loss, color_gradients, pixel_errors, nonfinite,
+    )  # fmt: skip
+    return LossOutput(loss, color_gradients, pixel_errors)
+
+
+def count_filled(samples: PixelSamples) -> Tensor:
+    """[1] int32 on the device: the filled slots."""
+    count = torch.zeros(1, dtype=torch.int32, device=samples.pixel_ids.device)
+    torch.ops.turbogs.count_filled(samples.pixel_ids, count)
+    return count
+
+
+def projection_backward(screen: CudaScreenGradients, rows: bool) -> GaussianGradients:
+    """The gradients of the parameters: one row per view (`rows`), or their sum. Adds to `screen.stats`.
+
+    The fields that have rows are views of one packed [K, N, 14] tensor. After an overflow they are zero.
+    """
+    kernels.require()
+    count, bands = len(screen.gaussians), screen.gaussians.shN.shape[1]
+    num_rows = len(screen.cameras) if rows else 1
+    # The kernel writes every entry, unless an overflow keeps it from running.
+    new = torch.empty if screen.overflow is None else torch.zeros
+    device = screen.records.device
+    packed = new(num_rows, count, ROW_WIDTH, device=device)
+    shN = new(count, bands, 3, device=device)
+    touched = new(count, dtype=torch.bool, device=device)
+    view_losses = new(num_rows, count, device=device)
+    torch.ops.turbogs.projection_backward(*_backward_arguments(screen), packed, shN, touched, view_losses)
+    return GaussianGradients(
+        means=packed[..., 0:3],
+        scales=packed[..., 3:6],
+        quats=packed[..., 6:10],
+        sh0=packed[..., 10:13].unsqueeze(-2),
+        opacities=packed[..., 13],
+        shN=shN,
+        touched=touched,
+        view_losses=view_losses,
+    )
+
+
+def fused_step(screen: CudaScreenGradients, gaussians: Gaussians, moments: GaussianMoments, rule: UpdateRule) -> None:
+    """Projection backward and one step of `rule` in one launch: changes `gaussians` and `moments`, adds to
+    `screen.stats`, and leaves nothing of use in `screen.records`.
+
+    Args:
+        screen: of at most `MAX_VIEWS` views.
+        gaussians: the model that `screen` was made of: float32, contiguous.
+        moments: its optimizer state, float32.
+    """
+    kernels.require()
+    if gaussians.means.data_ptr() != screen.gaussians.means.data_ptr():
+        raise ValueError("fused_step: these are not the Gaussians that the gradients were made of")
+    kind, curvature, max_step, rows_per_view = 0, 0.0, 0.0, False
+    if rule.lm is not None:
+        kind = 1 if rule.lm.units == "balanced" else 2
+        curvature, max_step, rows_per_view = rule.lm.curvature, rule.lm.max_step, rule.lm.rows == "views"
+    state = [getattr(moments, field.name) for field in fields(moments)]
+    torch.ops.turbogs.fused_step(
+        *_backward_arguments(screen), state, kind, rows_per_view, list(astuple(rule.rates)), rule.beta1, rule.beta2,
+        rule.eps, curvature, max_step,
+    )  # fmt: skip
+
+
+def _backward_arguments(screen: CudaScreenGradients) -> tuple:
+    """What the two operators have in common."""
+    stats = [] if screen.stats is None else [getattr(screen.stats, field.name) for field in fields(screen.stats)]
+    return (
+        [getattr(screen.gaussians, name).detach() for name in PARAMETER_NAMES],
+        screen.cameras.viewmats.contiguous(), screen.cameras.Ks.contiguous(),
+        screen.cameras.sizes.reshape(-1).tolist(), screen.records, screen.radii, stats, screen.sh_degree,
+        screen.settings.eps2d, count_filled(screen.samples), screen.overflow,
+    )  # fmt: skip
