@@ -27,7 +27,7 @@ def camera_to_world(angle: float) -> np.ndarray:
 
 
 def write_transforms(folder: Path, views: int = 9, mode: str = "RGB", **content) -> Path:
-    """Photos images/f0.png .. of 20x10 pixels of a colour each, and a transforms.json; None in `content` drops a key."""
+    """Photos images/f0.png .. of 20x10, one colour each, and a transforms.json; a None in `content` drops it."""
     (folder / "images").mkdir(parents=True)
     frames = []
     for view in range(views):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath, PureWindowsPath
+from pathlib import Path, PureWindowsPath
 
 import numpy as np
 
@@ -65,15 +65,7 @@ class Capture:
 
 def check_photo_name(name: str, source: Path) -> str:
     """The name, if it stays within the photo folder; else `InputError`."""
-    parts = PurePosixPath(name).parts
-    if (
-        not parts
-        or ".." in parts
-        or not name.isprintable()
-        or PurePosixPath(name).is_absolute()
-        or PureWindowsPath(name).is_absolute()
-        or PureWindowsPath(name).drive
-        or ".." in PureWindowsPath(name).parts
-    ):
+    path = PureWindowsPath(name)  # knows both kinds of separators, drives and roots
+    if not path.parts or ".." in path.parts or path.drive or path.root or not name.isprintable():
         raise InputError(f"{source}: image name {name!r} leaves the photo folder: names must be relative, without '..'")
     return name
