@@ -174,12 +174,12 @@ def host_time(function: Callable[[], object], repeats: int) -> dict[str, float]:
 def count_contributions(rendered: CudaRendered) -> dict[str, int]:
     """Walked and contributing (splat, work item) pairs of a pass."""
     forward = rendered._forward
-    tile_starts, masks, buckets, chunks = forward[4], forward[11], forward[12].long(), forward[13]
+    tile_starts, buckets, chunks = forward.tile_starts, forward.bucket_counts.long(), forward.chunks
     items = torch.arange(len(buckets), device=buckets.device)
     bases = (tile_starts[:-1].long() // 32 + torch.arange(len(tile_starts) - 1, device=buckets.device))[items // chunks]
     owners = torch.repeat_interleave(items, buckets)
     number = torch.arange(len(owners), device=buckets.device) - (buckets.cumsum(0) - buckets)[owners]
-    words = masks[(bases[owners] + number) * chunks + owners % chunks]
+    words = forward.masks[(bases[owners] + number) * chunks + owners % chunks]
     contributing = sum(int(((words >> bit) & 1).sum()) for bit in range(32))
     return {"walked": int(buckets.sum()) * 32, "contributing": contributing}
 
@@ -245,7 +245,7 @@ def bench_pass(
         "pairs": int(rendered.num_pairs),
         "tiles": len(samples.tile_ids),
         "samples": len(samples),
-        "items": len(rendered._forward[12]),
+        "items": len(rendered._forward.bucket_counts),
         **count_contributions(rendered),
     }
     return {

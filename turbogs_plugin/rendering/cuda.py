@@ -8,19 +8,22 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import lru_cache
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from turbogs_plugin import kernels
+from turbogs_plugin import kernels, training_kernels
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.rendering.reference import DifferentiableRender
 from turbogs_plugin.rendering.rendered import DEFAULT_SETTINGS, Projected, RasterSettings
 from turbogs_plugin.rendering.workspace import Workspace, round_capacity
-from turbogs_plugin.training_kernels import projection_backward
 from turbogs_plugin.types import Cameras, GaussianGradients, Gaussians, GaussianStats, PixelSamples
+
+if TYPE_CHECKING:
+    from turbogs_plugin.strategies.update_rule import GaussianMoments, UpdateRule
 
 MAX_VIEWS = 128
 MAX_DEGREE = 3
@@ -87,6 +90,30 @@ def work_shape(slots: int, tiles: int) -> tuple[int, int]:
     return WORK_SHAPES[min(groups, len(WORK_SHAPES)) - 1]
 
 
+class ForwardArguments(NamedTuple):
+    """Arguments of the forward operator, which the backward operator takes first; csrc/params.h says what they are."""
+
+    cameras: Tensor  # [K, 24]
+    tile_ids: Tensor | None  # [T], None where every tile is active
+    tile_offsets: Tensor  # [T + 1]
+    pixel_ids: Tensor  # [P]
+    tile_starts: Tensor  # [T + 1]
+    pair_ids: Tensor  # [M]
+    instances: Tensor  # [K * N, 12]
+    colors: Tensor  # [P, 3]
+    alphas: Tensor  # [P]
+    transmittances: Tensor  # [P]
+    depths: Tensor | None  # [P]
+    last_pairs: Tensor  # [P]
+    masks: Tensor  # [(M / 32 + T + 1) * chunks]
+    bucket_counts: Tensor  # [T * chunks]
+    chunks: int
+    samples_per_lane: int
+    alpha_min: float
+    alpha_max: float
+    transmittance_min: float
+
+
 @dataclass
 class CudaScreenGradients:
     """Gradients on the screen (see `ScreenGradients`), and what takes them to the parameters.
@@ -121,7 +148,15 @@ class CudaScreenGradients:
 
     def parameter_gradients(self, rows: bool) -> GaussianGradients:
         """The gradients of the parameters: one row per view (`rows`), or their sum. May be called once."""
-        return projection_backward(self, rows)
+        return training_kernels.projection_backward(self, rows)
+
+    def fused_step(self, gaussians: Gaussians, moments: GaussianMoments, rule: UpdateRule) -> None:
+        """Take the gradients to the parameters and make one optimizer step of them, in one kernel.
+
+        Args:
+            gaussians: the model that was drawn; changed in place, as is `moments`.
+        """
+        training_kernels.fused_step(self, gaussians, moments, rule)
 
 
 @dataclass
@@ -139,14 +174,13 @@ class CudaRendered:
     _sh_degree: int = field(repr=False)
     _settings: RasterSettings = field(repr=False)
     _buffers: _FreshBuffers | Workspace = field(repr=False)
-    _instances: Tensor = field(repr=False)  # [K * N, 12]
     _radii: Tensor = field(repr=False)  # [K, N, 2]
-    _forward: tuple = field(repr=False)  # the forward operator's arguments
+    _forward: ForwardArguments = field(repr=False)
 
     @torch.no_grad()
     def projected(self) -> Projected:
         """The projection that this pass drew."""
-        splats = self._instances.view(*self._radii.shape[:2], INSTANCE_FLOATS)
+        splats = self._forward.instances.view(*self._radii.shape[:2], INSTANCE_FLOATS)
         splats = torch.where((self._radii > 0).any(dim=-1, keepdim=True), splats, 0.0)
         return Projected(
             means2d=splats[..., :2],
@@ -186,7 +220,7 @@ class CudaRendered:
                 wanted = f"float32 {list(shape)} on {self.colors.device}"
                 raise InputError(f"{name} must be {wanted}, got {value.dtype} {list(value.shape)} on {value.device}")
             ready[name] = value.contiguous()
-        records = self._buffers.buffer("records", (len(self._instances), RECORD_FLOATS), torch.float32)
+        records = self._buffers.buffer("records", (len(self._forward.instances), RECORD_FLOATS), torch.float32)
         torch.ops.turbogs.raster_backward(
             *self._forward,
             ready["color_gradients"],
@@ -309,26 +343,26 @@ def rasterize_cuda(
     colors = torch.empty(slots, 3, device=device)
     alphas = torch.empty(slots, device=device)
     depths = torch.empty(slots, device=device) if with_depth else None
-    forward = (
-        packed_cameras,
-        tile_ids,
-        samples.tile_offsets.contiguous(),
-        samples.pixel_ids.contiguous(),
-        tile_starts,
-        pair_ids[current],
-        instances,
-        colors,
-        alphas,
-        floats("transmittances", slots),
-        depths,
-        integers("last_pairs", slots),
-        integers("masks", (capacity // WARP + num_active + 1) * chunks),
-        integers("bucket_counts", num_active * chunks),
-        chunks,
-        samples_per_lane,
-        settings.alpha_min,
-        settings.alpha_max,
-        settings.transmittance_min,
+    forward = ForwardArguments(
+        cameras=packed_cameras,
+        tile_ids=tile_ids,
+        tile_offsets=samples.tile_offsets.contiguous(),
+        pixel_ids=samples.pixel_ids.contiguous(),
+        tile_starts=tile_starts,
+        pair_ids=pair_ids[current],
+        instances=instances,
+        colors=colors,
+        alphas=alphas,
+        transmittances=floats("transmittances", slots),
+        depths=depths,
+        last_pairs=integers("last_pairs", slots),
+        masks=integers("masks", (capacity // WARP + num_active + 1) * chunks),
+        bucket_counts=integers("bucket_counts", num_active * chunks),
+        chunks=chunks,
+        samples_per_lane=samples_per_lane,
+        alpha_min=settings.alpha_min,
+        alpha_max=settings.alpha_max,
+        transmittance_min=settings.transmittance_min,
     )
     torch.ops.turbogs.raster_forward(*forward)
     return CudaRendered(
@@ -342,7 +376,6 @@ def rasterize_cuda(
         _sh_degree=degree,
         _settings=settings,
         _buffers=buffers,
-        _instances=instances,
         _radii=radii,
         _forward=forward,
     )
