@@ -5,9 +5,11 @@ All functions have one signature, ``solve(rows, weights, damping, rhs) -> x``:
 - rows: [K, n, D] the g_k; weights: [K, n] the c_k >= 0; damping: [n, D] the d > 0; rhs: [n, D] the b; x: [n, D].
 
 The optimizer uses `solve_scaled_cholesky` and `solve_low_rank`. They first scale the system by d^(-1/2) on both sides:
-it becomes I + (something positive semi-definite), whose eigenvalues and pivots are >= 1, so that neither can fail
-in any precision, however many orders of magnitude lie between the entries of d. `solve_raw_cholesky` is what happens
-without; `solve_float64` is the yardstick. Both are there for the table of docs/numerics.md.
+it becomes I + (something positive semi-definite), whose eigenvalues are >= 1, and the length of the scaled rows, on
+which alone its condition depends, can be bounded. Cholesky itself does not mind how many orders of magnitude lie
+between the entries of d; what it minds is damping lost in rounding beside long rows, and squares that overflow. The
+scaled form has neither. `solve_raw_cholesky` is what happens without it; `solve_float64` is the yardstick. Both are
+there for the table of docs/numerics.md.
 """
 
 from __future__ import annotations
@@ -17,7 +19,8 @@ from torch import Tensor
 
 ROW_LIMIT = 100.0
 """Longest scaled row. One row of length l shrinks the step along itself by 1 / (1 + l^2): at this limit to a ten
-thousandth, as good as none, while the condition number stays below 1 + K * 1e4, which float32 can carry."""
+thousandth, as good as none, while the condition number stays below 1 + K * 1e4, which float32 can carry. Where rows
+that long span many directions and all but depend on each other, cutting them changes the answer (it damps less)."""
 
 
 def scaled_rows(rows: Tensor, weights: Tensor, damping: Tensor) -> Tensor:
@@ -32,7 +35,7 @@ def scaled_rows(rows: Tensor, weights: Tensor, damping: Tensor) -> Tensor:
 
 
 def solve_scaled_cholesky(rows: Tensor, weights: Tensor, damping: Tensor, rhs: Tensor) -> Tensor:
-    """Cholesky of the scaled system, D x D. Exact pivots are >= 1, so computed ones are held there."""
+    """Cholesky of the scaled system, D x D."""
     scale = torch.rsqrt(damping)
     scaled = scaled_rows(rows, weights, damping)
     matrix = torch.einsum("kni,knj->ijn", scaled, scaled)
@@ -68,8 +71,9 @@ def _solve_identity_plus(matrix: Tensor, rhs: Tensor) -> Tensor:
     """Solve (I + matrix) x = rhs for n systems at once.
 
     Args:
-        matrix: [D, D, n] positive semi-definite; the batch lies last, so that each of the D^3 / 6 steps below is one
-            pass over contiguous memory.
+        matrix: [D, D, n] positive semi-definite, with a trace below about 1e6 in float32: the exact pivots are >= 1,
+            and rounding must not take them to zero. The batch lies last, so that each of the D^3 / 6 steps below
+            is one pass over contiguous memory.
         rhs: [D, n].
     """
     size = len(matrix)
@@ -87,7 +91,7 @@ def _solve_identity_plus(matrix: Tensor, rhs: Tensor) -> Tensor:
         for k in range(i):
             pivot.addcmul_(row[k], row[k], value=-1)
             target.addcmul_(row[k], forward[k], value=-1)
-        inverse_diagonal.append(pivot.clamp_(min=1).rsqrt_())
+        inverse_diagonal.append(pivot.rsqrt_())
         forward.append(target.mul_(inverse_diagonal[i]))
         factor.append(row)
     solution = forward  # L^T x = y, in place from the last entry

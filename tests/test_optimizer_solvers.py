@@ -133,6 +133,24 @@ def test_extremes_stay_finite(solve, dtype):
     ).all()
 
 
+@pytest.mark.parametrize("views", [1, 10, 32])
+@pytest.mark.parametrize("solve", STABLE)
+def test_worst_condition_that_the_limit_admits(views, solve):
+    """Endless rows, all parallel, or all but parallel: cut at the limit, they leave every pivot positive in float32."""
+    generator = torch.Generator().manual_seed(views)
+    rows = torch.randn(1, 500, 10, generator=generator).repeat(views, 1, 1)
+    rows[:, 250:] += 1e-3 * torch.randn(views, 250, 10, generator=generator)
+    rows *= ROW_LIMIT / rows.norm(dim=-1, keepdim=True)  # the longest that need no cut, so that the answer is known
+    weights, damping = torch.ones(views, 500), torch.ones(500, 10)
+    rhs = torch.randn(500, 10, generator=generator)
+    problem = rows, weights, damping, rhs
+    bound = 3 * torch.finfo(torch.float32).eps * views * ROW_LIMIT**2  # rounding times condition
+    assert scaled_error(solve(*problem), exact(*problem), damping, rhs) < bound
+    endless = solve(rows * 1e12, weights, damping, rhs)
+    assert torch.isfinite(endless).all()
+    assert (endless.norm(dim=-1) <= (1 + bound) * rhs.norm(dim=-1)).all()
+
+
 @pytest.mark.parametrize("solve", STABLE)
 def test_no_systems(solve):
     empty = torch.zeros(3, 0, 10), torch.zeros(3, 0), torch.ones(0, 10), torch.zeros(0, 10)
