@@ -56,8 +56,8 @@ class MomentLMOptimizer:
             is still less than one.
         units: see above.
         rows: one row of J per view, or one of their sum (rank 1).
-        solver: factorise the D x D system of each block, or the K x K system of its rows: one answer. In float32 and with
-            stiff rows (scaled length 50, K = 3) `low_rank` is off by 4e-7 of Adam's step, `cholesky` by 1e-4.
+        solver: factorise the D x D system of each block, or the K x K system of its rows: one answer. In float32, with
+            stiff rows (scaled length 50, K = 3), `low_rank` is off by 4e-7 of Adam's step, `cholesky` by 1e-4.
         curvature: 1/2 is Gauss-Newton for a loss r^2 / 2; 1 is that for |r| (iteratively reweighted). `balanced` only.
         max_step: no entry of delta exceeds this many learning rates, or Adam's own entry where that is longer: coupling
             may pass motion on to a parameter whose own gradient is near zero, and the linear model that wants it
