@@ -133,6 +133,22 @@ def test_a_stopped_run_resumes_bit_for_bit(capture, whole, tmp_path, monkeypatch
         )
 
 
+def test_a_run_stopped_before_its_first_iteration_resumes_bit_for_bit(capture, whole, tmp_path, monkeypatch):
+    initialise = Trainer.initialise_maps
+
+    def interrupted(trainer):
+        initialise(trainer)
+        signal.raise_signal(signal.SIGINT)
+
+    with monkeypatch.context() as context:
+        context.setattr(Trainer, "initialise_maps", interrupted)
+        assert run.train(tiny_config(capture), tmp_path / "run").signal == signal.SIGINT
+    assert saved(tmp_path / "run")["iteration"] == 0
+    resumed = run.resume(tmp_path / "run")
+    assert_identical(saved(whole.folder.path), saved(tmp_path / "run"))
+    assert [evaluation.iteration for evaluation in resumed.history] == [0, 7, 14]
+
+
 def test_a_run_killed_without_notice_resumes_bit_for_bit(capture, whole, tmp_path):
     """SIGKILL once the second checkpoint is there, wherever the process then is."""
     options = [*TINY, "train.checkpoint_every=2"]
@@ -184,7 +200,7 @@ def test_a_model_that_is_not_finite_is_never_saved(capture, tmp_path, monkeypatc
     def spoil(trainer):
         trainer.gaussians.means[3] = torch.nan
 
-    stop_after(monkeypatch, 8, spoil)
+    stop_after(monkeypatch, 10, spoil)
     with pytest.raises(TrainingStopped, match=r"iteration 10: means of 1 of \d+ Gaussians.*iteration-000005\.pt"):
         run.train(tiny_config(capture), tmp_path / "run")
     assert saved(tmp_path / "run")["iteration"] == 5
@@ -250,7 +266,7 @@ def test_the_trainer_names_no_strategy():
         ("schedule.type=fixed", "view_sampler.type=random", "pixel_sampler.type=random", "loss.type=charbonnier"),
         ("schedule.type=linear", "loss.type=sparse_ssim", "optimizer.type=sparse_adam", "density.type=none"),
         ("schedule.type=exponential", "pixel_sampler.type=dense", "density.type=gsplat_default"),
-        ("pixel_sampler.unit=cell", "pixel_sampler.importance=0.5", "optimizer.units=paper", "density.score=raw"),
+        ("pixel_sampler.unit=cell", "pixel_sampler.importance=0.5", "optimizer.rows=summed", "density.score=raw"),
         ("pixel_sampler.unit=tile", "train.sh_degree=0"),
     ],
     ids=lambda overrides: overrides[0],
@@ -262,3 +278,11 @@ def test_every_alternative_trains(capture, tmp_path, overrides):
     config.scene.path = str(capture)
     outcome = run.train(config, tmp_path / "run")
     assert outcome.history[-1].psnr > outcome.history[0].psnr
+
+
+def test_the_paper_taken_literally_stays_finite(capture, tmp_path):
+    config = load_config("turbogs-paper", [*TINY, "train.device=cpu"])
+    config.scene.path = str(capture)
+    outcome = run.train(config, tmp_path / "run")
+    assert outcome.history[-1].nonfinite_losses == 0
+    assert all(value.isfinite().all() for value in saved(tmp_path / "run")["gaussians"].values())

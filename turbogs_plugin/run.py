@@ -222,6 +222,7 @@ class _Session:
     scene: Scene
     trainer: Trainer
     history: list[Evaluation] = field(default_factory=list)
+    resumed: bool = False
 
     def __post_init__(self) -> None:
         self.device = self.trainer.gaussians.device
@@ -235,7 +236,7 @@ class _Session:
         saves = set(range(0, total, self.config.train.checkpoint_every or total)[1:]) | {total}
         try:
             with _Interrupts() as interrupts, TrainingProgress(total, trainer.iteration) as progress:
-                if not self.history:
+                if not self.resumed:
                     with self.clock:
                         trainer.initialise_maps()
                     self._evaluate(progress)
@@ -247,8 +248,10 @@ class _Session:
                             progress.advance(trainer.iteration, len(trainer.gaussians))
                     if trainer.iteration in evaluations:
                         self._evaluate(progress)
-                    if trainer.iteration in saves or interrupts.signal is not None:
+                    if trainer.iteration in saves:
                         self._save()
+                if interrupts.signal is not None and trainer.iteration not in saves:
+                    self._save()
             if trainer.iteration == total:
                 self._finish()
         except TrainingStopped as stop:
@@ -267,6 +270,7 @@ class _Session:
         try:
             self.trainer.load_state_dict(state["trainer"])
             self.clock.seconds = state["train_seconds"]
+            self.resumed = True
         except (KeyError, TypeError, AttributeError, RuntimeError, ValueError) as error:
             raise InputError(f"checkpoint '{source}' does not fit this run and its capture: {error}") from None
 
