@@ -76,6 +76,20 @@ def test_pixels_end_before_the_splat_that_would_bring_them_to_the_limit():
     assert float(gradients.opacities.abs().max()) == 0  # cut at alpha_max: no gradient
 
 
+def test_projected_is_what_was_drawn():
+    gaussians, cameras = make_gaussians(60, spread=3.0), make_cameras(SIZES)
+    samples = dense_samples(cameras)
+    projected = rasterize(gaussians, cameras, samples).projected()
+    output = rasterize_differentiable(gaussians, cameras, samples)
+    shown = (output.radii > 0).any(dim=-1)
+    assert 0 < int(shown.sum()) < shown.numel()
+    pairs = {"means2d": "means2d", "conics": "conics", "depths": "depths_per_gaussian", "opacities": "opacities"}
+    for ours, theirs in pairs.items():
+        assert torch.equal(getattr(projected, ours)[shown], getattr(output, theirs)[shown])
+        assert (getattr(projected, ours)[~shown] == 0).all()
+    assert torch.equal(projected.radii, output.radii)
+
+
 def test_what_lies_behind_the_end_of_a_pixel_has_no_gradient_at_all():
     """In float32 too, where the sums of what is left behind are not exactly zero."""
     gaussians, cameras = make_gaussians(200, dtype=torch.float32, spread=0.3), make_cameras([(32, 32)], torch.float32)

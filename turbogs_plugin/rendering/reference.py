@@ -118,7 +118,12 @@ class ReferenceRendered:
     def projected(self) -> Projected:
         """The projection that this pass drew."""
         names = ("means2d", "conics", "depths", "opacities", "radii")
-        return Projected(**{name: self._rows.scatter(getattr(self._splats, name)) for name in names})
+        shown = (self._splats.radii > 0).any(dim=-1)
+
+        def placed(values: Tensor) -> Tensor:
+            return self._rows.scatter(torch.where(shown.reshape(-1, *[1] * (values.dim() - 1)), values, 0))
+
+        return Projected(**{name: placed(getattr(self._splats, name)) for name in names})
 
     @torch.no_grad()
     def backward(
@@ -204,7 +209,7 @@ def rasterize_differentiable(
     settings: RasterSettings = DEFAULT_SETTINGS,
     with_depth: bool = False,
 ) -> DifferentiableRender:
-    """Render samples with gradients to `gaussians` through autograd; the arguments are those of `rasterize`."""
+    """Render samples with gradients to `gaussians` through autograd; same arguments as `rasterize`."""
     degree = used_degree(gaussians, sh_degree)
     rows = drawable_rows(gaussians, cameras, settings)
     parameters = [getattr(gaussians, name).index_select(0, rows.gaussians) for name in ROW_PARAMETERS]
