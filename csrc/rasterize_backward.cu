@@ -28,7 +28,10 @@ struct BackwardShared {
 
 __device__ __forceinline__ void add_quad(float* target, float x, float y, float z, float w) {
 #if __CUDA_ARCH__ >= 900
-    atomicAdd(reinterpret_cast<float4*>(target), make_float4(x, y, z, w));
+    // A reduction, not atomicAdd(float4*): that one asks for the old value back.
+    asm volatile("red.relaxed.gpu.global.add.v4.f32 [%0], {%1, %2, %3, %4};"
+                 ::"l"(__cvta_generic_to_global(target)), "f"(x), "f"(y), "f"(z), "f"(w)
+                 : "memory");
 #else
     atomicAdd(target, x);
     atomicAdd(target + 1, y);
