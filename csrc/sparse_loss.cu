@@ -86,7 +86,7 @@ __device__ __forceinline__ Similarity ssim(float mean_x, float mean_y, float var
 // One tile, kSlots samples a lane: slot j of a lane is first + 32 j + lane.
 template <int kSlots>
 __device__ __forceinline__ void tile_loss(const SparseLossParams& params, const SampleView& view, int first, int end,
-                                          float filled, Totals& totals) {
+                                          float filled, bool learns, Totals& totals) {
     const int lane = threadIdx.x & 31;
     float x[kSlots][3], y[kSlots][3], weight[kSlots];
     uint32_t valid = 0;
@@ -144,7 +144,7 @@ __device__ __forceinline__ void tile_loss(const SparseLossParams& params, const 
         l1_sum += weight[j] * value;
         total_weight += weight[j];
         if (slot < end) params.pixel_errors[slot] = error;
-        if (params.errors != nullptr && (valid >> j & 1u) != 0u && is_finite(error)) {
+        if (learns && (valid >> j & 1u) != 0u && is_finite(error)) {
             const int64_t flat = view.pixel_base + params.pixel_ids[slot];
             __half* place = static_cast<__half*>(params.errors) + flat;
             const __half old = *place;
@@ -251,6 +251,7 @@ __global__ void __launch_bounds__(kLossThreads) sparse_loss_kernel(const __grid_
     const int run = (params.num_tiles + warps - 1) / warps;
     const int first_tile = min(warp * run, params.num_tiles), end_tile = min(first_tile + run, params.num_tiles);
     const float filled = static_cast<float>(max(*params.num_filled, 1));
+    const bool learns = params.errors != nullptr && (params.overflow == nullptr || *params.overflow == 0);
 
     Totals totals;
     int view = -1;
@@ -269,13 +270,13 @@ __global__ void __launch_bounds__(kLossThreads) sparse_loss_kernel(const __grid_
         const int first = params.tile_offsets[tile], end = params.tile_offsets[tile + 1];
         const SampleView& of_tile = params.views[view];
         if (end - first <= 32) {
-            tile_loss<1>(params, of_tile, first, end, filled, totals);
+            tile_loss<1>(params, of_tile, first, end, filled, learns, totals);
         } else if (end - first <= 64) {
-            tile_loss<2>(params, of_tile, first, end, filled, totals);
+            tile_loss<2>(params, of_tile, first, end, filled, learns, totals);
         } else if (end - first <= 128) {
-            tile_loss<4>(params, of_tile, first, end, filled, totals);
+            tile_loss<4>(params, of_tile, first, end, filled, learns, totals);
         } else {
-            tile_loss<8>(params, of_tile, first, end, filled, totals);
+            tile_loss<8>(params, of_tile, first, end, filled, learns, totals);
         }
     }
     if (view >= 0 && params.view_sums != nullptr) {

@@ -116,6 +116,8 @@ void fused_step(const std::vector<Tensor>& gaussians, const Tensor& viewmats, co
     optimizer.rate_shN = static_cast<float>(rates[5]);
     optimizer.beta1 = static_cast<float>(beta1);
     optimizer.beta2 = static_cast<float>(beta2);
+    optimizer.one_minus_beta1 = static_cast<float>(1.0 - beta1);
+    optimizer.one_minus_beta2 = static_cast<float>(1.0 - beta2);
     optimizer.log_beta1 = static_cast<float>(std::log(beta1));
     optimizer.log_beta2 = static_cast<float>(std::log(beta2));
     optimizer.eps = static_cast<float>(eps);
@@ -235,7 +237,8 @@ void sparse_loss(const Tensor& colors, const std::optional<Tensor>& targets, con
                  const std::optional<Tensor>& weights, const std::vector<int64_t>& views, int64_t structure, double epsilon,
                  double l1_weight, double structure_weight, double variance_constant, bool balance, bool gate,
                  const std::vector<Tensor>& maps, double beta, int64_t stamp, const Tensor& num_filled, const Tensor& loss,
-                 const Tensor& color_gradients, const Tensor& pixel_errors, const std::optional<Tensor>& num_nonfinite) {
+                 const Tensor& color_gradients, const Tensor& pixel_errors, const std::optional<Tensor>& num_nonfinite,
+                 const std::optional<Tensor>& overflow) {
     const Checker check(colors);
     const ViewTable table = view_table(views);
     const int64_t slots = pixel_ids.numel(), tiles = tile_ids.numel();
@@ -288,6 +291,7 @@ void sparse_loss(const Tensor& colors, const std::optional<Tensor>& targets, con
     params.pixel_errors = check.pointer<float>(pixel_errors, "pixel_errors", ScalarType::Float, {slots});
     params.num_nonfinite =
         reinterpret_cast<unsigned long long*>(check.optional<int64_t>(num_nonfinite, "num_nonfinite", ScalarType::Long, {}));
+    params.overflow = check.optional<int32_t>(overflow, "overflow", ScalarType::Int, {1});
     check.launched(launch_sparse_loss(params, check.stream()), "sparse loss");
 }
 
@@ -314,7 +318,7 @@ STABLE_TORCH_LIBRARY_FRAGMENT(turbogs, m) {
         "Tensor tile_offsets, Tensor? weights, int[] views, int structure, float epsilon, float l1_weight, "
         "float structure_weight, float variance_constant, bool balance, bool gate, Tensor(a!)[] maps, float beta, "
         "int stamp, Tensor num_filled, Tensor(c!) loss, Tensor(d!) color_gradients, Tensor(e!) pixel_errors, "
-        "Tensor(f!)? num_nonfinite) -> ()");
+        "Tensor(f!)? num_nonfinite, Tensor? overflow) -> ()");
 }
 
 STABLE_TORCH_LIBRARY_IMPL(turbogs, CUDA, m) {

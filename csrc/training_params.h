@@ -71,6 +71,7 @@ struct OptimizerParams {
     float rates[kRowSize];   // learning rates in the order of a row
     float rate_shN;
     float beta1, beta2;
+    float one_minus_beta1, one_minus_beta2;  // rounded once: the difference of the floats is off by 1.3e-5 at 0.999
     float log_beta1, log_beta2;  // natural logarithms, rounded once from double; -infinity where beta is 0
     float eps;
     float curvature;         // balanced LM
@@ -167,6 +168,7 @@ struct SparseLossParams {
     void* errors;                 // [X] half
     int16_t* stamps;              // [X]
     double* view_sums;            // [V]
+    const int32_t* overflow;      // [1] where not 0, the maps are left alone; or null
     float ema_old, ema_new;       // 1 - beta and beta, each rounded from double
     int16_t stamp;
 };

@@ -18,7 +18,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from turbogs_plugin import kernels
 from turbogs_plugin.errors import require
+from turbogs_plugin.training_kernels import LossTerms, sparse_loss
 from turbogs_plugin.types import LossOutput, PixelSamples
 
 LUMINANCE_CONSTANT = 0.01**2
@@ -170,6 +172,10 @@ class _Problem:
         return LossOutput(loss, gradients, self.pixel_errors)
 
 
+def _runs_in_kernel(colors: Tensor) -> bool:
+    return colors.is_cuda and kernels.available()
+
+
 def _check_epsilon(epsilon: float) -> None:
     require(math.isfinite(epsilon) and epsilon > 0, "epsilon", epsilon, "a finite number above 0")
 
@@ -190,7 +196,13 @@ class CharbonnierLoss:
     def __post_init__(self) -> None:
         _check_epsilon(self.epsilon)
 
+    def kernel_terms(self) -> LossTerms:
+        """This loss as the CUDA kernel takes it."""
+        return LossTerms(self.epsilon)
+
     def __call__(self, colors: Tensor, targets: Tensor, samples: PixelSamples) -> LossOutput:
+        if _runs_in_kernel(colors):
+            return sparse_loss(colors, targets, samples, self.kernel_terms())
         problem = _Problem(colors, targets, samples, self.epsilon)
         return problem.output(problem.loss, problem.gradients)
 
@@ -235,7 +247,20 @@ class CharbonnierNccLoss:
         valid = math.isfinite(self.variance_constant) and self.variance_constant > 0
         require(valid, "variance_constant", self.variance_constant, "a finite number above 0")
 
+    def kernel_terms(self) -> LossTerms:
+        """This loss as the CUDA kernel takes it."""
+        return LossTerms(
+            self.epsilon,
+            structure=self.structure,
+            structure_weight=self.ncc_weight,
+            variance_constant=self.variance_constant,
+            balance=True,
+            gate=self.gate,
+        )
+
     def __call__(self, colors: Tensor, targets: Tensor, samples: PixelSamples) -> LossOutput:
+        if _runs_in_kernel(colors):
+            return sparse_loss(colors, targets, samples, self.kernel_terms())
         problem = _Problem(colors, targets, samples, self.epsilon)
         groups = problem.groups
         moments = TileMoments.of(groups, problem.colors, problem.targets)
@@ -269,7 +294,15 @@ class SparseSsimLoss:
         _check_epsilon(self.epsilon)
         require(0 <= self.ssim_weight <= 1, "ssim_weight", self.ssim_weight, "between 0 and 1")
 
+    def kernel_terms(self) -> LossTerms:
+        """This loss as the CUDA kernel takes it."""
+        return LossTerms(
+            self.epsilon, l1_weight=1.0 - self.ssim_weight, structure="ssim", structure_weight=self.ssim_weight
+        )
+
     def __call__(self, colors: Tensor, targets: Tensor, samples: PixelSamples) -> LossOutput:
+        if _runs_in_kernel(colors):
+            return sparse_loss(colors, targets, samples, self.kernel_terms())
         problem = _Problem(colors, targets, samples, self.epsilon)
         groups = problem.groups
         similarity, slopes = ssim(TileMoments.of(groups, problem.colors, problem.targets), groups)

@@ -50,6 +50,7 @@ from turbogs_plugin.strategies.philox import (
     random_words,
 )
 
+from turbogs_plugin import kernels, training_kernels
 from turbogs_plugin.error_maps import AGE_MAX, ErrorMaps
 from turbogs_plugin.errors import require
 from turbogs_plugin.tiles import TILE_PIXELS, compact, dense_pixels, pixel_table, tile_extents
@@ -236,7 +237,7 @@ def _draw_by_pixel(batch: _Batch, rate: float, rule: DrawRule) -> PixelSamples:
     widths, heights = tile_extents(batch.sizes)
     slots = np.minimum(wanted, widths * heights)
     weights = _importance_weights(probabilities, rule)
-    return compact(batch.view_ids, batch.sizes, batch.table, drawn, batch.all_tiles(), slots, weights)
+    return compact(batch.view_ids, batch.sizes, batch.table, drawn, batch.all_tiles(), slots, weights, full=True)
 
 
 def _draw_by_cell(batch: _Batch, rate: float, rule: DrawRule) -> PixelSamples:
@@ -311,7 +312,8 @@ def _pixels_of(cells: Tensor) -> Tensor:
 def _sample(rule: DrawRule, maps: ErrorMaps, view_ids: tuple[int, ...], rate: float, step: Step) -> PixelSamples:
     require(rate > 0, "rate", rate, "above 0")
     views = np.asarray(view_ids, dtype=np.int64)
-    return draw_pixels(
+    draw = training_kernels.sample_pixels if maps.errors.is_cuda and kernels.available() else draw_pixels
+    return draw(
         maps.errors,
         maps.stamps,
         step.iteration - maps.stamp_base,

@@ -246,6 +246,8 @@ class _Session:
                         while trainer.iteration < mark and interrupts.signal is None:
                             trainer.step()
                             progress.advance(trainer.iteration, len(trainer.gaussians))
+                            if trainer.iteration == mark:
+                                trainer.repeat_lost(wait=True)
                     if trainer.iteration in evaluations:
                         self._evaluate(progress)
                     if trainer.iteration in saves:

@@ -45,6 +45,7 @@ def compact(
     tile_ids: Tensor,
     slot_counts: np.ndarray,
     weights: Tensor | None = None,
+    full: bool = False,
 ) -> PixelSamples:
     """Samples of the masked places of tiles, in the table's order, without counting on the device.
 
@@ -55,6 +56,7 @@ def compact(
         tile_ids: [T] int32.
         slot_counts: [T] int64, on the host.
         weights: [T, 256] float32 of the places, or None; they are divided by their mean over the filled slots.
+        full: the mask fills every slot.
     """
     device = table.device
     offsets = np.concatenate([[0], np.cumsum(slot_counts)])
@@ -69,7 +71,7 @@ def compact(
         kept = torch.zeros(slots + 1, device=device)
         kept[positions] = torch.where(mask, weights, 0.0).reshape(-1)
         weights = kept[:-1] * ((pixel_ids >= 0).sum() / kept[:-1].sum())
-    return PixelSamples(tuple(view_ids), sizes, pixel_ids, tile_ids, tile_offsets, weights)
+    return PixelSamples(tuple(view_ids), sizes, pixel_ids, tile_ids, tile_offsets, weights, has_empty_slots=not full)
 
 
 def dense_pixels(view_ids: Sequence[int], sizes: np.ndarray, device: torch.device | str) -> PixelSamples:
@@ -77,4 +79,4 @@ def dense_pixels(view_ids: Sequence[int], sizes: np.ndarray, device: torch.devic
     table = pixel_table(sizes, device)
     widths, heights = tile_extents(sizes)
     tile_ids = torch.arange(len(table), dtype=torch.int32, device=device)
-    return compact(view_ids, sizes, table, table >= 0, tile_ids, widths * heights)
+    return compact(view_ids, sizes, table, table >= 0, tile_ids, widths * heights, full=True)

@@ -8,13 +8,16 @@ from __future__ import annotations
 from typing import Any
 
 import torch
+from torch import Tensor
 
+from turbogs_plugin import kernels
 from turbogs_plugin.config import Config
 from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.errors import TrainingStopped
 from turbogs_plugin.gaussians import gaussians_from_points
-from turbogs_plugin.rendering import rasterize, render_images
+from turbogs_plugin.rendering import Workspace, rasterize, render_images
 from turbogs_plugin.scene import Scene
+from turbogs_plugin.supervision import supervise
 from turbogs_plugin.types import PARAMETER_NAMES, Gaussians, RowUpdate, Step
 
 
@@ -44,7 +47,10 @@ class Trainer:
         self.view_sampler.setup(self.views.cameras, scene.extent)
         self.optimizer.setup(self.gaussians)
         self.density.setup(self.gaussians)
+        on_kernels = device.type == "cuda" and kernels.available()
+        self.workspace = Workspace(device) if on_kernels else None
         self.iteration = 0
+        self.first_repeatable = 0
         self.initial_error = 0.0
         self.nonfinite_losses = torch.zeros((), dtype=torch.int64, device=device)
 
@@ -59,6 +65,7 @@ class Trainer:
 
     def step(self) -> None:
         """One iteration, in the paper's order."""
+        self.repeat_lost()
         step = self.now
         view_errors = self.maps.view_means()
 
@@ -71,18 +78,19 @@ class Trainer:
         # 3) Pixel sampling
         samples = self.pixel_sampler.sample(self.maps, view_ids, budget.rate, step)
 
-        # 4) Ground truth at the samples
-        targets = self.views.photos.gather(samples)
-
         # 5) Sparse forward rendering
         cameras = self.views.cameras.select(view_ids)
-        rendered = rasterize(self.gaussians, cameras, samples, sh_degree=self.sh_degree, settings=self.config.raster)
+        rendered = rasterize(
+            self.gaussians,
+            cameras,
+            samples,
+            sh_degree=self.sh_degree,
+            settings=self.config.raster,
+            workspace=self.workspace,
+        )
 
-        # 6) Sparse loss and its gradients
-        loss = self.loss(rendered.colors, targets, samples)
-
-        # 7) EMA update of the error maps
-        self.maps.update(samples, loss.pixel_errors, step)
+        # 4) Ground truth at the samples, 6) sparse loss and its gradients, 7) EMA update of the error maps
+        loss = supervise(self.loss, rendered.colors, self.views.photos, samples, self.maps, step, self.overflow)
 
         # 8) Backward to the Gaussians; step 11's back-projection of errors happens in the same pass
         gradients = rendered.backward(loss.color_gradients, loss.pixel_errors, self.density.stats)
@@ -104,6 +112,24 @@ class Trainer:
             raise TrainingStopped(f"iteration {self.iteration}: density control removed every Gaussian")
         self.gaussians = update.apply(self.gaussians)
         self.optimizer.apply(update)
+        self.first_repeatable = self.iteration + 1
+
+    def repeat_lost(self, wait: bool = False) -> None:
+        """Go back by the iterations that did nothing because the rasterizer's workspace was too small for them.
+
+        Never behind a change of the set of Gaussians, which would be made twice.
+
+        Args:
+            wait: for the GPU, to know of all of them.
+        """
+        if self.workspace is not None:
+            lost = self.workspace.take_lost(wait)
+            self.iteration = max(self.iteration - lost, min(self.first_repeatable, self.iteration))
+
+    @property
+    def overflow(self) -> Tensor | None:
+        """[1] int32 on the device, not 0 while iterations do nothing; None where that cannot be."""
+        return None if self.workspace is None else self.workspace.overflow
 
     @property
     def now(self) -> Step:

@@ -95,7 +95,7 @@ def sample_pixels(
     )  # fmt: skip
     if weights is not None:
         weights = weights * ((pixel_ids >= 0).sum() / weights.sum())
-    return PixelSamples(tuple(view_ids), sizes, pixel_ids, tile_ids, tile_offsets, weights)
+    return PixelSamples(tuple(view_ids), sizes, pixel_ids, tile_ids, tile_offsets, weights, rule.unit != "pixel")
 
 
 def _view_slots(sizes: np.ndarray, shapes: np.ndarray, slots_per_tile: int, unit: str) -> np.ndarray:
@@ -150,10 +150,12 @@ class MapUpdate:
     Args:
         maps: of all views, on the device of the colours.
         step: gives the stamp.
+        overflow: [1] int32 on the device, or None; where it is not 0, the maps stay as they are.
     """
 
     maps: ErrorMaps
     step: Step
+    overflow: Tensor | None = None
 
 
 def sparse_loss(
@@ -206,12 +208,15 @@ def sparse_loss(
         _view_table(starts, samples.sizes, samples.view_ids, unused, unused), STRUCTURES.index(terms.structure),
         terms.epsilon, terms.l1_weight, terms.structure_weight, terms.variance_constant, terms.balance, terms.gate,
         maps, beta, stamp, count_filled(samples), loss, color_gradients, pixel_errors, nonfinite,
+        None if update is None else update.overflow,
     )  # fmt: skip
     return LossOutput(loss, color_gradients, pixel_errors)
 
 
 def count_filled(samples: PixelSamples) -> Tensor:
     """[1] int32 on the device: the filled slots."""
+    if not samples.has_empty_slots:
+        return torch.full((1,), len(samples), dtype=torch.int32, device=samples.pixel_ids.device)
     count = torch.zeros(1, dtype=torch.int32, device=samples.pixel_ids.device)
     torch.ops.turbogs.count_filled(samples.pixel_ids, count)
     return count
@@ -255,7 +260,7 @@ def fused_step(screen: CudaScreenGradients, gaussians: Gaussians, moments: Gauss
         moments: its optimizer state, float32.
     """
     kernels.require()
-    if gaussians.means.data_ptr() != screen.gaussians.means.data_ptr():
+    if any(value.data_ptr() != getattr(screen.gaussians, name).data_ptr() for name, value in gaussians.items()):
         raise ValueError("fused_step: these are not the Gaussians that the gradients were made of")
     kind, curvature, max_step, rows_per_view = 0, 0.0, 0.0, False
     if rule.lm is not None:

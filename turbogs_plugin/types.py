@@ -159,6 +159,7 @@ class PixelSamples:
         tile_ids: [T] int32, ascending, in the numbering of ``TileGrid(sizes)``.
         tile_offsets: [T + 1] int32, the first slot of each tile; the last entry is P.
         weights: [P] float32 importance weights with mean 1 over the filled slots, or None where all are 1.
+        has_empty_slots: False promises that every slot is filled, so that nobody needs to count them.
     """
 
     view_ids: tuple[int, ...]
@@ -167,6 +168,7 @@ class PixelSamples:
     tile_ids: Tensor
     tile_offsets: Tensor
     weights: Tensor | None = None
+    has_empty_slots: bool = True
 
     def __len__(self) -> int:
         return self.pixel_ids.shape[0]

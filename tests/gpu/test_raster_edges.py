@@ -179,6 +179,7 @@ def test_a_pass_that_would_fit_stays_empty_while_the_flag_is_up(case):
     memory.overflow.fill_(1)
     assert (render(case, workspace=memory).colors == 0).all()
     torch.cuda.synchronize()
+    memory.poll()
     with pytest.raises(RuntimeError, match="take_lost"):
         render(case, workspace=memory)
     assert memory.take_lost() >= 1

@@ -9,12 +9,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from turbogs_plugin import kernels
+from turbogs_plugin.rendering.cuda import rasterize_cuda, rasterize_differentiable_cuda
 from turbogs_plugin.rendering.reference import (
     DifferentiableRender,
-    rasterize_differentiable,
+    rasterize_differentiable_reference,
     rasterize_reference,
 )
 from turbogs_plugin.rendering.rendered import DEFAULT_SETTINGS, RasterSettings, Rendered, ScreenGradients
+from turbogs_plugin.rendering.workspace import Workspace
 from turbogs_plugin.types import TILE_SIZE, Cameras, Gaussians, PixelSamples, TileGrid, cell_order
 
 __all__ = [
@@ -23,9 +26,11 @@ __all__ = [
     "RasterSettings",
     "Rendered",
     "ScreenGradients",
+    "Workspace",
     "dense_samples",
     "rasterize",
     "rasterize_differentiable",
+    "rasterize_differentiable_reference",
     "rasterize_reference",
     "render_images",
 ]
@@ -39,6 +44,7 @@ def rasterize(
     sh_degree: int | None = None,
     settings: RasterSettings = DEFAULT_SETTINGS,
     with_depth: bool = False,
+    workspace: Workspace | None = None,
 ) -> Rendered:
     """Render samples of K views with gsplat's conventions, on a black background.
 
@@ -49,19 +55,40 @@ def rasterize(
         sh_degree: highest degree of spherical harmonics used; all there are where None.
         settings: thresholds and planes.
         with_depth: also give expected depths.
+        workspace: with the kernels, memory to use again and no waiting for the GPU; see `Workspace` for what the caller
+            then owes.
     """
-    if gaussians.device.type == "cuda":
-        from turbogs_plugin import kernels
-
-        if kernels.available():
-            from turbogs_plugin.rendering.cuda import rasterize_cuda
-
-            return rasterize_cuda(
-                gaussians, cameras, samples, sh_degree=sh_degree, settings=settings, with_depth=with_depth
-            )
+    if gaussians.device.type == "cuda" and kernels.available():
+        return rasterize_cuda(
+            gaussians,
+            cameras,
+            samples,
+            sh_degree=sh_degree,
+            settings=settings,
+            with_depth=with_depth,
+            workspace=workspace,
+        )
     return rasterize_reference(
         gaussians, cameras, samples, sh_degree=sh_degree, settings=settings, with_depth=with_depth
     )
+
+
+def rasterize_differentiable(
+    gaussians: Gaussians,
+    cameras: Cameras,
+    samples: PixelSamples,
+    *,
+    sh_degree: int | None = None,
+    settings: RasterSettings = DEFAULT_SETTINGS,
+    with_depth: bool = False,
+) -> DifferentiableRender:
+    """`rasterize` under torch autograd, for losses written in plain torch; the arguments are the same.
+
+    After a backward pass `means2d` has `.grad` and, as in gsplat with ``absgrad=True``, `.absgrad`.
+    """
+    on_gpu = gaussians.device.type == "cuda" and kernels.available()
+    function = rasterize_differentiable_cuda if on_gpu else rasterize_differentiable_reference
+    return function(gaussians, cameras, samples, sh_degree=sh_degree, settings=settings, with_depth=with_depth)
 
 
 @lru_cache(maxsize=32)
@@ -93,6 +120,7 @@ def dense_samples(cameras: Cameras, view_ids: Sequence[int] | None = None) -> Pi
         pixel_ids=torch.from_numpy(np.concatenate([order for order, _ in views])).to(device),
         tile_ids=torch.arange(len(TileGrid(sizes)), dtype=torch.int32, device=device),
         tile_offsets=torch.from_numpy(np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)).to(device),
+        has_empty_slots=False,
     )
 
 

@@ -200,7 +200,7 @@ class DifferentiableRender:
     sizes: np.ndarray
 
 
-def rasterize_differentiable(
+def rasterize_differentiable_reference(
     gaussians: Gaussians,
     cameras: Cameras,
     samples: PixelSamples,

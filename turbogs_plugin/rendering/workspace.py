@@ -98,7 +98,6 @@ class Workspace:
         Raises:
             RuntimeError: an overflow is known and `take_lost` has not been called.
         """
-        self.poll()
         if self.overflowed:
             raise RuntimeError("passes were lost to an overflow: call Workspace.take_lost() and repeat them")
         if gaussians != self._gaussians:
