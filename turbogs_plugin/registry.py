@@ -43,6 +43,8 @@ BUILT_IN: dict[str, dict[str, str]] = {
         "error_driven": "turbogs_plugin.strategies.density:ErrorDrivenDensity",
         "none": "turbogs_plugin.strategies.density:NoDensity",
         "gsplat_default": "turbogs_plugin.strategies.density_gsplat:GsplatDefaultDensity",
+        "mcmc": "turbogs_plugin.strategies.density_mcmc:GsplatMcmcDensity",
+        "fastgs": "turbogs_plugin.strategies.density_fastgs:FastGsDensity",
     },
     "optimizer": {
         "moment_lm": "turbogs_plugin.strategies.moment_lm:MomentLMOptimizer",

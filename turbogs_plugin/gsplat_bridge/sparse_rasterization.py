@@ -91,8 +91,7 @@ def sparse_rasterization(
         isect_offsets, flatten_ids and tiles_per_gauss are None.
 
         If "prediction" and "ground_truth" (both [P, 3] or both [C, H, W, 3]) are put into `info` before backward,
-        "gaussian_stats" is in it
-        after: the pass's `GaussianStats` with their error sums, and "loss_shares", [N].
+        "gaussian_stats" is in it after: the pass's `GaussianStats` with their error sums, and "loss_shares", [N].
 
     Raises:
         InputError: a wrong shape, or an option without support here.

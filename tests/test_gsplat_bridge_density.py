@@ -1,0 +1,193 @@
+"""Error-driven density control as a gsplat strategy."""
+
+import inspect
+
+import pytest
+import torch
+from bridge_host import Host, surgery
+from gsplat import DefaultStrategy
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.gsplat_bridge import TurboDensityStrategy, apply_row_update
+from turbogs_plugin.gsplat_bridge.gaussian_errors import iteration_stats
+from turbogs_plugin.types import PARAMETER_NAMES, RowUpdate
+
+SOON = {"refine_start_iter": 2, "refine_every": 3, "refine_stop_iter": 5, "grow_grad2d": 1e-6}
+
+
+def test_it_is_a_default_strategy_with_its_fields_and_hooks():
+    strategy = TurboDensityStrategy()
+    assert isinstance(strategy, DefaultStrategy) and strategy.absgrad is True
+    for name in ("refine_start_iter", "refine_stop_iter", "reset_every", "refine_every"):
+        setattr(strategy, name, getattr(strategy, name) * 2)  # as trainers do with their steps_scaler
+        assert getattr(strategy, name) == 2 * getattr(DefaultStrategy(), name)
+    for hook in ("step_pre_backward", "step_post_backward"):
+        theirs = inspect.signature(getattr(DefaultStrategy, hook)).parameters
+        assert list(inspect.signature(getattr(TurboDensityStrategy, hook)).parameters)[: len(theirs)] == list(theirs)
+
+
+@pytest.mark.parametrize("tells_errors", [False, True])
+def test_it_trains_and_says_once_what_drives_it(tells_errors, capsys):
+    host = Host(TurboDensityStrategy(**SOON), tells_errors=tells_errors)
+    losses = host.train(16)
+    assert losses[-1] < losses[0]
+    assert len(host.splats["means"]) > 40
+    host.assert_rows_match()
+    said = [line for line in capsys.readouterr().out.splitlines() if "TurboDensityStrategy" in line]
+    assert len(said) == 1
+    assert ("error-driven, by info['prediction']" in said[0]) == tells_errors
+    assert ("ranked by screen gradients" in said[0]) != tells_errors
+
+
+def test_the_error_decides_who_is_densified():
+    """All pass the gradient threshold; with a budget share of a tenth, only those of largest mean error grow."""
+    host = Host(TurboDensityStrategy(**SOON, top_fraction=0.1, lambda_base=0.0, prune_opa=0.0), tells_errors=True)
+    sums = torch.zeros(2, 40)
+    for step in range(4):
+        before = host.splats["sh0"].detach().flatten(1).clone()  # [40, 3]
+        host.step(step)
+        stats, _ = iteration_stats(host.info, 40)
+        sums += torch.stack([stats.error_sums, stats.weight_sums])
+    hardest = (sums[0] / sums[1].clamp(min=1e-12)).topk(4).indices
+    # Halves come last and have their parent's colour, which one step of training has hardly changed.
+    after = host.splats["sh0"].detach().flatten(1)
+    assert len(after) == 44
+    parents = torch.cdist(after[-8:], before).argmin(dim=1)
+    assert parents[:4].tolist() == parents[4:].tolist() == sorted(hardest.tolist())
+
+
+def test_schedule_events_happen_where_gsplats_do(monkeypatch):
+    events = {}
+    for cls in (DefaultStrategy, TurboDensityStrategy):
+        host = Host(cls(refine_start_iter=3, refine_every=3, refine_stop_iter=12, grow_grad2d=1e-9))
+        counts = [len(host.splats["means"])]
+        for step in range(16):
+            host.step(step)
+            counts.append(len(host.splats["means"]))
+        events[cls] = [step for step in range(16) if counts[step + 1] != counts[step]]
+    assert events[TurboDensityStrategy] == events[DefaultStrategy] == [6, 9]
+
+
+def test_no_opacity_is_reset_and_final_pruning_keeps_its_share():
+    host = Host(TurboDensityStrategy(refine_stop_iter=4, refine_start_iter=9, final_every=3, final_keep=0.8))
+    assert (host.train(6), len(host.splats["means"]))[1] == 40
+    host.step(6)  # three after the last step of refinement
+    assert 32 <= len(host.splats["means"]) < 40
+    host.assert_rows_match()
+
+
+@settings(max_examples=12, deadline=None)
+@given(
+    st.lists(st.sampled_from(["duplicate", "split", "remove", "reset", "step"]), min_size=1, max_size=6),
+    st.integers(0, 99),
+)
+def test_rows_match_after_any_sequence(operations, seed):
+    generator = torch.Generator().manual_seed(seed)
+    host = Host(TurboDensityStrategy(**{**SOON, "refine_stop_iter": 100}))
+    host.step(0)
+    for number, operation in enumerate(operations, start=1):
+        if operation == "step":
+            host.step(number)
+        else:
+            surgery(operation, host, generator)
+        host.assert_rows_match()
+    host.step(9)
+    host.assert_rows_match()
+
+
+def test_a_row_update_moves_parameters_state_and_statistics_alike():
+    host = Host(TurboDensityStrategy(refine_start_iter=1000))
+    host.train(2)
+    old = {name: value.detach().clone() for name, value in host.splats.items()}
+    old_state = {name: host.optimizers[name].state[host.splats[name]]["exp_avg"].clone() for name in old}
+    old_sums = host.state["grad_sums"].clone()
+    source = torch.tensor([5, 0, 7, 7, 39])
+    fresh = torch.tensor([False, False, False, True, True])
+    opacities = torch.arange(5.0)
+    update = RowUpdate(source, fresh, {"opacities": opacities}, reset=("sh0",))
+    apply_row_update(update, host.splats, host.optimizers, host.state)
+    host.assert_rows_match()
+    for name in PARAMETER_NAMES:
+        expected = opacities if name == "opacities" else old[name][source]
+        torch.testing.assert_close(host.splats[name].detach(), expected)
+        expected = old_state[name][source]
+        expected[fresh] = 0
+        state = host.optimizers[name].state[host.splats[name]]["exp_avg"]
+        torch.testing.assert_close(state, torch.zeros_like(expected) if name == "sh0" else expected)
+        assert host.splats[name].requires_grad
+    expected = old_sums[source]
+    expected[fresh] = 0
+    torch.testing.assert_close(host.state["grad_sums"], expected)
+
+
+def test_parameters_of_a_host_of_its_own_follow():
+    """A host with its own colour model: no sh0 or shN, but features."""
+    host = Host(TurboDensityStrategy(**SOON))
+    host.train(2)
+    names = ("means", "scales", "quats", "opacities")
+    splats = torch.nn.ParameterDict({name: host.splats[name] for name in names})
+    splats["features"] = torch.nn.Parameter(torch.arange(40.0)[:, None])
+    optimizers = {name: torch.optim.Adam([splats[name]]) for name in splats}
+    host.strategy.step_post_backward(splats, optimizers, host.state, 3, host.info, packed=False, scene=None)
+    assert len(splats["means"]) == len(splats["features"]) > 40
+
+
+def test_what_is_missing_is_named():
+    host = Host(TurboDensityStrategy(**SOON))
+    common = (host.splats, host.optimizers)
+    with pytest.raises(InputError, match=r"info has no 'means2d'"):
+        host.strategy.step_pre_backward(*common, host.state, 0, {})
+    host.step(0)
+    with pytest.raises(InputError, match=r"without its state"):
+        host.strategy.step_post_backward(*common, None, 0, host.info)
+    with pytest.raises(InputError, match=r"the state has no 'driven_by', .*initialize_state"):
+        host.strategy.step_post_backward(*common, DefaultStrategy().initialize_state(), 0, host.info)
+    without_radii = {key: value for key, value in host.info.items() if key != "radii"}
+    with pytest.raises(InputError, match=r"info has no 'radii'"):
+        host.strategy.step_post_backward(*common, host.state, 0, without_radii)
+    with pytest.raises(InputError, match=r"'opacities' has shape \(40, 1\): expected \[N\] with N = 40"):
+        bad = {**host.splats, "opacities": torch.nn.Parameter(torch.zeros(40, 1))}
+        host.strategy.step_post_backward(bad, host.optimizers, host.state, 0, host.info)
+    host.info["means2d"].grad = None
+    with pytest.raises(InputError, match=r"means2d'\] has no gradient"):
+        host.strategy.step_post_backward(*common, host.state, 0, host.info)
+
+
+def test_changes_in_mid_run_are_refused():
+    host = Host(TurboDensityStrategy(**SOON))
+    host.step(0)
+    host.tells_errors = True
+    with pytest.raises(InputError, match="was gradient-driven so far, this step's info is error-driven"):
+        host.step(1)
+    host = Host(TurboDensityStrategy(**SOON))
+    host.step(0)
+    host.state["grad_sums"] = host.state["grad_sums"][:7]
+    with pytest.raises(InputError, match=r"state\['grad_sums'\] has 7 rows, the parameters 40"):
+        host.step(1)
+
+
+def test_absgrad_must_be_there_or_off():
+    host = Host(TurboDensityStrategy(**SOON))
+    host.step(0)
+    del host.info["means2d"].absgrad
+    with pytest.raises(InputError, match="no absgrad: render with absgrad=True"):
+        host.strategy.step_post_backward(host.splats, host.optimizers, host.state, 1, host.info)
+    assert Host(TurboDensityStrategy(**SOON, absgrad=False)).train(4)
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [("revised_opacity", True), ("pause_refine_after_reset", 5), ("top_fraction", 0.0), ("split", "x")],
+)
+def test_invalid_fields_are_refused(field, value):
+    with pytest.raises(InputError, match=field):
+        TurboDensityStrategy(**{field: value})
+
+
+def test_gsplats_own_strategy_trains_on_our_rasterizer():
+    host = Host(DefaultStrategy(**SOON, absgrad=True))
+    losses = host.train(20)
+    assert losses[-1] < losses[0] and len(host.splats["means"]) > 40
+    host.assert_rows_match()
