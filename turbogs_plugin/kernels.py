@@ -40,6 +40,7 @@ def _load_failure() -> str:
     return ""
 
 
+@lru_cache(maxsize=1)
 def unavailable_reason() -> str:
     """Why the kernels cannot run here, in one line; "" where they can."""
     return _load_failure() or ("" if torch.cuda.is_available() else "torch sees no CUDA device")
