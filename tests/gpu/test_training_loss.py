@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 import torch
+from turbogs_plugin.strategies.loss import CharbonnierLoss, CharbonnierNccLoss, SparseSsimLoss
+from turbogs_plugin.strategies.pixel_sampling import DrawRule, draw_pixels
 
 from turbogs_plugin import kernels, training_kernels
 from turbogs_plugin.error_maps import ErrorMaps
-from turbogs_plugin.strategies.loss import CharbonnierLoss, CharbonnierNccLoss, SparseSsimLoss
-from turbogs_plugin.strategies.pixel_sampling import DrawRule, draw_pixels
 from turbogs_plugin.training_kernels import LossTerms, MapUpdate
 from turbogs_plugin.types import PixelSamples, Step
 

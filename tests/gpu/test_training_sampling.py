@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 import torch
+from turbogs_plugin.strategies.pixel_sampling import DrawRule, draw_pixels
 
 from turbogs_plugin import kernels, training_kernels
-from turbogs_plugin.strategies.pixel_sampling import DrawRule, draw_pixels
 
 pytestmark = [
     pytest.mark.gpu,

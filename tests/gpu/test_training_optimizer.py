@@ -1,0 +1,305 @@
+"""Projection backward against the float64 reference, and the fused step against the unfused torch twins."""
+
+from dataclasses import fields
+
+import numpy as np
+import pytest
+import torch
+from rendering_scenes import make_cameras, make_gaussians
+from turbogs_plugin.strategies.adam import SparseAdam
+from turbogs_plugin.strategies.learning_rates import LearningRates
+from turbogs_plugin.strategies.moment_lm import MomentLMOptimizer
+
+from turbogs_plugin import kernels, training_kernels
+from turbogs_plugin.rendering.cuda import CudaScreenGradients
+from turbogs_plugin.rendering.projection import drawable_rows, project_rows
+from turbogs_plugin.rendering.reference import ROW_PARAMETERS, ReferenceScreenGradients
+from turbogs_plugin.rendering.rendered import DEFAULT_SETTINGS
+from turbogs_plugin.types import Cameras, GaussianGradients, Gaussians, GaussianStats, PixelSamples, Step
+
+pytestmark = [
+    pytest.mark.gpu,
+    pytest.mark.skipif(not kernels.available(), reason=kernels.unavailable_reason() or "available"),
+]
+
+DEVICE = "cuda"
+SIZES = [(48, 32), (33, 40), (64, 20)]
+STEP = Step(iteration=100, total=5000, refine_until=3500, scene_extent=300.0)
+RATES = LearningRates(scales=0.1, quats=0.05, opacities=0.2, sh0=0.1, shN=0.05)
+"""Large, so that a step is not lost in the rounding of the parameters."""
+
+OPTIMIZERS = {
+    "adam": SparseAdam(RATES),
+    "lm": MomentLMOptimizer(RATES),
+    "lm unbound": MomentLMOptimizer(RATES, max_step=0.0, curvature=1.0),
+    "lm summed": MomentLMOptimizer(RATES, rows="summed"),
+    "paper": MomentLMOptimizer(RATES, units="paper", eps=1e-8),
+    "paper summed": MomentLMOptimizer(RATES, units="paper", rows="summed", eps=1e-8),
+    "no momentum": MomentLMOptimizer(RATES, beta1=0.0, beta2=0.0),
+}
+
+
+class Scene:
+    """A model, cameras and screen gradients of the right pattern: zero where a Gaussian is not drawn or not sampled."""
+
+    def __init__(self, count=300, degree=3, used_degree=None, seed=0, size=1e-5):
+        generator = torch.Generator().manual_seed(seed)
+        self.gaussians = make_gaussians(count, seed=seed, degree=degree, dtype=torch.float32)
+        self.gaussians.means[: count // 10] += 6 * torch.randn(count // 10, 3, generator=generator)  # off screen
+        self.cameras = make_cameras(SIZES, dtype=torch.float32)
+        self.degree = degree if used_degree is None else used_degree
+        views = len(SIZES)
+        self.samples = PixelSamples(
+            tuple(range(views)),
+            np.array(SIZES),
+            torch.tensor([0, 5, 9, -1], dtype=torch.int32),
+            torch.tensor([0], dtype=torch.int32),
+            torch.tensor([0, 4], dtype=torch.int32),
+        )
+        doubled = self.gaussians.map(lambda value: value.double())
+        self.rows = drawable_rows(doubled, self.cameras.to(dtype=torch.float64), DEFAULT_SETTINGS)
+        records = size * torch.randn(views, count, 16, generator=generator)
+        records[..., 9:14] = records[..., 9:14].abs()
+        records[torch.rand(views, count, generator=generator) < 0.3] = 0
+        records[:, count // 2 : count // 2 + 7] = 0  # never touched
+        drawn = torch.zeros(views * count, dtype=torch.bool)
+        drawn[self.rows.flat] = True
+        self.records = (records * drawn.view(views, count, 1)).float()
+        _, splats = self.project(doubled, torch.float64)
+        self.radii = self.rows.scatter(splats.radii).to(torch.int32)
+
+    def project(self, gaussians, dtype):
+        leaves = [getattr(gaussians, name)[self.rows.gaussians].detach().requires_grad_() for name in ROW_PARAMETERS]
+        leaves.append(gaussians.shN.detach().requires_grad_())
+        cameras = self.cameras.to(dtype=dtype)
+        with torch.enable_grad():
+            return leaves, project_rows(self.rows, *leaves, cameras, self.degree, DEFAULT_SETTINGS)
+
+    def reference(self, stats=None):
+        """The screen gradients of the reference in float64."""
+        leaves, splats = self.project(self.gaussians.map(lambda value: value.double()), torch.float64)
+        records = self.rows.gather(self.records.double())
+        return ReferenceScreenGradients(self.rows, splats, leaves, records, self.samples, stats)
+
+    def screen(self, gaussians=None, stats=None, overflow=None):
+        """Those of the kernels; the records are copied, as a step may overwrite them."""
+        gaussians = gaussians or self.on_device()
+        samples = PixelSamples(
+            self.samples.view_ids,
+            self.samples.sizes,
+            *(getattr(self.samples, name).to(DEVICE) for name in ("pixel_ids", "tile_ids", "tile_offsets")),
+        )
+        return CudaScreenGradients(
+            gaussians=gaussians,
+            cameras=Cameras(self.cameras.viewmats.to(DEVICE), self.cameras.Ks.to(DEVICE), self.cameras.sizes),
+            samples=samples,
+            sh_degree=self.degree,
+            settings=DEFAULT_SETTINGS,
+            records=self.records.to(DEVICE, copy=True),
+            radii=self.radii.to(DEVICE),
+            stats=stats,
+            overflow=overflow,
+        )
+
+    def on_device(self):
+        return self.gaussians.map(lambda value: value.to(DEVICE, copy=True))
+
+
+class Fixed:
+    """`ScreenGradients` made before."""
+
+    def __init__(self, gradients: GaussianGradients):
+        self.gradients = gradients
+
+    def parameter_gradients(self, rows: bool) -> GaussianGradients:
+        return self.gradients
+
+
+def doubled(value):
+    value = value.cpu()
+    return value.double() if value.is_floating_point() else value
+
+
+def assert_close_gradients(found, expected, name):
+    found, expected = found.double().cpu().flatten(), expected.flatten()
+    norms = float(found.norm() * expected.norm())
+    assert float(found @ expected) >= 0.9999 * norms, name
+    assert float((found - expected).norm()) <= 1e-4 * float(expected.norm()), name
+
+
+@pytest.mark.parametrize(("degree", "used_degree"), [(3, 3), (3, 1), (2, 2), (1, 1), (0, 0)])
+@pytest.mark.parametrize("rows", [True, False])
+def test_gradients_are_the_reference_s(degree, used_degree, rows):
+    scene = Scene(degree=degree, used_degree=used_degree)
+    count = len(scene.gaussians)
+    expected_stats, stats = GaussianStats.zeros(count, "cpu"), GaussianStats.zeros(count, DEVICE)
+    expected = scene.reference(expected_stats).parameter_gradients(rows)
+    found = training_kernels.projection_backward(scene.screen(stats=stats), rows)
+    for name in (*ROW_PARAMETERS, "shN", "view_losses"):
+        value, wanted = getattr(found, name), getattr(expected, name)
+        assert value.shape == wanted.shape, name
+        if wanted.numel():
+            assert_close_gradients(value, wanted, name)
+    for name in ROW_PARAMETERS:
+        lengths, wanted = (getattr(g, name).double().cpu().reshape(-1, count).norm(dim=0) for g in (found, expected))
+        assert float((lengths - wanted).norm()) <= 1e-4 * float(wanted.norm()), name
+    assert torch.equal(found.touched.cpu(), expected.touched)
+    assert 0 < int(expected.touched.sum()) < count
+    for field in fields(GaussianStats):
+        values, wanted = getattr(stats, field.name).cpu(), getattr(expected_stats, field.name)
+        torch.testing.assert_close(values, wanted, rtol=2e-5, atol=1e-10, msg=lambda text, n=field.name: f"{n}: {text}")
+    assert float(expected_stats.view_counts.sum()) > 0 and float(expected_stats.max_radii.max()) > 0
+
+
+def test_statistics_are_added_to():
+    scene = Scene(count=40)
+    stats = GaussianStats.zeros(40, DEVICE)
+    for _ in range(2):
+        training_kernels.projection_backward(scene.screen(stats=stats), rows=False)
+    once = GaussianStats.zeros(40, DEVICE)
+    training_kernels.projection_backward(scene.screen(stats=once), rows=False)
+    for field in fields(GaussianStats):
+        factor = 1 if field.name == "max_radii" else 2
+        torch.testing.assert_close(getattr(stats, field.name), factor * getattr(once, field.name))
+
+
+def twin_step(optimizer, gaussians, scene):
+    """The torch twin's step in float64, from the kernels' own gradients."""
+    rows = getattr(optimizer, "rows", "summed") == "views"
+    gradients = training_kernels.projection_backward(scene.screen(), rows)
+    values = {field.name: doubled(getattr(gradients, field.name)) for field in fields(GaussianGradients)}
+    optimizer.step(gaussians, Fixed(GaussianGradients(**values)), STEP)
+
+
+@pytest.mark.parametrize("name", OPTIMIZERS)
+@pytest.mark.parametrize("degree", [3, 2, 0])
+def test_fused_step_is_the_twin_s(name, degree):
+    optimizer, twin = OPTIMIZERS[name], OPTIMIZERS[name]
+    before = Scene(degree=degree).gaussians
+    gaussians, expected = before.map(lambda v: v.to(DEVICE, copy=True)), before.map(doubled)
+    optimizer.setup(gaussians)
+    moments = optimizer.moments
+    twin.setup(expected)
+    expected_moments = twin.moments
+    for iteration in range(3):
+        scene = Scene(degree=degree, seed=iteration)
+        scene.gaussians = gaussians.map(lambda value: value.cpu())  # gradients at the kernels' own parameters
+        twin.moments = expected_moments
+        twin_step(twin, expected, scene)
+        training_kernels.fused_step(scene.screen(gaussians), gaussians, moments, optimizer.rule(STEP))
+        for field in fields(moments):
+            found, wanted = doubled(getattr(moments, field.name)), doubled(getattr(expected_moments, field.name))
+            # The rows of the views may cancel in their sum: entries far below the largest carry its rounding.
+            bound = 1e-6 * float(wanted.abs().max()) if wanted.numel() else 0.0
+            torch.testing.assert_close(
+                found, wanted, rtol=1e-5, atol=bound, msg=lambda text, n=field.name: f"{n}: {text}"
+            )
+    assert int(expected_moments.steps.max()) == 3 and int(expected_moments.steps.min()) < 3
+    for parameter, value in before.items():
+        if value.numel() == 0:
+            continue
+        start, end = value.double(), getattr(gaussians, parameter).double().cpu()
+        wanted = getattr(expected, parameter)
+        assert float((wanted - start).norm()) > 0
+        assert float((end - wanted).norm()) <= 1e-5 * float((wanted - start).norm()), parameter
+    untouched = expected_moments.steps == 0
+    assert untouched.any()
+    for parameter, value in before.items():
+        assert torch.equal(getattr(gaussians, parameter).cpu()[untouched], value[untouched]), parameter
+
+
+def test_balanced_step_without_shares_is_adam():
+    scene = Scene()
+    scene.records[..., 11] = 0
+    stepped = []
+    for optimizer in (MomentLMOptimizer(RATES), SparseAdam(RATES, eps=1e-20)):
+        gaussians = scene.on_device()
+        optimizer.setup(gaussians)
+        training_kernels.fused_step(scene.screen(gaussians), gaussians, optimizer.moments, optimizer.rule(STEP))
+        stepped.append(gaussians)
+    for parameter, value in stepped[0].items():
+        assert torch.equal(value, getattr(stepped[1], parameter)), parameter
+
+
+@pytest.mark.parametrize("name", ["adam", "lm", "paper summed"])
+@pytest.mark.parametrize("entry", [0, 3, 5, 8])
+def test_bad_gradient_is_skipped_and_neighbours_step(name, entry):
+    optimizer, bad = OPTIMIZERS[name], 17
+    scene = Scene()
+    scene.records[:, bad] = 1e-5
+    results = []
+    for value in (1e-5, float("nan")):
+        scene.records[1, bad, entry] = value
+        gaussians = scene.on_device()
+        optimizer.setup(gaussians)
+        training_kernels.fused_step(scene.screen(gaussians), gaussians, optimizer.moments, optimizer.rule(STEP))
+        results.append((gaussians, optimizer.moments))
+    (clean, clean_moments), (found, moments) = results
+    assert int(clean_moments.skipped) == 0 and int(moments.skipped) == 1
+    assert int(moments.steps[bad]) == 0
+    others = torch.arange(len(scene.gaussians)) != bad
+    for parameter, value in found.items():
+        assert torch.equal(value.cpu()[others], getattr(clean, parameter).cpu()[others]), parameter
+        assert torch.equal(value.cpu()[bad], getattr(scene.gaussians, parameter)[bad]), parameter
+    for field in fields(moments):
+        if field.name != "skipped":
+            assert not getattr(moments, field.name)[bad].any(), field.name
+
+
+def test_overflow_changes_nothing():
+    scene = Scene(count=50)
+    gaussians, optimizer = scene.on_device(), OPTIMIZERS["lm"]
+    optimizer.setup(gaussians)
+    stats = GaussianStats.zeros(50, DEVICE)
+    overflow = torch.ones(1, dtype=torch.int32, device=DEVICE)
+    screen = scene.screen(gaussians, stats=stats, overflow=overflow)
+    training_kernels.fused_step(screen, gaussians, optimizer.moments, optimizer.rule(STEP))
+    for parameter, value in gaussians.items():
+        assert torch.equal(value.cpu(), getattr(scene.gaussians, parameter)), parameter
+    assert not optimizer.moments.steps.any() and not stats.view_counts.any()
+    gradients = training_kernels.projection_backward(scene.screen(overflow=overflow), rows=True)
+    assert not gradients.means.any() and not gradients.touched.any()
+
+
+@pytest.mark.parametrize("count", [0, 1, 129])
+def test_any_number_of_gaussians(count):
+    scene = Scene(count=300)
+    keep = slice(20, 20 + count)
+    scene.gaussians = scene.gaussians.map(lambda value: value[keep].contiguous())
+    scene.records = scene.records[:, keep].contiguous()
+    scene.radii = scene.radii[:, keep].contiguous()
+    gaussians, optimizer = scene.on_device(), OPTIMIZERS["lm"]
+    optimizer.setup(gaussians)
+    training_kernels.fused_step(scene.screen(gaussians), gaussians, optimizer.moments, optimizer.rule(STEP))
+    touched = (scene.records[..., 13] > 0).any(dim=0)
+    assert torch.equal(optimizer.moments.steps.cpu().bool(), touched)
+    assert len(training_kernels.projection_backward(scene.screen(), rows=True).touched) == count
+
+
+def test_wrong_tensors_are_named():
+    scene = Scene(count=20)
+    gaussians: Gaussians = scene.on_device()
+    optimizer = OPTIMIZERS["lm"]
+    optimizer.setup(gaussians)
+    optimizer.moments.exp_avg = optimizer.moments.exp_avg[:, :13]
+    with pytest.raises(RuntimeError, match="exp_avg must be a contiguous"):
+        training_kernels.fused_step(scene.screen(gaussians), gaussians, optimizer.moments, optimizer.rule(STEP))
+    with pytest.raises(ValueError, match="not the Gaussians"):
+        training_kernels.fused_step(scene.screen(), gaussians, optimizer.moments, optimizer.rule(STEP))
+
+
+def test_side_stream():
+    if DEVICE != "cuda":
+        pytest.skip("needs streams")
+    scene = Scene()
+    results = []
+    for stream in (torch.cuda.current_stream(), torch.cuda.Stream()):
+        torch.cuda.synchronize()
+        with torch.cuda.stream(stream):
+            gaussians, optimizer = scene.on_device(), OPTIMIZERS["lm"]
+            optimizer.setup(gaussians)
+            training_kernels.fused_step(scene.screen(gaussians), gaussians, optimizer.moments, optimizer.rule(STEP))
+        stream.synchronize()
+        results.append(gaussians)
+    for parameter, value in results[0].items():
+        assert torch.equal(value, getattr(results[1], parameter)), parameter
