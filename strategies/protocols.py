@@ -97,6 +97,11 @@ class DensityController(Protocol):
 class GaussianOptimizer(Protocol):
     """Turns gradients into a step of the parameters, in place (section 3.9)."""
 
+    @property
+    def skipped(self) -> Tensor:
+        """[] int64 on the device: updates left out so far because a gradient was not finite. Read at evaluations."""
+        ...
+
     def setup(self, gaussians: Gaussians) -> None:
         """Allocate state for these Gaussians; called once before training, and after a resume."""
         ...

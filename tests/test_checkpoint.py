@@ -117,6 +117,41 @@ def test_a_kill_between_any_two_steps_keeps_a_whole_checkpoint(tmp_path, monkeyp
     assert_newest(tmp_path, 4.0)
 
 
+@pytest.mark.parametrize(("number", "room"), [(1, 0), (1, 2000), (2, 0), (2, 5)])
+def test_a_kill_in_the_middle_of_a_write_keeps_a_whole_checkpoint(tmp_path, monkeypatch, number, room):
+    """The checkpoint is the first file that is written, the pointer the second."""
+    save_checkpoint(tmp_path, 1, state(1.0))
+    opened = []
+
+    class Torn(DiskFull):
+        def write(self, data) -> int:
+            if len(data) > self.room:
+                self.file.write(data[: self.room])
+                raise Killed
+            self.room -= len(data)
+            return self.file.write(data)
+
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *_) -> None:
+            self.file.close()
+
+    def torn_open(path, mode):
+        opened.append(path)
+        return Torn(open(path, mode), room if len(opened) == number else 10**9)
+
+    def killed(*_, **__):
+        raise Killed
+
+    monkeypatch.setattr(files, "open", torn_open, raising=False)
+    monkeypatch.setattr(files.Path, "unlink", killed)
+    with pytest.raises((Killed, TrainingStopped)):
+        save_checkpoint(tmp_path, 2, state(2.0))
+    monkeypatch.undo()
+    assert_newest(tmp_path, 1.0)
+
+
 def test_a_torn_temporary_file_is_no_checkpoint(tmp_path):
     path = save_checkpoint(tmp_path, 1, state(1.0))
     (tmp_path / ".iteration-000002.pt.part").write_bytes(path.read_bytes()[:100])
