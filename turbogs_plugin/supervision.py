@@ -1,4 +1,4 @@
-"""Ground truth, loss and error maps of an iteration (steps 4, 6, 7 of Algorithm 1), in one kernel where there is one."""
+"""Ground truth, loss and error maps of an iteration (steps 4, 6, 7 of Algorithm 1), in one kernel where possible."""
 
 from __future__ import annotations
 

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import itertools
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-import pycolmap
 
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene.capture import Capture, check_photo_name
 from turbogs_plugin.scene.colmap_check import check_binary_model
+
+if TYPE_CHECKING:
+    import pycolmap
 
 MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0")
 """Where a scene's reconstruction may lie, in order of preference."""
@@ -39,6 +42,8 @@ def read_colmap(scene: Path, model: Path, suffix: str) -> Capture:
     """
     if suffix == ".bin":
         check_binary_model(model)
+    import pycolmap  # here: other kinds of captures need neither its time to load nor its presence
+
     reconstruction = pycolmap.Reconstruction()
     try:
         (reconstruction.read_binary if suffix == ".bin" else reconstruction.read_text)(model)

@@ -11,7 +11,6 @@ import struct
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 
 from turbogs_plugin.errors import InputError
 
@@ -24,6 +23,8 @@ LONGEST_NAME = 4096
 
 def _parameter_counts() -> dict[int, int]:
     """Number of parameters of each camera model that pycolmap knows, by its number in the files."""
+    import pycolmap
+
     models = pycolmap.CameraModelId.__members__.values()
     return {
         int(model): len(pycolmap.Camera.create_from_model_id(1, model, 1.0, 1, 1).params)

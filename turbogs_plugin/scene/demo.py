@@ -11,12 +11,15 @@ import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-import pycolmap
 from PIL import Image
 
 from turbogs_plugin.errors import InputError
+
+if TYPE_CHECKING:
+    import pycolmap
 
 Texture = Callable[[np.ndarray], np.ndarray]
 """[R, 3] points in the solid's own coordinates -> [R, 3] colours, 0 .. 1."""
@@ -248,6 +251,8 @@ def _reconstruct(
     seen_depths = depths[np.arange(views)[:, None], rows.clip(0, height - 1), columns.clip(0, width - 1)]
     visible = inside & (np.abs(local[..., 2] - seen_depths) < 0.02 * seen_depths)  # [V, M]
     visible &= visible.sum(axis=0) >= 2
+
+    import pycolmap
 
     reconstruction = pycolmap.Reconstruction()
     camera = pycolmap.Camera(
