@@ -1,0 +1,1 @@
+"""Strategies that plug into TurboGS by entry point."""

@@ -1,0 +1,127 @@
+"""Every example runs, on the demo capture made small; the third-party package plugs in by its entry points."""
+
+import importlib.util
+import sys
+from pathlib import Path
+
+import pytest
+import tomllib
+import torch
+
+from turbogs_plugin import registry, run
+from turbogs_plugin.config import load_config
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.scene import write_demo_capture
+
+EXAMPLES = Path(__file__).parents[1] / "examples"
+PACKAGE = EXAMPLES / "third_party_strategy"
+SCRIPTS = ("density_swap", "optimizer_swap", "sparse_pixels", "all_swaps")
+
+pytestmark = pytest.mark.skipif(
+    torch.cuda.is_available(), reason="the examples run on the GPU there: tests/gpu has them"
+)
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory) -> Path:
+    return write_demo_capture(tmp_path_factory.mktemp("examples") / "demo", views=5, width=32, height=24)
+
+
+@pytest.fixture
+def example(monkeypatch):
+    """Imports an example by name as running it would, and forgets it afterwards."""
+    monkeypatch.syspath_prepend(str(EXAMPLES))
+    known = set(sys.modules)
+    yield lambda name: importlib.import_module(name)
+    for name in set(sys.modules) - known:
+        if getattr(sys.modules[name], "__file__", None) and str(EXAMPLES) in sys.modules[name].__file__:
+            del sys.modules[name]
+
+
+def test_every_script_is_run_here():
+    scripts = {path.stem for path in EXAMPLES.glob("*.py")}
+    assert scripts == {*SCRIPTS, "image_fitting", "baselines", "gsplat_host"}
+
+
+@pytest.mark.parametrize("name", SCRIPTS)
+def test_swaps(name, example, capture, capsys):
+    example(name).main(scene=str(capture), iterations=8, refine_start_iter=2, refine_every=4)
+    reports = [line for line in capsys.readouterr().out.splitlines() if "dB on the test views" in line]
+    assert len(reports) == {"density_swap": 2, "optimizer_swap": 3}.get(name, 1)
+    for line in reports:
+        first, last = (float(text) for text in line.split(": ")[1].split(" dB")[0].split(" -> "))
+        assert last > first, line
+
+
+def test_image_fitting(example):
+    fitting = example("image_fitting")
+    assert fitting.main(iterations=60) > fitting.main(iterations=1) + 3
+
+
+def test_baselines(example, capture, tmp_path, capsys):
+    example("baselines").main(scene=str(capture), output=str(tmp_path / "runs"), iterations=4)
+    lines = capsys.readouterr().out.splitlines()
+    said = {line.split(":")[0] for line in lines if " dB, " in line}
+    gpu = torch.cuda.is_available()
+    assert said == {"turbogs", "3dgs", "3dgs-as-shipped", "fastgs", *(["mcmc"] if gpu else [])}
+    assert ("mcmc: left out, needs a GPU" in lines) != gpu
+
+
+@pytest.fixture
+def third_party(tmp_path, monkeypatch):
+    """The package as if it were installed: its folder and the metadata that its pyproject.toml stands for."""
+    project = tomllib.loads((PACKAGE / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    metadata = tmp_path / f"{project['name'].replace('-', '_')}-{project['version']}.dist-info"
+    metadata.mkdir()
+    (metadata / "METADATA").write_text(
+        f"Metadata-Version: 2.1\nName: {project['name']}\nVersion: {project['version']}\n"
+    )
+    lines = []
+    for group, points in project["entry-points"].items():
+        lines += [f"[{group}]", *(f"{name} = {value}" for name, value in points.items())]
+    (metadata / "entry_points.txt").write_text("\n".join(lines))
+    monkeypatch.syspath_prepend(str(PACKAGE))
+    monkeypatch.syspath_prepend(str(tmp_path))
+    yield
+    for name in [name for name in sys.modules if name.startswith("patchwork_strategies")]:
+        del sys.modules[name]
+
+
+def test_third_party_strategies_are_named_in_a_yaml(third_party, capture, tmp_path):
+    overrides = ["train.iterations=5", "train.device=cpu", "density.every=2", "density.least_opacity=0.1"]
+    config = load_config(str(PACKAGE / "patchwork.yaml"), overrides)
+    config.scene.path = str(capture)
+    assert type(config.build("pixel_sampler")).__name__ == "CheckerboardPixelSampler"
+    history = run.train(config, tmp_path / "run").history
+    assert history[-1].psnr > history[0].psnr
+    assert history[-1].num_gaussians < history[0].num_gaussians
+
+
+def test_third_party_fields_are_checked_like_our_own(third_party):
+    with pytest.raises(InputError, match=r"field_sise.*field_size"):
+        registry.build("pixel_sampler", {"type": "checkerboard", "field_sise": 2})
+    with pytest.raises(InputError, match="least_opacity"):
+        registry.build("density", {"type": "opaque_only", "least_opacity": 2.0})
+
+
+def test_checkerboards_of_two_iterations_are_every_pixel_once(third_party):
+    from turbogs_plugin.error_maps import ErrorMaps
+    from turbogs_plugin.types import Step
+
+    sampler = registry.build("pixel_sampler", {"type": "checkerboard", "field_size": 3})
+    maps = ErrorMaps.from_images(torch.zeros(1, 21, 37))
+    seen = []
+    for iteration in range(2):
+        samples = sampler.sample(maps, (0,), 0.1, Step(iteration, 2, 2))
+        filled = samples.filled
+        # Empty slots are last within each tile.
+        for start, end in zip(samples.tile_offsets[:-1].tolist(), samples.tile_offsets[1:].tolist(), strict=True):
+            assert not (~filled[start : end - 1] & filled[start + 1 : end]).any()
+        seen.append(samples.pixel_ids[filled])
+    assert torch.cat(seen).sort().values.tolist() == list(range(21 * 37))
+
+
+def test_not_installed_it_is_not_known():
+    with pytest.raises(InputError, match=r"unknown pixel_sampler\.type 'checkerboard'"):
+        registry.build("pixel_sampler", {"type": "checkerboard"})
+    assert importlib.util.find_spec("patchwork_strategies") is None
