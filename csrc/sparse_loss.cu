@@ -17,6 +17,7 @@ constexpr uint32_t kFull = 0xFFFFFFFFu;
 constexpr int kLossThreads = 128;
 constexpr int kLossWarps = kLossThreads / 32;
 constexpr int kMaxBlocks = 2048;
+constexpr int kFewSlots = 64;  // of a tile with few samples
 constexpr float kBalanceEpsilon = 1e-8f;
 constexpr float kLuminanceConstant = 1e-4f;  // 0.01^2
 constexpr float kSsimConstant = 9e-4f;       // 0.03^2
@@ -244,6 +245,9 @@ __device__ __forceinline__ void tile_loss(const SparseLossParams& params, const 
     }
 }
 
+// Tiles of few samples and tiles of many are two launches over the same tiles, each passing by the other's: at low rates,
+// where there are most tiles, few registers leave room for twice the warps.
+template <bool kMany>
 __global__ void __launch_bounds__(kLossThreads) sparse_loss_kernel(const __grid_constant__ SparseLossParams params) {
     __shared__ double loss_parts[kLossWarps];
     const int lane = threadIdx.x & 31, warps = gridDim.x * kLossWarps;
@@ -256,6 +260,8 @@ __global__ void __launch_bounds__(kLossThreads) sparse_loss_kernel(const __grid_
     Totals totals;
     int view = -1;
     for (int tile = first_tile; tile < end_tile; ++tile) {
+        const int first = params.tile_offsets[tile], end = params.tile_offsets[tile + 1];
+        if ((end - first > kFewSlots) != kMany) continue;
         const int tile_id = params.tile_ids[tile];
         int tile_view = max(view, 0);
         while (tile_view + 1 < params.num_views && tile_id >= params.views[tile_view + 1].tile_base) ++tile_view;
@@ -267,16 +273,17 @@ __global__ void __launch_bounds__(kLossThreads) sparse_loss_kernel(const __grid_
             }
             view = tile_view;
         }
-        const int first = params.tile_offsets[tile], end = params.tile_offsets[tile + 1];
         const SampleView& of_tile = params.views[view];
-        if (end - first <= 32) {
+        if (kMany) {
+            if (end - first <= 128) {
+                tile_loss<4>(params, of_tile, first, end, filled, learns, totals);
+            } else {
+                tile_loss<8>(params, of_tile, first, end, filled, learns, totals);
+            }
+        } else if (end - first <= 32) {
             tile_loss<1>(params, of_tile, first, end, filled, learns, totals);
-        } else if (end - first <= 64) {
-            tile_loss<2>(params, of_tile, first, end, filled, learns, totals);
-        } else if (end - first <= 128) {
-            tile_loss<4>(params, of_tile, first, end, filled, learns, totals);
         } else {
-            tile_loss<8>(params, of_tile, first, end, filled, learns, totals);
+            tile_loss<2>(params, of_tile, first, end, filled, learns, totals);
         }
     }
     if (view >= 0 && params.view_sums != nullptr) {
@@ -309,7 +316,10 @@ cudaError_t launch_count_filled(const CountFilledParams& params, cudaStream_t st
 cudaError_t launch_sparse_loss(const SparseLossParams& params, cudaStream_t stream) {
     if (params.num_slots == 0 || params.num_tiles == 0) return cudaSuccess;
     const int blocks = min((params.num_tiles + kLossWarps - 1) / kLossWarps, kMaxBlocks);
-    sparse_loss_kernel<<<blocks, kLossThreads, 0, stream>>>(params);
+    sparse_loss_kernel<false><<<blocks, kLossThreads, 0, stream>>>(params);
+    const cudaError_t status = cudaGetLastError();
+    if (status != cudaSuccess) return status;
+    sparse_loss_kernel<true><<<blocks, kLossThreads, 0, stream>>>(params);
     return cudaGetLastError();
 }
 

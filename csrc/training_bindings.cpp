@@ -77,7 +77,8 @@ ScreenBackwardParams screen_backward_params(const Checker& check, const std::vec
 
 void projection_backward(const std::vector<Tensor>& gaussians, const Tensor& viewmats, const Tensor& Ks,
                          const std::vector<int64_t>& sizes, const Tensor& records, const std::optional<Tensor>& radii,
-                         const std::vector<Tensor>& stats, int64_t sh_degree, double eps2d, const Tensor& num_filled, const std::optional<Tensor>& overflow, const Tensor& rows,
+                         const std::vector<Tensor>& stats, int64_t sh_degree, double eps2d,
+                         const Tensor& num_filled, const std::optional<Tensor>& overflow, const Tensor& rows,
                          const Tensor& shN, const Tensor& touched, const Tensor& view_losses) {
     const Checker check(records);
     const ScreenBackwardParams params = screen_backward_params(check, gaussians, viewmats, Ks, sizes, records, radii, stats,
@@ -96,7 +97,8 @@ void projection_backward(const std::vector<Tensor>& gaussians, const Tensor& vie
 
 void fused_step(const std::vector<Tensor>& gaussians, const Tensor& viewmats, const Tensor& Ks,
                 const std::vector<int64_t>& sizes, const Tensor& records, const std::optional<Tensor>& radii,
-                const std::vector<Tensor>& stats, int64_t sh_degree, double eps2d, const Tensor& num_filled, const std::optional<Tensor>& overflow,
+                const std::vector<Tensor>& stats, int64_t sh_degree, double eps2d,
+                const Tensor& num_filled, const std::optional<Tensor>& overflow,
                 const std::vector<Tensor>& moments, int64_t kind, bool rows_per_view,
                 const std::vector<double>& rates, double beta1, double beta2, double eps,
                 double curvature, double max_step) {

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 import torch
-from turbogs_plugin.strategies.pixel_sampling import DrawRule, draw_pixels
+from turbogs_plugin.strategies.philox import PURPOSE_PIXELS, exponentials, random_words
+from turbogs_plugin.strategies.pixel_sampling import WEIGHT_FLOOR, DrawRule, draw_pixels
 
 from turbogs_plugin import kernels, training_kernels
 
@@ -77,6 +78,19 @@ def test_tied_errors_and_ages(value):
     errors, stamps = random_maps()
     errors[:], stamps[:] = value, 3
     given = arguments(errors, stamps, (0, 3), 0.1, DrawRule("pixel", 0.4, 0.3, False, 0.0), 0, 9)
+    on_device = (errors.to(DEVICE), stamps.to(DEVICE), *given[2:])
+    assert_equal_samples(training_kernels.sample_pixels(*on_device), draw_pixels(*given))
+
+
+@pytest.mark.parametrize("iteration", [144101, 222332, 285526])
+def test_equal_keys_at_the_threshold(iteration):
+    """Found by search: without errors, the 25th and 26th largest keys of this tile are one number; rank decides."""
+    errors, stamps = random_maps()
+    errors[:] = 0
+    given = arguments(errors, stamps, (1,), 0.1, DrawRule("pixel", 1.0, 0.0, False, 0.0), 0, iteration)
+    words = random_words(torch.arange(256), 4, PURPOSE_PIXELS, 0, iteration)
+    keys = (torch.tensor(WEIGHT_FLOOR) / exponentials(words[0])).sort(descending=True).values
+    assert keys[24] == keys[25]
     on_device = (errors.to(DEVICE), stamps.to(DEVICE), *given[2:])
     assert_equal_samples(training_kernels.sample_pixels(*on_device), draw_pixels(*given))
 
