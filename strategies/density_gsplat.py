@@ -76,7 +76,7 @@ class GsplatDefaultDensity:
         if self._stats is None or not (step.iteration % self.refine_every == 0 or reset_due) or len(gaussians) == 0:
             return None
         params = {name: torch.nn.Parameter(value, requires_grad=False) for name, value in gaussians.items()}
-        optimizers = {name: _marking_optimizer(params[name]) for name in ("means", "opacities")}
+        optimizers = {name: marking_optimizer(params[name]) for name in ("means", "opacities")}
         state = self._gsplat_state(step)
         strategy = _FilledStrategy(**self._gsplat_config(), refine_stop_iter=step.refine_until)
         with torch.random.fork_rng(devices=[gaussians.device] if gaussians.device.type == "cuda" else []):
@@ -120,7 +120,7 @@ class GsplatDefaultDensity:
             source = gaussians.opacities.argmax().reshape(1)
             self._stats = self._stats.map(lambda value: value[source])
             return RowUpdate(source, torch.zeros_like(source, dtype=torch.bool), {}, num_pruned=len(gaussians) - 1)
-        fresh, opacity_fresh = (_touched_rows(optimizers[name], params[name]) for name in ("means", "opacities"))
+        fresh, opacity_fresh = (touched_rows(optimizers[name], params[name]) for name in ("means", "opacities"))
         was_reset = bool(opacity_fresh.all()) and not bool(fresh.all())
         self._stats = GaussianStats.zeros(len(source), gaussians.device)
         gradients = "absgrad_sums" if self.absgrad else "grad_sums"
@@ -142,13 +142,13 @@ class GsplatDefaultDensity:
         )
 
 
-def _marking_optimizer(param: torch.nn.Parameter) -> torch.optim.Optimizer:
+def marking_optimizer(param: torch.nn.Parameter) -> torch.optim.Optimizer:
     """An optimizer whose one state tensor is 1 for rows it knows; gsplat puts 0 where it makes or resets rows."""
     optimizer = torch.optim.SGD([param], lr=0.0)
     optimizer.state[param]["known"] = torch.ones(len(param), device=param.device)
     return optimizer
 
 
-def _touched_rows(optimizer: torch.optim.Optimizer, param: torch.nn.Parameter) -> Tensor:
+def touched_rows(optimizer: torch.optim.Optimizer, param: torch.nn.Parameter) -> Tensor:
     """[M] bool: the rows that gsplat has made or reset."""
     return optimizer.state[param]["known"] == 0

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 from gsplat.strategy import MCMCStrategy
-from turbogs_plugin.strategies.density_gsplat import _marking_optimizer, _touched_rows
+from turbogs_plugin.strategies.density_gsplat import marking_optimizer, touched_rows
 from turbogs_plugin.strategies.learning_rates import LearningRates
 
 from turbogs_plugin.errors import InputError, require
@@ -69,7 +69,7 @@ class GsplatMcmcDensity:
             name: torch.nn.Parameter(value.clone() if refines else value, requires_grad=False)
             for name, value in gaussians.items()
         }
-        optimizers = {name: _marking_optimizer(params[name]) for name in params}
+        optimizers = {name: marking_optimizer(params[name]) for name in params}
         with torch.random.fork_rng(devices=[gaussians.device]):
             torch.manual_seed(int(np.random.SeedSequence([step.seed, iteration]).generate_state(1)[0]))
             rate = self.learning_rates.at(step).means
@@ -80,7 +80,7 @@ class GsplatMcmcDensity:
         source = torch.arange(count, device=gaussians.device)
         return RowUpdate(
             torch.where(source < len(gaussians), source, 0),
-            _touched_rows(optimizers["means"], params["means"]),
+            touched_rows(optimizers["means"], params["means"]),
             {name: value.data for name, value in params.items()},
             num_cloned=count - len(gaussians),
         )

@@ -1,16 +1,19 @@
 """Error-driven density control as a gsplat strategy."""
 
 import inspect
+from dataclasses import dataclass, field
 
 import pytest
 import torch
-from bridge_host import Host, surgery
-from gsplat import DefaultStrategy
+import tyro
+from bridge_host import SURGERY, Host, surgery
+from gsplat import DefaultStrategy, MCMCStrategy
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from turbogs_plugin.strategies.moment_lm import MomentLMOptimizer
 
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.gsplat_bridge import TurboDensityStrategy, apply_row_update
+from turbogs_plugin.gsplat_bridge import SharedOptimizer, TurboDensityStrategy, apply_row_update
 from turbogs_plugin.gsplat_bridge.gaussian_errors import iteration_stats
 from turbogs_plugin.types import PARAMETER_NAMES, RowUpdate
 
@@ -26,6 +29,20 @@ def test_it_is_a_default_strategy_with_its_fields_and_hooks():
     for hook in ("step_pre_backward", "step_post_backward"):
         theirs = inspect.signature(getattr(DefaultStrategy, hook)).parameters
         assert list(inspect.signature(getattr(TurboDensityStrategy, hook)).parameters)[: len(theirs)] == list(theirs)
+
+
+@dataclass
+class TrainerConfig:
+    """As in gsplat's trainer, whose command line is made by tyro from the type and the default."""
+
+    strategy: DefaultStrategy | MCMCStrategy = field(default_factory=DefaultStrategy)
+
+
+def test_its_fields_are_on_the_command_line_of_gsplats_trainer():
+    configs = {"default": ("named", TrainerConfig(strategy=TurboDensityStrategy(verbose=True)))}
+    arguments = ["default", "--strategy.refine-every", "7", "--strategy.top-fraction", "0.3"]
+    strategy = tyro.extras.overridable_config_cli(configs, args=arguments).strategy
+    assert strategy == TurboDensityStrategy(verbose=True, refine_every=7, top_fraction=0.3)
 
 
 @pytest.mark.parametrize("tells_errors", [False, True])
@@ -80,7 +97,7 @@ def test_no_opacity_is_reset_and_final_pruning_keeps_its_share():
 
 @settings(max_examples=12, deadline=None)
 @given(
-    st.lists(st.sampled_from(["duplicate", "split", "remove", "reset", "step"]), min_size=1, max_size=6),
+    st.lists(st.sampled_from([*SURGERY, "step"]), min_size=1, max_size=6),
     st.integers(0, 99),
 )
 def test_rows_match_after_any_sequence(operations, seed):
@@ -95,6 +112,53 @@ def test_rows_match_after_any_sequence(operations, seed):
         host.assert_rows_match()
     host.step(9)
     host.assert_rows_match()
+
+
+def tag_rows(host: Host) -> None:
+    """Row i has i + 1 as its colour, in every optimizer state and in every statistic."""
+    tags = torch.arange(1.0, 1.0 + len(host.splats["means"]))
+    host.splats["sh0"].data[:] = tags[:, None, None]
+    for name, parameter in host.splats.items():
+        for key, value in host.optimizers[name].state[parameter].items():
+            if key != "step":
+                value[:] = tags.reshape(-1, *[1] * (value.dim() - 1))
+    for value in host.state.values():
+        if isinstance(value, torch.Tensor):
+            value[:] = tags
+
+
+@pytest.mark.parametrize("optimizer", ["torch", "shared"])
+@settings(max_examples=15, deadline=None)
+@given(st.lists(st.sampled_from([*SURGERY, "update"]), min_size=1, max_size=8), st.integers(0, 99))
+def test_rows_keep_what_is_theirs(optimizer, operations, seed):
+    """After any sequence, what a row has is its own or, where the row is new or was reset, zero; some is its own."""
+    generator = torch.Generator().manual_seed(seed)
+    shared = SharedOptimizer(MomentLMOptimizer())
+    host = Host(TurboDensityStrategy(), torch.optim.Adam if optimizer == "torch" else shared)
+    host.step(0)
+    tag_rows(host)
+    for operation in operations:
+        count = len(host.splats["means"])
+        if operation == "update":
+            source = torch.randint(count, (count + 3,), generator=generator)
+            fresh = torch.rand(count + 3, generator=generator) < 0.2
+            apply_row_update(RowUpdate(source, fresh, {}), host.splats, host.optimizers, host.state)
+        else:
+            surgery(operation, host, generator)
+    host.assert_rows_match()
+    tags = host.splats["sh0"].detach()[:, 0, 0]
+    kept = {}
+    for name, parameter in host.splats.items():
+        for key, value in host.optimizers[name].state[parameter].items():
+            if key != "step":
+                kept[name, key] = value
+    kept |= {("statistics", key): value for key, value in host.state.items() if isinstance(value, torch.Tensor)}
+    for place, value in kept.items():
+        rows = value.flatten(1) if value.dim() > 1 else value[:, None]
+        assert ((rows == tags[:, None]) | (rows == 0)).all(), place
+    assert torch.equal(kept["means", "exp_avg"][:, 0] != 0, kept["quats", "exp_avg_sq"][:, 3] != 0)
+    if "update" not in operations:
+        assert torch.equal(host.state["grad_sums"], tags)  # gsplat copies running state to new rows
 
 
 def test_a_row_update_moves_parameters_state_and_statistics_alike():

@@ -203,8 +203,12 @@ class MemberOptimizer(torch.optim.Optimizer):
         """Hand the gradient over (``.grad`` is None afterwards); the last member to be stepped updates all.
 
         Raises:
-            InputError: stepped twice before all the others were, or a gradient is sparse.
+            InputError: stepped twice before all the others were, a gradient is sparse, or a mask of the visible was passed.
         """
+        if isinstance(closure, Tensor):
+            raise InputError(
+                "step takes no visibility mask, rows without a gradient stay anyway: set visible_adam=False"
+            )
         loss = None
         if closure is not None:
             with torch.enable_grad():
