@@ -26,7 +26,7 @@ class ImageNetwork(torch.nn.Module):
 
     def __init__(self, images: int, features: int = 64, width: int = 64) -> None:
         super().__init__()
-        self.register_buffer("waves", 6.0 * torch.randn(2, features))
+        self.register_buffer("waves", 20.0 * torch.randn(2, features))
         self.embedding = torch.nn.Embedding(images, 16)
         self.layers = torch.nn.Sequential(
             torch.nn.Linear(2 * features + 16, width),

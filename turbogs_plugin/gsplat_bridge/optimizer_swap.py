@@ -203,7 +203,7 @@ class MemberOptimizer(torch.optim.Optimizer):
         """Hand the gradient over (``.grad`` is None afterwards); the last member to be stepped updates all.
 
         Raises:
-            InputError: stepped twice before all the others were, a gradient is sparse, or a mask of the visible was passed.
+            InputError: stepped twice before all the others were, a sparse gradient, or a mask in the closure's place.
         """
         if isinstance(closure, Tensor):
             raise InputError(
