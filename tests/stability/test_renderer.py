@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from rendering_scenes import make_cameras, make_gaussians
 from tolerances import TOLERANCES
@@ -145,6 +145,7 @@ COLORS = st.sampled_from([0.0, 1.0, -1e4, 1e6])
     center=st.sampled_from([-500.0, 10.0, 5000.0]),
     size=st.sampled_from([(1, 1), (3, 40), (20, 17)]),
 )
+@example([-2.0] * 3, [0.0, 3e38, 4.0], 1.0, 0.0, 1.0, 60.0, 10.0, (20, 17))  # in front, and infinitely far to the side
 def test_any_gaussian_among_ordinary_ones_stays_finite(sizes, place, norm, logit, color, degrees, center, size):
     """Colours, gradients and statistics of everybody; a Gaussian that is not drawn has no gradient."""
     gaussians = random_scene(8)

@@ -24,6 +24,10 @@ SPAN_MAX = 1e7
 """Gaussians whose longest axis, seen face on, would span more pixels than this are not drawn: the determinant of their
 covariance would overflow in float32."""
 
+DISTANCE_MAX = 1e18
+"""Gaussians with a coordinate beyond this are not drawn: squared distances would overflow in float32. No image reaches
+that far to the side of what is nearer than the far plane."""
+
 QUATERNION_MIN = 1e-30
 """Quaternions whose largest component is below this have no direction; they count as the identity."""
 
@@ -83,6 +87,7 @@ class Splats:
 def drawable_rows(gaussians: Gaussians, cameras: Cameras, settings: RasterSettings) -> Rows:
     """The rows within the depth planes, with enough opacity, of Gaussians that are finite and of sane size."""
     usable = torch.sigmoid(gaussians.opacities) >= settings.alpha_min  # [N]; False for NaN
+    usable &= gaussians.means.abs().amax(dim=1) <= DISTANCE_MAX
     for name, value in gaussians.items():
         if name != "opacities":
             usable &= value.flatten(1).isfinite().all(dim=1)
