@@ -37,7 +37,8 @@ class LearningRates:
         opacities: of the opacity logits.
         sh0: of band 0.
         shN: of the higher bands.
-        final_factor: the rates of all but the means fall exponentially to this share of themselves at the last iteration.
+        final_factor: the rates of all but the means fall exponentially to this share of themselves at the end of the
+            run.
         batch_scale: multiplies every rate at every iteration, whatever K is at that iteration. 2 gained 0.5 dB over 1
             (fox, 4000 iterations, K from 10 down to 3); one-view baselines (3DGS) set 1.
     """
