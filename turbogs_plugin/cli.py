@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
-from tyro.conf import Positional, arg
+from tyro.conf import Positional, UseAppendAction, arg
 
 from turbogs_plugin.errors import InputError, TrainingStopped
 
@@ -101,6 +101,70 @@ def export(run: Positional[Path], /, *, format: Literal["ply"] = "ply", out: Pat
 
     print(f"model  {export_run(run, format, out)}")
     return 0
+
+
+@app.command
+def ablate(
+    config: Annotated[Positional[str | None], arg(metavar="NAME_OR_FILE")] = None,
+    overrides: Annotated[Positional[tuple[str, ...]], arg(metavar="[section.key=value ...]")] = (),
+    /,
+    *,
+    out: Path,
+    scene: Annotated[UseAppendAction[tuple[Path, ...]], arg(metavar="SCENE")] = (),
+    seeds: Annotated[tuple[int, ...], arg(metavar="N ...")] = (0,),
+    steps: Annotated[int | None, arg(metavar="N")] = None,
+    time_budget: Annotated[float, arg(metavar="SECONDS")] = 0.0,
+    only: Annotated[tuple[str, ...], arg(metavar="VARIANT ...")] = (),
+    psnr: Annotated[tuple[float, ...], arg(metavar="DB ...")] = (),
+    merge: Annotated[tuple[Path, ...], arg(metavar="STUDY ...")] = (),
+    device: Device = "auto",
+) -> int:
+    """Train named variants over scenes and seeds: error against run time. The same call goes on where it stopped.
+
+    Args:
+        config: a packaged ablation (components, replacements, optimizer, ...) or a .yaml file.
+        overrides: changes of every variant's configuration.
+        out: folder of the study; finished cells in it are kept.
+        scene: folder of a capture; may be given several times.
+        seeds: of each variant; two at least, or nothing can be called different.
+        steps: iterations of every cell; what counts iterations is scaled with them.
+        time_budget: seconds of training after which a cell stops; 0 for none.
+        only: these variants and the baseline.
+        psnr: test PSNRs whose time is asked for; from the baseline's result where absent.
+        merge: put these studies together in --out and write the report again, without training.
+        device: where to train.
+    """
+    from turbogs_plugin.ablation import commands
+    from turbogs_plugin.ablation.sweep import SweepOptions
+
+    if merge:
+        if config is not None or overrides or scene or only:
+            raise InputError("--merge trains nothing: give it --out and --psnr alone")
+        return commands.merge(merge, out, psnr)
+    if config is None or not scene:
+        raise InputError("ablate needs NAME_OR_FILE and --scene SCENE, or --merge STUDY ...")
+    options = SweepOptions(scene, seeds, overrides, steps, time_budget, device)
+    return commands.ablate(config, options, out, only, psnr)
+
+
+@app.command
+def compare(
+    runs: Annotated[Positional[tuple[Path, ...]], arg(metavar="RUN RUN ...")],
+    /,
+    *,
+    out: Path,
+    psnr: Annotated[tuple[float, ...], arg(metavar="DB ...")] = (),
+) -> int:
+    """Report any runs side by side; runs that differ in nothing but the seed count as one variant.
+
+    Args:
+        runs: folders of runs; the first one is what the others are compared with.
+        out: new folder for the report.
+        psnr: test PSNRs whose time is asked for; from the first run's result where absent.
+    """
+    from turbogs_plugin.ablation import commands
+
+    return commands.compare(runs, out, psnr)
 
 
 @app.command

@@ -1,0 +1,356 @@
+"""Ablations: the grid, its resumption, statistics over seeds, and the report."""
+
+import csv
+import json
+import math
+import re
+import shutil
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from framework_runs import TINY, tiny_capture
+from hypothesis import given
+from hypothesis import strategies as st
+
+from turbogs_plugin import cli
+from turbogs_plugin.ablation.grid import Ablation, ablation_names, load_ablation, variant_config, with_iterations
+from turbogs_plugin.ablation.results import CellResult, Study, StudyFolder
+from turbogs_plugin.ablation.statistics import Curve, Spread, differ, pareto_front, seconds_to_reach
+from turbogs_plugin.ablation.summary import summarise
+from turbogs_plugin.config import load_config
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.report.history import Evaluation
+from turbogs_plugin.trainer import Trainer
+
+SMALL = """
+title: Tiny
+base: turbogs
+baseline: full
+variants:
+  full: []
+  random: [pixel_sampler.type=random]
+notes: {random: "a | bar"}
+"""
+
+
+def entry(iteration: int, seconds: float, psnr: float, count: int = 100) -> Evaluation:
+    return Evaluation(iteration, seconds, psnr, 0.8, 0.1, count, 2**20)
+
+
+def cell(variant: str, seed: int, *entries: Evaluation, scene: str = "fox") -> CellResult:
+    config = load_config("turbogs", [f"train.seed={seed}", f"train.iterations={entries[-1].iteration}"])
+    return CellResult(scene, variant, seed, config.to_mapping(), 0.0, list(entries), fps=100.0)
+
+
+# The grid
+
+
+@pytest.mark.parametrize("name", ablation_names())
+def test_every_packaged_ablation_resolves_and_its_variants_differ(name):
+    ablation = load_ablation(name)
+    texts = {variant: variant_config(ablation, variant, 3, (), None).to_yaml() for variant in ablation.variants}
+    assert len(set(texts.values())) == len(texts)
+    assert all("seed: 3" in text for text in texts.values())
+
+
+def test_the_tables_of_the_paper_are_there():
+    assert set(ablation_names()) >= {"components", "replacements", "optimizer", "views", "hard_ratio", "schedule"}
+    assert list(load_ablation("components").variants) == ["3dgs", "+err-sps", "+geo-vs", "+sparse-ncc", "+err-dp"]
+    full = variant_config(load_ablation("components"), "+err-dp", 0, (), None)
+    assert full.to_yaml() == load_config("turbogs").to_yaml()
+
+
+def test_another_length_scales_what_counts_iterations_and_nothing_else():
+    config = load_config("turbogs")
+    before = config.to_yaml()
+    short = with_iterations(config, 500)
+    assert config.to_yaml() == before
+    assert (short.train.iterations, short.train.refine_until, short.train.sh_interval) == (500, 350, 100)
+    changed = {key for key, value in short.density.items() if value != config.density[key]}
+    assert changed == {"refine_from", "refine_every", "final_every"}
+    assert (short.density["refine_from"], short.density["refine_every"], short.density["final_every"]) == (20, 10, 50)
+    assert with_iterations(config, 50).density["refine_every"] == 5
+    assert with_iterations(config, config.train.iterations).to_yaml() == before
+
+
+@pytest.mark.parametrize(
+    ("text", "word"),
+    [
+        ("title: x\nvariants: {}", "at least one"),
+        ("title: x\nvariants: {a/b: []}", "a/b"),
+        ("title: x\nvariants: {..: []}", ".."),
+        ("title: x\nvariants: {full: []}\nbaseline: ful", "did you mean 'full'"),
+        ("title: x\nvariant: {a: []}", "variants"),
+        ("variants: {a: []}", "title"),
+        ("title: x\nvariants: {a: train.seed=1}", "list"),
+    ],
+)
+def test_a_bad_ablation_is_refused(tmp_path, text, word):
+    path = tmp_path / "a.yaml"
+    path.write_text(text)
+    with pytest.raises(InputError, match=re.escape(word)):
+        load_ablation(str(path))
+
+
+def test_a_variant_that_does_not_resolve_is_named():
+    ablation = Ablation("x", {"good": [], "bad": ["loss.nonsense=1"]})
+    with pytest.raises(InputError, match=r"variant 'bad'.*nonsense"):
+        variant_config(ablation, "bad", 0, (), None)
+
+
+# Statistics
+
+
+def test_spreads_and_when_two_are_different():
+    first, second = Spread.of([30.0, 30.2]), Spread.of([30.3, 30.5])
+    assert (first.mean, first.low, first.high, first.count) == (pytest.approx(30.1), 30.0, 30.2, 2)
+    assert differ(first, second) is True and differ(second, first) is True
+    assert differ(first, Spread.of([30.2, 31.0])) is False
+    assert differ(first, Spread.of([35.0])) is None
+    assert differ(first, Spread.of([math.nan, 35.0])) is None
+    assert math.isnan(Spread.of([1.0, math.nan]).mean)
+
+
+def test_time_to_a_psnr_is_linear_between_evaluations():
+    history = [entry(0, 0.5, 10.0), entry(10, 2.5, 20.0), entry(20, 4.5, 18.0), entry(30, 6.5, 24.0)]
+    assert seconds_to_reach(history, 9.0) == 0.5
+    assert seconds_to_reach(history, 15.0) == pytest.approx(1.5)
+    assert seconds_to_reach(history, 19.0) == pytest.approx(2.3)
+    assert seconds_to_reach(history, 21.0) == pytest.approx(5.5)
+    assert seconds_to_reach(history, 24.1) == math.inf
+
+
+def test_a_curve_pairs_common_iterations_and_the_ends():
+    early = [entry(0, 0.0, 10.0), entry(10, 2.0, 20.0), entry(17, 3.0, 21.0)]
+    late = [entry(0, 1.0, 12.0), entry(10, 4.0, 22.0), entry(19, 5.0, 25.0)]
+    curve = Curve.of([early, late], "psnr")
+    np.testing.assert_allclose(curve.seconds, [0.5, 3.0, 4.0])
+    np.testing.assert_allclose([curve.mean, curve.low, curve.high], [[11, 21, 23], [10, 20, 21], [12, 22, 25]])
+
+
+@given(st.lists(st.tuples(st.integers(0, 5), st.integers(0, 5)), min_size=1, max_size=12))
+def test_the_front_is_what_nothing_beats(points):
+    front = pareto_front([(float(x), float(y)) for x, y in points])
+    for (seconds, quality), on_front in zip(points, front, strict=True):
+        beaten = any(x <= seconds and y >= quality and (x < seconds or y > quality) for x, y in points)
+        assert on_front is not beaten
+
+
+def test_nan_is_not_on_the_front():
+    assert pareto_front([(1.0, math.nan), (2.0, 20.0)]) == [False, True]
+
+
+def test_a_summary_of_known_numbers():
+    study = Study(
+        Ablation("x", {"base": [], "fast": [], "slow": []}),
+        [
+            cell("base", 0, entry(0, 0.0, 10.0), entry(100, 10.0, 30.0, 1000)),
+            cell("base", 1, entry(0, 0.0, 10.0), entry(100, 12.0, 30.2, 1200)),
+            cell("fast", 0, entry(0, 0.0, 10.0), entry(100, 5.0, 31.0)),
+            cell("fast", 1, entry(0, 0.0, 10.0), entry(100, 5.0, 31.0)),
+            cell("slow", 0, entry(0, 0.0, 10.0), entry(100, 20.0, 30.1)),
+            cell("slow", 1, entry(0, 0.0, 10.0), entry(100, 20.0, 20.0)),
+        ],
+    )
+    (summary,) = summarise(study, [20.0, 30.5])
+    base, fast, slow = summary.rows
+    assert (base.seconds.mean, base.gaussians.mean) == (11.0, 1100.0)
+    assert fast.psnr_difference == pytest.approx(0.9) and fast.psnr_differs is True and fast.seconds_differ is True
+    assert slow.psnr_differs is False
+    assert [row.on_front for row in summary.rows] == [False, True, False]
+    of_base = (10.0 * 10 / 20.0 + 12.0 * 10 / 20.2) / 2
+    assert base.reaches[0].seconds.mean == pytest.approx(of_base) and base.reaches[0].ratio == pytest.approx(1.0)
+    assert fast.reaches[0].ratio == pytest.approx(5.0 * 10 / 21.0 / of_base)
+    assert (slow.reaches[0].reached, slow.reaches[1].reached) == (2, 0)
+    assert math.isnan(fast.reaches[1].ratio)  # the baseline never got there
+    (default,) = summarise(study)
+    assert default.targets == [29.1, 29.6, 30.1]
+
+
+# The command
+
+
+@pytest.fixture
+def turbogs(monkeypatch, capsys):
+    """Run the command in this process: (exit code, stdout, stderr)."""
+
+    def turbogs(*arguments) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["turbogs", *map(str, arguments)])
+        with pytest.raises(SystemExit) as end:
+            cli.main()
+        captured = capsys.readouterr()
+        return end.value.code or 0, captured.out, captured.err
+
+    return turbogs
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory) -> Path:
+    return tiny_capture(tmp_path_factory.mktemp("ablation"))
+
+
+@pytest.fixture
+def small(tmp_path) -> Path:
+    path = tmp_path / "small.yaml"
+    path.write_text(SMALL)
+    return path
+
+
+SETTINGS = ("train.sh_degree=1", "schedule.min_views=1", "schedule.max_views=2", "train.evaluate_at=[0.5]")
+
+
+def call(small: Path, capture: Path, out: Path, *more) -> list:
+    return ["ablate", small, *SETTINGS, "--scene", capture, "--out", out, "--device", "cpu", "--steps", "4", *more]
+
+
+def test_a_sweep_is_complete_and_goes_on_where_it_stopped(turbogs, small, capture, tmp_path, monkeypatch):
+    out = tmp_path / "study"
+    code, printed, err = turbogs(*call(small, capture, out, "--seeds", "0", "1"))
+    assert code == 0 and str(out / "report.html") in printed
+    assert "[4/4]" in err and "left" in err
+    cells = sorted(out.glob("cells/capture/*.json"))
+    assert [path.name for path in cells] == [f"{name}--seed{n}.json" for name in ("full", "random") for n in (0, 1)]
+    first = json.loads(cells[0].read_text())
+    assert first["history"][-1]["iteration"] == 4 and first["warmup_iterations"] == 2
+    assert first["provenance"]["machine"] and first["config"]["train"]["iterations"] == 4
+
+    rows = list(csv.DictReader((out / "table.csv").open()))
+    assert [row["variant"] for row in rows] == ["full", "random"]
+    mean = np.mean([json.loads(path.read_text())["history"][-1]["psnr"] for path in cells[2:]])
+    assert float(rows[1]["psnr_mean"]) == pytest.approx(mean) and rows[1]["lpips_mean"] == ""
+
+    page, markdown = (out / "report.html").read_text(), (out / "report.md").read_text()
+    assert page.count("data:image/png;base64,") == 2 and not re.search(r"(src|href)=\"(?!data:)", page)
+    for word in ("thrown away", "not computed", "not measured", "★", "torch", f"{mean:.2f}"):
+        assert word in page and word in markdown
+    assert "a \\| bar" in markdown
+    assert not list(out.rglob("*.ply")) and not list(out.rglob("*.pt"))
+    assert sum(path.stat().st_size for path in out.rglob("*") if path.is_file()) < 1_000_000
+
+    monkeypatch.setattr(Trainer, "step", lambda trainer: pytest.fail("a finished cell was trained again"))
+    stamps = [path.stat().st_mtime_ns for path in cells]
+    code, _, err = turbogs(*call(small, capture, out, "--seeds", "0", "1"))
+    assert code == 0 and "4 finished cells are kept" in err
+    assert [path.stat().st_mtime_ns for path in cells] == stamps
+
+
+def test_a_broken_cell_is_reported_and_tried_again(turbogs, small, capture, tmp_path, monkeypatch):
+    out, step = tmp_path / "study", Trainer.step
+
+    def broken(trainer):
+        if trainer.config.pixel_sampler["type"] == "error_guided":
+            raise RuntimeError("no such kernel")
+        step(trainer)
+
+    monkeypatch.setattr(Trainer, "step", broken)
+    code, printed, err = turbogs(*call(small, capture, out))
+    assert code == 1 and "no such kernel" in printed and "FAILED" in err
+    assert "no such kernel" in (out / "report.md").read_text()
+    assert (out / "cells/capture/random--seed0.json").is_file()
+    monkeypatch.setattr(Trainer, "step", step)
+    code, _, err = turbogs(*call(small, capture, out))
+    assert code == 0 and "1 finished cells are kept" in err and "[1/1]" in err
+    assert "no such kernel" not in (out / "report.md").read_text()
+
+
+def test_a_cell_of_other_settings_is_not_mixed_in(turbogs, small, capture, tmp_path):
+    out = tmp_path / "study"
+    assert turbogs(*call(small, capture, out, "--only", "full"))[0] == 0
+    before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
+    changed = [*call(small, capture, out, "--only", "full")]
+    changed.insert(2, "loss.ncc_weight=0.1")
+    code, _, err = turbogs(*changed)
+    assert code == 2 and "other settings (loss)" in err
+    code, _, err = turbogs(*call(small, capture, out, "--only", "full", "--time-budget", "1"))
+    assert code == 2 and "time budget" in err
+    assert {path: path.read_bytes() for path in out.rglob("*") if path.is_file()} == before
+
+
+def test_a_time_budget_ends_a_cell(turbogs, small, capture, tmp_path):
+    out = tmp_path / "study"
+    arguments = call(small, capture, out, "--only", "full", "--time-budget", "0.001")
+    arguments[arguments.index("4")] = "400"
+    assert turbogs(*arguments)[0] == 0
+    result = StudyFolder(out).read_study().results[0]
+    assert result.stopped_early and 1 <= result.final.iteration < 4
+    assert "Stopped by the time budget" in (out / "report.md").read_text()
+
+
+def test_an_interrupted_sweep_reports_what_is_there(turbogs, small, capture, tmp_path, monkeypatch):
+    out, step = tmp_path / "study", Trainer.step
+
+    def interrupted(trainer):
+        if trainer.config.pixel_sampler["type"] == "random":
+            raise KeyboardInterrupt
+        step(trainer)
+
+    monkeypatch.setattr(Trainer, "step", interrupted)
+    code, printed, _ = turbogs(*call(small, capture, out))
+    assert code == 130 and "report" in printed
+    assert [result.variant for result in StudyFolder(out).read_study().results] == ["full"]
+
+
+def test_studies_are_merged_and_reported_again_without_training(turbogs, small, capture, tmp_path, monkeypatch):
+    parts = [tmp_path / "a", tmp_path / "b"]
+    for number, part in enumerate(parts):
+        assert turbogs(*call(small, capture, part, "--only", "full", "--seeds", number))[0] == 0
+    monkeypatch.setattr(Trainer, "step", lambda trainer: pytest.fail("a merge trains nothing"))
+    out = tmp_path / "both"
+    code, printed, _ = turbogs("ablate", "--merge", *parts, "--out", out, "--psnr", "5")
+    assert code == 0 and "report.html" in printed
+    assert [result.seed for result in StudyFolder(out).read_study().results] == [0, 1]
+    assert "s to 5.0 dB" in (out / "report.md").read_text()
+    before = (out / "table.csv").read_bytes()
+    assert turbogs("ablate", "--merge", out, "--out", out, "--psnr", "5")[0] == 0
+    assert (out / "table.csv").read_bytes() == before
+    other = tmp_path / "b" / "cells/capture/full--seed1.json"
+    other.write_text(other.read_text().replace('"fps": ', '"fps": 1'))
+    code, _, err = turbogs("ablate", "--merge", *parts, out, "--out", tmp_path / "c")
+    assert code == 2 and "two different results" in err
+
+
+def test_runs_are_compared(turbogs, capture, tmp_path):
+    runs = {"a": ["train.seed=0"], "b": ["train.seed=1"], "c": ["pixel_sampler.type=random"]}
+    quick = [setting for setting in TINY if "iterations" not in setting] + ["train.iterations=3"]
+    for name, overrides in runs.items():
+        arguments = ["train", capture, "--out", tmp_path / name, "--device", "cpu", *quick, *overrides]
+        assert turbogs(*arguments)[0] == 0
+    paths = [tmp_path / name for name in runs]
+    code, printed, _ = turbogs("compare", *paths, "--out", tmp_path / "report")
+    assert code == 0 and "report.html" in printed
+    rows = list(csv.DictReader((tmp_path / "report" / "table.csv").open()))
+    assert [(row["variant"], row["seeds"]) for row in rows] == [("a", "2"), ("c", "1")]
+    markdown = (tmp_path / "report" / "report.md").read_text()
+    assert "pixel_sampler.type=random" in markdown and "not recorded" in markdown
+    assert turbogs("compare", *paths, "--out", tmp_path / "report")[0] == 2
+    shutil.copytree(tmp_path / "a", tmp_path / "again")
+    code, _, err = turbogs("compare", *paths, tmp_path / "again", "--out", tmp_path / "other")
+    assert code == 2 and "same run" in err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["ablate", "--out", "X"], ["--scene"]),
+        (["ablate", "component", "--scene", "CAPTURE", "--out", "X"], ["did you mean 'components'"]),
+        (["ablate", "components", "--scene", "absent", "--out", "X"], ["no such scene"]),
+        (["ablate", "components", "--scene", "CAPTURE", "--out", "X", "--only", "+geo"], ["+geo-vs"]),
+        (["ablate", "components", "--scene", "CAPTURE", "--out", "X", "--seeds", "1", "1"], ["seeds"]),
+        (["ablate", "components", "--scene", "CAPTURE", "--scene", "CAPTURE", "--out", "X"], ["scenes"]),
+        (["ablate", "components", "--scene", "CAPTURE", "--out", "X", "--steps", "0"], ["iteration"]),
+        (["ablate", "components", "--scene", "CAPTURE", "--out", "X", "--time-budget", "-1"], ["time budget"]),
+        (["ablate", "components", "--scene", "CAPTURE", "--out", "CAPTURE"], ["not empty"]),
+        (["ablate", "--merge", "CAPTURE", "--out", "X"], ["holds no ablation"]),
+        (["compare", "CAPTURE", "--out", "X"], ["holds no run"]),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else None,
+)
+def test_bad_calls_are_refused(turbogs, capture, tmp_path, arguments, words):
+    places = {"CAPTURE": capture, "X": tmp_path / "x"}
+    code, out, err = turbogs(*(places.get(argument, argument) for argument in arguments))
+    assert code == 2 and out == "" and err.count("\n") == 1, err
+    for word in words:
+        assert word in err
+    assert not (tmp_path / "x").exists()

@@ -1,0 +1,122 @@
+"""One training of a grid: the trainer of any run, without what a run keeps (checkpoints, model, pictures)."""
+
+from __future__ import annotations
+
+import gc
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import torch
+
+from turbogs_plugin.ablation.grid import with_iterations
+from turbogs_plugin.ablation.results import CellResult
+from turbogs_plugin.ablation.timing import PeakMemory, TrainingClock
+from turbogs_plugin.config import Config
+from turbogs_plugin.evaluation import Metrics, evaluate, load_lpips, peak_memory_bytes
+from turbogs_plugin.provenance import provenance
+from turbogs_plugin.report.history import Evaluation
+from turbogs_plugin.scene import Scene
+from turbogs_plugin.trainer import Trainer
+
+WARMUP_ITERATIONS = {"cuda": 20, "cpu": 2}
+"""Of the same configuration scaled to this length: every kind of step loads its code before the clock starts."""
+
+
+def scene_on(scene: Scene, device: torch.device) -> Scene:
+    """The scene with its photos on the device, once for all cells."""
+    return replace(scene, train=scene.train.to(device), test=scene.test.to(device))
+
+
+def train_cell(
+    variant: str,
+    config: Config,
+    scene: Scene,
+    device: torch.device,
+    time_budget: float = 0.0,
+    progress: Callable[[int], None] = lambda iteration: None,
+) -> CellResult:
+    """Train one variant.
+
+    Args:
+        variant: its name.
+        config: resolved.
+        scene: from `scene_on`.
+        device: where to train.
+        time_budget: seconds of training after which to stop; 0: none.
+        progress: is told the number of finished iterations.
+
+    Raises:
+        TrainingStopped: the model is lost.
+    """
+    warmup = min(WARMUP_ITERATIONS[device.type], config.train.iterations)
+    warm_up(config, scene, device, warmup)
+    lpips, lpips_reason = load_lpips(config.report.lpips_weights, device)
+    total, marks = config.train.iterations, config.train.evaluation_iterations()
+    memory, clock = PeakMemory(device), TrainingClock(device)
+    trainer = Trainer(config, scene, device)
+    history: list[Evaluation] = []
+
+    def measure(final: bool) -> Metrics:
+        memory.pause()
+        trainer.require_finite()
+        metrics = evaluate(trainer.gaussians, scene.test, trainer.sh_degree, config.raster, lpips if final else None)
+        history.append(
+            Evaluation(
+                iteration=trainer.iteration,
+                train_seconds=clock.seconds,
+                psnr=metrics.psnr,
+                ssim=metrics.ssim,
+                l1=metrics.l1,
+                num_gaussians=len(trainer.gaussians),
+                memory_bytes=memory.peak or peak_memory_bytes(device),
+                nonfinite_losses=int(trainer.nonfinite_losses),
+                skipped_updates=int(trainer.optimizer.skipped),
+            )
+        )
+        memory.resume()
+        return metrics
+
+    with clock:
+        trainer.initialise_maps()
+    metrics = measure(final=False)
+    in_time = True
+    while trainer.iteration < total and in_time:
+        mark = min(iteration for iteration in marks if iteration > trainer.iteration)
+        with clock:
+            while trainer.iteration < mark and in_time:
+                trainer.step()
+                in_time = not time_budget or clock.now() < time_budget
+                if trainer.iteration == mark or not in_time:
+                    trainer.repeat_lost(wait=True)
+                progress(trainer.iteration)
+        metrics = measure(final=trainer.iteration == total or not in_time)
+    return CellResult(
+        scene=scene.name,
+        variant=variant,
+        seed=config.train.seed,
+        config=config.to_mapping(),
+        time_budget=time_budget,
+        history=history,
+        lpips=math.nan if lpips is None else metrics.lpips,
+        lpips_reason=lpips_reason,
+        fps=metrics.fps,
+        peak_bytes=memory.peak,
+        warmup_iterations=warmup,
+        provenance=provenance(device.type),
+    )
+
+
+def warm_up(config: Config, scene: Scene, device: torch.device, iterations: int) -> None:
+    """Train and evaluate a model that is thrown away, with every kind of event that the configuration has."""
+    trainer = Trainer(with_iterations(config, iterations), scene, device)
+    trainer.initialise_maps()
+    while trainer.iteration < iterations:
+        trainer.step()
+        if trainer.iteration == iterations:
+            trainer.repeat_lost(wait=True)
+    evaluate(trainer.gaussians, scene.test, trainer.sh_degree, config.raster)
+    del trainer
+    gc.collect()
+    if device.type == "cuda":
+        torch.cuda.empty_cache()

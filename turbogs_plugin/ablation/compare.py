@@ -1,0 +1,79 @@
+"""Any runs side by side, as an ablation of them: runs that differ in nothing but the seed are seeds of one variant."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from turbogs_plugin.ablation.grid import Ablation
+from turbogs_plugin.ablation.results import CellResult, Study
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.report.history import read_history
+from turbogs_plugin.run import RunFolder
+
+
+def study_of_runs(paths: Sequence[Path]) -> Study:
+    """The runs' histories as cells. The first run's variant is the baseline; variants have the first run's name.
+
+    Raises:
+        InputError: no run there, one without an evaluation, or the same run twice.
+    """
+    variants: list[tuple[dict[str, Any], str]] = []  # configuration without the seed and the place, and its name
+    results: list[CellResult] = []
+    for path in paths:
+        folder = RunFolder(path)
+        config = folder.read_config()
+        history = read_history(folder.history)
+        if not history:
+            raise InputError(f"'{path}' has no evaluation yet")
+        mapping = config.to_mapping()
+        scene = Path(config.scene.path).name
+        shared = _without(mapping)
+        name = next((name for known, name in variants if known == shared), None)
+        if name is None:
+            name = _new_name(path, {taken for _, taken in variants})
+            variants.append((shared, name))
+        result = CellResult(scene, name, config.train.seed, mapping, time_budget=0.0, history=history)
+        if any(other.key == result.key for other in results):
+            raise InputError(f"'{path}' is the same run as another one: {result.key}")
+        # A CPU run records the peak of its process, which is its own.
+        result.peak_bytes = history[-1].memory_bytes
+        result.lpips_reason = "a run's history does not record it; see the runs' own reports"
+        results.append(result)
+    ablation = Ablation(
+        title=f"Comparison of {len(paths)} runs",
+        variants={name: _differences(variants[0][0], shared) for shared, name in variants},
+        base=str(variants[0][1]),
+    )
+    return Study(ablation, results)
+
+
+def _without(mapping: dict[str, Any]) -> dict[str, Any]:
+    """What makes two runs seeds of one variant: all but the seed, the place, and what is only reported or kept."""
+    sections = {name: dict(section) for name, section in mapping.items() if name != "report"}
+    for section, key in (("train", "seed"), ("train", "checkpoint_every"), ("train", "evaluate_at"), ("scene", "path")):
+        sections[section].pop(key)
+    return sections
+
+
+def _new_name(path: Path, taken: set[str]) -> str:
+    """The folder's name, made fit for a variant and unique."""
+    name = re.sub(r"[^A-Za-z0-9_+.-]", "-", path.resolve().name)[:40].lstrip("._-") or "run"
+    if name not in taken:
+        return name
+    return next(f"{name}-{number}" for number in range(2, len(taken) + 3) if f"{name}-{number}" not in taken)
+
+
+def _differences(base: dict[str, Any], other: dict[str, Any], place: str = "") -> list[str]:
+    """Overrides that lead from one configuration to another."""
+    found = []
+    for key, value in other.items():
+        path = f"{place}.{key}" if place else key
+        before = base.get(key) if isinstance(base, dict) else None
+        if isinstance(value, dict):
+            found += _differences(before if isinstance(before, dict) else {}, value, path)
+        elif value != before:
+            found.append(f"{path}={value}")
+    return found

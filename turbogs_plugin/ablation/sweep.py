@@ -1,0 +1,158 @@
+"""Carries a grid out: variants x scenes x seeds in one process, resumable, with the scene loaded once."""
+
+from __future__ import annotations
+
+import gc
+import traceback
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from turbogs_plugin.ablation.cell import scene_on, train_cell
+from turbogs_plugin.ablation.grid import Ablation, CellKey, variant_config
+from turbogs_plugin.ablation.progress import SweepProgress
+from turbogs_plugin.ablation.results import CellResult, Failure, StudyFolder
+from turbogs_plugin.config import Config
+from turbogs_plugin.errors import InputError, TrainingStopped
+from turbogs_plugin.evaluation import synchronize
+from turbogs_plugin.run import resolve_device
+from turbogs_plugin.scene import Scene, load_scene
+
+UNCOMPARED = (("scene", "path"), ("train", "device"))
+"""Settings that may differ between a kept cell and the present call: where things are, not what is computed."""
+
+
+@dataclass
+class SweepOptions:
+    """How a grid is carried out.
+
+    Args:
+        scenes: folders of captures, of different names.
+        seeds: of each variant.
+        overrides: ``section.key=value`` of all variants.
+        steps: iterations of every cell; None: the configurations' own.
+        time_budget: seconds of training after which a cell stops; 0: none.
+        device: auto, cpu or cuda.
+    """
+
+    scenes: Sequence[Path]
+    seeds: Sequence[int] = (0,)
+    overrides: Sequence[str] = ()
+    steps: int | None = None
+    time_budget: float = 0.0
+    device: str = "auto"
+
+    def __post_init__(self) -> None:
+        names = [path.resolve().name for path in self.scenes]
+        for what, values in (("scenes", names), ("seeds", list(self.seeds))):
+            if not values or len(set(values)) != len(values):
+                raise InputError(f"{what}: one or more different ones are needed, got {values}")
+        if self.time_budget < 0:
+            raise InputError(f"the time budget is {self.time_budget}: it must be 0 (none) or more seconds")
+
+
+def run_sweep(ablation: Ablation, options: SweepOptions, folder: StudyFolder) -> None:
+    """Train the cells that are not there yet and keep each result as it comes.
+
+    A cell that breaks is kept as a failure and the rest goes on; the same call tries it again.
+
+    Raises:
+        InputError: anything wrong with the input (then nothing was trained), or a cell made by another configuration.
+        TrainingStopped: the GPU can no longer be used by this process.
+    """
+    folder.require_usable()
+    device = resolve_device(options.device)
+    grid: dict[str, list[tuple[CellKey, Config]]] = {}
+    kept = 0
+    for path in options.scenes:
+        name = path.resolve().name
+        grid[name] = []
+        for seed in options.seeds:
+            for variant in ablation.variants:
+                config = variant_config(ablation, variant, seed, options.overrides, options.steps)
+                config.scene.path, config.train.device = str(path.resolve()), device.type
+                key = CellKey(name, variant, seed)
+                present = folder.read(key)
+                if present is None:
+                    grid[name].append((key, config))
+                else:
+                    _require_same(present, config, options.time_budget)
+                    kept += 1
+    # All scenes are read before anything is trained, so that a wrong one is known at once.
+    scenes = {path.resolve().name: path for path in options.scenes}
+    loaded: dict[str, Scene] = {}
+    for name, cells in grid.items():
+        if cells:
+            settings = cells[0][1].scene
+            for key, config in cells:
+                if config.scene != settings:
+                    raise InputError(f"variant '{key.variant}' changes the scene's photos, which all variants share")
+            loaded[name] = load_scene(scenes[name], settings.factor, settings.test_every)
+    folder.write_ablation(ablation)
+    with SweepProgress(sum(map(len, grid.values())), kept) as progress:
+        for name, cells in grid.items():
+            if cells:
+                _train_scene(cells, scene_on(loaded.pop(name), device), device, options.time_budget, folder, progress)
+
+
+def _train_scene(
+    cells: list[tuple[CellKey, Config]],
+    scene: Scene,
+    device: torch.device,
+    time_budget: float,
+    folder: StudyFolder,
+    progress: SweepProgress,
+) -> None:
+    for key, config in cells:
+        progress.begin(key, config.train.iterations)
+        try:
+            result = train_cell(key.variant, config, scene, device, time_budget, progress.advance)
+        except Exception as error:  # whatever a variant breaks by, the other cells go on
+            failure = Failure(key, _reason(error))
+            folder.write_failure(failure)
+            progress.failed(failure)
+            # Its traceback holds the broken model.
+            del error
+            _require_working(device)
+        else:
+            folder.write(result)
+            progress.finished(result)
+
+
+def _require_same(present: CellResult, config: Config, time_budget: float) -> None:
+    made, wanted = (_comparable(mapping) for mapping in (present.config, config.to_mapping()))
+    if made != wanted or present.time_budget != time_budget:
+        sections = [name for name in wanted if made.get(name) != wanted[name]] or ["the time budget"]
+        raise InputError(
+            f"the cell '{present.key}' was made with other settings ({', '.join(sections)}): choose a new --out"
+        )
+
+
+def _comparable(mapping: dict) -> dict:
+    sections = {name: dict(section) for name, section in mapping.items()}
+    for section, name in UNCOMPARED:
+        sections[section].pop(name, None)
+    return sections
+
+
+def _reason(error: Exception) -> str:
+    """One line: what happened, and where unless the message is written for the user."""
+    text = " ".join(str(error).split()) or "no message"
+    if isinstance(error, InputError | TrainingStopped):
+        return text
+    frame = traceback.extract_tb(error.__traceback__)[-1]
+    return f"{type(error).__name__}: {text[:500]} ({Path(frame.filename).name}:{frame.lineno})"
+
+
+def _require_working(device: torch.device) -> None:
+    """After a failure: free its memory, and see whether the GPU still answers this process."""
+    gc.collect()
+    try:
+        synchronize(device)
+    except RuntimeError as error:
+        reason = str(error).splitlines()[0]
+        raise TrainingStopped(f"the GPU no longer answers this process ({reason}): the same command goes on") from None
+    if device.type == "cuda":
+        torch.cuda.empty_cache()
