@@ -168,6 +168,63 @@ def compare(
 
 
 @app.command
+def bench(
+    what: Annotated[Positional[Literal["step", "raster"]], arg(metavar="step|raster")],
+    overrides: Annotated[Positional[tuple[str, ...]], arg(metavar="[section.key=value ...]")] = (),
+    /,
+    *,
+    scene: Annotated[Path | None, arg(metavar="SCENE")] = None,
+    ply: Annotated[Path | None, arg(metavar="FILE")] = None,
+    gaussians: Annotated[tuple[int, ...], arg(metavar="M ...")] = (150_000, 600_000),
+    views: Annotated[tuple[int, ...], arg(metavar="K ...")] = (10, 5, 3),
+    pixel_budget: Annotated[float, arg(metavar="LAMBDA")] = 1.0,
+    training: Annotated[int, arg(metavar="N")] = 1500,
+    repeats: Annotated[int, arg(metavar="N")] = 100,
+    rates: Annotated[tuple[float, ...], arg(metavar="R ...")] = (1.0, 0.1),
+    size: Annotated[tuple[int, int], arg(metavar="WIDTH HEIGHT")] = (841, 1500),
+    library: Annotated[tuple[Path, ...], arg(metavar="FILE ...")] = (),
+    factor: Annotated[int, arg(metavar="N")] = 1,
+    device: Device = "auto",
+    out: Annotated[Path | None, arg(metavar="FILE")] = None,
+) -> int:
+    """Time an iteration of training step by step, or the rasterizer stage by stage, beside what the machine allows.
+
+    Args:
+        what: step: from sampling to update; raster: forward and backward, beside gsplat's dense ones.
+        overrides: step: changes of the configuration whose strategies are timed.
+        scene: a capture, for its cameras and photos; raster takes synthetic cameras where absent.
+        ply: a trained model in place of one trained here (step) or of synthetic ones (raster).
+        gaussians: sizes of the model.
+        views: views of an iteration.
+        pixel_budget: pixels of an iteration in images (lambda).
+        training: step: iterations of the model's training before.
+        repeats: iterations or passes timed.
+        rates: raster: further sampling rates, with the fewest views.
+        size: raster: size of the synthetic images.
+        library: raster: other builds of the kernels, measured the same way.
+        factor: scale photos down by this.
+        device: what to time.
+        out: JSON file; standard output where absent.
+    """
+    from turbogs_plugin.bench import commands
+    from turbogs_plugin.bench.raster import RasterBench
+    from turbogs_plugin.bench.step import StepBench
+    from turbogs_plugin.run import resolve_device
+
+    for name, values in (("gaussians", gaussians), ("views", views), ("repeats", (repeats,))):
+        if not values or min(values) < 1:
+            raise InputError(f"--{name} {' '.join(map(str, values))}: each must be at least 1")
+    where = resolve_device(device)
+    if what == "step":
+        step = StepBench(gaussians, views, pixel_budget, training, repeats, overrides, ply)
+        return commands.run_step(step, scene, factor, where, out)
+    if overrides:
+        raise InputError("bench raster times the rasterizer alone: it has no section.key=value")
+    raster = RasterBench(gaussians, views, rates, pixel_budget, size, repeats, ply, library)
+    return commands.run_raster(raster, scene, factor, where, out)
+
+
+@app.command
 def demo(path: Positional[Path], /) -> int:
     """Write a small synthetic capture to try things on: a textured scene as a COLMAP dataset.
 

@@ -1,0 +1,44 @@
+"""Benches on the GPU: the fused steps are marked, nothing is lost, and floors are below what was measured."""
+
+import numpy as np
+import pytest
+import torch
+from framework_runs import tiny_capture
+
+from turbogs_plugin import kernels
+from turbogs_plugin.ablation.cell import scene_on
+from turbogs_plugin.bench.raster import STAGES, RasterBench
+from turbogs_plugin.bench.step import StepBench
+from turbogs_plugin.scene import load_scene
+
+pytestmark = [
+    pytest.mark.gpu,
+    pytest.mark.skipif(not kernels.available(), reason=kernels.unavailable_reason() or "available"),
+]
+
+
+def test_steps_on_the_kernels(tmp_path):
+    device = torch.device("cuda")
+    scene = scene_on(load_scene(tiny_capture(tmp_path)), device)
+    bench = StepBench((2000,), (3,), pixel_budget=1.0, training=20, repeats=5, overrides=())
+    (entry,) = bench.run(scene, device)["passes"]
+    assert {"GVS", "EPS", "FWD", "gather+L+E", "BWD", "solve+update", "EDC"} <= set(entry["steps"])
+    assert entry["lost_iterations"] == 0 and entry["counts"]["touched"] > 0
+    assert (
+        entry["memory_bytes"]["peak"] >= entry["memory_bytes"]["parameters"] and entry["memory_bytes"]["temporary"] >= 0
+    )
+    for name, floor in entry["floors_ms"].items():
+        assert 0 < floor < entry["steps"][name]["device"]["p90_ms"], name
+    parts = sum(value["device"]["median_ms"] for name, value in entry["steps"].items() if name != "iteration")
+    assert parts < 1.2 * entry["steps"]["iteration"]["device"]["median_ms"]
+
+
+@pytest.mark.parametrize("density", [False, True])
+def test_stages_of_the_rasterizer(density):
+    device = torch.device("cuda")
+    bench = RasterBench((3000,), (3,), (1.0,), 1.0, (160, 120), 5)
+    report = bench.run(None, device)
+    entry = next(entry for entry in report["passes"] if entry["density_sums"] is density)
+    assert set(entry["stages"]) == set(STAGES.values()) and entry["lost_passes"] == 0
+    assert np.isfinite(report["gsplat"][0]["packed"]["median_ms"])
+    assert report["precision"]["forward_mean"] < 1e-5

@@ -1,0 +1,1 @@
+"""`turbogs bench`: what an iteration and what the rasterizer take, beside what memory and arithmetic allow."""

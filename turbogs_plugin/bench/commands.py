@@ -1,0 +1,87 @@
+"""What `turbogs bench step` and `turbogs bench raster` do: measure, write JSON, and print the gist."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from turbogs_plugin.ablation.cell import scene_on
+from turbogs_plugin.bench.raster import RasterBench, other_build
+from turbogs_plugin.bench.step import StepBench
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.files import write_text_atomically
+from turbogs_plugin.provenance import provenance
+from turbogs_plugin.scene import load_scene
+
+
+def run_step(bench: StepBench, scene: Path | None, factor: int, device: torch.device, out: Path | None) -> int:
+    if scene is None:
+        raise InputError("bench step needs --scene SCENE, for cameras and photos")
+    _require_new(out)
+    measured = bench.run(scene_on(load_scene(scene, factor), device), device)
+    return _finish("step", measured, device, out, step_lines(measured))
+
+
+def run_raster(bench: RasterBench, scene: Path | None, factor: int, device: torch.device, out: Path | None) -> int:
+    _require_new(out)
+    measured = bench.run(None if scene is None else load_scene(scene, factor), device)
+    place = ["--device", device.type] + ([] if scene is None else ["--scene", str(scene), "--factor", str(factor)])
+    measured["other_builds"] = {
+        library.name: other_build(library, [*bench.arguments(), *place]) for library in bench.libraries
+    }
+    return _finish("raster", measured, device, out, raster_lines(measured))
+
+
+def _require_new(out: Path | None) -> None:
+    """A place to write to, known before anything is measured. An older result of the same name is replaced."""
+    if out is not None and (out.is_dir() or not out.absolute().parent.is_dir()):
+        raise InputError(f"--out '{out}': name a file in a folder that exists")
+
+
+def _finish(what: str, measured: dict[str, Any], device: torch.device, out: Path | None, lines: Sequence[str]) -> int:
+    report = {"bench": what, "device": device.type, "provenance": asdict(provenance(device.type)), **measured}
+    text = json.dumps(report, indent=2) + "\n"
+    if out is None:
+        print(text, end="")
+        return 0
+    write_text_atomically(out, text)
+    print("\n".join([*lines, f"json  {out}"]))
+    return 0
+
+
+def step_lines(measured: dict[str, Any]) -> list[str]:
+    """A line a pass: the whole iteration, then its steps with their floors in brackets."""
+    lines = []
+    for entry in measured["passes"]:
+        steps, floors = entry["steps"], entry["floors_ms"] or {}
+        parts = [
+            f"{name} {value['device']['median_ms']:.3f}" + (f" [{floors[name]:.3f}]" if name in floors else "")
+            for name, value in steps.items()
+            if name != "iteration"
+        ]
+        lines.append(
+            f"M={entry['gaussians']} K={entry['views']}: {steps['iteration']['device']['median_ms']:.3f} ms "
+            f"(wall {entry['wall']['median_ms']:.3f}) | {'  '.join(parts)}"
+        )
+    return lines
+
+
+def raster_lines(measured: dict[str, Any]) -> list[str]:
+    """A line a pass, and a line for gsplat's dense one."""
+    lines = []
+    for entry in measured["passes"]:
+        parts = [f"{name} {value['median_ms']:.3f}" for name, value in entry.get("stages", {}).items()]
+        lines.append(
+            f"M={entry['gaussians']} K={entry['views']} r={entry['rate']:.2f}: "
+            f"{entry['forward_backward']['median_ms']:.3f} ms" + (f" | {'  '.join(parts)}" if parts else "")
+        )
+    for entry in measured["gsplat"]:
+        times = [f"{kind} {entry[kind]['median_ms']:.3f} ms" for kind in ("unpacked", "packed") if kind in entry]
+        text = ", ".join(times) or entry["reason"]
+        lines.append(f"gsplat {entry['version']} dense, M={entry['gaussians']} K={entry['views']}: {text}")
+    return lines

@@ -1,0 +1,100 @@
+"""Counts of a pass, and the milliseconds that memory and arithmetic allow for them.
+
+Bytes go by the bandwidth measured for a copy on the same machine; instructions by what the multiprocessors can issue.
+A floor counts each array once, as if it were read and written without waste.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+
+from turbogs_plugin.rendering.cuda import CudaRendered
+from turbogs_plugin.types import PixelSamples
+
+FORWARD_INSTRUCTIONS, BACKWARD_INSTRUCTIONS = 20, 56
+"""Per (splat, sample): what the inner loops issue, counted in their source."""
+
+PARAMETER_FLOATS = 59
+"""Of a Gaussian with three bands."""
+
+Counts = dict[str, int]
+
+
+def raster_counts(rendered: CudaRendered, samples: PixelSamples) -> Counts:
+    """What a pass of the kernels had to do."""
+    views, gaussians = rendered._radii.shape[:2]
+    on_screen = (rendered._radii > 0).any(dim=-1)  # [K, N]
+    return {
+        "gaussians": gaussians,
+        "instances": views * gaussians,
+        "visible": int(on_screen.sum()),
+        "visible_gaussians": int(on_screen.any(dim=0).sum()),
+        "pairs": int(rendered.num_pairs),
+        "tiles": len(samples.tile_ids),
+        "samples": len(samples),
+        "items": len(rendered._forward.bucket_counts),
+        **count_contributions(rendered),
+    }
+
+
+def count_contributions(rendered: CudaRendered) -> Counts:
+    """Walked and contributing (splat, work item) pairs of a pass."""
+    forward = rendered._forward
+    tile_starts, buckets, chunks = forward.tile_starts, forward.bucket_counts.long(), forward.chunks
+    items = torch.arange(len(buckets), device=buckets.device)
+    bases = (tile_starts[:-1].long() // 32 + torch.arange(len(tile_starts) - 1, device=buckets.device))[items // chunks]
+    owners = torch.repeat_interleave(items, buckets)
+    number = torch.arange(len(owners), device=buckets.device) - (buckets.cumsum(0) - buckets)[owners]
+    words = forward.masks[(bases[owners] + number) * chunks + owners % chunks]
+    contributing = sum(int(((words >> bit) & 1).sum()) for bit in range(32))
+    return {"walked": int(buckets.sum()) * 32, "contributing": contributing}
+
+
+def raster_floors(counts: Counts, bandwidth: float) -> dict[str, float]:
+    """Milliseconds that each stage of the rasterizer cannot beat."""
+    n, kn, visible, pairs, samples = (
+        counts[name] for name in ("gaussians", "instances", "visible", "pairs", "samples")
+    )
+    properties = torch.cuda.get_device_properties(0)
+    issue = 4 * properties.multi_processor_count * 1e3 * getattr(properties, "clock_rate", 1_980_000)  # warps a second
+    slots = samples / max(1, counts["items"])
+    instructions = {
+        "forward": counts["walked"] * math.ceil(slots / 32) * FORWARD_INSTRUCTIONS,
+        "backward": counts["contributing"] * math.ceil(slots / 32) * BACKWARD_INSTRUCTIONS,
+    }
+    traffic = {
+        "projection": 236 * n + 52 * visible + 16 * kn,
+        "depth sort": 68 * kn + 16 * kn,
+        "pairs and tile sort": 40 * visible + 6 * pairs + 2 * 12 * pairs,
+        "forward": 52 * pairs + 32 * samples,
+        "backward": 64 * kn + (52 + 64) * counts["contributing"] + 32 * samples,
+    }
+    return {stage: 1e3 * max(size / bandwidth, instructions.get(stage, 0) / issue) for stage, size in traffic.items()}
+
+
+def step_floors(counts: Counts, bandwidth: float) -> dict[str, float]:
+    """Milliseconds that each step of an iteration cannot beat.
+
+    Args:
+        counts: of `raster_counts`, with `pixels` (of the K views) and `touched` (Gaussians updated).
+    """
+    raster = raster_floors(counts, bandwidth)
+    samples, touched = counts["samples"], counts["touched"]
+    traffic = {
+        # half errors and 16-bit stamps of every pixel of the views in, ids out
+        "EPS": 4 * counts["pixels"] + 4 * samples,
+        # id, photo, colour in; error and stamp in and out; gradient and error of the pixel out
+        "gather+L+E": (4 + 3 + 12 + 2 * 4 + 12 + 4) * samples,
+        # records and radii in; parameters and two moments of the touched in and out
+        "solve+update": 64 * counts["visible"] + 8 * counts["instances"] + 3 * 2 * 4 * PARAMETER_FLOATS * touched,
+    }
+    front = sum(raster[stage] for stage in ("projection", "depth sort", "pairs and tile sort", "forward"))
+    return {
+        "EPS": 1e3 * traffic["EPS"] / bandwidth,
+        "FWD": front,
+        "gather+L+E": 1e3 * traffic["gather+L+E"] / bandwidth,
+        "BWD": raster["backward"],
+        "solve+update": 1e3 * traffic["solve+update"] / bandwidth,
+    }

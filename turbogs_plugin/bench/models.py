@@ -1,0 +1,179 @@
+"""What is timed: a trained model brought to a wanted size, or a synthetic one with synthetic cameras."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from gsplat.utils import normalized_quat_to_rotmat
+from torch.nn.functional import normalize
+
+from turbogs_plugin.config import Config, load_config, resolve
+from turbogs_plugin.scene import Scene
+from turbogs_plugin.tiles import TILE_PIXELS, pixel_table
+from turbogs_plugin.trainer import Trainer
+from turbogs_plugin.types import Cameras, Gaussians, PixelSamples, TileGrid
+
+GROWING_SHARE = 0.8
+"""Share of a model's training in which it grows; in the rest it settles at its final size."""
+
+
+def trained_model(
+    scene: Scene, count: int, iterations: int, device: torch.device, overrides: Sequence[str]
+) -> Gaussians:
+    """A model of `count` Gaussians, trained briefly.
+
+    It grows by density control with a budget, is brought to the exact size by `resized`, and settles without density
+    control.
+
+    Args:
+        iterations: in all; 0: the initial model, resized.
+        overrides: of the configuration.
+    """
+    growing = max(1, round(GROWING_SHARE * iterations))
+    config = load_config(
+        "turbogs",
+        [
+            *overrides,
+            *(f"train.iterations={growing}", f"train.refine_until={round(0.9 * growing)}"),
+            f"train.sh_interval={max(1, growing // 5)}",
+            *("density.type=error_driven", "density.growth=budget", f"density.target_gaussians={count}"),
+        ],
+    )
+    trainer = Trainer(config, scene, device)
+    if iterations:
+        train(trainer, growing)
+    settled = settled_trainer(config, scene, resized(trainer.gaussians, count), device)
+    del trainer
+    train(settled, iterations - growing)
+    return settled.gaussians
+
+
+def settled_trainer(config: Config, scene: Scene, gaussians: Gaussians, device: torch.device) -> Trainer:
+    """A trainer of these Gaussians that uses every band and leaves their number as it is."""
+    trainer = Trainer(changed(config, train={"sh_interval": 1}, density={"type": "none"}), scene, device)
+    adopt(trainer, gaussians)
+    return trainer
+
+
+def changed(config: Config, **sections: dict[str, Any]) -> Config:
+    """The configuration with values of some sections replaced; a section with a `type` starts afresh."""
+    mapping = {name: dict(section) for name, section in config.to_mapping().items()}
+    for name, values in sections.items():
+        mapping[name] = dict(values) if "type" in values else {**mapping[name], **values}
+    return resolve(mapping)
+
+
+def adopt(trainer: Trainer, gaussians: Gaussians) -> None:
+    """Let a trainer go on with other Gaussians, as if it started from them."""
+    trainer.gaussians = gaussians.map(lambda value: value.clone())
+    trainer.optimizer.setup(trainer.gaussians)
+    trainer.density.setup(trainer.gaussians)
+    trainer.initialise_maps()
+
+
+def train(trainer: Trainer, iterations: int) -> None:
+    """So many more iterations, those repeated that were lost to an overflow."""
+    end = trainer.iteration + iterations
+    while trainer.iteration < end:
+        trainer.step()
+        if trainer.iteration == end:
+            trainer.repeat_lost(wait=True)
+
+
+def resized(gaussians: Gaussians, count: int, seed: int = 0) -> Gaussians:
+    """A model of the same look with `count` Gaussians: a random subset, or all and jittered copies of random ones.
+
+    Standard deviations change with the inverse root of the number, so that surfaces stay covered as they were. Copies
+    follow their original in memory.
+    """
+    present = len(gaussians)
+    generator = torch.Generator().manual_seed(seed)
+    if count <= present:
+        source = torch.randperm(present, generator=generator)[:count]
+        shrink = torch.full((count,), math.sqrt(count / present))
+    else:
+        extra = torch.randint(present, (count - present,), generator=generator)
+        source = torch.cat([torch.arange(present), extra])
+        shrink = source.bincount(minlength=present)[source].sqrt()
+    order = source.argsort(stable=True)
+    source, shrink = source[order].to(gaussians.device), shrink[order].to(gaussians.device)
+    result = gaussians.map(lambda value: value[source])
+    axes = normalized_quat_to_rotmat(normalize(result.quats, dim=-1)) * result.scales.exp()[:, None, :]  # [M, 3, 3]
+    noise = torch.randn(count, 3, 1, generator=generator).to(axes)
+    result.means = result.means + torch.where((shrink > 1)[:, None], (axes @ noise)[:, :, 0], 0.0)
+    result.scales = result.scales - shrink.log()[:, None]
+    return result
+
+
+def ring_cameras(count: int, width: int, height: int, device: torch.device) -> Cameras:
+    """Cameras on a ring that look at the origin."""
+    viewmats = []
+    for angle in np.linspace(0, 2 * math.pi, count, endpoint=False):
+        position = torch.tensor([3.0 * math.sin(angle), -0.6, -3.0 * math.cos(angle)], dtype=torch.float64)
+        forward = normalize(-position, dim=0)
+        right = normalize(torch.linalg.cross(torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64), forward), dim=0)
+        rotation = torch.stack([right, torch.linalg.cross(forward, right), forward])
+        viewmat = torch.eye(4, dtype=torch.float64)
+        viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ position
+        viewmats.append(viewmat)
+    focal = 0.9 * max(width, height)
+    intrinsics = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
+    sizes = np.array([[width, height]] * count, dtype=np.int64)
+    return Cameras(torch.stack(viewmats).float(), intrinsics.repeat(count, 1, 1), sizes).to(device)
+
+
+def surface_gaussians(count: int, device: torch.device, seed: int = 0) -> Gaussians:
+    """Flat Gaussians on a sphere, on the ground below it and on a far shell, about as large as their spacing."""
+    generator = torch.Generator().manual_seed(seed)
+    directions = normalize(torch.randn(count, 3, generator=generator), dim=1)
+    means = directions.clone()
+    third = count // 3
+    ground = 6 * torch.rand(third, 2, generator=generator) - 3
+    means[:third] = torch.stack([ground[:, 0], torch.full((third,), 1.0), ground[:, 1]], dim=1)
+    means[third : 2 * third] = 8 * directions[third : 2 * third]
+    spacing = torch.full((count,), math.sqrt(4 * math.pi / third))
+    spacing[:third] = math.sqrt(36 / third)
+    spacing[third : 2 * third] *= 8
+    scales = spacing.log()[:, None] + 0.5 * torch.randn(count, 3, generator=generator) - 0.3
+    gaussians = Gaussians(
+        means=means,
+        quats=torch.randn(count, 4, generator=generator),
+        scales=scales,
+        opacities=2 * torch.randn(count, generator=generator),
+        sh0=torch.randn(count, 1, 3, generator=generator),
+        shN=0.1 * torch.randn(count, 15, 3, generator=generator),
+    )
+    # Neighbours in space are neighbours in memory, as after a Morton sort.
+    cells = ((means - means.amin(dim=0)) / (means.amax(dim=0) - means.amin(dim=0)) * 1023).long()
+    bits = torch.arange(10)
+    code = (((cells[:, None, :] >> bits[:, None]) & 1) << (3 * bits[:, None] + torch.arange(3))).sum(dim=(1, 2))
+    order = code.argsort()
+    return gaussians.map(lambda value: value[order].to(device))
+
+
+def tile_samples(sizes: np.ndarray, rate: float, device: torch.device, seed: int) -> PixelSamples:
+    """floor(rate * 256) random pixels of every tile, in cell order."""
+    count = max(1, int(rate * TILE_PIXELS))
+    table = pixel_table(sizes, device)  # [T, 256]
+    generator = torch.Generator(device).manual_seed(seed)
+    keys = torch.rand(table.shape, device=device, generator=generator).masked_fill_(table < 0, -1.0)
+    places = keys.topk(count, dim=1).indices
+    places = torch.where(table.gather(1, places) >= 0, places, TILE_PIXELS).sort(dim=1).values
+    padded = torch.cat([table, table.new_full((len(table), 1), -1)], dim=1)
+    tiles = torch.arange(len(TileGrid(sizes)), dtype=torch.int32, device=device)
+    return PixelSamples(
+        view_ids=tuple(range(len(sizes))),
+        sizes=sizes,
+        pixel_ids=padded.gather(1, places).reshape(-1),
+        tile_ids=tiles,
+        tile_offsets=torch.arange(len(tiles) + 1, dtype=torch.int32, device=device) * count,
+    )
+
+
+def spread_views(count: int, of: int) -> list[int]:
+    """`count` views spread evenly over so many."""
+    return np.linspace(0, of - 1, min(count, of)).round().astype(int).tolist()

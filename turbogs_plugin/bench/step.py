@@ -1,0 +1,221 @@
+"""`turbogs bench step`: a whole iteration of training, and each of its steps."""
+
+from __future__ import annotations
+
+import copy
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from turbogs_plugin.bench.clocks import BLOCKS, Mark, back_to_back, copy_bandwidth, keep_busy, summary, wait
+from turbogs_plugin.bench.floors import raster_counts, step_floors
+from turbogs_plugin.bench.models import adopt, changed, resized, train, trained_model
+from turbogs_plugin.bench.recorder import StepRecorder, recorded
+from turbogs_plugin.config import Config, load_config
+from turbogs_plugin.gaussians import load_ply
+from turbogs_plugin.rendering.cuda import CudaRendered
+from turbogs_plugin.scene import Scene
+from turbogs_plugin.trainer import Trainer
+from turbogs_plugin.types import Gaussians, Step
+
+NO_EVENTS = 1 << 20
+"""Iteration of the first density event: none, while statistics are kept as in any iteration."""
+
+FIRST_EVENT = {"refine_from", "refine_start_iter"}
+"""What the kinds of density control call it."""
+
+RATE_FACTOR = 1e-3
+"""Of the learning rates: their size costs nothing, and the model stays the one that is to be timed."""
+
+WARMUP_ITERATIONS = 40
+"""More than the workspace's early passes, so that its buffers have their steady size."""
+
+
+@dataclass
+class StepBench:
+    """What `turbogs bench step` measures.
+
+    Args:
+        gaussians: sizes of the model.
+        views: K, one after the other.
+        pixel_budget: lambda.
+        training: iterations of the model's training.
+        repeats: iterations timed.
+        overrides: of the configuration, whose strategies are timed.
+        ply: a model in place of a trained one.
+    """
+
+    gaussians: Sequence[int]
+    views: Sequence[int]
+    pixel_budget: float
+    training: int
+    repeats: int
+    overrides: Sequence[str]
+    ply: Path | None = None
+
+    def run(self, scene: Scene, device: torch.device) -> dict[str, Any]:
+        """The measurements, ready for JSON. `scene`: its photos on the device."""
+        bandwidth = copy_bandwidth(device)
+        loaded = None if self.ply is None else load_ply(self.ply, scene.frame)
+        passes = []
+        for count in self.gaussians:
+            if loaded is None:
+                model = trained_model(scene, count, self.training, device, self.overrides)
+            else:
+                model = resized(loaded.map(lambda value: value.float().to(device).contiguous()), count)
+            for views in self.views:
+                passes.append(self._measure(scene, model, views, device, bandwidth))
+        return {
+            "scene": scene.name,
+            "image_size": scene.train.cameras.sizes.max(axis=0).tolist(),
+            "training_views": len(scene.train),
+            "model": f"trained for {self.training} iterations" if self.ply is None else self.ply.name,
+            "overrides": list(self.overrides),
+            "copy_bandwidth_bytes_per_s": bandwidth,
+            "passes": passes,
+        }
+
+    def _measure(
+        self, scene: Scene, model: Gaussians, views: int, device: torch.device, bandwidth: float
+    ) -> dict[str, Any]:
+        config, on_gpu = self._config(views), device.type == "cuda"
+        held = torch.cuda.memory_allocated(device) if on_gpu else 0
+        trainer = Trainer(config, scene, device)
+        adopt(trainer, model)
+        trainer.iteration = config.train.sh_degree  # every band is in use
+        train(trainer, WARMUP_ITERATIONS if on_gpu else 2)
+        if on_gpu:
+            torch.cuda.empty_cache()
+            torch.cuda.reset_peak_memory_stats(device)
+        start = trainer.iteration
+
+        recorder = StepRecorder(device)
+        with recorded(trainer, recorder) as iteration:
+            for _ in range(self.repeats):
+                keep_busy(device)
+                iteration()
+            wait(device)
+            steps = recorder.summaries()
+            stored = memory(trainer, held, device)
+            updates = trainer.optimizer.state_dict()["steps"].clone()
+            iteration()
+            samples = recorder.samples
+            counts = {
+                "gaussians": len(model),
+                "samples": len(samples),
+                "pixels": int(samples.sizes.prod(axis=1).sum()),
+                "touched": int((trainer.optimizer.state_dict()["steps"] != updates).sum()),
+            }
+            floors = None
+            if isinstance(recorder.rendered, CudaRendered):
+                counts = {**counts, **raster_counts(recorder.rendered, samples)}
+                floors = step_floors(counts, bandwidth)
+        free_running = self._free_running(trainer, device)
+        wall = back_to_back(trainer.step, self.repeats, device)
+        trainer.repeat_lost(wait=True)
+        return {
+            "gaussians": len(model),
+            "views": len(samples.view_ids),
+            "pixel_budget": self.pixel_budget,
+            "steps": steps,
+            "free_running": free_running,
+            "wall": wall,
+            "density_event": density_event(trainer, config, self.overrides, device),
+            "counts": counts,
+            "floors_ms": floors,
+            "memory_bytes": stored,
+            "lost_iterations": start + 1 + self.repeats * (2 + BLOCKS) - trainer.iteration,
+        }
+
+    def _config(self, views: int) -> Config:
+        config = load_config("turbogs", self.overrides)
+        rates = config.optimizer["learning_rates"]
+        return changed(
+            config,
+            train={"iterations": 2 * NO_EVENTS, "refine_until": 2 * NO_EVENTS - 1, "sh_interval": 1},
+            schedule={"type": "fixed", "views": views, "pixel_budget": self.pixel_budget},
+            density={**config.density, **dict.fromkeys(FIRST_EVENT & config.density.keys(), NO_EVENTS)},
+            optimizer={
+                **config.optimizer,
+                "learning_rates": {**rates, "batch_scale": RATE_FACTOR * rates["batch_scale"]},
+            },
+        )
+
+    def _free_running(self, trainer: Trainer, device: torch.device) -> dict[str, float]:
+        """Time from one iteration's end to the next one's on the device, which may have to wait for the host."""
+        marks = [Mark(device)]
+        for _ in range(self.repeats):
+            trainer.step()
+            marks.append(Mark(device))
+        wait(device)
+        return summary([first.until(last) for first, last in itertools.pairwise(marks)])
+
+
+def density_event(
+    trainer: Trainer, config: Config, overrides: Sequence[str], device: torch.device, repeats: int = 5
+) -> dict[str, Any] | None:
+    """One event of density control with its change of model and optimizer state, by the statistics of this trainer.
+
+    None where the density control has no such events.
+    """
+    usual = load_config("turbogs", overrides)
+    if "refine_from" not in usual.density:
+        return None
+    interval = usual.density["refine_every"]
+    due = Step(
+        iteration=-(-usual.density["refine_from"] // interval) * interval,
+        total=usual.train.iterations,
+        refine_until=usual.train.refine_until,
+        seed=config.train.seed,
+        scene_extent=trainer.extent,
+    )
+    spans, after = [], len(trainer.gaussians)
+    for _ in range(repeats):
+        density, optimizer = usual.build("density"), copy.deepcopy(trainer.optimizer)
+        density.setup(trainer.gaussians)
+        density.load_state_dict(trainer.density.state_dict())
+        wait(device)
+        first = Mark(device)
+        update = density.update(trainer.gaussians, due)
+        if update is not None:
+            after = len(update.apply(trainer.gaussians))
+            optimizer.apply(update)
+        wait(device)
+        spans.append(first.host_until(Mark(device)))
+    return {"wall": summary(spans), "every": interval, "gaussians_after": after}
+
+
+def memory(trainer: Trainer, held: int, device: torch.device) -> dict[str, int | None]:
+    """Bytes of what is stored, and the peak of the iterations timed.
+
+    Args:
+        held: bytes allocated before the trainer was made: the scene's photos and the bench's own copy of the model.
+    """
+    stored = {
+        "parameters": tensor_bytes(dict(trainer.gaussians.items())),
+        "optimizer": tensor_bytes(trainer.optimizer.state_dict()),
+        "density_statistics": tensor_bytes(trainer.density.state_dict()),
+        "error_maps": tensor_bytes([trainer.maps.errors, trainer.maps.stamps]),
+        "training_photos": tensor_bytes(trainer.views.photos.colors),
+        "raster_workspace": 0 if trainer.workspace is None else trainer.workspace.bytes_held(),
+    }
+    if device.type != "cuda":
+        return {**stored, "temporary": None, "peak": None}
+    # What a training run would not have: test photos and the bench's copy.
+    foreign = held - stored["training_photos"]
+    peak = torch.cuda.max_memory_allocated(device) - foreign
+    return {**stored, "temporary": peak - sum(stored.values()), "peak": peak}
+
+
+def tensor_bytes(value: Any) -> int:
+    """Bytes of the tensors in nested dicts and lists."""
+    if isinstance(value, dict):
+        return sum(map(tensor_bytes, value.values()))
+    if isinstance(value, list | tuple):
+        return sum(map(tensor_bytes, value))
+    return value.numel() * value.element_size() if isinstance(value, Tensor) else 0
