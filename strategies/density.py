@@ -293,8 +293,9 @@ class ErrorDrivenDensity:
 
 
 def _finite_rows(gaussians: Gaussians) -> Tensor:
-    """[N] bool: every parameter of the Gaussian is finite."""
-    return torch.stack([torch.isfinite(v.reshape(len(v), -1)).all(dim=-1) for _, v in gaussians.items()]).all(dim=0)
+    """[N] bool: every parameter of the Gaussian is finite, and so are its variances, that its halves may be, too."""
+    values = [value for _, value in gaussians.items()] + [(2 * gaussians.scales).exp()]
+    return torch.stack([torch.isfinite(value.reshape(len(value), -1)).all(dim=-1) for value in values]).all(dim=0)
 
 
 def _quantile(values: Tensor, mask: Tensor, fraction: float) -> Tensor:
