@@ -6,16 +6,15 @@ from torch import Tensor
 
 from turbogs_plugin import kernels, training_kernels
 from turbogs_plugin.error_maps import ErrorMaps
-from turbogs_plugin.scene import Photos
+from turbogs_plugin.scene.photos import PhotoSamples
 from turbogs_plugin.strategies.protocols import SparseLoss
-from turbogs_plugin.types import LossOutput, PixelSamples, Step
+from turbogs_plugin.types import LossOutput, Step
 
 
 def supervise(
     loss: SparseLoss,
     colors: Tensor,
-    photos: Photos,
-    samples: PixelSamples,
+    truth: PhotoSamples,
     maps: ErrorMaps,
     step: Step,
     overflow: Tensor | None = None,
@@ -28,8 +27,7 @@ def supervise(
     Args:
         loss: of the run.
         colors: [P, 3] rendered.
-        photos: of all training views, on the device of `colors`.
-        samples: what `colors` are.
+        truth: the photos at the samples, on the device of `colors`.
         maps: updated in place.
         step: gives the stamp.
         overflow: [1] int32 on the device; where it is not 0, the maps stay as they are.
@@ -37,8 +35,12 @@ def supervise(
     kernel_terms = getattr(loss, "kernel_terms", None)
     if colors.is_cuda and kernel_terms is not None and kernels.available():
         return training_kernels.sparse_loss(
-            colors, photos.colors, samples, kernel_terms(), update=training_kernels.MapUpdate(maps, step, overflow)
+            colors,
+            truth.photos.colors,
+            truth.samples,
+            kernel_terms(),
+            update=training_kernels.MapUpdate(maps, step, overflow),
         )
-    output = loss(colors, photos.gather(samples), samples)
-    maps.update(samples, output.pixel_errors, step)
+    output = loss(colors, truth.colors(), truth.samples)
+    maps.update(truth.samples, output.pixel_errors, step)
     return output

@@ -15,10 +15,10 @@ from turbogs_plugin.config import Config
 from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.errors import TrainingStopped
 from turbogs_plugin.gaussians import gaussians_from_points
-from turbogs_plugin.rendering import Workspace, rasterize, render_images
+from turbogs_plugin.rendering import Rendered, Workspace, rasterize, render_images
 from turbogs_plugin.scene import Scene
 from turbogs_plugin.supervision import supervise
-from turbogs_plugin.types import PARAMETER_NAMES, Gaussians, RowUpdate, Step
+from turbogs_plugin.types import PARAMETER_NAMES, Gaussians, PixelSamples, RowUpdate, Step
 
 
 class Trainer:
@@ -78,19 +78,14 @@ class Trainer:
         # 3) Pixel sampling
         samples = self.pixel_sampler.sample(self.maps, view_ids, budget.rate, step)
 
-        # 5) Sparse forward rendering
-        cameras = self.views.cameras.select(view_ids)
-        rendered = rasterize(
-            self.gaussians,
-            cameras,
-            samples,
-            sh_degree=self.sh_degree,
-            settings=self.config.raster,
-            workspace=self.workspace,
-        )
+        # 4) Ground truth at the samples
+        truth = self.views.photos.at(samples)
 
-        # 4) Ground truth at the samples, 6) sparse loss and its gradients, 7) EMA update of the error maps
-        loss = supervise(self.loss, rendered.colors, self.views.photos, samples, self.maps, step, self.overflow)
+        # 5) Sparse forward rendering
+        rendered = self.render(view_ids, samples)
+
+        # 6) Sparse loss and its gradients, and 7) EMA update of the error maps
+        loss = supervise(self.loss, rendered.colors, truth, self.maps, step, self.overflow)
 
         # 8) Backward to the Gaussians; step 11's back-projection of errors happens in the same pass
         gradients = rendered.backward(loss.color_gradients, loss.pixel_errors, self.density.stats)
@@ -103,6 +98,17 @@ class Trainer:
 
         self.nonfinite_losses += ~loss.loss.isfinite()
         self.iteration += 1
+
+    def render(self, view_ids: tuple[int, ...], samples: PixelSamples) -> Rendered:
+        """The present model at the samples of some training views."""
+        return rasterize(
+            self.gaussians,
+            self.views.cameras.select(view_ids),
+            samples,
+            sh_degree=self.sh_degree,
+            settings=self.config.raster,
+            workspace=self.workspace,
+        )
 
     def follow(self, update: RowUpdate | None) -> None:
         """Let model and optimizer follow a change of the set of Gaussians."""

@@ -46,6 +46,10 @@ class Photos:
         flat = starts[samples.view_of_slot()] + samples.pixel_ids.long().clamp(min=0)
         return self.colors[flat].float().div_(255.0).mul_(samples.filled[:, None])
 
+    def at(self, samples: PixelSamples) -> PhotoSamples:
+        """The photos at the samples, to be gathered where they are compared."""
+        return PhotoSamples(self, samples)
+
     def image(self, view_id: int) -> Tensor:
         """[H, W, 3] float32, 0 .. 1: one whole photo."""
         width, height = self.sizes[view_id].tolist()
@@ -54,6 +58,18 @@ class Photos:
 
     def to(self, device: torch.device | str) -> Photos:
         return Photos(self.colors.to(device), self.sizes)
+
+
+@dataclass(frozen=True)
+class PhotoSamples:
+    """Ground truth of an iteration. Not gathered yet: the loss's kernel does that itself."""
+
+    photos: Photos
+    samples: PixelSamples
+
+    def colors(self) -> Tensor:
+        """[P, 3] float32, 0 .. 1, as `Photos.gather` gives them."""
+        return self.photos.gather(self.samples)
 
 
 def pixel_offsets(sizes: np.ndarray) -> np.ndarray:
