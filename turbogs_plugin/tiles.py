@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -76,7 +77,21 @@ def compact(
 
 def dense_pixels(view_ids: Sequence[int], sizes: np.ndarray, device: torch.device | str) -> PixelSamples:
     """Every pixel of these views, in the order of samples. `sizes`: [K, 2] int64 (width, height)."""
-    table = pixel_table(sizes, device)
+    pixel_ids = [_dense_view(int(width), int(height), torch.device(device)) for width, height in sizes]
     widths, heights = tile_extents(sizes)
-    tile_ids = torch.arange(len(table), dtype=torch.int32, device=device)
-    return compact(view_ids, sizes, table, table >= 0, tile_ids, widths * heights, full=True)
+    offsets = np.concatenate([[0], np.cumsum(widths * heights)])
+    return PixelSamples(
+        view_ids=tuple(view_ids),
+        sizes=sizes,
+        pixel_ids=torch.cat(pixel_ids),
+        tile_ids=torch.arange(len(widths), dtype=torch.int32, device=device),
+        tile_offsets=torch.as_tensor(offsets, dtype=torch.int32, device=device),
+        has_empty_slots=False,
+    )
+
+
+@lru_cache(maxsize=32)
+def _dense_view(width: int, height: int, device: torch.device) -> Tensor:
+    """[H * W] int32: the pixels of one image in the order of samples. Kept, as evaluations ask for the same again."""
+    table = pixel_table(np.array([[width, height]]), device)
+    return table[table >= 0]

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import lru_cache
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -18,7 +16,8 @@ from turbogs_plugin.rendering.reference import (
 )
 from turbogs_plugin.rendering.rendered import DEFAULT_SETTINGS, RasterSettings, Rendered, ScreenGradients
 from turbogs_plugin.rendering.workspace import Workspace
-from turbogs_plugin.types import TILE_SIZE, Cameras, Gaussians, PixelSamples, TileGrid, cell_order
+from turbogs_plugin.tiles import dense_pixels
+from turbogs_plugin.types import Cameras, Gaussians, PixelSamples
 
 __all__ = [
     "DEFAULT_SETTINGS",
@@ -91,17 +90,6 @@ def rasterize_differentiable(
     return function(gaussians, cameras, samples, sh_degree=sh_degree, settings=settings, with_depth=with_depth)
 
 
-@lru_cache(maxsize=32)
-def _dense_view(width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
-    """Pixel ids [H * W] of one image in (tile, cell) order and the number of pixels of each of its tiles."""
-    y, x = np.divmod(np.arange(width * height), width)
-    columns = -(-width // TILE_SIZE)
-    tiles = (y // TILE_SIZE) * columns + x // TILE_SIZE
-    ranks = cell_order(torch.from_numpy(x % TILE_SIZE), torch.from_numpy(y % TILE_SIZE)).numpy()
-    order = np.argsort(tiles * TILE_SIZE**2 + ranks).astype(np.int32)
-    return order, np.bincount(tiles)
-
-
 def dense_samples(cameras: Cameras, view_ids: Sequence[int] | None = None) -> PixelSamples:
     """Every pixel of every tile of some views, in cell order, without empty slots.
 
@@ -110,18 +98,7 @@ def dense_samples(cameras: Cameras, view_ids: Sequence[int] | None = None) -> Pi
         view_ids: which of them; all where None.
     """
     view_ids = tuple(range(len(cameras)) if view_ids is None else view_ids)
-    sizes = cameras.sizes[list(view_ids)]
-    views = [_dense_view(int(width), int(height)) for width, height in sizes]
-    counts = np.concatenate([count for _, count in views])
-    device = cameras.viewmats.device
-    return PixelSamples(
-        view_ids=view_ids,
-        sizes=sizes,
-        pixel_ids=torch.from_numpy(np.concatenate([order for order, _ in views])).to(device),
-        tile_ids=torch.arange(len(TileGrid(sizes)), dtype=torch.int32, device=device),
-        tile_offsets=torch.from_numpy(np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)).to(device),
-        has_empty_slots=False,
-    )
+    return dense_pixels(view_ids, cameras.sizes[list(view_ids)], cameras.viewmats.device)
 
 
 @torch.no_grad()
