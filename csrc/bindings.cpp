@@ -17,20 +17,17 @@ struct SampleBuffers {
     std::optional<Tensor> tile_ids;
     Tensor colors, alphas, transmittances, last_pairs, masks, bucket_counts;
     std::optional<Tensor> depths;
-    int64_t chunks, samples_per_lane;
+    int64_t chunks;
     double alpha_min, alpha_max, transmittance_min;
 
     ForwardParams params(const Checker& check) const {
         ForwardParams out = {};
         const int64_t num_views = cameras.size(0), num_active = tile_offsets.numel() - 1, num_slots = pixel_ids.numel();
         STD_TORCH_CHECK(chunks > 0, "chunks must be positive, got ", chunks);
-        STD_TORCH_CHECK(samples_per_lane >= 1 && samples_per_lane <= kMaxSamplesPerLane, "samples_per_lane must be 1 .. ",
-                        kMaxSamplesPerLane, ", got ", samples_per_lane);
         STD_TORCH_CHECK(pair_ids.numel() / kBucket + num_active + 1 <= masks.numel() / chunks, "masks is too small");
         out.num_views = static_cast<int>(num_views);
         out.num_active = static_cast<int>(num_active);
         out.chunks = static_cast<int>(chunks);
-        out.samples_per_lane = static_cast<int>(samples_per_lane);
         out.with_depth = depths.has_value();
         out.alpha_min = static_cast<float>(alpha_min);
         out.alpha_max = static_cast<float>(alpha_max);
@@ -188,25 +185,34 @@ int64_t raster_sort_pairs(Tensor instances, Tensor depth_keys, Tensor instance_i
 void raster_forward(Tensor cameras, std::optional<Tensor> tile_ids, Tensor tile_offsets, Tensor pixel_ids,
                     Tensor tile_starts, Tensor pair_ids, Tensor instances, Tensor colors, Tensor alphas,
                     Tensor transmittances, std::optional<Tensor> depths, Tensor last_pairs, Tensor masks,
-                    Tensor bucket_counts, int64_t chunks, int64_t samples_per_lane, double alpha_min, double alpha_max,
-                    double transmittance_min) {
+                    Tensor bucket_counts, int64_t chunks, double alpha_min, double alpha_max,
+                    double transmittance_min, std::optional<Tensor> cleared) {
     const SampleBuffers buffers{cameras, tile_offsets, pixel_ids, tile_starts, pair_ids, instances, tile_ids,
                                 colors, alphas, transmittances, last_pairs, masks, bucket_counts, depths,
-                                chunks, samples_per_lane, alpha_min, alpha_max, transmittance_min};
+                                chunks, alpha_min, alpha_max, transmittance_min};
     Checker check(cameras);
-    check.launched(launch_rasterize_forward(buffers.params(check), check.stream()), "forward");
+    ForwardParams params = buffers.params(check);
+    if (cleared.has_value()) {
+        const int64_t total = instances.size(0);
+        params.cleared = reinterpret_cast<float4*>(
+            check.pointer<float>(*cleared, "cleared", ScalarType::Float, {total, kGradientFloats}));
+        params.num_cleared = static_cast<size_t>(total) * kGradientFloats / 4;
+    }
+    // Without work items there is no launch that would clear anything.
+    STD_TORCH_CHECK(params.num_cleared == 0 || params.num_active > 0, "nothing to render, but something to clear");
+    check.launched(launch_rasterize_forward(params, check.stream()), "forward");
 }
 
 void raster_backward(Tensor cameras, std::optional<Tensor> tile_ids, Tensor tile_offsets, Tensor pixel_ids,
                      Tensor tile_starts, Tensor pair_ids, Tensor instances, Tensor colors, Tensor alphas,
                      Tensor transmittances, std::optional<Tensor> depths, Tensor last_pairs, Tensor masks,
-                     Tensor bucket_counts, int64_t chunks, int64_t samples_per_lane, double alpha_min, double alpha_max,
+                     Tensor bucket_counts, int64_t chunks, double alpha_min, double alpha_max,
                      double transmittance_min, Tensor color_gradients, std::optional<Tensor> alpha_gradients,
                      std::optional<Tensor> depth_gradients, std::optional<Tensor> pixel_errors, Tensor screen_gradients,
-                     bool with_distances) {
+                     bool with_distances, bool cleared) {
     const SampleBuffers buffers{cameras, tile_offsets, pixel_ids, tile_starts, pair_ids, instances, tile_ids,
                                 colors, alphas, transmittances, last_pairs, masks, bucket_counts, depths,
-                                chunks, samples_per_lane, alpha_min, alpha_max, transmittance_min};
+                                chunks, alpha_min, alpha_max, transmittance_min};
     Checker check(cameras);
     const int64_t num_slots = pixel_ids.numel(), total = instances.size(0);
     STD_TORCH_CHECK(!depth_gradients.has_value() || depths.has_value(), "depth gradients without depths");
@@ -214,6 +220,7 @@ void raster_backward(Tensor cameras, std::optional<Tensor> tile_ids, Tensor tile
     params.forward = buffers.params(check);
     params.num_instances = static_cast<int>(total);
     params.with_distances = with_distances;
+    params.cleared = cleared;
     params.color_gradients = check.pointer<float>(color_gradients, "color_gradients", ScalarType::Float, {num_slots, 3});
     params.alpha_gradients = check.optional<float>(alpha_gradients, "alpha_gradients", ScalarType::Float, {num_slots});
     params.depth_gradients = check.optional<float>(depth_gradients, "depth_gradients", ScalarType::Float, {num_slots});
@@ -246,13 +253,13 @@ STABLE_TORCH_LIBRARY_FRAGMENT(turbogs, m) {
         "raster_forward(Tensor cameras, Tensor? tile_ids, Tensor tile_offsets, Tensor pixel_ids, Tensor tile_starts, "
         "Tensor pair_ids, Tensor instances, Tensor(a!) colors, Tensor(b!) alphas, Tensor(c!) transmittances, "
         "Tensor(d!)? depths, Tensor(e!) last_pairs, Tensor(f!) masks, Tensor(g!) bucket_counts, int chunks, "
-        "int samples_per_lane, float alpha_min, float alpha_max, float transmittance_min) -> ()");
+        "float alpha_min, float alpha_max, float transmittance_min, Tensor(h!)? cleared) -> ()");
     m.def(
         "raster_backward(Tensor cameras, Tensor? tile_ids, Tensor tile_offsets, Tensor pixel_ids, Tensor tile_starts, "
         "Tensor pair_ids, Tensor instances, Tensor colors, Tensor alphas, Tensor transmittances, Tensor? depths, "
-        "Tensor last_pairs, Tensor masks, Tensor bucket_counts, int chunks, int samples_per_lane, float alpha_min, "
+        "Tensor last_pairs, Tensor masks, Tensor bucket_counts, int chunks, float alpha_min, "
         "float alpha_max, float transmittance_min, Tensor color_gradients, Tensor? alpha_gradients, "
-        "Tensor? depth_gradients, Tensor? pixel_errors, Tensor(a!) screen_gradients, bool with_distances) -> ()");
+        "Tensor? depth_gradients, Tensor? pixel_errors, Tensor(a!) screen_gradients, bool with_distances, bool cleared) -> ()");
 }
 
 STABLE_TORCH_LIBRARY_IMPL(turbogs, CUDA, m) {

@@ -1,9 +1,9 @@
 // Stages 2 and 3: which splats each active tile must look at, front to back.
 //
-// Instances of all views are sorted by depth once (32-bit keys). Walking them in that order, every splat writes its
-// (tile position, instance) pairs to its own place, and one stable radix sort by tile position, over no more bits than the
-// tiles need, leaves each tile's pairs front to back; equal depths keep the order of the Gaussians. Nothing here needs the
-// number of pairs on the host: unused places hold a key behind the last tile's.
+// Instances of all views are sorted by depth once (32-bit keys). In that order every splat has its own places among the
+// (tile position, instance) pairs, and one stable radix sort by tile position, over no more bits than the tiles need,
+// leaves each tile's pairs front to back; equal depths keep the order of the Gaussians. Nothing here needs the number of
+// pairs on the host: unused places hold a key behind the last tile's.
 #include <cub/device/device_radix_sort.cuh>
 #include <cub/device/device_scan.cuh>
 #include <thrust/iterator/counting_iterator.h>
@@ -15,7 +15,8 @@ namespace turbogs {
 namespace {
 
 constexpr int kThreads = 256;
-constexpr uint32_t kLargeSplat = 24;  // pairs beyond which a whole warp writes a splat's pairs
+constexpr uint32_t kWindow = 2048;    // pairs that a block writes
+constexpr uint32_t kLargeSplat = 16;  // pairs beyond which a whole warp enumerates a splat's pairs
 
 // Addition that stays at kMaxPairs: associative, so the scan may use it, and a count that would wrap reads as too large.
 struct SaturatingSum {
@@ -44,76 +45,146 @@ __global__ void publish_count_kernel(const uint32_t* pair_ends, int num_instance
     status[0] = num_instances > 0 ? pair_ends[num_instances - 1] : 0u;
 }
 
+// First place whose pairs end behind `pair`, or `count`. All lanes of a warp search together, 32 shares at a step.
+__device__ __forceinline__ int first_place_behind(const uint32_t* __restrict__ pair_ends, int count, uint32_t pair, int lane) {
+    int low = 0, high = count;
+    while (low < high) {
+        const int share = (high - low + kWarpSize - 1) / kWarpSize;
+        const int probe = low + (lane + 1) * share - 1;
+        const bool whole = probe < high && pair_ends[probe] <= pair;  // the lane's share ends too early
+        low += __popc(__ballot_sync(kFullWarp, whole)) * share;
+        high = min(high, low + share - 1);
+    }
+    return min(low, count);
+}
+
+// The pairs that one block writes: a window of consecutive ones, gathered in shared memory, so that the work is even
+// however large the splats are, and memory is written in one sweep.
+template <typename Key>
+struct PairWindow {
+    uint32_t begin, end;  // pairs
+    Key keys[kWindow];
+    uint32_t ids[kWindow];
+    int num_large;
+    int large[kWindow / kLargeSplat + 2];  // places of the splats that a warp takes on
+
+    __device__ __forceinline__ void put(uint32_t pair, int tile, uint32_t instance) {
+        if (pair < begin || pair >= end) return;
+        keys[pair - begin] = static_cast<Key>(tile);
+        ids[pair - begin] = instance;
+    }
+};
+
+// What it takes to enumerate the pairs of one place.
+struct Emission {
+    uint32_t instance;
+    const RasterCamera* camera;
+    Reach reach;
+};
+
+__device__ __forceinline__ Emission make_emission(const SortPairsParams& params, int place) {
+    Emission out;
+    out.instance = params.instance_ids[place];
+    out.camera = params.cameras + out.instance / static_cast<uint32_t>(params.num_gaussians);
+    const float4* splat = reinterpret_cast<const float4*>(params.instances + out.instance);
+    const float4 first = splat[0], second = splat[1];
+    out.reach = make_reach(first.x, first.y, first.z, first.w, second.x, second.w);
+    return out;
+}
+
+__device__ __forceinline__ int2 tiles_of_row(const SortPairsParams& params, const Emission& emission, int row) {
+    const RasterCamera& camera = *emission.camera;
+    return active_tiles(camera, params.active_prefix, row, tile_columns(emission.reach, row, camera.tiles_x));
+}
+
+// One thread enumerates a splat of few pairs.
+template <typename Key>
+__device__ __forceinline__ void emit_small(const SortPairsParams& params, int place, uint32_t pair, PairWindow<Key>& window) {
+    const Emission emission = make_emission(params, place);
+    const int2 rows = tile_rows(emission.reach, emission.camera->tiles_y);
+    for (int row = rows.x; row < rows.y; ++row) {
+        const int2 tiles = tiles_of_row(params, emission, row);
+        for (int tile = tiles.x; tile < tiles.y; ++tile) window.put(pair++, tile, emission.instance);
+    }
+}
+
+// A warp enumerates a splat: a lane for each row of tiles, then a lane for each pair of those rows.
+template <typename Key>
+__device__ __forceinline__ void emit_large(const SortPairsParams& params, int place, uint32_t pair, PairWindow<Key>& window,
+                                           int lane) {
+    const Emission emission = make_emission(params, place);
+    const int2 rows = tile_rows(emission.reach, emission.camera->tiles_y);
+    for (int row_base = rows.x; row_base < rows.y && pair < window.end; row_base += kWarpSize) {
+        const int row = row_base + lane;
+        const int2 tiles = row < rows.y ? tiles_of_row(params, emission, row) : make_int2(0, 0);
+        const int count = tiles.y - tiles.x;
+        int sum = count;  // of the rows up to and including the lane's
+#pragma unroll
+        for (int step = 1; step < kWarpSize; step *= 2) {
+            const int below = __shfl_up_sync(kFullWarp, sum, step);
+            if (lane >= step) sum += below;
+        }
+        const int total = __shfl_sync(kFullWarp, sum, kWarpSize - 1);
+        const int shift = tiles.x - (sum - count);  // from the number of a pair to its tile
+        const int begin = pair < window.begin ? static_cast<int>(min(window.begin - pair, static_cast<uint32_t>(total))) : 0;
+        for (int base = begin; base < total && pair + base < window.end; base += kWarpSize) {
+            const int number = base + lane;
+            int owner = 0;  // the lane whose row holds this pair
+#pragma unroll
+            for (int step = kWarpSize / 2; step > 0; step /= 2) {
+                if (__shfl_sync(kFullWarp, sum, owner + step - 1) <= number) owner += step;
+            }
+            const int tile = number + __shfl_sync(kFullWarp, shift, owner);
+            if (number < total) window.put(pair + number, tile, emission.instance);
+        }
+        pair += static_cast<uint32_t>(total);
+    }
+}
+
 template <typename Key>
 __global__ void __launch_bounds__(kThreads) emit_pairs_kernel(const __grid_constant__ SortPairsParams params) {
-    if (params.pair_ends[params.num_instances - 1] > params.capacity) {
+    __shared__ PairWindow<Key> window;
+    const int lane = threadIdx.x % kWarpSize, warp = threadIdx.x / kWarpSize;
+    const uint32_t begin = blockIdx.x * kWindow;
+    uint32_t total = params.num_instances > 0 ? params.pair_ends[params.num_instances - 1] : 0u;
+    if (total > params.capacity) {
         if (blockIdx.x == 0 && threadIdx.x == 0) params.status[1] = 1u;
-        return;
+        total = 0;
+    } else if (params.status[1] != 0u) {
+        total = 0;
     }
-    if (params.status[1] != 0u) return;
+    const uint32_t end = min(begin + kWindow, total);
+    if (threadIdx.x == 0) {
+        window.begin = begin;
+        window.end = end;
+        window.num_large = 0;
+    }
+    __syncthreads();
+
+    if (begin < end) {
+        const auto first_pair = [&](int place) { return place > 0 ? params.pair_ends[place - 1] : 0u; };
+        int base = first_place_behind(params.pair_ends, params.num_instances, begin, lane);
+        do {
+            const int place = base + threadIdx.x;
+            const uint32_t pair = place < params.num_instances ? first_pair(place) : end;
+            if (pair < end) {
+                if (params.pair_ends[place] - pair <= kLargeSplat) emit_small(params, place, pair, window);
+                else window.large[atomicAdd(&window.num_large, 1)] = place;
+            }
+            base += kThreads;
+        } while (base < params.num_instances && first_pair(base) < end);
+        __syncthreads();
+        for (int i = warp; i < window.num_large; i += kThreads / kWarpSize) {
+            emit_large(params, window.large[i], first_pair(window.large[i]), window, lane);
+        }
+        __syncthreads();
+    }
+
     Key* tile_keys = static_cast<Key*>(params.tile_keys[0]);
-    uint32_t* pair_ids = params.pair_ids[0];
-    const int place = blockIdx.x * kThreads + threadIdx.x;  // in depth order
-    const int lane = threadIdx.x % kWarpSize;
-
-    uint32_t count = 0, begin = 0, instance = 0;
-    int view = 0;
-    Reach reach = {};
-    if (place < params.num_instances && params.depth_keys[place] != kInvisible) {
-        begin = place > 0 ? params.pair_ends[place - 1] : 0u;
-        count = params.pair_ends[place] - begin;
-        instance = params.instance_ids[place];
-        view = static_cast<int>(instance / static_cast<uint32_t>(params.num_gaussians));
-        const float4* splat = reinterpret_cast<const float4*>(params.instances + instance);
-        const float4 first = splat[0], second = splat[1];
-        reach = make_reach(first.x, first.y, first.z, first.w, second.x, second.w);
-    }
-
-    if (count > 0 && count <= kLargeSplat) {
-        const RasterCamera& camera = params.cameras[view];
-        const int2 rows = tile_rows(reach, camera.tiles_y);
-        uint32_t out = begin;
-        for (int row = rows.x; row < rows.y; ++row) {
-            const int2 tiles = active_tiles(camera, params.active_prefix, row, tile_columns(reach, row, camera.tiles_x));
-            for (int tile = tiles.x; tile < tiles.y; ++tile, ++out) {
-                tile_keys[out] = static_cast<Key>(tile);
-                pair_ids[out] = instance;
-            }
-        }
-    }
-
-    // Large splats one after another, their rows of tiles over the lanes.
-    for (uint32_t large = __ballot_sync(kFullWarp, count > kLargeSplat); large != 0u; large &= large - 1u) {
-        const int source = __ffs(large) - 1;
-        Reach shared;
-        shared.x = __shfl_sync(kFullWarp, reach.x, source);
-        shared.y = __shfl_sync(kFullWarp, reach.y, source);
-        shared.half_x = __shfl_sync(kFullWarp, reach.half_x, source);
-        shared.half_y = __shfl_sync(kFullWarp, reach.half_y, source);
-        shared.extreme_y = __shfl_sync(kFullWarp, reach.extreme_y, source);
-        shared.slope = __shfl_sync(kFullWarp, reach.slope, source);
-        shared.half_chord = __shfl_sync(kFullWarp, reach.half_chord, source);
-        shared.inverse_half_y = __shfl_sync(kFullWarp, reach.inverse_half_y, source);
-        const RasterCamera& camera = params.cameras[__shfl_sync(kFullWarp, view, source)];
-        const uint32_t shared_instance = __shfl_sync(kFullWarp, instance, source);
-        uint32_t out = __shfl_sync(kFullWarp, begin, source);
-        const int2 rows = tile_rows(shared, camera.tiles_y);
-        for (int row_base = rows.x; row_base < rows.y; row_base += kWarpSize) {
-            int2 tiles = make_int2(0, 0);
-            if (row_base + lane < rows.y) {
-                const int row = row_base + lane;
-                tiles = active_tiles(camera, params.active_prefix, row, tile_columns(shared, row, camera.tiles_x));
-            }
-            const int num_rows = min(kWarpSize, rows.y - row_base);
-            for (int i = 0; i < num_rows; ++i) {
-                const int first = __shfl_sync(kFullWarp, tiles.x, i), last = __shfl_sync(kFullWarp, tiles.y, i);
-                for (int tile = first + lane; tile < last; tile += kWarpSize) {
-                    tile_keys[out + (tile - first)] = static_cast<Key>(tile);
-                    pair_ids[out + (tile - first)] = shared_instance;
-                }
-                out += static_cast<uint32_t>(last - first);
-            }
-        }
+    for (uint32_t i = threadIdx.x; i < kWindow && begin + i < params.capacity; i += kThreads) {
+        const bool filled = begin + i < end;
+        tile_keys[begin + i] = filled ? window.keys[i] : static_cast<Key>(~Key{0});
+        if (filled) params.pair_ids[0][begin + i] = window.ids[i];
     }
 }
 
@@ -147,11 +218,7 @@ cudaError_t sort_pairs_bytes(uint32_t capacity, int num_active, size_t* bytes) {
 
 template <typename Key>
 cudaError_t sort_pairs(SortPairsParams& params, cudaStream_t stream) {
-    const int blocks = (params.num_instances + kThreads - 1) / kThreads;
-    if (params.capacity > 0) {
-        const cudaError_t error = cudaMemsetAsync(params.tile_keys[0], 0xFF, sizeof(Key) * params.capacity, stream);
-        if (error != cudaSuccess) return error;
-    }
+    const int blocks = static_cast<int>((params.capacity + kWindow - 1) / kWindow);
     if (blocks > 0) {
         emit_pairs_kernel<Key><<<blocks, kThreads, 0, stream>>>(params);
         if (const cudaError_t error = cudaGetLastError()) return error;

@@ -18,7 +18,6 @@ constexpr int kRasterMaxDegree = 3;         // of the spherical harmonics
 constexpr int kInstanceFloats = 12;         // one projected splat, three float4
 constexpr int kGradientFloats = 16;         // one screen-gradient record, four float4
 constexpr int kBucket = 32;                 // splats staged at once; one contribution mask holds one bucket
-constexpr int kMaxSamplesPerLane = 4;       // of the forward kernel's register tile
 constexpr uint32_t kInvisible = 0xFFFFFFFFu;  // depth key of an instance without pairs
 constexpr uint32_t kMaxPairs = 0x7FFFFFFFu;   // the pair count saturates here instead of wrapping
 
@@ -43,7 +42,7 @@ struct alignas(16) Instance {
     float depth;
     float log_reach;     // log(opacity / alpha_min): sigma beyond which the splat is invisible
     float red, green, blue;  // after the clamp at 0
-    float unused;
+    float inverse_sigma_y;  // 1 / standard deviation along y
 };
 
 // Stage 1. K views of every Gaussian; parameters are read once.
@@ -112,13 +111,12 @@ struct SortPairsParams {
     int current;                  // out, host: which buffer holds the sorted pairs
 };
 
-// Stage 4. One warp for each work item = (tile position, chunk): slots chunk * 32 * samples_per_lane ... of the tile.
-// Further slots of a tile follow with a stride of `chunks` chunks, so any number of slots is rendered.
+// Stage 4. One warp for each work item = (tile position, chunk): slots chunk * 32 ... chunk * 32 + 31 of the tile. Further
+// slots of a tile follow with a stride of `chunks` chunks, so any number of slots is rendered.
 struct ForwardParams {
     int num_views;
     int num_active;         // T
     int chunks;             // C, work items of a tile
-    int samples_per_lane;   // 1 .. kMaxSamplesPerLane
     bool with_depth;
     float alpha_min, alpha_max, transmittance_min;
     const RasterCamera* cameras;
@@ -137,6 +135,8 @@ struct ForwardParams {
     uint32_t* masks;        // [(M / 32 + T + 1) * C] out: bit of each splat of a bucket that contributed to the item.
                             // Bucket j of item (t, c) is word ((tile_starts[t] / 32 + t) + j) * C + c.
     int32_t* bucket_counts; // [T, C] out, buckets that the item walked
+    float4* cleared;        // set to zero meanwhile, for stage 5: this stage leaves the memory idle; or null
+    size_t num_cleared;     // float4
 };
 
 // Stage 5. Same work items; gradients on the screen.
@@ -144,6 +144,7 @@ struct BackwardParams {
     ForwardParams forward;            // as given to stage 4; its outputs are inputs here
     int num_instances;
     bool with_distances;              // fill sum D * w
+    bool cleared;                     // `screen_gradients` is zero already
     const float* color_gradients;     // [P, 3]
     const float* alpha_gradients;     // [P] or null
     const float* depth_gradients;     // [P] or null

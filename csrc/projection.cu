@@ -1,14 +1,16 @@
 // Stage 1: projection, colour and tile counts of every Gaussian in the K views of a batch.
 //
-// One thread holds one Gaussian and walks the views, so parameters are read once. Rows of `shN` are not 16-byte aligned,
-// but a block's rows together are: the block copies them to shared memory with 16-byte loads. Active tiles are found by
+// A block holds 64 Gaussians, each in up to four threads that share out the views, so parameters are read from memory
+// once. Rows of `shN` are not 16-byte aligned, but a block's rows together are: the block copies them to shared memory
+// with 16-byte loads. Active tiles are found by
 // their prefix counts, so counting a row of tiles costs two loads whatever its length.
 #include "common.cuh"
 
 namespace turbogs {
 namespace {
 
-constexpr int kProjectionThreads = 128;
+constexpr int kProjectionGaussians = 64;  // of a block
+constexpr int kProjectionSlices = 4;      // most threads of a Gaussian: a small model alone does not fill the GPU
 constexpr float kExtentMax = 3.33f;        // gsplat's cut of a splat's half width, standard deviations
 constexpr float kCovarianceMax = 1e18f;    // beyond, the determinant would overflow
 constexpr float kQuaternionMin = 1e-30f;   // largest component of a quaternion that still has a direction
@@ -167,6 +169,7 @@ __device__ __forceinline__ bool project(const ProjectionParams& params, const Ra
     splat.conic_b = -covariance * inverse_det;
     splat.conic_c = variance_x * inverse_det;
     splat.depth = point[2];
+    splat.inverse_sigma_y = 1.0f / sqrtf(variance_y);
 
     const float radius_x = ceilf(extent * sqrtf(variance_x)), radius_y = ceilf(extent * sqrtf(variance_y));
     if (!(radius_x > 0.0f || radius_y > 0.0f)) return false;
@@ -188,22 +191,25 @@ __device__ __forceinline__ uint32_t count_tiles(const RasterCamera& camera, cons
     return count;
 }
 
-__global__ void __launch_bounds__(kProjectionThreads) projection_kernel(const __grid_constant__ ProjectionParams params) {
+__global__ void __launch_bounds__(kProjectionGaussians* kProjectionSlices, 4)
+    projection_kernel(const __grid_constant__ ProjectionParams params) {
     extern __shared__ float4 shared_quads[];
     RasterCamera* cameras = reinterpret_cast<RasterCamera*>(shared_quads);
     float* coefficients = reinterpret_cast<float*>(cameras + params.num_views);
     const int row = 3 * params.bands;
 
+    const int thread = threadIdx.y * kProjectionGaussians + threadIdx.x;
+    const int threads = blockDim.y * kProjectionGaussians;
     {
         const int words = params.num_views * static_cast<int>(sizeof(RasterCamera) / sizeof(float4));
         const float4* in = reinterpret_cast<const float4*>(params.cameras);
-        for (int i = threadIdx.x; i < words; i += kProjectionThreads) shared_quads[i] = in[i];
+        for (int i = thread; i < words; i += threads) shared_quads[i] = in[i];
     }
-    const int first = blockIdx.x * kProjectionThreads;
+    const int first = blockIdx.x * kProjectionGaussians;
     if (params.sh_degree > 0) {
-        const int count = min(kProjectionThreads, params.num_gaussians - first) * row;
-        const float* in = params.shN + static_cast<size_t>(first) * row;  // 16-byte aligned: 128 rows
-        for (int i = 4 * threadIdx.x; i < count; i += 4 * kProjectionThreads) {
+        const int count = min(kProjectionGaussians, params.num_gaussians - first) * row;
+        const float* in = params.shN + static_cast<size_t>(first) * row;  // 16-byte aligned: 64 rows
+        for (int i = 4 * thread; i < count; i += 4 * threads) {
             if (i + 3 < count) {
                 *reinterpret_cast<float4*>(coefficients + i) = *reinterpret_cast<const float4*>(in + i);
             } else {
@@ -230,12 +236,11 @@ __global__ void __launch_bounds__(kProjectionThreads) projection_kernel(const __
     }
     Instance splat;
     splat.opacity = 1.0f / (1.0f + expf(-params.opacities[gaussian]));
-    splat.unused = 0.0f;
     const bool opaque = splat.opacity >= params.alpha_min;  // false for NaN
     splat.log_reach = logf(fmaxf(splat.opacity, params.alpha_min) / params.alpha_min);
     const float extent = fminf(kExtentMax, sqrtf(2.0f * splat.log_reach));
 
-    for (int view = 0; view < params.num_views; ++view) {
+    for (int view = threadIdx.y; view < params.num_views; view += blockDim.y) {
         const RasterCamera& camera = cameras[view];
         const size_t instance = static_cast<size_t>(view) * params.num_gaussians + gaussian;
         int2 radius = make_int2(0, 0);
@@ -253,7 +258,7 @@ __global__ void __launch_bounds__(kProjectionThreads) projection_kernel(const __
                 float4* out = reinterpret_cast<float4*>(params.instances + instance);
                 out[0] = make_float4(splat.x, splat.y, splat.conic_a, splat.conic_b);
                 out[1] = make_float4(splat.conic_c, splat.opacity, splat.depth, splat.log_reach);
-                out[2] = make_float4(splat.red, splat.green, splat.blue, splat.unused);
+                out[2] = make_float4(splat.red, splat.green, splat.blue, splat.inverse_sigma_y);
                 const uint32_t count = count_tiles(camera, params.active_prefix, splat);
                 if (count > 0) {
                     params.tile_counts[instance] = count;
@@ -280,9 +285,10 @@ cudaError_t launch_projection(const ProjectionParams& params, cudaStream_t strea
     }
     if (params.num_gaussians == 0) return cudaSuccess;
     const size_t shared = params.num_views * sizeof(RasterCamera) +
-                          (params.sh_degree > 0 ? kProjectionThreads * 3 * params.bands * sizeof(float) : 0);
-    const int blocks = (params.num_gaussians + kProjectionThreads - 1) / kProjectionThreads;
-    projection_kernel<<<blocks, kProjectionThreads, shared, stream>>>(params);
+                          (params.sh_degree > 0 ? kProjectionGaussians * 3 * params.bands * sizeof(float) : 0);
+    const int blocks = (params.num_gaussians + kProjectionGaussians - 1) / kProjectionGaussians;
+    const int slices = params.num_views < kProjectionSlices ? params.num_views : kProjectionSlices;
+    projection_kernel<<<blocks, dim3(kProjectionGaussians, slices), shared, stream>>>(params);
     return cudaGetLastError();
 }
 

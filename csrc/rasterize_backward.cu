@@ -1,29 +1,31 @@
 // Stage 5: from the gradients at the samples to a record for every splat on the screen, with the density sums.
 //
-// One warp takes one work item of the forward pass and walks back to front the splats that contributed to it (and no
-// others: the forward pass left their bits), 32 at a time. For every 32 samples it works in two phases that meet in shared
-// memory: first lane = sample, splat after splat, which recovers the transmittance and needs what lies behind as one number
-// a sample; this leaves (w, d loss / d sigma) of 32 x 32. Then lane = splat, sample after sample, which sums all
-// moments in the lane's own registers. So no value is ever reduced across lanes, and each splat ends in four 16-byte
-// atomic additions an item.
+// One warp takes one work item of the forward pass, 32 samples, and walks back to front the splats that contributed to it
+// (and no others: the forward pass left their bits), `kSplats` at a time, in two phases that meet in shared memory. First
+// lane = sample, splat after splat, which recovers the transmittance and needs what lies behind as one number a sample;
+// this leaves (w, d loss / d sigma) of kSplats x 32. Then lane = splat and a share of the samples, sample after sample,
+// which sums all moments in the lane's own registers. So next to nothing is reduced across lanes, and each splat ends in
+// four 16-byte atomic additions an item.
 #include "common.cuh"
 
 namespace turbogs {
 namespace {
 
-constexpr int kExchangeStride = kWarpSize + 1;  // float2: rows and columns are both read without bank conflicts
-
-// Samples of one group of 32.
-struct SampleGroup {
-    float4 position[kWarpSize];  // x, y, gradients of red and green
-    float4 rest[kWarpSize];      // gradient of blue, error, gradient of the depth sum, last pair (bits)
-    float2 state[kWarpSize];     // transmittance behind the splats walked so far; sum of w * (gradient . feature) behind
-};
+constexpr int kSplats = 16;                          // walked at once
+constexpr int kShares = kWarpSize / kSplats;         // lanes that sum for one splat
+constexpr int kShareSamples = kWarpSize / kShares;   // samples of such a lane
+constexpr int kExchangeStride = kWarpSize + 4;       // words: rows of float4 and columns are read without bank conflicts
+constexpr int kAhead = 4;                            // splats whose arithmetic overlaps
+constexpr int kListBuckets = 8;                      // buckets whose bits become a list at once: four lanes each
+constexpr float kTwoLn2 = 1.3862943611198906f;       // d sigma = 2 ln(2) (u du + v dv)
 
 struct BackwardShared {
-    float2 exchange[kWarpSize * kExchangeStride];  // [splat][sample]: w, d loss / d sigma
-    float4 splats[3][kWarpSize];                   // x, y, a/2, b | c/2, opacity, depth, pair (bits) | red, green, blue
-    int pending[2 * kWarpSize];                    // pairs to walk, back to front
+    float4 weights[kSplats * kExchangeStride / 4];  // [splat][sample]
+    float4 slopes[kSplats * kExchangeStride / 4];   // [splat][sample]: d loss / d sigma
+    float4 positions[kWarpSize];                    // of the samples: x, y, gradients of red and green
+    float4 others[kWarpSize];                       // gradient of blue, error, gradient of the depth sum
+    StagedSplat splats[kSplats];
+    int pending[kListBuckets * kBucket + kSplats];  // pairs to walk, back to front
 };
 
 __device__ __forceinline__ void add_quad(float* target, float x, float y, float z, float w) {
@@ -40,210 +42,256 @@ __device__ __forceinline__ void add_quad(float* target, float x, float y, float 
 #endif
 }
 
-// What a lane sums for its splat over the samples of the item.
-struct SplatSums {
-    float sigma = 0.0f;                       // d loss / d sigma
-    float mean_x = 0.0f, mean_y = 0.0f;       // d loss / d mean
-    float absolute_x = 0.0f, absolute_y = 0.0f;
-    float xx = 0.0f, xy = 0.0f, yy = 0.0f;    // second moments of d loss / d sigma
-    float red = 0.0f, green = 0.0f, blue = 0.0f;
-    float error = 0.0f, distance = 0.0f, weight = 0.0f;
-    float depth = 0.0f;
+// One sample while its splats are walked back to front.
+struct Sample {
+    float x, y;                            // in the tile's frame
+    float red, green, blue, depth;         // gradients; depth: of the sum
+    float transmittance = 1.0f;            // behind the splats walked so far
+    float behind = 0.0f;                   // sum of w * (gradient . feature) behind
+    int last = -1;                         // pair
 };
 
-// Reads the samples of a group: their upstream gradients and where the forward pass ended.
+// Reads a lane's sample: upstream gradients, and where the forward pass ended. Leaves in shared memory what phase 2 needs.
 template <bool kDepth>
-__device__ __forceinline__ void load_samples(const BackwardParams& params, int slot, int slot_end, int width,
-                                             SampleGroup& group, int lane) {
+__device__ __forceinline__ Sample load_sample(const BackwardParams& params, int slot, int slot_end, const TileFrame& frame,
+                                              BackwardShared& shared, int lane) {
     const ForwardParams& forward = params.forward;
     const int pixel = slot < slot_end ? forward.pixel_ids[slot] : -1;
-    float4 position = make_float4(0.0f, 0.0f, 0.0f, 0.0f), rest = make_float4(0.0f, 0.0f, 0.0f, __int_as_float(-1));
-    float2 state = make_float2(1.0f, 0.0f);
+    Sample sample = {};
+    float error = 0.0f;
     if (pixel >= 0) {
-        const int pixel_y = pixel / width;
-        position.x = static_cast<float>(pixel - pixel_y * width) + 0.5f;
-        position.y = static_cast<float>(pixel_y) + 0.5f;
-        position.z = params.color_gradients[3 * static_cast<size_t>(slot)];
-        position.w = params.color_gradients[3 * static_cast<size_t>(slot) + 1];
-        rest.x = params.color_gradients[3 * static_cast<size_t>(slot) + 2];
-        if (params.pixel_errors != nullptr) rest.y = params.pixel_errors[slot];
-        rest.w = __int_as_float(forward.last_pairs[slot]);
-        state.x = forward.transmittances[slot];
+        const float2 at = pixel_in_tile(frame, pixel);
+        sample.x = at.x;
+        sample.y = at.y;
+        const float* color = params.color_gradients + 3 * static_cast<size_t>(slot);
+        sample.red = color[0];
+        sample.green = color[1];
+        sample.blue = color[2];
+        if (params.pixel_errors != nullptr) error = params.pixel_errors[slot];
+        sample.last = forward.last_pairs[slot];
+        sample.transmittance = forward.transmittances[slot];
         float alpha_gradient = params.alpha_gradients != nullptr ? params.alpha_gradients[slot] : 0.0f;
         if (kDepth) {
             // depth = sum / max(alpha, tiny)
             const float alpha = forward.alphas[slot];
-            rest.z = params.depth_gradients[slot] / fmaxf(alpha, kAlphaTiny);
-            if (alpha > kAlphaTiny) alpha_gradient -= rest.z * forward.depths[slot];
+            sample.depth = params.depth_gradients[slot] / fmaxf(alpha, kAlphaTiny);
+            if (alpha > kAlphaTiny) alpha_gradient -= sample.depth * forward.depths[slot];
         }
         // alpha = 1 - transmittance: a background of value -1 per unit of its gradient.
-        state.y = -state.x * alpha_gradient;
+        sample.behind = -sample.transmittance * alpha_gradient;
     }
-    group.position[lane] = position;
-    group.rest[lane] = rest;
-    group.state[lane] = state;
+    shared.positions[lane] = make_float4(sample.x, sample.y, sample.red, sample.green);
+    shared.others[lane] = make_float4(sample.blue, error, sample.depth, 0.0f);
+    return sample;
 }
 
-// Phase 1, lane = sample: (w, d loss / d sigma) of each staged splat. True where any of them contributed.
+// Appends to the list the contributing splats of the buckets below `end`, at most kListBuckets of them, back to front.
+// Returns the new length.
+__device__ __forceinline__ int list_pairs(const uint32_t* masks, int chunks, int end, int length, int* pending, int lane) {
+    const int bucket = end - 1 - lane / 4, part = 3 - lane % 4;  // a lane takes 8 bits
+    uint32_t bits = bucket >= 0 ? masks[static_cast<size_t>(bucket) * chunks] >> (8 * part) & 0xFFu : 0u;
+    const int count = __popc(bits);
+    int sum = count;
+#pragma unroll
+    for (int step = 1; step < kWarpSize; step *= 2) {
+        const int below = __shfl_up_sync(kFullWarp, sum, step);
+        if (lane >= step) sum += below;
+    }
+    int place = length + sum - count;
+    while (bits != 0u) {
+        const int bit = 31 - __clz(bits);
+        pending[place++] = bucket * kBucket + 8 * part + bit;
+        bits ^= 1u << bit;
+    }
+    return length + __shfl_sync(kFullWarp, sum, kWarpSize - 1);
+}
+
+// Phase 1, lane = sample: (w, d loss / d sigma) of each staged splat. No branches, so that several splats overlap.
 template <bool kDepth>
-__device__ __forceinline__ bool exchange_splats(const ForwardParams& forward, BackwardShared& shared, SampleGroup& group,
-                                                int count, int lane) {
-    const float4 position = group.position[lane], rest = group.rest[lane];
-    const int last = __float_as_int(rest.w);
-    float2 state = group.state[lane];
-    bool any = false;
-#pragma unroll 2
-    for (int t = 0; t < count; ++t) {
-        const float4 shape = shared.splats[0][t], more = shared.splats[1][t];
-        const float sigma = splat_sigma(shape.z, shape.w, more.x, shape.x - position.x, shape.y - position.y);
-        const float raw = splat_alpha(more.y, sigma);
-        const float alpha = fminf(forward.alpha_max, raw);
-        float2 out = make_float2(0.0f, 0.0f);
-        if (sigma >= 0.0f && alpha >= forward.alpha_min && __float_as_int(more.w) <= last) {
-            const float4 color = shared.splats[2][t];
+__device__ __forceinline__ void exchange_splats(const ForwardParams& forward, float least_level, BackwardShared& shared,
+                                                Sample& sample, int count, int lane) {
+    float* weights = reinterpret_cast<float*>(shared.weights) + lane;
+    float* slopes = reinterpret_cast<float*>(shared.slopes) + lane;
+    for (int base = 0; base < count; base += kAhead) {
+#pragma unroll
+        for (int i = 0; i < kAhead; ++i) {
+            const float4 form = shared.splats[base + i].form, rest = shared.splats[base + i].rest;
+            const float4 color = shared.splats[base + i].color;
+            const float level = splat_level(form, rest, sample.x, sample.y);
+            const bool seen = level >= least_level && __float_as_int(rest.w) <= sample.last;
+            const float raw = seen ? blend_exp2(level) : 0.0f;
+            const float alpha = fminf(forward.alpha_max, raw);
             const float inverse = blend_reciprocal(1.0f - alpha);
-            state.x *= inverse;
-            out.x = alpha * state.x;
-            float feature = color.x * position.z + color.y * position.w + color.z * rest.x;
-            if (kDepth) feature += more.z * rest.z;
-            const float alpha_gradient = state.x * feature - state.y * inverse;
-            state.y += out.x * feature;
-            if (raw <= forward.alpha_max) out.y = -raw * alpha_gradient;
-            any = true;
+            sample.transmittance *= inverse;
+            const float weight = alpha * sample.transmittance;
+            float feature = color.x * sample.red + color.y * sample.green + color.z * sample.blue;
+            if (kDepth) feature += rest.z * sample.depth;
+            const float alpha_gradient = sample.transmittance * feature - sample.behind * inverse;
+            sample.behind += weight * feature;
+            weights[(base + i) * kExchangeStride] = weight;
+            slopes[(base + i) * kExchangeStride] = raw <= forward.alpha_max ? -raw * alpha_gradient : 0.0f;
         }
-        shared.exchange[t * kExchangeStride + lane] = out;
     }
-    group.state[lane] = state;
-    return any;
 }
 
-// Phase 2, lane = splat: adds the samples of a group to the lane's sums.
+// What a lane sums for its splat over samples; g is d loss / d sigma.
+struct SplatSums {
+    float slope = 0.0f;                        // g
+    float u = 0.0f, v = 0.0f;                  // g u, g v
+    float uu = 0.0f, uv = 0.0f, vv = 0.0f;     // g u^2, ...
+    float absolute_x = 0.0f, absolute_y = 0.0f;  // |g u|, |g (q u + r v)|
+    float red = 0.0f, green = 0.0f, blue = 0.0f, depth = 0.0f;
+    float error = 0.0f, distance = 0.0f, weight = 0.0f;
+};
+
+// Phase 2, lane = splat and share: adds the samples of the share to the lane's sums.
 template <bool kDepth, bool kDistance>
-__device__ __forceinline__ void sum_samples(const BackwardShared& shared, const SampleGroup& group, int count, int lane,
-                                            const float4& first, const float4& second, SplatSums& sums) {
-    const float a = first.z, b = first.w, c = second.x;
-#pragma unroll 4
-    for (int s = 0; s < count; ++s) {
-        const float2 pair = shared.exchange[lane * kExchangeStride + s];
-        const float4 position = group.position[s], rest = group.rest[s];
-        const float weight = pair.x, slope = pair.y;
-        const float dx = first.x - position.x, dy = first.y - position.y;
-        const float u = a * dx + b * dy, v = b * dx + c * dy;
-        const float slope_x = slope * dx, slope_y = slope * dy;
-        sums.sigma += slope;
-        sums.mean_x += slope * u;
-        sums.mean_y += slope * v;
-        sums.absolute_x += fabsf(slope) * fabsf(u);
-        sums.absolute_y += fabsf(slope) * fabsf(v);
-        sums.xx += slope_x * dx;
-        sums.xy += slope_x * dy;
-        sums.yy += slope_y * dy;
+__device__ __forceinline__ void sum_samples(const BackwardShared& shared, int row, int share, const StagedSplat& own,
+                                            SplatSums& sums) {
+    const float4* weights = shared.weights + (row * kExchangeStride + share * kShareSamples) / 4;
+    const float4* slopes = shared.slopes + (row * kExchangeStride + share * kShareSamples) / 4;
+    const float4* positions = shared.positions + share * kShareSamples;
+    const float4* others = shared.others + share * kShareSamples;
+    const auto add = [&](float weight, float slope, int s) {
+        const float4 position = positions[s], other = others[s];
+        const float2 f = splat_form(own.form, own.rest.x, position.x, position.y);
+        const float slope_u = slope * f.x, slope_v = slope * f.y;
+        sums.slope += slope;
+        sums.u += slope_u;
+        sums.v += slope_v;
+        sums.uu += slope_u * f.x;
+        sums.uv += slope_u * f.y;
+        sums.vv += slope_v * f.y;
+        sums.absolute_x += fabsf(slope_u);
+        sums.absolute_y += fabsf(own.form.y * slope_u + own.form.z * slope_v);
         sums.red += weight * position.z;
         sums.green += weight * position.w;
-        sums.blue += weight * rest.x;
-        sums.error += weight * rest.y;
+        sums.blue += weight * other.x;
+        sums.error += weight * other.y;
         sums.weight += weight;
-        if (kDepth) sums.depth += weight * rest.z;
-        if (kDistance) sums.distance += weight * blend_sqrt(fmaxf(0.0f, dx * u + dy * v));
+        if (kDepth) sums.depth += weight * other.z;
+        if (kDistance) sums.distance += weight * blend_sqrt(f.x * f.x + f.y * f.y);
+    };
+#pragma unroll 2
+    for (int s = 0; s < kShareSamples; s += 4) {
+        const float4 weight = weights[s / 4], slope = slopes[s / 4];
+        add(weight.x, slope.x, s);
+        add(weight.y, slope.y, s + 1);
+        add(weight.z, slope.z, s + 2);
+        add(weight.w, slope.w, s + 3);
+    }
+}
+
+// From sums over u and v to the record: those of x and y, and of the conic.
+__device__ __forceinline__ void make_record(const StagedSplat& own, const SplatSums& sums, float record[kGradientFloats]) {
+    const float p = own.form.x, q = own.form.y, r = own.form.z;
+    const float inverse_p = 1.0f / p, inverse_r = 1.0f / r, skew = q * inverse_r;  // dy = v / r, dx = (u - skew v) / p
+    record[0] = kTwoLn2 * p * sums.u;
+    record[1] = kTwoLn2 * (q * sums.u + r * sums.v);
+    record[2] = 0.5f * (sums.uu - 2.0f * skew * sums.uv + skew * skew * sums.vv) * inverse_p * inverse_p;
+    record[3] = (sums.uv - skew * sums.vv) * inverse_p * inverse_r;
+    record[4] = 0.5f * sums.vv * inverse_r * inverse_r;
+    record[5] = sums.red;
+    record[6] = sums.green;
+    record[7] = sums.blue;
+    record[8] = -sums.slope * exp2f(-own.rest.y);  // the level is log2 of the opacity
+    record[9] = kTwoLn2 * p * sums.absolute_x;
+    record[10] = kTwoLn2 * sums.absolute_y;
+    record[11] = sums.error;
+    record[12] = sqrtf(kTwoLn2) * sums.distance;
+    record[13] = sums.weight;
+    record[14] = sums.depth;
+    record[15] = 0.0f;
+}
+
+// Adds the records of the lanes that share a splat, and sends them to memory.
+__device__ __forceinline__ void send_record(float* target, const float record[kGradientFloats], bool live, int share) {
+    if (kShares == 1) {
+        if (!live) return;
+#pragma unroll
+        for (int i = 0; i < kGradientFloats; i += 4) {
+            add_quad(target + i, record[i], record[i + 1], record[i + 2], record[i + 3]);
+        }
+    } else {
+        // Two lanes: each takes over half of the record.
+        static_assert(kShares <= 2, "two lanes share a splat");
+        constexpr int kHalf = kGradientFloats / 2;
+        float sum[kHalf];
+#pragma unroll
+        for (int i = 0; i < kHalf; ++i) {
+            const float kept = share ? record[kHalf + i] : record[i], sent = share ? record[i] : record[kHalf + i];
+            sum[i] = kept + __shfl_xor_sync(kFullWarp, sent, kSplats);
+        }
+        if (!live) return;
+        target += share * kHalf;
+        add_quad(target, sum[0], sum[1], sum[2], sum[3]);
+        add_quad(target + 4, sum[4], sum[5], sum[6], sum[7]);
     }
 }
 
 template <bool kDepth, bool kDistance>
 __global__ void __launch_bounds__(kWarpSize) backward_kernel(const __grid_constant__ BackwardParams params) {
-    extern __shared__ float4 shared_memory[];
-    BackwardShared& shared = *reinterpret_cast<BackwardShared*>(shared_memory);
-    SampleGroup* groups = reinterpret_cast<SampleGroup*>(&shared + 1);
+    __shared__ BackwardShared shared;
     const ForwardParams& forward = params.forward;
-    const int lane = threadIdx.x;
+    const int lane = threadIdx.x, row = lane % kSplats, share = lane / kSplats;
     const int item = blockIdx.x;
     const int num_buckets = forward.bucket_counts[item];
     if (num_buckets == 0) return;
 
     const int tile = item / forward.chunks, chunk = item - tile * forward.chunks;
-    const int tile_id = forward.tile_ids != nullptr ? forward.tile_ids[tile] : tile;
-    const int width = forward.cameras[view_of_tile(forward.cameras, forward.num_views, tile_id)].width;
+    const TileFrame frame =
+        tile_frame(forward.cameras, forward.num_views, forward.tile_ids != nullptr ? forward.tile_ids[tile] : tile);
     const uint32_t first_pair = forward.tile_starts[tile];
     const uint32_t* masks = forward.masks + static_cast<size_t>(first_pair / kBucket + tile) * forward.chunks + chunk;
     const int slot_end = forward.tile_offsets[tile + 1];
-    const int chunk_slots = forward.samples_per_lane * kWarpSize;
+    const float least_level = log2f(forward.alpha_min);
 
-    for (int slot_base = forward.tile_offsets[tile] + chunk * chunk_slots; slot_base < slot_end;
-         slot_base += forward.chunks * chunk_slots) {
-        const int num_slots = min(chunk_slots, slot_end - slot_base);
-        const int num_groups = (num_slots + kWarpSize - 1) / kWarpSize;
-        __syncwarp();
-        for (int g = 0; g < num_groups; ++g) {
-            load_samples<kDepth>(params, slot_base + g * kWarpSize + lane, slot_end, width, groups[g], lane);
-        }
-
-        int filled = 0;
-        uint32_t words = 0;  // lane i: the mask of the i-th bucket from the one where the words were last read
-        for (int step = 0; step <= num_buckets; ++step) {
-            // Collect the contributing splats of one more bucket, back to front; the last step flushes.
-            if (step % kWarpSize == 0) {
-                const int bucket = num_buckets - 1 - step - lane;
-                words = bucket >= 0 ? masks[static_cast<size_t>(bucket) * forward.chunks] : 0u;
+    for (int slot_base = forward.tile_offsets[tile] + chunk * kWarpSize; slot_base < slot_end;
+         slot_base += forward.chunks * kWarpSize) {
+        Sample sample = load_sample<kDepth>(params, slot_base + lane, slot_end, frame, shared, lane);
+        int buckets_left = num_buckets, begin = 0, end = 0;  // of the list
+        while (true) {
+            if (end - begin < kSplats && buckets_left > 0) {
+                const int left = end - begin;
+                const int moved = lane < left ? shared.pending[begin + lane] : 0;
+                __syncwarp();
+                if (lane < left) shared.pending[lane] = moved;
+                begin = 0;
+                end = list_pairs(masks, forward.chunks, buckets_left, left, shared.pending, lane);
+                buckets_left -= kListBuckets;
+                __syncwarp();
+                continue;
             }
-            const uint32_t mask = __shfl_sync(kFullWarp, words, step % kWarpSize);
-            if (mask >> lane & 1u) {
-                shared.pending[filled + __popc(mask >> lane) - 1] = (num_buckets - 1 - step) * kBucket + lane;
-            }
-            filled += __popc(mask);
-            const int count = min(filled, kWarpSize);
-            if (count < (step < num_buckets ? kWarpSize : 1)) continue;
-            __syncwarp();
+            const int count = min(end - begin, kSplats);
+            if (count == 0) break;
 
             // Stage them; each lane also keeps its own.
             uint32_t instance = 0;
-            int pair = 0;
-            float4 first = make_float4(0.0f, 0.0f, 0.0f, 0.0f), second = first, third = first;
-            if (lane < count) {
-                pair = shared.pending[lane];
+            StagedSplat own = no_splat();
+            if (row < count) {
+                const int pair = shared.pending[begin + row];
                 instance = forward.pair_ids[first_pair + static_cast<uint32_t>(pair)];
-                const float4* splat = reinterpret_cast<const float4*>(forward.instances + instance);
-                first = __ldg(splat);
-                second = __ldg(splat + 1);
-                third = __ldg(splat + 2);
+                own = load_splat(forward.instances, instance);
+                stage_splat(own, frame.x, frame.y, least_level, pair, 0u);
             }
-            const int left = filled - count;
-            const int moved = lane < left ? shared.pending[kWarpSize + lane] : 0;
-            shared.splats[0][lane] = make_float4(first.x, first.y, 0.5f * first.z, first.w);
-            shared.splats[1][lane] = make_float4(0.5f * second.x, second.y, second.z, __int_as_float(pair));
-            shared.splats[2][lane] = third;
+            if (share == 0) shared.splats[row] = own;
+            begin += count;
             __syncwarp();
-            if (lane < left) shared.pending[lane] = moved;
-            filled = left;
-
-            const int front = __shfl_sync(kFullWarp, pair, count - 1);  // the pair nearest to the camera
+            exchange_splats<kDepth>(forward, least_level, shared, sample, count, lane);
+            __syncwarp();
             SplatSums sums;
-            for (int g = 0; g < num_groups; ++g) {
-                const int last = __float_as_int(groups[g].rest[lane].w);
-                if (!__any_sync(kFullWarp, last >= front)) continue;
-                const bool any = exchange_splats<kDepth>(forward, shared, groups[g], count, lane);
-                if (__any_sync(kFullWarp, any)) {
-                    __syncwarp();
-                    sum_samples<kDepth, kDistance>(shared, groups[g], min(kWarpSize, num_slots - g * kWarpSize), lane, first,
-                                                   second, sums);
-                }
-                __syncwarp();
-            }
-
-            if (lane < count && sums.weight > 0.0f) {
-                float* record = params.screen_gradients + static_cast<size_t>(instance) * kGradientFloats;
-                add_quad(record, sums.mean_x, sums.mean_y, 0.5f * sums.xx, sums.xy);
-                add_quad(record + 4, 0.5f * sums.yy, sums.red, sums.green, sums.blue);
-                add_quad(record + 8, -sums.sigma / second.y, sums.absolute_x, sums.absolute_y, sums.error);
-                add_quad(record + 12, sums.distance, sums.weight, sums.depth, 0.0f);
-            }
+            sum_samples<kDepth, kDistance>(shared, row, share, own, sums);
+            float record[kGradientFloats];
+            make_record(own, sums, record);
+            send_record(params.screen_gradients + static_cast<size_t>(instance) * kGradientFloats, record, row < count, share);
         }
+        __syncwarp();
     }
 }
 
 template <bool kDepth, bool kDistance>
 cudaError_t launch(const BackwardParams& params, cudaStream_t stream) {
-    const size_t bytes = sizeof(BackwardShared) + params.forward.samples_per_lane * sizeof(SampleGroup);
-    backward_kernel<kDepth, kDistance>
-        <<<params.forward.num_active * params.forward.chunks, kWarpSize, bytes, stream>>>(params);
+    backward_kernel<kDepth, kDistance><<<params.forward.num_active * params.forward.chunks, kWarpSize, 0, stream>>>(params);
     return cudaGetLastError();
 }
 
@@ -252,7 +300,9 @@ cudaError_t launch(const BackwardParams& params, cudaStream_t stream) {
 cudaError_t launch_rasterize_backward(const BackwardParams& params, cudaStream_t stream) {
     if (params.num_instances == 0) return cudaSuccess;
     const size_t bytes = sizeof(float) * kGradientFloats * static_cast<size_t>(params.num_instances);
-    if (const cudaError_t error = cudaMemsetAsync(params.screen_gradients, 0, bytes, stream)) return error;
+    if (!params.cleared) {
+        if (const cudaError_t error = cudaMemsetAsync(params.screen_gradients, 0, bytes, stream)) return error;
+    }
     if (params.forward.num_active * params.forward.chunks == 0) return cudaSuccess;
     const bool depth = params.depth_gradients != nullptr;
     if (params.with_distances) return depth ? launch<true, true>(params, stream) : launch<false, true>(params, stream);

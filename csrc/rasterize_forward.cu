@@ -1,116 +1,137 @@
 // Stage 4: colour, alpha and, when asked, depth at the sampled pixels.
 //
-// One warp renders one work item: up to 32 * samples_per_lane samples of one active tile, with the state of every pixel in
-// registers, so work follows the samples and no warp waits for another. Splats are staged 32 at a time in the warp's own
-// shared memory, the next 32 being fetched meanwhile, and read from there by all lanes at once. For the backward pass the
-// warp leaves one bit for each staged splat that contributed to any of its samples.
+// One warp renders one work item: 32 samples of one active tile, a lane each, with the state of the pixel in registers, so
+// work follows the samples and no warp waits for another. Splats come 32 at a time, one to a lane, the next 32 being
+// fetched meanwhile; each lane drops its splat where it reaches none of the warp's samples, and the others are read from
+// the warp's own shared memory by all lanes at once. For the backward pass the warp leaves one bit for each splat that
+// contributed to any of its samples.
 #include "common.cuh"
 
 namespace turbogs {
 namespace {
 
-constexpr int kForwardWarps = 2;  // of a block; they share nothing
+constexpr int kForwardWarps = 4;  // of a block; they share nothing but the first-level cache
+constexpr int kAhead = 4;         // splats whose alphas are computed before the first is blended
 
-struct Splat {
-    float4 quads[3];
+// Smallest box around the samples of a warp, in the tile's frame.
+struct SampleBox {
+    float x0, x1, y0, y1;
 };
 
-__device__ __forceinline__ Splat load_splat(const Instance* __restrict__ instances, uint32_t instance) {
-    const float4* in = reinterpret_cast<const float4*>(instances + instance);
-    return {{__ldg(in), __ldg(in + 1), __ldg(in + 2)}};
+__device__ __forceinline__ SampleBox box_of_samples(bool filled, float2 pixel) {
+    const float huge = 1e9f;
+    SampleBox box = {filled ? pixel.x : huge, filled ? pixel.x : -huge, filled ? pixel.y : huge, filled ? pixel.y : -huge};
+#pragma unroll
+    for (int step = kWarpSize / 2; step > 0; step /= 2) {
+        box.x0 = fminf(box.x0, __shfl_xor_sync(kFullWarp, box.x0, step));
+        box.x1 = fmaxf(box.x1, __shfl_xor_sync(kFullWarp, box.x1, step));
+        box.y0 = fminf(box.y0, __shfl_xor_sync(kFullWarp, box.y0, step));
+        box.y1 = fmaxf(box.y1, __shfl_xor_sync(kFullWarp, box.y1, step));
+    }
+    return box;
 }
 
-template <int kPerLane, bool kDepth>
+// Whether a splat may be seen within the box. The least u^2 + v^2 of a box lies at the mean, or on an edge that faces it: on
+// the line of the y nearest to the mean's or of the x nearest to it.
+__device__ __forceinline__ bool reaches_box(const StagedSplat& splat, float mean_x, float mean_y, const SampleBox& box,
+                                            float least_level) {
+    const float p = splat.form.x, q = splat.form.y, r = splat.form.z, u = splat.form.w, v = splat.rest.x;
+    const float near_x = fminf(fmaxf(mean_x, box.x0), box.x1), near_y = fminf(fmaxf(mean_y, box.y0), box.y1);
+    const float best_x = fminf(fmaxf(fmaf(-q, near_y, u) * blend_reciprocal(p), box.x0), box.x1);
+    const float partial = fmaf(-p, near_x, u);
+    const float best_y = fminf(fmaxf(fmaf(q, partial, r * v) * blend_reciprocal(fmaf(q, q, r * r)), box.y0), box.y1);
+    const float level = fmaxf(splat_level(splat.form, splat.rest, best_x, near_y),
+                              splat_level(splat.form, splat.rest, near_x, best_y));
+    return !(level < least_level - 0.01f);  // room for rounding; NaN stays
+}
+
+template <bool kDepth>
 __global__ void __launch_bounds__(kForwardWarps * kWarpSize) forward_kernel(const __grid_constant__ ForwardParams params) {
-    __shared__ float4 staged_splats[kForwardWarps][3][kBucket];
+    __shared__ StagedSplat staged_splats[kForwardWarps][kBucket];
     const int lane = threadIdx.x % kWarpSize;
     const int item = blockIdx.x * kForwardWarps + threadIdx.x / kWarpSize;
+    for (size_t i = blockIdx.x * blockDim.x + threadIdx.x; i < params.num_cleared; i += gridDim.x * blockDim.x) {
+        params.cleared[i] = make_float4(0.0f, 0.0f, 0.0f, 0.0f);
+    }
     if (item >= params.num_active * params.chunks) return;
-    float4(*staged)[kBucket] = staged_splats[threadIdx.x / kWarpSize];
+    StagedSplat* staged = staged_splats[threadIdx.x / kWarpSize];
 
     const int tile = item / params.chunks, chunk = item - tile * params.chunks;
-    const int tile_id = params.tile_ids != nullptr ? params.tile_ids[tile] : tile;
-    const int width = params.cameras[view_of_tile(params.cameras, params.num_views, tile_id)].width;
+    const TileFrame frame =
+        tile_frame(params.cameras, params.num_views, params.tile_ids != nullptr ? params.tile_ids[tile] : tile);
     const uint32_t first_pair = params.tile_starts[tile];
     const int num_pairs = static_cast<int>(params.tile_starts[tile + 1] - first_pair);
     const int num_buckets = (num_pairs + kBucket - 1) / kBucket;
     const uint32_t* pair_ids = params.pair_ids + first_pair;
     uint32_t* masks = params.masks + static_cast<size_t>(first_pair / kBucket + tile) * params.chunks + chunk;
     const int slot_end = params.tile_offsets[tile + 1];
-    constexpr int kChunkSlots = kPerLane * kWarpSize;
+    const float least_level = log2f(params.alpha_min);
+    const float never = __int_as_float(0x7F800000);
 
     int walked = 0;
-    for (int slot_base = params.tile_offsets[tile] + chunk * kChunkSlots; slot_base < slot_end;
-         slot_base += params.chunks * kChunkSlots) {
-        // A pixel that has ended, or an empty slot, has x = NaN: it then fails every test below.
-        const float ended_x = __int_as_float(0x7FFFFFFF);
-        float x[kPerLane], y[kPerLane], transmittance[kPerLane], red[kPerLane], green[kPerLane], blue[kPerLane], depth[kPerLane];
-        int last[kPerLane];
-#pragma unroll
-        for (int i = 0; i < kPerLane; ++i) {
-            const int slot = slot_base + i * kWarpSize + lane;
-            const int pixel = slot < slot_end ? params.pixel_ids[slot] : -1;
-            const int pixel_y = pixel / width;
-            x[i] = pixel < 0 ? ended_x : static_cast<float>(pixel - pixel_y * width) + 0.5f;
-            y[i] = static_cast<float>(pixel_y) + 0.5f;
-            transmittance[i] = 1.0f;
-            red[i] = green[i] = blue[i] = depth[i] = 0.0f;
-            last[i] = -1;
-        }
+    for (int slot_base = params.tile_offsets[tile] + chunk * kWarpSize; slot_base < slot_end;
+         slot_base += params.chunks * kWarpSize) {
+        const int slot = slot_base + lane;
+        const int pixel = slot < slot_end ? params.pixel_ids[slot] : -1;
+        const float2 at = pixel_in_tile(frame, max(pixel, 0));
+        const SampleBox box = box_of_samples(pixel >= 0, at);
+        // Level from which a splat is seen: never at a pixel that has ended, or at an empty slot.
+        float threshold = pixel >= 0 ? least_level : never;
+        float transmittance = 1.0f, red = 0.0f, green = 0.0f, blue = 0.0f, depth = 0.0f;
+        int last = -1;
 
         // Two steps ahead the identity of the splat to stage, one step ahead the splat.
-        Splat next = {};
+        StagedSplat next = {};
         uint32_t next_id = 0;
         if (lane < num_pairs) next = load_splat(params.instances, pair_ids[lane]);
         if (kBucket + lane < num_pairs) next_id = pair_ids[kBucket + lane];
 
         int bucket = 0;
         for (; bucket < num_buckets; ++bucket) {
-            bool alive = false;
-#pragma unroll
-            for (int i = 0; i < kPerLane; ++i) alive |= x[i] == x[i];
-            if (!__any_sync(kFullWarp, alive)) break;
+            if (!__any_sync(kFullWarp, threshold < never)) break;
 
+            const int own = bucket * kBucket + lane;
+            StagedSplat splat = next;
+            bool kept = own < num_pairs;
+            if (own + kBucket < num_pairs) next = load_splat(params.instances, next_id);
+            if (own + 2 * kBucket < num_pairs) next_id = pair_ids[own + 2 * kBucket];
+            if (kept) {
+                const float mean_x = splat.form.x - frame.x, mean_y = splat.form.y - frame.y;
+                stage_splat(splat, frame.x, frame.y, least_level, own, 1u << lane);
+                kept = reaches_box(splat, mean_x, mean_y, box, least_level);
+            }
+            const uint32_t keepers = __ballot_sync(kFullWarp, kept);
+            const int count = __popc(keepers);
             __syncwarp();
-            staged[0][lane] = make_float4(next.quads[0].x, next.quads[0].y, 0.5f * next.quads[0].z, next.quads[0].w);
-            staged[1][lane] = make_float4(0.5f * next.quads[1].x, next.quads[1].y, next.quads[1].z, 0.0f);
-            staged[2][lane] = next.quads[2];
+            const uint32_t below = (1u << lane) - 1u;
+            if (kept) staged[__popc(keepers & below)] = splat;
+            else staged[count + __popc(~keepers & below)] = no_splat();
             __syncwarp();
-            const int first = bucket * kBucket;
-            if (first + kBucket + lane < num_pairs) next = load_splat(params.instances, next_id);
-            if (first + 2 * kBucket + lane < num_pairs) next_id = pair_ids[first + 2 * kBucket + lane];
 
             uint32_t contributed = 0;
-            const int count = min(kBucket, num_pairs - first);
-#pragma unroll 2
-            for (int t = 0; t < count; ++t) {
-                const float4 shape = staged[0][t];  // x, y, a / 2, b
-                const float4 rest = staged[1][t];   // c / 2, opacity, depth
-                float alpha[kPerLane];
-                bool seen[kPerLane];
+            for (int base = 0; base < count; base += kAhead) {
+                float levels[kAhead];
 #pragma unroll
-                for (int i = 0; i < kPerLane; ++i) {
-                    const float sigma = splat_sigma(shape.z, shape.w, rest.x, shape.x - x[i], shape.y - y[i]);
-                    alpha[i] = fminf(params.alpha_max, splat_alpha(rest.y, sigma));
-                    seen[i] = sigma >= 0.0f && alpha[i] >= params.alpha_min;
+                for (int i = 0; i < kAhead; ++i) {
+                    levels[i] = splat_level(staged[base + i].form, staged[base + i].rest, at.x, at.y);
                 }
 #pragma unroll
-                for (int i = 0; i < kPerLane; ++i) {
-                    if (!seen[i]) continue;
-                    const float behind = transmittance[i] * (1.0f - alpha[i]);
+                for (int i = 0; i < kAhead; ++i) {
+                    if (!(levels[i] >= threshold)) continue;
+                    const float weight = fminf(params.alpha_max, blend_exp2(levels[i])) * transmittance;
+                    const float behind = transmittance - weight;
                     if (behind <= params.transmittance_min) {
-                        x[i] = ended_x;
+                        threshold = never;
                         continue;
                     }
-                    const float4 color = staged[2][t];
-                    const float weight = alpha[i] * transmittance[i];
-                    red[i] += weight * color.x;
-                    green[i] += weight * color.y;
-                    blue[i] += weight * color.z;
-                    if (kDepth) depth[i] += weight * rest.z;
-                    transmittance[i] = behind;
-                    last[i] = first + t;
-                    contributed |= 1u << t;
+                    const StagedSplat& seen = staged[base + i];
+                    red += weight * seen.color.x;
+                    green += weight * seen.color.y;
+                    blue += weight * seen.color.z;
+                    if (kDepth) depth += weight * seen.rest.z;
+                    transmittance = behind;
+                    last = __float_as_int(seen.rest.w);
+                    contributed |= __float_as_uint(seen.color.w);
                 }
             }
             contributed = __reduce_or_sync(kFullWarp, contributed);
@@ -121,27 +142,18 @@ __global__ void __launch_bounds__(kForwardWarps * kWarpSize) forward_kernel(cons
         }
         walked = max(walked, bucket);
 
-#pragma unroll
-        for (int i = 0; i < kPerLane; ++i) {
-            const int slot = slot_base + i * kWarpSize + lane;
-            if (slot >= slot_end) continue;
-            const float alpha = 1.0f - transmittance[i];
-            params.colors[3 * static_cast<size_t>(slot)] = red[i];
-            params.colors[3 * static_cast<size_t>(slot) + 1] = green[i];
-            params.colors[3 * static_cast<size_t>(slot) + 2] = blue[i];
+        if (slot < slot_end) {
+            const float alpha = 1.0f - transmittance;
+            params.colors[3 * static_cast<size_t>(slot)] = red;
+            params.colors[3 * static_cast<size_t>(slot) + 1] = green;
+            params.colors[3 * static_cast<size_t>(slot) + 2] = blue;
             params.alphas[slot] = alpha;
-            params.transmittances[slot] = transmittance[i];
-            params.last_pairs[slot] = last[i];
-            if (kDepth) params.depths[slot] = depth[i] / fmaxf(alpha, kAlphaTiny);
+            params.transmittances[slot] = transmittance;
+            params.last_pairs[slot] = last;
+            if (kDepth) params.depths[slot] = depth / fmaxf(alpha, kAlphaTiny);
         }
     }
     if (lane == 0) params.bucket_counts[item] = walked;
-}
-
-template <int kPerLane>
-void launch(const ForwardParams& params, int blocks, cudaStream_t stream) {
-    if (params.with_depth) forward_kernel<kPerLane, true><<<blocks, kForwardWarps * kWarpSize, 0, stream>>>(params);
-    else forward_kernel<kPerLane, false><<<blocks, kForwardWarps * kWarpSize, 0, stream>>>(params);
 }
 
 }  // namespace
@@ -150,13 +162,8 @@ cudaError_t launch_rasterize_forward(const ForwardParams& params, cudaStream_t s
     const int items = params.num_active * params.chunks;
     if (items == 0) return cudaSuccess;
     const int blocks = (items + kForwardWarps - 1) / kForwardWarps;
-    switch (params.samples_per_lane) {
-        case 1: launch<1>(params, blocks, stream); break;
-        case 2: launch<2>(params, blocks, stream); break;
-        case 3: launch<3>(params, blocks, stream); break;
-        case 4: launch<4>(params, blocks, stream); break;
-        default: return cudaErrorInvalidValue;
-    }
+    if (params.with_depth) forward_kernel<true><<<blocks, kForwardWarps * kWarpSize, 0, stream>>>(params);
+    else forward_kernel<false><<<blocks, kForwardWarps * kWarpSize, 0, stream>>>(params);
     return cudaGetLastError();
 }
 

@@ -133,7 +133,7 @@ def test_wrong_input_says_what_was_wanted(case):
         rendered.backward(torch.zeros_like(rendered.colors), depth_gradients=torch.zeros_like(rendered.alphas))
     with pytest.raises(RuntimeError, match=r"pixel_ids must be a contiguous Int"):
         forward = rendered._forward
-        torch.ops.turbogs.raster_forward(*forward._replace(pixel_ids=forward.pixel_ids.long()))
+        torch.ops.turbogs.raster_forward(*forward._replace(pixel_ids=forward.pixel_ids.long()), None)
 
 
 def test_workspace_gives_the_same_and_does_not_wait(case):

@@ -34,9 +34,6 @@ WARP = 32
 NARROW_TILES = 1 << 16
 """Fewer active tiles than this sort on 16-bit keys."""
 
-WORK_SHAPES = ((1, 1), (2, 1), (3, 1), (4, 1), (3, 2), (3, 2), (4, 2), (4, 2))
-"""Samples per lane, and warps that share a tile, for tiles of up to 32, 64, ... 256 samples."""
-
 
 class _FreshBuffers:
     """Buffers of a pass without a workspace."""
@@ -84,10 +81,9 @@ def _pair_scratch(device: int, capacity: int, tiles: int, narrow: bool) -> int:
         return torch.ops.turbogs.raster_sort_pairs_scratch(capacity, tiles, narrow)
 
 
-def work_shape(slots: int, tiles: int) -> tuple[int, int]:
-    """Samples per lane and warps per tile for tiles of this many slots on average."""
-    groups = max(1, -(-slots // (max(1, tiles) * WARP)))
-    return WORK_SHAPES[min(groups, len(WORK_SHAPES)) - 1]
+def warps_per_tile(slots: int, tiles: int) -> int:
+    """Work items of a tile, 32 slots each, for tiles of this many slots on average; fuller ones take several rounds."""
+    return max(1, -(-slots // (max(1, tiles) * WARP)))
 
 
 class ForwardArguments(NamedTuple):
@@ -108,7 +104,6 @@ class ForwardArguments(NamedTuple):
     masks: Tensor  # [(M / 32 + T + 1) * chunks]
     bucket_counts: Tensor  # [T * chunks]
     chunks: int
-    samples_per_lane: int
     alpha_min: float
     alpha_max: float
     transmittance_min: float
@@ -176,6 +171,7 @@ class CudaRendered:
     _buffers: _FreshBuffers | Workspace = field(repr=False)
     _radii: Tensor = field(repr=False)  # [K, N, 2]
     _forward: ForwardArguments = field(repr=False)
+    _cleared: bool = field(repr=False)  # the forward pass has set the workspace's records to zero for one backward pass
 
     @torch.no_grad()
     def projected(self) -> Projected:
@@ -229,7 +225,9 @@ class CudaRendered:
             ready.get("pixel_errors"),
             records,
             stats is not None,
+            self._cleared,
         )
+        self._cleared = False
         return CudaScreenGradients(
             gaussians=self._gaussians,
             cameras=self._cameras,
@@ -339,7 +337,7 @@ def rasterize_cuda(
     if workspace is not None:
         workspace.send_count(num_active)
 
-    samples_per_lane, chunks = work_shape(slots, num_active)
+    chunks = warps_per_tile(slots, num_active)
     colors = torch.empty(slots, 3, device=device)
     alphas = torch.empty(slots, device=device)
     depths = torch.empty(slots, device=device) if with_depth else None
@@ -359,12 +357,13 @@ def rasterize_cuda(
         masks=integers("masks", (capacity // WARP + num_active + 1) * chunks),
         bucket_counts=integers("bucket_counts", num_active * chunks),
         chunks=chunks,
-        samples_per_lane=samples_per_lane,
         alpha_min=settings.alpha_min,
         alpha_max=settings.alpha_max,
         transmittance_min=settings.transmittance_min,
     )
-    torch.ops.turbogs.raster_forward(*forward)
+    # With a workspace a backward pass is likely to follow.
+    cleared = floats("records", total, RECORD_FLOATS) if workspace is not None and num_active > 0 else None
+    torch.ops.turbogs.raster_forward(*forward, cleared)
     return CudaRendered(
         colors=colors,
         alphas=alphas,
@@ -378,6 +377,7 @@ def rasterize_cuda(
         _buffers=buffers,
         _radii=radii,
         _forward=forward,
+        _cleared=cleared is not None,
     )
 
 
