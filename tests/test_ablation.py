@@ -57,9 +57,35 @@ def test_every_packaged_ablation_resolves_and_its_variants_differ(name):
 
 def test_the_tables_of_the_paper_are_there():
     assert set(ablation_names()) >= {"components", "replacements", "optimizer", "views", "hard_ratio", "schedule"}
-    assert list(load_ablation("components").variants) == ["3dgs", "+err-sps", "+geo-vs", "+sparse-ncc", "+err-dp"]
-    full = variant_config(load_ablation("components"), "+err-dp", 0, (), None)
-    assert full.to_yaml() == load_config("turbogs").to_yaml()
+    components = load_ablation("components")
+    assert list(components.variants)[:5] == ["3dgs", "+err-sps", "+geo-vs", "+sparse-ncc", "+err-dp"]
+    assert variant_config(components, "turbogs", 0, (), None).to_yaml() == load_config("turbogs").to_yaml()
+
+
+@pytest.mark.parametrize("name", ablation_names())
+def test_what_a_variant_does_not_name_is_as_in_the_base(name):
+    """A new type starts its section afresh: an option that both types have must not change unnoticed."""
+    ablation = load_ablation(name)
+    base = _flat(load_config(ablation.base).to_mapping())
+    for variant, overrides in ablation.variants.items():
+        named = {override.partition("=")[0] for override in overrides}
+        mapping = _flat(variant_config(ablation, variant, 0, (), None).to_mapping())
+        changed = {key for key, value in mapping.items() if key in base and base[key] != value} - named
+        assert changed <= DEFAULTS_THAT_DIFFER.get(variant, set()), variant
+
+
+DEFAULTS_THAT_DIFFER = {
+    "3dgs": {"optimizer.learning_rates.final_factor", "optimizer.eps"},
+    "sparse-adam": {"optimizer.eps"},
+}
+"""A type's own values, where a variant is meant to have them."""
+
+
+def _flat(mapping: dict, place: str = "") -> dict:
+    result = {}
+    for key, value in mapping.items():
+        result |= _flat(value, f"{place}{key}.") if isinstance(value, dict) else {f"{place}{key}": value}
+    return result
 
 
 def test_another_length_scales_what_counts_iterations_and_nothing_else():

@@ -117,6 +117,6 @@ def warm_up(config: Config, scene: Scene, device: torch.device, iterations: int)
             trainer.repeat_lost(wait=True)
     evaluate(trainer.gaussians, scene.test, trainer.sh_degree, config.raster)
     del trainer
-    gc.collect()
     if device.type == "cuda":
+        gc.collect()
         torch.cuda.empty_cache()

@@ -20,9 +20,9 @@ from turbogs_plugin.files import write_text_atomically
 MIB = 2**20
 
 HOW_TO_READ = (
-    "A number is the mean over seeds, with the smallest and the largest in brackets. Two variants are called different "
-    "only where these ranges do not overlap; with one seed that stays open. A star marks the Pareto front: no other "
-    "variant is at least as fast and as good."
+    "A number is the mean over seeds, the smallest and the largest in brackets where they matter. Two variants are "
+    "called different only where these ranges do not overlap; with one seed that stays open. A star marks the Pareto "
+    "front: no other variant is at least as fast and as good."
 )
 
 
@@ -136,8 +136,8 @@ def _result_line(row: VariantRow, summary: SceneSummary) -> tuple[str, ...]:
         spread_text(row.ssim, 4),
         spread_text(row.lpips, 4),
         spread_text(row.gaussians, 0),
-        spread_text(row.fps, 0, "not recorded"),
-        spread_text(_scaled(row.peak_bytes, 1 / MIB), 0, "not measured"),
+        "not recorded" if math.isnan(row.fps.mean) else f"{row.fps.mean:.0f}",
+        "not measured" if math.isnan(row.peak_bytes.mean) else f"{row.peak_bytes.mean / MIB:.0f}",
         "★" if row.on_front else "",
     )
 
@@ -204,10 +204,6 @@ def table_csv(study: Study, summaries: Sequence[SceneSummary]) -> str:
                 line += [reach.psnr, reach.seconds.mean, reach.ratio]
             writer.writerow(["" if value is None or value != value else value for value in line])
     return text.getvalue()
-
-
-def _scaled(spread: Spread, factor: float) -> Spread:
-    return Spread(spread.mean * factor, spread.low * factor, spread.high * factor, spread.count)
 
 
 def _listing(values: Sequence[float]) -> str:

@@ -8,6 +8,7 @@ from pathlib import Path
 import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.transforms import Bbox
 
 from turbogs_plugin.ablation.summary import SceneSummary, VariantRow
 from turbogs_plugin.report.plots import STYLE
@@ -15,6 +16,10 @@ from turbogs_plugin.report.plots import STYLE
 COLORS = ("#1f5fa8", "#d1495b", "#2e8b57", "#e08e0b", "#7a4fa3", "#17919e", "#8c5a3c", "#5c6670")
 DASHES = ("-", "--", ":", "-.")
 BASELINE_COLOR = "black"
+LABEL_SIZE = 8
+BANDS_UP_TO = 10
+"""Spreads are shaded for so many variants; more would cover each other."""
+
 SHOWN_BELOW = 4.0
 """dB below the worst final result at which the PSNR plot ends: what comes before is over in a moment."""
 
@@ -29,7 +34,7 @@ def _styles(summary: SceneSummary) -> dict[str, tuple[str, str]]:
 
 
 def plot_curves(path: Path, summary: SceneSummary) -> None:
-    """PSNR and mean absolute error against seconds: mean over seeds, their spread shaded."""
+    """PSNR and mean absolute error against seconds: mean over seeds, their spread shaded where there is room."""
     styles = _styles(summary)
     with matplotlib.rc_context({**STYLE, "lines.markersize": 3.5}):
         figure = Figure(figsize=(12.0, 5.2 + 0.16 * max(0, len(summary.rows) - 8)), layout="constrained")
@@ -38,7 +43,7 @@ def plot_curves(path: Path, summary: SceneSummary) -> None:
                 curve = getattr(row, f"{name}_curve")
                 color, dash = styles[row.name]
                 axes.plot(curve.seconds, curve.mean, dash, marker="o", color=color, label=row.name)
-                if row.psnr.count > 1:
+                if row.psnr.count > 1 and len(summary.rows) <= BANDS_UP_TO:
                     axes.fill_between(curve.seconds, curve.low, curve.high, color=color, alpha=0.15, linewidth=0)
             axes.set_xlabel("training time in seconds (evaluation excluded)")
             axes.set_xlim(left=0)
@@ -82,7 +87,6 @@ def plot_front(path: Path, summary: SceneSummary) -> None:
             zorder=0,
             label="Pareto front (stars)",
         )
-        _label_points(axes, summary.rows)
         axes.set(
             xlabel="training time in seconds (evaluation excluded)",
             ylabel="final test PSNR in dB",
@@ -90,18 +94,34 @@ def plot_front(path: Path, summary: SceneSummary) -> None:
         )
         axes.margins(x=0.18, y=0.12)
         axes.legend(loc="lower right", frameon=False, fontsize=9)
+        _label_points(axes, summary.rows)
         figure.savefig(path)
 
 
 def _label_points(axes: Axes, rows: list[VariantRow]) -> None:
-    """Names beside points, alternately above and below in the order of time so that neighbours do not meet."""
-    for number, row in enumerate(sorted(rows, key=lambda row: (row.seconds.mean, row.psnr.mean))):
-        above = number % 2 == 0
+    """Names beside their points, each where it meets no other name and no other point, if there is such a place."""
+    axes.figure.draw_without_rendering()  # so that places in pixels are those of the picture
+    points = axes.transData.transform([(row.seconds.mean, row.psnr.mean) for row in rows])
+    pixels = axes.figure.dpi / 72.0
+    height = 1.3 * LABEL_SIZE * pixels
+    taken = [Bbox.from_bounds(x - 7, y - 7, 14, 14) for x, y in points]
+    for row, (x, y) in zip(rows, points, strict=True):
+        width = 0.62 * LABEL_SIZE * pixels * len(row.name)
+        places = [
+            Bbox.from_bounds(x + right, y + up - height / 2, width, height)
+            for up in (0.0, height, -height, 2 * height, -2 * height, 3 * height, -3 * height)
+            for right in (12.0, -12.0 - width)
+        ]
+        place = min(places, key=lambda box: sum(box.overlaps(other) for other in taken))
+        taken.append(place)
         axes.annotate(
             row.name,
-            (row.seconds.mean, row.psnr.mean),
-            xytext=(6, 6 if above else -6),
-            textcoords="offset points",
-            va="bottom" if above else "top",
-            fontsize=8,
+            (x, y),
+            xycoords="figure pixels",
+            xytext=(place.x0, (place.y0 + place.y1) / 2),
+            textcoords="figure pixels",
+            va="center",
+            fontsize=LABEL_SIZE,
+            arrowprops={"arrowstyle": "-", "color": "0.7", "linewidth": 0.6, "shrinkA": 0, "shrinkB": 3},
+            annotation_clip=False,
         )
