@@ -337,6 +337,23 @@ def test_studies_are_merged_and_reported_again_without_training(turbogs, small, 
     assert code == 2 and "two different results" in err
 
 
+def test_cells_of_the_same_settings_are_reused_from_another_study(turbogs, small, capture, tmp_path, monkeypatch):
+    first, other = tmp_path / "first", tmp_path / "other.yaml"
+    monkeypatch.setenv("TURBOGS_COMMIT", "one")
+    assert turbogs(*call(small, capture, first, "--only", "full"))[0] == 0
+    other.write_text("title: Other\nvariants: {same: [], l1: [loss.type=charbonnier]}\n")
+    code, _, err = turbogs(*call(other, capture, tmp_path / "second", "--reuse", first))
+    assert code == 0 and "1 finished cells are kept" in err and "[1/1]" in err
+    taken, (made,) = StudyFolder(tmp_path / "second").read_study().results[0], StudyFolder(first).read_study().results
+    assert taken.variant == "same" and taken.history == made.history
+    monkeypatch.setenv("TURBOGS_COMMIT", "another")
+    code, _, err = turbogs(*call(other, capture, tmp_path / "third", "--reuse", first))
+    assert code == 0 and "kept" not in err and "[2/2]" in err
+    monkeypatch.setenv("TURBOGS_COMMIT", "one-modified")
+    code, _, err = turbogs(*call(other, capture, tmp_path / "fourth", "--reuse", first))
+    assert code == 2 and "known commit" in err and not (tmp_path / "fourth").exists()
+
+
 def test_runs_are_compared(turbogs, capture, tmp_path):
     runs = {"a": ["train.seed=0"], "b": ["train.seed=1"], "c": ["pixel_sampler.type=random"]}
     quick = [setting for setting in TINY if "iterations" not in setting] + ["train.iterations=3"]

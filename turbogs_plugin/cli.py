@@ -116,6 +116,7 @@ def ablate(
     time_budget: Annotated[float, arg(metavar="SECONDS")] = 0.0,
     only: Annotated[tuple[str, ...], arg(metavar="VARIANT ...")] = (),
     psnr: Annotated[tuple[float, ...], arg(metavar="DB ...")] = (),
+    reuse: Annotated[tuple[Path, ...], arg(metavar="STUDY ...")] = (),
     merge: Annotated[tuple[Path, ...], arg(metavar="STUDY ...")] = (),
     device: Device = "auto",
 ) -> int:
@@ -131,6 +132,7 @@ def ablate(
         time_budget: seconds of training after which a cell stops; 0 for none.
         only: these variants and the baseline.
         psnr: test PSNRs whose time is asked for; from the baseline's result where absent.
+        reuse: take cells of the same settings from these studies where machine and sources are the same.
         merge: put these studies together in --out and write the report again, without training.
         device: where to train.
     """
@@ -143,7 +145,7 @@ def ablate(
         return commands.merge(merge, out, psnr)
     if config is None or not scene:
         raise InputError("ablate needs NAME_OR_FILE and --scene SCENE, or --merge STUDY ...")
-    options = SweepOptions(scene, seeds, overrides, steps, time_budget, device)
+    options = SweepOptions(scene, seeds, overrides, steps, time_budget, device, reuse)
     return commands.ablate(config, options, out, only, psnr)
 
 

@@ -13,6 +13,9 @@ from turbogs_plugin.report.pages import hardware, software
 COMMIT_VARIABLE = "TURBOGS_COMMIT"
 """Environment variable that names the commit where the sources are a copy without their history."""
 
+MODIFIED = "-modified"
+"""End of the commit of sources that differ from it."""
+
 
 @dataclass
 class Provenance:
@@ -42,7 +45,7 @@ def provenance(device_type: str) -> Provenance:
 
 
 def source_commit() -> str:
-    """The commit of these sources, with "-modified" where they differ from it; "" where there is no history."""
+    """The commit of these sources, with `MODIFIED` at its end where they differ from it; "" where there is no history."""
     if named := os.environ.get(COMMIT_VARIABLE):
         return named
     root = Path(__file__).resolve().parent.parent
@@ -56,4 +59,4 @@ def source_commit() -> str:
         )
     except (OSError, subprocess.SubprocessError):
         return ""
-    return commit.strip() + ("-modified" if changes.strip() else "")
+    return commit.strip() + (MODIFIED if changes.strip() else "")

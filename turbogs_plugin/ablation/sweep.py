@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import gc
+import json
 import traceback
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -17,6 +19,7 @@ from turbogs_plugin.ablation.results import CellResult, Failure, StudyFolder
 from turbogs_plugin.config import Config
 from turbogs_plugin.errors import InputError, TrainingStopped
 from turbogs_plugin.evaluation import synchronize
+from turbogs_plugin.provenance import COMMIT_VARIABLE, MODIFIED, provenance
 from turbogs_plugin.run import resolve_device
 from turbogs_plugin.scene import Scene, load_scene
 
@@ -35,6 +38,8 @@ class SweepOptions:
         steps: iterations of every cell; None: the configurations' own.
         time_budget: seconds of training after which a cell stops; 0: none.
         device: auto, cpu or cuda.
+        reuse: other studies; a cell of the same settings, made by the same sources on the same machine, is taken from
+            them. Tables share variants, the baseline above all.
     """
 
     scenes: Sequence[Path]
@@ -43,6 +48,7 @@ class SweepOptions:
     steps: int | None = None
     time_budget: float = 0.0
     device: str = "auto"
+    reuse: Sequence[Path] = ()
 
     def __post_init__(self) -> None:
         names = [path.resolve().name for path in self.scenes]
@@ -66,6 +72,8 @@ def run_sweep(ablation: Ablation, options: SweepOptions, folder: StudyFolder) ->
     device = resolve_device(options.device)
     grid: dict[str, list[tuple[CellKey, Config]]] = {}
     kept = 0
+    taken: list[CellResult] = []
+    reusable = _reusable_cells(options, device)
     for path in options.scenes:
         name = path.resolve().name
         grid[name] = []
@@ -75,7 +83,10 @@ def run_sweep(ablation: Ablation, options: SweepOptions, folder: StudyFolder) ->
                 config.scene.path, config.train.device = str(path.resolve()), device.type
                 key = CellKey(name, variant, seed)
                 present = folder.read(key)
-                if present is None:
+                known = reusable.get((name, _comparable(config.to_mapping())))
+                if present is None and known is not None:
+                    taken.append(replace(known, variant=variant))
+                elif present is None:
                     grid[name].append((key, config))
                 else:
                     _require_same(present, config, options.time_budget)
@@ -91,7 +102,9 @@ def run_sweep(ablation: Ablation, options: SweepOptions, folder: StudyFolder) ->
                     raise InputError(f"variant '{key.variant}' changes the scene's photos, which all variants share")
             loaded[name] = load_scene(scenes[name], settings.factor, settings.test_every)
     folder.write_ablation(ablation)
-    with SweepProgress(sum(map(len, grid.values())), kept) as progress:
+    for result in taken:
+        folder.write(result)
+    with SweepProgress(sum(map(len, grid.values())), kept + len(taken)) as progress:
         for name, cells in grid.items():
             if cells:
                 _train_scene(cells, scene_on(loaded.pop(name), device), device, options.time_budget, folder, progress)
@@ -122,7 +135,7 @@ def _train_scene(
 
 
 def _require_same(present: CellResult, config: Config, time_budget: float) -> None:
-    made, wanted = (_comparable(mapping) for mapping in (present.config, config.to_mapping()))
+    made, wanted = (_sections(mapping) for mapping in (present.config, config.to_mapping()))
     if made != wanted or present.time_budget != time_budget:
         sections = [name for name in wanted if made.get(name) != wanted[name]] or ["the time budget"]
         raise InputError(
@@ -130,7 +143,25 @@ def _require_same(present: CellResult, config: Config, time_budget: float) -> No
         )
 
 
-def _comparable(mapping: dict) -> dict:
+def _reusable_cells(options: SweepOptions, device: torch.device) -> dict[tuple[str, str], CellResult]:
+    """(scene, settings) -> a result of another study that a cell of these settings would repeat."""
+    here = provenance(device.type)
+    if options.reuse and (not here.commit or here.commit.endswith(MODIFIED)):
+        raise InputError(f"--reuse needs sources of a known commit, without changes; {COMMIT_VARIABLE} may name it")
+    results = [result for path in options.reuse for result in StudyFolder(path).read_study().results]
+    return {
+        (result.scene, _comparable(result.config)): result
+        for result in results
+        if (result.time_budget, result.provenance) == (options.time_budget, here)
+    }
+
+
+def _comparable(mapping: dict[str, Any]) -> str:
+    """What decides a result, as text to compare."""
+    return json.dumps(_sections(mapping), sort_keys=True)
+
+
+def _sections(mapping: dict[str, Any]) -> dict[str, dict[str, Any]]:
     sections = {name: dict(section) for name, section in mapping.items()}
     for section, name in UNCOMPARED:
         sections[section].pop(name, None)
