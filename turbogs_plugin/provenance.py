@@ -45,7 +45,7 @@ def provenance(device_type: str) -> Provenance:
 
 
 def source_commit() -> str:
-    """The commit of these sources, with `MODIFIED` at its end where they differ from it; "" where there is no history."""
+    """The commit of these sources, with `MODIFIED` at its end where they differ from it; "" without a history."""
     if named := os.environ.get(COMMIT_VARIABLE):
         return named
     root = Path(__file__).resolve().parent.parent
