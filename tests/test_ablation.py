@@ -97,7 +97,7 @@ def test_another_length_scales_what_counts_iterations_and_nothing_else():
     changed = {key for key, value in short.density.items() if value != config.density[key]}
     assert changed == {"refine_from", "refine_every", "final_every"}
     assert (short.density["refine_from"], short.density["refine_every"], short.density["final_every"]) == (20, 10, 50)
-    assert with_iterations(config, 50).density["refine_every"] == 5
+    assert with_iterations(config, 50).density["refine_every"] == 10
     assert with_iterations(config, config.train.iterations).to_yaml() == before
 
 
@@ -192,7 +192,7 @@ def test_a_summary_of_known_numbers():
     assert (slow.reaches[0].reached, slow.reaches[1].reached) == (2, 0)
     assert math.isnan(fast.reaches[1].ratio)  # the baseline never got there
     (default,) = summarise(study)
-    assert default.targets == [29.1, 29.6, 30.1]
+    assert default.targets == [29.0, 29.5, 30.0]
 
 
 # The command

@@ -41,14 +41,15 @@ Block = Heading | Paragraph | Table | Picture
 
 CSS = """
 :root { color-scheme: light; }
-body { font: 15px/1.5 system-ui, sans-serif; color: #1c2024; max-width: 76rem; margin: 2rem auto; padding: 0 1.2rem; }
+body { font: 15px/1.5 system-ui, sans-serif; color: #1c2024; max-width: 96rem; margin: 2rem auto; padding: 0 1.2rem; }
 h1 { font-size: 1.7rem; margin-bottom: .4rem; } h2 { font-size: 1.25rem; margin-top: 2.2rem; }
 h3 { font-size: 1.05rem; }
 .scroll { overflow-x: auto; } table { border-collapse: collapse; font-size: .88rem; margin: .8rem 0; }
 th, td { padding: .32rem .7rem; text-align: left; border-bottom: 1px solid #dfe3e8; vertical-align: top; }
 th { border-bottom: 2px solid #8c96a3; } tbody tr:hover { background: #f4f6f8; }
 table.numeric td:not(:first-child), table.numeric th:not(:first-child) { text-align: right; white-space: nowrap; }
-table.numeric td { font-variant-numeric: tabular-nums; } img { max-width: 100%; } p { max-width: 60rem; }
+table.numeric td { font-variant-numeric: tabular-nums; white-space: nowrap; }
+img { max-width: 100%; } p { max-width: 60rem; }
 """
 
 

@@ -34,7 +34,7 @@ ITERATION_FIELDS = {
 """Settings that count iterations: a run of another length scales them. Not gsplat's `reset_every`: what a reset of
 opacities takes away grows back at the rate of the optimizer, however short the run."""
 
-SHORTEST_INTERVAL = 5
+SHORTEST_INTERVAL = 10
 """Scaling makes no interval of density control shorter: its statistics need a window of some iterations."""
 
 _NAME = re.compile(r"[A-Za-z0-9+][A-Za-z0-9_+.-]{0,47}")

@@ -101,8 +101,8 @@ def _scene(folder: Path, study: Study, summary: SceneSummary) -> list[Block]:
     plot_front(front, summary)
     against = f" against {summary.baseline}" if summary.baseline else ""
     header = (
-        *("variant", "seeds", "time in s", f"time{against}", "PSNR in dB", f"PSNR{against}", "SSIM", "LPIPS (VGG)"),
-        *("Gaussians", "FPS", "peak memory in MiB", "front"),
+        *("variant", "front", "seeds", "time in s", f"time{against}", "PSNR in dB", f"PSNR{against}", "SSIM"),
+        *("LPIPS (VGG)", "Gaussians", "FPS", "peak MiB"),
     )
     reach_header = ["variant"]
     for target in summary.targets:
@@ -128,6 +128,7 @@ def _result_line(row: VariantRow, summary: SceneSummary) -> tuple[str, ...]:
     difference = "" if is_base else f"{row.psnr_difference:+.2f}{_verdict(row.psnr_differs)}"
     return (
         row.name,
+        "★" if row.on_front else "",
         str(len(row.seeds)),
         spread_text(row.seconds, 1),
         ratio,
@@ -135,10 +136,9 @@ def _result_line(row: VariantRow, summary: SceneSummary) -> tuple[str, ...]:
         difference,
         spread_text(row.ssim, 4),
         spread_text(row.lpips, 4),
-        spread_text(row.gaussians, 0),
+        f"{row.gaussians.mean:.0f}",
         "not recorded" if math.isnan(row.fps.mean) else f"{row.fps.mean:.0f}",
         "not measured" if math.isnan(row.peak_bytes.mean) else f"{row.peak_bytes.mean / MIB:.0f}",
-        "★" if row.on_front else "",
     )
 
 

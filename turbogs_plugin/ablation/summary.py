@@ -10,7 +10,7 @@ from turbogs_plugin.ablation.results import CellResult, Study
 from turbogs_plugin.ablation.statistics import Curve, Spread, differ, pareto_front, seconds_to_reach
 
 TARGET_STEP = 0.5
-"""Default targets of the time to a PSNR are this many dB apart, from the baseline's result downwards."""
+"""Default targets of the time to a PSNR are this many dB apart, from what every seed of the baseline reached down."""
 
 
 @dataclass
@@ -97,7 +97,7 @@ def _summarise_scene(study: Study, scene: str, targets: Sequence[float]) -> Scen
     baseline = study.ablation.baseline if study.ablation.baseline in cells else ""
     if not targets:
         reference = cells[baseline] if baseline else next(iter(cells.values()))
-        result = Spread.of(cell.final.psnr for cell in reference).mean
+        result = Spread.of(cell.final.psnr for cell in reference).low
         targets = [math.floor(10 * result) / 10 - step * TARGET_STEP for step in (2, 1, 0)]
     times = {
         name: [Spread.of(seconds_to_reach(cell.history, psnr) for cell in results) for psnr in targets]
