@@ -167,12 +167,10 @@ class ErrorDrivenDensity:
             self._stats = None
         else:
             saved = GaussianStats(**state["stats"])
-            require(
-                self._stats is not None and saved.weight_sums.shape == self._stats.weight_sums.shape,
-                "density statistics",
-                tuple(saved.weight_sums.shape),
-                "those of as many Gaussians as the model has",
-            )
+            for f in fields(saved):
+                shape = getattr(saved, f.name).shape
+                fits = self._stats is not None and shape == self._stats.weight_sums.shape
+                require(fits, f"density statistics {f.name}", tuple(shape), "of as many Gaussians as the model has")
             device = self._stats.weight_sums.device
             self._stats = saved.map(lambda value: value.to(device, copy=True))
 

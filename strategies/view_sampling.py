@@ -44,6 +44,12 @@ class ViewStack:
         self.views = np.delete(self.views, positions)
         return taken
 
+    def restore(self, views: np.ndarray) -> None:
+        """Take over a saved stack. ValueError where it does not hold distinct views of this scene."""
+        if len(np.unique(views)) != len(views) or not np.isin(views, np.arange(self.num_views)).all():
+            raise ValueError(f"the saved stack does not hold distinct ones of {self.num_views} views")
+        self.views = views
+
 
 @dataclass
 class RandomViewSampler:
@@ -65,7 +71,7 @@ class RandomViewSampler:
         return {"stack": torch.from_numpy(_ready(self.stack).views.copy())}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        _ready(self.stack).views = state["stack"].cpu().numpy().copy()
+        _ready(self.stack).restore(state["stack"].cpu().numpy().copy())
 
 
 @dataclass
@@ -126,7 +132,7 @@ class GeometryAwareViewSampler:
         return {"stack": torch.from_numpy(_ready(self.stack).views.copy())}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        _ready(self.stack).views = state["stack"].cpu().numpy().copy()
+        _ready(self.stack).restore(state["stack"].cpu().numpy().copy())
 
 
 def _ready(stack: ViewStack | None) -> ViewStack:

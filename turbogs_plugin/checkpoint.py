@@ -7,6 +7,7 @@ removed only after that: at every moment `latest` names a complete file.
 
 from __future__ import annotations
 
+import math
 import os
 import re
 import zipfile
@@ -22,6 +23,9 @@ from turbogs_plugin.files import write_atomically, write_text_atomically
 FORMAT = 1
 KEPT = 2
 """Checkpoints that stay on the disk: the newest and one before it."""
+
+COUNT_LIMIT = 2**31
+"""All whole numbers in a state are counts below this."""
 
 _NAME = re.compile(r"iteration-\d{6,}\.pt")
 
@@ -95,6 +99,41 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
         reason = str(error).splitlines()[0][:160] if str(error) else type(error).__name__
         raise InputError(f"checkpoint '{path}' cannot be used: {reason}") from None
     return state
+
+
+def require_like(saved: Any, present: Any, place: str) -> None:
+    """Refuse a state that is not made as a present one: other keys, other types, other dtypes or dimensions of tensors,
+    or numbers that are not finite.
+
+    How many rows a tensor has may differ, as that depends on how far the run had come, and so may whether a part has a
+    state at all: None stands for a mapping.
+
+    Raises:
+        ValueError: naming the place.
+    """
+    if present is None or (saved is None and isinstance(present, dict)):
+        return
+    if type(saved) is not type(present):
+        raise ValueError(f"{place} is of type {type(saved).__name__}, not {type(present).__name__}")
+    if isinstance(present, dict):
+        if saved.keys() != present.keys():
+            names = ", ".join(sorted(map(str, saved.keys() ^ present.keys()))[:4])
+            raise ValueError(f"{place} lacks, or has in excess: {names}")
+        for key, value in present.items():
+            require_like(saved[key], value, f"{place}.{key}")
+    elif isinstance(present, Tensor):
+        if saved.dtype != present.dtype or saved.dim() != present.dim() or saved.shape[1:] != present.shape[1:]:
+            raise ValueError(f"{place} is {_plan(saved)}, which does not fit {_plan(present)}")
+        if not saved.isfinite().all():
+            raise ValueError(f"{place} is not finite")
+    elif isinstance(present, float) and not math.isfinite(saved):
+        raise ValueError(f"{place} is {saved}")
+    elif isinstance(present, int) and not 0 <= saved < COUNT_LIMIT:
+        raise ValueError(f"{place} is {saved}, which is no count")
+
+
+def _plan(tensor: Tensor) -> str:
+    return f"{str(tensor.dtype).removeprefix('torch.')} {tuple(tensor.shape)}"
 
 
 def _kept(folder: Path) -> str:

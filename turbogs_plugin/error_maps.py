@@ -156,8 +156,11 @@ class ErrorMaps:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        if state["errors"].shape != self.errors.shape or state["view_sums"].shape != self.view_sums.shape:
-            raise ValueError("the state's error maps are of other views than these")
+        present = {"errors": self.errors, "stamps": self.stamps}
+        present.update(dict.fromkeys(("view_sums", "mean_values", "mean_pending"), self.view_sums))
+        for name, like in present.items():
+            if state[name].shape != like.shape:
+                raise ValueError("the state's error maps are of other views than these")
         self.errors.copy_(state["errors"])
         self.stamps.copy_(state["stamps"])
         self.stamp_base = int(state["stamp_base"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 import os
 import signal
 import time
@@ -13,7 +14,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from turbogs_plugin.checkpoint import latest_checkpoint, load_checkpoint, save_checkpoint
+from turbogs_plugin.checkpoint import latest_checkpoint, load_checkpoint, require_like, save_checkpoint
 from turbogs_plugin.config import Config, resolve
 from turbogs_plugin.errors import InputError, TrainingStopped
 from turbogs_plugin.evaluation import Metrics, evaluate, load_lpips, peak_memory_bytes, synchronize
@@ -166,8 +167,9 @@ def load_model(path: Path, device: torch.device) -> SavedModel:
     try:
         frame = Frame(np.array(state["frame"]["center"]), state["frame"]["scale"])
         trained = state["trainer"]
-        return SavedModel(folder, config, gaussians_of_state(trained, device), frame, trained["iteration"])
-    except (KeyError, TypeError, AttributeError) as error:
+        iteration = operator.index(trained["iteration"])
+        return SavedModel(folder, config, gaussians_of_state(trained, device), frame, iteration)
+    except (KeyError, TypeError, AttributeError, IndexError, ValueError, RuntimeError) as error:
         raise InputError(f"checkpoint '{checkpoint}' is not one of a run: {error}") from None
 
 
@@ -239,6 +241,7 @@ class _Session:
                 if not self.resumed:
                     with self.clock:
                         trainer.initialise_maps()
+                if not self.history:
                     self._evaluate(progress)
                 while trainer.iteration < total and interrupts.signal is None:
                     mark = min(iteration for iteration in evaluations | saves if iteration > trainer.iteration)
@@ -270,10 +273,11 @@ class _Session:
 
     def load_state_dict(self, state: dict[str, Any], source: str) -> None:
         try:
+            require_like(state, self.state_dict(), "state")
             self.trainer.load_state_dict(state["trainer"])
             self.clock.seconds = state["train_seconds"]
             self.resumed = True
-        except (KeyError, TypeError, AttributeError, RuntimeError, ValueError) as error:
+        except (KeyError, TypeError, AttributeError, IndexError, ArithmeticError, RuntimeError, ValueError) as error:
             raise InputError(f"checkpoint '{source}' does not fit this run and its capture: {error}") from None
 
     def _evaluate(self, progress: TrainingProgress) -> None:

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from turbogs_plugin import kernels
+from turbogs_plugin.checkpoint import require_like
 from turbogs_plugin.config import Config
 from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.errors import TrainingStopped
@@ -175,8 +176,15 @@ class Trainer:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Take over what `state_dict` gave, in a trainer of the same configuration and scene."""
+        """Take over what `state_dict` gave, in a trainer of the same configuration and scene.
+
+        Raises:
+            ValueError: the state is not one of such a trainer.
+        """
         device = self.gaussians.device
+        require_like(state, self.state_dict(), "trainer")
+        if not 0 <= state["iteration"] <= self.config.train.iterations or state["nonfinite_losses"] < 0:
+            raise ValueError(f"iteration {state['iteration']} with {state['nonfinite_losses']} non-finite losses")
         self.iteration = state["iteration"]
         self.initial_error = state["initial_error"]
         self.nonfinite_losses.fill_(state["nonfinite_losses"])
@@ -190,5 +198,19 @@ class Trainer:
 
 
 def gaussians_of_state(state: dict[str, Any], device: torch.device) -> Gaussians:
-    """The model in a checkpoint's state."""
-    return Gaussians(**{name: state["gaussians"][name].to(device) for name in PARAMETER_NAMES})
+    """The model in a checkpoint's state.
+
+    Raises:
+        ValueError: not the parameters of one model, or not finite.
+    """
+    gaussians = Gaussians(**{name: state["gaussians"][name].to(device) for name in PARAMETER_NAMES})
+    count, bands = len(gaussians), gaussians.shN.shape[1]
+    shapes = ((count, 3), (count, 4), (count, 3), (count,), (count, 1, 3), (count, bands, 3))
+    for (name, value), shape in zip(gaussians.items(), shapes, strict=True):
+        if value.shape != shape or value.dtype != torch.float32:
+            raise ValueError(f"gaussians.{name} has shape {tuple(value.shape)} where {shape} was expected")
+        if not value.isfinite().all():
+            raise ValueError(f"gaussians.{name} is not finite")
+    if bands not in (0, 3, 8, 15):
+        raise ValueError(f"gaussians.shN has {bands} bands")
+    return gaussians

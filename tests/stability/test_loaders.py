@@ -1,0 +1,225 @@
+"""Checkpoints, configurations, photos and transforms.json that were damaged or made to harm: a clear error or a correct
+result, in bounded memory. The loaders of COLMAP models and of .ply files are in test_scene_hostile.py."""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+import json
+import random
+import shutil
+import tracemalloc
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from framework_runs import tiny_capture, tiny_config
+
+from turbogs_plugin import run
+from turbogs_plugin.checkpoint import latest_checkpoint, load_checkpoint, save_checkpoint
+from turbogs_plugin.config import load_config
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.scene import load_scene
+from turbogs_plugin.yaml_text import parse_yaml
+
+MEMORY = 64 * 2**20
+"""Python and numpy may allocate this much for files of less than a megabyte."""
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory) -> Path:
+    return tiny_capture(tmp_path_factory.mktemp("loaders"))
+
+
+@pytest.fixture(scope="module")
+def finished(capture, tmp_path_factory) -> Path:
+    """The folder of a finished run, which is not to be changed."""
+    return run.train(tiny_config(capture, "train.iterations=3"), tmp_path_factory.mktemp("runs") / "run").folder.path
+
+
+def outcome_of(function, *arguments):
+    """The result of a call, or the InputError it ended in; anything else fails."""
+    tracemalloc.start()
+    try:
+        return function(*arguments)
+    except InputError as error:
+        assert len(str(error)) < 2000
+        return error
+    finally:
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        assert peak < MEMORY
+
+
+def damaged(content: bytes, choice: random.Random) -> bytes:
+    """Cut, overwritten in some bytes, or with a piece moved into it."""
+    data, place = bytearray(content), choice.randrange(len(content))
+    kind = choice.randrange(3)
+    if kind == 0:
+        del data[place:]
+    elif kind == 1:
+        for _ in range(choice.choice([1, 2, 8])):
+            data[choice.randrange(len(data))] = choice.randrange(256)
+    else:
+        source = choice.randrange(len(data))
+        data[place:place] = data[source : source + choice.randrange(64)]
+    return bytes(data)
+
+
+# ---- Checkpoints -------------------------------------------------------------------------------------------------
+
+
+def leaves(value, path=()):
+    """(path, leaf) of a nested state."""
+    if isinstance(value, dict):
+        for key, item in value.items():
+            yield from leaves(item, (*path, key))
+    else:
+        yield path, value
+
+
+def hostile_leaf(value, choice: random.Random):
+    """Something else in the place of a value."""
+    others = [None, "text", -1, 2**70, float("nan"), [], {}, [[1]], torch.zeros(0), torch.zeros(3, 1, 2), True]
+    if isinstance(value, torch.Tensor):
+        others += [value[:-1], value.reshape(-1), torch.cat([value, value])] if value.dim() else [value.reshape(1)]
+        others += [torch.full_like(value, torch.nan)] if value.is_floating_point() else [value - 10**6]
+    return choice.choice(others)
+
+
+def test_checkpoints_with_other_values(finished, tmp_path, monkeypatch):
+    """Every value of the state in turn replaced by another or left out: no model is given out that is not whole and
+    finite, and a run goes on by a step or refuses."""
+    monkeypatch.setattr(run._Session, "run", lambda session: session.trainer.step())
+    scene = load_scene(run.RunFolder(finished).read_config().scene.path)
+    monkeypatch.setattr(run, "load_scene", lambda *_: scene)
+    state = load_checkpoint(latest_checkpoint(finished / "checkpoints"))
+    (tmp_path / "run").mkdir()
+    shutil.copy(finished / "config.yaml", tmp_path / "run")
+    choice, refused, cases = random.Random(3), 0, 0
+    for path, _ in list(leaves(state)):
+        for _ in range(3):
+            changed = copy.deepcopy(state)
+            parent = changed
+            for key in path[:-1]:
+                parent = parent[key]
+            if choice.random() < 0.2:
+                del parent[path[-1]]
+            else:
+                parent[path[-1]] = hostile_leaf(parent[path[-1]], choice)
+            save_checkpoint(tmp_path / "run/checkpoints", 3, changed)
+            cases += 1
+            with contextlib.suppress(InputError):
+                model = run.load_model(tmp_path / "run", torch.device("cpu")).gaussians
+                assert all(value.isfinite().all() for _, value in model.items()), path
+                assert len({len(value) for _, value in model.items()}) == 1, path
+            try:
+                run.resume(tmp_path / "run")
+            except InputError:
+                refused += 1
+    assert cases > 80 and refused > 0.6 * cases
+
+
+def test_damaged_checkpoints(finished, tmp_path):
+    """Bytes of the archive changed: refused, or the very state that was saved (padding has no meaning)."""
+    content = latest_checkpoint(finished / "checkpoints").read_bytes()
+    choice, target, refused = random.Random(4), tmp_path / "iteration-000003.pt", 0
+    for _ in range(200):
+        target.write_bytes(damaged(content, choice))
+        refused += isinstance(outcome_of(load_checkpoint, target), InputError)
+    assert refused > 100
+
+
+def test_a_run_whose_history_is_gone_is_finished(finished, tmp_path):
+    folder = shutil.copytree(finished, tmp_path / "run")
+    (folder / "history.jsonl").unlink()
+    assert [evaluation.iteration for evaluation in run.resume(folder).history] == [3]
+
+
+# ---- Text --------------------------------------------------------------------------------------------------------
+
+
+def test_damaged_configurations():
+    text = load_config("turbogs").to_yaml().encode()
+    choice, refused = random.Random(5), 0
+    for _ in range(120):
+        changed = damaged(text, choice).decode("utf-8", "replace")
+        result = outcome_of(parse_yaml, changed, "config")
+        refused += isinstance(result, InputError)
+    assert 12 < refused < 120
+
+
+BOMBS = {
+    "aliases": "a: &a [x]\n" + "".join(f"b{i}: &b{i} [*a, *a]\n" for i in range(50)),
+    "merge keys": "a: &a {x: 1}\nb:\n  <<: *a\n",
+    "tag": "a: !!python/object/apply:os.system ['true']",
+    "binary tag": "a: !!binary aGVsbG8=",
+    "tag directive": "%TAG ! tag:yaml.org,2002:python/\n---\na: !name:os.system x",
+    "depth": "a: " + "{a: " * 5000 + "1" + "}" * 5000,
+    "width": "a: [" + "1," * 100_000 + "1]",
+    "interpolation": "a: ${oc.env:HOME}\nb: ${a}${a}",
+    "long number": "train: {seed: " + "9" * 10_000 + "}",
+    "many keys": "\n".join(f"k{i}: 1" for i in range(1000)),
+    "control characters": "a: \x00\x07",
+}
+
+
+@pytest.mark.parametrize("name", BOMBS)
+def test_yaml_bombs(tmp_path, name):
+    (tmp_path / "bomb.yaml").write_text(BOMBS[name])
+    assert isinstance(outcome_of(load_config, str(tmp_path / "bomb.yaml")), InputError)
+
+
+# ---- Captures ----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def transforms(capture, tmp_path) -> Path:
+    """A capture with a transforms.json and photos alone."""
+    scene = load_scene(capture)
+    folder = tmp_path / "transforms"
+    shutil.copytree(capture / "images", folder / "images")
+    frames = []
+    for name, viewmat in zip(scene.train.names, scene.train.cameras.viewmats, strict=True):
+        pose = torch.linalg.inv(viewmat.double()) @ torch.diag(torch.tensor([1.0, -1, -1, 1], dtype=torch.float64))
+        frames.append({"file_path": f"images/{name}", "transform_matrix": pose.tolist()})
+    record = {"camera_angle_x": 0.8, "w": 48, "h": 40, "fl_x": 55.2, "fl_y": 55.2, "cx": 24, "cy": 20, "frames": frames}
+    (folder / "transforms.json").write_text(json.dumps(record))
+    return folder
+
+
+def test_damaged_transforms(transforms):
+    content, choice, refused = (transforms / "transforms.json").read_bytes(), random.Random(6), 0
+    for _ in range(200):
+        (transforms / "transforms.json").write_bytes(damaged(content, choice))
+        result = outcome_of(load_scene, transforms)
+        refused += isinstance(result, InputError)
+        if not isinstance(result, InputError):
+            assert result.train.cameras.viewmats.isfinite().all() and result.points.isfinite().all()
+    assert refused > 50
+
+
+@pytest.mark.parametrize("kind", ["one byte", "cut", "other size", "text", "empty", "damaged"])
+def test_damaged_photos(capture, tmp_path, kind):
+    folder = shutil.copytree(capture, tmp_path / "capture")
+    photo = sorted((folder / "images").iterdir())[2]
+    content, choice = photo.read_bytes(), random.Random(7)
+    contents = {
+        "one byte": [b"\xff"],
+        "cut": [content[: len(content) // 2]],
+        "other size": [b"\x89PNG\r\n\x1a\n\x00\x00\x00\rIHDR\x7f\xff\xff\xff\x7f\xff\xff\xff" + content[24:]],
+        "text": [b"not a photo"],
+        "empty": [b""],
+        "damaged": [damaged(content, choice) for _ in range(40)],
+    }[kind]
+    refused = 0
+    for changed in contents:
+        photo.write_bytes(changed)
+        result = outcome_of(load_scene, folder)
+        refused += isinstance(result, InputError)
+        if isinstance(result, InputError):
+            assert photo.name in str(result)
+        else:
+            assert np.isfinite(result.train.photos.colors.float().mean().item())
+    assert refused >= (1 if kind != "damaged" else 20)
