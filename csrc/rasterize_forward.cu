@@ -1,26 +1,32 @@
 // Stage 4: colour, alpha and, when asked, depth at the sampled pixels.
 //
-// One warp renders one work item: 32 samples of one active tile, a lane each, with the state of the pixel in registers, so
-// work follows the samples and no warp waits for another. Splats come 32 at a time, one to a lane, the next 32 being
-// fetched meanwhile; each lane drops its splat where it reaches none of the warp's samples, and the others are read from
-// the warp's own shared memory by all lanes at once. For the backward pass the warp leaves one bit for each splat that
-// contributed to any of its samples.
+// One warp renders up to three work items of one active tile, 32 samples each, with the state of a lane's pixels in
+// registers, so work follows the samples and no warp waits for another. Splats come 32 at a time, one to a lane, the next 32
+// being fetched meanwhile; each lane drops its splat where it reaches none of the warp's samples, and the others are read
+// from the warp's own shared memory by all lanes at once. For the backward pass the warp leaves one bit for each splat that
+// contributed to any of an item's samples.
 #include "common.cuh"
 
 namespace turbogs {
 namespace {
 
 constexpr int kForwardWarps = 4;  // of a block; they share nothing but the first-level cache
-constexpr int kAhead = 4;         // splats whose alphas are computed before the first is blended
+constexpr int kAhead = 2;         // splats whose arithmetic overlaps
+constexpr int kMaxGroups = 3;     // work items of a warp
 
 // Smallest box around the samples of a warp, in the tile's frame.
 struct SampleBox {
     float x0, x1, y0, y1;
 };
 
-__device__ __forceinline__ SampleBox box_of_samples(bool filled, float2 pixel) {
-    const float huge = 1e9f;
-    SampleBox box = {filled ? pixel.x : huge, filled ? pixel.x : -huge, filled ? pixel.y : huge, filled ? pixel.y : -huge};
+constexpr SampleBox kNoBox = {1e9f, -1e9f, 1e9f, -1e9f};
+
+__device__ __forceinline__ void enlarge(SampleBox& box, float2 pixel) {
+    box = {fminf(box.x0, pixel.x), fmaxf(box.x1, pixel.x), fminf(box.y0, pixel.y), fmaxf(box.y1, pixel.y)};
+}
+
+// Of all lanes together.
+__device__ __forceinline__ SampleBox box_of_warp(SampleBox box) {
 #pragma unroll
     for (int step = kWarpSize / 2; step > 0; step /= 2) {
         box.x0 = fminf(box.x0, __shfl_xor_sync(kFullWarp, box.x0, step));
@@ -45,40 +51,53 @@ __device__ __forceinline__ bool reaches_box(const StagedSplat& splat, float mean
     return !(level < least_level - 0.01f);  // room for rounding; NaN stays
 }
 
-template <bool kDepth>
+template <int kGroups, bool kDepth>
 __global__ void __launch_bounds__(kForwardWarps * kWarpSize) forward_kernel(const __grid_constant__ ForwardParams params) {
     __shared__ StagedSplat staged_splats[kForwardWarps][kBucket];
     const int lane = threadIdx.x % kWarpSize;
+    const int warps_per_tile = (params.chunks + kGroups - 1) / kGroups;
     const int item = blockIdx.x * kForwardWarps + threadIdx.x / kWarpSize;
     for (size_t i = blockIdx.x * blockDim.x + threadIdx.x; i < params.num_cleared; i += gridDim.x * blockDim.x) {
         params.cleared[i] = make_float4(0.0f, 0.0f, 0.0f, 0.0f);
     }
-    if (item >= params.num_active * params.chunks) return;
+    if (item >= params.num_active * warps_per_tile) return;
     StagedSplat* staged = staged_splats[threadIdx.x / kWarpSize];
 
-    const int tile = item / params.chunks, chunk = item - tile * params.chunks;
+    const int tile = item / warps_per_tile, first_chunk = (item - tile * warps_per_tile) * kGroups;
+    const int num_groups = min(kGroups, params.chunks - first_chunk);
     const TileFrame frame =
         tile_frame(params.cameras, params.num_views, params.tile_ids != nullptr ? params.tile_ids[tile] : tile);
     const uint32_t first_pair = params.tile_starts[tile];
     const int num_pairs = static_cast<int>(params.tile_starts[tile + 1] - first_pair);
     const int num_buckets = (num_pairs + kBucket - 1) / kBucket;
     const uint32_t* pair_ids = params.pair_ids + first_pair;
-    uint32_t* masks = params.masks + static_cast<size_t>(first_pair / kBucket + tile) * params.chunks + chunk;
+    uint32_t* masks = params.masks + static_cast<size_t>(first_pair / kBucket + tile) * params.chunks + first_chunk;
     const int slot_end = params.tile_offsets[tile + 1];
     const float least_level = log2f(params.alpha_min);
     const float never = __int_as_float(0x7F800000);
 
     int walked = 0;
-    for (int slot_base = params.tile_offsets[tile] + chunk * kWarpSize; slot_base < slot_end;
+    for (int slot_base = params.tile_offsets[tile] + first_chunk * kWarpSize; slot_base < slot_end;
          slot_base += params.chunks * kWarpSize) {
-        const int slot = slot_base + lane;
-        const int pixel = slot < slot_end ? params.pixel_ids[slot] : -1;
-        const float2 at = pixel_in_tile(frame, max(pixel, 0));
-        const SampleBox box = box_of_samples(pixel >= 0, at);
         // Level from which a splat is seen: never at a pixel that has ended, or at an empty slot.
-        float threshold = pixel >= 0 ? least_level : never;
-        float transmittance = 1.0f, red = 0.0f, green = 0.0f, blue = 0.0f, depth = 0.0f;
-        int last = -1;
+        float x[kGroups], y[kGroups], threshold[kGroups];
+        float transmittance[kGroups], red[kGroups], green[kGroups], blue[kGroups], depth[kGroups];
+        int last[kGroups];
+        SampleBox box = kNoBox;
+#pragma unroll
+        for (int g = 0; g < kGroups; ++g) {
+            const int slot = slot_base + g * kWarpSize + lane;
+            const int pixel = g < num_groups && slot < slot_end ? params.pixel_ids[slot] : -1;
+            const float2 at = pixel_in_tile(frame, max(pixel, 0));
+            x[g] = at.x;
+            y[g] = at.y;
+            threshold[g] = pixel >= 0 ? least_level : never;
+            if (pixel >= 0) enlarge(box, at);
+            transmittance[g] = 1.0f;
+            red[g] = green[g] = blue[g] = depth[g] = 0.0f;
+            last[g] = -1;
+        }
+        box = box_of_warp(box);
 
         // Two steps ahead the identity of the splat to stage, one step ahead the splat.
         StagedSplat next = {};
@@ -88,7 +107,10 @@ __global__ void __launch_bounds__(kForwardWarps * kWarpSize) forward_kernel(cons
 
         int bucket = 0;
         for (; bucket < num_buckets; ++bucket) {
-            if (!__any_sync(kFullWarp, threshold < never)) break;
+            bool alive = false;
+#pragma unroll
+            for (int g = 0; g < kGroups; ++g) alive = alive || threshold[g] < never;
+            if (!__any_sync(kFullWarp, alive)) break;
 
             const int own = bucket * kBucket + lane;
             StagedSplat splat = next;
@@ -108,63 +130,78 @@ __global__ void __launch_bounds__(kForwardWarps * kWarpSize) forward_kernel(cons
             else staged[count + __popc(~keepers & below)] = no_splat();
             __syncwarp();
 
-            uint32_t contributed = 0;
+            // No branches: most splats left are seen by some lane, and several overlap this way.
+            uint32_t contributed[kGroups] = {};
             for (int base = 0; base < count; base += kAhead) {
-                float levels[kAhead];
 #pragma unroll
                 for (int i = 0; i < kAhead; ++i) {
-                    levels[i] = splat_level(staged[base + i].form, staged[base + i].rest, at.x, at.y);
-                }
+                    const float4 form = staged[base + i].form, rest = staged[base + i].rest, color = staged[base + i].color;
 #pragma unroll
-                for (int i = 0; i < kAhead; ++i) {
-                    if (!(levels[i] >= threshold)) continue;
-                    const float weight = fminf(params.alpha_max, blend_exp2(levels[i])) * transmittance;
-                    const float behind = transmittance - weight;
-                    if (behind <= params.transmittance_min) {
-                        threshold = never;
-                        continue;
+                    for (int g = 0; g < kGroups; ++g) {
+                        const float level = splat_level(form, rest, x[g], y[g]);
+                        const bool seen = level >= threshold[g];
+                        const float full = fminf(params.alpha_max, blend_exp2(level)) * transmittance[g];
+                        const bool ends = seen && transmittance[g] - full <= params.transmittance_min;
+                        const bool taken = seen && !ends;
+                        const float weight = taken ? full : 0.0f;
+                        if (ends) threshold[g] = never;
+                        transmittance[g] -= weight;
+                        red[g] += weight * color.x;
+                        green[g] += weight * color.y;
+                        blue[g] += weight * color.z;
+                        if (kDepth) depth[g] += weight * rest.z;
+                        if (taken) last[g] = __float_as_int(rest.w);
+                        if (taken) contributed[g] |= __float_as_uint(color.w);
                     }
-                    const StagedSplat& seen = staged[base + i];
-                    red += weight * seen.color.x;
-                    green += weight * seen.color.y;
-                    blue += weight * seen.color.z;
-                    if (kDepth) depth += weight * seen.rest.z;
-                    transmittance = behind;
-                    last = __float_as_int(seen.rest.w);
-                    contributed |= __float_as_uint(seen.color.w);
                 }
             }
-            contributed = __reduce_or_sync(kFullWarp, contributed);
-            if (lane == 0) {
-                uint32_t* mask = masks + static_cast<size_t>(bucket) * params.chunks;
-                *mask = bucket < walked ? (*mask | contributed) : contributed;
+#pragma unroll
+            for (int g = 0; g < kGroups; ++g) {
+                const uint32_t any = __reduce_or_sync(kFullWarp, contributed[g]);
+                if (lane == g && g < num_groups) {
+                    uint32_t* mask = masks + static_cast<size_t>(bucket) * params.chunks + g;
+                    *mask = bucket < walked ? (*mask | any) : any;
+                }
             }
         }
         walked = max(walked, bucket);
 
-        if (slot < slot_end) {
-            const float alpha = 1.0f - transmittance;
-            params.colors[3 * static_cast<size_t>(slot)] = red;
-            params.colors[3 * static_cast<size_t>(slot) + 1] = green;
-            params.colors[3 * static_cast<size_t>(slot) + 2] = blue;
+#pragma unroll
+        for (int g = 0; g < kGroups; ++g) {
+            const int slot = slot_base + g * kWarpSize + lane;
+            if (g >= num_groups || slot >= slot_end) continue;
+            const float alpha = 1.0f - transmittance[g];
+            params.colors[3 * static_cast<size_t>(slot)] = red[g];
+            params.colors[3 * static_cast<size_t>(slot) + 1] = green[g];
+            params.colors[3 * static_cast<size_t>(slot) + 2] = blue[g];
             params.alphas[slot] = alpha;
-            params.transmittances[slot] = transmittance;
-            params.last_pairs[slot] = last;
-            if (kDepth) params.depths[slot] = depth / fmaxf(alpha, kAlphaTiny);
+            params.transmittances[slot] = transmittance[g];
+            params.last_pairs[slot] = last[g];
+            if (kDepth) params.depths[slot] = depth[g] / fmaxf(alpha, kAlphaTiny);
         }
     }
-    if (lane == 0) params.bucket_counts[item] = walked;
+    if (lane < num_groups) params.bucket_counts[tile * params.chunks + first_chunk + lane] = walked;
+}
+
+template <int kGroups>
+cudaError_t launch(const ForwardParams& params, cudaStream_t stream) {
+    const int items = params.num_active * ((params.chunks + kGroups - 1) / kGroups);
+    const int blocks = (items + kForwardWarps - 1) / kForwardWarps;
+    if (params.with_depth) forward_kernel<kGroups, true><<<blocks, kForwardWarps * kWarpSize, 0, stream>>>(params);
+    else forward_kernel<kGroups, false><<<blocks, kForwardWarps * kWarpSize, 0, stream>>>(params);
+    return cudaGetLastError();
 }
 
 }  // namespace
 
 cudaError_t launch_rasterize_forward(const ForwardParams& params, cudaStream_t stream) {
-    const int items = params.num_active * params.chunks;
-    if (items == 0) return cudaSuccess;
-    const int blocks = (items + kForwardWarps - 1) / kForwardWarps;
-    if (params.with_depth) forward_kernel<true><<<blocks, kForwardWarps * kWarpSize, 0, stream>>>(params);
-    else forward_kernel<false><<<blocks, kForwardWarps * kWarpSize, 0, stream>>>(params);
-    return cudaGetLastError();
+    if (params.num_active * params.chunks == 0) return cudaSuccess;
+    const int warps = (params.chunks + kMaxGroups - 1) / kMaxGroups;  // of a tile
+    switch ((params.chunks + warps - 1) / warps) {
+        case 1: return launch<1>(params, stream);
+        case 2: return launch<2>(params, stream);
+        default: return launch<kMaxGroups>(params, stream);
+    }
 }
 
 }  // namespace turbogs
