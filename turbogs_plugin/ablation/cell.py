@@ -14,7 +14,7 @@ from turbogs_plugin.ablation.results import CellResult
 from turbogs_plugin.ablation.timing import PeakMemory, TrainingClock
 from turbogs_plugin.config import Config
 from turbogs_plugin.evaluation import Metrics, evaluate, load_lpips, peak_memory_bytes
-from turbogs_plugin.provenance import provenance
+from turbogs_plugin.provenance import Provenance
 from turbogs_plugin.report.history import Evaluation
 from turbogs_plugin.scene import Scene
 from turbogs_plugin.trainer import Trainer
@@ -33,6 +33,7 @@ def train_cell(
     config: Config,
     scene: Scene,
     device: torch.device,
+    made_by: Provenance,
     time_budget: float = 0.0,
     progress: Callable[[int], None] = lambda iteration: None,
 ) -> CellResult:
@@ -43,6 +44,7 @@ def train_cell(
         config: resolved.
         scene: from `scene_on`.
         device: where to train.
+        made_by: machine and sources, as they were when the process began.
         time_budget: seconds of training after which to stop; 0: none.
         progress: is told the number of finished iterations.
 
@@ -103,7 +105,7 @@ def train_cell(
         fps=metrics.fps,
         peak_bytes=memory.peak,
         warmup_iterations=warmup,
-        provenance=provenance(device.type),
+        provenance=made_by,
     )
 
 

@@ -19,7 +19,7 @@ from turbogs_plugin.ablation.results import CellResult, Failure, StudyFolder
 from turbogs_plugin.config import Config
 from turbogs_plugin.errors import InputError, TrainingStopped
 from turbogs_plugin.evaluation import synchronize
-from turbogs_plugin.provenance import COMMIT_VARIABLE, MODIFIED, provenance
+from turbogs_plugin.provenance import COMMIT_VARIABLE, MODIFIED, Provenance, provenance
 from turbogs_plugin.run import resolve_device
 from turbogs_plugin.scene import Scene, load_scene
 
@@ -73,7 +73,8 @@ def run_sweep(ablation: Ablation, options: SweepOptions, folder: StudyFolder) ->
     grid: dict[str, list[tuple[CellKey, Config]]] = {}
     kept = 0
     taken: list[CellResult] = []
-    reusable = _reusable_cells(options, device)
+    here = provenance(device.type)
+    reusable = _reusable_cells(options, here)
     for path in options.scenes:
         name = path.resolve().name
         grid[name] = []
@@ -107,13 +108,15 @@ def run_sweep(ablation: Ablation, options: SweepOptions, folder: StudyFolder) ->
     with SweepProgress(sum(map(len, grid.values())), kept + len(taken)) as progress:
         for name, cells in grid.items():
             if cells:
-                _train_scene(cells, scene_on(loaded.pop(name), device), device, options.time_budget, folder, progress)
+                scene = scene_on(loaded.pop(name), device)
+                _train_scene(cells, scene, device, here, options.time_budget, folder, progress)
 
 
 def _train_scene(
     cells: list[tuple[CellKey, Config]],
     scene: Scene,
     device: torch.device,
+    here: Provenance,
     time_budget: float,
     folder: StudyFolder,
     progress: SweepProgress,
@@ -121,7 +124,7 @@ def _train_scene(
     for key, config in cells:
         progress.begin(key, config.train.iterations)
         try:
-            result = train_cell(key.variant, config, scene, device, time_budget, progress.advance)
+            result = train_cell(key.variant, config, scene, device, here, time_budget, progress.advance)
         except Exception as error:  # whatever a variant breaks by, the other cells go on
             failure = Failure(key, _reason(error))
             folder.write_failure(failure)
@@ -143,9 +146,8 @@ def _require_same(present: CellResult, config: Config, time_budget: float) -> No
         )
 
 
-def _reusable_cells(options: SweepOptions, device: torch.device) -> dict[tuple[str, str], CellResult]:
+def _reusable_cells(options: SweepOptions, here: Provenance) -> dict[tuple[str, str], CellResult]:
     """(scene, settings) -> a result of another study that a cell of these settings would repeat."""
-    here = provenance(device.type)
     if options.reuse and (not here.commit or here.commit.endswith(MODIFIED)):
         raise InputError(f"--reuse needs sources of a known commit, without changes; {COMMIT_VARIABLE} may name it")
     results = [result for path in options.reuse for result in StudyFolder(path).read_study().results]
