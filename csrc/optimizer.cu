@@ -1,10 +1,12 @@
 // Projection backward and the optimizer's step in one kernel: gradients never reach memory.
 //
 // A thread per Gaussian, in two passes over its touched views. The first takes each view's record to a row of 14
-// gradients, puts the row in the record's place and sums the rows; the sum advances the moments, which give the damping.
-// The second pass scales each row by the damping, so that the systems are the identity plus something positive
-// semi-definite, and solves the 10- and the 4-block by Cholesky in registers. Afterwards the block updates its touched
-// Gaussians' harmonics together, in 16-byte quads.
+// gradients, keeps the row and sums the rows; the sum advances the moments, which give the damping. The second pass scales
+// each row by the damping, so that the systems are the identity plus something positive semi-definite, and solves the 10-
+// and the 4-block by Cholesky in registers. Afterwards the block updates its touched Gaussians' harmonics together, in
+// 16-byte quads.
+//
+// There are few warps, so what is read is read early and in batches, and sums are added without waiting for them.
 #include <cfloat>
 
 #include "projection_backward.cuh"
@@ -14,13 +16,21 @@ namespace {
 
 constexpr float kGradientLimit = 1e18f;         // gradients are cut here, so that their squares stay finite
 constexpr float kRowLimit = 100.0f;             // longest scaled row
+constexpr float kLargeGradient = 1e30f;
 constexpr float kTiny = FLT_MIN;
-constexpr float kRateMin = 1.0842021724855044e-19f;  // sqrt(FLT_MIN): the damping of a rate of zero
 
-// 3 blocks an SM leave 160 registers: nothing spills, at 12 warps. With 4 the kernel spills about 40 words a thread.
-constexpr int kStepBlocks = 3;
+// Up to 168 registers, so that nothing spills. More blocks (8, at 128 registers) were slower: what limits the kernel is
+// the latency of memory, and spilling adds to it.
+constexpr int kStepBlocks = 6;
 
-enum class Rows { kNone, kSummed, kPerView };
+constexpr int kQuadBatch = 4;  // quads of harmonics that a thread has under way
+constexpr int kFewViews = 4;
+
+// What the step keeps of the views' rows: nothing but the sum; each of up to kFewViews in the thread's local memory; or
+// each in the place of its record.
+enum class Rows { kNone, kSummed, kFew, kMany };
+
+__host__ __device__ constexpr bool per_view(Rows rows) { return rows == Rows::kFew || rows == Rows::kMany; }
 
 __device__ __forceinline__ float clip_gradient(float value) {
     return fminf(fmaxf(value, -kGradientLimit), kGradientLimit);
@@ -40,14 +50,16 @@ __device__ __forceinline__ void unpack(const RowGradient& row, float values[kRow
     values[13] = row.opacity;
 }
 
-// Sums the rows; where the step wants one per view, the record's 16 floats become the row and, behind it, the loss.
+// Sums the rows, and keeps them where the step wants one per view.
 template <Rows kRows>
 struct RowCollector {
     float4* records;  // of this Gaussian in view 0
     size_t step;      // from view to view
+    float few[kRows == Rows::kFew ? kFewViews : 1][kRowSize + 1];
     float sum[kRowSize] = {};
     float loss = 0.0f;
     bool finite = true;
+    bool large = false;  // colour gradients that might overflow in the harmonics' sums
 
     __device__ __forceinline__ void add(int view, const RowGradient& row, float view_loss) {
         float values[kRowSize];
@@ -55,10 +67,15 @@ struct RowCollector {
 #pragma unroll
         for (int i = 0; i < kRowSize; ++i) {
             finite = finite && is_finite(values[i]);
+            if (i >= 10 && i < 13) large = large || !(fabsf(values[i]) < kLargeGradient);
             values[i] = clip_gradient(values[i]);
             sum[i] += values[i];
         }
-        if (kRows == Rows::kPerView) {
+        if (kRows == Rows::kFew) {
+#pragma unroll
+            for (int i = 0; i < kRowSize; ++i) few[view][i] = values[i];
+            few[view][kRowSize] = view_loss;
+        } else if (kRows == Rows::kMany) {
             float4* out = records + view * step;
             out[0] = make_float4(values[0], values[1], values[2], values[3]);
             out[1] = make_float4(values[4], values[5], values[6], values[7]);
@@ -67,11 +84,39 @@ struct RowCollector {
         }
         loss += view_loss;
     }
+
+    // Row of a view, and behind it the loss.
+    __device__ __forceinline__ void get(int view, float values[kRowSize + 1]) const {
+        if (kRows == Rows::kFew) {
+#pragma unroll
+            for (int i = 0; i <= kRowSize; ++i) values[i] = few[view][i];
+        } else {
+            const float4* record = records + view * step;
+            const float4 r0 = record[0], r1 = record[1], r2 = record[2], r3 = record[3];
+            const float loaded[kRowSize + 1] = {r0.x, r0.y, r0.z, r0.w, r1.x, r1.y, r1.z, r1.w,
+                                                r2.x, r2.y, r2.z, r2.w, r3.x, r3.y, r3.z};
+#pragma unroll
+            for (int i = 0; i <= kRowSize; ++i) values[i] = loaded[i];
+        }
+    }
 };
+
+// Adam's part is rounded as written, so that all forms of the kernel give the same bits.
 
 // beta * old + (1 - beta) * gradient, from the nearer of the two.
 __device__ __forceinline__ float decay(float gradient, float old, float beta, float one_minus_beta) {
-    return beta < 0.5f ? gradient + beta * (old - gradient) : old - (old - gradient) * one_minus_beta;
+    return beta < 0.5f ? __fmaf_rn(beta, __fsub_rn(old, gradient), gradient)
+                       : __fmaf_rn(one_minus_beta, __fsub_rn(gradient, old), old);
+}
+
+// sqrt(v) + eps of the bias-corrected v.
+__device__ __forceinline__ float denominator_of(float square, float inverse_correction2, float eps) {
+    return __fadd_rn(approximate_sqrt(__fmul_rn(square, inverse_correction2)), eps);
+}
+
+// Adam's step over the rate, from the bias-corrected m.
+__device__ __forceinline__ float adam_direction(float corrected, float denominator) {
+    return __fmul_rn(corrected, approximate_reciprocal(fmaxf(denominator, FLT_MIN)));
 }
 
 __device__ __forceinline__ float bias_correction(float log_beta, int steps) {
@@ -97,14 +142,14 @@ struct DampedSystem {
             largest = fmaxf(largest, fabsf(unit[i]));
         }
         has_rows = has_rows || (nonzero && weight > 0.0f);
-        const float inverse = 1.0f / fmaxf(largest, kTiny);
+        const float inverse = approximate_reciprocal(fmaxf(largest, kTiny));
 #pragma unroll
         for (int i = 0; i < kSize; ++i) {
             unit[i] *= inverse;
             norm2 += unit[i] * unit[i];
         }
-        const float norm = fmaxf(sqrtf(norm2), kTiny);
-        const float factor = fminf(largest * norm * sqrtf(weight), kRowLimit) / norm;
+        const float norm = fmaxf(approximate_sqrt(norm2), kTiny);
+        const float factor = fminf(largest * norm * approximate_sqrt(weight), kRowLimit) * approximate_reciprocal(norm);
 #pragma unroll
         for (int i = 0; i < kSize; ++i) {
             unit[i] *= factor;
@@ -131,7 +176,7 @@ struct DampedSystem {
                 pivot -= lower[at(i, k)] * lower[at(i, k)];
                 x[i] -= lower[at(i, k)] * x[k];
             }
-            inverse_diagonal[i] = 1.0f / sqrtf(fmaxf(pivot, 1.0f));
+            inverse_diagonal[i] = approximate_rsqrt(fmaxf(pivot, 1.0f));
             x[i] *= inverse_diagonal[i];
         }
 #pragma unroll
@@ -160,14 +205,11 @@ __device__ __forceinline__ void solve_block(const OptimizerParams& optimizer, ui
         if (!balanced) return 1.0f;
         return loss > 0.0f && is_finite(loss) ? fminf(optimizer.curvature / loss, FLT_MAX) : 0.0f;
     };
-    if (kRows == Rows::kPerView) {
+    if (per_view(kRows)) {
         for (uint32_t left = mask; left != 0u; left &= left - 1u) {
-            const int view = __ffs(static_cast<int>(left)) - 1;
-            const float4* record = collected.records + view * collected.step;
-            const float4 r0 = record[0], r1 = record[1], r2 = record[2], r3 = record[3];
-            const float values[kRowSize] = {r0.x, r0.y, r0.z, r0.w, r1.x, r1.y, r1.z,
-                                            r1.w, r2.x, r2.y, r2.z, r2.w, r3.x, r3.y};
-            system.add(values + kFirst, terms.scale + kFirst, weight_of(r3.z));
+            float values[kRowSize + 1];
+            collected.get(__ffs(static_cast<int>(left)) - 1, values);
+            system.add(values + kFirst, terms.scale + kFirst, weight_of(values[kRowSize]));
         }
     } else {
         system.add(collected.sum + kFirst, terms.scale + kFirst, weight_of(collected.loss));
@@ -194,29 +236,38 @@ __device__ __forceinline__ void solve_block(const OptimizerParams& optimizer, ui
 
 // Moments, solution and new values of one Gaussian's 14 parameters.
 template <Rows kRows>
-__device__ __forceinline__ void update_row(const OptimizerParams& optimizer, int gaussian, uint32_t mask,
-                                           const RowCollector<kRows>& collected, float correction1, float correction2) {
+__device__ __forceinline__ void update_row(const ScreenBackwardParams& params, const OptimizerParams& optimizer,
+                                           int gaussian, uint32_t mask,
+                                           const RowCollector<kRows>& collected, float inverse_correction1,
+                                           float inverse_correction2) {
     float2* first = reinterpret_cast<float2*>(optimizer.exp_avg + static_cast<size_t>(gaussian) * kRowSize);
     float2* second = reinterpret_cast<float2*>(optimizer.exp_avg_sq + static_cast<size_t>(gaussian) * kRowSize);
     const bool paper = optimizer.kind == StepKind::kPaperLm;
+    // All of it is read before anything is written: the compiler must take the arrays for one.
+    float2 old_means[kRowSize / 2], old_squares[kRowSize / 2];
+#pragma unroll
+    for (int pair = 0; pair < kRowSize / 2; ++pair) {
+        old_means[pair] = first[pair];
+        old_squares[pair] = second[pair];
+    }
     Terms terms;
 #pragma unroll
     for (int pair = 0; pair < kRowSize / 2; ++pair) {
-        const float2 old_mean = first[pair], old_square = second[pair];
+        const float2 old_mean = old_means[pair], old_square = old_squares[pair];
         float mean[2] = {old_mean.x, old_mean.y}, square[2] = {old_square.x, old_square.y};
 #pragma unroll
         for (int i = 0; i < 2; ++i) {
             const int c = 2 * pair + i;
             const float gradient = collected.sum[c];
             mean[i] = decay(gradient, mean[i], optimizer.beta1, optimizer.one_minus_beta1);
-            square[i] = decay(gradient * gradient, square[i], optimizer.beta2, optimizer.one_minus_beta2);
-            const float corrected = mean[i] / correction1;
-            const float denominator = sqrtf(square[i] / correction2) + optimizer.eps;
-            terms.adam[c] = -(optimizer.rates[c] * (corrected / denominator));
+            square[i] = decay(__fmul_rn(gradient, gradient), square[i], optimizer.beta2, optimizer.one_minus_beta2);
+            const float corrected = __fmul_rn(mean[i], inverse_correction1);
+            const float denominator = denominator_of(square[i], inverse_correction2, optimizer.eps);
+            terms.adam[c] = -__fmul_rn(optimizer.rates[c], adam_direction(corrected, denominator));
             const float damping =
-                paper ? sqrtf(square[i]) + optimizer.eps : denominator / fmaxf(optimizer.rates[c], kRateMin);
+                paper ? approximate_sqrt(square[i]) + optimizer.eps : denominator * optimizer.inverse_rates[c];
             terms.mean[c] = paper ? mean[i] : corrected;
-            terms.scale[c] = 1.0f / sqrtf(damping);
+            terms.scale[c] = approximate_rsqrt(damping);
         }
         first[pair] = make_float2(mean[0], mean[1]);
         second[pair] = make_float2(square[0], square[1]);
@@ -225,25 +276,28 @@ __device__ __forceinline__ void update_row(const OptimizerParams& optimizer, int
         solve_block<0, 10, kRows>(optimizer, mask, collected, terms);
         solve_block<10, 4, kRows>(optimizer, mask, collected, terms);
     }
+    const StoredGaussian old = load_gaussian(params, gaussian);
     const size_t triple = 3 * static_cast<size_t>(gaussian);
 #pragma unroll
     for (int i = 0; i < 3; ++i) {
-        optimizer.means[triple + i] += terms.adam[i];
-        optimizer.scales[triple + i] += terms.adam[3 + i];
-        optimizer.sh0[triple + i] += terms.adam[10 + i];
+        optimizer.means[triple + i] = __fadd_rn(old.mean[i], terms.adam[i]);
+        optimizer.scales[triple + i] = __fadd_rn(old.log_scale[i], terms.adam[3 + i]);
+        optimizer.sh0[triple + i] = __fadd_rn(old.sh0[i], terms.adam[10 + i]);
     }
-    float4* quat = reinterpret_cast<float4*>(optimizer.quats) + gaussian;
-    const float4 old = *quat;
-    *quat = make_float4(old.x + terms.adam[6], old.y + terms.adam[7], old.z + terms.adam[8], old.w + terms.adam[9]);
-    optimizer.opacities[gaussian] += terms.adam[13];
+    reinterpret_cast<float4*>(optimizer.quats)[gaussian] =
+        make_float4(__fadd_rn(old.quat[0], terms.adam[6]), __fadd_rn(old.quat[1], terms.adam[7]),
+                    __fadd_rn(old.quat[2], terms.adam[8]), __fadd_rn(old.quat[3], terms.adam[9]));
+    optimizer.opacities[gaussian] = __fadd_rn(old.logit, terms.adam[13]);
 }
 
-__device__ __forceinline__ void adam(const OptimizerParams& optimizer, float gradient, float correction1,
-                                     float correction2, float& value, float& mean, float& square) {
+__device__ __forceinline__ void adam(const OptimizerParams& optimizer, float gradient, float inverse_correction1,
+                                     float inverse_correction2, float& value, float& mean, float& square) {
     gradient = clip_gradient(gradient);
     mean = decay(gradient, mean, optimizer.beta1, optimizer.one_minus_beta1);
-    square = decay(gradient * gradient, square, optimizer.beta2, optimizer.one_minus_beta2);
-    value -= optimizer.rate_shN * ((mean / correction1) / (sqrtf(square / correction2) + optimizer.eps));
+    square = decay(__fmul_rn(gradient, gradient), square, optimizer.beta2, optimizer.one_minus_beta2);
+    const float direction = adam_direction(__fmul_rn(mean, inverse_correction1),
+                                           denominator_of(square, inverse_correction2, optimizer.eps));
+    value = __fmaf_rn(-optimizer.rate_shN, direction, value);
 }
 
 // Adam on the harmonics of the block's updated Gaussians. Values come from shared memory; a quad that two Gaussians
@@ -253,42 +307,56 @@ __device__ __forceinline__ void update_harmonics(const ScreenBackwardParams& par
     const int first = static_cast<int>(blockIdx.x) * kBackwardThreads;
     const int count = min(kBackwardThreads, params.num_gaussians - first) * block.row;
     const size_t base = static_cast<size_t>(first) * block.row;
-    for (int i = 4 * threadIdx.x; i < count; i += 4 * kBackwardThreads) {
-        const int size = min(4, count - i);
-        if (!(block.touched[block.owner(i)] | block.touched[block.owner(i + size - 1)])) continue;
-        float mean[4] = {}, square[4] = {}, value[4] = {};
-        if (size == 4) {
-            const float4 m = *reinterpret_cast<const float4*>(optimizer.exp_avg_shN + base + i);
-            const float4 v = *reinterpret_cast<const float4*>(optimizer.exp_avg_sq_shN + base + i);
-            mean[0] = m.x, mean[1] = m.y, mean[2] = m.z, mean[3] = m.w;
-            square[0] = v.x, square[1] = v.y, square[2] = v.z, square[3] = v.w;
-        } else {
-            for (int j = 0; j < size; ++j) {
-                mean[j] = optimizer.exp_avg_shN[base + i + j];
-                square[j] = optimizer.exp_avg_sq_shN[base + i + j];
+    for (int start = 4 * threadIdx.x; start < count; start += kQuadBatch * 4 * kBackwardThreads) {
+        float means[kQuadBatch][4] = {}, squares[kQuadBatch][4] = {};
+        bool wanted[kQuadBatch];
+#pragma unroll
+        for (int q = 0; q < kQuadBatch; ++q) {
+            const int i = start + q * 4 * kBackwardThreads, last = min(i + 3, count - 1);
+            wanted[q] = i < count && (block.touched[block.owner(i)] | block.touched[block.owner(last)]);
+            if (wanted[q] && last == i + 3) {
+                const float4 m = *reinterpret_cast<const float4*>(optimizer.exp_avg_shN + base + i);
+                const float4 v = *reinterpret_cast<const float4*>(optimizer.exp_avg_sq_shN + base + i);
+                means[q][0] = m.x, means[q][1] = m.y, means[q][2] = m.z, means[q][3] = m.w;
+                squares[q][0] = v.x, squares[q][1] = v.y, squares[q][2] = v.z, squares[q][3] = v.w;
+            } else if (wanted[q]) {
+#pragma unroll
+                for (int j = 0; j < 4; ++j) {
+                    if (i + j > last) break;
+                    means[q][j] = optimizer.exp_avg_shN[base + i + j];
+                    squares[q][j] = optimizer.exp_avg_sq_shN[base + i + j];
+                }
             }
         }
 #pragma unroll
-        for (int j = 0; j < 4; ++j) {
-            if (j >= size) break;
-            const int owner = block.owner(i + j);
-            const int place = i + j + owner * (block.stride - block.row);
-            value[j] = block.coefficients[place];
-            if (block.touched[owner]) {
-                adam(optimizer, block.gradients[place], block.corrections[owner],
-                     block.corrections[kBackwardThreads + owner], value[j], mean[j], square[j]);
+        for (int q = 0; q < kQuadBatch; ++q) {
+            if (!wanted[q]) continue;
+            const int i = start + q * 4 * kBackwardThreads, size = min(4, count - i);
+            float(&mean)[4] = means[q], (&square)[4] = squares[q], value[4] = {};
+#pragma unroll
+            for (int j = 0; j < 4; ++j) {
+                if (j >= size) break;
+                const int owner = block.owner(i + j);
+                const int place = i + j + owner * (block.stride - block.row);
+                value[j] = block.coefficients[place];
+                if (block.touched[owner]) {
+                    adam(optimizer, block.gradients[place], block.corrections[owner],
+                         block.corrections[kBackwardThreads + owner], value[j], mean[j], square[j]);
+                }
             }
-        }
-        if (size == 4) {
-            *reinterpret_cast<float4*>(optimizer.exp_avg_shN + base + i) = make_float4(mean[0], mean[1], mean[2], mean[3]);
-            *reinterpret_cast<float4*>(optimizer.exp_avg_sq_shN + base + i) =
-                make_float4(square[0], square[1], square[2], square[3]);
-            *reinterpret_cast<float4*>(optimizer.shN + base + i) = make_float4(value[0], value[1], value[2], value[3]);
-        } else {
-            for (int j = 0; j < size; ++j) {
-                optimizer.exp_avg_shN[base + i + j] = mean[j];
-                optimizer.exp_avg_sq_shN[base + i + j] = square[j];
-                optimizer.shN[base + i + j] = value[j];
+            if (size == 4) {
+                *reinterpret_cast<float4*>(optimizer.exp_avg_shN + base + i) = make_float4(mean[0], mean[1], mean[2], mean[3]);
+                *reinterpret_cast<float4*>(optimizer.exp_avg_sq_shN + base + i) =
+                    make_float4(square[0], square[1], square[2], square[3]);
+                *reinterpret_cast<float4*>(optimizer.shN + base + i) = make_float4(value[0], value[1], value[2], value[3]);
+            } else {
+#pragma unroll
+                for (int j = 0; j < 4; ++j) {
+                    if (j >= size) break;
+                    optimizer.exp_avg_shN[base + i + j] = mean[j];
+                    optimizer.exp_avg_sq_shN[base + i + j] = square[j];
+                    optimizer.shN[base + i + j] = value[j];
+                }
             }
         }
     }
@@ -297,32 +365,39 @@ __device__ __forceinline__ void update_harmonics(const ScreenBackwardParams& par
 template <Rows kRows>
 __global__ void __launch_bounds__(kBackwardThreads, kStepBlocks) fused_step_kernel(
     const __grid_constant__ ScreenBackwardParams params, const __grid_constant__ OptimizerParams optimizer) {
-    if (params.overflow != nullptr && *params.overflow != 0) return;
     extern __shared__ float shared[];
     const BackwardShared block(shared, params);
     const int gaussian = blockIdx.x * kBackwardThreads + threadIdx.x;
     const bool inside = gaussian < params.num_gaussians;
 
+    const int32_t overflow = params.overflow != nullptr ? *params.overflow : 0;
     load_cameras(params, block);
-    const uint32_t mask = inside ? touched_views(params, gaussian) : 0u;
-    load_harmonics(params, block, mask != 0u);
+    const Sight sight = inside ? sight_of(params, gaussian) : Sight{};
+    const uint32_t mask = sight.touched;
+    if (overflow != 0) return;  // here, so that no load waits for another
+    start_harmonics(params, block, mask != 0u);
+    const StoredGaussian stored = mask != 0u ? load_gaussian(params, gaussian) : StoredGaussian{};
+    wait_for_copies();
+    __syncthreads();
 
     if (inside) {
         RowCollector<kRows> collected;
         collected.records = params.records + static_cast<size_t>(gaussian) * kRecordQuads;
         collected.step = static_cast<size_t>(params.num_gaussians) * kRecordQuads;
-        backward_views(params, block, gaussian, mask, collected);
+        backward_views(params, block, gaussian, mask, sight, stored, collected);
         if (mask != 0u) {
             const float* gradients = block.gradients + threadIdx.x * block.stride;
-            for (int i = 0; i < block.row; ++i) collected.finite = collected.finite && is_finite(gradients[i]);
+            for (int i = 0; collected.large && i < block.row; ++i) {
+                collected.finite = collected.finite && is_finite(gradients[i]);
+            }
             if (collected.finite) {
                 const int steps = optimizer.steps[gaussian] + 1;
                 optimizer.steps[gaussian] = steps;
-                const float correction1 = bias_correction(optimizer.log_beta1, steps);
-                const float correction2 = bias_correction(optimizer.log_beta2, steps);
-                block.corrections[threadIdx.x] = correction1;
-                block.corrections[kBackwardThreads + threadIdx.x] = correction2;
-                update_row(optimizer, gaussian, mask, collected, correction1, correction2);
+                const float inverse_correction1 = 1.0f / bias_correction(optimizer.log_beta1, steps);
+                const float inverse_correction2 = 1.0f / bias_correction(optimizer.log_beta2, steps);
+                block.corrections[threadIdx.x] = inverse_correction1;
+                block.corrections[kBackwardThreads + threadIdx.x] = inverse_correction2;
+                update_row(params, optimizer, gaussian, mask, collected, inverse_correction1, inverse_correction2);
             } else {
                 block.touched[threadIdx.x] = 0;
                 atomicAdd(optimizer.skipped, 1ull);
@@ -351,8 +426,9 @@ cudaError_t launch_fused_step(const ScreenBackwardParams& params, const Optimize
                               cudaStream_t stream) {
     if (params.num_gaussians == 0) return cudaSuccess;
     if (optimizer.kind == StepKind::kAdam) return launch<Rows::kNone>(params, optimizer, stream);
-    return optimizer.rows_per_view ? launch<Rows::kPerView>(params, optimizer, stream)
-                                   : launch<Rows::kSummed>(params, optimizer, stream);
+    if (!optimizer.rows_per_view) return launch<Rows::kSummed>(params, optimizer, stream);
+    return params.num_views <= kFewViews ? launch<Rows::kFew>(params, optimizer, stream)
+                                         : launch<Rows::kMany>(params, optimizer, stream);
 }
 
 }  // namespace turbogs

@@ -1,15 +1,16 @@
 // Error-guided sampling of pixels: every tile of K views in one launch, a warp per tile.
 //
 // A lane holds 8 pixels of its tile in registers, pixel (j, lane) being number 32 j + lane of `cell_order`. Each of the
-// three stages gives every unit not yet drawn an integer key and takes the largest, found by building the threshold bit
-// by bit from warp-wide counts. Slots of a tile follow from the image's size alone, so nothing is counted on the host.
-// Keys are made of single-precision operations that are rounded one by one, as strategies/philox.py prescribes: the
-// sets equal the torch twin's.
+// three stages gives every unit not yet drawn an integer key and takes the largest, found by searching the threshold with
+// warp-wide counts. Slots of a tile follow from the image's size alone, so nothing is counted on the host. Keys are made of
+// single-precision operations that are rounded one by one, as strategies/philox.py prescribes: the sets equal the torch
+// twin's.
 //
 // With whole tiles as units three small kernels take over: sums of each tile, a block per view that draws tiles, and the
 // pixel ids of the chosen ones.
 #include <cuda_fp16.h>
 
+#include "training_math.cuh"
 #include "training_params.h"
 
 namespace turbogs {
@@ -18,6 +19,7 @@ namespace {
 constexpr uint32_t kFull = 0xFFFFFFFFu;
 constexpr int kTile = 16, kTilePixels = 256, kPerLane = kTilePixels / 32;
 constexpr int kSampleThreads = 128;
+constexpr int kSampleBlocks = 8;  // of an SM: 64 registers
 constexpr int kChooseThreads = 1024;
 constexpr int kAgeMax = 32767;
 constexpr int kAgeTieBits = 24, kRankBits = 20;
@@ -32,19 +34,26 @@ struct Words {
 __device__ __forceinline__ Words random_words(const SamplePixelsParams& params, uint32_t place, uint32_t view,
                                               uint32_t purpose) {
     uint32_t c0 = place, c1 = view, c2 = purpose, c3 = params.seed_high;
-    uint32_t k0 = params.seed_low, k1 = params.iteration;
 #pragma unroll
     for (int round = 0; round < 10; ++round) {
         const uint32_t high0 = __umulhi(c0, 0xD2511F53u), low0 = c0 * 0xD2511F53u;
         const uint32_t high1 = __umulhi(c2, 0xCD9E8D57u), low1 = c2 * 0xCD9E8D57u;
-        c0 = high1 ^ c1 ^ k0;
+        c0 = high1 ^ c1 ^ params.round_keys[round][0];
         c1 = low1;
-        c2 = high0 ^ c3 ^ k1;
+        c2 = high0 ^ c3 ^ params.round_keys[round][1];
         c3 = low0;
-        k0 += 0x9E3779B9u;
-        k1 += 0xBB67AE85u;
     }
     return {c0, c1, c2, c3};
+}
+
+// a / b, correctly rounded: the steps of __fdiv_rn without its test for extreme exponents. What is divided here lies within
+// 2^-100 .. 2^24, by 2^-24 .. 2^24.
+__device__ __forceinline__ float divide(float a, float b) {
+    float reciprocal = approximate_reciprocal(b);
+    reciprocal = __fmaf_rn(reciprocal, __fmaf_rn(-b, reciprocal, 1.0f), reciprocal);
+    float quotient = __fmul_rn(a, reciprocal);
+    quotient = __fmaf_rn(reciprocal, __fmaf_rn(-b, quotient, a), quotient);
+    return __fmaf_rn(reciprocal, __fmaf_rn(-b, quotient, a), quotient);
 }
 
 // -log(u) of the word's uniform number, the same bits on every device.
@@ -52,7 +61,7 @@ __device__ __forceinline__ float exponential(uint32_t word) {
     const int bits = __float_as_int(__uint2float_rn(((word >> 9) << 1) | 1u));
     const int exponent = (bits - 0x3F3504F3) >> 23;
     const float f = __int_as_float(bits - (exponent << 23));
-    const float s = __fdiv_rn(__fsub_rn(f, 1.0f), __fadd_rn(f, 1.0f));
+    const float s = divide(__fsub_rn(f, 1.0f), __fadd_rn(f, 1.0f));
     const float q = __fmul_rn(s, s);
     float p = __fadd_rn(__fmul_rn(q, 2.0f / 9.0f), 2.0f / 7.0f);
     p = __fadd_rn(__fmul_rn(p, q), 2.0f / 5.0f);
@@ -63,7 +72,7 @@ __device__ __forceinline__ float exponential(uint32_t word) {
 }
 
 __device__ __forceinline__ uint32_t race_key(float weight, uint32_t word) {
-    return __float_as_uint(__fdiv_rn(fmaxf(weight, kWeightFloor), exponential(word)));
+    return __float_as_uint(divide(fmaxf(weight, kWeightFloor), exponential(word)));
 }
 
 __device__ __forceinline__ uint64_t age_key(int age, uint32_t word) {
@@ -72,8 +81,8 @@ __device__ __forceinline__ uint64_t age_key(int age, uint32_t word) {
 
 // Error and age shares of a unit, for the mixed stage.
 __device__ __forceinline__ float mixed_weight(float error, int age, float error_sum, float age_sum) {
-    const float error_share = error_sum > 0.0f ? __fdiv_rn(error, error_sum) : 0.0f;
-    const float age_share = age_sum > 0.0f ? __fdiv_rn(__int2float_rn(age), age_sum) : 0.0f;
+    const float error_share = error_sum > 0.0f ? divide(error, error_sum) : 0.0f;
+    const float age_share = age_sum > 0.0f ? divide(__int2float_rn(age), age_sum) : 0.0f;
     return __fadd_rn(error_share, age_share);
 }
 
@@ -93,170 +102,182 @@ __device__ __forceinline__ float importance_weight(float missed, float importanc
     return powf(fmaxf(1.0f - missed, 5.9604644775390625e-8f), -importance);
 }
 
-__device__ __forceinline__ uint32_t warp_or(uint32_t value) { return __reduce_or_sync(kFull, value); }
-__device__ __forceinline__ uint32_t warp_and(uint32_t value) { return __reduce_and_sync(kFull, value); }
-__device__ __forceinline__ uint64_t warp_or(uint64_t value) {
-    return static_cast<uint64_t>(warp_or(static_cast<uint32_t>(value >> 32))) << 32 | warp_or(static_cast<uint32_t>(value));
-}
-__device__ __forceinline__ uint64_t warp_and(uint64_t value) {
-    return static_cast<uint64_t>(warp_and(static_cast<uint32_t>(value >> 32))) << 32 |
-           warp_and(static_cast<uint32_t>(value));
-}
 __device__ __forceinline__ uint32_t warp_max(uint32_t value) { return __reduce_max_sync(kFull, value); }
 __device__ __forceinline__ uint64_t warp_max(uint64_t value) {
     const uint32_t high = warp_max(static_cast<uint32_t>(value >> 32));
     const uint32_t low = static_cast<uint32_t>(value >> 32) == high ? static_cast<uint32_t>(value) : 0u;
     return static_cast<uint64_t>(high) << 32 | warp_max(low);
 }
-__device__ __forceinline__ int highest_bit(uint32_t value) { return 31 - __clz(static_cast<int>(value)); }
-__device__ __forceinline__ int highest_bit(uint64_t value) {
-    const uint32_t high = static_cast<uint32_t>(value >> 32);
-    return high != 0u ? 32 + highest_bit(high) : highest_bit(static_cast<uint32_t>(value));
-}
-
 __device__ __forceinline__ double warp_sum(double value) {
 #pragma unroll
     for (int step = 16; step > 0; step >>= 1) value += __shfl_xor_sync(kFull, value, step);
     return value;
 }
 
-// What a stage did, for importance weights: the largest key it left and the smallest it took; or `exhausted`, where it
-// took all there were.
-template <class Key>
-struct Taken {
-    uint32_t units;  // bit j: the lane's j-th unit
-    bool exhausted;
-    Key largest_left, smallest_taken;  // where asked for
+// The largest of a warp's units: some that are taken, and of those `tied` at the threshold `room` more.
+struct Split {
+    uint32_t taken, tied;  // bit j: the lane's j-th unit
+    int room;
 };
 
-// The `count` largest keys of a warp's units, unit (j, lane) having rank 32 j + lane: among equals the lower rank goes
-// first. `active` holds bit j for the lane's j-th unit.
-template <class Key, int kUnits>
-__device__ __forceinline__ Taken<Key> take_largest(const Key (&keys)[kUnits], uint32_t active, int count,
-                                                   bool with_thresholds) {
-    const int available = static_cast<int>(__reduce_add_sync(kFull, static_cast<uint32_t>(__popc(active))));
-    if (available <= count) return {active, true, 0, 0};
-
-    Key any = 0, all = ~Key{0};
+// Divides the units with a key above 0 into the `count` largest and the rest. The threshold is searched between the
+// smallest and the largest key, until it parts exactly so many from the rest or only equal keys are left to part. Keys are
+// below 2^31. By halves suits keys whose logarithms, the bits of a float, are spread; by proportion suits uniform ones.
+template <bool kUniform, int kUnits>
+__device__ __forceinline__ Split split_largest(const uint32_t (&keys)[kUnits], int count) {
+    uint32_t available = 0, smallest = kFull, largest = 0;
 #pragma unroll
     for (int j = 0; j < kUnits; ++j) {
-        if (active >> j & 1u) {
-            any |= keys[j];
-            all &= keys[j];
-        }
+        available += keys[j] != 0u;
+        smallest = min(smallest, keys[j] - 1u);  // no unit: the largest number
+        largest = max(largest, keys[j]);
     }
-    any = warp_or(any);
-    all = warp_and(all);
-    // The bits above the highest that differs are common; below it the threshold is built bit by bit, as the largest
-    // number that at least `count` keys reach.
-    int bit = any == all ? -1 : highest_bit(any ^ all);
-    Key threshold = all & ~((Key{2} << (bit < 0 ? 0 : bit)) - 1);
-    if (bit < 0) threshold = all;
-    bool exact = false;
-    for (; bit >= 0 && (with_thresholds || !exact); --bit) {
-        const Key candidate = threshold | Key{1} << bit;
-        uint32_t reached = 0;
+    int low_count = static_cast<int>(__reduce_add_sync(kFull, available)), high_count = 0;
+    uint32_t threshold = 1u;
+    bool exact = low_count <= count;
+    if (!exact) {
+        uint32_t low = __reduce_min_sync(kFull, smallest) + 1u, high = __reduce_max_sync(kFull, largest) + 1u;
+        for (int pass = 0; high - low > 1u; ++pass) {  // low_count > count > high_count reach `low` and `high`
+            threshold = low + ((high - low) >> 1);
+            if (kUniform && (pass & 3) != 3) {
+                const float share = static_cast<float>(low_count - count) / static_cast<float>(low_count - high_count);
+                threshold = low + static_cast<uint32_t>(share * static_cast<float>(high - low));
+                threshold = min(max(threshold, low + 1u), high - 1u);
+            }
+            uint32_t reached = 0;
 #pragma unroll
-        for (int j = 0; j < kUnits; ++j) reached += (active >> j & 1u) != 0u && keys[j] >= candidate;
-        const int total = static_cast<int>(__reduce_add_sync(kFull, reached));
-        if (total >= count) {
-            threshold = candidate;
-            exact = exact || total == count;
+            for (int j = 0; j < kUnits; ++j) reached += keys[j] >= threshold;
+            const int total = static_cast<int>(__reduce_add_sync(kFull, reached));
+            exact = total == count;
+            if (exact) break;
+            if (total > count) {
+                low = threshold;
+                low_count = total;
+            } else {
+                high = threshold;
+                high_count = total;
+            }
         }
+        if (!exact) threshold = high;
     }
+    Split split = {0u, 0u, exact ? 0 : count - high_count};
+#pragma unroll
+    for (int j = 0; j < kUnits; ++j) {
+        split.taken |= static_cast<uint32_t>(keys[j] >= threshold) << j;
+        split.tied |= static_cast<uint32_t>(keys[j] == threshold - 1u && keys[j] != 0u) << j;
+    }
+    if (exact) split.tied = 0u;
+    return split;
+}
+
+// The first `room` of the tied units; unit (j, lane) has rank 32 j + lane.
+template <int kUnits>
+__device__ __forceinline__ uint32_t take_by_rank(uint32_t tied, int room) {
     uint32_t taken = 0;
-    if (exact) {
+    const uint32_t lower_lanes = (1u << (threadIdx.x & 31u)) - 1u;
 #pragma unroll
-        for (int j = 0; j < kUnits; ++j) taken |= static_cast<uint32_t>((active >> j & 1u) != 0u && keys[j] >= threshold) << j;
-    } else {
-        // More keys equal the threshold than there is room for.
-        uint32_t above = 0;
-#pragma unroll
-        for (int j = 0; j < kUnits; ++j) taken |= static_cast<uint32_t>((active >> j & 1u) != 0u && keys[j] > threshold) << j;
-        above = __reduce_add_sync(kFull, static_cast<uint32_t>(__popc(taken)));
-        int room = count - static_cast<int>(above);
-        const uint32_t lower_lanes = (1u << (threadIdx.x & 31u)) - 1u;
-#pragma unroll
-        for (int j = 0; j < kUnits; ++j) {
-            const bool tied = (active >> j & 1u) != 0u && keys[j] == threshold;
-            const uint32_t ties = __ballot_sync(kFull, tied);
-            if (tied && __popc(ties & lower_lanes) < room) taken |= 1u << j;
-            room -= __popc(ties);
-        }
+    for (int j = 0; j < kUnits; ++j) {
+        const bool mine = (tied >> j & 1u) != 0u;
+        const uint32_t lanes = __ballot_sync(kFull, mine);
+        if (mine && __popc(lanes & lower_lanes) < room) taken |= 1u << j;
+        room -= __popc(lanes);
     }
-    Key left = 0;
-    if (with_thresholds) {
-#pragma unroll
-        for (int j = 0; j < kUnits; ++j) {
-            if (((active & ~taken) >> j & 1u) != 0u && keys[j] > left) left = keys[j];
-        }
-        left = warp_max(left);
-    }
-    return {taken, false, left, threshold};
+    return taken;
 }
 
-// The chance of the lane's j-th unit to be taken by a stage, given the others' keys.
-__device__ __forceinline__ float race_chance(float weight, const Taken<uint32_t>& taken, int j) {
-    if (taken.exhausted) return 1.0f;
-    return race_chance(weight, (taken.units >> j & 1u) != 0u ? taken.largest_left : taken.smallest_taken);
+// The `count` largest keys; among equals the lower rank goes first.
+template <bool kUniform, int kUnits>
+__device__ __forceinline__ uint32_t take_largest(const uint32_t (&keys)[kUnits], int count) {
+    const Split split = split_largest<kUniform>(keys, count);
+    return split.room > 0 ? split.taken | take_by_rank<kUnits>(split.tied, split.room) : split.taken;
 }
 
-__device__ __forceinline__ float age_chance(int age, const Taken<uint64_t>& taken, int j) {
-    if (taken.exhausted) return 1.0f;
-    return age_chance(age, (taken.units >> j & 1u) != 0u ? taken.largest_left : taken.smallest_taken);
+// For importance weights: the largest key that a stage left, 0 where it left none, and the smallest that it took. A key
+// of 0 is no unit.
+template <class Key>
+struct Thresholds {
+    Key largest_left, smallest_taken;
+};
+
+template <class Key, int kUnits>
+__device__ __forceinline__ Thresholds<Key> stage_thresholds(const Key (&keys)[kUnits], uint32_t taken) {
+    Key left = 0, not_taken = 0;  // the smallest taken is the complement of the largest complement
+#pragma unroll
+    for (int j = 0; j < kUnits; ++j) {
+        const bool mine = (taken >> j & 1u) != 0u;
+        if (mine) not_taken = max(not_taken, static_cast<Key>(~keys[j]));
+        else left = max(left, keys[j]);
+    }
+    return {warp_max(left), static_cast<Key>(~warp_max(not_taken))};
 }
 
 // The three stages over a warp's units. Returns the drawn ones; `missed` the probability of not being drawn.
-template <int kUnits>
+template <bool kWeighted, int kUnits>
 __device__ __forceinline__ uint32_t draw(const SamplePixelsParams& params, const float (&errors)[kUnits],
                                          const int (&ages)[kUnits], const uint32_t (&places)[kUnits], uint32_t exist,
                                          uint32_t view, uint32_t purpose, double error_sum, int age_sum,
                                          float (&missed)[kUnits]) {
     const int hard = params.stages[0][0], stable = params.stages[0][1], mixed = params.stages[0][2];
-    const bool weighted = params.weights != nullptr;
-    Words words[kUnits];
+    uint32_t keys[kUnits], stable_words[kUnits], mixed_words[kUnits];
 #pragma unroll
     for (int j = 0; j < kUnits; ++j) {
-        words[j] = random_words(params, places[j], view, purpose);
-        missed[j] = 1.0f;
+        const Words words = random_words(params, places[j], view, purpose);
+        keys[j] = exist >> j & 1u ? race_key(errors[j], words.x0) : 0u;
+        stable_words[j] = words.x1;
+        mixed_words[j] = words.x2;
+        if (kWeighted) missed[j] = 1.0f;
     }
+    const auto miss = [&](uint32_t taken, const auto& thresholds, const auto& chance_of) {
+#pragma unroll
+        for (int j = 0; j < kUnits; ++j) {
+            const auto tau = (taken >> j & 1u) != 0u ? thresholds.largest_left : thresholds.smallest_taken;
+            missed[j] *= thresholds.largest_left == 0 ? 0.0f : 1.0f - chance_of(j, tau);
+        }
+    };
     uint32_t drawn = 0;
-    uint32_t keys[kUnits];
     if (hard > 0) {
-#pragma unroll
-        for (int j = 0; j < kUnits; ++j) keys[j] = race_key(errors[j], words[j].x0);
-        const Taken<uint32_t> taken = take_largest(keys, exist, hard, weighted);
-        drawn |= taken.units;
-        if (weighted) {
-#pragma unroll
-            for (int j = 0; j < kUnits; ++j) missed[j] *= 1.0f - race_chance(errors[j], taken, j);
+        drawn = take_largest<false>(keys, hard);
+        if (kWeighted) {
+            miss(drawn, stage_thresholds(keys, drawn), [&](int j, uint32_t tau) { return race_chance(errors[j], tau); });
         }
     }
     if (stable > 0) {
-        uint64_t age_keys[kUnits];
+        // By age first; of equal ages by the random words.
+        const uint32_t open = exist & ~drawn;
 #pragma unroll
-        for (int j = 0; j < kUnits; ++j) age_keys[j] = age_key(ages[j], words[j].x1);
-        const Taken<uint64_t> taken = take_largest(age_keys, exist & ~drawn, stable, weighted);
-        drawn |= taken.units;
-        if (weighted) {
+        for (int j = 0; j < kUnits; ++j) keys[j] = open >> j & 1u ? static_cast<uint32_t>(ages[j]) + 1u : 0u;
+        const Split oldest = split_largest<false>(keys, stable);
+        uint32_t taken = oldest.taken;
+        if (oldest.room > 0) {
 #pragma unroll
-            for (int j = 0; j < kUnits; ++j) missed[j] *= 1.0f - age_chance(ages[j], taken, j);
+            for (int j = 0; j < kUnits; ++j) {
+                keys[j] = oldest.tied >> j & 1u ? (stable_words[j] >> (32 - kAgeTieBits)) + 1u : 0u;
+            }
+            taken |= take_largest<true>(keys, oldest.room);
         }
+        if (kWeighted) {
+            uint64_t age_keys[kUnits];  // plus 1, so that 0 is no unit
+#pragma unroll
+            for (int j = 0; j < kUnits; ++j) age_keys[j] = open >> j & 1u ? age_key(ages[j], stable_words[j]) + 1u : 0u;
+            miss(taken, stage_thresholds(age_keys, taken),
+                 [&](int j, uint64_t tau) { return age_chance(ages[j], tau - 1u); });
+        }
+        drawn |= taken;
     }
     if (mixed > 0) {
         const float error_total = __double2float_rn(error_sum), age_total = __int2float_rn(age_sum);
+        const uint32_t open = exist & ~drawn;
         float weights[kUnits];
 #pragma unroll
         for (int j = 0; j < kUnits; ++j) {
             weights[j] = params.mixed_uniform ? 1.0f : mixed_weight(errors[j], ages[j], error_total, age_total);
-            keys[j] = race_key(weights[j], words[j].x2);
+            keys[j] = open >> j & 1u ? race_key(weights[j], mixed_words[j]) : 0u;
         }
-        const Taken<uint32_t> taken = take_largest(keys, exist & ~drawn, mixed, weighted);
-        drawn |= taken.units;
-        if (weighted) {
-#pragma unroll
-            for (int j = 0; j < kUnits; ++j) missed[j] *= 1.0f - race_chance(weights[j], taken, j);
+        const uint32_t taken = take_largest<false>(keys, mixed);
+        if (kWeighted) {
+            miss(taken, stage_thresholds(keys, taken), [&](int j, uint32_t tau) { return race_chance(weights[j], tau); });
         }
+        drawn |= taken;
     }
     return drawn;
 }
@@ -267,7 +288,7 @@ struct TilePixels {
     int column, row;           // of the tile
     int width, height;         // of the part inside the image
     uint32_t inside;           // bit j: pixel (j, lane) exists
-    uint32_t ids[kPerLane];    // y * width + x, 0 outside
+    uint32_t ids[kPerLane];    // y * width + x
 };
 
 __device__ __forceinline__ TilePixels locate_tile(const SamplePixelsParams& params, int tile) {
@@ -281,26 +302,37 @@ __device__ __forceinline__ TilePixels locate_tile(const SamplePixelsParams& para
     pixels.width = min(kTile, view.width - kTile * pixels.column);
     pixels.height = min(kTile, view.height - kTile * pixels.row);
     pixels.inside = 0;
-    const int lane = threadIdx.x & 31;
+    const int lane = threadIdx.x & 31, x = lane & 7, y = lane >> 3;
+    const int first = (kTile * pixels.row + y) * view.width + kTile * pixels.column + x;
 #pragma unroll
     for (int j = 0; j < kPerLane; ++j) {
-        const int x = (j & 1) * 8 + (lane & 7), y = (j >> 1) * 4 + (lane >> 3);
-        const bool exists = x < pixels.width && y < pixels.height;
+        const bool exists = x + (j & 1) * 8 < pixels.width && y + (j >> 1) * 4 < pixels.height;
         pixels.inside |= static_cast<uint32_t>(exists) << j;
-        pixels.ids[j] = exists ? (kTile * pixels.row + y) * view.width + kTile * pixels.column + x : 0;
+        pixels.ids[j] = static_cast<uint32_t>(first + (j >> 1) * 4 * view.width + (j & 1) * 8);
     }
     return pixels;
 }
 
 __device__ __forceinline__ void load_maps(const SamplePixelsParams& params, const TilePixels& pixels,
                                           float (&errors)[kPerLane], int (&ages)[kPerLane]) {
-    const int64_t base = params.views[pixels.view].pixel_base;
-    const __half* half_errors = static_cast<const __half*>(params.errors);
+    const SampleView& view = params.views[pixels.view];
+    const int64_t first = view.pixel_base + pixels.ids[0];
+    const __half* of_errors = static_cast<const __half*>(params.errors) + first;
+    const int16_t* of_stamps = params.stamps + first;
+    __half loaded_errors[kPerLane];
+    int16_t loaded_stamps[kPerLane];
 #pragma unroll
     for (int j = 0; j < kPerLane; ++j) {
+        const int offset = (j >> 1) * 4 * view.width + (j & 1) * 8;
         const bool exists = pixels.inside >> j & 1u;
-        errors[j] = exists ? __half2float(half_errors[base + pixels.ids[j]]) : 0.0f;
-        ages[j] = exists ? min(max(params.now - static_cast<int>(params.stamps[base + pixels.ids[j]]), 0), kAgeMax) : 0;
+        loaded_errors[j] = exists ? of_errors[offset] : __ushort_as_half(0);
+        loaded_stamps[j] = exists ? of_stamps[offset] : static_cast<int16_t>(0);
+    }
+#pragma unroll
+    for (int j = 0; j < kPerLane; ++j) {
+        errors[j] = __half2float(loaded_errors[j]);
+        const int age = min(max(params.now - static_cast<int>(loaded_stamps[j]), 0), kAgeMax);
+        ages[j] = pixels.inside >> j & 1u ? age : 0;
     }
 }
 
@@ -322,8 +354,8 @@ __device__ __forceinline__ int first_slot(const SamplePixelsParams& params, cons
     return view.slot_base + pixels.row * row_slots + pixels.column * tile_slots<kUnit>(params, kTile, pixels.height);
 }
 
-template <SampleUnit kUnit>
-__global__ void __launch_bounds__(kSampleThreads) sample_tiles_kernel(
+template <SampleUnit kUnit, bool kWeighted>
+__global__ void __launch_bounds__(kSampleThreads, kSampleBlocks) sample_tiles_kernel(
     const __grid_constant__ SamplePixelsParams params) {
     const int tile = (blockIdx.x * kSampleThreads + threadIdx.x) / 32;
     if (tile >= params.num_tiles) return;  // a whole warp
@@ -349,7 +381,7 @@ __global__ void __launch_bounds__(kSampleThreads) sample_tiles_kernel(
             error_sum = warp_sum(error_sum);
             age_sum = static_cast<int>(__reduce_add_sync(kFull, static_cast<uint32_t>(age_sum)));
         }
-        drawn = draw(params, errors, ages, pixels.ids, pixels.inside, view_number, kPurposePixels, error_sum, age_sum,
+        drawn = draw<kWeighted>(params, errors, ages, pixels.ids, pixels.inside, view_number, kPurposePixels, error_sum, age_sum,
                      missed);
     } else {
         // Block j holds the 4x4 cells of its left (lane bit 2 clear) and right half; lane n < 16 takes over cell n.
@@ -382,14 +414,14 @@ __global__ void __launch_bounds__(kSampleThreads) sample_tiles_kernel(
         error_sum = warp_sum(cell_error);
         age_sum = static_cast<int>(__reduce_add_sync(kFull, static_cast<uint32_t>(cell_age[0])));
         float cell_missed[1];
-        const uint32_t cell_drawn = draw(params, cell_errors, cell_age, cell_place, cell_exists, view_number, kPurposeCells,
+        const uint32_t cell_drawn = draw<kWeighted>(params, cell_errors, cell_age, cell_place, cell_exists, view_number, kPurposeCells,
                                          error_sum, age_sum, cell_missed);
         const uint32_t cells = __ballot_sync(kFull, cell_drawn != 0u);
 #pragma unroll
         for (int j = 0; j < kPerLane; ++j) {
             const int cell = (j >> 1) * 4 + (j & 1) * 2 + ((lane >> 2) & 1);
             drawn |= (cells >> cell & 1u) << j;
-            missed[j] = __shfl_sync(kFull, cell_missed[0], cell);
+            if (kWeighted) missed[j] = __shfl_sync(kFull, cell_missed[0], cell);
         }
         drawn &= pixels.inside;
     }
@@ -405,13 +437,13 @@ __global__ void __launch_bounds__(kSampleThreads) sample_tiles_kernel(
         if (mine) {
             const int slot = next + __popc(lanes & lower_lanes);
             params.pixel_ids[slot] = static_cast<int32_t>(pixels.ids[j]);
-            if (params.weights != nullptr) params.weights[slot] = importance_weight(missed[j], params.importance);
+            if (kWeighted) params.weights[slot] = importance_weight(missed[j], params.importance);
         }
         next += __popc(lanes);
     }
     for (int slot = next + lane; slot < end; slot += 32) {
         params.pixel_ids[slot] = -1;
-        if (params.weights != nullptr) params.weights[slot] = 0.0f;
+        if (kWeighted) params.weights[slot] = 0.0f;
     }
     if (lane == 0) {
         params.tile_ids[tile] = tile;
@@ -587,6 +619,16 @@ __global__ void __launch_bounds__(kSampleThreads) fill_tiles_kernel(const __grid
     }
 }
 
+template <SampleUnit kUnit>
+cudaError_t launch_tiles(const SamplePixelsParams& params, int blocks, cudaStream_t stream) {
+    if (params.weights != nullptr) {
+        sample_tiles_kernel<kUnit, true><<<blocks, kSampleThreads, 0, stream>>>(params);
+    } else {
+        sample_tiles_kernel<kUnit, false><<<blocks, kSampleThreads, 0, stream>>>(params);
+    }
+    return cudaGetLastError();
+}
+
 int warp_blocks(int warps) { return (warps * 32 + kSampleThreads - 1) / kSampleThreads; }
 
 }  // namespace
@@ -594,14 +636,8 @@ int warp_blocks(int warps) { return (warps * 32 + kSampleThreads - 1) / kSampleT
 cudaError_t launch_sample_pixels(const SamplePixelsParams& params, cudaStream_t stream) {
     if (params.num_tiles == 0) return cudaSuccess;
     const int blocks = warp_blocks(params.num_tiles);
-    if (params.unit == SampleUnit::kPixel) {
-        sample_tiles_kernel<SampleUnit::kPixel><<<blocks, kSampleThreads, 0, stream>>>(params);
-        return cudaGetLastError();
-    }
-    if (params.unit == SampleUnit::kCell) {
-        sample_tiles_kernel<SampleUnit::kCell><<<blocks, kSampleThreads, 0, stream>>>(params);
-        return cudaGetLastError();
-    }
+    if (params.unit == SampleUnit::kPixel) return launch_tiles<SampleUnit::kPixel>(params, blocks, stream);
+    if (params.unit == SampleUnit::kCell) return launch_tiles<SampleUnit::kCell>(params, blocks, stream);
     tile_sums_kernel<<<blocks, kSampleThreads, 0, stream>>>(params);
     cudaError_t status = cudaGetLastError();
     if (status != cudaSuccess) return status;

@@ -39,7 +39,7 @@ struct RowSum {
     }
 };
 
-// Bit k: some gradient or sum of view k is not zero. Wider than `touched_views`: a loss of a user may put gradients on
+// Bit k: some gradient or sum of view k is not zero. Wider than `Sight::touched`: a loss of a user may put gradients on
 // projected means that no sample saw.
 __device__ __forceinline__ uint32_t views_with_gradient(const ScreenBackwardParams& params, int gaussian) {
     uint32_t mask = 0u;
@@ -68,22 +68,26 @@ __global__ void __launch_bounds__(kBackwardThreads) projection_backward_kernel(
 
     load_cameras(params, block);
     const uint32_t mask = inside ? views_with_gradient(params, gaussian) : 0u;
-    load_harmonics(params, block, mask != 0u);  // a barrier inside
+    const Sight sight = inside ? sight_of(params, gaussian) : Sight{};
+    start_harmonics(params, block, mask != 0u);
+    const StoredGaussian stored = mask != 0u ? load_gaussian(params, gaussian) : StoredGaussian{};
+    wait_for_copies();
+    __syncthreads();
 
     if (inside) {
         RowWriter writer{outputs.rows, outputs.view_losses, params.num_gaussians, gaussian};
         if (kPerView) {
-            backward_views(params, block, gaussian, mask, writer);
+            backward_views(params, block, gaussian, mask, sight, stored, writer);
             const RowGradient zero = {};
             for (int view = 0; view < params.num_views; ++view) {
                 if ((mask >> view & 1u) == 0u) writer.write(view, zero, 0.0f);
             }
         } else {
             RowSum total;
-            backward_views(params, block, gaussian, mask, total);
+            backward_views(params, block, gaussian, mask, sight, stored, total);
             writer.write(0, total.sum, total.loss);
         }
-        outputs.touched[gaussian] = touched_views(params, gaussian) != 0u;
+        outputs.touched[gaussian] = sight.touched != 0u;
     }
     __syncthreads();
     const int row = 3 * params.bands;

@@ -6,6 +6,7 @@
 // d/dM = T^T Q, d/dlog s_j = sum_i U_ij Q_ij, d/dT = Q M^T.
 #pragma once
 
+#include "training_math.cuh"
 #include "training_params.h"
 
 namespace turbogs {
@@ -30,7 +31,6 @@ struct ViewCamera {
     float fx, fy, cx, cy;
     float limit_x_low, limit_x_high, limit_y_low, limit_y_high;  // bounds of x/z and y/z in the Jacobian
     float grad_scale_x, grad_scale_y;                            // K * width / 2, K * height / 2
-    float side;                                                  // larger image side
 };
 
 // Gradient of the 14 parameters that a view's row holds, in the order of the blocks.
@@ -68,7 +68,6 @@ __device__ __forceinline__ ViewCamera load_camera(const float* __restrict__ view
     camera.limit_y_high = (height - camera.cy) / camera.fy + margin_y;
     camera.grad_scale_x = 0.5f * num_views * width;
     camera.grad_scale_y = 0.5f * num_views * height;
-    camera.side = static_cast<float>(width > height ? width : height);
     return camera;
 }
 
@@ -280,15 +279,16 @@ __device__ __forceinline__ void color_backward(const GaussianShape& shape, const
 #pragma unroll
     for (int i = 0; i < 3; ++i) direction[i] *= inverse_length;
 
-    const int bands = (degree + 1) * (degree + 1) - 1;
-    float basis[15];
+    float basis[15], dots[15];
     sh_basis(degree, direction[0], direction[1], direction[2], basis);
     float color[3];
 #pragma unroll
     for (int c = 0; c < 3; ++c) color[c] = kShBand0 * sh0[c] + 0.5f;
 #pragma unroll
-    for (int b = 0; b < 15; ++b) {
-        if (b < bands) {
+    for (int band = 1; band <= 3; ++band) {
+        if (band > degree) break;
+#pragma unroll
+        for (int b = band * band - 1; b < (band + 1) * (band + 1) - 1; ++b) {
 #pragma unroll
             for (int c = 0; c < 3; ++c) color[c] += basis[b] * coefficients[3 * b + c];
         }
@@ -298,17 +298,24 @@ __device__ __forceinline__ void color_backward(const GaussianShape& shape, const
         grad_color[c] = color[c] >= 0.0f ? grad_color[c] : 0.0f;
         row.sh0[c] = kShBand0 * grad_color[c];
     }
-    float dots[15];
+    // A band is read whole before any of it is written: the compiler must take the two arrays for one.
 #pragma unroll
-    for (int b = 0; b < 15; ++b) {
-        if (b < bands) {
-            dots[b] = 0.0f;
+    for (int band = 1; band <= 3; ++band) {
+        if (band > degree) break;
+        constexpr int kLargest = 7;
+        const int first = band * band - 1, count = 2 * band + 1;
+        float sums[3 * kLargest];
+#pragma unroll
+        for (int b = 0; b < count; ++b) {
+            dots[first + b] = 0.0f;
 #pragma unroll
             for (int c = 0; c < 3; ++c) {
-                dots[b] += coefficients[3 * b + c] * grad_color[c];
-                gradients[3 * b + c] += basis[b] * grad_color[c];
+                dots[first + b] += coefficients[3 * (first + b) + c] * grad_color[c];
+                sums[3 * b + c] = gradients[3 * (first + b) + c] + basis[first + b] * grad_color[c];
             }
         }
+#pragma unroll
+        for (int i = 0; i < 3 * count; ++i) gradients[3 * first + i] = sums[i];
     }
     float grad_unit[3];
     sh_basis_backward(degree, direction[0], direction[1], direction[2], dots, grad_unit);
@@ -333,7 +340,7 @@ __device__ __forceinline__ void add_row(RowGradient& sum, const RowGradient& row
 // A block owns this many consecutive Gaussians, a thread each. Their harmonics are one contiguous piece of memory, which
 // the block moves in 16-byte quads; in shared memory each thread works on its own row, whose odd stride keeps the banks
 // apart.
-constexpr int kBackwardThreads = 128;
+constexpr int kBackwardThreads = 64;
 
 struct BackwardShared {
     float* coefficients;   // [threads, stride]
@@ -374,22 +381,35 @@ __device__ __forceinline__ void load_cameras(const ScreenBackwardParams& params,
     }
 }
 
-// Bit k: some sampled pixel of view k had a contribution of this Gaussian.
-__device__ __forceinline__ uint32_t touched_views(const ScreenBackwardParams& params, int gaussian) {
+// How the views of a batch see one Gaussian.
+struct Sight {
+    uint32_t touched = 0u;  // bit k: some sampled pixel of view k had a contribution
+    int visible = 0;        // views in which it is on screen; where statistics are wanted
+    float largest = 0.0f;   // radius over the image's larger side
+};
+
+__device__ __forceinline__ Sight sight_of(const ScreenBackwardParams& params, int gaussian) {
     const float* weight = reinterpret_cast<const float*>(params.records + static_cast<size_t>(gaussian) * kRecordQuads) + 13;
     const size_t step = static_cast<size_t>(params.num_gaussians) * kRecordQuads * 4;
-    uint32_t mask = 0u;
+    Sight sight;
 #pragma unroll 4
     for (int view = 0; view < params.num_views; ++view) {
-        if (weight[view * step] > 0.0f) mask |= 1u << view;
+        if (weight[view * step] > 0.0f) sight.touched |= 1u << view;
+        if (params.error_sums == nullptr) continue;
+        const int2 radius = params.radii[static_cast<size_t>(view) * params.num_gaussians + gaussian];
+        if (radius.x > 0 || radius.y > 0) {
+            const float side = static_cast<float>(max(params.widths[view], params.heights[view]));
+            ++sight.visible;
+            sight.largest = fmaxf(sight.largest, static_cast<float>(max(radius.x, radius.y)) / side);
+        }
     }
-    return mask;
+    return sight;
 }
 
-// Harmonics of the block's touched Gaussians into shared memory, and zeros into their gradients. Two barriers; the
-// cameras are in place too when it returns.
-__device__ __forceinline__ void load_harmonics(const ScreenBackwardParams& params, const BackwardShared& block,
-                                               bool touched) {
+// Starts to copy the harmonics of the block's touched Gaussians to shared memory, and clears their gradients. A barrier
+// inside; `wait_for_copies` and a barrier make them, and the cameras, ready.
+__device__ __forceinline__ void start_harmonics(const ScreenBackwardParams& params, const BackwardShared& block,
+                                                bool touched) {
     block.touched[threadIdx.x] = touched;
     for (int i = threadIdx.x; i < kBackwardThreads * block.stride; i += kBackwardThreads) block.gradients[i] = 0.0f;
     __syncthreads();
@@ -398,46 +418,53 @@ __device__ __forceinline__ void load_harmonics(const ScreenBackwardParams& param
     const float* in = params.shN + static_cast<size_t>(first) * block.row;
     for (int i = 4 * threadIdx.x; i < count; i += 4 * kBackwardThreads) {
         const int last = min(i + 3, count - 1);
-        int owner = block.owner(i);
-        if (!(block.touched[owner] | block.touched[block.owner(last)])) continue;
-        if (last == i + 3) {
-            const float4 quad = *reinterpret_cast<const float4*>(in + i);
-            if (block.stride == block.row) {
-                *reinterpret_cast<float4*>(block.coefficients + i) = quad;
-            } else {
-                const float values[4] = {quad.x, quad.y, quad.z, quad.w};
-#pragma unroll
-                for (int j = 0; j < 4; ++j) block.coefficients[i + j + block.owner(i + j) * (block.stride - block.row)] = values[j];
-            }
+        if (!(block.touched[block.owner(i)] | block.touched[block.owner(last)])) continue;
+        if (last == i + 3 && block.stride == block.row) {
+            copy_async<4>(block.coefficients + i, in + i);
         } else {
             for (int j = i; j <= last; ++j) {
-                block.coefficients[j + block.owner(j) * (block.stride - block.row)] = in[j];
+                copy_async<1>(block.coefficients + j + block.owner(j) * (block.stride - block.row), in + j);
             }
         }
     }
-    __syncthreads();
 }
+
+// The parameters of one Gaussian but its harmonics, as they are stored.
+struct StoredGaussian {
+    float mean[3], log_scale[3], quat[4], sh0[3], logit;
+};
+
+__device__ __forceinline__ StoredGaussian load_gaussian(const ScreenBackwardParams& params, int gaussian) {
+    StoredGaussian stored;
+    const size_t triple = 3 * static_cast<size_t>(gaussian);
+#pragma unroll
+    for (int i = 0; i < 3; ++i) {
+        stored.mean[i] = params.means[triple + i];
+        stored.log_scale[i] = params.scales[triple + i];
+        stored.sh0[i] = params.sh0[triple + i];
+    }
+    const float4 quat = reinterpret_cast<const float4*>(params.quats)[gaussian];
+    stored.quat[0] = quat.x, stored.quat[1] = quat.y, stored.quat[2] = quat.z, stored.quat[3] = quat.w;
+    stored.logit = params.opacities[gaussian];
+    return stored;
+}
+
+// Adds to the window of statistics; nobody waits for what is there.
+__device__ __forceinline__ void add_stat(float* sums, int gaussian, float value) { atomicAdd(sums + gaussian, value); }
 
 // All views of one Gaussian: gives each touched view's row and loss to `sink.add`, adds the harmonics' gradients to the
 // block's shared memory, and the statistics to their window.
 template <class Sink>
 __device__ __forceinline__ void backward_views(const ScreenBackwardParams& params, const BackwardShared& block,
-                                               int gaussian, uint32_t mask, Sink& sink) {
+                                               int gaussian, uint32_t mask, const Sight& sight,
+                                               const StoredGaussian& stored, Sink& sink) {
     const bool with_stats = params.error_sums != nullptr;
-    float error_sum = 0.0f, distance_sum = 0.0f, weight_sum = 0.0f, grad_sum = 0.0f, absgrad_sum = 0.0f;
     if (mask != 0u) {
-        const float count = static_cast<float>(max(*params.num_filled, 1));
-        float mean[3], log_scale[3], sh0[3];
-#pragma unroll
-        for (int i = 0; i < 3; ++i) {
-            mean[i] = params.means[3 * static_cast<size_t>(gaussian) + i];
-            log_scale[i] = params.scales[3 * static_cast<size_t>(gaussian) + i];
-            sh0[i] = params.sh0[3 * static_cast<size_t>(gaussian) + i];
-        }
-        const float4 raw_quat = reinterpret_cast<const float4*>(params.quats)[gaussian];
-        const float quat[4] = {raw_quat.x, raw_quat.y, raw_quat.z, raw_quat.w};
-        const GaussianShape shape = make_shape(mean, log_scale, quat);
-        const float opacity = 1.0f / (1.0f + expf(-params.opacities[gaussian]));
+        float error_sum = 0.0f, distance_sum = 0.0f, weight_sum = 0.0f, grad_sum = 0.0f, absgrad_sum = 0.0f;
+        const int filled = params.num_filled != nullptr ? *params.num_filled : params.num_slots;
+        const float inverse_filled = 1.0f / static_cast<float>(max(filled, 1));
+        const GaussianShape shape = make_shape(stored.mean, stored.log_scale, stored.quat);
+        const float opacity = 1.0f / (1.0f + expf(-stored.logit));
         const float* coefficients = block.coefficients + threadIdx.x * block.stride;
         float* gradients = block.gradients + threadIdx.x * block.stride;
 
@@ -452,40 +479,30 @@ __device__ __forceinline__ void backward_views(const ScreenBackwardParams& param
             float grad_color[3] = {r1.y, r1.z, r1.w};
             RowGradient row;
             geometry_backward(shape, camera, params.eps2d, grad_mean2d, grad_conic, r3.z, row);
-            color_backward(shape, camera, sh0, params.sh_degree, coefficients, gradients, grad_color, row);
+            color_backward(shape, camera, stored.sh0, params.sh_degree, coefficients, gradients, grad_color, row);
             row.opacity = r2.x * opacity * (1.0f - opacity);
-            sink.add(view, row, r2.w / count);
+            sink.add(view, row, r2.w * inverse_filled);
 
             error_sum += r2.w;
             distance_sum += r3.x;
             weight_sum += r3.y;
             const float gx = r0.x * camera.grad_scale_x, gy = r0.y * camera.grad_scale_y;
             const float ax = r2.y * camera.grad_scale_x, ay = r2.z * camera.grad_scale_y;
-            grad_sum += sqrtf(gx * gx + gy * gy);
-            absgrad_sum += sqrtf(ax * ax + ay * ay);
+            grad_sum += approximate_sqrt(gx * gx + gy * gy);
+            absgrad_sum += approximate_sqrt(ax * ax + ay * ay);
+        }
+        if (with_stats) {
+            add_stat(params.error_sums, gaussian, error_sum);
+            add_stat(params.distance_sums, gaussian, distance_sum);
+            add_stat(params.weight_sums, gaussian, weight_sum);
+            add_stat(params.grad_sums, gaussian, grad_sum);
+            add_stat(params.absgrad_sums, gaussian, absgrad_sum);
         }
     }
-    if (with_stats) {
-        if (mask != 0u) {
-            params.error_sums[gaussian] += error_sum;
-            params.distance_sums[gaussian] += distance_sum;
-            params.weight_sums[gaussian] += weight_sum;
-            params.grad_sums[gaussian] += grad_sum;
-            params.absgrad_sums[gaussian] += absgrad_sum;
-        }
-        int visible = 0;
-        float largest = 0.0f;
-        for (int view = 0; view < params.num_views; ++view) {
-            const int2 radius = params.radii[static_cast<size_t>(view) * params.num_gaussians + gaussian];
-            if (radius.x > 0 || radius.y > 0) {
-                ++visible;
-                largest = fmaxf(largest, static_cast<float>(max(radius.x, radius.y)) / block.cameras[view].side);
-            }
-        }
-        if (visible > 0) {
-            params.view_counts[gaussian] += static_cast<float>(visible);
-            params.max_radii[gaussian] = fmaxf(params.max_radii[gaussian], largest);
-        }
+    if (sight.visible > 0) {
+        add_stat(params.view_counts, gaussian, static_cast<float>(sight.visible));
+        // Of numbers that are not negative, the bits are in order.
+        atomicMax(reinterpret_cast<int*>(params.max_radii) + gaussian, __float_as_int(sight.largest));
     }
 }
 

@@ -1,13 +1,14 @@
-// Loss, its gradient and the update of the error maps, a warp per tile.
+// Loss on sampled pixels with its gradient, and the update of the error maps: one pass over the samples in memory, a warp
+// per tile.
 //
-// A lane keeps up to 8 of its tile's samples in registers: colour and truth are read once, the tile's moments are warp
+// A lane keeps up to 4 of its tile's samples in registers: colour and truth are read once, the tile's moments are warp
 // sums in two passes about its first sample (a constant tile has variance 0 exactly), and the gradient is written in the
-// third. Warps take consecutive runs of tiles, so that the loss and the sums of the views meet in few atomics; the sums
-// of the views are of half-precision numbers in double, exact in any order.
+// last. Larger tiles are read once a pass. Sums of the views are of half-precision numbers in double, exact in any order.
 #include <cfloat>
 
 #include <cuda_fp16.h>
 
+#include "training_math.cuh"
 #include "training_params.h"
 
 namespace turbogs {
@@ -15,9 +16,8 @@ namespace {
 
 constexpr uint32_t kFull = 0xFFFFFFFFu;
 constexpr int kLossThreads = 128;
+constexpr int kLossBlocks = 7;  // of an SM: 72 registers
 constexpr int kLossWarps = kLossThreads / 32;
-constexpr int kMaxBlocks = 2048;
-constexpr int kFewSlots = 64;  // of a tile with few samples
 constexpr float kBalanceEpsilon = 1e-8f;
 constexpr float kLuminanceConstant = 1e-4f;  // 0.01^2
 constexpr float kSsimConstant = 9e-4f;       // 0.03^2
@@ -36,6 +36,7 @@ __device__ __forceinline__ double warp_sum(double value) {
 }
 
 __device__ __forceinline__ bool is_finite(float value) { return fabsf(value) <= FLT_MAX; }
+__device__ __forceinline__ bool is_finite(double value) { return fabs(value) <= DBL_MAX; }
 
 constexpr int kCountThreads = 256;
 
@@ -47,13 +48,6 @@ __global__ void __launch_bounds__(kCountThreads) count_filled_kernel(const Count
     const uint32_t total = __reduce_add_sync(kFull, static_cast<uint32_t>(mine));
     if ((threadIdx.x & 31) == 0 && total != 0u) atomicAdd(params.num_filled, static_cast<int32_t>(total));
 }
-
-// What a warp adds up over its run of tiles.
-struct Totals {
-    double loss = 0.0;         // lane's part
-    double view_delta = 0.0;   // lane's part, of the view at hand
-    int nonfinite = 0;         // lane's part
-};
 
 // Similarity S of a tile in one channel, and its gradient dS/dx = share * (at_y * dy - at_x * dx + constant), with dx, dy
 // the offsets of prediction and truth from their means.
@@ -84,110 +78,192 @@ __device__ __forceinline__ Similarity ssim(float mean_x, float mean_y, float var
             structure.value * slope};
 }
 
-// One tile, kSlots samples a lane: slot j of a lane is first + 32 j + lane.
-template <int kSlots>
-__device__ __forceinline__ void tile_loss(const SparseLossParams& params, const SampleView& view, int first, int end,
-                                          float filled, bool learns, Totals& totals) {
+// Sums of 8 values over the warp, the same in every lane: the lanes first divide the values among themselves.
+__device__ __forceinline__ void warp_sums(float (&values)[8]) {
     const int lane = threadIdx.x & 31;
+#pragma unroll
+    for (int half = 4; half > 0; half >>= 1) {
+        const bool upper = (lane & (4 * half)) != 0;
+#pragma unroll
+        for (int i = 0; i < half; ++i) {
+            const float given = upper ? values[i] : values[i + half], kept = upper ? values[i + half] : values[i];
+            values[i] = kept + __shfl_xor_sync(kFull, given, 4 * half);
+        }
+    }
+    const float pairs = values[0] + __shfl_xor_sync(kFull, values[0], 2);
+    const float sum = pairs + __shfl_xor_sync(kFull, pairs, 1);  // of value lane / 4
+#pragma unroll
+    for (int i = 0; i < 8; ++i) values[i] = __shfl_sync(kFull, sum, 4 * i);
+}
+
+// byte / 255, correctly rounded.
+__device__ __forceinline__ float unit_color(uint8_t byte) {
+    const float value = static_cast<float>(byte), quotient = value * (1.0f / 255.0f);
+    return __fmaf_rn(__fmaf_rn(-quotient, 255.0f, value), 1.0f / 255.0f, quotient);
+}
+
+// What a lane holds of a tile: slots first + 32 j + lane. An empty slot has weight 0 and pixel -1.
+template <int kSlots>
+struct LaneSamples {
+    int pixel[kSlots];
     float x[kSlots][3], y[kSlots][3], weight[kSlots];
-    uint32_t valid = 0;
+};
+
+template <int kSlots>
+__device__ __forceinline__ void load_samples(const SparseLossParams& params, const SampleView& view, int first, int end,
+                                             LaneSamples<kSlots>& samples, int& nonfinite) {
+    const int lane = threadIdx.x & 31;
 #pragma unroll
     for (int j = 0; j < kSlots; ++j) {
         const int slot = first + 32 * j + lane;
-        const int pixel = slot < end ? params.pixel_ids[slot] : -1;
-        weight[j] = 0.0f;
+        samples.pixel[j] = slot < end ? params.pixel_ids[slot] : -1;
+    }
 #pragma unroll
-        for (int c = 0; c < 3; ++c) x[j][c] = y[j][c] = 0.0f;
-        if (pixel < 0) continue;
-        bool finite = true;
+    for (int j = 0; j < kSlots; ++j) {
+        const size_t slot = static_cast<size_t>(first + 32 * j + lane);
+        const bool filled = samples.pixel[j] >= 0;
 #pragma unroll
         for (int c = 0; c < 3; ++c) {
-            x[j][c] = params.colors[3 * static_cast<size_t>(slot) + c];
-            finite = finite && is_finite(x[j][c]);
+            samples.x[j][c] = filled ? params.colors[3 * slot + c] : 0.0f;
+            samples.y[j][c] = 0.0f;
         }
-        if (!finite) {
-            ++totals.nonfinite;
-#pragma unroll
-            for (int c = 0; c < 3; ++c) x[j][c] = 0.0f;
-            continue;
-        }
-        valid |= 1u << j;
-        weight[j] = params.weights != nullptr ? params.weights[slot] : 1.0f;
+        samples.weight[j] = filled ? (params.weights != nullptr ? params.weights[slot] : 1.0f) : 0.0f;
+        if (!filled) continue;
         if (params.targets != nullptr) {
 #pragma unroll
-            for (int c = 0; c < 3; ++c) y[j][c] = params.targets[3 * static_cast<size_t>(slot) + c];
+            for (int c = 0; c < 3; ++c) samples.y[j][c] = params.targets[3 * slot + c];
         } else {
-            const uint8_t* photo = params.photos + 3 * (view.pixel_base + pixel);
+            const uint8_t* photo = params.photos + 3 * (view.pixel_base + samples.pixel[j]);
 #pragma unroll
-            for (int c = 0; c < 3; ++c) y[j][c] = __fdiv_rn(static_cast<float>(photo[c]), 255.0f);
+            for (int c = 0; c < 3; ++c) samples.y[j][c] = unit_color(photo[c]);
         }
     }
-
-    // Charbonnier term, and the error of each pixel with its map.
-    const float l1_scale = params.l1_weight / (3.0f * filled);
-    const float epsilon2 = params.epsilon * params.epsilon;
-    float slope_norm[kSlots];
-    float l1_sum = 0.0f, total_weight = 0.0f;
 #pragma unroll
     for (int j = 0; j < kSlots; ++j) {
-        const int slot = first + 32 * j + lane;
-        float error = 0.0f, value = 0.0f;
-        slope_norm[j] = 0.0f;
+        if (is_finite(samples.x[j][0]) && is_finite(samples.x[j][1]) && is_finite(samples.x[j][2])) continue;
+        ++nonfinite;
+        samples.pixel[j] = -1;
+        samples.weight[j] = 0.0f;
 #pragma unroll
-        for (int c = 0; c < 3; ++c) {
-            const float d = x[j][c] - y[j][c];
-            const float root = sqrtf(d * d + epsilon2);
-            const float slope = d / root;
-            error = __fadd_rn(error, fabsf(d));
-            value += d * slope * (root / (root + params.epsilon));
-            slope_norm[j] += fabsf(slope);
+        for (int c = 0; c < 3; ++c) samples.x[j][c] = samples.y[j][c] = 0.0f;
+    }
+}
+
+// What a tile adds to the loss and to the sum of its view; the lane's part of the latter.
+struct TileTotals {
+    double loss = 0.0, view_delta = 0.0;
+    int nonfinite = 0;
+};
+
+// One tile. Up to 32 kSlots samples stay in registers; of more, each pass loads them again, in as many rounds.
+template <int kSlots>
+__device__ __forceinline__ TileTotals tile_loss(const SparseLossParams& params, const SampleView& view, int first, int end,
+                                                float filled, bool learns) {
+    constexpr int kRound = 32 * kSlots;
+    const int lane = threadIdx.x & 31;
+    const bool resident = end - first <= kRound;
+    const bool structured = params.structure != Structure::kNone;
+    const float l1_scale = params.l1_weight / (3.0f * filled), epsilon2 = params.epsilon * params.epsilon;
+    TileTotals totals;
+    LaneSamples<kSlots> samples;
+
+    // Pass 1: Charbonnier term, errors and maps; means, about the first sample.
+    float first_x[3] = {}, first_y[3] = {}, mean_x[3] = {}, mean_y[3] = {};
+    float l1_sum = 0.0f, norm_l1 = 0.0f, inverse_total = 1.0f;
+    {
+        float sums[8] = {};  // offsets of x 0-2 and y 3-5, weights, norms of the Charbonnier gradients
+        for (int start = first; start < end; start += kRound) {
+            load_samples(params, view, start, end, samples, totals.nonfinite);
+            if (start == first) {
+#pragma unroll
+                for (int c = 0; c < 3; ++c) {
+                    first_x[c] = __shfl_sync(kFull, samples.x[0][c], 0);
+                    first_y[c] = __shfl_sync(kFull, samples.y[0][c], 0);
+                }
+            }
+            __half old[kSlots];
+            int64_t flat[kSlots];
+            if (learns) {
+#pragma unroll
+                for (int j = 0; j < kSlots; ++j) {
+                    flat[j] = view.pixel_base + samples.pixel[j];
+                    if (samples.pixel[j] >= 0) old[j] = static_cast<const __half*>(params.errors)[flat[j]];
+                }
+            }
+#pragma unroll
+            for (int j = 0; j < kSlots; ++j) {
+                const int slot = start + 32 * j + lane;
+                float error = 0.0f, value = 0.0f, slope_norm = 0.0f;
+#pragma unroll
+                for (int c = 0; c < 3; ++c) {
+                    const float d = samples.x[j][c] - samples.y[j][c];
+                    const float square = fmaxf(d * d + epsilon2, FLT_MIN);
+                    const float inverse_root = approximate_rsqrt(square), root = square * inverse_root;
+                    const float slope = d * inverse_root;
+                    error = __fadd_rn(error, fabsf(d));
+                    value += d * slope * (root * approximate_reciprocal(root + params.epsilon));
+                    slope_norm += fabsf(slope);
+                    sums[c] += samples.weight[j] * (samples.x[j][c] - first_x[c]);
+                    sums[3 + c] += samples.weight[j] * (samples.y[j][c] - first_y[c]);
+                }
+                l1_sum += samples.weight[j] * value;
+                sums[6] += samples.weight[j];
+                sums[7] += samples.weight[j] * slope_norm;
+                if (slot < end) params.pixel_errors[slot] = error;
+                if (learns && samples.pixel[j] >= 0 && is_finite(error)) {
+                    const float blended =
+                        __fadd_rn(__fmul_rn(__half2float(old[j]), params.ema_old), __fmul_rn(error, params.ema_new));
+                    const __half updated = __float2half_rn(fminf(blended, kErrorMax));
+                    static_cast<__half*>(params.errors)[flat[j]] = updated;
+                    params.stamps[flat[j]] = params.stamp;
+                    totals.view_delta += static_cast<double>(__half2float(updated)) - static_cast<double>(__half2float(old[j]));
+                }
+            }
         }
-        l1_sum += weight[j] * value;
-        total_weight += weight[j];
-        if (slot < end) params.pixel_errors[slot] = error;
-        if (learns && (valid >> j & 1u) != 0u && is_finite(error)) {
-            const int64_t flat = view.pixel_base + params.pixel_ids[slot];
-            __half* place = static_cast<__half*>(params.errors) + flat;
-            const __half old = *place;
-            const float blended =
-                __fadd_rn(__fmul_rn(__half2float(old), params.ema_old), __fmul_rn(error, params.ema_new));
-            const __half updated = __float2half_rn(fminf(blended, kErrorMax));
-            *place = updated;
-            params.stamps[flat] = params.stamp;
-            totals.view_delta += static_cast<double>(__half2float(updated)) - static_cast<double>(__half2float(old));
+        l1_sum = warp_sum(l1_sum);
+        if (structured) {
+            warp_sums(sums);
+            inverse_total = sums[6] > 0.0f ? 1.0f / sums[6] : 1.0f;
+            norm_l1 = sums[7] * inverse_total;
+#pragma unroll
+            for (int c = 0; c < 3; ++c) {
+                mean_x[c] = sums[c] * inverse_total;
+                mean_y[c] = sums[3 + c] * inverse_total;
+            }
         }
     }
-    totals.loss += static_cast<double>(l1_sum) * static_cast<double>(l1_scale);
+    totals.loss = static_cast<double>(l1_sum) * static_cast<double>(l1_scale);
 
     float factor[3] = {}, at_y[3] = {}, at_x[3] = {}, constant[3] = {};
-    float first_x[3] = {}, first_y[3] = {}, mean_x[3] = {}, mean_y[3] = {};  // means are about the first sample
-    if (params.structure != Structure::kNone) {
-        total_weight = warp_sum(total_weight);
-        const float inverse_total = total_weight > 0.0f ? 1.0f / total_weight : 1.0f;
+    const auto offset_x = [&](int j, int c) { return (samples.x[j][c] - first_x[c]) - mean_x[c]; };
+    const auto offset_y = [&](int j, int c) { return (samples.y[j][c] - first_y[c]) - mean_y[c]; };
+    const auto load_again = [&](int start) {
+        int counted = 0;
+        if (!resident) load_samples(params, view, start, end, samples, counted);
+    };
+    if (structured) {
+        // Pass 2: variances and covariances.
+        float sums[8] = {}, last = 0.0f;  // xx 0-2, yy 3-5, xy 6, 7 and `last`
+        for (int start = first; start < end; start += kRound) {
+            load_again(start);
+#pragma unroll
+            for (int j = 0; j < kSlots; ++j) {
+#pragma unroll
+                for (int c = 0; c < 3; ++c) {
+                    const float dx = offset_x(j, c), dy = offset_y(j, c);
+                    sums[c] += samples.weight[j] * (dx * dx);
+                    sums[3 + c] += samples.weight[j] * (dy * dy);
+                    (c < 2 ? sums[6 + c] : last) += samples.weight[j] * (dx * dy);
+                }
+            }
+        }
+        warp_sums(sums);
+        last = warp_sum(last);
         float variance_y[3];
 #pragma unroll
         for (int c = 0; c < 3; ++c) {
-            first_x[c] = __shfl_sync(kFull, x[0][c], 0);
-            first_y[c] = __shfl_sync(kFull, y[0][c], 0);
-#pragma unroll
-            for (int j = 0; j < kSlots; ++j) {
-                mean_x[c] += weight[j] * inverse_total * (x[j][c] - first_x[c]);
-                mean_y[c] += weight[j] * inverse_total * (y[j][c] - first_y[c]);
-            }
-            mean_x[c] = warp_sum(mean_x[c]);
-            mean_y[c] = warp_sum(mean_y[c]);
-            float xx = 0.0f, yy = 0.0f, xy = 0.0f;
-#pragma unroll
-            for (int j = 0; j < kSlots; ++j) {
-                const float share = weight[j] * inverse_total;
-                const float dx = (x[j][c] - first_x[c]) - mean_x[c], dy = (y[j][c] - first_y[c]) - mean_y[c];
-                xx += share * (dx * dx);
-                yy += share * (dy * dy);
-                xy += share * (dx * dy);
-            }
-            xx = warp_sum(xx);
-            yy = variance_y[c] = warp_sum(yy);
-            xy = warp_sum(xy);
+            const float xx = sums[c] * inverse_total, yy = sums[3 + c] * inverse_total;
+            const float xy = (c < 2 ? sums[6 + c] : last) * inverse_total;
             Similarity similarity;
             if (params.structure == Structure::kNcc) {
                 similarity = correlation(xx, yy, xy, params.variance_constant);
@@ -196,6 +272,7 @@ __device__ __forceinline__ void tile_loss(const SparseLossParams& params, const 
             } else {
                 similarity = ssim(mean_x[c] + first_x[c], mean_y[c] + first_y[c], xx, yy, xy);
             }
+            variance_y[c] = yy;
             at_y[c] = similarity.at_y;
             at_x[c] = similarity.at_x;
             constant[c] = similarity.constant;
@@ -203,20 +280,21 @@ __device__ __forceinline__ void tile_loss(const SparseLossParams& params, const 
         }
         float balance = 1.0f;
         if (params.balance) {
-            float norm_l1 = 0.0f, norm_structure = 0.0f;
+            // Pass 3: norms of the structure term's gradients.
+            float norm = 0.0f;
+            for (int start = first; start < end; start += kRound) {
+                load_again(start);
 #pragma unroll
-            for (int j = 0; j < kSlots; ++j) {
-                const float share = weight[j] * inverse_total;
-                float norm = 0.0f;
+                for (int j = 0; j < kSlots; ++j) {
+                    float norm_of_sample = 0.0f;
 #pragma unroll
-                for (int c = 0; c < 3; ++c) {
-                    const float dx = (x[j][c] - first_x[c]) - mean_x[c], dy = (y[j][c] - first_y[c]) - mean_y[c];
-                    norm += fabsf(dy * at_y[c] - dx * at_x[c] + constant[c]);
+                    for (int c = 0; c < 3; ++c) {
+                        norm_of_sample += fabsf(offset_y(j, c) * at_y[c] - offset_x(j, c) * at_x[c] + constant[c]);
+                    }
+                    norm += samples.weight[j] * norm_of_sample;
                 }
-                norm_l1 += share * slope_norm[j];
-                norm_structure += share * norm;
             }
-            balance = fminf(warp_sum(norm_l1) / (warp_sum(norm_structure) + kBalanceEpsilon), 1.0f);
+            balance = fminf(norm_l1 / (warp_sum(norm) * inverse_total + kBalanceEpsilon), 1.0f);
         }
         float tile_sum = 0.0f;
 #pragma unroll
@@ -227,80 +305,75 @@ __device__ __forceinline__ void tile_loss(const SparseLossParams& params, const 
             tile_sum += scale * factor[c];
             factor[c] = scale * inverse_total;
         }
-        if (lane == 0) totals.loss += static_cast<double>(tile_sum);
+        totals.loss += static_cast<double>(tile_sum);
     }
 
+    // Last pass: gradients.
+    for (int start = first; start < end; start += kRound) {
+        load_again(start);
 #pragma unroll
-    for (int j = 0; j < kSlots; ++j) {
-        const int slot = first + 32 * j + lane;
-        if (slot >= end) continue;
+        for (int j = 0; j < kSlots; ++j) {
+            const int slot = start + 32 * j + lane;
+            if (slot >= end) continue;
 #pragma unroll
-        for (int c = 0; c < 3; ++c) {
-            const float d = x[j][c] - y[j][c];
-            const float l1 = d / sqrtf(d * d + epsilon2) * (weight[j] * l1_scale);
-            const float dx = (x[j][c] - first_x[c]) - mean_x[c], dy = (y[j][c] - first_y[c]) - mean_y[c];
-            const float structure = dy * at_y[c] - dx * at_x[c] + constant[c];
-            params.color_gradients[3 * static_cast<size_t>(slot) + c] = l1 - factor[c] * weight[j] * structure;
+            for (int c = 0; c < 3; ++c) {
+                const float d = samples.x[j][c] - samples.y[j][c];
+                const float l1 = d * approximate_rsqrt(fmaxf(d * d + epsilon2, FLT_MIN)) * l1_scale;
+                const float structure = offset_y(j, c) * at_y[c] - offset_x(j, c) * at_x[c] + constant[c];
+                params.color_gradients[3 * static_cast<size_t>(slot) + c] = samples.weight[j] * (l1 - factor[c] * structure);
+            }
         }
     }
+    return totals;
 }
 
-// Tiles of few samples and tiles of many are two launches over the same tiles, each passing by the other's: at low rates,
-// where there are most tiles, few registers leave room for twice the warps.
-template <bool kMany>
-__global__ void __launch_bounds__(kLossThreads) sparse_loss_kernel(const __grid_constant__ SparseLossParams params) {
-    __shared__ double loss_parts[kLossWarps];
-    const int lane = threadIdx.x & 31, warps = gridDim.x * kLossWarps;
-    const int warp = blockIdx.x * kLossWarps + threadIdx.x / 32;
-    const int run = (params.num_tiles + warps - 1) / warps;
-    const int first_tile = min(warp * run, params.num_tiles), end_tile = min(first_tile + run, params.num_tiles);
-    const float filled = static_cast<float>(max(*params.num_filled, 1));
+// A warp per tile; its block adds up what belongs together. Up to 32 kSlots samples of a tile are held in registers.
+template <int kSlots>
+__global__ void __launch_bounds__(kLossThreads, kLossBlocks) sparse_loss_kernel(const __grid_constant__ SparseLossParams params) {
+    __shared__ double losses[kLossWarps], view_deltas[kLossWarps];
+    __shared__ int views[kLossWarps];
+    const int lane = threadIdx.x & 31, warp = threadIdx.x / 32;
+    const int tile = blockIdx.x * kLossWarps + warp;
+    const float filled = static_cast<float>(params.num_filled != nullptr ? max(*params.num_filled, 1) : params.num_slots);
     const bool learns = params.errors != nullptr && (params.overflow == nullptr || *params.overflow == 0);
 
-    Totals totals;
+    TileTotals totals;
     int view = -1;
-    for (int tile = first_tile; tile < end_tile; ++tile) {
-        const int first = params.tile_offsets[tile], end = params.tile_offsets[tile + 1];
-        if ((end - first > kFewSlots) != kMany) continue;
-        const int tile_id = params.tile_ids[tile];
-        int tile_view = max(view, 0);
-        while (tile_view + 1 < params.num_views && tile_id >= params.views[tile_view + 1].tile_base) ++tile_view;
-        if (tile_view != view) {
-            if (view >= 0 && params.view_sums != nullptr) {
-                const double delta = warp_sum(totals.view_delta);
-                if (lane == 0) atomicAdd(params.view_sums + params.views[view].view_number, delta);
-                totals.view_delta = 0.0;
-            }
-            view = tile_view;
-        }
-        const SampleView& of_tile = params.views[view];
-        if (kMany) {
-            if (end - first <= 128) {
-                tile_loss<4>(params, of_tile, first, end, filled, learns, totals);
-            } else {
-                tile_loss<8>(params, of_tile, first, end, filled, learns, totals);
-            }
-        } else if (end - first <= 32) {
-            tile_loss<1>(params, of_tile, first, end, filled, learns, totals);
-        } else {
-            tile_loss<2>(params, of_tile, first, end, filled, learns, totals);
+    if (tile < params.num_tiles) {
+        const int first = params.tile_offsets[tile], end = params.tile_offsets[tile + 1], tile_id = params.tile_ids[tile];
+        view = 0;
+        while (view + 1 < params.num_views && tile_id >= params.views[view + 1].tile_base) ++view;
+        totals = tile_loss<kSlots>(params, params.views[view], first, end, filled, learns);
+        totals.view_delta = warp_sum(totals.view_delta);
+        const uint32_t nonfinite = __reduce_add_sync(kFull, static_cast<uint32_t>(totals.nonfinite));
+        if (lane == 0 && nonfinite != 0u && params.num_nonfinite != nullptr) {
+            atomicAdd(params.num_nonfinite, static_cast<unsigned long long>(nonfinite));
         }
     }
-    if (view >= 0 && params.view_sums != nullptr) {
-        const double delta = warp_sum(totals.view_delta);
-        if (lane == 0) atomicAdd(params.view_sums + params.views[view].view_number, delta);
+    if (lane == 0) {
+        losses[warp] = totals.loss;
+        view_deltas[warp] = totals.view_delta;
+        views[warp] = view;
     }
-    const uint32_t nonfinite = __reduce_add_sync(kFull, static_cast<uint32_t>(totals.nonfinite));
-    if (lane == 0 && nonfinite != 0u && params.num_nonfinite != nullptr) {
-        atomicAdd(params.num_nonfinite, static_cast<unsigned long long>(nonfinite));
-    }
-    const double loss = warp_sum(totals.loss);
-    if (lane == 0) loss_parts[threadIdx.x / 32] = loss;
     __syncthreads();
     if (threadIdx.x == 0) {
-        double sum = 0.0;
-        for (int i = 0; i < kLossWarps; ++i) sum += loss_parts[i];
-        if (sum != 0.0) atomicAdd(params.loss, sum);
+        double loss = 0.0, delta = 0.0;
+        for (int i = 0; i < kLossWarps; ++i) {
+            loss += losses[i];
+            delta += view_deltas[i];
+            const bool last_of_view = i + 1 == kLossWarps || views[i + 1] != views[i];
+            if (last_of_view && delta != 0.0) {
+                atomicAdd(params.view_sums + params.views[views[i]].view_number, delta);
+                delta = 0.0;
+            }
+        }
+        if (loss != 0.0) {
+            const double before = atomicAdd(params.loss, loss);
+            // Once lost, the sum stays so: one block sees it happen.
+            if (params.nonfinite_losses != nullptr && is_finite(before) && !is_finite(before + loss)) {
+                atomicAdd(params.nonfinite_losses, 1ull);
+            }
+        }
     }
 }
 
@@ -315,11 +388,17 @@ cudaError_t launch_count_filled(const CountFilledParams& params, cudaStream_t st
 
 cudaError_t launch_sparse_loss(const SparseLossParams& params, cudaStream_t stream) {
     if (params.num_slots == 0 || params.num_tiles == 0) return cudaSuccess;
-    const int blocks = min((params.num_tiles + kLossWarps - 1) / kLossWarps, kMaxBlocks);
-    sparse_loss_kernel<false><<<blocks, kLossThreads, 0, stream>>>(params);
-    const cudaError_t status = cudaGetLastError();
-    if (status != cudaSuccess) return status;
-    sparse_loss_kernel<true><<<blocks, kLossThreads, 0, stream>>>(params);
+    const int blocks = (params.num_tiles + kLossWarps - 1) / kLossWarps;
+    // By the average: most samplers give every tile as many slots.
+    if (params.num_slots <= 32 * static_cast<int64_t>(params.num_tiles)) {
+        sparse_loss_kernel<1><<<blocks, kLossThreads, 0, stream>>>(params);
+    } else if (params.num_slots <= 64 * static_cast<int64_t>(params.num_tiles)) {
+        sparse_loss_kernel<2><<<blocks, kLossThreads, 0, stream>>>(params);
+    } else if (params.num_slots <= 96 * static_cast<int64_t>(params.num_tiles)) {
+        sparse_loss_kernel<3><<<blocks, kLossThreads, 0, stream>>>(params);
+    } else {
+        sparse_loss_kernel<4><<<blocks, kLossThreads, 0, stream>>>(params);
+    }
     return cudaGetLastError();
 }
 

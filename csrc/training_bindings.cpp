@@ -4,6 +4,7 @@
 #include <torch/csrc/stable/tensor.h>
 #include <torch/headeronly/core/ScalarType.h>
 
+#include <algorithm>
 #include <cmath>
 #include <cstdint>
 #include <optional>
@@ -20,7 +21,7 @@ ScreenBackwardParams screen_backward_params(const Checker& check, const std::vec
                                             const Tensor& viewmats, const Tensor& Ks, const std::vector<int64_t>& sizes,
                                             const Tensor& records, const std::optional<Tensor>& radii,
                                             const std::vector<Tensor>& stats, int64_t sh_degree, double eps2d,
-                                            const Tensor& num_filled,
+                                            const std::optional<Tensor>& num_filled, int64_t num_slots,
                                             const std::optional<Tensor>& overflow) {
     STD_TORCH_CHECK(gaussians.size() == 6, "turbogs: gaussians must be means, quats, scales, opacities, sh0, shN");
     STD_TORCH_CHECK(gaussians[0].dim() == 2 && gaussians[5].dim() == 3, "turbogs: means must be [N, 3], shN [N, B, 3]");
@@ -56,7 +57,8 @@ ScreenBackwardParams screen_backward_params(const Checker& check, const std::vec
     check.aligned(params.quats, "quats");
     check.aligned(params.shN, "shN");
     check.aligned(params.records, "screen gradients");
-    params.num_filled = check.pointer<int32_t>(num_filled, "num_filled", ScalarType::Int, {1});
+    params.num_filled = check.optional<int32_t>(num_filled, "num_filled", ScalarType::Int, {1});
+    params.num_slots = static_cast<int>(num_slots);
     params.overflow = check.optional<int32_t>(overflow, "overflow", ScalarType::Int, {1});
     if (!stats.empty()) {
         STD_TORCH_CHECK(stats.size() == 7, "turbogs: stats must be the seven tensors of GaussianStats");
@@ -78,11 +80,11 @@ ScreenBackwardParams screen_backward_params(const Checker& check, const std::vec
 void projection_backward(const std::vector<Tensor>& gaussians, const Tensor& viewmats, const Tensor& Ks,
                          const std::vector<int64_t>& sizes, const Tensor& records, const std::optional<Tensor>& radii,
                          const std::vector<Tensor>& stats, int64_t sh_degree, double eps2d,
-                         const Tensor& num_filled, const std::optional<Tensor>& overflow, const Tensor& rows,
+                         const std::optional<Tensor>& num_filled, int64_t num_slots, const std::optional<Tensor>& overflow, const Tensor& rows,
                          const Tensor& shN, const Tensor& touched, const Tensor& view_losses) {
     const Checker check(records);
     const ScreenBackwardParams params = screen_backward_params(check, gaussians, viewmats, Ks, sizes, records, radii, stats,
-                                                               sh_degree, eps2d, num_filled, overflow);
+                                                               sh_degree, eps2d, num_filled, num_slots, overflow);
     STD_TORCH_CHECK(rows.dim() == 3 && (rows.size(0) == 1 || rows.size(0) == params.num_views),
                     "turbogs: rows must be [1, N, 14] or [K, N, 14]");
     const int64_t num_rows = rows.size(0), count = params.num_gaussians;
@@ -98,13 +100,13 @@ void projection_backward(const std::vector<Tensor>& gaussians, const Tensor& vie
 void fused_step(const std::vector<Tensor>& gaussians, const Tensor& viewmats, const Tensor& Ks,
                 const std::vector<int64_t>& sizes, const Tensor& records, const std::optional<Tensor>& radii,
                 const std::vector<Tensor>& stats, int64_t sh_degree, double eps2d,
-                const Tensor& num_filled, const std::optional<Tensor>& overflow,
+                const std::optional<Tensor>& num_filled, int64_t num_slots, const std::optional<Tensor>& overflow,
                 const std::vector<Tensor>& moments, int64_t kind, bool rows_per_view,
                 const std::vector<double>& rates, double beta1, double beta2, double eps,
                 double curvature, double max_step) {
     const Checker check(records);
     const ScreenBackwardParams params = screen_backward_params(check, gaussians, viewmats, Ks, sizes, records, radii, stats,
-                                                               sh_degree, eps2d, num_filled, overflow);
+                                                               sh_degree, eps2d, num_filled, num_slots, overflow);
     STD_TORCH_CHECK(moments.size() == 6, "turbogs: moments must be the six tensors of GaussianMoments");
     STD_TORCH_CHECK(rates.size() == 6, "turbogs: rates must be of means, quats, scales, opacities, sh0, shN");
     STD_TORCH_CHECK(kind >= 0 && kind <= 2, "turbogs: kind must be 0 (Adam), 1 (balanced LM) or 2 (paper's LM)");
@@ -114,7 +116,10 @@ void fused_step(const std::vector<Tensor>& gaussians, const Tensor& viewmats, co
     optimizer.rows_per_view = rows_per_view;
     const double row_rates[kRowSize] = {rates[0], rates[0], rates[0], rates[2], rates[2], rates[2], rates[1],
                                         rates[1], rates[1], rates[1], rates[4], rates[4], rates[4], rates[3]};
-    for (int i = 0; i < kRowSize; ++i) optimizer.rates[i] = static_cast<float>(row_rates[i]);
+    for (int i = 0; i < kRowSize; ++i) {
+        optimizer.rates[i] = static_cast<float>(row_rates[i]);
+        optimizer.inverse_rates[i] = 1.0f / std::max(optimizer.rates[i], kRateMin);
+    }
     optimizer.rate_shN = static_cast<float>(rates[5]);
     optimizer.beta1 = static_cast<float>(beta1);
     optimizer.beta2 = static_cast<float>(beta2);
@@ -205,9 +210,11 @@ void sample_pixels(const Tensor& errors, const Tensor& stamps, const std::vector
     params.slots_per_tile = static_cast<int>(slots_per_tile);
     params.mixed_uniform = mixed_uniform;
     params.importance = static_cast<float>(importance);
-    params.seed_low = static_cast<uint32_t>(seed);
     params.seed_high = static_cast<uint32_t>(static_cast<uint64_t>(seed) >> 32);
-    params.iteration = static_cast<uint32_t>(iteration);
+    for (uint32_t round = 0; round < 10; ++round) {
+        params.round_keys[round][0] = static_cast<uint32_t>(seed) + round * 0x9E3779B9u;
+        params.round_keys[round][1] = static_cast<uint32_t>(iteration) + round * 0xBB67AE85u;
+    }
     params.now = static_cast<int>(now);
     params.errors = check.pointer<void>(errors, "errors", ScalarType::Half, {pixels});
     params.stamps = check.pointer<int16_t>(stamps, "stamps", ScalarType::Short, {pixels});
@@ -238,9 +245,10 @@ void sparse_loss(const Tensor& colors, const std::optional<Tensor>& targets, con
                  const Tensor& pixel_ids, const Tensor& tile_ids, const Tensor& tile_offsets,
                  const std::optional<Tensor>& weights, const std::vector<int64_t>& views, int64_t structure, double epsilon,
                  double l1_weight, double structure_weight, double variance_constant, bool balance, bool gate,
-                 const std::vector<Tensor>& maps, double beta, int64_t stamp, const Tensor& num_filled, const Tensor& loss,
+                 const std::vector<Tensor>& maps, double beta, int64_t stamp, const std::optional<Tensor>& num_filled,
+                 const Tensor& loss,
                  const Tensor& color_gradients, const Tensor& pixel_errors, const std::optional<Tensor>& num_nonfinite,
-                 const std::optional<Tensor>& overflow) {
+                 const std::optional<Tensor>& nonfinite_losses, const std::optional<Tensor>& overflow) {
     const Checker check(colors);
     const ViewTable table = view_table(views);
     const int64_t slots = pixel_ids.numel(), tiles = tile_ids.numel();
@@ -287,12 +295,14 @@ void sparse_loss(const Tensor& colors, const std::optional<Tensor>& targets, con
                             (maps.empty() || view.view_number < maps[2].numel()),
                         "turbogs: view ", view.view_number, " lies outside the photos or maps");
     }
-    params.num_filled = check.pointer<int32_t>(num_filled, "num_filled", ScalarType::Int, {1});
+    params.num_filled = check.optional<int32_t>(num_filled, "num_filled", ScalarType::Int, {1});
     params.loss = check.pointer<double>(loss, "loss", ScalarType::Double, {});
     params.color_gradients = check.pointer<float>(color_gradients, "color_gradients", ScalarType::Float, {slots, 3});
     params.pixel_errors = check.pointer<float>(pixel_errors, "pixel_errors", ScalarType::Float, {slots});
     params.num_nonfinite =
         reinterpret_cast<unsigned long long*>(check.optional<int64_t>(num_nonfinite, "num_nonfinite", ScalarType::Long, {}));
+    params.nonfinite_losses = reinterpret_cast<unsigned long long*>(
+        check.optional<int64_t>(nonfinite_losses, "nonfinite_losses", ScalarType::Long, {}));
     params.overflow = check.optional<int32_t>(overflow, "overflow", ScalarType::Int, {1});
     check.launched(launch_sparse_loss(params, check.stream()), "sparse loss");
 }
@@ -302,7 +312,7 @@ void sparse_loss(const Tensor& colors, const std::optional<Tensor>& targets, con
 
 #define TURBOGS_BACKWARD_INPUTS                                                                              \
     "Tensor(p!)[] gaussians, Tensor viewmats, Tensor Ks, int[] sizes, Tensor(r!) records, Tensor? radii, "           \
-    "Tensor(s!)[] stats, int sh_degree, float eps2d, Tensor num_filled, Tensor? overflow, "
+    "Tensor(s!)[] stats, int sh_degree, float eps2d, Tensor? num_filled, int num_slots, Tensor? overflow, "
 
 STABLE_TORCH_LIBRARY_FRAGMENT(turbogs, m) {
     m.def("projection_backward(" TURBOGS_BACKWARD_INPUTS
@@ -319,8 +329,8 @@ STABLE_TORCH_LIBRARY_FRAGMENT(turbogs, m) {
         "sparse_loss(Tensor colors, Tensor? targets, Tensor? photos, Tensor pixel_ids, Tensor tile_ids, "
         "Tensor tile_offsets, Tensor? weights, int[] views, int structure, float epsilon, float l1_weight, "
         "float structure_weight, float variance_constant, bool balance, bool gate, Tensor(a!)[] maps, float beta, "
-        "int stamp, Tensor num_filled, Tensor(c!) loss, Tensor(d!) color_gradients, Tensor(e!) pixel_errors, "
-        "Tensor(f!)? num_nonfinite, Tensor? overflow) -> ()");
+        "int stamp, Tensor? num_filled, Tensor(c!) loss, Tensor(d!) color_gradients, Tensor(e!) pixel_errors, "
+        "Tensor(f!)? num_nonfinite, Tensor(g!)? nonfinite_losses, Tensor? overflow) -> ()");
 }
 
 STABLE_TORCH_LIBRARY_IMPL(turbogs, CUDA, m) {

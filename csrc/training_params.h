@@ -12,6 +12,7 @@ namespace turbogs {
 
 constexpr int kTrainingMaxViews = 32;      // views of one batch: a Gaussian's touched views are one 32-bit mask
 constexpr int kTrainingMaxBands = 15;      // harmonics above band 0: degree 3
+constexpr float kRateMin = 1.0842021724855044e-19f;  // sqrt(FLT_MIN)
 constexpr int kRowSize = 14;               // mean 3, scale 3, quaternion 4, sh0 3, opacity 1
 constexpr int kRecordQuads = 4;            // a screen-gradient record is 16 floats
 
@@ -40,7 +41,8 @@ struct ScreenBackwardParams {
 
     float4* records;             // [K, N, 4]; the fused step puts the rows of the parameters in their place
     const int2* radii;           // [K, N]; read only where `stats` are wanted
-    const int32_t* num_filled;   // [1] filled samples of the batch
+    const int32_t* num_filled;   // [1] filled slots of the batch; null where all are
+    int num_slots;               // P
     const int32_t* overflow;     // [1], or null; where set, the launch does nothing
 
     // GaussianStats, added to in place; all null where not wanted.
@@ -69,6 +71,7 @@ struct OptimizerParams {
     StepKind kind;
     bool rows_per_view;      // LM: a row of J for each view, or one of their sum
     float rates[kRowSize];   // learning rates in the order of a row
+    float inverse_rates[kRowSize];  // at most 2^63: the damping of a rate of zero
     float rate_shN;
     float beta1, beta2;
     float one_minus_beta1, one_minus_beta2;  // rounded once: the difference of the floats is off by 1.3e-5 at 0.999
@@ -115,7 +118,8 @@ struct SamplePixelsParams {
     int slots_per_tile;        // units pixel and cell: slots of a tile that is not cut; also the cap of a cut one
     bool mixed_uniform;
     float importance;          // a of the weights p^-a, 0 for none
-    uint32_t seed_low, seed_high, iteration;
+    uint32_t seed_high;
+    uint32_t round_keys[10][2];  // of Philox, from the low half of the seed and the iteration
     int now;                   // a pixel's age is now - stamp, within 0 .. 32767
 
     const void* errors;        // [X] half
@@ -158,11 +162,12 @@ struct SparseLossParams {
     const float* targets;         // [P, 3], or null: then `photos` are gathered
     const uint8_t* photos;        // [X, 3]
 
-    const int32_t* num_filled;    // [1] filled slots
+    const int32_t* num_filled;    // [1] filled slots; null where all are
     double* loss;                 // [1], zero before the launch
     float* color_gradients;       // [P, 3] out
     float* pixel_errors;          // [P] out
     unsigned long long* num_nonfinite;  // [1] samples whose colour was not finite are added; or null
+    unsigned long long* nonfinite_losses;  // [1] 1 is added if the loss is not finite; or null
 
     // Maps of all views; all null where they are not to be updated.
     void* errors;                 // [X] half

@@ -43,13 +43,15 @@ Words = tuple[Tensor, Tensor, Tensor, Tensor]
 Array = TypeVar("Array", Tensor, np.ndarray)
 
 
-def philox4x32(counter: tuple[Array, Array, Array, Array], key: tuple[int, int]) -> tuple[Array, Array, Array, Array]:
+def philox4x32(
+    counter: tuple[Array, Array, Array, Array], key: tuple[int | Array, int | Array]
+) -> tuple[Array, Array, Array, Array]:
     """Philox4x32-10.
 
     Args:
         counter: four int64 tensors (or numpy arrays), each holding values 0 .. 2^32 - 1; the first has the shape of the
             result, the others broadcast to it.
-        key: two such numbers.
+        key: two such numbers, or arrays of them that broadcast to the first.
 
     Returns:
         Four int64 tensors (or arrays), each holding values 0 .. 2^32 - 1.

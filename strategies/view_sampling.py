@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -13,11 +14,22 @@ from turbogs_plugin.strategies.philox import MASK, PURPOSE_STACK, PURPOSE_VIEWS,
 from turbogs_plugin.errors import require
 from turbogs_plugin.types import Cameras, Step
 
+_BLOCK = 64
+"""Iterations whose numbers are made at once: numpy costs the same for one as for many of this size."""
+
 
 def _uniforms(purpose: int, num_views: int, step: Step) -> np.ndarray:
     """[V] float64 in (0, 1) with 52 random bits, a function of (seed, iteration, view) alone."""
-    constants = (np.array([value]) for value in (0, purpose, step.seed >> 32 & MASK))
-    high, low = philox4x32((np.arange(num_views), *constants), (step.seed & MASK, step.iteration & MASK))[:2]
+    return _uniform_block(purpose, num_views, step.seed, step.iteration // _BLOCK)[step.iteration % _BLOCK]
+
+
+@lru_cache(maxsize=8)
+def _uniform_block(purpose: int, num_views: int, seed: int, block: int) -> np.ndarray:
+    """[_BLOCK, V] float64, not to be written to: `_uniforms` of the iterations from ``block * _BLOCK`` on."""
+    views = np.tile(np.arange(num_views), (_BLOCK, 1))
+    iterations = np.arange(block * _BLOCK, (block + 1) * _BLOCK)[:, None] & MASK
+    constants = (np.array([value]) for value in (0, purpose, seed >> 32 & MASK))
+    high, low = philox4x32((views, *constants), (seed & MASK, iterations))[:2]
     return (high * 2.0**20 + (low >> 12) + 0.5) / 2.0**52
 
 

@@ -18,6 +18,7 @@ def supervise(
     maps: ErrorMaps,
     step: Step,
     overflow: Tensor | None = None,
+    nonfinite_losses: Tensor | None = None,
 ) -> LossOutput:
     """Compare rendered samples with the photos, and let the error maps learn from it.
 
@@ -31,6 +32,7 @@ def supervise(
         maps: updated in place.
         step: gives the stamp.
         overflow: [1] int32 on the device; where it is not 0, the maps stay as they are.
+        nonfinite_losses: [] int64 on the device; 1 is added if the loss is not finite.
     """
     kernel_terms = getattr(loss, "kernel_terms", None)
     if colors.is_cuda and kernel_terms is not None and kernels.available():
@@ -40,7 +42,10 @@ def supervise(
             truth.samples,
             kernel_terms(),
             update=training_kernels.MapUpdate(maps, step, overflow),
+            nonfinite_losses=nonfinite_losses,
         )
     output = loss(colors, truth.colors(), truth.samples)
     maps.update(truth.samples, output.pixel_errors, step)
+    if nonfinite_losses is not None:
+        nonfinite_losses += ~output.loss.isfinite()
     return output

@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 
 from turbogs_plugin import kernels
-from turbogs_plugin.checkpoint import require_like
 from turbogs_plugin.config import Config
 from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.errors import TrainingStopped
@@ -86,7 +85,7 @@ class Trainer:
         rendered = self.render(view_ids, samples)
 
         # 6) Sparse loss and its gradients, and 7) EMA update of the error maps
-        loss = supervise(self.loss, rendered.colors, truth, self.maps, step, self.overflow)
+        loss = supervise(self.loss, rendered.colors, truth, self.maps, step, self.overflow, self.nonfinite_losses)
 
         # 8) Backward to the Gaussians; step 11's back-projection of errors happens in the same pass
         gradients = rendered.backward(loss.color_gradients, loss.pixel_errors, self.density.stats)
@@ -97,7 +96,6 @@ class Trainer:
         # 11) Error-driven density control
         self.follow(self.density.update(self.gaussians, step))
 
-        self.nonfinite_losses += ~loss.loss.isfinite()
         self.iteration += 1
 
     def render(self, view_ids: tuple[int, ...], samples: PixelSamples) -> Rendered:
@@ -178,11 +176,12 @@ class Trainer:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Take over what `state_dict` gave, in a trainer of the same configuration and scene.
 
+        A state that nobody vouches for is first compared with the present one (`checkpoint.require_like`).
+
         Raises:
-            ValueError: the state is not one of such a trainer.
+            ValueError: the parts of the state do not fit each other or this trainer.
         """
         device = self.gaussians.device
-        require_like(state, self.state_dict(), "trainer")
         if not 0 <= state["iteration"] <= self.config.train.iterations or state["nonfinite_losses"] < 0:
             raise ValueError(f"iteration {state['iteration']} with {state['nonfinite_losses']} non-finite losses")
         self.iteration = state["iteration"]

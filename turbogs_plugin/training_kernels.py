@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass, fields
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -65,37 +66,69 @@ def sample_pixels(
         view_ids: at most `MAX_VIEWS` training views.
     """
     kernels.require()
-    shapes = TileGrid(sizes).shapes
-    tiles = shapes.prod(axis=1)  # [K]
-    wanted, stages, slots_per_tile = np.zeros(len(tiles), dtype=np.int64), [], 0
     if rule.unit == "tile":
-        wanted = np.array([rule.wanted(rate, int(count)) for count in tiles])
-        stages = [number for count in wanted for number in rule.stages(int(count))]
-        bases = np.concatenate([[0], np.cumsum(wanted)])  # chosen tiles
-        chosen, slots = int(bases[-1]), int(bases[-1]) * TILE_PIXELS
+        plan = _plan_of_tiles(sizes, rate, rule)
     else:
         of_tile = rule.wanted(rate, TILE_PIXELS if rule.unit == "pixel" else TILE_CELLS)
-        stages = rule.stages(of_tile)
-        slots_per_tile = of_tile * (1 if rule.unit == "pixel" else CELL_SIDE**2)
-        bases = np.concatenate([[0], np.cumsum(_view_slots(sizes, shapes, slots_per_tile, rule.unit))])
-        chosen, slots = int(tiles.sum()), int(bases[-1])
+        plan = _plan_within_tiles(sizes.tobytes(), of_tile, rule)
     device = errors.device
-    pixel_ids = torch.empty(slots, dtype=torch.int32, device=device)
-    tile_ids = torch.empty(chosen, dtype=torch.int32, device=device)
-    tile_offsets = torch.empty(chosen + 1, dtype=torch.int32, device=device)
-    weights = torch.empty(slots, device=device) if rule.importance else None
+    pixel_ids = torch.empty(plan.slots, dtype=torch.int32, device=device)
+    tile_ids = torch.empty(plan.chosen, dtype=torch.int32, device=device)
+    tile_offsets = torch.empty(plan.chosen + 1, dtype=torch.int32, device=device)
+    weights = torch.empty(plan.slots, device=device) if rule.importance else None
     scratch = []
     if rule.unit == "tile":
         dtypes = (torch.float64, torch.int32, torch.int64, torch.float32)
-        scratch = [torch.empty(int(tiles.sum()), dtype=dtype, device=device) for dtype in dtypes]
+        scratch = [torch.empty(plan.tiles, dtype=dtype, device=device) for dtype in dtypes]
     torch.ops.turbogs.sample_pixels(
-        errors, stamps, _view_table(starts, sizes, view_ids, bases[:-1], wanted), UNITS.index(rule.unit), stages,
-        slots_per_tile, rule.mixed_uniform, rule.importance, seed, iteration, now,
+        errors, stamps, _view_table(starts, sizes, view_ids, plan.bases, plan.wanted), UNITS.index(rule.unit),
+        plan.stages, plan.slots_per_tile, rule.mixed_uniform, rule.importance, seed, iteration, now,
         pixel_ids, tile_ids, tile_offsets, weights, scratch,
     )  # fmt: skip
     if weights is not None:
         weights = weights * ((pixel_ids >= 0).sum() / weights.sum())
     return PixelSamples(tuple(view_ids), sizes, pixel_ids, tile_ids, tile_offsets, weights, rule.unit != "pixel")
+
+
+@dataclass(frozen=True)
+class _DrawPlan:
+    """What of a draw follows from the sizes of the K views, the rate and the rule.
+
+    Args:
+        tiles: of all views; chosen: of them, those that hold samples; slots: of all these.
+        bases: [K] the first slot of each view, or for unit = tile its first chosen tile.
+        wanted: [K] for unit = tile the tiles to choose, else 0.
+        stages: units of the three stages; for unit = tile of each view, end to end.
+        slots_per_tile: of a tile that is not cut; 0 for unit = tile.
+    """
+
+    tiles: int
+    chosen: int
+    slots: int
+    bases: list[int]
+    wanted: list[int]
+    stages: list[int]
+    slots_per_tile: int
+
+
+@lru_cache(maxsize=256)
+def _plan_within_tiles(sizes_bytes: bytes, wanted: int, rule: DrawRule) -> _DrawPlan:
+    """Pixels or cells as units, `wanted` of each tile. `sizes_bytes`: of the [K, 2] int64 array."""
+    sizes = np.frombuffer(sizes_bytes, dtype=np.int64).reshape(-1, 2)
+    shapes = TileGrid(sizes).shapes
+    tiles, slots_per_tile = int(shapes.prod(axis=1).sum()), wanted * (1 if rule.unit == "pixel" else CELL_SIDE**2)
+    ends = np.cumsum(_view_slots(sizes, shapes, slots_per_tile, rule.unit)).tolist()
+    bases, unused = [0, *ends[:-1]], [0] * len(sizes)
+    return _DrawPlan(tiles, tiles, ends[-1], bases, unused, list(rule.stages(wanted)), slots_per_tile)
+
+
+def _plan_of_tiles(sizes: np.ndarray, rate: float, rule: DrawRule) -> _DrawPlan:
+    """Whole tiles as units."""
+    tiles = TileGrid(sizes).shapes.prod(axis=1).tolist()  # [K]
+    wanted = [rule.wanted(rate, count) for count in tiles]
+    stages = [number for count in wanted for number in rule.stages(count)]
+    ends = np.cumsum(wanted).tolist()
+    return _DrawPlan(sum(tiles), ends[-1], ends[-1] * TILE_PIXELS, [0, *ends[:-1]], wanted, stages, 0)
 
 
 def _view_slots(sizes: np.ndarray, shapes: np.ndarray, slots_per_tile: int, unit: str) -> np.ndarray:
@@ -114,10 +147,11 @@ def _view_slots(sizes: np.ndarray, shapes: np.ndarray, slots_per_tile: int, unit
 
 
 def _view_table(
-    starts: np.ndarray, sizes: np.ndarray, view_ids: Sequence[int], bases: np.ndarray, wanted: np.ndarray
+    starts: np.ndarray, sizes: np.ndarray, view_ids: Sequence[int], bases: Sequence[int], wanted: Sequence[int]
 ) -> list[int]:
     """Six numbers for each view, as csrc/training_bindings.cpp reads them."""
-    return np.stack([starts, sizes[:, 0], sizes[:, 1], view_ids, bases, wanted], axis=1).reshape(-1).tolist()
+    columns = zip(starts.tolist(), sizes.tolist(), view_ids, bases, wanted, strict=True)
+    return [number for start, size, *others in columns for number in (start, *size, *others)]
 
 
 @dataclass(frozen=True)
@@ -167,6 +201,7 @@ def sparse_loss(
     starts: np.ndarray | None = None,
     update: MapUpdate | None = None,
     nonfinite: Tensor | None = None,
+    nonfinite_losses: Tensor | None = None,
 ) -> LossOutput:
     """Loss, gradient and pixel errors, and with `update` what `ErrorMaps.update` does, in one launch.
 
@@ -181,6 +216,7 @@ def sparse_loss(
         starts: [K] int64, first flat pixel of each view.
         update: the maps to update; their offsets give `starts`.
         nonfinite: [] int64, added to.
+        nonfinite_losses: [] int64, 1 is added if the loss is not finite.
 
     Returns:
         The loss (a float64 scalar on the device), gradients [P, 3] float32 and errors [P] float32.
@@ -199,7 +235,7 @@ def sparse_loss(
         if photos is not None:
             raise ValueError("photos are gathered from the first flat pixel of each view: give `starts`")
         starts = np.zeros(len(samples.view_ids), dtype=np.int64)
-    unused = np.zeros(len(starts), dtype=np.int64)
+    unused = [0] * len(starts)
     loss = torch.zeros((), dtype=torch.float64, device=device)
     color_gradients, pixel_errors = torch.empty_like(colors), torch.empty(slots, device=device)
     torch.ops.turbogs.sparse_loss(
@@ -207,16 +243,16 @@ def sparse_loss(
         samples.pixel_ids, samples.tile_ids, samples.tile_offsets, samples.weights,
         _view_table(starts, samples.sizes, samples.view_ids, unused, unused), STRUCTURES.index(terms.structure),
         terms.epsilon, terms.l1_weight, terms.structure_weight, terms.variance_constant, terms.balance, terms.gate,
-        maps, beta, stamp, count_filled(samples), loss, color_gradients, pixel_errors, nonfinite,
+        maps, beta, stamp, count_filled(samples), loss, color_gradients, pixel_errors, nonfinite, nonfinite_losses,
         None if update is None else update.overflow,
     )  # fmt: skip
     return LossOutput(loss, color_gradients, pixel_errors)
 
 
-def count_filled(samples: PixelSamples) -> Tensor:
-    """[1] int32 on the device: the filled slots."""
+def count_filled(samples: PixelSamples) -> Tensor | None:
+    """[1] int32 on the device: the filled slots; None where all are."""
     if not samples.has_empty_slots:
-        return torch.full((1,), len(samples), dtype=torch.int32, device=samples.pixel_ids.device)
+        return None
     count = torch.zeros(1, dtype=torch.int32, device=samples.pixel_ids.device)
     torch.ops.turbogs.count_filled(samples.pixel_ids, count)
     return count
@@ -280,5 +316,5 @@ def _backward_arguments(screen: CudaScreenGradients) -> tuple:
         [getattr(screen.gaussians, name).detach() for name in PARAMETER_NAMES],
         screen.cameras.viewmats.contiguous(), screen.cameras.Ks.contiguous(),
         screen.cameras.sizes.reshape(-1).tolist(), screen.records, screen.radii, stats, screen.sh_degree,
-        screen.settings.eps2d, count_filled(screen.samples), screen.overflow,
+        screen.settings.eps2d, count_filled(screen.samples), len(screen.samples), screen.overflow,
     )  # fmt: skip

@@ -102,8 +102,9 @@ class Cameras:
 
     def select(self, view_ids: Sequence[int]) -> Cameras:
         """The cameras of these views, in this order."""
-        index = torch.as_tensor(list(view_ids), dtype=torch.int64).to(self.viewmats.device, non_blocking=True)
-        return Cameras(self.viewmats[index], self.Ks[index], self.sizes[np.asarray(view_ids, dtype=np.int64)])
+        # Stacked rather than indexed: no index has to travel to the device.
+        viewmats, Ks = (torch.stack([of_all[view] for view in view_ids]) for of_all in (self.viewmats, self.Ks))
+        return Cameras(viewmats, Ks, self.sizes[np.asarray(view_ids, dtype=np.int64)])
 
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Cameras:
         return Cameras(self.viewmats.to(device, dtype), self.Ks.to(device, dtype), self.sizes)

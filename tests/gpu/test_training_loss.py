@@ -144,3 +144,16 @@ def test_side_stream_and_half_colors():
         )
     stream.synchronize()
     assert torch.equal(found.color_gradients, expected.color_gradients)
+
+
+def test_lost_losses_are_counted_once():
+    """A finite colour whose square is not: the loss overflows in many tiles, and counts as one lost."""
+    samples = make_samples(0.3, "pixel")
+    colors, targets, _, _ = make_colors(samples)
+    counter = torch.zeros((), dtype=torch.int64, device=DEVICE)
+    for value, expected in ((0.5, 0), (1e38, 1), (0.5, 1), (1e38, 2)):
+        colors[::7] = value
+        found = training_kernels.sparse_loss(
+            colors.to(DEVICE), targets.to(DEVICE), to_device(samples), CASES["l1"][1], nonfinite_losses=counter
+        )
+        assert int(counter) == expected and bool(torch.isfinite(found.loss)) == (value == 0.5)
