@@ -18,6 +18,7 @@ pytestmark = [
 
 
 def test_steps_on_the_kernels(tmp_path):
+    pytest.importorskip("pycolmap", reason="the capture is written by pycolmap")
     device = torch.device("cuda")
     scene = scene_on(load_scene(tiny_capture(tmp_path)), device)
     bench = StepBench((2000,), (3,), pixel_budget=1.0, training=20, repeats=5, overrides=())
