@@ -145,7 +145,7 @@ COLORS = st.sampled_from([0.0, 1.0, -1e4, 1e6])
     center=st.sampled_from([-500.0, 10.0, 5000.0]),
     size=st.sampled_from([(1, 1), (3, 40), (20, 17)]),
 )
-@example([-2.0] * 3, [0.0, 3e38, 4.0], 1.0, 0.0, 1.0, 60.0, 10.0, (20, 17))  # in front, and infinitely far to the side
+@example([-200.0] * 3, [0.0, 3e38, -4.0], 0.0, -5.0, 0.0, 5.0, -500.0, (1, 1))  # near, and endlessly far to the side
 def test_any_gaussian_among_ordinary_ones_stays_finite(sizes, place, norm, logit, color, degrees, center, size):
     """Colours, gradients and statistics of everybody; a Gaussian that is not drawn has no gradient."""
     gaussians = random_scene(8)
