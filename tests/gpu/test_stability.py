@@ -1,0 +1,102 @@
+"""The kernels on the worst inputs of tests/stability."""
+
+import dataclasses
+
+import pytest
+import torch
+from framework_runs import tiny_capture, tiny_config
+from helpers_optim import make_gaussians as optimizer_gaussians
+from raster_cases import FORWARD_BOUND, GPU_ONLY, GRADIENT_BOUND
+from raster_extremes import CASES, NAMES, TWO_VIEWS, assert_within, compare, random_scene, render
+from tolerances import TOLERANCES
+from turbogs_plugin.strategies.density import ErrorDrivenDensity
+
+from turbogs_plugin.rendering import dense_samples, rasterize
+from turbogs_plugin.run import train
+from turbogs_plugin.scene import load_scene
+from turbogs_plugin.trainer import Trainer
+from turbogs_plugin.types import GaussianStats, Step
+
+pytestmark = GPU_ONLY
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_kernels_are_close_to_float64(case, record_property):
+    """The kernels use the hardware's exponential, so their bound is that of the rasterizer's own tests."""
+    single = TOLERANCES[torch.float32]
+    bounds = dataclasses.replace(
+        single,
+        pixel=FORWARD_BOUND,
+        gradient=GRADIENT_BOUND,
+        needle_pixel=5 * FORWARD_BOUND,
+        needle_gradient=max(single.needle_gradient, 5 * GRADIENT_BOUND),
+    )
+    error, errors = compare(case, torch.float32, "cuda")
+    record_property("errors", f"{error:.1e} {errors}")
+    assert_within(case, error, errors, bounds)
+
+
+def test_equal_depths_render_the_same_bits_every_time():
+    gaussians = random_scene(300)
+    gaussians.means[:] = gaussians.means[:1].clone()
+    gaussians.opacities[:], gaussians.scales[:] = 1.0, -1.0
+    first, _ = render(gaussians, TWO_VIEWS, torch.float32, "cuda")
+    again, _ = render(gaussians, TWO_VIEWS, torch.float32, "cuda")
+    assert torch.equal(first, again)
+
+
+@pytest.mark.parametrize("size", [-200.0, -20.0, 9.0, 20.0, 88.0, 200.0])
+@pytest.mark.parametrize("place", [0.0, 1e-30, 4.0, 1e6, 1e18, 3e38])
+@pytest.mark.parametrize("norm", [0.0, 1e-38, 1.0, 1e37])
+def test_any_gaussian_among_ordinary_ones_stays_finite(size, place, norm):
+    gaussians = random_scene(8)
+    gaussians.scales[3] = torch.tensor([size, -2.0, -20.0])
+    gaussians.means[3] = torch.tensor([0.0, place, -place if place < 1e3 else 0.0])
+    gaussians.quats[3] *= norm
+    gaussians, cameras = gaussians.map(lambda value: value.cuda()), TWO_VIEWS.to("cuda")
+    samples, stats = dense_samples(cameras), GaussianStats.zeros(len(gaussians), "cuda")
+    rendered = rasterize(gaussians, cameras, samples)
+    ones = torch.ones_like(rendered.alphas)
+    gradients = rendered.backward(torch.ones_like(rendered.colors), ones, stats).parameter_gradients(rows=True)
+    assert rendered.colors.isfinite().all() and rendered.alphas.isfinite().all()
+    assert all(value.isfinite().all() for value in (*vars(gradients).values(), *vars(stats).values()))
+    for name in NAMES[:-1]:
+        assert (getattr(gradients, name)[:, ~gradients.touched] == 0).all(), name
+
+
+def test_what_is_too_large_to_split_goes():
+    gaussians = optimizer_gaussians(200, dtype=torch.float32).map(lambda value: value.cuda())
+    gaussians.scales[::2] = 88.0
+    density = ErrorDrivenDensity(refine_from=200, top_fraction=1.0)
+    density.setup(gaussians)
+    for name in ("error_sums", "weight_sums", "grad_sums", "view_counts"):
+        getattr(density.stats, name).fill_(1.0)
+    step = Step(iteration=200, total=5000, refine_until=3500, seed=7, scene_extent=1.0)
+    result = density.update(gaussians, step).apply(gaussians)
+    assert all(value.isfinite().all() for _, value in result.items())
+
+
+@pytest.mark.parametrize("factor", [100, 1e4])
+def test_learning_rates_far_too_large(tmp_path, factor):
+    rates = f"optimizer.learning_rates.batch_scale={2 * factor}"
+    config = tiny_config(tiny_capture(tmp_path), rates, "train.device=cuda", "density.max_gaussians=3000")
+    outcome = train(config, tmp_path / "run")
+    assert all(evaluation.psnr == evaluation.psnr for evaluation in outcome.history)
+
+
+def test_the_guard_waits_for_nothing(tmp_path):
+    """Between two events of density control, no iteration makes the host wait for the GPU."""
+    scene = load_scene(tiny_capture(tmp_path))
+    config = tiny_config(tmp_path / "capture", "train.device=cuda", "density.refine_from=1000")
+    trainer = Trainer(config, scene, torch.device("cuda"))
+    trainer.initialise_maps()
+    for _ in range(5):
+        trainer.step()
+    torch.cuda.synchronize()
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        for _ in range(3):
+            trainer.step()
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    assert int(trainer.nonfinite_losses) == int(trainer.optimizer.skipped) == 0
