@@ -7,6 +7,7 @@ from raster_cases import GPU_ONLY, assert_gradients_close, make_case
 from rendering_scenes import thin_out
 
 from turbogs_plugin.rendering import cuda, dense_samples
+from turbogs_plugin.rendering.cuda_autograd import rasterize_differentiable_cuda
 
 pytestmark = GPU_ONLY
 SIZE = (250, 170)
@@ -62,7 +63,7 @@ def test_gradients(case):
     theirs = case.gpu_gaussians.map(lambda value: value.clone().requires_grad_())
     weights = torch.randn(len(case.cameras) * height * width, 4, device="cuda")
 
-    render = cuda.rasterize_differentiable_cuda(ours, case.gpu_cameras, case.gpu_samples)
+    render = rasterize_differentiable_cuda(ours, case.gpu_cameras, case.gpu_samples)
     images, alphas, info = render_gsplat(theirs, case.gpu_cameras, absgrad=True)
     info["means2d"].retain_grad()
     rows = pixel_rows(case.samples)

@@ -14,6 +14,7 @@ from raster_cases import (
 
 from turbogs_plugin.rendering import cuda, rasterize_reference
 from turbogs_plugin.rendering import rasterize_differentiable as differentiable_reference
+from turbogs_plugin.rendering.cuda_autograd import rasterize_differentiable_cuda
 from turbogs_plugin.types import GaussianStats
 
 pytestmark = GPU_ONLY
@@ -102,7 +103,10 @@ def test_autograd(case):
     cpu = case.gaussians.map(lambda value: value.clone().requires_grad_())
     values = upstream(case)
     renders = (
-        (cuda.rasterize_differentiable_cuda(gpu, case.gpu_cameras, case.gpu_samples, with_depth=True), on_gpu(values)),
+        (
+            rasterize_differentiable_cuda(gpu, case.gpu_cameras, case.gpu_samples, with_depth=True),
+            on_gpu(values),
+        ),
         (differentiable_reference(cpu, case.cameras, case.samples, with_depth=True), values),
     )
     for render, weights in renders:

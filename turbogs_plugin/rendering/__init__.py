@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 from turbogs_plugin import kernels
-from turbogs_plugin.rendering.cuda import rasterize_cuda, rasterize_differentiable_cuda
+from turbogs_plugin.rendering.cuda import rasterize_cuda
+from turbogs_plugin.rendering.cuda_autograd import rasterize_differentiable_cuda
 from turbogs_plugin.rendering.reference import (
     DifferentiableRender,
     rasterize_differentiable_reference,
