@@ -5,7 +5,6 @@ import json
 import math
 import re
 import shutil
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +13,6 @@ from framework_runs import TINY, tiny_capture
 from hypothesis import given
 from hypothesis import strategies as st
 
-from turbogs_plugin import cli
 from turbogs_plugin.ablation.grid import Ablation, ablation_names, load_ablation, variant_config, with_iterations
 from turbogs_plugin.ablation.results import CellResult, Study, StudyFolder
 from turbogs_plugin.ablation.statistics import Curve, Spread, differ, pareto_front, seconds_to_reach
@@ -196,20 +194,6 @@ def test_a_summary_of_known_numbers():
 
 
 # The command
-
-
-@pytest.fixture
-def turbogs(monkeypatch, capsys):
-    """Run the command in this process: (exit code, stdout, stderr)."""
-
-    def turbogs(*arguments) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["turbogs", *map(str, arguments)])
-        with pytest.raises(SystemExit) as end:
-            cli.main()
-        captured = capsys.readouterr()
-        return end.value.code or 0, captured.out, captured.err
-
-    return turbogs
 
 
 @pytest.fixture(scope="module")

@@ -2,7 +2,6 @@
 
 import json
 import math
-import sys
 import time
 from types import SimpleNamespace
 
@@ -11,7 +10,6 @@ import pytest
 import torch
 from framework_runs import tiny_capture, tiny_config
 
-from turbogs_plugin import cli
 from turbogs_plugin import trainer as trainer_module
 from turbogs_plugin.bench import floors
 from turbogs_plugin.bench.clocks import Mark, back_to_back, measure, summary
@@ -30,20 +28,6 @@ CPU = torch.device("cpu")
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory):
     return tiny_capture(tmp_path_factory.mktemp("bench"))
-
-
-@pytest.fixture
-def turbogs(monkeypatch, capsys):
-    """Run the command in this process: (exit code, stdout, stderr)."""
-
-    def turbogs(*arguments) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["turbogs", *map(str, arguments)])
-        with pytest.raises(SystemExit) as end:
-            cli.main()
-        captured = capsys.readouterr()
-        return end.value.code or 0, captured.out, captured.err
-
-    return turbogs
 
 
 def test_clocks_measure_what_passes():

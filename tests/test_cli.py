@@ -13,7 +13,6 @@ import torch
 from framework_runs import TINY, tiny_capture
 from PIL import Image
 
-from turbogs_plugin import cli
 from turbogs_plugin.trainer import Trainer
 
 QUICK = ("train.iterations=2", "train.sh_degree=0", "train.evaluate_at=[]")
@@ -28,20 +27,6 @@ def capture(tmp_path_factory) -> Path:
 def copy(capture, tmp_path) -> Path:
     """A capture to break."""
     return Path(shutil.copytree(capture, tmp_path / "copy"))
-
-
-@pytest.fixture
-def turbogs(monkeypatch, capsys):
-    """Run the command in this process: (exit code, stdout, stderr)."""
-
-    def turbogs(*arguments) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["turbogs", *map(str, arguments)])
-        with pytest.raises(SystemExit) as end:
-            cli.main()
-        captured = capsys.readouterr()
-        return end.value.code or 0, captured.out, captured.err
-
-    return turbogs
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import operator
 import os
 import signal
-import time
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import FrameType, TracebackType
@@ -15,9 +14,10 @@ import numpy as np
 import torch
 
 from turbogs_plugin.checkpoint import latest_checkpoint, load_checkpoint, require_like, save_checkpoint
+from turbogs_plugin.clock import TrainingClock
 from turbogs_plugin.config import Config, resolve
 from turbogs_plugin.errors import InputError, TrainingStopped
-from turbogs_plugin.evaluation import Metrics, evaluate, load_lpips, peak_memory_bytes, synchronize
+from turbogs_plugin.evaluation import Metrics, evaluate, load_lpips, peak_memory_bytes
 from turbogs_plugin.files import write_text_atomically
 from turbogs_plugin.gaussians import save_ply
 from turbogs_plugin.progress import TrainingProgress
@@ -173,24 +173,6 @@ def load_model(path: Path, device: torch.device) -> SavedModel:
         raise InputError(f"checkpoint '{checkpoint}' is not one of a run: {error}") from None
 
 
-class _Clock:
-    """Seconds of training. Entered for training alone; waits for the GPU at both ends."""
-
-    def __init__(self, device: torch.device) -> None:
-        self.device = device
-        self.seconds = 0.0
-
-    def __enter__(self) -> None:
-        synchronize(self.device)
-        self._started = time.perf_counter()
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        synchronize(self.device)
-        self.seconds += time.perf_counter() - self._started
-
-
 class _Interrupts:
     """Turns SIGINT and SIGTERM into a wish to stop after this iteration; a second one stops at once."""
 
@@ -229,7 +211,7 @@ class _Session:
     def __post_init__(self) -> None:
         self.device = self.trainer.gaussians.device
         self.test: PosedImages = self.scene.test.to(self.device)
-        self.clock = _Clock(self.device)
+        self.clock = TrainingClock(self.device)
 
     def run(self) -> Outcome:
         """Train to the end, or until a signal; both end with a checkpoint."""

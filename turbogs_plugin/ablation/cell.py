@@ -11,7 +11,8 @@ import torch
 
 from turbogs_plugin.ablation.grid import with_iterations
 from turbogs_plugin.ablation.results import CellResult
-from turbogs_plugin.ablation.timing import PeakMemory, TrainingClock
+from turbogs_plugin.ablation.timing import PeakMemory
+from turbogs_plugin.clock import TrainingClock
 from turbogs_plugin.config import Config
 from turbogs_plugin.evaluation import Metrics, evaluate, load_lpips, peak_memory_bytes
 from turbogs_plugin.provenance import Provenance
