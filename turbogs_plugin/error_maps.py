@@ -85,8 +85,7 @@ class ErrorMaps:
 
     def flat_pixels(self, samples: PixelSamples) -> Tensor:
         """[P] int64: flat pixel of each slot; an empty slot gets the first pixel of its view."""
-        starts = torch.as_tensor(self.offsets[list(samples.view_ids)], device=samples.pixel_ids.device)
-        return starts[samples.view_of_slot()] + samples.pixel_ids.long().clamp(min=0)
+        return samples.flat_pixels(self.offsets)
 
     def initialise(self, view_id: int, errors: Tensor) -> None:
         """Set the errors of one whole view. `errors`: [H * W] float; non-finite ones count as zero."""

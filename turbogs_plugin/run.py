@@ -21,7 +21,7 @@ from turbogs_plugin.evaluation import Metrics, evaluate, load_lpips, peak_memory
 from turbogs_plugin.files import write_text_atomically
 from turbogs_plugin.gaussians import save_ply
 from turbogs_plugin.progress import TrainingProgress
-from turbogs_plugin.report.history import Evaluation, append_evaluation, read_history, rewind_history
+from turbogs_plugin.report.history import Evaluation, append_evaluation, rewind_history
 from turbogs_plugin.report.pages import RunRecord, write_report
 from turbogs_plugin.scene import Frame, PosedImages, Scene, load_scene
 from turbogs_plugin.trainer import Trainer, gaussians_of_state
@@ -229,14 +229,13 @@ class _Session:
                     mark = min(iteration for iteration in evaluations | saves if iteration > trainer.iteration)
                     with self.clock:
                         while trainer.iteration < mark and interrupts.signal is None:
-                            trainer.step()
+                            trainer.step_towards(mark)
                             progress.advance(trainer.iteration, len(trainer.gaussians))
-                            if trainer.iteration == mark:
-                                trainer.repeat_lost(wait=True)
                     if trainer.iteration in evaluations:
                         self._evaluate(progress)
                     if trainer.iteration in saves:
                         self._save()
+                trainer.repeat_lost(wait=True)  # a stop between marks must not count iterations that did nothing
                 if interrupts.signal is not None and trainer.iteration not in saves:
                     self._save()
             if trainer.iteration == total:
@@ -309,8 +308,3 @@ class _Session:
     def _last_good(self) -> str:
         checkpoint = latest_checkpoint(self.folder.checkpoints)
         return f"the last good checkpoint is '{checkpoint}'" if checkpoint else "no checkpoint was saved before"
-
-
-def finished_history(path: Path) -> list[Evaluation]:
-    """The history of a run, for showing it."""
-    return read_history(RunFolder(path).history)

@@ -119,6 +119,12 @@ class Trainer:
         self.optimizer.apply(update)
         self.first_repeatable = self.iteration + 1
 
+    def step_towards(self, mark: int) -> None:
+        """One iteration. The one that reaches `mark` waits for the GPU, so that none is missing there."""
+        self.step()
+        if self.iteration == mark:
+            self.repeat_lost(wait=True)
+
     def repeat_lost(self, wait: bool = False) -> None:
         """Go back by the iterations that did nothing because the rasterizer's workspace was too small for them.
 

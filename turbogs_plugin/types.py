@@ -193,6 +193,15 @@ class PixelSamples:
         ends = torch.as_tensor(self.grid.offsets[1:], device=self.tile_ids.device)
         return torch.searchsorted(ends, self.tile_ids.long(), right=True)[self.tile_of_slot()]
 
+    def flat_pixels(self, offsets: np.ndarray) -> Tensor:
+        """[P] int64: flat pixel of each slot; an empty slot gets the first pixel of its view.
+
+        Args:
+            offsets: [V + 1] int64, first flat pixel of each training view.
+        """
+        starts = torch.as_tensor(offsets[list(self.view_ids)], device=self.pixel_ids.device)
+        return starts[self.view_of_slot()] + self.pixel_ids.long().clamp(min=0)
+
     def coordinates(self) -> Tensor:
         """[P, 2] int64 (x, y) of each slot in its view; (0, 0) for an empty slot."""
         widths = torch.as_tensor(self.sizes[:, 0], device=self.pixel_ids.device)[self.view_of_slot()]

@@ -88,9 +88,9 @@ def train_cell(
         mark = min(iteration for iteration in marks if iteration > trainer.iteration)
         with clock:
             while trainer.iteration < mark and in_time:
-                trainer.step()
+                trainer.step_towards(mark)
                 in_time = not time_budget or clock.now() < time_budget
-                if trainer.iteration == mark or not in_time:
+                if not in_time:
                     trainer.repeat_lost(wait=True)
                 progress(trainer.iteration)
         metrics = measure(final=trainer.iteration == total or not in_time)
@@ -115,9 +115,7 @@ def warm_up(config: Config, scene: Scene, device: torch.device, iterations: int)
     trainer = Trainer(with_iterations(config, iterations), scene, device)
     trainer.initialise_maps()
     while trainer.iteration < iterations:
-        trainer.step()
-        if trainer.iteration == iterations:
-            trainer.repeat_lost(wait=True)
+        trainer.step_towards(iterations)
     evaluate(trainer.gaussians, scene.test, trainer.sh_degree, config.raster)
     del trainer
     if device.type == "cuda":

@@ -79,9 +79,7 @@ def train(trainer: Trainer, iterations: int) -> None:
     """So many more iterations, those repeated that were lost to an overflow."""
     end = trainer.iteration + iterations
     while trainer.iteration < end:
-        trainer.step()
-        if trainer.iteration == end:
-            trainer.repeat_lost(wait=True)
+        trainer.step_towards(end)
 
 
 def resized(gaussians: Gaussians, count: int, seed: int = 0) -> Gaussians:

@@ -42,9 +42,7 @@ class Photos:
 
     def gather(self, samples: PixelSamples) -> Tensor:
         """[P, 3] float32, 0 .. 1: the colours at the samples, 0 in empty slots."""
-        starts = torch.as_tensor(self.offsets[list(samples.view_ids)], device=samples.pixel_ids.device)
-        flat = starts[samples.view_of_slot()] + samples.pixel_ids.long().clamp(min=0)
-        return self.colors[flat].float().div_(255.0).mul_(samples.filled[:, None])
+        return self.colors[samples.flat_pixels(self.offsets)].float().div_(255.0).mul_(samples.filled[:, None])
 
     def at(self, samples: PixelSamples) -> PhotoSamples:
         """The photos at the samples, to be gathered where they are compared."""
