@@ -10,6 +10,8 @@
 #include <cstddef>
 #include <cstdint>
 
+#include "camera.cuh"
+
 namespace turbogs {
 
 constexpr int kTileSize = 16;               // side of a tile, pixels (TILE_SIZE in types.py)
@@ -21,16 +23,13 @@ constexpr int kBucket = 32;                 // splats staged at once; one contri
 constexpr uint32_t kInvisible = 0xFFFFFFFFu;  // depth key of an instance without pairs
 constexpr uint32_t kMaxPairs = 0x7FFFFFFFu;   // the pair count saturates here instead of wrapping
 
-// One view as the kernels read it, 96 bytes. Written by the projection launcher.
-struct RasterCamera {
-    float rotation[9];     // row-major, world to camera
-    float translation[3];
-    float fx, fy, cx, cy;  // pixels
-    float center[3];       // of the camera in the world
+// One view as the kernels read it, 112 bytes. Written by the projection launcher.
+struct alignas(16) RasterCamera : Pinhole {
     int tiles_y;
-    int width, height;     // pixels
+    int width, height;   // pixels
     int tiles_x;
-    int tile_base;         // id of the view's first tile
+    int tile_base;       // id of the view's first tile
+    SlopeBounds slopes;  // where the Jacobian is taken
 };
 
 // A splat on the screen, 48 bytes: what the tile stages gather.

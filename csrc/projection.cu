@@ -5,39 +5,24 @@
 // with 16-byte loads. Active tiles are found by
 // their prefix counts, so counting a row of tiles costs two loads whatever its length.
 #include "common.cuh"
+#include "quaternion.cuh"
+#include "spherical_harmonics.cuh"
 
 namespace turbogs {
 namespace {
 
 constexpr int kProjectionGaussians = 64;  // of a block
 constexpr int kProjectionSlices = 4;      // most threads of a Gaussian: a small model alone does not fill the GPU
+constexpr int kProjectionEnough = 500'000;  // threads that do
 constexpr float kExtentMax = 3.33f;        // gsplat's cut of a splat's half width, standard deviations
 constexpr float kCovarianceMax = 1e18f;    // beyond, the determinant would overflow
-constexpr float kQuaternionMin = 1e-30f;   // largest component of a quaternion that still has a direction
-constexpr float kClampMargin = 0.15f;      // of the image's width, as in gsplat: where the Jacobian is taken
 constexpr int kRadiusMax = 1 << 24;
 
 __global__ void pack_cameras_kernel(const __grid_constant__ ProjectionParams params) {
     const int view = threadIdx.x;
     if (view >= params.num_views) return;
-    const float* matrix = params.viewmats + 16 * view;
-    const float* intrinsics = params.intrinsics + 9 * view;
     RasterCamera camera;
-#pragma unroll
-    for (int i = 0; i < 3; ++i) {
-#pragma unroll
-        for (int j = 0; j < 3; ++j) camera.rotation[3 * i + j] = matrix[4 * i + j];
-        camera.translation[i] = matrix[4 * i + 3];
-    }
-#pragma unroll
-    for (int j = 0; j < 3; ++j) {
-        camera.center[j] = -(camera.rotation[j] * camera.translation[0] + camera.rotation[3 + j] * camera.translation[1] +
-                             camera.rotation[6 + j] * camera.translation[2]);
-    }
-    camera.fx = intrinsics[0];
-    camera.fy = intrinsics[4];
-    camera.cx = intrinsics[2];
-    camera.cy = intrinsics[5];
+    static_cast<Pinhole&>(camera) = load_pinhole(params.viewmats + 16 * view, params.intrinsics + 9 * view);
     camera.tile_base = 0;
     for (int i = 0; i <= view; ++i) {
         camera.width = params.widths[i];
@@ -46,6 +31,7 @@ __global__ void pack_cameras_kernel(const __grid_constant__ ProjectionParams par
         camera.tiles_y = (camera.height + kTileSize - 1) / kTileSize;
         if (i < view) camera.tile_base += camera.tiles_x * camera.tiles_y;
     }
+    camera.slopes = slope_bounds(camera, camera.width, camera.height);
     params.cameras[view] = camera;
 }
 
@@ -62,59 +48,16 @@ __global__ void active_prefix_kernel(const __grid_constant__ ProjectionParams pa
     params.active_prefix[tile_id] = low;
 }
 
-// Colour in a unit direction, without offset and clamp: gsplat's order and signs (Sloan, JCGT 2013).
-// `coefficients`: [bands, 3].
+// Colour in a unit direction, without offset and clamp. `coefficients`: [bands, 3].
 __device__ __forceinline__ float3 evaluate_harmonics(int degree, const float sh0[3], const float* coefficients, float x,
                                                      float y, float z) {
-    float3 color = make_float3(0.28209479177387814f * sh0[0], 0.28209479177387814f * sh0[1], 0.28209479177387814f * sh0[2]);
-    const auto add = [&](int band, float basis) {
-        color.x += basis * coefficients[3 * band];
-        color.y += basis * coefficients[3 * band + 1];
-        color.z += basis * coefficients[3 * band + 2];
-    };
-    if (degree < 1) return color;
-    add(0, -0.48860251190292f * y);
-    add(1, 0.48860251190292f * z);
-    add(2, -0.48860251190292f * x);
-    if (degree < 2) return color;
-    const float z2 = z * z, c1 = x * x - y * y, s1 = 2.0f * x * y;
-    add(3, 0.5462742152960395f * s1);
-    add(4, -1.092548430592079f * z * y);
-    add(5, 0.9461746957575601f * z2 - 0.3153915652525201f);
-    add(6, -1.092548430592079f * z * x);
-    add(7, 0.5462742152960395f * c1);
-    if (degree < 3) return color;
-    const float c2 = x * c1 - y * s1, s2 = x * s1 + y * c1;
-    const float ring = -2.285228997322329f * z2 + 0.4570457994644658f, axis = 1.445305721320277f * z;
-    add(8, -0.5900435899266435f * s2);
-    add(9, axis * s1);
-    add(10, ring * y);
-    add(11, z * (1.865881662950577f * z2 - 1.119528997770346f));
-    add(12, ring * x);
-    add(13, axis * c1);
-    add(14, -0.5900435899266435f * c2);
+    float3 color = make_float3(kShBand0 * sh0[0], kShBand0 * sh0[1], kShBand0 * sh0[2]);
+    visit_harmonics(degree, x, y, z, [&](int harmonic, float value) {
+        color.x += value * coefficients[3 * harmonic];
+        color.y += value * coefficients[3 * harmonic + 1];
+        color.z += value * coefficients[3 * harmonic + 2];
+    });
     return color;
-}
-
-// Columns of rotation times standard deviation, row-major.
-__device__ __forceinline__ void axes_of(const float4 raw, const float log_scale[3], float axes[9]) {
-    // Divided by the largest component first, so that the squares of tiny and huge quaternions stay in range; one without
-    // a direction is the identity.
-    const float size = fmaxf(fmaxf(fabsf(raw.x), fabsf(raw.y)), fmaxf(fabsf(raw.z), fabsf(raw.w)));
-    const bool directed = size > kQuaternionMin;
-    const float inverse_size = directed ? 1.0f / size : 0.0f;
-    float w = directed ? raw.x * inverse_size : 1.0f, x = raw.y * inverse_size, y = raw.z * inverse_size, z = raw.w * inverse_size;
-    const float inverse_norm = 1.0f / sqrtf(w * w + x * x + y * y + z * z);
-    w *= inverse_norm, x *= inverse_norm, y *= inverse_norm, z *= inverse_norm;
-    const float rotation[9] = {1.0f - 2.0f * (y * y + z * z), 2.0f * (x * y - w * z),        2.0f * (x * z + w * y),
-                               2.0f * (x * y + w * z),        1.0f - 2.0f * (x * x + z * z), 2.0f * (y * z - w * x),
-                               2.0f * (x * z - w * y),        2.0f * (y * z + w * x),        1.0f - 2.0f * (x * x + y * y)};
-#pragma unroll
-    for (int j = 0; j < 3; ++j) {
-        const float scale = expf(log_scale[j]);
-#pragma unroll
-        for (int i = 0; i < 3; ++i) axes[3 * i + j] = rotation[3 * i + j] * scale;
-    }
 }
 
 // The geometry of one Gaussian in one view. False where the splat is off screen; comparisons are written so that NaN is.
@@ -122,19 +65,13 @@ __device__ __forceinline__ bool project(const ProjectionParams& params, const Ra
                                         const float axes[9], float extent, Instance& splat, int2& radius) {
     const float* W = camera.rotation;
     float point[3];
-#pragma unroll
-    for (int i = 0; i < 3; ++i) {
-        point[i] = W[3 * i] * mean[0] + W[3 * i + 1] * mean[1] + W[3 * i + 2] * mean[2] + camera.translation[i];
-    }
+    camera_point(camera, mean, point);
     if (!(point[2] >= params.near_plane && point[2] <= params.far_plane)) return false;
 
     const float inverse_depth = 1.0f / point[2];
     const float slope_x = point[0] * inverse_depth, slope_y = point[1] * inverse_depth;
-    const float margin_x = kClampMargin * camera.width / camera.fx, margin_y = kClampMargin * camera.height / camera.fy;
-    const float clamped_x =
-        fminf((camera.width - camera.cx) / camera.fx + margin_x, fmaxf(-(camera.cx / camera.fx + margin_x), slope_x));
-    const float clamped_y =
-        fminf((camera.height - camera.cy) / camera.fy + margin_y, fmaxf(-(camera.cy / camera.fy + margin_y), slope_y));
+    const float clamped_x = fminf(camera.slopes.high_x, fmaxf(camera.slopes.low_x, slope_x));
+    const float clamped_y = fminf(camera.slopes.high_y, fmaxf(camera.slopes.low_y, slope_y));
     const float j00 = camera.fx * inverse_depth, j11 = camera.fy * inverse_depth;
 
     float u[3], v[3];  // Jacobian * rotation * axes, row by row
@@ -232,7 +169,12 @@ __global__ void __launch_bounds__(kProjectionGaussians* kProjectionSlices, 4)
             log_scale[i] = params.scales[3 * static_cast<size_t>(gaussian) + i];
             sh0[i] = params.sh0[3 * static_cast<size_t>(gaussian) + i];
         }
-        axes_of(reinterpret_cast<const float4*>(params.quats)[gaussian], log_scale, axes);
+        const float4 raw = reinterpret_cast<const float4*>(params.quats)[gaussian];
+        const float quat[4] = {raw.x, raw.y, raw.z, raw.w};
+        const float scale[3] = {expf(log_scale[0]), expf(log_scale[1]), expf(log_scale[2])};
+        float unit[4];
+        unit_quaternion(quat, unit);
+        scaled_rotation(unit, scale, axes);
     }
     Instance splat;
     splat.opacity = 1.0f / (1.0f + expf(-params.opacities[gaussian]));
@@ -287,7 +229,10 @@ cudaError_t launch_projection(const ProjectionParams& params, cudaStream_t strea
     const size_t shared = params.num_views * sizeof(RasterCamera) +
                           (params.sh_degree > 0 ? kProjectionGaussians * 3 * params.bands * sizeof(float) : 0);
     const int blocks = (params.num_gaussians + kProjectionGaussians - 1) / kProjectionGaussians;
-    const int slices = params.num_views < kProjectionSlices ? params.num_views : kProjectionSlices;
+    int slices = 1;
+    while (slices < kProjectionSlices && slices < params.num_views && params.num_gaussians < kProjectionEnough / slices) {
+        ++slices;
+    }
     projection_kernel<<<blocks, dim3(kProjectionGaussians, slices), shared, stream>>>(params);
     return cudaGetLastError();
 }

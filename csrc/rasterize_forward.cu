@@ -1,10 +1,10 @@
 // Stage 4: colour, alpha and, when asked, depth at the sampled pixels.
 //
-// One warp renders up to three work items of one active tile, 32 samples each, with the state of a lane's pixels in
-// registers, so work follows the samples and no warp waits for another. Splats come 32 at a time, one to a lane, the next 32
-// being fetched meanwhile; each lane drops its splat where it reaches none of the warp's samples, and the others are read
-// from the warp's own shared memory by all lanes at once. For the backward pass the warp leaves one bit for each splat that
-// contributed to any of an item's samples.
+// One warp renders one work item of an active tile, or two where a tile has an even number of them: 32 samples each, with
+// the state of a lane's pixels in registers, so work follows the samples and no warp waits for another. Splats come 32 at a
+// time, one to a lane, the next 32 being fetched meanwhile; each lane drops its splat where it reaches none of the warp's
+// samples, and the others are read from the warp's own shared memory by all lanes at once. For the backward pass the warp
+// leaves one bit for each splat that contributed to any of an item's samples.
 #include "common.cuh"
 
 namespace turbogs {
@@ -12,7 +12,6 @@ namespace {
 
 constexpr int kForwardWarps = 4;  // of a block; they share nothing but the first-level cache
 constexpr int kAhead = 2;         // splats whose arithmetic overlaps
-constexpr int kMaxGroups = 3;     // work items of a warp
 
 // Smallest box around the samples of a warp, in the tile's frame.
 struct SampleBox {
@@ -55,16 +54,15 @@ template <int kGroups, bool kDepth>
 __global__ void __launch_bounds__(kForwardWarps * kWarpSize) forward_kernel(const __grid_constant__ ForwardParams params) {
     __shared__ StagedSplat staged_splats[kForwardWarps][kBucket];
     const int lane = threadIdx.x % kWarpSize;
-    const int warps_per_tile = (params.chunks + kGroups - 1) / kGroups;
-    const int item = blockIdx.x * kForwardWarps + threadIdx.x / kWarpSize;
+    const int warps_per_tile = params.chunks / kGroups;
+    const int warp = blockIdx.x * kForwardWarps + threadIdx.x / kWarpSize;
     for (size_t i = blockIdx.x * blockDim.x + threadIdx.x; i < params.num_cleared; i += gridDim.x * blockDim.x) {
         params.cleared[i] = make_float4(0.0f, 0.0f, 0.0f, 0.0f);
     }
-    if (item >= params.num_active * warps_per_tile) return;
+    if (warp >= params.num_active * warps_per_tile) return;
     StagedSplat* staged = staged_splats[threadIdx.x / kWarpSize];
 
-    const int tile = item / warps_per_tile, first_chunk = (item - tile * warps_per_tile) * kGroups;
-    const int num_groups = min(kGroups, params.chunks - first_chunk);
+    const int tile = warp / warps_per_tile, first_chunk = (warp - tile * warps_per_tile) * kGroups;
     const TileFrame frame =
         tile_frame(params.cameras, params.num_views, params.tile_ids != nullptr ? params.tile_ids[tile] : tile);
     const uint32_t first_pair = params.tile_starts[tile];
@@ -87,7 +85,7 @@ __global__ void __launch_bounds__(kForwardWarps * kWarpSize) forward_kernel(cons
 #pragma unroll
         for (int g = 0; g < kGroups; ++g) {
             const int slot = slot_base + g * kWarpSize + lane;
-            const int pixel = g < num_groups && slot < slot_end ? params.pixel_ids[slot] : -1;
+            const int pixel = slot < slot_end ? params.pixel_ids[slot] : -1;
             const float2 at = pixel_in_tile(frame, max(pixel, 0));
             x[g] = at.x;
             y[g] = at.y;
@@ -158,7 +156,7 @@ __global__ void __launch_bounds__(kForwardWarps * kWarpSize) forward_kernel(cons
 #pragma unroll
             for (int g = 0; g < kGroups; ++g) {
                 const uint32_t any = __reduce_or_sync(kFullWarp, contributed[g]);
-                if (lane == g && g < num_groups) {
+                if (lane == g) {
                     uint32_t* mask = masks + static_cast<size_t>(bucket) * params.chunks + g;
                     *mask = bucket < walked ? (*mask | any) : any;
                 }
@@ -169,7 +167,7 @@ __global__ void __launch_bounds__(kForwardWarps * kWarpSize) forward_kernel(cons
 #pragma unroll
         for (int g = 0; g < kGroups; ++g) {
             const int slot = slot_base + g * kWarpSize + lane;
-            if (g >= num_groups || slot >= slot_end) continue;
+            if (slot >= slot_end) continue;
             const float alpha = 1.0f - transmittance[g];
             params.colors[3 * static_cast<size_t>(slot)] = red[g];
             params.colors[3 * static_cast<size_t>(slot) + 1] = green[g];
@@ -180,13 +178,13 @@ __global__ void __launch_bounds__(kForwardWarps * kWarpSize) forward_kernel(cons
             if (kDepth) params.depths[slot] = depth[g] / fmaxf(alpha, kAlphaTiny);
         }
     }
-    if (lane < num_groups) params.bucket_counts[tile * params.chunks + first_chunk + lane] = walked;
+    if (lane < kGroups) params.bucket_counts[tile * params.chunks + first_chunk + lane] = walked;
 }
 
 template <int kGroups>
 cudaError_t launch(const ForwardParams& params, cudaStream_t stream) {
-    const int items = params.num_active * ((params.chunks + kGroups - 1) / kGroups);
-    const int blocks = (items + kForwardWarps - 1) / kForwardWarps;
+    const int warps = params.num_active * (params.chunks / kGroups);
+    const int blocks = (warps + kForwardWarps - 1) / kForwardWarps;
     if (params.with_depth) forward_kernel<kGroups, true><<<blocks, kForwardWarps * kWarpSize, 0, stream>>>(params);
     else forward_kernel<kGroups, false><<<blocks, kForwardWarps * kWarpSize, 0, stream>>>(params);
     return cudaGetLastError();
@@ -196,12 +194,7 @@ cudaError_t launch(const ForwardParams& params, cudaStream_t stream) {
 
 cudaError_t launch_rasterize_forward(const ForwardParams& params, cudaStream_t stream) {
     if (params.num_active * params.chunks == 0) return cudaSuccess;
-    const int warps = (params.chunks + kMaxGroups - 1) / kMaxGroups;  // of a tile
-    switch ((params.chunks + warps - 1) / warps) {
-        case 1: return launch<1>(params, stream);
-        case 2: return launch<2>(params, stream);
-        default: return launch<kMaxGroups>(params, stream);
-    }
+    return params.chunks % 2 == 0 ? launch<2>(params, stream) : launch<1>(params, stream);
 }
 
 }  // namespace turbogs

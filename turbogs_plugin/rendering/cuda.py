@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 MAX_VIEWS = 128
 MAX_DEGREE = 3
 INSTANCE_FLOATS = 12
-CAMERA_FLOATS = 24
+CAMERA_FLOATS = 28
 RECORD_FLOATS = 16
 WARP = 32
 NARROW_TILES = 1 << 16
@@ -87,7 +87,7 @@ def warps_per_tile(slots: int, tiles: int) -> int:
 class ForwardArguments(NamedTuple):
     """Arguments of the forward operator, which the backward operator takes first; csrc/params.h says what they are."""
 
-    cameras: Tensor  # [K, 24]
+    cameras: Tensor  # [K, 28]
     tile_ids: Tensor | None  # [T], None where every tile is active
     tile_offsets: Tensor  # [T + 1]
     pixel_ids: Tensor  # [P]
