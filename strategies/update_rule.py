@@ -118,14 +118,7 @@ class GaussianMoments:
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Take a saved state. Raises `InputError` where it is not one of as many Gaussians and bands as this."""
-        for field in fields(self):
-            present, saved = getattr(self, field.name), state.get(field.name)
-            if saved is None or saved.shape != present.shape:
-                found = "nothing" if saved is None else f"shape {tuple(saved.shape)}"
-                raise InputError(
-                    f"optimizer state {field.name}: found {found}, expected shape {tuple(present.shape)}; "
-                    "is it of another model?"
-                )
+        check_state(state, self.state_dict())
         for field in fields(self):
             present = getattr(self, field.name)
             setattr(self, field.name, state[field.name].to(device=present.device, dtype=present.dtype, copy=True))
@@ -159,12 +152,18 @@ def clipped(gradient: Tensor) -> Tensor:
     return gradient.clamp(-GRADIENT_LIMIT, GRADIENT_LIMIT)
 
 
-def updatable(gradients: GaussianGradients, moments: GaussianMoments) -> Tensor:
-    """[n] int64: the touched Gaussians whose every gradient is finite; the others are added to `moments.skipped`."""
+def finite_gradients(gradients: GaussianGradients) -> Tensor:
+    """[N] bool: every gradient of the Gaussian is finite, in every view."""
     finite = torch.isfinite(gradients.shN.flatten(1)).all(dim=-1)
     for name in COLUMNS:
         value = getattr(gradients, name)
         finite &= torch.isfinite(value).unsqueeze(-1).flatten(2).all(dim=-1).all(dim=0)
+    return finite
+
+
+def updatable(gradients: GaussianGradients, moments: GaussianMoments) -> Tensor:
+    """[n] int64: the touched Gaussians whose every gradient is finite; the others are added to `moments.skipped`."""
+    finite = finite_gradients(gradients)
     moments.skipped += (gradients.touched & ~finite).sum()
     return torch.nonzero(gradients.touched & finite).squeeze(-1)
 
@@ -206,6 +205,16 @@ def add_packed(gaussians: Gaussians, index: Tensor, delta: Tensor) -> None:
 def add_shN(gaussians: Gaussians, index: Tensor, delta: Tensor) -> None:
     """Add [n, B * 3] changes to the higher bands of the Gaussians `index`, in place."""
     gaussians.shN.index_add_(0, index, delta.reshape(len(index), *gaussians.shN.shape[1:]))
+
+
+def check_state(saved: dict[str, Any], present: dict[str, Tensor]) -> None:
+    """Raise `InputError` where a saved state lacks a tensor of the present one, or has it of another shape."""
+    for name, value in present.items():
+        if name not in saved or saved[name].shape != value.shape:
+            found = f"shape {tuple(saved[name].shape)}" if name in saved else "nothing"
+            raise InputError(
+                f"optimizer state {name}: found {found}, expected shape {tuple(value.shape)}; is it of another model?"
+            )
 
 
 def check_moments_config(beta1: float, beta2: float, eps: float) -> None:

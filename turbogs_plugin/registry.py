@@ -49,6 +49,7 @@ BUILT_IN: dict[str, dict[str, str]] = {
     "optimizer": {
         "moment_lm": "turbogs_plugin.strategies.moment_lm:MomentLMOptimizer",
         "sparse_adam": "turbogs_plugin.strategies.adam:SparseAdam",
+        "adam": "turbogs_plugin.strategies.dense_adam:DenseAdam",
     },
 }
 """Kind -> name -> "module:class". The first of a kind is the one that a config without that section gets."""
