@@ -204,7 +204,7 @@ class ErrorDrivenDensity:
         stats, extent = self._stats, step.scene_extent
         views = stats.view_counts.clamp(min=1)
         passes = (stats.grad_sums / views > self.grad_threshold) | (stats.absgrad_sums / views > self.absgrad_threshold)
-        hopeless = ~_finite_rows(gaussians) | (torch.sigmoid(gaussians.opacities) < self.prune_opacity)
+        hopeless = ~finite_rows(gaussians) | (torch.sigmoid(gaussians.opacities) < self.prune_opacity)
         if self.prune_score_fraction > 0:
             hopeless |= seen & (score < _quantile(score, seen, self.prune_score_fraction))
         difficult = seen & (score >= _quantile(score, seen, 1 - self.top_fraction))
@@ -218,7 +218,7 @@ class ErrorDrivenDensity:
                 big |= largest > self.prune_world_size * extent
             if self.prune_screen_size > 0:
                 big |= stats.max_radii > self.prune_screen_size
-        pruned = _leave_one(hopeless | (big & ~(candidates & ~small)), gaussians)
+        pruned = leave_one(hopeless | (big & ~(candidates & ~small)), gaussians)
         candidates &= ~pruned
         if self.max_gaussians > 0:
             excess = int((~pruned).sum()) - self.max_gaussians
@@ -243,8 +243,8 @@ class ErrorDrivenDensity:
         return max(0, min(limits) - count) if limits else None
 
     def _final_prune(self, gaussians: Gaussians, score: Tensor, seen: Tensor, step: Step) -> RowUpdate | None:
-        pruned = ~_finite_rows(gaussians) | (seen & (score < _quantile(score, seen, 1 - self.final_keep)))
-        pruned = _leave_one(pruned, gaussians)
+        pruned = ~finite_rows(gaussians) | (seen & (score < _quantile(score, seen, 1 - self.final_keep)))
+        pruned = leave_one(pruned, gaussians)
         if not pruned.any():
             return None
         source = torch.nonzero(~pruned).squeeze(-1)
@@ -290,7 +290,7 @@ class ErrorDrivenDensity:
         return (means + offsets).reshape(-1, 3), (scales - shrink).repeat(2, 1)
 
 
-def _finite_rows(gaussians: Gaussians) -> Tensor:
+def finite_rows(gaussians: Gaussians) -> Tensor:
     """[N] bool: every parameter of the Gaussian is finite, and so are its variances, that its halves may be, too."""
     values = [value for _, value in gaussians.items()] + [(2 * gaussians.scales).exp()]
     return torch.stack([torch.isfinite(value.reshape(len(value), -1)).all(dim=-1) for value in values]).all(dim=0)
@@ -316,12 +316,12 @@ def _first(keys: Tensor, mask: Tensor, count: int) -> Tensor:
     return chosen & mask
 
 
-def _leave_one(pruned: Tensor, gaussians: Gaussians) -> Tensor:
+def leave_one(pruned: Tensor, gaussians: Gaussians) -> Tensor:
     """The mask [N], without the most opaque (finite) Gaussian where it would leave none."""
     if not bool(pruned.all()):
         return pruned
     pruned = pruned.clone()
-    pruned[torch.where(_finite_rows(gaussians), gaussians.opacities, -torch.inf).argmax()] = False
+    pruned[torch.where(finite_rows(gaussians), gaussians.opacities, -torch.inf).argmax()] = False
     return pruned
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from turbogs_plugin.strategies.density import ErrorDrivenDensity
+from turbogs_plugin.strategies.density import ErrorDrivenDensity, finite_rows, leave_one
 
 from turbogs_plugin.errors import InputError, require
 from turbogs_plugin.types import Gaussians, GaussianStats, RowUpdate, Step
@@ -33,10 +33,11 @@ class ViewVotes:
         return cls(*(torch.zeros(count, device=device) for _ in fields(cls)))
 
     def add(self, look: GaussianStats, error_threshold: float) -> None:
-        """Count one look: the statistics of one iteration."""
-        mean_error = look.error_sums.sum() / look.weight_sums.sum().clamp(min=1e-12)
-        seen = look.weight_sums > 0
-        marked = seen & (look.error_sums > error_threshold * mean_error * look.weight_sums)
+        """Count one look: the statistics of one iteration. What is not finite was not seen."""
+        seen = (look.weight_sums > 0) & torch.isfinite(look.weight_sums + look.error_sums)
+        errors, weights = (torch.where(seen, sums, 0.0) for sums in (look.error_sums, look.weight_sums))
+        mean_error = errors.sum() / weights.sum().clamp(min=1e-12)
+        marked = seen & (errors > error_threshold * mean_error * weights)
         self.seen += seen
         self.marked += marked
         self.blame += marked * mean_error
@@ -56,7 +57,8 @@ class FastGsDensity:
     Until `Step.refine_until`, every `refine_every` iterations from `refine_from` on, a Gaussian is cloned or split
     where its screen gradient, or its absolute one, passes the threshold *and* at least `consistency` of the looks that
     saw it marked it. Transparent and huge ones are pruned. Afterwards, every `prune_every` iterations, transparent ones
-    are pruned and those whose blame (the marking looks' mean errors, summed) exceeds `blame_threshold` of the largest.
+    are pruned and those whose blame (the marking looks' mean errors, summed) exceeds `blame_threshold` of the largest,
+    unless all have as much. A Gaussian that is not finite is pruned at either; one is always left.
 
     Args:
         refine_from, refine_every, grad_threshold, absgrad_threshold, percent_dense, prune_opacity, prune_world_size:
@@ -170,12 +172,16 @@ class FastGsDensity:
         return self._events.update(gaussians, step)
 
     def _prune(self, gaussians: Gaussians) -> RowUpdate | None:
+        if len(gaussians) == 0:
+            return None
         blame = self._votes.blame
-        pruned = (blame > self.blame_threshold * blame.max()) | (
-            torch.sigmoid(gaussians.opacities) < self.prune_opacity
-        )
+        blamed = blame > self.blame_threshold * blame.max()
+        if bool(blamed.all()):  # all alike: this tells none from another
+            blamed = torch.zeros_like(blamed)
+        transparent = torch.sigmoid(gaussians.opacities) < self.prune_opacity
+        pruned = leave_one(blamed | transparent | ~finite_rows(gaussians), gaussians)
         source = torch.nonzero(~pruned).squeeze(-1)
-        if len(source) in (0, len(gaussians)):  # never the last ones
+        if len(source) == len(gaussians):
             return None
         return RowUpdate(
             source, torch.zeros_like(source, dtype=torch.bool), {}, num_pruned=len(gaussians) - len(source)

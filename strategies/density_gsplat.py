@@ -10,6 +10,7 @@ import torch
 from gsplat.strategy import DefaultStrategy
 from gsplat.strategy.ops import reset_opa
 from torch import Tensor
+from turbogs_plugin.strategies.density import finite_rows
 
 from turbogs_plugin.errors import require
 from turbogs_plugin.types import Gaussians, GaussianStats, RowUpdate, Step
@@ -29,6 +30,9 @@ class GsplatDefaultDensity:
     gsplat changes parameters and optimizer state together. Here it is handed the parameters, two optimizers whose only
     state marks rows that it has touched, and the row numbers as a running statistic of its own; what comes back
     is a `RowUpdate`. It stops at `Step.refine_until` (its `refine_stop_iter`).
+
+    Unlike gsplat, which would train on with NaN or fail, an event first removes Gaussians that are not finite or too
+    large to be split, and one Gaussian, the most opaque, is always left.
 
     Args:
         prune_opa, grow_grad2d, grow_scale3d, grow_scale2d, prune_scale3d, prune_scale2d, refine_scale2d_stop_iter,
@@ -75,15 +79,20 @@ class GsplatDefaultDensity:
         reset_due = step.iteration > 0 and step.iteration % self.reset_every == 0
         if self._stats is None or not (step.iteration % self.refine_every == 0 or reset_due) or len(gaussians) == 0:
             return None
-        params = {name: torch.nn.Parameter(value, requires_grad=False) for name, value in gaussians.items()}
+        usable = torch.nonzero(finite_rows(gaussians)).squeeze(-1)
+        if len(usable) == 0:
+            return self._keep_one(gaussians, usable)
+        params = {name: torch.nn.Parameter(value[usable], requires_grad=False) for name, value in gaussians.items()}
         optimizers = {name: marking_optimizer(params[name]) for name in ("means", "opacities")}
-        state = self._gsplat_state(step)
+        state = self._gsplat_state(usable, step)
         strategy = _FilledStrategy(**self._gsplat_config(), refine_stop_iter=step.refine_until)
         with torch.random.fork_rng(devices=[gaussians.device] if gaussians.device.type == "cuda" else []):
             torch.manual_seed(int(np.random.SeedSequence([step.seed, step.iteration]).generate_state(1)[0]))
             strategy.step_post_backward(params, optimizers, state, step.iteration, {})
         if reset_due and self.opacity_reset == "repaired":
             reset_opa(params, optimizers, state, self.prune_opa * 2.0)
+        if len(state["source_row"]) == 0:
+            return self._keep_one(gaussians, usable)
         return self._follow(gaussians, params, optimizers, state)
 
     def state_dict(self) -> dict[str, Any]:
@@ -102,24 +111,27 @@ class GsplatDefaultDensity:
         ours = ("opacity_reset", "_stats")
         return {item.name: getattr(self, item.name) for item in fields(self) if item.name not in ours}
 
-    def _gsplat_state(self, step: Step) -> dict[str, Any]:
-        """gsplat's running state out of our statistics, and the row numbers, which it will treat alike."""
+    def _gsplat_state(self, rows: Tensor, step: Step) -> dict[str, Any]:
+        """gsplat's running state out of our statistics, and the row numbers, which it will treat alike. `rows`: [M]."""
         stats = self._stats
         return {
-            "grad2d": (stats.absgrad_sums if self.absgrad else stats.grad_sums).clone(),
-            "count": stats.view_counts.clone(),
-            "radii": stats.max_radii.clone(),
-            "source_row": torch.arange(len(stats.view_counts), device=stats.view_counts.device),
+            "grad2d": (stats.absgrad_sums if self.absgrad else stats.grad_sums)[rows],
+            "count": stats.view_counts[rows],
+            "radii": stats.max_radii[rows],
+            "source_row": rows,
             "scene_scale": step.scene_extent,
         }
 
+    def _keep_one(self, gaussians: Gaussians, usable: Tensor) -> RowUpdate | None:
+        """What there is instead of a model of nothing: the most opaque Gaussian of those that are `usable` [M]."""
+        self._stats = GaussianStats.zeros(1, gaussians.device)
+        if len(gaussians) == 1:
+            return None
+        source = usable[gaussians.opacities[usable].argmax()] if len(usable) else usable.new_zeros(())
+        return RowUpdate(source.reshape(1), usable.new_zeros(1, dtype=torch.bool), {}, num_pruned=len(gaussians) - 1)
+
     def _follow(self, gaussians: Gaussians, params: dict, optimizers: dict, state: dict) -> RowUpdate | None:
         source = state["source_row"]
-        if len(source) == 0:  # gsplat would leave nothing to train: keep the most opaque
-            self._stats.zero_()
-            source = gaussians.opacities.argmax().reshape(1)
-            self._stats = self._stats.map(lambda value: value[source])
-            return RowUpdate(source, torch.zeros_like(source, dtype=torch.bool), {}, num_pruned=len(gaussians) - 1)
         fresh, opacity_fresh = (touched_rows(optimizers[name], params[name]) for name in ("means", "opacities"))
         was_reset = bool(opacity_fresh.all()) and not bool(fresh.all())
         self._stats = GaussianStats.zeros(len(source), gaussians.device)
