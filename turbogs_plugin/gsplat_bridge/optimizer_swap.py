@@ -4,8 +4,11 @@ A Gaussian's parameters are solved for together, but a gsplat trainer steps one 
 gradient in between. So each member of the dict is a `torch.optim.Optimizer` that *hands over* its gradient when it is
 stepped, and whichever member comes last, in any order, carries out the update of all. Until then no parameter moves.
 
-What each member keeps for its parameter is in its own ``state``, as gsplat's operations on rows expect: every value is
-a tensor with one row a Gaussian. Learning rate, betas and eps are those of the member's own parameter group.
+What each member keeps for its parameter is in its own ``state``, as gsplat's operations on rows expect: the moments are
+tensors with one row a Gaussian; "step", which they leave as it is, is one number. The bias correction counts steps of
+the host, as torch's Adam does, not updates of each Gaussian: a new Gaussian, whose moments are zero, then moves faster
+than its rate (`DenseAdam` says by how much), which hosts of few steps live on. Learning rate, betas and eps are those
+of the member's own parameter group.
 """
 
 from __future__ import annotations
@@ -25,9 +28,9 @@ from turbogs_plugin.strategies.learning_rates import ParameterRates
 from turbogs_plugin.strategies.update_rule import COLUMNS, GaussianMoments
 from turbogs_plugin.types import PARAMETER_NAMES, GaussianGradients, Gaussians, Step
 
-UPDATES = "updates"
-"""State of the means' member alone: [N] float, how many updates each Gaussian has had. Not "step", which gsplat's
-operations leave as it is."""
+COUNT = "step"
+"""State of the means' member alone: [] float on the host, the updates so far. Named as in torch's Adam: gsplat's
+operations take every other value for one with rows."""
 
 MOMENTS = ("exp_avg", "exp_avg_sq")
 
@@ -144,7 +147,7 @@ class SharedOptimizer:
                     getattr(packed, f"{moment}_shN").copy_(state[moment].flatten(1))
                 else:
                     getattr(packed, moment)[:, COLUMNS[name]] = state[moment].reshape(len(packed), -1)
-        packed.steps.copy_(self.members["means"].checked_state()[UPDATES])
+        packed.steps.fill_(int(self.members["means"].checked_state()[COUNT]))
         return packed
 
     def _unpack(self, packed: GaussianMoments) -> None:
@@ -155,7 +158,7 @@ class SharedOptimizer:
                     getattr(packed, f"{moment}_shN") if name == "shN" else getattr(packed, moment)[:, COLUMNS[name]]
                 )
                 state[moment].copy_(source.reshape(state[moment].shape))
-        self.members["means"].checked_state()[UPDATES].copy_(packed.steps)
+        self.members["means"].checked_state()[COUNT] += 1
 
     def _shares(self, gaussians: Gaussians, info: dict[str, Any] | None) -> Tensor:
         """[1, N] the Gaussians' share of the loss, zero where nothing is known of it."""
@@ -241,13 +244,12 @@ class MemberOptimizer(torch.optim.Optimizer):
         if not state:
             state.update({moment: torch.zeros_like(parameter) for moment in MOMENTS})
             if self.name == "means":
-                state[UPDATES] = parameter.new_zeros(len(parameter))
-        for key, value in state.items():
-            expected = parameter.shape if key in MOMENTS else parameter.shape[:1]
-            if value.shape != expected:
+                state[COUNT] = torch.zeros(())
+        for moment in MOMENTS:
+            if state[moment].shape != parameter.shape:
                 raise InputError(
-                    f"optimizer state '{key}' of '{self.name}' has shape {tuple(value.shape)}, "
-                    f"expected {tuple(expected)}: rows were added or removed without the optimizer"
+                    f"optimizer state '{moment}' of '{self.name}' has shape {tuple(state[moment].shape)}, "
+                    f"expected {tuple(parameter.shape)}: rows were added or removed without the optimizer"
                 )
         return state
 
