@@ -144,6 +144,27 @@ def test_equal_blame_blames_nobody():
     assert len(result) == 29 and 3.0 not in result.sh0[:, 0, 0]
 
 
+@pytest.mark.parametrize("bad", BROKEN)
+def test_a_look_that_is_not_finite_spoils_no_vote(bad):
+    """Gaussian 0 stands out, 1 has an error that is not finite: 0 is marked as ever, 1 was not seen."""
+    gaussians = make_gaussians(10, dtype=torch.float32)
+    density = controller("fastgs", gaussians)
+    density.stats.weight_sums.fill_(1.0)
+    density.stats.error_sums[:] = torch.tensor([0.9, bad] + [0.1] * 8)
+    density.update(gaussians, Step(601, 5000, 3500))
+    assert density._votes.marked.tolist() == [1.0] + [0.0] * 9
+    assert density._votes.seen.tolist() == [1.0, 0.0] + [1.0] * 8
+    assert density._votes.blame.isfinite().all()
+
+
+def test_late_pruning_removes_what_is_not_finite():
+    gaussians = make_gaussians(10, dtype=torch.float32)
+    gaussians.opacities[:] = 1.0
+    gaussians.quats[4, 1] = float("nan")
+    result = follow(controller("fastgs", gaussians), gaussians, LATE)
+    assert result.sh0[:, 0, 0].tolist() == [0, 1, 2, 3, 5, 6, 7, 8, 9]
+
+
 @pytest.mark.parametrize("name", MAKERS)
 @pytest.mark.parametrize("parameter", PARAMETER_NAMES)
 @pytest.mark.parametrize("bad", BROKEN)
