@@ -78,14 +78,16 @@ class ErrorDrivenDensity:
         max_gaussians: never more than this; an initial model that has more is cut to it at the first event, easiest
             first. 0: no cap.
         prune_opacity: less opaque ones are pruned.
-        prune_world_size: pruned where the largest standard deviation exceeds this * scene extent. 0: off.
+        prune_world_size: pruned where the largest standard deviation exceeds this * scene extent, or where it is more,
+            this * the distance from the cameras' centre: what is far may be large. 0: off.
         prune_screen_size: pruned where the screen radius exceeds this * the larger side of the image. 0: off, as in
             3DGS in effect.
         prune_size_from: both size rules begin at this progress; 3DGS has 3000 / 15000.
         prune_score_fraction: share of the seen, the easiest, that each densification event prunes. Off by default: the
             paper gives no value, and what has little error may be what is rendered well.
-        opacity_decay: share of its opacity that every Gaussian loses at each densification event. What the photos need
-            grows back, what they do not falls below `prune_opacity`; a gentle substitute for 3DGS's reset.
+        opacity_decay: share of its opacity that every seen Gaussian loses at each densification event. What the photos
+            need grows back, what they do not falls below `prune_opacity`; a gentle substitute for 3DGS's reset. What
+            no photo saw has nothing to grow back by, and is left alone.
         final_every, final_keep: interval of the final pruning, and the share of the seen that each one keeps, the
             most difficult (Delta_prune, eta_final). 1 keeps all.
     """
@@ -215,7 +217,7 @@ class ErrorDrivenDensity:
         big = torch.zeros_like(seen)
         if step.progress >= self.prune_size_from:
             if self.prune_world_size > 0:
-                big |= largest > self.prune_world_size * extent
+                big |= largest > self.prune_world_size * gaussians.means.norm(dim=-1).clamp(min=extent)
             if self.prune_screen_size > 0:
                 big |= stats.max_radii > self.prune_screen_size
         pruned = leave_one(hopeless | (big & ~(candidates & ~small)), gaussians)
@@ -229,7 +231,7 @@ class ErrorDrivenDensity:
         allowed = self._allowed_growth(int((~pruned).sum()), step)
         if allowed is not None:
             candidates = _first(score, candidates, allowed)
-        return self._compose(gaussians, candidates & small, candidates & ~small, pruned, step)
+        return self._compose(gaussians, candidates & small, candidates & ~small, pruned, seen, step)
 
     def _allowed_growth(self, count: int, step: Step) -> int | None:
         """How many Gaussians may be added to `count`, or None for any number."""
@@ -251,9 +253,9 @@ class ErrorDrivenDensity:
         return RowUpdate(source, torch.zeros_like(source, dtype=torch.bool), {}, num_pruned=int(pruned.sum()))
 
     def _compose(
-        self, gaussians: Gaussians, cloned: Tensor, split: Tensor, pruned: Tensor, step: Step
+        self, gaussians: Gaussians, cloned: Tensor, split: Tensor, pruned: Tensor, seen: Tensor, step: Step
     ) -> RowUpdate | None:
-        """One change out of three masks [N]: the rest in order, the clones, the first halves, the second halves."""
+        """One change out of masks [N]: the rest in order, the clones, the first halves, the second halves."""
         rest, copies, halves = (torch.nonzero(mask).squeeze(-1) for mask in (~(pruned | split), cloned, split))
         if len(rest) == len(gaussians) and len(copies) == 0 and self.opacity_decay == 0:
             return None
@@ -266,7 +268,8 @@ class ErrorDrivenDensity:
                 gaussians, halves, step
             )
         if self.opacity_decay > 0:
-            values["opacities"] = _decayed(gaussians.opacities[source], self.opacity_decay)
+            opacities = torch.where(seen, _decayed(gaussians.opacities, self.opacity_decay), gaussians.opacities)
+            values["opacities"] = opacities[source]
         counts = {"num_cloned": len(copies), "num_split": len(halves), "num_pruned": int(pruned.sum())}
         return RowUpdate(source, fresh, values, **counts)
 

@@ -100,7 +100,7 @@ def test_event_equals_plain_loops(seed, config):
             prunes.add(i)
         elif passes and seen[i] and score[i] >= hard_limit and not small:
             splits.add(i)
-        elif largest > density.prune_world_size * 2.0 or (
+        elif largest > density.prune_world_size * max(2.0, float(gaussians.means[i].norm())) or (
             density.prune_screen_size and stats.max_radii[i] > density.prune_screen_size
         ):
             prunes.add(i)
@@ -222,9 +222,13 @@ def test_split_is_a_function_of_seed_and_iteration():
 def test_opacity_decay(dtype):
     gaussians = make_gaussians(6, dtype=dtype)
     gaussians.opacities[:] = torch.tensor([-200.0, -50.0, -2.0, 0.0, 3.0, 60.0], dtype=dtype)
-    density = controlled(gaussians, opacity_decay=0.1, **QUIET)
+    stats = busy_stats(6)
+    stats.weight_sums[3] = 0.0  # unseen
+    stats.grad_sums.zero_()  # nothing is densified
+    density = controlled(gaussians, stats, opacity_decay=0.1, **QUIET)
     update = density.update(gaussians, FULL)
     expected = 0.9 * torch.sigmoid(gaussians.opacities.double())
+    expected[3] = 0.5
     result = torch.sigmoid(update.apply(gaussians).opacities.double())
     torch.testing.assert_close(result, expected, rtol=1e-5, atol=0)
     assert torch.isfinite(update.values["opacities"]).all() and not update.fresh.any()

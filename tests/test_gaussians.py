@@ -8,7 +8,14 @@ import torch
 from gsplat import export_splats
 
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.gaussians import gaussians_from_points, load_ply, save_ply
+from turbogs_plugin.gaussians import (
+    BACKDROP_RADIUS,
+    SH_C0,
+    backdrop_gaussians,
+    gaussians_from_points,
+    load_ply,
+    save_ply,
+)
 from turbogs_plugin.scene import Frame
 from turbogs_plugin.scene.nearest import mean_neighbor_distances
 from turbogs_plugin.scene.ply import read_vertices
@@ -173,3 +180,15 @@ def test_load_refuses_what_is_not_finite_or_not_there(tmp_path):
         load_ply(tmp_path / "model.ply")
     with pytest.raises(InputError, match=r"cannot read .*absent\.ply"):
         load_ply(tmp_path / "absent.ply")
+
+
+def test_a_backdrop_surrounds_everything_in_its_colour():
+    backdrop = backdrop_gaussians(torch.tensor([0.2, 0.4, 0.6]), sh_degree=2, extent=3.0)
+    assert torch.allclose(backdrop.means.norm(dim=1), torch.tensor(BACKDROP_RADIUS * 3.0))
+    colors = backdrop.sh0[:, 0] * SH_C0 + 0.5
+    assert torch.allclose(colors, torch.tensor([51.0, 102.0, 153.0]) / 255.0, atol=1e-6)
+    assert backdrop.shN.shape[1] == 8
+    directions = torch.nn.functional.normalize(torch.randn(500, 3, generator=torch.Generator().manual_seed(0)), dim=1)
+    # Whatever the direction, the nearest Gaussian's centre is within one standard deviation.
+    nearest = torch.cdist(directions * BACKDROP_RADIUS * 3.0, backdrop.means).amin(dim=1)
+    assert (nearest < backdrop.scales.exp().amin()).all()

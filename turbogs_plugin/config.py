@@ -57,6 +57,7 @@ class TrainConfig:
         device: auto (CUDA where there is one), cpu, or cuda.
         sh_degree: highest degree of the spherical harmonics.
         sh_interval: iterations between two bands; the run starts with band 0.
+        backdrop: start with a far sphere of Gaussians in the photos' mean colour behind the scene.
         evaluate_at: when to evaluate, as fractions of T; the start and the end are always evaluated.
         checkpoint_every: iterations between checkpoints; the end always has one. 0: only the end.
     """
@@ -67,6 +68,7 @@ class TrainConfig:
     device: str = "auto"
     sh_degree: int = 3
     sh_interval: int = 1000
+    backdrop: bool = False
     evaluate_at: tuple[float, ...] = (0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
     checkpoint_every: int = 2500
 

@@ -28,6 +28,11 @@ LONELY_SCALE = 0.01
 POSITION_ERROR = 1e-6
 """Largest rounding of exported positions that the place of the capture may cause, in units of the frame's scale."""
 LARGEST_SH_DEGREE = 4
+BACKDROP_COUNT = 3000
+BACKDROP_RADIUS = 20.0
+"""In extents: beyond what a capture shows, near enough that floats tell its Gaussians apart."""
+BACKDROP_OPACITY = 0.88
+"""Several of its Gaussians cover a direction, so that nothing shines through."""
 
 
 def gaussians_from_points(points: Tensor, colors: Tensor, sh_degree: int, extent: float) -> Gaussians:
@@ -70,6 +75,27 @@ def gaussians_from_points(points: Tensor, colors: Tensor, sh_degree: int, extent
         sh0=((colors.to(points) / 255.0 - 0.5) / SH_C0)[:, None, :],
         shN=points.new_zeros(count, (sh_degree + 1) ** 2 - 1, 3),
     )
+
+
+def backdrop_gaussians(color: Tensor, sh_degree: int, extent: float) -> Gaussians:
+    """A sphere around the scene and all cameras, of one colour: what is seen where the model has nothing.
+
+    Without it, that is black. Its Gaussians lie on a Fibonacci lattice and train like all others.
+
+    Args:
+        color: [3] float, 0 .. 1, for instance the mean of the photos.
+        sh_degree: the degree to make room for, 0 .. 4.
+        extent: the scene's.
+    """
+    index = torch.arange(BACKDROP_COUNT, dtype=torch.float64) + 0.5
+    height = 1.0 - 2.0 * index / BACKDROP_COUNT
+    angle = index * math.pi * (1.0 + math.sqrt(5.0))
+    ring = (1.0 - height * height).sqrt()
+    directions = torch.stack([ring * angle.cos(), ring * angle.sin(), height], dim=1).float()
+    colors = (color.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8).expand(BACKDROP_COUNT, 3)
+    backdrop = gaussians_from_points(directions * BACKDROP_RADIUS * extent, colors, sh_degree, extent)
+    backdrop.opacities.fill_(math.log(BACKDROP_OPACITY / (1.0 - BACKDROP_OPACITY)))
+    return backdrop
 
 
 def save_ply(gaussians: Gaussians, path: str | Path, frame: Frame | None = None) -> None:

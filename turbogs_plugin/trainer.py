@@ -11,14 +11,17 @@ import torch
 from torch import Tensor
 
 from turbogs_plugin import kernels
-from turbogs_plugin.config import Config
+from turbogs_plugin.config import Config, TrainConfig
 from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.errors import TrainingStopped
-from turbogs_plugin.gaussians import gaussians_from_points
+from turbogs_plugin.gaussians import backdrop_gaussians, gaussians_from_points
 from turbogs_plugin.rendering import Rendered, Workspace, rasterize, render_images
 from turbogs_plugin.scene import Scene
 from turbogs_plugin.supervision import supervise
 from turbogs_plugin.types import PARAMETER_NAMES, Gaussians, PixelSamples, RowUpdate, Step
+
+COLOR_STRIDE = 97
+"""Every so many pixels count for the mean colour of the photos; coprime to usual widths."""
 
 
 class Trainer:
@@ -41,9 +44,7 @@ class Trainer:
         self.optimizer = config.build("optimizer")
         self.density = config.build("density")
         self.maps = ErrorMaps(self.views.cameras.sizes, device, beta=config.maps.beta)
-        self.gaussians = gaussians_from_points(
-            scene.points, scene.point_colors, config.train.sh_degree, scene.extent
-        ).map(lambda tensor: tensor.to(device))
+        self.gaussians = initial_gaussians(scene, config.train).map(lambda tensor: tensor.to(device))
         self.view_sampler.setup(self.views.cameras, scene.extent)
         self.optimizer.setup(self.gaussians)
         self.density.setup(self.gaussians)
@@ -200,6 +201,16 @@ class Trainer:
         self.optimizer.load_state_dict(state["optimizer"])
         self.density.setup(self.gaussians)
         self.density.load_state_dict(state["density"])
+
+
+def initial_gaussians(scene: Scene, train: TrainConfig) -> Gaussians:
+    """The model that training starts from: the capture's points, and a backdrop where one is wanted."""
+    gaussians = gaussians_from_points(scene.points, scene.point_colors, train.sh_degree, scene.extent)
+    if not train.backdrop:
+        return gaussians
+    color = scene.train.photos.colors[::COLOR_STRIDE].float().mean(dim=0).cpu() / 255.0
+    backdrop = backdrop_gaussians(color, train.sh_degree, scene.extent)
+    return Gaussians(**{name: torch.cat([tensor, getattr(backdrop, name)]) for name, tensor in gaussians.items()})
 
 
 def gaussians_of_state(state: dict[str, Any], device: torch.device) -> Gaussians:
