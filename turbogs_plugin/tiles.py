@@ -77,17 +77,25 @@ def compact(
 
 def dense_pixels(view_ids: Sequence[int], sizes: np.ndarray, device: torch.device | str) -> PixelSamples:
     """Every pixel of these views, in the order of samples. `sizes`: [K, 2] int64 (width, height)."""
-    pixel_ids = [_dense_view(int(width), int(height), torch.device(device)) for width, height in sizes]
-    widths, heights = tile_extents(sizes)
-    offsets = np.concatenate([[0], np.cumsum(widths * heights)])
+    device = torch.device(device)
+    pixel_ids = [_dense_view(int(width), int(height), device) for width, height in sizes]
+    offsets = _dense_offsets(np.ascontiguousarray(sizes, dtype=np.int64).tobytes(), device)
     return PixelSamples(
         view_ids=tuple(view_ids),
         sizes=sizes,
         pixel_ids=torch.cat(pixel_ids),
-        tile_ids=torch.arange(len(widths), dtype=torch.int32, device=device),
-        tile_offsets=torch.as_tensor(offsets, dtype=torch.int32, device=device),
+        tile_ids=torch.arange(len(offsets) - 1, dtype=torch.int32, device=device),
+        tile_offsets=offsets,
         has_empty_slots=False,
     )
+
+
+@lru_cache(maxsize=32)
+def _dense_offsets(sizes_bytes: bytes, device: torch.device) -> Tensor:
+    """[T + 1] int32: first slot of each tile of dense views, `sizes_bytes` those of the [K, 2] int64 array. Kept, as
+    sending them anew would make every iteration of a dense trainer wait for the device."""
+    widths, heights = tile_extents(np.frombuffer(sizes_bytes, dtype=np.int64).reshape(-1, 2))
+    return torch.as_tensor(np.concatenate([[0], np.cumsum(widths * heights)]), dtype=torch.int32, device=device)
 
 
 @lru_cache(maxsize=32)
