@@ -1,18 +1,51 @@
 // Backward pass of the projection alone: gradients of the parameters in memory, for optimizers without a kernel of
 // their own and for torch autograd.
-#include "projection_backward.cuh"
+#include "backward_block.cuh"
 
 namespace turbogs {
 namespace {
 
+struct BackwardShared {
+    SharedHarmonics harmonics;
+    float* gradients;  // [threads, stride] of the harmonics
+    ViewCamera* cameras;
+
+    __device__ BackwardShared(float* shared, const ScreenBackwardParams& params)
+        : harmonics(shared, nullptr, params) {
+        gradients = shared + kBackwardThreads * harmonics.stride;
+        cameras = reinterpret_cast<ViewCamera*>(gradients + kBackwardThreads * harmonics.stride);
+        harmonics.wanted = reinterpret_cast<bool*>(cameras + params.num_views);
+    }
+
+    static size_t bytes(const ScreenBackwardParams& params) {
+        return 2 * kBackwardThreads * SharedHarmonics::row_stride(params) * sizeof(float) +
+               params.num_views * sizeof(ViewCamera) + kBackwardThreads;
+    }
+};
+
+// Gradients of the harmonics of one Gaussian, added up in its row of shared memory.
+struct HarmonicsSum {
+    const float* mean;
+    int degree;
+    float* gradients;
+
+    __device__ void add(const ViewCamera& camera, const float grad_color[3]) {
+        add_harmonics_gradient(mean, camera, degree, grad_color, gradients);
+    }
+};
+
 // Where the rows of one Gaussian go: to memory, view by view.
 struct RowWriter {
+    HarmonicsSum harmonics;
     float* rows;         // [K, N, 14]
     float* view_losses;  // [K, N]
     int num_gaussians;
     int gaussian;
 
-    __device__ void add(int view, const RowGradient& row, float loss) { write(view, row, loss); }
+    __device__ void add(int view, const ViewCamera& camera, const RowGradient& row, const float grad_color[3], float loss) {
+        harmonics.add(camera, grad_color);
+        write(view, row, loss);
+    }
 
     __device__ void write(int view, const RowGradient& row, float loss) {
         const size_t place = static_cast<size_t>(view) * num_gaussians + gaussian;
@@ -30,29 +63,41 @@ struct RowWriter {
 
 // The sum of the rows, in registers.
 struct RowSum {
+    HarmonicsSum harmonics;
     RowGradient sum = {};
     float loss = 0.0f;
 
-    __device__ void add(int, const RowGradient& row, float view_loss) {
-        add_row(sum, row);
+    __device__ void add(int, const ViewCamera& camera, const RowGradient& row, const float grad_color[3], float view_loss) {
+        harmonics.add(camera, grad_color);
+#pragma unroll
+        for (int i = 0; i < 3; ++i) {
+            sum.mean[i] += row.mean[i];
+            sum.scale[i] += row.scale[i];
+            sum.sh0[i] += row.sh0[i];
+        }
+#pragma unroll
+        for (int i = 0; i < 4; ++i) sum.quat[i] += row.quat[i];
+        sum.opacity += row.opacity;
         loss += view_loss;
     }
 };
 
-// Bit k: some gradient or sum of view k is not zero. Wider than `Sight::touched`: a loss of a user may put gradients on
+// Bit k: some gradient or sum of view first + k is not zero. Wider than `touched`: a loss of a user may put gradients on
 // projected means that no sample saw.
-__device__ __forceinline__ uint32_t views_with_gradient(const ScreenBackwardParams& params, int gaussian) {
+__device__ __forceinline__ uint32_t views_with_gradient(const ScreenBackwardParams& params, int gaussian, int first,
+                                                        bool& touched) {
+    const int end = min(params.num_views, first + kViewGroup);
     uint32_t mask = 0u;
-    for (int view = 0; view < params.num_views; ++view) {
-        const float4* record =
-            params.records + (static_cast<size_t>(view) * params.num_gaussians + gaussian) * kRecordQuads;
+    for (int view = first; view < end; ++view) {
+        const float4* record = record_of(params, view, gaussian);
         bool any = false;
 #pragma unroll
         for (int i = 0; i < kRecordQuads; ++i) {
             const float4 quad = record[i];
             any = any || quad.x != 0.0f || quad.y != 0.0f || quad.z != 0.0f || (i < 3 && quad.w != 0.0f);
+            if (i == 3) touched = touched || quad.y > 0.0f;
         }
-        if (any) mask |= 1u << view;
+        if (any) mask |= 1u << (view - first);
     }
     return mask;
 }
@@ -61,41 +106,56 @@ template <bool kPerView>
 __global__ void __launch_bounds__(kBackwardThreads) projection_backward_kernel(
     const __grid_constant__ ScreenBackwardParams params, const ProjectionBackwardOutputs outputs) {
     if (params.overflow != nullptr && *params.overflow != 0) return;
-    extern __shared__ float shared[];
-    const BackwardShared block(shared, params);
+    extern __shared__ float4 shared[];
+    const BackwardShared block(reinterpret_cast<float*>(shared), params);
+    const SharedHarmonics& harmonics = block.harmonics;
     const int gaussian = blockIdx.x * kBackwardThreads + threadIdx.x;
     const bool inside = gaussian < params.num_gaussians;
 
-    load_cameras(params, block);
-    const uint32_t mask = inside ? views_with_gradient(params, gaussian) : 0u;
-    const Sight sight = inside ? sight_of(params, gaussian) : Sight{};
-    start_harmonics(params, block, mask != 0u);
-    const StoredGaussian stored = mask != 0u ? load_gaussian(params, gaussian) : StoredGaussian{};
+    load_cameras(params, block.cameras);
+    bool touched = false, any = false;
+    for (int first = 0; inside && first < params.num_views; first += kViewGroup) {
+        any = views_with_gradient(params, gaussian, first, touched) != 0u || any;
+    }
+    harmonics.wanted[threadIdx.x] = any;
+    for (int i = threadIdx.x; i < kBackwardThreads * harmonics.stride; i += kBackwardThreads) block.gradients[i] = 0.0f;
+    __syncthreads();
+    harmonics.start(params);
+    const StoredGaussian stored = any ? load_gaussian(params, gaussian) : StoredGaussian{};
     wait_for_copies();
     __syncthreads();
 
+    const auto views_of = [&](int first) {
+        bool unused = false;
+        return any ? views_with_gradient(params, gaussian, first, unused) : 0u;
+    };
+    const float* coefficients = harmonics.coefficients + threadIdx.x * harmonics.stride;
+    const HarmonicsSum sum{stored.mean, params.sh_degree, block.gradients + threadIdx.x * harmonics.stride};
     if (inside) {
-        RowWriter writer{outputs.rows, outputs.view_losses, params.num_gaussians, gaussian};
+        RowWriter writer{sum, outputs.rows, outputs.view_losses, params.num_gaussians, gaussian};
         if (kPerView) {
-            backward_views(params, block, gaussian, mask, sight, stored, writer);
+            if (any) backward_views<false>(params, block.cameras, coefficients, gaussian, stored, views_of, writer);
             const RowGradient zero = {};
-            for (int view = 0; view < params.num_views; ++view) {
-                if ((mask >> view & 1u) == 0u) writer.write(view, zero, 0.0f);
+            for (int first = 0; first < params.num_views; first += kViewGroup) {
+                const uint32_t mask = views_of(first);
+                for (int view = first; view < min(params.num_views, first + kViewGroup); ++view) {
+                    if ((mask >> (view - first) & 1u) == 0u) writer.write(view, zero, 0.0f);
+                }
             }
         } else {
-            RowSum total;
-            backward_views(params, block, gaussian, mask, sight, stored, total);
+            RowSum total{sum};
+            if (any) backward_views<false>(params, block.cameras, coefficients, gaussian, stored, views_of, total);
             writer.write(0, total.sum, total.loss);
         }
-        outputs.touched[gaussian] = sight.touched != 0u;
+        if (params.view_counts != nullptr) add_sight(params, gaussian, sight_of(params, gaussian));
+        outputs.touched[gaussian] = touched;
     }
     __syncthreads();
-    const int row = 3 * params.bands;
+    const int row = harmonics.row;
     const int count = min(kBackwardThreads, params.num_gaussians - static_cast<int>(blockIdx.x) * kBackwardThreads) * row;
     float* out = outputs.shN + static_cast<size_t>(blockIdx.x) * kBackwardThreads * row;
     for (int i = threadIdx.x; i < count; i += kBackwardThreads) {
-        const int owner = block.owner(i);
-        out[i] = block.gradients[owner * block.stride + (i - owner * row)];
+        out[i] = block.gradients[i + harmonics.owner(i) * (harmonics.stride - row)];
     }
 }
 

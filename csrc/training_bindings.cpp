@@ -19,7 +19,7 @@ namespace {
 // The batch that a backward pass works on: what `CudaScreenGradients` of rendering/cuda.py holds.
 ScreenBackwardParams screen_backward_params(const Checker& check, const std::vector<Tensor>& gaussians,
                                             const Tensor& viewmats, const Tensor& Ks, const std::vector<int64_t>& sizes,
-                                            const Tensor& records, const std::optional<Tensor>& radii,
+                                            const Tensor& records, const Tensor& radii,
                                             const std::vector<Tensor>& stats, int64_t sh_degree, double eps2d,
                                             const std::optional<Tensor>& num_filled, int64_t num_slots,
                                             const std::optional<Tensor>& overflow) {
@@ -54,6 +54,9 @@ ScreenBackwardParams screen_backward_params(const Checker& check, const std::vec
     }
     params.records = reinterpret_cast<float4*>(
         check.pointer<float>(records, "screen gradients", ScalarType::Float, {num_views, num_gaussians, kRecordQuads * 4}));
+    params.radii = reinterpret_cast<const int2*>(
+        check.pointer<int32_t>(radii, "radii", ScalarType::Int, {num_views, num_gaussians, 2}));
+    check.aligned(params.radii, "radii");
     check.aligned(params.quats, "quats");
     check.aligned(params.shN, "shN");
     check.aligned(params.records, "screen gradients");
@@ -62,10 +65,6 @@ ScreenBackwardParams screen_backward_params(const Checker& check, const std::vec
     params.overflow = check.optional<int32_t>(overflow, "overflow", ScalarType::Int, {1});
     if (!stats.empty()) {
         STD_TORCH_CHECK(stats.size() == 7, "turbogs: stats must be the seven tensors of GaussianStats");
-        STD_TORCH_CHECK(radii.has_value(), "turbogs: statistics need the radii");
-        params.radii = reinterpret_cast<const int2*>(
-            check.pointer<int32_t>(*radii, "radii", ScalarType::Int, {num_views, num_gaussians, 2}));
-        check.aligned(params.radii, "radii");
         params.error_sums = check.pointer<float>(stats[0], "error_sums", ScalarType::Float, {num_gaussians});
         params.distance_sums = check.pointer<float>(stats[1], "distance_sums", ScalarType::Float, {num_gaussians});
         params.weight_sums = check.pointer<float>(stats[2], "weight_sums", ScalarType::Float, {num_gaussians});
@@ -78,7 +77,7 @@ ScreenBackwardParams screen_backward_params(const Checker& check, const std::vec
 }
 
 void projection_backward(const std::vector<Tensor>& gaussians, const Tensor& viewmats, const Tensor& Ks,
-                         const std::vector<int64_t>& sizes, const Tensor& records, const std::optional<Tensor>& radii,
+                         const std::vector<int64_t>& sizes, const Tensor& records, const Tensor& radii,
                          const std::vector<Tensor>& stats, int64_t sh_degree, double eps2d,
                          const std::optional<Tensor>& num_filled, int64_t num_slots, const std::optional<Tensor>& overflow, const Tensor& rows,
                          const Tensor& shN, const Tensor& touched, const Tensor& view_losses) {
@@ -98,7 +97,7 @@ void projection_backward(const std::vector<Tensor>& gaussians, const Tensor& vie
 }
 
 void fused_step(const std::vector<Tensor>& gaussians, const Tensor& viewmats, const Tensor& Ks,
-                const std::vector<int64_t>& sizes, const Tensor& records, const std::optional<Tensor>& radii,
+                const std::vector<int64_t>& sizes, const Tensor& records, const Tensor& radii,
                 const std::vector<Tensor>& stats, int64_t sh_degree, double eps2d,
                 const std::optional<Tensor>& num_filled, int64_t num_slots, const std::optional<Tensor>& overflow,
                 const std::vector<Tensor>& moments, int64_t kind, bool rows_per_view,
@@ -311,7 +310,7 @@ void sparse_loss(const Tensor& colors, const std::optional<Tensor>& targets, con
 }  // namespace turbogs
 
 #define TURBOGS_BACKWARD_INPUTS                                                                              \
-    "Tensor(p!)[] gaussians, Tensor viewmats, Tensor Ks, int[] sizes, Tensor(r!) records, Tensor? radii, "           \
+    "Tensor(p!)[] gaussians, Tensor viewmats, Tensor Ks, int[] sizes, Tensor(r!) records, Tensor radii, "           \
     "Tensor(s!)[] stats, int sh_degree, float eps2d, Tensor? num_filled, int num_slots, Tensor? overflow, "
 
 STABLE_TORCH_LIBRARY_FRAGMENT(turbogs, m) {

@@ -27,6 +27,13 @@ __device__ __forceinline__ float approximate_sqrt(float x) {
     return result;
 }
 
+// Absolute error 2^-22 within 0.5 .. 2, else relative.
+__device__ __forceinline__ float approximate_log2(float x) {
+    float result;
+    asm("lg2.approx.ftz.f32 %0, %1;" : "=f"(result) : "f"(x));
+    return result;
+}
+
 template <int kFloats>
 __device__ __forceinline__ void copy_async(float* shared, const float* global) {
     __pipeline_memcpy_async(shared, global, kFloats * sizeof(float));

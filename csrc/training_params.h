@@ -10,7 +10,7 @@
 
 namespace turbogs {
 
-constexpr int kTrainingMaxViews = 32;      // views of one batch: a Gaussian's touched views are one 32-bit mask
+constexpr int kTrainingMaxViews = 128;     // views of one batch: they travel as a kernel argument
 constexpr int kTrainingMaxBands = 15;      // harmonics above band 0: degree 3
 constexpr float kRateMin = 1.0842021724855044e-19f;  // sqrt(FLT_MIN)
 constexpr int kRowSize = 14;               // mean 3, scale 3, quaternion 4, sh0 3, opacity 1
@@ -39,8 +39,8 @@ struct ScreenBackwardParams {
     int widths[kTrainingMaxViews];
     int heights[kTrainingMaxViews];
 
-    float4* records;             // [K, N, 4]; the fused step puts the rows of the parameters in their place
-    const int2* radii;           // [K, N]; read only where `stats` are wanted
+    float4* records;             // [K, N, 4]; the fused step reads those on screen, and may leave rows there
+    const int2* radii;           // [K, N]; 0 where the Gaussian is off screen
     const int32_t* num_filled;   // [1] filled slots of the batch; null where all are
     int num_slots;               // P
     const int32_t* overflow;     // [1], or null; where set, the launch does nothing
@@ -188,6 +188,7 @@ struct CountFilledParams {
 cudaError_t launch_count_filled(const CountFilledParams& params, cudaStream_t stream);
 cudaError_t launch_sparse_loss(const SparseLossParams& params, cudaStream_t stream);
 cudaError_t launch_sample_pixels(const SamplePixelsParams& params, cudaStream_t stream);
+cudaError_t launch_sample_tiles(const SamplePixelsParams& params, cudaStream_t stream);  // unit tile
 
 cudaError_t launch_projection_backward(const ScreenBackwardParams& params, const ProjectionBackwardOutputs& outputs,
                                        cudaStream_t stream);

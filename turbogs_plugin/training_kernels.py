@@ -3,7 +3,7 @@
 Each function does what its torch twin defines (`draw_pixels`, the losses of `strategies.loss` with `ErrorMaps.update`,
 `ReferenceScreenGradients.parameter_gradients`, the steps of `strategies.adam` and `strategies.moment_lm`). It is
 enqueued on torch's current stream and not waited for. Tensors must be contiguous; one of another device, dtype or shape
-raises `RuntimeError`, naming it and what was expected.
+raises `RuntimeError`, naming it and what was expected; more views than `MAX_VIEWS` raise `InputError`.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from torch import Tensor
 
 from turbogs_plugin import kernels
 from turbogs_plugin.error_maps import ErrorMaps
+from turbogs_plugin.errors import InputError
 from turbogs_plugin.tiles import TILE_PIXELS
 from turbogs_plugin.types import (
     PARAMETER_NAMES,
@@ -36,8 +37,8 @@ if TYPE_CHECKING:
     from turbogs_plugin.strategies.pixel_sampling import DrawRule
     from turbogs_plugin.strategies.update_rule import GaussianMoments, UpdateRule
 
-MAX_VIEWS = 32
-"""Views of one batch that the kernels take."""
+MAX_VIEWS = 128
+"""Views of one batch that the kernels take, as many as the rasterizer."""
 
 ROW_WIDTH = 14
 """Gradients of a view's row: means 3, scales 3, quats 4, sh0 3, opacities 1."""
@@ -150,6 +151,7 @@ def _view_table(
     starts: np.ndarray, sizes: np.ndarray, view_ids: Sequence[int], bases: Sequence[int], wanted: Sequence[int]
 ) -> list[int]:
     """Six numbers for each view, as csrc/training_bindings.cpp reads them."""
+    _check_views(len(view_ids))
     columns = zip(starts.tolist(), sizes.tolist(), view_ids, bases, wanted, strict=True)
     return [number for start, size, *others in columns for number in (start, *size, *others)]
 
@@ -309,8 +311,14 @@ def fused_step(screen: CudaScreenGradients, gaussians: Gaussians, moments: Gauss
     )  # fmt: skip
 
 
+def _check_views(count: int) -> None:
+    if not 1 <= count <= MAX_VIEWS:
+        raise InputError(f"a batch takes 1 .. {MAX_VIEWS} views, got {count}")
+
+
 def _backward_arguments(screen: CudaScreenGradients) -> tuple:
     """What the two operators have in common."""
+    _check_views(len(screen.cameras))
     stats = [] if screen.stats is None else [getattr(screen.stats, field.name) for field in fields(screen.stats)]
     return (
         [getattr(screen.gaussians, name).detach() for name in PARAMETER_NAMES],

@@ -11,6 +11,8 @@ from turbogs_plugin.strategies.learning_rates import LearningRates
 from turbogs_plugin.strategies.moment_lm import MomentLMOptimizer
 
 from turbogs_plugin import kernels, training_kernels
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.rendering import cuda
 from turbogs_plugin.rendering.cuda import CudaScreenGradients
 from turbogs_plugin.rendering.projection import drawable_rows, project_rows
 from turbogs_plugin.rendering.reference import ROW_PARAMETERS, ReferenceScreenGradients
@@ -42,16 +44,16 @@ OPTIMIZERS = {
 class Scene:
     """A model, cameras and screen gradients of the right pattern: zero where a Gaussian is not drawn or not sampled."""
 
-    def __init__(self, count=300, degree=3, used_degree=None, seed=0, size=1e-5):
+    def __init__(self, count=300, degree=3, used_degree=None, seed=0, size=1e-5, views=3):
         generator = torch.Generator().manual_seed(seed)
         self.gaussians = make_gaussians(count, seed=seed, degree=degree, dtype=torch.float32)
         self.gaussians.means[: count // 10] += 6 * torch.randn(count // 10, 3, generator=generator)  # off screen
-        self.cameras = make_cameras(SIZES, dtype=torch.float32)
+        sizes = [SIZES[view % len(SIZES)] for view in range(views)]
+        self.cameras = make_cameras(sizes, dtype=torch.float32)
         self.degree = degree if used_degree is None else used_degree
-        views = len(SIZES)
         self.samples = PixelSamples(
             tuple(range(views)),
-            np.array(SIZES),
+            np.array(sizes),
             torch.tensor([0, 5, 9, -1], dtype=torch.int32),
             torch.tensor([0], dtype=torch.int32),
             torch.tensor([0, 4], dtype=torch.int32),
@@ -62,11 +64,9 @@ class Scene:
         records[..., 9:14] = records[..., 9:14].abs()
         records[torch.rand(views, count, generator=generator) < 0.3] = 0
         records[:, count // 2 : count // 2 + 7] = 0  # never touched
-        drawn = torch.zeros(views * count, dtype=torch.bool)
-        drawn[self.rows.flat] = True
-        self.records = (records * drawn.view(views, count, 1)).float()
         _, splats = self.project(doubled, torch.float64)
-        self.radii = self.rows.scatter(splats.radii).to(torch.int32)
+        self.radii = self.rows.scatter(splats.radii).to(torch.int32)  # [K, N, 2], 0 off screen
+        self.records = (records * (self.radii > 0).any(dim=-1, keepdim=True)).float()
 
     def project(self, gaussians, dtype):
         leaves = [getattr(gaussians, name)[self.rows.gaussians].detach().requires_grad_() for name in ROW_PARAMETERS]
@@ -174,15 +174,28 @@ def twin_step(optimizer, gaussians, scene):
 @pytest.mark.parametrize("name", OPTIMIZERS)
 @pytest.mark.parametrize("degree", [3, 2, 0])
 def test_fused_step_is_the_twin_s(name, degree):
+    check_fused_step(name, degree=degree)
+
+
+@pytest.mark.parametrize(
+    ("name", "views"),
+    [("lm", 1), ("lm", 9), ("paper", 9), ("lm", 40), ("adam", 40), ("adam", 128), ("lm summed", 128)],
+)
+def test_fused_step_of_few_and_of_many_views(name, views):
+    """More rows than a Gaussian has room for in shared memory, and more views than a mask has bits."""
+    check_fused_step(name, views=views, count=70)
+
+
+def check_fused_step(name, **case):
     optimizer, twin = OPTIMIZERS[name], OPTIMIZERS[name]
-    before = Scene(degree=degree).gaussians
+    before = Scene(**case).gaussians
     gaussians, expected = before.map(lambda v: v.to(DEVICE, copy=True)), before.map(doubled)
     optimizer.setup(gaussians)
     moments = optimizer.moments
     twin.setup(expected)
     expected_moments = twin.moments
     for iteration in range(3):
-        scene = Scene(degree=degree, seed=iteration)
+        scene = Scene(**case, seed=iteration)
         scene.gaussians = gaussians.map(lambda value: value.cpu())  # gradients at the kernels' own parameters
         twin.moments = expected_moments
         twin_step(twin, expected, scene)
@@ -303,6 +316,17 @@ def test_wrong_tensors_are_named():
         training_kernels.fused_step(scene.screen(gaussians), gaussians, optimizer.moments, optimizer.rule(STEP))
     with pytest.raises(ValueError, match="not the Gaussians"):
         training_kernels.fused_step(scene.screen(), gaussians, optimizer.moments, optimizer.rule(STEP))
+
+
+def test_more_views_than_the_kernels_take_are_refused():
+    scene = Scene(count=20, views=training_kernels.MAX_VIEWS + 1)
+    gaussians, optimizer = scene.on_device(), OPTIMIZERS["lm"]
+    optimizer.setup(gaussians)
+    with pytest.raises(InputError, match="views, got 129"):
+        training_kernels.fused_step(scene.screen(gaussians), gaussians, optimizer.moments, optimizer.rule(STEP))
+    with pytest.raises(InputError, match="views, got 129"):
+        training_kernels.projection_backward(scene.screen(), rows=False)
+    assert cuda.MAX_VIEWS == training_kernels.MAX_VIEWS
 
 
 def test_side_stream():

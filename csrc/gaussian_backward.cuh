@@ -1,0 +1,251 @@
+// From the screen back to the parameters of one Gaussian in one view: the vector-Jacobian product of the projection
+// (gsplat's, with its clamped Jacobian) and of the spherical harmonics, recomputed in registers.
+//
+// With T = J W (J the 2x3 Jacobian of the perspective, W the view rotation), M = R diag(s) and U = T M, the screen
+// covariance is U U^T + eps2d I. Its gradient V gives Q = 2 V U, and everything else follows from Q:
+// d/dM = T^T Q, d/dlog s_j = sum_i U_ij Q_ij, d/dT = Q M^T.
+#pragma once
+
+#include "camera.cuh"
+#include "quaternion.cuh"
+#include "spherical_harmonics.cuh"
+#include "training_params.h"
+
+namespace turbogs {
+
+// What all views of a Gaussian share.
+struct GaussianShape {
+    float mean[3];
+    float scale[3];       // standard deviations
+    float quat[4];        // normalised, wxyz
+    float inverse_norm;   // 1 / |unnormalised quaternion|
+    float spread[9];      // M = R diag(scale), row-major
+};
+
+// A view as the kernels keep it in shared memory: 25 words, so that lanes may read different ones at once.
+struct ViewCamera : Pinhole {
+    SlopeBounds slopes;
+    float grad_scale_x, grad_scale_y;  // K * width / 2, K * height / 2
+};
+
+// Gradient of the 14 parameters that a view's row holds, in the order of the blocks.
+struct RowGradient {
+    float mean[3];
+    float scale[3];
+    float quat[4];
+    float sh0[3];
+    float opacity;
+};
+
+__device__ __forceinline__ ViewCamera load_camera(const float* __restrict__ viewmat, const float* __restrict__ intrinsics,
+                                                  int width, int height, int num_views) {
+    ViewCamera camera;
+    static_cast<Pinhole&>(camera) = load_pinhole(viewmat, intrinsics);
+    camera.slopes = slope_bounds(camera, width, height);
+    camera.grad_scale_x = 0.5f * num_views * width;
+    camera.grad_scale_y = 0.5f * num_views * height;
+    return camera;
+}
+
+__device__ __forceinline__ GaussianShape make_shape(const float mean[3], const float log_scale[3], const float quat[4]) {
+    GaussianShape shape;
+    shape.inverse_norm = unit_quaternion(quat, shape.quat);
+#pragma unroll
+    for (int i = 0; i < 3; ++i) {
+        shape.mean[i] = mean[i];
+        shape.scale[i] = expf(log_scale[i]);
+    }
+    scaled_rotation(shape.quat, shape.scale, shape.spread);
+    return shape;
+}
+
+// Mean, scales and quaternion from the gradients of the screen mean, the conic (a, b, c; b's counts both off-diagonal
+// entries) and the depth. Sets those three of `row`; the direction's part of the mean is added by the caller.
+__device__ __forceinline__ void geometry_backward(const GaussianShape& shape, const ViewCamera& camera, float eps2d,
+                                                  const float grad_mean2d[2], const float grad_conic[3], float grad_depth,
+                                                  RowGradient& row) {
+    const float* W = camera.rotation;
+    const float* M = shape.spread;
+    float point[3];
+    camera_point(camera, shape.mean, point);
+    const float rz = 1.0f / point[2], rz2 = rz * rz;
+    const float slope_x = point[0] * rz, slope_y = point[1] * rz;
+    const float clamped_x = fminf(camera.slopes.high_x, fmaxf(camera.slopes.low_x, slope_x));
+    const float clamped_y = fminf(camera.slopes.high_y, fmaxf(camera.slopes.low_y, slope_y));
+    const float j00 = camera.fx * rz, j11 = camera.fy * rz;
+    const float j02 = -j00 * clamped_x, j12 = -j11 * clamped_y;
+
+    float T0[3], T1[3], U0[3], U1[3];
+#pragma unroll
+    for (int l = 0; l < 3; ++l) {
+        T0[l] = j00 * W[l] + j02 * W[6 + l];
+        T1[l] = j11 * W[3 + l] + j12 * W[6 + l];
+    }
+#pragma unroll
+    for (int j = 0; j < 3; ++j) {
+        U0[j] = T0[0] * M[j] + T0[1] * M[3 + j] + T0[2] * M[6 + j];
+        U1[j] = T1[0] * M[j] + T1[1] * M[3 + j] + T1[2] * M[6 + j];
+    }
+    const float c00 = U0[0] * U0[0] + U0[1] * U0[1] + U0[2] * U0[2];
+    const float c01 = U0[0] * U1[0] + U0[1] * U1[1] + U0[2] * U1[2];
+    const float c11 = U1[0] * U1[0] + U1[1] * U1[1] + U1[2] * U1[2];
+    // Lagrange's identity: the determinant as a sum of squares does not cancel, however thin the splat.
+    const float x12 = U0[1] * U1[2] - U0[2] * U1[1];
+    const float x20 = U0[2] * U1[0] - U0[0] * U1[2];
+    const float x01 = U0[0] * U1[1] - U0[1] * U1[0];
+    const float inverse_det = 1.0f / (x12 * x12 + x20 * x20 + x01 * x01 + eps2d * (c00 + c11 + eps2d));
+    const float a = (c11 + eps2d) * inverse_det, b = -c01 * inverse_det, c = (c00 + eps2d) * inverse_det;
+
+    // V = -A G A with A the conic and G its symmetric gradient.
+    const float g00 = grad_conic[0], g01 = 0.5f * grad_conic[1], g11 = grad_conic[2];
+    const float h00 = a * g00 + b * g01, h01 = a * g01 + b * g11;  // A G
+    const float h10 = b * g00 + c * g01, h11 = b * g01 + c * g11;
+    const float v00 = -(h00 * a + h01 * b), v01 = -(h00 * b + h01 * c), v11 = -(h10 * b + h11 * c);
+
+    float Q0[3], Q1[3];
+#pragma unroll
+    for (int j = 0; j < 3; ++j) {
+        Q0[j] = 2.0f * (v00 * U0[j] + v01 * U1[j]);
+        Q1[j] = 2.0f * (v01 * U0[j] + v11 * U1[j]);
+        row.scale[j] = U0[j] * Q0[j] + U1[j] * Q1[j];
+    }
+
+    // d/dT = Q M^T, and d/dJ = d/dT W^T at J's four entries.
+    float grad_j00 = 0.0f, grad_j02 = 0.0f, grad_j11 = 0.0f, grad_j12 = 0.0f;
+#pragma unroll
+    for (int l = 0; l < 3; ++l) {
+        const float grad_t0 = Q0[0] * M[3 * l] + Q0[1] * M[3 * l + 1] + Q0[2] * M[3 * l + 2];
+        const float grad_t1 = Q1[0] * M[3 * l] + Q1[1] * M[3 * l + 1] + Q1[2] * M[3 * l + 2];
+        grad_j00 += grad_t0 * W[l];
+        grad_j02 += grad_t0 * W[6 + l];
+        grad_j11 += grad_t1 * W[3 + l];
+        grad_j12 += grad_t1 * W[6 + l];
+    }
+
+    float grad_point[3];
+    grad_point[0] = j00 * grad_mean2d[0];
+    grad_point[1] = j11 * grad_mean2d[1];
+    grad_point[2] = grad_depth - (j00 * slope_x * grad_mean2d[0] + j11 * slope_y * grad_mean2d[1]);
+    // Inside the limits J's last column follows x and z; outside it depends on z alone.
+    const float column_x = camera.fx * rz2 * grad_j02, column_y = camera.fy * rz2 * grad_j12;
+    const bool inside_x = slope_x <= camera.slopes.high_x && slope_x >= camera.slopes.low_x;
+    const bool inside_y = slope_y <= camera.slopes.high_y && slope_y >= camera.slopes.low_y;
+    grad_point[0] -= inside_x ? column_x : 0.0f;
+    grad_point[1] -= inside_y ? column_y : 0.0f;
+    grad_point[2] += (inside_x ? 2.0f : 1.0f) * column_x * clamped_x + (inside_y ? 2.0f : 1.0f) * column_y * clamped_y -
+                     rz2 * (camera.fx * grad_j00 + camera.fy * grad_j11);
+#pragma unroll
+    for (int l = 0; l < 3; ++l) {
+        row.mean[l] = W[l] * grad_point[0] + W[3 + l] * grad_point[1] + W[6 + l] * grad_point[2];
+    }
+
+    // d/dR_ij = T_0i Q_0j s_j + T_1i Q_1j s_j, then the quaternion's own derivative and its normalisation.
+    float G[9];
+#pragma unroll
+    for (int j = 0; j < 3; ++j) {
+        const float q0 = Q0[j] * shape.scale[j], q1 = Q1[j] * shape.scale[j];
+#pragma unroll
+        for (int i = 0; i < 3; ++i) G[3 * i + j] = T0[i] * q0 + T1[i] * q1;
+    }
+    const float w = shape.quat[0], x = shape.quat[1], y = shape.quat[2], z = shape.quat[3];
+    const float d21 = G[7] - G[5], d02 = G[2] - G[6], d10 = G[3] - G[1];
+    const float s10 = G[3] + G[1], s20 = G[6] + G[2], s21 = G[7] + G[5];
+    float direct[4];
+    direct[0] = 2.0f * (x * d21 + y * d02 + z * d10);
+    direct[1] = 2.0f * (w * d21 + y * s10 + z * s20 - 2.0f * x * (G[4] + G[8]));
+    direct[2] = 2.0f * (w * d02 + x * s10 + z * s21 - 2.0f * y * (G[0] + G[8]));
+    direct[3] = 2.0f * (w * d10 + x * s20 + y * s21 - 2.0f * z * (G[0] + G[4]));
+    const float along = direct[0] * w + direct[1] * x + direct[2] * y + direct[3] * z;
+#pragma unroll
+    for (int i = 0; i < 4; ++i) row.quat[i] = (direct[i] - along * shape.quat[i]) * shape.inverse_norm;
+}
+
+// d/d(unit direction) of sum_b basis_b * dots[b].
+__device__ __forceinline__ void sh_basis_backward(int degree, float x, float y, float z, const float dots[15],
+                                                  float grad[3]) {
+    grad[0] = grad[1] = grad[2] = 0.0f;
+    if (degree < 1) return;
+    grad[0] = -0.48860251190292f * dots[2];
+    grad[1] = -0.48860251190292f * dots[0];
+    grad[2] = 0.48860251190292f * dots[1];
+    if (degree < 2) return;
+    constexpr float k2 = 1.0925484305920792f, k20 = 1.8923493915151202f;
+    grad[0] += k2 * (y * dots[3] - z * dots[6] + x * dots[7]);
+    grad[1] += k2 * (x * dots[3] - z * dots[4] - y * dots[7]);
+    grad[2] += k20 * z * dots[5] - k2 * (y * dots[4] + x * dots[6]);
+    if (degree < 3) return;
+    const float z2 = z * z;
+    const float c1 = x * x - y * y, s1 = 2.0f * x * y;
+    const float t0 = -2.285228997322329f * z2 + 0.4570457994644658f;
+    const float t0_z = -4.570457994644658f * z;
+    constexpr float k3 = 1.445305721320277f, k33 = -1.7701307697799304f;  // 3 * -0.5900435899266435
+    // d c2 = 3 (c1, -s1), d s2 = 3 (s1, c1) in (x, y); d c1 = 2 (x, -y), d s1 = 2 (y, x).
+    grad[0] += k33 * (s1 * dots[8] + c1 * dots[14]) + 2.0f * k3 * z * (y * dots[9] + x * dots[13]) + t0 * dots[12];
+    grad[1] += k33 * (c1 * dots[8] - s1 * dots[14]) + 2.0f * k3 * z * (x * dots[9] - y * dots[13]) + t0 * dots[10];
+    grad[2] += k3 * (s1 * dots[9] + c1 * dots[13]) + t0_z * (y * dots[10] + x * dots[12]) +
+               (5.597644988851731f * z2 - 1.119528997770346f) * dots[11];
+}
+
+// Unit vector from a camera to the Gaussian, zero where they coincide; returns the inverse of their distance.
+__device__ __forceinline__ float view_direction(const float mean[3], const ViewCamera& camera, float direction[3]) {
+    float length2 = 0.0f;
+#pragma unroll
+    for (int i = 0; i < 3; ++i) {
+        direction[i] = mean[i] - camera.center[i];
+        length2 += direction[i] * direction[i];
+    }
+    const float inverse_length = length2 > 0.0f ? 1.0f / sqrtf(length2) : 0.0f;
+#pragma unroll
+    for (int i = 0; i < 3; ++i) direction[i] *= inverse_length;
+    return inverse_length;
+}
+
+// Colour of one view back to band 0 and, through the direction, to the mean, which is added to. `coefficients`: [3 * bands]
+// of this Gaussian. `grad_color` comes in behind the clamp at 0 and leaves masked by it.
+__device__ __forceinline__ void color_backward(const GaussianShape& shape, const ViewCamera& camera, const float sh0[3],
+                                               int degree, const float* coefficients, float grad_color[3],
+                                               RowGradient& row) {
+    float direction[3];
+    const float inverse_length = view_direction(shape.mean, camera, direction);
+    float color[3];
+#pragma unroll
+    for (int c = 0; c < 3; ++c) color[c] = kShBand0 * sh0[c] + 0.5f;
+    visit_harmonics(degree, direction[0], direction[1], direction[2], [&](int b, float value) {
+#pragma unroll
+        for (int c = 0; c < 3; ++c) color[c] += value * coefficients[3 * b + c];
+    });
+#pragma unroll
+    for (int c = 0; c < 3; ++c) {
+        grad_color[c] = color[c] >= 0.0f ? grad_color[c] : 0.0f;
+        row.sh0[c] = kShBand0 * grad_color[c];
+    }
+    float dots[kTrainingMaxBands];
+#pragma unroll
+    for (int band = 1; band <= 3; ++band) {
+        if (band > degree) break;
+#pragma unroll
+        for (int b = band * band - 1; b < (band + 1) * (band + 1) - 1; ++b) {
+            dots[b] = coefficients[3 * b] * grad_color[0] + coefficients[3 * b + 1] * grad_color[1] +
+                      coefficients[3 * b + 2] * grad_color[2];
+        }
+    }
+    float grad_unit[3];
+    sh_basis_backward(degree, direction[0], direction[1], direction[2], dots, grad_unit);
+    const float along =
+        grad_unit[0] * direction[0] + grad_unit[1] * direction[1] + grad_unit[2] * direction[2];
+#pragma unroll
+    for (int i = 0; i < 3; ++i) row.mean[i] += (grad_unit[i] - along * direction[i]) * inverse_length;
+}
+
+// Adds one view's gradient of the harmonics, [3 * bands]. `grad_color`: masked by the clamp.
+__device__ __forceinline__ void add_harmonics_gradient(const float mean[3], const ViewCamera& camera, int degree,
+                                                       const float grad_color[3], float* gradients) {
+    float direction[3];
+    view_direction(mean, camera, direction);
+    visit_harmonics(degree, direction[0], direction[1], direction[2], [&](int b, float value) {
+#pragma unroll
+        for (int c = 0; c < 3; ++c) gradients[3 * b + c] += value * grad_color[c];
+    });
+}
+
+}  // namespace turbogs

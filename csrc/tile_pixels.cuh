@@ -1,0 +1,85 @@
+// A warp's tile in the maps: a lane holds 8 of its pixels, pixel (j, lane) being number 32 j + lane of `cell_order`.
+#pragma once
+
+#include <cuda_fp16.h>
+
+#include "training_params.h"
+
+namespace turbogs {
+
+constexpr int kTile = 16, kTilePixels = 256, kPerLane = kTilePixels / 32;
+constexpr int kSampleThreads = 128;
+constexpr int kAgeMax = 32767;
+
+// The tile of this warp, and its 8 pixels a lane.
+struct TilePixels {
+    int view;                  // in the batch
+    int column, row;           // of the tile
+    int width, height;         // of the part inside the image
+    uint32_t inside;           // bit j: pixel (j, lane) exists
+    uint32_t first;            // id of pixel (0, lane), y * width + x
+    int image_width;
+
+    __device__ __forceinline__ int offset(int j) const { return (j >> 1) * 4 * image_width + (j & 1) * 8; }
+    __device__ __forceinline__ uint32_t id(int j) const { return first + static_cast<uint32_t>(offset(j)); }
+};
+
+__device__ __forceinline__ TilePixels locate_tile(const SamplePixelsParams& params, int tile) {
+    TilePixels pixels;
+    pixels.view = 0;
+    while (pixels.view + 1 < params.num_views && tile >= params.views[pixels.view + 1].tile_base) ++pixels.view;
+    const SampleView& view = params.views[pixels.view];
+    const int number = tile - view.tile_base;
+    pixels.row = number / view.tiles_x;
+    pixels.column = number - pixels.row * view.tiles_x;
+    pixels.width = min(kTile, view.width - kTile * pixels.column);
+    pixels.height = min(kTile, view.height - kTile * pixels.row);
+    pixels.inside = 0;
+    const int lane = threadIdx.x & 31, x = lane & 7, y = lane >> 3;
+    pixels.image_width = view.width;
+    pixels.first = static_cast<uint32_t>((kTile * pixels.row + y) * view.width + kTile * pixels.column + x);
+#pragma unroll
+    for (int j = 0; j < kPerLane; ++j) {
+        const bool exists = x + (j & 1) * 8 < pixels.width && y + (j >> 1) * 4 < pixels.height;
+        pixels.inside |= static_cast<uint32_t>(exists) << j;
+    }
+    return pixels;
+}
+
+// What the maps say of a lane's pixels: errors, halves, and above them the ages.
+struct PixelUnits {
+    const TilePixels& pixels;
+    uint32_t packed[kPerLane];
+
+    __device__ __forceinline__ float error(int j) const {
+        return __half2float(__ushort_as_half(static_cast<unsigned short>(packed[j])));
+    }
+    __device__ __forceinline__ int age(int j) const { return static_cast<int>(packed[j] >> 16); }
+    __device__ __forceinline__ uint32_t place(int j) const { return pixels.id(j); }
+};
+
+__device__ __forceinline__ PixelUnits load_maps(const SamplePixelsParams& params, const TilePixels& pixels) {
+    const SampleView& view = params.views[pixels.view];
+    const int64_t first = view.pixel_base + pixels.first;
+    const uint16_t* of_errors = static_cast<const uint16_t*>(params.errors) + first;
+    const int16_t* of_stamps = params.stamps + first;
+    uint16_t errors[kPerLane];
+    int16_t stamps[kPerLane];
+#pragma unroll
+    for (int j = 0; j < kPerLane; ++j) {
+        const bool exists = pixels.inside >> j & 1u;
+        errors[j] = exists ? of_errors[pixels.offset(j)] : uint16_t{0};
+        stamps[j] = exists ? of_stamps[pixels.offset(j)] : int16_t{0};
+    }
+    PixelUnits units{pixels, {}};
+#pragma unroll
+    for (int j = 0; j < kPerLane; ++j) {
+        const int age = min(max(params.now - static_cast<int>(stamps[j]), 0), kAgeMax);
+        units.packed[j] = errors[j] | (pixels.inside >> j & 1u ? static_cast<uint32_t>(age) << 16 : 0u);
+    }
+    return units;
+}
+
+inline int warp_blocks(int warps) { return (warps * 32 + kSampleThreads - 1) / kSampleThreads; }
+
+}  // namespace turbogs
