@@ -78,16 +78,16 @@ class ErrorDrivenDensity:
         max_gaussians: never more than this; an initial model that has more is cut to it at the first event, easiest
             first. 0: no cap.
         prune_opacity: less opaque ones are pruned.
-        prune_world_size: pruned where the largest standard deviation exceeds this * scene extent, or where it is more,
-            this * the distance from the cameras' centre: what is far may be large. 0: off.
+        prune_world_size: pruned where the largest standard deviation exceeds this * scene extent. 0: off.
         prune_screen_size: pruned where the screen radius exceeds this * the larger side of the image. 0: off, as in
             3DGS in effect.
         prune_size_from: both size rules begin at this progress; 3DGS has 3000 / 15000.
         prune_score_fraction: share of the seen, the easiest, that each densification event prunes. Off by default: the
             paper gives no value, and what has little error may be what is rendered well.
-        opacity_decay: share of its opacity that every seen Gaussian loses at each densification event. What the photos
-            need grows back, what they do not falls below `prune_opacity`; a gentle substitute for 3DGS's reset. What
-            no photo saw has nothing to grow back by, and is left alone.
+        opacity_decay: share of its opacity that every Gaussian loses at each densification event. What the photos need
+            grows back, what they do not falls below `prune_opacity`; a gentle substitute for 3DGS's reset.
+        spare_beyond: Gaussians farther from the cameras' centre than this * scene extent are neither decayed nor pruned
+            (unless they are not finite): a backdrop behind the scene, which few photos see. 0: none.
         final_every, final_keep: interval of the final pruning, and the share of the seen that each one keeps, the
             most difficult (Delta_prune, eta_final). 1 keeps all.
     """
@@ -110,6 +110,7 @@ class ErrorDrivenDensity:
     prune_size_from: float = 0.2
     prune_score_fraction: float = 0.0
     opacity_decay: float = 0.0
+    spare_beyond: float = 0.0
     final_every: int = 500
     final_keep: float = 0.95
     initial_count: int = field(init=False, default=0)
@@ -127,7 +128,7 @@ class ErrorDrivenDensity:
             require(0 <= getattr(self, name) < 1, name, getattr(self, name), "at least 0 and less than 1")
         for name in (
             *("lambda_base", "refine_from", "grad_threshold", "absgrad_threshold", "percent_dense", "target_gaussians"),
-            *("max_gaussians", "prune_world_size", "prune_screen_size", "prune_size_from"),
+            *("max_gaussians", "prune_world_size", "prune_screen_size", "prune_size_from", "spare_beyond"),
         ):
             value = getattr(self, name)
             require(math.isfinite(value) and value >= 0, name, value, "a finite number >= 0")
@@ -206,7 +207,9 @@ class ErrorDrivenDensity:
         stats, extent = self._stats, step.scene_extent
         views = stats.view_counts.clamp(min=1)
         passes = (stats.grad_sums / views > self.grad_threshold) | (stats.absgrad_sums / views > self.absgrad_threshold)
-        hopeless = ~finite_rows(gaussians) | (torch.sigmoid(gaussians.opacities) < self.prune_opacity)
+        finite = finite_rows(gaussians)
+        spared = self._spared(gaussians, finite, extent)
+        hopeless = ~finite | (torch.sigmoid(gaussians.opacities) < self.prune_opacity)
         if self.prune_score_fraction > 0:
             hopeless |= seen & (score < _quantile(score, seen, self.prune_score_fraction))
         difficult = seen & (score >= _quantile(score, seen, 1 - self.top_fraction))
@@ -217,10 +220,10 @@ class ErrorDrivenDensity:
         big = torch.zeros_like(seen)
         if step.progress >= self.prune_size_from:
             if self.prune_world_size > 0:
-                big |= largest > self.prune_world_size * gaussians.means.norm(dim=-1).clamp(min=extent)
+                big |= largest > self.prune_world_size * extent
             if self.prune_screen_size > 0:
                 big |= stats.max_radii > self.prune_screen_size
-        pruned = leave_one(hopeless | (big & ~(candidates & ~small)), gaussians)
+        pruned = leave_one((hopeless | (big & ~(candidates & ~small))) & ~spared, gaussians)
         candidates &= ~pruned
         if self.max_gaussians > 0:
             excess = int((~pruned).sum()) - self.max_gaussians
@@ -231,7 +234,13 @@ class ErrorDrivenDensity:
         allowed = self._allowed_growth(int((~pruned).sum()), step)
         if allowed is not None:
             candidates = _first(score, candidates, allowed)
-        return self._compose(gaussians, candidates & small, candidates & ~small, pruned, seen, step)
+        return self._compose(gaussians, candidates & small, candidates & ~small, pruned, spared, step)
+
+    def _spared(self, gaussians: Gaussians, finite: Tensor, extent: float) -> Tensor:
+        """[N] bool: the finite ones that lie beyond `spare_beyond`."""
+        if self.spare_beyond == 0:
+            return torch.zeros_like(finite)
+        return finite & (gaussians.means.norm(dim=-1) > self.spare_beyond * extent)
 
     def _allowed_growth(self, count: int, step: Step) -> int | None:
         """How many Gaussians may be added to `count`, or None for any number."""
@@ -245,15 +254,16 @@ class ErrorDrivenDensity:
         return max(0, min(limits) - count) if limits else None
 
     def _final_prune(self, gaussians: Gaussians, score: Tensor, seen: Tensor, step: Step) -> RowUpdate | None:
-        pruned = ~finite_rows(gaussians) | (seen & (score < _quantile(score, seen, 1 - self.final_keep)))
-        pruned = leave_one(pruned, gaussians)
+        finite = finite_rows(gaussians)
+        easy = seen & (score < _quantile(score, seen, 1 - self.final_keep))
+        pruned = leave_one(~finite | easy & ~self._spared(gaussians, finite, step.scene_extent), gaussians)
         if not pruned.any():
             return None
         source = torch.nonzero(~pruned).squeeze(-1)
         return RowUpdate(source, torch.zeros_like(source, dtype=torch.bool), {}, num_pruned=int(pruned.sum()))
 
     def _compose(
-        self, gaussians: Gaussians, cloned: Tensor, split: Tensor, pruned: Tensor, seen: Tensor, step: Step
+        self, gaussians: Gaussians, cloned: Tensor, split: Tensor, pruned: Tensor, spared: Tensor, step: Step
     ) -> RowUpdate | None:
         """One change out of masks [N]: the rest in order, the clones, the first halves, the second halves."""
         rest, copies, halves = (torch.nonzero(mask).squeeze(-1) for mask in (~(pruned | split), cloned, split))
@@ -268,7 +278,7 @@ class ErrorDrivenDensity:
                 gaussians, halves, step
             )
         if self.opacity_decay > 0:
-            opacities = torch.where(seen, _decayed(gaussians.opacities, self.opacity_decay), gaussians.opacities)
+            opacities = torch.where(spared, gaussians.opacities, _decayed(gaussians.opacities, self.opacity_decay))
             values["opacities"] = opacities[source]
         counts = {"num_cloned": len(copies), "num_split": len(halves), "num_pruned": int(pruned.sum())}
         return RowUpdate(source, fresh, values, **counts)

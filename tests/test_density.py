@@ -100,7 +100,7 @@ def test_event_equals_plain_loops(seed, config):
             prunes.add(i)
         elif passes and seen[i] and score[i] >= hard_limit and not small:
             splits.add(i)
-        elif largest > density.prune_world_size * max(2.0, float(gaussians.means[i].norm())) or (
+        elif largest > density.prune_world_size * 2.0 or (
             density.prune_screen_size and stats.max_radii[i] > density.prune_screen_size
         ):
             prunes.add(i)
@@ -223,9 +223,10 @@ def test_opacity_decay(dtype):
     gaussians = make_gaussians(6, dtype=dtype)
     gaussians.opacities[:] = torch.tensor([-200.0, -50.0, -2.0, 0.0, 3.0, 60.0], dtype=dtype)
     stats = busy_stats(6)
-    stats.weight_sums[3] = 0.0  # unseen
     stats.grad_sums.zero_()  # nothing is densified
-    density = controlled(gaussians, stats, opacity_decay=0.1, **QUIET)
+    gaussians.means[:] = gaussians.means / gaussians.means.norm(dim=1, keepdim=True)
+    gaussians.means[3] *= 2.0 * 10.1  # of an extent of 2
+    density = controlled(gaussians, stats, opacity_decay=0.1, spare_beyond=10.0, **QUIET)
     update = density.update(gaussians, FULL)
     expected = 0.9 * torch.sigmoid(gaussians.opacities.double())
     expected[3] = 0.5
@@ -391,3 +392,21 @@ def test_statistics_of_another_model_are_refused():
 def test_refuses(values):
     with pytest.raises(InputError, match=next(iter(values))):
         ErrorDrivenDensity(**values)
+
+
+def test_what_lies_beyond_is_spared_unless_it_is_not_finite():
+    gaussians = make_gaussians(5)
+    gaussians.means[:] = torch.tensor([[1.0, 0, 0], [30.0, 0, 0], [30.0, 0, 0], [30.0, 0, 0], [torch.inf, 0, 0]])
+    gaussians.opacities[:] = torch.tensor([-9.0, -9.0, 3.0, 3.0, 3.0])  # the first two are transparent
+    gaussians.scales[:] = torch.tensor([-5.0, -5.0, 5.0, -5.0, -5.0])[:, None]  # the third is huge
+    gaussians.quats[3] = torch.nan
+    stats = busy_stats(5)
+    stats.grad_sums.zero_()
+    for spare_beyond, kept in ((10.0, [1, 2]), (0.0, [2])):
+        density = controlled(
+            gaussians, stats, spare_beyond=spare_beyond, prune_world_size=0.0 if spare_beyond == 0 else 0.1
+        )
+        assert density.update(gaussians, FULL).source.tolist() == kept
+    stats.error_sums[1:3] = 0.0  # the easiest
+    density = controlled(gaussians, stats, spare_beyond=10.0, final_keep=0.1)
+    assert {1, 2} <= set(density.update(gaussians, Step(4000, 5000, 3500, scene_extent=2.0)).source.tolist())
