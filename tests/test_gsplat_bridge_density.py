@@ -219,6 +219,19 @@ def test_what_is_missing_is_named():
         host.strategy.step_post_backward(*common, host.state, 0, host.info)
 
 
+@pytest.mark.parametrize("tells_errors", [False, True])
+def test_info_of_another_model_is_refused(tells_errors):
+    host = Host(TurboDensityStrategy(**SOON), tells_errors=tells_errors)
+    host.step(0)
+    message = r"info is of 40 Gaussians, the parameters are (7|80): pass the info of this step's rasterization"
+    for rows in (torch.arange(7), torch.arange(80) % 40):
+        other = {name: torch.nn.Parameter(value.detach()[rows]) for name, value in host.splats.items()}
+        with pytest.raises(InputError, match=message):
+            host.strategy.step_post_backward(other, host.optimizers, host.strategy.initialize_state(), 1, host.info)
+    with pytest.raises(InputError, match="info is None"):
+        host.strategy.step_post_backward(host.splats, host.optimizers, host.state, 1, None)
+
+
 def test_changes_in_mid_run_are_refused():
     host = Host(TurboDensityStrategy(**SOON))
     host.step(0)

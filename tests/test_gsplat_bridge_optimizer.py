@@ -10,6 +10,7 @@ from gsplat import DefaultStrategy
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from turbogs_plugin.strategies.adam import SparseAdam
+from turbogs_plugin.strategies.dense_adam import DenseAdam
 from turbogs_plugin.strategies.moment_lm import MomentLMOptimizer
 
 from turbogs_plugin.errors import InputError
@@ -258,6 +259,17 @@ def test_mistakes_are_named():
     splats["quats"].grad = torch.zeros_like(splats["quats"]).to_sparse()
     with pytest.raises(InputError, match="gradient of 'quats' is sparse"):
         members["quats"].step()
+
+    for wrong in (SparseAdam, DenseAdam(), ADAM):
+        with pytest.raises(InputError, match=r"SharedOptimizer takes SparseAdam\(\) or .*: got (Sparse|Dense)?Adam"):
+            SharedOptimizer(wrong)
+
+    members = members_of(splats, MomentLMOptimizer())
+    set_gradients(splats, 0)
+    members["means"].observe({"loss_shares": torch.ones(7)})
+    with pytest.raises(InputError, match="info is of 7 Gaussians, the parameters are 40"):
+        for member in members.values():
+            member.step()
 
     shared = SharedOptimizer(SparseAdam())
     with pytest.raises(InputError, match=r"got groups named \['features'\]"):

@@ -190,6 +190,16 @@ REFUSED = [
     ({"scales": torch.ones(3, 3)}, r"scales has shape \(3, 3\): expected \[40, 3\]"),
     ({"opacities": torch.ones(40, 1)}, r"opacities has shape \(40, 1\): expected \[40\]"),
     ({"colors": torch.ones(40, 3, 3)}, r"sh_degree 1 needs 4 bands: colors have 3"),
+    ({"sh_degree": 0.5}, r"sh_degree is 0.5: expected a whole number"),
+    ({"backgrounds": torch.ones(3)}, r"backgrounds has shape \(3,\): expected \[2, 3\]"),
+    (
+        {"means": torch.ones(40, 3).double()},
+        r"quats is of torch.float32 .*: expected torch.float64 on cpu",
+    ),
+    ({"means": torch.ones(40, 3).long()}, r"means is of torch.int64: expected floating point"),
+    ({"quats": np.ones((40, 4))}, r"quats is a ndarray: expected a tensor"),
+    ({"covars": torch.ones(40, 3, 3)}, r"covars=a tensor of shape \(40, 3, 3\) is not supported, only None"),
+    ({"samples": None}, r"samples is a NoneType: expected the PixelSamples"),
     ({"width": 41}, r"samples are of 2 views .*expected 2, one for each of viewmats, all of \(41, 24\)"),
 ]
 

@@ -119,3 +119,10 @@ def test_errors_that_come_too_late_for_our_rasterizer_are_refused(rendered):
     late = {key: value for key, value in rendered.items() if key not in ("gaussian_stats", "loss_shares")}
     with pytest.raises(InputError, match="put them in before backward"):
         iteration_stats(late, COUNT)
+
+
+def test_errors_of_other_images_are_refused(rendered):
+    info, _ = stock_info(rendered, packed=False)
+    info.update(prediction=torch.zeros(CAMERAS, 5, 5, 3), ground_truth=torch.zeros(CAMERAS, 5, 5, 3))
+    with pytest.raises(InputError, match=r"of shape \(\d, 5, 5, 3\): expected \(\d, 24, 40, 3\), what gsplat"):
+        iteration_stats(info, COUNT)

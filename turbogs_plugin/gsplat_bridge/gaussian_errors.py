@@ -59,8 +59,13 @@ def iteration_stats(info: dict[str, Any], count: int) -> tuple[GaussianStats, bo
 
     Returns:
         The statistics, and whether they have error sums (then also weight sums).
+
+    Raises:
+        InputError: `info` lacks a key or a gradient, or is of another number of Gaussians.
     """
+    require_keys(info, ("means2d",), "info", "pass what the rasterization returned")
     if info.get(STATISTICS) is not None:
+        _require_count(len(info[STATISTICS].view_counts), count)
         return info[STATISTICS], True
     stats = screen_statistics(info, count)
     sums = _error_sums(info, count)
@@ -77,6 +82,7 @@ def loss_shares(info: dict[str, Any], count: int) -> Tensor | None:
     After backward, for renders of `sparse_rasterization`.
     """
     if info.get(LOSS_SHARES) is not None:
+        _require_count(len(info[LOSS_SHARES]), count)
         return info[LOSS_SHARES]
     sums = _error_sums(info, count)
     return None if sums is None else sums[:, 0] / info[PREDICTION][..., 0].numel()
@@ -103,6 +109,15 @@ def _error_sums(info: dict[str, Any], count: int) -> Tensor | None:
     return info[ERROR_SUMS]
 
 
+def _require_count(found: int, count: int) -> None:
+    """Raise `InputError` where `info` is of another number of Gaussians than the parameters."""
+    if found != count:
+        raise InputError(
+            f"info is of {found} Gaussians, the parameters are {count}: pass the info of this step's rasterization, "
+            "from before rows were added or removed"
+        )
+
+
 def screen_statistics(info: dict[str, Any], count: int) -> GaussianStats:
     """Sums of screen gradients, of views and largest radii, in gsplat's units; the sums over pixels stay zero."""
     keys = ("means2d", "radii", "width", "height", "n_cameras", "gaussian_ids")
@@ -119,6 +134,7 @@ def screen_statistics(info: dict[str, Any], count: int) -> GaussianStats:
     if info["gaussian_ids"] is not None:  # packed
         ids = info["gaussian_ids"].long()
     else:
+        _require_count(visible.shape[-1], count)
         ids = torch.where(visible)[-1]
         norms, radii = [norm[visible] for norm in norms], radii[visible]
     stats = GaussianStats.zeros(count, means2d.device)
@@ -143,6 +159,12 @@ def zero_channel_sums(info: dict[str, Any], upstream: Tensor) -> Tensor:
     from gsplat import rasterize_to_pixels
 
     require_keys(info, _INTERSECTION, "info", "pass what gsplat.rasterization returned")
+    images = (info["isect_offsets"].shape[0], info["height"], info["width"])
+    if upstream.shape[:-1] != images:
+        raise InputError(
+            f"info['{PREDICTION}'] and info['{GROUND_TRUTH}'] are of shape {(*upstream.shape[:-1], 3)}: "
+            f"expected {(*images, 3)}, what gsplat.rasterization rendered"
+        )
     means2d = info["means2d"].detach()
     with torch.enable_grad():
         channels = means2d.new_zeros(*means2d.shape[:-1], upstream.shape[-1]).requires_grad_()

@@ -36,8 +36,10 @@ SHAPES = {
 GEOMETRY = ("means", "quats", "scales", "opacities")
 
 
-def require_keys(mapping: Mapping[str, Any], keys: Iterable[str], what: str, remedy: str) -> None:
-    """Raise `InputError` naming the `keys` that `mapping` (called `what`) lacks."""
+def require_keys(mapping: Mapping[str, Any] | None, keys: Iterable[str], what: str, remedy: str) -> None:
+    """Raise `InputError` naming the `keys` that `mapping` (called `what`) lacks; None lacks all of them."""
+    if mapping is None:
+        raise InputError(f"{what} is None: {remedy}")
     missing = [key for key in keys if key not in mapping]
     if missing:
         raise InputError(f"{what} has no {', '.join(repr(key) for key in missing)}: {remedy}")
@@ -54,7 +56,7 @@ def host_gaussians(params: Mapping[str, Tensor], names: Iterable[str] = PARAMETE
     Raises:
         InputError: a parameter is missing, or has another shape than in gsplat's layout, or another number of rows.
     """
-    require_keys(params, names, "the parameters", f"expected {', '.join(names)}")
+    require_keys(params, names, "params", f"expected {', '.join(names)}")
     count = params["means"].shape[0]
     for name in PARAMETER_NAMES:
         if name in params and not _fits(tuple(params[name].shape), SHAPES[name], count):

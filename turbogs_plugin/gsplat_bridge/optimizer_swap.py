@@ -64,6 +64,9 @@ class SharedOptimizer:
     """
 
     def __init__(self, optimizer: BlockOptimizer) -> None:
+        if isinstance(optimizer, type) or "moments" not in getattr(optimizer, "__dataclass_fields__", ()):
+            name = optimizer.__name__ if isinstance(optimizer, type) else type(optimizer).__name__
+            raise InputError(f"SharedOptimizer takes SparseAdam() or MomentLMOptimizer(), an instance: got {name}")
         self.optimizer = copy.copy(optimizer)
         self.members: dict[str, MemberOptimizer] = {}
         self.skipped: Tensor | None = None

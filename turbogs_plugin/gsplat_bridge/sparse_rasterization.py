@@ -97,7 +97,12 @@ def sparse_rasterization(
         InputError: a wrong shape, or an option without support here.
     """
     _check_options(gsplat_options)
-    _check_shapes(means, quats, scales, opacities, colors, viewmats, Ks, sh_degree)
+    given = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "colors": colors}
+    given |= {"viewmats": viewmats, "Ks": Ks} | ({} if backgrounds is None else {"backgrounds": backgrounds})
+    _check_tensors(given)
+    _check_shapes(given, sh_degree)
+    if not isinstance(samples, PixelSamples):
+        raise InputError(f"samples is a {type(samples).__name__}: expected the PixelSamples that a sampler drew")
     sizes = {(int(w), int(h)) for w, h in samples.sizes}
     if sizes != {(width, height)} or len(samples.view_ids) != len(viewmats):
         raise InputError(
@@ -239,33 +244,46 @@ def _check_options(options: dict[str, Any]) -> None:
     for name, value in options.items():
         if name not in _ONLY:
             raise InputError(f"sparse_rasterization has no option '{name}'; of gsplat's it takes {', '.join(_ONLY)}")
-        if value != _ONLY[name]:
-            raise InputError(f"sparse_rasterization: {name}={value!r} is not supported, only {_ONLY[name]!r}")
+        if isinstance(value, Tensor) or value != _ONLY[name]:
+            found = f"a tensor of shape {tuple(value.shape)}" if isinstance(value, Tensor) else repr(value)
+            raise InputError(f"sparse_rasterization: {name}={found} is not supported, only {_ONLY[name]!r}")
 
 
-def _check_shapes(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    colors: Tensor,
-    viewmats: Tensor,
-    Ks: Tensor,
-    sh_degree: int | None,
-) -> None:
-    count, cameras = means.shape[0], viewmats.shape[0]
+def _check_tensors(given: dict[str, Any]) -> None:
+    """All are tensors of the means' floating point type, on the means' device."""
+    for name, value in given.items():
+        if not isinstance(value, Tensor):
+            raise InputError(f"{name} is a {type(value).__name__}: expected a tensor")
+        if not value.is_floating_point():
+            raise InputError(f"{name} is of {value.dtype}: expected floating point")
+        means = given["means"]
+        if (value.dtype, value.device) != (means.dtype, means.device):
+            raise InputError(
+                f"{name} is of {value.dtype} on {value.device}: expected {means.dtype} on {means.device} as means"
+            )
+
+
+def _check_shapes(given: dict[str, Tensor], sh_degree: int | None) -> None:
+    means, viewmats, colors = given["means"], given["viewmats"], given["colors"]
+    count, cameras = len(means), len(viewmats)
     expected = {
-        "means": (means, (count, 3)),
-        "quats": (quats, (count, 4)),
-        "scales": (scales, (count, 3)),
-        "opacities": (opacities, (count,)),
-        "viewmats": (viewmats, (cameras, 4, 4)),
-        "Ks": (Ks, (cameras, 3, 3)),
-        "colors": (colors, (count, 3) if sh_degree is None else (count, *colors.shape[1:2], 3)),
+        "means": (count, 3),
+        "quats": (count, 4),
+        "scales": (count, 3),
+        "opacities": (count,),
+        "viewmats": (cameras, 4, 4),
+        "Ks": (cameras, 3, 3),
+        "colors": (count, 3) if sh_degree is None else (count, *colors.shape[1:2], 3),
+        "backgrounds": (cameras, 3),
     }
-    for name, (value, shape) in expected.items():
+    for name, value in given.items():
+        shape = expected[name]
         if tuple(value.shape) != shape:
             form = "[N, 3] without sh_degree" if name == "colors" and sh_degree is None else str(list(shape))
             raise InputError(f"{name} has shape {tuple(value.shape)}: expected {form} (N = {count}, C = {cameras})")
-    if sh_degree is not None and not 0 <= (sh_degree + 1) ** 2 <= colors.shape[1]:
+    if sh_degree is None:
+        return
+    if not isinstance(sh_degree, int) or sh_degree < 0:
+        raise InputError(f"sh_degree is {sh_degree!r}: expected a whole number, 0 or more, or None")
+    if (sh_degree + 1) ** 2 > colors.shape[1]:
         raise InputError(f"sh_degree {sh_degree} needs {(sh_degree + 1) ** 2} bands: colors have {colors.shape[1]}")
