@@ -52,9 +52,8 @@ struct SampleBuffers {
 
 void raster_project(Tensor means, Tensor quats, Tensor scales, Tensor opacities, Tensor sh0, Tensor shN, Tensor viewmats,
                     Tensor Ks, Tensor sizes, std::optional<Tensor> tile_ids, Tensor cameras,
-                    std::optional<Tensor> active_prefix, Tensor instances, Tensor radii, Tensor depth_keys,
-                    Tensor instance_ids, Tensor tile_counts, int64_t sh_degree, double eps2d, double near_plane,
-                    double far_plane, double alpha_min) {
+                    std::optional<Tensor> active_prefix, Tensor instances, Tensor radii, Tensor tile_differences,
+                    int64_t sh_degree, double eps2d, double near_plane, double far_plane, double alpha_min) {
     Checker check(means);
     const int64_t count = means.size(0), views = viewmats.size(0), bands = shN.size(1), total = views * count;
     STD_TORCH_CHECK(views >= 1 && views <= kRasterMaxViews, "viewmats: 1 .. ", kRasterMaxViews, " views a launch, got ", views);
@@ -105,81 +104,57 @@ void raster_project(Tensor means, Tensor quats, Tensor scales, Tensor opacities,
     params.active_prefix = check.optional<int32_t>(active_prefix, "active_prefix", ScalarType::Int, {tiles + 1});
     params.instances = check.bytes_of<Instance>(instances, "instances", ScalarType::Float, total);
     params.radii = reinterpret_cast<int2*>(check.pointer<int32_t>(radii, "radii", ScalarType::Int, {views, count, 2}));
-    params.depth_keys = check.pointer<uint32_t>(depth_keys, "depth_keys", ScalarType::Int, {2, total});
-    params.instance_ids = check.pointer<uint32_t>(instance_ids, "instance_ids", ScalarType::Int, {2, total});
-    params.tile_counts = check.pointer<uint32_t>(tile_counts, "tile_counts", ScalarType::Int, {total});
+    params.tile_differences =
+        check.pointer<int32_t>(tile_differences, "tile_differences", ScalarType::Int, {params.num_active + 1});
     check.launched(launch_projection(params, check.stream()), "projection");
 }
 
 // What the library was built for, such as "sm_90".
 std::string architectures() { return TURBOGS_ARCHITECTURES; }
 
-int64_t raster_sort_instances_scratch(int64_t num_instances) {
-    size_t bytes = 0;
-    check_cuda(sort_instances_scratch(static_cast<int>(num_instances), &bytes), "size of the instance sort");
-    return static_cast<int64_t>(bytes);
-}
-
-int64_t raster_sort_pairs_scratch(int64_t capacity, int64_t num_active, bool narrow_keys) {
-    size_t bytes = 0;
-    check_cuda(sort_pairs_scratch(static_cast<uint32_t>(capacity), static_cast<int>(num_active), narrow_keys, &bytes),
-               "size of the pair sort");
-    return static_cast<int64_t>(bytes);
-}
-
-int64_t raster_sort_instances(Tensor depth_keys, Tensor instance_ids, Tensor tile_counts, Tensor pair_ends, Tensor status,
-                              Tensor scratch) {
-    Checker check(depth_keys);
-    const int64_t total = tile_counts.numel();
-    SortInstancesParams params = {};
-    params.num_instances = static_cast<int>(total);
-    params.depth_keys[0] = check.pointer<uint32_t>(depth_keys, "depth_keys", ScalarType::Int, {2, total});
-    params.depth_keys[1] = params.depth_keys[0] + total;
-    params.instance_ids[0] = check.pointer<uint32_t>(instance_ids, "instance_ids", ScalarType::Int, {2, total});
-    params.instance_ids[1] = params.instance_ids[0] + total;
-    params.tile_counts = check.pointer<uint32_t>(tile_counts, "tile_counts", ScalarType::Int, {total});
-    params.pair_ends = check.pointer<uint32_t>(pair_ends, "pair_ends", ScalarType::Int, {total});
-    params.status = check.pointer<uint32_t>(status, "status", ScalarType::Int, {2});
-    params.scratch = check.pointer<uint8_t>(scratch, "scratch", ScalarType::Byte, {scratch.numel()});
-    params.scratch_bytes = static_cast<size_t>(scratch.numel());
-    check.launched(launch_sort_instances(params, check.stream()), "instance sort");
-    return params.current;
-}
-
-int64_t raster_sort_pairs(Tensor instances, Tensor depth_keys, Tensor instance_ids, Tensor pair_ends, Tensor cameras,
-                          std::optional<Tensor> active_prefix, Tensor tile_keys, Tensor pair_ids, Tensor status,
-                          Tensor tile_starts, Tensor scratch, int64_t num_gaussians) {
-    Checker check(instances);
-    const int64_t total = pair_ends.numel(), capacity = pair_ids.size(1), num_active = tile_starts.numel() - 1;
-    SortPairsParams params = {};
-    params.narrow_keys = tile_keys.scalar_type() == ScalarType::Short;
-    STD_TORCH_CHECK(!params.narrow_keys || num_active <= UINT16_MAX, "16-bit tile keys hold 65535 tiles, got ", num_active);
-    STD_TORCH_CHECK(capacity < kMaxPairs, "capacity must stay below 2^31 - 1, got ", capacity);
-    params.num_instances = static_cast<int>(total);
-    params.num_gaussians = static_cast<int>(num_gaussians);
+// `deferred`: [T + 1], the number of deferred tiles, then the tiles.
+void raster_count_pairs(Tensor tile_cursors, Tensor tile_starts, Tensor status, Tensor deferred, Tensor block_sums,
+                        int64_t capacity) {
+    Checker check(tile_cursors);
+    const int64_t num_active = tile_starts.numel() - 1;
+    STD_TORCH_CHECK(capacity >= 0 && capacity <= kMaxPairs, "capacity must be below 2^31, got ", capacity);
+    CountPairsParams params = {};
     params.num_active = static_cast<int>(num_active);
     params.capacity = static_cast<uint32_t>(capacity);
+    params.tile_cursors = check.pointer<int32_t>(tile_cursors, "tile_cursors", ScalarType::Int, {num_active + 1});
+    params.tile_starts = check.pointer<uint32_t>(tile_starts, "tile_starts", ScalarType::Int, {num_active + 1});
+    params.status = check.pointer<uint32_t>(status, "status", ScalarType::Int, {2});
+    params.num_deferred = check.pointer<uint32_t>(deferred, "deferred", ScalarType::Int, {num_active + 1});
+    params.block_sums = check.pointer<int64_t>(block_sums, "block_sums", ScalarType::Long,
+                                               {num_active > 0 ? (num_active + kScanTiles - 1) / kScanTiles : 1, 2});
+    check.launched(launch_count_pairs(params, check.stream()), "pair count");
+}
+
+void raster_sort_pairs(Tensor instances, Tensor radii, Tensor cameras, std::optional<Tensor> active_prefix,
+                       Tensor tile_cursors, Tensor tile_starts, Tensor status, Tensor pair_keys, Tensor pair_ids,
+                       Tensor deferred) {
+    Checker check(instances);
+    const int64_t views = radii.size(0), count = radii.size(1), total = views * count, capacity = pair_ids.numel();
+    const int64_t num_active = tile_starts.numel() - 1;
+    SortPairsParams params = {};
+    params.num_instances = static_cast<int>(total);
+    params.num_gaussians = static_cast<int>(count);
+    params.num_active = static_cast<int>(num_active);
     params.instances = check.bytes_of<Instance>(instances, "instances", ScalarType::Float, total);
-    params.depth_keys = check.pointer<uint32_t>(depth_keys, "depth_keys", ScalarType::Int, {total});
-    params.instance_ids = check.pointer<uint32_t>(instance_ids, "instance_ids", ScalarType::Int, {total});
-    params.pair_ends = check.pointer<uint32_t>(pair_ends, "pair_ends", ScalarType::Int, {total});
-    params.cameras = check.bytes_of<RasterCamera>(cameras, "cameras", ScalarType::Float, cameras.size(0));
+    params.radii = reinterpret_cast<int2*>(check.pointer<int32_t>(radii, "radii", ScalarType::Int, {views, count, 2}));
+    params.cameras = check.bytes_of<RasterCamera>(cameras, "cameras", ScalarType::Float, views);
     params.active_prefix =
         active_prefix.has_value()
             ? check.pointer<int32_t>(*active_prefix, "active_prefix", ScalarType::Int, {active_prefix->numel()})
             : nullptr;
-    char* keys = static_cast<char*>(
-        check.pointer<void>(tile_keys, "tile_keys", params.narrow_keys ? ScalarType::Short : ScalarType::Int, {2, capacity}));
-    params.tile_keys[0] = keys;
-    params.tile_keys[1] = keys + capacity * (params.narrow_keys ? sizeof(uint16_t) : sizeof(uint32_t));
-    params.pair_ids[0] = check.pointer<uint32_t>(pair_ids, "pair_ids", ScalarType::Int, {2, capacity});
-    params.pair_ids[1] = params.pair_ids[0] + capacity;
-    params.status = check.pointer<uint32_t>(status, "status", ScalarType::Int, {2});
+    params.tile_cursors = check.pointer<int32_t>(tile_cursors, "tile_cursors", ScalarType::Int, {num_active + 1});
     params.tile_starts = check.pointer<uint32_t>(tile_starts, "tile_starts", ScalarType::Int, {num_active + 1});
-    params.scratch = check.pointer<uint8_t>(scratch, "scratch", ScalarType::Byte, {scratch.numel()});
-    params.scratch_bytes = static_cast<size_t>(scratch.numel());
+    params.status = check.pointer<uint32_t>(status, "status", ScalarType::Int, {2});
+    params.pair_keys = check.pointer<uint64_t>(pair_keys, "pair_keys", ScalarType::Long, {capacity});
+    params.pair_ids = check.pointer<uint32_t>(pair_ids, "pair_ids", ScalarType::Int, {capacity});
+    params.num_deferred = check.pointer<uint32_t>(deferred, "deferred", ScalarType::Int, {num_active + 1});
+    params.deferred = reinterpret_cast<int32_t*>(params.num_deferred) + 1;
     check.launched(launch_sort_pairs(params, check.stream()), "pair sort");
-    return params.current;
 }
 
 void raster_forward(Tensor cameras, std::optional<Tensor> tile_ids, Tensor tile_offsets, Tensor pixel_ids,
@@ -237,18 +212,15 @@ STABLE_TORCH_LIBRARY_FRAGMENT(turbogs, m) {
     m.def(
         "raster_project(Tensor means, Tensor quats, Tensor scales, Tensor opacities, Tensor sh0, Tensor shN, Tensor viewmats, "
         "Tensor Ks, Tensor sizes, Tensor? tile_ids, Tensor(a!) cameras, Tensor(b!)? active_prefix, Tensor(c!) instances, "
-        "Tensor(d!) radii, Tensor(e!) depth_keys, Tensor(f!) instance_ids, Tensor(g!) tile_counts, int sh_degree, "
-        "float eps2d, float near_plane, float far_plane, float alpha_min) -> ()");
+        "Tensor(d!) radii, Tensor(e!) tile_differences, int sh_degree, float eps2d, float near_plane, float far_plane, "
+        "float alpha_min) -> ()");
     m.def("architectures() -> str");
-    m.def("raster_sort_instances_scratch(int num_instances) -> int");
-    m.def("raster_sort_pairs_scratch(int capacity, int num_active, bool narrow_keys) -> int");
     m.def(
-        "raster_sort_instances(Tensor(a!) depth_keys, Tensor(b!) instance_ids, Tensor tile_counts, Tensor(c!) pair_ends, "
-        "Tensor(d!) status, Tensor(e!) scratch) -> int");
+        "raster_count_pairs(Tensor(a!) tile_cursors, Tensor(b!) tile_starts, Tensor(c!) status, Tensor(d!) deferred, "
+        "Tensor(e!) block_sums, int capacity) -> ()");
     m.def(
-        "raster_sort_pairs(Tensor instances, Tensor depth_keys, Tensor instance_ids, Tensor pair_ends, Tensor cameras, "
-        "Tensor? active_prefix, Tensor(a!) tile_keys, Tensor(b!) pair_ids, Tensor(c!) status, Tensor(d!) tile_starts, "
-        "Tensor(e!) scratch, int num_gaussians) -> int");
+        "raster_sort_pairs(Tensor instances, Tensor radii, Tensor cameras, Tensor? active_prefix, Tensor(a!) tile_cursors, "
+        "Tensor tile_starts, Tensor status, Tensor(b!) pair_keys, Tensor(c!) pair_ids, Tensor(d!) deferred) -> ()");
     m.def(
         "raster_forward(Tensor cameras, Tensor? tile_ids, Tensor tile_offsets, Tensor pixel_ids, Tensor tile_starts, "
         "Tensor pair_ids, Tensor instances, Tensor(a!) colors, Tensor(b!) alphas, Tensor(c!) transmittances, "
@@ -264,7 +236,7 @@ STABLE_TORCH_LIBRARY_FRAGMENT(turbogs, m) {
 
 STABLE_TORCH_LIBRARY_IMPL(turbogs, CUDA, m) {
     m.impl("raster_project", TORCH_BOX(&turbogs::raster_project));
-    m.impl("raster_sort_instances", TORCH_BOX(&turbogs::raster_sort_instances));
+    m.impl("raster_count_pairs", TORCH_BOX(&turbogs::raster_count_pairs));
     m.impl("raster_sort_pairs", TORCH_BOX(&turbogs::raster_sort_pairs));
     m.impl("raster_forward", TORCH_BOX(&turbogs::raster_forward));
     m.impl("raster_backward", TORCH_BOX(&turbogs::raster_backward));
@@ -272,6 +244,4 @@ STABLE_TORCH_LIBRARY_IMPL(turbogs, CUDA, m) {
 
 STABLE_TORCH_LIBRARY_IMPL(turbogs, CompositeExplicitAutograd, m) {
     m.impl("architectures", TORCH_BOX(&turbogs::architectures));
-    m.impl("raster_sort_instances_scratch", TORCH_BOX(&turbogs::raster_sort_instances_scratch));
-    m.impl("raster_sort_pairs_scratch", TORCH_BOX(&turbogs::raster_sort_pairs_scratch));
 }

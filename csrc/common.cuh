@@ -1,7 +1,7 @@
 // What several raster kernels share: the arithmetic of a splat at a pixel, and which tiles a splat reaches.
 //
 // The forward and the backward pass must agree to the bit on which splats a pixel sees, and the projection and the
-// emission on how many tiles a splat reaches. So both pairs call the same functions here, written with intrinsics, where
+// pair sort on how many tiles a splat reaches. So both pairs call the same functions here, written with intrinsics, where
 // it matters, that the compiler neither contracts nor reorders.
 #pragma once
 
@@ -109,8 +109,9 @@ struct TileFrame {
 
 // ---- The tiles that a splat reaches ----------------------------------------------------------------------------
 
-// The ellipse sigma <= log_reach, a little enlarged: by 0.001 for the rounding of exp, sigma and pixel coordinates, and by the cancellation of
-// a thin splat's conic, so that no pixel is lost. A pair too many costs time only.
+// The ellipse sigma <= log_reach, a little enlarged: by 0.001 for the rounding of exp, sigma, pixel coordinates and what is
+// approximated here, and by the cancellation of a thin splat's conic, so that no pixel is lost. A pair too many costs time
+// only.
 struct Reach {
     float x, y;
     float half_x, half_y;    // half width and height of the ellipse's box
@@ -126,19 +127,20 @@ __device__ __forceinline__ Reach make_reach(float x, float y, float a, float b, 
     const float bb_error = __fmaf_rn(-b, b, bb);
     const float ac = __fmul_rn(a, c);
     const float det = fmaxf(__fadd_rn(__fmaf_rn(a, c, -bb), bb_error), __fmul_rn(ac, 1e-7f));
-    const float thinness = __fdiv_rn(ac, det);  // 1 / (1 - correlation^2)
+    const float inverse_det = blend_reciprocal(det), inverse_a = blend_reciprocal(a);
+    const float thinness = __fmul_rn(ac, inverse_det);  // 1 / (1 - correlation^2)
     const float slack = __fmaf_rn(4e-7f, thinness, 1.001f);
     const float bound = __fmaf_rn(__fmul_rn(2.0f, log_reach), slack, 2e-3f);  // dx' conic dx <= bound
 
     Reach reach;
     reach.x = x;
     reach.y = y;
-    reach.half_x = __fsqrt_rn(__fmul_rn(bound, __fdiv_rn(c, det)));
-    reach.half_y = __fsqrt_rn(__fmul_rn(bound, __fdiv_rn(a, det)));
-    reach.extreme_y = __fmul_rn(-__fdiv_rn(b, c), reach.half_x);
-    reach.slope = -__fdiv_rn(b, a);
-    reach.half_chord = __fsqrt_rn(__fdiv_rn(bound, a));
-    reach.inverse_half_y = __frcp_rn(reach.half_y);
+    reach.half_x = blend_sqrt(__fmul_rn(bound, __fmul_rn(c, inverse_det)));
+    reach.half_y = blend_sqrt(__fmul_rn(bound, __fmul_rn(a, inverse_det)));
+    reach.extreme_y = __fmul_rn(__fmul_rn(-b, blend_reciprocal(c)), reach.half_x);
+    reach.slope = __fmul_rn(-b, inverse_a);
+    reach.half_chord = blend_sqrt(__fmul_rn(bound, inverse_a));
+    reach.inverse_half_y = blend_reciprocal(reach.half_y);
     return reach;
 }
 
@@ -165,8 +167,8 @@ __device__ __forceinline__ int2 tile_columns(const Reach& reach, int row, int ti
     const float dy_right = fminf(fmaxf(reach.extreme_y, top), bottom);
     const float dy_left = fminf(fmaxf(-reach.extreme_y, top), bottom);
     const float v_right = __fmul_rn(dy_right, reach.inverse_half_y), v_left = __fmul_rn(dy_left, reach.inverse_half_y);
-    const float chord_right = __fsqrt_rn(fmaxf(0.0f, __fmaf_rn(-v_right, v_right, 1.0f)));
-    const float chord_left = __fsqrt_rn(fmaxf(0.0f, __fmaf_rn(-v_left, v_left, 1.0f)));
+    const float chord_right = blend_sqrt(fmaxf(0.0f, __fmaf_rn(-v_right, v_right, 1.0f)));
+    const float chord_left = blend_sqrt(fmaxf(0.0f, __fmaf_rn(-v_left, v_left, 1.0f)));
     const float right = __fmaf_rn(reach.slope, dy_right, __fmul_rn(reach.half_chord, chord_right));
     const float left = __fmaf_rn(reach.slope, dy_left, -__fmul_rn(reach.half_chord, chord_left));
     return tile_span(__fadd_rn(reach.x, left), __fadd_rn(reach.x, right), tiles_x);

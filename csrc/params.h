@@ -20,7 +20,7 @@ constexpr int kRasterMaxDegree = 3;         // of the spherical harmonics
 constexpr int kInstanceFloats = 12;         // one projected splat, three float4
 constexpr int kGradientFloats = 16;         // one screen-gradient record, four float4
 constexpr int kBucket = 32;                 // splats staged at once; one contribution mask holds one bucket
-constexpr uint32_t kInvisible = 0xFFFFFFFFu;  // depth key of an instance without pairs
+constexpr int kScanTiles = 1024;            // of a block that finds the first pairs of tiles
 constexpr uint32_t kMaxPairs = 0x7FFFFFFFu;   // the pair count saturates here instead of wrapping
 
 // One view as the kernels read it, 112 bytes. Written by the projection launcher.
@@ -70,44 +70,37 @@ struct ProjectionParams {
     int32_t* active_prefix;   // [num_tiles + 1] out: active tiles with a smaller id; null where every tile is active
     Instance* instances;      // [K, N] out, where the radius is not 0
     int2* radii;              // [K, N] out, 0 where off screen
-    uint32_t* depth_keys;     // [K, N] out, bits of the depth, kInvisible where the instance has no pairs
-    uint32_t* instance_ids;   // [K, N] out, 0 .. K * N - 1
-    uint32_t* tile_counts;    // [K, N] out, active tiles that the splat reaches; written where the key is not kInvisible
+    int32_t* tile_differences;  // [T + 1] out: splats that reach each active tile, less those of the tile before it
 };
 
-// Stage 2. Instances in order of depth, and the running sum of their pairs.
-struct SortInstancesParams {
-    int num_instances;            // K * N
-    uint32_t* depth_keys[2];      // [K * N] in (0) and scratch
-    uint32_t* instance_ids[2];    // [K * N] in (0) and scratch
-    const uint32_t* tile_counts;  // [K * N]
-    uint32_t* pair_ends;          // [K * N] out: pairs of the instances up to and including this one, in depth order
-    uint32_t* status;             // [2] out: [0] pairs of this pass; [1] sticky overflow flag, left alone
-    void* scratch;
-    size_t scratch_bytes;
-    int current;                  // out, host: which of the two buffers holds the sorted arrays
+// Stage 2. First pair of each tile.
+struct CountPairsParams {
+    int num_active;         // T
+    uint32_t capacity;      // M, or kMaxPairs where it is not known yet
+    int32_t* tile_cursors;  // [T + 1] in: the projection's differences; out: first pair of each tile
+    uint32_t* tile_starts;  // [T + 1] out: the same, and the number of pairs; all 0 in a pass that overflows
+    uint32_t* status;       // [2]: [0] out: pairs of this pass; [1] sticky flag, raised where they exceed the capacity.
+                            // No pair is made while it is up.
+    uint32_t* num_deferred; // [1] out: 0
+    int64_t* block_sums;    // [ceil(T / kScanTiles), 2] scratch
 };
 
-// Stage 3. Pairs in depth order, then stably by tile; ranges of the tiles.
+// Stage 3. Pairs to their tiles, and every tile's in order of depth, then of the instance.
 struct SortPairsParams {
     int num_instances;
     int num_gaussians;
     int num_active;               // T
-    uint32_t capacity;            // M
-    const Instance* instances;
-    const uint32_t* depth_keys;   // [K * N] sorted
-    const uint32_t* instance_ids; // [K * N] sorted
-    const uint32_t* pair_ends;    // [K * N]
+    const Instance* instances;    // [K, N]
+    const int2* radii;            // [K, N]
     const RasterCamera* cameras;
     const int32_t* active_prefix; // or null
-    void* tile_keys[2];           // [M] uint16 where `narrow_keys`, else uint32
-    uint32_t* pair_ids[2];        // [M] instance of each pair
-    bool narrow_keys;
-    uint32_t* status;             // [2]: [1] is set where the pairs exceed the capacity; no pair is made then, nor while it is set
-    uint32_t* tile_starts;        // [T + 1] out: first pair of each active tile
-    void* scratch;
-    size_t scratch_bytes;
-    int current;                  // out, host: which buffer holds the sorted pairs
+    const uint32_t* tile_starts;  // [T + 1]
+    const uint32_t* status;       // [2]
+    int32_t* tile_cursors;        // [T + 1] in: first pair of each tile; changed
+    uint64_t* pair_keys;          // [M] scratch: depth and instance of each pair
+    uint32_t* pair_ids;           // [M] out: instance of each pair
+    uint32_t* num_deferred;       // [1] in: 0
+    int32_t* deferred;            // [T] scratch: tiles for the last kernel
 };
 
 // Stage 4. One warp for each work item = (tile position, chunk): slots chunk * 32 ... chunk * 32 + 31 of the tile. Further
@@ -153,10 +146,8 @@ struct BackwardParams {
 
 // Every launcher returns the first CUDA error, and only enqueues work on `stream`.
 cudaError_t launch_projection(const ProjectionParams& params, cudaStream_t stream);
-cudaError_t sort_instances_scratch(int num_instances, size_t* bytes);
-cudaError_t launch_sort_instances(SortInstancesParams& params, cudaStream_t stream);
-cudaError_t sort_pairs_scratch(uint32_t capacity, int num_active, bool narrow_keys, size_t* bytes);
-cudaError_t launch_sort_pairs(SortPairsParams& params, cudaStream_t stream);
+cudaError_t launch_count_pairs(const CountPairsParams& params, cudaStream_t stream);
+cudaError_t launch_sort_pairs(const SortPairsParams& params, cudaStream_t stream);
 cudaError_t launch_rasterize_forward(const ForwardParams& params, cudaStream_t stream);
 cudaError_t launch_rasterize_backward(const BackwardParams& params, cudaStream_t stream);
 

@@ -1,9 +1,10 @@
-// Stage 1: projection, colour and tile counts of every Gaussian in the K views of a batch.
+// Stage 1: projection and colour of every Gaussian in the K views of a batch, and how many splats reach each active tile.
 //
 // A block holds 64 Gaussians, each in up to four threads that share out the views, so parameters are read from memory
 // once. Rows of `shN` are not 16-byte aligned, but a block's rows together are: the block copies them to shared memory
-// with 16-byte loads. Active tiles are found by
-// their prefix counts, so counting a row of tiles costs two loads whatever its length.
+// with 16-byte loads. Most Gaussians are off screen in most views, so those that are not go through a queue, and all threads
+// together work on their colours and tiles. Active tiles of a row of tiles have consecutive positions, found by their
+// prefix counts, so a splat is counted by two additions a row, whatever its length.
 #include "common.cuh"
 #include "quaternion.cuh"
 #include "spherical_harmonics.cuh"
@@ -15,37 +16,35 @@ constexpr int kProjectionGaussians = 64;  // of a block
 constexpr int kProjectionSlices = 4;      // most threads of a Gaussian: a small model alone does not fill the GPU
 constexpr int kProjectionEnough = 500'000;  // threads that do
 constexpr float kExtentMax = 3.33f;        // gsplat's cut of a splat's half width, standard deviations
-constexpr float kCovarianceMax = 1e18f;    // beyond, the determinant would overflow
-constexpr int kRadiusMax = 1 << 24;
+constexpr float kSpanMax = 1e7f;           // pixels of the longest axis, seen face on, beyond which a splat is not drawn
+constexpr float kDistanceMax = 1e18f;      // of a coordinate, beyond which squared distances would overflow
 
-__global__ void pack_cameras_kernel(const __grid_constant__ ProjectionParams params) {
-    const int view = threadIdx.x;
-    if (view >= params.num_views) return;
-    RasterCamera camera;
-    static_cast<Pinhole&>(camera) = load_pinhole(params.viewmats + 16 * view, params.intrinsics + 9 * view);
-    camera.tile_base = 0;
-    for (int i = 0; i <= view; ++i) {
-        camera.width = params.widths[i];
-        camera.height = params.heights[i];
-        camera.tiles_x = (camera.width + kTileSize - 1) / kTileSize;
-        camera.tiles_y = (camera.height + kTileSize - 1) / kTileSize;
-        if (i < view) camera.tile_base += camera.tiles_x * camera.tiles_y;
+// Packs the cameras, counts active_prefix[t] = active tiles with an id below t, and clears the tiles' counts.
+__global__ void prepare_kernel(const __grid_constant__ ProjectionParams params) {
+    const int i = blockIdx.x * blockDim.x + threadIdx.x;
+    if (i < params.num_views) {
+        RasterCamera camera;
+        static_cast<Pinhole&>(camera) = load_pinhole(params.viewmats + 16 * i, params.intrinsics + 9 * i);
+        camera.tile_base = 0;
+        for (int view = 0; view <= i; ++view) {
+            camera.width = params.widths[view];
+            camera.height = params.heights[view];
+            camera.tiles_x = (camera.width + kTileSize - 1) / kTileSize;
+            camera.tiles_y = (camera.height + kTileSize - 1) / kTileSize;
+            if (view < i) camera.tile_base += camera.tiles_x * camera.tiles_y;
+        }
+        camera.slopes = slope_bounds(camera, camera.width, camera.height);
+        params.cameras[i] = camera;
     }
-    camera.slopes = slope_bounds(camera, camera.width, camera.height);
-    params.cameras[view] = camera;
-}
-
-// active_prefix[t] = number of active tiles with an id below t.
-__global__ void active_prefix_kernel(const __grid_constant__ ProjectionParams params) {
-    const int tile_id = blockIdx.x * blockDim.x + threadIdx.x;
-    if (tile_id > params.num_tiles) return;
+    if (i <= params.num_active) params.tile_differences[i] = 0;
+    if (i > params.num_tiles || params.active_prefix == nullptr) return;
     int low = 0, high = params.num_active;
     while (low < high) {
         const int middle = (low + high) / 2;
-        if (params.tile_ids[middle] < tile_id) low = middle + 1;
+        if (params.tile_ids[middle] < i) low = middle + 1;
         else high = middle;
     }
-    params.active_prefix[tile_id] = low;
+    params.active_prefix[i] = low;
 }
 
 // Colour in a unit direction, without offset and clamp. `coefficients`: [bands, 3].
@@ -62,11 +61,12 @@ __device__ __forceinline__ float3 evaluate_harmonics(int degree, const float sh0
 
 // The geometry of one Gaussian in one view. False where the splat is off screen; comparisons are written so that NaN is.
 __device__ __forceinline__ bool project(const ProjectionParams& params, const RasterCamera& camera, const float mean[3],
-                                        const float axes[9], float extent, Instance& splat, int2& radius) {
+                                        const float axes[9], float span, float extent, Instance& splat, int2& radius) {
     const float* W = camera.rotation;
     float point[3];
     camera_point(camera, mean, point);
     if (!(point[2] >= params.near_plane && point[2] <= params.far_plane)) return false;
+    if (!(span * fmaxf(camera.fx, camera.fy) <= kSpanMax * point[2])) return false;
 
     const float inverse_depth = 1.0f / point[2];
     const float slope_x = point[0] * inverse_depth, slope_y = point[1] * inverse_depth;
@@ -91,7 +91,6 @@ __device__ __forceinline__ bool project(const ProjectionParams& params, const Ra
     float variance_x = u[0] * u[0] + u[1] * u[1] + u[2] * u[2];
     float variance_y = v[0] * v[0] + v[1] * v[1] + v[2] * v[2];
     const float covariance = u[0] * v[0] + u[1] * v[1] + u[2] * v[2];
-    if (!(variance_x <= kCovarianceMax && variance_y <= kCovarianceMax)) return false;
     // Lagrange's identity: the determinant as a sum of squares does not cancel, however thin the splat.
     const float n0 = u[1] * v[2] - u[2] * v[1], n1 = u[2] * v[0] - u[0] * v[2], n2 = u[0] * v[1] - u[1] * v[0];
     const float det = n0 * n0 + n1 * n1 + n2 * n2 + params.eps2d * (variance_x + variance_y + params.eps2d);
@@ -106,133 +105,185 @@ __device__ __forceinline__ bool project(const ProjectionParams& params, const Ra
     splat.conic_b = -covariance * inverse_det;
     splat.conic_c = variance_x * inverse_det;
     splat.depth = point[2];
-    splat.inverse_sigma_y = 1.0f / sqrtf(variance_y);
+    splat.inverse_sigma_y = rsqrtf(variance_y);
 
     const float radius_x = ceilf(extent * sqrtf(variance_x)), radius_y = ceilf(extent * sqrtf(variance_y));
     if (!(radius_x > 0.0f || radius_y > 0.0f)) return false;
     if (!(splat.x + radius_x > 0.0f && splat.x - radius_x < camera.width)) return false;
     if (!(splat.y + radius_y > 0.0f && splat.y - radius_y < camera.height)) return false;
-    radius = make_int2(static_cast<int>(fminf(radius_x, kRadiusMax)), static_cast<int>(fminf(radius_y, kRadiusMax)));
+    radius = make_int2(static_cast<int>(radius_x), static_cast<int>(radius_y));
     return true;
 }
 
-__device__ __forceinline__ uint32_t count_tiles(const RasterCamera& camera, const int32_t* active_prefix,
-                                                const Instance& splat) {
+// A splat on its way from the geometry to its colour and tiles.
+struct alignas(16) Queued {
+    float x, y, conic_a, conic_b;
+    float conic_c, log_reach, inverse_sigma_y;
+    int source;  // view * kProjectionGaussians + Gaussian of the block
+};
+
+__device__ __forceinline__ void count_tiles(const RasterCamera& camera, const int32_t* active_prefix, const Queued& splat,
+                                            int32_t* tile_differences) {
     const Reach reach = make_reach(splat.x, splat.y, splat.conic_a, splat.conic_b, splat.conic_c, splat.log_reach);
     const int2 rows = tile_rows(reach, camera.tiles_y);
-    uint32_t count = 0;
     for (int row = rows.x; row < rows.y; ++row) {
         const int2 tiles = active_tiles(camera, active_prefix, row, tile_columns(reach, row, camera.tiles_x));
-        count += static_cast<uint32_t>(tiles.y - tiles.x);
+        if (tiles.x == tiles.y) continue;
+        atomicAdd(tile_differences + tiles.x, 1);
+        atomicAdd(tile_differences + tiles.y, -1);
     }
-    return count;
+}
+
+// Of four numbers: 0 times any other is not 0.
+__device__ __forceinline__ bool all_finite(const float4& v) {
+    return fmaf(0.0f, v.x, fmaf(0.0f, v.y, fmaf(0.0f, v.z, 0.0f * v.w))) == 0.0f;
+}
+
+// A block's shared memory. Dynamic: the queue, the cameras, the harmonics.
+struct ProjectionShared {
+    float means[kProjectionGaussians][3];
+    float sh0[kProjectionGaussians][3];
+    bool broken[kProjectionGaussians];  // has harmonics that are not finite
+    int num_queued;                     // so far
+};
+
+// Colour and tiles of a queued splat.
+__device__ __forceinline__ void finish_splat(const ProjectionParams& params, const ProjectionShared& shared,
+                                             const RasterCamera* cameras, const float* coefficients, int first,
+                                             const Queued& splat) {
+    const int local = splat.source % kProjectionGaussians, view = splat.source / kProjectionGaussians;
+    const RasterCamera& camera = cameras[view];
+    const float* mean = shared.means[local];
+    const float dx = mean[0] - camera.center[0], dy = mean[1] - camera.center[1], dz = mean[2] - camera.center[2];
+    const float length2 = dx * dx + dy * dy + dz * dz;
+    const float inverse_length = length2 > 0.0f ? rsqrtf(length2) : 0.0f;
+    const float3 color = evaluate_harmonics(params.sh_degree, shared.sh0[local], coefficients + local * 3 * params.bands,
+                                            dx * inverse_length, dy * inverse_length, dz * inverse_length);
+    Instance* instance = params.instances + static_cast<size_t>(view) * params.num_gaussians + first + local;
+    reinterpret_cast<float4*>(instance)[2] = make_float4(fmaxf(color.x + 0.5f, 0.0f), fmaxf(color.y + 0.5f, 0.0f),
+                                                         fmaxf(color.z + 0.5f, 0.0f), splat.inverse_sigma_y);
+    count_tiles(camera, params.active_prefix, splat, params.tile_differences);
 }
 
 __global__ void __launch_bounds__(kProjectionGaussians* kProjectionSlices, 4)
     projection_kernel(const __grid_constant__ ProjectionParams params) {
     extern __shared__ float4 shared_quads[];
-    RasterCamera* cameras = reinterpret_cast<RasterCamera*>(shared_quads);
+    __shared__ ProjectionShared shared;
+    const int thread = threadIdx.y * kProjectionGaussians + threadIdx.x;
+    const int threads = blockDim.y * kProjectionGaussians;
+    Queued* queue = reinterpret_cast<Queued*>(shared_quads);
+    RasterCamera* cameras = reinterpret_cast<RasterCamera*>(queue + 2 * threads);
     float* coefficients = reinterpret_cast<float*>(cameras + params.num_views);
     const int row = 3 * params.bands;
 
-    const int thread = threadIdx.y * kProjectionGaussians + threadIdx.x;
-    const int threads = blockDim.y * kProjectionGaussians;
+    if (thread < kProjectionGaussians) shared.broken[thread] = false;
+    if (thread == 0) shared.num_queued = 0;
+    __syncthreads();
     {
         const int words = params.num_views * static_cast<int>(sizeof(RasterCamera) / sizeof(float4));
         const float4* in = reinterpret_cast<const float4*>(params.cameras);
-        for (int i = thread; i < words; i += threads) shared_quads[i] = in[i];
+        for (int i = thread; i < words; i += threads) reinterpret_cast<float4*>(cameras)[i] = in[i];
     }
     const int first = blockIdx.x * kProjectionGaussians;
-    if (params.sh_degree > 0) {
-        const int count = min(kProjectionGaussians, params.num_gaussians - first) * row;
+    const int block_gaussians = min(kProjectionGaussians, params.num_gaussians - first);
+    for (int i = thread; i < 3 * block_gaussians; i += threads) {
+        (&shared.means[0][0])[i] = params.means[3 * static_cast<size_t>(first) + i];
+        (&shared.sh0[0][0])[i] = params.sh0[3 * static_cast<size_t>(first) + i];
+    }
+    {
+        const int count = block_gaussians * row;
         const float* in = params.shN + static_cast<size_t>(first) * row;  // 16-byte aligned: 64 rows
         for (int i = 4 * thread; i < count; i += 4 * threads) {
-            if (i + 3 < count) {
-                *reinterpret_cast<float4*>(coefficients + i) = *reinterpret_cast<const float4*>(in + i);
+            float4 quad = make_float4(0.0f, 0.0f, 0.0f, 0.0f);
+            const int length = min(4, count - i);
+            if (length == 4) {
+                quad = *reinterpret_cast<const float4*>(in + i);
+                *reinterpret_cast<float4*>(coefficients + i) = quad;
             } else {
-                for (int j = i; j < count; ++j) coefficients[j] = in[j];
+                float* values = &quad.x;
+                for (int j = 0; j < length; ++j) coefficients[i + j] = values[j] = in[i + j];
+            }
+            if (all_finite(quad)) continue;
+            for (int j = i; j < i + length; ++j) {
+                if (!isfinite(coefficients[j])) shared.broken[j / row] = true;
             }
         }
     }
     __syncthreads();
 
-    const int gaussian = first + threadIdx.x;
-    if (gaussian >= params.num_gaussians) return;
-    coefficients += threadIdx.x * row;
-
-    float mean[3], axes[9], sh0[3];
-    {
-        float log_scale[3];
+    const int local = threadIdx.x, gaussian = first + local;
+    bool usable = local < block_gaussians && !shared.broken[local];
+    float mean[3], axes[9], span = 0.0f, extent = 0.0f;
+    Instance splat = {};
+    if (usable) {
+        float scale[3];
 #pragma unroll
         for (int i = 0; i < 3; ++i) {
-            mean[i] = params.means[3 * static_cast<size_t>(gaussian) + i];
-            log_scale[i] = params.scales[3 * static_cast<size_t>(gaussian) + i];
-            sh0[i] = params.sh0[3 * static_cast<size_t>(gaussian) + i];
+            const float log_scale = params.scales[3 * static_cast<size_t>(gaussian) + i];
+            mean[i] = shared.means[local][i];
+            usable = usable && fabsf(mean[i]) <= kDistanceMax && isfinite(log_scale) && isfinite(shared.sh0[local][i]);
+            scale[i] = expf(log_scale);
         }
         const float4 raw = reinterpret_cast<const float4*>(params.quats)[gaussian];
+        usable = usable && all_finite(raw);
         const float quat[4] = {raw.x, raw.y, raw.z, raw.w};
-        const float scale[3] = {expf(log_scale[0]), expf(log_scale[1]), expf(log_scale[2])};
         float unit[4];
         unit_quaternion(quat, unit);
         scaled_rotation(unit, scale, axes);
+        span = fmaxf(scale[0], fmaxf(scale[1], scale[2]));
+        splat.opacity = 1.0f / (1.0f + expf(-params.opacities[gaussian]));
+        usable = usable && splat.opacity >= params.alpha_min;  // false for NaN
+        splat.log_reach = logf(fmaxf(splat.opacity, params.alpha_min) / params.alpha_min);
+        extent = fminf(kExtentMax, sqrtf(2.0f * splat.log_reach));
     }
-    Instance splat;
-    splat.opacity = 1.0f / (1.0f + expf(-params.opacities[gaussian]));
-    const bool opaque = splat.opacity >= params.alpha_min;  // false for NaN
-    splat.log_reach = logf(fmaxf(splat.opacity, params.alpha_min) / params.alpha_min);
-    const float extent = fminf(kExtentMax, sqrtf(2.0f * splat.log_reach));
 
-    for (int view = threadIdx.y; view < params.num_views; view += blockDim.y) {
-        const RasterCamera& camera = cameras[view];
-        const size_t instance = static_cast<size_t>(view) * params.num_gaussians + gaussian;
+    int finished = 0;  // splats that have left the queue
+    for (int base = 0; base < params.num_views; base += blockDim.y) {
+        const int view = base + threadIdx.y;
         int2 radius = make_int2(0, 0);
-        uint32_t key = kInvisible;
-        if (opaque && project(params, camera, mean, axes, extent, splat, radius)) {
-            float dx = mean[0] - camera.center[0], dy = mean[1] - camera.center[1], dz = mean[2] - camera.center[2];
-            const float length2 = dx * dx + dy * dy + dz * dz;
-            const float inverse_length = length2 > 0.0f ? 1.0f / sqrtf(length2) : 0.0f;
-            const float3 color = evaluate_harmonics(params.sh_degree, sh0, coefficients, dx * inverse_length,
-                                                    dy * inverse_length, dz * inverse_length);
-            if (isfinite(color.x) && isfinite(color.y) && isfinite(color.z)) {
-                splat.red = fmaxf(color.x + 0.5f, 0.0f);
-                splat.green = fmaxf(color.y + 0.5f, 0.0f);
-                splat.blue = fmaxf(color.z + 0.5f, 0.0f);
-                float4* out = reinterpret_cast<float4*>(params.instances + instance);
-                out[0] = make_float4(splat.x, splat.y, splat.conic_a, splat.conic_b);
-                out[1] = make_float4(splat.conic_c, splat.opacity, splat.depth, splat.log_reach);
-                out[2] = make_float4(splat.red, splat.green, splat.blue, splat.inverse_sigma_y);
-                const uint32_t count = count_tiles(camera, params.active_prefix, splat);
-                if (count > 0) {
-                    params.tile_counts[instance] = count;
-                    key = __float_as_uint(splat.depth);
-                }
-            } else {
-                radius = make_int2(0, 0);
-            }
+        const bool seen =
+            usable && view < params.num_views && project(params, cameras[view], mean, axes, span, extent, splat, radius);
+        const size_t instance = static_cast<size_t>(view) * params.num_gaussians + gaussian;
+        if (local < block_gaussians && view < params.num_views) params.radii[instance] = radius;
+        const uint32_t lanes = __ballot_sync(kFullWarp, seen);
+        const int lane = thread % kWarpSize;
+        int place = 0;
+        if (lane == 0 && lanes != 0u) place = atomicAdd(&shared.num_queued, __popc(lanes)) - finished;
+        place = __shfl_sync(kFullWarp, place, 0) + __popc(lanes & ((1u << lane) - 1u));
+        if (seen) {
+            float4* out = reinterpret_cast<float4*>(params.instances + instance);
+            out[0] = make_float4(splat.x, splat.y, splat.conic_a, splat.conic_b);
+            out[1] = make_float4(splat.conic_c, splat.opacity, splat.depth, splat.log_reach);
+            queue[place] = {splat.x,         splat.y,         splat.conic_a,         splat.conic_b,
+                            splat.conic_c,   splat.log_reach, splat.inverse_sigma_y, view * kProjectionGaussians + local};
         }
-        params.radii[instance] = radius;
-        params.depth_keys[instance] = key;
-        params.instance_ids[instance] = static_cast<uint32_t>(instance);
+        __syncthreads();
+        // As many as there are threads leave the queue's end; in the last round, all.
+        const int queued = shared.num_queued - finished;
+        const bool last = base + static_cast<int>(blockDim.y) >= params.num_views;
+        const int left = last ? 0 : queued < threads ? queued : queued - threads;
+        for (int i = left + thread; i < queued; i += threads) {
+            finish_splat(params, shared, cameras, coefficients, first, queue[i]);
+        }
+        finished += queued - left;
+        __syncthreads();
     }
 }
 
 }  // namespace
 
 cudaError_t launch_projection(const ProjectionParams& params, cudaStream_t stream) {
-    pack_cameras_kernel<<<1, kRasterMaxViews, 0, stream>>>(params);
+    const int entries = params.num_tiles + 1 > kRasterMaxViews ? params.num_tiles + 1 : kRasterMaxViews;
+    prepare_kernel<<<(entries + 255) / 256, 256, 0, stream>>>(params);
     if (const cudaError_t error = cudaGetLastError()) return error;
-    if (params.active_prefix != nullptr) {
-        active_prefix_kernel<<<params.num_tiles / 256 + 1, 256, 0, stream>>>(params);
-        if (const cudaError_t error = cudaGetLastError()) return error;
-    }
     if (params.num_gaussians == 0) return cudaSuccess;
-    const size_t shared = params.num_views * sizeof(RasterCamera) +
-                          (params.sh_degree > 0 ? kProjectionGaussians * 3 * params.bands * sizeof(float) : 0);
     const int blocks = (params.num_gaussians + kProjectionGaussians - 1) / kProjectionGaussians;
     int slices = 1;
     while (slices < kProjectionSlices && slices < params.num_views && params.num_gaussians < kProjectionEnough / slices) {
         ++slices;
     }
+    const size_t shared = 2 * slices * kProjectionGaussians * sizeof(Queued) + params.num_views * sizeof(RasterCamera) +
+                          kProjectionGaussians * 3 * params.bands * sizeof(float);
     projection_kernel<<<blocks, dim3(kProjectionGaussians, slices), shared, stream>>>(params);
     return cudaGetLastError();
 }

@@ -51,7 +51,8 @@ __device__ __forceinline__ bool reaches_box(const StagedSplat& splat, float mean
 }
 
 template <int kGroups, bool kDepth>
-__global__ void __launch_bounds__(kForwardWarps * kWarpSize) forward_kernel(const __grid_constant__ ForwardParams params) {
+__global__ void __launch_bounds__(kForwardWarps* kWarpSize, kGroups == 1 ? 7 : 6)
+    forward_kernel(const __grid_constant__ ForwardParams params) {
     __shared__ StagedSplat staged_splats[kForwardWarps][kBucket];
     const int lane = threadIdx.x % kWarpSize;
     const int warps_per_tile = params.chunks / kGroups;

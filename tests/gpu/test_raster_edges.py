@@ -1,5 +1,6 @@
 """Edges of the CUDA rasterizer: nothing to draw, streams, layouts, wrong input, and overflow with its retry."""
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -7,7 +8,8 @@ import torch
 from raster_cases import GPU_ONLY, make_case, on_gpu, samples_to, upstream
 
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.rendering import cuda, workspace
+from turbogs_plugin.rendering import cuda, rasterize_reference, workspace
+from turbogs_plugin.rendering.projection import SPAN_MAX
 from turbogs_plugin.rendering.workspace import Workspace
 
 pytestmark = GPU_ONLY
@@ -46,8 +48,6 @@ def test_no_samples(case):
 
 def test_one_pixel():
     case = make_case([(1, 1)], count=50, seed=12)
-    from turbogs_plugin.rendering import rasterize_reference
-
     wanted = rasterize_reference(case.gaussians, case.cameras, case.samples)
     torch.testing.assert_close(render(case).colors.cpu().double(), wanted.colors, rtol=1e-4, atol=1e-4)
 
@@ -59,6 +59,40 @@ def test_not_finite_parameters_are_not_drawn(case):
     broken.opacities[-2], broken.sh0[-1] = float("nan"), float("nan")
     case.gpu_gaussians = broken
     assert torch.equal(render(case).colors, clean)
+
+
+SPAN = math.log(SPAN_MAX)
+LIMITS = {
+    "longest axis spans too much": ("scales", SPAN + 0.01, False),
+    "longest axis spans enough": ("scales", SPAN - 0.01, True),
+    "scale of 0": ("scales", -math.inf, False),
+    "NaN mean": ("means", math.nan, False),
+    "opaque without bound": ("opacities", math.inf, True),
+    "opacity of 0": ("opacities", -math.inf, False),
+    "NaN opacity": ("opacities", math.nan, False),
+    "infinite quaternion": ("quats", -math.inf, False),
+    "colour of NaN": ("sh0", math.nan, False),
+    "last harmonic infinite": ("shN", math.inf, False),
+}
+
+
+@pytest.mark.parametrize("degree", [0, 3])
+@pytest.mark.parametrize("limit", LIMITS)
+def test_draws_what_the_reference_draws(case, limit, degree):
+    """Gaussians on either side of every rule about which ones are drawn; here a pixel is one unit at depth 1."""
+    name, value, drawn = LIMITS[limit]
+    for gaussians, cameras in ((case.gpu_gaussians, case.gpu_cameras), (case.gaussians, case.cameras)):
+        cameras.Ks[:, [0, 1], [0, 1]] = 1.0
+        cameras.viewmats[:] = torch.eye(4, dtype=cameras.viewmats.dtype)
+        gaussians.means[:] = torch.tensor([0.0, 0.0, 1.0], dtype=gaussians.means.dtype)
+        gaussians.scales[:], gaussians.opacities[:] = -3.0, 1.0
+        getattr(gaussians, name).view(len(gaussians), -1)[::3, -1] = value
+    got = render(case, sh_degree=degree).projected().radii.cpu().any(dim=-1)
+    wanted = (
+        rasterize_reference(case.gaussians, case.cameras, case.samples, sh_degree=degree).projected().radii.any(dim=-1)
+    )
+    assert torch.equal(got, wanted)
+    assert (got[:, ::3] == drawn).all() and got[:, 1::3].all()
 
 
 def test_side_stream(case):

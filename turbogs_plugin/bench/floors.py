@@ -13,8 +13,8 @@ import torch
 from turbogs_plugin.rendering.cuda import CudaRendered
 from turbogs_plugin.types import PixelSamples
 
-FORWARD_INSTRUCTIONS, BACKWARD_INSTRUCTIONS = 20, 56
-"""Per (splat, sample): what the inner loops issue, counted in their source."""
+FORWARD_INSTRUCTIONS, BACKWARD_INSTRUCTIONS = 23, 75
+"""Per (splat, 32 samples): what the inner loops issue, as profiled."""
 
 PARAMETER_FLOATS = 59
 """Of a Gaussian with three bands."""
@@ -65,9 +65,10 @@ def raster_floors(counts: Counts, bandwidth: float) -> dict[str, float]:
         "backward": counts["contributing"] * math.ceil(slots / 32) * BACKWARD_INSTRUCTIONS,
     }
     traffic = {
-        "projection": 236 * n + 52 * visible + 16 * kn,
-        "depth sort": 68 * kn + 16 * kn,
-        "pairs and tile sort": 40 * visible + 6 * pairs + 2 * 12 * pairs,
+        "projection": 236 * n + 48 * visible + 8 * kn,
+        "pair count": 16 * counts["tiles"],
+        # radii and splats in; keys out and in; ids out
+        "pair sort": 8 * kn + 32 * visible + 20 * pairs,
         "forward": 52 * pairs + 32 * samples,
         "backward": 64 * kn + (52 + 64) * counts["contributing"] + 32 * samples,
     }
@@ -90,7 +91,7 @@ def step_floors(counts: Counts, bandwidth: float) -> dict[str, float]:
         # records and radii in; parameters and two moments of the touched in and out
         "solve+update": 64 * counts["visible"] + 8 * counts["instances"] + 3 * 2 * 4 * PARAMETER_FLOATS * touched,
     }
-    front = sum(raster[stage] for stage in ("projection", "depth sort", "pairs and tile sort", "forward"))
+    front = sum(raster[stage] for stage in ("projection", "pair count", "pair sort", "forward"))
     return {
         "EPS": 1e3 * traffic["EPS"] / bandwidth,
         "FWD": front,

@@ -30,8 +30,8 @@ from turbogs_plugin.types import Cameras, Gaussians, GaussianStats
 
 STAGES = {
     "raster_project": "projection",
-    "raster_sort_instances": "depth sort",
-    "raster_sort_pairs": "pairs and tile sort",
+    "raster_count_pairs": "pair count",
+    "raster_sort_pairs": "pair sort",
     "raster_forward": "forward",
     "raster_backward": "backward",
     "projection_backward": "projection backward",

@@ -1,4 +1,4 @@
-"""The rasterizer in CUDA (csrc/), twin of `reference.py`: projection, two sorts, forward and backward pass.
+"""The rasterizer in CUDA (csrc/), twin of `reference.py`: projection, sort by tile, forward and backward pass.
 
 Everything is float32. Without a `Workspace` a pass waits once for the GPU, to learn the number of (tile, splat) pairs;
 with one it never waits (see `workspace.py`).
@@ -6,8 +6,8 @@ with one it never waits (see `workspace.py`).
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
-from functools import lru_cache
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -29,8 +29,9 @@ INSTANCE_FLOATS = 12
 CAMERA_FLOATS = 28
 RECORD_FLOATS = 16
 WARP = 32
-NARROW_TILES = 1 << 16
-"""Fewer active tiles than this sort on 16-bit keys."""
+SCAN_TILES = 1024
+MAX_PAIRS = (1 << 31) - 1
+"""The count of pairs stays here where it would be more."""
 
 
 class _FreshBuffers:
@@ -65,18 +66,6 @@ def _check(gaussians: Gaussians, cameras: Cameras, samples: PixelSamples, degree
         raise InputError(f"a pass takes 1 .. {MAX_VIEWS} views, got {len(cameras)}")
     if not np.array_equal(cameras.sizes, samples.sizes):
         raise InputError("cameras and samples differ in their image sizes: select the cameras of samples.view_ids")
-
-
-@lru_cache(maxsize=1024)
-def _instance_scratch(device: int, instances: int) -> int:
-    with torch.cuda.device(device):
-        return torch.ops.turbogs.raster_sort_instances_scratch(instances)
-
-
-@lru_cache(maxsize=1024)
-def _pair_scratch(device: int, capacity: int, tiles: int, narrow: bool) -> int:
-    with torch.cuda.device(device):
-        return torch.ops.turbogs.raster_sort_pairs_scratch(capacity, tiles, narrow)
 
 
 def warps_per_tile(slots: int, tiles: int) -> int:
@@ -280,8 +269,7 @@ def rasterize_cuda(
     packed_cameras = floats("cameras", views, CAMERA_FLOATS)
     instances = floats("instances", total, INSTANCE_FLOATS)
     radii = integers("radii", views, count, 2)
-    depth_keys, instance_ids = integers("depth_keys", 2, total), integers("instance_ids", 2, total)
-    tile_counts = integers("tile_counts", total)
+    tile_cursors = integers("tile_cursors", num_active + 1)
     torch.ops.turbogs.raster_project(
         *(value for _, value in gaussians.items()),
         cameras.viewmats.detach().contiguous(),
@@ -292,9 +280,7 @@ def rasterize_cuda(
         active_prefix,
         instances,
         radii,
-        depth_keys,
-        instance_ids,
-        tile_counts,
+        tile_cursors,
         degree,
         settings.eps2d,
         settings.near_plane,
@@ -302,35 +288,39 @@ def rasterize_cuda(
         settings.alpha_min,
     )
 
-    pair_ends = integers("pair_ends", total)
     status = workspace.status if workspace is not None else torch.zeros(2, dtype=torch.int32, device=device)
     capacity = workspace.capacity(count, num_active) if workspace is not None else None
-    scratch = integers("scratch", _instance_scratch(device.index, total), dtype=torch.uint8)
-    current = torch.ops.turbogs.raster_sort_instances(depth_keys, instance_ids, tile_counts, pair_ends, status, scratch)
+    tile_starts, deferred = integers("tile_starts", num_active + 1), integers("deferred", num_active + 1)
+    torch.ops.turbogs.raster_count_pairs(
+        tile_cursors,
+        tile_starts,
+        status,
+        deferred,
+        integers("block_sums", max(1, math.ceil(num_active / SCAN_TILES)), 2, dtype=torch.int64),
+        MAX_PAIRS if capacity is None else capacity,
+    )
     if capacity is None:
         pairs = int(status[0])
+        if pairs == MAX_PAIRS:
+            raise InputError(
+                f"a pass takes fewer than {MAX_PAIRS} pairs of a tile and a splat: take fewer views or tiles"
+            )
         capacity = round_capacity(pairs)
         if workspace is not None:
             workspace.learn(pairs, num_active)
 
-    narrow = num_active < NARROW_TILES
-    tile_keys = integers("tile_keys", 2, capacity, dtype=torch.int16 if narrow else torch.int32)
-    pair_ids = integers("pair_ids", 2, capacity)
-    tile_starts = integers("tile_starts", num_active + 1)
-    scratch = integers("scratch", _pair_scratch(device.index, capacity, num_active, narrow), dtype=torch.uint8)
-    current = torch.ops.turbogs.raster_sort_pairs(
+    pair_ids = integers("pair_ids", capacity)
+    torch.ops.turbogs.raster_sort_pairs(
         instances,
-        depth_keys[current],
-        instance_ids[current],
-        pair_ends,
+        radii,
         packed_cameras,
         active_prefix,
-        tile_keys,
-        pair_ids,
-        status,
+        tile_cursors,
         tile_starts,
-        scratch,
-        count,
+        status,
+        integers("pair_keys", capacity, dtype=torch.int64),
+        pair_ids,
+        deferred,
     )
     if workspace is not None:
         workspace.send_count(num_active)
@@ -345,7 +335,7 @@ def rasterize_cuda(
         tile_offsets=samples.tile_offsets.contiguous(),
         pixel_ids=samples.pixel_ids.contiguous(),
         tile_starts=tile_starts,
-        pair_ids=pair_ids[current],
+        pair_ids=pair_ids,
         instances=instances,
         colors=colors,
         alphas=alphas,
