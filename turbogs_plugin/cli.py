@@ -47,16 +47,32 @@ def train(
         return _tell(run.resume(resume))
     if scene is None or out is None:
         raise InputError("train needs a SCENE and --out RUN, or --resume RUN")
+    return _tell(run.train(_settings(scene, overrides, config, factor, device), out))
 
-    from turbogs_plugin.config import DEFAULT_CONFIG, load_config
 
-    settings = load_config(DEFAULT_CONFIG if config is None else config, overrides)
-    settings.scene.path = str(scene)
-    if factor is not None:
-        settings.scene.factor = factor
-    if device is not None:
-        settings.train.device = device
-    return _tell(run.train(settings, out))
+@app.command
+def plan(
+    scene: Annotated[Positional[Path], arg(metavar="SCENE")],
+    overrides: Annotated[Positional[tuple[str, ...]], arg(metavar="[section.key=value ...]")] = (),
+    /,
+    *,
+    config: Annotated[str | None, arg(metavar="NAME_OR_FILE")] = None,
+    factor: Annotated[int | None, arg(metavar="N")] = None,
+    device: Annotated[Device | None, arg(metavar="auto|cpu|cuda")] = None,
+) -> int:
+    """Print what training on a capture would leave out, and because of which numbers, without training.
+
+    Args:
+        scene: as in train, and so are all others.
+        overrides: a decision is forced by plan.NAME=VALUE.
+        config: as in train.
+        factor: as in train.
+        device: as in train.
+    """
+    from turbogs_plugin.run import plan_run
+
+    print(plan_run(_settings(scene, overrides, config, factor, device)).text())
+    return 0
 
 
 @app.command(name="eval")
@@ -246,6 +262,19 @@ def doctor() -> int:
 
     print(diagnosis())
     return 0
+
+
+def _settings(scene: Path, overrides: tuple[str, ...], config: str | None, factor: int | None, device: Device | None):
+    """The configuration that a command line asks for."""
+    from turbogs_plugin.config import DEFAULT_CONFIG, load_config
+
+    settings = load_config(DEFAULT_CONFIG if config is None else config, overrides)
+    settings.scene.path = str(scene)
+    if factor is not None:
+        settings.scene.factor = factor
+    if device is not None:
+        settings.train.device = device
+    return settings
 
 
 def _tell(outcome) -> int:

@@ -1,8 +1,8 @@
 """The configuration of a run: dataclasses <- YAML <- dotted overrides.
 
-A YAML has one section a part. Sections of our own (`scene`, `train`, `maps`, `raster`, `report`) hold the fields of the
-dataclass below; a section of a strategy holds its ``type`` and the fields of that strategy's dataclass. Defaults live
-in those dataclasses and nowhere else. ``base: NAME_OR_FILE`` puts a YAML on top of another.
+A YAML has one section a part. Sections of our own (`scene`, `train`, `maps`, `raster`, `report`, `plan`) hold the
+fields of the dataclass below; a section of a strategy holds its ``type`` and the fields of that strategy's dataclass.
+Defaults live in those dataclasses and nowhere else. ``base: NAME_OR_FILE`` puts a YAML on top of another.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from omegaconf import OmegaConf
 
@@ -119,6 +119,47 @@ class ReportConfig:
 
 
 @dataclass
+class PlanConfig:
+    """What the plan of a run may decide by looking at scene and machine (`turbogs_plugin.plan`).
+
+    ``auto`` leaves it to the plan, ``keep`` leaves the settings as they are elsewhere in the configuration, and a value
+    forces it. A YAML or override that gives such a setting itself turns the decision about it, made below it, to
+    ``keep`` (`PLANNED_SETTINGS`): what one says, no plan changes.
+
+    Args:
+        backdrop: `train.backdrop`.
+        ncc: whether the loss has its structure term (true), or is Charbonnier alone (false).
+        views: ``all``: every training view in every iteration, with no schedule and no selection.
+        sh_degree: `train.sh_degree`.
+        optimizer: `optimizer.type`.
+        maps_on: where error and age maps are: on the device, or in pinned memory of the host. It changes no result.
+        photos_on: the same of the photos.
+    """
+
+    backdrop: bool | Literal["auto", "keep"] = "keep"
+    ncc: bool | Literal["auto", "keep"] = "keep"
+    views: Literal["auto", "keep", "all"] = "keep"
+    sh_degree: int | Literal["auto", "keep"] = "keep"
+    optimizer: Literal["auto", "keep", "moment_lm", "sparse_adam"] = "keep"
+    maps_on: Literal["auto", "device", "host"] = "auto"
+    photos_on: Literal["auto", "device", "host"] = "auto"
+
+    def __post_init__(self) -> None:
+        if self.sh_degree not in ("auto", "keep"):
+            require(0 <= self.sh_degree <= 3, "sh_degree", self.sh_degree, "within 0 .. 3")
+
+
+PLANNED_SETTINGS: dict[str, tuple[str, ...]] = {
+    "backdrop": ("train.backdrop",),
+    "ncc": ("loss.type", "loss.ncc_weight", "loss.structure", "loss.gate"),
+    "views": ("schedule.type", "schedule.min_views", "schedule.max_views", "schedule.views", "view_sampler.type"),
+    "sh_degree": ("train.sh_degree",),
+    "optimizer": ("optimizer.type", "optimizer.units", "optimizer.rows", "optimizer.curvature", "optimizer.max_step"),
+}
+"""Decision of `PlanConfig` -> the settings it is about."""
+
+
+@dataclass
 class Config:
     """Everything that decides a run. The strategies' sections are complete: `type` and every init field."""
 
@@ -133,6 +174,7 @@ class Config:
     maps: MapsConfig
     raster: RasterSettings
     report: ReportConfig = field(default_factory=ReportConfig)
+    plan: PlanConfig = field(default_factory=PlanConfig)
 
     def build(self, kind: str) -> Any:
         """A new strategy of this kind."""
@@ -158,6 +200,7 @@ SECTION_CLASSES = {
     "maps": MapsConfig,
     "raster": RasterSettings,
     "report": ReportConfig,
+    "plan": PlanConfig,
 }
 
 
@@ -194,7 +237,7 @@ def resolve(mapping: Mapping[str, Any]) -> Config:
 
 def apply_overrides(mapping: Mapping[str, Any], overrides: Sequence[str]) -> dict[str, Any]:
     """`mapping` with ``section.key=value`` on top; a new ``section.type=name`` starts that section afresh."""
-    result = dict(mapping)
+    result, named = dict(mapping), set()
     for override in sorted(overrides, key=lambda text: ".type=" not in text):  # types first, the rest in order
         path, separator, text = override.partition("=")
         keys = path.strip().split(".")
@@ -207,7 +250,8 @@ def apply_overrides(mapping: Mapping[str, Any], overrides: Sequence[str]) -> dic
         for key in reversed(keys):
             nested = {key: nested}
         result = _merge(result, nested)
-    return result
+        named.add(".".join(keys[:2]))
+    return _yield_plan(result, named)
 
 
 def _load_mapping(name_or_file: str, depth: int = 0) -> dict[str, Any]:
@@ -221,7 +265,27 @@ def _load_mapping(name_or_file: str, depth: int = 0) -> dict[str, Any]:
     else:
         raise InputError(f"unknown config '{name_or_file}': {nearest(name_or_file, config_names())}, or a .yaml file")
     base = mapping.pop("base", None)
-    return mapping if base is None else _merge(_load_mapping(str(base), depth + 1), mapping)
+    if base is None:
+        return mapping
+    named = {f"{section}.{key}" for section, value in mapping.items() if isinstance(value, Mapping) for key in value}
+    return _yield_plan(_merge(_load_mapping(str(base), depth + 1), mapping), named)
+
+
+def _yield_plan(merged: dict[str, Any], named: set[str]) -> dict[str, Any]:
+    """`merged`, with no plan for what its uppermost layer says itself.
+
+    Args:
+        named: ``section.key`` of everything in that layer.
+    """
+    plan = merged.get("plan")
+    if not isinstance(plan, Mapping):
+        return merged
+    kept = {
+        decision: "keep"
+        for decision, settings in PLANNED_SETTINGS.items()
+        if decision in plan and f"plan.{decision}" not in named and not named.isdisjoint(settings)
+    }
+    return {**merged, "plan": {**plan, **kept}}
 
 
 def _merge(under: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:

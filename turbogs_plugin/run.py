@@ -5,6 +5,7 @@ from __future__ import annotations
 import operator
 import os
 import signal
+import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import FrameType, TracebackType
@@ -20,6 +21,7 @@ from turbogs_plugin.errors import InputError, TrainingStopped
 from turbogs_plugin.evaluation import Metrics, evaluate, load_lpips, peak_memory_bytes
 from turbogs_plugin.files import write_text_atomically
 from turbogs_plugin.gaussians import save_ply
+from turbogs_plugin.plan import Plan, make_plan
 from turbogs_plugin.progress import TrainingProgress
 from turbogs_plugin.report.history import Evaluation, append_evaluation, rewind_history
 from turbogs_plugin.report.pages import RunRecord, write_report
@@ -38,6 +40,10 @@ class RunFolder:
     @property
     def config(self) -> Path:
         return self.path / "config.yaml"
+
+    @property
+    def plan(self) -> Path:
+        return self.path / "plan.json"
 
     @property
     def history(self) -> Path:
@@ -77,6 +83,13 @@ class RunFolder:
             raise InputError(f"'{self.path}' holds no run: there is no config.yaml")
         return resolve(read_yaml(self.config))
 
+    def read_plan(self) -> Plan:
+        """What was planned when the run began. Raises `InputError` where it cannot be read."""
+        try:
+            return Plan.from_json(self.plan.read_text(encoding="utf-8"))
+        except (OSError, UnicodeDecodeError, InputError) as error:
+            raise InputError(f"cannot read the plan '{self.plan}': {error}") from None
+
 
 @dataclass
 class Outcome:
@@ -110,8 +123,18 @@ def resolve_device(name: str) -> torch.device:
     return torch.device("cuda" if name != "cpu" and torch.cuda.is_available() else "cpu")
 
 
+def plan_run(config: Config) -> Plan:
+    """What `train` would decide here and now.
+
+    Raises:
+        InputError: anything wrong with the input.
+    """
+    device = resolve_device(config.train.device)
+    return make_plan(config, load_scene(config.scene.path, config.scene.factor, config.scene.test_every), device)
+
+
 def train(config: Config, out: Path) -> Outcome:
-    """Train from the start into a new folder.
+    """Train from the start into a new folder, by a plan that is told first.
 
     Raises:
         InputError: anything wrong with the input; then nothing was written.
@@ -122,16 +145,20 @@ def train(config: Config, out: Path) -> Outcome:
     device = resolve_device(config.train.device)
     scene = load_scene(config.scene.path, config.scene.factor, config.scene.test_every)
     load_lpips(config.report.lpips_weights, device)
+    plan = make_plan(config, scene, device)
+    config = plan.apply(config)
     config.scene.path = str(Path(config.scene.path).resolve())
     config.train.device = device.type
-    session = _Session(folder, config, scene, Trainer(config, scene, device))
+    session = _Session(folder, config, plan, scene, Trainer(config, scene, device))
+    print(plan.text(), file=sys.stderr)
     folder.path.mkdir(parents=True, exist_ok=True)
+    write_text_atomically(folder.plan, plan.to_json())
     write_text_atomically(folder.config, config.to_yaml())
     return session.run()
 
 
 def resume(path: Path) -> Outcome:
-    """Go on with a stopped run from its newest checkpoint, by its own configuration.
+    """Go on with a stopped run from its newest checkpoint, by its own configuration, in which all is decided.
 
     On a CPU, the result is bit for bit that of a run never stopped.
 
@@ -140,12 +167,12 @@ def resume(path: Path) -> Outcome:
         TrainingStopped: the run cannot go on.
     """
     folder = RunFolder(path)
-    config = folder.read_config()
+    config, plan = folder.read_config(), folder.read_plan()
     checkpoint = latest_checkpoint(folder.checkpoints)
     state = None if checkpoint is None else load_checkpoint(checkpoint)
     device = resolve_device(config.train.device)
     scene = load_scene(config.scene.path, config.scene.factor, config.scene.test_every)
-    session = _Session(folder, config, scene, Trainer(config, scene, device))
+    session = _Session(folder, config, plan, scene, Trainer(config, scene, device))
     if state is not None:
         session.load_state_dict(state, str(checkpoint))
     session.history = rewind_history(folder.history, session.trainer.iteration if state is not None else -1)
@@ -203,6 +230,7 @@ class _Session:
 
     folder: RunFolder
     config: Config
+    plan: Plan
     scene: Scene
     trainer: Trainer
     history: list[Evaluation] = field(default_factory=list)
@@ -295,6 +323,7 @@ class _Session:
                 folder=self.folder.path,
                 scene=self.scene.name,
                 config=self.config,
+                plan=self.plan,
                 history=self.history,
                 metrics=final,
                 lpips_reason=lpips_reason,

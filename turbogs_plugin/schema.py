@@ -127,4 +127,7 @@ def _convert_union(value: Any, arguments: tuple, hint: Any, where: str) -> Any:
         except InputError as error:
             messages.append(str(error))
     concrete = [argument for argument in arguments if argument is not type(None)]
-    raise InputError(messages[arguments.index(concrete[0])] if len(concrete) == 1 else f"{where}: got {value!r}")
+    if len(concrete) == 1:
+        raise InputError(messages[arguments.index(concrete[0])])
+    reasons = "; nor: ".join(message.removeprefix(f"{where}: ") for message in messages)
+    raise InputError(f"{where}: {reasons}")

@@ -15,6 +15,7 @@ import torch
 from turbogs_plugin.config import Config
 from turbogs_plugin.evaluation import Metrics, render_view
 from turbogs_plugin.files import write_text_atomically
+from turbogs_plugin.plan import Plan
 from turbogs_plugin.report.history import Evaluation
 from turbogs_plugin.report.plots import ERROR_FULL_SCALE, plot_against_seconds, save_strip
 from turbogs_plugin.scene import PosedImages
@@ -33,6 +34,7 @@ class RunRecord:
         folder: of the run; the report goes there.
         scene: name of the capture.
         config: resolved.
+        plan: that the run followed.
         history: every evaluation.
         metrics: of the final model.
         lpips_reason: why LPIPS was not computed; empty where it was.
@@ -42,6 +44,7 @@ class RunRecord:
     folder: Path
     scene: str
     config: Config
+    plan: Plan
     history: list[Evaluation]
     metrics: Metrics
     lpips_reason: str
@@ -153,6 +156,10 @@ def _page(record: RunRecord, shown: int) -> str:
             for evaluation in record.history
         ),
     )
+    plan = table(
+        ("decision", "value", "made", "reason"),
+        ((decision.name, decision.text, decision.made, decision.reason) for decision in record.plan.decisions),
+    )
     strips = "\n\n".join(
         f"{view.name}: {view.psnr:.2f} dB\n\n![{view.name}](report/test-{view_id:03d}.png)"
         for view_id, view in enumerate(metrics.views[:shown])
@@ -182,6 +189,12 @@ From left to right: photo, render, error (mean absolute difference over RGB: bla
 {strips}
 
 {table(("view", *ERRORS, "LPIPS (VGG)"), views)}
+
+## Plan
+
+{record.plan.facts_text()}.
+
+{plan}
 
 ## Numerical events
 

@@ -1,0 +1,213 @@
+"""Numbers about a scene and a machine that decisions rest on, from a bounded number of its pixels and points."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from turbogs_plugin.scene import PosedImages, Scene
+from turbogs_plugin.types import TILE_SIZE
+
+FLAT_DEVIATION = 0.01
+"""Standard deviation of luminance (0 .. 1) below which a tile has no texture: 2.5 of 255 steps, a camera's noise."""
+TILES_AT_MOST = 6400
+"""Tiles looked at, over all photos."""
+TILES_PER_PHOTO = 64
+POINTS_AT_MOST = 2000
+"""3D points looked at."""
+COMMON_POINTS = 32
+"""Points that two photos must share for their exposures to be compared."""
+LUMINANCE = (0.299, 0.587, 0.114)
+MAP_BYTES_PER_PIXEL = 4
+"""Error in half precision and a stamp of 16 bits."""
+MODEL_BYTES_PER_GAUSSIAN = 3 * 4 * 59
+"""59 single-precision numbers at degree 3, with two moments each."""
+
+
+@dataclass(frozen=True)
+class SceneFacts:
+    """What the plan knows.
+
+    Args:
+        scene: name of the capture.
+        train_views, test_views: V and the number of test views.
+        smallest_photo, largest_photo: (width, height) of the training photos with the fewest and most pixels.
+        points: M, of the reconstruction.
+        extent: radius of the scene in the capture's own unit.
+        baseline: median distance of a training camera to its nearest, over the median depth of the points it sees.
+        flat_tiles: share of the photos' 16x16 tiles without texture (`FLAT_DEVIATION`).
+        exposure_spread: in stops (factors of 2 of luminance): median over the training views of the difference to the
+            nearest camera's photo at common points.
+        direction_concentration: norm of the mean unit viewing direction of the training cameras; 1: all look the same
+            way, 0: all around.
+        photo_bytes: of all photos, training and test.
+        map_bytes: of the training views' error and age maps.
+        model_bytes: of one Gaussian a point with an optimizer's two moments.
+        device: cpu or cuda.
+        device_free_bytes, host_free_bytes: memory free for this run; on a CPU both are the same memory.
+        memory_limit: bytes of the device that the run was told not to exceed, or None.
+        time_budget: seconds that the run was told to take, or None.
+    """
+
+    scene: str
+    train_views: int
+    test_views: int
+    smallest_photo: tuple[int, int]
+    largest_photo: tuple[int, int]
+    points: int
+    extent: float
+    baseline: float
+    flat_tiles: float
+    exposure_spread: float
+    direction_concentration: float
+    photo_bytes: int
+    map_bytes: int
+    model_bytes: int
+    device: str
+    device_free_bytes: int
+    host_free_bytes: int
+    memory_limit: int | None = None
+    time_budget: float | None = None
+
+
+@torch.no_grad()
+def gather_facts(
+    scene: Scene, device: torch.device, *, memory_limit: int | None = None, time_budget: float | None = None
+) -> SceneFacts:
+    """The facts of a scene, to be trained on a device.
+
+    Args:
+        scene: on any device; photos that are already on `device` count as free memory, for they are planned here.
+        device: where training is to be.
+        memory_limit: bytes of the device that must not be exceeded.
+        time_budget: seconds.
+    """
+    views, sizes = scene.train, scene.train.cameras.sizes
+    order = np.argsort(sizes.prod(axis=1), kind="stable")
+    pixels, test_pixels = int(sizes.prod(axis=1).sum()), int(scene.test.cameras.sizes.prod(axis=1).sum())
+    sight = _Sight.of(views, scene.points)
+    host_free = _free_host_bytes()
+    return SceneFacts(
+        scene=scene.name,
+        train_views=len(views),
+        test_views=len(scene.test),
+        smallest_photo=_pair(sizes[order[0]]),
+        largest_photo=_pair(sizes[order[-1]]),
+        points=len(scene.points),
+        extent=scene.extent * scene.frame.scale,
+        baseline=_baseline(views, sight, scene.extent),
+        flat_tiles=flat_tile_share(views),
+        exposure_spread=_exposure_spread(views, sight),
+        direction_concentration=float(views.cameras.directions.double().mean(dim=0).norm()),
+        photo_bytes=3 * (pixels + test_pixels),
+        map_bytes=MAP_BYTES_PER_PIXEL * pixels,
+        model_bytes=MODEL_BYTES_PER_GAUSSIAN * len(scene.points),
+        device=device.type,
+        device_free_bytes=_free_device_bytes(device, scene) if device.type == "cuda" else host_free,
+        host_free_bytes=host_free,
+        memory_limit=memory_limit,
+        time_budget=time_budget,
+    )
+
+
+def flat_tile_share(views: PosedImages) -> float:
+    """Share of whole 16x16 tiles whose luminance deviates less than `FLAT_DEVIATION`, of tiles spread evenly."""
+    colors, offsets = views.photos.colors, views.photos.offsets
+    per_photo = max(1, min(TILES_PER_PHOTO, TILES_AT_MOST // len(views)))
+    within = np.arange(TILE_SIZE)
+    places = []
+    for (width, height), start in zip(views.photos.sizes.tolist(), offsets[:-1].tolist(), strict=True):
+        columns, rows = width // TILE_SIZE, height // TILE_SIZE
+        if columns * rows:
+            tiles = np.unique(np.linspace(0, columns * rows - 1, per_photo).astype(np.int64))
+            y = (tiles // columns * TILE_SIZE)[:, None, None] + within[:, None]
+            x = (tiles % columns * TILE_SIZE)[:, None, None] + within
+            places.append((start + y * width + x).reshape(len(tiles), -1))
+    if not places:
+        return 0.0
+    flat = torch.from_numpy(np.concatenate(places)).to(colors.device)  # [T, 256]
+    deviations = _luminance(colors[flat]).std(dim=1, correction=0)
+    return float((deviations < FLAT_DEVIATION).float().mean())
+
+
+@dataclass(frozen=True)
+class _Sight:
+    """Where Q of the points are in V photos.
+
+    Args:
+        depths: [V, Q].
+        inside: [V, Q] bool, in front of the camera and within the photo.
+        flat: [V, Q] int64, flat pixel; 0 where not inside.
+        distances: [V, V] between camera centres, infinite on the diagonal.
+    """
+
+    depths: Tensor
+    inside: Tensor
+    flat: Tensor
+    distances: Tensor
+
+    @classmethod
+    def of(cls, views: PosedImages, points: Tensor) -> _Sight:
+        cameras = views.cameras.to("cpu", torch.float64)
+        chosen = points[:: -(-len(points) // POINTS_AT_MOST)].cpu().double()  # [Q, 3]
+        seen = chosen @ cameras.viewmats[:, :3, :3].transpose(1, 2) + cameras.viewmats[:, None, :3, 3]  # [V, Q, 3]
+        depths = seen[..., 2]
+        pixels = (seen @ cameras.Ks.transpose(1, 2))[..., :2] / depths.clamp(min=1e-9)[..., None]
+        sizes = torch.from_numpy(cameras.sizes)[:, None]  # [V, 1, 2]
+        inside = (depths > 1e-9) & (pixels >= 0).all(dim=-1) & (pixels < sizes).all(dim=-1)
+        x, y = torch.where(inside[..., None], pixels, 0.0).long().unbind(dim=-1)
+        flat = torch.from_numpy(views.photos.offsets[:-1])[:, None] + y * sizes[..., 0] + x
+        distances = torch.cdist(cameras.centers, cameras.centers, compute_mode="donot_use_mm_for_euclid_dist")
+        return cls(depths, inside, torch.where(inside, flat, 0), distances.fill_diagonal_(torch.inf))
+
+
+def _baseline(views: PosedImages, sight: _Sight, extent: float) -> float:
+    if len(views) < 2:
+        return 0.0
+    depth = sight.depths[sight.inside].median() if sight.inside.any() else torch.tensor(extent)
+    return float(sight.distances.amin(dim=1).median() / depth)
+
+
+def _exposure_spread(views: PosedImages, sight: _Sight) -> float:
+    """See `SceneFacts`. Medians over points, so that those hidden from one camera do not matter."""
+    if len(views) < 2:
+        return 0.0
+    colors = views.photos.colors
+    stops = torch.log2(_luminance(colors[sight.flat.to(colors.device)]).cpu() + 1.0 / 255.0)  # [V, Q]
+    differences = []
+    for view, nearest in enumerate(sight.distances.argmin(dim=1).tolist()):
+        common = sight.inside[view] & sight.inside[nearest]
+        if int(common.sum()) >= COMMON_POINTS:
+            differences.append((stops[view, common] - stops[nearest, common]).median().abs())
+    return float(torch.stack(differences).median()) if differences else 0.0
+
+
+def _luminance(colors: Tensor) -> Tensor:
+    """[..., 3] uint8 -> [...] float32, 0 .. 1."""
+    return colors.float() @ (torch.tensor(LUMINANCE, device=colors.device) / 255.0)
+
+
+def _free_device_bytes(device: torch.device, scene: Scene) -> int:
+    free, _ = torch.cuda.mem_get_info(device)
+    free += torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
+    ours = (views.photos.colors for views in (scene.train, scene.test))
+    return free + sum(colors.numel() for colors in ours if colors.device.type == "cuda")
+
+
+def _free_host_bytes() -> int:
+    try:
+        with open("/proc/meminfo", encoding="ascii") as file:
+            for line in file:
+                if line.startswith("MemAvailable:"):
+                    return 1024 * int(line.split()[1])
+    except OSError:
+        pass  # not Linux
+    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+
+
+def _pair(size: np.ndarray) -> tuple[int, int]:
+    return int(size[0]), int(size[1])

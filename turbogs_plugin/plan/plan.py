@@ -1,0 +1,105 @@
+"""The plan of a run: what was decided by which numbers, and the configuration that follows from it."""
+
+from __future__ import annotations
+
+import json
+import textwrap
+from dataclasses import asdict, dataclass
+
+import torch
+
+from turbogs_plugin.config import PLANNED_SETTINGS, Config, resolve
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.plan.decisions import RULES, Decision, mebibytes
+from turbogs_plugin.plan.facts import SceneFacts, gather_facts
+from turbogs_plugin.scene import Scene
+from turbogs_plugin.schema import build_dataclass
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Facts and decisions, in the order in which they are told."""
+
+    facts: SceneFacts
+    decisions: tuple[Decision, ...]
+
+    def value(self, name: str) -> bool | int | str:
+        """What was decided about a field of `PlanConfig`."""
+        return next(decision.value for decision in self.decisions if decision.name == name)
+
+    def apply(self, config: Config) -> Config:
+        """The configuration with every decision carried out. It leaves nothing to decide, so that a plan of it is this
+        very configuration."""
+        mapping = {name: dict(section) for name, section in config.to_mapping().items()}
+        for decision in self.decisions:
+            if decision.made != "kept":
+                RULES[decision.name].apply(mapping, decision.value, self.facts)
+            mapping["plan"][decision.name] = "keep" if decision.name in PLANNED_SETTINGS else decision.value
+        return resolve(mapping)
+
+    def text(self) -> str:
+        """For a terminal: the facts, and a line a decision."""
+        width = max(len(decision.text) for decision in self.decisions)
+        lines = [
+            f"  {decision.name:<10} {decision.text:<{width}}  {decision.made:<6}  {decision.reason}"
+            for decision in self.decisions
+        ]
+        facts = textwrap.fill(self.facts_text(), 118, initial_indent="plan for ", subsequent_indent="  ")
+        return "\n".join([facts, *lines])
+
+    def facts_text(self) -> str:
+        """The facts in a sentence."""
+        facts = self.facts
+        small, large = (f"{width}x{height}" for width, height in (facts.smallest_photo, facts.largest_photo))
+        memory = "" if facts.memory_limit is None else f", of which {mebibytes(facts.memory_limit)} may be used"
+        free = f"{mebibytes(facts.device_free_bytes)} free on the {facts.device.upper()}{memory}"
+        host = "" if facts.device == "cpu" else f", {mebibytes(facts.host_free_bytes)} on the host"
+        seconds = "" if facts.time_budget is None else f"; {facts.time_budget:g} s to train"
+        return (
+            f"{facts.scene}: {facts.train_views} + {facts.test_views} views of "
+            f"{small if small == large else f'{small} to {large}'} pixels, {facts.points} points; "
+            f"extent {facts.extent:.4g}, baselines {facts.baseline:.3f} of depth, view directions concentrated to "
+            f"{facts.direction_concentration:.3f}, {facts.flat_tiles:.1%} of tiles without texture, exposures "
+            f"{facts.exposure_spread:.2f} stops apart; {mebibytes(facts.photo_bytes)} of photos, "
+            f"{mebibytes(facts.map_bytes)} of maps, {mebibytes(facts.model_bytes)} of model at the start; {free}{host}"
+            f"{seconds}"
+        )
+
+    def to_json(self) -> str:
+        """Read back by `from_json`."""
+        return json.dumps(asdict(self), indent=1) + "\n"
+
+    @classmethod
+    def from_json(cls, text: str) -> Plan:
+        """Raises `InputError` where the text is not a plan's."""
+        try:
+            mapping = json.loads(text)
+        except ValueError as error:
+            raise InputError(f"the plan is not JSON: {error}") from None
+        return build_dataclass(cls, mapping, "plan")
+
+
+def make_plan(
+    config: Config,
+    scene: Scene,
+    device: torch.device,
+    *,
+    memory_limit: int | None = None,
+    time_budget: float | None = None,
+) -> Plan:
+    """Look at scene and machine, and decide what the configuration leaves to decide.
+
+    Args:
+        config: its `plan` section says what that is.
+        scene: loaded.
+        device: where training is to be.
+        memory_limit: bytes of the device that must not be exceeded.
+        time_budget: seconds.
+    """
+    facts = gather_facts(scene, device, memory_limit=memory_limit, time_budget=time_budget)
+    return plan_from_facts(facts, config)
+
+
+def plan_from_facts(facts: SceneFacts, config: Config) -> Plan:
+    """The plan that these facts lead to."""
+    return Plan(facts, tuple(rule.decide(facts, config) for rule in RULES.values()))
