@@ -1,4 +1,7 @@
-"""Every example runs, on the demo capture made small; the third-party package plugs in by its entry points."""
+"""Every example runs, on the demo capture made small; the third-party package plugs in by its entry points.
+
+The scripts take a GPU where there is one, and so do these tests.
+"""
 
 import importlib.util
 import sys
@@ -16,10 +19,6 @@ from turbogs_plugin.scene import write_demo_capture
 EXAMPLES = Path(__file__).parents[1] / "examples"
 PACKAGE = EXAMPLES / "third_party_strategy"
 SCRIPTS = ("density_swap", "optimizer_swap", "sparse_pixels", "all_swaps")
-
-pytestmark = pytest.mark.skipif(
-    torch.cuda.is_available(), reason="the examples run on the GPU there: tests/gpu has them"
-)
 
 
 @pytest.fixture(scope="module")
