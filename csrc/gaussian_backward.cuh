@@ -96,18 +96,21 @@ __device__ __forceinline__ void geometry_backward(const GaussianShape& shape, co
     const float inverse_det = 1.0f / (x12 * x12 + x20 * x20 + x01 * x01 + eps2d * (c00 + c11 + eps2d));
     const float a = (c11 + eps2d) * inverse_det, b = -c01 * inverse_det, c = (c00 + eps2d) * inverse_det;
 
-    // V = -A G A with A the conic and G its symmetric gradient.
+    // With A the conic, G its symmetric gradient and y_j = A u_j, the covariance's gradient -A G A gives Q_j = -2 A G y_j and
+    // d/dlog s_j = -2 y_j . G y_j. In y_j = adj(C) u_j / det the part of u_j itself is exactly zero, so it is left out: for a
+    // needle it would be all of the sum, and what remains its rounding.
     const float g00 = grad_conic[0], g01 = 0.5f * grad_conic[1], g11 = grad_conic[2];
-    const float h00 = a * g00 + b * g01, h01 = a * g01 + b * g11;  // A G
-    const float h10 = b * g00 + c * g01, h11 = b * g01 + c * g11;
-    const float v00 = -(h00 * a + h01 * b), v01 = -(h00 * b + h01 * c), v11 = -(h10 * b + h11 * c);
-
+    const float cross[3] = {x12, x20, x01};  // of the two other columns, in cyclic order
     float Q0[3], Q1[3];
 #pragma unroll
     for (int j = 0; j < 3; ++j) {
-        Q0[j] = 2.0f * (v00 * U0[j] + v01 * U1[j]);
-        Q1[j] = 2.0f * (v01 * U0[j] + v11 * U1[j]);
-        row.scale[j] = U0[j] * Q0[j] + U1[j] * Q1[j];
+        const int k = (j + 1) % 3, l = (j + 2) % 3;
+        const float y0 = (eps2d * U0[j] + U1[k] * cross[l] - U1[l] * cross[k]) * inverse_det;
+        const float y1 = (eps2d * U1[j] - U0[k] * cross[l] + U0[l] * cross[k]) * inverse_det;
+        const float w0 = g00 * y0 + g01 * y1, w1 = g01 * y0 + g11 * y1;
+        Q0[j] = -2.0f * (a * w0 + b * w1);
+        Q1[j] = -2.0f * (b * w0 + c * w1);
+        row.scale[j] = -2.0f * (y0 * w0 + y1 * w1);
     }
 
     // d/dT = Q M^T, and d/dJ = d/dT W^T at J's four entries.
