@@ -83,10 +83,12 @@ class RunFolder:
             raise InputError(f"'{self.path}' holds no run: there is no config.yaml")
         return resolve(read_yaml(self.config))
 
-    def read_plan(self) -> Plan:
-        """What was planned when the run began. Raises `InputError` where it cannot be read."""
+    def read_plan(self) -> Plan | None:
+        """What was planned when the run began, if it is there. Raises `InputError` where it cannot be read."""
         try:
             return Plan.from_json(self.plan.read_text(encoding="utf-8"))
+        except FileNotFoundError:
+            return None
         except (OSError, UnicodeDecodeError, InputError) as error:
             raise InputError(f"cannot read the plan '{self.plan}': {error}") from None
 
@@ -230,7 +232,7 @@ class _Session:
 
     folder: RunFolder
     config: Config
-    plan: Plan
+    plan: Plan | None
     scene: Scene
     trainer: Trainer
     history: list[Evaluation] = field(default_factory=list)

@@ -34,7 +34,7 @@ class RunRecord:
         folder: of the run; the report goes there.
         scene: name of the capture.
         config: resolved.
-        plan: that the run followed.
+        plan: that the run followed; None where its folder holds none.
         history: every evaluation.
         metrics: of the final model.
         lpips_reason: why LPIPS was not computed; empty where it was.
@@ -44,7 +44,7 @@ class RunRecord:
     folder: Path
     scene: str
     config: Config
-    plan: Plan
+    plan: Plan | None
     history: list[Evaluation]
     metrics: Metrics
     lpips_reason: str
@@ -156,10 +156,6 @@ def _page(record: RunRecord, shown: int) -> str:
             for evaluation in record.history
         ),
     )
-    plan = table(
-        ("decision", "value", "made", "reason"),
-        ((decision.name, decision.text, decision.made, decision.reason) for decision in record.plan.decisions),
-    )
     strips = "\n\n".join(
         f"{view.name}: {view.psnr:.2f} dB\n\n![{view.name}](report/test-{view_id:03d}.png)"
         for view_id, view in enumerate(metrics.views[:shown])
@@ -192,9 +188,7 @@ From left to right: photo, render, error (mean absolute difference over RGB: bla
 
 ## Plan
 
-{record.plan.facts_text()}.
-
-{plan}
+{_plan(record.plan)}
 
 ## Numerical events
 
@@ -213,3 +207,10 @@ finite: {last.skipped_updates}.
 {record.config.to_yaml().rstrip()}
 ```
 """
+
+
+def _plan(plan: Plan | None) -> str:
+    if plan is None:
+        return "The run's folder holds no plan."
+    rows = ((decision.name, decision.text, decision.made, decision.reason) for decision in plan.decisions)
+    return f"{plan.facts_text()}.\n\n{table(('decision', 'value', 'made', 'reason'), rows)}"
