@@ -311,6 +311,7 @@ def _pixels_of(cells: Tensor) -> Tensor:
 
 def _sample(rule: DrawRule, maps: ErrorMaps, view_ids: tuple[int, ...], rate: float, step: Step) -> PixelSamples:
     require(rate > 0, "rate", rate, "above 0")
+    maps.fetch(view_ids)
     views = np.asarray(view_ids, dtype=np.int64)
     draw = training_kernels.sample_pixels if maps.errors.is_cuda and kernels.available() else draw_pixels
     return draw(

@@ -15,7 +15,7 @@ Without Gaussians, from plain error images::
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -60,14 +60,17 @@ class ErrorMaps:
         require(0 < self.beta <= 1, "beta", self.beta, "above 0, at most 1")
         require(self.refresh >= 1, "refresh", self.refresh, "1 or more")
         self.sizes = np.asarray(self.sizes, dtype=np.int64)
+        self._allocate()
+        self.view_sums = torch.zeros(len(self.sizes), dtype=torch.float64, device=self.device)
+        self._means = _LaggedCopy(self.view_sums, self.refresh)
+
+    def _allocate(self) -> None:
         self.offsets = np.concatenate([[0], np.cumsum(self.sizes.prod(axis=1))])  # [V + 1]
         pixels = int(self.offsets[-1])
         # One pixel more than the maps: empty slots write there, so that no device has to count them first.
         self._errors = torch.zeros(pixels + 1, dtype=torch.float16, device=self.device)
         self._stamps = torch.full((pixels + 1,), -1, dtype=torch.int16, device=self.device)
         self.errors, self.stamps = self._errors[:-1], self._stamps[:-1]
-        self.view_sums = torch.zeros(len(self.sizes), dtype=torch.float64, device=self.device)
-        self._means = _LaggedCopy(self.view_sums, self.refresh)
 
     @classmethod
     def from_images(cls, errors: Tensor | Sequence[Tensor], **options: Any) -> ErrorMaps:
@@ -83,6 +86,12 @@ class ErrorMaps:
             maps.initialise(view_id, image.reshape(-1))
         return maps
 
+    def fetch(self, view_ids: Sequence[int]) -> None:
+        """Have the maps of these views where they are drawn from and updated: `errors`, `stamps`, from `offsets` on.
+
+        Whoever reads or writes these arrays calls it first. Here all views are always there; see `offload`.
+        """
+
     def flat_pixels(self, samples: PixelSamples) -> Tensor:
         """[P] int64: flat pixel of each slot; an empty slot gets the first pixel of its view."""
         return samples.flat_pixels(self.offsets)
@@ -92,7 +101,8 @@ class ErrorMaps:
         width, height = self.sizes[view_id]
         if errors.shape != (width * height,):
             raise ValueError(f"errors of view {view_id} have shape {tuple(errors.shape)}, expected ({width * height},)")
-        start, end = self.offsets[view_id : view_id + 2]
+        self.fetch([view_id])
+        start, end = self._extent(view_id)
         errors = torch.nan_to_num(errors.float(), nan=0.0, posinf=0.0, neginf=0.0).clamp(0.0, ERROR_MAX)
         self.errors[start:end] = errors.to(torch.float16)
         self.view_sums[view_id] = self.errors[start:end].sum(dtype=torch.float64)
@@ -109,6 +119,7 @@ class ErrorMaps:
             pixel_errors: [P] float, 0 or more; what stands in empty slots is ignored.
             step: gives the stamp.
         """
+        self.fetch(samples.view_ids)
         self._rebase(step.iteration)
         views = samples.view_of_slot()
         errors = pixel_errors.float()
@@ -126,7 +137,8 @@ class ErrorMaps:
 
     def ages(self, view_id: int, step: Step) -> Tensor:
         """[H * W] int32: iterations since each pixel of a view was last sampled, saturated at `AGE_MAX`."""
-        start, end = self.offsets[view_id : view_id + 2]
+        self.fetch([view_id])
+        start, end = self._extent(view_id)
         now = step.iteration - self.stamp_base
         return (now - self.stamps[start:end].int()).clamp(0, AGE_MAX)
 
@@ -146,31 +158,49 @@ class ErrorMaps:
 
     def state_dict(self) -> dict[str, Any]:
         """Plain tensors and numbers; resuming from them is bit-identical."""
+        errors, stamps = self._stored()
         return {
-            "errors": self.errors.clone(),
-            "stamps": self.stamps.clone(),
+            "errors": errors.clone(),
+            "stamps": stamps.clone(),
             "stamp_base": self.stamp_base,
             "view_sums": self.view_sums.clone(),
             **self._means.state_dict(),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        present = {"errors": self.errors, "stamps": self.stamps}
-        present.update(dict.fromkeys(("view_sums", "mean_values", "mean_pending"), self.view_sums))
-        for name, like in present.items():
-            if state[name].shape != like.shape:
+        pixels, views = (int(self.sizes.prod(axis=1).sum()),), (len(self.sizes),)
+        shapes = {"errors": pixels, "stamps": pixels, "view_sums": views, "mean_values": views, "mean_pending": views}
+        for name, shape in shapes.items():
+            if state[name].shape != shape:
                 raise ValueError("the state's error maps are of other views than these")
-        self.errors.copy_(state["errors"])
-        self.stamps.copy_(state["stamps"])
+        self._load(state["errors"], state["stamps"])
         self.stamp_base = int(state["stamp_base"])
         self.view_sums.copy_(state["view_sums"])
         self._means.load_state_dict(state)
+
+    def _extent(self, view_id: int) -> tuple[int, int]:
+        """First flat pixel of a view, and the one after its last."""
+        start = int(self.offsets[view_id])
+        return start, start + int(self.sizes[view_id].prod())
+
+    def _stored(self) -> tuple[Tensor, Tensor]:
+        """([X] errors, [X] stamps) of all views, end to end."""
+        return self.errors, self.stamps
+
+    def _load(self, errors: Tensor, stamps: Tensor) -> None:
+        """Take over [X] errors and [X] stamps of all views."""
+        self.errors.copy_(errors)
+        self.stamps.copy_(stamps)
+
+    def _change_stamps(self, function: Callable[[Tensor], Tensor]) -> None:
+        """Replace the stamps of all views by a function of each."""
+        self._stamps.copy_(function(self._stamps))
 
     def _rebase(self, iteration: int) -> None:
         """Keep ``iteration - stamp_base`` within the stamps' range; stamps too old to matter saturate."""
         shift = iteration - self.stamp_base
         if shift > AGE_MAX:
-            self._stamps.copy_((self._stamps.int() - shift).clamp(min=-AGE_MAX))
+            self._change_stamps(lambda stamps: (stamps.int() - shift).clamp(min=-AGE_MAX))
             self.stamp_base = iteration
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 from torch import Tensor
 
 from turbogs_plugin import kernels, training_kernels
@@ -22,8 +23,9 @@ def supervise(
 ) -> LossOutput:
     """Compare rendered samples with the photos, and let the error maps learn from it.
 
-    On CUDA, a loss that offers ``kernel_terms()`` is evaluated by the kernel that also gathers the truth and updates
-    the maps; a test holds the two ways equal.
+    On CUDA, a loss that offers ``kernel_terms()`` is evaluated by the kernel that also updates the maps, and gathers
+    the truth where photos and maps of each view begin at the same pixel (with only one of the two offloaded, they do
+    not); tests hold the ways equal.
 
     Args:
         loss: of the run.
@@ -36,9 +38,10 @@ def supervise(
     """
     kernel_terms = getattr(loss, "kernel_terms", None)
     if colors.is_cuda and kernel_terms is not None and kernels.available():
+        aligned = np.array_equal(truth.starts, maps.offsets[list(truth.samples.view_ids)])
         return training_kernels.sparse_loss(
             colors,
-            truth.photos.colors,
+            truth.photos.colors if aligned else truth.colors(),
             truth.samples,
             kernel_terms(),
             update=training_kernels.MapUpdate(maps, step, overflow),

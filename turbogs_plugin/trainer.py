@@ -208,7 +208,7 @@ def initial_gaussians(scene: Scene, train: TrainConfig) -> Gaussians:
     gaussians = gaussians_from_points(scene.points, scene.point_colors, train.sh_degree, scene.extent)
     if not train.backdrop:
         return gaussians
-    color = scene.train.photos.colors[::COLOR_STRIDE].float().mean(dim=0).cpu() / 255.0
+    color = scene.train.photos.stored[::COLOR_STRIDE].float().mean(dim=0).cpu() / 255.0
     backdrop = backdrop_gaussians(color, train.sh_degree, scene.extent)
     return Gaussians(**{name: torch.cat([tensor, getattr(backdrop, name)]) for name, tensor in gaussians.items()})
 

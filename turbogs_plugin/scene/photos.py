@@ -40,16 +40,30 @@ class Photos:
         """[V + 1] int64: the first flat pixel of each view, and the count of all at the end."""
         return pixel_offsets(self.sizes)
 
+    @property
+    def stored(self) -> Tensor:
+        """[X, 3] uint8: the pixels of all views end to end, wherever they are."""
+        return self.colors
+
+    def fetch(self, view_ids: Sequence[int]) -> None:
+        """Have the photos of these views in `colors`, from `offsets` on.
+
+        Whoever reads these arrays calls it first. Here all views are always there; see `offload`.
+        """
+
     def gather(self, samples: PixelSamples) -> Tensor:
         """[P, 3] float32, 0 .. 1: the colours at the samples, 0 in empty slots."""
+        self.fetch(samples.view_ids)
         return self.colors[samples.flat_pixels(self.offsets)].float().div_(255.0).mul_(samples.filled[:, None])
 
     def at(self, samples: PixelSamples) -> PhotoSamples:
         """The photos at the samples, to be gathered where they are compared."""
+        self.fetch(samples.view_ids)
         return PhotoSamples(self, samples)
 
     def image(self, view_id: int) -> Tensor:
         """[H, W, 3] float32, 0 .. 1: one whole photo."""
+        self.fetch([view_id])
         width, height = self.sizes[view_id].tolist()
         start = int(self.offsets[view_id])
         return self.colors[start : start + width * height].view(height, width, 3).float().div_(255.0)
@@ -64,6 +78,11 @@ class PhotoSamples:
 
     photos: Photos
     samples: PixelSamples
+
+    @property
+    def starts(self) -> np.ndarray:
+        """[K] int64: the first flat pixel of each view of the batch."""
+        return self.photos.offsets[list(self.samples.view_ids)]
 
     def colors(self) -> Tensor:
         """[P, 3] float32, 0 .. 1, as `Photos.gather` gives them."""
