@@ -1,0 +1,137 @@
+"""The facts of a plan, against captures whose numbers are known."""
+
+import time
+
+import numpy as np
+import pytest
+import torch
+
+from turbogs_plugin.plan import gather_facts
+from turbogs_plugin.plan.facts import flat_tile_share
+from turbogs_plugin.scene import Frame, PosedImages, Scene
+from turbogs_plugin.scene.photos import Photos
+from turbogs_plugin.types import Cameras
+
+CPU = torch.device("cpu")
+
+
+def posed(images: list[np.ndarray], viewmats: np.ndarray, focal: float = 40.0) -> PosedImages:
+    """Views of [H, W, 3] uint8 images, the principal point in the middle."""
+    sizes = np.array([(image.shape[1], image.shape[0]) for image in images], dtype=np.int64)
+    Ks = torch.zeros(len(images), 3, 3)
+    Ks[:, 0, 0] = Ks[:, 1, 1] = focal
+    Ks[:, :2, 2] = torch.from_numpy(sizes) / 2
+    Ks[:, 2, 2] = 1.0
+    colors = torch.from_numpy(np.concatenate([image.reshape(-1, 3) for image in images]))
+    names = tuple(f"{index}.png" for index in range(len(images)))
+    return PosedImages(Cameras(torch.from_numpy(viewmats).float(), Ks, sizes), names, Photos(colors, sizes))
+
+
+def nadir(centers: np.ndarray) -> np.ndarray:
+    """[V, 4, 4] cameras that all look along +z."""
+    viewmats = np.tile(np.eye(4), (len(centers), 1, 1))
+    viewmats[:, :3, 3] = -centers
+    return viewmats
+
+
+def noise(height: int = 48, width: int = 64, seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).integers(60, 120, (height, width, 3)).astype(np.uint8)
+
+
+def scene_of(train: PosedImages, points: np.ndarray | None = None) -> Scene:
+    if points is None:
+        grid = np.stack(np.meshgrid(np.linspace(-0.3, 0.3, 9), np.linspace(-0.3, 0.3, 9)), axis=-1).reshape(-1, 2)
+        points = np.concatenate([grid, np.full((len(grid), 1), 2.0)], axis=1)
+    colors = torch.zeros(len(points), 3, dtype=torch.uint8)
+    return Scene("made", train, train, torch.from_numpy(points).float(), colors, Frame(np.zeros(3), 5.0), 1.0)
+
+
+LINE = np.array([[0.0, 0, 0], [0.1, 0, 0], [0.2, 0, 0], [0.5, 0, 0]])
+
+
+def test_counts_sizes_and_bytes():
+    images = [noise(48, 64), noise(48, 80), noise(32, 64), noise(48, 64)]
+    facts = gather_facts(scene_of(posed(images, nadir(LINE))), CPU, memory_limit=5, time_budget=20.0)
+    pixels = 48 * 64 * 2 + 48 * 80 + 32 * 64
+    assert (facts.train_views, facts.test_views, facts.points) == (4, 4, 81)
+    assert (facts.smallest_photo, facts.largest_photo) == ((64, 32), (80, 48))
+    assert (facts.photo_bytes, facts.map_bytes, facts.model_bytes) == (6 * pixels, 4 * pixels, 81 * 59 * 12)
+    assert (facts.device, facts.memory_limit, facts.time_budget) == ("cpu", 5, 20.0)
+    assert facts.extent == 5.0
+    assert 0 < facts.device_free_bytes == facts.host_free_bytes
+
+
+def test_baselines_are_relative_to_depth():
+    facts = gather_facts(scene_of(posed([noise()] * 4, nadir(LINE))), CPU)
+    # Nearest cameras are 0.1, 0.1, 0.1 and 0.3 away; the points are 2 deep.
+    assert facts.baseline == pytest.approx(0.05)
+
+
+@pytest.mark.parametrize("tilt", [0.0, 30.0, 90.0])
+def test_concentration_of_view_directions(tilt):
+    angle = np.radians(tilt)
+    viewmats = nadir(np.zeros((2, 3)))
+    for viewmat, sign in zip(viewmats, (1, -1), strict=True):
+        c, s = np.cos(angle), sign * np.sin(angle)
+        viewmat[:3, :3] = [[c, 0, -s], [0, 1, 0], [s, 0, c]]
+    facts = gather_facts(scene_of(posed([noise()] * 2, viewmats)), CPU)
+    assert facts.direction_concentration == pytest.approx(abs(np.cos(angle)), abs=1e-6)
+
+
+@pytest.mark.parametrize("flat_rows", [0, 1, 3])
+def test_share_of_tiles_without_texture(flat_rows):
+    image = noise(48, 64)
+    image[: 16 * flat_rows] = 100
+    image[: 16 * flat_rows, ::2] += 1  # a step of 1 of 255 is no texture
+    views = posed([image, image], nadir(LINE[:2]))
+    assert flat_tile_share(views) == pytest.approx(flat_rows / 3)
+
+
+def test_photos_smaller_than_a_tile_have_none():
+    assert flat_tile_share(posed([noise(15, 40), noise(40, 15)], nadir(LINE[:2]))) == 0.0
+
+
+@pytest.mark.parametrize("stops", [0.0, 1.0])
+def test_exposures_are_compared_at_common_points(stops):
+    """Every second photo is darker by so many stops; the photos' contents differ by their positions."""
+    images = []
+    for view, center in enumerate(LINE):
+        x = (np.arange(64) + 0.5 - 32) / 40.0 * 2.0 + center[0]  # of the surface at depth 2
+        shade = 160.0 + 60.0 * np.sin(3.0 * x)
+        image = np.broadcast_to(shade[None, :, None], (48, 64, 3)) / 2.0 ** (stops * (view % 2))
+        images.append(np.round(image).astype(np.uint8))
+    facts = gather_facts(scene_of(posed(images, nadir(LINE))), CPU)
+    assert facts.exposure_spread == pytest.approx(stops, abs=0.02)
+
+
+def test_points_that_no_camera_sees_decide_nothing():
+    behind = np.array([[0.0, 0.0, -2.0], [50.0, 0.0, 1.0]])
+    facts = gather_facts(scene_of(posed([noise()] * 4, nadir(LINE)), behind), CPU)
+    assert facts.exposure_spread == 0.0 and facts.baseline == pytest.approx(0.1)  # of the extent instead
+
+
+def test_a_single_view_has_no_neighbour():
+    facts = gather_facts(scene_of(posed([noise()], nadir(LINE[:1]))), CPU)
+    assert (facts.baseline, facts.exposure_spread, facts.direction_concentration) == (0.0, 0.0, 1.0)
+
+
+def test_facts_are_cheap():
+    """The work is bounded: a hundred photos of a megapixel take as long as any other number."""
+    size, views = (1000, 1000), 100
+    centers = np.random.default_rng(0).uniform(-1, 1, (views, 3)) * [1, 1, 0]
+    one = posed([noise()], nadir(centers[:1]))
+    sizes = np.tile(np.array([size], dtype=np.int64), (views, 1))
+    cameras = Cameras(torch.from_numpy(nadir(centers)).float(), one.cameras.Ks.repeat(views, 1, 1), sizes)
+    colors = torch.zeros(views * size[0] * size[1], 3, dtype=torch.uint8)
+    train = PosedImages(cameras, tuple(map(str, range(views))), Photos(colors, sizes))
+    points = np.random.default_rng(1).normal(0, 1, (20_000, 3)) + np.array([0, 0, 4])
+    scene = scene_of(train, points)
+    gather_facts(scene, CPU)
+    seconds = min(_seconds(lambda: gather_facts(scene, CPU)) for _ in range(3))
+    assert seconds < 0.6  # 0.1 alone on one core
+
+
+def _seconds(call) -> float:
+    started = time.perf_counter()
+    call()
+    return time.perf_counter() - started
