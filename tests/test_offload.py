@@ -2,7 +2,6 @@
 
 import random
 from collections import deque
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -33,14 +32,10 @@ def scene(capture) -> Scene:
     return load_scene(capture)
 
 
-def trainer_of(scene: Scene, config, maps: bool, photos: bool) -> Trainer:
+def trainer_of(scene: Scene, capture: Path, maps: bool, photos: bool, *overrides: str) -> Trainer:
     """A trainer with these two in host memory."""
-    if photos:
-        scene = replace(scene, train=replace(scene.train, photos=OffloadedPhotos(scene.train.photos, CPU)))
-    trainer = Trainer(config, scene, CPU)
-    if maps:
-        trainer.maps = OffloadedErrorMaps(trainer.views.cameras.sizes, CPU, beta=config.maps.beta)
-    return trainer
+    places = [f"plan.{name}_on={'host' if host else 'device'}" for name, host in (("maps", maps), ("photos", photos))]
+    return Trainer(tiny_config(capture, *places, *overrides), scene, CPU)
 
 
 def assert_identical(a, b, place: str = "state") -> None:
@@ -59,8 +54,10 @@ def assert_identical(a, b, place: str = "state") -> None:
     [(True, True, "pixel"), (True, True, "tile"), (True, False, "pixel"), (False, True, "pixel")],
 )
 def test_training_is_bit_for_bit_that_of_resident_maps_and_photos(scene, capture, maps, photos, unit):
-    config = tiny_config(capture, f"pixel_sampler.unit={unit}", "schedule.max_views=2")
-    resident, offloaded = Trainer(config, scene, CPU), trainer_of(scene, config, maps, photos)
+    overrides = (f"pixel_sampler.unit={unit}", "schedule.max_views=2")
+    resident, offloaded = (
+        trainer_of(scene, capture, *places, *overrides) for places in ((False, False), (maps, photos))
+    )
     for trainer in (resident, offloaded):
         trainer.initialise_maps()
     assert_identical(resident.state_dict(), offloaded.state_dict())
@@ -79,8 +76,7 @@ def test_training_is_bit_for_bit_that_of_resident_maps_and_photos(scene, capture
 
 
 def test_a_run_stops_with_resident_maps_and_goes_on_with_offloaded_ones(scene, capture):
-    config = tiny_config(capture)
-    whole, first, second = (trainer_of(scene, config, maps, maps) for maps in (False, False, True))
+    whole, first, second = (trainer_of(scene, capture, host, host) for host in (False, False, True))
     for trainer in (whole, first):
         trainer.initialise_maps()
     for _ in range(6):
@@ -96,8 +92,7 @@ def test_a_run_stops_with_resident_maps_and_goes_on_with_offloaded_ones(scene, c
 
 
 def test_the_initial_colour_is_that_of_the_photos(scene, capture):
-    config = tiny_config(capture)
-    sh0 = [trainer_of(scene, config, False, photos).gaussians.sh0 for photos in (False, True)]
+    sh0 = [trainer_of(scene, capture, False, photos).gaussians.sh0 for photos in (False, True)]
     assert torch.equal(*sh0)
 
 

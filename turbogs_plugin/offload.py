@@ -20,6 +20,7 @@ import contextlib
 import itertools
 import weakref
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -27,6 +28,7 @@ from torch import Tensor
 
 from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.evaluation import synchronize
+from turbogs_plugin.scene import PosedImages
 from turbogs_plugin.scene.photos import Photos, pixel_offsets
 
 SETS = 2
@@ -248,6 +250,18 @@ class OffloadedErrorMaps(ErrorMaps):
 
     def _change_stamps(self, function: Callable[[Tensor], Tensor]) -> None:
         self._window.change_all(1, function)
+
+
+def place_views(views: PosedImages, device: torch.device, photos_on: str) -> PosedImages:
+    """Views whose cameras are on the device, and their photos there or, for ``host``, in host memory with a window."""
+    if photos_on != "host":
+        return views.to(device)
+    return replace(views, cameras=views.cameras.to(device), photos=OffloadedPhotos(views.photos, device))
+
+
+def place_maps(sizes: np.ndarray, device: torch.device, maps_on: str, beta: float) -> ErrorMaps:
+    """New maps on the device or, for ``host``, in host memory with a window. Arguments as those of `ErrorMaps`."""
+    return (OffloadedErrorMaps if maps_on == "host" else ErrorMaps)(sizes, device, beta=beta)
 
 
 class _CopyStream:

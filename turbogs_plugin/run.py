@@ -21,6 +21,7 @@ from turbogs_plugin.errors import InputError, TrainingStopped
 from turbogs_plugin.evaluation import Metrics, evaluate, load_lpips, peak_memory_bytes
 from turbogs_plugin.files import write_text_atomically
 from turbogs_plugin.gaussians import save_ply
+from turbogs_plugin.offload import place_views
 from turbogs_plugin.plan import Plan, make_plan
 from turbogs_plugin.progress import TrainingProgress
 from turbogs_plugin.report.history import Evaluation, append_evaluation, rewind_history
@@ -240,7 +241,7 @@ class _Session:
 
     def __post_init__(self) -> None:
         self.device = self.trainer.gaussians.device
-        self.test: PosedImages = self.scene.test.to(self.device)
+        self.test: PosedImages = place_views(self.scene.test, self.device, self.config.plan.photos_on)
         self.clock = TrainingClock(self.device)
 
     def run(self) -> Outcome:

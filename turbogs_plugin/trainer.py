@@ -12,9 +12,9 @@ from torch import Tensor
 
 from turbogs_plugin import kernels
 from turbogs_plugin.config import Config, TrainConfig
-from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.errors import TrainingStopped
 from turbogs_plugin.gaussians import backdrop_gaussians, gaussians_from_points
+from turbogs_plugin.offload import place_maps, place_views
 from turbogs_plugin.rendering import Rendered, Workspace, rasterize, render_images
 from turbogs_plugin.scene import Scene
 from turbogs_plugin.supervision import supervise
@@ -35,7 +35,7 @@ class Trainer:
 
     def __init__(self, config: Config, scene: Scene, device: torch.device) -> None:
         self.config = config
-        self.views = scene.train.to(device)
+        self.views = place_views(scene.train, device, config.plan.photos_on)
         self.extent = scene.extent
         self.schedule = config.build("schedule")
         self.view_sampler = config.build("view_sampler")
@@ -43,7 +43,7 @@ class Trainer:
         self.loss = config.build("loss")
         self.optimizer = config.build("optimizer")
         self.density = config.build("density")
-        self.maps = ErrorMaps(self.views.cameras.sizes, device, beta=config.maps.beta)
+        self.maps = place_maps(self.views.cameras.sizes, device, config.plan.maps_on, config.maps.beta)
         self.gaussians = initial_gaussians(scene, config.train).map(lambda tensor: tensor.to(device))
         self.view_sampler.setup(self.views.cameras, scene.extent)
         self.optimizer.setup(self.gaussians)
