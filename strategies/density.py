@@ -18,6 +18,9 @@ from turbogs_plugin.types import Gaussians, GaussianStats, RowUpdate, Step
 SPLIT_SHRINK = 1.6
 """A split divides standard deviations by this (3DGS)."""
 
+FLAT_EVENTS = 5
+"""Events of density control over which `stop_when_flat` looks at the error's fall."""
+
 EPS = 1e-12
 """Keeps divisions defined; the least weight a drawn splat can have in a pixel is 1e-4 / 255."""
 
@@ -90,6 +93,10 @@ class ErrorDrivenDensity:
             (unless they are not finite): a backdrop behind the scene, which few photos see. 0: none.
         final_every, final_keep: interval of the final pruning, and the share of the seen that each one keeps, the
             most difficult (Delta_prune, eta_final). 1 keeps all.
+        stop_when_flat: densification ends early, at the first event where the error has fallen by less than this share
+            of itself over the last `FLAT_EVENTS` events. The error of a window is the mean over what its samples saw of
+            e, weighted by w; as the sampling's rate rises, it falls a little by itself, so the rule waits rather than
+            hurries. 0: never.
     """
 
     lambda_base: float = 0.8
@@ -113,7 +120,10 @@ class ErrorDrivenDensity:
     spare_beyond: float = 0.0
     final_every: int = 500
     final_keep: float = 0.95
+    stop_when_flat: float = 0.0
     initial_count: int = field(init=False, default=0)
+    window_errors: list[float] = field(init=False, repr=False, default_factory=list)
+    stopped_at: int = field(init=False, repr=False, default=0)
     _stats: GaussianStats | None = field(init=False, repr=False, default=None)
 
     def __post_init__(self) -> None:
@@ -124,7 +134,7 @@ class ErrorDrivenDensity:
             require(getattr(self, name) >= 1, name, getattr(self, name), "at least 1")
         for name in ("top_fraction", "final_keep"):
             require(0 < getattr(self, name) <= 1, name, getattr(self, name), "more than 0 and at most 1")
-        for name in ("prune_opacity", "prune_score_fraction", "opacity_decay"):
+        for name in ("prune_opacity", "prune_score_fraction", "opacity_decay", "stop_when_flat"):
             require(0 <= getattr(self, name) < 1, name, getattr(self, name), "at least 0 and less than 1")
         for name in (
             *("lambda_base", "refine_from", "grad_threshold", "absgrad_threshold", "percent_dense", "target_gaussians"),
@@ -150,6 +160,9 @@ class ErrorDrivenDensity:
     def update(self, gaussians: Gaussians, step: Step) -> RowUpdate | None:
         densify, final = self._due(step)
         update = None
+        if densify and self._stats is not None and self.stop_when_flat > 0 and self._error_is_flat():
+            self.stopped_at, densify = step.iteration, False
+            self._stats.zero_()
         if self._stats is not None and (densify or final) and len(gaussians) > 0:
             score, seen = self.scores(step)
             event = self._refine if densify else self._final_prune
@@ -162,10 +175,17 @@ class ErrorDrivenDensity:
 
     def state_dict(self) -> dict[str, Any]:
         stats = None if self._stats is None else {f.name: getattr(self._stats, f.name) for f in fields(self._stats)}
-        return {"initial_count": self.initial_count, "stats": stats}
+        state = {"initial_count": self.initial_count, "stats": stats}
+        if self.stop_when_flat > 0:
+            window_errors = torch.tensor(self.window_errors, dtype=torch.float64)
+            state |= {"window_errors": window_errors, "stopped_at": self.stopped_at}
+        return state
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         self.initial_count = state["initial_count"]
+        if self.stop_when_flat > 0:
+            self.window_errors = state["window_errors"].tolist()
+            self.stopped_at = state["stopped_at"]
         if state["stats"] is None:
             self._stats = None
         else:
@@ -194,6 +214,7 @@ class ErrorDrivenDensity:
         """Whether this iteration densifies, and whether it prunes finally."""
         iteration, after = step.iteration, step.iteration - step.refine_until
         densify = after <= 0 and iteration >= self.refine_from and iteration % self.refine_every == 0
+        densify = densify and not self.stopped_at
         return densify, self.final_keep < 1 and after > 0 and after % self.final_every == 0
 
     def _last_event(self, step: Step) -> int:
@@ -201,7 +222,21 @@ class ErrorDrivenDensity:
         rest = max(0, step.total - 1 - step.refine_until)
         if self.final_keep < 1 and rest >= self.final_every:
             return step.refine_until + rest // self.final_every * self.final_every
+        if self.stopped_at:
+            return self.stopped_at
         return step.refine_until // self.refine_every * self.refine_every
+
+    def _error_is_flat(self) -> bool:
+        """Take the present window's error into the record; whether it has stopped falling."""
+        stats = self._stats
+        valid = torch.isfinite(stats.error_sums + stats.weight_sums)
+        sums = torch.stack([stats.error_sums, stats.weight_sums]).where(valid, 0.0).double().sum(dim=1)
+        error, weight = sums.tolist()  # events wait for the device anyway
+        if weight == 0:
+            return False  # nothing was seen, which says nothing
+        self.window_errors = [*self.window_errors[-FLAT_EVENTS:], error / weight]
+        before, now = self.window_errors[0], self.window_errors[-1]
+        return len(self.window_errors) > FLAT_EVENTS and before - now < self.stop_when_flat * before
 
     def _refine(self, gaussians: Gaussians, score: Tensor, seen: Tensor, step: Step) -> RowUpdate | None:
         stats, extent = self._stats, step.scene_extent
