@@ -112,8 +112,7 @@ void raster_project(Tensor means, Tensor quats, Tensor scales, Tensor opacities,
 // What the library was built for, such as "sm_90".
 std::string architectures() { return TURBOGS_ARCHITECTURES; }
 
-// `deferred`: [T + 1], the number of deferred tiles, then the tiles.
-void raster_count_pairs(Tensor tile_cursors, Tensor tile_starts, Tensor status, Tensor deferred, Tensor block_sums,
+void raster_count_pairs(Tensor tile_cursors, Tensor tile_starts, Tensor status, Tensor counters, Tensor block_sums,
                         int64_t capacity) {
     Checker check(tile_cursors);
     const int64_t num_active = tile_starts.numel() - 1;
@@ -124,7 +123,7 @@ void raster_count_pairs(Tensor tile_cursors, Tensor tile_starts, Tensor status, 
     params.tile_cursors = check.pointer<int32_t>(tile_cursors, "tile_cursors", ScalarType::Int, {num_active + 1});
     params.tile_starts = check.pointer<uint32_t>(tile_starts, "tile_starts", ScalarType::Int, {num_active + 1});
     params.status = check.pointer<uint32_t>(status, "status", ScalarType::Int, {2});
-    params.num_deferred = check.pointer<uint32_t>(deferred, "deferred", ScalarType::Int, {num_active + 1});
+    params.counters = reinterpret_cast<PairCounters*>(check.pointer<uint32_t>(counters, "counters", ScalarType::Int, {2}));
     params.block_sums = check.pointer<int64_t>(block_sums, "block_sums", ScalarType::Long,
                                                {num_active > 0 ? (num_active + kScanTiles - 1) / kScanTiles : 1, 2});
     check.launched(launch_count_pairs(params, check.stream()), "pair count");
@@ -132,7 +131,7 @@ void raster_count_pairs(Tensor tile_cursors, Tensor tile_starts, Tensor status, 
 
 void raster_sort_pairs(Tensor instances, Tensor radii, Tensor cameras, std::optional<Tensor> active_prefix,
                        Tensor tile_cursors, Tensor tile_starts, Tensor status, Tensor pair_keys, Tensor pair_ids,
-                       Tensor deferred) {
+                       Tensor counters, Tensor runs) {
     Checker check(instances);
     const int64_t views = radii.size(0), count = radii.size(1), total = views * count, capacity = pair_ids.numel();
     const int64_t num_active = tile_starts.numel() - 1;
@@ -152,8 +151,10 @@ void raster_sort_pairs(Tensor instances, Tensor radii, Tensor cameras, std::opti
     params.status = check.pointer<uint32_t>(status, "status", ScalarType::Int, {2});
     params.pair_keys = check.pointer<uint64_t>(pair_keys, "pair_keys", ScalarType::Long, {capacity});
     params.pair_ids = check.pointer<uint32_t>(pair_ids, "pair_ids", ScalarType::Int, {capacity});
-    params.num_deferred = check.pointer<uint32_t>(deferred, "deferred", ScalarType::Int, {num_active + 1});
-    params.deferred = reinterpret_cast<int32_t*>(params.num_deferred) + 1;
+    check.aligned(params.pair_ids, "pair_ids");
+    params.capacity = static_cast<uint32_t>(capacity);
+    params.counters = reinterpret_cast<PairCounters*>(check.pointer<uint32_t>(counters, "counters", ScalarType::Int, {2}));
+    params.runs = reinterpret_cast<int2*>(check.pointer<int32_t>(runs, "runs", ScalarType::Int, {capacity / (kRun / 2), 2}));
     check.launched(launch_sort_pairs(params, check.stream()), "pair sort");
 }
 
@@ -216,11 +217,12 @@ STABLE_TORCH_LIBRARY_FRAGMENT(turbogs, m) {
         "float alpha_min) -> ()");
     m.def("architectures() -> str");
     m.def(
-        "raster_count_pairs(Tensor(a!) tile_cursors, Tensor(b!) tile_starts, Tensor(c!) status, Tensor(d!) deferred, "
+        "raster_count_pairs(Tensor(a!) tile_cursors, Tensor(b!) tile_starts, Tensor(c!) status, Tensor(d!) counters, "
         "Tensor(e!) block_sums, int capacity) -> ()");
     m.def(
         "raster_sort_pairs(Tensor instances, Tensor radii, Tensor cameras, Tensor? active_prefix, Tensor(a!) tile_cursors, "
-        "Tensor tile_starts, Tensor status, Tensor(b!) pair_keys, Tensor(c!) pair_ids, Tensor(d!) deferred) -> ()");
+        "Tensor tile_starts, Tensor status, Tensor(b!) pair_keys, Tensor(c!) pair_ids, Tensor(d!) counters, "
+        "Tensor(e!) runs) -> ()");
     m.def(
         "raster_forward(Tensor cameras, Tensor? tile_ids, Tensor tile_offsets, Tensor pixel_ids, Tensor tile_starts, "
         "Tensor pair_ids, Tensor instances, Tensor(a!) colors, Tensor(b!) alphas, Tensor(c!) transmittances, "

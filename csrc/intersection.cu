@@ -106,11 +106,11 @@ __global__ void __launch_bounds__(kScanThreads) start_tiles_kernel(const __grid_
         start += splats_before + splats[i];
     }
     if (block == 0 && threadIdx.x == 0) {
+        params.counters->num_windows = params.counters->num_runs = 0u;
         const uint32_t count = static_cast<uint32_t>(min(all_pairs, static_cast<int64_t>(kMaxPairs)));
         params.tile_starts[params.num_active] = lost ? 0u : count;
         params.status[0] = count;
         if (lost) params.status[1] = 1u;  // other blocks may read it before or after: they find the same
-        *params.num_deferred = 0u;
     }
 }
 
@@ -119,8 +119,12 @@ __global__ void __launch_bounds__(kScanThreads) start_tiles_kernel(const __grid_
 constexpr int kThreads = 256;
 constexpr int kScatterWarps = kThreads / kWarpSize;
 constexpr int kScatterInstances = 512;  // of a block
-constexpr int kWindow = 512;            // pairs that a warp takes on, of a splat whose box has more tiles
+constexpr int kLargeBox = 96;           // tiles of a splat's box beyond which several warps share its pairs
+constexpr int kWindow = 256;            // pairs of such a splat that a warp takes on
+constexpr int kWindowBlocks = 528;
 constexpr int kUnderWay = 4;            // places that a lane waits for at a time
+
+constexpr uint32_t kNoInstance = 0xFFFFFFFFu;
 
 // What it takes to enumerate the pairs of a splat.
 struct Emission {
@@ -197,6 +201,19 @@ __device__ __forceinline__ void emit_window(const SortPairsParams& params, const
     }
 }
 
+// Lists the windows of a large splat for the next kernel. False where the list has no room: places of it that are left then
+// hold no instance.
+__device__ __forceinline__ bool list_windows(const SortPairsParams& params, uint32_t instance, int box_tiles) {
+    const uint32_t room = params.capacity / 2, windows = static_cast<uint32_t>((box_tiles + kWindow - 1) / kWindow);
+    uint2* list = reinterpret_cast<uint2*>(params.pair_ids);  // free until the pairs are sorted
+    const uint32_t place = atomicAdd(&params.counters->num_windows, windows);
+    const bool fits = place < room && windows <= room - place;
+    for (uint32_t i = 0; i < windows && place < room - min(i, room); ++i) {
+        list[place + i] = make_uint2(fits ? instance : kNoInstance, i);
+    }
+    return fits;
+}
+
 __global__ void __launch_bounds__(kThreads) scatter_kernel(const __grid_constant__ SortPairsParams params) {
     __shared__ uint32_t visible[kScatterInstances], large[kScatterInstances];
     __shared__ Emission emissions[kThreads];
@@ -225,8 +242,8 @@ __global__ void __launch_bounds__(kThreads) scatter_kernel(const __grid_constant
         if (base + lane < num_visible) {
             int box_tiles;
             splats[lane] = make_emission(params, visible[base + lane], box_tiles);
-            if (box_tiles <= kWindow) rows = splats[lane].rows.y - splats[lane].rows.x;
-            else large[atomicAdd(&num_large, 1)] = visible[base + lane];
+            if (box_tiles <= kLargeBox) rows = splats[lane].rows.y - splats[lane].rows.x;
+            else if (!list_windows(params, visible[base + lane], box_tiles)) large[atomicAdd(&num_large, 1)] = visible[base + lane];
         }
         __syncwarp();
         const int sum = sum_to_lane(rows, lane);
@@ -238,33 +255,52 @@ __global__ void __launch_bounds__(kThreads) scatter_kernel(const __grid_constant
             const Emission& emission = splats[owner];
             const int2 tiles = number < total ? tiles_of_row(params, emission, emission.rows.x + number - before)
                                               : make_int2(0, 0);
-            emit_rows(params, tiles, emission.key, 0, kWarpSize * kWindow, lane);
+            emit_rows(params, tiles, emission.key, 0, kWarpSize * kLargeBox, lane);
         }
         __syncwarp();
     }
     __syncthreads();
 
-    // Windows of large splats go round the warps.
-    int window = warp;
+    // What has found no room in the list.
     for (int i = 0; i < num_large; ++i) {
         int box_tiles;
         const Emission emission = make_emission(params, large[i], box_tiles);
-        const int windows = (box_tiles + kWindow - 1) / kWindow;
-        for (; window < windows; window += kScatterWarps) emit_window(params, emission, window * kWindow, lane);
-        window -= windows;
+        for (int begin = warp * kWindow; begin < box_tiles; begin += kScatterWarps * kWindow) {
+            emit_window(params, emission, begin, lane);
+        }
+    }
+}
+
+// The windows of the list; and lists the runs of tiles with more than kRun pairs.
+__global__ void __launch_bounds__(kThreads) scatter_windows_kernel(const __grid_constant__ SortPairsParams params) {
+    if (params.status[1] != 0u) return;
+    const int lane = threadIdx.x % kWarpSize, thread = blockIdx.x * kThreads + threadIdx.x;
+    const uint2* list = reinterpret_cast<const uint2*>(params.pair_ids);
+    const uint32_t num_windows = min(params.counters->num_windows, params.capacity / 2);
+    for (uint32_t i = thread / kWarpSize; i < num_windows; i += gridDim.x * kScatterWarps) {
+        const uint2 window = list[i];
+        if (window.x == kNoInstance) continue;
+        int box_tiles;
+        const Emission emission = make_emission(params, window.x, box_tiles);
+        emit_window(params, emission, static_cast<int>(window.y) * kWindow, lane);
+    }
+    for (int tile = thread; tile < params.num_active; tile += gridDim.x * kThreads) {
+        const int count = static_cast<int>(params.tile_starts[tile + 1] - params.tile_starts[tile]);
+        if (count <= kRun) continue;
+        const int runs = (count + kRun - 1) / kRun;
+        const uint32_t place = atomicAdd(&params.counters->num_runs, static_cast<unsigned>(runs));
+        for (int run = 0; run < runs; ++run) params.runs[place + run] = make_int2(tile, run);
     }
 }
 
 // ---- A tile's pairs in order -----------------------------------------------------------------------------------
 
-constexpr int kSortWarps = 4;        // of a block, a tile each
-constexpr int kStagedPairs = 512;    // that a warp keeps in shared memory
-constexpr int kWarpPairs = 1024;     // of a tile at most; a block sorts those with more
+constexpr int kSortWarps = 4;  // of a block
 constexpr int kRepairs = 8;
 
 struct SortShared {
-    uint64_t keys[kStagedPairs];
-    uint16_t order[kWarpPairs];
+    uint64_t keys[kRun];
+    uint16_t order[kRun];
 };
 
 // Sorts 32 * kPer numbers, lane * kPer + i being the place of a lane's i-th: a bitonic network whose comparators all point
@@ -315,47 +351,66 @@ __device__ __forceinline__ void sort_numbers(uint32_t numbers[kPer], int lane) {
     }
 }
 
-// Writes the ids in order. Returns whether the order is right.
-__device__ __forceinline__ bool write_ids(const uint64_t* keys, const uint16_t* order, int count, uint32_t* ids, int lane) {
+// Writes in order the ids, or the keys where `ids` is null. Returns whether the order is right.
+__device__ __forceinline__ bool write_sorted(const SortShared& shared, int count, uint64_t* pairs, uint32_t* ids, int lane) {
     bool right = true;
     uint32_t last_depth = 0, last_id = 0;  // of the lane below; of the last lane for the next step
     for (int base = 0; base < count; base += kWarpSize) {
         const int place = base + lane;
-        const uint64_t key = place < count ? keys[order[place]] : ~uint64_t{0};
+        const uint64_t key = place < count ? shared.keys[shared.order[place]] : ~uint64_t{0};
         const uint32_t depth = static_cast<uint32_t>(key >> 32), id = static_cast<uint32_t>(key);
         const uint32_t depth_below = __shfl_up_sync(kFullWarp, depth, 1), id_below = __shfl_up_sync(kFullWarp, id, 1);
         if (lane > 0) last_depth = depth_below, last_id = id_below;
         if (depth < last_depth || (depth == last_depth && id < last_id)) right = false;
         last_depth = __shfl_sync(kFullWarp, depth, kWarpSize - 1);
         last_id = __shfl_sync(kFullWarp, id, kWarpSize - 1);
-        if (place < count) ids[place] = id;
+        if (place >= count) break;
+        if (ids != nullptr) ids[place] = id;
+        else pairs[place] = key;
     }
     return !__any_sync(kFullWarp, !right);
 }
 
+__device__ __forceinline__ void order_places(SortShared& shared, int low, int high) {
+    const uint16_t a = shared.order[low], b = shared.order[high];
+    if (shared.keys[a] > shared.keys[b]) {
+        shared.order[low] = b;
+        shared.order[high] = a;
+    }
+}
+
 // Swaps neighbours that are out of order.
-__device__ __forceinline__ void repair(const uint64_t* keys, uint16_t* order, int count, int lane) {
+__device__ __forceinline__ void repair(SortShared& shared, int count, int lane) {
 #pragma unroll
     for (int parity = 0; parity < 2; ++parity) {
-        for (int place = 2 * lane + parity; place + 1 < count; place += 2 * kWarpSize) {
-            const uint16_t a = order[place], b = order[place + 1];
-            if (keys[a] > keys[b]) {
-                order[place] = b;
-                order[place + 1] = a;
-            }
-        }
+        for (int place = 2 * lane + parity; place + 1 < count; place += 2 * kWarpSize) order_places(shared, place, place + 1);
         __syncwarp();
     }
 }
 
-// One warp sorts up to 32 * kPer pairs. It sorts 32-bit numbers: as many bits of the depth, less the tile's nearest, as the
-// place in the tile leaves room for, then that place. Depths that agree in all these bits may be out of order; they are
-// neighbours, and swapped. Returns whether that has sufficed.
+// The whole network by whole keys, where depths are too alike for a few repairs. Behind the last key there are none smaller.
+__device__ __forceinline__ void sort_places(SortShared& shared, int count, int lane) {
+    for (int size = 2; size / 2 < count; size *= 2) {
+        for (int part = size; part > 1; part /= 2) {
+            const int half = part / 2;
+            for (int i = lane;; i += kWarpSize) {
+                const int low = 2 * (i & -half) | (i & (half - 1)), high = part == size ? low ^ (part - 1) : low + half;
+                if (low >= count) break;
+                if (high < count) order_places(shared, low, high);
+            }
+            __syncwarp();
+        }
+    }
+}
+
+// One warp sorts up to 32 * kPer pairs. It sorts 32-bit numbers: as many bits of the depth, less the nearest, as the place
+// among the pairs leaves room for, then that place. Depths that agree in all these bits may be out of order; they are
+// neighbours, and swapped.
 template <int kPer>
-__device__ __forceinline__ bool sort_tile(const uint64_t* __restrict__ pairs, int count, uint32_t* ids, SortShared& shared,
-                                          int lane) {
-    constexpr int kPlaceBits = kPer == 1 ? 5 : kPer == 2 ? 6 : kPer == 4 ? 7 : kPer == 8 ? 8 : kPer == 16 ? 9 : 10;
-    constexpr bool kStaged = kWarpSize * kPer <= kStagedPairs;
+__device__ __forceinline__ void sort_some(uint64_t* pairs, int count, uint32_t* ids, SortShared& shared, int lane) {
+    constexpr int kPlaceBits = kPer == 1 ? 5 : kPer == 2 ? 6 : kPer == 4 ? 7 : kPer == 8 ? 8 : 9;
+    constexpr uint32_t kPlaceMask = (1u << kPlaceBits) - 1u;
+    static_assert(kWarpSize * kPer == 1 << kPlaceBits && kWarpSize * kPer <= kRun, "places have their bits");
     uint32_t numbers[kPer];
     uint32_t nearest = 0xFFFFFFFFu, farthest = 0u;
 #pragma unroll
@@ -363,7 +418,7 @@ __device__ __forceinline__ bool sort_tile(const uint64_t* __restrict__ pairs, in
         const int place = i * kWarpSize + lane;
         if (place < count) {
             const uint64_t key = pairs[place];
-            if (kStaged) shared.keys[place] = key;
+            shared.keys[place] = key;
             numbers[i] = static_cast<uint32_t>(key >> 32);
             nearest = min(nearest, numbers[i]);
             farthest = max(farthest, numbers[i]);
@@ -378,99 +433,67 @@ __device__ __forceinline__ bool sort_tile(const uint64_t* __restrict__ pairs, in
         numbers[i] = place < count ? (numbers[i] - nearest) >> shift << kPlaceBits | place : 0xFFFFFFFFu;
     }
     sort_numbers<kPer>(numbers, lane);
-    constexpr uint32_t kPlaceMask = (1u << kPlaceBits) - 1u;
-    if (kPer == 1) {
-        shared.order[lane] = static_cast<uint16_t>(numbers[0] & kPlaceMask);
-    } else {
 #pragma unroll
-        for (int i = 0; i + 1 < kPer; i += 2) {
-            reinterpret_cast<uint32_t*>(shared.order)[(lane * kPer + i) / 2] =
-                (numbers[i] & kPlaceMask) | (numbers[i + 1] & kPlaceMask) << 16;
-        }
-    }
+    for (int i = 0; i < kPer; ++i) shared.order[lane * kPer + i] = static_cast<uint16_t>(numbers[i] & kPlaceMask);
     __syncwarp();
-    const uint64_t* keys = kStaged ? shared.keys : pairs;
-    for (int round = 0; !write_ids(keys, shared.order, count, ids, lane); ++round) {
-        if (round == kRepairs) return false;
-        repair(keys, shared.order, count, lane);
+    for (int round = 0; !write_sorted(shared, count, pairs, ids, lane); ++round) {
+        if (round < kRepairs) repair(shared, count, lane);
+        else sort_places(shared, count, lane);
     }
-    return true;
 }
 
-__global__ void __launch_bounds__(kSortWarps* kWarpSize, 8)
-    sort_tiles_kernel(const __grid_constant__ SortPairsParams params) {
+__global__ void __launch_bounds__(kSortWarps* kWarpSize, 9)
+    sort_tiles_kernel(const __grid_constant__ SortPairsParams params, int run_warps) {
     __shared__ SortShared shareds[kSortWarps];
-    const int lane = threadIdx.x % kWarpSize;
-    const int tile = blockIdx.x * kSortWarps + threadIdx.x / kWarpSize;
-    if (tile >= params.num_active) return;
+    const int lane = threadIdx.x % kWarpSize, warp = blockIdx.x * kSortWarps + threadIdx.x / kWarpSize;
     SortShared& shared = shareds[threadIdx.x / kWarpSize];
-    const uint32_t first = params.tile_starts[tile];
-    const int count = static_cast<int>(params.tile_starts[tile + 1] - first);
-    const uint64_t* pairs = params.pair_keys + first;
-    uint32_t* ids = params.pair_ids + first;
-    bool done = true;
-    if (count == 0) return;
-    if (count <= kWarpSize) done = sort_tile<1>(pairs, count, ids, shared, lane);
-    else if (count <= 2 * kWarpSize) done = sort_tile<2>(pairs, count, ids, shared, lane);
-    else if (count <= 4 * kWarpSize) done = sort_tile<4>(pairs, count, ids, shared, lane);
-    else if (count <= 8 * kWarpSize) done = sort_tile<8>(pairs, count, ids, shared, lane);
-    else if (count <= 16 * kWarpSize) done = sort_tile<16>(pairs, count, ids, shared, lane);
-    else if (count <= kWarpPairs) done = sort_tile<32>(pairs, count, ids, shared, lane);
-    else done = false;
-    if (!done && lane == 0) params.deferred[atomicAdd(params.num_deferred, 1u)] = tile;
+    // The first warps take a run each, where there are so many, the others a tile. No warp takes two: what the compiler would
+    // keep in registers from one to the next is more than there are.
+    const bool takes_run = warp < run_warps;
+    if (takes_run && static_cast<uint32_t>(warp) >= params.counters->num_runs) return;
+    if (!takes_run && warp - run_warps >= params.num_active) return;
+    const int2 run = takes_run ? params.runs[warp] : make_int2(warp - run_warps, 0);
+    const uint32_t first = params.tile_starts[run.x];
+    const int all = static_cast<int>(params.tile_starts[run.x + 1] - first);
+    if (all == 0 || (!takes_run && all > kRun)) return;
+    const int count = min(all - run.y * kRun, kRun);
+    uint64_t* pairs = params.pair_keys + first + run.y * kRun;
+    uint32_t* ids = takes_run ? nullptr : params.pair_ids + first;
+    if (count <= kWarpSize) sort_some<1>(pairs, count, ids, shared, lane);
+    else if (count <= 2 * kWarpSize) sort_some<2>(pairs, count, ids, shared, lane);
+    else if (count <= 4 * kWarpSize) sort_some<4>(pairs, count, ids, shared, lane);
+    else if (count <= 8 * kWarpSize) sort_some<8>(pairs, count, ids, shared, lane);
+    else sort_some<16>(pairs, count, ids, shared, lane);
 }
 
-// ---- Tiles with many pairs, or with many of one depth ----------------------------------------------------------
+// ---- Tiles of several runs -------------------------------------------------------------------------------------
 
-constexpr int kChunk = 4096;           // keys in shared memory
-constexpr int kDeferredThreads = 1024;
-constexpr int kDeferredBlocks = 264;
+constexpr int kMergeBlocks = 528;
 
-// A stage of the bitonic network over keys 0 .. count - 1, behind which there are none smaller: within blocks of `size`, first
-// with last where `facing`, else each with the one half a block on.
-__device__ __forceinline__ void order_stage(uint64_t* keys, int count, int size, bool facing) {
-    const int half = size / 2;
-    for (int i = threadIdx.x;; i += kDeferredThreads) {
-        const int low = 2 * (i & -half) | (i & (half - 1)), high = facing ? low ^ (size - 1) : low + half;
-        if (low >= count) break;
-        if (high >= count) continue;
-        const uint64_t a = keys[low], b = keys[high];
-        if (a > b) {
-            keys[low] = b;
-            keys[high] = a;
+// Every key's place among all runs of its tile is the number of smaller keys: its place in its own run, and those found by
+// bisection in the others.
+__global__ void __launch_bounds__(kThreads) merge_runs_kernel(const __grid_constant__ SortPairsParams params) {
+    const int num_runs = static_cast<int>(params.counters->num_runs);
+    for (int item = blockIdx.x; item < num_runs; item += gridDim.x) {
+        const int2 run = params.runs[item];
+        const uint32_t first = params.tile_starts[run.x];
+        const int count = static_cast<int>(params.tile_starts[run.x + 1] - first);
+        const uint64_t* pairs = params.pair_keys + first;
+        for (int place = run.y * kRun + threadIdx.x; place < min(count, (run.y + 1) * kRun); place += kThreads) {
+            const uint64_t key = pairs[place];
+            int smaller = place - run.y * kRun;
+            for (int begin = 0; begin < count; begin += kRun) {
+                if (begin == run.y * kRun) continue;
+                int low = begin, high = min(begin + kRun, count);
+                while (low < high) {
+                    const int middle = (low + high) / 2;
+                    if (pairs[middle] < key) low = middle + 1;
+                    else high = middle;
+                }
+                smaller += low - begin;
+            }
+            params.pair_ids[first + smaller] = static_cast<uint32_t>(key);
         }
-    }
-    __syncthreads();
-}
-
-// The stages of sizes `size` and below, of each chunk in shared memory; from nothing where `whole`.
-__device__ __forceinline__ void order_chunks(uint64_t* pairs, int count, bool whole, uint64_t* shared) {
-    for (int first = 0; first < count; first += kChunk) {
-        const int length = min(kChunk, count - first);
-        for (int i = threadIdx.x; i < length; i += kDeferredThreads) shared[i] = pairs[first + i];
-        __syncthreads();
-        for (int size = whole ? 2 : kChunk; size <= kChunk && !(whole && size / 2 >= length); size *= 2) {
-            for (int part = size; part > 1; part /= 2) order_stage(shared, length, part, whole && part == size);
-        }
-        for (int i = threadIdx.x; i < length; i += kDeferredThreads) pairs[first + i] = shared[i];
-        __syncthreads();
-    }
-}
-
-__global__ void __launch_bounds__(kDeferredThreads) sort_deferred_kernel(const __grid_constant__ SortPairsParams params) {
-    __shared__ uint64_t shared[kChunk];
-    const int deferred = static_cast<int>(*params.num_deferred);
-    for (int i = blockIdx.x; i < deferred; i += gridDim.x) {
-        const int tile = params.deferred[i];
-        const uint32_t first = params.tile_starts[tile];
-        const int count = static_cast<int>(params.tile_starts[tile + 1] - first);
-        uint64_t* pairs = params.pair_keys + first;
-        order_chunks(pairs, count, true, shared);
-        for (int size = 2 * kChunk; size / 2 < count; size *= 2) {
-            for (int part = size; part > kChunk; part /= 2) order_stage(pairs, count, part, part == size);
-            order_chunks(pairs, count, false, shared);
-        }
-        for (int j = threadIdx.x; j < count; j += kDeferredThreads) params.pair_ids[first + j] = static_cast<uint32_t>(pairs[j]);
     }
 }
 
@@ -488,10 +511,13 @@ cudaError_t launch_sort_pairs(const SortPairsParams& params, cudaStream_t stream
     if (params.num_instances == 0 || params.num_active == 0) return cudaSuccess;
     scatter_kernel<<<(params.num_instances + kScatterInstances - 1) / kScatterInstances, kThreads, 0, stream>>>(params);
     if (const cudaError_t error = cudaGetLastError()) return error;
-    sort_tiles_kernel<<<(params.num_active + kSortWarps - 1) / kSortWarps, kSortWarps * kWarpSize, 0, stream>>>(params);
+    scatter_windows_kernel<<<kWindowBlocks, kThreads, 0, stream>>>(params);
     if (const cudaError_t error = cudaGetLastError()) return error;
-    const int blocks = params.num_active < kDeferredBlocks ? params.num_active : kDeferredBlocks;
-    sort_deferred_kernel<<<blocks, kDeferredThreads, 0, stream>>>(params);
+    const int run_warps = static_cast<int>(params.capacity / (kRun / 2));  // no more runs than that, see params.h
+    const int blocks = (run_warps + params.num_active + kSortWarps - 1) / kSortWarps;
+    sort_tiles_kernel<<<blocks, kSortWarps * kWarpSize, 0, stream>>>(params, run_warps);
+    if (const cudaError_t error = cudaGetLastError()) return error;
+    merge_runs_kernel<<<kMergeBlocks, kThreads, 0, stream>>>(params);
     return cudaGetLastError();
 }
 

@@ -21,6 +21,7 @@ constexpr int kInstanceFloats = 12;         // one projected splat, three float4
 constexpr int kGradientFloats = 16;         // one screen-gradient record, four float4
 constexpr int kBucket = 32;                 // splats staged at once; one contribution mask holds one bucket
 constexpr int kScanTiles = 1024;            // of a block that finds the first pairs of tiles
+constexpr int kRun = 512;                   // pairs of a tile that a warp sorts
 constexpr uint32_t kMaxPairs = 0x7FFFFFFFu;   // the pair count saturates here instead of wrapping
 
 // One view as the kernels read it, 112 bytes. Written by the projection launcher.
@@ -73,6 +74,11 @@ struct ProjectionParams {
     int32_t* tile_differences;  // [T + 1] out: splats that reach each active tile, less those of the tile before it
 };
 
+// Lengths of lists that stage 3 makes on the way.
+struct PairCounters {
+    uint32_t num_windows, num_runs;
+};
+
 // Stage 2. First pair of each tile.
 struct CountPairsParams {
     int num_active;         // T
@@ -81,7 +87,7 @@ struct CountPairsParams {
     uint32_t* tile_starts;  // [T + 1] out: the same, and the number of pairs; all 0 in a pass that overflows
     uint32_t* status;       // [2]: [0] out: pairs of this pass; [1] sticky flag, raised where they exceed the capacity.
                             // No pair is made while it is up.
-    uint32_t* num_deferred; // [1] out: 0
+    PairCounters* counters; // out: zeros
     int64_t* block_sums;    // [ceil(T / kScanTiles), 2] scratch
 };
 
@@ -99,8 +105,9 @@ struct SortPairsParams {
     int32_t* tile_cursors;        // [T + 1] in: first pair of each tile; changed
     uint64_t* pair_keys;          // [M] scratch: depth and instance of each pair
     uint32_t* pair_ids;           // [M] out: instance of each pair
-    uint32_t* num_deferred;       // [1] in: 0
-    int32_t* deferred;            // [T] scratch: tiles for the last kernel
+    uint32_t capacity;            // M
+    PairCounters* counters;       // in: zeros
+    int2* runs;                   // [M / (kRun / 2)] scratch: (tile, number) of every run of a tile with more than one
 };
 
 // Stage 4. One warp for each work item = (tile position, chunk): slots chunk * 32 ... chunk * 32 + 31 of the tile. Further

@@ -1,10 +1,11 @@
 """Every tile's pairs: each splat that reaches it once, by depth and then by instance, whatever their number."""
 
+from dataclasses import replace
 from itertools import pairwise
 
 import pytest
 import torch
-from raster_cases import GPU_ONLY, make_case
+from raster_cases import GPU_ONLY, make_case, samples_to
 from rendering_scenes import make_cameras, make_gaussians
 
 from turbogs_plugin.rendering import cuda, dense_samples
@@ -80,3 +81,23 @@ def test_tiles_of_many_views_are_in_order():
         later = (order[1:] > order[:-1]) | ((order[1:] == order[:-1]) & (instances[1:] > instances[:-1]))
         assert later.all()
     assert all(torch.equal(a, b) for a, b in zip(tiles, pairs_of_tiles(again), strict=True))
+
+
+def test_more_large_splats_than_their_list_has_room_for():
+    """One active tile of a wide image, which every splat covers."""
+    gaussians, cameras = make_gaussians(60, dtype=torch.float32), make_cameras([(4096, 4096)], torch.float32)
+    gaussians.scales[:], gaussians.opacities[:] = 2.0, 1.0
+    samples = dense_samples(cameras)
+    samples = replace(
+        samples,
+        tile_ids=samples.tile_ids[5000:5001],
+        pixel_ids=samples.pixel_ids[5000 * 256 : 5001 * 256],
+        tile_offsets=samples.tile_offsets[:2],
+    )
+    rendered = cuda.rasterize_cuda(
+        gaussians.map(lambda value: value.cuda()), cameras.to("cuda"), samples_to(samples, "cuda")
+    )
+    (got,) = pairs_of_tiles(rendered)
+    drawn = rendered.projected()
+    assert torch.equal(got.long(), drawn.depths[0].cpu().sort(stable=True).indices)
+    assert (drawn.radii[0] > 2000).all()

@@ -30,6 +30,7 @@ CAMERA_FLOATS = 28
 RECORD_FLOATS = 16
 WARP = 32
 SCAN_TILES = 1024
+RUN = 512
 MAX_PAIRS = (1 << 31) - 1
 """The count of pairs stays here where it would be more."""
 
@@ -290,12 +291,12 @@ def rasterize_cuda(
 
     status = workspace.status if workspace is not None else torch.zeros(2, dtype=torch.int32, device=device)
     capacity = workspace.capacity(count, num_active) if workspace is not None else None
-    tile_starts, deferred = integers("tile_starts", num_active + 1), integers("deferred", num_active + 1)
+    tile_starts, counters = integers("tile_starts", num_active + 1), integers("pair_counters", 2)
     torch.ops.turbogs.raster_count_pairs(
         tile_cursors,
         tile_starts,
         status,
-        deferred,
+        counters,
         integers("block_sums", max(1, math.ceil(num_active / SCAN_TILES)), 2, dtype=torch.int64),
         MAX_PAIRS if capacity is None else capacity,
     )
@@ -320,7 +321,8 @@ def rasterize_cuda(
         status,
         integers("pair_keys", capacity, dtype=torch.int64),
         pair_ids,
-        deferred,
+        counters,
+        integers("runs", capacity // (RUN // 2), 2),
     )
     if workspace is not None:
         workspace.send_count(num_active)
