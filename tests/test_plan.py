@@ -280,3 +280,19 @@ def test_a_spoiled_plan_is_named_and_a_missing_one_is_not_missed(capture, tmp_pa
     folder.plan.unlink()
     run.resume(folder.path)
     assert "holds no plan" in folder.report.read_text()
+
+
+def test_the_ablation_of_leave_outs_plans_each_cell(turbogs, capture, tmp_path):
+    """Forced both ways, and by the plan; where things are changes no result."""
+    variants = ["plan", "all-views", "no-ncc", "host-maps", "host-photos"]
+    options = ["--steps", 4, "--device", "cpu", "--scene", capture, "--out", tmp_path / "study"]
+    code, _, err = turbogs("ablate", "leave_out", "train.evaluate_at=[]", *options, "--only", *variants)
+    assert code == 0, err
+    cells = {path.stem.partition("--")[0]: json.loads(path.read_text()) for path in tmp_path.rglob("*--seed0.json")}
+    psnr = {name: cell["history"][-1]["psnr"] for name, cell in cells.items()}
+    assert set(psnr) == {"nothing", *variants}
+    assert psnr["host-maps"] == psnr["host-photos"] == psnr["nothing"]
+    assert len({psnr[name] for name in ("nothing", "plan", "all-views", "no-ncc")}) == 4
+    assert cells["plan"]["config"]["plan"]["optimizer"] == "auto", (
+        "what was asked for is kept, so that a call can go on"
+    )

@@ -15,9 +15,11 @@ from turbogs_plugin.ablation.timing import PeakMemory
 from turbogs_plugin.clock import TrainingClock
 from turbogs_plugin.config import Config
 from turbogs_plugin.evaluation import Metrics, evaluate, load_lpips, peak_memory_bytes
+from turbogs_plugin.offload import place_views
+from turbogs_plugin.plan import make_plan
 from turbogs_plugin.provenance import Provenance
 from turbogs_plugin.report.history import Evaluation
-from turbogs_plugin.scene import Scene
+from turbogs_plugin.scene import PosedImages, Scene
 from turbogs_plugin.trainer import Trainer
 
 WARMUP_ITERATIONS = {"cuda": 20, "cpu": 2}
@@ -25,7 +27,7 @@ WARMUP_ITERATIONS = {"cuda": 20, "cpu": 2}
 
 
 def scene_on(scene: Scene, device: torch.device) -> Scene:
-    """The scene with its photos on the device, once for all cells."""
+    """The scene with its photos on the device, for what is timed without a plan."""
     return replace(scene, train=scene.train.to(device), test=scene.test.to(device))
 
 
@@ -42,8 +44,8 @@ def train_cell(
 
     Args:
         variant: its name.
-        config: resolved.
-        scene: from `scene_on`.
+        config: resolved. Its plan is made here, by the scene; the result keeps the configuration that was asked for.
+        scene: in host memory; the plan says what of it goes to the device.
         device: where to train.
         made_by: machine and sources, as they were when the process began.
         time_budget: seconds of training after which to stop; 0: none.
@@ -52,8 +54,10 @@ def train_cell(
     Raises:
         TrainingStopped: the model is lost.
     """
+    asked, config = config, make_plan(config, scene, device).apply(config)
+    test = place_views(scene.test, device, config.plan.photos_on)
     warmup = min(WARMUP_ITERATIONS[device.type], config.train.iterations)
-    warm_up(config, scene, device, warmup)
+    warm_up(config, scene, test, device, warmup)
     lpips, lpips_reason = load_lpips(config.report.lpips_weights, device)
     total, marks = config.train.iterations, config.train.evaluation_iterations()
     memory, clock = PeakMemory(device), TrainingClock(device)
@@ -63,7 +67,7 @@ def train_cell(
     def measure(final: bool) -> Metrics:
         memory.pause()
         trainer.require_finite()
-        metrics = evaluate(trainer.gaussians, scene.test, trainer.sh_degree, config.raster, lpips if final else None)
+        metrics = evaluate(trainer.gaussians, test, trainer.sh_degree, config.raster, lpips if final else None)
         history.append(
             Evaluation(
                 iteration=trainer.iteration,
@@ -98,7 +102,7 @@ def train_cell(
         scene=scene.name,
         variant=variant,
         seed=config.train.seed,
-        config=config.to_mapping(),
+        config=asked.to_mapping(),
         time_budget=time_budget,
         history=history,
         lpips=math.nan if lpips is None else metrics.lpips,
@@ -110,13 +114,13 @@ def train_cell(
     )
 
 
-def warm_up(config: Config, scene: Scene, device: torch.device, iterations: int) -> None:
+def warm_up(config: Config, scene: Scene, test: PosedImages, device: torch.device, iterations: int) -> None:
     """Train and evaluate a model that is thrown away, with every kind of event that the configuration has."""
     trainer = Trainer(with_iterations(config, iterations), scene, device)
     trainer.initialise_maps()
     while trainer.iteration < iterations:
         trainer.step_towards(iterations)
-    evaluate(trainer.gaussians, scene.test, trainer.sh_degree, config.raster)
+    evaluate(trainer.gaussians, test, trainer.sh_degree, config.raster)
     del trainer
     if device.type == "cuda":
         gc.collect()

@@ -12,7 +12,7 @@ from typing import Any
 
 import torch
 
-from turbogs_plugin.ablation.cell import scene_on, train_cell
+from turbogs_plugin.ablation.cell import train_cell
 from turbogs_plugin.ablation.grid import Ablation, CellKey, variant_config
 from turbogs_plugin.ablation.progress import SweepProgress
 from turbogs_plugin.ablation.results import CellResult, Failure, StudyFolder
@@ -108,8 +108,7 @@ def run_sweep(ablation: Ablation, options: SweepOptions, folder: StudyFolder) ->
     with SweepProgress(sum(map(len, grid.values())), kept + len(taken)) as progress:
         for name, cells in grid.items():
             if cells:
-                scene = scene_on(loaded.pop(name), device)
-                _train_scene(cells, scene, device, here, options.time_budget, folder, progress)
+                _train_scene(cells, loaded.pop(name), device, here, options.time_budget, folder, progress)
 
 
 def _train_scene(
