@@ -2,8 +2,9 @@
 //
 // The projection has counted every tile's splats, as differences along the rows of tiles; their double running sum is the
 // first pair of each tile. Splats then put their pairs into their tiles in any order, and each tile is sorted by itself, by
-// depth and then by instance: keys differ, so the result does not depend on the order they came in. Nothing here needs the
-// number of pairs on the host.
+// depth and then by instance: keys differ, so the result does not depend on the order they came in. Large splats are put into
+// their tiles by several warps, window by window, and tiles with many pairs sorted by several, run by run. Nothing here needs
+// the number of pairs on the host.
 #include "common.cuh"
 
 namespace turbogs {

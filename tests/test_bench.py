@@ -114,6 +114,7 @@ def test_floors_grow_with_counts_and_fall_with_bandwidth(monkeypatch):
     properties = SimpleNamespace(multi_processor_count=132, clock_rate=1_980_000)
     monkeypatch.setattr(torch.cuda, "get_device_properties", lambda device: properties)
     counts = {
+        "tiles": 5_000,
         "gaussians": 150_000, "instances": 450_000, "visible": 300_000, "pairs": 900_000, "samples": 1_200_000,
         "items": 15_000, "walked": 3_000_000, "contributing": 1_000_000, "pixels": 3_800_000, "touched": 120_000,
     }  # fmt: skip
