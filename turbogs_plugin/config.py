@@ -1,8 +1,8 @@
 """The configuration of a run: dataclasses <- YAML <- dotted overrides.
 
-A YAML has one section a part. Sections of our own (`scene`, `train`, `maps`, `raster`, `report`, `plan`) hold the
-fields of the dataclass below; a section of a strategy holds its ``type`` and the fields of that strategy's dataclass.
-Defaults live in those dataclasses and nowhere else. ``base: NAME_OR_FILE`` puts a YAML on top of another.
+A YAML has one section a part. Sections of our own (`scene`, `train`, `maps`, `raster`, `report`, `plan`, `budget`)
+hold the fields of the dataclass below; a section of a strategy holds its ``type`` and the fields of that strategy's
+dataclass. Defaults live in those dataclasses and nowhere else. ``base: NAME_OR_FILE`` puts a YAML on top of another.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from typing import Any, Literal
 from omegaconf import OmegaConf
 
 from turbogs_plugin import registry
+from turbogs_plugin.amounts import parse_bytes, parse_seconds
 from turbogs_plugin.errors import InputError, require
 from turbogs_plugin.rendering.rendered import RasterSettings
 from turbogs_plugin.schema import build_dataclass, dataclass_mapping, nearest
@@ -160,6 +161,34 @@ PLANNED_SETTINGS: dict[str, tuple[str, ...]] = {
 
 
 @dataclass
+class BudgetConfig:
+    """What the run may take (`turbogs_plugin.budget`).
+
+    Args:
+        max_gaussians: never more than this; 0: no cap.
+        max_memory: of the device, for instance 2GiB; empty: no limit.
+        time: seconds of training to end after, for instance 20s or 2m; empty: `train.iterations` decide.
+    """
+
+    max_gaussians: int = 0
+    max_memory: str = ""
+    time: str = ""
+
+    def __post_init__(self) -> None:
+        require(self.max_gaussians >= 0, "max_gaussians", self.max_gaussians, "at least 0")
+        self.memory_bytes()
+        self.seconds()
+
+    def memory_bytes(self) -> int | None:
+        """`max_memory`, or None for no limit. Raises `InputError` where it is no amount."""
+        return parse_bytes(self.max_memory) if self.max_memory else None
+
+    def seconds(self) -> float | None:
+        """`time`, or None for no limit. Raises `InputError` where it is no amount."""
+        return parse_seconds(self.time) if self.time else None
+
+
+@dataclass
 class Config:
     """Everything that decides a run. The strategies' sections are complete: `type` and every init field."""
 
@@ -175,6 +204,7 @@ class Config:
     raster: RasterSettings
     report: ReportConfig = field(default_factory=ReportConfig)
     plan: PlanConfig = field(default_factory=PlanConfig)
+    budget: BudgetConfig = field(default_factory=BudgetConfig)
 
     def build(self, kind: str) -> Any:
         """A new strategy of this kind."""
@@ -201,6 +231,7 @@ SECTION_CLASSES = {
     "raster": RasterSettings,
     "report": ReportConfig,
     "plan": PlanConfig,
+    "budget": BudgetConfig,
 }
 
 

@@ -1,0 +1,32 @@
+"""Amounts of memory and time as people write them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+
+from turbogs_plugin.errors import InputError
+
+BYTE_UNITS = {"": 1, "b": 1, "kib": 2**10, "mib": 2**20, "gib": 2**30, "kb": 10**3, "mb": 10**6, "gb": 10**9}
+SECOND_UNITS = {"": 1.0, "s": 1.0, "m": 60.0, "min": 60.0, "h": 3600.0}
+
+
+def parse_bytes(text: str) -> int:
+    """``2GiB``, ``1500 MB``, ``300000000``. Raises `InputError`."""
+    number = _parse(text, BYTE_UNITS)
+    if number is None or number < 1:
+        raise InputError(f"'{text}' is no amount of memory: write 2GiB, 1500MB or a number of bytes")
+    return int(number)
+
+
+def parse_seconds(text: str) -> float:
+    """``20s``, ``2m``, ``1.5h``, ``20``. Raises `InputError`."""
+    number = _parse(text, SECOND_UNITS)
+    if number is None or number <= 0:
+        raise InputError(f"'{text}' is no amount of time: write 20s, 2m or 1.5h")
+    return number
+
+
+def _parse(text: str, units: Mapping[str, float]) -> float | None:
+    match = re.fullmatch(r"\s*(\d+(?:\.\d*)?|\.\d+)\s*([a-z]*)\s*", str(text).lower())
+    return None if match is None or match[2] not in units else float(match[1]) * units[match[2]]
