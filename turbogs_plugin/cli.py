@@ -105,17 +105,26 @@ def render(run: Positional[Path], /, *, split: Literal["test", "train"] = "test"
 
 
 @app.command
-def export(run: Positional[Path], /, *, format: Literal["ply"] = "ply", out: Path | None = None) -> int:
+def export(
+    run: Positional[Path],
+    /,
+    *,
+    format: Literal["ply"] = "ply",
+    out: Path | None = None,
+    drop_bands: Annotated[float | None, arg(metavar="SHARE")] = None,
+) -> int:
     """Write the newest model of a run for other programs, in the capture's own coordinates.
 
     Args:
         run: folder of the run.
         format: ply: as the original 3DGS writes it, which viewers read.
         out: new file; model.ply in the run's folder where absent.
+        drop_bands: leave out the highest bands of spherical harmonics, as many as together have at most this share of
+            the colours' energy, e.g. 1e-4.
     """
     from turbogs_plugin.outputs import export_run
 
-    print(f"model  {export_run(run, format, out)}")
+    print(f"model  {export_run(run, format, out, drop_bands)}")
     return 0
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from PIL import Image
 
+from turbogs_plugin.bands import band_energy, drop_faint_bands
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.evaluation import evaluate, load_lpips, render_view
 from turbogs_plugin.gaussians import save_ply
@@ -56,14 +57,30 @@ def render_run(path: Path, split: str, device_name: str) -> Path:
     return folder
 
 
-def export_run(path: Path, file_format: str, out: Path | None) -> Path:
-    """Write a run's newest model; the file. `file_format`: ply, the only one yet."""
+def export_run(path: Path, file_format: str, out: Path | None, drop_bands: float | None = None) -> str:
+    """Write a run's newest model; what was written, in words.
+
+    Args:
+        path: folder of the run.
+        file_format: ply, the only one yet.
+        out: new file; None: the model in the run's folder.
+        drop_bands: threshold of `drop_faint_bands`; None: all bands are written.
+    """
+    if drop_bands is not None and not 0 <= drop_bands < 1:
+        raise InputError(f"--drop-bands {drop_bands}: it must be a share, at least 0 and less than 1")
     if out is not None and out.exists():
         raise InputError(f"--out '{out}' exists: choose a new file")
     model = load_model(path, resolve_device("cpu"))
     target = model.folder.model if out is None else out
-    save_ply(model.gaussians, target, model.frame)
-    return target
+    gaussians = model.gaussians if drop_bands is None else drop_faint_bands(model.gaussians, drop_bands)
+    save_ply(gaussians, target, model.frame)
+    if drop_bands is None:
+        return f"{target}"
+    before, after = model.gaussians.sh_degree, gaussians.sh_degree
+    if before == after:
+        return f"{target} (degree {before} stays: it has {band_energy(model.gaussians)[-1]:.2g} of the colours' energy)"
+    share = sum(band_energy(model.gaussians)[after + 1 :])
+    return f"{target} (degree {before} -> {after}, without {share:.2g} of the colours' energy)"
 
 
 def _open(path: Path, device_name: str, split: str) -> tuple[SavedModel, PosedImages]:
