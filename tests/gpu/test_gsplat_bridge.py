@@ -172,7 +172,17 @@ def test_mcmc_behind_our_protocol():
     assert (torch.sigmoid(first.apply(gaussians).opacities) > 0.299).all()  # the dead ones have moved
 
 
-def test_our_rasterizer_trains_as_gsplats_does(monkeypatch):
+@pytest.mark.parametrize(
+    ("options", "runs", "bound"),
+    [
+        # Measured: 0.003 dB.
+        pytest.param({"refine_start_iter": 10**9}, 1, 0.02, id="without densification"),
+        # gsplat itself ends anywhere within 0.11 dB from one seed, as its sums have no order and a Gaussian more or less
+        # moves all random numbers after it: so means of three runs each. Measured: 0.02 dB.
+        pytest.param({}, 3, 0.1, id="with densification"),
+    ],
+)
+def test_our_rasterizer_trains_as_gsplats_does(monkeypatch, options, runs, bound):
     """r = 1, gsplat's DefaultStrategy and torch's Adam, 1000 steps from one seed: test PSNR within 0.1 dB."""
     folder = os.environ.get("TURBOGS_SCENE")
     if not folder:
@@ -187,10 +197,13 @@ def test_our_rasterizer_trains_as_gsplats_does(monkeypatch):
         colors, _, info = host.dense_rasterization(**host.splat_arguments(splats), **views, packed=False, **render)
         return torch.nn.functional.l1_loss(colors, batch.pixels), info
 
-    results = {}
+    means = {}
     for name, forward in (("gsplat", host.l1_of_images), ("ours", with_our_rasterizer)):
-        torch.manual_seed(0)
-        results[name] = host.train(scene, 1000, DefaultStrategy(), forward=forward)
-        host.report(name, results[name])
-    assert results["gsplat"].last_psnr > results["gsplat"].first_psnr + 3
-    assert abs(results["ours"].last_psnr - results["gsplat"].last_psnr) <= 0.1
+        results = []
+        for _ in range(runs):
+            torch.manual_seed(0)
+            results.append(host.train(scene, 1000, DefaultStrategy(**options), forward=forward))
+            host.report(name, results[-1])
+        assert all(result.last_psnr > result.first_psnr + 3 for result in results)
+        means[name] = sum(result.last_psnr for result in results) / runs
+    assert abs(means["ours"] - means["gsplat"]) <= bound
