@@ -20,6 +20,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from turbogs_plugin.config import Config, resolve
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.offload import SETS
@@ -63,6 +65,22 @@ def with_cap(config: Config, cap: int) -> Config:
     present = config.budget.max_gaussians
     mapping["budget"]["max_gaussians"] = min(present, cap) if present else cap
     return resolve(mapping)
+
+
+def chosen_points(count: int, cap: int, others: int) -> slice | np.ndarray:
+    """Which of `count` points a model begins with: all, or as many as leave room for `others` under a cap.
+
+    Args:
+        cap: 0: none.
+
+    Raises:
+        InputError: there is no room.
+    """
+    if not cap or count + others <= cap:
+        return slice(None)
+    if cap <= others:
+        raise InputError(f"--max-gaussians {cap} leaves no room beside the {others} of the backdrop: allow more")
+    return np.linspace(0, count - 1, cap - others).round().astype(np.int64)
 
 
 @dataclass(frozen=True)

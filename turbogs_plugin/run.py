@@ -22,6 +22,7 @@ from turbogs_plugin.evaluation import Metrics, evaluate, load_lpips, peak_memory
 from turbogs_plugin.files import write_text_atomically
 from turbogs_plugin.gaussians import save_ply
 from turbogs_plugin.offload import place_views
+from turbogs_plugin.pacing import Pace, pace_of, within_budget
 from turbogs_plugin.plan import Plan, make_plan
 from turbogs_plugin.progress import TrainingProgress
 from turbogs_plugin.report.history import Evaluation, append_evaluation, rewind_history
@@ -133,7 +134,12 @@ def plan_run(config: Config) -> Plan:
         InputError: anything wrong with the input.
     """
     device = resolve_device(config.train.device)
-    return make_plan(config, load_scene(config.scene.path, config.scene.factor, config.scene.test_every), device)
+    return _plan(config, load_scene(config.scene.path, config.scene.factor, config.scene.test_every), device)
+
+
+def _plan(config: Config, scene: Scene, device: torch.device) -> Plan:
+    limit, seconds = config.budget.memory_bytes(), config.budget.seconds()
+    return make_plan(config, scene, device, memory_limit=limit, time_budget=seconds)
 
 
 def train(config: Config, out: Path) -> Outcome:
@@ -148,11 +154,13 @@ def train(config: Config, out: Path) -> Outcome:
     device = resolve_device(config.train.device)
     scene = load_scene(config.scene.path, config.scene.factor, config.scene.test_every)
     load_lpips(config.report.lpips_weights, device)
-    plan = make_plan(config, scene, device)
-    config = plan.apply(config)
+    plan = _plan(config, scene, device)
+    config, calibration = within_budget(plan.apply(config), scene, device)
     config.scene.path = str(Path(config.scene.path).resolve())
     config.train.device = device.type
-    session = _Session(folder, config, plan, scene, Trainer(config, scene, device))
+    pace = pace_of(config, calibration and calibration.cost)
+    session = _Session(folder, config, plan, scene, Trainer(config, scene, device), pace)
+    session.clock.seconds = calibration.seconds if calibration else 0.0
     print(plan.text(), file=sys.stderr)
     folder.path.mkdir(parents=True, exist_ok=True)
     write_text_atomically(folder.plan, plan.to_json())
@@ -175,7 +183,7 @@ def resume(path: Path) -> Outcome:
     state = None if checkpoint is None else load_checkpoint(checkpoint)
     device = resolve_device(config.train.device)
     scene = load_scene(config.scene.path, config.scene.factor, config.scene.test_every)
-    session = _Session(folder, config, plan, scene, Trainer(config, scene, device))
+    session = _Session(folder, config, plan, scene, Trainer(config, scene, device), pace_of(config))
     if state is not None:
         session.load_state_dict(state, str(checkpoint))
     session.history = rewind_history(folder.history, session.trainer.iteration if state is not None else -1)
@@ -236,8 +244,10 @@ class _Session:
     plan: Plan | None
     scene: Scene
     trainer: Trainer
+    pace: Pace
     history: list[Evaluation] = field(default_factory=list)
     resumed: bool = False
+    saved_at: int = -1
 
     def __post_init__(self) -> None:
         self.device = self.trainer.gaussians.device
@@ -246,46 +256,55 @@ class _Session:
 
     def run(self) -> Outcome:
         """Train to the end, or until a signal; both end with a checkpoint."""
-        trainer, total = self.trainer, self.config.train.iterations
-        evaluations = self.config.train.evaluation_iterations()
-        saves = set(range(0, total, self.config.train.checkpoint_every or total)[1:]) | {total}
+        trainer, pace = self.trainer, self.pace
         try:
-            with _Interrupts() as interrupts, TrainingProgress(total, trainer.iteration) as progress:
+            with _Interrupts() as interrupts, TrainingProgress(pace.iterations, trainer.iteration) as progress:
                 if not self.resumed:
                     with self.clock:
                         trainer.initialise_maps()
                 if not self.history:
                     self._evaluate(progress)
-                while trainer.iteration < total and interrupts.signal is None:
-                    mark = min(iteration for iteration in evaluations | saves if iteration > trainer.iteration)
+                pace.start(trainer.iteration, self.clock.seconds, len(trainer.gaussians))
+                while trainer.iteration < pace.iterations and interrupts.signal is None:
+                    mark = pace.next_mark(trainer.iteration, self.clock.seconds)
                     with self.clock:
                         while trainer.iteration < mark and interrupts.signal is None:
                             trainer.step_towards(mark)
                             progress.advance(trainer.iteration, len(trainer.gaussians))
-                    if trainer.iteration in evaluations:
+                    due = pace.reached(trainer.iteration, self.clock.seconds, len(trainer.gaussians))
+                    progress.total = pace.iterations
+                    if due.evaluate:
                         self._evaluate(progress)
-                    if trainer.iteration in saves:
+                    if due.save:
                         self._save()
                 trainer.repeat_lost(wait=True)  # a stop between marks must not count iterations that did nothing
-                if interrupts.signal is not None and trainer.iteration not in saves:
+                if interrupts.signal is not None and trainer.iteration != self.saved_at:
                     self._save()
-            if trainer.iteration == total:
+            finished = trainer.iteration == pace.iterations
+            if finished:
                 self._finish()
         except TrainingStopped as stop:
             raise TrainingStopped(f"{stop}; {self._last_good()}") from stop
-        return Outcome(self.folder, self.history, None if trainer.iteration == total else interrupts.signal)
+        except torch.cuda.OutOfMemoryError as error:
+            raise TrainingStopped(
+                f"iteration {trainer.iteration}: the device's memory was too small for {len(trainer.gaussians)} "
+                f"Gaussians; try --max-gaussians {round(0.7 * len(trainer.gaussians))}; {self._last_good()}"
+            ) from error
+        return Outcome(self.folder, self.history, None if finished else interrupts.signal)
 
     def state_dict(self) -> dict[str, Any]:
         frame = self.scene.frame
         return {
             "trainer": self.trainer.state_dict(),
             "train_seconds": self.clock.seconds,
+            "pace": self.pace.state_dict(),
             "frame": {"center": frame.center.tolist(), "scale": frame.scale},
         }
 
     def load_state_dict(self, state: dict[str, Any], source: str) -> None:
         try:
             require_like(state, self.state_dict(), "state")
+            self.pace.load_state_dict(state["pace"])
             self.trainer.load_state_dict(state["trainer"])
             self.clock.seconds = state["train_seconds"]
             self.resumed = True
@@ -314,6 +333,7 @@ class _Session:
     def _save(self) -> None:
         self.trainer.require_finite()
         save_checkpoint(self.folder.checkpoints, self.trainer.iteration, self.state_dict())
+        self.saved_at = self.trainer.iteration
 
     def _finish(self) -> None:
         """The model as a .ply and the report."""

@@ -11,9 +11,10 @@ import torch
 from torch import Tensor
 
 from turbogs_plugin import kernels
-from turbogs_plugin.config import Config, TrainConfig
+from turbogs_plugin.budget import chosen_points
+from turbogs_plugin.config import Config
 from turbogs_plugin.errors import TrainingStopped
-from turbogs_plugin.gaussians import backdrop_gaussians, gaussians_from_points
+from turbogs_plugin.gaussians import BACKDROP_COUNT, backdrop_gaussians, gaussians_from_points
 from turbogs_plugin.offload import place_maps, place_views
 from turbogs_plugin.rendering import Rendered, Workspace, rasterize, render_images
 from turbogs_plugin.scene import Scene
@@ -44,7 +45,7 @@ class Trainer:
         self.optimizer = config.build("optimizer")
         self.density = config.build("density")
         self.maps = place_maps(self.views.cameras.sizes, device, config.plan.maps_on, config.maps.beta)
-        self.gaussians = initial_gaussians(scene, config.train).map(lambda tensor: tensor.to(device))
+        self.gaussians = initial_gaussians(scene, config).map(lambda tensor: tensor.to(device))
         self.view_sampler.setup(self.views.cameras, scene.extent)
         self.optimizer.setup(self.gaussians)
         self.density.setup(self.gaussians)
@@ -203,9 +204,14 @@ class Trainer:
         self.density.load_state_dict(state["density"])
 
 
-def initial_gaussians(scene: Scene, train: TrainConfig) -> Gaussians:
-    """The model that training starts from: the capture's points, and a backdrop where one is wanted."""
-    gaussians = gaussians_from_points(scene.points, scene.point_colors, train.sh_degree, scene.extent)
+def initial_gaussians(scene: Scene, config: Config) -> Gaussians:
+    """The model that training starts from: the capture's points, and a backdrop where one is wanted.
+
+    Of more points than `budget.max_gaussians` has room for, that many are taken, evenly in their order.
+    """
+    train = config.train
+    rows = chosen_points(len(scene.points), config.budget.max_gaussians, BACKDROP_COUNT if train.backdrop else 0)
+    gaussians = gaussians_from_points(scene.points[rows], scene.point_colors[rows], train.sh_degree, scene.extent)
     if not train.backdrop:
         return gaussians
     color = scene.train.photos.stored[::COLOR_STRIDE].float().mean(dim=0).cpu() / 255.0
