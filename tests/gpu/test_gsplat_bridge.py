@@ -177,8 +177,8 @@ def test_mcmc_behind_our_protocol():
     [
         # Measured: 0.003 dB.
         pytest.param({"refine_start_iter": 10**9}, 1, 0.02, id="without densification"),
-        # gsplat itself ends anywhere within 0.11 dB from one seed, as its sums have no order and a Gaussian more or less
-        # moves all random numbers after it: so means of three runs each. Measured: 0.02 dB.
+        # From one seed gsplat itself ends anywhere within 0.11 dB: its sums have no order, and one Gaussian more moves
+        # all random numbers after it: so means of three runs each. Measured: 0.02 dB.
         pytest.param({}, 3, 0.1, id="with densification"),
     ],
 )
