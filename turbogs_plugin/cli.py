@@ -27,6 +27,9 @@ def train(
     config: Annotated[str | None, arg(metavar="NAME_OR_FILE")] = None,
     factor: Annotated[int | None, arg(metavar="N")] = None,
     device: Annotated[Device | None, arg(metavar="auto|cpu|cuda")] = None,
+    max_gaussians: Annotated[int | None, arg(metavar="N")] = None,
+    max_memory: Annotated[str | None, arg(metavar="2GiB")] = None,
+    time_budget: Annotated[str | None, arg(metavar="20s")] = None,
 ) -> int:
     """Train on a capture, or go on with a stopped run.
 
@@ -38,16 +41,22 @@ def train(
         config: name of a packaged configuration or a .yaml file; turbogs where absent.
         factor: scale photos down by this.
         device: where to train; auto takes a GPU where there is one.
+        max_gaussians: never more than this (budget.max_gaussians).
+        max_memory: of the GPU, never more than this for tensors: 2GiB, 1500MB (budget.max_memory). Photos and error
+            maps move to the host if need be, then the number of Gaussians is limited.
+        time_budget: seconds of training to end after: 20s, 2m (budget.time). Schedule and number of Gaussians are
+            fitted to it.
     """
     from turbogs_plugin import run
 
+    budget = _budget(max_gaussians, max_memory, time_budget)
     if resume is not None:
-        if scene or overrides or any(option is not None for option in (out, config, factor, device)):
+        if scene or overrides or budget or any(option is not None for option in (out, config, factor, device)):
             raise InputError("--resume goes on by the run's own configuration: give it nothing else")
         return _tell(run.resume(resume))
     if scene is None or out is None:
         raise InputError("train needs a SCENE and --out RUN, or --resume RUN")
-    return _tell(run.train(_settings(scene, overrides, config, factor, device), out))
+    return _tell(run.train(_settings(scene, (*overrides, *budget), config, factor, device), out))
 
 
 @app.command
@@ -59,6 +68,9 @@ def plan(
     config: Annotated[str | None, arg(metavar="NAME_OR_FILE")] = None,
     factor: Annotated[int | None, arg(metavar="N")] = None,
     device: Annotated[Device | None, arg(metavar="auto|cpu|cuda")] = None,
+    max_gaussians: Annotated[int | None, arg(metavar="N")] = None,
+    max_memory: Annotated[str | None, arg(metavar="2GiB")] = None,
+    time_budget: Annotated[str | None, arg(metavar="20s")] = None,
 ) -> int:
     """Print what training on a capture would leave out, and because of which numbers, without training.
 
@@ -68,10 +80,14 @@ def plan(
         config: as in train.
         factor: as in train.
         device: as in train.
+        max_gaussians: as in train.
+        max_memory: as in train.
+        time_budget: as in train.
     """
     from turbogs_plugin.run import plan_run
 
-    print(plan_run(_settings(scene, overrides, config, factor, device)).text())
+    budget = _budget(max_gaussians, max_memory, time_budget)
+    print(plan_run(_settings(scene, (*overrides, *budget), config, factor, device)).text())
     return 0
 
 
@@ -271,6 +287,16 @@ def doctor() -> int:
 
     print(diagnosis())
     return 0
+
+
+def _budget(max_gaussians: int | None, max_memory: str | None, time_budget: str | None) -> tuple[str, ...]:
+    """The options of a budget as overrides."""
+    given = {"max_gaussians": max_gaussians, "max_memory": max_memory, "time": time_budget}
+    return tuple(
+        f"budget.{name}={value if name == 'max_gaussians' else repr(value)}"
+        for name, value in given.items()
+        if value is not None
+    )
 
 
 def _settings(scene: Path, overrides: tuple[str, ...], config: str | None, factor: int | None, device: Device | None):
