@@ -1,7 +1,7 @@
-"""A small case that runs every kernel once, for compute-sanitizer. From the repository's root, on a machine with a GPU:
+"""A small case that runs every kernel once, for compute-sanitizer. From the repository's root, on a machine with a GPU::
 
-    compute-sanitizer --tool memcheck --error-exitcode 1 python tests/gpu/sanitizer_case.py
-    compute-sanitizer --tool racecheck --error-exitcode 1 python tests/gpu/sanitizer_case.py
+compute-sanitizer --tool memcheck --error-exitcode 1 python tests/gpu/sanitizer_case.py
+compute-sanitizer --tool racecheck --error-exitcode 1 python tests/gpu/sanitizer_case.py
 """
 
 import sys
