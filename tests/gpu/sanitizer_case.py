@@ -1,7 +1,9 @@
 """A small case that runs every kernel once, for compute-sanitizer. From the repository's root, on a machine with a GPU::
 
-compute-sanitizer --tool memcheck --error-exitcode 1 python tests/gpu/sanitizer_case.py
-compute-sanitizer --tool racecheck --error-exitcode 1 python tests/gpu/sanitizer_case.py
+    compute-sanitizer --tool memcheck --error-exitcode 1 python tests/gpu/sanitizer_case.py
+    compute-sanitizer --tool racecheck --error-exitcode 1 python tests/gpu/sanitizer_case.py
+
+Both must end with 0 errors.
 """
 
 import sys
