@@ -116,7 +116,7 @@ def gather_facts(
 
 def flat_tile_share(views: PosedImages) -> float:
     """Share of whole 16x16 tiles whose luminance deviates less than `FLAT_DEVIATION`, of tiles spread evenly."""
-    colors, offsets = views.photos.colors, views.photos.offsets
+    colors, offsets = views.photos.stored, views.photos.offsets
     per_photo = max(1, min(TILES_PER_PHOTO, TILES_AT_MOST // len(views)))
     within = np.arange(TILE_SIZE)
     places = []
@@ -176,7 +176,7 @@ def _exposure_spread(views: PosedImages, sight: _Sight) -> float:
     """See `SceneFacts`. Medians over points, so that those hidden from one camera do not matter."""
     if len(views) < 2:
         return 0.0
-    colors = views.photos.colors
+    colors = views.photos.stored
     stops = torch.log2(_luminance(colors[sight.flat.to(colors.device)]).cpu() + 1.0 / 255.0)  # [V, Q]
     differences = []
     for view, nearest in enumerate(sight.distances.argmin(dim=1).tolist()):
@@ -194,7 +194,7 @@ def _luminance(colors: Tensor) -> Tensor:
 def _free_device_bytes(device: torch.device, scene: Scene) -> int:
     free, _ = torch.cuda.mem_get_info(device)
     free += torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
-    ours = (views.photos.colors for views in (scene.train, scene.test))
+    ours = (views.photos.stored for views in (scene.train, scene.test))
     return free + sum(colors.numel() for colors in ours if colors.device.type == "cuda")
 
 
