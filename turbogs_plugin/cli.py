@@ -225,6 +225,8 @@ def bench(
     repeats: Annotated[int, arg(metavar="N")] = 100,
     rates: Annotated[tuple[float, ...], arg(metavar="R ...")] = (1.0, 0.1),
     size: Annotated[tuple[int, int], arg(metavar="WIDTH HEIGHT")] = (841, 1500),
+    photos: Annotated[int, arg(metavar="N")] = 0,
+    offload: bool = False,
     library: Annotated[tuple[Path, ...], arg(metavar="FILE ...")] = (),
     factor: Annotated[int, arg(metavar="N")] = 1,
     device: Device = "auto",
@@ -235,7 +237,7 @@ def bench(
     Args:
         what: step: from sampling to update; raster: forward and backward, beside gsplat's dense ones.
         overrides: step: changes of the configuration whose strategies are timed.
-        scene: a capture, for its cameras and photos; raster takes synthetic cameras where absent.
+        scene: a capture, for its cameras and photos; synthetic ones where absent.
         ply: a trained model in place of one trained here (step) or of synthetic ones (raster).
         gaussians: sizes of the model.
         views: views of an iteration.
@@ -243,7 +245,9 @@ def bench(
         training: step: iterations of the model's training before.
         repeats: iterations or passes timed.
         rates: raster: further sampling rates, with the fewest views.
-        size: raster: size of the synthetic images.
+        size: of synthetic images, where there is no scene.
+        photos: step: number of synthetic photos, in place of a scene.
+        offload: step: with photos and error maps in host memory, too.
         library: raster: other builds of the kernels, measured the same way.
         factor: scale photos down by this.
         device: what to time.
@@ -259,8 +263,8 @@ def bench(
             raise InputError(f"--{name} {' '.join(map(str, values))}: each must be at least 1")
     where = resolve_device(device)
     if what == "step":
-        step = StepBench(gaussians, views, pixel_budget, training, repeats, overrides, ply)
-        return commands.run_step(step, scene, factor, where, out)
+        step = StepBench(gaussians, views, pixel_budget, training, repeats, overrides, ply, offload)
+        return commands.run_step(step, scene, commands.Synthetic(photos, size), factor, where, out)
     if overrides:
         raise InputError("bench raster times the rasterizer alone: it has no section.key=value")
     raster = RasterBench(gaussians, views, rates, pixel_budget, size, repeats, ply, library)

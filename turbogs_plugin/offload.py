@@ -203,6 +203,11 @@ class OffloadedPhotos(Photos):
     def offsets(self) -> np.ndarray:
         return self._window.offsets
 
+    @property
+    def window_bytes(self) -> int:
+        """Memory of the window."""
+        return self._window.bytes_held()
+
     def fetch(self, view_ids: Sequence[int]) -> None:
         self._window.fetch(view_ids)
 
@@ -233,6 +238,11 @@ class OffloadedErrorMaps(ErrorMaps):
     @property
     def _stamps(self) -> Tensor:
         return self._window.arrays[1]
+
+    @property
+    def window_bytes(self) -> int:
+        """Memory of the window."""
+        return self._window.bytes_held()
 
     def fetch(self, view_ids: Sequence[int]) -> None:
         self._window.fetch(view_ids)

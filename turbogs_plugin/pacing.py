@@ -207,7 +207,7 @@ def _limited(config: Config, scene: Scene, device: torch.device, limit: int) -> 
     largest = int(max(train.max(), test.max()))
     count = MemoryDemand.of(config, int(train.sum()), int(test.sum()), largest, len(train)).gaussians(limit)
     total = torch.cuda.get_device_properties(device).total_memory
-    torch.cuda.set_per_process_memory_fraction(min(1.0, limit / total), device)
+    torch.cuda.set_per_process_memory_fraction(min(1.0, limit / total))
     return count
 
 

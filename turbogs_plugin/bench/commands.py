@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from turbogs_plugin.ablation.cell import scene_on
+from turbogs_plugin.bench.large_capture import synthetic_scene
 from turbogs_plugin.bench.raster import RasterBench, other_build
 from turbogs_plugin.bench.step import StepBench
 from turbogs_plugin.errors import InputError
@@ -19,11 +20,25 @@ from turbogs_plugin.provenance import provenance
 from turbogs_plugin.scene import load_scene
 
 
-def run_step(bench: StepBench, scene: Path | None, factor: int, device: torch.device, out: Path | None) -> int:
-    if scene is None:
-        raise InputError("bench step needs --scene SCENE, for cameras and photos")
+@dataclass(frozen=True)
+class Synthetic:
+    """A capture to time on where none is given: so many photos of (width, height)."""
+
+    photos: int
+    size: tuple[int, int]
+
+
+def run_step(
+    bench: StepBench, scene: Path | None, synthetic: Synthetic, factor: int, device: torch.device, out: Path | None
+) -> int:
+    if (scene is None) == (synthetic.photos == 0):
+        raise InputError("bench step needs cameras and photos: --scene SCENE, or --photos N for synthetic ones")
     _require_new(out)
-    measured = bench.run(scene_on(load_scene(scene, factor), device), device)
+    if scene is None:
+        capture = synthetic_scene(synthetic.photos, *synthetic.size, device)
+    else:
+        capture = scene_on(load_scene(scene, factor), device)
+    measured = bench.run(capture, device)
     return _finish("step", measured, device, out, step_lines(measured))
 
 
@@ -68,6 +83,9 @@ def step_lines(measured: dict[str, Any]) -> list[str]:
             f"M={entry['gaussians']} K={entry['views']}: {steps['iteration']['device']['median_ms']:.3f} ms "
             f"(wall {entry['wall']['median_ms']:.3f}) | {'  '.join(parts)}"
         )
+        for name, row in (entry["offload"] or {}).items():
+            wall, slower = row["wall"]["median_ms"], row["wall"]["median_ms"] - entry["wall"]["median_ms"]
+            lines.append(f"  {name} in host memory: wall {wall:.3f} ({slower:+.3f})")
     return lines
 
 

@@ -29,6 +29,12 @@ NO_EVENTS = 1 << 20
 FIRST_EVENT = {"refine_from", "refine_start_iter"}
 """What the kinds of density control call it."""
 
+OFFLOADED = {"photos": ("photos",), "maps": ("maps",), "both": ("maps", "photos")}
+"""Rows of the offload table: what is in host memory."""
+BYTES_IN = {"maps": 4, "photos": 3}
+BYTES_OUT = {"maps": 4, "photos": 0}
+"""Of a pixel of a view that comes into the window, at most: views of the iteration before are there already."""
+
 RATE_FACTOR = 1e-3
 """Of the learning rates: their size costs nothing, and the model stays the one that is to be timed."""
 
@@ -48,6 +54,7 @@ class StepBench:
         repeats: iterations timed.
         overrides: of the configuration, whose strategies are timed.
         ply: a model in place of a trained one.
+        offload: time the iteration with photos and error maps in host memory, too.
     """
 
     gaussians: Sequence[int]
@@ -57,9 +64,10 @@ class StepBench:
     repeats: int
     overrides: Sequence[str]
     ply: Path | None = None
+    offload: bool = False
 
     def run(self, scene: Scene, device: torch.device) -> dict[str, Any]:
-        """The measurements, ready for JSON. `scene`: its photos on the device."""
+        """The measurements, ready for JSON. `scene`: its photos on the device, or where every trainer gets its own."""
         bandwidth = copy_bandwidth(device)
         loaded = None if self.ply is None else load_ply(self.ply, scene.frame)
         passes = []
@@ -101,7 +109,7 @@ class StepBench:
                 iteration()
             wait(device)
             steps = recorder.summaries()
-            stored = memory(trainer, held, device)
+            stored = memory(trainer, scene, held, device)
             updates = trainer.optimizer.state_dict()["steps"].clone()
             iteration()
             samples = recorder.samples
@@ -118,6 +126,9 @@ class StepBench:
         free_running = self._free_running(trainer, device)
         wall = back_to_back(trainer.step, self.repeats, device)
         trainer.repeat_lost(wait=True)
+        event = density_event(trainer, config, self.overrides, device)
+        lost = start + 1 + self.repeats * (2 + BLOCKS) - trainer.iteration
+        del trainer
         return {
             "gaussians": len(model),
             "views": len(samples.view_ids),
@@ -125,12 +136,39 @@ class StepBench:
             "steps": steps,
             "free_running": free_running,
             "wall": wall,
-            "density_event": density_event(trainer, config, self.overrides, device),
+            "density_event": event,
+            "offload": self._offloaded(scene, model, config, device) if self.offload else None,
             "counts": counts,
             "floors_ms": floors,
             "memory_bytes": stored,
-            "lost_iterations": start + 1 + self.repeats * (2 + BLOCKS) - trainer.iteration,
+            "lost_iterations": lost,
         }
+
+    def _offloaded(
+        self, scene: Scene, model: Gaussians, config: Config, device: torch.device
+    ) -> dict[str, dict[str, Any]]:
+        """What is in host memory -> time of an iteration back to back, bytes of the windows, bytes that travel."""
+        results = {}
+        for name, hosted in OFFLOADED.items():
+            places = {f"{what}_on": "host" if what in hosted else "device" for what in ("maps", "photos")}
+            trainer = Trainer(changed(config, plan=places), scene, device)
+            adopt(trainer, model)
+            trainer.iteration = config.train.sh_degree
+            train(trainer, WARMUP_ITERATIONS if device.type == "cuda" else 2)
+            wall = back_to_back(trainer.step, self.repeats, device)
+            trainer.repeat_lost(wait=True)
+            pixels = min(config.schedule["views"], len(scene.train)) * int(
+                scene.train.cameras.sizes.prod(axis=1).mean()
+            )
+            results[name] = {
+                "wall": wall,
+                "window_bytes": sum(
+                    getattr(owner, "window_bytes", 0) for owner in (trainer.maps, trainer.views.photos)
+                ),
+                "bytes_in": pixels * sum(BYTES_IN[what] for what in hosted),
+                "bytes_out": pixels * sum(BYTES_OUT[what] for what in hosted),
+            }
+        return results
 
     def _config(self, views: int) -> Config:
         config = load_config("turbogs", self.overrides)
@@ -190,11 +228,12 @@ def density_event(
     return {"wall": summary(spans), "every": interval, "gaussians_after": after}
 
 
-def memory(trainer: Trainer, held: int, device: torch.device) -> dict[str, int | None]:
+def memory(trainer: Trainer, scene: Scene, held: int, device: torch.device) -> dict[str, int | None]:
     """Bytes of what is stored, and the peak of the iterations timed.
 
     Args:
-        held: bytes allocated before the trainer was made: the scene's photos and the bench's own copy of the model.
+        scene: whose photos the trainer shares where they were on the device already.
+        held: bytes allocated before the trainer was made: the scene's photos there, the bench's own copy of the model.
     """
     stored = {
         "parameters": tensor_bytes(dict(trainer.gaussians.items())),
@@ -207,7 +246,8 @@ def memory(trainer: Trainer, held: int, device: torch.device) -> dict[str, int |
     if device.type != "cuda":
         return {**stored, "temporary": None, "peak": None}
     # What a training run would not have: test photos and the bench's copy.
-    foreign = held - stored["training_photos"]
+    shared = trainer.views.photos.colors.data_ptr() == scene.train.photos.stored.data_ptr()
+    foreign = held - (stored["training_photos"] if shared else 0)
     peak = torch.cuda.max_memory_allocated(device) - foreign
     return {**stored, "temporary": peak - sum(stored.values()), "peak": peak}
 

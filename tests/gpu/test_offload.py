@@ -1,0 +1,151 @@
+"""Maps and photos in host memory while a GPU trains: the bits of resident ones, and captures that do not fit."""
+
+import copy
+
+import pytest
+import torch
+
+from turbogs_plugin import kernels, pacing
+from turbogs_plugin.bench.large_capture import synthetic_scene
+from turbogs_plugin.config import Config, load_config
+from turbogs_plugin.error_maps import AGE_MAX
+from turbogs_plugin.evaluation import evaluate
+from turbogs_plugin.offload import place_views
+from turbogs_plugin.plan import make_plan
+from turbogs_plugin.scene import Scene
+from turbogs_plugin.trainer import Trainer
+
+pytestmark = [
+    pytest.mark.gpu,
+    pytest.mark.skipif(not kernels.available(), reason="needs a GPU and the kernels"),
+]
+
+GPU = torch.device("cuda")
+LIMIT = "6GiB"
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return synthetic_scene(24, 333, 215, GPU, gaussians=20_000)
+
+
+def config_of(*overrides: str) -> Config:
+    return load_config(
+        "turbogs",
+        [
+            *("train.iterations=40", "train.refine_until=30", "train.sh_interval=8", "schedule.max_views=5"),
+            *("density.refine_from=5", "density.refine_every=10", *overrides),
+        ],
+    )
+
+
+def trained(scene: Scene, maps: str, photos: str, iterations: int, *overrides: str) -> Trainer:
+    config = config_of(f"plan.maps_on={maps}", f"plan.photos_on={photos}", *overrides)
+    trainer = Trainer(config, scene, GPU)
+    trainer.initialise_maps()
+    run(trainer, iterations)
+    return trainer
+
+
+def run(trainer: Trainer, iterations: int) -> None:
+    end = trainer.iteration + iterations
+    while trainer.iteration < end:
+        trainer.step_towards(end)
+
+
+def assert_same_maps(a: Trainer, b: Trainer) -> None:
+    left, right = (copy.deepcopy(trainer.maps.state_dict()) for trainer in (a, b))
+    for name, value in left.items():
+        same = torch.equal(value.cpu(), right[name].cpu()) if isinstance(value, torch.Tensor) else value == right[name]
+        assert same, name
+
+
+@pytest.mark.parametrize("unit", ["pixel", "tile"])
+@pytest.mark.parametrize(("maps", "photos"), [("host", "host"), ("host", "device"), ("device", "host")])
+def test_maps_and_samples_are_those_of_resident_ones(scene, maps, photos, unit):
+    """With a model that stands still, whose renders are the same to the bit: what is left is what travels.
+
+    (Gradients are summed in any order on a GPU, so that models that learn differ in their last bits.)
+    """
+    still = [f"optimizer.learning_rates.{name}=0" for name in ("means", "means_final", "scales", "quats", "opacities")]
+    still += ["optimizer.learning_rates.sh0=0", "optimizer.learning_rates.shN=0", "density.type=none"]
+    still += ["optimizer.type=sparse_adam", f"pixel_sampler.unit={unit}"]
+    resident, offloaded = (trained(scene, *places, 30, *still) for places in (("device", "device"), (maps, photos)))
+    assert torch.equal(resident.gaussians.means, offloaded.gaussians.means)
+    assert_same_maps(resident, offloaded)
+    step = resident.now
+    samples = [trainer.pixel_sampler.sample(trainer.maps, (7, 2, 11), 0.2, step) for trainer in (resident, offloaded)]
+    assert torch.equal(samples[0].pixel_ids, samples[1].pixel_ids)
+    truths = [
+        trainer.views.photos.at(drawn).colors() for trainer, drawn in zip((resident, offloaded), samples, strict=True)
+    ]
+    assert torch.equal(*truths)
+    if maps == photos == "host":
+        assert (offloaded.maps.offsets == offloaded.views.photos.offsets).all()
+
+
+def test_maps_follow_through_checkpoints_and_the_turn_of_the_stamps(scene):
+    still = ("optimizer.type=sparse_adam", "optimizer.learning_rates.batch_scale=0", "density.type=none")
+    resident, offloaded = (trained(scene, place, place, 8, *still) for place in ("device", "host"))
+    resumed = Trainer(offloaded.config, scene, GPU)
+    resumed.load_state_dict(copy.deepcopy(offloaded.state_dict()))
+    for trainer in (resident, offloaded, resumed):
+        trainer.iteration = AGE_MAX + 20
+        run(trainer, 8)
+        assert trainer.maps.stamp_base == AGE_MAX + 20
+    assert_same_maps(resident, offloaded)
+    assert_same_maps(resident, resumed)
+
+
+def test_iterations_that_do_nothing_leave_the_maps_alone(scene):
+    trainer = trained(scene, "host", "host", 10)
+    before = copy.deepcopy(trainer.maps.state_dict())
+    trainer.workspace.status[1] = 1  # as after an overflow
+    trainer.step()
+    trainer.step()
+    after = trainer.maps.state_dict()
+    assert all(torch.equal(before[name], after[name]) for name in ("errors", "stamps"))
+    assert torch.equal(before["view_sums"], after["view_sums"])
+
+
+def test_training_with_everything_in_host_memory_learns(scene):
+    trainer = trained(scene, "host", "host", 0)
+    first = trainer.maps.mean()
+    run(trainer, 40)
+    trainer.maps._means.restart()
+    assert trainer.maps.mean() < 0.8 * first
+    assert trainer.maps._window.bytes_held() <= 4 * (10 * 333 * 215 + 1)
+
+
+def test_a_capture_larger_than_the_limit_trains_within_it():
+    """200 photos of 3840x2160: 10 GB of maps and photos in 6 GiB, beside everything else."""
+    scene = synthetic_scene(200, 3840, 2160, GPU)
+    torch.cuda.empty_cache()
+    asked = config_of(f"budget.max_memory={LIMIT}", "schedule.max_views=5", "schedule.min_views=3")
+    limit = asked.budget.memory_bytes()
+    sizes = scene.train.cameras.sizes.prod(axis=1).sum()
+    assert 7 * sizes > 1.5 * limit
+    try:
+        plan = make_plan(asked, scene, GPU, memory_limit=limit)
+        config, _ = pacing.within_budget(plan.apply(asked), scene, GPU)
+        assert (config.plan.maps_on, config.plan.photos_on) == ("host", "host")
+        with pytest.raises(torch.cuda.OutOfMemoryError):
+            Trainer(config_of("plan.maps_on=device", "plan.photos_on=device"), scene, GPU)
+        torch.cuda.empty_cache()
+        torch.cuda.reset_peak_memory_stats()
+        trainer = Trainer(config, scene, GPU)
+        trainer.initialise_maps()
+        first = trainer.maps.mean()
+        run(trainer, 30)
+        metrics = evaluate(trainer.gaussians, place_views(scene.test, GPU, "host"), trainer.sh_degree, config.raster)
+        assert torch.cuda.max_memory_reserved() <= limit
+        assert len(trainer.gaussians) <= config.budget.max_gaussians
+        trainer.maps._means.restart()
+        assert trainer.maps.mean() < first
+        print(
+            f"\nallocated at most {torch.cuda.max_memory_allocated() / 2**30:.2f} GiB, reserved "
+            f"{torch.cuda.max_memory_reserved() / 2**30:.2f} GiB of {LIMIT}; cap {config.budget.max_gaussians}, "
+            f"{len(trainer.gaussians)} Gaussians; PSNR {metrics.psnr:.2f}"
+        )
+    finally:
+        torch.cuda.set_per_process_memory_fraction(1.0)
