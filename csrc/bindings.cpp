@@ -11,7 +11,7 @@
 namespace turbogs {
 namespace {
 
-// Slots, tiles and buffers that stages 4 and 5 have in common.
+// Slots, tiles and buffers that stages 5 and 6 have in common.
 struct SampleBuffers {
     Tensor cameras, tile_offsets, pixel_ids, tile_starts, pair_ids, instances;
     std::optional<Tensor> tile_ids;
@@ -135,27 +135,36 @@ void raster_sort_pairs(Tensor instances, Tensor radii, Tensor cameras, std::opti
     Checker check(instances);
     const int64_t views = radii.size(0), count = radii.size(1), total = views * count, capacity = pair_ids.numel();
     const int64_t num_active = tile_starts.numel() - 1;
-    SortPairsParams params = {};
-    params.num_instances = static_cast<int>(total);
-    params.num_gaussians = static_cast<int>(count);
-    params.num_active = static_cast<int>(num_active);
-    params.instances = check.bytes_of<Instance>(instances, "instances", ScalarType::Float, total);
-    params.radii = reinterpret_cast<int2*>(check.pointer<int32_t>(radii, "radii", ScalarType::Int, {views, count, 2}));
-    params.cameras = check.bytes_of<RasterCamera>(cameras, "cameras", ScalarType::Float, views);
-    params.active_prefix =
+    ScatterPairsParams scatter = {};
+    scatter.num_instances = static_cast<int>(total);
+    scatter.num_gaussians = static_cast<int>(count);
+    scatter.num_active = static_cast<int>(num_active);
+    scatter.capacity = static_cast<uint32_t>(capacity);
+    scatter.instances = check.bytes_of<Instance>(instances, "instances", ScalarType::Float, total);
+    scatter.radii = reinterpret_cast<int2*>(check.pointer<int32_t>(radii, "radii", ScalarType::Int, {views, count, 2}));
+    scatter.cameras = check.bytes_of<RasterCamera>(cameras, "cameras", ScalarType::Float, views);
+    scatter.active_prefix =
         active_prefix.has_value()
             ? check.pointer<int32_t>(*active_prefix, "active_prefix", ScalarType::Int, {active_prefix->numel()})
             : nullptr;
-    params.tile_cursors = check.pointer<int32_t>(tile_cursors, "tile_cursors", ScalarType::Int, {num_active + 1});
-    params.tile_starts = check.pointer<uint32_t>(tile_starts, "tile_starts", ScalarType::Int, {num_active + 1});
-    params.status = check.pointer<uint32_t>(status, "status", ScalarType::Int, {2});
-    params.pair_keys = check.pointer<uint64_t>(pair_keys, "pair_keys", ScalarType::Long, {capacity});
-    params.pair_ids = check.pointer<uint32_t>(pair_ids, "pair_ids", ScalarType::Int, {capacity});
-    check.aligned(params.pair_ids, "pair_ids");
-    params.capacity = static_cast<uint32_t>(capacity);
-    params.counters = reinterpret_cast<PairCounters*>(check.pointer<uint32_t>(counters, "counters", ScalarType::Int, {2}));
-    params.runs = reinterpret_cast<int2*>(check.pointer<int32_t>(runs, "runs", ScalarType::Int, {capacity / (kRun / 2), 2}));
-    check.launched(launch_sort_pairs(params, check.stream()), "pair sort");
+    scatter.tile_cursors = check.pointer<int32_t>(tile_cursors, "tile_cursors", ScalarType::Int, {num_active + 1});
+    scatter.tile_starts = check.pointer<uint32_t>(tile_starts, "tile_starts", ScalarType::Int, {num_active + 1});
+    scatter.status = check.pointer<uint32_t>(status, "status", ScalarType::Int, {2});
+    scatter.pair_keys = check.pointer<uint64_t>(pair_keys, "pair_keys", ScalarType::Long, {capacity});
+    scatter.counters = reinterpret_cast<PairCounters*>(check.pointer<uint32_t>(counters, "counters", ScalarType::Int, {2}));
+    scatter.runs = reinterpret_cast<int2*>(check.pointer<int32_t>(runs, "runs", ScalarType::Int, {capacity / (kRun / 2), 2}));
+    SortPairsParams sort = {};
+    sort.num_active = scatter.num_active;
+    sort.capacity = scatter.capacity;
+    sort.tile_starts = scatter.tile_starts;
+    sort.counters = scatter.counters;
+    sort.runs = scatter.runs;
+    sort.pair_keys = scatter.pair_keys;
+    sort.pair_ids = check.pointer<uint32_t>(pair_ids, "pair_ids", ScalarType::Int, {capacity});
+    check.aligned(sort.pair_ids, "pair_ids");
+    scatter.windows = reinterpret_cast<uint2*>(sort.pair_ids);  // free until the pairs are sorted
+    check.launched(launch_scatter_pairs(scatter, check.stream()), "pair scatter");
+    check.launched(launch_sort_pairs(sort, check.stream()), "pair sort");
 }
 
 void raster_forward(Tensor cameras, std::optional<Tensor> tile_ids, Tensor tile_offsets, Tensor pixel_ids,

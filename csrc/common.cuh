@@ -6,11 +6,10 @@
 #pragma once
 
 #include "params.h"
+#include "warp.cuh"
 
 namespace turbogs {
 
-constexpr uint32_t kFullWarp = 0xFFFFFFFFu;
-constexpr int kWarpSize = 32;
 constexpr float kAlphaTiny = 1e-10f;  // smallest alpha by which a depth is divided, as in gsplat
 
 // ---- The one place where precision is chosen -------------------------------------------------------------------

@@ -2,8 +2,6 @@
 // of the 10- and the 4-block.
 #pragma once
 
-#include <cfloat>
-
 #include "training_math.cuh"
 #include "training_params.h"
 
@@ -15,8 +13,6 @@ constexpr float kRowLimit = 100.0f;      // longest scaled row
 __device__ __forceinline__ float clip_gradient(float value) {
     return fminf(fmaxf(value, -kGradientLimit), kGradientLimit);
 }
-
-__device__ __forceinline__ bool is_finite(float value) { return fabsf(value) <= FLT_MAX; }
 
 // ---- Adam: rounded as written, so that all forms of the kernel give the same bits --------------------------------------
 

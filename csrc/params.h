@@ -74,7 +74,7 @@ struct ProjectionParams {
     int32_t* tile_differences;  // [T + 1] out: splats that reach each active tile, less those of the tile before it
 };
 
-// Lengths of lists that stage 3 makes on the way.
+// Lengths of the two lists that stage 3 makes on the way.
 struct PairCounters {
     uint32_t num_windows, num_runs;
 };
@@ -91,8 +91,8 @@ struct CountPairsParams {
     int64_t* block_sums;    // [ceil(T / kScanTiles), 2] scratch
 };
 
-// Stage 3. Pairs to their tiles, and every tile's in order of depth, then of the instance.
-struct SortPairsParams {
+// Stage 3. Pairs to their tiles.
+struct ScatterPairsParams {
     int num_instances;
     int num_gaussians;
     int num_active;               // T
@@ -103,14 +103,26 @@ struct SortPairsParams {
     const uint32_t* tile_starts;  // [T + 1]
     const uint32_t* status;       // [2]
     int32_t* tile_cursors;        // [T + 1] in: first pair of each tile; changed
-    uint64_t* pair_keys;          // [M] scratch: depth and instance of each pair
-    uint32_t* pair_ids;           // [M] out: instance of each pair
+    uint64_t* pair_keys;          // [M] out: depth and instance of each pair
     uint32_t capacity;            // M
     PairCounters* counters;       // in: zeros
-    int2* runs;                   // [M / (kRun / 2)] scratch: (tile, number) of every run of a tile with more than one
+    uint2* windows;               // [M / 2] scratch: (instance, number) of every window of a large splat
+    int2* runs;                   // [M / (kRun / 2)] out: (tile, number) of every run of kRun pairs, of tiles with more
+                                  // pairs than that: those have kRun / 2 pairs or more for each run
 };
 
-// Stage 4. One warp for each work item = (tile position, chunk): slots chunk * 32 ... chunk * 32 + 31 of the tile. Further
+// Stage 4. Every tile's pairs in order of depth, then of the instance.
+struct SortPairsParams {
+    int num_active;               // T
+    uint32_t capacity;            // M
+    const uint32_t* tile_starts;  // [T + 1]
+    const PairCounters* counters;
+    const int2* runs;             // [M / (kRun / 2)]
+    uint64_t* pair_keys;          // [M] changed
+    uint32_t* pair_ids;           // [M] out: instance of each pair
+};
+
+// Stage 5. One warp for each work item = (tile position, chunk): slots chunk * 32 ... chunk * 32 + 31 of the tile. Further
 // slots of a tile follow with a stride of `chunks` chunks, so any number of slots is rendered.
 struct ForwardParams {
     int num_views;
@@ -134,13 +146,13 @@ struct ForwardParams {
     uint32_t* masks;        // [(M / 32 + T + 1) * C] out: bit of each splat of a bucket that contributed to the item.
                             // Bucket j of item (t, c) is word ((tile_starts[t] / 32 + t) + j) * C + c.
     int32_t* bucket_counts; // [T, C] out, buckets that the item walked
-    float4* cleared;        // set to zero meanwhile, for stage 5: this stage leaves the memory idle; or null
+    float4* cleared;        // set to zero meanwhile, for stage 6: this stage leaves the memory idle; or null
     size_t num_cleared;     // float4
 };
 
-// Stage 5. Same work items; gradients on the screen.
+// Stage 6. Same work items; gradients on the screen.
 struct BackwardParams {
-    ForwardParams forward;            // as given to stage 4; its outputs are inputs here
+    ForwardParams forward;            // as given to stage 5; its outputs are inputs here
     int num_instances;
     bool with_distances;              // fill sum D * w
     bool cleared;                     // `screen_gradients` is zero already
@@ -154,6 +166,7 @@ struct BackwardParams {
 // Every launcher returns the first CUDA error, and only enqueues work on `stream`.
 cudaError_t launch_projection(const ProjectionParams& params, cudaStream_t stream);
 cudaError_t launch_count_pairs(const CountPairsParams& params, cudaStream_t stream);
+cudaError_t launch_scatter_pairs(const ScatterPairsParams& params, cudaStream_t stream);
 cudaError_t launch_sort_pairs(const SortPairsParams& params, cudaStream_t stream);
 cudaError_t launch_rasterize_forward(const ForwardParams& params, cudaStream_t stream);
 cudaError_t launch_rasterize_backward(const BackwardParams& params, cudaStream_t stream);

@@ -60,7 +60,7 @@ __global__ void __launch_bounds__(kSampleThreads, kSampleBlocks) sample_tiles_ke
             age_sum += units.age(j);
         }
         error_sum = warp_sum(error_sum);
-        age_sum = static_cast<int>(__reduce_add_sync(kFull, static_cast<uint32_t>(age_sum)));
+        age_sum = static_cast<int>(__reduce_add_sync(kFullWarp, static_cast<uint32_t>(age_sum)));
         drawn = draw<kWeighted>(params, units, pixels.inside, view_number, kPurposePixels, error_sum, age_sum, missed);
     } else {
         // Block j holds the 4x4 cells of its left (lane bit 2 clear) and right half; lane n < 16 takes over cell n.
@@ -75,13 +75,13 @@ __global__ void __launch_bounds__(kSampleThreads, kSampleBlocks) sample_tiles_ke
 #pragma unroll
             for (int bit = 0; bit < 5; ++bit) {
                 if (bit == 2) continue;
-                sum += __shfl_xor_sync(kFull, sum, 1 << bit);
-                oldest = max(oldest, __shfl_xor_sync(kFull, oldest, 1 << bit));
+                sum += __shfl_xor_sync(kFullWarp, sum, 1 << bit);
+                oldest = max(oldest, __shfl_xor_sync(kFullWarp, oldest, 1 << bit));
             }
-            const double source_sum = __shfl_sync(kFull, sum, source);
-            const int source_age = __shfl_sync(kFull, oldest, source);
-            const uint32_t source_place = __shfl_sync(kFull, pixels.id(j), source);
-            const uint32_t source_exists = __shfl_sync(kFull, pixels.inside >> j & 1u, source);
+            const double source_sum = __shfl_sync(kFullWarp, sum, source);
+            const int source_age = __shfl_sync(kFullWarp, oldest, source);
+            const uint32_t source_place = __shfl_sync(kFullWarp, pixels.id(j), source);
+            const uint32_t source_exists = __shfl_sync(kFullWarp, pixels.inside >> j & 1u, source);
             if (lane < 16 && block == j) {
                 cell_error = source_sum;
                 cell.oldest = source_age;
@@ -90,17 +90,17 @@ __global__ void __launch_bounds__(kSampleThreads, kSampleBlocks) sample_tiles_ke
             }
         }
         error_sum = warp_sum(cell_error);
-        age_sum = static_cast<int>(__reduce_add_sync(kFull, static_cast<uint32_t>(cell.oldest)));
+        age_sum = static_cast<int>(__reduce_add_sync(kFullWarp, static_cast<uint32_t>(cell.oldest)));
         cell.error_sum = __double2float_rn(cell_error);
         float cell_missed[1];
         const uint32_t cell_drawn = draw<kWeighted>(params, cell, cell_exists, view_number, kPurposeCells, error_sum, age_sum,
                                                     cell_missed);
-        const uint32_t cells = __ballot_sync(kFull, cell_drawn != 0u);
+        const uint32_t cells = __ballot_sync(kFullWarp, cell_drawn != 0u);
 #pragma unroll
         for (int j = 0; j < kPerLane; ++j) {
             const int number = (j >> 1) * 4 + (j & 1) * 2 + ((lane >> 2) & 1);
             drawn |= (cells >> number & 1u) << j;
-            if (kWeighted) missed[j] = __shfl_sync(kFull, cell_missed[0], number);
+            if (kWeighted) missed[j] = __shfl_sync(kFullWarp, cell_missed[0], number);
         }
         drawn &= pixels.inside;
     }
@@ -112,7 +112,7 @@ __global__ void __launch_bounds__(kSampleThreads, kSampleBlocks) sample_tiles_ke
 #pragma unroll
     for (int j = 0; j < kPerLane; ++j) {
         const bool mine = drawn >> j & 1u;
-        const uint32_t lanes = __ballot_sync(kFull, mine);
+        const uint32_t lanes = __ballot_sync(kFullWarp, mine);
         if (mine) {
             const int slot = next + __popc(lanes & lower_lanes);
             params.pixel_ids[slot] = static_cast<int32_t>(pixels.id(j));

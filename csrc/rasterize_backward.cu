@@ -1,4 +1,4 @@
-// Stage 5: from the gradients at the samples to a record for every splat on the screen, with the density sums.
+// Stage 6: from the gradients at the samples to a record for every splat on the screen, with the density sums.
 //
 // One warp takes one work item of the forward pass, 32 samples, and walks back to front the splats that contributed to it
 // (and no others: the forward pass left their bits), `kSplats` at a time, in two phases that meet in shared memory. First
@@ -91,12 +91,7 @@ __device__ __forceinline__ int list_pairs(const uint32_t* masks, int chunks, int
     const int bucket = end - 1 - lane / 4, part = 3 - lane % 4;  // a lane takes 8 bits
     uint32_t bits = bucket >= 0 ? masks[static_cast<size_t>(bucket) * chunks] >> (8 * part) & 0xFFu : 0u;
     const int count = __popc(bits);
-    int sum = count;
-#pragma unroll
-    for (int step = 1; step < kWarpSize; step *= 2) {
-        const int below = __shfl_up_sync(kFullWarp, sum, step);
-        if (lane >= step) sum += below;
-    }
+    const int sum = sum_to_lane(count, lane);
     int place = length + sum - count;
     while (bits != 0u) {
         const int bit = 31 - __clz(bits);

@@ -1,4 +1,4 @@
-// Stage 4: colour, alpha and, when asked, depth at the sampled pixels.
+// Stage 5: colour, alpha and, when asked, depth at the sampled pixels.
 //
 // One warp renders one work item of an active tile, or two where a tile has an even number of them: 32 samples each, with
 // the state of a lane's pixels in registers, so work follows the samples and no warp waits for another. Splats come 32 at a

@@ -8,93 +8,19 @@
 
 #include <cuda_fp16.h>
 
+#include "tile_similarity.cuh"
 #include "training_math.cuh"
 #include "training_params.h"
+#include "warp.cuh"
 
 namespace turbogs {
 namespace {
 
-constexpr uint32_t kFull = 0xFFFFFFFFu;
 constexpr int kLossThreads = 128;
 constexpr int kLossBlocks = 7;  // of an SM: 72 registers
 constexpr int kLossWarps = kLossThreads / 32;
 constexpr float kBalanceEpsilon = 1e-8f;
-constexpr float kLuminanceConstant = 1e-4f;  // 0.01^2
-constexpr float kSsimConstant = 9e-4f;       // 0.03^2
-constexpr float kErrorMax = 65504.0f;        // largest finite half
-
-__device__ __forceinline__ float warp_sum(float value) {
-#pragma unroll
-    for (int step = 16; step > 0; step >>= 1) value += __shfl_xor_sync(kFull, value, step);
-    return value;
-}
-
-__device__ __forceinline__ double warp_sum(double value) {
-#pragma unroll
-    for (int step = 16; step > 0; step >>= 1) value += __shfl_xor_sync(kFull, value, step);
-    return value;
-}
-
-__device__ __forceinline__ bool is_finite(float value) { return fabsf(value) <= FLT_MAX; }
-__device__ __forceinline__ bool is_finite(double value) { return fabs(value) <= DBL_MAX; }
-
-constexpr int kCountThreads = 256;
-
-__global__ void __launch_bounds__(kCountThreads) count_filled_kernel(const CountFilledParams params) {
-    int mine = 0;
-    for (int i = blockIdx.x * kCountThreads + threadIdx.x; i < params.num_slots; i += gridDim.x * kCountThreads) {
-        mine += params.pixel_ids[i] >= 0;
-    }
-    const uint32_t total = __reduce_add_sync(kFull, static_cast<uint32_t>(mine));
-    if ((threadIdx.x & 31) == 0 && total != 0u) atomicAdd(params.num_filled, static_cast<int32_t>(total));
-}
-
-// Similarity S of a tile in one channel, and its gradient dS/dx = share * (at_y * dy - at_x * dx + constant), with dx, dy
-// the offsets of prediction and truth from their means.
-struct Similarity {
-    float value, at_y, at_x, constant;
-};
-
-__device__ __forceinline__ Similarity correlation(float variance_x, float variance_y, float covariance, float c) {
-    const float floor = 0.5f * c;
-    const float scale_x = sqrtf(variance_x + floor), scale_y = sqrtf(variance_y + floor);
-    const float value = (covariance + floor) / scale_x / scale_y;
-    return {value, 1.0f / scale_x / scale_y, value / scale_x / scale_x, 0.0f};
-}
-
-__device__ __forceinline__ Similarity contrast(float variance_x, float variance_y, float covariance, float c) {
-    const float denominator = variance_x + variance_y + c;
-    const float value = (2.0f * covariance + c) / denominator;
-    return {value, 2.0f / denominator, 2.0f * value / denominator, 0.0f};
-}
-
-__device__ __forceinline__ Similarity ssim(float mean_x, float mean_y, float variance_x, float variance_y,
-                                           float covariance) {
-    const Similarity structure = contrast(variance_x, variance_y, covariance, kSsimConstant);
-    const float denominator = mean_x * mean_x + mean_y * mean_y + kLuminanceConstant;
-    const float luminance = (2.0f * mean_x * mean_y + kLuminanceConstant) / denominator;
-    const float slope = 2.0f * (mean_y - luminance * mean_x) / denominator;
-    return {structure.value * luminance, structure.at_y * luminance, structure.at_x * luminance,
-            structure.value * slope};
-}
-
-// Sums of 8 values over the warp, the same in every lane: the lanes first divide the values among themselves.
-__device__ __forceinline__ void warp_sums(float (&values)[8]) {
-    const int lane = threadIdx.x & 31;
-#pragma unroll
-    for (int half = 4; half > 0; half >>= 1) {
-        const bool upper = (lane & (4 * half)) != 0;
-#pragma unroll
-        for (int i = 0; i < half; ++i) {
-            const float given = upper ? values[i] : values[i + half], kept = upper ? values[i + half] : values[i];
-            values[i] = kept + __shfl_xor_sync(kFull, given, 4 * half);
-        }
-    }
-    const float pairs = values[0] + __shfl_xor_sync(kFull, values[0], 2);
-    const float sum = pairs + __shfl_xor_sync(kFull, pairs, 1);  // of value lane / 4
-#pragma unroll
-    for (int i = 0; i < 8; ++i) values[i] = __shfl_sync(kFull, sum, 4 * i);
-}
+constexpr float kErrorMax = 65504.0f;  // largest finite half
 
 // byte / 255, correctly rounded.
 __device__ __forceinline__ float unit_color(uint8_t byte) {
@@ -177,8 +103,8 @@ __device__ __forceinline__ TileTotals tile_loss(const SparseLossParams& params, 
             if (start == first) {
 #pragma unroll
                 for (int c = 0; c < 3; ++c) {
-                    first_x[c] = __shfl_sync(kFull, samples.x[0][c], 0);
-                    first_y[c] = __shfl_sync(kFull, samples.y[0][c], 0);
+                    first_x[c] = __shfl_sync(kFullWarp, samples.x[0][c], 0);
+                    first_y[c] = __shfl_sync(kFullWarp, samples.y[0][c], 0);
                 }
             }
             __half old[kSlots];
@@ -345,7 +271,7 @@ __global__ void __launch_bounds__(kLossThreads, kLossBlocks) sparse_loss_kernel(
         while (view + 1 < params.num_views && tile_id >= params.views[view + 1].tile_base) ++view;
         totals = tile_loss<kSlots>(params, params.views[view], first, end, filled, learns);
         totals.view_delta = warp_sum(totals.view_delta);
-        const uint32_t nonfinite = __reduce_add_sync(kFull, static_cast<uint32_t>(totals.nonfinite));
+        const uint32_t nonfinite = __reduce_add_sync(kFullWarp, static_cast<uint32_t>(totals.nonfinite));
         if (lane == 0 && nonfinite != 0u && params.num_nonfinite != nullptr) {
             atomicAdd(params.num_nonfinite, static_cast<unsigned long long>(nonfinite));
         }
@@ -378,13 +304,6 @@ __global__ void __launch_bounds__(kLossThreads, kLossBlocks) sparse_loss_kernel(
 }
 
 }  // namespace
-
-cudaError_t launch_count_filled(const CountFilledParams& params, cudaStream_t stream) {
-    if (params.num_slots == 0) return cudaSuccess;
-    const int blocks = min((params.num_slots + 4 * kCountThreads - 1) / (4 * kCountThreads), 512);
-    count_filled_kernel<<<blocks, kCountThreads, 0, stream>>>(params);
-    return cudaGetLastError();
-}
 
 cudaError_t launch_sparse_loss(const SparseLossParams& params, cudaStream_t stream) {
     if (params.num_slots == 0 || params.num_tiles == 0) return cudaSuccess;

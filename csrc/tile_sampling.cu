@@ -22,7 +22,7 @@ __global__ void __launch_bounds__(kSampleThreads) tile_sums_kernel(const __grid_
         oldest = max(oldest, units.age(j));
     }
     error_sum = warp_sum(error_sum);
-    oldest = static_cast<int>(__reduce_max_sync(kFull, static_cast<uint32_t>(oldest)));
+    oldest = static_cast<int>(__reduce_max_sync(kFullWarp, static_cast<uint32_t>(oldest)));
     if ((threadIdx.x & 31) == 0) {
         params.tile_errors[tile] = error_sum;
         params.tile_ages[tile] = oldest;
@@ -32,8 +32,7 @@ __global__ void __launch_bounds__(kSampleThreads) tile_sums_kernel(const __grid_
 // Sum over the block, the same in every thread. `scratch` holds one entry a warp.
 template <class T>
 __device__ __forceinline__ T block_sum(T value, T* scratch) {
-#pragma unroll
-    for (int step = 16; step > 0; step >>= 1) value += __shfl_xor_sync(kFull, value, step);
+    value = warp_sum(value);
     __syncthreads();  // the last use of `scratch` is over
     if ((threadIdx.x & 31) == 0) scratch[threadIdx.x / 32] = value;
     __syncthreads();
@@ -126,7 +125,7 @@ __global__ void __launch_bounds__(kChooseThreads) choose_tiles_kernel(
     for (int start = 0; start < count; start += kChooseThreads) {
         const int i = start + threadIdx.x;
         const bool mine = i < count && keys[i] < 0;
-        const uint32_t lanes = __ballot_sync(kFull, mine);
+        const uint32_t lanes = __ballot_sync(kFullWarp, mine);
         __syncthreads();
         if ((threadIdx.x & 31) == 0) scratch[threadIdx.x / 32] = __popc(lanes);
         __syncthreads();
@@ -154,7 +153,7 @@ __global__ void __launch_bounds__(kSampleThreads) fill_tiles_kernel(const __grid
 #pragma unroll
     for (int j = 0; j < kPerLane; ++j) {
         const bool mine = pixels.inside >> j & 1u;
-        const uint32_t lanes = __ballot_sync(kFull, mine);
+        const uint32_t lanes = __ballot_sync(kFullWarp, mine);
         if (mine) {
             const int slot = next + __popc(lanes & lower_lanes);
             params.pixel_ids[slot] = static_cast<int32_t>(pixels.id(j));

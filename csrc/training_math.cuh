@@ -2,6 +2,8 @@
 // rounded result is needed, and copies to shared memory that nobody waits for until told to.
 #pragma once
 
+#include <cfloat>
+
 #include <cuda_pipeline.h>
 #include <cuda_runtime.h>
 
@@ -33,6 +35,9 @@ __device__ __forceinline__ float approximate_log2(float x) {
     asm("lg2.approx.ftz.f32 %0, %1;" : "=f"(result) : "f"(x));
     return result;
 }
+
+__device__ __forceinline__ bool is_finite(float value) { return fabsf(value) <= FLT_MAX; }
+__device__ __forceinline__ bool is_finite(double value) { return fabs(value) <= DBL_MAX; }
 
 template <int kFloats>
 __device__ __forceinline__ void copy_async(float* shared, const float* global) {

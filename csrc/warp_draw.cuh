@@ -3,21 +3,15 @@
 #pragma once
 
 #include "race_keys.cuh"
+#include "warp.cuh"
 
 namespace turbogs {
 
-constexpr uint32_t kFull = 0xFFFFFFFFu;
-
-__device__ __forceinline__ uint32_t warp_max(uint32_t value) { return __reduce_max_sync(kFull, value); }
+__device__ __forceinline__ uint32_t warp_max(uint32_t value) { return __reduce_max_sync(kFullWarp, value); }
 __device__ __forceinline__ uint64_t warp_max(uint64_t value) {
     const uint32_t high = warp_max(static_cast<uint32_t>(value >> 32));
     const uint32_t low = static_cast<uint32_t>(value >> 32) == high ? static_cast<uint32_t>(value) : 0u;
     return static_cast<uint64_t>(high) << 32 | warp_max(low);
-}
-__device__ __forceinline__ double warp_sum(double value) {
-#pragma unroll
-    for (int step = 16; step > 0; step >>= 1) value += __shfl_xor_sync(kFull, value, step);
-    return value;
 }
 
 // The largest of a warp's units: those that are taken, and of those `tied` at the threshold `room` more.
@@ -36,7 +30,7 @@ enum class Spread { kAges, kUniform, kRace };
 template <Spread kSpread, int kUnits>
 __device__ __forceinline__ Split split_largest(const uint32_t (&keys)[kUnits], int count, uint32_t guess = 0u) {
     constexpr uint32_t kEnd = 0x7F800000u;  // no race's key
-    uint32_t available = 0, smallest = kFull, largest = 0;
+    uint32_t available = 0, smallest = 0xFFFFFFFFu, largest = 0;
 #pragma unroll
     for (int j = 0; j < kUnits; ++j) {
         available += keys[j] != 0u;
@@ -44,14 +38,14 @@ __device__ __forceinline__ Split split_largest(const uint32_t (&keys)[kUnits], i
         smallest = min(smallest, keys[j] - 1u);  // no unit: the largest number
         largest = max(largest, keys[j]);
     }
-    int low_count = static_cast<int>(__reduce_add_sync(kFull, available)), high_count = 0;
+    int low_count = static_cast<int>(__reduce_add_sync(kFullWarp, available)), high_count = 0;
     uint32_t threshold = 1u;
     bool exact = low_count <= count;
     if (!exact) {
         uint32_t low = 1u, high = kEnd;
         if (kSpread != Spread::kRace) {
-            low = __reduce_min_sync(kFull, smallest) + 1u;
-            high = __reduce_max_sync(kFull, largest) + 1u;
+            low = __reduce_min_sync(kFullWarp, smallest) + 1u;
+            high = __reduce_max_sync(kFullWarp, largest) + 1u;
         }
         const float inverse = approximate_reciprocal(static_cast<float>(count) + 0.5f);
         for (int pass = 0, total = 0; high - low > 1u; ++pass) {  // low_count > count > high_count reach `low` and `high`
@@ -71,7 +65,7 @@ __device__ __forceinline__ Split split_largest(const uint32_t (&keys)[kUnits], i
             uint32_t reached = 0;
 #pragma unroll
             for (int j = 0; j < kUnits; ++j) reached += keys[j] >= threshold;
-            total = static_cast<int>(__reduce_add_sync(kFull, reached));
+            total = static_cast<int>(__reduce_add_sync(kFullWarp, reached));
             exact = total == count;
             if (exact) break;
             if (total > count) {
@@ -101,7 +95,7 @@ __device__ __forceinline__ uint32_t take_by_rank(uint32_t tied, int room) {
 #pragma unroll
     for (int j = 0; j < kUnits; ++j) {
         const bool mine = (tied >> j & 1u) != 0u;
-        const uint32_t lanes = __ballot_sync(kFull, mine);
+        const uint32_t lanes = __ballot_sync(kFullWarp, mine);
         if (mine && __popc(lanes & lower_lanes) < room) taken |= 1u << j;
         room -= __popc(lanes);
     }
@@ -132,7 +126,7 @@ __device__ __forceinline__ uint32_t take_race(uint32_t (&keys)[kUnits], uint32_t
     bool doubt = false;
 #pragma unroll
     for (int j = 0; j < kUnits; ++j) doubt = doubt || keys[j] - (split.threshold - kKeyGuard) <= 2u * kKeyGuard;
-    if (!__any_sync(kFull, doubt)) return split.taken;
+    if (!__any_sync(kFullWarp, doubt)) return split.taken;
 #pragma unroll
     for (int j = 0; j < kUnits; ++j) keys[j] = open >> j & 1u ? exact_key(j) : 0u;
     return take_largest<Spread::kRace>(keys, count, split.threshold);
