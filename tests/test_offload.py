@@ -71,7 +71,8 @@ def test_training_is_bit_for_bit_that_of_resident_maps_and_photos(scene, capture
         assert len(offloaded.views.photos.colors) < len(resident.views.photos.colors)
     if maps and photos:
         places = offloaded.maps.offsets
-        assert np.array_equal(places, offloaded.views.photos.offsets)  # so that one kernel can use both
+        assert np.array_equal(places, offloaded.views.photos.offsets)  # so that one kernel can use both,
+        assert len(offloaded.maps.errors) == len(offloaded.views.photos.colors)  # which it checks
         assert (places != ABSENT).sum() == 4
 
 

@@ -197,7 +197,7 @@ class OffloadedPhotos(Photos):
 
     @property
     def colors(self) -> Tensor:
-        return self._window.arrays[0]
+        return self._window.arrays[0][:-1]
 
     @property
     def offsets(self) -> np.ndarray:

@@ -38,7 +38,9 @@ def supervise(
     """
     kernel_terms = getattr(loss, "kernel_terms", None)
     if colors.is_cuda and kernel_terms is not None and kernels.available():
-        aligned = np.array_equal(truth.starts, maps.offsets[list(truth.samples.view_ids)])
+        aligned = len(truth.photos.colors) == len(maps.errors) and np.array_equal(
+            truth.starts, maps.offsets[list(truth.samples.view_ids)]
+        )
         return training_kernels.sparse_loss(
             colors,
             truth.photos.colors if aligned else truth.colors(),
