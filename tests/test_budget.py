@@ -1,7 +1,9 @@
 """Budgets, on synthetic numbers."""
 
+import json
 import math
 import random
+from pathlib import Path
 
 import pytest
 
@@ -77,6 +79,19 @@ def test_memory_is_what_is_kept_and_what_is_done_with_it():
     assert resident.fixed - maps.fixed == 4 * (200 - 20) * 8_294_400
     assert maps.fixed - both.fixed == 3 * (225 - 22) * 8_294_400
     assert demand("train.sh_degree=0").per_gaussian == resident.per_gaussian - 2 * 45 * 12
+
+
+def test_no_measured_peak_is_above_the_prediction():
+    """Nor far below: the measured iterations have neither an event of density control nor an evaluation in them."""
+    report = json.loads((Path(__file__).parents[1] / "docs/results/h200/bench-step.json").read_text())
+    width, height = report["image_size"]
+    assert len(report["passes"]) >= 4
+    for entry in report["passes"]:
+        fixed = ("schedule.type=fixed", f"schedule.views={entry['views']}", "train.sh_degree=3")
+        pixels, views = width * height, report["training_views"]
+        memory = MemoryDemand.of(load_config("turbogs", fixed), pixels * views, 0, pixels, views)
+        predicted = memory.fixed + memory.per_gaussian * entry["gaussians"]
+        assert 1.0 <= predicted / entry["memory_bytes"]["peak"] <= 1.6
 
 
 @pytest.mark.parametrize("limit", [2**33, 2**34])

@@ -199,6 +199,26 @@ def within_budget(config: Config, scene: Scene, device: torch.device) -> tuple[C
     return with_iterations(config, iterations), measured
 
 
+def budget_text(config: Config, measured: Calibration | None) -> str:
+    """What the budgets came to, for a terminal; empty where there are none.
+
+    Args:
+        config: as `within_budget` gave it.
+    """
+    parts = []
+    if config.budget.max_gaussians:
+        parts.append(f"at most {config.budget.max_gaussians} Gaussians")
+    if config.budget.max_memory:
+        parts.append(f"{config.budget.max_memory} of device memory")
+    if measured is not None:
+        cost = 1e3 * measured.cost.at(measured.gaussians)
+        parts.append(
+            f"{config.budget.time} of training: about {config.train.iterations} iterations, for one "
+            f"takes {cost:.3g} ms with {measured.gaussians} Gaussians (measured in {measured.seconds:.1f} s)"
+        )
+    return f"budget: {'; '.join(parts)}" if parts else ""
+
+
 def _limited(config: Config, scene: Scene, device: torch.device, limit: int) -> int:
     """Hold torch to a limit of device memory; how many Gaussians fit into it."""
     if device.type != "cuda":

@@ -19,7 +19,7 @@ class TrainingProgress:
     """Shows iteration, test PSNR, number of Gaussians and time left on stderr.
 
     Args:
-        total: T.
+        total: T; may be set anew, where a run goes by time.
         iteration: where the run begins.
     """
 
@@ -58,7 +58,7 @@ class TrainingProgress:
         if self._bar is None or time.perf_counter() < self._next_refresh:
             return
         self._next_refresh = time.perf_counter() + REFRESH_SECONDS
-        self._bar.update(self._task, completed=iteration, gaussians=f"{num_gaussians:,}")
+        self._bar.update(self._task, completed=iteration, total=self.total, gaussians=f"{num_gaussians:,}")
         self._bar.refresh()
 
     def evaluated(self, evaluation: Evaluation) -> None:
@@ -68,6 +68,7 @@ class TrainingProgress:
             self._bar.update(
                 self._task,
                 completed=evaluation.iteration,
+                total=self.total,
                 psnr=f"{evaluation.psnr:.2f}",
                 gaussians=f"{evaluation.num_gaussians:,}",
                 warning=warning,

@@ -22,7 +22,7 @@ from turbogs_plugin.evaluation import Metrics, evaluate, load_lpips, peak_memory
 from turbogs_plugin.files import write_text_atomically
 from turbogs_plugin.gaussians import save_ply
 from turbogs_plugin.offload import place_views
-from turbogs_plugin.pacing import Pace, pace_of, within_budget
+from turbogs_plugin.pacing import Pace, budget_text, pace_of, within_budget
 from turbogs_plugin.plan import Plan, make_plan
 from turbogs_plugin.progress import TrainingProgress
 from turbogs_plugin.report.history import Evaluation, append_evaluation, rewind_history
@@ -161,7 +161,7 @@ def train(config: Config, out: Path) -> Outcome:
     pace = pace_of(config, calibration and calibration.cost)
     session = _Session(folder, config, plan, scene, Trainer(config, scene, device), pace)
     session.clock.seconds = calibration.seconds if calibration else 0.0
-    print(plan.text(), file=sys.stderr)
+    print("\n".join(filter(None, [plan.text(), budget_text(config, calibration)])), file=sys.stderr)
     folder.path.mkdir(parents=True, exist_ok=True)
     write_text_atomically(folder.plan, plan.to_json())
     write_text_atomically(folder.config, config.to_yaml())
