@@ -53,7 +53,7 @@ struct SampleBuffers {
 void raster_project(Tensor means, Tensor quats, Tensor scales, Tensor opacities, Tensor sh0, Tensor shN, Tensor viewmats,
                     Tensor Ks, Tensor sizes, std::optional<Tensor> tile_ids, Tensor cameras,
                     std::optional<Tensor> active_prefix, Tensor instances, Tensor radii, Tensor tile_differences,
-                    int64_t sh_degree, double eps2d, double near_plane, double far_plane, double alpha_min) {
+                    std::optional<Tensor> records, int64_t sh_degree, double eps2d, double near_plane, double far_plane, double alpha_min) {
     Checker check(means);
     const int64_t count = means.size(0), views = viewmats.size(0), bands = shN.size(1), total = views * count;
     STD_TORCH_CHECK(views >= 1 && views <= kRasterMaxViews, "viewmats: 1 .. ", kRasterMaxViews, " views a launch, got ", views);
@@ -106,6 +106,9 @@ void raster_project(Tensor means, Tensor quats, Tensor scales, Tensor opacities,
     params.radii = reinterpret_cast<int2*>(check.pointer<int32_t>(radii, "radii", ScalarType::Int, {views, count, 2}));
     params.tile_differences =
         check.pointer<int32_t>(tile_differences, "tile_differences", ScalarType::Int, {params.num_active + 1});
+    params.records = reinterpret_cast<float4*>(
+        check.optional<float>(records, "records", ScalarType::Float, {total, kGradientFloats}));
+    check.aligned(params.records, "records");
     check.launched(launch_projection(params, check.stream()), "projection");
 }
 
@@ -171,21 +174,12 @@ void raster_forward(Tensor cameras, std::optional<Tensor> tile_ids, Tensor tile_
                     Tensor tile_starts, Tensor pair_ids, Tensor instances, Tensor colors, Tensor alphas,
                     Tensor transmittances, std::optional<Tensor> depths, Tensor last_pairs, Tensor masks,
                     Tensor bucket_counts, int64_t chunks, double alpha_min, double alpha_max,
-                    double transmittance_min, std::optional<Tensor> cleared) {
+                    double transmittance_min) {
     const SampleBuffers buffers{cameras, tile_offsets, pixel_ids, tile_starts, pair_ids, instances, tile_ids,
                                 colors, alphas, transmittances, last_pairs, masks, bucket_counts, depths,
                                 chunks, alpha_min, alpha_max, transmittance_min};
     Checker check(cameras);
-    ForwardParams params = buffers.params(check);
-    if (cleared.has_value()) {
-        const int64_t total = instances.size(0);
-        params.cleared = reinterpret_cast<float4*>(
-            check.pointer<float>(*cleared, "cleared", ScalarType::Float, {total, kGradientFloats}));
-        params.num_cleared = static_cast<size_t>(total) * kGradientFloats / 4;
-    }
-    // Without work items there is no launch that would clear anything.
-    STD_TORCH_CHECK(params.num_cleared == 0 || params.num_active > 0, "nothing to render, but something to clear");
-    check.launched(launch_rasterize_forward(params, check.stream()), "forward");
+    check.launched(launch_rasterize_forward(buffers.params(check), check.stream()), "forward");
 }
 
 void raster_backward(Tensor cameras, std::optional<Tensor> tile_ids, Tensor tile_offsets, Tensor pixel_ids,
@@ -222,7 +216,7 @@ STABLE_TORCH_LIBRARY_FRAGMENT(turbogs, m) {
     m.def(
         "raster_project(Tensor means, Tensor quats, Tensor scales, Tensor opacities, Tensor sh0, Tensor shN, Tensor viewmats, "
         "Tensor Ks, Tensor sizes, Tensor? tile_ids, Tensor(a!) cameras, Tensor(b!)? active_prefix, Tensor(c!) instances, "
-        "Tensor(d!) radii, Tensor(e!) tile_differences, int sh_degree, float eps2d, float near_plane, float far_plane, "
+        "Tensor(d!) radii, Tensor(e!) tile_differences, Tensor(f!)? records, int sh_degree, float eps2d, float near_plane, float far_plane, "
         "float alpha_min) -> ()");
     m.def("architectures() -> str");
     m.def(
@@ -236,7 +230,7 @@ STABLE_TORCH_LIBRARY_FRAGMENT(turbogs, m) {
         "raster_forward(Tensor cameras, Tensor? tile_ids, Tensor tile_offsets, Tensor pixel_ids, Tensor tile_starts, "
         "Tensor pair_ids, Tensor instances, Tensor(a!) colors, Tensor(b!) alphas, Tensor(c!) transmittances, "
         "Tensor(d!)? depths, Tensor(e!) last_pairs, Tensor(f!) masks, Tensor(g!) bucket_counts, int chunks, "
-        "float alpha_min, float alpha_max, float transmittance_min, Tensor(h!)? cleared) -> ()");
+        "float alpha_min, float alpha_max, float transmittance_min) -> ()");
     m.def(
         "raster_backward(Tensor cameras, Tensor? tile_ids, Tensor tile_offsets, Tensor pixel_ids, Tensor tile_starts, "
         "Tensor pair_ids, Tensor instances, Tensor colors, Tensor alphas, Tensor transmittances, Tensor? depths, "

@@ -72,6 +72,7 @@ struct ProjectionParams {
     Instance* instances;      // [K, N] out, where the radius is not 0
     int2* radii;              // [K, N] out, 0 where off screen
     int32_t* tile_differences;  // [T + 1] out: splats that reach each active tile, less those of the tile before it
+    float4* records;          // [K, N, 4] set to zero where the radius is not 0, for stage 6; or null
 };
 
 // Lengths of the two lists that stage 3 makes on the way.
@@ -146,8 +147,6 @@ struct ForwardParams {
     uint32_t* masks;        // [(M / 32 + T + 1) * C] out: bit of each splat of a bucket that contributed to the item.
                             // Bucket j of item (t, c) is word ((tile_starts[t] / 32 + t) + j) * C + c.
     int32_t* bucket_counts; // [T, C] out, buckets that the item walked
-    float4* cleared;        // set to zero meanwhile, for stage 6: this stage leaves the memory idle; or null
-    size_t num_cleared;     // float4
 };
 
 // Stage 6. Same work items; gradients on the screen.
@@ -155,12 +154,12 @@ struct BackwardParams {
     ForwardParams forward;            // as given to stage 5; its outputs are inputs here
     int num_instances;
     bool with_distances;              // fill sum D * w
-    bool cleared;                     // `screen_gradients` is zero already
+    bool cleared;                     // `screen_gradients` is zero where the radius is not 0
     const float* color_gradients;     // [P, 3]
     const float* alpha_gradients;     // [P] or null
     const float* depth_gradients;     // [P] or null
     const float* pixel_errors;        // [P] or null
-    float* screen_gradients;          // [K, N, 16] out, all of it written
+    float* screen_gradients;          // [K, N, 16] out; off screen zero, or where `cleared`, left alone
 };
 
 // Every launcher returns the first CUDA error, and only enqueues work on `stream`.

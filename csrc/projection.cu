@@ -3,8 +3,9 @@
 // A block holds 64 Gaussians, each in up to four threads that share out the views, so parameters are read from memory
 // once. Rows of `shN` are not 16-byte aligned, but a block's rows together are: the block copies them to shared memory
 // with 16-byte loads. Most Gaussians are off screen in most views, so those that are not go through a queue, and all threads
-// together work on their colours and tiles. Active tiles of a row of tiles have consecutive positions, found by their
-// prefix counts, so a splat is counted by two additions a row, whatever its length.
+// together work on their colours and tiles, and clear their records where a backward pass will add to them: what is off
+// screen has none. Active tiles of a row of tiles have consecutive positions, found by their prefix counts, so a splat is
+// counted by two additions a row, whatever its length.
 #include "common.cuh"
 #include "quaternion.cuh"
 #include "spherical_harmonics.cuh"
@@ -147,6 +148,20 @@ struct ProjectionShared {
     int num_queued;                     // so far
 };
 
+__device__ __forceinline__ size_t instance_of(const ProjectionParams& params, int first, int source) {
+    return static_cast<size_t>(source / kProjectionGaussians) * params.num_gaussians + first + source % kProjectionGaussians;
+}
+
+// Clears the records of queued splats, four threads each, so that they write whole sectors.
+__device__ __forceinline__ void clear_records(const ProjectionParams& params, int first, const Queued* queue, int count,
+                                              int thread, int threads) {
+    constexpr int kQuads = kGradientFloats / 4;
+    for (int i = thread; i < kQuads * count; i += threads) {
+        params.records[instance_of(params, first, queue[i / kQuads].source) * kQuads + i % kQuads] =
+            make_float4(0.0f, 0.0f, 0.0f, 0.0f);
+    }
+}
+
 // Colour and tiles of a queued splat.
 __device__ __forceinline__ void finish_splat(const ProjectionParams& params, const ProjectionShared& shared,
                                              const RasterCamera* cameras, const float* coefficients, int first,
@@ -159,7 +174,7 @@ __device__ __forceinline__ void finish_splat(const ProjectionParams& params, con
     const float inverse_length = length2 > 0.0f ? rsqrtf(length2) : 0.0f;
     const float3 color = evaluate_harmonics(params.sh_degree, shared.sh0[local], coefficients + local * 3 * params.bands,
                                             dx * inverse_length, dy * inverse_length, dz * inverse_length);
-    Instance* instance = params.instances + static_cast<size_t>(view) * params.num_gaussians + first + local;
+    Instance* instance = params.instances + instance_of(params, first, splat.source);
     reinterpret_cast<float4*>(instance)[2] = make_float4(fmaxf(color.x + 0.5f, 0.0f), fmaxf(color.y + 0.5f, 0.0f),
                                                          fmaxf(color.z + 0.5f, 0.0f), splat.inverse_sigma_y);
     count_tiles(camera, params.active_prefix, splat, params.tile_differences);
@@ -262,6 +277,7 @@ __global__ void __launch_bounds__(kProjectionGaussians* kProjectionSlices, 4)
         const int queued = shared.num_queued - finished;
         const bool last = base + static_cast<int>(blockDim.y) >= params.num_views;
         const int left = last ? 0 : queued < threads ? queued : queued - threads;
+        if (params.records != nullptr) clear_records(params, first, queue + left, queued - left, thread, threads);
         for (int i = left + thread; i < queued; i += threads) {
             finish_splat(params, shared, cameras, coefficients, first, queue[i]);
         }

@@ -82,14 +82,14 @@ struct RowSum {
     }
 };
 
-// Bit k: some gradient or sum of view first + k is not zero. Wider than `touched`: a loss of a user may put gradients on
-// projected means that no sample saw.
+// Bit k: the Gaussian is on screen in view first + k, and some gradient or sum of its is not zero there; off screen records
+// hold anything. Wider than `touched`: a loss of a user may put gradients on projected means that no sample saw.
 __device__ __forceinline__ uint32_t views_with_gradient(const ScreenBackwardParams& params, int gaussian, int first,
                                                         bool& touched) {
-    const int end = min(params.num_views, first + kViewGroup);
     uint32_t mask = 0u;
-    for (int view = first; view < end; ++view) {
-        const float4* record = record_of(params, view, gaussian);
+    for (uint32_t left = views_on_screen(params, gaussian, first); left != 0u; left &= left - 1u) {
+        const int number = __ffs(static_cast<int>(left)) - 1;
+        const float4* record = record_of(params, first + number, gaussian);
         bool any = false;
 #pragma unroll
         for (int i = 0; i < kRecordQuads; ++i) {
@@ -97,7 +97,7 @@ __device__ __forceinline__ uint32_t views_with_gradient(const ScreenBackwardPara
             any = any || quad.x != 0.0f || quad.y != 0.0f || quad.z != 0.0f || (i < 3 && quad.w != 0.0f);
             if (i == 3) touched = touched || quad.y > 0.0f;
         }
-        if (any) mask |= 1u << (view - first);
+        if (any) mask |= 1u << number;
     }
     return mask;
 }

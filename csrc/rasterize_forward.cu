@@ -57,9 +57,6 @@ __global__ void __launch_bounds__(kForwardWarps* kWarpSize, kGroups == 1 ? 7 : 6
     const int lane = threadIdx.x % kWarpSize;
     const int warps_per_tile = params.chunks / kGroups;
     const int warp = blockIdx.x * kForwardWarps + threadIdx.x / kWarpSize;
-    for (size_t i = blockIdx.x * blockDim.x + threadIdx.x; i < params.num_cleared; i += gridDim.x * blockDim.x) {
-        params.cleared[i] = make_float4(0.0f, 0.0f, 0.0f, 0.0f);
-    }
     if (warp >= params.num_active * warps_per_tile) return;
     StagedSplat* staged = staged_splats[threadIdx.x / kWarpSize];
 

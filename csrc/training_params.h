@@ -39,7 +39,7 @@ struct ScreenBackwardParams {
     int widths[kTrainingMaxViews];
     int heights[kTrainingMaxViews];
 
-    float4* records;             // [K, N, 4]; the fused step reads those on screen, and may leave rows there
+    float4* records;             // [K, N, 4]; read where on screen; the fused step leaves rows in any of them
     const int2* radii;           // [K, N]; 0 where the Gaussian is off screen
     const int32_t* num_filled;   // [1] filled slots of the batch; null where all are
     int num_slots;               // P

@@ -11,6 +11,7 @@ from turbogs_plugin.errors import InputError
 from turbogs_plugin.rendering import cuda, rasterize_reference, workspace
 from turbogs_plugin.rendering.projection import SPAN_MAX
 from turbogs_plugin.rendering.workspace import Workspace
+from turbogs_plugin.types import PARAMETER_NAMES
 
 pytestmark = GPU_ONLY
 
@@ -167,7 +168,7 @@ def test_wrong_input_says_what_was_wanted(case):
         rendered.backward(torch.zeros_like(rendered.colors), depth_gradients=torch.zeros_like(rendered.alphas))
     with pytest.raises(RuntimeError, match=r"pixel_ids must be a contiguous Int"):
         forward = rendered._forward
-        torch.ops.turbogs.raster_forward(*forward._replace(pixel_ids=forward.pixel_ids.long()), None)
+        torch.ops.turbogs.raster_forward(*forward._replace(pixel_ids=forward.pixel_ids.long()))
 
 
 def test_workspace_gives_the_same_and_does_not_wait(case):
@@ -186,6 +187,46 @@ def test_workspace_gives_the_same_and_does_not_wait(case):
         assert torch.equal(got.colors, wanted.colors)
         torch.testing.assert_close(got_records, records, rtol=1e-3, atol=1e-4)
     assert memory.take_lost(wait=True) == 0
+
+
+def poison_records(memory, case):
+    """What passes before may have left in the records."""
+    shape = (len(case.gpu_cameras) * len(case.gpu_gaussians), cuda.RECORD_FLOATS)
+    memory.buffer("records", shape, torch.float32).fill_(math.nan)
+
+
+@pytest.mark.parametrize("rows", [True, False])
+def test_what_is_off_screen_has_no_record(case, rows):
+    """A pass clears the records of what it sees, once; what lies in the others reaches nothing."""
+    case.gpu_gaussians.means[::3] += case.gpu_gaussians.means.new_tensor([0.0, 50.0, 0.0])
+    values = on_gpu({name: value for name, value in upstream(case).items() if name != "depth_gradients"})
+    plain, memory = render(case), Workspace("cuda")
+    on_screen = (plain.projected().radii > 0).any(dim=-1)
+    assert not on_screen[:, ::3].any() and on_screen.any()
+    wanted = plain.backward(**values)
+    poison_records(memory, case)
+    rendered = render(case, workspace=memory)
+    for _ in range(2):  # nothing is clear any more before the second
+        screen = rendered.backward(**values)
+        torch.testing.assert_close(screen.full_records(), wanted.full_records(), rtol=1e-3, atol=1e-4)
+    poison_records(memory, case)
+    screen = render(case, workspace=memory).backward(**values)
+    assert screen.records[~on_screen].isnan().all() and screen.records[on_screen].isfinite().all()
+    gradients, wanted_gradients = screen.parameter_gradients(rows), wanted.parameter_gradients(rows)
+    assert torch.equal(gradients.touched, wanted_gradients.touched)
+    for name in (*PARAMETER_NAMES, "view_losses"):
+        got = getattr(gradients, name)
+        torch.testing.assert_close(got, getattr(wanted_gradients, name), rtol=1e-3, atol=1e-3, msg=name)
+
+
+def test_no_tiles_and_a_workspace(case):
+    """Records are cleared though nothing is rendered."""
+    memory = Workspace("cuda")
+    none = {"pixel_ids": case.gpu_samples.pixel_ids[:0], "tile_ids": case.gpu_samples.tile_ids[:0]}
+    case.gpu_samples = replace(case.gpu_samples, **none, tile_offsets=case.gpu_samples.tile_offsets[:1])
+    poison_records(memory, case)
+    rendered = render(case, workspace=memory)
+    assert (rendered.backward(rendered.colors).full_records() == 0).all()
 
 
 def test_overflow_is_noticed_and_passes_are_repeated(case, monkeypatch):

@@ -82,8 +82,9 @@ class Scene:
         return ReferenceScreenGradients(self.rows, splats, leaves, records, self.samples, stats)
 
     def screen(self, gaussians=None, stats=None, overflow=None):
-        """Those of the kernels; the records are copied, as a step may overwrite them."""
+        """Those of the kernels; the records are copied, as a step may overwrite them. Off screen they hold anything."""
         gaussians = gaussians or self.on_device()
+        on_screen = (self.radii > 0).any(dim=-1, keepdim=True)
         samples = PixelSamples(
             self.samples.view_ids,
             self.samples.sizes,
@@ -95,7 +96,7 @@ class Scene:
             samples=samples,
             sh_degree=self.degree,
             settings=DEFAULT_SETTINGS,
-            records=self.records.to(DEVICE, copy=True),
+            records=torch.where(on_screen, self.records, torch.nan).to(DEVICE, copy=True),
             radii=self.radii.to(DEVICE),
             stats=stats,
             overflow=overflow,

@@ -65,12 +65,13 @@ def raster_floors(counts: Counts, bandwidth: float) -> dict[str, float]:
         "backward": counts["contributing"] * math.ceil(slots / 32) * BACKWARD_INSTRUCTIONS,
     }
     traffic = {
-        "projection": 236 * n + 48 * visible + 8 * kn,
+        # parameters in; splats, cleared records and radii out
+        "projection": 236 * n + (48 + 64) * visible + 8 * kn,
         "pair count": 16 * counts["tiles"],
         # radii and splats in; keys out and in; ids out
         "pair sort": 8 * kn + 32 * visible + 20 * pairs,
         "forward": 52 * pairs + 32 * samples,
-        "backward": 64 * kn + (52 + 64) * counts["contributing"] + 32 * samples,
+        "backward": (52 + 64) * counts["contributing"] + 32 * samples,
     }
     return {stage: 1e3 * max(size / bandwidth, instructions.get(stage, 0) / issue) for stage, size in traffic.items()}
 

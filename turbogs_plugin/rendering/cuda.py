@@ -109,7 +109,8 @@ class CudaScreenGradients:
         settings: of the pass.
         records: [K, N, 16] float32: 0-1 d/dmean2d, 2-4 d/dconic (b's entry counts both off-diagonal ones), 5-7 d/dcolor
             after the clamp at 0, 8 d/dopacity after the sigmoid, 9-10 sums of |d/dmean2d| per pixel, 11 sum e * w,
-            12 sum D * w (0 without `stats`), 13 sum w, 14 d/ddepth. Zero where a Gaussian is not drawn.
+            12 sum D * w (0 without `stats`), 13 sum w, 14 d/ddepth. Anything where a Gaussian is off screen: `full_records`
+            has zeros there.
         radii: [K, N, 2] int32, zero where off screen.
         stats: the window to add to, if any.
         overflow: [1] int32 on the device, or None; where not 0 the pass drew nothing and nothing may change.
@@ -126,8 +127,8 @@ class CudaScreenGradients:
     overflow: Tensor | None
 
     def full_records(self) -> Tensor:
-        """[K, N, 16]."""
-        return self.records
+        """[K, N, 16] the records, zero where a Gaussian is off screen."""
+        return torch.where((self.radii > 0).any(dim=-1, keepdim=True), self.records, 0.0)
 
     def parameter_gradients(self, rows: bool) -> GaussianGradients:
         """The gradients of the parameters: one row per view (`rows`), or their sum. May be called once."""
@@ -159,7 +160,7 @@ class CudaRendered:
     _buffers: _FreshBuffers | Workspace = field(repr=False)
     _radii: Tensor = field(repr=False)  # [K, N, 2]
     _forward: ForwardArguments = field(repr=False)
-    _cleared: bool = field(repr=False)  # the forward pass has set the workspace's records to zero for one backward pass
+    _cleared: bool = field(repr=False)  # the projection has cleared the records on screen, for one backward pass
 
     @torch.no_grad()
     def projected(self) -> Projected:
@@ -271,6 +272,8 @@ def rasterize_cuda(
     instances = floats("instances", total, INSTANCE_FLOATS)
     radii = integers("radii", views, count, 2)
     tile_cursors = integers("tile_cursors", num_active + 1)
+    # With a workspace a backward pass is likely to follow.
+    records = floats("records", total, RECORD_FLOATS) if workspace is not None else None
     torch.ops.turbogs.raster_project(
         *(value for _, value in gaussians.items()),
         cameras.viewmats.detach().contiguous(),
@@ -282,6 +285,7 @@ def rasterize_cuda(
         instances,
         radii,
         tile_cursors,
+        records,
         degree,
         settings.eps2d,
         settings.near_plane,
@@ -351,9 +355,7 @@ def rasterize_cuda(
         alpha_max=settings.alpha_max,
         transmittance_min=settings.transmittance_min,
     )
-    # With a workspace a backward pass is likely to follow.
-    cleared = floats("records", total, RECORD_FLOATS) if workspace is not None and num_active > 0 else None
-    torch.ops.turbogs.raster_forward(*forward, cleared)
+    torch.ops.turbogs.raster_forward(*forward)
     return CudaRendered(
         colors=colors,
         alphas=alphas,
@@ -367,5 +369,5 @@ def rasterize_cuda(
         _buffers=buffers,
         _radii=radii,
         _forward=forward,
-        _cleared=cleared is not None,
+        _cleared=records is not None,
     )

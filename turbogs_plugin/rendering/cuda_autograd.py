@@ -66,8 +66,9 @@ class _Composite(torch.autograd.Function):
             color_gradients = torch.zeros_like(rendered.colors)
         screen = rendered.backward(color_gradients, alpha_gradients=alpha_gradients, depth_gradients=depth_gradients)
         ctx.shared.screen = screen
-        means2d.absgrad = screen.records[..., 9:11].clone()
-        return None, screen.records[..., :2].clone()
+        records = screen.full_records()
+        means2d.absgrad = records[..., 9:11].clone()
+        return None, records[..., :2].clone()
 
 
 def rasterize_differentiable_cuda(
