@@ -180,10 +180,10 @@ def test_a_run_ends_with_its_time(machine, seconds):
     assert len(set(over)) == 1
 
 
-def test_few_slow_iterations_end_within_one():
+def test_few_slow_iterations_end_within_half_of_one():
     plan = TimePlan(10.0, 40, 28)
     marks = simulate(plan, lambda i, n: 0.4, lambda i, plan: 100)
-    assert 9.2 <= marks[-1][1] <= 10.4
+    assert 9.8 <= marks[-1][1] <= 10.2
 
 
 def test_a_plan_foresees_growth():

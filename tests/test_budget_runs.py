@@ -74,7 +74,7 @@ def test_a_run_by_time_goes_on_after_a_stop(capture, tmp_path, monkeypatch):
         if trainer.iteration == 5 and trainer.config.density["type"] != "none":  # not while calibrating
             os.kill(os.getpid(), signal.SIGINT)
 
-    config = tiny_config(capture, "budget.time=4s", "train.evaluate_at=[0.3, 0.6]")
+    config = tiny_config(capture, "budget.time=4s", "budget.max_gaussians=2000", "train.evaluate_at=[0.3, 0.6]")
     monkeypatch.setattr(Trainer, "step", stopping)
     first = run.train(config, tmp_path / "run")
     assert first.signal == signal.SIGINT
@@ -117,6 +117,16 @@ def test_a_cap_without_room_beside_the_backdrop_is_refused(capture):
 def test_a_limit_of_a_gpus_memory_says_nothing_of_a_cpu(capture, tmp_path):
     with pytest.raises(InputError, match="--max-memory limits the memory of a GPU"):
         run.train(tiny_config(capture, "budget.max_memory=2GiB"), tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_scene_that_does_not_fit_is_refused(capture, tmp_path, monkeypatch):
+    def full(trainer, *arguments):
+        raise torch.cuda.OutOfMemoryError("CUDA out of memory")
+
+    monkeypatch.setattr(Trainer, "__init__", full)
+    with pytest.raises(InputError, match="'capture' does not fit into the device's memory"):
+        run.train(tiny_config(capture), tmp_path / "run")
     assert not (tmp_path / "run").exists()
 
 

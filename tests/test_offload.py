@@ -10,7 +10,7 @@ import torch
 from framework_runs import tiny_capture, tiny_config
 from turbogs_plugin.strategies.pixel_sampling import ErrorGuidedPixelSampler
 
-from turbogs_plugin import offload
+from turbogs_plugin import offload, run
 from turbogs_plugin.error_maps import AGE_MAX, ErrorMaps
 from turbogs_plugin.offload import ABSENT, OffloadedErrorMaps, OffloadedPhotos, ViewWindow
 from turbogs_plugin.scene import Scene, load_scene
@@ -90,6 +90,16 @@ def test_a_run_stops_with_resident_maps_and_goes_on_with_offloaded_ones(scene, c
         if iteration == 2:
             second.state_dict()  # a checkpoint in between changes nothing
     assert_identical(whole.state_dict(), second.state_dict())
+
+
+def test_a_whole_run_leaves_the_same_model(capture, tmp_path):
+    models = []
+    for place in ("device", "host"):
+        config = tiny_config(capture, f"plan.maps_on={place}", f"plan.photos_on={place}")
+        outcome = run.train(config, tmp_path / place)
+        assert outcome.folder.read_config().plan.maps_on == place
+        models.append(outcome.folder.model.read_bytes())
+    assert models[0] == models[1]
 
 
 def test_the_initial_colour_is_that_of_the_photos(scene, capture):

@@ -217,7 +217,8 @@ class TimePlan:
             growth = (gaussians - fewer) / (iteration - before)
             self._last = (iteration, seconds, gaussians)
             left = max(0.0, self.seconds - seconds)
-            self.iterations = iteration + int(left / max(1e-9, self._now * self._rise(iteration, gaussians, growth)))
+            cost = max(1e-9, self._now * self._rise(iteration, gaussians, growth))
+            self.iterations = iteration + int(left / cost + 0.5)  # to the nearest, so half of one late or early
             if iteration < self.refine_until:
                 self.refine_until = max(iteration, round(self._refine_share * self.iterations))
 

@@ -155,11 +155,18 @@ def train(config: Config, out: Path) -> Outcome:
     scene = load_scene(config.scene.path, config.scene.factor, config.scene.test_every)
     load_lpips(config.report.lpips_weights, device)
     plan = _plan(config, scene, device)
-    config, calibration = within_budget(plan.apply(config), scene, device)
+    try:
+        config, calibration = within_budget(plan.apply(config), scene, device)
+        trainer = Trainer(config, scene, device)
+    except torch.cuda.OutOfMemoryError:
+        raise InputError(
+            f"'{scene.name}' does not fit into the device's memory: use plan.photos_on=host and plan.maps_on=host, "
+            "--max-gaussians or a larger --factor"
+        ) from None
     config.scene.path = str(Path(config.scene.path).resolve())
     config.train.device = device.type
     pace = pace_of(config, calibration and calibration.cost)
-    session = _Session(folder, config, plan, scene, Trainer(config, scene, device), pace)
+    session = _Session(folder, config, plan, scene, trainer, pace)
     session.clock.seconds = calibration.seconds if calibration else 0.0
     print("\n".join(filter(None, [plan.text(), budget_text(config, calibration)])), file=sys.stderr)
     folder.path.mkdir(parents=True, exist_ok=True)
