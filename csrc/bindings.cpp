@@ -188,7 +188,7 @@ void raster_backward(Tensor cameras, std::optional<Tensor> tile_ids, Tensor tile
                      Tensor bucket_counts, int64_t chunks, double alpha_min, double alpha_max,
                      double transmittance_min, Tensor color_gradients, std::optional<Tensor> alpha_gradients,
                      std::optional<Tensor> depth_gradients, std::optional<Tensor> pixel_errors, Tensor screen_gradients,
-                     bool with_distances, bool cleared) {
+                     bool with_density_sums, bool cleared) {
     const SampleBuffers buffers{cameras, tile_offsets, pixel_ids, tile_starts, pair_ids, instances, tile_ids,
                                 colors, alphas, transmittances, last_pairs, masks, bucket_counts, depths,
                                 chunks, alpha_min, alpha_max, transmittance_min};
@@ -198,7 +198,7 @@ void raster_backward(Tensor cameras, std::optional<Tensor> tile_ids, Tensor tile
     BackwardParams params = {};
     params.forward = buffers.params(check);
     params.num_instances = static_cast<int>(total);
-    params.with_distances = with_distances;
+    params.with_density_sums = with_density_sums;
     params.cleared = cleared;
     params.color_gradients = check.pointer<float>(color_gradients, "color_gradients", ScalarType::Float, {num_slots, 3});
     params.alpha_gradients = check.optional<float>(alpha_gradients, "alpha_gradients", ScalarType::Float, {num_slots});
@@ -236,7 +236,7 @@ STABLE_TORCH_LIBRARY_FRAGMENT(turbogs, m) {
         "Tensor pair_ids, Tensor instances, Tensor colors, Tensor alphas, Tensor transmittances, Tensor? depths, "
         "Tensor last_pairs, Tensor masks, Tensor bucket_counts, int chunks, float alpha_min, "
         "float alpha_max, float transmittance_min, Tensor color_gradients, Tensor? alpha_gradients, "
-        "Tensor? depth_gradients, Tensor? pixel_errors, Tensor(a!) screen_gradients, bool with_distances, bool cleared) -> ()");
+        "Tensor? depth_gradients, Tensor? pixel_errors, Tensor(a!) screen_gradients, bool with_density_sums, bool cleared) -> ()");
 }
 
 STABLE_TORCH_LIBRARY_IMPL(turbogs, CUDA, m) {

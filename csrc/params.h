@@ -153,7 +153,7 @@ struct ForwardParams {
 struct BackwardParams {
     ForwardParams forward;            // as given to stage 5; its outputs are inputs here
     int num_instances;
-    bool with_distances;              // fill sum D * w
+    bool with_density_sums;           // fill what only densification asks for: sum D * w and the absolute sums; else zeros
     bool cleared;                     // `screen_gradients` is zero where the radius is not 0
     const float* color_gradients;     // [P, 3]
     const float* alpha_gradients;     // [P] or null

@@ -140,7 +140,7 @@ struct SplatSums {
 };
 
 // Phase 2, lane = splat and share: adds the samples of the share to the lane's sums.
-template <bool kDepth, bool kDistance>
+template <bool kDepth, bool kDensity>
 __device__ __forceinline__ void sum_samples(const BackwardShared& shared, int row, int share, const StagedSplat& own,
                                             SplatSums& sums) {
     const float4* weights = shared.weights + (row * kExchangeStride + share * kShareSamples) / 4;
@@ -157,15 +157,17 @@ __device__ __forceinline__ void sum_samples(const BackwardShared& shared, int ro
         sums.uu += slope_u * f.x;
         sums.uv += slope_u * f.y;
         sums.vv += slope_v * f.y;
-        sums.absolute_x += fabsf(slope_u);
-        sums.absolute_y += fabsf(own.form.y * slope_u + own.form.z * slope_v);
         sums.red += weight * position.z;
         sums.green += weight * position.w;
         sums.blue += weight * other.x;
         sums.error += weight * other.y;
         sums.weight += weight;
         if (kDepth) sums.depth += weight * other.z;
-        if (kDistance) sums.distance += weight * blend_sqrt(f.x * f.x + f.y * f.y);
+        if (kDensity) {
+            sums.absolute_x += fabsf(slope_u);
+            sums.absolute_y += fabsf(own.form.y * slope_u + own.form.z * slope_v);
+            sums.distance += weight * blend_sqrt(f.x * f.x + f.y * f.y);
+        }
     };
 #pragma unroll 2
     for (int s = 0; s < kShareSamples; s += 4) {
@@ -224,7 +226,7 @@ __device__ __forceinline__ void send_record(float* target, const float record[kG
     }
 }
 
-template <bool kDepth, bool kDistance>
+template <bool kDepth, bool kDensity>
 __global__ void __launch_bounds__(kWarpSize) backward_kernel(const __grid_constant__ BackwardParams params) {
     __shared__ BackwardShared shared;
     const ForwardParams& forward = params.forward;
@@ -275,7 +277,7 @@ __global__ void __launch_bounds__(kWarpSize) backward_kernel(const __grid_consta
             exchange_splats<kDepth>(forward, least_level, shared, sample, count, lane);
             __syncwarp();
             SplatSums sums;
-            sum_samples<kDepth, kDistance>(shared, row, share, own, sums);
+            sum_samples<kDepth, kDensity>(shared, row, share, own, sums);
             float record[kGradientFloats];
             make_record(own, sums, record);
             send_record(params.screen_gradients + static_cast<size_t>(instance) * kGradientFloats, record, row < count, share);
@@ -284,9 +286,9 @@ __global__ void __launch_bounds__(kWarpSize) backward_kernel(const __grid_consta
     }
 }
 
-template <bool kDepth, bool kDistance>
+template <bool kDepth, bool kDensity>
 cudaError_t launch(const BackwardParams& params, cudaStream_t stream) {
-    backward_kernel<kDepth, kDistance><<<params.forward.num_active * params.forward.chunks, kWarpSize, 0, stream>>>(params);
+    backward_kernel<kDepth, kDensity><<<params.forward.num_active * params.forward.chunks, kWarpSize, 0, stream>>>(params);
     return cudaGetLastError();
 }
 
@@ -300,7 +302,7 @@ cudaError_t launch_rasterize_backward(const BackwardParams& params, cudaStream_t
     }
     if (params.forward.num_active * params.forward.chunks == 0) return cudaSuccess;
     const bool depth = params.depth_gradients != nullptr;
-    if (params.with_distances) return depth ? launch<true, true>(params, stream) : launch<false, true>(params, stream);
+    if (params.with_density_sums) return depth ? launch<true, true>(params, stream) : launch<false, true>(params, stream);
     return depth ? launch<true, false>(params, stream) : launch<false, false>(params, stream);
 }
 

@@ -130,7 +130,12 @@ def test_every_division_of_the_work_gives_the_same(warps, monkeypatch):
     monkeypatch.setattr(cuda, "warps_per_tile", lambda slots, tiles: warps)
     got = cuda.rasterize_cuda(case.gpu_gaussians, case.gpu_cameras, case.gpu_samples)
     assert_forward_close(got.colors, wanted.colors, "colors")
-    records, wanted_records = got.backward(**on_gpu(values)).full_records(), wanted.backward(**values).full_records()
+    stats = GaussianStats.zeros(len(case.gaussians), "cuda")
+    records, plain = (got.backward(**on_gpu(values), stats=window).full_records() for window in (stats, None))
+    wanted_records = wanted.backward(**values).full_records()
     for name, column in RECORD_COLUMNS.items():
-        if name != "distance_sum":
-            assert_gradients_close(records[..., column], wanted_records[..., column], name)
+        assert_gradients_close(records[..., column], wanted_records[..., column], name)
+        if name in ("absolute", "distance_sum"):
+            assert (plain[..., column] == 0).all()
+        else:
+            assert_gradients_close(plain[..., column], wanted_records[..., column], f"{name} without a window")

@@ -109,8 +109,8 @@ class CudaScreenGradients:
         settings: of the pass.
         records: [K, N, 16] float32: 0-1 d/dmean2d, 2-4 d/dconic (b's entry counts both off-diagonal ones), 5-7 d/dcolor
             after the clamp at 0, 8 d/dopacity after the sigmoid, 9-10 sums of |d/dmean2d| per pixel, 11 sum e * w,
-            12 sum D * w (0 without `stats`), 13 sum w, 14 d/ddepth. Anything where a Gaussian is off screen: `full_records`
-            has zeros there.
+            12 sum D * w, 13 sum w, 14 d/ddepth; 9, 10 and 12 are 0 without `stats`. Where a Gaussian is off screen, a
+            record may hold anything.
         radii: [K, N, 2] int32, zero where off screen.
         stats: the window to add to, if any.
         overflow: [1] int32 on the device, or None; where not 0 the pass drew nothing and nothing may change.

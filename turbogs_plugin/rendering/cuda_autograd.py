@@ -11,7 +11,7 @@ from torch.autograd.function import once_differentiable
 from turbogs_plugin.rendering.cuda import CudaRendered, CudaScreenGradients, rasterize_cuda
 from turbogs_plugin.rendering.reference import DifferentiableRender
 from turbogs_plugin.rendering.rendered import DEFAULT_SETTINGS, RasterSettings
-from turbogs_plugin.types import Cameras, Gaussians, PixelSamples
+from turbogs_plugin.types import Cameras, Gaussians, GaussianStats, PixelSamples
 
 
 @dataclass
@@ -64,7 +64,12 @@ class _Composite(torch.autograd.Function):
         rendered = ctx.shared.rendered
         if color_gradients is None:
             color_gradients = torch.zeros_like(rendered.colors)
-        screen = rendered.backward(color_gradients, alpha_gradients=alpha_gradients, depth_gradients=depth_gradients)
+        screen = rendered.backward(
+            color_gradients,
+            stats=GaussianStats.zeros(means2d.shape[1], means2d.device),  # for the absolute sums
+            alpha_gradients=alpha_gradients,
+            depth_gradients=depth_gradients,
+        )
         ctx.shared.screen = screen
         records = screen.full_records()
         means2d.absgrad = records[..., 9:11].clone()

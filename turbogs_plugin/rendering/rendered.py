@@ -43,7 +43,7 @@ class ScreenGradients(Protocol):
 
     def full_records(self) -> Tensor:
         """[K, N, 16] the gradients on the screen: of the projected mean in columns 0-1, of its absolute value per pixel
-        in 9-10; zero where a Gaussian is not drawn."""
+        in 9-10, which need a window of statistics; zero where a Gaussian is not drawn."""
         ...
 
 
