@@ -13,12 +13,13 @@ from framework_runs import TINY, tiny_capture
 from hypothesis import given
 from hypothesis import strategies as st
 
-from turbogs_plugin.ablation.grid import Ablation, ablation_names, load_ablation, variant_config, with_iterations
+from turbogs_plugin.ablation.grid import Ablation, ablation_names, load_ablation, variant_config
 from turbogs_plugin.ablation.results import CellResult, Study, StudyFolder
 from turbogs_plugin.ablation.statistics import Curve, Spread, differ, pareto_front, seconds_to_reach
 from turbogs_plugin.ablation.summary import summarise
 from turbogs_plugin.config import PLANNED_SETTINGS, load_config
 from turbogs_plugin.errors import InputError
+from turbogs_plugin.lengths import with_iterations
 from turbogs_plugin.report.history import Evaluation
 from turbogs_plugin.trainer import Trainer
 
@@ -97,7 +98,10 @@ def test_another_length_scales_what_counts_iterations_and_nothing_else():
     assert changed == {"refine_from", "refine_every", "final_every"}
     assert (short.density["refine_from"], short.density["refine_every"], short.density["final_every"]) == (20, 10, 50)
     assert with_iterations(config, 50).density["refine_every"] == 10
-    assert with_iterations(config, config.train.iterations).to_yaml() == before
+    same = with_iterations(config, config.train.iterations)
+    same.plan.iterations = config.plan.iterations
+    assert same.to_yaml() == before
+    assert short.plan.iterations == "keep", "a length that was asked for is not the plan's to change"
 
 
 @pytest.mark.parametrize(

@@ -62,6 +62,9 @@ BOTH_SIDES = [
     ("sh_degree", {"train_views": 3}, (), 0, "4 coefficients of degree 1 > 3"),
     ("sh_degree", {"direction_concentration": 0.96}, (), 1, "0.960 >= 0.95"),
     ("sh_degree", {"direction_concentration": 0.96}, ("train.sh_degree=0",), 0, "1 coefficients"),
+    ("iterations", {"train_views": 100}, (), 5000, "50 looks at each of 100 training views >= 50"),
+    ("iterations", {"train_views": 250}, (), 12500, "20 looks at each of 250 training views < 50"),
+    ("iterations", {"train_views": 100}, ("schedule.pixel_budget=0.5",), 10000, "25 looks"),
     ("optimizer", {}, (), "sparse_adam", "2 to 5 %"),
     ("optimizer", {}, ("optimizer.type=adam",), "keep", "the optimizer is adam"),
     ("maps_on", {"device_free_bytes": 240 * MIB}, (), "device", "120 MiB <= 50% of 240 MiB free"),
@@ -96,6 +99,7 @@ FORCED = [
     ("ncc", "true", {"flat_tiles": 1.0}, lambda config: config.loss == load_config("turbogs").loss),
     ("views", "all", {"train_views": 50}, lambda config: config.schedule["views"] == 50),
     ("sh_degree", "3", {"train_views": 3}, lambda config: config.train.sh_degree == 3),
+    ("iterations", "700", {"train_views": 250}, lambda config: config.train.refine_until == 490),
     ("optimizer", "moment_lm", {}, lambda config: config.optimizer == load_config("turbogs").optimizer),
     ("optimizer", "sparse_adam", {}, lambda config: config.optimizer["type"] == "sparse_adam"),
     ("maps_on", "host", {}, lambda config: config.plan.maps_on == "host"),
@@ -161,6 +165,7 @@ PLANNED = [(name, setting) for name, settings in PLANNED_SETTINGS.items() for se
 A_VALUE = {
     "train.backdrop": "true",
     "train.sh_degree": "2",
+    "train.iterations": "700",
     "loss.type": "charbonnier",
     "loss.ncc_weight": "0.3",
     "loss.structure": "contrast",
@@ -182,7 +187,8 @@ A_VALUE = {
 def test_what_one_says_oneself_no_plan_changes(tmp_path, name, setting):
     fixed = "  type: fixed\n" if setting == "schedule.views" else ""
     base = tmp_path / "base.yaml"
-    base.write_text("base: turbogs\nplan: {backdrop: auto, ncc: auto, views: auto, sh_degree: auto, optimizer: auto}\n")
+    planned = ", ".join(f"{decision}: auto" for decision in PLANNED_SETTINGS)
+    base.write_text(f"base: turbogs\nplan: {{{planned}}}\n")
     section, _, key = setting.partition(".")
     upper = tmp_path / "upper.yaml"
     upper.write_text(f"base: {base}\n{section}:\n{fixed}  {key}: {A_VALUE[setting]}\n")
@@ -229,6 +235,7 @@ def test_the_verb_prints_the_plan_of_a_capture(turbogs, capture):
         "ncc": ["true", "auto"],
         "views": ["all", "auto"],
         "sh_degree": ["1", "auto"],
+        "iterations": ["5000", "auto"],
         "optimizer": ["sparse_adam", "auto"],
         "maps_on": ["device", "auto"],
         "photos_on": ["device", "auto"],
@@ -243,7 +250,8 @@ def test_a_planned_run_tells_its_plan_and_resumes_bit_for_bit(turbogs, capture, 
     # What the plan decides must not be among the overrides' own settings.
     short = [option for option in TINY if not option.startswith(("schedule", "train.sh_degree"))]
     whole, stopped = tmp_path / "whole", tmp_path / "stopped"
-    code, _, err = turbogs("train", capture, *short, *AUTO, "--out", whole, "--device", "cpu")
+    decided = [option for option in AUTO if option != "plan.iterations=auto"]  # 50 looks would take minutes
+    code, _, err = turbogs("train", capture, *short, *decided, "--out", whole, "--device", "cpu")
     assert code == 0 and "sparse_adam  auto" in err
     page = (whole / "report.md").read_text()
     assert "## Plan" in page and "7 training views <= at most 10 an iteration" in page
@@ -259,7 +267,7 @@ def test_a_planned_run_tells_its_plan_and_resumes_bit_for_bit(turbogs, capture, 
             run.signal.raise_signal(run.signal.SIGINT)
 
     monkeypatch.setattr(Trainer, "step", interrupted)
-    assert turbogs("train", capture, *short, *AUTO, "--out", stopped, "--device", "cpu")[0] == 130
+    assert turbogs("train", capture, *short, *decided, "--out", stopped, "--device", "cpu")[0] == 130
     monkeypatch.undo()
     monkeypatch.setattr(run, "make_plan", None)  # a resumed run must not plan again
     run.resume(stopped)

@@ -133,6 +133,7 @@ class PlanConfig:
         views: ``all``: every training view in every iteration, with no schedule and no selection.
         sh_degree: `train.sh_degree`.
         optimizer: `optimizer.type`.
+        iterations: `train.iterations`, with all that counts iterations.
         maps_on: where error and age maps are: on the device, or in pinned memory of the host. It changes no result.
         photos_on: the same of the photos.
     """
@@ -142,12 +143,15 @@ class PlanConfig:
     views: Literal["auto", "keep", "all"] = "keep"
     sh_degree: int | Literal["auto", "keep"] = "keep"
     optimizer: Literal["auto", "keep", "moment_lm", "sparse_adam"] = "keep"
+    iterations: int | Literal["auto", "keep"] = "keep"
     maps_on: Literal["auto", "device", "host"] = "auto"
     photos_on: Literal["auto", "device", "host"] = "auto"
 
     def __post_init__(self) -> None:
         if self.sh_degree not in ("auto", "keep"):
             require(0 <= self.sh_degree <= 3, "sh_degree", self.sh_degree, "within 0 .. 3")
+        if self.iterations not in ("auto", "keep"):
+            require(self.iterations >= 1, "iterations", self.iterations, "at least 1")
 
 
 PLANNED_SETTINGS: dict[str, tuple[str, ...]] = {
@@ -155,6 +159,7 @@ PLANNED_SETTINGS: dict[str, tuple[str, ...]] = {
     "ncc": ("loss.type", "loss.ncc_weight", "loss.structure", "loss.gate"),
     "views": ("schedule.type", "schedule.min_views", "schedule.max_views", "schedule.views", "view_sampler.type"),
     "sh_degree": ("train.sh_degree",),
+    "iterations": ("train.iterations",),
     "optimizer": ("optimizer.type", "optimizer.units", "optimizer.rows", "optimizer.curvature", "optimizer.max_step"),
 }
 """Decision of `PlanConfig` -> the settings it is about."""

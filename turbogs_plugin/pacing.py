@@ -10,11 +10,11 @@ from typing import Any, Protocol
 
 import torch
 
-from turbogs_plugin.ablation.grid import with_iterations
 from turbogs_plugin.budget import IterationCost, MemoryDemand, TimePlan, fit_to_time, with_cap
 from turbogs_plugin.config import Config, TrainConfig, resolve
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.evaluation import synchronize
+from turbogs_plugin.lengths import with_iterations
 from turbogs_plugin.rendering import render_images
 from turbogs_plugin.scene import Scene
 from turbogs_plugin.trainer import Trainer

@@ -9,12 +9,12 @@ from dataclasses import replace
 
 import torch
 
-from turbogs_plugin.ablation.grid import with_iterations
 from turbogs_plugin.ablation.results import CellResult
 from turbogs_plugin.ablation.timing import PeakMemory
 from turbogs_plugin.clock import TrainingClock
 from turbogs_plugin.config import Config
 from turbogs_plugin.evaluation import Metrics, evaluate, load_lpips, peak_memory_bytes
+from turbogs_plugin.lengths import with_iterations
 from turbogs_plugin.offload import place_views
 from turbogs_plugin.plan import make_plan
 from turbogs_plugin.provenance import Provenance

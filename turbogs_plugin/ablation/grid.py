@@ -19,23 +19,11 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from turbogs_plugin.config import Config, load_config, resolve
+from turbogs_plugin.config import Config, load_config
 from turbogs_plugin.errors import InputError
+from turbogs_plugin.lengths import with_iterations
 from turbogs_plugin.schema import build_dataclass, nearest
 from turbogs_plugin.yaml_text import parse_yaml, read_yaml
-
-ITERATION_FIELDS = {
-    "train": ("refine_until", "sh_interval"),
-    "density": (
-        *("refine_from", "refine_every", "final_every", "prune_every"),
-        *("refine_start_iter", "refine_scale2d_stop_iter"),
-    ),
-}
-"""Settings that count iterations: a run of another length scales them. Not gsplat's `reset_every`: what a reset of
-opacities takes away grows back at the rate of the optimizer, however short the run."""
-
-SHORTEST_INTERVAL = 10
-"""Scaling makes no interval of density control shorter: its statistics need a window of some iterations."""
 
 _NAME = re.compile(r"[A-Za-z0-9+][A-Za-z0-9_+.-]{0,47}")
 
@@ -139,22 +127,3 @@ def variant_config(ablation: Ablation, variant: str, seed: int, overrides: Seque
     except InputError as error:
         raise InputError(f"variant '{variant}': {error}") from None
     return config if steps is None else with_iterations(config, steps)
-
-
-def with_iterations(config: Config, iterations: int) -> Config:
-    """The configuration for a run of this length: everything that counts iterations is scaled with it.
-
-    Intervals of density control stay at `SHORTEST_INTERVAL` or above; 0 stays 0.
-    """
-    if iterations < 1:
-        raise InputError(f"a run has at least one iteration, not {iterations}")
-    mapping = {name: dict(section) for name, section in config.to_mapping().items()}
-    factor = iterations / config.train.iterations
-    for section, names in ITERATION_FIELDS.items():
-        for name in names:
-            value = mapping[section].get(name, 0)
-            if value:
-                least = min(value, SHORTEST_INTERVAL) if section == "density" else 1
-                mapping[section][name] = max(least, round(value * factor))
-    mapping["train"]["iterations"] = iterations
-    return resolve(mapping)
