@@ -65,6 +65,16 @@ def test_initial_gaussians():
     assert all(value.dtype == torch.float32 for _, value in gaussians.items())
 
 
+def test_other_starts():
+    """gsplat's MCMC preset begins with opacities of 0.5 and a tenth of the scales."""
+    points = torch.rand(50, 3, generator=torch.Generator().manual_seed(1))
+    colors = torch.zeros(50, 3, dtype=torch.uint8)
+    plain = gaussians_from_points(points, colors, 1, 1.0)
+    small = gaussians_from_points(points, colors, 1, 1.0, opacity=0.5, size=0.1)
+    torch.testing.assert_close(small.scales, plain.scales - math.log(10))
+    torch.testing.assert_close(torch.sigmoid(small.opacities), torch.full((50,), 0.5))
+
+
 def test_coincident_and_lonely_points_get_a_scale():
     colors = torch.zeros(5, 3, dtype=torch.uint8)
     same = gaussians_from_points(torch.ones(5, 3), colors, sh_degree=0, extent=2.0)

@@ -35,17 +35,21 @@ BACKDROP_OPACITY = 0.88
 """Several of its Gaussians cover a direction, so that nothing shines through."""
 
 
-def gaussians_from_points(points: Tensor, colors: Tensor, sh_degree: int, extent: float) -> Gaussians:
+def gaussians_from_points(
+    points: Tensor, colors: Tensor, sh_degree: int, extent: float, opacity: float = INITIAL_OPACITY, size: float = 1.0
+) -> Gaussians:
     """One isotropic Gaussian a point, as 3DGS starts (Kerbl et al. 2023, section 5.1).
 
-    Its scale is the mean distance to the three nearest points, its opacity 0.1, its colour the point's; the higher
-    bands are zero.
+    Its scale is `size` times the mean distance to the three nearest points, its colour the point's; the higher bands
+    are zero.
 
     Args:
         points: [M, 3] float. Points that are not finite are left out, with a warning that counts them.
         colors: [M, 3] uint8.
         sh_degree: the degree to make room for, 0 .. 4.
         extent: the scene's, in the points' unit; bounds the scales from below where points coincide.
+        opacity: of every Gaussian, within (0, 1).
+        size: factor of the scales.
 
     Raises:
         InputError: no finite points, a degree out of range, an extent that is not positive.
@@ -64,14 +68,14 @@ def gaussians_from_points(points: Tensor, colors: Tensor, sh_degree: int, extent
     distances = (
         mean_neighbor_distances(points, neighbors=3) if count > 1 else points.new_full((1,), LONELY_SCALE * extent)
     )
-    scales = distances.clamp(min=SMALLEST_SCALE * extent).log()
+    scales = (size * distances).clamp(min=SMALLEST_SCALE * extent).log()
     quats = points.new_zeros(count, 4)
     quats[:, 0] = 1.0
     return Gaussians(
         means=points.clone(),
         quats=quats,
         scales=scales[:, None].repeat(1, 3),
-        opacities=points.new_full((count,), math.log(INITIAL_OPACITY / (1.0 - INITIAL_OPACITY))),
+        opacities=points.new_full((count,), math.log(opacity / (1.0 - opacity))),
         sh0=((colors.to(points) / 255.0 - 0.5) / SH_C0)[:, None, :],
         shN=points.new_zeros(count, (sh_degree + 1) ** 2 - 1, 3),
     )

@@ -322,17 +322,8 @@ class _Session:
         trainer = self.trainer
         trainer.require_finite()
         metrics = evaluate(trainer.gaussians, self.test, trainer.sh_degree, self.config.raster)
-        evaluation = Evaluation(
-            iteration=trainer.iteration,
-            train_seconds=self.clock.seconds,
-            psnr=metrics.psnr,
-            ssim=metrics.ssim,
-            l1=metrics.l1,
-            num_gaussians=len(trainer.gaussians),
-            memory_bytes=peak_memory_bytes(self.device),
-            nonfinite_losses=int(trainer.nonfinite_losses),
-            skipped_updates=int(trainer.optimizer.skipped),
-        )
+        memory = peak_memory_bytes(self.device)
+        evaluation = Evaluation.of(trainer, metrics, self.clock.seconds, memory)
         self.history.append(evaluation)
         append_evaluation(self.folder.history, evaluation)
         progress.evaluated(evaluation)

@@ -211,7 +211,10 @@ def initial_gaussians(scene: Scene, config: Config) -> Gaussians:
     """
     train = config.train
     rows = chosen_points(len(scene.points), config.budget.max_gaussians, BACKDROP_COUNT if train.backdrop else 0)
-    gaussians = gaussians_from_points(scene.points[rows], scene.point_colors[rows], train.sh_degree, scene.extent)
+    points, colors = scene.points[rows], scene.point_colors[rows]
+    gaussians = gaussians_from_points(
+        points, colors, train.sh_degree, scene.extent, train.initial_opacity, train.initial_size
+    )
     if not train.backdrop:
         return gaussians
     color = scene.train.photos.stored[::COLOR_STRIDE].float().mean(dim=0).cpu() / 255.0

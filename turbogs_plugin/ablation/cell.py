@@ -68,19 +68,7 @@ def train_cell(
         memory.pause()
         trainer.require_finite()
         metrics = evaluate(trainer.gaussians, test, trainer.sh_degree, config.raster, lpips if final else None)
-        history.append(
-            Evaluation(
-                iteration=trainer.iteration,
-                train_seconds=clock.seconds,
-                psnr=metrics.psnr,
-                ssim=metrics.ssim,
-                l1=metrics.l1,
-                num_gaussians=len(trainer.gaussians),
-                memory_bytes=memory.peak or peak_memory_bytes(device),
-                nonfinite_losses=int(trainer.nonfinite_losses),
-                skipped_updates=int(trainer.optimizer.skipped),
-            )
-        )
+        history.append(Evaluation.of(trainer, metrics, clock.seconds, memory.peak or peak_memory_bytes(device)))
         memory.resume()
         return metrics
 
