@@ -4,7 +4,7 @@ Environment:
     TURBOGS_CUDA: ``auto`` (default) builds where nvcc, torch's headers and a GPU are found, and else ends CPU-only,
         saying why in one line; ``require`` makes a missing library an error; ``off`` builds nothing.
     TURBOGS_CUDA_ARCH: compute capabilities to build for, such as ``90`` or ``80;90``, in place of the GPUs found here.
-    TURBOGS_EXACT_MATH: ``1`` builds the blending kernels with correctly rounded functions (csrc/common.cuh).
+    TURBOGS_EXACT_MATH: ``1`` builds the blending kernels with correctly rounded functions (csrc/blend_math.cuh).
 """
 
 from __future__ import annotations

@@ -1,5 +1,9 @@
 // From the screen gradients of K views to the parameters, a thread per Gaussian: what a block shares, and the loop over
 // the views of one Gaussian.
+//
+// Radii say which views those are, and only their records are read: there are none of what is off screen. Each lane goes
+// through its own views, so a warp makes as many turns as its busiest lane has views. Harmonics come to shared memory by
+// asynchronous copies, all of a block's in quads, and cameras are kept there.
 #pragma once
 
 #include "gaussian_backward.cuh"

@@ -25,6 +25,12 @@ inline void check_cuda(cudaError_t error, const char* what) {
     STD_TORCH_CHECK(error == cudaSuccess, "turbogs: ", what, ": ", cudaGetErrorString(error));
 }
 
+// Kernels count in 32 bits.
+inline int to_int(int64_t value, const char* what) {
+    STD_TORCH_CHECK(value >= 0 && value < INT32_MAX, "turbogs: ", what, ": a launch takes fewer than 2^31 - 1, got ", value);
+    return static_cast<int>(value);
+}
+
 // One call of an operator: makes the device of its tensors current while it lives, and gives raw pointers of tensors that
 // are contiguous, on that device, of the wanted type and shape; says what was wanted where one is not.
 class Checker {
@@ -65,14 +71,15 @@ public:
 
     // Rows of one struct each.
     template <typename T>
-    T* bytes_of(const Tensor& tensor, const char* name, ScalarType type, int64_t rows) const {
+    T* structs(const Tensor& tensor, const char* name, ScalarType type, int64_t rows) const {
         T* out = pointer<T>(tensor, name, type, {rows, static_cast<int64_t>(sizeof(T) / sizeof(float))});
         aligned(out, name);
         return out;
     }
 
     void aligned(const void* pointer, const char* name) const {
-        STD_TORCH_CHECK(reinterpret_cast<uintptr_t>(pointer) % 16 == 0, "turbogs: ", name, " must start at a multiple of 16 bytes");
+        STD_TORCH_CHECK(reinterpret_cast<uintptr_t>(pointer) % 16 == 0, "turbogs: ", name,
+                        " must start at a multiple of 16 bytes");
     }
 
     cudaStream_t stream() const {
@@ -101,7 +108,8 @@ private:
     static std::string describe(const Tensor& tensor) {
         std::ostringstream out;
         out << torch::headeronly::toString(tensor.scalar_type()) << " " << text(tensor.sizes()) << " on "
-            << (tensor.is_cuda() ? "cuda:" + std::to_string(static_cast<int>(tensor.get_device_index())) : "another kind of device")
+            << (tensor.is_cuda() ? "cuda:" + std::to_string(static_cast<int>(tensor.get_device_index()))
+                                 : "another kind of device")
             << (tensor.is_contiguous() ? "" : ", not contiguous");
         return out.str();
     }

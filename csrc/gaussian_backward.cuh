@@ -222,7 +222,7 @@ __device__ __forceinline__ void color_backward(const GaussianShape& shape, const
         grad_color[c] = color[c] >= 0.0f ? grad_color[c] : 0.0f;
         row.sh0[c] = kShBand0 * grad_color[c];
     }
-    float dots[kTrainingMaxBands];
+    float dots[kMaxBands];
 #pragma unroll
     for (int band = 1; band <= 3; ++band) {
         if (band > degree) break;

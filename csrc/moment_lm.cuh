@@ -1,5 +1,9 @@
 // The rule of a step for one Gaussian, strategies/update_rule.py's and moment_lm.py's: Adam's terms, and the damped systems
 // of the 10- and the 4-block.
+//
+// With S the damping's inverse root, (J^T J + damping) x = m becomes (I + S J^T J S) y = S m with x = S y: its pivots are 1 or
+// more, whatever the scales of the parameters, so Cholesky in single precision holds. Everything of a Gaussian stays in the
+// registers of its thread.
 #pragma once
 
 #include "training_math.cuh"

@@ -137,7 +137,7 @@ struct RowCollector {
 
     // Gradients of the harmonics above band 0.
     __device__ __forceinline__ void harmonics(const float mean[3], const ViewCamera* cameras, int degree,
-                                              float (&gradients)[3 * kTrainingMaxBands]) const {
+                                              float (&gradients)[3 * kMaxBands]) const {
         for (int s = 0; s < count; ++s) {
             float row[5];
             get<10, 3>(s, row);
@@ -151,7 +151,7 @@ struct RowCollector {
     __device__ __forceinline__ bool all_finite(const float mean[3], const ViewCamera* cameras, int degree) const {
         bool result = finite;
         if (large && degree > 0) {
-            float gradients[3 * kTrainingMaxBands] = {};
+            float gradients[3 * kMaxBands] = {};
             harmonics(mean, cameras, degree, gradients);
             for (float gradient : gradients) result = result && is_finite(gradient);
         }
@@ -287,7 +287,7 @@ __global__ void __launch_bounds__(kBackwardThreads, kStepBlocks) fused_step_kern
     wait_for_copies();
     __syncthreads();
 
-    float gradients[3 * kTrainingMaxBands] = {};
+    float gradients[3 * kMaxBands] = {};
     bool updated = false;
     if (seen) {
         RowCollector rows;
@@ -316,7 +316,7 @@ __global__ void __launch_bounds__(kBackwardThreads, kStepBlocks) fused_step_kern
     __syncthreads();  // all rows are done with
     block.updated[threadIdx.x] = updated;
 #pragma unroll
-    for (int i = 0; i < 3 * kTrainingMaxBands; ++i) {
+    for (int i = 0; i < 3 * kMaxBands; ++i) {
         if (i < harmonics.row) block.work[threadIdx.x * harmonics.row + i] = gradients[i];
     }
     __syncthreads();

@@ -6,7 +6,8 @@
 // no splat came in from the blocks before it. In the second every block sums what the blocks before it left, adds for each
 // splat that comes in the tiles that it goes through, and writes its tiles' first pairs. Sums are 64 bits wide, so that a pass
 // with more pairs than fit is noticed: it leaves every tile empty and raises the flag.
-#include "common.cuh"
+#include "raster_params.h"
+#include "warp.cuh"
 
 namespace turbogs {
 namespace {

@@ -4,10 +4,11 @@
 // together: a lane for each row of tiles that they reach, then a lane for each pair of those rows, which takes the next place
 // of its tile from the tile's cursor and writes its key there, four pairs a lane under way. Splats of many tiles would hold
 // such a warp up: they go into a list, in windows of kWindow pairs, which a second launch shares out over all warps. Those
-// that the list has no room for are done by their block. Order does not matter here, as stage 4 makes keys that all differ
-// ascend. The second launch also lists the runs of tiles with many pairs, as stage 4 wants them. Nothing needs the number of
-// pairs on the host, and a pass that overflows does nothing.
-#include "common.cuh"
+// that the list has no room for are done by their block. The second launch also lists the runs of tiles with many pairs, as
+// stage 4 wants them. In which order pairs arrive does not matter, as that stage sorts keys of which no two are equal. Nothing
+// needs the number of pairs on the host, and a pass that overflows does nothing.
+#include "tile_reach.cuh"
+#include "warp.cuh"
 
 namespace turbogs {
 namespace {

@@ -4,7 +4,8 @@
 // of a depth and a place among the pairs. Few depths agree in those bits, and few swaps put them right. Of a tile with more
 // pairs, every run of kRun is sorted so by a warp of its own, and a second launch merges the runs, a thread for each key, which
 // finds its place by bisection in the other runs. Keys differ, so the order does not depend on the one they came in.
-#include "common.cuh"
+#include "raster_params.h"
+#include "warp.cuh"
 
 namespace turbogs {
 namespace {

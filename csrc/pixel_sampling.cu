@@ -1,6 +1,8 @@
 // Error-guided sampling of pixels and cells: every tile of K views in one launch, a warp per tile.
 //
-// Slots of a tile follow from the image's size alone, so nothing is counted on the host. The sets equal the torch twin's.
+// A lane holds eight of the tile's 256 pixels, or one of its 16 cells, whose sums the warp makes of the pixels'. The warp draws
+// (warp_draw.cuh) and writes the drawn pixels in the order of the cells. Slots of a tile follow from the image's size alone, so
+// nothing is counted on the host, and no warp waits for another. The sets equal the torch twin's.
 #include "tile_pixels.cuh"
 #include "warp_draw.cuh"
 
@@ -32,10 +34,10 @@ __device__ __forceinline__ int tile_slots(const SamplePixelsParams& params, int 
 template <SampleUnit kUnit>
 __device__ __forceinline__ int first_slot(const SamplePixelsParams& params, const TilePixels& pixels) {
     const SampleView& view = params.views[pixels.view];
-    const int last_width = view.width - kTile * (view.tiles_x - 1);
+    const int last_width = view.width - kTileSize * (view.tiles_x - 1);
     const int row_slots =
-        (view.tiles_x - 1) * tile_slots<kUnit>(params, kTile, kTile) + tile_slots<kUnit>(params, last_width, kTile);
-    return view.slot_base + pixels.row * row_slots + pixels.column * tile_slots<kUnit>(params, kTile, pixels.height);
+        (view.tiles_x - 1) * tile_slots<kUnit>(params, kTileSize, kTileSize) + tile_slots<kUnit>(params, last_width, kTileSize);
+    return view.slot_base + pixels.row * row_slots + pixels.column * tile_slots<kUnit>(params, kTileSize, pixels.height);
 }
 
 template <SampleUnit kUnit, bool kWeighted>

@@ -6,9 +6,10 @@
 // together work on their colours and tiles, and clear their records where a backward pass will add to them: what is off
 // screen has none. Active tiles of a row of tiles have consecutive positions, found by their prefix counts, so a splat is
 // counted by two additions a row, whatever its length.
-#include "common.cuh"
 #include "quaternion.cuh"
 #include "spherical_harmonics.cuh"
+#include "tile_reach.cuh"
+#include "warp.cuh"
 
 namespace turbogs {
 namespace {
@@ -155,9 +156,8 @@ __device__ __forceinline__ size_t instance_of(const ProjectionParams& params, in
 // Clears the records of queued splats, four threads each, so that they write whole sectors.
 __device__ __forceinline__ void clear_records(const ProjectionParams& params, int first, const Queued* queue, int count,
                                               int thread, int threads) {
-    constexpr int kQuads = kGradientFloats / 4;
-    for (int i = thread; i < kQuads * count; i += threads) {
-        params.records[instance_of(params, first, queue[i / kQuads].source) * kQuads + i % kQuads] =
+    for (int i = thread; i < kRecordQuads * count; i += threads) {
+        params.records[instance_of(params, first, queue[i / kRecordQuads].source) * kRecordQuads + i % kRecordQuads] =
             make_float4(0.0f, 0.0f, 0.0f, 0.0f);
     }
 }
@@ -289,7 +289,7 @@ __global__ void __launch_bounds__(kProjectionGaussians* kProjectionSlices, 4)
 }  // namespace
 
 cudaError_t launch_projection(const ProjectionParams& params, cudaStream_t stream) {
-    const int entries = params.num_tiles + 1 > kRasterMaxViews ? params.num_tiles + 1 : kRasterMaxViews;
+    const int entries = params.num_tiles + 1 > kMaxViews ? params.num_tiles + 1 : kMaxViews;
     prepare_kernel<<<(entries + 255) / 256, 256, 0, stream>>>(params);
     if (const cudaError_t error = cudaGetLastError()) return error;
     if (params.num_gaussians == 0) return cudaSuccess;

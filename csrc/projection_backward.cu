@@ -1,5 +1,9 @@
 // Backward pass of the projection alone: gradients of the parameters in memory, for optimizers without a kernel of
 // their own and for torch autograd.
+//
+// A thread per Gaussian. It looks for the views in which the Gaussian has gradients, takes each of those records to a row of 14
+// numbers, and writes the rows or their sum; where there is nothing it writes zeros. Gradients of the harmonics add up in
+// shared memory and leave it at the end, all of a block's together.
 #include "backward_block.cuh"
 
 namespace turbogs {

@@ -1,4 +1,5 @@
-// Quaternions of any norm, wxyz, and their rotations.
+// Quaternions of any norm, wxyz, and their rotations: one version for the projection and for its backward pass. Those that
+// optimizers leave may be tiny, huge or zero, and each of them is given a rotation.
 #pragma once
 
 namespace turbogs {

@@ -1,5 +1,9 @@
 // Random words and the keys of the pixel sampler, to the bit as strategies/philox.py and pixel_sampling.py define them: single-
 // precision operations that are rounded one by one.
+//
+// A unit's random words depend on the seed, the iteration and its place alone. In a race its key is weight over an exponential
+// number, and the largest keys win with the probabilities of drawing one by one without replacement; by age, the key is the age
+// with random bits below it. Keys are integers, so that a threshold can be searched.
 #pragma once
 
 #include "training_math.cuh"

@@ -6,7 +6,7 @@
 // this leaves (w, d loss / d sigma) of kSplats x 32. Then lane = splat and a share of the samples, sample after sample,
 // which sums all moments in the lane's own registers. So next to nothing is reduced across lanes, and each splat ends in
 // four 16-byte atomic additions an item.
-#include "common.cuh"
+#include "staged_splat.cuh"
 
 namespace turbogs {
 namespace {
@@ -180,7 +180,7 @@ __device__ __forceinline__ void sum_samples(const BackwardShared& shared, int ro
 }
 
 // From sums over u and v to the record: those of x and y, and of the conic.
-__device__ __forceinline__ void make_record(const StagedSplat& own, const SplatSums& sums, float record[kGradientFloats]) {
+__device__ __forceinline__ void make_record(const StagedSplat& own, const SplatSums& sums, float record[kRecordFloats]) {
     const float p = own.form.x, q = own.form.y, r = own.form.z;
     const float inverse_p = 1.0f / p, inverse_r = 1.0f / r, skew = q * inverse_r;  // dy = v / r, dx = (u - skew v) / p
     record[0] = kTwoLn2 * p * sums.u;
@@ -201,29 +201,20 @@ __device__ __forceinline__ void make_record(const StagedSplat& own, const SplatS
     record[15] = 0.0f;
 }
 
-// Adds the records of the lanes that share a splat, and sends them to memory.
-__device__ __forceinline__ void send_record(float* target, const float record[kGradientFloats], bool live, int share) {
-    if (kShares == 1) {
-        if (!live) return;
+// Adds the records of the two lanes that share a splat, and sends them to memory: each lane takes over half of the record.
+__device__ __forceinline__ void send_record(float* target, const float record[kRecordFloats], bool live, int share) {
+    static_assert(kShares == 2, "two lanes share a splat");
+    constexpr int kHalf = kRecordFloats / 2;
+    float sum[kHalf];
 #pragma unroll
-        for (int i = 0; i < kGradientFloats; i += 4) {
-            add_quad(target + i, record[i], record[i + 1], record[i + 2], record[i + 3]);
-        }
-    } else {
-        // Two lanes: each takes over half of the record.
-        static_assert(kShares <= 2, "two lanes share a splat");
-        constexpr int kHalf = kGradientFloats / 2;
-        float sum[kHalf];
-#pragma unroll
-        for (int i = 0; i < kHalf; ++i) {
-            const float kept = share ? record[kHalf + i] : record[i], sent = share ? record[i] : record[kHalf + i];
-            sum[i] = kept + __shfl_xor_sync(kFullWarp, sent, kSplats);
-        }
-        if (!live) return;
-        target += share * kHalf;
-        add_quad(target, sum[0], sum[1], sum[2], sum[3]);
-        add_quad(target + 4, sum[4], sum[5], sum[6], sum[7]);
+    for (int i = 0; i < kHalf; ++i) {
+        const float kept = share ? record[kHalf + i] : record[i], sent = share ? record[i] : record[kHalf + i];
+        sum[i] = kept + __shfl_xor_sync(kFullWarp, sent, kSplats);
     }
+    if (!live) return;
+    target += share * kHalf;
+    add_quad(target, sum[0], sum[1], sum[2], sum[3]);
+    add_quad(target + 4, sum[4], sum[5], sum[6], sum[7]);
 }
 
 template <bool kDepth, bool kDensity>
@@ -278,9 +269,9 @@ __global__ void __launch_bounds__(kWarpSize) backward_kernel(const __grid_consta
             __syncwarp();
             SplatSums sums;
             sum_samples<kDepth, kDensity>(shared, row, share, own, sums);
-            float record[kGradientFloats];
+            float record[kRecordFloats];
             make_record(own, sums, record);
-            send_record(params.screen_gradients + static_cast<size_t>(instance) * kGradientFloats, record, row < count, share);
+            send_record(params.screen_gradients + static_cast<size_t>(instance) * kRecordFloats, record, row < count, share);
         }
         __syncwarp();
     }
@@ -296,7 +287,7 @@ cudaError_t launch(const BackwardParams& params, cudaStream_t stream) {
 
 cudaError_t launch_rasterize_backward(const BackwardParams& params, cudaStream_t stream) {
     if (params.num_instances == 0) return cudaSuccess;
-    const size_t bytes = sizeof(float) * kGradientFloats * static_cast<size_t>(params.num_instances);
+    const size_t bytes = sizeof(float) * kRecordFloats * static_cast<size_t>(params.num_instances);
     if (!params.cleared) {
         if (const cudaError_t error = cudaMemsetAsync(params.screen_gradients, 0, bytes, stream)) return error;
     }

@@ -5,7 +5,7 @@
 // time, one to a lane, the next 32 being fetched meanwhile; each lane drops its splat where it reaches none of the warp's
 // samples, and the others are read from the warp's own shared memory by all lanes at once. For the backward pass the warp
 // leaves one bit for each splat that contributed to any of an item's samples.
-#include "common.cuh"
+#include "staged_splat.cuh"
 
 namespace turbogs {
 namespace {
@@ -183,7 +183,7 @@ template <int kGroups>
 cudaError_t launch(const ForwardParams& params, cudaStream_t stream) {
     const int warps = params.num_active * (params.chunks / kGroups);
     const int blocks = (warps + kForwardWarps - 1) / kForwardWarps;
-    if (params.with_depth) forward_kernel<kGroups, true><<<blocks, kForwardWarps * kWarpSize, 0, stream>>>(params);
+    if (params.depths != nullptr) forward_kernel<kGroups, true><<<blocks, kForwardWarps * kWarpSize, 0, stream>>>(params);
     else forward_kernel<kGroups, false><<<blocks, kForwardWarps * kWarpSize, 0, stream>>>(params);
     return cudaGetLastError();
 }

@@ -255,7 +255,8 @@ __device__ __forceinline__ TileTotals tile_loss(const SparseLossParams& params, 
 
 // A warp per tile; its block adds up what belongs together. Up to 32 kSlots samples of a tile are held in registers.
 template <int kSlots>
-__global__ void __launch_bounds__(kLossThreads, kLossBlocks) sparse_loss_kernel(const __grid_constant__ SparseLossParams params) {
+__global__ void __launch_bounds__(kLossThreads, kLossBlocks)
+    sparse_loss_kernel(const __grid_constant__ SparseLossParams params) {
     __shared__ double losses[kLossWarps], view_deltas[kLossWarps];
     __shared__ int views[kLossWarps];
     const int lane = threadIdx.x & 31, warp = threadIdx.x / 32;

@@ -7,7 +7,7 @@
 
 namespace turbogs {
 
-constexpr int kTile = 16, kTilePixels = 256, kPerLane = kTilePixels / 32;
+constexpr int kTilePixels = kTileSize * kTileSize, kPerLane = kTilePixels / 32;
 constexpr int kSampleThreads = 128;
 constexpr int kAgeMax = 32767;
 
@@ -32,12 +32,12 @@ __device__ __forceinline__ TilePixels locate_tile(const SamplePixelsParams& para
     const int number = tile - view.tile_base;
     pixels.row = number / view.tiles_x;
     pixels.column = number - pixels.row * view.tiles_x;
-    pixels.width = min(kTile, view.width - kTile * pixels.column);
-    pixels.height = min(kTile, view.height - kTile * pixels.row);
+    pixels.width = min(kTileSize, view.width - kTileSize * pixels.column);
+    pixels.height = min(kTileSize, view.height - kTileSize * pixels.row);
     pixels.inside = 0;
     const int lane = threadIdx.x & 31, x = lane & 7, y = lane >> 3;
     pixels.image_width = view.width;
-    pixels.first = static_cast<uint32_t>((kTile * pixels.row + y) * view.width + kTile * pixels.column + x);
+    pixels.first = static_cast<uint32_t>((kTileSize * pixels.row + y) * view.width + kTileSize * pixels.column + x);
 #pragma unroll
     for (int j = 0; j < kPerLane; ++j) {
         const bool exists = x + (j & 1) * 8 < pixels.width && y + (j >> 1) * 4 < pixels.height;

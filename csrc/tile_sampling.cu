@@ -1,5 +1,8 @@
-// Error-guided sampling of whole tiles: sums of each tile, a block per view that draws tiles, and the pixel ids of the chosen
-// ones.
+// Error-guided sampling of whole tiles, in three launches: a warp per tile sums its errors and finds its greatest age; a block
+// per view draws tiles; a warp per drawn tile lists its pixels.
+//
+// A view's tiles are too many for registers, so their keys lie in memory, and each stage of the draw searches its threshold bit
+// by bit with counts over the block. It runs once for a few thousand keys, and its sets equal the torch twin's.
 #include "tile_pixels.cuh"
 #include "warp_draw.cuh"
 

@@ -28,15 +28,16 @@ ScreenBackwardParams screen_backward_params(const Checker& check, const std::vec
     const int64_t num_views = static_cast<int64_t>(sizes.size()) / 2;
     const int64_t num_gaussians = gaussians[0].size(0);
     const int64_t bands = gaussians[5].size(1);
-    STD_TORCH_CHECK(num_views >= 1 && num_views <= kTrainingMaxViews, "turbogs: a batch has 1 to ", kTrainingMaxViews,
+    STD_TORCH_CHECK(num_views >= 1 && num_views <= kMaxViews, "turbogs: a batch has 1 to ", kMaxViews,
                     " views, not ", num_views);
-    STD_TORCH_CHECK(sh_degree >= 0 && sh_degree <= 3, "turbogs: sh_degree must be 0 .. 3, not ", sh_degree);
-    STD_TORCH_CHECK(bands <= kTrainingMaxBands && (sh_degree + 1) * (sh_degree + 1) - 1 <= bands,
+    STD_TORCH_CHECK(sh_degree >= 0 && sh_degree <= kMaxDegree, "turbogs: sh_degree must be 0 .. ", kMaxDegree, ", not ",
+                    sh_degree);
+    STD_TORCH_CHECK(bands <= kMaxBands && (sh_degree + 1) * (sh_degree + 1) - 1 <= bands,
                     "turbogs: shN holds ", bands, " bands, which does not suit degree ", sh_degree);
 
     ScreenBackwardParams params = {};
     params.num_views = static_cast<int>(num_views);
-    params.num_gaussians = static_cast<int>(num_gaussians);
+    params.num_gaussians = to_int(num_gaussians, "Gaussians");
     params.sh_degree = static_cast<int>(sh_degree);
     params.bands = static_cast<int>(bands);
     params.eps2d = static_cast<float>(eps2d);
@@ -52,16 +53,15 @@ ScreenBackwardParams screen_backward_params(const Checker& check, const std::vec
         params.widths[view] = static_cast<int>(sizes[2 * view]);
         params.heights[view] = static_cast<int>(sizes[2 * view + 1]);
     }
-    params.records = reinterpret_cast<float4*>(
-        check.pointer<float>(records, "screen gradients", ScalarType::Float, {num_views, num_gaussians, kRecordQuads * 4}));
-    params.radii = reinterpret_cast<const int2*>(
-        check.pointer<int32_t>(radii, "radii", ScalarType::Int, {num_views, num_gaussians, 2}));
+    params.records =
+        check.pointer<float4>(records, "screen gradients", ScalarType::Float, {num_views, num_gaussians, kRecordFloats});
+    params.radii = check.pointer<int2>(radii, "radii", ScalarType::Int, {num_views, num_gaussians, 2});
     check.aligned(params.radii, "radii");
     check.aligned(params.quats, "quats");
     check.aligned(params.shN, "shN");
     check.aligned(params.records, "screen gradients");
     params.num_filled = check.optional<int32_t>(num_filled, "num_filled", ScalarType::Int, {1});
-    params.num_slots = static_cast<int>(num_slots);
+    params.num_slots = to_int(num_slots, "samples");
     params.overflow = check.optional<int32_t>(overflow, "overflow", ScalarType::Int, {1});
     if (!stats.empty()) {
         STD_TORCH_CHECK(stats.size() == 7, "turbogs: stats must be the seven tensors of GaussianStats");
@@ -79,8 +79,8 @@ ScreenBackwardParams screen_backward_params(const Checker& check, const std::vec
 void projection_backward(const std::vector<Tensor>& gaussians, const Tensor& viewmats, const Tensor& Ks,
                          const std::vector<int64_t>& sizes, const Tensor& records, const Tensor& radii,
                          const std::vector<Tensor>& stats, int64_t sh_degree, double eps2d,
-                         const std::optional<Tensor>& num_filled, int64_t num_slots, const std::optional<Tensor>& overflow, const Tensor& rows,
-                         const Tensor& shN, const Tensor& touched, const Tensor& view_losses) {
+                         const std::optional<Tensor>& num_filled, int64_t num_slots, const std::optional<Tensor>& overflow,
+                         const Tensor& rows, const Tensor& shN, const Tensor& touched, const Tensor& view_losses) {
     const Checker check(records);
     const ScreenBackwardParams params = screen_backward_params(check, gaussians, viewmats, Ks, sizes, records, radii, stats,
                                                                sh_degree, eps2d, num_filled, num_slots, overflow);
@@ -145,7 +145,7 @@ void fused_step(const std::vector<Tensor>& gaussians, const Tensor& viewmats, co
     check.aligned(optimizer.exp_avg_sq_shN, "exp_avg_sq_shN");
     optimizer.steps = check.pointer<int32_t>(moments[4], "steps", ScalarType::Int, {count});
     optimizer.skipped =
-        reinterpret_cast<unsigned long long*>(check.pointer<int64_t>(moments[5], "skipped", ScalarType::Long, {}));
+        check.pointer<unsigned long long>(moments[5], "skipped", ScalarType::Long, {});
     check.launched(launch_fused_step(params, optimizer, check.stream()), "fused step");
 }
 
@@ -154,7 +154,7 @@ void fused_step(const std::vector<Tensor>& gaussians, const Tensor& viewmats, co
 constexpr int64_t kViewFields = 6;
 
 struct ViewTable {
-    SampleView views[kTrainingMaxViews] = {};
+    SampleView views[kMaxViews] = {};
     int num_views = 0;
     int num_tiles = 0;
 };
@@ -162,7 +162,7 @@ struct ViewTable {
 ViewTable view_table(const std::vector<int64_t>& fields) {
     ViewTable table;
     const int64_t count = static_cast<int64_t>(fields.size()) / kViewFields;
-    STD_TORCH_CHECK(count >= 1 && count <= kTrainingMaxViews, "turbogs: a batch has 1 to ", kTrainingMaxViews,
+    STD_TORCH_CHECK(count >= 1 && count <= kMaxViews, "turbogs: a batch has 1 to ", kMaxViews,
                     " views, not ", count);
     table.num_views = static_cast<int>(count);
     for (int i = 0; i < table.num_views; ++i) {
@@ -174,8 +174,8 @@ ViewTable view_table(const std::vector<int64_t>& fields) {
         view.view_number = static_cast<int>(field[3]);
         view.slot_base = static_cast<int>(field[4]);
         view.wanted = static_cast<int>(field[5]);
-        view.tiles_x = (view.width + 15) / 16;
-        view.tiles_y = (view.height + 15) / 16;
+        view.tiles_x = (view.width + kTileSize - 1) / kTileSize;
+        view.tiles_y = (view.height + kTileSize - 1) / kTileSize;
         view.tile_base = table.num_tiles;
         table.num_tiles += view.tiles_x * view.tiles_y;
     }
@@ -192,13 +192,13 @@ void sample_pixels(const Tensor& errors, const Tensor& stamps, const std::vector
     SamplePixelsParams params = {};
     STD_TORCH_CHECK(unit >= 0 && unit <= 2, "turbogs: unit must be 0 (pixel), 1 (cell) or 2 (tile)");
     params.unit = static_cast<SampleUnit>(unit);
-    const bool by_tile = params.unit == SampleUnit::kTile;
+    const bool by_tile = params.unit == SampleUnit::kTileSize;
     const size_t stage_rows = by_tile ? static_cast<size_t>(table.num_views) : 1;
     STD_TORCH_CHECK(stages.size() == 3 * stage_rows, "turbogs: stages must hold ", 3 * stage_rows, " numbers");
     STD_TORCH_CHECK(by_tile || tiles == table.num_tiles, "turbogs: tile_ids must have an entry for each tile");
     params.num_views = table.num_views;
     params.num_tiles = table.num_tiles;
-    params.num_chosen = static_cast<int>(tiles);
+    params.num_chosen = to_int(tiles, "tiles");
     for (int i = 0; i < table.num_views; ++i) {
         params.views[i] = table.views[i];
         const SampleView& view = table.views[i];
@@ -234,7 +234,7 @@ void sample_pixels(const Tensor& errors, const Tensor& stamps, const std::vector
 void count_filled(const Tensor& pixel_ids, const Tensor& num_filled) {
     const Checker check(pixel_ids);
     CountFilledParams params = {};
-    params.num_slots = static_cast<int>(pixel_ids.numel());
+    params.num_slots = to_int(pixel_ids.numel(), "samples");
     params.pixel_ids = check.pointer<int32_t>(pixel_ids, "pixel_ids", ScalarType::Int, {params.num_slots});
     params.num_filled = check.pointer<int32_t>(num_filled, "num_filled", ScalarType::Int, {1});
     check.launched(launch_count_filled(params, check.stream()), "count of samples");
@@ -245,19 +245,20 @@ void sparse_loss(const Tensor& colors, const std::optional<Tensor>& targets, con
                  const std::optional<Tensor>& weights, const std::vector<int64_t>& views, int64_t structure, double epsilon,
                  double l1_weight, double structure_weight, double variance_constant, bool balance, bool gate,
                  const std::vector<Tensor>& maps, double beta, int64_t stamp, const std::optional<Tensor>& num_filled,
-                 const Tensor& loss,
-                 const Tensor& color_gradients, const Tensor& pixel_errors, const std::optional<Tensor>& num_nonfinite,
+                 const Tensor& loss, const Tensor& color_gradients, const Tensor& pixel_errors,
+                 const std::optional<Tensor>& num_nonfinite,
                  const std::optional<Tensor>& nonfinite_losses, const std::optional<Tensor>& overflow) {
     const Checker check(colors);
     const ViewTable table = view_table(views);
     const int64_t slots = pixel_ids.numel(), tiles = tile_ids.numel();
     SparseLossParams params = {};
-    STD_TORCH_CHECK(structure >= 0 && structure <= 3, "turbogs: structure must be 0 (none), 1 (ncc), 2 (contrast) or 3 (ssim)");
+    STD_TORCH_CHECK(structure >= 0 && structure <= 3,
+                    "turbogs: structure must be 0 (none), 1 (ncc), 2 (contrast) or 3 (ssim)");
     STD_TORCH_CHECK(targets.has_value() != photos.has_value(), "turbogs: give either targets or photos");
     params.num_views = table.num_views;
     for (int i = 0; i < table.num_views; ++i) params.views[i] = table.views[i];
-    params.num_tiles = static_cast<int>(tiles);
-    params.num_slots = static_cast<int>(slots);
+    params.num_tiles = to_int(tiles, "tiles");
+    params.num_slots = to_int(slots, "samples");
     params.structure = static_cast<Structure>(structure);
     params.epsilon = static_cast<float>(epsilon);
     params.l1_weight = static_cast<float>(l1_weight);
@@ -299,9 +300,8 @@ void sparse_loss(const Tensor& colors, const std::optional<Tensor>& targets, con
     params.color_gradients = check.pointer<float>(color_gradients, "color_gradients", ScalarType::Float, {slots, 3});
     params.pixel_errors = check.pointer<float>(pixel_errors, "pixel_errors", ScalarType::Float, {slots});
     params.num_nonfinite =
-        reinterpret_cast<unsigned long long*>(check.optional<int64_t>(num_nonfinite, "num_nonfinite", ScalarType::Long, {}));
-    params.nonfinite_losses = reinterpret_cast<unsigned long long*>(
-        check.optional<int64_t>(nonfinite_losses, "nonfinite_losses", ScalarType::Long, {}));
+        check.optional<unsigned long long>(num_nonfinite, "num_nonfinite", ScalarType::Long, {});
+    params.nonfinite_losses = check.optional<unsigned long long>(nonfinite_losses, "nonfinite_losses", ScalarType::Long, {});
     params.overflow = check.optional<int32_t>(overflow, "overflow", ScalarType::Int, {1});
     check.launched(launch_sparse_loss(params, check.stream()), "sparse loss");
 }
@@ -309,7 +309,7 @@ void sparse_loss(const Tensor& colors, const std::optional<Tensor>& targets, con
 }  // namespace
 }  // namespace turbogs
 
-#define TURBOGS_BACKWARD_INPUTS                                                                              \
+#define TURBOGS_BACKWARD_INPUTS                                                                                     \
     "Tensor(p!)[] gaussians, Tensor viewmats, Tensor Ks, int[] sizes, Tensor(r!) records, Tensor radii, "           \
     "Tensor(s!)[] stats, int sh_degree, float eps2d, Tensor? num_filled, int num_slots, Tensor? overflow, "
 

@@ -8,18 +8,14 @@
 
 #include <cstdint>
 
+#include "sizes.h"
+
 namespace turbogs {
 
-constexpr int kTrainingMaxViews = 128;     // views of one batch: they travel as a kernel argument
-constexpr int kTrainingMaxBands = 15;      // harmonics above band 0: degree 3
 constexpr float kRateMin = 1.0842021724855044e-19f;  // sqrt(FLT_MIN)
-constexpr int kRowSize = 14;               // mean 3, scale 3, quaternion 4, sh0 3, opacity 1
-constexpr int kRecordQuads = 4;            // a screen-gradient record is 16 floats
+constexpr int kRowSize = 14;                         // mean 3, scale 3, quaternion 4, sh0 3, opacity 1
 
 // The screen gradients of a batch, the parameters that they belong to, and what the backward pass adds up.
-//
-// Record of (view, Gaussian): 0-1 d/dmean2d, 2-4 d/dconic, 5-7 d/dcolor behind the clamp at 0, 8 d/dopacity,
-// 9-10 absolute sums of d/dmean2d, 11 sum e*w, 12 sum D*w, 13 sum w, 14 d/ddepth, 15 unused.
 struct ScreenBackwardParams {
     int num_views;      // K
     int num_gaussians;  // N
@@ -36,8 +32,8 @@ struct ScreenBackwardParams {
 
     const float* viewmats;    // [K, 4, 4]
     const float* intrinsics;  // [K, 3, 3]
-    int widths[kTrainingMaxViews];
-    int heights[kTrainingMaxViews];
+    int widths[kMaxViews];
+    int heights[kMaxViews];
 
     float4* records;             // [K, N, 4]; read where on screen; the fused step leaves rows in any of them
     const int2* radii;           // [K, N]; 0 where the Gaussian is off screen
@@ -105,7 +101,7 @@ struct SampleView {
     int wanted;          // unit tile: tiles to choose
 };
 
-enum class SampleUnit : int { kPixel = 0, kCell = 1, kTile = 2 };
+enum class SampleUnit : int { kPixel = 0, kCell = 1, kTileSize = 2 };
 
 // The pixel sampler; strategies/pixel_sampling.py defines the draw, bit for bit.
 struct SamplePixelsParams {
@@ -113,8 +109,8 @@ struct SamplePixelsParams {
     int num_views;             // K
     int num_tiles;             // of all views
     int num_chosen;            // unit tile: chosen tiles of all views
-    SampleView views[kTrainingMaxViews];
-    int stages[kTrainingMaxViews][3];  // units of the hard, stable and mixed stage: [0] holds for all tiles, or one a view
+    SampleView views[kMaxViews];
+    int stages[kMaxViews][3];  // units of the hard, stable and mixed stage: [0] holds for all tiles, or one a view
     int slots_per_tile;        // units pixel and cell: slots of a tile that is not cut; also the cap of a cut one
     bool mixed_uniform;
     float importance;          // a of the weights p^-a, 0 for none
@@ -145,7 +141,7 @@ struct SparseLossParams {
     int num_views;             // K
     int num_tiles;             // T, tiles with samples
     int num_slots;             // P
-    SampleView views[kTrainingMaxViews];
+    SampleView views[kMaxViews];
     Structure structure;
     float epsilon;             // of the Charbonnier term
     float l1_weight;

@@ -6,7 +6,7 @@
 #include <torch/headeronly/core/ScalarType.h>
 
 #include "binding_checks.h"
-#include "params.h"
+#include "raster_params.h"
 
 namespace turbogs {
 namespace {
@@ -23,22 +23,21 @@ struct SampleBuffers {
     ForwardParams params(const Checker& check) const {
         ForwardParams out = {};
         const int64_t num_views = cameras.size(0), num_active = tile_offsets.numel() - 1, num_slots = pixel_ids.numel();
-        STD_TORCH_CHECK(chunks > 0, "chunks must be positive, got ", chunks);
-        STD_TORCH_CHECK(pair_ids.numel() / kBucket + num_active + 1 <= masks.numel() / chunks, "masks is too small");
-        out.num_views = static_cast<int>(num_views);
-        out.num_active = static_cast<int>(num_active);
-        out.chunks = static_cast<int>(chunks);
-        out.with_depth = depths.has_value();
+        STD_TORCH_CHECK(chunks > 0, "turbogs: chunks must be positive, got ", chunks);
+        STD_TORCH_CHECK(pair_ids.numel() / kBucket + num_active + 1 <= masks.numel() / chunks, "turbogs: masks is too small");
+        out.num_views = to_int(num_views, "views");
+        out.num_active = to_int(num_active, "active tiles");
+        out.chunks = to_int(chunks, "chunks");
         out.alpha_min = static_cast<float>(alpha_min);
         out.alpha_max = static_cast<float>(alpha_max);
         out.transmittance_min = static_cast<float>(transmittance_min);
-        out.cameras = check.bytes_of<RasterCamera>(cameras, "cameras", ScalarType::Float, num_views);
+        out.cameras = check.structs<RasterCamera>(cameras, "cameras", ScalarType::Float, num_views);
         out.tile_ids = check.optional<int32_t>(tile_ids, "tile_ids", ScalarType::Int, {num_active});
         out.tile_offsets = check.pointer<int32_t>(tile_offsets, "tile_offsets", ScalarType::Int, {num_active + 1});
         out.pixel_ids = check.pointer<int32_t>(pixel_ids, "pixel_ids", ScalarType::Int, {num_slots});
         out.tile_starts = check.pointer<uint32_t>(tile_starts, "tile_starts", ScalarType::Int, {num_active + 1});
         out.pair_ids = check.pointer<uint32_t>(pair_ids, "pair_ids", ScalarType::Int, {pair_ids.numel()});
-        out.instances = check.bytes_of<Instance>(instances, "instances", ScalarType::Float, instances.size(0));
+        out.instances = check.structs<Instance>(instances, "instances", ScalarType::Float, instances.size(0));
         out.colors = check.pointer<float>(colors, "colors", ScalarType::Float, {num_slots, 3});
         out.alphas = check.pointer<float>(alphas, "alphas", ScalarType::Float, {num_slots});
         out.transmittances = check.pointer<float>(transmittances, "transmittances", ScalarType::Float, {num_slots});
@@ -53,25 +52,26 @@ struct SampleBuffers {
 void raster_project(Tensor means, Tensor quats, Tensor scales, Tensor opacities, Tensor sh0, Tensor shN, Tensor viewmats,
                     Tensor Ks, Tensor sizes, std::optional<Tensor> tile_ids, Tensor cameras,
                     std::optional<Tensor> active_prefix, Tensor instances, Tensor radii, Tensor tile_differences,
-                    std::optional<Tensor> records, int64_t sh_degree, double eps2d, double near_plane, double far_plane, double alpha_min) {
+                    std::optional<Tensor> records, int64_t sh_degree, double eps2d, double near_plane, double far_plane,
+                    double alpha_min) {
     Checker check(means);
     const int64_t count = means.size(0), views = viewmats.size(0), bands = shN.size(1), total = views * count;
-    STD_TORCH_CHECK(views >= 1 && views <= kRasterMaxViews, "viewmats: 1 .. ", kRasterMaxViews, " views a launch, got ", views);
-    STD_TORCH_CHECK(total <= INT32_MAX, "views * Gaussians must stay below 2^31, got ", views, " * ", count);
-    STD_TORCH_CHECK(sh_degree >= 0 && sh_degree <= kRasterMaxDegree, "sh_degree must be 0 .. ", kRasterMaxDegree, ", got ",
+    STD_TORCH_CHECK(views >= 1 && views <= kMaxViews, "turbogs: viewmats: 1 .. ", kMaxViews, " views a launch, got ", views);
+    to_int(total, "views * Gaussians");
+    STD_TORCH_CHECK(sh_degree >= 0 && sh_degree <= kMaxDegree, "turbogs: sh_degree must be 0 .. ", kMaxDegree, ", got ",
                     sh_degree);
-    STD_TORCH_CHECK(bands >= (sh_degree + 1) * (sh_degree + 1) - 1, "shN holds ", bands, " bands, too few for sh_degree ",
-                    sh_degree);
+    STD_TORCH_CHECK(bands >= (sh_degree + 1) * (sh_degree + 1) - 1, "turbogs: shN holds ", bands,
+                    " bands, too few for sh_degree ", sh_degree);
     STD_TORCH_CHECK(sizes.is_cpu() && sizes.scalar_type() == ScalarType::Long && sizes.is_contiguous() && sizes.dim() == 2 &&
                         sizes.size(0) == views && sizes.size(1) == 2,
-                    "sizes must be a contiguous int64 [", views, ", 2] tensor on the CPU");
-    STD_TORCH_CHECK(tile_ids.has_value() == active_prefix.has_value(), "tile_ids and active_prefix go together");
+                    "turbogs: sizes must be a contiguous int64 [", views, ", 2] tensor on the CPU");
+    STD_TORCH_CHECK(tile_ids.has_value() == active_prefix.has_value(), "turbogs: tile_ids and active_prefix go together");
 
     ProjectionParams params = {};
     params.num_views = static_cast<int>(views);
-    params.num_gaussians = static_cast<int>(count);
+    params.num_gaussians = to_int(count, "Gaussians");
     params.sh_degree = static_cast<int>(sh_degree);
-    params.bands = static_cast<int>(bands);
+    params.bands = to_int(bands, "bands");
     params.eps2d = static_cast<float>(eps2d);
     params.near_plane = static_cast<float>(near_plane);
     params.far_plane = static_cast<float>(far_plane);
@@ -80,14 +80,14 @@ void raster_project(Tensor means, Tensor quats, Tensor scales, Tensor opacities,
     int64_t tiles = 0;
     for (int64_t view = 0; view < views; ++view) {
         const int64_t width = size[2 * view], height = size[2 * view + 1];
-        STD_TORCH_CHECK(width > 0 && height > 0 && width * height <= INT32_MAX, "sizes: view ", view, " is ", width, " x ", height);
+        STD_TORCH_CHECK(width > 0 && height > 0 && width * height <= INT32_MAX, "turbogs: sizes: view ", view, " is ", width,
+                        " x ", height);
         params.widths[view] = static_cast<int>(width);
         params.heights[view] = static_cast<int>(height);
         tiles += ((width + kTileSize - 1) / kTileSize) * ((height + kTileSize - 1) / kTileSize);
     }
-    STD_TORCH_CHECK(tiles < INT32_MAX, "sizes: too many tiles");
-    params.num_tiles = static_cast<int>(tiles);
-    params.num_active = static_cast<int>(tile_ids.has_value() ? tile_ids->size(0) : tiles);
+    params.num_tiles = to_int(tiles, "tiles");
+    params.num_active = to_int(tile_ids.has_value() ? tile_ids->size(0) : tiles, "active tiles");
 
     params.means = check.pointer<float>(means, "means", ScalarType::Float, {count, 3});
     params.quats = check.pointer<float>(quats, "quats", ScalarType::Float, {count, 4});
@@ -100,33 +100,29 @@ void raster_project(Tensor means, Tensor quats, Tensor scales, Tensor opacities,
     params.viewmats = check.pointer<float>(viewmats, "viewmats", ScalarType::Float, {views, 4, 4});
     params.intrinsics = check.pointer<float>(Ks, "Ks", ScalarType::Float, {views, 3, 3});
     params.tile_ids = check.optional<int32_t>(tile_ids, "tile_ids", ScalarType::Int, {params.num_active});
-    params.cameras = check.bytes_of<RasterCamera>(cameras, "cameras", ScalarType::Float, views);
+    params.cameras = check.structs<RasterCamera>(cameras, "cameras", ScalarType::Float, views);
     params.active_prefix = check.optional<int32_t>(active_prefix, "active_prefix", ScalarType::Int, {tiles + 1});
-    params.instances = check.bytes_of<Instance>(instances, "instances", ScalarType::Float, total);
-    params.radii = reinterpret_cast<int2*>(check.pointer<int32_t>(radii, "radii", ScalarType::Int, {views, count, 2}));
+    params.instances = check.structs<Instance>(instances, "instances", ScalarType::Float, total);
+    params.radii = check.pointer<int2>(radii, "radii", ScalarType::Int, {views, count, 2});
     params.tile_differences =
         check.pointer<int32_t>(tile_differences, "tile_differences", ScalarType::Int, {params.num_active + 1});
-    params.records = reinterpret_cast<float4*>(
-        check.optional<float>(records, "records", ScalarType::Float, {total, kGradientFloats}));
+    params.records = check.optional<float4>(records, "records", ScalarType::Float, {total, kRecordFloats});
     check.aligned(params.records, "records");
     check.launched(launch_projection(params, check.stream()), "projection");
 }
-
-// What the library was built for, such as "sm_90".
-std::string architectures() { return TURBOGS_ARCHITECTURES; }
 
 void raster_count_pairs(Tensor tile_cursors, Tensor tile_starts, Tensor status, Tensor counters, Tensor block_sums,
                         int64_t capacity) {
     Checker check(tile_cursors);
     const int64_t num_active = tile_starts.numel() - 1;
-    STD_TORCH_CHECK(capacity >= 0 && capacity <= kMaxPairs, "capacity must be below 2^31, got ", capacity);
+    STD_TORCH_CHECK(capacity >= 0 && capacity <= kMaxPairs, "turbogs: capacity must be below 2^31, got ", capacity);
     CountPairsParams params = {};
-    params.num_active = static_cast<int>(num_active);
+    params.num_active = to_int(num_active, "active tiles");
     params.capacity = static_cast<uint32_t>(capacity);
     params.tile_cursors = check.pointer<int32_t>(tile_cursors, "tile_cursors", ScalarType::Int, {num_active + 1});
     params.tile_starts = check.pointer<uint32_t>(tile_starts, "tile_starts", ScalarType::Int, {num_active + 1});
     params.status = check.pointer<uint32_t>(status, "status", ScalarType::Int, {2});
-    params.counters = reinterpret_cast<PairCounters*>(check.pointer<uint32_t>(counters, "counters", ScalarType::Int, {2}));
+    params.counters = check.pointer<PairCounters>(counters, "counters", ScalarType::Int, {2});
     params.block_sums = check.pointer<int64_t>(block_sums, "block_sums", ScalarType::Long,
                                                {num_active > 0 ? (num_active + kScanTiles - 1) / kScanTiles : 1, 2});
     check.launched(launch_count_pairs(params, check.stream()), "pair count");
@@ -139,23 +135,23 @@ void raster_sort_pairs(Tensor instances, Tensor radii, Tensor cameras, std::opti
     const int64_t views = radii.size(0), count = radii.size(1), total = views * count, capacity = pair_ids.numel();
     const int64_t num_active = tile_starts.numel() - 1;
     ScatterPairsParams scatter = {};
-    scatter.num_instances = static_cast<int>(total);
-    scatter.num_gaussians = static_cast<int>(count);
-    scatter.num_active = static_cast<int>(num_active);
+    scatter.num_instances = to_int(total, "views * Gaussians");
+    scatter.num_gaussians = to_int(count, "Gaussians");
+    scatter.num_active = to_int(num_active, "active tiles");
     scatter.capacity = static_cast<uint32_t>(capacity);
-    scatter.instances = check.bytes_of<Instance>(instances, "instances", ScalarType::Float, total);
-    scatter.radii = reinterpret_cast<int2*>(check.pointer<int32_t>(radii, "radii", ScalarType::Int, {views, count, 2}));
-    scatter.cameras = check.bytes_of<RasterCamera>(cameras, "cameras", ScalarType::Float, views);
-    scatter.active_prefix =
-        active_prefix.has_value()
-            ? check.pointer<int32_t>(*active_prefix, "active_prefix", ScalarType::Int, {active_prefix->numel()})
-            : nullptr;
+    scatter.instances = check.structs<Instance>(instances, "instances", ScalarType::Float, total);
+    scatter.radii = check.pointer<int2>(radii, "radii", ScalarType::Int, {views, count, 2});
+    scatter.cameras = check.structs<RasterCamera>(cameras, "cameras", ScalarType::Float, views);
+    if (active_prefix.has_value()) {
+        scatter.active_prefix =
+            check.pointer<int32_t>(*active_prefix, "active_prefix", ScalarType::Int, {active_prefix->numel()});
+    }
     scatter.tile_cursors = check.pointer<int32_t>(tile_cursors, "tile_cursors", ScalarType::Int, {num_active + 1});
     scatter.tile_starts = check.pointer<uint32_t>(tile_starts, "tile_starts", ScalarType::Int, {num_active + 1});
     scatter.status = check.pointer<uint32_t>(status, "status", ScalarType::Int, {2});
     scatter.pair_keys = check.pointer<uint64_t>(pair_keys, "pair_keys", ScalarType::Long, {capacity});
-    scatter.counters = reinterpret_cast<PairCounters*>(check.pointer<uint32_t>(counters, "counters", ScalarType::Int, {2}));
-    scatter.runs = reinterpret_cast<int2*>(check.pointer<int32_t>(runs, "runs", ScalarType::Int, {capacity / (kRun / 2), 2}));
+    scatter.counters = check.pointer<PairCounters>(counters, "counters", ScalarType::Int, {2});
+    scatter.runs = check.pointer<int2>(runs, "runs", ScalarType::Int, {capacity / (kRun / 2), 2});
     SortPairsParams sort = {};
     sort.num_active = scatter.num_active;
     sort.capacity = scatter.capacity;
@@ -194,10 +190,10 @@ void raster_backward(Tensor cameras, std::optional<Tensor> tile_ids, Tensor tile
                                 chunks, alpha_min, alpha_max, transmittance_min};
     Checker check(cameras);
     const int64_t num_slots = pixel_ids.numel(), total = instances.size(0);
-    STD_TORCH_CHECK(!depth_gradients.has_value() || depths.has_value(), "depth gradients without depths");
+    STD_TORCH_CHECK(!depth_gradients.has_value() || depths.has_value(), "turbogs: depth gradients without depths");
     BackwardParams params = {};
     params.forward = buffers.params(check);
-    params.num_instances = static_cast<int>(total);
+    params.num_instances = to_int(total, "views * Gaussians");
     params.with_density_sums = with_density_sums;
     params.cleared = cleared;
     params.color_gradients = check.pointer<float>(color_gradients, "color_gradients", ScalarType::Float, {num_slots, 3});
@@ -205,7 +201,8 @@ void raster_backward(Tensor cameras, std::optional<Tensor> tile_ids, Tensor tile
     params.depth_gradients = check.optional<float>(depth_gradients, "depth_gradients", ScalarType::Float, {num_slots});
     params.pixel_errors = check.optional<float>(pixel_errors, "pixel_errors", ScalarType::Float, {num_slots});
     params.screen_gradients =
-        check.pointer<float>(screen_gradients, "screen_gradients", ScalarType::Float, {total, kGradientFloats});
+        check.pointer<float>(screen_gradients, "screen_gradients", ScalarType::Float, {total, kRecordFloats});
+    check.aligned(params.screen_gradients, "screen_gradients");
     check.launched(launch_rasterize_backward(params, check.stream()), "backward");
 }
 
@@ -216,9 +213,8 @@ STABLE_TORCH_LIBRARY_FRAGMENT(turbogs, m) {
     m.def(
         "raster_project(Tensor means, Tensor quats, Tensor scales, Tensor opacities, Tensor sh0, Tensor shN, Tensor viewmats, "
         "Tensor Ks, Tensor sizes, Tensor? tile_ids, Tensor(a!) cameras, Tensor(b!)? active_prefix, Tensor(c!) instances, "
-        "Tensor(d!) radii, Tensor(e!) tile_differences, Tensor(f!)? records, int sh_degree, float eps2d, float near_plane, float far_plane, "
-        "float alpha_min) -> ()");
-    m.def("architectures() -> str");
+        "Tensor(d!) radii, Tensor(e!) tile_differences, Tensor(f!)? records, int sh_degree, float eps2d, float near_plane, "
+        "float far_plane, float alpha_min) -> ()");
     m.def(
         "raster_count_pairs(Tensor(a!) tile_cursors, Tensor(b!) tile_starts, Tensor(c!) status, Tensor(d!) counters, "
         "Tensor(e!) block_sums, int capacity) -> ()");
@@ -236,7 +232,8 @@ STABLE_TORCH_LIBRARY_FRAGMENT(turbogs, m) {
         "Tensor pair_ids, Tensor instances, Tensor colors, Tensor alphas, Tensor transmittances, Tensor? depths, "
         "Tensor last_pairs, Tensor masks, Tensor bucket_counts, int chunks, float alpha_min, "
         "float alpha_max, float transmittance_min, Tensor color_gradients, Tensor? alpha_gradients, "
-        "Tensor? depth_gradients, Tensor? pixel_errors, Tensor(a!) screen_gradients, bool with_density_sums, bool cleared) -> ()");
+        "Tensor? depth_gradients, Tensor? pixel_errors, Tensor(a!) screen_gradients, bool with_density_sums, "
+        "bool cleared) -> ()");
 }
 
 STABLE_TORCH_LIBRARY_IMPL(turbogs, CUDA, m) {
@@ -245,8 +242,4 @@ STABLE_TORCH_LIBRARY_IMPL(turbogs, CUDA, m) {
     m.impl("raster_sort_pairs", TORCH_BOX(&turbogs::raster_sort_pairs));
     m.impl("raster_forward", TORCH_BOX(&turbogs::raster_forward));
     m.impl("raster_backward", TORCH_BOX(&turbogs::raster_backward));
-}
-
-STABLE_TORCH_LIBRARY_IMPL(turbogs, CompositeExplicitAutograd, m) {
-    m.impl("architectures", TORCH_BOX(&turbogs::architectures));
 }

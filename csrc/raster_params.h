@@ -11,18 +11,14 @@
 #include <cstdint>
 
 #include "camera.cuh"
+#include "sizes.h"
 
 namespace turbogs {
 
-constexpr int kTileSize = 16;               // side of a tile, pixels (TILE_SIZE in types.py)
-constexpr int kRasterMaxViews = 128;        // views of one launch: their sizes travel as a kernel argument
-constexpr int kRasterMaxDegree = 3;         // of the spherical harmonics
-constexpr int kInstanceFloats = 12;         // one projected splat, three float4
-constexpr int kGradientFloats = 16;         // one screen-gradient record, four float4
-constexpr int kBucket = 32;                 // splats staged at once; one contribution mask holds one bucket
-constexpr int kScanTiles = 1024;            // of a block that finds the first pairs of tiles
-constexpr int kRun = 512;                   // pairs of a tile that a warp sorts
-constexpr uint32_t kMaxPairs = 0x7FFFFFFFu;   // the pair count saturates here instead of wrapping
+constexpr int kBucket = 32;                  // splats staged at once; one contribution mask holds one bucket
+constexpr int kScanTiles = 1024;             // of a block that finds the first pairs of tiles
+constexpr int kRun = 512;                    // pairs of a tile that a warp sorts
+constexpr uint32_t kMaxPairs = 0x7FFFFFFFu;  // the pair count saturates here instead of wrapping
 
 // One view as the kernels read it, 112 bytes. Written by the projection launcher.
 struct alignas(16) RasterCamera : Pinhole {
@@ -54,8 +50,8 @@ struct ProjectionParams {
     int sh_degree;      // degree to evaluate
     int bands;          // B, harmonics above band 0 that `shN` stores
     float eps2d, near_plane, far_plane, alpha_min;
-    int widths[kRasterMaxViews];
-    int heights[kRasterMaxViews];
+    int widths[kMaxViews];
+    int heights[kMaxViews];
 
     const float* means;      // [N, 3]
     const float* quats;      // [N, 4], not normalised
@@ -129,7 +125,6 @@ struct ForwardParams {
     int num_views;
     int num_active;         // T
     int chunks;             // C, work items of a tile
-    bool with_depth;
     float alpha_min, alpha_max, transmittance_min;
     const RasterCamera* cameras;
     const int32_t* tile_ids;      // [T], or null where every tile is active
