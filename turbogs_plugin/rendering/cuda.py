@@ -75,7 +75,7 @@ def warps_per_tile(slots: int, tiles: int) -> int:
 
 
 class ForwardArguments(NamedTuple):
-    """Arguments of the forward operator, which the backward operator takes first; csrc/raster_params.h says what they are."""
+    """Arguments of the forward operator, which the backward operator takes first; see csrc/raster_params.h."""
 
     cameras: Tensor  # [K, 28]
     tile_ids: Tensor | None  # [T], None where every tile is active
