@@ -9,10 +9,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from framework_runs import TINY, tiny_capture
 from hypothesis import given
 from hypothesis import strategies as st
 
+from turbogs_plugin.ablation.cell import train_cell
 from turbogs_plugin.ablation.grid import Ablation, ablation_names, load_ablation, variant_config
 from turbogs_plugin.ablation.results import CellResult, Study, StudyFolder
 from turbogs_plugin.ablation.statistics import Curve, Spread, differ, pareto_front, seconds_to_reach
@@ -20,7 +22,9 @@ from turbogs_plugin.ablation.summary import summarise
 from turbogs_plugin.config import PLANNED_SETTINGS, load_config
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.lengths import with_iterations
+from turbogs_plugin.provenance import provenance
 from turbogs_plugin.report.history import Evaluation
+from turbogs_plugin.scene import load_scene
 from turbogs_plugin.trainer import Trainer
 
 SMALL = """
@@ -386,3 +390,16 @@ def test_bad_calls_are_refused(turbogs, capture, tmp_path, arguments, words):
     for word in words:
         assert word in err
     assert not (tmp_path / "x").exists()
+
+
+@pytest.mark.parametrize("budget", ["budget.time=20s", "budget.max_memory=2GiB"])
+def test_budgets_of_single_runs_are_refused(budget):
+    with pytest.raises(InputError, match=r"variant 'moment-lm'.*--time-budget"):
+        variant_config(load_ablation("optimizer"), "moment-lm", 0, (budget,), None)
+
+
+def test_a_cell_keeps_a_cap_on_gaussians(tmp_path):
+    scene = load_scene(tiny_capture(tmp_path))
+    config = load_config("turbogs", [*TINY, "budget.max_gaussians=90"])
+    result = train_cell("capped", config, scene, torch.device("cpu"), provenance("cpu"))
+    assert [evaluation.num_gaussians <= 90 for evaluation in result.history] == [True] * 3

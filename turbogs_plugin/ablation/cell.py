@@ -11,6 +11,7 @@ import torch
 
 from turbogs_plugin.ablation.results import CellResult
 from turbogs_plugin.ablation.timing import PeakMemory
+from turbogs_plugin.budget import with_cap
 from turbogs_plugin.clock import TrainingClock
 from turbogs_plugin.config import Config
 from turbogs_plugin.evaluation import Metrics, evaluate, load_lpips, peak_memory_bytes
@@ -55,6 +56,8 @@ def train_cell(
         TrainingStopped: the model is lost.
     """
     asked, config = config, make_plan(config, scene, device).apply(config)
+    if config.budget.max_gaussians:
+        config = with_cap(config, config.budget.max_gaussians)
     test = place_views(scene.test, device, config.plan.photos_on)
     warmup = min(WARMUP_ITERATIONS[device.type], config.train.iterations)
     warm_up(config, scene, test, device, warmup)
