@@ -1,4 +1,4 @@
-"""A small case that runs every kernel once, for compute-sanitizer. From the repository's root, on a machine with a GPU::
+"""A small case that runs every kernel once, for compute-sanitizer. From the repository's root, with a GPU::
 
     compute-sanitizer --tool memcheck --error-exitcode 1 python tests/gpu/sanitizer_case.py
     compute-sanitizer --tool racecheck --error-exitcode 1 python tests/gpu/sanitizer_case.py
