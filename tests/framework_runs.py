@@ -2,8 +2,11 @@
 
 from pathlib import Path
 
+import torch
+
 from turbogs_plugin.config import Config, load_config
 from turbogs_plugin.scene import write_demo_capture
+from turbogs_plugin.trainer import Trainer
 
 TINY = (
     "train.iterations=14",
@@ -31,3 +34,30 @@ def tiny_config(capture: Path, *overrides: str) -> Config:
     config = load_config("turbogs", [*TINY, "train.device=cpu", *overrides])
     config.scene.path = str(capture)
     return config
+
+
+def assert_identical(a, b, place: str = "state") -> None:
+    """Nested states, to the last bit and type."""
+    if isinstance(a, dict):
+        assert a.keys() == b.keys(), place
+        for key in a:
+            assert_identical(a[key], b[key], f"{place}.{key}")
+    elif isinstance(a, torch.Tensor):
+        assert a.dtype == b.dtype and torch.equal(a, b), place
+    else:
+        assert a == b, place
+
+
+def assert_iterations_wait_for_nothing(trainer: Trainer) -> None:
+    """After some iterations, further ones never make the host wait for the GPU, and none of them is lost."""
+    trainer.initialise_maps()
+    for _ in range(5):
+        trainer.step()
+    torch.cuda.synchronize()
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        for _ in range(3):
+            trainer.step()
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    assert int(trainer.nonfinite_losses) == int(trainer.optimizer.skipped) == 0

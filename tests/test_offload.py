@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from framework_runs import tiny_capture, tiny_config
+from framework_runs import assert_identical, tiny_capture, tiny_config
 from turbogs_plugin.strategies.pixel_sampling import ErrorGuidedPixelSampler
 
 from turbogs_plugin import offload, run
@@ -36,17 +36,6 @@ def trainer_of(scene: Scene, capture: Path, maps: bool, photos: bool, *overrides
     """A trainer with these two in host memory."""
     places = [f"plan.{name}_on={'host' if host else 'device'}" for name, host in (("maps", maps), ("photos", photos))]
     return Trainer(tiny_config(capture, *places, *overrides), scene, CPU)
-
-
-def assert_identical(a, b, place: str = "state") -> None:
-    if isinstance(a, dict):
-        assert a.keys() == b.keys(), place
-        for key in a:
-            assert_identical(a[key], b[key], f"{place}.{key}")
-    elif isinstance(a, torch.Tensor):
-        assert a.dtype == b.dtype and torch.equal(a, b), place
-    else:
-        assert a == b, place
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,15 @@ import math
 
 import pytest
 import torch
-from helpers_optim import STEP, all_finite, clone, equal, make_gaussians, make_gradients
+from helpers_optim import (
+    STEP,
+    all_finite,
+    assert_resumed_is_bit_identical,
+    clone,
+    equal,
+    make_gaussians,
+    make_gradients,
+)
 from turbogs_plugin.strategies.adam import SparseAdam
 from turbogs_plugin.strategies.learning_rates import LearningRates
 from turbogs_plugin.strategies.moment_lm import MomentLMOptimizer
@@ -172,18 +180,7 @@ def test_state_follows_rows(cls):
 
 @pytest.mark.parametrize("cls", OPTIMIZERS)
 def test_resumed_is_bit_identical(cls):
-    whole, parts = make_gaussians(6, dtype=torch.float32), make_gaussians(6, dtype=torch.float32)
-    first, second, resumed = cls(), cls(), cls()
-    first.setup(whole)
-    second.setup(parts)
-    for seed in range(6):
-        gradients = make_gradients(3, 6, seed, torch.float32)
-        first.step(whole, gradients, STEP)
-        if seed == 3:
-            resumed.setup(parts)
-            resumed.load_state_dict(second.state_dict())
-        (second if seed < 3 else resumed).step(parts, gradients, STEP)
-    assert equal(whole, parts)
+    assert_resumed_is_bit_identical(cls)
 
 
 def test_state_of_another_model_is_refused():

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from framework_runs import TINY, tiny_capture, tiny_config
+from framework_runs import TINY, assert_identical, tiny_capture, tiny_config
 from PIL import Image
 
 from turbogs_plugin import run
@@ -40,17 +40,6 @@ def whole(capture, tmp_path_factory) -> run.Outcome:
 
 def saved(folder: Path) -> dict:
     return load_checkpoint(latest_checkpoint(folder / "checkpoints"))["trainer"]
-
-
-def assert_identical(a, b, place: str = "state") -> None:
-    if isinstance(a, dict):
-        assert a.keys() == b.keys(), place
-        for key in a:
-            assert_identical(a[key], b[key], f"{place}.{key}")
-    elif isinstance(a, torch.Tensor):
-        assert a.dtype == b.dtype and torch.equal(a, b), place
-    else:
-        assert a == b, place
 
 
 def stop_after(monkeypatch, iteration: int, action) -> None:

@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from framework_runs import tiny_capture
+from framework_runs import assert_iterations_wait_for_nothing, tiny_capture
 from helpers_optim import STEP, FixedGradients, clone, equal, make_gaussians, make_gradients
 from raster_cases import GPU_ONLY
 from turbogs_plugin.strategies.dense_adam import DenseAdam
@@ -114,15 +114,4 @@ def test_baselines_train(tmp_path, name):
 def test_a_baseline_waits_for_nothing_between_events(tmp_path):
     scene = load_scene(tiny_capture(tmp_path))
     config = load_config("3dgs", ["train.device=cuda", "density.refine_start_iter=1000"])
-    trainer = Trainer(config, scene, torch.device("cuda"))
-    trainer.initialise_maps()
-    for _ in range(5):
-        trainer.step()
-    torch.cuda.synchronize()
-    torch.cuda.set_sync_debug_mode("error")
-    try:
-        for _ in range(3):
-            trainer.step()
-    finally:
-        torch.cuda.set_sync_debug_mode("default")
-    assert int(trainer.nonfinite_losses) == int(trainer.optimizer.skipped) == 0
+    assert_iterations_wait_for_nothing(Trainer(config, scene, torch.device("cuda")))

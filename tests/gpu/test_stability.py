@@ -5,7 +5,7 @@ import math
 
 import pytest
 import torch
-from framework_runs import tiny_capture, tiny_config
+from framework_runs import assert_iterations_wait_for_nothing, tiny_capture, tiny_config
 from helpers_optim import make_gaussians as optimizer_gaussians
 from raster_cases import FORWARD_BOUND, GPU_ONLY, GRADIENT_BOUND
 from raster_extremes import CASES, NAMES, TWO_VIEWS, assert_within, compare, random_scene, render
@@ -95,15 +95,4 @@ def test_the_guard_waits_for_nothing(tmp_path):
     """Between two events of density control, no iteration makes the host wait for the GPU."""
     scene = load_scene(tiny_capture(tmp_path))
     config = tiny_config(tmp_path / "capture", "train.device=cuda", "density.refine_from=1000")
-    trainer = Trainer(config, scene, torch.device("cuda"))
-    trainer.initialise_maps()
-    for _ in range(5):
-        trainer.step()
-    torch.cuda.synchronize()
-    torch.cuda.set_sync_debug_mode("error")
-    try:
-        for _ in range(3):
-            trainer.step()
-    finally:
-        torch.cuda.set_sync_debug_mode("default")
-    assert int(trainer.nonfinite_losses) == int(trainer.optimizer.skipped) == 0
+    assert_iterations_wait_for_nothing(Trainer(config, scene, torch.device("cuda")))
