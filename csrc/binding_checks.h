@@ -63,6 +63,15 @@ public:
         return static_cast<T*>(tensor.data_ptr());
     }
 
+    // The same, of memory that kernels read or write 16 bytes at a time.
+    template <typename T>
+    T* aligned_pointer(const Tensor& tensor, const char* name, ScalarType type, std::initializer_list<int64_t> shape) const {
+        T* out = pointer<T>(tensor, name, type, shape);
+        STD_TORCH_CHECK(reinterpret_cast<uintptr_t>(out) % 16 == 0, "turbogs: ", name,
+                        " must start at a multiple of 16 bytes");
+        return out;
+    }
+
     template <typename T>
     T* optional(const std::optional<Tensor>& tensor, const char* name, ScalarType type,
                 std::initializer_list<int64_t> shape) const {
@@ -72,14 +81,7 @@ public:
     // Rows of one struct each.
     template <typename T>
     T* structs(const Tensor& tensor, const char* name, ScalarType type, int64_t rows) const {
-        T* out = pointer<T>(tensor, name, type, {rows, static_cast<int64_t>(sizeof(T) / sizeof(float))});
-        aligned(out, name);
-        return out;
-    }
-
-    void aligned(const void* pointer, const char* name) const {
-        STD_TORCH_CHECK(reinterpret_cast<uintptr_t>(pointer) % 16 == 0, "turbogs: ", name,
-                        " must start at a multiple of 16 bytes");
+        return aligned_pointer<T>(tensor, name, type, {rows, static_cast<int64_t>(sizeof(T) / sizeof(float))});
     }
 
     cudaStream_t stream() const {

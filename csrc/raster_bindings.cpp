@@ -5,18 +5,21 @@
 #include <torch/csrc/stable/tensor.h>
 #include <torch/headeronly/core/ScalarType.h>
 
+#include <vector>
+
 #include "binding_checks.h"
 #include "raster_params.h"
+#include "scene_checks.h"
 
 namespace turbogs {
 namespace {
 
 // Slots, tiles and buffers that stages 5 and 6 have in common.
 struct SampleBuffers {
-    Tensor cameras, tile_offsets, pixel_ids, tile_starts, pair_ids, instances;
-    std::optional<Tensor> tile_ids;
-    Tensor colors, alphas, transmittances, last_pairs, masks, bucket_counts;
-    std::optional<Tensor> depths;
+    const Tensor &cameras, &tile_offsets, &pixel_ids, &tile_starts, &pair_ids, &instances;
+    const std::optional<Tensor>& tile_ids;
+    const Tensor &colors, &alphas, &transmittances, &last_pairs, &masks, &bucket_counts;
+    const std::optional<Tensor>& depths;
     int64_t chunks;
     double alpha_min, alpha_max, transmittance_min;
 
@@ -49,56 +52,26 @@ struct SampleBuffers {
     }
 };
 
-void raster_project(Tensor means, Tensor quats, Tensor scales, Tensor opacities, Tensor sh0, Tensor shN, Tensor viewmats,
-                    Tensor Ks, Tensor sizes, std::optional<Tensor> tile_ids, Tensor cameras,
-                    std::optional<Tensor> active_prefix, Tensor instances, Tensor radii, Tensor tile_differences,
-                    std::optional<Tensor> records, int64_t sh_degree, double eps2d, double near_plane, double far_plane,
-                    double alpha_min) {
-    Checker check(means);
-    const int64_t count = means.size(0), views = viewmats.size(0), bands = shN.size(1), total = views * count;
-    STD_TORCH_CHECK(views >= 1 && views <= kMaxViews, "turbogs: viewmats: 1 .. ", kMaxViews, " views a launch, got ", views);
-    to_int(total, "views * Gaussians");
-    STD_TORCH_CHECK(sh_degree >= 0 && sh_degree <= kMaxDegree, "turbogs: sh_degree must be 0 .. ", kMaxDegree, ", got ",
-                    sh_degree);
-    STD_TORCH_CHECK(bands >= (sh_degree + 1) * (sh_degree + 1) - 1, "turbogs: shN holds ", bands,
-                    " bands, too few for sh_degree ", sh_degree);
-    STD_TORCH_CHECK(sizes.is_cpu() && sizes.scalar_type() == ScalarType::Long && sizes.is_contiguous() && sizes.dim() == 2 &&
-                        sizes.size(0) == views && sizes.size(1) == 2,
-                    "turbogs: sizes must be a contiguous int64 [", views, ", 2] tensor on the CPU");
-    STD_TORCH_CHECK(tile_ids.has_value() == active_prefix.has_value(), "turbogs: tile_ids and active_prefix go together");
-
+void raster_project(const std::vector<Tensor>& gaussians, const Tensor& viewmats, const Tensor& Ks,
+                    const std::vector<int64_t>& sizes, int64_t sh_degree, double eps2d, double near_plane, double far_plane,
+                    double alpha_min, const std::optional<Tensor>& tile_ids, const Tensor& cameras,
+                    const std::optional<Tensor>& active_prefix, const Tensor& instances, const Tensor& radii,
+                    const Tensor& tile_differences, const std::optional<Tensor>& records) {
+    const Checker check(viewmats);
     ProjectionParams params = {};
-    params.num_views = static_cast<int>(views);
-    params.num_gaussians = to_int(count, "Gaussians");
-    params.sh_degree = static_cast<int>(sh_degree);
-    params.bands = to_int(bands, "bands");
-    params.eps2d = static_cast<float>(eps2d);
-    params.near_plane = static_cast<float>(near_plane);
-    params.far_plane = static_cast<float>(far_plane);
-    params.alpha_min = static_cast<float>(alpha_min);
-    const int64_t* size = static_cast<const int64_t*>(sizes.const_data_ptr());
+    check_scene(check, gaussians, viewmats, Ks, sizes, sh_degree, eps2d, params);
+    STD_TORCH_CHECK(tile_ids.has_value() == active_prefix.has_value(), "turbogs: tile_ids and active_prefix go together");
+    const int64_t views = params.num_views, count = params.num_gaussians, total = views * count;
     int64_t tiles = 0;
-    for (int64_t view = 0; view < views; ++view) {
-        const int64_t width = size[2 * view], height = size[2 * view + 1];
-        STD_TORCH_CHECK(width > 0 && height > 0 && width * height <= INT32_MAX, "turbogs: sizes: view ", view, " is ", width,
-                        " x ", height);
-        params.widths[view] = static_cast<int>(width);
-        params.heights[view] = static_cast<int>(height);
-        tiles += ((width + kTileSize - 1) / kTileSize) * ((height + kTileSize - 1) / kTileSize);
+    for (int view = 0; view < params.num_views; ++view) {
+        tiles += int64_t{1} * ((params.widths[view] + kTileSize - 1) / kTileSize) *
+                 ((params.heights[view] + kTileSize - 1) / kTileSize);
     }
     params.num_tiles = to_int(tiles, "tiles");
     params.num_active = to_int(tile_ids.has_value() ? tile_ids->size(0) : tiles, "active tiles");
-
-    params.means = check.pointer<float>(means, "means", ScalarType::Float, {count, 3});
-    params.quats = check.pointer<float>(quats, "quats", ScalarType::Float, {count, 4});
-    params.scales = check.pointer<float>(scales, "scales", ScalarType::Float, {count, 3});
-    params.opacities = check.pointer<float>(opacities, "opacities", ScalarType::Float, {count});
-    params.sh0 = check.pointer<float>(sh0, "sh0", ScalarType::Float, {count, 1, 3});
-    params.shN = check.pointer<float>(shN, "shN", ScalarType::Float, {count, bands, 3});
-    check.aligned(params.quats, "quats");
-    check.aligned(params.shN, "shN");
-    params.viewmats = check.pointer<float>(viewmats, "viewmats", ScalarType::Float, {views, 4, 4});
-    params.intrinsics = check.pointer<float>(Ks, "Ks", ScalarType::Float, {views, 3, 3});
+    params.near_plane = static_cast<float>(near_plane);
+    params.far_plane = static_cast<float>(far_plane);
+    params.alpha_min = static_cast<float>(alpha_min);
     params.tile_ids = check.optional<int32_t>(tile_ids, "tile_ids", ScalarType::Int, {params.num_active});
     params.cameras = check.structs<RasterCamera>(cameras, "cameras", ScalarType::Float, views);
     params.active_prefix = check.optional<int32_t>(active_prefix, "active_prefix", ScalarType::Int, {tiles + 1});
@@ -106,14 +79,15 @@ void raster_project(Tensor means, Tensor quats, Tensor scales, Tensor opacities,
     params.radii = check.pointer<int2>(radii, "radii", ScalarType::Int, {views, count, 2});
     params.tile_differences =
         check.pointer<int32_t>(tile_differences, "tile_differences", ScalarType::Int, {params.num_active + 1});
-    params.records = check.optional<float4>(records, "records", ScalarType::Float, {total, kRecordFloats});
-    check.aligned(params.records, "records");
+    if (records.has_value()) {
+        params.records = check.aligned_pointer<float4>(*records, "records", ScalarType::Float, {total, kRecordFloats});
+    }
     check.launched(launch_projection(params, check.stream()), "projection");
 }
 
-void raster_count_pairs(Tensor tile_cursors, Tensor tile_starts, Tensor status, Tensor counters, Tensor block_sums,
-                        int64_t capacity) {
-    Checker check(tile_cursors);
+void raster_count_pairs(const Tensor& tile_cursors, const Tensor& tile_starts, const Tensor& status,
+                        const Tensor& counters, const Tensor& block_sums, int64_t capacity) {
+    const Checker check(tile_cursors);
     const int64_t num_active = tile_starts.numel() - 1;
     STD_TORCH_CHECK(capacity >= 0 && capacity <= kMaxPairs, "turbogs: capacity must be below 2^31, got ", capacity);
     CountPairsParams params = {};
@@ -128,10 +102,11 @@ void raster_count_pairs(Tensor tile_cursors, Tensor tile_starts, Tensor status, 
     check.launched(launch_count_pairs(params, check.stream()), "pair count");
 }
 
-void raster_sort_pairs(Tensor instances, Tensor radii, Tensor cameras, std::optional<Tensor> active_prefix,
-                       Tensor tile_cursors, Tensor tile_starts, Tensor status, Tensor pair_keys, Tensor pair_ids,
-                       Tensor counters, Tensor runs) {
-    Checker check(instances);
+void raster_sort_pairs(const Tensor& instances, const Tensor& radii, const Tensor& cameras,
+                       const std::optional<Tensor>& active_prefix, const Tensor& tile_cursors, const Tensor& tile_starts,
+                       const Tensor& status, const Tensor& pair_keys, const Tensor& pair_ids, const Tensor& counters,
+                       const Tensor& runs) {
+    const Checker check(instances);
     const int64_t views = radii.size(0), count = radii.size(1), total = views * count, capacity = pair_ids.numel();
     const int64_t num_active = tile_starts.numel() - 1;
     ScatterPairsParams scatter = {};
@@ -159,36 +134,38 @@ void raster_sort_pairs(Tensor instances, Tensor radii, Tensor cameras, std::opti
     sort.counters = scatter.counters;
     sort.runs = scatter.runs;
     sort.pair_keys = scatter.pair_keys;
-    sort.pair_ids = check.pointer<uint32_t>(pair_ids, "pair_ids", ScalarType::Int, {capacity});
-    check.aligned(sort.pair_ids, "pair_ids");
+    sort.pair_ids = check.aligned_pointer<uint32_t>(pair_ids, "pair_ids", ScalarType::Int, {capacity});
     scatter.windows = reinterpret_cast<uint2*>(sort.pair_ids);  // free until the pairs are sorted
     check.launched(launch_scatter_pairs(scatter, check.stream()), "pair scatter");
     check.launched(launch_sort_pairs(sort, check.stream()), "pair sort");
 }
 
-void raster_forward(Tensor cameras, std::optional<Tensor> tile_ids, Tensor tile_offsets, Tensor pixel_ids,
-                    Tensor tile_starts, Tensor pair_ids, Tensor instances, Tensor colors, Tensor alphas,
-                    Tensor transmittances, std::optional<Tensor> depths, Tensor last_pairs, Tensor masks,
-                    Tensor bucket_counts, int64_t chunks, double alpha_min, double alpha_max,
+void raster_forward(const Tensor& cameras, const std::optional<Tensor>& tile_ids, const Tensor& tile_offsets,
+                    const Tensor& pixel_ids, const Tensor& tile_starts, const Tensor& pair_ids, const Tensor& instances,
+                    const Tensor& colors, const Tensor& alphas, const Tensor& transmittances,
+                    const std::optional<Tensor>& depths, const Tensor& last_pairs, const Tensor& masks,
+                    const Tensor& bucket_counts, int64_t chunks, double alpha_min, double alpha_max,
                     double transmittance_min) {
     const SampleBuffers buffers{cameras, tile_offsets, pixel_ids, tile_starts, pair_ids, instances, tile_ids,
                                 colors, alphas, transmittances, last_pairs, masks, bucket_counts, depths,
                                 chunks, alpha_min, alpha_max, transmittance_min};
-    Checker check(cameras);
+    const Checker check(cameras);
     check.launched(launch_rasterize_forward(buffers.params(check), check.stream()), "forward");
 }
 
-void raster_backward(Tensor cameras, std::optional<Tensor> tile_ids, Tensor tile_offsets, Tensor pixel_ids,
-                     Tensor tile_starts, Tensor pair_ids, Tensor instances, Tensor colors, Tensor alphas,
-                     Tensor transmittances, std::optional<Tensor> depths, Tensor last_pairs, Tensor masks,
-                     Tensor bucket_counts, int64_t chunks, double alpha_min, double alpha_max,
-                     double transmittance_min, Tensor color_gradients, std::optional<Tensor> alpha_gradients,
-                     std::optional<Tensor> depth_gradients, std::optional<Tensor> pixel_errors, Tensor screen_gradients,
-                     bool with_density_sums, bool cleared) {
+void raster_backward(const Tensor& cameras, const std::optional<Tensor>& tile_ids, const Tensor& tile_offsets,
+                     const Tensor& pixel_ids, const Tensor& tile_starts, const Tensor& pair_ids, const Tensor& instances,
+                     const Tensor& colors, const Tensor& alphas, const Tensor& transmittances,
+                     const std::optional<Tensor>& depths, const Tensor& last_pairs, const Tensor& masks,
+                     const Tensor& bucket_counts, int64_t chunks, double alpha_min, double alpha_max,
+                     double transmittance_min, const Tensor& color_gradients,
+                     const std::optional<Tensor>& alpha_gradients, const std::optional<Tensor>& depth_gradients,
+                     const std::optional<Tensor>& pixel_errors, const Tensor& screen_gradients, bool with_density_sums,
+                     bool cleared) {
     const SampleBuffers buffers{cameras, tile_offsets, pixel_ids, tile_starts, pair_ids, instances, tile_ids,
                                 colors, alphas, transmittances, last_pairs, masks, bucket_counts, depths,
                                 chunks, alpha_min, alpha_max, transmittance_min};
-    Checker check(cameras);
+    const Checker check(cameras);
     const int64_t num_slots = pixel_ids.numel(), total = instances.size(0);
     STD_TORCH_CHECK(!depth_gradients.has_value() || depths.has_value(), "turbogs: depth gradients without depths");
     BackwardParams params = {};
@@ -201,8 +178,7 @@ void raster_backward(Tensor cameras, std::optional<Tensor> tile_ids, Tensor tile
     params.depth_gradients = check.optional<float>(depth_gradients, "depth_gradients", ScalarType::Float, {num_slots});
     params.pixel_errors = check.optional<float>(pixel_errors, "pixel_errors", ScalarType::Float, {num_slots});
     params.screen_gradients =
-        check.pointer<float>(screen_gradients, "screen_gradients", ScalarType::Float, {total, kRecordFloats});
-    check.aligned(params.screen_gradients, "screen_gradients");
+        check.aligned_pointer<float>(screen_gradients, "screen_gradients", ScalarType::Float, {total, kRecordFloats});
     check.launched(launch_rasterize_backward(params, check.stream()), "backward");
 }
 
@@ -211,10 +187,10 @@ void raster_backward(Tensor cameras, std::optional<Tensor> tile_ids, Tensor tile
 
 STABLE_TORCH_LIBRARY_FRAGMENT(turbogs, m) {
     m.def(
-        "raster_project(Tensor means, Tensor quats, Tensor scales, Tensor opacities, Tensor sh0, Tensor shN, Tensor viewmats, "
-        "Tensor Ks, Tensor sizes, Tensor? tile_ids, Tensor(a!) cameras, Tensor(b!)? active_prefix, Tensor(c!) instances, "
-        "Tensor(d!) radii, Tensor(e!) tile_differences, Tensor(f!)? records, int sh_degree, float eps2d, float near_plane, "
-        "float far_plane, float alpha_min) -> ()");
+        "raster_project(Tensor[] gaussians, Tensor viewmats, Tensor Ks, int[] sizes, int sh_degree, float eps2d, "
+        "float near_plane, float far_plane, float alpha_min, Tensor? tile_ids, Tensor(a!) cameras, "
+        "Tensor(b!)? active_prefix, Tensor(c!) instances, Tensor(d!) radii, Tensor(e!) tile_differences, "
+        "Tensor(f!)? records) -> ()");
     m.def(
         "raster_count_pairs(Tensor(a!) tile_cursors, Tensor(b!) tile_starts, Tensor(c!) status, Tensor(d!) counters, "
         "Tensor(e!) block_sums, int capacity) -> ()");

@@ -11,6 +11,7 @@
 #include <cstdint>
 
 #include "camera.cuh"
+#include "scene_params.h"
 #include "sizes.h"
 
 namespace turbogs {
@@ -42,26 +43,11 @@ struct alignas(16) Instance {
 };
 
 // Stage 1. K views of every Gaussian; parameters are read once.
-struct ProjectionParams {
-    int num_views;      // K
-    int num_gaussians;  // N
-    int num_tiles;      // tiles of all views
-    int num_active;     // T
-    int sh_degree;      // degree to evaluate
-    int bands;          // B, harmonics above band 0 that `shN` stores
-    float eps2d, near_plane, far_plane, alpha_min;
-    int widths[kMaxViews];
-    int heights[kMaxViews];
-
-    const float* means;      // [N, 3]
-    const float* quats;      // [N, 4], not normalised
-    const float* scales;     // [N, 3], logarithms
-    const float* opacities;  // [N], logits
-    const float* sh0;        // [N, 3]
-    const float* shN;        // [N, B, 3]
-    const float* viewmats;   // [K, 4, 4]
-    const float* intrinsics; // [K, 3, 3]
-    const int32_t* tile_ids; // [T] ascending, or null where every tile is active
+struct ProjectionParams : SceneParams {
+    int num_tiles;   // tiles of all views
+    int num_active;  // T
+    float near_plane, far_plane, alpha_min;
+    const int32_t* tile_ids;  // [T] ascending, or null where every tile is active
 
     RasterCamera* cameras;    // [K] out
     int32_t* active_prefix;   // [num_tiles + 1] out: active tiles with a smaller id; null where every tile is active

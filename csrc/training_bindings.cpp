@@ -11,6 +11,7 @@
 #include <vector>
 
 #include "binding_checks.h"
+#include "scene_checks.h"
 #include "training_params.h"
 
 namespace turbogs {
@@ -23,43 +24,13 @@ ScreenBackwardParams screen_backward_params(const Checker& check, const std::vec
                                             const std::vector<Tensor>& stats, int64_t sh_degree, double eps2d,
                                             const std::optional<Tensor>& num_filled, int64_t num_slots,
                                             const std::optional<Tensor>& overflow) {
-    STD_TORCH_CHECK(gaussians.size() == 6, "turbogs: gaussians must be means, quats, scales, opacities, sh0, shN");
-    STD_TORCH_CHECK(gaussians[0].dim() == 2 && gaussians[5].dim() == 3, "turbogs: means must be [N, 3], shN [N, B, 3]");
-    const int64_t num_views = static_cast<int64_t>(sizes.size()) / 2;
-    const int64_t num_gaussians = gaussians[0].size(0);
-    const int64_t bands = gaussians[5].size(1);
-    STD_TORCH_CHECK(num_views >= 1 && num_views <= kMaxViews, "turbogs: a batch has 1 to ", kMaxViews,
-                    " views, not ", num_views);
-    STD_TORCH_CHECK(sh_degree >= 0 && sh_degree <= kMaxDegree, "turbogs: sh_degree must be 0 .. ", kMaxDegree, ", not ",
-                    sh_degree);
-    STD_TORCH_CHECK(bands <= kMaxBands && (sh_degree + 1) * (sh_degree + 1) - 1 <= bands,
-                    "turbogs: shN holds ", bands, " bands, which does not suit degree ", sh_degree);
-
     ScreenBackwardParams params = {};
-    params.num_views = static_cast<int>(num_views);
-    params.num_gaussians = to_int(num_gaussians, "Gaussians");
-    params.sh_degree = static_cast<int>(sh_degree);
-    params.bands = static_cast<int>(bands);
-    params.eps2d = static_cast<float>(eps2d);
-    params.means = check.pointer<float>(gaussians[0], "means", ScalarType::Float, {num_gaussians, 3});
-    params.quats = check.pointer<float>(gaussians[1], "quats", ScalarType::Float, {num_gaussians, 4});
-    params.scales = check.pointer<float>(gaussians[2], "scales", ScalarType::Float, {num_gaussians, 3});
-    params.opacities = check.pointer<float>(gaussians[3], "opacities", ScalarType::Float, {num_gaussians});
-    params.sh0 = check.pointer<float>(gaussians[4], "sh0", ScalarType::Float, {num_gaussians, 1, 3});
-    params.shN = check.pointer<float>(gaussians[5], "shN", ScalarType::Float, {num_gaussians, bands, 3});
-    params.viewmats = check.pointer<float>(viewmats, "viewmats", ScalarType::Float, {num_views, 4, 4});
-    params.intrinsics = check.pointer<float>(Ks, "Ks", ScalarType::Float, {num_views, 3, 3});
-    for (int64_t view = 0; view < num_views; ++view) {
-        params.widths[view] = static_cast<int>(sizes[2 * view]);
-        params.heights[view] = static_cast<int>(sizes[2 * view + 1]);
-    }
-    params.records =
-        check.pointer<float4>(records, "screen gradients", ScalarType::Float, {num_views, num_gaussians, kRecordFloats});
-    params.radii = check.pointer<int2>(radii, "radii", ScalarType::Int, {num_views, num_gaussians, 2});
-    check.aligned(params.radii, "radii");
-    check.aligned(params.quats, "quats");
-    check.aligned(params.shN, "shN");
-    check.aligned(params.records, "screen gradients");
+    check_scene(check, gaussians, viewmats, Ks, sizes, sh_degree, eps2d, params);
+    STD_TORCH_CHECK(params.bands <= kMaxBands, "turbogs: shN holds ", params.bands, " bands, more than ", kMaxBands);
+    const int64_t num_views = params.num_views, num_gaussians = params.num_gaussians;
+    params.records = check.aligned_pointer<float4>(records, "screen gradients", ScalarType::Float,
+                                                   {num_views, num_gaussians, kRecordFloats});
+    params.radii = check.aligned_pointer<int2>(radii, "radii", ScalarType::Int, {num_views, num_gaussians, 2});
     params.num_filled = check.optional<int32_t>(num_filled, "num_filled", ScalarType::Int, {1});
     params.num_slots = to_int(num_slots, "samples");
     params.overflow = check.optional<int32_t>(overflow, "overflow", ScalarType::Int, {1});
@@ -135,14 +106,11 @@ void fused_step(const std::vector<Tensor>& gaussians, const Tensor& viewmats, co
     optimizer.opacities = const_cast<float*>(params.opacities);
     optimizer.sh0 = const_cast<float*>(params.sh0);
     optimizer.shN = const_cast<float*>(params.shN);
-    optimizer.exp_avg = check.pointer<float>(moments[0], "exp_avg", ScalarType::Float, {count, kRowSize});
-    optimizer.exp_avg_sq = check.pointer<float>(moments[1], "exp_avg_sq", ScalarType::Float, {count, kRowSize});
-    optimizer.exp_avg_shN = check.pointer<float>(moments[2], "exp_avg_shN", ScalarType::Float, {count, harmonics});
-    optimizer.exp_avg_sq_shN = check.pointer<float>(moments[3], "exp_avg_sq_shN", ScalarType::Float, {count, harmonics});
-    check.aligned(optimizer.exp_avg, "exp_avg");
-    check.aligned(optimizer.exp_avg_sq, "exp_avg_sq");
-    check.aligned(optimizer.exp_avg_shN, "exp_avg_shN");
-    check.aligned(optimizer.exp_avg_sq_shN, "exp_avg_sq_shN");
+    optimizer.exp_avg = check.aligned_pointer<float>(moments[0], "exp_avg", ScalarType::Float, {count, kRowSize});
+    optimizer.exp_avg_sq = check.aligned_pointer<float>(moments[1], "exp_avg_sq", ScalarType::Float, {count, kRowSize});
+    optimizer.exp_avg_shN = check.aligned_pointer<float>(moments[2], "exp_avg_shN", ScalarType::Float, {count, harmonics});
+    optimizer.exp_avg_sq_shN =
+        check.aligned_pointer<float>(moments[3], "exp_avg_sq_shN", ScalarType::Float, {count, harmonics});
     optimizer.steps = check.pointer<int32_t>(moments[4], "steps", ScalarType::Int, {count});
     optimizer.skipped =
         check.pointer<unsigned long long>(moments[5], "skipped", ScalarType::Long, {});

@@ -8,6 +8,7 @@
 
 #include <cstdint>
 
+#include "scene_params.h"
 #include "sizes.h"
 
 namespace turbogs {
@@ -16,25 +17,7 @@ constexpr float kRateMin = 1.0842021724855044e-19f;  // sqrt(FLT_MIN)
 constexpr int kRowSize = 14;                         // mean 3, scale 3, quaternion 4, sh0 3, opacity 1
 
 // The screen gradients of a batch, the parameters that they belong to, and what the backward pass adds up.
-struct ScreenBackwardParams {
-    int num_views;      // K
-    int num_gaussians;  // N
-    int sh_degree;      // active degree
-    int bands;          // B, harmonics above band 0 that `shN` stores; B >= (sh_degree + 1)^2 - 1
-    float eps2d;        // added to the diagonal of the screen covariance
-
-    const float* means;      // [N, 3]
-    const float* quats;      // [N, 4], not normalised
-    const float* scales;     // [N, 3], logarithms
-    const float* opacities;  // [N], logits
-    const float* sh0;        // [N, 3]
-    const float* shN;        // [N, B, 3]
-
-    const float* viewmats;    // [K, 4, 4]
-    const float* intrinsics;  // [K, 3, 3]
-    int widths[kMaxViews];
-    int heights[kMaxViews];
-
+struct ScreenBackwardParams : SceneParams {
     float4* records;             // [K, N, 4]; read where on screen; the fused step leaves rows in any of them
     const int2* radii;           // [K, N]; 0 where the Gaussian is off screen
     const int32_t* num_filled;   // [1] filled slots of the batch; null where all are

@@ -275,10 +275,15 @@ def rasterize_cuda(
     # With a workspace a backward pass is likely to follow.
     records = floats("records", total, RECORD_FLOATS) if workspace is not None else None
     torch.ops.turbogs.raster_project(
-        *(value for _, value in gaussians.items()),
+        [value for _, value in gaussians.items()],
         cameras.viewmats.detach().contiguous(),
         cameras.Ks.detach().contiguous(),
-        torch.from_numpy(np.ascontiguousarray(samples.sizes, dtype=np.int64)),
+        samples.sizes.reshape(-1).tolist(),
+        degree,
+        settings.eps2d,
+        settings.near_plane,
+        settings.far_plane,
+        settings.alpha_min,
         tile_ids,
         packed_cameras,
         active_prefix,
@@ -286,11 +291,6 @@ def rasterize_cuda(
         radii,
         tile_cursors,
         records,
-        degree,
-        settings.eps2d,
-        settings.near_plane,
-        settings.far_plane,
-        settings.alpha_min,
     )
 
     status = workspace.status if workspace is not None else torch.zeros(2, dtype=torch.int32, device=device)
