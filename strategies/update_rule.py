@@ -75,7 +75,9 @@ class GaussianMoments:
     Args:
         exp_avg, exp_avg_sq: [N, 14], the order of `COLUMNS`.
         exp_avg_shN, exp_avg_sq_shN: [N, B * 3].
-        steps: [N] int32, updates that each Gaussian has had; its bias correction counts these.
+        steps: [N] int32, updates that each Gaussian and the ones it was made of have had; its bias correction counts
+            these. A new one has moments of zero and its source's count, as with torch's Adam and gsplat's surgery: as
+            nothing corrects them, its first steps are 3 to 6 times the rate, by which it finds its place.
         skipped: [] int64, updates left out because of a non-finite gradient, since the start of the run. Stays on the
             device: reading it is a synchronisation.
     """
@@ -104,8 +106,11 @@ class GaussianMoments:
     def apply(self, update: RowUpdate) -> None:
         """Follow a change of the set of Gaussians."""
         for field in fields(self):
-            if field.name != "skipped":
-                setattr(self, field.name, update.apply_state(getattr(self, field.name)))
+            value = getattr(self, field.name)
+            if field.name == "steps":
+                self.steps = value[update.source]
+            elif field.name != "skipped":
+                setattr(self, field.name, update.apply_state(value))
         for name in update.reset:
             for moment in ("exp_avg", "exp_avg_sq"):
                 if name == "shN":
