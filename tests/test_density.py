@@ -342,7 +342,7 @@ def test_state_statistics_and_parameters_stay_together(seed, split, cap, decay, 
             moments, tags = optimizer.moments, gaussians.sh0[:, 0, 0]
             expected = torch.where(update.fresh, 0.0, tags)
             assert torch.equal(moments.exp_avg[:, 0], expected) and torch.equal(moments.exp_avg_shN[:, 0], expected)
-            assert torch.equal(moments.steps, torch.where(update.fresh, 0, tags.int() + 1))
+            assert torch.equal(moments.steps, tags.int() + 1)
         assert all(len(value) == len(gaussians) for _, value in gaussians.items())
         assert all(len(v) == len(gaussians) for k, v in optimizer.state_dict().items() if k != "skipped")
         if density.stats is not None:
