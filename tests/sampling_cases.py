@@ -1,0 +1,34 @@
+"""Error maps and steps for tests of pixel samplers."""
+
+import numpy as np
+import torch
+
+from turbogs_plugin.error_maps import ErrorMaps
+from turbogs_plugin.types import Step
+
+SIZES = np.array([[37, 21], [16, 16], [1, 1], [50, 3], [64, 48]])
+UNITS = ["pixel", "cell", "tile"]
+SIGMAS = 4.5  # a seeded test compares fewer than 1000 frequencies: a false alarm would have had a chance below 1 %
+
+
+def step(iteration, seed=0):
+    return Step(iteration=iteration, total=10**6, refine_until=10**6, seed=seed)
+
+
+def random_maps(sizes=SIZES, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    maps = ErrorMaps(np.asarray(sizes))
+    for view_id, (width, height) in enumerate(maps.sizes):
+        maps.initialise(view_id, torch.rand(int(width * height), generator=generator))
+    maps.stamps.copy_(torch.randint(-1, 90, maps.stamps.shape, generator=generator))
+    return maps
+
+
+def pixels_by_tile(samples):
+    """{tile id: list of pixel ids without the empty slots}."""
+    offsets = samples.tile_offsets.tolist()
+    ids = samples.pixel_ids.tolist()
+    return {
+        tile: [pixel for pixel in ids[begin:end] if pixel >= 0]
+        for tile, begin, end in zip(samples.tile_ids.tolist(), offsets[:-1], offsets[1:], strict=True)
+    }
