@@ -136,6 +136,7 @@ def test_a_broken_capture_is_refused(turbogs, copy, tmp_path, damage, words):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
+        (["--max-gaussians", "0"], ["--max-gaussians 0", "at least 1"]),
         (["--config", "turbo"], ["'turbo'", "turbogs-big", "did you mean 'turbogs'"]),
         (["--config", "absent.yaml"], ["absent.yaml"]),
         (["schedule.min_views=9", "schedule.max_views=4"], ["max_views", "9", "4"]),

@@ -295,6 +295,8 @@ def doctor() -> int:
 
 def _budget(max_gaussians: int | None, max_memory: str | None, time_budget: str | None) -> tuple[str, ...]:
     """The options of a budget as overrides."""
+    if max_gaussians is not None and max_gaussians < 1:
+        raise InputError(f"--max-gaussians {max_gaussians}: it must be at least 1; leave it out for no limit")
     given = {"max_gaussians": max_gaussians, "max_memory": max_memory, "time": time_budget}
     return tuple(
         f"budget.{name}={value if name == 'max_gaussians' else repr(value)}"
