@@ -13,6 +13,7 @@ from torch import Tensor
 from torch.nn.functional import logsigmoid, normalize
 
 from turbogs_plugin.errors import InputError, require
+from turbogs_plugin.spatial_order import spatial_order
 from turbogs_plugin.types import Gaussians, GaussianStats, RowUpdate, Step
 
 SPLIT_SHRINK = 1.6
@@ -57,7 +58,7 @@ class ErrorDrivenDensity:
 
     is its difficulty. A Gaussian with W = 0, or with non-finite statistics, was not seen: it has no score, and is
     neither densified nor pruned by score. Equal scores stand or fall together, except where a budget must choose
-    (then the lower row goes first).
+    (then the lower row goes first). After densification, rows are in the order of space (`spatial_order`).
 
     Until `Step.refine_until`, every `refine_every` iterations from `refine_from` on, one event clones, splits and
     prunes. A Gaussian that is due for pruning is not densified; one that is too big but chosen to be split is not
@@ -300,7 +301,7 @@ class ErrorDrivenDensity:
     def _compose(
         self, gaussians: Gaussians, cloned: Tensor, split: Tensor, pruned: Tensor, spared: Tensor, step: Step
     ) -> RowUpdate | None:
-        """One change out of masks [N]: the rest in order, the clones, the first halves, the second halves."""
+        """One change out of masks [N]: the rest, the clones, and both halves of the split, in the order of space."""
         rest, copies, halves = (torch.nonzero(mask).squeeze(-1) for mask in (~(pruned | split), cloned, split))
         if len(rest) == len(gaussians) and len(copies) == 0 and self.opacity_decay == 0:
             return None
@@ -316,7 +317,9 @@ class ErrorDrivenDensity:
             opacities = torch.where(spared, gaussians.opacities, _decayed(gaussians.opacities, self.opacity_decay))
             values["opacities"] = opacities[source]
         counts = {"num_cloned": len(copies), "num_split": len(halves), "num_pruned": int(pruned.sum())}
-        return RowUpdate(source, fresh, values, **counts)
+        # What is seen together is then read together: splats of a tile are gathered, and added to, by row.
+        order = spatial_order(values.get("means", gaussians.means[source]), step.scene_extent)
+        return RowUpdate(source, fresh, values, **counts).reordered(order)
 
     def _halves(self, gaussians: Gaussians, index: Tensor, step: Step) -> tuple[Tensor, Tensor]:
         """([2 n, 3] means, [2 n, 3] log scales) of what the Gaussians `index` [n] are split into."""

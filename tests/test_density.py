@@ -10,15 +10,25 @@ import torch
 from helpers_optim import STEP, all_finite, fill, make_gaussians, make_gradients, random_stats
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from turbogs_plugin.strategies import density as density_module
 from turbogs_plugin.strategies.density import ErrorDrivenDensity, NoDensity
 from turbogs_plugin.strategies.density_gsplat import GsplatDefaultDensity
 from turbogs_plugin.strategies.moment_lm import MomentLMOptimizer
 
 from turbogs_plugin.errors import InputError
+from turbogs_plugin.spatial_order import spatial_order
 from turbogs_plugin.types import GaussianStats, Step
 
 FULL = Step(1200, 5000, 3500, seed=3, scene_extent=2.0)  # past `prune_size_from`
 QUIET = {"prune_world_size": 0.0, "prune_opacity": 0.0}
+
+
+@pytest.fixture(autouse=True, scope="module")
+def rows_in_the_order_of_their_making():
+    """Without the order of space, which a test below holds to be all the difference."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(density_module, "spatial_order", lambda means, extent: torch.arange(len(means)))
+        yield
 
 
 def controlled(gaussians, stats: GaussianStats | None = None, **config) -> ErrorDrivenDensity:
@@ -410,3 +420,17 @@ def test_what_lies_beyond_is_spared_unless_it_is_not_finite():
     stats.error_sums[1:3] = 0.0  # the easiest
     density = controlled(gaussians, stats, spare_beyond=10.0, final_keep=0.1)
     assert {1, 2} <= set(density.update(gaussians, Step(4000, 5000, 3500, scene_extent=2.0)).source.tolist())
+
+
+@pytest.mark.parametrize("split", ["sample", "long_axis"])
+def test_rows_end_in_the_order_of_space(monkeypatch, split):
+    gaussians, stats = make_gaussians(80), random_stats(80, seed=4)
+    config = {"split": split, "opacity_decay": 0.1, "prune_opacity": 0.3}
+    made = controlled(gaussians, stats, **config).update(gaussians, FULL)
+    expected = made.reordered(spatial_order(made.apply(gaussians).means, FULL.scene_extent))
+    monkeypatch.setattr(density_module, "spatial_order", spatial_order)
+    update = controlled(gaussians, stats, **config).update(gaussians, FULL)
+    assert made.num_split > 0 and not torch.equal(update.source, made.source)
+    assert torch.equal(update.source, expected.source) and torch.equal(update.fresh, expected.fresh)
+    for name, value in update.apply(gaussians).items():
+        assert torch.equal(value, getattr(expected.apply(gaussians), name)), name

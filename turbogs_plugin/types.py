@@ -13,7 +13,7 @@ Nothing here imports anything of the project, so strategies and framework can bo
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import torch
@@ -318,6 +318,11 @@ class RowUpdate:
                 for name, value in gaussians.items()
             }
         )
+
+    def reordered(self, order: Tensor) -> RowUpdate:
+        """The same change with its new rows in another order [M], a permutation."""
+        values = {name: value[order] for name, value in self.values.items()}
+        return replace(self, source=self.source[order], fresh=self.fresh[order], values=values)
 
     def apply_state(self, state: Tensor) -> Tensor:
         """A state tensor [N, ...] after the change: rows follow their Gaussian, fresh ones are zero."""
