@@ -15,21 +15,29 @@ app = tyro.extras.SubcommandApp()
 
 Device = Literal["auto", "cpu", "cuda"]
 
+# Options that several verbs have.
+Overrides = Annotated[Positional[tuple[str, ...]], arg(metavar="[section.key=value ...]")]
+ConfigName = Annotated[str | None, arg(metavar="NAME_OR_FILE")]
+Count = Annotated[int | None, arg(metavar="N")]
+Place = Annotated[Device | None, arg(metavar="auto|cpu|cuda")]
+Memory = Annotated[str | None, arg(metavar="2GiB")]
+Time = Annotated[str | None, arg(metavar="20s")]
+
 
 @app.command
 def train(
     scene: Annotated[Positional[Path | None], arg(metavar="SCENE")] = None,
-    overrides: Annotated[Positional[tuple[str, ...]], arg(metavar="[section.key=value ...]")] = (),
+    overrides: Overrides = (),
     /,
     *,
     out: Annotated[Path | None, arg(metavar="RUN")] = None,
     resume: Annotated[Path | None, arg(metavar="RUN")] = None,
-    config: Annotated[str | None, arg(metavar="NAME_OR_FILE")] = None,
-    factor: Annotated[int | None, arg(metavar="N")] = None,
-    device: Annotated[Device | None, arg(metavar="auto|cpu|cuda")] = None,
-    max_gaussians: Annotated[int | None, arg(metavar="N")] = None,
-    max_memory: Annotated[str | None, arg(metavar="2GiB")] = None,
-    time_budget: Annotated[str | None, arg(metavar="20s")] = None,
+    config: ConfigName = None,
+    factor: Count = None,
+    device: Place = None,
+    max_gaussians: Count = None,
+    max_memory: Memory = None,
+    time_budget: Time = None,
 ) -> int:
     """Train on a capture, or go on with a stopped run.
 
@@ -62,15 +70,15 @@ def train(
 @app.command
 def plan(
     scene: Annotated[Positional[Path], arg(metavar="SCENE")],
-    overrides: Annotated[Positional[tuple[str, ...]], arg(metavar="[section.key=value ...]")] = (),
+    overrides: Overrides = (),
     /,
     *,
-    config: Annotated[str | None, arg(metavar="NAME_OR_FILE")] = None,
-    factor: Annotated[int | None, arg(metavar="N")] = None,
-    device: Annotated[Device | None, arg(metavar="auto|cpu|cuda")] = None,
-    max_gaussians: Annotated[int | None, arg(metavar="N")] = None,
-    max_memory: Annotated[str | None, arg(metavar="2GiB")] = None,
-    time_budget: Annotated[str | None, arg(metavar="20s")] = None,
+    config: ConfigName = None,
+    factor: Count = None,
+    device: Place = None,
+    max_gaussians: Count = None,
+    max_memory: Memory = None,
+    time_budget: Time = None,
 ) -> int:
     """Print what training on a capture would leave out, and because of which numbers, without training.
 
@@ -147,13 +155,13 @@ def export(
 @app.command
 def ablate(
     config: Annotated[Positional[str | None], arg(metavar="NAME_OR_FILE")] = None,
-    overrides: Annotated[Positional[tuple[str, ...]], arg(metavar="[section.key=value ...]")] = (),
+    overrides: Overrides = (),
     /,
     *,
     out: Path,
     scene: Annotated[UseAppendAction[tuple[Path, ...]], arg(metavar="SCENE")] = (),
     seeds: Annotated[tuple[int, ...], arg(metavar="N ...")] = (0,),
-    steps: Annotated[int | None, arg(metavar="N")] = None,
+    steps: Count = None,
     time_budget: Annotated[float, arg(metavar="SECONDS")] = 0.0,
     only: Annotated[tuple[str, ...], arg(metavar="VARIANT ...")] = (),
     psnr: Annotated[tuple[float, ...], arg(metavar="DB ...")] = (),
@@ -213,7 +221,7 @@ def compare(
 @app.command
 def bench(
     what: Annotated[Positional[Literal["step", "raster"]], arg(metavar="step|raster")],
-    overrides: Annotated[Positional[tuple[str, ...]], arg(metavar="[section.key=value ...]")] = (),
+    overrides: Overrides = (),
     /,
     *,
     scene: Annotated[Path | None, arg(metavar="SCENE")] = None,
