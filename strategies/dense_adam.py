@@ -24,9 +24,11 @@ class DenseAdam:
     What differs from `SparseAdam`:
 
     - a Gaussian that no sample touched has a gradient of zero: its moments decay and it goes on along its momentum;
-    - the bias correction counts iterations of the run, not updates of the Gaussian. A new Gaussian has moments of zero
-      and hardly any correction, so that it moves by more than the rate: with the usual betas and a constant gradient
-      by 3.2 rates at once, 6.5 rates after ten iterations, and 1.6 rates after five hundred.
+    - the bias correction counts iterations of the run, not updates of the Gaussian and those it was made of.
+
+    In both, a new Gaussian has moments of zero and hardly any correction, so that it moves by more than the rate: with
+    the usual betas and a constant gradient by 3.2 rates at once, 6.5 rates after ten iterations, and 1.6 rates after
+    five hundred.
 
     Two things differ from `torch.optim.Adam`: an iteration whose samples touched nothing changes nothing (on the GPU,
     such are also iterations that are going to be done again), and a Gaussian with a non-finite gradient is treated

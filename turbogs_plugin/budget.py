@@ -23,8 +23,10 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from turbogs_plugin.config import Config, resolve
+from turbogs_plugin.error_maps import MAP_BYTES
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.offload import SETS
+from turbogs_plugin.scene.photos import PHOTO_BYTES
 
 CAPS = {"error_driven": "max_gaussians", "mcmc": "cap_max"}
 """Kinds of density control that keep a cap -> its name there. With `none` the initial model is all there is."""
@@ -56,7 +58,7 @@ def with_cap(config: Config, cap: int) -> Config:
     kind = config.density["type"]
     if kind != "none" and kind not in CAPS:
         raise InputError(f"density.type {kind} keeps no cap on Gaussians: use one of {', '.join([*CAPS, 'none'])}")
-    mapping = {name: dict(section) for name, section in config.to_mapping().items()}
+    mapping = config.to_mapping()
     if kind != "none":
         present = mapping["density"][CAPS[kind]]
         mapping["density"][CAPS[kind]] = min(present, cap) if present else cap
@@ -107,7 +109,7 @@ class MemoryDemand:
         bands = (config.train.sh_degree + 1) ** 2 - 1
         numbers = 14 + 3 * bands
         return cls(
-            fixed=3 * photos + 4 * maps + SAMPLE_BYTES * samples + IMAGE_BYTES * largest,
+            fixed=PHOTO_BYTES * photos + MAP_BYTES * maps + SAMPLE_BYTES * samples + IMAGE_BYTES * largest,
             per_gaussian=2 * (3 * 4 * numbers + 4 + 7 * 4) + VIEW_BYTES * views,
         )
 

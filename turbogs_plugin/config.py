@@ -222,9 +222,9 @@ class Config:
         return registry.build(kind, getattr(self, kind))
 
     def to_mapping(self) -> dict[str, Any]:
-        """Plain YAML values, every field written out."""
+        """Plain YAML values, every field written out, in sections that may be changed."""
         return {
-            section.name: getattr(self, section.name)
+            section.name: dict(getattr(self, section.name))
             if section.name in registry.KINDS
             else dataclass_mapping(getattr(self, section.name))
             for section in fields(self)

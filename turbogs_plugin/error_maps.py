@@ -29,6 +29,9 @@ from turbogs_plugin.types import PixelSamples, Step
 AGE_MAX = 32767
 """Ages saturate here, in iterations."""
 
+MAP_BYTES = 4
+"""Of a pixel: an error in half precision and a stamp of 16 bits."""
+
 ERROR_MAX = 65504.0
 """Errors saturate here: the largest finite number in half precision."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import importlib.util
 import math
 import sys
@@ -174,6 +175,13 @@ def synchronize(device: torch.device) -> None:
     """Wait for the GPU, so that a clock read next counts what was asked for."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)
+
+
+def free_device_memory(device: torch.device) -> None:
+    """Give back to a GPU what nothing refers to any more, so that what comes next is measured by itself."""
+    if device.type == "cuda":
+        gc.collect()
+        torch.cuda.empty_cache()
 
 
 def peak_memory_bytes(device: torch.device) -> int:

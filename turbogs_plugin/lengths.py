@@ -23,7 +23,7 @@ SHORTEST_INTERVAL = 10
 
 def with_iterations(config: Config, iterations: int) -> Config:
     """The configuration for a run of exactly this length, with everything scaled that counts iterations."""
-    mapping = {name: dict(section) for name, section in config.to_mapping().items()}
+    mapping = config.to_mapping()
     scale_iterations(mapping, iterations)
     mapping["plan"]["iterations"] = "keep"
     return resolve(mapping)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -13,9 +12,8 @@ import torch
 from turbogs_plugin.budget import IterationCost, MemoryDemand, TimePlan, fit_to_time, with_cap
 from turbogs_plugin.config import Config, TrainConfig, resolve
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.evaluation import synchronize
+from turbogs_plugin.evaluation import free_device_memory, synchronize
 from turbogs_plugin.lengths import with_iterations
-from turbogs_plugin.rendering import render_images
 from turbogs_plugin.scene import Scene
 from turbogs_plugin.trainer import Trainer
 
@@ -244,24 +242,16 @@ def calibrate(config: Config, scene: Scene, device: torch.device, seconds: float
     gaussians = len(trainer.gaussians)
     initialisation, cost = _measure(trainer, seconds)
     del trainer
-    if device.type == "cuda":
-        gc.collect()
-        torch.cuda.empty_cache()
+    free_device_memory(device)
     return Calibration(time.perf_counter() - started, initialisation, cost, gaussians)
 
 
 def _measure(trainer: Trainer, seconds: float) -> tuple[float, IterationCost]:
     """(seconds of `Trainer.initialise_maps`, cost of an iteration)."""
     model, device = trainer.gaussians, trainer.gaussians.device
-    train, first = trainer.config.train, trainer.views.cameras.select([0])
-
-    def initialise() -> None:
-        image, _ = render_images(model, first, 0, trainer.config.raster)[0]
-        error = (image - trainer.views.photos.image(0)).abs().sum(dim=-1)
-        trainer.maps.initialise(0, error.reshape(-1))
-
-    initialise()  # loads code
-    view = _seconds_of(initialise, 1, 0.0, device)
+    train = trainer.config.train
+    trainer.initialise_map(0)  # loads code
+    view = _seconds_of(lambda: trainer.initialise_map(0), 1, 0.0, device)
     measured = []
     for stride in (2, 1):
         trainer.gaussians = model.map(lambda value, stride=stride: value[::stride].clone())

@@ -59,11 +59,15 @@ class Trainer:
     def initialise_maps(self) -> None:
         """The errors of a dense render of the initial Gaussians, Algorithm 1's initialization."""
         for view_id in range(len(self.views)):
-            camera = self.views.cameras.select([view_id])
-            image, _ = render_images(self.gaussians, camera, self.sh_degree, self.config.raster)[0]
-            errors = (image - self.views.photos.image(view_id)).abs().sum(dim=-1)  # [H, W]
-            self.maps.initialise(view_id, errors.reshape(-1))
+            self.initialise_map(view_id)
         self.initial_error = self.maps.mean()
+
+    def initialise_map(self, view_id: int) -> None:
+        """The errors of one view."""
+        camera = self.views.cameras.select([view_id])
+        image, _ = render_images(self.gaussians, camera, self.sh_degree, self.config.raster)[0]
+        errors = (image - self.views.photos.image(view_id)).abs().sum(dim=-1)  # [H, W]
+        self.maps.initialise(view_id, errors.reshape(-1))
 
     def step(self) -> None:
         """One iteration, in the paper's order."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 import math
 from collections.abc import Callable
 from dataclasses import replace
@@ -14,7 +13,7 @@ from turbogs_plugin.ablation.timing import PeakMemory
 from turbogs_plugin.budget import with_cap
 from turbogs_plugin.clock import TrainingClock
 from turbogs_plugin.config import Config
-from turbogs_plugin.evaluation import Metrics, evaluate, load_lpips, peak_memory_bytes
+from turbogs_plugin.evaluation import Metrics, evaluate, free_device_memory, load_lpips, peak_memory_bytes
 from turbogs_plugin.lengths import with_iterations
 from turbogs_plugin.offload import place_views
 from turbogs_plugin.plan import make_plan
@@ -113,6 +112,4 @@ def warm_up(config: Config, scene: Scene, test: PosedImages, device: torch.devic
         trainer.step_towards(iterations)
     evaluate(trainer.gaussians, test, trainer.sh_degree, config.raster)
     del trainer
-    if device.type == "cuda":
-        gc.collect()
-        torch.cuda.empty_cache()
+    free_device_memory(device)

@@ -61,7 +61,7 @@ def settled_trainer(config: Config, scene: Scene, gaussians: Gaussians, device: 
 
 def changed(config: Config, **sections: dict[str, Any]) -> Config:
     """The configuration with values of some sections replaced; a section with a `type` starts afresh."""
-    mapping = {name: dict(section) for name, section in config.to_mapping().items()}
+    mapping = config.to_mapping()
     for name, values in sections.items():
         mapping[name] = dict(values) if "type" in values else {**mapping[name], **values}
     return resolve(mapping)

@@ -9,7 +9,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from turbogs_plugin.error_maps import MAP_BYTES
 from turbogs_plugin.scene import PosedImages, Scene
+from turbogs_plugin.scene.photos import PHOTO_BYTES
 from turbogs_plugin.types import TILE_SIZE
 
 FLAT_DEVIATION = 0.01
@@ -22,8 +24,6 @@ POINTS_AT_MOST = 2000
 COMMON_POINTS = 32
 """Points that two photos must share for their exposures to be compared."""
 LUMINANCE = (0.299, 0.587, 0.114)
-MAP_BYTES_PER_PIXEL = 4
-"""Error in half precision and a stamp of 16 bits."""
 MODEL_BYTES_PER_GAUSSIAN = 3 * 4 * 59
 """59 single-precision numbers at degree 3, with two moments each."""
 
@@ -103,8 +103,8 @@ def gather_facts(
         flat_tiles=flat_tile_share(views),
         exposure_spread=_exposure_spread(views, sight),
         direction_concentration=float(views.cameras.directions.double().mean(dim=0).norm()),
-        photo_bytes=3 * (pixels + test_pixels),
-        map_bytes=MAP_BYTES_PER_PIXEL * pixels,
+        photo_bytes=PHOTO_BYTES * (pixels + test_pixels),
+        map_bytes=MAP_BYTES * pixels,
         model_bytes=MODEL_BYTES_PER_GAUSSIAN * len(scene.points),
         device=device.type,
         device_free_bytes=_free_device_bytes(device, scene) if device.type == "cuda" else host_free,

@@ -30,7 +30,7 @@ class Plan:
     def apply(self, config: Config) -> Config:
         """The configuration with every decision carried out. It leaves nothing to decide, so that a plan of it is this
         very configuration."""
-        mapping = {name: dict(section) for name, section in config.to_mapping().items()}
+        mapping = config.to_mapping()
         for decision in self.decisions:
             if decision.made != "kept":
                 RULES[decision.name].apply(mapping, decision.value, self.facts)

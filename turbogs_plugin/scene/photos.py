@@ -16,6 +16,8 @@ from torch import Tensor
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.types import PixelSamples
 
+PHOTO_BYTES = 3
+"""Of a pixel."""
 MEMORY_SHARE = 0.8
 """Photos may take this share of the machine's memory."""
 
@@ -124,7 +126,7 @@ def load_photos(paths: Sequence[Path], sizes: np.ndarray, targets: np.ndarray) -
             photos than fit in memory.
     """
     offsets = pixel_offsets(targets)
-    needed, present = 3 * int(offsets[-1]), os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    needed, present = PHOTO_BYTES * int(offsets[-1]), os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     if needed > MEMORY_SHARE * present:
         raise InputError(
             f"{len(paths)} photos take {needed / 2**30:.1f} GiB of the machine's {present / 2**30:.1f} GiB: "
