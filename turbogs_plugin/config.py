@@ -7,6 +7,7 @@ dataclass. Defaults live in those dataclasses and nowhere else. ``base: NAME_OR_
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from importlib import resources
@@ -139,7 +140,8 @@ class PlanConfig:
         views: ``all``: every training view in every iteration, with no schedule and no selection.
         sh_degree: `train.sh_degree`.
         optimizer: `optimizer.type`.
-        iterations: `train.iterations`, with all that counts iterations.
+        iterations: `train.iterations`, with all that counts iterations. ``auto``: as many as make `looks`.
+        looks: at each training pixel in the mean, which is iterations times images an iteration over views.
         maps_on: where error and age maps are: on the device, or in pinned memory of the host. It changes no result.
         photos_on: the same of the photos.
     """
@@ -150,6 +152,7 @@ class PlanConfig:
     sh_degree: int | Literal["auto", "keep"] = "keep"
     optimizer: Literal["auto", "keep", "moment_lm", "sparse_adam"] = "keep"
     iterations: int | Literal["auto", "keep"] = "keep"
+    looks: float = 75.0
     maps_on: Literal["auto", "device", "host"] = "auto"
     photos_on: Literal["auto", "device", "host"] = "auto"
 
@@ -158,6 +161,7 @@ class PlanConfig:
             require(0 <= self.sh_degree <= 3, "sh_degree", self.sh_degree, "within 0 .. 3")
         if self.iterations not in ("auto", "keep"):
             require(self.iterations >= 1, "iterations", self.iterations, "at least 1")
+        require(math.isfinite(self.looks) and self.looks > 0, "looks", self.looks, "a finite number above 0")
 
 
 PLANNED_SETTINGS: dict[str, tuple[str, ...]] = {

@@ -25,10 +25,9 @@ ONE_SIDED_DEGREE = 1
 """Degree that a one-sided capture gets: on caliterra 1 and 3 reach 31.68 dB each, 1 in 10 % less time."""
 DEVICE_SHARE = 0.5
 """Share of the device's memory that photos and maps may take: the rest is for the model, its optimizer, workspaces."""
-FEWEST_LOOKS = 50
-"""Times that a run looks at every training pixel, in the mean: photos times this are the fewest iterations at a pixel
-budget of one image. fox, caliterra and snowmiku get 116, 77 and 60 looks from 5000 iterations, whose last quarter is
-worth 0.1, 0.0 and 0.2 dB. Fewer have not been measured."""
+FEWEST_SHARE = 0.4
+"""Of the configured iterations: fewer leave the events of density control too little time between them, however few the
+photos. fox has half of them with 50 looks, and loses 0.1 dB."""
 SPARSE_ADAM_REASON = "equal PSNR within noise and 2 to 5 % less time than moment_lm, measured on an H200"
 
 Value = bool | int | str
@@ -109,12 +108,14 @@ def decide_optimizer(facts: SceneFacts, config: Config) -> Decision:
 
 
 def decide_iterations(facts: SceneFacts, config: Config) -> Decision:
-    """As configured, but more where there are so many photos that each would be looked at too seldom."""
+    """As many as look at each training pixel so often: error stops falling after looks, not after iterations."""
     present, budget = config.train.iterations, config.schedule.get("pixel_budget", 1.0)
-    looks = present * budget / max(1, facts.train_views)
-    enough = looks >= FEWEST_LOOKS
-    reason = f"{looks:.0f} looks at each of {facts.train_views} training views {_sign(enough)} {FEWEST_LOOKS}"
-    needed = present if enough else math.ceil(FEWEST_LOOKS * facts.train_views / budget / 100) * 100
+    wanted = config.plan.looks * facts.train_views / budget
+    fewest = FEWEST_SHARE * present
+    reason = f"{config.plan.looks:g} looks at each of {facts.train_views} training views"
+    if wanted < fewest:
+        reason += f" are fewer than {FEWEST_SHARE:.0%} of {present}"
+    needed = math.ceil(max(wanted, fewest) / 100) * 100
     return _decision("iterations", config, present, (needed, reason))
 
 
