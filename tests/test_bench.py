@@ -3,6 +3,7 @@
 import json
 import math
 import time
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -11,14 +12,25 @@ import torch
 from framework_runs import tiny_capture, tiny_config
 
 from turbogs_plugin import trainer as trainer_module
-from turbogs_plugin.bench import floors
+from turbogs_plugin.bench import commands, floors
+from turbogs_plugin.bench import raster as raster_module
 from turbogs_plugin.bench.clocks import Mark, back_to_back, measure, summary
 from turbogs_plugin.bench.commands import raster_lines, step_lines
-from turbogs_plugin.bench.models import resized, ring_cameras, spread_views, surface_gaussians, tile_samples
+from turbogs_plugin.bench.models import (
+    resized,
+    ring_cameras,
+    spread_views,
+    surface_gaussians,
+    tile_samples,
+    trained_model,
+)
 from turbogs_plugin.bench.precision import precision
 from turbogs_plugin.bench.raster import RasterBench
 from turbogs_plugin.bench.recorder import STEPS, StepRecorder, recorded
 from turbogs_plugin.bench.step import tensor_bytes
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.gaussians import load_ply, save_ply
+from turbogs_plugin.rendering import rasterize
 from turbogs_plugin.scene import load_scene
 from turbogs_plugin.trainer import Trainer
 
@@ -177,6 +189,87 @@ def test_bench_raster_says_what_it_measured_on(turbogs, tmp_path):
     ]  # fmt: skip
     assert all(math.isfinite(entry["forward_backward"]["median_ms"]) for entry in report["passes"])
     assert len(raster_lines(report)) == 4
+    assert (report["scene"], report["image_size"], report["model"]) == (None, [48, 32], "synthetic")
+
+
+RASTER_PASSES = ("--views", 2, "--rates", 0.1, "--repeats", 1, "--device", "cpu")
+
+
+def visible(model, cameras) -> int:
+    """Gaussians that one of two views of the capture sees."""
+    chosen = cameras.select(spread_views(2, len(cameras)))
+    radii = rasterize(model, chosen, tile_samples(chosen.sizes, 0.1, CPU, seed=0)).projected().radii
+    return int((radii > 0).all(dim=-1).any(dim=0).sum())
+
+
+def test_bench_raster_times_models_trained_on_the_scene(turbogs, capture, tmp_path):
+    out, sizes = tmp_path / "raster.json", (150, 300)
+    options = ["--scene", capture, "--gaussians", *sizes, "--training", 3, *RASTER_PASSES]
+    code, _, error = turbogs("bench", "raster", *options, "--out", out)
+    assert code == 0, error
+    report = json.loads(out.read_text())
+    assert (report["scene"], report["image_size"]) == ("capture", [48, 40])
+    assert report["model"] == "trained for 3 iterations"
+    assert [entry["gaussians"] for entry in report["gsplat"]] == list(sizes)
+    scene = load_scene(capture)
+    for count in sizes:
+        seen = {entry["counts"]["visible_gaussians"] for entry in report["passes"] if entry["gaussians"] == count}
+        assert seen == {visible(trained_model(scene, count, 3, CPU, ()), scene.train.cameras)}
+        assert seen != {visible(surface_gaussians(count, CPU), scene.train.cameras)}
+
+
+def test_bench_raster_times_the_models_of_files(turbogs, capture, tmp_path):
+    out, scene, files = tmp_path / "raster.json", load_scene(capture), []
+    for count in (40, 90):
+        files.append(tmp_path / f"model-{count}.ply")
+        save_ply(surface_gaussians(count, CPU), files[-1], scene.frame)
+    code, _, error = turbogs("bench", "raster", "--scene", capture, "--ply", *files, *RASTER_PASSES, "--out", out)
+    assert code == 0, error
+    report = json.loads(out.read_text())
+    assert report["model"] == "model-40.ply, model-90.ply"
+    assert [entry["gaussians"] for entry in report["passes"]] == 3 * [40] + 3 * [90]
+    seen = [visible(load_ply(file, scene.frame), scene.train.cameras) for file in files]
+    assert [entry["counts"]["visible_gaussians"] for entry in report["passes"]] == 3 * seen[:1] + 3 * seen[1:]
+
+
+def test_other_builds_get_the_models_that_this_one_times(turbogs, capture, tmp_path, monkeypatch):
+    library, out, timed, handed_on = tmp_path / "other.so", tmp_path / "raster.json", [], []
+    library.touch()
+    measure_one = RasterBench._measure
+
+    def watched(bench, model, *others):
+        timed.append(model)
+        return measure_one(bench, model, *others)
+
+    def other_build(path, command):
+        assert path == library and "--training" not in command
+        files = command[command.index("--ply") + 1 :][:2]
+        handed_on.extend(load_ply(file, load_scene(capture).frame) for file in files)
+        return {"model": "files"}
+
+    monkeypatch.setattr(RasterBench, "_measure", watched)
+    monkeypatch.setattr(commands, "other_build", other_build)
+    options = ["--scene", capture, "--gaussians", 150, 200, "--training", 0, *RASTER_PASSES, "--library", library]
+    code, _, error = turbogs("bench", "raster", *options, "--out", out)
+    assert code == 0, error
+    assert [len(model) for model in handed_on] == [150, 200] and len(timed) == 6
+    for mine, theirs in zip(timed[::3], handed_on, strict=True):
+        assert all(torch.equal(a, b) for (_, a), (_, b) in zip(mine.items(), theirs.items(), strict=True))
+    report = json.loads(out.read_text())
+    assert report["model"] == report["other_builds"]["other.so"]["model"] == "trained for 0 iterations"
+
+
+def test_another_build_measures_in_a_process_of_its_own(monkeypatch, tmp_path):
+    def run(arguments, env, **options):
+        assert env["TURBOGS_LIBRARY"] == str((tmp_path / "other.so").resolve())
+        code, words = (0, "") if "--views" in arguments else (2, "warning\nturbogs: error: no views\n")
+        Path(arguments[arguments.index("--out") + 1]).write_text('{"passes": []}', encoding="utf-8")
+        return SimpleNamespace(returncode=code, stderr=words)
+
+    monkeypatch.setattr(raster_module.subprocess, "run", run)
+    assert raster_module.other_build(tmp_path / "other.so", ["--views", "2"]) == {"passes": []}
+    with pytest.raises(InputError, match=r"other\.so.*no views"):
+        raster_module.other_build(tmp_path / "other.so", [])
 
 
 @pytest.mark.parametrize(
@@ -189,6 +282,12 @@ def test_bench_raster_says_what_it_measured_on(turbogs, tmp_path):
         (["raster", "--views", "0"], "--views"),
         (["raster", "--ply", "absent.ply"], "--scene"),
         (["raster", "--out", "absent/bench.json"], "absent"),
+        (["raster", "--training", "5"], "--scene"),
+        (["raster", "--scene", "CAPTURE", "--training", "5", "--ply", "model.ply"], "--training"),
+        (["raster", "--scene", "CAPTURE", "--training", "-1"], "--training"),
+        (["raster", "--scene", "CAPTURE", "--ply", "absent.ply"], "absent.ply"),
+        (["raster", "--library", "absent.so"], "absent.so"),
+        (["step", "--scene", "CAPTURE", "--ply", "one.ply", "two.ply"], "--ply"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else None,
 )

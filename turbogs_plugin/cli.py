@@ -225,11 +225,11 @@ def bench(
     /,
     *,
     scene: Annotated[Path | None, arg(metavar="SCENE")] = None,
-    ply: Annotated[Path | None, arg(metavar="FILE")] = None,
+    ply: Annotated[tuple[Path, ...], arg(metavar="FILE ...")] = (),
     gaussians: Annotated[tuple[int, ...], arg(metavar="M ...")] = (150_000, 600_000),
     views: Annotated[tuple[int, ...], arg(metavar="K ...")] = (10, 5, 3),
     pixel_budget: Annotated[float, arg(metavar="LAMBDA")] = 1.0,
-    training: Annotated[int, arg(metavar="N")] = 1500,
+    training: Count = None,
     repeats: Annotated[int, arg(metavar="N")] = 100,
     rates: Annotated[tuple[float, ...], arg(metavar="R ...")] = (1.0, 0.1),
     size: Annotated[tuple[int, int], arg(metavar="WIDTH HEIGHT")] = (841, 1500),
@@ -245,12 +245,12 @@ def bench(
     Args:
         what: step: from sampling to update; raster: forward and backward, beside gsplat's dense ones.
         overrides: step: changes of the configuration whose strategies are timed.
-        scene: a capture, for its cameras and photos; synthetic ones where absent.
-        ply: a trained model in place of one trained here (step) or of synthetic ones (raster).
+        scene: a capture, for its cameras and photos; where absent, all is synthetic, the models of raster as well.
+        ply: a trained model in place of those trained here; raster: one or more, timed at their own sizes.
         gaussians: sizes of the model.
         views: views of an iteration.
         pixel_budget: pixels of an iteration in images (lambda).
-        training: step: iterations of the model's training before.
+        training: iterations of the model's training before; 1500 where absent, 0 for the initial model.
         repeats: iterations or passes timed.
         rates: raster: further sampling rates, with the fewest views.
         size: of synthetic images, where there is no scene.
@@ -262,6 +262,7 @@ def bench(
         out: JSON file; standard output where absent.
     """
     from turbogs_plugin.bench import commands
+    from turbogs_plugin.bench.models import TRAINING_ITERATIONS
     from turbogs_plugin.bench.raster import RasterBench
     from turbogs_plugin.bench.step import StepBench
     from turbogs_plugin.run import resolve_device
@@ -269,13 +270,24 @@ def bench(
     for name, values in (("gaussians", gaussians), ("views", views), ("repeats", (repeats,))):
         if not values or min(values) < 1:
             raise InputError(f"--{name} {' '.join(map(str, values))}: each must be at least 1")
+    if training is not None and training < 0:
+        raise InputError(f"--training {training}: it must be at least 0")
+    if training is not None and ply:
+        raise InputError("--ply names a trained model: leave --training out")
+    iterations = TRAINING_ITERATIONS if training is None else training
     where = resolve_device(device)
     if what == "step":
-        step = StepBench(gaussians, views, pixel_budget, training, repeats, overrides, ply, offload)
+        if len(ply) > 1:
+            raise InputError("bench step takes one --ply, at the sizes of --gaussians")
+        step = StepBench(
+            gaussians, views, pixel_budget, iterations, repeats, overrides, ply[0] if ply else None, offload
+        )
         return commands.run_step(step, scene, commands.Synthetic(photos, size), factor, where, out)
     if overrides:
         raise InputError("bench raster times the rasterizer alone: it has no section.key=value")
-    raster = RasterBench(gaussians, views, rates, pixel_budget, size, repeats, ply, library)
+    if training is not None and scene is None:
+        raise InputError("--training needs --scene: without a capture, bench raster times synthetic models")
+    raster = RasterBench(gaussians, views, rates, pixel_budget, size, repeats, iterations, ply, library)
     return commands.run_raster(raster, scene, factor, where, out)
 
 

@@ -43,3 +43,19 @@ def test_stages_of_the_rasterizer(density):
     assert set(entry["stages"]) == set(STAGES.values()) and entry["lost_passes"] == 0
     assert np.isfinite(report["gsplat"][0]["packed"]["median_ms"])
     assert report["precision"]["forward_mean"] < 1e-5
+
+
+def test_the_rasterizer_is_timed_on_models_of_the_scene(tmp_path):
+    pytest.importorskip("pycolmap", reason="the capture is written by pycolmap")
+    device, scene = torch.device("cuda"), load_scene(tiny_capture(tmp_path))
+    bench = RasterBench((2000,), (3,), (1.0,), 1.0, (160, 120), 5, training=20)
+    (model,) = bench.models(scene, device)
+    assert len(model) == 2000 and model.device.type == "cpu"
+    held = torch.cuda.memory_allocated(device)
+    bench.models(scene, device)
+    assert torch.cuda.memory_allocated(device) <= held  # no photos, trainers or models stay there
+    report = bench.run(scene, device)
+    assert report["model"] == "trained for 20 iterations" and report["image_size"] == [48, 40]
+    for entry in report["passes"]:
+        assert entry["counts"]["visible_gaussians"] > 0.9 * len(model) and entry["lost_passes"] == 0
+    assert np.isfinite(report["gsplat"][0]["packed"]["median_ms"])

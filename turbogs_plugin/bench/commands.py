@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import tempfile
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -44,11 +45,16 @@ def run_step(
 
 def run_raster(bench: RasterBench, scene: Path | None, factor: int, device: torch.device, out: Path | None) -> int:
     _require_new(out)
-    measured = bench.run(None if scene is None else load_scene(scene, factor), device)
+    capture = None if scene is None else load_scene(scene, factor)
     place = ["--device", device.type] + ([] if scene is None else ["--scene", str(scene), "--factor", str(factor)])
-    measured["other_builds"] = {
-        library.name: other_build(library, [*bench.arguments(), *place]) for library in bench.libraries
-    }
+    model = {"model": bench.described(capture)}
+    with tempfile.TemporaryDirectory() as folder:
+        shared = bench.with_saved_models(capture, device, Path(folder)) if bench.libraries else bench
+        command = [*shared.arguments(), *place]
+        measured = {**shared.run(capture, device), **model}
+        measured["other_builds"] = {
+            library.name: {**other_build(library, command), **model} for library in bench.libraries
+        }
     return _finish("raster", measured, device, out, raster_lines(measured))
 
 

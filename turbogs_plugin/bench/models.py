@@ -17,6 +17,9 @@ from turbogs_plugin.tiles import TILE_PIXELS, pixel_table
 from turbogs_plugin.trainer import Trainer
 from turbogs_plugin.types import Cameras, Gaussians, PixelSamples, TileGrid
 
+TRAINING_ITERATIONS = 1500
+"""Of a model that is trained to be timed, where nothing else is asked for."""
+
 GROWING_SHARE = 0.8
 """Share of a model's training in which it grows; in the rest it settles at its final size."""
 

@@ -10,20 +10,29 @@ import tempfile
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from turbogs_plugin import kernels
+from turbogs_plugin.ablation.cell import scene_on
 from turbogs_plugin.bench.clocks import Mark, Summary, back_to_back, copy_bandwidth, measure, summary
 from turbogs_plugin.bench.floors import raster_counts, raster_floors
 from turbogs_plugin.bench.gsplat_dense import bench_gsplat
-from turbogs_plugin.bench.models import ring_cameras, spread_views, surface_gaussians, tile_samples
+from turbogs_plugin.bench.models import (
+    TRAINING_ITERATIONS,
+    ring_cameras,
+    spread_views,
+    surface_gaussians,
+    tile_samples,
+    trained_model,
+)
 from turbogs_plugin.bench.precision import precision
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.gaussians import load_ply
+from turbogs_plugin.evaluation import free_device_memory
+from turbogs_plugin.gaussians import load_ply, save_ply
 from turbogs_plugin.rendering import Rendered, Workspace, rasterize
 from turbogs_plugin.scene import Scene
 from turbogs_plugin.types import Cameras, Gaussians, GaussianStats
@@ -67,14 +76,18 @@ class RasterBench:
     """What `turbogs bench raster` measures.
 
     Args:
-        gaussians: sizes of the synthetic models; not used with `ply`.
+        gaussians: sizes of the models; not used with `ply`.
         views: K; each with the rate of the pixel budget.
         rates: further rates, with the fewest views: 1 and 0.1 are compared with gsplat's dense passes of those views.
         pixel_budget: K times the rate (lambda).
         size: (width, height) of the synthetic cameras; not used with a scene.
         repeats: of each pass.
-        ply: a trained model in the capture's own coordinates.
+        training: iterations of the models' training on a scene; without one they are synthetic.
+        ply: models in the capture's own coordinates, in place of those trained here.
         libraries: other builds of the kernels, measured each in a process of its own.
+
+    Raises:
+        InputError: a library that is not there.
     """
 
     gaussians: Sequence[int]
@@ -83,11 +96,17 @@ class RasterBench:
     pixel_budget: float
     size: tuple[int, int]
     repeats: int
-    ply: Path | None = None
+    training: int = TRAINING_ITERATIONS
+    ply: Sequence[Path] = ()
     libraries: Sequence[Path] = ()
 
+    def __post_init__(self) -> None:
+        for library in self.libraries:
+            if not library.is_file():
+                raise InputError(f"no such library: '{library}'")
+
     def arguments(self) -> list[str]:
-        """Of the command line that measures the same, the libraries left out."""
+        """Of the command line that measures the same models, synthetic ones or files, the libraries left out."""
         values = {
             "--gaussians": self.gaussians,
             "--views": self.views,
@@ -95,25 +114,61 @@ class RasterBench:
             "--pixel-budget": [self.pixel_budget],
             "--size": self.size,
             "--repeats": [self.repeats],
-            "--ply": [] if self.ply is None else [self.ply],
+            "--ply": self.ply,
         }
         return [text for flag, given in values.items() if given for text in (flag, *map(str, given))]
 
+    def described(self, scene: Scene | None) -> str:
+        """Which models these are."""
+        if self.ply:
+            return ", ".join(path.name for path in self.ply)
+        return "synthetic" if scene is None else f"trained for {self.training} iterations"
+
+    def models(self, scene: Scene | None, device: torch.device) -> list[Gaussians]:
+        """The models in host memory, so that the device holds the one that is timed.
+
+        Args:
+            scene: to train on, its photos in host memory, or whose frame the files' models come into.
+            device: where to train; nothing is left there.
+        """
+        if self.ply:
+            return [load_ply(path, scene.frame) for path in self.ply]
+        if scene is None:
+            return [surface_gaussians(count, torch.device("cpu")) for count in self.gaussians]
+        placed = scene_on(scene, device)
+        trained = [
+            trained_model(placed, count, self.training, device, ()).map(lambda value: value.detach().cpu())
+            for count in self.gaussians
+        ]
+        del placed
+        free_device_memory(device)
+        return trained
+
+    def with_saved_models(self, scene: Scene | None, device: torch.device, folder: Path) -> RasterBench:
+        """The same bench with its trained models as files in a folder.
+
+        For several builds: what each of them trains would differ in the last bits.
+        """
+        if scene is None or self.ply:
+            return self
+        files = [folder / f"trained-{self.training}-{count}.ply" for count in self.gaussians]
+        for model, file in zip(self.models(scene, device), files, strict=True):
+            save_ply(model, file, scene.frame)
+        return replace(self, ply=files)
+
     def run(self, scene: Scene | None, device: torch.device) -> dict[str, Any]:
         """The measurements, ready for JSON. `scene`: whose cameras to use; None: synthetic ones."""
-        if self.ply is not None and scene is None:
+        if self.ply and scene is None:
             raise InputError("--ply needs --scene: the model lies in a capture's own coordinates")
         if scene is None:
             cameras = ring_cameras(max(self.views), *self.size, device)
         else:
             cameras = scene.train.cameras.to(device, torch.float32)
-        if self.ply is None:
-            models = [surface_gaussians(count, device) for count in self.gaussians]
-        else:
-            models = [load_ply(self.ply, scene.frame).map(lambda value: value.float().to(device).contiguous())]
+        models = self.models(scene, device)
         bandwidth = copy_bandwidth(device)
         passes, dense = [], []
-        for model in models:
+        for held in models:
+            model = held.map(lambda value: value.to(device).contiguous())
             settings = [(views, self.pixel_budget / views, False) for views in self.views]
             settings += [(min(self.views), rate, False) for rate in self.rates]
             settings.append((*settings[0][:2], True))
@@ -123,6 +178,9 @@ class RasterBench:
             chosen = cameras.select(spread_views(min(self.views), len(cameras)))
             dense.append({"gaussians": len(model), "views": len(chosen), **bench_gsplat(model, chosen, self.repeats)})
         return {
+            "scene": None if scene is None else scene.name,
+            "image_size": cameras.sizes.max(axis=0).tolist(),
+            "model": self.described(scene),
             "copy_bandwidth_bytes_per_s": bandwidth,
             "precision": precision(device),
             "passes": passes,
@@ -154,7 +212,13 @@ class RasterBench:
             "samples": len(samples),
         }
         if not on_kernels:
-            return {**measured, "forward": measure(render, self.repeats, device), **self._totals(whole, device)}
+            visible = (render().projected().radii > 0).any(dim=-1).any(dim=0)  # [N]
+            return {
+                **measured,
+                "forward": measure(render, self.repeats, device),
+                **self._totals(whole, device),
+                "counts": {"visible_gaussians": int(visible.sum())},
+            }
         torch.cuda.reset_peak_memory_stats(device)
         whole()
         times: dict[str, list[tuple[Mark, Mark]]] = defaultdict(list)
@@ -185,8 +249,6 @@ class RasterBench:
 
 def other_build(library: Path, command: Sequence[str]) -> dict[str, Any]:
     """The same measurements by another build of the library, in a process of its own."""
-    if not library.is_file():
-        raise InputError(f"no such library: '{library}'")
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "bench.json"
         arguments = [sys.executable, "-m", "turbogs_plugin.cli", "bench", "raster", *command, "--out", str(out)]
