@@ -152,7 +152,7 @@ class PlanConfig:
     sh_degree: int | Literal["auto", "keep"] = "keep"
     optimizer: Literal["auto", "keep", "moment_lm", "sparse_adam"] = "keep"
     iterations: int | Literal["auto", "keep"] = "keep"
-    looks: float = 75.0
+    looks: float = 60.0
     maps_on: Literal["auto", "device", "host"] = "auto"
     photos_on: Literal["auto", "device", "host"] = "auto"
 

@@ -53,7 +53,8 @@ def write_study(folder: Path, study: Study, targets: Sequence[float] = ()) -> Pa
 
 def _header(study: Study) -> list[Block]:
     results = study.results
-    lengths = sorted({result.config["train"]["iterations"] for result in results})
+    # The plan may have made them other than configured, a time budget fewer.
+    lengths = sorted({result.final.iteration for result in results if not result.stopped_early})
     budgets = sorted({result.time_budget for result in results} - {0.0})
     warmups = sorted({result.warmup_iterations for result in results})
     budget = f", at most {_listing(budgets)} s of training" if budgets else ""
@@ -64,7 +65,7 @@ def _header(study: Study) -> list[Block]:
         else "Without warm-up."
     )
     blocks: list[Block] = [
-        Paragraph(f"{_listing(lengths)} iterations{budget}. {TIMING_RULES} {warmup}"),
+        Paragraph(f"{_listing(lengths) or 'As many'} iterations{budget}. {TIMING_RULES} {warmup}"),
         Paragraph(HOW_TO_READ),
     ]
     missing = sorted({result.lpips_reason for result in results if result.lpips_reason})

@@ -60,7 +60,7 @@ class CellResult:
     @property
     def stopped_early(self) -> bool:
         """The time budget ended it."""
-        return self.final.iteration < self.config["train"]["iterations"]
+        return 0 < self.time_budget <= self.final.train_seconds
 
 
 @dataclass

@@ -1,0 +1,78 @@
+"""The CUDA rasterizer against the reference in float64 on real captures, with models in the middle of their training.
+
+``TURBOGS_SCENES=FOLDER`` names the folder that holds the captures; those that are not there are skipped.
+"""
+
+import os
+from pathlib import Path
+
+import pytest
+import torch
+from raster_cases import (
+    GPU_ONLY,
+    RECORD_COLUMNS,
+    Case,
+    assert_forward_close,
+    assert_gradients_close,
+    on_gpu,
+    samples_to,
+    upstream,
+)
+
+from turbogs_plugin.bench.models import tile_samples, train
+from turbogs_plugin.config import load_config
+from turbogs_plugin.rendering import rasterize, rasterize_reference
+from turbogs_plugin.scene import load_scene
+from turbogs_plugin.trainer import Trainer
+from turbogs_plugin.types import GaussianStats
+
+pytestmark = GPU_ONLY
+
+SAMPLES_A_TILE = 4
+VIEWS = (3, 20)
+
+
+@pytest.fixture(scope="module", params=["fox", "caliterra"])
+def case(request) -> Case:
+    """Two training views, four pixels of every tile, and the model after 1000 iterations."""
+    folder = Path(os.environ.get("TURBOGS_SCENES", "")) / request.param
+    if "TURBOGS_SCENES" not in os.environ or not folder.is_dir():
+        pytest.skip(f"set TURBOGS_SCENES to the folder that holds {request.param}")
+    config = load_config("turbogs", ["train.iterations=5000", f"train.backdrop={request.param == 'caliterra'}"])
+    trainer = Trainer(config, load_scene(folder), torch.device("cuda"))
+    trainer.initialise_maps()
+    train(trainer, 1000)
+    cameras = trainer.views.cameras.select(VIEWS)
+    samples = tile_samples(cameras.sizes, SAMPLES_A_TILE / 256, torch.device("cuda"), seed=1)
+    return Case(
+        trainer.gaussians.map(lambda value: value.detach().double().cpu()),
+        cameras.to("cpu", torch.float64),
+        samples_to(samples, "cpu"),
+        trainer.gaussians,
+        cameras,
+        samples,
+    )
+
+
+def test_colors_and_gradients(case):
+    got = rasterize(case.gpu_gaussians, case.gpu_cameras, case.gpu_samples)
+    wanted = rasterize_reference(case.gaussians, case.cameras, case.samples)
+    assert_forward_close(got.colors, wanted.colors, "colors")
+    assert_forward_close(got.alphas, wanted.alphas, "alphas")
+    beyond = (got.colors.double().cpu() - wanted.colors)[(got.colors.double().cpu() - wanted.colors).abs() > 1e-4]
+    if len(beyond) >= 20:  # symmetric: neither draws more than the other
+        assert 0.2 <= (beyond > 0).double().mean() <= 0.8
+
+    values = upstream(case)
+    del values["depth_gradients"], values["alpha_gradients"]
+    stats = GaussianStats.zeros(len(case.gaussians), "cuda")
+    wanted_stats = GaussianStats.zeros(len(case.gaussians), "cpu").map(torch.Tensor.double)
+    got, wanted = got.backward(**on_gpu(values), stats=stats), wanted.backward(**values, stats=wanted_stats)
+    records, wanted_records = got.full_records(), wanted.full_records()
+    for name, column in RECORD_COLUMNS.items():
+        if name != "depth":
+            assert_gradients_close(records[..., column], wanted_records[..., column], name)
+    gradients, wanted_gradients = got.parameter_gradients(rows=True), wanted.parameter_gradients(rows=True)
+    for name, _ in case.gaussians.items():
+        ours, theirs = getattr(gradients, name), getattr(wanted_gradients, name)
+        assert_gradients_close(ours.reshape(*theirs.shape[:2], -1), theirs.reshape(*theirs.shape[:2], -1), name)
