@@ -9,6 +9,7 @@ import pytest
 
 from turbogs_plugin.amounts import parse_bytes, parse_seconds
 from turbogs_plugin.budget import (
+    EXPECTED_GROWTH,
     FEWEST_GAUSSIANS,
     FEWEST_SHARE,
     IterationCost,
@@ -120,7 +121,7 @@ def test_cost_through_two_measurements():
 def test_a_generous_time_is_used_for_iterations():
     iterations, cap = fit_to_time(100.0, COST, initial=50_000, cap=0, iterations=5000, refine_share=0.7)
     assert cap == 0
-    mean = 0.35 * 50_000 + 0.65 * 200_000
+    mean = (0.35 + 0.65 * EXPECTED_GROWTH) * 50_000
     assert iterations == int(100.0 / COST.at(mean)) > 5000
     assert fit_to_time(100.0, COST, 50_000, 60_000, 5000, 0.7)[0] > iterations  # fewer Gaussians, faster iterations
 

@@ -9,15 +9,18 @@ lambda images of S pixels an iteration:
 - fixed: photos and maps, or their windows of 2 K views; `SAMPLE_BYTES` for each of lambda S samples; `IMAGE_BYTES` for
   each pixel of the largest photo, which is rendered whole at the start and in evaluations.
 
-Time. The cost of an iteration is ``base + per_gaussian * N``. A run is given as many iterations as fit; where these
-would be fewer than `FEWEST_SHARE` of the configured ones, Gaussians are given up for them. While it trains, the number
-of iterations left follows the cost measured (`TimePlan`), so that all that goes by progress (learning rates, sampling,
-density control) ends with the time.
+Time. The cost of an iteration is ``base + per_gaussian * N``. Where fewer iterations fit than are configured, the run
+is that much shorter; where these would be fewer than `FEWEST_SHARE` of the configured ones, Gaussians are given up for
+them. Where more fit, an iteration gets more pixels (lambda) until the configured number fills the time, and only then
+there are more iterations: those overfit the photos (docs/budgets.md). While it trains, the number of iterations left
+follows the cost measured (`TimePlan`), so that all that goes by progress (learning rates, sampling, density control)
+ends with the time.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -31,6 +34,9 @@ from turbogs_plugin.scene.photos import PHOTO_BYTES
 CAPS = {"error_driven": "max_gaussians", "mcmc": "cap_max"}
 """Kinds of density control that keep a cap -> its name there. With `none` the initial model is all there is."""
 
+WHOLE_VIEWS = ("dense",)
+"""Pixel samplers that take every pixel of a view, whatever the rate: to these, lambda says nothing."""
+
 VIEW_BYTES = 230
 """Of a Gaussian in a view: the rasterizer's instance, radius and gradient record, and its share of the pairs. Measured
 on an H200: 213 between 150 and 600 thousand Gaussians (docs/results/h200/bench-step.json)."""
@@ -43,8 +49,12 @@ FEWEST_GAUSSIANS = 1000
 
 FEWEST_SHARE = 0.3
 """Of the configured iterations; a shorter schedule gets fewer Gaussians instead."""
-EXPECTED_GROWTH = 4.0
-"""Final Gaussians per initial one, before anything is known of the scene."""
+EXPECTED_GROWTH = 8.0
+"""Final Gaussians per initial one, before anything is known of the scene: 10 on fox, 7 on caliterra (sweeps.json)."""
+TOLERANCE = 0.1
+"""So many more or fewer iterations, as a share of the configured ones, are as good as those."""
+RAISES = 3
+"""How often lambda is raised and the cost measured again, at most."""
 MARK_SHARE = 0.03
 """Of the time, between two looks at the clock; towards the end, half of what is left."""
 
@@ -69,6 +79,43 @@ def with_cap(config: Config, cap: int) -> Config:
     return resolve(mapping)
 
 
+def growth_cap(config: Config, initial: int) -> int:
+    """The cap that the density control keeps; 0: none. A model that does not grow has its initial number."""
+    kind = config.density["type"]
+    if kind == "none":
+        return initial
+    return config.density[CAPS[kind]] if kind in CAPS else 0
+
+
+def expected_gaussians(initial: int, cap: int) -> float:
+    """How many there will be at the end, before anything is known of the scene. A `cap` of 0 is none."""
+    return max(initial, min(EXPECTED_GROWTH * initial, cap or math.inf))
+
+
+def most_views(config: Config, num_views: int) -> int:
+    """K where it is largest, of a scene with so many training views."""
+    return min(num_views, config.schedule.get("max_views", config.schedule.get("views", num_views)))
+
+
+def pixel_budget_range(config: Config, num_views: int) -> tuple[float, float]:
+    """(lambda as configured, the largest that adds a pixel): the rate, lambda / K, is at most 1.
+
+    The two are equal where more pixels cannot be asked for: the pixel sampler takes all, or the schedule has no lambda.
+    """
+    views = most_views(config, num_views)
+    configured = config.schedule.get("pixel_budget", views)
+    if config.pixel_sampler["type"] in WHOLE_VIEWS:
+        return configured, configured
+    return configured, max(configured, float(views))
+
+
+def with_pixel_budget(config: Config, pixel_budget: float) -> Config:
+    """The configuration with another lambda."""
+    mapping = config.to_mapping()
+    mapping["schedule"]["pixel_budget"] = pixel_budget
+    return resolve(mapping)
+
+
 def chosen_points(count: int, cap: int, others: int) -> slice | np.ndarray:
     """Which of `count` points a model begins with: all, or as many as leave room for `others` under a cap.
 
@@ -87,10 +134,15 @@ def chosen_points(count: int, cap: int, others: int) -> slice | np.ndarray:
 
 @dataclass(frozen=True)
 class MemoryDemand:
-    """Bytes of the device at the peak of a run, as the module's text counts them: ``fixed + per_gaussian * N``."""
+    """Bytes of the device at the peak of a run, as the module's text counts them: ``fixed + per_gaussian * N``.
+
+    Args:
+        per_image: of an image of samples; lambda of these are counted in `fixed`.
+    """
 
     fixed: int
     per_gaussian: int
+    per_image: int
 
     @classmethod
     def of(cls, config: Config, pixels: int, test_pixels: int, largest: int, num_views: int) -> MemoryDemand:
@@ -101,16 +153,19 @@ class MemoryDemand:
             largest: pixels of the largest photo.
             num_views: V.
         """
-        views = min(num_views, config.schedule.get("max_views", config.schedule.get("views", num_views)))
+        views = most_views(config, num_views)
         window = SETS * views * largest
         photos = window + SETS * largest if config.plan.photos_on == "host" else pixels + test_pixels
         maps = window if config.plan.maps_on == "host" else pixels
-        samples = math.ceil(config.schedule.get("pixel_budget", views) * largest)
+        dense = config.pixel_sampler["type"] in WHOLE_VIEWS
+        images = views if dense else min(views, config.schedule.get("pixel_budget", views))
+        samples = math.ceil(images * largest)
         bands = (config.train.sh_degree + 1) ** 2 - 1
         numbers = 14 + 3 * bands
         return cls(
             fixed=PHOTO_BYTES * photos + MAP_BYTES * maps + SAMPLE_BYTES * samples + IMAGE_BYTES * largest,
             per_gaussian=2 * (3 * 4 * numbers + 4 + 7 * 4) + VIEW_BYTES * views,
+            per_image=SAMPLE_BYTES * largest,
         )
 
     def gaussians(self, limit: int) -> int:
@@ -128,6 +183,10 @@ class MemoryDemand:
                 "schedule.max_views or schedule.pixel_budget"
             )
         return count
+
+    def more_images(self, limit: int, gaussians: float) -> float:
+        """How much lambda may rise within `limit` bytes, beside so many Gaussians."""
+        return max(0.0, limit - self.fixed - gaussians * self.per_gaussian) / self.per_image
 
 
 @dataclass(frozen=True)
@@ -148,6 +207,9 @@ class IterationCost:
     def at(self, gaussians: float) -> float:
         return self.base + self.per_gaussian * gaussians
 
+    def times(self, factor: float) -> IterationCost:
+        return IterationCost(factor * self.base, factor * self.per_gaussian)
+
 
 def fit_to_time(
     seconds: float, cost: IterationCost, initial: int, cap: int, iterations: int, refine_share: float
@@ -156,7 +218,8 @@ def fit_to_time(
 
     Args:
         seconds: left for iterations.
-        initial: Gaussians at the start; their number is expected to rise along a line until the end of density control.
+        initial: Gaussians at the start; their number is expected to rise along a line until the end of density control,
+            to `expected_gaussians`.
         cap: never more Gaussians; 0: none.
         iterations: configured.
         refine_share: of the iterations, those with density control.
@@ -169,7 +232,7 @@ def fit_to_time(
     def mean(final: float) -> float:
         return growing * initial + (1.0 - growing) * final
 
-    final = max(initial, min(EXPECTED_GROWTH * initial, cap or math.inf))
+    final = expected_gaussians(initial, cap)
     fitting = seconds / max(1e-9, cost.at(mean(final)))
     fewest = FEWEST_SHARE * iterations
     if fitting >= fewest:
@@ -178,6 +241,38 @@ def fit_to_time(
         wanted = (seconds / fewest - cost.base) / cost.per_gaussian  # the mean number that leaves time for so many
         final = min(final, max(initial, (wanted - growing * initial) / (1.0 - growing)))
     return max(1, int(seconds / max(1e-9, cost.at(mean(final))))), math.ceil(final)
+
+
+def pixels_for_time(
+    configured: float, largest: float, iterations: int, raises: int, fitting: Callable[[float], int]
+) -> float:
+    """The lambda with which about the configured number of iterations fills the time.
+
+    The cost of an iteration grows more slowly than lambda, so that raising lambda by the ratio of the iterations that
+    fit to those wanted never raises it too far, but again and again not far enough.
+
+    Args:
+        configured, largest: the range of lambda.
+        iterations: wanted.
+        raises: at most.
+        fitting: how many iterations fit with a lambda; it is asked for the configured one first.
+
+    Returns:
+        The configured lambda unless more iterations fit with it than wanted; of those tried and costing none of the
+        iterations wanted, beyond `TOLERANCE`, the one with which their number is nearest.
+    """
+    enough, most = (1.0 - TOLERANCE) * iterations, (1.0 + TOLERANCE) * iterations
+    pixel_budget, fits = configured, fitting(configured)
+    best, excess = configured, abs(fits - iterations)
+    for _ in range(raises):
+        if fits <= most or pixel_budget >= largest:
+            break
+        raised = min(largest, pixel_budget * fits / iterations)
+        pixel_budget = max(configured, math.floor(1000 * raised) / 1000)  # for readers; never beyond the largest
+        fits = fitting(pixel_budget)
+        if fits >= enough and abs(fits - iterations) < excess:
+            best, excess = pixel_budget, abs(fits - iterations)
+    return best
 
 
 @dataclass
