@@ -143,7 +143,7 @@ class SyntheticTrial:
 
 def planned(scene: Scene, monkeypatch, *overrides: str):
     monkeypatch.setattr(pacing, "_Trial", SyntheticTrial)
-    config = tiny_config(Path("capture"), "schedule.max_views=7", "train.iterations=300", *overrides)
+    config = tiny_config(Path("capture"), "schedule.max_views=7", "train.iterations=300", "plan.looks=40", *overrides)
     return pacing.within_budget(config, scene, CPU)
 
 
@@ -154,6 +154,7 @@ def planned(scene: Scene, monkeypatch, *overrides: str):
         (8, (), 3.0, 320),
         (30, (), 7.0, 660),
         (8, ("pixel_sampler.type=dense",), 1.0, 530),
+        (8, ("plan.looks=60",), 1.47, 460),  # of 7 views: too few of 300 iterations, so 420 first
     ],
 )
 def test_a_configuration_for_its_time(scene, monkeypatch, seconds, overrides, pixel_budget, iterations):
@@ -198,7 +199,7 @@ def test_a_run_with_time_for_more_looks_at_more_pixels(tmp_path, monkeypatch):
     """It ends with its time after about the configured iterations, and all that a run writes says with which lambda."""
     monkeypatch.setattr(pacing, "CALIBRATION_SHARE", 0.3)  # so few iterations are a long time to measure for otherwise
     overrides = ("budget.time=6s", "budget.max_gaussians=1200", "schedule.min_views=7", "schedule.max_views=7")
-    lengths = ("train.iterations=30", "train.refine_until=20")
+    lengths = ("train.iterations=30", "train.refine_until=20", "plan.looks=4")
     outcome = run.train(tiny_config(tiny_capture(tmp_path), *overrides, *lengths), tmp_path / "run")
     end = outcome.history[-1]
     assert end.train_seconds == pytest.approx(6.0, rel=0.1)

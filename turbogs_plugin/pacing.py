@@ -291,9 +291,11 @@ def _measure(config: Config, scene: Scene, device: torch.device, seconds: float,
         )
     configured, largest = pixel_budget_range(config, len(scene.train))
     largest = min(largest, configured + _room_for_images(config, scene, device, gaussians))
+    # What more iterations overfit is photos that are looked at often already.
+    wanted = max(config.train.iterations, math.ceil(config.plan.looks * len(scene.train) / configured))
     # A measured iteration with more pixels takes at most about seconds / iterations.
     fewest = WARMUP_ITERATIONS[device.type] + FEWEST_MEASURED[device.type]
-    raises = min(RAISES, max(1, int(CALIBRATION_SHARE * config.train.iterations / fewest)))
+    raises = min(RAISES, max(1, int(CALIBRATION_SHARE * wanted / fewest)))
     costs = {configured: cost}
 
     def fitting(pixel_budget: float) -> int:
@@ -303,7 +305,7 @@ def _measure(config: Config, scene: Scene, device: torch.device, seconds: float,
         left = seconds - initialisation - (time.perf_counter() - started)
         return _fit(config, left, costs[pixel_budget], gaussians)[0]
 
-    chosen = pixels_for_time(configured, largest, config.train.iterations, raises, fitting)
+    chosen = pixels_for_time(configured, largest, wanted, raises, fitting)
     return Calibration(time.perf_counter() - started, initialisation, costs[chosen], gaussians, configured, chosen)
 
 
