@@ -66,7 +66,8 @@ BOTH_SIDES = [
     ("iterations", {"train_views": 43}, ("plan.looks=75",), 3300, "75 looks at each of 43 training views"),
     ("iterations", {"train_views": 100}, ("plan.looks=75", "schedule.pixel_budget=0.5"), 15000, "75 looks"),
     ("iterations", {"train_views": 20}, ("plan.looks=75",), 2000, "fewer than 40% of 5000"),
-    ("optimizer", {}, (), "sparse_adam", "2 to 5 %"),
+    ("optimizer", {"device": "cpu"}, (), "sparse_adam", "5 to 10 % of an iteration"),
+    ("optimizer", {"device": "cuda"}, (), "moment_lm", "at most 7 %"),
     ("optimizer", {}, ("optimizer.type=adam",), "keep", "the optimizer is adam"),
     ("maps_on", {"device_free_bytes": 240 * MIB}, (), "device", "120 MiB <= 50% of 240 MiB free"),
     ("maps_on", {"device_free_bytes": 239 * MIB}, (), "host", "120 MiB > 50% of 239 MiB free"),
@@ -138,7 +139,7 @@ def test_all_views_leave_nothing_to_select():
 
 def test_the_other_optimizer_keeps_the_learning_rates():
     config = load_config("turbogs", ["plan.optimizer=auto", "optimizer.learning_rates.batch_scale=2.5"])
-    planned = plan_from_facts(FACTS, config).apply(config)
+    planned = plan_from_facts(facts(device="cpu"), config).apply(config)
     assert planned.optimizer["type"] == "sparse_adam"
     assert planned.optimizer["learning_rates"] == config.optimizer["learning_rates"]
     planned.build("optimizer")

@@ -22,6 +22,8 @@ BANDS_UP_TO = 10
 
 SHOWN_BELOW = 4.0
 """dB below the worst final result at which the PSNR plot ends: what comes before is over in a moment."""
+SHOWN_ABOVE = 1.6
+"""Times the worst final error, at which that plot ends: 4 dB as well."""
 
 
 def _styles(summary: SceneSummary) -> dict[str, tuple[str, str]]:
@@ -51,9 +53,10 @@ def plot_curves(path: Path, summary: SceneSummary) -> None:
         floor = min(row.psnr.mean for row in summary.rows) - SHOWN_BELOW
         psnr_axes.set(ylabel="test PSNR in dB", title=f"{summary.scene}: PSNR")
         psnr_axes.set_ylim(bottom=max(floor, psnr_axes.get_ylim()[0]))
-        l1_axes.set(ylabel="mean absolute error on test views (0 .. 1)", title="mean absolute error", yscale="log")
-        l1_axes.yaxis.set_major_formatter(matplotlib.ticker.FormatStrFormatter("%.3f"))
-        l1_axes.yaxis.set_minor_formatter(matplotlib.ticker.FormatStrFormatter("%.3f"))
+        l1_axes.set(ylabel="mean absolute error on test views (0 .. 1)", title="mean absolute error")
+        ceiling = SHOWN_ABOVE * max(row.l1_curve.mean[-1] for row in summary.rows)
+        floor = 0.9 * min(min(row.l1_curve.mean) for row in summary.rows)
+        l1_axes.set_ylim(bottom=floor, top=min(ceiling, l1_axes.get_ylim()[1]))
         handles, labels = psnr_axes.get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside right center", frameon=False, fontsize=9)
         figure.savefig(path)
