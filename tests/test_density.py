@@ -82,6 +82,7 @@ def test_scores_equal_the_equation(kind, iteration):
         {},
         {"top_fraction": 0.8, "prune_score_fraction": 0.1, "score": "raw"},
         {"prune_world_size": 0.02, "prune_screen_size": 0.15, "prune_opacity": 0.3},
+        {"prune_world_size": 0.02, "prune_screen_size": 0.15, "prune_size_from": 0.9},  # not yet
         {"max_gaussians": 220},
         {"max_gaussians": 150},
         {"growth": "budget", "target_gaussians": 260},
@@ -110,8 +111,9 @@ def test_event_equals_plain_loops(seed, config):
             prunes.add(i)
         elif passes and seen[i] and score[i] >= hard_limit and not small:
             splits.add(i)
-        elif largest > density.prune_world_size * 2.0 or (
-            density.prune_screen_size and stats.max_radii[i] > density.prune_screen_size
+        elif FULL.progress >= density.prune_size_from and (
+            largest > density.prune_world_size * 2.0
+            or (density.prune_screen_size and stats.max_radii[i] > density.prune_screen_size)
         ):
             prunes.add(i)
         elif passes and seen[i] and score[i] >= hard_limit:

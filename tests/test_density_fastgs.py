@@ -58,6 +58,16 @@ def test_only_what_most_looks_mark_is_densified(gaussians):
     assert run_looks(lenient, gaussians, [OFTEN, ONCE, OFTEN, OFTEN])[-1].num_split == 2
 
 
+@pytest.mark.parametrize(("error_threshold", "splits"), [(2.9, 2), (3.1, 0)])
+def test_a_mark_is_an_error_of_so_many_means(gaussians, error_threshold, splits):
+    """The two Gaussians of `ONCE` that stand out have three times the mean error."""
+    always = {"prune_opacity": 0.0, "prune_world_size": 0.0, "error_threshold": error_threshold}
+    density = FastGsDensity(refine_from=2, refine_every=2, **always)
+    density.setup(gaussians)
+    update = run_looks(density, gaussians, [ONCE, ONCE])[-1]
+    assert (0 if update is None else update.num_split) == splits
+
+
 def test_looks_that_did_not_see_it_do_not_count(gaussians):
     density = FastGsDensity(refine_from=4, refine_every=4, prune_opacity=0.0, prune_world_size=0.0)
     density.setup(gaussians)

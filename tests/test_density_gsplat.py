@@ -78,6 +78,8 @@ def ours(gaussians, batch, step: Step, config: dict, opacity_reset: str) -> RowU
         ({}, 600),
         ({"absgrad": True, "grow_grad2d": 4e-4}, 600),
         ({"refine_scale2d_stop_iter": 5000, "grow_scale2d": 0.1}, 3100),
+        ({"refine_scale2d_stop_iter": 5000, "prune_scale2d": 0.05}, 3100),
+        ({"pause_refine_after_reset": 99}, 3100),
         ({"revised_opacity": True, "prune_opa": 0.2}, 700),
         ({"prune_opa": 0.1}, 3000),
     ],
@@ -109,6 +111,12 @@ def test_leaves_global_random_numbers_alone():
     torch.manual_seed(5)
     assert ours(gaussians, batch, Step(600, 30_000, 15_000, scene_extent=1.3), {}, "repaired") is not None
     assert torch.equal(torch.rand(3), expected)
+
+
+def test_refinement_pauses_after_a_reset():
+    gaussians, batch = make_gaussians(COUNT, dtype=torch.float32), screen(0)
+    step = Step(3100, 30_000, 15_000, scene_extent=1.3)
+    assert ours(gaussians, batch, step, {"pause_refine_after_reset": 101}, "repaired") is None
 
 
 def test_nothing_to_do_and_the_end():

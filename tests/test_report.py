@@ -6,8 +6,10 @@ import math
 import numpy as np
 import pytest
 import torch
+from framework_runs import tiny_capture, tiny_config
 from PIL import Image
 
+from turbogs_plugin import run
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.evaluation import compare, load_lpips, peak_memory_bytes
 from turbogs_plugin.progress import TrainingProgress, describe_nonfinite
@@ -152,3 +154,11 @@ def test_progress_bar_on_a_terminal(capsys, monkeypatch):
         progress.advance(50, 1234)
     shown = capsys.readouterr().err
     assert "50/100" in shown and "20.10" in shown and "1,234" in shown
+
+
+@pytest.mark.parametrize("strips", [0, 1])
+def test_no_more_strips_than_asked_for(tmp_path, strips):
+    config = tiny_config(tiny_capture(tmp_path), "train.iterations=1", "scene.test_every=4", f"report.strips={strips}")
+    folder = run.train(config, tmp_path / "run").folder
+    assert len(list((folder.path / "report").glob("test-*.png"))) == strips
+    assert f"{strips} of 2 are shown" in folder.report.read_text()
