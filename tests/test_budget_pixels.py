@@ -6,7 +6,7 @@ import pytest
 import torch
 from framework_runs import tiny_capture, tiny_config
 
-from turbogs_plugin import pacing, run
+from turbogs_plugin import calibration, run
 from turbogs_plugin.budget import (
     EXPECTED_GROWTH,
     TOLERANCE,
@@ -142,9 +142,9 @@ class SyntheticTrial:
 
 
 def planned(scene: Scene, monkeypatch, *overrides: str):
-    monkeypatch.setattr(pacing, "_Trial", SyntheticTrial)
+    monkeypatch.setattr(calibration, "_Trial", SyntheticTrial)
     config = tiny_config(Path("capture"), "schedule.max_views=7", "train.iterations=300", "plan.looks=40", *overrides)
-    return pacing.within_budget(config, scene, CPU)
+    return calibration.within_budget(config, scene, CPU)
 
 
 @pytest.mark.parametrize(
@@ -162,20 +162,20 @@ def test_a_configuration_for_its_time(scene, monkeypatch, seconds, overrides, pi
     assert config.schedule["pixel_budget"] == measured.pixel_budget == pytest.approx(pixel_budget, rel=0.1)
     assert config.train.iterations == pytest.approx(iterations, rel=0.1)
     told = f"with schedule.pixel_budget {measured.pixel_budget:g} instead of 1"
-    assert (told in pacing.budget_text(config, measured)) == (pixel_budget > 1.0)
+    assert (told in calibration.budget_text(config, measured)) == (pixel_budget > 1.0)
 
 
 def test_pixels_and_gaussians_share_the_memory(scene, monkeypatch):
     """A generous time raises lambda as far as the expected Gaussians leave room, and the cap is that of this lambda."""
-    monkeypatch.setattr(pacing, "_hold_to", lambda limit, device: None)
+    monkeypatch.setattr(calibration, "_hold_to", lambda limit, device: None)
     config, _ = planned(scene, monkeypatch)
-    demand = pacing._memory_demand(config, scene)
+    demand = calibration._memory_demand(config, scene)
     expected = int(EXPECTED_GROWTH * SyntheticTrial.gaussians)
     for room, raised in ((1.5, 2.5), (-0.5, 1.0)):
         limit = int(demand.fixed + expected * demand.per_gaussian + room * demand.per_image)
         config, _ = planned(scene, monkeypatch, f"budget.max_memory='{limit}'", "budget.time=30s")
         assert config.schedule["pixel_budget"] == pytest.approx(raised, abs=2e-3)
-        needed = pacing._memory_demand(config, scene)
+        needed = calibration._memory_demand(config, scene)
         cap = config.budget.max_gaussians
         assert config.density["max_gaussians"] == cap == (limit - needed.fixed) // needed.per_gaussian
         assert room < 0 or cap == pytest.approx(expected, rel=0.01)
@@ -183,7 +183,7 @@ def test_pixels_and_gaussians_share_the_memory(scene, monkeypatch):
 
 def test_iterations_are_timed_with_the_lambda_asked_for(scene):
     config = tiny_config(Path("capture"), "schedule.min_views=7", "schedule.max_views=7")
-    trial = pacing._Trial(config, scene, CPU)
+    trial = calibration._Trial(config, scene, CPU)
     rates, sampler = [], trial._trainer.pixel_sampler
     draw = sampler.sample
     sampler.sample = lambda maps, view_ids, rate, step: rates.append(rate) or draw(maps, view_ids, rate, step)
@@ -197,7 +197,9 @@ def test_iterations_are_timed_with_the_lambda_asked_for(scene):
 
 def test_a_run_with_time_for_more_looks_at_more_pixels(tmp_path, monkeypatch):
     """It ends with its time after about the configured iterations, and all that a run writes says with which lambda."""
-    monkeypatch.setattr(pacing, "CALIBRATION_SHARE", 0.3)  # so few iterations are a long time to measure for otherwise
+    monkeypatch.setattr(
+        calibration, "CALIBRATION_SHARE", 0.3
+    )  # so few iterations are a long time to measure for otherwise
     overrides = ("budget.time=6s", "budget.max_gaussians=1200", "schedule.min_views=7", "schedule.max_views=7")
     lengths = ("train.iterations=30", "train.refine_until=20", "plan.looks=4")
     outcome = run.train(tiny_config(tiny_capture(tmp_path), *overrides, *lengths), tmp_path / "run")

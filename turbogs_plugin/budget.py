@@ -1,4 +1,5 @@
-"""What a run may take: Gaussians, bytes of the device, seconds of training. Pure functions; `pacing` carries them out.
+"""What a run may take: Gaussians, bytes of the device, seconds of training. Pure functions; `calibration` and `pacing`
+carry them out.
 
 Memory. The peak of a run on a GPU is taken to be ``fixed + per_gaussian * N``, all of it torch's own allocations (the
 CUDA context comes on top, with its 0.3 to 0.6 GiB). With K views an iteration, degree-d harmonics (B bands above 0) and

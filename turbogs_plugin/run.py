@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from turbogs_plugin.calibration import budget_text, within_budget
 from turbogs_plugin.checkpoint import latest_checkpoint, load_checkpoint, require_like, save_checkpoint
 from turbogs_plugin.clock import TrainingClock
 from turbogs_plugin.config import Config, resolve
@@ -22,7 +23,7 @@ from turbogs_plugin.evaluation import Metrics, evaluate, load_lpips, peak_memory
 from turbogs_plugin.files import write_text_atomically
 from turbogs_plugin.gaussians import save_ply
 from turbogs_plugin.offload import place_views
-from turbogs_plugin.pacing import Pace, budget_text, pace_of, within_budget
+from turbogs_plugin.pacing import Pace, pace_of
 from turbogs_plugin.plan import Plan, make_plan
 from turbogs_plugin.progress import TrainingProgress
 from turbogs_plugin.report.history import Evaluation, append_evaluation, rewind_history

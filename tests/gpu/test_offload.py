@@ -6,7 +6,7 @@ import gc
 import pytest
 import torch
 
-from turbogs_plugin import kernels, pacing
+from turbogs_plugin import calibration, kernels
 from turbogs_plugin.bench.large_capture import synthetic_scene
 from turbogs_plugin.config import Config, load_config
 from turbogs_plugin.error_maps import AGE_MAX
@@ -123,7 +123,7 @@ def test_a_capture_larger_than_the_limit_trains_within_it():
     assert 7 * sizes > 1.5 * limit
     try:
         plan = make_plan(asked, scene, GPU, memory_limit=limit)
-        config, _ = pacing.within_budget(plan.apply(asked), scene, GPU)
+        config, _ = calibration.within_budget(plan.apply(asked), scene, GPU)
         assert (config.plan.maps_on, config.plan.photos_on) == ("host", "host")
         with pytest.raises(torch.cuda.OutOfMemoryError):
             Trainer(config_of("plan.maps_on=device", "plan.photos_on=device"), scene, GPU)
