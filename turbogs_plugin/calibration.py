@@ -1,5 +1,5 @@
-"""What budgets change before a run: memory the cap on Gaussians; time, by iterations timed on this machine, the length of
-the run and the pixels of an iteration."""
+"""What budgets change before a run: memory the cap on Gaussians; time, by iterations timed on this machine, how long the
+run is and how many pixels an iteration has."""
 
 from __future__ import annotations
 
