@@ -1,5 +1,5 @@
-"""What budgets change before a run: memory the cap on Gaussians; time, by iterations timed on this machine, how long the
-run is and how many pixels an iteration has."""
+"""What budgets change before a run: memory, the cap on Gaussians; time, how long the run is and how many pixels an
+iteration has, by iterations timed on this machine."""
 
 from __future__ import annotations
 
