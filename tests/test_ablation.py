@@ -347,6 +347,24 @@ def test_cells_of_the_same_settings_are_reused_from_another_study(turbogs, small
     assert code == 2 and "known commit" in err and not (tmp_path / "fourth").exists()
 
 
+def test_several_ablations_in_one_call_share_their_cells(turbogs, small, capture, tmp_path):
+    other, out = tmp_path / "other.yaml", tmp_path / "studies"
+    other.write_text("title: Other\nvariants: {same: [], l1: [loss.type=charbonnier]}\n")
+    arguments = call(small, capture, out)
+    arguments.insert(2, other)
+    code, printed, err = turbogs(*arguments)
+    assert code == 0 and printed.count("report.html") == 2
+    assert "[2/2]" in err and "1 finished cells are kept" in err and "[1/1]" in err
+    first, second = (StudyFolder(out / name).read_study().results for name in (small.stem, "other"))
+    assert [result.variant for result in first] == ["full", "random"]
+    assert [result.variant for result in second] == ["same", "l1"] and second[0].history == first[0].history
+    code, _, err = turbogs(*arguments, "--only", "full")
+    assert code == 2 and "--only" in err
+    arguments[2] = small
+    code, _, err = turbogs(*arguments)
+    assert code == 2 and "share a folder" in err
+
+
 def test_runs_are_compared(turbogs, capture, tmp_path):
     runs = {"a": ["train.seed=0"], "b": ["train.seed=1"], "c": ["pixel_sampler.type=random"]}
     quick = [setting for setting in TINY if "iterations" not in setting] + ["train.iterations=3"]

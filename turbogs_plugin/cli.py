@@ -154,8 +154,7 @@ def export(
 
 @app.command
 def ablate(
-    config: Annotated[Positional[str | None], arg(metavar="NAME_OR_FILE")] = None,
-    overrides: Overrides = (),
+    names: Annotated[Positional[tuple[str, ...]], arg(metavar="NAME_OR_FILE ... [section.key=value ...]")] = (),
     /,
     *,
     out: Path,
@@ -172,9 +171,9 @@ def ablate(
     """Train named variants over scenes and seeds: error against run time. The same call goes on where it stopped.
 
     Args:
-        config: a packaged ablation (components, replacements, optimizer, ...) or a .yaml file.
-        overrides: changes of every variant's configuration.
-        out: folder of the study; finished cells in it are kept.
+        names: packaged ablations (components, replacements, optimizer, ...) or .yaml files; then changes of every
+            variant's configuration.
+        out: folder of the study, or of one for each of several ablations; finished cells in it are kept.
         scene: folder of a capture; may be given several times.
         seeds: of each variant; two at least, or nothing can be called different.
         steps: iterations of every cell; what counts iterations is scaled with them.
@@ -188,14 +187,18 @@ def ablate(
     from turbogs_plugin.ablation import commands
     from turbogs_plugin.ablation.sweep import SweepOptions
 
+    ablations = [text for text in names if "=" not in text]
+    overrides = tuple(text for text in names if "=" in text)
     if merge:
-        if config is not None or overrides or scene or only:
+        if names or scene or only:
             raise InputError("--merge trains nothing: give it --out and --psnr alone")
         return commands.merge(merge, out, psnr)
-    if config is None or not scene:
+    if not ablations or not scene:
         raise InputError("ablate needs NAME_OR_FILE and --scene SCENE, or --merge STUDY ...")
+    if only and len(ablations) > 1:
+        raise InputError("--only names variants of one ablation: give it one NAME_OR_FILE")
     options = SweepOptions(scene, seeds, overrides, steps, time_budget, device, reuse)
-    return commands.ablate(config, options, out, only, psnr)
+    return commands.ablate(ablations, options, out, only, psnr)
 
 
 @app.command

@@ -6,26 +6,46 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from turbogs_plugin.ablation.compare import study_of_runs
-from turbogs_plugin.ablation.grid import load_ablation
+from turbogs_plugin.ablation.grid import Ablation, load_ablation
 from turbogs_plugin.ablation.pages import write_study
 from turbogs_plugin.ablation.results import StudyFolder, merge_studies
 from turbogs_plugin.ablation.sweep import SweepOptions, run_sweep
 from turbogs_plugin.errors import InputError
 
 
-def ablate(name_or_file: str, options: SweepOptions, out: Path, only: Sequence[str], targets: Sequence[float]) -> int:
-    """Train what is missing of a grid and write its report; the exit code.
+def ablate(
+    names: Sequence[str], options: SweepOptions, out: Path, only: Sequence[str], targets: Sequence[float]
+) -> int:
+    """Train what is missing of one or more grids and write their reports; the exit code.
 
-    The report is also written where the call is interrupted, of what is there.
+    Args:
+        names: packaged ablations or YAML files. The study of one is `out` itself; of several, each has a folder in it.
+
+    A report is also written where the call is interrupted, of what is there.
     """
-    folder = StudyFolder(out)
-    ablation = load_ablation(name_or_file).only(only)
+    ablations = {Path(name).stem: load_ablation(name).only(only) for name in names}
+    if len(ablations) < len(names):
+        raise InputError(f"ablations of one name would share a folder: {', '.join(names)}")
+    folders = [StudyFolder(out if len(names) == 1 else out / name) for name in ablations]
+    code = 0
+    for number, (ablation, folder) in enumerate(zip(ablations.values(), folders, strict=True)):
+        code = max(code, _study(ablation, options, folder, folders[:number], targets))
+    return code
+
+
+def _study(
+    ablation: Ablation,
+    options: SweepOptions,
+    folder: StudyFolder,
+    siblings: Sequence[StudyFolder],
+    targets: Sequence[float],
+) -> int:
     try:
-        run_sweep(ablation, options, folder)
+        run_sweep(ablation, options, folder, siblings)
     finally:
         # Not after a refusal, which leaves no cells.
         if any(folder.cells.glob("*/*.json")):
-            print(f"report  {write_study(out, folder.read_study(), targets)}")
+            print(f"report  {write_study(folder.path, folder.read_study(), targets)}")
     failures = folder.read_study().failures
     for failure in failures:
         print(f"failed  {failure.key}: {failure.reason}")

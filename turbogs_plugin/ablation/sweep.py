@@ -59,10 +59,15 @@ class SweepOptions:
             raise InputError(f"the time budget is {self.time_budget}: it must be 0 (none) or more seconds")
 
 
-def run_sweep(ablation: Ablation, options: SweepOptions, folder: StudyFolder) -> None:
+def run_sweep(
+    ablation: Ablation, options: SweepOptions, folder: StudyFolder, siblings: Sequence[StudyFolder] = ()
+) -> None:
     """Train the cells that are not there yet and keep each result as it comes.
 
     A cell that breaks is kept as a failure and the rest goes on; the same call tries it again.
+
+    Args:
+        siblings: studies by this very process, whose cells of the same settings are taken.
 
     Raises:
         InputError: anything wrong with the input (then nothing was trained), or a cell made by another configuration.
@@ -74,7 +79,7 @@ def run_sweep(ablation: Ablation, options: SweepOptions, folder: StudyFolder) ->
     kept = 0
     taken: list[CellResult] = []
     here = provenance(device.type)
-    reusable = _reusable_cells(options, here)
+    reusable = _reusable_cells(options, here, siblings)
     for path in options.scenes:
         name = path.resolve().name
         grid[name] = []
@@ -145,11 +150,14 @@ def _require_same(present: CellResult, config: Config, time_budget: float) -> No
         )
 
 
-def _reusable_cells(options: SweepOptions, here: Provenance) -> dict[tuple[str, str], CellResult]:
+def _reusable_cells(
+    options: SweepOptions, here: Provenance, siblings: Sequence[StudyFolder]
+) -> dict[tuple[str, str], CellResult]:
     """(scene, settings) -> a result of another study that a cell of these settings would repeat."""
     if options.reuse and (not here.commit or here.commit.endswith(MODIFIED)):
         raise InputError(f"--reuse needs sources of a known commit, without changes; {COMMIT_VARIABLE} may name it")
-    results = [result for path in options.reuse for result in StudyFolder(path).read_study().results]
+    folders = [*map(StudyFolder, options.reuse), *siblings]
+    results = [result for folder in folders for result in folder.read_study().results]
     return {
         (result.scene, _comparable(result.config)): result
         for result in results
