@@ -131,6 +131,7 @@ def test_a_short_time_gives_up_gaussians_before_iterations():
     iterations, cap = fit_to_time(seconds, COST, 50_000, 0, 5000, 0.7)
     assert 50_000 <= cap < 200_000
     assert iterations == pytest.approx(FEWEST_SHARE * 5000, rel=0.01)
+    assert fit_to_time(seconds, COST, 50_000, 0, 5000, 0.7, keeps_cap=False)[1] == 0  # it would keep no other
     iterations, cap = fit_to_time(0.5, COST, 50_000, 0, 5000, 0.7)
     assert (iterations, cap) == (int(0.5 / COST.at(50_000)), 50_000)  # no growth at all, and what fits
     assert fit_to_time(1e-9, COST, 50_000, 0, 5000, 0.7)[0] == 1

@@ -48,6 +48,8 @@ def decision(name: str, of: SceneFacts, *overrides: str):
     return next(decision for decision in plan.decisions if decision.name == name)
 
 
+ONE_VIEW = ("schedule.type=fixed", "schedule.views=1")
+
 BOTH_SIDES = [
     ("backdrop", {"direction_concentration": 0.95}, (), True, "0.950 >= 0.95"),
     ("backdrop", {"direction_concentration": 0.9499}, (), False, "< 0.95"),
@@ -65,6 +67,8 @@ BOTH_SIDES = [
     ("iterations", {"train_views": 100}, ("plan.looks=75",), 7500, "75 looks at each of 100 training views"),
     ("iterations", {"train_views": 43}, ("plan.looks=75",), 3300, "75 looks at each of 43 training views"),
     ("iterations", {"train_views": 100}, ("plan.looks=75", "schedule.pixel_budget=0.5"), 15000, "75 looks"),
+    ("iterations", {"train_views": 600}, ("plan.looks=75", "pixel_sampler.type=dense"), 4500, "75 looks"),
+    ("iterations", {"train_views": 100}, (*ONE_VIEW, "schedule.pixel_budget=4"), 6000, "60 looks"),
     ("iterations", {"train_views": 20}, ("plan.looks=75",), 2000, "fewer than 40% of 5000"),
     ("optimizer", {"device": "cpu"}, (), "sparse_adam", "5 to 10 % of an iteration"),
     ("optimizer", {"device": "cuda"}, (), "moment_lm", "at most 7 %"),

@@ -12,10 +12,10 @@ lambda images of S pixels an iteration:
 
 Time. The cost of an iteration is ``base + per_gaussian * N``. Where fewer iterations fit than are configured, the run
 is that much shorter; where these would be fewer than `FEWEST_SHARE` of the configured ones, Gaussians are given up for
-them. Where more fit, an iteration gets more pixels (lambda) until the configured number fills the time, and only then
-there are more iterations: those overfit the photos (docs/budgets.md). While it trains, the number of iterations left
-follows the cost measured (`TimePlan`), so that all that goes by progress (learning rates, sampling, density control)
-ends with the time.
+them. Where more fit than are configured, and than look at the photos often enough (`plan.looks`), an iteration gets
+more pixels (lambda) until these fill the time, and only then there are more iterations: those overfit the photos
+(docs/budgets.md). While it trains, the number of iterations left follows the cost measured (`TimePlan`), so that all
+that goes by progress (learning rates, sampling, density control) ends with the time.
 """
 
 from __future__ import annotations
@@ -98,6 +98,15 @@ def most_views(config: Config, num_views: int) -> int:
     return min(num_views, config.schedule.get("max_views", config.schedule.get("views", num_views)))
 
 
+def images_per_iteration(config: Config, num_views: int) -> float:
+    """So many images' worth of pixels does an iteration look at: lambda of its views; all of them with a pixel sampler
+    that takes whole views, at the largest K."""
+    views = most_views(config, num_views)
+    if config.pixel_sampler["type"] in WHOLE_VIEWS:
+        return views
+    return min(views, config.schedule.get("pixel_budget", views))
+
+
 def pixel_budget_range(config: Config, num_views: int) -> tuple[float, float]:
     """(lambda as configured, the largest that adds a pixel): the rate, lambda / K, is at most 1.
 
@@ -158,9 +167,7 @@ class MemoryDemand:
         window = SETS * views * largest
         photos = window + SETS * largest if config.plan.photos_on == "host" else pixels + test_pixels
         maps = window if config.plan.maps_on == "host" else pixels
-        dense = config.pixel_sampler["type"] in WHOLE_VIEWS
-        images = views if dense else min(views, config.schedule.get("pixel_budget", views))
-        samples = math.ceil(images * largest)
+        samples = math.ceil(images_per_iteration(config, num_views) * largest)
         bands = (config.train.sh_degree + 1) ** 2 - 1
         numbers = 14 + 3 * bands
         return cls(
@@ -213,7 +220,13 @@ class IterationCost:
 
 
 def fit_to_time(
-    seconds: float, cost: IterationCost, initial: int, cap: int, iterations: int, refine_share: float
+    seconds: float,
+    cost: IterationCost,
+    initial: int,
+    cap: int,
+    iterations: int,
+    refine_share: float,
+    keeps_cap: bool = True,
 ) -> tuple[int, int]:
     """How long a schedule, and how many Gaussians, before training.
 
@@ -224,9 +237,11 @@ def fit_to_time(
         cap: never more Gaussians; 0: none.
         iterations: configured.
         refine_share: of the iterations, those with density control.
+        keeps_cap: whether the density control would keep a smaller cap.
 
     Returns:
-        (iterations, cap): the cap is the given one where at least `FEWEST_SHARE` of the configured iterations fit.
+        (iterations, cap): the cap is the given one where at least `FEWEST_SHARE` of the configured iterations fit, or
+        where no other would be kept.
     """
     growing = 0.5 * refine_share  # share of the run that the initial number counts for
 
@@ -236,7 +251,7 @@ def fit_to_time(
     final = expected_gaussians(initial, cap)
     fitting = seconds / max(1e-9, cost.at(mean(final)))
     fewest = FEWEST_SHARE * iterations
-    if fitting >= fewest:
+    if fitting >= fewest or not keeps_cap:
         return max(1, int(fitting)), cap
     if cost.per_gaussian > 0:
         wanted = (seconds / fewest - cost.base) / cost.per_gaussian  # the mean number that leaves time for so many

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import torch
 
 from turbogs_plugin.budget import (
+    CAPS,
     FEWEST_GAUSSIANS,
     RAISES,
     IterationCost,
@@ -18,6 +19,7 @@ from turbogs_plugin.budget import (
     expected_gaussians,
     fit_to_time,
     growth_cap,
+    images_per_iteration,
     pixel_budget_range,
     pixels_for_time,
     with_cap,
@@ -134,7 +136,8 @@ def _fit(config: Config, seconds: float, cost: IterationCost, gaussians: int) ->
     """`fit_to_time` of a configuration: (iterations, cap)."""
     train = config.train
     share = min(1.0, train.refine_until / train.iterations)
-    return fit_to_time(seconds, cost, gaussians, growth_cap(config, gaussians), train.iterations, share)
+    keeps_cap = config.density["type"] in CAPS
+    return fit_to_time(seconds, cost, gaussians, growth_cap(config, gaussians), train.iterations, share, keeps_cap)
 
 
 def calibrate(config: Config, scene: Scene, device: torch.device, seconds: float) -> Calibration:
@@ -168,7 +171,8 @@ def _measure(config: Config, scene: Scene, device: torch.device, seconds: float,
     configured, largest = pixel_budget_range(config, len(scene.train))
     largest = min(largest, configured + _room_for_images(config, scene, device, gaussians))
     # What more iterations overfit is photos that are looked at often already.
-    wanted = max(config.train.iterations, math.ceil(config.plan.looks * len(scene.train) / configured))
+    images = images_per_iteration(config, len(scene.train))
+    wanted = max(config.train.iterations, math.ceil(config.plan.looks * len(scene.train) / images))
     # A measured iteration with more pixels takes at most about seconds / iterations.
     fewest = WARMUP_ITERATIONS[device.type] + FEWEST_MEASURED[device.type]
     raises = min(RAISES, max(1, int(CALIBRATION_SHARE * wanted / fewest)))
