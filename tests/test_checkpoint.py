@@ -32,15 +32,21 @@ def test_what_goes_in_comes_out(tmp_path):
     assert all(torch.equal(loaded["tensors"][name], value) for name, value in state()["tensors"].items())
 
 
-def test_only_the_newest_two_stay(tmp_path):
-    for iteration in (5, 100, 999_999, 1_000_000):
+@pytest.mark.parametrize("iterations", [(5,), (5, 100), (1, 5, 100), (995_000, 997_500, 1_000_000, 1_002_500)])
+def test_only_the_newest_two_stay(tmp_path, iterations):
+    """After each save, also from the iteration on that has a digit more."""
+    for count, iteration in enumerate(iterations, start=1):
         save_checkpoint(tmp_path, iteration, state(iteration))
-    assert sorted(file.name for file in tmp_path.iterdir()) == [
-        "iteration-1000000.pt",
-        "iteration-999999.pt",
-        "latest",
-    ]
-    assert_newest(tmp_path, 1_000_000)
+        kept = {f"iteration-{number:06d}.pt" for number in iterations[max(0, count - 2) : count]}
+        assert {file.name for file in tmp_path.iterdir()} == kept | {"latest"}
+        assert_newest(tmp_path, iteration)
+
+
+def test_the_one_just_written_stays_beside_leftovers_of_a_later_iteration(tmp_path):
+    for name in ("iteration-000010.pt", "iteration-000011.pt"):
+        (tmp_path / name).touch()
+    save_checkpoint(tmp_path, 6, state(6.0))
+    assert_newest(tmp_path, 6.0)
 
 
 def test_no_checkpoint_is_none(tmp_path):

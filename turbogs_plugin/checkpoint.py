@@ -27,7 +27,7 @@ KEPT = 2
 COUNT_LIMIT = 2**31
 """All whole numbers in a state are counts below this."""
 
-_NAME = re.compile(r"iteration-\d{6,}\.pt")
+_NAME = re.compile(r"iteration-(\d{6,})\.pt")
 
 
 def save_checkpoint(folder: Path, iteration: int, state: dict[str, Any]) -> Path:
@@ -56,7 +56,8 @@ def save_checkpoint(folder: Path, iteration: int, state: dict[str, Any]) -> Path
         raise TrainingStopped(
             f"iteration {iteration}: the checkpoint could not be written to '{folder}' ({reason}); {_kept(folder)}"
         ) from error
-    for old in sorted(file for file in folder.iterdir() if _NAME.fullmatch(file.name))[:-KEPT]:
+    others = [file for file in folder.iterdir() if _NAME.fullmatch(file.name) and file != path]
+    for old in sorted(others, key=_iteration_of)[: len(others) - (KEPT - 1)]:
         old.unlink(missing_ok=True)
     return path
 
@@ -134,6 +135,10 @@ def require_like(saved: Any, present: Any, place: str) -> None:
 
 def _plan(tensor: Tensor) -> str:
     return f"{str(tensor.dtype).removeprefix('torch.')} {tuple(tensor.shape)}"
+
+
+def _iteration_of(file: Path) -> int:
+    return int(_NAME.fullmatch(file.name).group(1))
 
 
 def _kept(folder: Path) -> str:
