@@ -52,8 +52,8 @@ def train(
         max_gaussians: never more than this (budget.max_gaussians).
         max_memory: of the GPU, never more than this for tensors: 2GiB, 1500MB (budget.max_memory). Photos and error
             maps move to the host if need be, then the number of Gaussians is limited.
-        time_budget: seconds of training to end after: 20s, 2m (budget.time). Schedule and number of Gaussians are
-            fitted to it.
+        time_budget: seconds of training to end after: 20s, 2m (budget.time). The schedule is fitted to it, and
+            the pixels of an iteration or the number of Gaussians.
     """
     from turbogs_plugin import run
 
