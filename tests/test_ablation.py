@@ -311,6 +311,29 @@ def test_an_interrupted_sweep_reports_what_is_there(turbogs, small, capture, tmp
     assert [result.variant for result in StudyFolder(out).read_study().results] == ["full"]
 
 
+def test_variants_of_one_study_may_be_trained_by_several_calls(turbogs, capture, tmp_path):
+    three, out = tmp_path / "three.yaml", tmp_path / "study"
+    three.write_text(SMALL.replace("notes:", "  l1: [loss.type=charbonnier]\nnotes:"))
+    for variant, there in (("random", ["full", "random"]), ("l1", ["full", "random", "l1"])):
+        code, printed, err = turbogs(*call(three, capture, out, "--only", variant))
+        assert code == 0 and "report.html" in printed, err
+        assert [row["variant"] for row in csv.DictReader((out / "table.csv").open())] == there
+        assert ("loss.type=charbonnier" in (out / "report.md").read_text()) is (variant == "l1")
+    assert list(StudyFolder(out).read_ablation().variants) == ["full", "random", "l1"]
+    assert turbogs("ablate", "--merge", out, "--out", tmp_path / "merged")[0] == 0
+
+
+def test_a_study_of_another_ablation_is_refused_before_training(turbogs, small, capture, tmp_path, monkeypatch):
+    out, other = tmp_path / "study", tmp_path / "other.yaml"
+    assert turbogs(*call(small, capture, out, "--only", "full"))[0] == 0
+    before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
+    other.write_text("title: Other\nvariants: {same: []}\n")
+    monkeypatch.setattr(Trainer, "step", lambda trainer: pytest.fail("trained"))
+    code, _, err = turbogs(*call(other, capture, out))
+    assert code == 2 and "another ablation" in err and "full" in err
+    assert {path: path.read_bytes() for path in out.rglob("*") if path.is_file()} == before
+
+
 def test_studies_are_merged_and_reported_again_without_training(turbogs, small, capture, tmp_path, monkeypatch):
     parts = [tmp_path / "a", tmp_path / "b"]
     for number, part in enumerate(parts):

@@ -23,25 +23,26 @@ def ablate(
 
     A report is also written where the call is interrupted, of what is there.
     """
-    ablations = {Path(name).stem: load_ablation(name).only(only) for name in names}
+    ablations = {Path(name).stem: load_ablation(name) for name in names}
     if len(ablations) < len(names):
         raise InputError(f"ablations of one name would share a folder: {', '.join(names)}")
     folders = [StudyFolder(out if len(names) == 1 else out / name) for name in ablations]
     code = 0
     for number, (ablation, folder) in enumerate(zip(ablations.values(), folders, strict=True)):
-        code = max(code, _study(ablation, options, folder, folders[:number], targets))
+        code = max(code, _study(ablation, ablation.only(only), options, folder, folders[:number], targets))
     return code
 
 
 def _study(
     ablation: Ablation,
+    variants: Sequence[str],
     options: SweepOptions,
     folder: StudyFolder,
     siblings: Sequence[StudyFolder],
     targets: Sequence[float],
 ) -> int:
     try:
-        run_sweep(ablation, options, folder, siblings)
+        run_sweep(ablation, variants, options, folder, siblings)
     finally:
         # Not after a refusal, which leaves no cells.
         if any(folder.cells.glob("*/*.json")):

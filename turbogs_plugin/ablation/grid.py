@@ -61,13 +61,11 @@ class Ablation:
         if name not in self.variants:
             raise InputError(f"no variant '{name}': {nearest(name, self.variants)}")
 
-    def only(self, names: Sequence[str]) -> Ablation:
-        """The ablation with these variants, and the baseline; all of them where none is named."""
+    def only(self, names: Sequence[str]) -> list[str]:
+        """These variants and the baseline, in the ablation's order; all variants where none is named."""
         for name in names:
             self.require_variant(name)
-        kept = {name: value for name, value in self.variants.items() if not names or name in (*names, self.baseline)}
-        notes = {name: note for name, note in self.notes.items() if name in kept}
-        return Ablation(self.title, kept, self.base, self.baseline, notes)
+        return [name for name in self.variants if not names or name in (*names, self.baseline)]
 
 
 @dataclass(frozen=True)

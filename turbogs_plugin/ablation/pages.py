@@ -173,9 +173,11 @@ def spread_text(spread: Spread, digits: int, absent: str = "not computed") -> st
 
 def _settings(study: Study) -> list[Block]:
     ablation = study.ablation
+    tried = {result.variant for result in study.results} | {failure.key.variant for failure in study.failures}
     rows = [
         (name, ", ".join(overrides) or "as the base", ablation.notes.get(name, ""))
         for name, overrides in ablation.variants.items()
+        if name in tried
     ]
     return [
         Heading("Variants"),

@@ -73,7 +73,7 @@ class Failure:
 
 @dataclass
 class Study:
-    """An ablation with the results that are there.
+    """An ablation with the results that are there, of all its variants or some.
 
     Args:
         ablation: titles, variants, baseline.
@@ -132,16 +132,16 @@ class StudyFolder:
         path.parent.mkdir(parents=True, exist_ok=True)
         write_text_atomically(path, failure.reason + "\n")
 
-    def read(self, key: CellKey) -> CellResult | None:
-        """The result of a cell, or None where there is none yet."""
-        path = self.cells / key.file
-        return _read_result(path) if path.is_file() else None
+    def read_results(self) -> dict[CellKey, CellResult]:
+        """The finished cells."""
+        results = map(_read_result, sorted(self.cells.glob("*/*.json")))
+        return {result.key: result for result in results}
 
     def read_study(self) -> Study:
         """Everything that is there, variants in the order of the ablation, scenes and seeds sorted."""
         ablation = self.read_ablation()
         order = {name: number for number, name in enumerate(ablation.variants)}
-        results = [_read_result(path) for path in sorted(self.cells.glob("*/*.json"))]
+        results = list(self.read_results().values())
         for result in results:
             ablation.require_variant(result.variant)
         results.sort(key=lambda result: (result.scene, order[result.variant], result.seed))

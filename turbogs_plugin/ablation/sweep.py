@@ -60,13 +60,19 @@ class SweepOptions:
 
 
 def run_sweep(
-    ablation: Ablation, options: SweepOptions, folder: StudyFolder, siblings: Sequence[StudyFolder] = ()
+    ablation: Ablation,
+    variants: Sequence[str],
+    options: SweepOptions,
+    folder: StudyFolder,
+    siblings: Sequence[StudyFolder] = (),
 ) -> None:
     """Train the cells that are not there yet and keep each result as it comes.
 
     A cell that breaks is kept as a failure and the rest goes on; the same call tries it again.
 
     Args:
+        ablation: all of it is what the study is of.
+        variants: of it, the ones to train now.
         siblings: studies by this very process, whose cells of the same settings are taken.
 
     Raises:
@@ -74,6 +80,10 @@ def run_sweep(
         TrainingStopped: the GPU can no longer be used by this process.
     """
     folder.require_usable()
+    finished = folder.read_results()
+    for result in finished.values():
+        if result.variant not in ablation.variants:
+            raise InputError(f"'{folder.path}' has a cell of another ablation ({result.key}): choose a new --out")
     device = resolve_device(options.device)
     grid: dict[str, list[tuple[CellKey, Config]]] = {}
     kept = 0
@@ -84,11 +94,11 @@ def run_sweep(
         name = path.resolve().name
         grid[name] = []
         for seed in options.seeds:
-            for variant in ablation.variants:
+            for variant in variants:
                 config = variant_config(ablation, variant, seed, options.overrides, options.steps)
                 config.scene.path, config.train.device = str(path.resolve()), device.type
                 key = CellKey(name, variant, seed)
-                present = folder.read(key)
+                present = finished.get(key)
                 known = reusable.get((name, _comparable(config.to_mapping())))
                 if present is None and known is not None:
                     taken.append(replace(known, variant=variant))
