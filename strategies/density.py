@@ -62,7 +62,8 @@ class ErrorDrivenDensity:
 
     Until `Step.refine_until`, every `refine_every` iterations from `refine_from` on, one event clones, splits and
     prunes. A Gaussian that is due for pruning is not densified; one that is too big but chosen to be split is not
-    pruned. Afterwards, every `final_every` iterations, one only prunes. At least one Gaussian is always left.
+    pruned, while one that a budget or cap denies its split is. Afterwards, every `final_every` iterations, one only
+    prunes. At least one Gaussian is always left.
 
     Args:
         lambda_base: weight of the distance term.
@@ -80,7 +81,7 @@ class ErrorDrivenDensity:
             initial one to `target_gaussians` at `refine_until`, the most difficult candidates first (`budget`).
         target_gaussians: end of that line. `budget` only.
         max_gaussians: never more than this; an initial model that has more is cut to it at the first event, easiest
-            first. 0: no cap.
+            first, those of `spare_beyond` last. 0: no cap.
         prune_opacity: less opaque ones are pruned.
         prune_world_size: pruned where the largest standard deviation exceeds this * scene extent. 0: off.
         prune_screen_size: pruned where the screen radius exceeds this * the larger side of the image. 0: off, as in
@@ -91,7 +92,8 @@ class ErrorDrivenDensity:
         opacity_decay: share of its opacity that every Gaussian loses at each densification event. What the photos need
             grows back, what they do not falls below `prune_opacity`; a gentle substitute for 3DGS's reset.
         spare_beyond: Gaussians farther from the cameras' centre than this * scene extent are neither decayed nor pruned
-            (unless they are not finite): a backdrop behind the scene, which few photos see. 0: none.
+            (unless they are not finite, or `max_gaussians` leaves no other choice): a backdrop behind the scene, which
+            few photos see. 0: none.
         final_every, final_keep: interval of the final pruning, and the share of the seen that each one keeps, the
             most difficult (Delta_prune, eta_final). 1 keeps all.
         stop_when_flat: densification ends early, at the first event where the error has fallen by less than this share
@@ -261,15 +263,16 @@ class ErrorDrivenDensity:
                 big |= stats.max_radii > self.prune_screen_size
         pruned = leave_one((hopeless | (big & ~(candidates & ~small))) & ~spared, gaussians)
         candidates &= ~pruned
-        if self.max_gaussians > 0:
-            excess = int((~pruned).sum()) - self.max_gaussians
-            if excess > 0:  # the unseen count as average: nothing says that they are easy
-                average = torch.where(seen, score, 0.0).sum() / seen.sum().clamp(min=1)
-                pruned = pruned | _first(-torch.where(seen, score, average), ~pruned, excess)
-                candidates &= ~pruned
         allowed = self._allowed_growth(int((~pruned).sum()), step)
         if allowed is not None:
-            candidates = _first(score, candidates, allowed)
+            chosen = _first(score, candidates, allowed)
+            denied = candidates & ~chosen
+            candidates = chosen
+            pruned = leave_one(pruned | (big & denied & ~spared), gaussians)  # makes room for the next event
+        if self.max_gaussians > 0:
+            excess = int((~pruned).sum()) - self.max_gaussians
+            if excess > 0:  # then nothing was chosen
+                pruned = pruned | self._easiest(score, seen, ~pruned, spared, excess)
         return self._compose(gaussians, candidates & small, candidates & ~small, pruned, spared, step)
 
     def _spared(self, gaussians: Gaussians, finite: Tensor, extent: float) -> Tensor:
@@ -277,6 +280,14 @@ class ErrorDrivenDensity:
         if self.spare_beyond == 0:
             return torch.zeros_like(finite)
         return finite & (gaussians.means.norm(dim=-1) > self.spare_beyond * extent)
+
+    def _easiest(self, score: Tensor, seen: Tensor, present: Tensor, spared: Tensor, count: int) -> Tensor:
+        """[N] bool: the easiest `count` of those `present`, the spared ones only for what the others leave to take."""
+        # The unseen count as average: nothing says that they are easy.
+        average = torch.where(seen, score, 0.0).sum() / seen.sum().clamp(min=1)
+        ease = -torch.where(seen, score, average)
+        taken = _first(ease, present & ~spared, count)
+        return taken | _first(ease, present & spared, count - int(taken.sum()))
 
     def _allowed_growth(self, count: int, step: Step) -> int | None:
         """How many Gaussians may be added to `count`, or None for any number."""

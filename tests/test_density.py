@@ -86,6 +86,9 @@ def test_scores_equal_the_equation(kind, iteration):
         {"max_gaussians": 220},
         {"max_gaussians": 150},
         {"growth": "budget", "target_gaussians": 260},
+        {"prune_world_size": 0.02, "max_gaussians": 220},  # no room for the huge: neither split nor kept
+        {"prune_world_size": 0.02, "max_gaussians": 150},
+        {"prune_world_size": 0.02, "prune_screen_size": 0.15, "growth": "budget", "target_gaussians": 20},
     ],
 )
 def test_event_equals_plain_loops(seed, config):
@@ -99,7 +102,7 @@ def test_event_equals_plain_loops(seed, config):
     ranked = sorted(score[i] for i in range(count) if seen[i])
     easy_limit = ranked[math.floor(density.prune_score_fraction * len(ranked) + 1e-6)]
     hard_limit = ranked[math.floor((1 - density.top_fraction) * len(ranked) + 1e-6)]
-    clones, splits, prunes = set(), set(), set()
+    clones, splits, prunes, huge = set(), set(), set(), set()
     for i in range(count):
         views = max(1.0, float(stats.view_counts[i]))
         largest = math.exp(float(gaussians.scales[i].max()))
@@ -107,28 +110,34 @@ def test_event_equals_plain_loops(seed, config):
         passes = float(stats.grad_sums[i]) / views > 2e-4 or float(stats.absgrad_sums[i]) / views > 4e-4
         transparent = 1 / (1 + math.exp(-float(gaussians.opacities[i]))) < density.prune_opacity
         easy = density.prune_score_fraction > 0 and seen[i] and score[i] < easy_limit
+        if FULL.progress >= density.prune_size_from and (
+            largest > density.prune_world_size * 2.0
+            or (density.prune_screen_size and stats.max_radii[i] > density.prune_screen_size)
+        ):
+            huge.add(i)
         if transparent or easy:
             prunes.add(i)
         elif passes and seen[i] and score[i] >= hard_limit and not small:
             splits.add(i)
-        elif FULL.progress >= density.prune_size_from and (
-            largest > density.prune_world_size * 2.0
-            or (density.prune_screen_size and stats.max_radii[i] > density.prune_screen_size)
-        ):
+        elif i in huge:
             prunes.add(i)
         elif passes and seen[i] and score[i] >= hard_limit:
             clones.add(i)
     limits = [density.max_gaussians] if density.max_gaussians else []
+    if density.growth == "budget":
+        limits.append(math.floor(count + (density.target_gaussians - count) * (1200 - 200) / (3500 - 200)))
+    if limits:
+        room = max(0, min(limits) - (count - len(prunes)))
+        chosen = sorted(clones | splits, key=lambda i: (-score[i], i))[:room]
+        denied = splits - set(chosen)
+        clones, splits = clones & set(chosen), splits & set(chosen)
+        prunes |= denied & huge
+        if density.prune_world_size == 0.02:
+            assert denied & huge  # or the case shows nothing
     if density.max_gaussians:
         average = sum(score[i] for i in range(count) if seen[i]) / sum(seen)
         rest = sorted(set(range(count)) - prunes, key=lambda i: (score[i] if seen[i] else average, i))
         prunes |= set(rest[: max(0, len(rest) - density.max_gaussians)])
-    if density.growth == "budget":
-        limits.append(math.floor(count + (260 - count) * (1200 - 200) / (3500 - 200)))
-    if limits:
-        room = max(0, min(limits) - (count - len(prunes)))
-        chosen = sorted((clones | splits) - prunes, key=lambda i: (-score[i], i))[:room]
-        clones, splits = clones & set(chosen), splits & set(chosen)
 
     assert (update.num_cloned, update.num_split, update.num_pruned) == (len(clones), len(splits), len(prunes))
     rest = [i for i in range(count) if i not in prunes | splits]
@@ -422,6 +431,31 @@ def test_what_lies_beyond_is_spared_unless_it_is_not_finite():
     stats.error_sums[1:3] = 0.0  # the easiest
     density = controlled(gaussians, stats, spare_beyond=10.0, final_keep=0.1)
     assert {1, 2} <= set(density.update(gaussians, Step(4000, 5000, 3500, scene_extent=2.0)).source.tolist())
+
+
+def test_a_held_cap_does_not_keep_the_huge():
+    """Huge and difficult where nothing may grow: they are pruned, all but the backdrop."""
+    gaussians = make_gaussians(40)
+    gaussians.means[:] = torch.nn.functional.normalize(gaussians.means, dim=1)
+    gaussians.scales[:] = -6.0
+    gaussians.scales[:5] = 3.0
+    gaussians.means[4] *= 100.0
+    density = controlled(gaussians, busy_stats(40), max_gaussians=40, spare_beyond=10.0)
+    update = density.update(gaussians, FULL)
+    assert update.source.tolist() == list(range(4, 40)) and update.num_pruned == 4
+    alone = gaussians.map(lambda value: value[:2])
+    density = controlled(alone, busy_stats(2), max_gaussians=2)
+    assert len(density.update(alone, FULL).source) == 1  # never none
+
+
+@pytest.mark.parametrize(("cap", "kept"), [(8, [2, 3, 4, 5, 6, 7, 8, 9]), (2, [8, 9])])
+def test_the_cap_takes_the_backdrop_last(cap, kept):
+    gaussians, stats = make_gaussians(10), busy_stats(10)
+    gaussians.means[:] = torch.nn.functional.normalize(gaussians.means, dim=1)
+    gaussians.means[6:] *= 100.0
+    stats.error_sums[:] = torch.tensor([0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 0.1, 0.2, 0.3, 0.4])  # the backdrop is easiest
+    density = controlled(gaussians, stats, max_gaussians=cap, spare_beyond=10.0, **QUIET)
+    assert density.update(gaussians, FULL).source.tolist() == kept
 
 
 @pytest.mark.parametrize("split", ["sample", "long_axis"])
