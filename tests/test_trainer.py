@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -9,12 +10,14 @@ import time
 from pathlib import Path
 
 import numpy as np
+import pycolmap
 import pytest
 import torch
 from framework_runs import TINY, assert_identical, tiny_capture, tiny_config
 from PIL import Image
 
 from turbogs_plugin import run
+from turbogs_plugin.capture_state import capture_difference, capture_state
 from turbogs_plugin.checkpoint import latest_checkpoint, load_checkpoint
 from turbogs_plugin.config import load_config, resolve
 from turbogs_plugin.errors import InputError, TrainingStopped
@@ -238,8 +241,63 @@ def test_a_checkpoint_of_another_capture_is_refused(capture, whole, tmp_path):
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "config.yaml").write_text(tiny_config(other, "scene.factor=2").to_yaml())
     (tmp_path / "run" / "checkpoints").symlink_to(whole.folder.checkpoints)
-    with pytest.raises(InputError, match="does not fit this run"):
+    with pytest.raises(InputError, match="has other sizes of train images than when the run"):
         run.resume(tmp_path / "run")
+
+
+def moved(by: pycolmap.Sim3d):
+    return lambda reconstruction: reconstruction.transform(by)
+
+
+def zoomed(reconstruction) -> None:
+    for camera in reconstruction.cameras.values():
+        camera.params = camera.params * [1.01, 1.01, 1, 1]
+
+
+def renamed(reconstruction) -> None:
+    """Two photos change places."""
+    images = sorted(reconstruction.images.values(), key=lambda image: image.name)
+    images[1].name, images[2].name = images[2].name, images[1].name
+
+
+TURN, STAY = pycolmap.Rotation3d(np.array([0.0, 0.0, 0.01, 1.0])), pycolmap.Rotation3d()
+
+
+@pytest.mark.parametrize(
+    ("change", "difference"),
+    [
+        (moved(pycolmap.Sim3d(1.0, TURN, np.zeros(3))), "other poses of train images"),
+        (moved(pycolmap.Sim3d(2.0, STAY, np.zeros(3))), "other coordinates"),
+        (moved(pycolmap.Sim3d(1.0, STAY, np.ones(3))), "other coordinates"),
+        (zoomed, "other intrinsics of train images"),
+        (renamed, "other poses of train images"),
+    ],
+    ids=["turned", "scaled", "moved", "zoomed", "renamed"],
+)
+def test_a_capture_made_anew_since_the_run_began_is_refused(whole, tmp_path, change, difference):
+    model = tiny_capture(tmp_path) / "sparse" / "0"
+    shutil.copytree(whole.folder.path, tmp_path / "run")
+    config = whole.folder.read_config()
+    config.scene.path = str(tmp_path / "capture")
+    (tmp_path / "run" / "config.yaml").write_text(config.to_yaml())
+    run.resume(tmp_path / "run")  # the same capture elsewhere
+    reconstruction = pycolmap.Reconstruction(model)
+    change(reconstruction)
+    reconstruction.write_binary(model)
+    before = latest_checkpoint(tmp_path / "run" / "checkpoints").read_bytes()
+    with pytest.raises(InputError, match=rf"capture '.*capture' has {difference} than .*run' began: .*another --out"):
+        run.resume(tmp_path / "run")
+    assert latest_checkpoint(tmp_path / "run" / "checkpoints").read_bytes() == before
+
+
+def test_a_capture_read_with_other_rounding_is_the_same(capture):
+    saved, present = (capture_state(load_scene(capture)) for _ in range(2))
+    for views in (present["train_views"], present["test_views"]):
+        views["viewmats"] += 2e-6
+        views["Ks"] *= 1 + 2e-6
+    assert capture_difference(saved, present) == ""
+    present["test_views"]["viewmats"][0, 0, 3] += 2e-5
+    assert capture_difference(saved, present) == "other poses of test images"
 
 
 def test_the_trainer_names_no_strategy():

@@ -11,10 +11,10 @@ from pathlib import Path
 from types import FrameType, TracebackType
 from typing import Any
 
-import numpy as np
 import torch
 
 from turbogs_plugin.calibration import budget_text, within_budget
+from turbogs_plugin.capture_state import capture_difference, capture_state, frame_of_state
 from turbogs_plugin.checkpoint import latest_checkpoint, load_checkpoint, require_like, save_checkpoint
 from turbogs_plugin.clock import TrainingClock
 from turbogs_plugin.config import Config, resolve
@@ -211,7 +211,7 @@ def load_model(path: Path, device: torch.device) -> SavedModel:
         raise InputError(f"'{path}' has no checkpoint yet")
     state = load_checkpoint(checkpoint)
     try:
-        frame = Frame(np.array(state["frame"]["center"]), state["frame"]["scale"])
+        frame = frame_of_state(state)
         trained = state["trainer"]
         iteration = operator.index(trained["iteration"])
         return SavedModel(folder, config, gaussians_of_state(trained, device), frame, iteration)
@@ -301,23 +301,30 @@ class _Session:
         return Outcome(self.folder, self.history, None if finished else interrupts.signal)
 
     def state_dict(self) -> dict[str, Any]:
-        frame = self.scene.frame
         return {
             "trainer": self.trainer.state_dict(),
             "train_seconds": self.clock.seconds,
             "pace": self.pace.state_dict(),
-            "frame": {"center": frame.center.tolist(), "scale": frame.scale},
+            **capture_state(self.scene),
         }
 
     def load_state_dict(self, state: dict[str, Any], source: str) -> None:
+        present = self.state_dict()
         try:
-            require_like(state, self.state_dict(), "state")
-            self.pace.load_state_dict(state["pace"])
-            self.trainer.load_state_dict(state["trainer"])
-            self.clock.seconds = state["train_seconds"]
-            self.resumed = True
+            require_like(state, present, "state")
+            difference = capture_difference(state, present)
+            if not difference:
+                self.pace.load_state_dict(state["pace"])
+                self.trainer.load_state_dict(state["trainer"])
+                self.clock.seconds = state["train_seconds"]
+                self.resumed = True
         except (KeyError, TypeError, AttributeError, IndexError, ArithmeticError, RuntimeError, ValueError) as error:
             raise InputError(f"checkpoint '{source}' does not fit this run and its capture: {error}") from None
+        if difference:
+            raise InputError(
+                f"capture '{self.config.scene.path}' has {difference} than when the run in '{self.folder.path}' began: "
+                "bring that state of it back, or train anew with another --out"
+            )
 
     def _evaluate(self, progress: TrainingProgress) -> None:
         trainer = self.trainer

@@ -1,0 +1,68 @@
+"""What a checkpoint says of the capture that it was trained on, so that a run goes on with no other."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+
+from turbogs_plugin.scene import Frame, PosedImages, Scene
+
+ROUNDING = 1e-5
+"""Two readings of one reconstruction differ by less, in extents and in parts of an intrinsic."""
+
+
+def capture_state(scene: Scene) -> dict[str, Any]:
+    """The frame and the cameras of a scene, as plain tensors and values."""
+    return {
+        "frame": {"center": scene.frame.center.tolist(), "scale": scene.frame.scale},
+        "train_views": _views_state(scene.train),
+        "test_views": _views_state(scene.test),
+    }
+
+
+def frame_of_state(state: dict[str, Any]) -> Frame:
+    """The frame that `capture_state` wrote down.
+
+    Raises:
+        InputError: it is none.
+    """
+    return Frame(np.array(state["frame"]["center"]), state["frame"]["scale"])
+
+
+def capture_difference(saved: dict[str, Any], present: dict[str, Any]) -> str:
+    """What a capture has other than a saved one, in words; empty where it is the same.
+
+    Args:
+        saved, present: what `capture_state` gave, of one structure (`checkpoint.require_like`), among other things.
+    """
+    for split in ("train", "test"):
+        before, now = saved[f"{split}_views"], present[f"{split}_views"]
+        if before["names"] != now["names"]:
+            return f"other {split} images"
+        if not torch.equal(before["sizes"], now["sizes"]):
+            return f"other sizes of {split} images"
+        if not _close(before["Ks"], now["Ks"], ROUNDING * now["Ks"].abs()):
+            return f"other intrinsics of {split} images"
+        if not _close(before["viewmats"], now["viewmats"], torch.tensor(ROUNDING)):
+            return f"other poses of {split} images"
+    before, now = frame_of_state(saved), frame_of_state(present)
+    moved = np.abs(before.center - now.center).max()
+    if max(moved, abs(before.scale - now.scale)) > ROUNDING * now.scale:
+        return "other coordinates"
+    return ""
+
+
+def _views_state(views: PosedImages) -> dict[str, Any]:
+    cameras = views.cameras
+    return {
+        "names": list(views.names),
+        "sizes": torch.from_numpy(cameras.sizes),  # [V, 2] int64
+        "viewmats": cameras.viewmats,  # [V, 4, 4] float32
+        "Ks": cameras.Ks,  # [V, 3, 3] float32
+    }
+
+
+def _close(before: torch.Tensor, now: torch.Tensor, tolerance: torch.Tensor) -> bool:
+    return before.shape == now.shape and bool(((before - now).abs() <= tolerance).all())
