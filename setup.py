@@ -1,9 +1,11 @@
 """Builds the CUDA library, where there is something to build it with and for. Everything else is in pyproject.toml.
 
 Environment:
-    TURBOGS_CUDA: ``auto`` (default) builds where nvcc, torch's headers and a GPU are found, and else ends CPU-only,
-        saying why in one line; ``require`` makes a missing library an error; ``off`` builds nothing.
-    TURBOGS_CUDA_ARCH: compute capabilities to build for, such as ``90`` or ``80;90``, in place of the GPUs found here.
+    TURBOGS_CUDA: ``auto`` (default) builds where nvcc, torch's headers and a GPU are found, and else, or where nvcc
+        fails, ends CPU-only, saying why in one line; ``require`` makes a missing library an error; ``off`` builds
+        nothing.
+    TURBOGS_CUDA_ARCH: compute capabilities to build for, such as ``90`` or ``80;90``, in place of the GPUs found here;
+        8.0 or newer.
     TURBOGS_EXACT_MATH: ``1`` builds the blending kernels with correctly rounded functions (csrc/blend_math.cuh).
 """
 
@@ -26,6 +28,7 @@ from setuptools.command.build_ext import build_ext
 ROOT = Path(__file__).resolve().parent
 SOURCES = ROOT / "csrc"
 BUILD_COMMANDS = {"build", "build_ext", "bdist_wheel", "editable_wheel", "develop", "install"}
+OLDEST_CAPABILITY = 80  # warp reductions in hardware (__reduce_*_sync)
 TORCH_TARGET = "0x020A000000000000ULL"  # the library loads on torch 2.10 and later
 
 
@@ -41,12 +44,14 @@ class Toolchain:
 
     @property
     def code_flags(self) -> list[str]:
-        """Machine code for every architecture, and PTX of the newest for what comes after it."""
-        flags = [f"-gencode=arch=compute_{a},code=sm_{a}" for a in self.architectures]
-        if len(self.architectures) > 1:
-            newest = self.architectures[-1]
-            flags.append(f"-gencode=arch=compute_{newest},code=compute_{newest}")
-        return flags
+        """Machine code for every architecture; of several also PTX of the newest, for GPUs that come after it."""
+        return [f"-gencode=arch=compute_{name.split('_')[1]},code={name}" for name in self.code_names]
+
+    @property
+    def code_names(self) -> list[str]:
+        """What the library holds: ``sm_90`` is machine code, ``compute_90`` PTX. A library for one GPU has no PTX."""
+        names = [f"sm_{a}" for a in self.architectures]
+        return [*names, f"compute_{self.architectures[-1]}"] if len(names) > 1 else names
 
 
 def find_nvcc() -> Path:
@@ -70,12 +75,19 @@ def find_torch() -> Path:
     raise CannotBuildError("torch's headers are not in the build environment (install with --no-build-isolation)")
 
 
+def capability(architecture: str) -> int:
+    """90 of ``90``, ``90a``, ``90f``."""
+    return int(architecture.rstrip("af"))
+
+
 def find_architectures() -> list[str]:
     named = os.environ.get("TURBOGS_CUDA_ARCH", "")
     if named:
         found = [part.replace(".", "") for part in re.split(r"[;,\s]+", named) if part]
         if not found or not all(re.fullmatch(r"\d{2,3}[af]?", part) for part in found):
             raise SystemExit(f"TURBOGS_CUDA_ARCH={named!r}: expected compute capabilities such as 90 or 80;90")
+        if any(capability(part) < OLDEST_CAPABILITY for part in found):
+            raise SystemExit(f"TURBOGS_CUDA_ARCH={named!r}: the CUDA library needs compute capability 8.0 or newer")
     else:
         query = ["nvidia-smi", "--query-gpu=compute_cap", "--format=csv,noheader"]
         try:
@@ -85,7 +97,37 @@ def find_architectures() -> list[str]:
         found = [line.replace(".", "") for line in lines if re.fullmatch(r"\d+\.\d", line)]
         if not found:
             raise CannotBuildError("nvcc is here but no GPU, and TURBOGS_CUDA_ARCH names none")
-    return sorted(set(found), key=lambda part: int(re.match(r"\d+", part)[0]))
+        newest = max(found, key=capability)
+        found = [part for part in found if capability(part) >= OLDEST_CAPABILITY]
+        if not found:
+            raise CannotBuildError(f"it needs compute capability 8.0 or newer, the GPU has {newest[:-1]}.{newest[-1]}")
+    return sorted(set(found), key=capability)
+
+
+def run_compiler(command: list[str], what: str) -> None:
+    """Run nvcc, and pass its messages on.
+
+    Raises:
+        CannotBuildError: it failed; the line holds its first error.
+    """
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, errors="replace")
+    except OSError as error:
+        raise CannotBuildError(f"{command[0]} does not run: {error.strerror}") from None
+    messages = (done.stderr + done.stdout).strip()
+    if messages:
+        print(messages, file=sys.stderr, flush=True)
+    if done.returncode:
+        lines = [line.strip() for line in messages.splitlines()] or [f"exit status {done.returncode}"]
+        first = next((line for line in lines if re.search(r"\b(error|fatal)\b", line)), lines[-1])
+        raise CannotBuildError(f"nvcc failed {what}: {first}")
+
+
+def give_up(mode: str, reason: CannotBuildError) -> None:
+    """End with an error where the library is required, else say that there will be none."""
+    if mode == "require":
+        raise SystemExit(f"turbogs: TURBOGS_CUDA=require, but no CUDA library: {reason}")
+    print(f"turbogs: CPU only, no CUDA library: {reason}", flush=True)
 
 
 def plan() -> tuple[str, Toolchain | None]:
@@ -99,9 +141,7 @@ def plan() -> tuple[str, Toolchain | None]:
     try:
         return mode, Toolchain(find_nvcc(), find_torch(), find_architectures())
     except CannotBuildError as reason:
-        if mode == "require":
-            raise SystemExit(f"turbogs: TURBOGS_CUDA=require, but {reason}") from None
-        print(f"turbogs: CPU only, no CUDA library: {reason}", flush=True)
+        give_up(mode, reason)
         return mode, None
 
 
@@ -109,6 +149,14 @@ class BuildCuda(build_ext):
     """Compiles every csrc/*.cu and csrc/*.cpp with nvcc and links them into one library."""
 
     def build_extension(self, extension: Extension) -> None:
+        library = Path(self.get_ext_fullpath(extension.name))
+        try:
+            self.build_library(library)
+        except CannotBuildError as reason:
+            library.unlink(missing_ok=True)  # one of a build before this one
+            give_up(mode, reason)
+
+    def build_library(self, library: Path) -> None:
         objects_dir = Path(self.build_temp, "csrc").resolve()
         objects_dir.mkdir(parents=True, exist_ok=True)
         headers = [*SOURCES.glob("*.h"), *SOURCES.glob("*.cuh"), Path(__file__)]
@@ -122,17 +170,16 @@ class BuildCuda(build_ext):
             text = " ".join(command)
             fresh = target.exists() and target.stat().st_mtime > max(newest_header, source.stat().st_mtime)
             if not (fresh and stamp.exists() and stamp.read_text() == text):
-                subprocess.run([*command, "-o", str(target)], check=True)
+                run_compiler([*command, "-o", str(target)], f"on {source.name}")
                 stamp.write_text(text)
             return target
 
         with ThreadPoolExecutor(os.cpu_count()) as pool:
             objects = list(pool.map(compile_one, sources))
-        library = Path(self.get_ext_fullpath(extension.name))
         library.parent.mkdir(parents=True, exist_ok=True)
         link = [str(toolchain.nvcc), *toolchain.code_flags, "-shared", f"-L{toolchain.torch / 'lib'}"]
         link += ["-Xlinker", "--no-as-needed,-ltorch", "-o", str(library), *map(str, objects)]
-        subprocess.run(link, check=True)
+        run_compiler(link, "to link")
         print(f"turbogs: built {library.name} with {toolchain.nvcc} {' '.join(toolchain.code_flags)}", flush=True)
 
     def cuda_command(self) -> list[str]:
@@ -150,7 +197,7 @@ class BuildCuda(build_ext):
     def cpp_command(self) -> list[str]:
         # nvcc hands .cpp files to the host compiler, and knows where the toolkit's headers are.
         flags = ["-O2", "-std=c++17", "-Xcompiler", "-fPIC,-fvisibility=hidden", f"-I{toolchain.torch / 'include'}"]
-        names = " ".join(f"sm_{a}" for a in toolchain.architectures)
+        names = " ".join(toolchain.code_names)
         flags += ["-DUSE_CUDA", f"-DTORCH_TARGET_VERSION={TORCH_TARGET}", f'-DTURBOGS_ARCHITECTURES="{names}"']
         return [str(toolchain.nvcc), *flags]
 

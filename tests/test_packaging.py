@@ -2,6 +2,7 @@
 
 import ast
 import importlib
+import importlib.util
 import os
 import shutil
 import subprocess
@@ -10,6 +11,7 @@ import zipfile
 from pathlib import Path
 
 import pytest
+import setuptools
 
 import turbogs_plugin
 
@@ -98,3 +100,70 @@ def test_importing_the_command_line_does_not_import_torch():
     code = "import sys, turbogs_plugin.cli; print('torch' in sys.modules)"
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert found.stdout.strip() == "False"
+
+
+@pytest.fixture
+def build_script(monkeypatch):
+    """setup.py as a module that builds nothing."""
+    monkeypatch.setattr(setuptools, "setup", lambda **arguments: None)
+    spec = importlib.util.spec_from_file_location("build_script", ROOT / "setup.py")
+    module = importlib.util.module_from_spec(spec)
+    monkeypatch.setitem(sys.modules, "build_script", module)
+    spec.loader.exec_module(module)
+    return module
+
+
+def answer_of_nvidia_smi(text):
+    return lambda command, **options: subprocess.CompletedProcess(command, 0, stdout=text)
+
+
+def test_architectures_are_those_of_the_gpus_that_have_kernels(build_script, monkeypatch):
+    monkeypatch.delenv("TURBOGS_CUDA_ARCH", raising=False)
+    monkeypatch.setattr(build_script.subprocess, "run", answer_of_nvidia_smi("9.0\n7.5\n12.0\n8.0\n9.0\n"))
+    assert build_script.find_architectures() == ["80", "90", "120"]
+    monkeypatch.setattr(build_script.subprocess, "run", answer_of_nvidia_smi("7.5\n7.0\n"))
+    with pytest.raises(
+        build_script.CannotBuildError, match=r"needs compute capability 8\.0 or newer, the GPU has 7\.5"
+    ):
+        build_script.find_architectures()
+
+
+@pytest.mark.parametrize(
+    ("named", "wanted"),
+    [("90", ["90"]), ("9.0;8.0", ["80", "90"]), ("100f,90a", ["90a", "100f"]), ("75", None), ("90;7.5", None)],
+)
+def test_named_architectures(build_script, monkeypatch, named, wanted):
+    monkeypatch.setenv("TURBOGS_CUDA_ARCH", named)
+    if wanted:
+        assert build_script.find_architectures() == wanted
+    else:
+        with pytest.raises(SystemExit, match=r"needs compute capability 8\.0"):
+            build_script.find_architectures()
+
+
+def test_ptx_is_of_the_newest_of_several(build_script):
+    several = build_script.Toolchain(Path("nvcc"), Path("torch"), ["80", "90"])
+    assert several.code_names == ["sm_80", "sm_90", "compute_90"]
+    assert several.code_flags[-1] == "-gencode=arch=compute_90,code=compute_90"
+    assert build_script.Toolchain(Path("nvcc"), Path("torch"), ["90"]).code_names == ["sm_90"]
+
+
+@pytest.mark.parametrize("mode", ["auto", "require"])
+def test_a_compiler_that_fails_ends_without_a_library(tmp_path, mode):
+    """`auto` goes on without one, `require` fails; both say why in one line."""
+    nvcc = tmp_path / "toolkit/bin/nvcc"
+    nvcc.parent.mkdir(parents=True)
+    nvcc.write_text("#!/bin/sh\necho 'a note' >&2\necho 'x.h(3): fatal error: too new' >&2\nexit 2\n")
+    nvcc.chmod(0o755)
+    stale = tmp_path / "lib/turbogs_plugin/_C.abi3.so"
+    stale.parent.mkdir(parents=True)
+    stale.touch()
+    command = [sys.executable, "setup.py", "build_ext", "-b", tmp_path / "lib", "-t", tmp_path / "objects"]
+    settings = {"TURBOGS_CUDA": mode, "TURBOGS_CUDA_ARCH": "90", "CUDA_HOME": tmp_path / "toolkit"}
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, env={**os.environ, **settings})
+    said = [line for line in (done.stdout + done.stderr).splitlines() if line.startswith("turbogs: ")]
+    assert "Traceback" not in done.stderr and not stale.exists()
+    assert (done.returncode == 0) == (mode == "auto"), done.stderr
+    assert len(said) == 1 and "no CUDA library: nvcc failed on " in said[0]
+    assert said[0].endswith(": x.h(3): fatal error: too new")
+    assert said[0].startswith("turbogs: CPU only" if mode == "auto" else "turbogs: TURBOGS_CUDA=require, but")
