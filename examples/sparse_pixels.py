@@ -22,7 +22,8 @@ class SparseForward:
     """The forward part of a step on a share of the pixels, drawn by the errors of their last visits.
 
     Args:
-        scene: its training views get error maps.
+        scene: its training views get error maps, which must not start from zero: only visited pixels would have an
+            error, and the share of the samples that goes by error would visit them again and again.
         rate: the share.
         iterations: of the run.
     """
@@ -30,7 +31,8 @@ class SparseForward:
     def __init__(self, scene: Scene, rate: float, iterations: int) -> None:
         self.rate, self.iterations = rate, iterations
         device = "cuda" if torch.cuda.is_available() else "cpu"
-        self.maps = ErrorMaps(scene.train.cameras.sizes, device)
+        photos = (scene.train.photos.image(view).to(device) for view in range(len(scene.train)))  # [H, W, 3] each
+        self.maps = ErrorMaps.from_images([photo.sum(dim=-1) for photo in photos])  # the errors of a black prediction
         self.sampler, self.loss = ErrorGuidedPixelSampler(), CharbonnierNccLoss()
 
     def __call__(self, splats: torch.nn.ParameterDict, batch: Batch, step: int, **render: Any) -> tuple[Tensor, dict]:

@@ -14,7 +14,7 @@ import torch
 from turbogs_plugin import registry, run
 from turbogs_plugin.config import load_config
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.scene import write_demo_capture
+from turbogs_plugin.scene import load_scene, write_demo_capture
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 PACKAGE = EXAMPLES / "third_party_strategy"
@@ -50,6 +50,16 @@ def test_swaps(name, example, capture, capsys):
     for line in reports:
         first, last = (float(text) for text in line.split(": ")[1].split(" dB")[0].split(" -> "))
         assert last > first, line
+
+
+def test_sparse_pixels_draws_by_errors_from_the_first_step_on(example, capture):
+    """Zeros would send the share that goes by error back to the pixels visited already."""
+    scene = load_scene(capture)
+    maps = example("sparse_pixels").SparseForward(scene, rate=0.25, iterations=8).maps
+    for view in range(len(scene.train)):
+        start, end = maps.offsets[view : view + 2]
+        expected = scene.train.photos.image(view).sum(dim=-1).reshape(-1).half()
+        torch.testing.assert_close(maps.errors[start:end].cpu(), expected)
 
 
 def test_image_fitting(example):
