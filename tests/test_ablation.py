@@ -1,6 +1,7 @@
 """Ablations: the grid, its resumption, statistics over seeds, and the report."""
 
 import csv
+import itertools
 import json
 import math
 import re
@@ -14,7 +15,8 @@ from framework_runs import TINY, tiny_capture
 from hypothesis import given
 from hypothesis import strategies as st
 
-from turbogs_plugin.ablation.cell import train_cell
+from turbogs_plugin import provenance as provenance_module
+from turbogs_plugin.ablation.cell import capture_digest, train_cell
 from turbogs_plugin.ablation.grid import Ablation, ablation_names, load_ablation, variant_config
 from turbogs_plugin.ablation.results import CellResult, Study, StudyFolder
 from turbogs_plugin.ablation.statistics import Curve, Spread, differ, pareto_front, seconds_to_reach
@@ -24,7 +26,7 @@ from turbogs_plugin.errors import InputError
 from turbogs_plugin.lengths import with_iterations
 from turbogs_plugin.provenance import provenance
 from turbogs_plugin.report.history import Evaluation
-from turbogs_plugin.scene import load_scene
+from turbogs_plugin.scene import load_scene, write_demo_capture
 from turbogs_plugin.trainer import Trainer
 
 SMALL = """
@@ -368,6 +370,66 @@ def test_cells_of_the_same_settings_are_reused_from_another_study(turbogs, small
     monkeypatch.setenv("TURBOGS_COMMIT", "one-modified")
     code, _, err = turbogs(*call(other, capture, tmp_path / "fourth", "--reuse", first))
     assert code == 2 and "known commit" in err and not (tmp_path / "fourth").exists()
+
+
+def test_another_capture_of_the_same_name_is_not_taken_for_the_first(turbogs, small, capture, tmp_path, monkeypatch):
+    monkeypatch.setenv("TURBOGS_COMMIT", "one")
+    first, second = tmp_path / "first", tmp_path / "second"
+    assert turbogs(*call(small, capture, first, "--only", "full"))[0] == 0
+    (tmp_path / "moved").mkdir()
+    moved = shutil.copytree(capture, tmp_path / "moved" / capture.name)
+    code, _, err = turbogs(*call(small, moved, first, "--only", "full"))
+    assert code == 0 and "1 finished cells are kept" in err
+    other = write_demo_capture(tmp_path / capture.name, views=9, width=48, height=40)
+    for seed in (0, 1):
+        code, _, err = turbogs(*call(small, other, first, "--only", "full", "--seeds", seed))
+        assert code == 2 and "other photos or cameras" in err
+    code, _, err = turbogs(*call(small, other, second, "--only", "full", "--reuse", first))
+    assert code == 0 and "kept" not in err and "[1/1]" in err
+    code, _, err = turbogs("ablate", "--merge", first, second, "--out", tmp_path / "both")
+    assert code == 2 and "two different captures" in err
+
+
+def test_a_cell_of_an_unknown_capture_is_kept_and_merged_but_not_reused(turbogs, small, capture, tmp_path, monkeypatch):
+    monkeypatch.setenv("TURBOGS_COMMIT", "one")
+    old = tmp_path / "old"
+    assert turbogs(*call(small, capture, old, "--only", "full"))[0] == 0
+    (path,) = old.glob("cells/*/*.json")
+    mapping = json.loads(path.read_text())
+    assert mapping.pop("capture") == capture_digest(load_scene(capture))
+    path.write_text(json.dumps(mapping))
+    code, _, err = turbogs(*call(small, capture, old, "--only", "full"))
+    assert code == 0 and "1 finished cells are kept" in err
+    assert turbogs("ablate", "--merge", old, "--out", tmp_path / "merged")[0] == 0
+    code, _, err = turbogs(*call(small, capture, tmp_path / "new", "--only", "full", "--reuse", old))
+    assert code == 0 and "kept" not in err and "[1/1]" in err
+
+
+def test_the_digest_of_a_capture_is_of_names_sizes_and_cameras(capture):
+    scene = load_scene(capture)
+    before = capture_digest(scene)
+    assert capture_digest(load_scene(capture)) == before != capture_digest(load_scene(capture, 2))
+    for part in (scene.train, scene.test):
+        unchanged = part.cameras.viewmats
+        part.cameras.viewmats = unchanged + 1e-3
+        assert capture_digest(scene) != before
+        part.cameras.viewmats = unchanged
+        assert capture_digest(scene) == before
+    scene.train.names = ("other", *scene.train.names[1:])
+    assert capture_digest(scene) != before
+
+
+def test_a_commit_made_meanwhile_changes_no_cell_and_no_sharing(turbogs, small, capture, tmp_path, monkeypatch):
+    commits = (f"commit-{number}" for number in itertools.count())
+    monkeypatch.setattr(provenance_module, "source_commit", lambda: next(commits))
+    other, out = tmp_path / "other.yaml", tmp_path / "studies"
+    other.write_text("title: Other\nvariants: {same: []}\n")
+    arguments = call(small, capture, out)
+    arguments.insert(2, other)
+    code, _, err = turbogs(*arguments)
+    assert code == 0 and "1 finished cells are kept" in err
+    results = [result for name in (small.stem, "other") for result in StudyFolder(out / name).read_study().results]
+    assert [result.provenance.commit for result in results] == 3 * ["commit-0"]
 
 
 def test_several_ablations_in_one_call_share_their_cells(turbogs, small, capture, tmp_path):

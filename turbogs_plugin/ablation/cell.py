@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections.abc import Callable
 from dataclasses import replace
 
+import numpy as np
 import torch
 
 from turbogs_plugin.ablation.results import CellResult
@@ -24,6 +26,21 @@ from turbogs_plugin.trainer import Trainer
 
 WARMUP_ITERATIONS = {"cuda": 20, "cpu": 2}
 """Of the same configuration scaled to this length: every kind of step loads its code before the clock starts."""
+
+
+def capture_digest(scene: Scene) -> str:
+    """What tells a capture from another one of its name: names, sizes and cameras of its photos, and how many points.
+
+    Not the photos' pixels: decoders differ in them from version to version.
+    """
+    digest = hashlib.sha256(str(len(scene.points)).encode())
+    for part in (scene.train, scene.test):
+        digest.update("\n".join(("", *part.names)).encode())
+        digest.update(np.ascontiguousarray(part.cameras.sizes, dtype="<i8").tobytes())
+        for array in (part.cameras.viewmats, part.cameras.Ks):
+            # The sum makes -0 a 0.
+            digest.update((array.cpu().numpy() + 0.0).astype("<f4").tobytes())
+    return digest.hexdigest()[:16]
 
 
 def scene_on(scene: Scene, device: torch.device) -> Scene:
@@ -101,6 +118,7 @@ def train_cell(
         peak_bytes=memory.peak,
         warmup_iterations=warmup,
         provenance=made_by,
+        capture=capture_digest(scene),
     )
 
 

@@ -11,6 +11,8 @@ from turbogs_plugin.ablation.pages import write_study
 from turbogs_plugin.ablation.results import StudyFolder, merge_studies
 from turbogs_plugin.ablation.sweep import SweepOptions, run_sweep
 from turbogs_plugin.errors import InputError
+from turbogs_plugin.provenance import Provenance, provenance
+from turbogs_plugin.run import resolve_device
 
 
 def ablate(
@@ -27,9 +29,10 @@ def ablate(
     if len(ablations) < len(names):
         raise InputError(f"ablations of one name would share a folder: {', '.join(names)}")
     folders = [StudyFolder(out if len(names) == 1 else out / name) for name in ablations]
+    here = provenance(resolve_device(options.device).type)
     code = 0
     for number, (ablation, folder) in enumerate(zip(ablations.values(), folders, strict=True)):
-        code = max(code, _study(ablation, ablation.only(only), options, folder, folders[:number], targets))
+        code = max(code, _study(ablation, ablation.only(only), options, here, folder, folders[:number], targets))
     return code
 
 
@@ -37,12 +40,13 @@ def _study(
     ablation: Ablation,
     variants: Sequence[str],
     options: SweepOptions,
+    here: Provenance,
     folder: StudyFolder,
     siblings: Sequence[StudyFolder],
     targets: Sequence[float],
 ) -> int:
     try:
-        run_sweep(ablation, variants, options, folder, siblings)
+        run_sweep(ablation, variants, options, here, folder, siblings)
     finally:
         # Not after a refusal, which leaves no cells.
         if any(folder.cells.glob("*/*.json")):

@@ -33,6 +33,7 @@ class CellResult:
         peak_bytes: peak of the GPU's tensors while training, or None where it was not measured.
         warmup_iterations: iterations of the same configuration before the clock started, on a model thrown away.
         provenance: machine, versions and commit, or None where they were not recorded.
+        capture: `capture_digest` of the scene, or "" where it was not recorded.
     """
 
     scene: str
@@ -47,6 +48,7 @@ class CellResult:
     peak_bytes: int | None = None
     warmup_iterations: int = 0
     provenance: Provenance | None = None
+    capture: str = ""
 
     @property
     def key(self) -> CellKey:
@@ -162,7 +164,8 @@ def merge_studies(sources: list[StudyFolder], target: StudyFolder) -> None:
     """Put the cells of several studies into one; title and baseline are the first one's. The target may be a source.
 
     Raises:
-        InputError: a folder without a study, a variant with two meanings, or two different results of one cell.
+        InputError: a folder without a study, a variant with two meanings, two different results of one cell, or two
+            captures of one name.
     """
     ablations = [source.read_ablation() for source in sources]
     merged = ablations[0]
@@ -173,8 +176,11 @@ def merge_studies(sources: list[StudyFolder], target: StudyFolder) -> None:
             merged.variants.setdefault(name, overrides)
         merged.notes = {**ablation.notes, **merged.notes}
     results: dict[CellKey, CellResult] = {}
+    captures: dict[str, str] = {}
     for source in sources:
         for result in source.read_study().results:
+            if result.capture and captures.setdefault(result.scene, result.capture) != result.capture:
+                raise InputError(f"two different captures are called '{result.scene}' in what is to be merged")
             if not _equal(results.setdefault(result.key, result), result):
                 raise InputError(f"two different results of the cell {result.key}")
     target.write_ablation(merged)

@@ -5,21 +5,21 @@ from __future__ import annotations
 import gc
 import json
 import traceback
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from turbogs_plugin.ablation.cell import train_cell
+from turbogs_plugin.ablation.cell import capture_digest, train_cell
 from turbogs_plugin.ablation.grid import Ablation, CellKey, variant_config
 from turbogs_plugin.ablation.progress import SweepProgress
 from turbogs_plugin.ablation.results import CellResult, Failure, StudyFolder
 from turbogs_plugin.config import Config
 from turbogs_plugin.errors import InputError, TrainingStopped
 from turbogs_plugin.evaluation import synchronize
-from turbogs_plugin.provenance import COMMIT_VARIABLE, MODIFIED, Provenance, provenance
+from turbogs_plugin.provenance import COMMIT_VARIABLE, MODIFIED, Provenance
 from turbogs_plugin.run import resolve_device
 from turbogs_plugin.scene import Scene, load_scene
 
@@ -63,6 +63,7 @@ def run_sweep(
     ablation: Ablation,
     variants: Sequence[str],
     options: SweepOptions,
+    here: Provenance,
     folder: StudyFolder,
     siblings: Sequence[StudyFolder] = (),
 ) -> None:
@@ -73,6 +74,7 @@ def run_sweep(
     Args:
         ablation: all of it is what the study is of.
         variants: of it, the ones to train now.
+        here: machine and sources, as they were when the process began.
         siblings: studies by this very process, whose cells of the same settings are taken.
 
     Raises:
@@ -85,38 +87,32 @@ def run_sweep(
         if result.variant not in ablation.variants:
             raise InputError(f"'{folder.path}' has a cell of another ablation ({result.key}): choose a new --out")
     device = resolve_device(options.device)
-    grid: dict[str, list[tuple[CellKey, Config]]] = {}
-    kept = 0
-    taken: list[CellResult] = []
-    here = provenance(device.type)
     reusable = _reusable_cells(options, here, siblings)
+    grid: dict[str, list[tuple[CellKey, Config]]] = {}
+    taken: list[CellResult] = []
+    kept = 0
+    # All scenes are read before anything is trained, so that a wrong one is known at once.
+    loaded: dict[str, Scene] = {}
     for path in options.scenes:
         name = path.resolve().name
+        configs = _scene_configs(ablation, variants, options, path.resolve(), device)
+        settings = next(iter(configs.values())).scene
+        scene = load_scene(path, settings.factor, settings.test_every)
+        capture = capture_digest(scene)
         grid[name] = []
-        for seed in options.seeds:
-            for variant in variants:
-                config = variant_config(ablation, variant, seed, options.overrides, options.steps)
-                config.scene.path, config.train.device = str(path.resolve()), device.type
-                key = CellKey(name, variant, seed)
-                present = finished.get(key)
-                known = reusable.get((name, _comparable(config.to_mapping())))
-                if present is None and known is not None:
-                    taken.append(replace(known, variant=variant))
-                elif present is None:
-                    grid[name].append((key, config))
-                else:
-                    _require_same(present, config, options.time_budget)
-                    kept += 1
-    # All scenes are read before anything is trained, so that a wrong one is known at once.
-    scenes = {path.resolve().name: path for path in options.scenes}
-    loaded: dict[str, Scene] = {}
-    for name, cells in grid.items():
-        if cells:
-            settings = cells[0][1].scene
-            for key, config in cells:
-                if config.scene != settings:
-                    raise InputError(f"variant '{key.variant}' changes the scene's photos, which all variants share")
-            loaded[name] = load_scene(scenes[name], settings.factor, settings.test_every)
+        for key, config in configs.items():
+            known = reusable.get((name, capture, _comparable(config.to_mapping())))
+            if key in finished:
+                _require_same(finished[key], config, options.time_budget)
+                kept += 1
+            elif known is not None:
+                taken.append(replace(known, variant=key.variant))
+            else:
+                grid[name].append((key, config))
+        _require_capture(finished.values(), name, capture)
+        if grid[name]:
+            loaded[name] = scene
+        del scene  # photos take room
     folder.write_ablation(ablation)
     for result in taken:
         folder.write(result)
@@ -124,6 +120,21 @@ def run_sweep(
         for name, cells in grid.items():
             if cells:
                 _train_scene(cells, loaded.pop(name), device, here, options.time_budget, folder, progress)
+
+
+def _scene_configs(
+    ablation: Ablation, variants: Sequence[str], options: SweepOptions, scene: Path, device: torch.device
+) -> dict[CellKey, Config]:
+    """The cells of a scene, seed after seed. Raises `InputError` where they would not share its photos."""
+    configs: dict[CellKey, Config] = {}
+    for seed in options.seeds:
+        for variant in variants:
+            config = variant_config(ablation, variant, seed, options.overrides, options.steps)
+            config.scene.path, config.train.device = str(scene), device.type
+            configs[CellKey(scene.name, variant, seed)] = config
+            if config.scene != next(iter(configs.values())).scene:
+                raise InputError(f"variant '{variant}' changes the scene's photos, which all variants share")
+    return configs
 
 
 def _train_scene(
@@ -151,6 +162,14 @@ def _train_scene(
             progress.finished(result)
 
 
+def _require_capture(results: Iterable[CellResult], scene: str, capture: str) -> None:
+    for result in results:
+        if result.scene == scene and result.capture not in ("", capture):
+            raise InputError(
+                f"the cell '{result.key}' has other photos or cameras than '{scene}' has now: choose a new --out"
+            )
+
+
 def _require_same(present: CellResult, config: Config, time_budget: float) -> None:
     made, wanted = (_sections(mapping) for mapping in (present.config, config.to_mapping()))
     if made != wanted or present.time_budget != time_budget:
@@ -162,16 +181,16 @@ def _require_same(present: CellResult, config: Config, time_budget: float) -> No
 
 def _reusable_cells(
     options: SweepOptions, here: Provenance, siblings: Sequence[StudyFolder]
-) -> dict[tuple[str, str], CellResult]:
-    """(scene, settings) -> a result of another study that a cell of these settings would repeat."""
+) -> dict[tuple[str, str, str], CellResult]:
+    """(scene, capture, settings) -> a result of another study that a cell of these settings would repeat."""
     if options.reuse and (not here.commit or here.commit.endswith(MODIFIED)):
         raise InputError(f"--reuse needs sources of a known commit, without changes; {COMMIT_VARIABLE} may name it")
     folders = [*map(StudyFolder, options.reuse), *siblings]
     results = [result for folder in folders for result in folder.read_study().results]
     return {
-        (result.scene, _comparable(result.config)): result
+        (result.scene, result.capture, _comparable(result.config)): result
         for result in results
-        if (result.time_budget, result.provenance) == (options.time_budget, here)
+        if result.capture and (result.time_budget, result.provenance) == (options.time_budget, here)
     }
 
 
