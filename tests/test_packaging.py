@@ -12,8 +12,11 @@ from pathlib import Path
 
 import pytest
 import setuptools
+import torch
 
 import turbogs_plugin
+from turbogs_plugin import doctor, kernels
+from turbogs_plugin.errors import InputError
 
 ROOT = Path(__file__).resolve().parent.parent
 TOP_LEVEL = {"pyproject.toml", "turbogs_plugin", "strategies", "csrc", "configs", "tests", "examples"}
@@ -167,3 +170,52 @@ def test_a_compiler_that_fails_ends_without_a_library(tmp_path, mode):
     assert len(said) == 1 and "no CUDA library: nvcc failed on " in said[0]
     assert said[0].endswith(": x.h(3): fatal error: too new")
     assert said[0].startswith("turbogs: CPU only" if mode == "auto" else "turbogs: TURBOGS_CUDA=require, but")
+
+
+@pytest.fixture
+def library_of(monkeypatch):
+    """Makes kernels.py find a library of these architectures and a GPU of this capability."""
+
+    def pretend(architectures, capability):
+        monkeypatch.setattr(kernels, "_load_failure", lambda: "")
+        monkeypatch.setattr(kernels, "architectures", lambda: tuple(architectures.split()))
+        monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+        monkeypatch.setattr(torch.cuda, "get_device_capability", lambda device=None: capability)
+        kernels.unavailable_reason.cache_clear()
+
+    yield pretend
+    kernels.unavailable_reason.cache_clear()
+
+
+@pytest.mark.parametrize(
+    ("architectures", "capability", "usable"),
+    [
+        ("sm_90", (9, 0), True),
+        ("sm_90", (8, 0), False),
+        ("sm_90", (10, 0), False),
+        ("sm_80", (8, 6), True),
+        ("sm_86", (8, 0), False),
+        ("sm_80", (9, 0), False),
+        ("sm_80 sm_90", (8, 9), True),
+        ("sm_80 sm_90 compute_90", (12, 0), True),
+        ("sm_86 sm_90 compute_90", (8, 0), False),
+        ("sm_90a", (9, 0), True),
+        ("sm_100a", (10, 3), False),
+        ("sm_100f", (10, 3), True),
+        ("sm_80 sm_90a compute_90a", (12, 0), False),
+    ],
+)
+def test_a_library_without_code_for_the_gpu_is_unavailable(library_of, architectures, capability, usable):
+    library_of(architectures, capability)
+    assert kernels.available() == usable
+
+
+def test_the_reason_names_the_remedy_and_doctor_shows_it(library_of, monkeypatch):
+    library_of("sm_90", (8, 0))
+    reason = "built for sm_90, this GPU is sm_80: rebuild with TURBOGS_CUDA_ARCH=80"
+    assert kernels.unavailable_reason() == reason
+    assert doctor._kernels() == ("not usable", [f"kernels: {reason}"])
+    with pytest.raises(InputError, match="rebuild with"):
+        kernels.require()
+    library_of("sm_90", (7, 5))
+    assert "need compute capability 8.0" in kernels.unavailable_reason()

@@ -53,4 +53,4 @@ def _kernels() -> tuple[str, list[str]]:
 
     if kernels.available():
         return f"loaded from {kernels.library_path()}, for {', '.join(kernels.architectures())}", []
-    return "not loaded", [f"kernels: {kernels.unavailable_reason()}"]
+    return "not usable", [f"kernels: {kernels.unavailable_reason()}"]

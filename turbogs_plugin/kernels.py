@@ -18,6 +18,10 @@ FIRST_TORCH = (2, 10)
 """The library is built on torch's stable interface of this version."""
 
 
+OLDEST_CAPABILITY = (8, 0)
+"""GPUs before this lack an instruction that the kernels use."""
+
+
 def library_path() -> Path:
     """Where the library is looked for, whether or not it is there."""
     named = os.environ.get(LIBRARY_VARIABLE)
@@ -40,14 +44,39 @@ def _load_failure() -> str:
     return ""
 
 
+def _runs_on(architecture: str, capability: tuple[int, int]) -> bool:
+    """Whether code of this name (``sm_90``, ``sm_90a``, PTX: ``compute_90``) runs on such a GPU."""
+    kind, major, minor, kin = re.fullmatch(r"(sm|compute)_(\d+)(\d)([af]?)", architecture).groups()
+    built = int(major), int(minor)
+    if kin == "a":  # of that GPU only
+        return built == capability
+    if kind == "compute" and not kin:
+        return built <= capability
+    return built[0] == capability[0] and built[1] <= capability[1]
+
+
+def _mismatch(architectures: tuple[str, ...], capability: tuple[int, int]) -> str:
+    """Why a library of these architectures has no code for such a GPU, in one line; "" where it has."""
+    if any(_runs_on(architecture, capability) for architecture in architectures):
+        return ""
+    present = "{}{}".format(*capability)
+    if capability < OLDEST_CAPABILITY:
+        return f"this GPU is sm_{present}: the kernels need compute capability 8.0 or newer"
+    return f"built for {', '.join(architectures)}, this GPU is sm_{present}: rebuild with TURBOGS_CUDA_ARCH={present}"
+
+
 @lru_cache(maxsize=1)
 def unavailable_reason() -> str:
-    """Why the kernels cannot run here, in one line; "" where they can."""
-    return _load_failure() or ("" if torch.cuda.is_available() else "torch sees no CUDA device")
+    """Why the kernels cannot run here, in one line; "" where they can. The GPU is torch's current one."""
+    if failure := _load_failure():
+        return failure
+    if not torch.cuda.is_available():
+        return "torch sees no CUDA device"
+    return _mismatch(architectures(), torch.cuda.get_device_capability())
 
 
 def available() -> bool:
-    """The library is loaded and torch sees a CUDA device."""
+    """The library is loaded, torch sees a CUDA device, and the library has code for it."""
     return not unavailable_reason()
 
 
@@ -62,5 +91,5 @@ def require() -> None:
 
 
 def architectures() -> tuple[str, ...]:
-    """The architectures (``sm_90``, ...) that the library was built for; none where it is not loaded."""
+    """What the library holds code for: ``sm_90``, ..., or PTX, ``compute_90``; nothing where it is not loaded."""
     return () if _load_failure() else tuple(torch.ops.turbogs.architectures().split())
