@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, fields
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 import torch
@@ -185,20 +185,16 @@ class ErrorDrivenDensity:
         return state
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
+        if self.stop_when_flat > 0 and "window_errors" not in state:
+            raise InputError(
+                f"stop_when_flat = {self.stop_when_flat:g}, but the saved run had it at 0 and kept no record of its "
+                "error: continue it with stop_when_flat = 0, or start a new run"
+            )
+        self._stats = loaded_rows("stats", state["stats"], self._stats)
         self.initial_count = state["initial_count"]
         if self.stop_when_flat > 0:
             self.window_errors = state["window_errors"].tolist()
             self.stopped_at = state["stopped_at"]
-        if state["stats"] is None:
-            self._stats = None
-        else:
-            saved = GaussianStats(**state["stats"])
-            for f in fields(saved):
-                shape = getattr(saved, f.name).shape
-                fits = self._stats is not None and shape == self._stats.weight_sums.shape
-                require(fits, f"density statistics {f.name}", tuple(shape), "of as many Gaussians as the model has")
-            device = self._stats.weight_sums.device
-            self._stats = saved.map(lambda value: value.to(device, copy=True))
 
     def scores(self, step: Step) -> tuple[Tensor, Tensor]:
         """([N] score, [N] bool seen) of the present window; the score of what was not seen is 0 and means nothing."""
@@ -350,6 +346,31 @@ class ErrorDrivenDensity:
             offsets = torch.stack([offset, -offset])
             shrink = axis * math.log(SPLIT_SHRINK)
         return (means + offsets).reshape(-1, 3), (scales - shrink).repeat(2, 1)
+
+
+RowsType = TypeVar("RowsType")  # a dataclass of [N] tensors
+
+
+def loaded_rows(name: str, saved: dict[str, Tensor] | None, present: RowsType | None) -> RowsType | None:
+    """What a state holds of Gaussians, as copies on the device of what is there, which must be of as many.
+
+    Args:
+        name: of the entry, for the error.
+        saved: name of a field -> [N], or None where the saved run needed them no more.
+        present: what `setup` made.
+    """
+    if saved is None:
+        return None
+    if present is None:
+        raise InputError(f"density {name}: nothing to load into, call setup with the model of the saved run first")
+    like = getattr(present, fields(present)[0].name)
+    for key, value in saved.items():
+        if value.shape != like.shape:
+            raise InputError(
+                f"density {name}.{key} has shape {tuple(value.shape)}, expected {tuple(like.shape)}: "
+                "load the state together with its own model"
+            )
+    return type(present)(**{key: value.to(like.device, copy=True) for key, value in saved.items()})
 
 
 def finite_rows(gaussians: Gaussians) -> Tensor:

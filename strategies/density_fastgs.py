@@ -8,9 +8,9 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from turbogs_plugin.strategies.density import ErrorDrivenDensity, finite_rows, leave_one
+from turbogs_plugin.strategies.density import ErrorDrivenDensity, finite_rows, leave_one, loaded_rows
 
-from turbogs_plugin.errors import InputError, require
+from turbogs_plugin.errors import require
 from turbogs_plugin.types import Gaussians, GaussianStats, RowUpdate, Step
 
 
@@ -134,18 +134,9 @@ class FastGsDensity:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        for name, cls in (("look", GaussianStats), ("window", GaussianStats), ("votes", ViewVotes)):
-            present, saved = getattr(self, f"_{name}"), state[name]
-            if saved is None:
-                setattr(self, f"_{name}", None)
-                continue
-            like = getattr(present, fields(cls)[0].name)
-            for key, value in saved.items():
-                if value.shape != like.shape:
-                    raise InputError(
-                        f"density {name}.{key} has shape {tuple(value.shape)}, expected {tuple(like.shape)}"
-                    )
-            setattr(self, f"_{name}", cls(**{key: value.to(like.device, copy=True) for key, value in saved.items()}))
+        parts = {"look": self._look, "window": self._window, "votes": self._votes}
+        loaded = {name: loaded_rows(name, state[name], present) for name, present in parts.items()}
+        self._look, self._window, self._votes = loaded.values()
 
     def _restart(self, count: int, device: torch.device) -> None:
         self._look, self._window = GaussianStats.zeros(count, device), GaussianStats.zeros(count, device)

@@ -10,7 +10,7 @@ import torch
 from gsplat.strategy import DefaultStrategy
 from gsplat.strategy.ops import reset_opa
 from torch import Tensor
-from turbogs_plugin.strategies.density import finite_rows
+from turbogs_plugin.strategies.density import finite_rows, loaded_rows
 
 from turbogs_plugin.errors import require
 from turbogs_plugin.types import Gaussians, GaussianStats, RowUpdate, Step
@@ -101,11 +101,7 @@ class GsplatDefaultDensity:
         return {"stats": {item.name: getattr(self._stats, item.name) for item in fields(self._stats)}}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        if state["stats"] is None:
-            self._stats = None
-            return
-        device = self._stats.weight_sums.device
-        self._stats = GaussianStats(**state["stats"]).map(lambda value: value.to(device, copy=True))
+        self._stats = loaded_rows("stats", state["stats"], self._stats)
 
     def _gsplat_config(self) -> dict[str, Any]:
         ours = ("opacity_reset", "_stats")

@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from turbogs_plugin.strategies import density as density_module
 from turbogs_plugin.strategies.density import ErrorDrivenDensity, NoDensity
+from turbogs_plugin.strategies.density_fastgs import FastGsDensity
 from turbogs_plugin.strategies.density_gsplat import GsplatDefaultDensity
 from turbogs_plugin.strategies.moment_lm import MomentLMOptimizer
 
@@ -389,10 +390,22 @@ def test_resumed_is_bit_identical(cls):
     assert first.stats is None and second.stats is None
 
 
-def test_statistics_of_another_model_are_refused():
-    small, large = controlled(make_gaussians(3)), controlled(make_gaussians(4))
-    with pytest.raises(InputError, match=r"\(4,\)"):
+@pytest.mark.parametrize("cls", [ErrorDrivenDensity, GsplatDefaultDensity, FastGsDensity])
+def test_statistics_of_another_model_are_refused(cls):
+    small, large, never_set_up = cls(), cls(), cls()
+    small.setup(make_gaussians(3))
+    large.setup(make_gaussians(4))
+    with pytest.raises(InputError, match=r"\(4,\), expected \(3,\)"):
         small.load_state_dict(large.state_dict())
+    assert len(small.stats.weight_sums) == 3
+    with pytest.raises(InputError, match="setup"):
+        never_set_up.load_state_dict(large.state_dict())
+
+
+def test_a_run_without_a_record_of_its_error_cannot_go_on_with_one():
+    saved, resumed = controlled(make_gaussians(3)), controlled(make_gaussians(3), stop_when_flat=0.01)
+    with pytest.raises(InputError, match="stop_when_flat = 0, or"):
+        resumed.load_state_dict(saved.state_dict())
 
 
 @pytest.mark.parametrize(
