@@ -91,6 +91,26 @@ def test_plain_colors_and_backgrounds(scene):
     torch.testing.assert_close(colors[hit] / alphas[hit], wall["colors"].expand(int(hit.sum()), 3))
 
 
+def test_planes_and_blur_reach_the_renderer(scene):
+    splats, cameras, samples = scene
+    given = {**arguments(splats, cameras), "samples": samples, "sh_degree": 1}
+    _, _, everything = sparse_rasterization(**given)
+    depths = splats["means"][:, 2] + 3.0
+    near, far = depths.quantile(0.3).item(), depths.quantile(0.7).item()
+    _, _, cut = sparse_rasterization(**given, near_plane=near, far_plane=far)
+    between, drawn = (depths > near) & (depths < far), (everything["radii"] > 0).all(dim=-1)
+    for side in (depths < near, depths > far, between):
+        assert (drawn & side).any()
+    assert torch.equal((cut["radii"] > 0).all(dim=-1), drawn & between)
+    _, _, blurred = sparse_rasterization(**given, eps2d=1.0)
+    covariances = []
+    for info in (everything, blurred):
+        a, b, c = info["conics"][drawn].unbind(dim=-1)
+        covariances.append(torch.stack([c, -b, a], dim=-1) / (a * c - b * b)[:, None])
+    expected = torch.tensor([0.7, 0.0, 0.7]).expand_as(covariances[0])  # 1 in the place of gsplat's 0.3
+    torch.testing.assert_close(covariances[1] - covariances[0], expected, atol=5e-3, rtol=0)
+
+
 def test_saturated_opacities_and_vanished_scales_have_finite_gradients(scene):
     splats, cameras, samples = scene
     with torch.no_grad():
@@ -209,6 +229,75 @@ def test_what_does_not_fit_is_refused_by_name(scene, changed, message):
     splats, cameras, samples = scene
     with pytest.raises(InputError, match=message):
         sparse_rasterization(**{**arguments(splats, cameras), "samples": samples, "sh_degree": 1, **changed})
+
+
+@pytest.mark.parametrize("name", ["viewmats", "Ks"])
+def test_cameras_that_want_a_gradient_are_refused(scene, name):
+    """As a trainer's pose optimisation does: it would train on without ever moving a camera."""
+    splats, cameras, samples = scene
+    given = arguments(splats, cameras)
+    given[name] = given[name].clone().requires_grad_() * 1.0
+    with pytest.raises(InputError, match=rf"{name} requires a gradient, .* pass {name}\.detach\(\)"):
+        sparse_rasterization(**given, samples=samples, sh_degree=1)
+    with torch.no_grad():
+        sparse_rasterization(**given, samples=samples, sh_degree=1)
+
+
+def plain_difference(colors, targets, samples):
+    return (colors - targets).abs().mean()
+
+
+NO_LOSSES = {
+    "the class CharbonnierNccLoss": CharbonnierNccLoss,
+    "l1_loss": torch.nn.functional.l1_loss,
+    "L1Loss": torch.nn.L1Loss(),
+    "dist": torch.dist,
+    "plain_difference": plain_difference,
+    "NoneType": None,
+}
+
+
+@pytest.mark.filterwarnings("ignore:size_average")
+@pytest.mark.parametrize("name", NO_LOSSES)
+def test_what_is_no_loss_on_samples_is_refused_by_name(scene, name):
+    samples = scene[2]
+    colors = torch.rand(len(samples), 3, requires_grad=True)
+    with pytest.raises(InputError, match=rf"^loss is {name}: expected an instance .*CharbonnierNccLoss\(\)"):
+        sparse_loss(NO_LOSSES[name], colors, torch.rand(len(samples), 3), samples)
+
+
+def test_a_loss_of_ones_own_may_be_a_function_or_a_module(scene):
+    samples = scene[2]
+    colors, targets = torch.rand(len(samples), 3, requires_grad=True), torch.rand(len(samples), 3)
+
+    class Own(torch.nn.Module):
+        def forward(self, colors, targets, samples):
+            return CharbonnierLoss()(colors, targets, samples)
+
+    expected = CharbonnierLoss()(colors.detach(), targets, samples).loss
+    for own in (Own(), Own().forward):
+        assert torch.equal(sparse_loss(own, colors, targets, samples), expected)
+
+
+def test_what_does_not_fit_the_samples_is_refused_by_name(scene):
+    samples = scene[2]
+    loss, count = CharbonnierNccLoss(), len(samples)
+    colors = torch.rand(count, 3)
+    with pytest.raises(InputError, match="samples is a NoneType: expected the PixelSamples"):
+        sparse_loss(loss, colors, colors, None)
+    with pytest.raises(InputError, match="samples is a NoneType: expected the PixelSamples"):
+        gather_pixels(torch.zeros(2, HEIGHT, WIDTH, 3), None)
+    with pytest.raises(InputError, match=r"images is a ndarray: expected a tensor \[C, H, W, D\]"):
+        gather_pixels(np.zeros((2, HEIGHT, WIDTH, 3)), samples)
+    images = torch.zeros(2, HEIGHT, WIDTH, 3)
+    with pytest.raises(InputError, match=rf"targets is torch.uint8 .*: expected floating point \({count}, 3\)"):
+        sparse_loss(loss, colors, colors.byte(), samples)
+    with pytest.raises(InputError, match=r"targets is torch.float32 \(2, 24, 40, 3\): expected"):
+        sparse_loss(loss, colors, images, samples)
+    with pytest.raises(InputError, match=r"colors is torch.float32 \(2, 24, 40, 3\): expected"):
+        sparse_loss(loss, images, colors, samples)
+    with pytest.raises(InputError, match="targets is ndarray: expected"):
+        sparse_loss(loss, colors, colors.numpy(), samples)
 
 
 def test_wrong_images_and_half_of_the_errors_are_refused(scene):

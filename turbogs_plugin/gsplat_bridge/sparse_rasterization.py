@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import weakref
 from collections.abc import Callable
 from typing import Any
@@ -75,7 +76,7 @@ def sparse_rasterization(
     Args:
         means: [N, 3]. quats: [N, 4] wxyz, any norm. scales: [N, 3] after exp. opacities: [N] after sigmoid.
         colors: [N, 3] colours, 0 or more, where `sh_degree` is None; else [N, B, 3] harmonics, band 0 first.
-        viewmats: [C, 4, 4] world to camera. Ks: [C, 3, 3].
+        viewmats: [C, 4, 4] world to camera. Ks: [C, 3, 3]. Neither gets a gradient.
         width, height: of the images, all of one size.
         samples: the pixels, of a batch of C views in the order of `viewmats`.
         sh_degree: highest degree used.
@@ -94,15 +95,20 @@ def sparse_rasterization(
         "gaussian_stats" is in it after: the pass's `GaussianStats` with their error sums, and "loss_shares", [N].
 
     Raises:
-        InputError: a wrong shape, or an option without support here.
+        InputError: a wrong shape, an option without support here, or cameras that a gradient is wanted of.
     """
     _check_options(gsplat_options)
     given = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "colors": colors}
     given |= {"viewmats": viewmats, "Ks": Ks} | ({} if backgrounds is None else {"backgrounds": backgrounds})
     _check_tensors(given)
     _check_shapes(given, sh_degree)
-    if not isinstance(samples, PixelSamples):
-        raise InputError(f"samples is a {type(samples).__name__}: expected the PixelSamples that a sampler drew")
+    for name in ("viewmats", "Ks"):
+        if given[name].requires_grad and torch.is_grad_enabled():
+            raise InputError(
+                f"{name} requires a gradient, and cameras get none from sparse_rasterization: pass {name}.detach(), or "
+                "optimise the cameras with gsplat's rasterization"
+            )
+    _check_samples(samples)
     sizes = {(int(w), int(h)) for w, h in samples.sizes}
     if sizes != {(width, height)} or len(samples.view_ids) != len(viewmats):
         raise InputError(
@@ -143,6 +149,9 @@ def gather_pixels(images: Tensor, samples: PixelSamples) -> Tensor:
     Returns:
         [P, D]; zero in empty slots. Differentiable.
     """
+    _check_samples(samples)
+    if not isinstance(images, Tensor):
+        raise InputError(f"images is a {type(images).__name__}: expected a tensor [C, H, W, D]")
     expected = [(int(height), int(width)) for width, height in samples.sizes]
     if images.dim() != 4 or [tuple(images.shape[1:3])] * len(images) != expected:
         raise InputError(f"images have shape {tuple(images.shape)}: expected [C, H, W, D] with H, W = {expected}")
@@ -154,8 +163,43 @@ def gather_pixels(images: Tensor, samples: PixelSamples) -> Tensor:
 def sparse_loss(
     loss: Callable[[Tensor, Tensor, PixelSamples], LossOutput], colors: Tensor, targets: Tensor, samples: PixelSamples
 ) -> Tensor:
-    """A `SparseLoss` as a scalar that `backward` can be called on: its own gradient is handed to autograd."""
-    return _Loss.apply(colors, loss(colors.detach(), targets.detach(), samples))
+    """A `SparseLoss` as a scalar that `backward` can be called on: its own gradient is handed to autograd.
+
+    Args:
+        loss: an instance, such as ``CharbonnierNccLoss()``.
+        colors, targets: [P, 3] float.
+
+    Raises:
+        InputError: `loss` is something else, as a loss of torch's is; or a tensor does not fit the samples.
+    """
+    _check_samples(samples)
+    for name, value in (("colors", colors), ("targets", targets)):
+        if not isinstance(value, Tensor) or not value.is_floating_point() or value.shape != (len(samples), 3):
+            found = f"{value.dtype} {tuple(value.shape)}" if isinstance(value, Tensor) else type(value).__name__
+            raise InputError(f"{name} is {found}: expected floating point {(len(samples), 3)}, as there are samples")
+    if isinstance(loss, type) or not _takes_three(loss):
+        raise _not_a_loss(loss)
+    output = loss(colors.detach(), targets.detach(), samples)
+    if not isinstance(output, LossOutput):
+        raise _not_a_loss(loss)
+    return _Loss.apply(colors, output)
+
+
+def _takes_three(loss: Any) -> bool:
+    """Whether it can be called with colours, targets and samples."""
+    try:
+        inspect.signature(loss.forward if isinstance(loss, torch.nn.Module) else loss).bind(None, None, None)
+    except (TypeError, ValueError):  # of other arguments, or none that can be told; not callable
+        return False
+    return True
+
+
+def _not_a_loss(loss: Any) -> InputError:
+    name = f"the class {loss.__name__}" if isinstance(loss, type) else getattr(loss, "__name__", type(loss).__name__)
+    return InputError(
+        f"loss is {name}: expected an instance of a loss on samples, as CharbonnierNccLoss() is, which is called with "
+        "(colors, targets, samples) and gives a LossOutput"
+    )
 
 
 class _Loss(torch.autograd.Function):
@@ -238,6 +282,11 @@ def _info(rendered: Rendered, cameras: int, width: int, height: int) -> _Info:
             "n_cameras": cameras,
         }
     )
+
+
+def _check_samples(samples: Any) -> None:
+    if not isinstance(samples, PixelSamples):
+        raise InputError(f"samples is a {type(samples).__name__}: expected the PixelSamples that a sampler drew")
 
 
 def _check_options(options: dict[str, Any]) -> None:
