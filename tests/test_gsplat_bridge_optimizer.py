@@ -22,10 +22,10 @@ ADAM = torch.optim.Adam
 LATE = {"refine_start_iter": 1000}
 
 
-def members_of(splats, optimizer):
+def members_of(splats, optimizer, eps=1e-15, betas=(0.9, 0.999)):
     shared = SharedOptimizer(optimizer)
     return {
-        name: shared([{"params": splats[name], "lr": RATES[name], "name": name}], eps=1e-15, betas=(0.9, 0.999))
+        name: shared([{"params": splats[name], "lr": RATES[name], "name": name}], eps=eps, betas=betas)
         for name in splats
     }
 
@@ -36,12 +36,13 @@ def set_gradients(splats, seed):
         splats[name].grad = torch.randn(splats[name].shape, generator=generator)
 
 
+@pytest.mark.parametrize("options", [{"eps": 1e-15, "betas": (0.9, 0.999)}, {"eps": 1e-3, "betas": (0.8, 0.95)}])
 @pytest.mark.parametrize("rule", RULES)
-def test_without_shares_of_the_loss_it_is_adam(rule):
+def test_without_shares_of_the_loss_it_is_adam(rule, options):
     ours, theirs = make_splats(), make_splats()
-    members = members_of(ours, RULES[rule]())
+    members = members_of(ours, RULES[rule](), **options)
     adams = {
-        name: torch.optim.Adam([{"params": theirs[name], "lr": RATES[name]}], eps=1e-15) for name in PARAMETER_NAMES
+        name: torch.optim.Adam([{"params": theirs[name], "lr": RATES[name]}], **options) for name in PARAMETER_NAMES
     }
     for seed in range(4):
         set_gradients(ours, seed)
@@ -277,6 +278,24 @@ def test_mistakes_are_named():
     shared([{"params": splats["means"], "lr": 1e-3, "name": "means"}])
     with pytest.raises(InputError, match="'means' already"):
         shared([{"params": splats["means"], "lr": 1e-3, "name": "means"}])
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "message"),
+    [("eps", 0.0, "eps = 0.0"), ("betas", (0.9, 1.5), "beta2 = 1.5"), ("betas", (1.0, 0.999), "beta1 = 1.0")],
+)
+@pytest.mark.parametrize("rule", RULES)
+def test_options_that_adam_cannot_use_are_refused_before_anything_moves(rule, option, value, message):
+    splats = make_splats()
+    members = members_of(splats, RULES[rule](), **{option: value})
+    set_gradients(splats, 0)
+    with pytest.raises(InputError, match=message):
+        for member in members.values():
+            member.step()
+    assert all(torch.equal(splats[name], value) for name, value in make_splats().items())
+    assert not any(member.state for member in members.values())
+    rule_used = members["means"].shared.optimizer
+    assert (rule_used.beta1, rule_used.beta2, rule_used.eps) == (RULES[rule].beta1, RULES[rule].beta2, RULES[rule].eps)
 
 
 def test_rows_removed_behind_its_back_are_refused():

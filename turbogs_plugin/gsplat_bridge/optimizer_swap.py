@@ -25,7 +25,7 @@ from turbogs_plugin.gsplat_bridge.gaussian_errors import loss_shares
 from turbogs_plugin.gsplat_bridge.host import host_gaussians
 from turbogs_plugin.rendering import ScreenGradients
 from turbogs_plugin.strategies.learning_rates import ParameterRates
-from turbogs_plugin.strategies.update_rule import COLUMNS, GaussianMoments
+from turbogs_plugin.strategies.update_rule import COLUMNS, GaussianMoments, check_moments_config
 from turbogs_plugin.types import PARAMETER_NAMES, GaussianGradients, Gaussians, Step
 
 COUNT = "step"
@@ -124,7 +124,11 @@ class SharedOptimizer:
         self._unpack(moments)
 
     def _take_options(self) -> None:
-        """Learning rates, betas and eps of the members' groups."""
+        """Learning rates, betas and eps of the members' groups.
+
+        Raises:
+            InputError: betas or eps differ between members, or are none that Adam can use.
+        """
         groups = {name: member.param_groups[0] for name, member in self.members.items()}
         for option in ("betas", "eps"):
             values = {name: group[option] for name, group in groups.items()}
@@ -133,9 +137,10 @@ class SharedOptimizer:
                     f"{option} differ between the members of one shared update: {values}; expected one value"
                 )
         rates = ParameterRates(**{name: float(group["lr"]) for name, group in groups.items()})
+        (beta1, beta2), eps = groups["means"]["betas"], groups["means"]["eps"]
+        check_moments_config(beta1, beta2, eps)
         self.optimizer.learning_rates = _FixedRates(rates)
-        self.optimizer.beta1, self.optimizer.beta2 = groups["means"]["betas"]
-        self.optimizer.eps = groups["means"]["eps"]
+        self.optimizer.beta1, self.optimizer.beta2, self.optimizer.eps = beta1, beta2, eps
 
     def _pack(self, gaussians: Gaussians) -> GaussianMoments:
         """The members' state in the form that the rule takes."""
