@@ -153,8 +153,33 @@ def test_state_is_a_copy_and_must_fit():
         ErrorMaps(SIZES[:2]).load_state_dict(state)
 
 
+def test_errors_come_without_their_graph():
+    image = torch.rand(1, 16, 16, requires_grad=True)
+    maps = ErrorMaps.from_images(image)
+    maps.initialise(0, image.reshape(-1))
+    for t in range(2):
+        maps.update(one_tile([3, 200]), torch.ones(2, requires_grad=True) * 2.0, step(t))
+    assert not maps.errors.requires_grad and not maps.view_sums.requires_grad
+    assert maps.view_means()[0] * 256 == maps.errors.double().sum()
+
+
+@pytest.mark.parametrize("shape", [(), (1,), (2, 1), (2, 3), (1, 2), (3,)])
+def test_errors_of_another_shape_change_nothing(shape):
+    maps = ErrorMaps.from_images(torch.rand(1, 16, 16))
+    before = maps.state_dict()
+    with pytest.raises(InputError, match=r"expected \(2,\)"):
+        maps.update(one_tile([3, 200]), torch.ones(shape), step(AGE_MAX + 5))
+    after = maps.state_dict()
+    assert all(torch.equal(before[name], after[name]) for name in ("errors", "stamps", "view_sums"))
+    assert after["stamp_base"] == before["stamp_base"]
+
+
 def test_wrong_shape_and_options_are_named():
-    with pytest.raises(ValueError, match=r"view 1 have shape \(7,\), expected \(200,\)"):
+    with pytest.raises(InputError, match=r"view 0 has shape \(16, 16, 3\)"):
+        ErrorMaps.from_images(torch.rand(2, 16, 16, 3))
+    with pytest.raises(InputError, match="none"):
+        ErrorMaps.from_images([])
+    with pytest.raises(InputError, match=r"view 1 have shape \(7,\), expected \(200,\)"):
         ErrorMaps(SIZES).initialise(1, torch.zeros(7))
     with pytest.raises(InputError, match="beta"):
         ErrorMaps(SIZES, beta=0.0)

@@ -23,7 +23,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from turbogs_plugin.errors import require
+from turbogs_plugin.errors import InputError, require
 from turbogs_plugin.types import PixelSamples, Step
 
 AGE_MAX = 32767
@@ -82,7 +82,15 @@ class ErrorMaps:
         Args:
             errors: [V, H, W] float, or V tensors [H, W] whose sizes may differ; the maps live on their device.
             options: further arguments of `ErrorMaps`.
+
+        Raises:
+            InputError: there is no image, or one is not [H, W].
         """
+        if len(errors) == 0:
+            raise InputError("error images: there are none, give one [H, W] for each view")
+        for view_id, image in enumerate(errors):
+            if image.dim() != 2:
+                raise InputError(f"error image of view {view_id} has shape {tuple(image.shape)}, expected [H, W]")
         sizes = np.array([(image.shape[1], image.shape[0]) for image in errors], dtype=np.int64)
         maps = cls(sizes, device=errors[0].device, **options)
         for view_id, image in enumerate(errors):
@@ -100,13 +108,20 @@ class ErrorMaps:
         return samples.flat_pixels(self.offsets)
 
     def initialise(self, view_id: int, errors: Tensor) -> None:
-        """Set the errors of one whole view. `errors`: [H * W] float; non-finite ones count as zero."""
+        """Set the errors of one whole view.
+
+        Args:
+            errors: [H * W] float, detached here; non-finite ones and those below 0 count as zero.
+
+        Raises:
+            InputError: another shape.
+        """
         width, height = self.sizes[view_id]
         if errors.shape != (width * height,):
-            raise ValueError(f"errors of view {view_id} have shape {tuple(errors.shape)}, expected ({width * height},)")
+            raise InputError(f"errors of view {view_id} have shape {tuple(errors.shape)}, expected ({width * height},)")
         self.fetch([view_id])
         start, end = self._extent(view_id)
-        errors = torch.nan_to_num(errors.float(), nan=0.0, posinf=0.0, neginf=0.0).clamp(0.0, ERROR_MAX)
+        errors = torch.nan_to_num(errors.detach().float(), nan=0.0, posinf=0.0, neginf=0.0).clamp(0.0, ERROR_MAX)
         self.errors[start:end] = errors.to(torch.float16)
         self.view_sums[view_id] = self.errors[start:end].sum(dtype=torch.float64)
         self._means.restart()
@@ -119,13 +134,21 @@ class ErrorMaps:
         both factors and every operation rounded to single precision.
 
         Args:
-            pixel_errors: [P] float, 0 or more; what stands in empty slots is ignored.
+            pixel_errors: [P] float, 0 or more, detached here; what stands in empty slots is ignored. Nobody checks the
+                sign, for that would wait for the device: negative errors are stored, and falsify means and draws.
             step: gives the stamp.
+
+        Raises:
+            InputError: another shape; nothing is changed.
         """
+        if pixel_errors.shape != (len(samples),):
+            raise InputError(
+                f"pixel errors have shape {tuple(pixel_errors.shape)}, expected ({len(samples)},): one for each sample"
+            )
         self.fetch(samples.view_ids)
         self._rebase(step.iteration)
         views = samples.view_of_slot()
-        errors = pixel_errors.float()
+        errors = pixel_errors.detach().float()
         starts = torch.as_tensor(self.offsets[list(samples.view_ids)], device=errors.device)
         changed = samples.filled & torch.isfinite(errors)
         flat = torch.where(changed, starts[views] + samples.pixel_ids, len(self.errors))
