@@ -6,14 +6,17 @@ import torch
 from gsplat.cuda._torch_impl import _spherical_harmonics
 from rendering_scenes import loop_render, make_cameras, make_gaussians, thin_out
 
+from turbogs_plugin.errors import InputError
 from turbogs_plugin.rendering import (
     RasterSettings,
     compositing,
     dense_samples,
+    projection,
     rasterize,
     rasterize_differentiable,
     render_images,
 )
+from turbogs_plugin.rendering.rendered import ALPHA_MIN_LOWEST
 from turbogs_plugin.types import PARAMETER_NAMES, Gaussians, GaussianStats, PixelSamples, cell_order
 
 SIZES = [(37, 29), (20, 50)]
@@ -305,6 +308,35 @@ def test_settings_are_used():
     expected = loop_render(gaussians, cameras, samples, colors, np.zeros(len(samples)), settings)
     rendered = rasterize(gaussians, cameras, samples, settings=settings)
     np.testing.assert_allclose(rendered.colors, expected.colors, atol=1e-13)
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"eps2d": -0.1},
+        {"eps2d": np.inf},
+        {"near_plane": 0.0},
+        {"near_plane": np.nan},
+        {"near_plane": 2.0, "far_plane": 2.0},
+        {"far_plane": np.nan},
+        {"alpha_min": 0.0039},
+        {"alpha_min": 0.5, "alpha_max": 0.5},
+        {"alpha_max": 1.0},
+        {"transmittance_min": 0.0},
+        {"transmittance_min": 1.0},
+    ],
+    ids=str,
+)
+def test_settings_out_of_bounds_are_refused(values):
+    with pytest.raises(InputError, match=f"{list(values)[-1]} = "):
+        RasterSettings(**values)
+
+
+def test_settings_of_gsplat_are_taken():
+    """Its defaults, and bounds that are allowed themselves."""
+    RasterSettings(eps2d=0.3, near_plane=0.01, far_plane=1e10, alpha_min=1 / 255, alpha_max=0.99)
+    RasterSettings(eps2d=0.0, far_plane=np.inf, alpha_min=ALPHA_MIN_LOWEST)
+    assert pytest.approx(projection.EXTENT_MAX) == (-2 * np.log(ALPHA_MIN_LOWEST)) ** 0.5
 
 
 def test_dense_samples_are_every_pixel_in_cell_order():

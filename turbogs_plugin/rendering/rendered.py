@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Protocol
 
 from torch import Tensor
 
+from turbogs_plugin.errors import require
 from turbogs_plugin.types import GaussianGradients, GaussianStats
 
 
@@ -83,16 +85,26 @@ class Rendered(Protocol):
         ...
 
 
+ALPHA_MIN_LOWEST = math.exp(-(3.33**2) / 2)
+"""The most opacity that a splat has 3.33 standard deviations from its mean, where the reference and gsplat cut it."""
+
+
 @dataclass(frozen=True)
 class RasterSettings:
     """The constants of gsplat's `rasterization`; a model trained with them is a normal gsplat model.
 
     Args:
-        eps2d: added to the diagonal of the projected covariance, pixels squared.
-        near_plane, far_plane: depths outside are not drawn, world units.
-        alpha_min: a splat with less opacity at a pixel is skipped there.
-        alpha_max: opacity at a pixel is cut here (and has no gradient beyond).
-        transmittance_min: a pixel ends before the splat that would bring its transmittance to this or below.
+        eps2d: added to the diagonal of the projected covariance, pixels squared; 0 or more.
+        near_plane, far_plane: depths outside are not drawn, world units; 0 < near_plane < far_plane.
+        alpha_min: a splat with less opacity at a pixel is skipped there. At least exp(-3.33^2 / 2), about 0.00391:
+            below that the reference, which cuts splats at 3.33 standard deviations, and the CUDA kernels, which reach
+            as far as alpha_min asks, would differ.
+        alpha_max: opacity at a pixel is cut here (and has no gradient beyond); between alpha_min and 1.
+        transmittance_min: a pixel ends before the splat that would bring its transmittance to this or below; between 0
+            and 1.
+
+    Raises:
+        InputError: a value outside these bounds.
     """
 
     eps2d: float = 0.3
@@ -101,6 +113,17 @@ class RasterSettings:
     alpha_min: float = 1.0 / 255.0
     alpha_max: float = 0.999
     transmittance_min: float = 1e-4
+
+    def __post_init__(self) -> None:
+        require(0 <= self.eps2d < math.inf, "eps2d", self.eps2d, "finite and at least 0")
+        require(self.near_plane > 0, "near_plane", self.near_plane, "above 0")
+        beyond = f"above near_plane = {self.near_plane!r}"
+        require(self.far_plane > self.near_plane, "far_plane", self.far_plane, beyond)
+        lowest = f"at least exp(-3.33^2 / 2) = {ALPHA_MIN_LOWEST:.7f} and below 1"
+        require(ALPHA_MIN_LOWEST <= self.alpha_min < 1, "alpha_min", self.alpha_min, lowest)
+        between = f"above alpha_min = {self.alpha_min!r} and below 1"
+        require(self.alpha_min < self.alpha_max < 1, "alpha_max", self.alpha_max, between)
+        require(0 < self.transmittance_min < 1, "transmittance_min", self.transmittance_min, "between 0 and 1")
 
 
 DEFAULT_SETTINGS = RasterSettings()
