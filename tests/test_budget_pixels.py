@@ -167,7 +167,7 @@ def test_a_configuration_for_its_time(scene, monkeypatch, seconds, overrides, pi
 
 def test_pixels_and_gaussians_share_the_memory(scene, monkeypatch):
     """A generous time raises lambda as far as the expected Gaussians leave room, and the cap is that of this lambda."""
-    monkeypatch.setattr(calibration, "_hold_to", lambda limit, device: None)
+    monkeypatch.setattr(calibration, "hold_to", lambda limit, device: None)
     config, _ = planned(scene, monkeypatch)
     demand = calibration._memory_demand(config, scene)
     expected = int(EXPECTED_GROWTH * SyntheticTrial.gaussians)

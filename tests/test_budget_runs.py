@@ -12,7 +12,7 @@ from framework_runs import tiny_capture, tiny_config
 from turbogs_plugin import pacing, run
 from turbogs_plugin.budget import IterationCost
 from turbogs_plugin.checkpoint import latest_checkpoint, load_checkpoint
-from turbogs_plugin.config import TrainConfig
+from turbogs_plugin.config import TrainConfig, resolve
 from turbogs_plugin.errors import InputError, TrainingStopped
 from turbogs_plugin.report.history import read_history
 from turbogs_plugin.scene import load_scene, write_demo_capture
@@ -128,6 +128,73 @@ def test_a_scene_that_does_not_fit_is_refused(capture, tmp_path, monkeypatch):
     with pytest.raises(InputError, match="'capture' does not fit into the device's memory"):
         run.train(tiny_config(capture), tmp_path / "run")
     assert not (tmp_path / "run").exists()
+
+
+@pytest.fixture
+def stopped(capture, tmp_path, monkeypatch) -> Path:
+    """The folder of a run with a checkpoint of its fifth iteration."""
+    with monkeypatch.context() as context:
+        step = Trainer.step
+
+        def stopping(trainer):
+            step(trainer)
+            if trainer.iteration == 5:
+                os.kill(os.getpid(), signal.SIGINT)
+
+        context.setattr(Trainer, "step", stopping)
+        run.train(tiny_config(capture), tmp_path / "run")
+    return tmp_path / "run"
+
+
+def change_config(folder: Path, **sections: dict) -> None:
+    """Of a run."""
+    config = run.RunFolder(folder).read_config()
+    mapping = config.to_mapping()
+    for name, fields in sections.items():
+        mapping[name] |= fields
+    (folder / "config.yaml").write_text(resolve(mapping).to_yaml())
+
+
+@pytest.mark.parametrize("place", [(Trainer, "__init__"), (Trainer, "load_state_dict"), (run, "place_views")])
+def test_a_run_that_no_longer_fits_is_not_resumed(stopped, monkeypatch, place):
+    def full(*arguments):
+        raise torch.cuda.OutOfMemoryError("CUDA out of memory")
+
+    monkeypatch.setattr(*place, full)
+    with pytest.raises(InputError, match="'capture' does not fit into the device's memory: end what else"):
+        run.resume(stopped)
+
+
+def test_test_photos_that_do_not_fit_are_refused(capture, tmp_path, monkeypatch):
+    def full(*arguments):
+        raise torch.cuda.OutOfMemoryError("CUDA out of memory")
+
+    monkeypatch.setattr(run, "place_views", full)
+    with pytest.raises(InputError, match=r"'capture' does not fit into the device's memory: use plan.photos_on=host"):
+        run.train(tiny_config(capture), tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_resumed_run_is_held_to_its_memory(stopped, monkeypatch):
+    """Before anything of it is on the device."""
+    change_config(stopped, budget={"max_memory": "2GiB"})
+    held = []
+    build = Trainer.__init__
+
+    def building(trainer, *arguments):
+        assert held == [(2**31, torch.device("cpu"))]
+        build(trainer, *arguments)
+
+    monkeypatch.setattr(run, "hold_to", lambda *arguments: held.append(arguments))
+    monkeypatch.setattr(Trainer, "__init__", building)
+    assert run.resume(stopped).signal is None
+
+
+def test_a_run_of_a_gpu_is_not_told_to_resume_on_a_cpu(turbogs, stopped, monkeypatch):
+    change_config(stopped, train={"device": "cuda"})
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    code, _, error = turbogs("train", "--resume", stopped)
+    assert code == 2 and "go on with this run where there is a GPU" in error and "--device" not in error
 
 
 def test_memory_that_is_spent_names_what_may_fit(capture, tmp_path, monkeypatch):

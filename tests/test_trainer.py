@@ -236,6 +236,25 @@ def test_the_disk_fills_up(capture, tmp_path, monkeypatch):
     assert saved(tmp_path / "run")["iteration"] == 5
 
 
+def test_weights_of_lpips_are_found_from_another_folder(capture, tmp_path, monkeypatch):
+    """And where they are gone, that is said before anything is trained."""
+    (tmp_path / "here").mkdir()
+    (tmp_path / "here" / "w.pth").touch()
+    monkeypatch.setattr("turbogs_plugin.evaluation._load_lpips", lambda file, device: None)
+    with monkeypatch.context() as context:
+        context.chdir(tmp_path / "here")
+        stop_after(context, 5, lambda trainer: os.kill(os.getpid(), signal.SIGINT))
+        run.train(tiny_config(capture, "report.lpips_weights=w.pth"), tmp_path / "run")
+    monkeypatch.chdir(tmp_path)
+    with monkeypatch.context() as context:
+        stop_after(context, 6, lambda trainer: os.kill(os.getpid(), signal.SIGINT))
+        assert run.resume(tmp_path / "run").signal == signal.SIGINT
+    (tmp_path / "here" / "w.pth").unlink()
+    with pytest.raises(InputError, match=r"lpips_weights: no such file '.*here/w\.pth'"):
+        run.resume(tmp_path / "run")
+    assert saved(tmp_path / "run")["iteration"] == 6
+
+
 def test_a_checkpoint_of_another_capture_is_refused(capture, whole, tmp_path):
     other = tiny_capture(tmp_path)
     (tmp_path / "run").mkdir()

@@ -81,7 +81,7 @@ def within_budget(config: Config, scene: Scene, device: torch.device) -> tuple[C
         config = with_cap(config, config.budget.max_gaussians)
     limit, seconds = config.budget.memory_bytes(), config.budget.seconds()
     if limit is not None:
-        _hold_to(limit, device)
+        hold_to(limit, device)
         config = with_cap(config, _memory_demand(config, scene).gaussians(limit))
     if seconds is None:
         return config, None
@@ -118,8 +118,12 @@ def budget_text(config: Config, measured: Calibration | None) -> str:
     return f"budget: {'; '.join(parts)}" if parts else ""
 
 
-def _hold_to(limit: int, device: torch.device) -> None:
-    """Hold torch to a limit of device memory."""
+def hold_to(limit: int, device: torch.device) -> None:
+    """Hold torch to a limit of device memory, for the rest of the process.
+
+    Raises:
+        InputError: the device is no GPU.
+    """
     if device.type != "cuda":
         raise InputError("--max-memory limits the memory of a GPU: leave it out with --device cpu")
     total = torch.cuda.get_device_properties(device).total_memory

@@ -6,6 +6,8 @@ import operator
 import os
 import signal
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import FrameType, TracebackType
@@ -13,7 +15,7 @@ from typing import Any
 
 import torch
 
-from turbogs_plugin.calibration import budget_text, within_budget
+from turbogs_plugin.calibration import budget_text, hold_to, within_budget
 from turbogs_plugin.capture_state import capture_difference, capture_state, frame_of_state
 from turbogs_plugin.checkpoint import latest_checkpoint, load_checkpoint, require_like, save_checkpoint
 from turbogs_plugin.clock import TrainingClock
@@ -120,11 +122,11 @@ class SavedModel:
         return self.config.train.sh_degree_at(self.iteration)
 
 
-def resolve_device(name: str) -> torch.device:
+def resolve_device(name: str, remedy: str = "use --device cpu, or see 'turbogs doctor'") -> torch.device:
     """The device of ``auto``, ``cpu`` or ``cuda``. Raises `InputError` where CUDA is asked for and absent."""
     if name == "cuda" and not torch.cuda.is_available():
         build = "this PyTorch is built without CUDA" if torch.version.cuda is None else "no GPU answers"
-        raise InputError(f"CUDA was asked for and is absent ({build}): use --device cpu, or see 'turbogs doctor'")
+        raise InputError(f"CUDA was asked for and is absent ({build}): {remedy}")
     return torch.device("cuda" if name != "cpu" and torch.cuda.is_available() else "cpu")
 
 
@@ -156,18 +158,13 @@ def train(config: Config, out: Path) -> Outcome:
     scene = load_scene(config.scene.path, config.scene.factor, config.scene.test_every)
     load_lpips(config.report.lpips_weights, device)
     plan = _plan(config, scene, device)
-    try:
+    remedy = "use plan.photos_on=host and plan.maps_on=host, --max-gaussians or a larger --factor"
+    with _fitting(scene, remedy):
         config, calibration = within_budget(plan.apply(config), scene, device)
         trainer = Trainer(config, scene, device)
-    except torch.cuda.OutOfMemoryError:
-        raise InputError(
-            f"'{scene.name}' does not fit into the device's memory: use plan.photos_on=host and plan.maps_on=host, "
-            "--max-gaussians or a larger --factor"
-        ) from None
-    config.scene.path = str(Path(config.scene.path).resolve())
-    config.train.device = device.type
-    pace = pace_of(config, calibration and calibration.cost)
-    session = _Session(folder, config, plan, scene, trainer, pace)
+        _make_independent(config, device)
+        pace = pace_of(config, calibration and calibration.cost)
+        session = _Session(folder, config, plan, scene, trainer, pace)
     session.clock.seconds = calibration.seconds if calibration else 0.0
     print("\n".join(filter(None, [plan.text(), budget_text(config, calibration)])), file=sys.stderr)
     folder.path.mkdir(parents=True, exist_ok=True)
@@ -182,20 +179,43 @@ def resume(path: Path) -> Outcome:
     On a CPU, the result is bit for bit that of a run never stopped.
 
     Raises:
-        InputError: no run there, an unusable checkpoint, or a capture that is no longer what it was.
+        InputError: no run there, an unusable checkpoint, a capture that is no longer what it was, or a machine that
+            does not have what the run needs; then nothing was changed.
         TrainingStopped: the run cannot go on.
     """
     folder = RunFolder(path)
     config, plan = folder.read_config(), folder.read_plan()
     checkpoint = latest_checkpoint(folder.checkpoints)
     state = None if checkpoint is None else load_checkpoint(checkpoint)
-    device = resolve_device(config.train.device)
+    device = resolve_device(config.train.device, "go on with this run where there is a GPU, or see 'turbogs doctor'")
     scene = load_scene(config.scene.path, config.scene.factor, config.scene.test_every)
-    session = _Session(folder, config, plan, scene, Trainer(config, scene, device), pace_of(config))
-    if state is not None:
-        session.load_state_dict(state, str(checkpoint))
+    load_lpips(config.report.lpips_weights, device)
+    limit = config.budget.memory_bytes()
+    if limit is not None:
+        hold_to(limit, device)
+    with _fitting(scene, "end what else is in that memory, or go on with this run where there is more"):
+        session = _Session(folder, config, plan, scene, Trainer(config, scene, device), pace_of(config))
+        if state is not None:
+            session.load_state_dict(state, str(checkpoint))
     session.history = rewind_history(folder.history, session.trainer.iteration if state is not None else -1)
     return session.run()
+
+
+@contextmanager
+def _fitting(scene: Scene, remedy: str) -> Iterator[None]:
+    """Around what takes memory of the device before training; where there is too little, the user hears of a remedy."""
+    try:
+        yield
+    except torch.cuda.OutOfMemoryError:
+        raise InputError(f"'{scene.name}' does not fit into the device's memory: {remedy}") from None
+
+
+def _make_independent(config: Config, device: torch.device) -> None:
+    """Write into a run's configuration what else would depend on where it is resumed from."""
+    config.scene.path = str(Path(config.scene.path).resolve())
+    if config.report.lpips_weights is not None:
+        config.report.lpips_weights = str(Path(config.report.lpips_weights).resolve())
+    config.train.device = device.type
 
 
 def load_model(path: Path, device: torch.device) -> SavedModel:
@@ -318,6 +338,8 @@ class _Session:
                 self.trainer.load_state_dict(state["trainer"])
                 self.clock.seconds = state["train_seconds"]
                 self.resumed = True
+        except torch.cuda.OutOfMemoryError:  # a RuntimeError, which says nothing of the checkpoint
+            raise
         except (KeyError, TypeError, AttributeError, IndexError, ArithmeticError, RuntimeError, ValueError) as error:
             raise InputError(f"checkpoint '{source}' does not fit this run and its capture: {error}") from None
         if difference:
