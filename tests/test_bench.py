@@ -277,6 +277,8 @@ def test_another_build_measures_in_a_process_of_its_own(monkeypatch, tmp_path):
     [
         (["step"], "--scene"),
         (["step", "--scene", "absent"], "no such scene"),
+        (["step", "--photos", "1"], "--photos 1: at least 3"),
+        (["step", "--photos", "2"], "--photos 2: at least 3"),
         (["step", "--scene", "CAPTURE", "loss.nonsense=1"], "nonsense"),
         (["raster", "loss.type=charbonnier"], "section.key"),
         (["raster", "--views", "0"], "--views"),

@@ -19,6 +19,7 @@ from turbogs_plugin.errors import InputError
 from turbogs_plugin.files import write_text_atomically
 from turbogs_plugin.provenance import provenance
 from turbogs_plugin.scene import load_scene
+from turbogs_plugin.scene.load import FEWEST_VIEWS
 
 
 @dataclass(frozen=True)
@@ -34,6 +35,8 @@ def run_step(
 ) -> int:
     if (scene is None) == (synthetic.photos == 0):
         raise InputError("bench step needs cameras and photos: --scene SCENE, or --photos N for synthetic ones")
+    if scene is None and synthetic.photos < FEWEST_VIEWS:
+        raise InputError(f"--photos {synthetic.photos}: at least {FEWEST_VIEWS} are needed, as of any capture")
     _require_new(out)
     if scene is None:
         capture = synthetic_scene(synthetic.photos, *synthetic.size, device)
