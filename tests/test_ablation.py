@@ -17,7 +17,8 @@ from hypothesis import strategies as st
 
 from turbogs_plugin import provenance as provenance_module
 from turbogs_plugin.ablation.cell import capture_digest, train_cell
-from turbogs_plugin.ablation.grid import Ablation, ablation_names, load_ablation, variant_config
+from turbogs_plugin.ablation.compare import study_of_runs
+from turbogs_plugin.ablation.grid import Ablation, ablation_names, alike_at, load_ablation, variant_config
 from turbogs_plugin.ablation.results import CellResult, Study, StudyFolder
 from turbogs_plugin.ablation.statistics import Curve, Spread, differ, pareto_front, seconds_to_reach
 from turbogs_plugin.ablation.summary import summarise
@@ -25,7 +26,7 @@ from turbogs_plugin.config import PLANNED_SETTINGS, load_config
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.lengths import with_iterations
 from turbogs_plugin.provenance import provenance
-from turbogs_plugin.report.history import Evaluation
+from turbogs_plugin.report.history import Evaluation, append_evaluation
 from turbogs_plugin.scene import load_scene, write_demo_capture
 from turbogs_plugin.trainer import Trainer
 
@@ -133,6 +134,17 @@ def test_a_variant_that_does_not_resolve_is_named():
     ablation = Ablation("x", {"good": [], "bad": ["loss.nonsense=1"]})
     with pytest.raises(InputError, match=r"variant 'bad'.*nonsense"):
         variant_config(ablation, "bad", 0, (), None)
+
+
+def test_a_common_length_leaves_out_what_it_makes_a_copy():
+    ablation = load_ablation("leave_out")
+    alike = {"looks-50": "nothing", "looks-75": "nothing"}
+    assert alike_at(ablation, list(ablation.variants), (), 1000) == alike
+    assert alike_at(ablation, ["nothing", "plan", "looks-75"], (), 1000) == {"looks-75": "nothing"}
+    for name in set(ablation_names()) - {"leave_out"}:
+        assert alike_at(load_ablation(name), list(load_ablation(name).variants), (), 1000) == {}
+    same = Ablation("x", {"long": ["train.iterations=5000"], "a": [], "b": [], "last": ["plan.looks=5"]}, baseline="a")
+    assert alike_at(same, list(same.variants), ("plan.iterations=auto",), 1000) == {"last": "a"}
 
 
 # Statistics
@@ -325,6 +337,16 @@ def test_variants_of_one_study_may_be_trained_by_several_calls(turbogs, capture,
     assert turbogs("ablate", "--merge", out, "--out", tmp_path / "merged")[0] == 0
 
 
+def test_a_variant_that_steps_make_a_copy_is_left_out_and_said(turbogs, capture, tmp_path):
+    looks, out = tmp_path / "looks.yaml", tmp_path / "study"
+    looks.write_text(
+        "title: Looks\nvariants: {nothing: [plan.iterations=keep], few: [plan.iterations=auto, plan.looks=5]}"
+    )
+    code, _, err = turbogs(*call(looks, capture, out))
+    assert code == 0 and "left out" in err and "few (as nothing)" in err and "[1/1]" in err
+    assert [result.variant for result in StudyFolder(out).read_study().results] == ["nothing"]
+
+
 def test_a_study_of_another_ablation_is_refused_before_training(turbogs, small, capture, tmp_path, monkeypatch):
     out, other = tmp_path / "study", tmp_path / "other.yaml"
     assert turbogs(*call(small, capture, out, "--only", "full"))[0] == 0
@@ -467,6 +489,39 @@ def test_runs_are_compared(turbogs, capture, tmp_path):
     shutil.copytree(tmp_path / "a", tmp_path / "again")
     code, _, err = turbogs("compare", *paths, tmp_path / "again", "--out", tmp_path / "other")
     assert code == 2 and "same run" in err
+
+
+def test_runs_of_one_time_budget_are_seeds_however_long_they_came_out(tmp_path):
+    def run(name: str, seed: int, time: str, iterations: int, pixel_budget: float, *overrides: str) -> Path:
+        settings = [f"train.seed={seed}", f"budget.time={time}", f"schedule.pixel_budget={pixel_budget}", *overrides]
+        folder = tmp_path / name
+        folder.mkdir()
+        (folder / "config.yaml").write_text(with_iterations(load_config("turbogs", settings), iterations).to_yaml())
+        append_evaluation(folder / "history.jsonl", entry(iterations, 20.0, 30.0))
+        return folder
+
+    runs = [
+        run("a", 0, "20s", 2600, 1.0),
+        run("b", 1, "20s", 2471, 1.5),
+        run("longer", 0, "30s", 2600, 1.0),
+        run("other", 0, "20s", 2600, 1.0, "density.prune_opacity=0.02"),
+        run("free", 0, "''", 2600, 1.0),
+        run("free-2", 1, "''", 2471, 1.0),
+    ]
+    study = study_of_runs(runs)
+    assert {name: len(study.of("", name)) for name in study.ablation.variants} == {
+        "a": 2, "longer": 1, "other": 1, "free": 1, "free-2": 1,
+    }  # fmt: skip
+    assert study.ablation.variants["longer"] == ["budget.time=30s"]
+
+
+def test_the_bar_of_a_cell_has_the_planned_length(tmp_path):
+    scene = load_scene(tiny_capture(tmp_path))
+    config = load_config("turbogs", [*TINY, "plan.iterations=6"])
+    told = []
+    advance = lambda iteration, total: told.append((iteration, total))  # noqa: E731
+    train_cell("short", config, scene, torch.device("cpu"), provenance("cpu"), progress=advance)
+    assert told == [(iteration, 6) for iteration in range(1, 7)] and config.train.iterations == 14
 
 
 @pytest.mark.parametrize(

@@ -55,7 +55,7 @@ def train_cell(
     device: torch.device,
     made_by: Provenance,
     time_budget: float = 0.0,
-    progress: Callable[[int], None] = lambda iteration: None,
+    progress: Callable[[int, int], None] = lambda iteration, total: None,
 ) -> CellResult:
     """Train one variant.
 
@@ -66,7 +66,7 @@ def train_cell(
         device: where to train.
         made_by: machine and sources, as they were when the process began.
         time_budget: seconds of training after which to stop; 0: none.
-        progress: is told the number of finished iterations.
+        progress: is told the number of finished iterations, and of all by the plan.
 
     Raises:
         TrainingStopped: the model is lost.
@@ -103,7 +103,7 @@ def train_cell(
                 in_time = not time_budget or clock.now() < time_budget
                 if not in_time:
                     trainer.repeat_lost(wait=True)
-                progress(trainer.iteration)
+                progress(trainer.iteration, total)
         metrics = measure(final=trainer.iteration == total or not in_time)
     return CellResult(
         scene=scene.name,

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 
 from turbogs_plugin.ablation.compare import study_of_runs
-from turbogs_plugin.ablation.grid import Ablation, load_ablation
+from turbogs_plugin.ablation.grid import Ablation, alike_at, load_ablation
 from turbogs_plugin.ablation.pages import write_study
 from turbogs_plugin.ablation.results import StudyFolder, merge_studies
 from turbogs_plugin.ablation.sweep import SweepOptions, run_sweep
@@ -30,10 +31,23 @@ def ablate(
         raise InputError(f"ablations of one name would share a folder: {', '.join(names)}")
     folders = [StudyFolder(out if len(names) == 1 else out / name) for name in ablations]
     here = provenance(resolve_device(options.device).type)
+    chosen = [_variants(ablation, only, options) for ablation in ablations.values()]
     code = 0
-    for number, (ablation, folder) in enumerate(zip(ablations.values(), folders, strict=True)):
-        code = max(code, _study(ablation, ablation.only(only), options, here, folder, folders[:number], targets))
+    for number, (ablation, variants, folder) in enumerate(zip(ablations.values(), chosen, folders, strict=True)):
+        code = max(code, _study(ablation, variants, options, here, folder, folders[:number], targets))
     return code
+
+
+def _variants(ablation: Ablation, only: Sequence[str], options: SweepOptions) -> list[str]:
+    """The variants to train. What `--steps` makes a copy of another one is left out, and said."""
+    variants = ablation.only(only)
+    if options.steps is None:
+        return variants
+    alike = alike_at(ablation, variants, options.overrides, options.steps)
+    if alike:
+        named = ", ".join(f"{variant} (as {known})" for variant, known in alike.items())
+        print(f"left out, for with --steps {options.steps} nothing tells them apart: {named}", file=sys.stderr)
+    return [variant for variant in variants if variant not in alike]
 
 
 def _study(

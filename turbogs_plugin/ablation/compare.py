@@ -10,8 +10,16 @@ from typing import Any
 from turbogs_plugin.ablation.grid import Ablation
 from turbogs_plugin.ablation.results import CellResult, Study
 from turbogs_plugin.errors import InputError
+from turbogs_plugin.lengths import ITERATION_FIELDS
 from turbogs_plugin.report.history import read_history
 from turbogs_plugin.run import RunFolder
+
+FITTED = {
+    "train": ("iterations", *ITERATION_FIELDS["train"]),
+    "density": ITERATION_FIELDS["density"],
+    "schedule": ("pixel_budget",),
+}
+"""Section -> settings that calibration chooses where there is a time budget."""
 
 
 def study_of_runs(paths: Sequence[Path]) -> Study:
@@ -51,10 +59,17 @@ def study_of_runs(paths: Sequence[Path]) -> Study:
 
 
 def _without(mapping: dict[str, Any]) -> dict[str, Any]:
-    """What makes two runs seeds of one variant: all but the seed, the place, and what is only reported or kept."""
+    """What makes two runs seeds of one variant: all but the seed, the place, and what is only reported or kept.
+
+    A time budget fits the length and the pixels of an iteration to the machine, to each seed its own: not that either.
+    """
     sections = {name: dict(section) for name, section in mapping.items() if name != "report"}
     for section, key in (("train", "seed"), ("train", "checkpoint_every"), ("train", "evaluate_at"), ("scene", "path")):
         sections[section].pop(key)
+    if sections["budget"]["time"]:
+        for section, keys in FITTED.items():
+            for key in keys:
+                sections[section].pop(key, None)
     return sections
 
 

@@ -12,6 +12,7 @@ A YAML in ``configs/ablations/``::
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -108,6 +109,31 @@ def load_ablation(name_or_file: str) -> Ablation:
             f"unknown ablation '{name_or_file}': {nearest(name_or_file, ablation_names())}, or a .yaml file"
         )
     return build_dataclass(Ablation, mapping, f"ablation '{name_or_file}'")
+
+
+def alike_at(ablation: Ablation, variants: Sequence[str], overrides: Sequence[str], steps: int) -> dict[str, str]:
+    """Of these variants, those that a common length leaves without a difference -> the one that they would repeat.
+
+    A length that is asked for is not the plan's to change, so that a variant about `plan.looks` would be another one
+    under its own name. Which variants are the same at their own lengths as well is the ablation's affair.
+
+    Raises:
+        InputError: naming the variant, whatever is wrong with its configuration.
+    """
+
+    def text(variant: str, length: int | None) -> str:
+        mapping = variant_config(ablation, variant, 0, overrides, length).to_mapping()
+        if mapping["plan"]["iterations"] == "keep":
+            del mapping["plan"]["looks"]
+        return json.dumps(mapping, sort_keys=True)
+
+    alike: dict[str, str] = {}
+    first: dict[str, str] = {}
+    for variant in sorted(variants, key=lambda name: name != ablation.baseline):
+        known = first.setdefault(text(variant, steps), variant)
+        if known != variant and text(known, None) != text(variant, None):
+            alike[variant] = known
+    return alike
 
 
 def variant_config(ablation: Ablation, variant: str, seed: int, overrides: Sequence[str], steps: int | None) -> Config:

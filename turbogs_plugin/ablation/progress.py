@@ -45,17 +45,17 @@ class SweepProgress:
         if self._bar is not None:
             self._bar.stop()
 
-    def begin(self, key: CellKey, iterations: int) -> None:
+    def begin(self, key: CellKey) -> None:
         """Called before a cell."""
         if self._bar is not None:
-            self._bar.reset(self._task, total=iterations, description=str(key), left=self._left())
+            self._bar.reset(self._task, total=None, description=str(key), left=self._left())
 
-    def advance(self, iteration: int) -> None:
+    def advance(self, iteration: int, total: int) -> None:
         """Called after every iteration; cheap."""
         if self._bar is None or time.perf_counter() < self._next_refresh:
             return
         self._next_refresh = time.perf_counter() + REFRESH_SECONDS
-        self._bar.update(self._task, completed=iteration)
+        self._bar.update(self._task, completed=iteration, total=total)
         self._bar.refresh()
 
     def finished(self, result: CellResult) -> None:

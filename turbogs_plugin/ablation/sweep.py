@@ -147,7 +147,7 @@ def _train_scene(
     progress: SweepProgress,
 ) -> None:
     for key, config in cells:
-        progress.begin(key, config.train.iterations)
+        progress.begin(key)
         try:
             result = train_cell(key.variant, config, scene, device, here, time_budget, progress.advance)
         except Exception as error:  # whatever a variant breaks by, the other cells go on
