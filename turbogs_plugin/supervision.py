@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from turbogs_plugin import kernels, training_kernels
@@ -33,7 +34,8 @@ def supervise(
         truth: the photos at the samples, on the device of `colors`.
         maps: updated in place.
         step: gives the stamp.
-        overflow: [1] int32 on the device; where it is not 0, the maps stay as they are.
+        overflow: [1] int32 on the device; where it is not 0, nothing was drawn: the maps stay as they are, and the loss
+            does not count as lost. It is never read on the host.
         nonfinite_losses: [] int64 on the device; 1 is added if the loss is not finite.
     """
     kernel_terms = getattr(loss, "kernel_terms", None)
@@ -50,7 +52,12 @@ def supervise(
             nonfinite_losses=nonfinite_losses,
         )
     output = loss(colors, truth.colors(), truth.samples)
-    maps.update(truth.samples, output.pixel_errors, step)
+    pixel_errors, nonfinite = output.pixel_errors, ~output.loss.isfinite()
+    if overflow is not None:
+        lost = overflow != 0
+        pixel_errors = torch.where(lost, torch.nan, pixel_errors)  # of which the maps learn nothing
+        nonfinite &= ~lost[0]
+    maps.update(truth.samples, pixel_errors, step)
     if nonfinite_losses is not None:
-        nonfinite_losses += ~output.loss.isfinite()
+        nonfinite_losses += nonfinite
     return output
