@@ -35,7 +35,8 @@ Together, ``p = 1 - (1 - p_hard) (1 - p_stable) (1 - p_mixed)``, and 1 where all
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+import operator
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -52,7 +53,7 @@ from turbogs_plugin.strategies.philox import (
 
 from turbogs_plugin import kernels, training_kernels
 from turbogs_plugin.error_maps import AGE_MAX, ErrorMaps
-from turbogs_plugin.errors import require
+from turbogs_plugin.errors import InputError, require
 from turbogs_plugin.tiles import TILE_PIXELS, compact, dense_pixels, pixel_table, tile_extents
 from turbogs_plugin.types import CELL_HEIGHT, CELL_WIDTH, TILE_SIZE, PixelSamples, Step, TileGrid
 
@@ -309,8 +310,35 @@ def _pixels_of(cells: Tensor) -> Tensor:
     return wide.expand(-1, -1, CELL_HEIGHT, -1, CELL_SIDE).reshape(-1, TILE_PIXELS)
 
 
-def _sample(rule: DrawRule, maps: ErrorMaps, view_ids: tuple[int, ...], rate: float, step: Step) -> PixelSamples:
+ViewIds = Sequence[int] | int | np.ndarray | Tensor
+"""Views as a sampler takes them; see `view_numbers`."""
+
+
+def view_numbers(view_ids: ViewIds, maps: ErrorMaps) -> tuple[int, ...]:
+    """The views of a batch as plain numbers on the host.
+
+    Args:
+        view_ids: K training views; a single one may be given as its number. For those of a tensor on another device
+            the host waits, once; whoever has them on the host gives them from there.
+
+    Raises:
+        InputError: not whole numbers, none, or one that the maps do not have.
+    """
+    plain = view_ids.tolist() if isinstance(view_ids, (Tensor, np.ndarray)) else view_ids
+    try:
+        numbers = tuple(operator.index(view) for view in (plain if isinstance(plain, Iterable) else (plain,)))
+    except TypeError:
+        numbers = ()
+    if not numbers or min(numbers) < 0 or max(numbers) >= len(maps.sizes):
+        raise InputError(
+            f"view_ids = {plain!r} is not valid: give whole numbers of views from 0 to {len(maps.sizes) - 1}"
+        )
+    return numbers
+
+
+def _sample(rule: DrawRule, maps: ErrorMaps, view_ids: ViewIds, rate: float, step: Step) -> PixelSamples:
     require(rate > 0, "rate", rate, "above 0")
+    view_ids = view_numbers(view_ids, maps)
     maps.fetch(view_ids)
     views = np.asarray(view_ids, dtype=np.int64)
     draw = training_kernels.sample_pixels if maps.errors.is_cuda and kernels.available() else draw_pixels
@@ -320,7 +348,7 @@ def _sample(rule: DrawRule, maps: ErrorMaps, view_ids: tuple[int, ...], rate: fl
         step.iteration - maps.stamp_base,
         maps.offsets[views],
         maps.sizes[views],
-        tuple(view_ids),
+        view_ids,
         rate,
         rule,
         step.seed,
@@ -354,8 +382,8 @@ class ErrorGuidedPixelSampler:
         require(self.unit in UNITS, "unit", self.unit, f"one of {', '.join(UNITS)}")
         require(0 <= self.importance <= 1, "importance", self.importance, "between 0 and 1")
 
-    def sample(self, maps: ErrorMaps, view_ids: tuple[int, ...], rate: float, step: Step) -> PixelSamples:
-        """Draw the fraction `rate` (r) of the units of each tile, or of the tiles of each view."""
+    def sample(self, maps: ErrorMaps, view_ids: ViewIds, rate: float, step: Step) -> PixelSamples:
+        """Draw the fraction `rate` (r) of the units of each tile, or of the tiles of each view (of `view_numbers`)."""
         uniform = self.mixed == "uniform"
         rule = DrawRule(self.unit, self.hard_ratio, self.stable_ratio, uniform, self.importance)
         return _sample(rule, maps, view_ids, rate, step)
@@ -374,7 +402,7 @@ class RandomPixelSampler:
     def __post_init__(self) -> None:
         require(self.unit in UNITS, "unit", self.unit, f"one of {', '.join(UNITS)}")
 
-    def sample(self, maps: ErrorMaps, view_ids: tuple[int, ...], rate: float, step: Step) -> PixelSamples:
+    def sample(self, maps: ErrorMaps, view_ids: ViewIds, rate: float, step: Step) -> PixelSamples:
         """Draw the fraction `rate` of the units; of the maps, only the sizes matter."""
         return _sample(DrawRule(self.unit, 0.0, 0.0, True, 0.0), maps, view_ids, rate, step)
 
@@ -383,5 +411,6 @@ class RandomPixelSampler:
 class DensePixelSampler:
     """Every pixel of the chosen views, whatever the rate."""
 
-    def sample(self, maps: ErrorMaps, view_ids: tuple[int, ...], rate: float, step: Step) -> PixelSamples:
+    def sample(self, maps: ErrorMaps, view_ids: ViewIds, rate: float, step: Step) -> PixelSamples:
+        view_ids = view_numbers(view_ids, maps)
         return dense_pixels(view_ids, maps.sizes[np.asarray(view_ids, dtype=np.int64)], maps.errors.device)

@@ -52,6 +52,31 @@ def test_layout(sampler, unit, rate):
     assert (rising & (filled[:-1] | ~filled[1:]) | ~same_tile).all()
 
 
+SAMPLERS = [ErrorGuidedPixelSampler(), RandomPixelSampler(), DensePixelSampler()]
+
+
+@pytest.mark.parametrize("sampler", SAMPLERS, ids=lambda sampler: type(sampler).__name__)
+@pytest.mark.parametrize(
+    "views",
+    [[2, 0], torch.tensor([2, 0]), [torch.tensor(2), torch.tensor(0)], np.array([2, 0]), (np.int64(2), np.int64(0))],
+)
+def test_views_may_come_in_any_form(sampler, views):
+    expected = sampler.sample(random_maps(), (2, 0), 0.1, step(4))
+    samples = sampler.sample(random_maps(), views, 0.1, step(4))
+    assert samples.view_ids == (2, 0) and all(type(view) is int for view in samples.view_ids)
+    assert torch.equal(samples.pixel_ids, expected.pixel_ids)
+    for one in (2, torch.tensor(2), np.int64(2)):
+        assert sampler.sample(random_maps(), one, 0.1, step(4)).view_ids == (2,)
+
+
+@pytest.mark.parametrize("sampler", SAMPLERS, ids=lambda sampler: type(sampler).__name__)
+@pytest.mark.parametrize("views", [(5,), (0, -1), -1, (), (0.5,), torch.tensor([0.0, 1.0]), None, "01", [[0, 1]]])
+def test_views_that_are_none_are_refused(sampler, views):
+    assert len(SIZES) == 5
+    with pytest.raises(InputError, match=r"view_ids = .* from 0 to 4"):
+        sampler.sample(random_maps(), views, 0.1, step(4))
+
+
 @pytest.mark.parametrize(("rate", "wanted"), [(1e-6, 1), (0.1, 25), (1 / 3, 85), (1.0, 256), (3.0, 256)])
 def test_counts_of_pixels(rate, wanted):
     samples = ErrorGuidedPixelSampler().sample(random_maps(), (0, 2), rate, step(1))
