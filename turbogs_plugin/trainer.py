@@ -134,10 +134,14 @@ class Trainer:
     def repeat_lost(self, wait: bool = False) -> None:
         """Go back by the iterations that did nothing because the rasterizer's workspace was too small for them.
 
-        Never behind a change of the set of Gaussians, which would be made twice.
+        Never behind a change of the set of Gaussians, which would be made twice: iterations lost just before one are
+        not repeated.
 
         Args:
             wait: for the GPU, to know of all of them.
+
+        Raises:
+            InputError: an iteration has more pairs of a tile and a splat than a pass can have.
         """
         if self.workspace is not None:
             lost = self.workspace.take_lost(wait)

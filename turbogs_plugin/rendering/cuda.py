@@ -17,7 +17,7 @@ from torch import Tensor
 from turbogs_plugin import kernels, training_kernels
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.rendering.rendered import DEFAULT_SETTINGS, Projected, RasterSettings
-from turbogs_plugin.rendering.workspace import Workspace, round_capacity
+from turbogs_plugin.rendering.workspace import COUNT_MAX, Workspace, require_possible, round_capacity
 from turbogs_plugin.types import Cameras, GaussianGradients, Gaussians, GaussianStats, PixelSamples
 
 if TYPE_CHECKING:
@@ -31,8 +31,6 @@ RECORD_FLOATS = 16
 WARP = 32
 SCAN_TILES = 1024
 RUN = 512
-MAX_PAIRS = (1 << 31) - 1
-"""The count of pairs stays here where it would be more."""
 
 
 class _FreshBuffers:
@@ -247,7 +245,7 @@ def rasterize_cuda(
         workspace: memory to use again, and no waiting for the GPU; see `Workspace` for what the caller then owes.
 
     Raises:
-        InputError: no kernels here, or a tensor of wrong dtype or device.
+        InputError: no kernels here, a tensor of wrong dtype or device, or more pairs than a pass can have.
     """
     kernels.require()
     degree = gaussians.sh_degree if sh_degree is None else sh_degree
@@ -302,14 +300,11 @@ def rasterize_cuda(
         status,
         counters,
         integers("block_sums", max(1, math.ceil(num_active / SCAN_TILES)), 2, dtype=torch.int64),
-        MAX_PAIRS if capacity is None else capacity,
+        COUNT_MAX if capacity is None else capacity,
     )
     if capacity is None:
         pairs = int(status[0])
-        if pairs == MAX_PAIRS:
-            raise InputError(
-                f"a pass takes fewer than {MAX_PAIRS} pairs of a tile and a splat: take fewer views or tiles"
-            )
+        require_possible(pairs)
         capacity = round_capacity(pairs)
         if workspace is not None:
             workspace.learn(pairs, num_active)

@@ -4,7 +4,8 @@ The number of (tile, splat) pairs of a pass is known on the GPU only. A `Workspa
 pairs as earlier passes lead to expect. Each pass sends its true count to the host without waiting, and later passes
 look whether it has come. Where a count exceeds its room, the kernels raise a flag on the device: that pass and all that
 follow it draw nothing and change nothing, until the host learns of it, makes room and lowers the flag
-(`Workspace.take_lost`). So a splat is never dropped silently; the passes in between are done again.
+(`Workspace.take_lost`). So a splat is never dropped silently. Whoever lost passes does them again; in training that is
+`Trainer.repeat_lost`, which leaves out those before a change of the set of Gaussians.
 """
 
 from __future__ import annotations
@@ -15,6 +16,8 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+
+from turbogs_plugin.errors import InputError
 
 GROWTH = 1.25
 """A buffer that must grow gets this much more than was asked for."""
@@ -28,6 +31,12 @@ FORGETTING = 0.998
 CAPACITY_STEP = 1 << 14
 """Capacities are multiples of this, so that sizes of scratch memory can be remembered."""
 
+COUNT_MAX = (1 << 31) - 1
+"""The count of pairs stays here where it would be more."""
+
+MAX_PAIRS = COUNT_MAX // CAPACITY_STEP * CAPACITY_STEP
+"""The largest capacity. A count of `COUNT_MAX` is beyond it and therefore raises the flag."""
+
 PENDING_MAX = 8
 """Counts under way; one more waits for the oldest."""
 
@@ -35,6 +44,16 @@ PENDING_MAX = 8
 def round_capacity(pairs: float) -> int:
     """The capacity for this many pairs."""
     return CAPACITY_STEP * max(1, math.ceil(pairs / CAPACITY_STEP))
+
+
+def require_possible(pairs: int) -> None:
+    """Refuse a pass of more pairs than one can have.
+
+    Raises:
+        InputError: no memory would be room enough.
+    """
+    if pairs > MAX_PAIRS:
+        raise InputError(f"a pass takes at most {MAX_PAIRS} pairs of a tile and a splat: take fewer views or tiles")
 
 
 @dataclass
@@ -106,10 +125,15 @@ class Workspace:
         if self._pairs_per_tile == 0.0:
             return None
         margin = EARLY_MARGIN if self.passes < EARLY_PASSES else MARGIN
-        return round_capacity(margin * self._pairs_per_tile * tiles)
+        return min(round_capacity(margin * self._pairs_per_tile * tiles), MAX_PAIRS)
 
     def learn(self, pairs: int, tiles: int) -> None:
-        """Take in the true count of a pass."""
+        """Take in the true count of a pass.
+
+        Raises:
+            InputError: a pass cannot have that many.
+        """
+        require_possible(pairs)
         self._pairs_per_tile = max(self._pairs_per_tile * FORGETTING, pairs / max(1, tiles))
 
     def send_count(self, tiles: int) -> None:
@@ -125,19 +149,26 @@ class Workspace:
         self.passes += 1
 
     def poll(self) -> None:
-        """Take in the counts that have arrived."""
+        """Take in the counts that have arrived.
+
+        Raises:
+            InputError: a pass had more pairs than one can have; it drew nothing.
+        """
         while self._pending and self._pending[0].event.query():
             arrived = self._pending.popleft()
             pairs, flag = arrived.values.tolist()
-            self.learn(pairs, arrived.tiles)
             if flag and self._first_lost is None:
                 self._first_lost = arrived.number
+            self.learn(pairs, arrived.tiles)
 
     def take_lost(self, wait: bool = False) -> int:
         """Number of passes at the end that did nothing and must be done again; makes room for them and lowers the flag.
 
         Args:
             wait: for every count under way, as at the end of training; else only what has arrived is looked at.
+
+        Raises:
+            InputError: a pass had more pairs than one can have: repeating it is no use.
         """
         if wait and self._pending:
             self._pending[-1].event.synchronize()
