@@ -1,5 +1,6 @@
 """Whole runs within budgets."""
 
+import math
 import os
 import signal
 from pathlib import Path
@@ -11,7 +12,7 @@ from framework_runs import tiny_capture, tiny_config
 
 from turbogs_plugin import pacing, run
 from turbogs_plugin.budget import IterationCost
-from turbogs_plugin.checkpoint import latest_checkpoint, load_checkpoint
+from turbogs_plugin.checkpoint import latest_checkpoint, load_checkpoint, require_like
 from turbogs_plugin.config import TrainConfig, resolve
 from turbogs_plugin.errors import InputError, TrainingStopped
 from turbogs_plugin.report.history import read_history
@@ -222,3 +223,37 @@ def test_stops_by_time_evaluate_once_a_fraction_and_save_at_intervals():
     saved = [iteration for iteration, _, due in dues if due.save]
     assert len(saved) == 200 // 40 and saved[-1] == pace.iterations == pytest.approx(200, abs=2)
     assert train.refine_until == pytest.approx(140, abs=3)
+
+
+def paced(stop_after: float = math.inf) -> list[tuple[int, float, int, int]]:
+    """(iteration, seconds, iterations planned, end of density control) at each stop of a run of 20 s, whose model grows
+    to 20 times its size; stopped and resumed once."""
+
+    def pace_and_train(cost: IterationCost | None) -> tuple[pacing.TimePace, TrainConfig]:
+        train = TrainConfig(iterations=5000, refine_until=3500)
+        return pacing.TimePace(train, 20.0, cost, cap=0), train
+
+    cost = IterationCost(1e-3, 1e-8)
+    pace, train = pace_and_train(cost)
+    iteration, seconds, gaussians, stops = 0, 0.0, 20_000, []
+    pace.start(iteration, seconds, gaussians)
+    while iteration < pace.iterations:
+        mark = pace.next_mark(iteration, seconds)
+        while iteration < mark:
+            seconds += cost.at(gaussians)
+            iteration += 1
+            gaussians += 100 * (iteration < train.refine_until)
+        pace.reached(iteration, seconds, gaussians)
+        stops.append((iteration, seconds, pace.iterations, train.refine_until))
+        if seconds > stop_after:
+            state, stop_after = pace.state_dict(), math.inf
+            pace, train = pace_and_train(None)  # a resumed run is not calibrated
+            require_like(state, pace.state_dict(), "pace")
+            pace.load_state_dict(state)
+            pace.start(iteration, seconds, gaussians)
+    return stops
+
+
+@pytest.mark.parametrize("seconds", [0.1, 4.0, 15.0])
+def test_the_plan_of_a_resumed_run_goes_on_where_it_was(seconds):
+    assert paced(stop_after=seconds) == paced()
