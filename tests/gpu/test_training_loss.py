@@ -129,21 +129,19 @@ def test_bad_colors_stay_out(bad):
 
 
 def test_side_stream_and_half_colors():
-    if DEVICE != "cuda":
-        pytest.skip("needs streams")
     samples = make_samples(0.3, "cell")
     colors, targets, _, _ = make_colors(samples)
-    expected = training_kernels.sparse_loss(
-        colors.half().to(DEVICE), targets.to(DEVICE), to_device(samples), CASES["ncc"][1]
-    )
-    torch.cuda.synchronize()
+    colors, targets, samples = colors.half().to(DEVICE), targets.to(DEVICE), to_device(samples)
+    expected = training_kernels.sparse_loss(colors, targets, samples, CASES["ncc"][1])
     stream = torch.cuda.Stream()
+    stream.wait_stream(torch.cuda.current_stream())
     with torch.cuda.stream(stream):
-        found = training_kernels.sparse_loss(
-            colors.half().to(DEVICE), targets.to(DEVICE), to_device(samples), CASES["ncc"][1]
-        )
+        torch.cuda._sleep(50_000_000)  # work on the default stream would overtake this
+        found = training_kernels.sparse_loss(colors + 0, targets + 0, samples, CASES["ncc"][1])
     stream.synchronize()
     assert torch.equal(found.color_gradients, expected.color_gradients)
+    assert torch.equal(found.pixel_errors, expected.pixel_errors)
+    assert expected.color_gradients.any()
 
 
 def test_lost_losses_are_counted_once():

@@ -1,6 +1,6 @@
 """Projection backward against the float64 reference, and the fused step against the unfused torch twins."""
 
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -331,17 +331,19 @@ def test_more_views_than_the_kernels_take_are_refused():
 
 
 def test_side_stream():
-    if DEVICE != "cuda":
-        pytest.skip("needs streams")
-    scene = Scene()
-    results = []
-    for stream in (torch.cuda.current_stream(), torch.cuda.Stream()):
-        torch.cuda.synchronize()
-        with torch.cuda.stream(stream):
-            gaussians, optimizer = scene.on_device(), OPTIMIZERS["lm"]
-            optimizer.setup(gaussians)
-            training_kernels.fused_step(scene.screen(gaussians), gaussians, optimizer.moments, optimizer.rule(STEP))
-        stream.synchronize()
-        results.append(gaussians)
-    for parameter, value in results[0].items():
-        assert torch.equal(value, getattr(results[1], parameter)), parameter
+    scene, optimizer = Scene(), OPTIMIZERS["lm"]
+    wanted = scene.on_device()
+    optimizer.setup(wanted)
+    training_kernels.fused_step(scene.screen(wanted), wanted, optimizer.moments, optimizer.rule(STEP))
+    start = scene.screen()
+    stream = torch.cuda.Stream()
+    stream.wait_stream(torch.cuda.current_stream())
+    with torch.cuda.stream(stream):
+        torch.cuda._sleep(50_000_000)  # work on the default stream would overtake this
+        gaussians = start.gaussians.map(lambda value: value + 0)
+        screen = replace(start, gaussians=gaussians, records=start.records + 0)
+        optimizer.setup(gaussians)
+        training_kernels.fused_step(screen, gaussians, optimizer.moments, optimizer.rule(STEP))
+    stream.synchronize()
+    for parameter, value in wanted.items():
+        assert torch.equal(value, getattr(gaussians, parameter)), parameter
