@@ -45,6 +45,12 @@ class MomentLMOptimizer:
 
     A loss of c times the size (c L_k, c g_k) gives the same delta, and without rows delta is Adam's step exactly.
     Where the gradients of the views agree that an Adam step would overshoot the loss there is, delta stops short.
+    That needs shares and gradients of one loss. What the renderers give as L_k is the share of the L1 error summed over
+    the three channels and averaged over the samples, `GaussianGradients.view_losses`, whatever loss the gradients are
+    of. Two things follow. For a loss that is a mean over channels too, as ours are, L_k is 3 times its share, and
+    `curvature` acts as a third of itself. And a loss multiplied by c on the way (a sum instead of a mean, loss scaling)
+    multiplies the rows' term by c against Adam's, which shortens the steps where c > 1, unless its shares are
+    multiplied alike.
     `units: paper` is the printed equation, (J^T J + diag(sqrt(v) + eps)) delta = -m with m and v as they are and
     the g_k as rows of J: it has no learning rate and changes with the unit of the loss. It is there to compare.
 
@@ -58,7 +64,9 @@ class MomentLMOptimizer:
         rows: one row of J per view, or one of their sum (rank 1).
         solver: factorise the D x D system of each block, or the K x K system of its rows: one answer. In float32, with
             stiff rows (scaled length 50, K = 3), `low_rank` is off by 4e-7 of Adam's step, `cholesky` by 1e-4.
-        curvature: 1/2 is Gauss-Newton for a loss r^2 / 2; 1 is that for |r| (iteratively reweighted). `balanced` only.
+        curvature: for L_k that are true shares, 1/2 is Gauss-Newton for a loss r^2 / 2, and 1 is that for |r|
+            (iteratively reweighted); with the L_k above and a mean over channels, the default of 0.5 acts as 1/6.
+            `balanced` only.
         max_step: no entry of delta exceeds this many learning rates, or Adam's own entry where that is longer: coupling
             may pass motion on to a parameter whose own gradient is near zero, and the linear model that wants it
             does not hold that far. 1 is the length of Adam's step for gradients that always agree; 0 turns the bound
