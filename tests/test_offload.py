@@ -10,7 +10,7 @@ import torch
 from framework_runs import assert_identical, tiny_capture, tiny_config
 from turbogs_plugin.strategies.pixel_sampling import ErrorGuidedPixelSampler
 
-from turbogs_plugin import offload, run
+from turbogs_plugin import offload, outputs, run
 from turbogs_plugin.error_maps import AGE_MAX, ErrorMaps
 from turbogs_plugin.offload import ABSENT, OffloadedErrorMaps, OffloadedPhotos, ViewWindow
 from turbogs_plugin.scene import Scene, load_scene
@@ -89,6 +89,20 @@ def test_a_whole_run_leaves_the_same_model(capture, tmp_path):
         assert outcome.folder.read_config().plan.maps_on == place
         models.append(outcome.folder.model.read_bytes())
     assert models[0] == models[1]
+
+
+@pytest.mark.parametrize("place", ["device", "host"])
+def test_photos_stay_in_host_memory_when_a_run_is_looked_at(capture, tmp_path, monkeypatch, place):
+    """Evaluated, where it was planned so, with the same errors; rendered, always."""
+    config = tiny_config(capture, f"plan.photos_on={place}", "train.iterations=2")
+    outcome = run.train(config, tmp_path / "run")
+    to, moved = Photos.to, []
+    monkeypatch.setattr(Photos, "to", lambda photos, device: moved.append(device) or to(photos, device))
+    table = outputs.evaluate_run(tmp_path / "run", "cpu")
+    assert f"{outcome.history[-1].psnr:.4f}" in table
+    assert moved == ([] if place == "host" else [CPU])
+    outputs.render_run(tmp_path / "run", "train", "cpu")
+    assert len(moved) == (place == "device")
 
 
 def test_the_initial_colour_is_that_of_the_photos(scene, capture):

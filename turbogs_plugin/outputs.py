@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 from PIL import Image
@@ -10,6 +11,7 @@ from turbogs_plugin.bands import band_energy, drop_faint_bands
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.evaluation import evaluate, load_lpips, render_view
 from turbogs_plugin.gaussians import save_ply
+from turbogs_plugin.offload import place_views
 from turbogs_plugin.report.history import Evaluation
 from turbogs_plugin.report.pages import ERRORS, number, table
 from turbogs_plugin.report.plots import to_uint8
@@ -31,6 +33,7 @@ def history_table(history: list[Evaluation]) -> str:
 def evaluate_run(path: Path, device_name: str) -> str:
     """Errors of a run's newest model on each test view, as a table."""
     model, views = _open(path, device_name, "test")
+    views = place_views(views, model.gaussians.device, model.config.plan.photos_on)
     lpips, reason = load_lpips(model.config.report.lpips_weights, model.gaussians.device)
     metrics = evaluate(model.gaussians, views, model.sh_degree, model.config.raster, lpips)
     rows = [
@@ -48,6 +51,7 @@ def evaluate_run(path: Path, device_name: str) -> str:
 def render_run(path: Path, split: str, device_name: str) -> Path:
     """Write the views of a split, rendered from a run's newest model, as PNGs; their folder."""
     model, views = _open(path, device_name, split)
+    views = replace(views, cameras=views.cameras.to(model.gaussians.device))
     folder = model.folder.renders / split
     folder.mkdir(parents=True, exist_ok=True)
     for view_id, name in enumerate(views.names):
@@ -84,8 +88,8 @@ def export_run(path: Path, file_format: str, out: Path | None, drop_bands: float
 
 
 def _open(path: Path, device_name: str, split: str) -> tuple[SavedModel, PosedImages]:
-    device = resolve_device(device_name)
-    model = load_model(path, device)
+    """A run's newest model on a device, and the views of a split on the CPU."""
+    model = load_model(path, resolve_device(device_name))
     scene = model.config.scene
     loaded = load_scene(scene.path, scene.factor, scene.test_every)
-    return model, (loaded.test if split == "test" else loaded.train).to(device)
+    return model, loaded.test if split == "test" else loaded.train
