@@ -7,7 +7,7 @@ import zipfile
 import pytest
 import torch
 
-from turbogs_plugin import checkpoint, files
+from turbogs_plugin import checkpoint, files, gaussians
 from turbogs_plugin.checkpoint import latest_checkpoint, load_checkpoint, save_checkpoint
 from turbogs_plugin.errors import InputError, TrainingStopped
 
@@ -241,3 +241,23 @@ def test_an_atomic_write_leaves_the_old_text_on_failure(tmp_path):
     with pytest.raises(ValueError):
         files.write_atomically(target, fail)
     assert target.read_text() == "old" and os.listdir(tmp_path) == ["text"]
+
+
+def test_a_model_is_written_as_atomically_as_a_checkpoint(tmp_path, monkeypatch):
+    """A full disk leaves the old one, and what a killed process left behind does not stay."""
+    target = tmp_path / "model.ply"
+    model = gaussians.gaussians_from_points(torch.rand(5, 3), torch.zeros(5, 3, dtype=torch.uint8), 0, 1.0)
+    target.write_text("old")
+    (tmp_path / ".model.ply.part").write_text("torn")
+    whole_write = files.write_atomically
+
+    def limited(path, write):
+        whole_write(path, lambda file: write(DiskFull(file, 10)))
+
+    with monkeypatch.context() as context:
+        context.setattr(gaussians, "write_atomically", limited)
+        with pytest.raises(InputError, match=r"cannot write .*model\.ply: No space left"):
+            gaussians.save_ply(model, target)
+    assert target.read_text() == "old" and os.listdir(tmp_path) == ["model.ply"]
+    gaussians.save_ply(model, target)
+    assert len(gaussians.load_ply(target)) == 5 and os.listdir(tmp_path) == ["model.ply"]

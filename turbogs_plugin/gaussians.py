@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import math
-import os
 import warnings
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from turbogs_plugin.errors import InputError
+from turbogs_plugin.files import write_atomically
 from turbogs_plugin.scene.frame import Frame
 from turbogs_plugin.scene.nearest import mean_neighbor_distances
 from turbogs_plugin.scene.ply import read_vertices
@@ -139,7 +140,15 @@ def save_ply(gaussians: Gaussians, path: str | Path, frame: Frame | None = None)
     types = {"<f4": "float", "<f8": "double"}
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(table)}"]
     header += [f"property {types[table.dtype[name].str]} {name}" for name in names]
-    _write_atomically(path, "\n".join([*header, "end_header\n"]).encode(), table)
+
+    def write(file: BinaryIO) -> None:
+        file.write("\n".join([*header, "end_header\n"]).encode())
+        table.tofile(file)
+
+    try:
+        write_atomically(path, write)
+    except OSError as error:
+        raise InputError(f"cannot write {path}: {error.strerror or error}") from error
 
 
 def load_ply(path: str | Path, frame: Frame | None = None) -> Gaussians:
@@ -221,18 +230,3 @@ def _columns(gaussians: Gaussians) -> list[tuple[str, Tensor]]:
         ("scales", gaussians.scales),
         ("quats", gaussians.quats),
     ]
-
-
-def _write_atomically(path: Path, header: bytes, table: np.ndarray) -> None:
-    partial = path.with_name(f"{path.name}.partial-{os.getpid()}")
-    try:
-        with partial.open("wb") as file:
-            file.write(header)
-            table.tofile(file)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(partial, path)
-    except OSError as error:
-        raise InputError(f"cannot write {path}: {error.strerror or error}") from error
-    finally:
-        partial.unlink(missing_ok=True)
