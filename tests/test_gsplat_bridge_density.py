@@ -6,16 +6,17 @@ from dataclasses import dataclass, field
 import pytest
 import torch
 import tyro
-from bridge_host import SURGERY, Host, surgery
+from bridge_host import SURGERY, Host, make_splats, surgery
 from gsplat import DefaultStrategy, MCMCStrategy
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from turbogs_plugin.strategies.density import ErrorDrivenDensity
 from turbogs_plugin.strategies.moment_lm import MomentLMOptimizer
 
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.gsplat_bridge import SharedOptimizer, TurboDensityStrategy, apply_row_update
 from turbogs_plugin.gsplat_bridge.gaussian_errors import iteration_stats
-from turbogs_plugin.types import PARAMETER_NAMES, RowUpdate
+from turbogs_plugin.types import PARAMETER_NAMES, Gaussians, GaussianStats, RowUpdate, Step
 
 SOON = {"refine_start_iter": 2, "refine_every": 3, "refine_stop_iter": 5, "grow_grad2d": 1e-6}
 
@@ -87,11 +88,162 @@ def test_schedule_events_happen_where_gsplats_do(monkeypatch):
     assert events[TurboDensityStrategy] == events[DefaultStrategy] == [6, 9]
 
 
-def test_no_opacity_is_reset_and_final_pruning_keeps_its_share():
+EVENT = 3
+"""The step of the only event of `FIELDS`' runs."""
+
+BASE = {
+    "refine_start_iter": 2,
+    "refine_every": 3,
+    "grow_grad2d": 0.02,
+    "grow_absgrad2d": 0.02,
+    "grow_scale3d": 0.17,
+    "top_fraction": 0.5,
+}
+BASE_OF_CONTROLLER = {
+    "refine_from": 3,
+    "refine_every": 3,
+    "grad_threshold": 0.02,
+    "absgrad_threshold": 0.02,
+    "percent_dense": 0.51,  # of three standard deviations
+    "top_fraction": 0.5,
+    "lambda_base": 0.8,
+    "score": "balanced",
+    "split": "sample",
+    "max_gaussians": 0,
+    "prune_opacity": 0.005,
+    "prune_world_size": 0.1,
+    "prune_screen_size": 0.0,
+    "prune_size_from": 0.2,  # gsplat's 3000 of 15 000
+    "prune_score_fraction": 0.0,
+    "opacity_decay": 0.0,
+    "final_every": 500,
+    "final_keep": 1.0,
+}
+FIELDS = {
+    "base": ({}, {}),
+    "grow_grad2d": ({"grow_grad2d": 0.001}, {"grad_threshold": 0.001}),
+    "absgrad": ({"absgrad": False}, {}),
+    "grow_absgrad2d": ({"grow_absgrad2d": 0.05}, {"absgrad_threshold": 0.05}),
+    "grow_scale3d": ({"grow_scale3d": 0.2}, {"percent_dense": 0.6}),
+    "scene_scale": ({}, {}),
+    "seed": ({"seed": 7}, {}),
+    "top_fraction": ({"top_fraction": 0.2}, {"top_fraction": 0.2}),
+    "lambda_base": ({"lambda_base": 5.0}, {"lambda_base": 5.0}),
+    "score": ({"score": "raw"}, {"score": "raw"}),
+    "split": ({"split": "long_axis"}, {"split": "long_axis"}),
+    "max_gaussians": ({"max_gaussians": 45}, {"max_gaussians": 45}),
+    "prune_opa": ({"prune_opa": 0.4}, {"prune_opacity": 0.4}),
+    "prune_scale3d": ({"prune_scale3d": 0.16, "reset_every": 1}, {"prune_world_size": 0.16, "prune_size_from": 0.0}),
+    "prune_scale2d": (
+        {"prune_scale2d": 0.2, "refine_scale2d_stop_iter": 4, "reset_every": 1, "prune_scale3d": 0.0},
+        {"prune_screen_size": 0.2, "prune_size_from": 0.0, "prune_world_size": 0.0},
+    ),
+    "refine_scale2d_stop_iter": (
+        {"prune_scale2d": 0.2, "refine_scale2d_stop_iter": 3, "reset_every": 1, "prune_scale3d": 0.0},
+        {"prune_screen_size": 0.0, "prune_size_from": 0.0, "prune_world_size": 0.0},
+    ),
+    "prune_score_fraction": ({"prune_score_fraction": 0.3}, {"prune_score_fraction": 0.3}),
+    "opacity_decay": ({"opacity_decay": 0.1}, {"opacity_decay": 0.1}),
+    "final_keep": (
+        {"refine_stop_iter": 2, "final_every": 2, "final_keep": 0.7},
+        {"final_every": 2, "final_keep": 0.7},
+    ),
+}
+"""Field -> values of the strategy's fields, and the controller's by which the same happens."""
+
+
+def controlled(options, before, window, seed, extent, refine_until):
+    """The Gaussians after the event by an `ErrorDrivenDensity` with exactly these options."""
+    controller = ErrorDrivenDensity(**options)
+    controller.setup(before)
+    controller.load_state_dict({"initial_count": len(before), "stats": window})
+    update = controller.update(before, Step(EVENT, 10**6, refine_until, seed, extent))
+    return before if update is None else update.apply(before)
+
+
+def differ(some: Gaussians, other: Gaussians) -> bool:
+    return any(
+        not torch.equal(value, other_value)
+        for (_, value), (_, other_value) in zip(some.items(), other.items(), strict=True)
+    )
+
+
+@pytest.mark.parametrize("name", FIELDS)
+@pytest.mark.parametrize("tells_errors", [False, True])
+def test_an_event_is_the_controllers_with_these_values(name, tells_errors):
+    """And what a field changes, it changes: with the base's values the controller does something else."""
+    fields, options = FIELDS[name]
+    strategy = TurboDensityStrategy(**{**BASE, **fields})
+    host = Host(strategy, tells_errors=tells_errors)
+    extent = host.state["scene_scale"] = 1.2 if name == "scene_scale" else 1.0
+    seen, before = [], {}
+    step_post_backward = strategy.step_post_backward
+
+    def watched(params, info, **rest):
+        seen.append(iteration_stats(info, 40)[0].map(torch.clone))
+        before.update({key: value.detach().clone() for key, value in params.items()})
+        step_post_backward(params=params, info=info, **rest)
+
+    strategy.step_post_backward = watched
+    host.train(EVENT + 1)
+
+    window = {key: sum(getattr(stats, key) for stats in seen) for key in GaussianStats.__dataclass_fields__}
+    window["max_radii"] = torch.stack([stats.max_radii for stats in seen]).amax(dim=0)
+    if not tells_errors:
+        assert not window["error_sums"].any() and not window["weight_sums"].any()
+        window |= {"error_sums": window["grad_sums"], "weight_sums": window["view_counts"]}
+    without_absolute = {**window, "absgrad_sums": torch.zeros(40)}
+    before = Gaussians(**{key: before[key] for key in PARAMETER_NAMES})
+    until = fields.get("refine_stop_iter", 15_000) - 1
+    used = window if strategy.absgrad else without_absolute
+    expected = controlled({**BASE_OF_CONTROLLER, **options}, before, used, strategy.seed, extent, until)
+    after = Gaussians(**{key: host.splats[key].detach() for key in PARAMETER_NAMES})
+    for (key, value), (_, wanted) in zip(after.items(), expected.items(), strict=True):
+        torch.testing.assert_close(value, wanted, msg=lambda text, key=key: f"{key}: {text}")
+    assert all(len(host.state[key]) == len(after) and not host.state[key].any() for key in window)
+    if name not in (
+        ("base", "refine_scale2d_stop_iter")
+        if tells_errors
+        else ("base", "refine_scale2d_stop_iter", "lambda_base", "score")
+    ):
+        assert differ(after, controlled(BASE_OF_CONTROLLER, before, window, 0, 1.0, 14_999))
+
+
+def test_no_opacity_is_reset():
+    """gsplat resets where step % reset_every == 0; here, the optimizers apart, no step changes an opacity."""
+    fields = {"refine_start_iter": 1, "refine_every": 2, "reset_every": 2, "grow_grad2d": 1.0}
+    strategy = TurboDensityStrategy(**fields, grow_absgrad2d=1.0, prune_scale3d=0.0)
+    host = Host(strategy)
+    trained = []
+    step_post_backward = strategy.step_post_backward
+
+    def watched(params, **rest):
+        trained.append(params["opacities"].detach().clone())
+        step_post_backward(params=params, **rest)
+        assert torch.equal(params["opacities"], trained[-1])
+
+    strategy.step_post_backward = watched
+    host.train(9)
+    assert not torch.equal(trained[0], trained[-1])
+    assert host.optimizers["opacities"].state[host.splats["opacities"]]["exp_avg"].any()
+
+
+def test_final_pruning_keeps_its_share():
     host = Host(TurboDensityStrategy(refine_stop_iter=4, refine_start_iter=9, final_every=3, final_keep=0.8))
     assert (host.train(6), len(host.splats["means"]))[1] == 40
     host.step(6)  # three after the last step of refinement
     assert 32 <= len(host.splats["means"]) < 40
+    host.assert_rows_match()
+
+
+@pytest.mark.parametrize("tells_errors", [False, True])
+def test_a_host_in_double_precision_trains(tells_errors):
+    splats = {name: torch.nn.Parameter(value.detach().double()) for name, value in make_splats().items()}
+    host = Host(TurboDensityStrategy(**SOON), tells_errors=tells_errors, splats=torch.nn.ParameterDict(splats))
+    host.cameras, host.pixels = host.cameras.to(dtype=torch.float64), host.pixels.double()
+    host.train(6)
+    assert len(host.splats["means"]) > 40
+    assert {value.dtype for value in host.splats.values()} == {torch.float64}
     host.assert_rows_match()
 
 

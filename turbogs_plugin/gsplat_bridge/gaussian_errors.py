@@ -127,9 +127,10 @@ def screen_statistics(info: dict[str, Any], count: int) -> GaussianStats:
         raise InputError("info['means2d'] has no gradient: call step_pre_backward before loss.backward()")
     width, height, cameras = info["width"], info["height"], info["n_cameras"]
     half = means2d.new_tensor([0.5 * width * cameras, 0.5 * height * cameras])
-    norms = [(means2d.grad * half).norm(dim=-1)]
+    # Statistics are in single precision, whatever the host's.
+    norms = [(means2d.grad * half).norm(dim=-1).float()]
     absolute = getattr(means2d, "absgrad", None)
-    norms.append(torch.zeros_like(norms[0]) if absolute is None else (absolute * half).norm(dim=-1))
+    norms.append(torch.zeros_like(norms[0]) if absolute is None else (absolute * half).norm(dim=-1).float())
     visible = (radii > 0).all(dim=-1)
     if info["gaussian_ids"] is not None:  # packed
         ids = info["gaussian_ids"].long()
