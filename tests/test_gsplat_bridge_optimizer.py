@@ -115,6 +115,21 @@ def test_shares_of_the_loss_change_the_step():
     assert not torch.allclose(plain.splats["means"], damped.splats["means"], atol=1e-5)
 
 
+def test_a_loss_of_another_scale_damps_lm_alone(monkeypatch):
+    """As the document says: shares are those of a mean L1 error, whatever multiplies the host's loss."""
+    mean_difference = torch.nn.functional.l1_loss
+    moved = {}
+    for rule, scale in itertools.product(RULES, (1.0, 1000.0)):
+        monkeypatch.setattr(torch.nn.functional, "l1_loss", lambda a, b, scale=scale: scale * mean_difference(a, b))
+        host = Host(TurboDensityStrategy(**LATE), SharedOptimizer(RULES[rule]()), tells_errors=True)
+        before = host.splats["means"].detach().clone()
+        host.train(10)
+        moved[rule, scale] = float((host.splats["means"].detach() - before).norm())
+    assert moved["adam", 1000.0] == pytest.approx(moved["adam", 1.0], rel=1e-2)
+    assert moved["lm", 1000.0] / moved["lm", 1.0] == pytest.approx(0.36, abs=0.05)
+    assert moved["lm", 1.0] == pytest.approx(moved["adam", 1.0], rel=0.1)
+
+
 def test_it_says_once_that_it_lacks_shares(capsys):
     host = Host(DefaultStrategy(**LATE), SharedOptimizer(MomentLMOptimizer()))
     host.train(3)
