@@ -1,4 +1,4 @@
-"""A small case that runs every kernel once, for compute-sanitizer. From the repository's root, with a GPU::
+"""Small cases that run every kernel, for compute-sanitizer. From the repository's root, with a GPU::
 
     compute-sanitizer --tool memcheck --error-exitcode 1 python tests/gpu/sanitizer_case.py
     compute-sanitizer --tool racecheck --error-exitcode 1 python tests/gpu/sanitizer_case.py
@@ -14,10 +14,16 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from framework_runs import tiny_capture, tiny_config
+from raster_cases import samples_to
+from rendering_scenes import make_cameras, make_gaussians
+from test_raster_sorting import stacked_case, wide_case
 
-from turbogs_plugin.rendering import dense_samples, rasterize_differentiable
-from turbogs_plugin.scene import load_scene
+from turbogs_plugin.rendering import dense_samples, rasterize, rasterize_differentiable
+from turbogs_plugin.scene import load_scene, write_demo_capture
 from turbogs_plugin.trainer import Trainer
+from turbogs_plugin.types import GaussianStats
+
+DEVICE = "cuda"
 
 VARIANTS = (
     (),
@@ -26,22 +32,53 @@ VARIANTS = (
 )
 """Overrides that lead through the kernels' other branches."""
 
+NINE_VIEWS = ("schedule.min_views=9", "schedule.max_views=9")
+"""More rows of a Gaussian than shared memory has room for."""
+
+
+def train(capture: Path, *overrides: str, iterations: int | None = None) -> Trainer:
+    """The iterations of a tiny run, or the first of them."""
+    config = tiny_config(capture, f"train.device={DEVICE}", *overrides)
+    trainer = Trainer(config, load_scene(capture), torch.device(DEVICE))
+    trainer.initialise_maps()
+    for iteration in range(1, (iterations or config.train.iterations) + 1):
+        trainer.step_towards(iteration)
+    trainer.require_finite()
+    return trainer
+
+
+def many_tiles():
+    """1250 tiles, all active: more than one block finds the first pairs of."""
+    cameras = make_cameras([(400, 400), (400, 400)], torch.float32)
+    return make_gaussians(60, dtype=torch.float32), cameras, dense_samples(cameras)
+
+
+def draw(gaussians, cameras, samples) -> None:
+    """A pass forward and backward, with statistics."""
+    gaussians = gaussians.map(lambda value: value.to(DEVICE))
+    rendered = rasterize(gaussians, cameras.to(DEVICE), samples_to(samples, DEVICE))
+    stats = GaussianStats.zeros(len(gaussians), DEVICE)
+    ones = torch.ones_like(rendered.colors)
+    gradients = rendered.backward(ones, pixel_errors=ones[:, 0].contiguous(), stats=stats)
+    assert gradients.parameter_gradients(rows=True).means.isfinite().all()
+
 
 def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
+        nine = write_demo_capture(Path(folder, "nine"), views=11, width=48, height=40)  # every 8th is a test view
+        trainer = train(nine, *NINE_VIEWS, iterations=1)
+        assert len(trainer.views) == 9
         capture = tiny_capture(Path(folder))
         for overrides in VARIANTS:
-            config = tiny_config(capture, "train.device=cuda", *overrides)
-            trainer = Trainer(config, load_scene(capture), torch.device("cuda"))
-            trainer.initialise_maps()
-            for iteration in range(1, config.train.iterations + 1):
-                trainer.step_towards(iteration)
-            trainer.require_finite()
+            trainer = train(capture, *overrides)
     cameras = trainer.views.cameras.select([0, 1])
     gaussians = trainer.gaussians.map(lambda value: value.requires_grad_())
     image = rasterize_differentiable(gaussians, cameras, dense_samples(cameras), with_depth=True)
     (image.colors.sum() + image.alphas.sum() + image.depths.sum()).backward()
     assert gaussians.means.grad.isfinite().all()
+    draw(*wide_case())  # more large splats than their list has room for
+    draw(*stacked_case(torch.full((4097,), 3.0)))  # runs of equal depths to merge, and a last one of one pair
+    draw(*many_tiles())
     torch.cuda.synchronize()
     print(f"{len(gaussians)} Gaussians, {len(VARIANTS)} variants, done")
 
