@@ -22,7 +22,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -316,7 +317,8 @@ class TimePlan:
     def start(self, iteration: int, seconds: float, gaussians: int) -> None:
         """Where training stands as it begins or goes on."""
         self._last = (iteration, seconds, gaussians)
-        self._now = max(0.0, self.seconds - seconds) / max(1, self.iterations - iteration)
+        if self._now == 0.0:
+            self._now = max(0.0, self.seconds - seconds) / max(1, self.iterations - iteration)
 
     def replan(self, iteration: int, seconds: float, gaussians: int) -> None:
         """Fit `iterations` and `refine_until` to where training stands.
@@ -339,6 +341,19 @@ class TimePlan:
         """The finished iteration after which to look at the clock again."""
         stretch = min(MARK_SHARE * self.seconds, 0.5 * max(0.0, self.seconds - seconds))
         return min(self.iterations, iteration + max(1, int(stretch / max(1e-9, self._now))))
+
+    def state_dict(self) -> dict[str, Any]:
+        return {
+            "iterations": self.iterations,
+            "refine_until": self.refine_until,
+            "cost": asdict(self.cost),
+            "iteration_seconds": self._now,
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self.iterations, self.refine_until = state["iterations"], state["refine_until"]
+        self.cost = IterationCost(**state["cost"])
+        self._now = state["iteration_seconds"]
 
     def _rise(self, iteration: int, gaussians: int, growth: float) -> float:
         """Mean cost of the iterations left, in units of the present cost, if the number goes on to grow as of late."""

@@ -81,7 +81,7 @@ class TimePace:
     def __init__(self, train: TrainConfig, seconds: float, cost: IterationCost | None, cap: int) -> None:
         self._train = train
         self._fractions = sorted({*train.evaluate_at, 1.0})
-        self._plan = _SavedPlan(seconds, train.iterations, train.refine_until, cost or IterationCost(1.0, 0.0), cap)
+        self._plan = TimePlan(seconds, train.iterations, train.refine_until, cost or IterationCost(1.0, 0.0), cap)
         self._evaluated = 0
         self._saved = 0
 
@@ -116,30 +116,6 @@ class TimePace:
 
     def _follow(self) -> None:
         self._train.iterations, self._train.refine_until = self._plan.iterations, self._plan.refine_until
-
-
-class _SavedPlan(TimePlan):
-    """A plan that goes on where a saved one was: with the calibrated cost, and with what iterations took of late."""
-
-    _taken_over = 0.0  # seconds of an iteration; 0: nothing was saved
-
-    def start(self, iteration: int, seconds: float, gaussians: int) -> None:
-        super().start(iteration, seconds, gaussians)
-        if self._taken_over > 0:
-            self._now = self._taken_over
-
-    def state_dict(self) -> dict[str, Any]:
-        return {
-            "iterations": self.iterations,
-            "refine_until": self.refine_until,
-            "cost": {"base": self.cost.base, "per_gaussian": self.cost.per_gaussian},
-            "iteration_seconds": self._now,
-        }
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        self.iterations, self.refine_until = state["iterations"], state["refine_until"]
-        self.cost = IterationCost(state["cost"]["base"], state["cost"]["per_gaussian"])
-        self._taken_over = state["iteration_seconds"]
 
 
 def pace_of(config: Config, cost: IterationCost | None = None) -> Pace:
