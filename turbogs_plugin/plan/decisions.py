@@ -126,7 +126,7 @@ def decide_iterations(facts: SceneFacts, config: Config) -> Decision:
     fewest = FEWEST_SHARE * present
     reason = f"{config.plan.looks:g} looks at each of {facts.train_views} training views"
     if wanted < fewest:
-        reason += f" are fewer than {FEWEST_SHARE:.0%} of {present}"
+        reason += f" take fewer than {FEWEST_SHARE:.0%} of {present}"
     needed = math.ceil(max(wanted, fewest) / 100) * 100
     return _decision("iterations", config, present, (needed, reason))
 
