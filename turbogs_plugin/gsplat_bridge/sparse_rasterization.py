@@ -177,9 +177,14 @@ def sparse_loss(
         if not isinstance(value, Tensor) or not value.is_floating_point() or value.shape != (len(samples), 3):
             found = f"{value.dtype} {tuple(value.shape)}" if isinstance(value, Tensor) else type(value).__name__
             raise InputError(f"{name} is {found}: expected floating point {(len(samples), 3)}, as there are samples")
-    if isinstance(loss, type) or not _takes_three(loss):
+    if isinstance(loss, type):
         raise _not_a_loss(loss)
-    output = loss(colors.detach(), targets.detach(), samples)
+    try:
+        output = loss(colors.detach(), targets.detach(), samples)
+    except TypeError:
+        if _takes_three(loss):
+            raise
+        raise _not_a_loss(loss) from None
     if not isinstance(output, LossOutput):
         raise _not_a_loss(loss)
     return _Loss.apply(colors, output)

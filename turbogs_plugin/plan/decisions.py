@@ -27,7 +27,7 @@ ONE_SIDED_DEGREE = 1
 memory."""
 DEVICE_SHARE = 0.5
 """Share of the device's memory that photos and maps may take: the rest is for the model, its optimizer, workspaces."""
-FEWEST_SHARE = 0.4
+SHORTEST_SHARE = 0.4
 """Of the configured iterations: fewer leave the events of density control too little time between them, however few the
 photos. fox has 44 % of them with 50 looks, and loses nothing."""
 
@@ -123,10 +123,10 @@ def decide_iterations(facts: SceneFacts, config: Config) -> Decision:
     """As many as look at each training pixel so often: error stops falling after looks, not after iterations."""
     present = config.train.iterations
     wanted = config.plan.looks * facts.train_views / images_per_iteration(config, facts.train_views)
-    fewest = FEWEST_SHARE * present
+    fewest = SHORTEST_SHARE * present
     reason = f"{config.plan.looks:g} looks at each of {facts.train_views} training views"
     if wanted < fewest:
-        reason += f" take fewer than {FEWEST_SHARE:.0%} of {present}"
+        reason += f" take fewer than {SHORTEST_SHARE:.0%} of {present}"
     needed = math.ceil(max(wanted, fewest) / 100) * 100
     return _decision("iterations", config, present, (needed, reason))
 

@@ -12,13 +12,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from turbogs_plugin.rendering.rendered import RasterSettings
+from turbogs_plugin.rendering.rendered import EXTENT_MAX, RasterSettings
 from turbogs_plugin.rendering.spherical_harmonics import evaluate, num_bands, unit_directions
 from turbogs_plugin.types import Cameras, Gaussians
-
-EXTENT_MAX = 3.33
-"""gsplat's cut of a splat's half-width, in standard deviations. At the default `alpha_min` it cuts nothing visible:
-an opaque splat fades to 1/255 at 3.329."""
 
 SPAN_MAX = 1e7
 """Gaussians whose longest axis, seen face on, would span more pixels than this are not drawn: the determinant of their

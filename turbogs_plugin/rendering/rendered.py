@@ -85,8 +85,12 @@ class Rendered(Protocol):
         ...
 
 
-ALPHA_MIN_LOWEST = math.exp(-(3.33**2) / 2)
-"""The most opacity that a splat has 3.33 standard deviations from its mean, where the reference and gsplat cut it."""
+EXTENT_MAX = 3.33
+"""gsplat's cut of a splat's half-width, in standard deviations. At the default `alpha_min` it cuts nothing visible:
+an opaque splat fades to 1/255 at 3.329."""
+
+ALPHA_MIN_LOWEST = math.exp(-(EXTENT_MAX**2) / 2)
+"""The most opacity that a splat has there."""
 
 
 @dataclass(frozen=True)
