@@ -118,7 +118,7 @@ void fused_step(const std::vector<Tensor>& gaussians, const Tensor& viewmats, co
 }
 
 // `views` holds six numbers for each view: first flat pixel, width, height, number of the training view, first slot (or
-// chosen tile), tiles to choose; see `view_table` in training_kernels.py.
+// chosen tile), tiles to choose; see `_view_table` in training_kernels.py.
 constexpr int64_t kViewFields = 6;
 
 struct ViewTable {
@@ -136,12 +136,15 @@ ViewTable view_table(const std::vector<int64_t>& fields) {
     for (int i = 0; i < table.num_views; ++i) {
         const int64_t* field = fields.data() + i * kViewFields;
         SampleView& view = table.views[i];
+        const int64_t width = field[1], height = field[2];
+        STD_TORCH_CHECK(width > 0 && height > 0 && width <= INT32_MAX / height, "turbogs: sizes: view ", i, " is ", width,
+                        " x ", height);
         view.pixel_base = field[0];
-        view.width = static_cast<int>(field[1]);
-        view.height = static_cast<int>(field[2]);
-        view.view_number = static_cast<int>(field[3]);
-        view.slot_base = static_cast<int>(field[4]);
-        view.wanted = static_cast<int>(field[5]);
+        view.width = static_cast<int>(width);
+        view.height = static_cast<int>(height);
+        view.view_number = to_int(field[3], "view number");
+        view.slot_base = to_int(field[4], "first slot");
+        view.wanted = to_int(field[5], "tiles to choose");
         view.tiles_x = (view.width + kTileSize - 1) / kTileSize;
         view.tiles_y = (view.height + kTileSize - 1) / kTileSize;
         view.tile_base = table.num_tiles;
@@ -160,7 +163,7 @@ void sample_pixels(const Tensor& errors, const Tensor& stamps, const std::vector
     SamplePixelsParams params = {};
     STD_TORCH_CHECK(unit >= 0 && unit <= 2, "turbogs: unit must be 0 (pixel), 1 (cell) or 2 (tile)");
     params.unit = static_cast<SampleUnit>(unit);
-    const bool by_tile = params.unit == SampleUnit::kTileSize;
+    const bool by_tile = params.unit == SampleUnit::kTile;
     const size_t stage_rows = by_tile ? static_cast<size_t>(table.num_views) : 1;
     STD_TORCH_CHECK(stages.size() == 3 * stage_rows, "turbogs: stages must hold ", 3 * stage_rows, " numbers");
     STD_TORCH_CHECK(by_tile || tiles == table.num_tiles, "turbogs: tile_ids must have an entry for each tile");

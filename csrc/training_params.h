@@ -84,7 +84,7 @@ struct SampleView {
     int wanted;          // unit tile: tiles to choose
 };
 
-enum class SampleUnit : int { kPixel = 0, kCell = 1, kTileSize = 2 };
+enum class SampleUnit : int { kPixel = 0, kCell = 1, kTile = 2 };
 
 // The pixel sampler; strategies/pixel_sampling.py defines the draw, bit for bit.
 struct SamplePixelsParams {
