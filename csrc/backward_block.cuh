@@ -13,7 +13,7 @@ namespace turbogs {
 
 // A block owns this many consecutive Gaussians. Their harmonics are one contiguous piece of memory, which the block moves
 // in 16-byte quads; in shared memory each thread works on its own row, whose odd stride keeps the banks apart.
-constexpr int kBackwardThreads = 64;
+constexpr int kBackwardThreads = 128;
 
 // Harmonics of a block's Gaussians in shared memory.
 struct SharedHarmonics {

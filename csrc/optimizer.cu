@@ -18,7 +18,7 @@ namespace {
 constexpr float kLargeGradient = 1e30f;  // of a colour: beyond, the sums of the harmonics may overflow
 
 // Up to 168 registers, so that nothing spills.
-constexpr int kStepBlocks = 6;
+constexpr int kStepBlocks = 3;
 
 constexpr int kQuadBatch = 4;     // quads of harmonics that a thread has under way
 constexpr int kSharedSlots = 4;   // rows of a Gaussian in shared memory

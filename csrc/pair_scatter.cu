@@ -1,12 +1,12 @@
 // Stage 3: pairs to their tiles, in any order.
 //
 // A block takes kScatterInstances instances and keeps those on screen, so that its warps are full. A warp works on 32 splats
-// together: a lane for each row of tiles that they reach, then a lane for each pair of those rows, which takes the next place
-// of its tile from the tile's cursor and writes its key there, four pairs a lane under way. Splats of many tiles would hold
-// such a warp up: they go into a list, in windows of kWindow pairs, which a second launch shares out over all warps. Those
-// that the list has no room for are done by their block. The second launch also lists the runs of tiles with many pairs, as
-// stage 4 wants them. In which order pairs arrive does not matter, as that stage sorts keys of which no two are equal. Nothing
-// needs the number of pairs on the host, and a pass that overflows does nothing.
+// together: a lane for each row of tiles that they reach, then a lane for each pair of those rows. The lanes of one tile
+// take their places from its cursor in one addition and write their keys there, four pairs a lane under way. Splats of many
+// tiles would hold such a warp up: they go into a list, in windows of kWindow pairs, which a second launch shares out over
+// all warps. Those that the list has no room for are done by their block. The second launch also lists the runs of tiles
+// with many pairs, as stage 4 wants them. In which order pairs arrive does not matter, as that stage sorts keys of which no
+// two are equal. Nothing needs the number of pairs on the host, and a pass that overflows does nothing.
 #include "tile_reach.cuh"
 #include "warp.cuh"
 
@@ -71,7 +71,7 @@ __device__ __forceinline__ int emit_rows(const ScatterPairsParams& params, int2 
     end = min(end, total);
     for (int base = begin; base < end; base += kUnderWay * kWarpSize) {
         uint64_t keys[kUnderWay];
-        uint32_t places[kUnderWay];
+        uint32_t places[kUnderWay], peers[kUnderWay];
 #pragma unroll
         for (int i = 0; i < kUnderWay; ++i) {
             if (base + i * kWarpSize >= end) break;
@@ -79,11 +79,17 @@ __device__ __forceinline__ int emit_rows(const ScatterPairsParams& params, int2 
             const int owner = owner_of(number, sum);
             const int tile = number + __shfl_sync(kFullWarp, shift, owner);
             keys[i] = __shfl_sync(kFullWarp, key, owner);
-            if (number < end) places[i] = atomicAdd(reinterpret_cast<unsigned*>(params.tile_cursors) + tile, 1u);
+            peers[i] = __match_any_sync(kFullWarp, number < end ? tile : -1 - lane);
+            if (number < end && (peers[i] & ((1u << lane) - 1u)) == 0u) {
+                places[i] = atomicAdd(reinterpret_cast<unsigned*>(params.tile_cursors) + tile, __popc(peers[i]));
+            }
         }
 #pragma unroll
         for (int i = 0; i < kUnderWay; ++i) {
-            if (base + i * kWarpSize + lane < end) params.pair_keys[places[i]] = keys[i];
+            if (base + i * kWarpSize >= end) break;
+            const uint32_t place = __shfl_sync(kFullWarp, places[i], __ffs(peers[i]) - 1) +
+                                   __popc(peers[i] & ((1u << lane) - 1u));
+            if (base + i * kWarpSize + lane < end) params.pair_keys[place] = keys[i];
         }
     }
     return total;

@@ -60,7 +60,7 @@ def test_initial_gaussians():
     assert gaussians.opacities.sigmoid().tolist() == pytest.approx([0.1] * 4)
     assert gaussians.quats.tolist() == [[1, 0, 0, 0]] * 4
     color = gaussians.sh0[0, 0] * 0.5 / math.sqrt(math.pi) + 0.5
-    assert color.tolist() == pytest.approx([1, 0, 0.2], abs=1e-6)
+    assert color.tolist() == pytest.approx([1, 0.5 / 255, 0.2], abs=1e-6)
     assert gaussians.shN.shape == (4, 8, 3) and not gaussians.shN.any()
     assert all(value.dtype == torch.float32 for _, value in gaussians.items())
 

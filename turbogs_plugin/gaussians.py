@@ -22,6 +22,8 @@ SH_C0 = 0.28209479177387814
 """Band 0 of the spherical harmonics: colour = SH_C0 * sh0 + 0.5."""
 
 INITIAL_OPACITY = 0.1
+DARKEST = 0.5
+"""A new Gaussian's channel, of 255: at 0 it would lie on the clamp of colours, where rounding says if it can learn."""
 SMALLEST_SCALE = 1e-4
 """Of a new Gaussian, in extents: coincident points would otherwise give a scale of zero."""
 LONELY_SCALE = 0.01
@@ -41,8 +43,8 @@ def gaussians_from_points(
 ) -> Gaussians:
     """One isotropic Gaussian a point, as 3DGS starts (Kerbl et al. 2023, section 5.1).
 
-    Its scale is `size` times the mean distance to the three nearest points, its colour the point's; the higher bands
-    are zero.
+    Its scale is `size` times the mean distance to the three nearest points, its colour the point's, black as half a
+    step above it; the higher bands are zero.
 
     Args:
         points: [M, 3] float. Points that are not finite are left out, with a warning that counts them.
@@ -77,7 +79,7 @@ def gaussians_from_points(
         quats=quats,
         scales=scales[:, None].repeat(1, 3),
         opacities=points.new_full((count,), math.log(opacity / (1.0 - opacity))),
-        sh0=((colors.to(points) / 255.0 - 0.5) / SH_C0)[:, None, :],
+        sh0=((colors.to(points).clamp(min=DARKEST) / 255.0 - 0.5) / SH_C0)[:, None, :],
         shN=points.new_zeros(count, (sh_degree + 1) ** 2 - 1, 3),
     )
 
