@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from turbogs_plugin.ablation.grid import Ablation, ablation_names, alike_at, load_ablation, variant_config
+from turbogs_plugin.ablation.plots import told_apart
 from turbogs_plugin.ablation.results import CellResult, Study
 from turbogs_plugin.ablation.statistics import Curve, Spread, differ, pareto_front, seconds_to_reach
 from turbogs_plugin.ablation.summary import summarise
@@ -191,3 +192,12 @@ def test_a_summary_of_known_numbers():
     assert math.isnan(fast.reaches[1].ratio)  # the baseline never got there
     (default,) = summarise(study)
     assert default.targets == [29.0, 29.5, 30.0]
+
+
+def test_a_variant_that_failed_does_not_set_the_scale_of_the_plots():
+    results = {"good": 31.0, "fair": 24.0, "lost": 9.5, "unknown": math.nan}
+    cells = [cell(name, 0, entry(0, 0.0, 5.0), entry(100, 10.0, psnr)) for name, psnr in results.items()]
+    (summary,) = summarise(Study(Ablation("x", {name: [] for name in results}), cells), [20.0])
+    shown, words = told_apart(summary)
+    assert [row.name for row in shown] == ["good", "fair", "unknown"]
+    assert words == "Not in the plot: lost (9.5 dB in 10.0 s)"

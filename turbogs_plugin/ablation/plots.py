@@ -24,6 +24,8 @@ SHOWN_BELOW = 4.0
 """dB below the worst final result at which the PSNR plot ends: what comes before is over in a moment."""
 SHOWN_ABOVE = 1.6
 """Times the worst final error, at which that plot ends: 4 dB as well."""
+FAILED_BELOW = 8.0
+"""dB below the best final result at which a variant has failed: it is named below the plot, whose scale is the others'."""
 
 
 def _styles(summary: SceneSummary) -> dict[str, tuple[str, str]]:
@@ -35,40 +37,50 @@ def _styles(summary: SceneSummary) -> dict[str, tuple[str, str]]:
     }
 
 
+def told_apart(summary: SceneSummary) -> tuple[list[VariantRow], str]:
+    """The variants that set a plot's scale, and a line that names those that failed ("" for none)."""
+    best = max(row.psnr.mean for row in summary.rows)
+    shown = [row for row in summary.rows if not row.psnr.mean < best - FAILED_BELOW]
+    failed = [row for row in summary.rows if row not in shown]
+    words = (f"{row.name} ({row.psnr.mean:.1f} dB in {row.seconds.mean:.1f} s)" for row in failed)
+    return shown, "Not in the plot: " + ", ".join(words) if failed else ""
+
+
 def plot_curves(path: Path, summary: SceneSummary) -> None:
     """PSNR and mean absolute error against seconds: mean over seeds, their spread shaded where there is room."""
-    styles = _styles(summary)
+    styles, (rows, failed) = _styles(summary), told_apart(summary)
     with matplotlib.rc_context({**STYLE, "lines.markersize": 3.5}):
-        figure = Figure(figsize=(12.0, 5.2 + 0.16 * max(0, len(summary.rows) - 8)), layout="constrained")
+        figure = Figure(figsize=(12.0, 5.2 + 0.16 * max(0, len(rows) - 8)), layout="constrained")
         for axes, name in zip(figure.subplots(1, 2), ("psnr", "l1"), strict=True):
-            for row in summary.rows:
+            for row in rows:
                 curve = getattr(row, f"{name}_curve")
                 color, dash = styles[row.name]
                 axes.plot(curve.seconds, curve.mean, dash, marker="o", color=color, label=row.name)
-                if row.psnr.count > 1 and len(summary.rows) <= BANDS_UP_TO:
+                if row.psnr.count > 1 and len(rows) <= BANDS_UP_TO:
                     axes.fill_between(curve.seconds, curve.low, curve.high, color=color, alpha=0.15, linewidth=0)
             axes.set_xlabel("training time in seconds (evaluation excluded)")
             axes.set_xlim(left=0)
         psnr_axes, l1_axes = figure.axes
-        floor = min(row.psnr.mean for row in summary.rows) - SHOWN_BELOW
+        floor = min(row.psnr.mean for row in rows) - SHOWN_BELOW
         psnr_axes.set(ylabel="test PSNR in dB", title=f"{summary.scene}: PSNR")
         psnr_axes.set_ylim(bottom=max(floor, psnr_axes.get_ylim()[0]))
         l1_axes.set(ylabel="mean absolute error on test views (0 .. 1)", title="mean absolute error")
-        ceiling = SHOWN_ABOVE * max(row.l1_curve.mean[-1] for row in summary.rows)
-        floor = 0.9 * min(min(row.l1_curve.mean) for row in summary.rows)
+        ceiling = SHOWN_ABOVE * max(row.l1_curve.mean[-1] for row in rows)
+        floor = 0.9 * min(min(row.l1_curve.mean) for row in rows)
         l1_axes.set_ylim(bottom=floor, top=min(ceiling, l1_axes.get_ylim()[1]))
         handles, labels = psnr_axes.get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside right center", frameon=False, fontsize=9)
+        figure.supxlabel(failed, fontsize=9)
         figure.savefig(path)
 
 
 def plot_front(path: Path, summary: SceneSummary) -> None:
     """Final PSNR against training time: a point a variant with the seeds' spreads, the Pareto front marked."""
-    styles = _styles(summary)
+    styles, (rows, failed) = _styles(summary), told_apart(summary)
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(8.6, 5.2), layout="constrained")
         axes = figure.add_subplot()
-        for row in summary.rows:
+        for row in rows:
             axes.errorbar(
                 row.seconds.mean,
                 row.psnr.mean,
@@ -80,7 +92,7 @@ def plot_front(path: Path, summary: SceneSummary) -> None:
                 elinewidth=1.0,
                 alpha=0.9,
             )
-        front = sorted((row for row in summary.rows if row.on_front), key=lambda row: row.seconds.mean)
+        front = sorted((row for row in rows if row.on_front), key=lambda row: row.seconds.mean)
         axes.step(
             [row.seconds.mean for row in front],
             [row.psnr.mean for row in front],
@@ -97,7 +109,8 @@ def plot_front(path: Path, summary: SceneSummary) -> None:
         )
         axes.margins(x=0.18, y=0.12)
         axes.legend(loc="lower right", frameon=False, fontsize=9)
-        _label_points(axes, summary.rows)
+        figure.supxlabel(failed, fontsize=9)
+        _label_points(axes, rows)
         figure.savefig(path)
 
 
