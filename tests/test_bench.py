@@ -245,13 +245,17 @@ def test_other_builds_get_the_models_that_this_one_times(turbogs, capture, tmp_p
         assert path == library and "--training" not in command
         files = command[command.index("--ply") + 1 :][:2]
         handed_on.extend(load_ply(file, load_scene(capture).frame) for file in files)
-        return {"model": "files"}
+        assert (
+            len(json.loads(out.read_text())["passes"]) == 6
+        )  # what is measured is kept, whatever becomes of this build
+        return {"model": "files", "passes": [], "gsplat": []}
 
     monkeypatch.setattr(RasterBench, "_measure", watched)
     monkeypatch.setattr(commands, "other_build", other_build)
     options = ["--scene", capture, "--gaussians", 150, 200, "--training", 0, *RASTER_PASSES, "--library", library]
-    code, _, error = turbogs("bench", "raster", *options, "--out", out)
+    code, output, error = turbogs("bench", "raster", *options, "--out", out)
     assert code == 0, error
+    assert output.splitlines()[-2:] == ["other.so:", f"json  {out}"]
     assert [len(model) for model in handed_on] == [150, 200] and len(timed) == 6
     for mine, theirs in zip(timed[::3], handed_on, strict=True):
         assert all(torch.equal(a, b) for (_, a), (_, b) in zip(mine.items(), theirs.items(), strict=True))

@@ -25,7 +25,7 @@ SHOWN_BELOW = 4.0
 SHOWN_ABOVE = 1.6
 """Times the worst final error, at which that plot ends: 4 dB as well."""
 FAILED_BELOW = 8.0
-"""dB below the best final result at which a variant has failed: it is named below the plot, whose scale is the others'."""
+"""dB below the best final result at which a variant has failed: it is named below a plot to the scale of the others."""
 
 
 def _styles(summary: SceneSummary) -> dict[str, tuple[str, str]]:

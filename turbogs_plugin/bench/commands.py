@@ -43,7 +43,8 @@ def run_step(
     else:
         capture = scene_on(load_scene(scene, factor), device)
     measured = bench.run(capture, device)
-    return _finish("step", measured, device, out, step_lines(measured))
+    _tell(step_lines(measured), out)
+    return _finish(_report("step", measured, device), out)
 
 
 def run_raster(bench: RasterBench, scene: Path | None, factor: int, device: torch.device, out: Path | None) -> int:
@@ -54,11 +55,16 @@ def run_raster(bench: RasterBench, scene: Path | None, factor: int, device: torc
     with tempfile.TemporaryDirectory() as folder:
         shared = bench.with_saved_models(capture, device, Path(folder)) if bench.libraries else bench
         command = [*shared.arguments(), *place]
-        measured = {**shared.run(capture, device), **model}
-        measured["other_builds"] = {
-            library.name: {**other_build(library, command), **model} for library in bench.libraries
-        }
-    return _finish("raster", measured, device, out, raster_lines(measured))
+        measured = shared.run(capture, device)
+        report = _report("raster", {**measured, **model, "other_builds": {}}, device)
+        _save(report, out)  # a build that fails takes nothing away
+        _tell(raster_lines(measured), out)
+        for library in bench.libraries:
+            measured = other_build(library, command)
+            report["other_builds"][library.name] = {**measured, **model}
+            _save(report, out)
+            _tell([f"{library.name}:", *raster_lines(measured)], out)
+    return _finish(report, out)
 
 
 def _require_new(out: Path | None) -> None:
@@ -67,14 +73,24 @@ def _require_new(out: Path | None) -> None:
         raise InputError(f"--out '{out}': name a file in a folder that exists")
 
 
-def _finish(what: str, measured: dict[str, Any], device: torch.device, out: Path | None, lines: Sequence[str]) -> int:
-    report = {"bench": what, "device": device.type, "provenance": asdict(provenance(device.type)), **measured}
-    text = json.dumps(report, indent=2) + "\n"
-    if out is None:
-        print(text, end="")
-        return 0
-    write_text_atomically(out, text)
-    print("\n".join([*lines, f"json  {out}"]))
+def _report(what: str, measured: dict[str, Any], device: torch.device) -> dict[str, Any]:
+    return {"bench": what, "device": device.type, "provenance": asdict(provenance(device.type)), **measured}
+
+
+def _save(report: dict[str, Any], out: Path | None) -> None:
+    if out is not None:
+        write_text_atomically(out, json.dumps(report, indent=2) + "\n")
+
+
+def _tell(lines: Sequence[str], out: Path | None) -> None:
+    """The gist as it is known; without a file standard output is for the JSON alone."""
+    if out is not None:
+        print("\n".join(lines), flush=True)
+
+
+def _finish(report: dict[str, Any], out: Path | None) -> int:
+    _save(report, out)
+    print(json.dumps(report, indent=2) if out is None else f"json  {out}")
     return 0
 
 
