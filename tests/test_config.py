@@ -3,6 +3,7 @@
 import pytest
 
 from turbogs_plugin import registry
+from turbogs_plugin.ablation.grid import load_ablation
 from turbogs_plugin.config import apply_overrides, config_names, load_config, resolve
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.yaml_text import DEPTH_LIMIT, SIZE_LIMIT, parse_yaml
@@ -26,7 +27,7 @@ def test_packaged_configurations_are_complete_and_round_trip(name):
 
 
 def test_the_names_of_the_issue_are_packaged():
-    assert {"turbogs", "turbogs-big", "turbogs-paper", "demo"} <= set(config_names())
+    assert {"turbogs", "turbogs-big", "turbogs-ssim", "turbogs-paper", "demo"} <= set(config_names())
 
 
 def test_the_table_of_the_paper():
@@ -37,6 +38,11 @@ def test_the_table_of_the_paper():
         assert config.schedule["type"] == "sinusoidal"
         assert (config.schedule["min_views"], config.schedule["max_views"], config.schedule["alpha"]) == (3, 10, 3.0)
         assert config.maps.beta == 0.4
+
+
+def test_turbogs_ssim_is_what_was_measured_under_another_name():
+    measured = load_config("turbogs", load_ablation("choices").variants["ssim-unit-tile"])
+    assert load_config("turbogs-ssim") == measured
 
 
 @pytest.mark.parametrize(
