@@ -7,6 +7,7 @@ import importlib
 import os
 from pathlib import Path
 
+import gsplat.strategy.default
 import pytest
 import torch
 from bridge_host import HEIGHT, RATES, WIDTH, arguments, make_cameras, make_splats
@@ -172,17 +173,43 @@ def test_mcmc_behind_our_protocol():
     assert (torch.sigmoid(first.apply(gaussians).opacities) > 0.299).all()  # the dead ones have moved
 
 
+class Surgery:
+    """Duplications, splits and removals of one run of gsplat's, made again in another.
+
+    One Gaussian more moves all random numbers after it, so that runs of one rasterizer from one seed end up to 0.5 dB
+    apart; with the same surgery and the same random numbers in both, what is left is the rasterizers'. The other run's
+    own decisions are compared before they are overruled.
+    """
+
+    def __init__(self, monkeypatch):
+        self.masks, self.made, self.repeated, self.differing, self.chosen = [], 0, False, 0, 0
+        for name in ("duplicate", "split", "remove"):
+            monkeypatch.setattr(gsplat.strategy.default, name, self.watched(getattr(gsplat.strategy.default, name)))
+
+    def repeat(self) -> None:
+        self.made, self.repeated = 0, True
+
+    def watched(self, operation):
+        def surgery(params, optimizers, state, mask, **options):
+            if not self.repeated:
+                self.masks.append((operation, mask.clone()))
+            wanted_operation, wanted = self.masks[self.made]
+            assert operation is wanted_operation
+            common = min(len(mask), len(wanted))  # a split's mask ends with the duplicates just made
+            self.differing += int((mask[:common] != wanted[:common]).sum())
+            self.chosen += int(wanted.sum())
+            self.made += 1
+            torch.manual_seed(self.made)
+            operation(params=params, optimizers=optimizers, state=state, mask=wanted, **options)
+
+        return surgery
+
+
 @pytest.mark.parametrize(
-    ("options", "runs", "bound"),
-    [
-        # Measured: 0.003 dB.
-        pytest.param({"refine_start_iter": 10**9}, 1, 0.02, id="without densification"),
-        # From one seed gsplat itself ends anywhere within 0.11 dB: its sums have no order, and one Gaussian more moves
-        # all random numbers after it: so means of three runs each. Measured: 0.02 dB.
-        pytest.param({}, 3, 0.1, id="with densification"),
-    ],
+    "options",
+    [pytest.param({"refine_start_iter": 10**9}, id="without densification"), pytest.param({}, id="with densification")],
 )
-def test_our_rasterizer_trains_as_gsplats_does(monkeypatch, options, runs, bound):
+def test_our_rasterizer_trains_as_gsplats_does(monkeypatch, options):
     """r = 1, gsplat's DefaultStrategy and torch's Adam, 1000 steps from one seed: test PSNR within 0.1 dB."""
     folder = os.environ.get("TURBOGS_SCENE")
     if not folder:
@@ -197,13 +224,13 @@ def test_our_rasterizer_trains_as_gsplats_does(monkeypatch, options, runs, bound
         colors, _, info = host.dense_rasterization(**host.splat_arguments(splats), **views, packed=False, **render)
         return torch.nn.functional.l1_loss(colors, batch.pixels), info
 
-    means = {}
+    results, surgery = {}, Surgery(monkeypatch)
     for name, forward in (("gsplat", host.l1_of_images), ("ours", with_our_rasterizer)):
-        results = []
-        for _ in range(runs):
-            torch.manual_seed(0)
-            results.append(host.train(scene, 1000, DefaultStrategy(**options), forward=forward))
-            host.report(name, results[-1])
-        assert all(result.last_psnr > result.first_psnr + 3 for result in results)
-        means[name] = sum(result.last_psnr for result in results) / runs
-    assert abs(means["ours"] - means["gsplat"]) <= bound
+        torch.manual_seed(0)
+        results[name] = host.train(scene, 1000, DefaultStrategy(**options), forward=forward)
+        host.report(name, results[name])
+        assert results[name].last_psnr > results[name].first_psnr + 3
+        surgery.repeat()
+    print(f"{surgery.differing} decisions differ, {surgery.chosen // 2} Gaussians were chosen")
+    assert abs(results["ours"].last_psnr - results["gsplat"].last_psnr) <= 0.1
+    assert surgery.differing <= 0.2 * surgery.chosen
