@@ -71,7 +71,7 @@ BOTH_SIDES = [
     ("iterations", {"train_views": 100}, (*ONE_VIEW, "schedule.pixel_budget=4"), 6000, "60 looks"),
     ("iterations", {"train_views": 20}, ("plan.looks=75",), 2000, "fewer than 40% of 5000"),
     ("optimizer", {"device": "cpu"}, (), "sparse_adam", "5 to 10 % of an iteration"),
-    ("optimizer", {"device": "cuda"}, (), "moment_lm", "at most 7 %"),
+    ("optimizer", {"device": "cuda"}, (), "moment_lm", "within 7 %"),
     ("optimizer", {}, ("optimizer.type=adam",), "keep", "the optimizer is adam"),
     ("maps_on", {"device_free_bytes": 240 * MIB}, (), "device", "120 MiB <= 50% of 240 MiB free"),
     ("maps_on", {"device_free_bytes": 239 * MIB}, (), "host", "120 MiB > 50% of 239 MiB free"),
