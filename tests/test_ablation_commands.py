@@ -70,10 +70,12 @@ def test_a_sweep_is_complete_and_goes_on_where_it_stopped(turbogs, small, captur
     assert [row["variant"] for row in rows] == ["full", "random"]
     mean = np.mean([json.loads(path.read_text())["history"][-1]["psnr"] for path in cells[2:]])
     assert float(rows[1]["psnr_mean"]) == pytest.approx(mean) and rows[1]["lpips_mean"] == ""
+    worst = [json.loads(path.read_text())["history"][-1]["worst_psnr"] for path in cells[2:]]
+    assert float(rows[1]["worst_psnr_low"]) == pytest.approx(min(worst)) and min(worst) < mean
 
     page, markdown = (out / "report.html").read_text(), (out / "report.md").read_text()
     assert page.count("data:image/png;base64,") == 2 and not re.search(r"(src|href)=\"(?!data:)", page)
-    for word in ("thrown away", "not computed", "not measured", "★", "torch", f"{mean:.2f}"):
+    for word in ("thrown away", "not computed", "not measured", "★", "torch", f"{mean:.2f}", f"{min(worst):.2f}"):
         assert word in page and word in markdown
     assert "a \\| bar" in markdown
     assert not list(out.rglob("*.ply")) and not list(out.rglob("*.pt"))

@@ -11,7 +11,7 @@ from PIL import Image
 
 from turbogs_plugin import run
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.evaluation import compare, load_lpips, peak_memory_bytes
+from turbogs_plugin.evaluation import Metrics, ViewMetrics, compare, load_lpips, peak_memory_bytes
 from turbogs_plugin.progress import TrainingProgress, describe_nonfinite
 from turbogs_plugin.report.history import Evaluation, append_evaluation, read_history, rewind_history
 from turbogs_plugin.report.pages import number, table
@@ -31,6 +31,12 @@ def test_a_line_has_every_field_and_reads_back(tmp_path):
         append_evaluation(path, line)
     assert all(set(json.loads(line)) >= FIELDS for line in path.read_text().splitlines())
     assert read_history(path) == written
+
+
+def test_the_worst_view_is_recorded():
+    views = [ViewMetrics("a", 31.0, 0.9, 0.01), ViewMetrics("b", 18.5, 0.7, 0.1), ViewMetrics("c", 33.0, 0.9, 0.01)]
+    assert Metrics(views, 10.0).worst_psnr == 18.5
+    assert math.isnan(Metrics([*views, ViewMetrics("d", math.nan, 0.9, 0.01)], 10.0).worst_psnr)
 
 
 def test_nan_is_null(tmp_path):

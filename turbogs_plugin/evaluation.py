@@ -63,6 +63,12 @@ class Metrics:
         return self.mean("psnr")
 
     @property
+    def worst_psnr(self) -> float:
+        """Of the worst view: a mean hides that something covers one of them. NaN where a view has none."""
+        values = [view.psnr for view in self.views]
+        return math.nan if any(map(math.isnan, values)) else min(values)
+
+    @property
     def ssim(self) -> float:
         return self.mean("ssim")
 

@@ -36,7 +36,8 @@ class VariantRow:
 
     Args:
         name: of the variant.
-        seconds, psnr, ssim, l1, lpips, gaussians, fps, peak_bytes: over seeds; NaN where not computed or not measured.
+        seconds, psnr, worst_psnr, ssim, l1, lpips, gaussians, fps, peak_bytes: over seeds; NaN where not computed or
+            not measured.
         iterations: of the seeds, where the time budget stopped some, else empty.
         psnr_difference: mean PSNR minus the baseline's.
         psnr_differs, seconds_differ: whether the seeds' spreads are apart from the baseline's; None where that is open.
@@ -49,6 +50,7 @@ class VariantRow:
     seeds: list[int]
     seconds: Spread
     psnr: Spread
+    worst_psnr: Spread
     ssim: Spread
     l1: Spread
     lpips: Spread
@@ -124,6 +126,7 @@ def _summarise_scene(study: Study, scene: str, targets: Sequence[float]) -> Scen
                 seeds=[cell.seed for cell in results],
                 seconds=seconds,
                 psnr=psnr,
+                worst_psnr=Spread.of(cell.final.worst_psnr for cell in results),
                 ssim=Spread.of(cell.final.ssim for cell in results),
                 l1=Spread.of(cell.final.l1 for cell in results),
                 lpips=Spread.of(cell.lpips for cell in results),

@@ -28,6 +28,7 @@ class Evaluation:
         memory_bytes: peak of the GPU's tensors, or of the process on a CPU.
         nonfinite_losses: iterations so far whose loss was not finite.
         skipped_updates: Gaussians' updates left out so far because their gradient was not finite.
+        worst_psnr: of the worst test view; NaN in what was written before it was recorded.
     """
 
     iteration: int
@@ -39,6 +40,7 @@ class Evaluation:
     memory_bytes: int
     nonfinite_losses: int = 0
     skipped_updates: int = 0
+    worst_psnr: float = math.nan
 
     @classmethod
     def of(cls, trainer: Trainer, metrics: Metrics, train_seconds: float, memory_bytes: int) -> Evaluation:
@@ -53,6 +55,7 @@ class Evaluation:
             memory_bytes=memory_bytes,
             nonfinite_losses=int(trainer.nonfinite_losses),
             skipped_updates=int(trainer.optimizer.skipped),
+            worst_psnr=metrics.worst_psnr,
         )
 
     def to_json(self) -> str:
