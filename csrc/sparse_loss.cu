@@ -8,6 +8,8 @@
 
 #include <cuda_fp16.h>
 
+#include "cell_structure.cuh"
+#include "lane_samples.cuh"
 #include "tile_similarity.cuh"
 #include "training_math.cuh"
 #include "training_params.h"
@@ -17,63 +19,11 @@ namespace turbogs {
 namespace {
 
 constexpr int kLossThreads = 128;
-constexpr int kLossBlocks = 7;  // of an SM: 72 registers
+constexpr int kLossBlocks = 7;      // of an SM: 72 registers
+constexpr int kCellLossBlocks = 4;  // with cells as windows: 128
 constexpr int kLossWarps = kLossThreads / 32;
 constexpr float kBalanceEpsilon = 1e-8f;
 constexpr float kErrorMax = 65504.0f;  // largest finite half
-
-// byte / 255, correctly rounded.
-__device__ __forceinline__ float unit_color(uint8_t byte) {
-    const float value = static_cast<float>(byte), quotient = value * (1.0f / 255.0f);
-    return __fmaf_rn(__fmaf_rn(-quotient, 255.0f, value), 1.0f / 255.0f, quotient);
-}
-
-// What a lane holds of a tile: slots first + 32 j + lane. An empty slot has weight 0 and pixel -1.
-template <int kSlots>
-struct LaneSamples {
-    int pixel[kSlots];
-    float x[kSlots][3], y[kSlots][3], weight[kSlots];
-};
-
-template <int kSlots>
-__device__ __forceinline__ void load_samples(const SparseLossParams& params, const SampleView& view, int first, int end,
-                                             LaneSamples<kSlots>& samples, int& nonfinite) {
-    const int lane = threadIdx.x & 31;
-#pragma unroll
-    for (int j = 0; j < kSlots; ++j) {
-        const int slot = first + 32 * j + lane;
-        samples.pixel[j] = slot < end ? params.pixel_ids[slot] : -1;
-    }
-#pragma unroll
-    for (int j = 0; j < kSlots; ++j) {
-        const size_t slot = static_cast<size_t>(first + 32 * j + lane);
-        const bool filled = samples.pixel[j] >= 0;
-#pragma unroll
-        for (int c = 0; c < 3; ++c) {
-            samples.x[j][c] = filled ? params.colors[3 * slot + c] : 0.0f;
-            samples.y[j][c] = 0.0f;
-        }
-        samples.weight[j] = filled ? (params.weights != nullptr ? params.weights[slot] : 1.0f) : 0.0f;
-        if (!filled) continue;
-        if (params.targets != nullptr) {
-#pragma unroll
-            for (int c = 0; c < 3; ++c) samples.y[j][c] = params.targets[3 * slot + c];
-        } else {
-            const uint8_t* photo = params.photos + 3 * (view.pixel_base + samples.pixel[j]);
-#pragma unroll
-            for (int c = 0; c < 3; ++c) samples.y[j][c] = unit_color(photo[c]);
-        }
-    }
-#pragma unroll
-    for (int j = 0; j < kSlots; ++j) {
-        if (is_finite(samples.x[j][0]) && is_finite(samples.x[j][1]) && is_finite(samples.x[j][2])) continue;
-        ++nonfinite;
-        samples.pixel[j] = -1;
-        samples.weight[j] = 0.0f;
-#pragma unroll
-        for (int c = 0; c < 3; ++c) samples.x[j][c] = samples.y[j][c] = 0.0f;
-    }
-}
 
 // What a tile adds to the loss and to the sum of its view; the lane's part of the latter.
 struct TileTotals {
@@ -82,13 +32,13 @@ struct TileTotals {
 };
 
 // One tile. Up to 32 kSlots samples stay in registers; of more, each pass loads them again, in as many rounds.
-template <int kSlots>
+template <int kSlots, bool kCells>
 __device__ __forceinline__ TileTotals tile_loss(const SparseLossParams& params, const SampleView& view, int first, int end,
                                                 float filled, bool learns) {
     constexpr int kRound = 32 * kSlots;
     const int lane = threadIdx.x & 31;
     const bool resident = end - first <= kRound;
-    const bool structured = params.structure != Structure::kNone;
+    const bool structured = !kCells && params.structure != Structure::kNone;
     const float l1_scale = params.l1_weight / (3.0f * filled), epsilon2 = params.epsilon * params.epsilon;
     TileTotals totals;
     LaneSamples<kSlots> samples;
@@ -250,12 +200,13 @@ __device__ __forceinline__ TileTotals tile_loss(const SparseLossParams& params, 
             }
         }
     }
+    if (kCells) totals.loss += static_cast<double>(cell_structure<kSlots>(params, view, first, end, samples));
     return totals;
 }
 
 // A warp per tile; its block adds up what belongs together. Up to 32 kSlots samples of a tile are held in registers.
-template <int kSlots>
-__global__ void __launch_bounds__(kLossThreads, kLossBlocks)
+template <int kSlots, bool kCells>
+__global__ void __launch_bounds__(kLossThreads, kCells ? kCellLossBlocks : kLossBlocks)
     sparse_loss_kernel(const __grid_constant__ SparseLossParams params) {
     __shared__ double losses[kLossWarps], view_deltas[kLossWarps];
     __shared__ int views[kLossWarps];
@@ -270,7 +221,7 @@ __global__ void __launch_bounds__(kLossThreads, kLossBlocks)
         const int first = params.tile_offsets[tile], end = params.tile_offsets[tile + 1], tile_id = params.tile_ids[tile];
         view = 0;
         while (view + 1 < params.num_views && tile_id >= params.views[view + 1].tile_base) ++view;
-        totals = tile_loss<kSlots>(params, params.views[view], first, end, filled, learns);
+        totals = tile_loss<kSlots, kCells>(params, params.views[view], first, end, filled, learns);
         totals.view_delta = warp_sum(totals.view_delta);
         const uint32_t nonfinite = __reduce_add_sync(kFullWarp, static_cast<uint32_t>(totals.nonfinite));
         if (lane == 0 && nonfinite != 0u && params.num_nonfinite != nullptr) {
@@ -304,6 +255,15 @@ __global__ void __launch_bounds__(kLossThreads, kLossBlocks)
     }
 }
 
+template <int kSlots>
+void launch(const SparseLossParams& params, int blocks, cudaStream_t stream) {
+    if (params.structure == Structure::kCellSsim) {
+        sparse_loss_kernel<kSlots, true><<<blocks, kLossThreads, 0, stream>>>(params);
+    } else {
+        sparse_loss_kernel<kSlots, false><<<blocks, kLossThreads, 0, stream>>>(params);
+    }
+}
+
 }  // namespace
 
 cudaError_t launch_sparse_loss(const SparseLossParams& params, cudaStream_t stream) {
@@ -311,13 +271,13 @@ cudaError_t launch_sparse_loss(const SparseLossParams& params, cudaStream_t stre
     const int blocks = (params.num_tiles + kLossWarps - 1) / kLossWarps;
     // By the average: most samplers give every tile as many slots.
     if (params.num_slots <= 32 * static_cast<int64_t>(params.num_tiles)) {
-        sparse_loss_kernel<1><<<blocks, kLossThreads, 0, stream>>>(params);
+        launch<1>(params, blocks, stream);
     } else if (params.num_slots <= 64 * static_cast<int64_t>(params.num_tiles)) {
-        sparse_loss_kernel<2><<<blocks, kLossThreads, 0, stream>>>(params);
+        launch<2>(params, blocks, stream);
     } else if (params.num_slots <= 96 * static_cast<int64_t>(params.num_tiles)) {
-        sparse_loss_kernel<3><<<blocks, kLossThreads, 0, stream>>>(params);
+        launch<3>(params, blocks, stream);
     } else {
-        sparse_loss_kernel<4><<<blocks, kLossThreads, 0, stream>>>(params);
+        launch<4>(params, blocks, stream);
     }
     return cudaGetLastError();
 }

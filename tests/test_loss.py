@@ -19,6 +19,8 @@ EVERY = [
     CharbonnierNccLoss(ncc_weight=0.5, structure="contrast", gate=True, variance_constant=1e-4),
     SparseSsimLoss(),
     SparseSsimLoss(ssim_weight=1.0),
+    SparseSsimLoss(window="cell"),
+    SparseSsimLoss(ssim_weight=1.0, window="cell"),
 ]
 STRUCTURED = [loss for loss in EVERY if isinstance(loss, CharbonnierNccLoss)]
 
@@ -55,6 +57,15 @@ def tiles_of(samples):
     """Filled slots of each tile."""
     offsets, ids = samples.tile_offsets.tolist(), samples.pixel_ids.tolist()
     return [[p for p in range(a, b) if ids[p] >= 0] for a, b in itertools.pairwise(offsets)]
+
+
+def cells_of(samples, slots):
+    """Those slots of one tile by its 4x4 cells."""
+    cells = {}
+    for slot in slots:
+        y, x = divmod(int(samples.pixel_ids[slot]), int(samples.sizes[0, 0]))
+        cells.setdefault((y // 4 % 4, x // 4 % 4), []).append(slot)
+    return list(cells.values())
 
 
 def expected_similarity(loss, x, y, w):
@@ -107,9 +118,10 @@ def expected_loss(loss, colors, targets, samples, balance):
     )
     structure = 0.0
     for slots, factor in zip(tiles_of(samples), balance, strict=True):
-        for channel in range(3):
-            similarity, gate = expected_similarity(loss, colors[slots, channel], targets[slots, channel], w[slots])
-            structure += factor * gate * (1 - similarity) / 3
+        windows = cells_of(samples, slots) if getattr(loss, "window", "tile") == "cell" else [slots]
+        for window, channel in itertools.product(windows, range(3)):
+            similarity, gate = expected_similarity(loss, colors[window, channel], targets[window, channel], w[window])
+            structure += factor * gate * (1 - similarity) / 3 / len(windows)
     return base * l1 + weight * structure / len(samples.tile_ids)
 
 
@@ -326,6 +338,7 @@ def test_without_a_single_filled_slot_the_loss_is_zero():
         (lambda: CharbonnierNccLoss(variance_constant=0.0), "variance_constant"),
         (lambda: CharbonnierNccLoss(epsilon=float("nan")), "epsilon"),
         (lambda: SparseSsimLoss(ssim_weight=1.1), "ssim_weight"),
+        (lambda: SparseSsimLoss(window="view"), "window"),
     ],
 )
 def test_invalid_values_are_named(make, named):

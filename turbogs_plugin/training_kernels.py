@@ -45,7 +45,7 @@ ROW_WIDTH = 14
 
 CELL_SIDE, TILE_CELLS = 4, 16
 UNITS = ("pixel", "cell", "tile")
-STRUCTURES = ("none", "ncc", "contrast", "ssim")
+STRUCTURES = ("none", "ncc", "contrast", "ssim", "cell_ssim")
 
 
 def sample_pixels(
