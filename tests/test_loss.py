@@ -246,9 +246,10 @@ def test_gradients_stay_below_the_stated_bound(loss, name, count, weighted):
 
 @pytest.mark.parametrize("name", list(extreme_tiles()))
 @pytest.mark.parametrize("ssim_weight", [0.2, 1.0])
-def test_ssim_stays_finite(name, ssim_weight):
+@pytest.mark.parametrize("window", ["tile", "cell"])
+def test_ssim_stays_finite(name, ssim_weight, window):
     colors, targets = extreme_tiles()[name]
-    result = SparseSsimLoss(ssim_weight=ssim_weight)(colors, targets, make_samples([30]))
+    result = SparseSsimLoss(ssim_weight=ssim_weight, window=window)(colors, targets, make_samples([30]))
     assert torch.isfinite(result.loss)
     assert torch.isfinite(result.color_gradients).all()
     assert result.color_gradients.abs().max() < 30
