@@ -1,8 +1,9 @@
 """The swaps in front of gsplat's own kernels, and our rasterizer in the place of gsplat's for a whole training.
 
-The last test trains on a scene: ``TURBOGS_SCENE=FOLDER pytest tests/gpu/test_gsplat_bridge.py``.
+The last tests train on a scene: ``TURBOGS_SCENE=FOLDER pytest tests/gpu/test_gsplat_bridge.py``.
 """
 
+import functools
 import importlib
 import os
 from pathlib import Path
@@ -192,12 +193,13 @@ class Surgery:
     def watched(self, operation):
         def surgery(params, optimizers, state, mask, **options):
             if not self.repeated:
-                self.masks.append((operation, mask.clone()))
+                self.masks.append((operation, mask))
             wanted_operation, wanted = self.masks[self.made]
             assert operation is wanted_operation
-            common = min(len(mask), len(wanted))  # a split's mask ends with the duplicates just made
-            self.differing += int((mask[:common] != wanted[:common]).sum())
-            self.chosen += int(wanted.sum())
+            if self.repeated:
+                common = min(len(mask), len(wanted))  # a split's mask ends with the duplicates just made
+                self.differing += int((mask[:common] != wanted[:common]).sum())
+                self.chosen += int(wanted.sum())
             self.made += 1
             torch.manual_seed(self.made)
             operation(params=params, optimizers=optimizers, state=state, mask=wanted, **options)
@@ -205,12 +207,8 @@ class Surgery:
         return surgery
 
 
-@pytest.mark.parametrize(
-    "options",
-    [pytest.param({"refine_start_iter": 10**9}, id="without densification"), pytest.param({}, id="with densification")],
-)
-def test_our_rasterizer_trains_as_gsplats_does(monkeypatch, options):
-    """r = 1, gsplat's DefaultStrategy and torch's Adam, 1000 steps from one seed: test PSNR within 0.1 dB."""
+def trainings(monkeypatch):
+    """Name of the rasterizer -> a training with it, from options of DefaultStrategy to its result."""
     folder = os.environ.get("TURBOGS_SCENE")
     if not folder:
         pytest.skip("set TURBOGS_SCENE to the folder of a scene")
@@ -224,13 +222,42 @@ def test_our_rasterizer_trains_as_gsplats_does(monkeypatch, options):
         colors, _, info = host.dense_rasterization(**host.splat_arguments(splats), **views, packed=False, **render)
         return torch.nn.functional.l1_loss(colors, batch.pixels), info
 
-    results, surgery = {}, Surgery(monkeypatch)
-    for name, forward in (("gsplat", host.l1_of_images), ("ours", with_our_rasterizer)):
+    def train(name, forward, options):
         torch.manual_seed(0)
-        results[name] = host.train(scene, 1000, DefaultStrategy(**options), forward=forward)
-        host.report(name, results[name])
-        assert results[name].last_psnr > results[name].first_psnr + 3
+        result = host.train(scene, 1000, DefaultStrategy(**options), forward=forward)
+        host.report(name, result)
+        return result
+
+    forwards = {"gsplat": host.l1_of_images, "ours": with_our_rasterizer}
+    return {name: functools.partial(train, name, forward) for name, forward in forwards.items()}
+
+
+@pytest.mark.parametrize(
+    ("options", "runs", "bound"),
+    [
+        # Measured: 0.003 dB.
+        pytest.param({"refine_start_iter": 10**9}, 1, 0.02, id="without densification"),
+        # From one seed gsplat itself ends anywhere within 0.11 dB: its sums have no order, and one Gaussian more moves
+        # all random numbers after it: so means of three runs each. Measured: 0.02 dB.
+        pytest.param({}, 3, 0.1, id="with densification"),
+    ],
+)
+def test_our_rasterizer_trains_as_gsplats_does(monkeypatch, options, runs, bound):
+    """r = 1, gsplat's DefaultStrategy and torch's Adam, 1000 steps from one seed: test PSNR within 0.1 dB."""
+    means = {}
+    for name, train in trainings(monkeypatch).items():
+        results = [train(options) for _ in range(runs)]
+        assert all(result.last_psnr > result.first_psnr + 3 for result in results)
+        means[name] = sum(result.last_psnr for result in results) / runs
+    assert abs(means["ours"] - means["gsplat"]) <= bound
+
+
+def test_our_rasterizer_trains_as_gsplats_does_with_the_same_surgery(monkeypatch):
+    """The same, without the chaos of the decisions of density control."""
+    surgery, psnr = Surgery(monkeypatch), {}
+    for name, train in trainings(monkeypatch).items():
+        psnr[name] = train({}).last_psnr
         surgery.repeat()
-    print(f"{surgery.differing} decisions differ, {surgery.chosen // 2} Gaussians were chosen")
-    assert abs(results["ours"].last_psnr - results["gsplat"].last_psnr) <= 0.1
-    assert surgery.differing <= 0.2 * surgery.chosen
+    print(f"{surgery.differing} decisions differ, {surgery.chosen} Gaussians were chosen")
+    assert abs(psnr["ours"] - psnr["gsplat"]) <= 0.1
+    assert surgery.chosen > 0 and surgery.differing <= 0.2 * surgery.chosen
