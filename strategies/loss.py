@@ -21,7 +21,8 @@ from torch import Tensor
 
 from turbogs_plugin import kernels
 from turbogs_plugin.errors import require
-from turbogs_plugin.training_kernels import CELL_SIDE, TILE_CELLS, LossTerms, sparse_loss
+from turbogs_plugin.tiles import CELL_SIDE, TILE_CELLS
+from turbogs_plugin.training_kernels import LossTerms, sparse_loss
 from turbogs_plugin.types import TILE_SIZE, LossOutput, PixelSamples
 
 LUMINANCE_CONSTANT = 0.01**2
@@ -67,6 +68,7 @@ class TileGroups(SampleGroups):
 
     Attributes:
         filled: scalar tensor, the number of filled slots, at least 1.
+        factors: [G, 1], what turns a sum over tiles into their mean.
     """
 
     def __init__(self, samples: PixelSamples, used: Tensor) -> None:
@@ -74,6 +76,7 @@ class TileGroups(SampleGroups):
         weights = (used if samples.weights is None else used * samples.weights)[:, None]
         super().__init__(samples.tile_of_slot(), len(samples.tile_ids), samples.tile_offsets[:-1].long(), weights)
         self.filled = samples.filled.sum().clamp(min=1).to(used.dtype)
+        self.factors = torch.full_like(self.totals, 1.0 / max(1, self.count))
 
 
 class CellGroups(SampleGroups):
@@ -343,13 +346,9 @@ class SparseSsimLoss:
         if _runs_in_kernel(colors):
             return sparse_loss(colors, targets, samples, self.kernel_terms())
         problem = _Problem(colors, targets, samples, self.epsilon)
-        groups: SampleGroups = problem.groups
-        factors = groups.totals.new_full((groups.count, 1), 1.0 / max(1, groups.count))  # [G, 1]
-        if self.window == "cell":
-            groups = CellGroups(samples, problem.groups)
-            factors = groups.factors
+        groups = CellGroups(samples, problem.groups) if self.window == "cell" else problem.groups
         similarity, slopes = ssim(TileMoments.of(groups, problem.colors, problem.targets), groups)
-        factors = factors * (self.ssim_weight / 3.0)
+        factors = groups.factors * (self.ssim_weight / 3.0)
         loss = (1.0 - self.ssim_weight) * problem.loss + (factors * (1.0 - similarity)).sum()
         gradients = (1.0 - self.ssim_weight) * problem.gradients - groups.spread(factors) * groups.shares * slopes
         return problem.output(loss, gradients)

@@ -54,12 +54,10 @@ from turbogs_plugin.strategies.philox import (
 from turbogs_plugin import kernels, training_kernels
 from turbogs_plugin.error_maps import AGE_MAX, ErrorMaps
 from turbogs_plugin.errors import InputError, require
-from turbogs_plugin.tiles import TILE_PIXELS, compact, dense_pixels, pixel_table, tile_extents
+from turbogs_plugin.tiles import CELL_SIDE, TILE_CELLS, TILE_PIXELS, compact, dense_pixels, pixel_table, tile_extents
 from turbogs_plugin.types import CELL_HEIGHT, CELL_WIDTH, TILE_SIZE, PixelSamples, Step, TileGrid
 
 UNITS = ("pixel", "cell", "tile")
-CELL_SIDE = 4
-TILE_CELLS = (TILE_SIZE // CELL_SIDE) ** 2
 
 RANK_BITS = 20
 AGE_TIE_BITS = 24

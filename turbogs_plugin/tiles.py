@@ -12,6 +12,8 @@ from torch import Tensor
 from turbogs_plugin.types import TILE_SIZE, PixelSamples, TileGrid, cell_order
 
 TILE_PIXELS = TILE_SIZE * TILE_SIZE
+CELL_SIDE = 4
+TILE_CELLS = (TILE_SIZE // CELL_SIDE) ** 2
 
 
 def pixel_table(sizes: np.ndarray, device: torch.device | str) -> Tensor:

@@ -20,7 +20,7 @@ from torch import Tensor
 from turbogs_plugin import kernels
 from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.tiles import TILE_PIXELS
+from turbogs_plugin.tiles import CELL_SIDE, TILE_CELLS, TILE_PIXELS
 from turbogs_plugin.types import (
     PARAMETER_NAMES,
     TILE_SIZE,
@@ -43,7 +43,6 @@ MAX_VIEWS = 128
 ROW_WIDTH = 14
 """Gradients of a view's row: means 3, scales 3, quats 4, sh0 3, opacities 1."""
 
-CELL_SIDE, TILE_CELLS = 4, 16
 UNITS = ("pixel", "cell", "tile")
 STRUCTURES = ("none", "ncc", "contrast", "ssim", "cell_ssim")
 

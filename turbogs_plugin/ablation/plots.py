@@ -39,9 +39,9 @@ def _styles(summary: SceneSummary) -> dict[str, tuple[str, str]]:
 
 def told_apart(summary: SceneSummary) -> tuple[list[VariantRow], str]:
     """The variants that set a plot's scale, and a line that names those that failed ("" for none)."""
-    best = max(row.psnr.mean for row in summary.rows)
-    shown = [row for row in summary.rows if not row.psnr.mean < best - FAILED_BELOW]
-    failed = [row for row in summary.rows if row not in shown]
+    floor = max(row.psnr.mean for row in summary.rows) - FAILED_BELOW
+    failed = [row for row in summary.rows if row.psnr.mean < floor]
+    shown = [row for row in summary.rows if not row.psnr.mean < floor]  # NaN is shown
     words = (f"{row.name} ({row.psnr.mean:.1f} dB in {row.seconds.mean:.1f} s)" for row in failed)
     return shown, "Not in the plot: " + ", ".join(words) if failed else ""
 

@@ -43,8 +43,10 @@ def run_step(
     else:
         capture = scene_on(load_scene(scene, factor), device)
     measured = bench.run(capture, device)
+    report = _report("step", measured, device)
+    _save(report, out)
     _tell(step_lines(measured), out)
-    return _finish(_report("step", measured, device), out)
+    return _finish(report, out)
 
 
 def run_raster(bench: RasterBench, scene: Path | None, factor: int, device: torch.device, out: Path | None) -> int:
@@ -89,7 +91,6 @@ def _tell(lines: Sequence[str], out: Path | None) -> None:
 
 
 def _finish(report: dict[str, Any], out: Path | None) -> int:
-    _save(report, out)
     print(json.dumps(report, indent=2) if out is None else f"json  {out}")
     return 0
 
