@@ -31,6 +31,12 @@ inline int to_int(int64_t value, const char* what) {
     return static_cast<int>(value);
 }
 
+// Pixels of a view are counted in 32 bits, too.
+inline void check_size(int64_t view, int64_t width, int64_t height) {
+    STD_TORCH_CHECK(width > 0 && height > 0 && width <= INT32_MAX / height, "turbogs: sizes: view ", view, " is ", width,
+                    " x ", height);
+}
+
 // One call of an operator: makes the device of its tensors current while it lives, and gives raw pointers of tensors that
 // are contiguous, on that device, of the wanted type and shape; says what was wanted where one is not.
 class Checker {

@@ -45,7 +45,8 @@ __device__ __forceinline__ float cell_structure(const SparseLossParams& params, 
     float tile_sum = 0.0f;
     for (; present != 0u; present &= present - 1u) {
         const int cell = __ffs(static_cast<int>(present)) - 1;
-        float first_x[3] = {}, first_y[3] = {}, mean_x[3], mean_y[3], inverse_total;
+        WindowMeans means;
+        float inverse_total;
         {
             bool found = false;
             float sums[8] = {};  // offsets of x 0-2 and y 3-5, weights
@@ -57,59 +58,34 @@ __device__ __forceinline__ float cell_structure(const SparseLossParams& params, 
                     const uint32_t lanes = __ballot_sync(kFullWarp, mine);
                     if (!found && lanes != 0u) {
                         found = true;
-#pragma unroll
-                        for (int c = 0; c < 3; ++c) {
-                            first_x[c] = __shfl_sync(kFullWarp, samples.x[j][c], __ffs(static_cast<int>(lanes)) - 1);
-                            first_y[c] = __shfl_sync(kFullWarp, samples.y[j][c], __ffs(static_cast<int>(lanes)) - 1);
-                        }
+                        means.start(samples, j, __ffs(static_cast<int>(lanes)) - 1);
                     }
                     const float weight = mine ? samples.weight[j] : 0.0f;
 #pragma unroll
                     for (int c = 0; c < 3; ++c) {
-                        sums[c] += weight * (samples.x[j][c] - first_x[c]);
-                        sums[3 + c] += weight * (samples.y[j][c] - first_y[c]);
+                        sums[c] += weight * (samples.x[j][c] - means.first_x[c]);
+                        sums[3 + c] += weight * (samples.y[j][c] - means.first_y[c]);
                     }
                     sums[6] += weight;
                 }
             }
             warp_sums(sums);
             inverse_total = 1.0f / sums[6];
-#pragma unroll
-            for (int c = 0; c < 3; ++c) {
-                mean_x[c] = sums[c] * inverse_total;
-                mean_y[c] = sums[3 + c] * inverse_total;
-            }
+            means.finish(sums, inverse_total);
         }
-        float at_y[3], at_x[3], constant[3];
-        {
-            float sums[8] = {}, last = 0.0f;  // xx 0-2, yy 3-5, xy 6, 7 and `last`
-            for (int start = first; start < end; start += kRound) {
-                if (!resident) load_again(start);
+        SecondMoments moments;
+        for (int start = first; start < end; start += kRound) {
+            if (!resident) load_again(start);
 #pragma unroll
-                for (int j = 0; j < kSlots; ++j) {
-                    const float weight = cells[j] == cell ? samples.weight[j] : 0.0f;
+            for (int j = 0; j < kSlots; ++j) moments.add(samples, means, j, cells[j] == cell ? samples.weight[j] : 0.0f);
+        }
+        moments.sum_over_warp();
+        Similarity similarity[3];
 #pragma unroll
-                    for (int c = 0; c < 3; ++c) {
-                        const float dx = (samples.x[j][c] - first_x[c]) - mean_x[c];
-                        const float dy = (samples.y[j][c] - first_y[c]) - mean_y[c];
-                        sums[c] += weight * (dx * dx);
-                        sums[3 + c] += weight * (dy * dy);
-                        (c < 2 ? sums[6 + c] : last) += weight * (dx * dy);
-                    }
-                }
-            }
-            warp_sums(sums);
-            last = warp_sum(last);
-#pragma unroll
-            for (int c = 0; c < 3; ++c) {
-                const Similarity similarity =
-                    ssim(mean_x[c] + first_x[c], mean_y[c] + first_y[c], sums[c] * inverse_total, sums[3 + c] * inverse_total,
-                         (c < 2 ? sums[6 + c] : last) * inverse_total);
-                at_y[c] = similarity.at_y;
-                at_x[c] = similarity.at_x;
-                constant[c] = similarity.constant;
-                tile_sum += scale * (1.0f - similarity.value);
-            }
+        for (int c = 0; c < 3; ++c) {
+            similarity[c] = ssim(means.mean_x[c] + means.first_x[c], means.mean_y[c] + means.first_y[c],
+                                 moments.xx(c) * inverse_total, moments.yy(c) * inverse_total, moments.xy(c) * inverse_total);
+            tile_sum += scale * (1.0f - similarity[c].value);
         }
         for (int start = first; start < end; start += kRound) {
             if (!resident) load_again(start);
@@ -119,9 +95,8 @@ __device__ __forceinline__ float cell_structure(const SparseLossParams& params, 
                 float* gradient = params.color_gradients + 3 * static_cast<size_t>(start + 32 * j + lane);
 #pragma unroll
                 for (int c = 0; c < 3; ++c) {
-                    const float dx = (samples.x[j][c] - first_x[c]) - mean_x[c];
-                    const float dy = (samples.y[j][c] - first_y[c]) - mean_y[c];
-                    gradient[c] -= samples.weight[j] * (scale * inverse_total) * (dy * at_y[c] - dx * at_x[c] + constant[c]);
+                    gradient[c] -= samples.weight[j] * (scale * inverse_total) *
+                                   slope(similarity[c], means.offset_x(samples, j, c), means.offset_y(samples, j, c));
                 }
             }
         }

@@ -1,8 +1,10 @@
-// What a warp holds of a tile's samples in its registers: colour, truth, weight.
+// What a warp holds of a tile's samples in its registers: colour, truth, weight; and the moments of a window of them, which is
+// the tile or a cell of it.
 #pragma once
 
 #include "training_math.cuh"
 #include "training_params.h"
+#include "warp.cuh"
 
 namespace turbogs {
 
@@ -58,5 +60,64 @@ __device__ __forceinline__ void load_samples(const SparseLossParams& params, con
         for (int c = 0; c < 3; ++c) samples.x[j][c] = samples.y[j][c] = 0.0f;
     }
 }
+
+// A window's means of colour and truth, as offsets from its first sample, so that a constant window has variance 0 exactly.
+struct WindowMeans {
+    float first_x[3] = {}, first_y[3] = {}, mean_x[3] = {}, mean_y[3] = {};
+
+    // The first sample is slot j of `source`.
+    template <int kSlots>
+    __device__ __forceinline__ void start(const LaneSamples<kSlots>& samples, int j, int source) {
+#pragma unroll
+        for (int c = 0; c < 3; ++c) {
+            first_x[c] = __shfl_sync(kFullWarp, samples.x[j][c], source);
+            first_y[c] = __shfl_sync(kFullWarp, samples.y[j][c], source);
+        }
+    }
+
+    // `sums`: offsets from the first sample of x 0-2 and y 3-5, weighted.
+    __device__ __forceinline__ void finish(const float (&sums)[8], float inverse_total) {
+#pragma unroll
+        for (int c = 0; c < 3; ++c) {
+            mean_x[c] = sums[c] * inverse_total;
+            mean_y[c] = sums[3 + c] * inverse_total;
+        }
+    }
+
+    template <int kSlots>
+    __device__ __forceinline__ float offset_x(const LaneSamples<kSlots>& samples, int j, int c) const {
+        return (samples.x[j][c] - first_x[c]) - mean_x[c];
+    }
+
+    template <int kSlots>
+    __device__ __forceinline__ float offset_y(const LaneSamples<kSlots>& samples, int j, int c) const {
+        return (samples.y[j][c] - first_y[c]) - mean_y[c];
+    }
+};
+
+// Variances and covariances of a window, times its total weight until they are read.
+struct SecondMoments {
+    float sums[8] = {}, last = 0.0f;  // xx 0-2, yy 3-5, xy 6, 7 and `last`
+
+    template <int kSlots>
+    __device__ __forceinline__ void add(const LaneSamples<kSlots>& samples, const WindowMeans& means, int j, float weight) {
+#pragma unroll
+        for (int c = 0; c < 3; ++c) {
+            const float dx = means.offset_x(samples, j, c), dy = means.offset_y(samples, j, c);
+            sums[c] += weight * (dx * dx);
+            sums[3 + c] += weight * (dy * dy);
+            (c < 2 ? sums[6 + c] : last) += weight * (dx * dy);
+        }
+    }
+
+    __device__ __forceinline__ void sum_over_warp() {
+        warp_sums(sums);
+        last = warp_sum(last);
+    }
+
+    __device__ __forceinline__ float xx(int c) const { return sums[c]; }
+    __device__ __forceinline__ float yy(int c) const { return sums[3 + c]; }
+    __device__ __forceinline__ float xy(int c) const { return c < 2 ? sums[6 + c] : last; }
+};
 
 }  // namespace turbogs

@@ -35,8 +35,7 @@ inline void check_scene(const Checker& check, const std::vector<Tensor>& gaussia
     scene.intrinsics = check.pointer<float>(Ks, "Ks", ScalarType::Float, {views, 3, 3});
     for (int64_t view = 0; view < views; ++view) {
         const int64_t width = sizes[2 * view], height = sizes[2 * view + 1];
-        STD_TORCH_CHECK(width > 0 && height > 0 && width <= INT32_MAX / height, "turbogs: sizes: view ", view, " is ", width,
-                        " x ", height);
+        check_size(view, width, height);
         scene.widths[view] = static_cast<int>(width);
         scene.heights[view] = static_cast<int>(height);
     }

@@ -44,19 +44,13 @@ __device__ __forceinline__ TileTotals tile_loss(const SparseLossParams& params, 
     LaneSamples<kSlots> samples;
 
     // Pass 1: Charbonnier term, errors and maps; means, about the first sample.
-    float first_x[3] = {}, first_y[3] = {}, mean_x[3] = {}, mean_y[3] = {};
+    WindowMeans means;
     float l1_sum = 0.0f, norm_l1 = 0.0f, inverse_total = 1.0f;
     {
         float sums[8] = {};  // offsets of x 0-2 and y 3-5, weights, norms of the Charbonnier gradients
         for (int start = first; start < end; start += kRound) {
             load_samples(params, view, start, end, samples, totals.nonfinite);
-            if (start == first) {
-#pragma unroll
-                for (int c = 0; c < 3; ++c) {
-                    first_x[c] = __shfl_sync(kFullWarp, samples.x[0][c], 0);
-                    first_y[c] = __shfl_sync(kFullWarp, samples.y[0][c], 0);
-                }
-            }
+            if (start == first) means.start(samples, 0, 0);
             __half old[kSlots];
             int64_t flat[kSlots];
             if (learns) {
@@ -79,8 +73,8 @@ __device__ __forceinline__ TileTotals tile_loss(const SparseLossParams& params, 
                     error = __fadd_rn(error, fabsf(d));
                     value += d * slope * (root * approximate_reciprocal(root + params.epsilon));
                     slope_norm += fabsf(slope);
-                    sums[c] += samples.weight[j] * (samples.x[j][c] - first_x[c]);
-                    sums[3 + c] += samples.weight[j] * (samples.y[j][c] - first_y[c]);
+                    sums[c] += samples.weight[j] * (samples.x[j][c] - means.first_x[c]);
+                    sums[3 + c] += samples.weight[j] * (samples.y[j][c] - means.first_y[c]);
                 }
                 l1_sum += samples.weight[j] * value;
                 sums[6] += samples.weight[j];
@@ -101,58 +95,42 @@ __device__ __forceinline__ TileTotals tile_loss(const SparseLossParams& params, 
             warp_sums(sums);
             inverse_total = sums[6] > 0.0f ? 1.0f / sums[6] : 1.0f;
             norm_l1 = sums[7] * inverse_total;
-#pragma unroll
-            for (int c = 0; c < 3; ++c) {
-                mean_x[c] = sums[c] * inverse_total;
-                mean_y[c] = sums[3 + c] * inverse_total;
-            }
+            means.finish(sums, inverse_total);
         }
     }
     totals.loss = static_cast<double>(l1_sum) * static_cast<double>(l1_scale);
 
-    float factor[3] = {}, at_y[3] = {}, at_x[3] = {}, constant[3] = {};
-    const auto offset_x = [&](int j, int c) { return (samples.x[j][c] - first_x[c]) - mean_x[c]; };
-    const auto offset_y = [&](int j, int c) { return (samples.y[j][c] - first_y[c]) - mean_y[c]; };
+    float factor[3] = {};
+    Similarity similarity[3] = {};
+    const auto structure_slope = [&](int j, int c) {
+        return slope(similarity[c], means.offset_x(samples, j, c), means.offset_y(samples, j, c));
+    };
     const auto load_again = [&](int start) {
         int counted = 0;
         if (!resident) load_samples(params, view, start, end, samples, counted);
     };
     if (structured) {
         // Pass 2: variances and covariances.
-        float sums[8] = {}, last = 0.0f;  // xx 0-2, yy 3-5, xy 6, 7 and `last`
+        SecondMoments moments;
         for (int start = first; start < end; start += kRound) {
             load_again(start);
 #pragma unroll
-            for (int j = 0; j < kSlots; ++j) {
-#pragma unroll
-                for (int c = 0; c < 3; ++c) {
-                    const float dx = offset_x(j, c), dy = offset_y(j, c);
-                    sums[c] += samples.weight[j] * (dx * dx);
-                    sums[3 + c] += samples.weight[j] * (dy * dy);
-                    (c < 2 ? sums[6 + c] : last) += samples.weight[j] * (dx * dy);
-                }
-            }
+            for (int j = 0; j < kSlots; ++j) moments.add(samples, means, j, samples.weight[j]);
         }
-        warp_sums(sums);
-        last = warp_sum(last);
+        moments.sum_over_warp();
         float variance_y[3];
 #pragma unroll
         for (int c = 0; c < 3; ++c) {
-            const float xx = sums[c] * inverse_total, yy = sums[3 + c] * inverse_total;
-            const float xy = (c < 2 ? sums[6 + c] : last) * inverse_total;
-            Similarity similarity;
+            const float xx = moments.xx(c) * inverse_total, yy = moments.yy(c) * inverse_total;
+            const float xy = moments.xy(c) * inverse_total;
             if (params.structure == Structure::kNcc) {
-                similarity = correlation(xx, yy, xy, params.variance_constant);
+                similarity[c] = correlation(xx, yy, xy, params.variance_constant);
             } else if (params.structure == Structure::kContrast) {
-                similarity = contrast(xx, yy, xy, params.variance_constant);
+                similarity[c] = contrast(xx, yy, xy, params.variance_constant);
             } else {
-                similarity = ssim(mean_x[c] + first_x[c], mean_y[c] + first_y[c], xx, yy, xy);
+                similarity[c] = ssim(means.mean_x[c] + means.first_x[c], means.mean_y[c] + means.first_y[c], xx, yy, xy);
             }
             variance_y[c] = yy;
-            at_y[c] = similarity.at_y;
-            at_x[c] = similarity.at_x;
-            constant[c] = similarity.constant;
-            factor[c] = 1.0f - similarity.value;
         }
         float balance = 1.0f;
         if (params.balance) {
@@ -165,7 +143,7 @@ __device__ __forceinline__ TileTotals tile_loss(const SparseLossParams& params, 
                     float norm_of_sample = 0.0f;
 #pragma unroll
                     for (int c = 0; c < 3; ++c) {
-                        norm_of_sample += fabsf(offset_y(j, c) * at_y[c] - offset_x(j, c) * at_x[c] + constant[c]);
+                        norm_of_sample += fabsf(structure_slope(j, c));
                     }
                     norm += samples.weight[j] * norm_of_sample;
                 }
@@ -178,7 +156,7 @@ __device__ __forceinline__ TileTotals tile_loss(const SparseLossParams& params, 
             float scale = balance;
             if (params.gate) scale *= variance_y[c] / (variance_y[c] + params.variance_constant);
             scale *= params.structure_weight / (3.0f * static_cast<float>(params.num_tiles));
-            tile_sum += scale * factor[c];
+            tile_sum += scale * (1.0f - similarity[c].value);
             factor[c] = scale * inverse_total;
         }
         totals.loss += static_cast<double>(tile_sum);
@@ -195,8 +173,8 @@ __device__ __forceinline__ TileTotals tile_loss(const SparseLossParams& params, 
             for (int c = 0; c < 3; ++c) {
                 const float d = samples.x[j][c] - samples.y[j][c];
                 const float l1 = d * approximate_rsqrt(fmaxf(d * d + epsilon2, FLT_MIN)) * l1_scale;
-                const float structure = offset_y(j, c) * at_y[c] - offset_x(j, c) * at_x[c] + constant[c];
-                params.color_gradients[3 * static_cast<size_t>(slot) + c] = samples.weight[j] * (l1 - factor[c] * structure);
+                params.color_gradients[3 * static_cast<size_t>(slot) + c] =
+                    samples.weight[j] * (l1 - factor[c] * structure_slope(j, c));
             }
         }
     }

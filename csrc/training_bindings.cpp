@@ -137,8 +137,7 @@ ViewTable view_table(const std::vector<int64_t>& fields) {
         const int64_t* field = fields.data() + i * kViewFields;
         SampleView& view = table.views[i];
         const int64_t width = field[1], height = field[2];
-        STD_TORCH_CHECK(width > 0 && height > 0 && width <= INT32_MAX / height, "turbogs: sizes: view ", i, " is ", width,
-                        " x ", height);
+        check_size(i, width, height);
         view.pixel_base = field[0];
         view.width = static_cast<int>(width);
         view.height = static_cast<int>(height);
