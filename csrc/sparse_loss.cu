@@ -8,8 +8,6 @@
 
 #include <cuda_fp16.h>
 
-#include "cell_structure.cuh"
-#include "lane_samples.cuh"
 #include "tile_similarity.cuh"
 #include "training_math.cuh"
 #include "training_params.h"
@@ -19,11 +17,63 @@ namespace turbogs {
 namespace {
 
 constexpr int kLossThreads = 128;
-constexpr int kLossBlocks = 7;      // of an SM: 72 registers
-constexpr int kCellLossBlocks = 4;  // with cells as windows: 128
+constexpr int kLossBlocks = 7;  // of an SM: 72 registers
 constexpr int kLossWarps = kLossThreads / 32;
 constexpr float kBalanceEpsilon = 1e-8f;
 constexpr float kErrorMax = 65504.0f;  // largest finite half
+
+// byte / 255, correctly rounded.
+__device__ __forceinline__ float unit_color(uint8_t byte) {
+    const float value = static_cast<float>(byte), quotient = value * (1.0f / 255.0f);
+    return __fmaf_rn(__fmaf_rn(-quotient, 255.0f, value), 1.0f / 255.0f, quotient);
+}
+
+// What a lane holds of a tile: slots first + 32 j + lane. An empty slot has weight 0 and pixel -1.
+template <int kSlots>
+struct LaneSamples {
+    int pixel[kSlots];
+    float x[kSlots][3], y[kSlots][3], weight[kSlots];
+};
+
+template <int kSlots>
+__device__ __forceinline__ void load_samples(const SparseLossParams& params, const SampleView& view, int first, int end,
+                                             LaneSamples<kSlots>& samples, int& nonfinite) {
+    const int lane = threadIdx.x & 31;
+#pragma unroll
+    for (int j = 0; j < kSlots; ++j) {
+        const int slot = first + 32 * j + lane;
+        samples.pixel[j] = slot < end ? params.pixel_ids[slot] : -1;
+    }
+#pragma unroll
+    for (int j = 0; j < kSlots; ++j) {
+        const size_t slot = static_cast<size_t>(first + 32 * j + lane);
+        const bool filled = samples.pixel[j] >= 0;
+#pragma unroll
+        for (int c = 0; c < 3; ++c) {
+            samples.x[j][c] = filled ? params.colors[3 * slot + c] : 0.0f;
+            samples.y[j][c] = 0.0f;
+        }
+        samples.weight[j] = filled ? (params.weights != nullptr ? params.weights[slot] : 1.0f) : 0.0f;
+        if (!filled) continue;
+        if (params.targets != nullptr) {
+#pragma unroll
+            for (int c = 0; c < 3; ++c) samples.y[j][c] = params.targets[3 * slot + c];
+        } else {
+            const uint8_t* photo = params.photos + 3 * (view.pixel_base + samples.pixel[j]);
+#pragma unroll
+            for (int c = 0; c < 3; ++c) samples.y[j][c] = unit_color(photo[c]);
+        }
+    }
+#pragma unroll
+    for (int j = 0; j < kSlots; ++j) {
+        if (is_finite(samples.x[j][0]) && is_finite(samples.x[j][1]) && is_finite(samples.x[j][2])) continue;
+        ++nonfinite;
+        samples.pixel[j] = -1;
+        samples.weight[j] = 0.0f;
+#pragma unroll
+        for (int c = 0; c < 3; ++c) samples.x[j][c] = samples.y[j][c] = 0.0f;
+    }
+}
 
 // What a tile adds to the loss and to the sum of its view; the lane's part of the latter.
 struct TileTotals {
@@ -32,25 +82,31 @@ struct TileTotals {
 };
 
 // One tile. Up to 32 kSlots samples stay in registers; of more, each pass loads them again, in as many rounds.
-template <int kSlots, bool kCells>
+template <int kSlots>
 __device__ __forceinline__ TileTotals tile_loss(const SparseLossParams& params, const SampleView& view, int first, int end,
                                                 float filled, bool learns) {
     constexpr int kRound = 32 * kSlots;
     const int lane = threadIdx.x & 31;
     const bool resident = end - first <= kRound;
-    const bool structured = !kCells && params.structure != Structure::kNone;
+    const bool structured = params.structure != Structure::kNone;
     const float l1_scale = params.l1_weight / (3.0f * filled), epsilon2 = params.epsilon * params.epsilon;
     TileTotals totals;
     LaneSamples<kSlots> samples;
 
     // Pass 1: Charbonnier term, errors and maps; means, about the first sample.
-    WindowMeans means;
+    float first_x[3] = {}, first_y[3] = {}, mean_x[3] = {}, mean_y[3] = {};
     float l1_sum = 0.0f, norm_l1 = 0.0f, inverse_total = 1.0f;
     {
         float sums[8] = {};  // offsets of x 0-2 and y 3-5, weights, norms of the Charbonnier gradients
         for (int start = first; start < end; start += kRound) {
             load_samples(params, view, start, end, samples, totals.nonfinite);
-            if (start == first) means.start(samples, 0, 0);
+            if (start == first) {
+#pragma unroll
+                for (int c = 0; c < 3; ++c) {
+                    first_x[c] = __shfl_sync(kFullWarp, samples.x[0][c], 0);
+                    first_y[c] = __shfl_sync(kFullWarp, samples.y[0][c], 0);
+                }
+            }
             __half old[kSlots];
             int64_t flat[kSlots];
             if (learns) {
@@ -73,8 +129,8 @@ __device__ __forceinline__ TileTotals tile_loss(const SparseLossParams& params, 
                     error = __fadd_rn(error, fabsf(d));
                     value += d * slope * (root * approximate_reciprocal(root + params.epsilon));
                     slope_norm += fabsf(slope);
-                    sums[c] += samples.weight[j] * (samples.x[j][c] - means.first_x[c]);
-                    sums[3 + c] += samples.weight[j] * (samples.y[j][c] - means.first_y[c]);
+                    sums[c] += samples.weight[j] * (samples.x[j][c] - first_x[c]);
+                    sums[3 + c] += samples.weight[j] * (samples.y[j][c] - first_y[c]);
                 }
                 l1_sum += samples.weight[j] * value;
                 sums[6] += samples.weight[j];
@@ -95,42 +151,58 @@ __device__ __forceinline__ TileTotals tile_loss(const SparseLossParams& params, 
             warp_sums(sums);
             inverse_total = sums[6] > 0.0f ? 1.0f / sums[6] : 1.0f;
             norm_l1 = sums[7] * inverse_total;
-            means.finish(sums, inverse_total);
+#pragma unroll
+            for (int c = 0; c < 3; ++c) {
+                mean_x[c] = sums[c] * inverse_total;
+                mean_y[c] = sums[3 + c] * inverse_total;
+            }
         }
     }
     totals.loss = static_cast<double>(l1_sum) * static_cast<double>(l1_scale);
 
-    float factor[3] = {};
-    Similarity similarity[3] = {};
-    const auto structure_slope = [&](int j, int c) {
-        return slope(similarity[c], means.offset_x(samples, j, c), means.offset_y(samples, j, c));
-    };
+    float factor[3] = {}, at_y[3] = {}, at_x[3] = {}, constant[3] = {};
+    const auto offset_x = [&](int j, int c) { return (samples.x[j][c] - first_x[c]) - mean_x[c]; };
+    const auto offset_y = [&](int j, int c) { return (samples.y[j][c] - first_y[c]) - mean_y[c]; };
     const auto load_again = [&](int start) {
         int counted = 0;
         if (!resident) load_samples(params, view, start, end, samples, counted);
     };
     if (structured) {
         // Pass 2: variances and covariances.
-        SecondMoments moments;
+        float sums[8] = {}, last = 0.0f;  // xx 0-2, yy 3-5, xy 6, 7 and `last`
         for (int start = first; start < end; start += kRound) {
             load_again(start);
 #pragma unroll
-            for (int j = 0; j < kSlots; ++j) moments.add(samples, means, j, samples.weight[j]);
+            for (int j = 0; j < kSlots; ++j) {
+#pragma unroll
+                for (int c = 0; c < 3; ++c) {
+                    const float dx = offset_x(j, c), dy = offset_y(j, c);
+                    sums[c] += samples.weight[j] * (dx * dx);
+                    sums[3 + c] += samples.weight[j] * (dy * dy);
+                    (c < 2 ? sums[6 + c] : last) += samples.weight[j] * (dx * dy);
+                }
+            }
         }
-        moments.sum_over_warp();
+        warp_sums(sums);
+        last = warp_sum(last);
         float variance_y[3];
 #pragma unroll
         for (int c = 0; c < 3; ++c) {
-            const float xx = moments.xx(c) * inverse_total, yy = moments.yy(c) * inverse_total;
-            const float xy = moments.xy(c) * inverse_total;
+            const float xx = sums[c] * inverse_total, yy = sums[3 + c] * inverse_total;
+            const float xy = (c < 2 ? sums[6 + c] : last) * inverse_total;
+            Similarity similarity;
             if (params.structure == Structure::kNcc) {
-                similarity[c] = correlation(xx, yy, xy, params.variance_constant);
+                similarity = correlation(xx, yy, xy, params.variance_constant);
             } else if (params.structure == Structure::kContrast) {
-                similarity[c] = contrast(xx, yy, xy, params.variance_constant);
+                similarity = contrast(xx, yy, xy, params.variance_constant);
             } else {
-                similarity[c] = ssim(means.mean_x[c] + means.first_x[c], means.mean_y[c] + means.first_y[c], xx, yy, xy);
+                similarity = ssim(mean_x[c] + first_x[c], mean_y[c] + first_y[c], xx, yy, xy);
             }
             variance_y[c] = yy;
+            at_y[c] = similarity.at_y;
+            at_x[c] = similarity.at_x;
+            constant[c] = similarity.constant;
+            factor[c] = 1.0f - similarity.value;
         }
         float balance = 1.0f;
         if (params.balance) {
@@ -143,7 +215,7 @@ __device__ __forceinline__ TileTotals tile_loss(const SparseLossParams& params, 
                     float norm_of_sample = 0.0f;
 #pragma unroll
                     for (int c = 0; c < 3; ++c) {
-                        norm_of_sample += fabsf(structure_slope(j, c));
+                        norm_of_sample += fabsf(offset_y(j, c) * at_y[c] - offset_x(j, c) * at_x[c] + constant[c]);
                     }
                     norm += samples.weight[j] * norm_of_sample;
                 }
@@ -156,7 +228,7 @@ __device__ __forceinline__ TileTotals tile_loss(const SparseLossParams& params, 
             float scale = balance;
             if (params.gate) scale *= variance_y[c] / (variance_y[c] + params.variance_constant);
             scale *= params.structure_weight / (3.0f * static_cast<float>(params.num_tiles));
-            tile_sum += scale * (1.0f - similarity[c].value);
+            tile_sum += scale * factor[c];
             factor[c] = scale * inverse_total;
         }
         totals.loss += static_cast<double>(tile_sum);
@@ -173,18 +245,17 @@ __device__ __forceinline__ TileTotals tile_loss(const SparseLossParams& params, 
             for (int c = 0; c < 3; ++c) {
                 const float d = samples.x[j][c] - samples.y[j][c];
                 const float l1 = d * approximate_rsqrt(fmaxf(d * d + epsilon2, FLT_MIN)) * l1_scale;
-                params.color_gradients[3 * static_cast<size_t>(slot) + c] =
-                    samples.weight[j] * (l1 - factor[c] * structure_slope(j, c));
+                const float structure = offset_y(j, c) * at_y[c] - offset_x(j, c) * at_x[c] + constant[c];
+                params.color_gradients[3 * static_cast<size_t>(slot) + c] = samples.weight[j] * (l1 - factor[c] * structure);
             }
         }
     }
-    if (kCells) totals.loss += static_cast<double>(cell_structure<kSlots>(params, view, first, end, samples));
     return totals;
 }
 
 // A warp per tile; its block adds up what belongs together. Up to 32 kSlots samples of a tile are held in registers.
-template <int kSlots, bool kCells>
-__global__ void __launch_bounds__(kLossThreads, kCells ? kCellLossBlocks : kLossBlocks)
+template <int kSlots>
+__global__ void __launch_bounds__(kLossThreads, kLossBlocks)
     sparse_loss_kernel(const __grid_constant__ SparseLossParams params) {
     __shared__ double losses[kLossWarps], view_deltas[kLossWarps];
     __shared__ int views[kLossWarps];
@@ -199,7 +270,7 @@ __global__ void __launch_bounds__(kLossThreads, kCells ? kCellLossBlocks : kLoss
         const int first = params.tile_offsets[tile], end = params.tile_offsets[tile + 1], tile_id = params.tile_ids[tile];
         view = 0;
         while (view + 1 < params.num_views && tile_id >= params.views[view + 1].tile_base) ++view;
-        totals = tile_loss<kSlots, kCells>(params, params.views[view], first, end, filled, learns);
+        totals = tile_loss<kSlots>(params, params.views[view], first, end, filled, learns);
         totals.view_delta = warp_sum(totals.view_delta);
         const uint32_t nonfinite = __reduce_add_sync(kFullWarp, static_cast<uint32_t>(totals.nonfinite));
         if (lane == 0 && nonfinite != 0u && params.num_nonfinite != nullptr) {
@@ -233,15 +304,6 @@ __global__ void __launch_bounds__(kLossThreads, kCells ? kCellLossBlocks : kLoss
     }
 }
 
-template <int kSlots>
-void launch(const SparseLossParams& params, int blocks, cudaStream_t stream) {
-    if (params.structure == Structure::kCellSsim) {
-        sparse_loss_kernel<kSlots, true><<<blocks, kLossThreads, 0, stream>>>(params);
-    } else {
-        sparse_loss_kernel<kSlots, false><<<blocks, kLossThreads, 0, stream>>>(params);
-    }
-}
-
 }  // namespace
 
 cudaError_t launch_sparse_loss(const SparseLossParams& params, cudaStream_t stream) {
@@ -249,13 +311,13 @@ cudaError_t launch_sparse_loss(const SparseLossParams& params, cudaStream_t stre
     const int blocks = (params.num_tiles + kLossWarps - 1) / kLossWarps;
     // By the average: most samplers give every tile as many slots.
     if (params.num_slots <= 32 * static_cast<int64_t>(params.num_tiles)) {
-        launch<1>(params, blocks, stream);
+        sparse_loss_kernel<1><<<blocks, kLossThreads, 0, stream>>>(params);
     } else if (params.num_slots <= 64 * static_cast<int64_t>(params.num_tiles)) {
-        launch<2>(params, blocks, stream);
+        sparse_loss_kernel<2><<<blocks, kLossThreads, 0, stream>>>(params);
     } else if (params.num_slots <= 96 * static_cast<int64_t>(params.num_tiles)) {
-        launch<3>(params, blocks, stream);
+        sparse_loss_kernel<3><<<blocks, kLossThreads, 0, stream>>>(params);
     } else {
-        launch<4>(params, blocks, stream);
+        sparse_loss_kernel<4><<<blocks, kLossThreads, 0, stream>>>(params);
     }
     return cudaGetLastError();
 }

@@ -1,5 +1,5 @@
-// How alike prediction and truth are over the samples of a tile or cell, in one channel: the structure terms of strategies/loss.py
-// with their gradients, as functions of the window's moments.
+// How alike prediction and truth are over the samples of a tile, in one channel: the structure terms of strategies/loss.py with
+// their gradients, as functions of the tile's moments.
 #pragma once
 
 #include <cuda_runtime.h>
@@ -9,15 +9,11 @@ namespace turbogs {
 constexpr float kLuminanceConstant = 1e-4f;  // 0.01^2
 constexpr float kSsimConstant = 9e-4f;       // 0.03^2
 
-// Similarity S of a window in one channel, and what its gradient is made of.
+// Similarity S of a tile in one channel, and its gradient dS/dx = share * (at_y * dy - at_x * dx + constant), with dx, dy
+// the offsets of prediction and truth from their means.
 struct Similarity {
     float value, at_y, at_x, constant;
 };
-
-// dS/dx of a sample over its share of the window's weight; dx, dy: its offsets of prediction and truth from their means.
-__device__ __forceinline__ float slope(const Similarity& similarity, float dx, float dy) {
-    return dy * similarity.at_y - dx * similarity.at_x + similarity.constant;
-}
 
 __device__ __forceinline__ Similarity correlation(float variance_x, float variance_y, float covariance, float c) {
     const float floor = 0.5f * c;

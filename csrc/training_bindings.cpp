@@ -222,8 +222,8 @@ void sparse_loss(const Tensor& colors, const std::optional<Tensor>& targets, con
     const ViewTable table = view_table(views);
     const int64_t slots = pixel_ids.numel(), tiles = tile_ids.numel();
     SparseLossParams params = {};
-    STD_TORCH_CHECK(structure >= 0 && structure <= 4,
-                    "turbogs: structure must be 0 (none), 1 (ncc), 2 (contrast), 3 (ssim) or 4 (cell_ssim)");
+    STD_TORCH_CHECK(structure >= 0 && structure <= 3,
+                    "turbogs: structure must be 0 (none), 1 (ncc), 2 (contrast) or 3 (ssim)");
     STD_TORCH_CHECK(targets.has_value() != photos.has_value(), "turbogs: give either targets or photos");
     params.num_views = table.num_views;
     for (int i = 0; i < table.num_views; ++i) params.views[i] = table.views[i];

@@ -116,7 +116,7 @@ struct SamplePixelsParams {
     float* tile_missed;        // [tiles]
 };
 
-enum class Structure : int { kNone = 0, kNcc = 1, kContrast = 2, kSsim = 3, kCellSsim = 4 };
+enum class Structure : int { kNone = 0, kNcc = 1, kContrast = 2, kSsim = 3 };
 
 // Loss on the samples with its gradient, and where maps are given their update; strategies/loss.py and error_maps.py
 // define both. A sample whose colour is not finite counts as an empty slot: no gradient, no error, no visit.
@@ -128,7 +128,7 @@ struct SparseLossParams {
     Structure structure;
     float epsilon;             // of the Charbonnier term
     float l1_weight;
-    float structure_weight;    // factor of the mean over tiles and channels of 1 - S; cell_ssim: S is the mean over cells
+    float structure_weight;    // factor of the mean over tiles and channels of 1 - S
     float variance_constant;   // ncc, contrast
     bool balance;              // lambda of the paper: structure gradients no larger than those of l1
     bool gate;                 // by the truth's variance

@@ -14,16 +14,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
 
 import torch
 from torch import Tensor
 
 from turbogs_plugin import kernels
 from turbogs_plugin.errors import require
-from turbogs_plugin.tiles import CELL_SIDE, TILE_CELLS
 from turbogs_plugin.training_kernels import LossTerms, sparse_loss
-from turbogs_plugin.types import TILE_SIZE, LossOutput, PixelSamples
+from turbogs_plugin.types import LossOutput, PixelSamples
 
 LUMINANCE_CONSTANT = 0.01**2
 STRUCTURE_CONSTANT = 0.03**2
@@ -32,80 +30,46 @@ STRUCTURE_CONSTANT = 0.03**2
 BALANCE_EPSILON = 1e-8
 
 
-class SampleGroups:
-    """Samples in groups, with their weights.
+class TileGroups:
+    """The samples of each tile, with their weights.
 
     Attributes:
-        group_of_slot: [P] int64.
-        count: G.
-        first_slots: [G] int64; any slot for a group without one.
         weights: [P, 1], 0 in slots without a part.
-        totals: [G, 1], the weights' sums.
-        shares: [P, 1], omega: the weights over their sum in the group.
-    """
-
-    def __init__(self, group_of_slot: Tensor, count: int, first_slots: Tensor, weights: Tensor) -> None:
-        self.group_of_slot, self.count, self.weights = group_of_slot, count, weights
-        self.first_slots = first_slots.clamp(max=max(0, len(weights) - 1))
-        self.totals = self.sum(self.weights)
-        self.shares = self.weights / torch.where(self.totals > 0, self.totals, 1.0)[self.group_of_slot]
-
-    def sum(self, values: Tensor) -> Tensor:
-        """[P, C] -> [G, C]: sums over the slots of each group."""
-        return values.new_zeros(self.count, values.shape[1]).index_add_(0, self.group_of_slot, values)
-
-    def mean(self, values: Tensor) -> Tensor:
-        """[P, C] -> [G, C]: means under the shares."""
-        return self.sum(self.shares * values)
-
-    def spread(self, values: Tensor) -> Tensor:
-        """[G, C] -> [P, C]: each slot gets its group's value."""
-        return values[self.group_of_slot]
-
-
-class TileGroups(SampleGroups):
-    """The samples of each tile, G = T.
-
-    Attributes:
+        shares: [P, 1], omega: the weights over their sum in the tile.
+        tiles: T.
         filled: scalar tensor, the number of filled slots, at least 1.
-        factors: [G, 1], what turns a sum over tiles into their mean.
     """
 
     def __init__(self, samples: PixelSamples, used: Tensor) -> None:
         """`used`: [P], 1 for the slots that have a part, 0 for the others, in the dtype of the computation."""
-        weights = (used if samples.weights is None else used * samples.weights)[:, None]
-        super().__init__(samples.tile_of_slot(), len(samples.tile_ids), samples.tile_offsets[:-1].long(), weights)
+        self.tile_of_slot = samples.tile_of_slot()
+        self.tiles = len(samples.tile_ids)
+        self.first_slots = samples.tile_offsets[:-1].long().clamp(max=max(0, len(samples) - 1))  # [T]
         self.filled = samples.filled.sum().clamp(min=1).to(used.dtype)
-        self.factors = torch.full_like(self.totals, 1.0 / max(1, self.count))
+        self.weights = (used if samples.weights is None else used * samples.weights)[:, None]
+        totals = self.sum(self.weights)
+        self.shares = self.weights / torch.where(totals > 0, totals, 1.0)[self.tile_of_slot]
 
+    def sum(self, values: Tensor) -> Tensor:
+        """[P, C] -> [T, C]: sums over the slots of each tile."""
+        return values.new_zeros(self.tiles, values.shape[1]).index_add_(0, self.tile_of_slot, values)
 
-class CellGroups(SampleGroups):
-    """The samples of each 4x4 cell of each tile, G = 16 T; most cells may have none.
+    def mean(self, values: Tensor) -> Tensor:
+        """[P, C] -> [T, C]: means under the shares."""
+        return self.sum(self.shares * values)
 
-    Attributes:
-        factors: [G, 1], what turns a sum over cells into the mean over tiles of the mean over their cells with samples.
-    """
-
-    def __init__(self, samples: PixelSamples, tiles: TileGroups) -> None:
-        cells = (samples.coordinates() % TILE_SIZE) // CELL_SIDE  # [P, 2]
-        group_of_slot = TILE_CELLS * tiles.group_of_slot + cells[:, 1] * (TILE_SIZE // CELL_SIDE) + cells[:, 0]
-        count, slots = TILE_CELLS * tiles.count, torch.arange(len(group_of_slot), device=group_of_slot.device)
-        slots = torch.where(tiles.weights[:, 0] > 0, slots, len(slots))
-        first_slots = torch.full((count,), len(slots), device=slots.device)
-        super().__init__(
-            group_of_slot, count, first_slots.scatter_reduce(0, group_of_slot, slots, "amin"), tiles.weights
-        )
-        seen = (self.totals > 0).to(self.totals.dtype).reshape(-1, TILE_CELLS)  # [T, 16]
-        self.factors = (seen / seen.sum(dim=1, keepdim=True).clamp(min=1.0) / max(1, tiles.count)).reshape(-1, 1)
+    def spread(self, values: Tensor) -> Tensor:
+        """[T, C] -> [P, C]: each slot gets its tile's value."""
+        return values[self.tile_of_slot]
 
 
 @dataclass
 class TileMoments:
-    """First and second moments of prediction (x) and truth (y) of each tile, or other group, and channel.
+    """First and second moments of prediction (x) and truth (y) of each tile and channel.
 
     Args:
-        mean_x, mean_y, variance_x, variance_y, covariance: [G, C].
-        offset_x, offset_y: [P, C], the samples minus their group's mean.
+        mean_x, mean_y, variance_x, variance_y, covariance: [T, C].
+        offset_x, offset_y: [P, C], the samples minus their tile's mean.
     """
 
     mean_x: Tensor
@@ -117,8 +81,8 @@ class TileMoments:
     offset_y: Tensor
 
     @classmethod
-    def of(cls, groups: SampleGroups, colors: Tensor, targets: Tensor) -> TileMoments:
-        """Two passes, about the group's first sample: a constant one has variance 0 exactly, at any brightness."""
+    def of(cls, groups: TileGroups, colors: Tensor, targets: Tensor) -> TileMoments:
+        """Two passes, about the tile's first sample: a constant tile has variance 0 exactly, at any brightness."""
         first_x, first_y = colors[groups.first_slots], targets[groups.first_slots]
         relative_x, relative_y = colors - groups.spread(first_x), targets - groups.spread(first_y)
         mean_x, mean_y = groups.mean(torch.cat([relative_x, relative_y], dim=1)).chunk(2, dim=1)
@@ -129,10 +93,10 @@ class TileMoments:
 
 
 Similarity = tuple[Tensor, Tensor]
-"""Similarity S of each group and channel, [G, C], at most 1; and g, [P, C], with d S / d x = omega * g."""
+"""Similarity S of each tile and channel, [T, C], at most 1; and g, [P, C], with d S / d x = omega * g."""
 
 
-def correlation(moments: TileMoments, groups: SampleGroups, constant: float) -> Similarity:
+def correlation(moments: TileMoments, groups: TileGroups, constant: float) -> Similarity:
     """NCC with a variance floor f = constant / 2, the structure term of SSIM::
 
         S = (s_xy + f) / sqrt((s_x^2 + f) (s_y^2 + f))
@@ -148,7 +112,7 @@ def correlation(moments: TileMoments, groups: SampleGroups, constant: float) -> 
     return similarity, moments.offset_y * groups.spread(slope_y) - moments.offset_x * groups.spread(slope_x)
 
 
-def contrast(moments: TileMoments, groups: SampleGroups, constant: float) -> Similarity:
+def contrast(moments: TileMoments, groups: TileGroups, constant: float) -> Similarity:
     """The contrast-structure term of SSIM, with c = constant::
 
         S = (2 s_xy + c) / (s_x^2 + s_y^2 + c)
@@ -162,8 +126,8 @@ def contrast(moments: TileMoments, groups: SampleGroups, constant: float) -> Sim
     return similarity, moments.offset_y * groups.spread(slope_y) - moments.offset_x * groups.spread(slope_x)
 
 
-def ssim(moments: TileMoments, groups: SampleGroups) -> Similarity:
-    """SSIM of each group's samples taken as one window: the luminance term times `contrast`."""
+def ssim(moments: TileMoments, groups: TileGroups) -> Similarity:
+    """SSIM of each tile's samples taken as one window: the luminance term times `contrast`."""
     structure, structure_gradients = contrast(moments, groups, STRUCTURE_CONSTANT)
     mean_x, mean_y = moments.mean_x, moments.mean_y
     denominator = mean_x * mean_x + mean_y * mean_y + LUMINANCE_CONSTANT
@@ -173,7 +137,7 @@ def ssim(moments: TileMoments, groups: SampleGroups) -> Similarity:
     return structure * luminance, gradients
 
 
-STRUCTURES: dict[str, Callable[[TileMoments, SampleGroups, float], Similarity]] = {
+STRUCTURES: dict[str, Callable[[TileMoments, TileGroups, float], Similarity]] = {
     "ncc": correlation,
     "contrast": contrast,
 }
@@ -306,7 +270,7 @@ class CharbonnierNccLoss:
         factors = (norm_l1 / (norm_structure + BALANCE_EPSILON)).clamp(max=1.0)[:, None]  # [T, 1]
         if self.gate:
             factors = factors * (moments.variance_y / (moments.variance_y + self.variance_constant))
-        factors = factors * (self.ncc_weight / (3 * groups.count))
+        factors = factors * (self.ncc_weight / (3 * groups.tiles))
         loss = problem.loss + (factors * (1.0 - similarity)).sum()
         gradients = problem.gradients - groups.spread(factors.expand_as(similarity)) * groups.shares * slopes
         return problem.output(loss, gradients)
@@ -316,39 +280,33 @@ class CharbonnierNccLoss:
 class SparseSsimLoss:
     """``(1 - ssim_weight) * l1 + ssim_weight * mean over tiles and channels of (1 - SSIM)``, 3DGS' mixture.
 
-    SSIM's statistics are those of a tile's samples, taken as one window, or the mean over those 4x4 cells of the tile
-    that have samples, each a window: for samplers whose unit is the cell or the tile, as SSIM itself looks at no more
-    than the neighbours of a pixel.
+    SSIM's statistics are those of a tile's samples, taken as one window.
 
     Args:
         epsilon: of the Charbonnier term.
         ssim_weight: 0 .. 1.
-        window: `tile` or `cell`.
     """
 
     epsilon: float = 1e-3
     ssim_weight: float = 0.2
-    window: Literal["tile", "cell"] = "tile"
 
     def __post_init__(self) -> None:
         _check_epsilon(self.epsilon)
         require(0 <= self.ssim_weight <= 1, "ssim_weight", self.ssim_weight, "between 0 and 1")
-        require(self.window in ("tile", "cell"), "window", self.window, "tile or cell")
 
     def kernel_terms(self) -> LossTerms:
         """This loss as the CUDA kernel takes it."""
-        structure = "ssim" if self.window == "tile" else "cell_ssim"
         return LossTerms(
-            self.epsilon, l1_weight=1.0 - self.ssim_weight, structure=structure, structure_weight=self.ssim_weight
+            self.epsilon, l1_weight=1.0 - self.ssim_weight, structure="ssim", structure_weight=self.ssim_weight
         )
 
     def __call__(self, colors: Tensor, targets: Tensor, samples: PixelSamples) -> LossOutput:
         if _runs_in_kernel(colors):
             return sparse_loss(colors, targets, samples, self.kernel_terms())
         problem = _Problem(colors, targets, samples, self.epsilon)
-        groups = CellGroups(samples, problem.groups) if self.window == "cell" else problem.groups
+        groups = problem.groups
         similarity, slopes = ssim(TileMoments.of(groups, problem.colors, problem.targets), groups)
-        factors = groups.factors * (self.ssim_weight / 3.0)
-        loss = (1.0 - self.ssim_weight) * problem.loss + (factors * (1.0 - similarity)).sum()
-        gradients = (1.0 - self.ssim_weight) * problem.gradients - groups.spread(factors) * groups.shares * slopes
+        factor = self.ssim_weight / (3 * groups.tiles)
+        loss = (1.0 - self.ssim_weight) * problem.loss + factor * (1.0 - similarity).sum()
+        gradients = (1.0 - self.ssim_weight) * problem.gradients - factor * groups.shares * slopes
         return problem.output(loss, gradients)

@@ -19,8 +19,6 @@ EVERY = [
     CharbonnierNccLoss(ncc_weight=0.5, structure="contrast", gate=True, variance_constant=1e-4),
     SparseSsimLoss(),
     SparseSsimLoss(ssim_weight=1.0),
-    SparseSsimLoss(window="cell"),
-    SparseSsimLoss(ssim_weight=1.0, window="cell"),
 ]
 STRUCTURED = [loss for loss in EVERY if isinstance(loss, CharbonnierNccLoss)]
 
@@ -57,15 +55,6 @@ def tiles_of(samples):
     """Filled slots of each tile."""
     offsets, ids = samples.tile_offsets.tolist(), samples.pixel_ids.tolist()
     return [[p for p in range(a, b) if ids[p] >= 0] for a, b in itertools.pairwise(offsets)]
-
-
-def cells_of(samples, slots):
-    """Those slots of one tile by its 4x4 cells."""
-    cells = {}
-    for slot in slots:
-        y, x = divmod(int(samples.pixel_ids[slot]), int(samples.sizes[0, 0]))
-        cells.setdefault((y // 4 % 4, x // 4 % 4), []).append(slot)
-    return list(cells.values())
 
 
 def expected_similarity(loss, x, y, w):
@@ -118,10 +107,9 @@ def expected_loss(loss, colors, targets, samples, balance):
     )
     structure = 0.0
     for slots, factor in zip(tiles_of(samples), balance, strict=True):
-        windows = cells_of(samples, slots) if getattr(loss, "window", "tile") == "cell" else [slots]
-        for window, channel in itertools.product(windows, range(3)):
-            similarity, gate = expected_similarity(loss, colors[window, channel], targets[window, channel], w[window])
-            structure += factor * gate * (1 - similarity) / 3 / len(windows)
+        for channel in range(3):
+            similarity, gate = expected_similarity(loss, colors[slots, channel], targets[slots, channel], w[slots])
+            structure += factor * gate * (1 - similarity) / 3
     return base * l1 + weight * structure / len(samples.tile_ids)
 
 
@@ -246,10 +234,9 @@ def test_gradients_stay_below_the_stated_bound(loss, name, count, weighted):
 
 @pytest.mark.parametrize("name", list(extreme_tiles()))
 @pytest.mark.parametrize("ssim_weight", [0.2, 1.0])
-@pytest.mark.parametrize("window", ["tile", "cell"])
-def test_ssim_stays_finite(name, ssim_weight, window):
+def test_ssim_stays_finite(name, ssim_weight):
     colors, targets = extreme_tiles()[name]
-    result = SparseSsimLoss(ssim_weight=ssim_weight, window=window)(colors, targets, make_samples([30]))
+    result = SparseSsimLoss(ssim_weight=ssim_weight)(colors, targets, make_samples([30]))
     assert torch.isfinite(result.loss)
     assert torch.isfinite(result.color_gradients).all()
     assert result.color_gradients.abs().max() < 30
@@ -339,7 +326,6 @@ def test_without_a_single_filled_slot_the_loss_is_zero():
         (lambda: CharbonnierNccLoss(variance_constant=0.0), "variance_constant"),
         (lambda: CharbonnierNccLoss(epsilon=float("nan")), "epsilon"),
         (lambda: SparseSsimLoss(ssim_weight=1.1), "ssim_weight"),
-        (lambda: SparseSsimLoss(window="view"), "window"),
     ],
 )
 def test_invalid_values_are_named(make, named):

@@ -44,7 +44,7 @@ ROW_WIDTH = 14
 """Gradients of a view's row: means 3, scales 3, quats 4, sh0 3, opacities 1."""
 
 UNITS = ("pixel", "cell", "tile")
-STRUCTURES = ("none", "ncc", "contrast", "ssim", "cell_ssim")
+STRUCTURES = ("none", "ncc", "contrast", "ssim")
 
 
 def sample_pixels(

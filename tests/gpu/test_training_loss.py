@@ -28,7 +28,6 @@ CASES = {
         LossTerms(1e-3, 1.0, "contrast", 1.0, 9e-4, True, True),
     ),
     "ssim": (SparseSsimLoss(), LossTerms(1e-3, 0.8, "ssim", 0.2)),
-    "cell_ssim": (SparseSsimLoss(window="cell"), LossTerms(1e-3, 0.8, "cell_ssim", 0.2)),
 }
 
 
