@@ -1,6 +1,7 @@
 """Runs from end to end: the order of Algorithm 1, stops and resumes, and runs that cannot go on."""
 
 import json
+import math
 import os
 import shutil
 import signal
@@ -317,6 +318,18 @@ def test_a_capture_read_with_other_rounding_is_the_same(capture):
     assert capture_difference(saved, present) == ""
     present["test_views"]["viewmats"][0, 0, 3] += 2e-5
     assert capture_difference(saved, present) == "other poses of test images"
+
+
+@pytest.mark.parametrize("backdrop", ["true", "false"])
+def test_a_backdrop_is_kept_from_growing(capture, backdrop):
+    config = tiny_config(capture, f"train.backdrop={backdrop}", "density.refine_from=100")
+    trainer = Trainer(config, load_scene(capture), torch.device("cpu"))
+    trainer.initialise_maps()
+    far = trainer.gaussians.means.norm(dim=1).argmax()
+    trainer.gaussians.means[far] = 15.0 * trainer.extent
+    trainer.gaussians.scales[far] = math.log(40.0 * trainer.extent)
+    trainer.step()
+    assert (trainer.gaussians.scales[far] < math.log(10.0 * trainer.extent)).all() == (backdrop == "true")
 
 
 def test_the_trainer_names_no_strategy():

@@ -14,7 +14,13 @@ from turbogs_plugin import kernels
 from turbogs_plugin.budget import chosen_points
 from turbogs_plugin.config import Config
 from turbogs_plugin.errors import TrainingStopped
-from turbogs_plugin.gaussians import BACKDROP_COUNT, backdrop_gaussians, gaussians_from_points
+from turbogs_plugin.gaussians import (
+    BACKDROP_COUNT,
+    RESTRAIN_EVERY,
+    backdrop_gaussians,
+    gaussians_from_points,
+    restrain_backdrop,
+)
 from turbogs_plugin.offload import place_maps, place_views
 from turbogs_plugin.rendering import Rendered, Workspace, rasterize, render_images
 from turbogs_plugin.scene import Scene
@@ -101,6 +107,8 @@ class Trainer:
 
         # 11) Error-driven density control
         self.follow(self.density.update(self.gaussians, step))
+        if self.config.train.backdrop and self.iteration % RESTRAIN_EVERY == 0:
+            restrain_backdrop(self.gaussians, self.extent)
 
         self.iteration += 1
 
