@@ -21,6 +21,7 @@ TINY = (
     "density.refine_every=3",
     "density.final_every=2",
     "density.grad_threshold=1e-6",
+    "density.opacity_decay=0.2",
 )
 
 

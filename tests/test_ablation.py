@@ -80,13 +80,22 @@ def test_another_length_scales_what_counts_iterations_and_nothing_else():
     assert config.to_yaml() == before
     assert (short.train.iterations, short.train.refine_until, short.train.sh_interval) == (500, 350, 30)
     changed = {key for key, value in short.density.items() if value != config.density[key]}
-    assert changed == {"refine_from", "refine_every", "final_every"}
+    assert changed == {"refine_from", "refine_every", "final_every", "opacity_decay"}
     assert (short.density["refine_from"], short.density["refine_every"], short.density["final_every"]) == (20, 10, 50)
     assert with_iterations(config, 50).density["refine_every"] == 10
     same = with_iterations(config, config.train.iterations)
     same.plan.iterations = config.plan.iterations
     assert same.to_yaml() == before
     assert short.plan.iterations == "keep", "a length that was asked for is not the plan's to change"
+
+
+def test_events_that_come_sooner_take_less_of_the_opacities():
+    config = load_config("turbogs")
+    left = 1.0 - config.density["opacity_decay"]
+    decays = {count: with_iterations(config, count).density["opacity_decay"] for count in (1000, 2500, 4000)}
+    assert decays == {1000: pytest.approx(1.0 - left**0.4), 2500: 1.0 - left, 4000: 1.0 - left}
+    there_and_back = with_iterations(with_iterations(config, 1000), 5000)
+    assert there_and_back.density["opacity_decay"] == pytest.approx(1.0 - left)
 
 
 @pytest.mark.parametrize(

@@ -10,12 +10,12 @@ from gsplat import export_splats
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.gaussians import (
     BACKDROP_RADIUS,
-    BACKDROP_SIZE,
+    DISTANT,
     SH_C0,
     backdrop_gaussians,
     gaussians_from_points,
     load_ply,
-    restrain_backdrop,
+    restrain_distant,
     save_ply,
 )
 from turbogs_plugin.rendering import render_images
@@ -207,16 +207,17 @@ def test_a_backdrop_surrounds_everything_in_its_colour():
     assert (nearest < backdrop.scales.exp().amin()).all()
 
 
-def test_a_backdrop_is_restrained_and_the_scene_is_not():
+def test_distant_gaussians_are_restrained_and_the_scene_is_not():
     gaussians = random_gaussians(60)
     gaussians.means *= torch.linspace(0.1, 30.0, 60)[:, None]
     gaussians.scales += 3.0
     before = gaussians.scales.clone()
-    restrain_backdrop(gaussians, extent=2.0)
+    restrain_distant(gaussians, extent=2.0, size=0.3)
     distances = gaussians.means.norm(dim=1, keepdim=True)
-    limits = torch.where(distances > BACKDROP_RADIUS, (BACKDROP_SIZE * distances).log(), torch.inf)
+    limits = torch.where(distances > DISTANT * 2.0, (0.3 * (distances - 2.0)).log(), torch.inf)
     assert torch.equal(gaussians.scales, torch.minimum(before, limits))
     assert 0 < (before > gaussians.scales).sum() < before.numel()
+    assert (distances < DISTANT * 2.0).any()
 
 
 @pytest.mark.parametrize("depth", [0.05, 0.6, 2.0])
@@ -227,5 +228,5 @@ def test_what_lies_beside_a_camera_covers_none_of_its_view(depth):
     gaussians.scales[0], gaussians.opacities[0] = torch.tensor([45.0, 32.0, 0.4]).log(), 10.0
     camera = Cameras(torch.eye(4)[None], torch.tensor([[[80.0, 0, 48], [0, 80, 32], [0, 0, 1]]]), np.array([[96, 64]]))
     assert render_images(gaussians, camera)[0][1][32, 48] > 0.8
-    restrain_backdrop(gaussians, extent=1.0)
+    restrain_distant(gaussians, extent=1.0, size=0.3)
     assert render_images(gaussians, camera)[0][1][32, 48] < 0.01

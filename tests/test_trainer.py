@@ -320,16 +320,16 @@ def test_a_capture_read_with_other_rounding_is_the_same(capture):
     assert capture_difference(saved, present) == "other poses of test images"
 
 
-@pytest.mark.parametrize("backdrop", ["true", "false"])
-def test_a_backdrop_is_kept_from_growing(capture, backdrop):
-    config = tiny_config(capture, f"train.backdrop={backdrop}", "density.refine_from=100")
+@pytest.mark.parametrize(("size", "expected"), [(0.0, 40.0), (0.3, 0.3 * 14.0)])
+def test_what_is_far_is_kept_from_growing(capture, size, expected):
+    config = tiny_config(capture, f"train.distant_size={size}", "density.refine_from=100")
     trainer = Trainer(config, load_scene(capture), torch.device("cpu"))
     trainer.initialise_maps()
     far = trainer.gaussians.means.norm(dim=1).argmax()
-    trainer.gaussians.means[far] = 15.0 * trainer.extent
+    trainer.gaussians.means[far] *= 15.0 * trainer.extent / trainer.gaussians.means[far].norm()
     trainer.gaussians.scales[far] = math.log(40.0 * trainer.extent)
     trainer.step()
-    assert (trainer.gaussians.scales[far] < math.log(10.0 * trainer.extent)).all() == (backdrop == "true")
+    assert torch.allclose(trainer.gaussians.scales[far].exp(), torch.tensor(expected * trainer.extent), rtol=0.05)
 
 
 def test_the_trainer_names_no_strategy():

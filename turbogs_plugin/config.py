@@ -62,6 +62,8 @@ class TrainConfig:
         initial_opacity, initial_size: of the Gaussians that training starts with; the size in mean distances to the
             three nearest points. 3DGS has 0.1 and 1, gsplat's MCMC preset 0.5 and 0.1.
         backdrop: start with a far sphere of Gaussians in the photos' mean colour behind the scene.
+        distant_size: largest standard deviation of a Gaussian beyond 2 scene extents, over its distance from the
+            cameras (`restrain_distant`). 0: no bound.
         evaluate_at: when to evaluate, as fractions of T; the start and the end are always evaluated.
         checkpoint_every: iterations between checkpoints; the end always has one. 0: only the end.
     """
@@ -75,6 +77,7 @@ class TrainConfig:
     initial_opacity: float = 0.1
     initial_size: float = 1.0
     backdrop: bool = False
+    distant_size: float = 0.0
     evaluate_at: tuple[float, ...] = (0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
     checkpoint_every: int = 2500
 
@@ -87,6 +90,7 @@ class TrainConfig:
         require(self.sh_interval >= 1, "sh_interval", self.sh_interval, "at least 1")
         require(0 < self.initial_opacity < 1, "initial_opacity", self.initial_opacity, "more than 0 and less than 1")
         require(0 < self.initial_size <= 100, "initial_size", self.initial_size, "more than 0 and at most 100")
+        require(0 <= self.distant_size < math.inf, "distant_size", self.distant_size, "a finite number >= 0")
         for value in self.evaluate_at:
             require(0 < value <= 1, "evaluate_at", value, "fractions within (0, 1]")
         require(self.checkpoint_every >= 0, "checkpoint_every", self.checkpoint_every, "at least 0")

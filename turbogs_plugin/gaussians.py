@@ -36,8 +36,8 @@ BACKDROP_RADIUS = 20.0
 """In extents: beyond what a capture shows, near enough that floats tell its Gaussians apart."""
 BACKDROP_OPACITY = 0.88
 """Several of its Gaussians cover a direction, so that nothing shines through."""
-BACKDROP_SIZE = 0.3
-"""Largest standard deviation of a Gaussian there, over its distance."""
+DISTANT = 2.0
+"""In extents: what lies beyond is bounded in size by its distance."""
 RESTRAIN_EVERY = 10
 """Iterations between two looks at these sizes; in so few they grow by a quarter."""
 
@@ -110,20 +110,21 @@ def backdrop_gaussians(color: Tensor, sh_degree: int, extent: float) -> Gaussian
 
 
 @torch.no_grad()
-def restrain_backdrop(gaussians: Gaussians, extent: float) -> None:
-    """Keep what lies beyond half the backdrop's radius from growing, in place, past `BACKDROP_SIZE` of its distance.
+def restrain_distant(gaussians: Gaussians, extent: float, size: float) -> None:
+    """Keep Gaussians beyond `DISTANT` extents from growing, in place, past a share of their distance from all cameras.
 
     A splat is as large as its Gaussian over its depth, and as far from the image's middle as its centre over that
-    depth. So one beside the cameras reaches the middle of their images, whatever its depth and perhaps in front of all
-    else, once its deviation is a third of its distance (splats are cut at 3.33). No training view need show it.
+    depth. So one beside a camera reaches the middle of its image, whatever its depth and perhaps in front of all else,
+    once its deviation is a third of its distance (splats are cut at 3.33). No training view need show it.
 
     Args:
         gaussians: about the cameras' centre.
-        extent: the scene's.
+        extent: the scene's, which holds all cameras.
+        size: largest standard deviation over the distance from the nearest place where a camera may be.
     """
     distances = gaussians.means.norm(dim=-1, keepdim=True)  # [N, 1]
-    far = distances > 0.5 * BACKDROP_RADIUS * extent
-    limits = torch.where(far, (BACKDROP_SIZE * distances).log(), torch.inf)
+    limits = (size * (distances - extent)).log()
+    limits = torch.where(distances > DISTANT * extent, limits, torch.inf)
     torch.minimum(gaussians.scales, limits, out=gaussians.scales)
 
 

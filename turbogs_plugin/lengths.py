@@ -20,6 +20,9 @@ opacities takes away grows back at the rate of the optimizer, however short the 
 SHORTEST_INTERVAL = 10
 """Scaling makes no interval of density control shorter: its statistics need a window of some iterations."""
 
+REGROWTH = 50
+"""Iterations in which opacities grow back what an event of density control takes; one that comes sooner takes less."""
+
 
 def with_iterations(config: Config, iterations: int) -> Config:
     """The configuration for a run of exactly this length, with everything scaled that counts iterations."""
@@ -40,6 +43,8 @@ def scale_iterations(mapping: dict[str, dict[str, Any]], iterations: int) -> Non
     if iterations < 1:
         raise InputError(f"a run has at least one iteration, not {iterations}")
     factor = iterations / mapping["train"]["iterations"]
+    density = mapping["density"]
+    interval = density.get("refine_every", REGROWTH)
     for section, names in ITERATION_FIELDS.items():
         for name in names:
             value = mapping[section].get(name, 0)
@@ -47,3 +52,6 @@ def scale_iterations(mapping: dict[str, dict[str, Any]], iterations: int) -> Non
                 least = min(value, SHORTEST_INTERVAL) if section == "density" else 1
                 mapping[section][name] = max(least, round(value * factor))
     mapping["train"]["iterations"] = iterations
+    exponent = min(REGROWTH, density.get("refine_every", REGROWTH)) / min(REGROWTH, interval)
+    if density.get("opacity_decay", 0.0) and exponent != 1.0:
+        density["opacity_decay"] = 1.0 - (1.0 - density["opacity_decay"]) ** exponent

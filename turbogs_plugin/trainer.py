@@ -19,7 +19,7 @@ from turbogs_plugin.gaussians import (
     RESTRAIN_EVERY,
     backdrop_gaussians,
     gaussians_from_points,
-    restrain_backdrop,
+    restrain_distant,
 )
 from turbogs_plugin.offload import place_maps, place_views
 from turbogs_plugin.rendering import Rendered, Workspace, rasterize, render_images
@@ -107,8 +107,8 @@ class Trainer:
 
         # 11) Error-driven density control
         self.follow(self.density.update(self.gaussians, step))
-        if self.config.train.backdrop and self.iteration % RESTRAIN_EVERY == 0:
-            restrain_backdrop(self.gaussians, self.extent)
+        if self.config.train.distant_size > 0 and self.iteration % RESTRAIN_EVERY == 0:
+            restrain_distant(self.gaussians, self.extent, self.config.train.distant_size)
 
         self.iteration += 1
 

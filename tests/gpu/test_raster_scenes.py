@@ -59,7 +59,8 @@ def test_colors_and_gradients(case):
     wanted = rasterize_reference(case.gaussians, case.cameras, case.samples)
     assert_forward_close(got.colors, wanted.colors, "colors")
     assert_forward_close(got.alphas, wanted.alphas, "alphas")
-    beyond = (got.colors.double().cpu() - wanted.colors)[(got.colors.double().cpu() - wanted.colors).abs() > 1e-4]
+    difference = got.colors.double().cpu() - wanted.colors
+    beyond = difference[(difference.abs() > 1e-4).any(dim=1)].sum(dim=1)  # a flip moves all channels of its sample
     if len(beyond) >= 20:  # symmetric: neither draws more than the other
         assert 0.2 <= (beyond > 0).double().mean() <= 0.8
 
