@@ -320,7 +320,7 @@ def view_numbers(view_ids: ViewIds, maps: ErrorMaps) -> tuple[int, ...]:
             the host waits, once; whoever has them on the host gives them from there.
 
     Raises:
-        InputError: not whole numbers, none, or one that the maps do not have.
+        InputError: not whole numbers, none, one that the maps do not have, or one of them twice.
     """
     plain = view_ids.tolist() if isinstance(view_ids, (Tensor, np.ndarray)) else view_ids
     try:
@@ -331,11 +331,14 @@ def view_numbers(view_ids: ViewIds, maps: ErrorMaps) -> tuple[int, ...]:
         raise InputError(
             f"view_ids = {plain!r} is not valid: give whole numbers of views from 0 to {len(maps.sizes) - 1}"
         )
+    if len(set(numbers)) < len(numbers):  # its pixels would be updated twice, and the sum of its errors be wrong
+        raise InputError(f"view_ids = {plain!r} is not valid: a batch has each view once")
     return numbers
 
 
 def _sample(rule: DrawRule, maps: ErrorMaps, view_ids: ViewIds, rate: float, step: Step) -> PixelSamples:
-    require(rate > 0, "rate", rate, "above 0")
+    require(0 < rate < math.inf, "rate", rate, "finite and above 0")
+    require(isinstance(step, Step), "step", step, "a Step, as Step(iteration=0, total=1000, refine_until=500) is")
     view_ids = view_numbers(view_ids, maps)
     maps.fetch(view_ids)
     views = np.asarray(view_ids, dtype=np.int64)

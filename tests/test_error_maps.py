@@ -177,6 +177,8 @@ def test_errors_of_another_shape_change_nothing(shape):
 def test_wrong_shape_and_options_are_named():
     with pytest.raises(InputError, match=r"view 0 has shape \(16, 16, 3\)"):
         ErrorMaps.from_images(torch.rand(2, 16, 16, 3))
+    with pytest.raises(InputError, match=r"view 0 is a ndarray.*from_numpy"):
+        ErrorMaps.from_images(np.zeros((2, 16, 16)))
     with pytest.raises(InputError, match="none"):
         ErrorMaps.from_images([])
     with pytest.raises(InputError, match=r"view 1 have shape \(7,\), expected \(200,\)"):

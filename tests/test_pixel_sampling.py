@@ -77,6 +77,14 @@ def test_views_that_are_none_are_refused(sampler, views):
         sampler.sample(random_maps(), views, 0.1, step(4))
 
 
+@pytest.mark.parametrize("sampler", SAMPLERS, ids=lambda sampler: type(sampler).__name__)
+@pytest.mark.parametrize("views", [(2, 2), torch.tensor([0, 3, 0])])
+def test_a_view_twice_is_refused(sampler, views):
+    """`ErrorMaps.update` would count its pixels' changes twice."""
+    with pytest.raises(InputError, match=r"view_ids = .* each view once"):
+        sampler.sample(random_maps(), views, 0.1, step(4))
+
+
 @pytest.mark.parametrize(("rate", "wanted"), [(1e-6, 1), (0.1, 25), (1 / 3, 85), (1.0, 256), (3.0, 256)])
 def test_counts_of_pixels(rate, wanted):
     samples = ErrorGuidedPixelSampler().sample(random_maps(), (0, 2), rate, step(1))
@@ -308,8 +316,16 @@ def test_invalid_values_are_named(values, named):
         ErrorGuidedPixelSampler(**values)
 
 
-def test_invalid_rate_and_unit_are_named():
-    with pytest.raises(InputError, match="rate"):
-        ErrorGuidedPixelSampler().sample(random_maps(), (0,), 0.0, step(0))
+@pytest.mark.parametrize("sampler", SAMPLERS[:2], ids=lambda sampler: type(sampler).__name__)
+@pytest.mark.parametrize(
+    ("rate", "at", "named"),
+    [*((rate, step(0), f"rate = {rate}") for rate in (0.0, float("nan"), float("inf"))), (0.1, 7, "step = 7.*a Step")],
+)
+def test_invalid_rates_and_steps_are_named(sampler, rate, at, named):
+    with pytest.raises(InputError, match=named):
+        sampler.sample(random_maps(), (0,), rate, at)
+
+
+def test_an_invalid_unit_is_named():
     with pytest.raises(InputError, match="unit"):
         RandomPixelSampler(unit="cells")

@@ -84,11 +84,16 @@ class ErrorMaps:
             options: further arguments of `ErrorMaps`.
 
         Raises:
-            InputError: there is no image, or one is not [H, W].
+            InputError: there is no image, or one is not a tensor [H, W].
         """
         if len(errors) == 0:
             raise InputError("error images: there are none, give one [H, W] for each view")
         for view_id, image in enumerate(errors):
+            if not isinstance(image, Tensor):
+                raise InputError(
+                    f"error image of view {view_id} is a {type(image).__name__}, expected a tensor [H, W]: "
+                    "torch.from_numpy makes one of a numpy array"
+                )
             if image.dim() != 2:
                 raise InputError(f"error image of view {view_id} has shape {tuple(image.shape)}, expected [H, W]")
         sizes = np.array([(image.shape[1], image.shape[0]) for image in errors], dtype=np.int64)
