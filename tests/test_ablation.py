@@ -107,6 +107,8 @@ def test_events_that_come_sooner_take_less_of_the_opacities():
         ("title: x\nvariants: {full: []}\nbaseline: ful", "did you mean 'full'"),
         ("title: x\nvariant: {a: []}", "variants"),
         ("variants: {a: []}", "title"),
+        ("title: x\nvariants: {1: []}", "name 1 is not text: put it in quotes, '1'"),
+        ("title: x\nvariants: {a: []}\nnotes: {true: b}", "name True is not text"),
         ("title: x\nvariants: {a: train.seed=1}", "list"),
     ],
 )

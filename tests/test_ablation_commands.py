@@ -16,7 +16,7 @@ from turbogs_plugin import provenance as provenance_module
 from turbogs_plugin.ablation.cell import capture_digest, train_cell
 from turbogs_plugin.ablation.compare import study_of_runs
 from turbogs_plugin.ablation.grid import load_ablation, variant_config
-from turbogs_plugin.ablation.results import StudyFolder
+from turbogs_plugin.ablation.results import CellResult, StudyFolder
 from turbogs_plugin.config import load_config
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.lengths import with_iterations
@@ -118,6 +118,25 @@ def test_a_cell_of_other_settings_is_not_mixed_in(turbogs, small, capture, tmp_p
     code, _, err = turbogs(*call(small, capture, out, "--only", "full", "--time-budget", "1"))
     assert code == 2 and "time budget" in err
     assert {path: path.read_bytes() for path in out.rglob("*") if path.is_file()} == before
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"time_budget": None}, "full--seed0.json.*time_budget: expected a number"),
+        ({"variant": 1}, "full--seed0.json.*variant: expected text"),
+        ({"seed": "0"}, "full--seed0.json.*seed: expected a whole number"),
+        ({"variant": "other"}, "other--seed0.json.*no variant"),
+    ],
+)
+def test_a_cell_that_cannot_be_used_is_named_by_its_file(small, tmp_path, changes, words):
+    folder = StudyFolder(tmp_path / "study")
+    folder.write_ablation(load_ablation(str(small)))
+    folder.write(CellResult("fox", "full", 0, {}, 0.0, [Evaluation(4, 1.0, 30.0, 0.8, 0.1, 100, 2**20)]))
+    path = folder.cells / "fox" / "full--seed0.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | changes))
+    with pytest.raises(InputError, match=words):
+        folder.read_study()
 
 
 def test_a_time_budget_ends_a_cell(turbogs, small, capture, tmp_path):
@@ -310,14 +329,35 @@ def test_runs_are_compared(turbogs, capture, tmp_path):
     assert code == 2 and "same run" in err
 
 
+def a_run(folder: Path, iterations: int, *overrides: str) -> Path:
+    """What `compare` reads of a run."""
+    folder.mkdir()
+    (folder / "config.yaml").write_text(with_iterations(load_config("turbogs", overrides), iterations).to_yaml())
+    append_evaluation(folder / "history.jsonl", Evaluation(iterations, 20.0, 30.0, 0.8, 0.1, 100, 2**20))
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("second", "names"),
+    [
+        (["scene.path=/a/fox"], ["fox"]),
+        (["scene.path=/b/fox"], ["a-fox", "b-fox"]),
+        (["scene.path=/fox"], ["a-fox", "fox"]),
+        (["scene.path=/a/bear", "scene.factor=2"], ["fox", "bear"]),
+        (["scene.path=/a/fox", "scene.factor=2"], ["fox-factor-1", "fox-factor-2"]),
+        (["scene.path=/a/fox", "scene.test_every=4"], ["fox-test_every-8", "fox-test_every-4"]),
+    ],
+)
+def test_captures_that_share_a_name_are_kept_apart(tmp_path, second, names):
+    runs = [a_run(tmp_path / "x", 30, "scene.path=/a/fox"), a_run(tmp_path / "y", 30, "train.seed=1", *second)]
+    study = study_of_runs(runs)
+    assert study.scenes == names and list(study.ablation.variants) == ["x"]
+
+
 def test_runs_of_one_time_budget_are_seeds_however_long_they_came_out(tmp_path):
     def run(name: str, seed: int, time: str, iterations: int, pixel_budget: float, *overrides: str) -> Path:
         settings = [f"train.seed={seed}", f"budget.time={time}", f"schedule.pixel_budget={pixel_budget}", *overrides]
-        folder = tmp_path / name
-        folder.mkdir()
-        (folder / "config.yaml").write_text(with_iterations(load_config("turbogs", settings), iterations).to_yaml())
-        append_evaluation(folder / "history.jsonl", Evaluation(iterations, 20.0, 30.0, 0.8, 0.1, 100, 2**20))
-        return folder
+        return a_run(tmp_path / name, iterations, *settings)
 
     runs = [
         run("a", 0, "20s", 2600, 1.0),
@@ -353,7 +393,14 @@ def test_the_bar_of_a_cell_has_the_planned_length(tmp_path):
         (["ablate", "components", "--scene", "CAPTURE", "--out", "X", "--seeds", "1", "1"], ["seeds"]),
         (["ablate", "components", "--scene", "CAPTURE", "--scene", "CAPTURE", "--out", "X"], ["scenes"]),
         (["ablate", "components", "--scene", "CAPTURE", "--out", "X", "--steps", "0"], ["iteration"]),
-        (["ablate", "components", "--scene", "CAPTURE", "--out", "X", "--time-budget", "-1"], ["time budget"]),
+        (
+            ["ablate", "components", "--scene", "x/CAPTURE", "--scene", "y/CAPTURE", "--out", "X"],
+            ["x/CAPTURE and", "y/"],
+        ),
+        *(
+            (["ablate", "components", "--scene", "CAPTURE", "--out", "X", "--time-budget", time], ["time budget"])
+            for time in ("-1", "nan", "inf")
+        ),
         (["ablate", "components", "--scene", "CAPTURE", "--out", "CAPTURE"], ["not empty"]),
         (["ablate", "--merge", "CAPTURE", "--out", "X"], ["holds no ablation"]),
         (["compare", "CAPTURE", "--out", "X"], ["holds no run"]),

@@ -87,6 +87,9 @@ def convert(value: Any, hint: Any, where: str) -> Any:
     if origin is dict:
         if not isinstance(value, Mapping):
             raise InputError(f"{where}: expected a mapping of keys, got {value!r}")
+        for key in value:
+            if arguments[0] is str and not isinstance(key, str):
+                raise InputError(f"{where}: the name {key!r} is not text: put it in quotes, '{key}'")
         return {key: convert(item, arguments[1], f"{where}.{key}") for key, item in value.items()}
     return _convert_scalar(value, hint, where)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -9,8 +10,9 @@ from typing import Any
 
 from turbogs_plugin.ablation.grid import Ablation
 from turbogs_plugin.ablation.results import CellResult, Study
+from turbogs_plugin.config import SceneConfig
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.lengths import ITERATION_FIELDS
+from turbogs_plugin.lengths import ITERATION_FIELDS, REGROWTH
 from turbogs_plugin.report.history import read_history
 from turbogs_plugin.run import RunFolder
 
@@ -30,14 +32,14 @@ def study_of_runs(paths: Sequence[Path]) -> Study:
     """
     variants: list[tuple[dict[str, Any], str]] = []  # configuration without the seed and the place, and its name
     results: list[CellResult] = []
-    for path in paths:
-        folder = RunFolder(path)
-        config = folder.read_config()
+    folders = [RunFolder(path) for path in paths]
+    configs = [folder.read_config() for folder in folders]
+    scenes = _scene_names([config.scene for config in configs])
+    for path, folder, config, scene in zip(paths, folders, configs, scenes, strict=True):
         history = read_history(folder.history)
         if not history:
             raise InputError(f"'{path}' has no evaluation yet")
         mapping = config.to_mapping()
-        scene = Path(config.scene.path).name
         shared = _without(mapping)
         name = next((name for known, name in variants if known == shared), None)
         if name is None:
@@ -58,15 +60,35 @@ def study_of_runs(paths: Sequence[Path]) -> Study:
     return Study(ablation, results)
 
 
+def _scene_names(scenes: Sequence[SceneConfig]) -> list[str]:
+    """The captures' names, with what tells those of one name apart: parent folders, the factor, the test views."""
+    names = []
+    for scene in scenes:
+        path = Path(scene.path)
+        alike = [other for other in scenes if Path(other.path).name == path.name]
+        folders = {Path(other.path).parts for other in alike}
+        depth = next(n for n in itertools.count(1) if len({parts[-n:] for parts in folders}) == len(folders))
+        name = "-".join(part for part in path.parts[-depth:] if part != path.anchor)
+        for setting in ("factor", "test_every"):
+            if len({getattr(other, setting) for other in alike}) > 1:
+                name += f"-{setting}-{getattr(scene, setting)}"
+        names.append(name)
+    return names
+
+
 def _without(mapping: dict[str, Any]) -> dict[str, Any]:
-    """What makes two runs seeds of one variant: all but the seed, the place, and what is only reported or kept.
+    """What makes two runs seeds of one variant: all but the seed, the photos, and what is only reported or kept.
 
     A time budget fits the length and the pixels of an iteration to the machine, to each seed its own: not that either.
     """
-    sections = {name: dict(section) for name, section in mapping.items() if name != "report"}
-    for section, key in (("train", "seed"), ("train", "checkpoint_every"), ("train", "evaluate_at"), ("scene", "path")):
-        sections[section].pop(key)
+    sections = {name: dict(section) for name, section in mapping.items() if name not in ("report", "scene")}
+    for key in ("seed", "checkpoint_every", "evaluate_at"):
+        sections["train"].pop(key)
     if sections["budget"]["time"]:
+        density = sections["density"]
+        if density.get("opacity_decay"):  # it goes along with the length, by the interval of its events
+            events = REGROWTH / min(REGROWTH, density.get("refine_every", REGROWTH))
+            density["opacity_decay"] = round(1.0 - (1.0 - density["opacity_decay"]) ** events, 9)
         for section, keys in FITTED.items():
             for key in keys:
                 sections[section].pop(key, None)

@@ -6,14 +6,14 @@ import json
 import math
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 
 from turbogs_plugin.ablation.grid import Ablation, CellKey
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.files import write_text_atomically
 from turbogs_plugin.provenance import Provenance
 from turbogs_plugin.report.history import Evaluation
-from turbogs_plugin.schema import build_dataclass
+from turbogs_plugin.schema import build_dataclass, convert, nearest
 
 FORMAT = 1
 
@@ -145,7 +145,11 @@ class StudyFolder:
         order = {name: number for number, name in enumerate(ablation.variants)}
         results = list(self.read_results().values())
         for result in results:
-            ablation.require_variant(result.variant)
+            if result.variant not in ablation.variants:
+                raise InputError(
+                    f"'{self.cells / result.key.file}' is of no variant of the ablation: "
+                    f"'{result.variant}', {nearest(result.variant, ablation.variants)}"
+                )
         results.sort(key=lambda result: (result.scene, order[result.variant], result.seed))
         return Study(ablation, results, self._failures())
 
@@ -158,6 +162,9 @@ class StudyFolder:
 
     def _failure_file(self, key: CellKey) -> Path:
         return self.cells / key.file.with_suffix(".failed")
+
+
+_HINTS = get_type_hints(CellResult)
 
 
 def merge_studies(sources: list[StudyFolder], target: StudyFolder) -> None:
@@ -205,6 +212,8 @@ def _read_result(path: Path) -> CellResult:
             raise ValueError("without an evaluation")
         made = mapping["provenance"]
         mapping["provenance"] = None if made is None else Provenance(**made)
+        for name in ("scene", "variant", "seed", "time_budget"):
+            mapping[name] = convert(mapping[name], _HINTS[name], name)
         mapping.update(history=history, lpips=_number(mapping["lpips"]), fps=_number(mapping["fps"]))
         return CellResult(**mapping)
     except (KeyError, TypeError, ValueError, AttributeError) as error:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import gc
+import itertools
 import json
+import math
 import traceback
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -51,12 +53,15 @@ class SweepOptions:
     reuse: Sequence[Path] = ()
 
     def __post_init__(self) -> None:
-        names = [path.resolve().name for path in self.scenes]
-        for what, values in (("scenes", names), ("seeds", list(self.seeds))):
+        scenes = [path.resolve() for path in self.scenes]
+        for what, values in (("scenes", [str(path) for path in scenes]), ("seeds", list(self.seeds))):
             if not values or len(set(values)) != len(values):
                 raise InputError(f"{what}: one or more different ones are needed, got {values}")
-        if self.time_budget < 0:
-            raise InputError(f"the time budget is {self.time_budget}: it must be 0 (none) or more seconds")
+        for first, second in itertools.combinations(scenes, 2):
+            if first.name == second.name:
+                raise InputError(f"scenes: two folders are called '{first.name}', {first} and {second}: rename one")
+        if not 0 <= self.time_budget < math.inf:
+            raise InputError(f"the time budget is {self.time_budget}: it must be 0 (none) or a number of seconds")
 
 
 def run_sweep(
