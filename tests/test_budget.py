@@ -37,11 +37,24 @@ def test_amounts_of_time(text, expected):
     assert parse_seconds(text) == expected
 
 
-@pytest.mark.parametrize("text", ["", "GiB", "-2GiB", "2 apples", "0", "1e9", "2GiB 3", "inf", "nan"])
+@pytest.mark.parametrize("text", ["", "GiB", "-2GiB", "2 apples", "0", "1e9", "2GiB 3", "inf", "nan", "9" * 400])
 def test_no_amounts(text):
     for parse in (parse_bytes, parse_seconds):
         with pytest.raises(InputError, match="is no amount of"):
             parse(text)
+
+
+@pytest.mark.parametrize(
+    ("override", "word"),
+    [
+        ("train.iterations=2147483648", "iterations = 2147483648"),
+        ("plan.iterations=2147483648", "iterations = 2147483648"),
+        ("budget.time=1000000h", "at most 100h"),
+    ],
+)
+def test_lengths_that_cannot_be_counted_are_refused(override, word):
+    with pytest.raises(InputError, match=word):
+        load_config("turbogs", [override])
 
 
 @pytest.mark.parametrize(

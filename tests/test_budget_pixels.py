@@ -165,6 +165,14 @@ def test_a_configuration_for_its_time(scene, monkeypatch, seconds, overrides, pi
     assert (told in calibration.budget_text(config, measured)) == (pixel_budget > 1.0)
 
 
+@pytest.mark.parametrize(("seconds", "longest"), [(30, 1.2), (3600, 5.0), (360_000, 5.0)])
+def test_a_long_time_is_not_spent_on_calibration(scene, monkeypatch, seconds, longest):
+    asked, cost = [], SyntheticTrial.cost
+    monkeypatch.setattr(SyntheticTrial, "cost", lambda trial, share: asked.append(share) or cost(trial, share))
+    planned(scene, monkeypatch, f"budget.time={seconds}s")
+    assert asked == [pytest.approx(0.5 * longest)]
+
+
 def test_pixels_and_gaussians_share_the_memory(scene, monkeypatch):
     """A generous time raises lambda as far as the expected Gaussians leave room, and the cap is that of this lambda."""
     monkeypatch.setattr(calibration, "hold_to", lambda limit, device: None)

@@ -3,6 +3,7 @@
 import math
 import os
 import signal
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -205,6 +206,25 @@ def test_memory_that_is_spent_names_what_may_fit(capture, tmp_path, monkeypatch)
     monkeypatch.setattr(Trainer, "step", full)
     with pytest.raises(TrainingStopped, match=r"too small for \d+ Gaussians; try --max-gaussians \d+; no checkpoint"):
         run.train(tiny_config(capture), tmp_path / "run")
+
+
+@pytest.mark.parametrize("every", [0, 1, 4, 5, 10, 11])
+def test_stops_by_iterations_evaluate_and_save_where_asked(every):
+    train = TrainConfig(iterations=10, evaluate_at=(0.3, 0.5), checkpoint_every=every)
+    pace, iteration, dues = pacing.IterationPace(train), 0, {}
+    while iteration < pace.iterations:
+        iteration = pace.next_mark(iteration, 0.0)
+        dues[iteration] = pace.reached(iteration, 0.0, 10)
+    saves = {*range(every, 10, every), 10} if every else {10}
+    assert {iteration for iteration, due in dues.items() if due.save} == saves
+    assert {iteration for iteration, due in dues.items() if due.evaluate} == {3, 5, 10}
+    assert dues.keys() == saves | {3, 5, 10}
+
+
+def test_a_long_run_takes_no_memory_for_its_stops():
+    pace = pacing.IterationPace(TrainConfig(iterations=2**20, checkpoint_every=1, evaluate_at=()))
+    assert sum(sys.getsizeof(value) for value in vars(pace).values()) < 1000
+    assert pace.next_mark(2**19, 0.0) == 2**19 + 1
 
 
 def test_stops_by_time_evaluate_once_a_fraction_and_save_at_intervals():

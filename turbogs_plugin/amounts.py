@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping
 
@@ -15,7 +16,7 @@ def parse_bytes(text: str) -> int:
     """``2GiB``, ``1500 MB``, ``300000000``. Raises `InputError`."""
     number = _parse(text, BYTE_UNITS)
     if number is None or number < 1:
-        raise InputError(f"'{text}' is no amount of memory: write 2GiB, 1500MB or a number of bytes")
+        raise InputError(f"'{text[:40]}' is no amount of memory: write 2GiB, 1500MB or a number of bytes")
     return int(number)
 
 
@@ -23,10 +24,13 @@ def parse_seconds(text: str) -> float:
     """``20s``, ``2m``, ``1.5h``, ``20``. Raises `InputError`."""
     number = _parse(text, SECOND_UNITS)
     if number is None or number <= 0:
-        raise InputError(f"'{text}' is no amount of time: write 20s, 2m or 1.5h")
+        raise InputError(f"'{text[:40]}' is no amount of time: write 20s, 2m or 1.5h")
     return number
 
 
 def _parse(text: str, units: Mapping[str, float]) -> float | None:
     match = re.fullmatch(r"\s*(\d+(?:\.\d*)?|\.\d+)\s*([a-z]*)\s*", str(text).lower())
-    return None if match is None or match[2] not in units else float(match[1]) * units[match[2]]
+    if match is None or match[2] not in units:
+        return None
+    amount = float(match[1]) * units[match[2]]
+    return amount if math.isfinite(amount) else None

@@ -34,6 +34,8 @@ from turbogs_plugin.trainer import Trainer
 
 CALIBRATION_SHARE = 0.04
 """Of the time budget, for the measurements that the first plan rests on: half for lambda as configured."""
+CALIBRATION_SECONDS = 5.0
+"""Never more than that, as further measurements would say no more."""
 WARMUP_ITERATIONS = {"cuda": 20, "cpu": 1}
 """Not measured: they load code and find the sizes of buffers."""
 FEWEST_MEASURED = {"cuda": 20, "cpu": 2}
@@ -148,8 +150,8 @@ def calibrate(config: Config, scene: Scene, device: torch.device, seconds: float
     """Measure what an iteration costs; where more than the configured ones would fit, with more pixels too.
 
     Args:
-        seconds: of the time budget. `CALIBRATION_SHARE` of them are for this; more where the fewest iterations that are
-            measured take longer.
+        seconds: of the time budget. `CALIBRATION_SHARE` of them are for this, at most `CALIBRATION_SECONDS`; more where
+            the fewest iterations that are measured take longer.
 
     Raises:
         InputError: too much of the time would pass before the first iteration.
@@ -164,7 +166,7 @@ def calibrate(config: Config, scene: Scene, device: torch.device, seconds: float
 def _measure(config: Config, scene: Scene, device: torch.device, seconds: float, started: float) -> Calibration:
     """`calibrate`, but for what cleaning up takes."""
     trial = _Trial(config, scene, device)
-    gaussians, share = trial.gaussians, 0.5 * CALIBRATION_SHARE * seconds
+    gaussians, share = trial.gaussians, 0.5 * min(CALIBRATION_SHARE * seconds, CALIBRATION_SECONDS)
     initialisation, cost = trial.initialisation(), trial.cost(share)
     before = time.perf_counter() - started + initialisation
     if before > LARGEST_OVERHEAD * seconds:

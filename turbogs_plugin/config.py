@@ -27,6 +27,8 @@ DEFAULT_CONFIG = "turbogs"
 """The packaged configuration that a run without ``--config`` takes."""
 
 BASE_DEPTH_LIMIT = 8
+LONGEST_TIME = 100 * 3600.0
+"""Seconds of a time budget: the iterations that fit can be counted (less than 2^31) even where one takes 0.2 ms."""
 
 
 @dataclass
@@ -82,7 +84,7 @@ class TrainConfig:
     checkpoint_every: int = 2500
 
     def __post_init__(self) -> None:
-        require(self.iterations >= 1, "iterations", self.iterations, "at least 1")
+        require(1 <= self.iterations < 2**31, "iterations", self.iterations, "within 1 .. 2^31 - 1")
         require(self.refine_until >= 0, "refine_until", self.refine_until, "at least 0")
         require(0 <= self.seed < 2**31, "seed", self.seed, "within 0 .. 2^31 - 1")
         require(self.device in ("auto", "cpu", "cuda"), "device", self.device, "auto, cpu or cuda")
@@ -164,7 +166,7 @@ class PlanConfig:
         if self.sh_degree not in ("auto", "keep"):
             require(0 <= self.sh_degree <= 3, "sh_degree", self.sh_degree, "within 0 .. 3")
         if self.iterations not in ("auto", "keep"):
-            require(self.iterations >= 1, "iterations", self.iterations, "at least 1")
+            require(1 <= self.iterations < 2**31, "iterations", self.iterations, "within 1 .. 2^31 - 1")
         require(math.isfinite(self.looks) and self.looks > 0, "looks", self.looks, "a finite number above 0")
 
 
@@ -196,7 +198,7 @@ class BudgetConfig:
     def __post_init__(self) -> None:
         require(self.max_gaussians >= 0, "max_gaussians", self.max_gaussians, "at least 0")
         self.memory_bytes()
-        self.seconds()
+        require((self.seconds() or 0.0) <= LONGEST_TIME, "time", self.time, "at most 100h")
 
     def memory_bytes(self) -> int | None:
         """`max_memory`, or None for no limit. Raises `InputError` where it is no amount."""

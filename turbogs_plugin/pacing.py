@@ -48,16 +48,18 @@ class IterationPace:
     def __init__(self, train: TrainConfig) -> None:
         self.iterations = train.iterations
         self._evaluations = train.evaluation_iterations()
-        self._saves = set(range(0, self.iterations, train.checkpoint_every or self.iterations)[1:]) | {self.iterations}
+        self._save_every = train.checkpoint_every or self.iterations
 
     def start(self, iteration: int, seconds: float, gaussians: int) -> None:
         pass
 
     def next_mark(self, iteration: int, seconds: float) -> int:
-        return min(mark for mark in self._evaluations | self._saves if mark > iteration)
+        save = iteration - iteration % self._save_every + self._save_every
+        return min(save, self.iterations, *(mark for mark in self._evaluations if mark > iteration))
 
     def reached(self, iteration: int, seconds: float, gaussians: int) -> Due:
-        return Due(iteration in self._evaluations, iteration in self._saves)
+        save = iteration == self.iterations or (iteration > 0 and iteration % self._save_every == 0)
+        return Due(iteration in self._evaluations, save)
 
     def state_dict(self) -> dict[str, Any]:
         return {}
