@@ -10,6 +10,7 @@ import tyro
 
 from turbogs_plugin import run
 from turbogs_plugin.config import load_config
+from turbogs_plugin.lengths import with_iterations
 from turbogs_plugin.scene.demo import write_demo_capture
 
 CONFIGS = ("turbogs", "3dgs", "3dgs-as-shipped", "fastgs", "mcmc")
@@ -29,7 +30,7 @@ def main(scene: str = "", output: str = "", iterations: int = 300, configs: tupl
             if name == "mcmc" and not torch.cuda.is_available():
                 print("mcmc: left out, needs a GPU")
                 continue
-            config = load_config(name, [f"train.iterations={iterations}", f"train.refine_until={iterations * 7 // 10}"])
+            config = with_iterations(load_config(name), iterations)
             config.scene.path = path
             last = run.train(config, Path(output or folder) / name).history[-1]
             print(f"{name}: {last.psnr:.2f} dB, {last.num_gaussians} Gaussians, {last.train_seconds:.1f} s")

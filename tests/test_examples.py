@@ -14,6 +14,7 @@ import torch
 from turbogs_plugin import registry, run
 from turbogs_plugin.config import load_config
 from turbogs_plugin.errors import InputError
+from turbogs_plugin.report.history import read_history
 from turbogs_plugin.scene import load_scene, write_demo_capture
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
@@ -68,12 +69,15 @@ def test_image_fitting(example):
 
 
 def test_baselines(example, capture, tmp_path, capsys):
-    example("baselines").main(scene=str(capture), output=str(tmp_path / "runs"), iterations=4)
+    example("baselines").main(scene=str(capture), output=str(tmp_path / "runs"), iterations=44)
     lines = capsys.readouterr().out.splitlines()
     said = {line.split(":")[0] for line in lines if " dB, " in line}
     gpu = torch.cuda.is_available()
     assert said == {"turbogs", "3dgs", "3dgs-as-shipped", "fastgs", *(["mcmc"] if gpu else [])}
     assert ("mcmc: left out, needs a GPU" in lines) != gpu
+    for name in said:  # short as they are, the runs have events of density control
+        history = read_history(tmp_path / "runs" / name / "history.jsonl")
+        assert history[-1].num_gaussians > history[0].num_gaussians, name
 
 
 @pytest.fixture
