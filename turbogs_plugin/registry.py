@@ -10,13 +10,15 @@ and a YAML names it by ``pixel_sampler: {type: my_sampler, ...}``. Nothing is im
 
 from __future__ import annotations
 
-import importlib
+import inspect
 from collections.abc import Mapping
-from importlib.metadata import entry_points
+from dataclasses import fields, is_dataclass
+from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.schema import build_dataclass, nearest
+from turbogs_plugin.strategies import protocols
 
 BUILT_IN: dict[str, dict[str, str]] = {
     "schedule": {
@@ -56,6 +58,15 @@ BUILT_IN: dict[str, dict[str, str]] = {
 
 KINDS = tuple(BUILT_IN)
 
+PROTOCOLS: dict[str, type] = {
+    "schedule": protocols.SamplingSchedule,
+    "view_sampler": protocols.ViewSampler,
+    "pixel_sampler": protocols.PixelSampler,
+    "loss": protocols.SparseLoss,
+    "density": protocols.DensityController,
+    "optimizer": protocols.GaussianOptimizer,
+}
+
 
 def known_types(kind: str) -> dict[str, str]:
     """Every name of a kind -> "module:class". A name of ours cannot be taken over by an entry point."""
@@ -72,23 +83,29 @@ def strategy_class(kind: str, name: str) -> type:
     """The class behind a name.
 
     Raises:
-        InputError: an unknown name (naming the nearest and all that are known), or one whose module cannot be imported.
+        InputError: an unknown name (naming the nearest and all that are known), one whose module cannot be imported,
+            or one of something else than a dataclass.
     """
     known = known_types(kind)
     if not isinstance(name, str) or name not in known:
         raise InputError(f"unknown {kind}.type '{name}': {nearest(name, known)}")
-    module, _, attribute = known[name].partition(":")
+    place = f"{kind}.type '{name}' ({known[name]})"
     try:
-        return getattr(importlib.import_module(module), attribute)
-    except (ImportError, AttributeError) as error:
-        raise InputError(f"{kind}.type '{name}' ({known[name]}) cannot be imported: {error}") from error
+        found = EntryPoint(name, known[name], f"turbogs.{kind}").load()
+    except (Exception, SystemExit) as error:  # another's module can do anything as it is imported
+        reason = " ".join(f"{type(error).__name__}: {error}".split())
+        raise InputError(f"{place} cannot be imported: {reason}") from error
+    if not (isinstance(found, type) and is_dataclass(found)):
+        raise InputError(f"{place} is not a dataclass, whose init fields would be its configuration")
+    return found
 
 
 def build(kind: str, mapping: Mapping[str, Any]) -> Any:
     """A new strategy from ``{"type": name, **its init fields}``.
 
     Raises:
-        InputError: an unknown kind, type or key, a wrong type of a value, or one out of range.
+        InputError: an unknown kind, type or key, a wrong type of a value, one out of range, or a class without what
+            its kind's protocol has.
     """
     if kind not in BUILT_IN:
         raise InputError(f"unknown kind of strategy '{kind}': {nearest(kind, KINDS)}")
@@ -96,4 +113,22 @@ def build(kind: str, mapping: Mapping[str, Any]) -> Any:
         raise InputError(f"{kind}: expected a mapping with a 'type', got {mapping!r}")
     options = dict(mapping)
     name = options.pop("type", default_type(kind))
-    return build_dataclass(strategy_class(kind, name), options, kind)
+    strategy = build_dataclass(strategy_class(kind, name), options, kind)
+    missing = [member for member in _members(PROTOCOLS[kind]) if not _has(strategy, member)]
+    if missing:
+        raise InputError(
+            f"{kind}.type '{name}' ({known_types(kind)[name]}) is no {PROTOCOLS[kind].__name__}: "
+            f"it lacks {', '.join(missing)}"
+        )
+    return strategy
+
+
+def _members(protocol: type) -> list[str]:
+    return [name for name in vars(protocol) if not name.startswith("_") or name == "__call__"]
+
+
+def _has(strategy: Any, member: str) -> bool:
+    """Whether the attribute is there, or a field of run-time state. Nothing is read: that may need `setup`."""
+    absent = object()
+    known = {field.name for field in fields(strategy)}
+    return member in known or inspect.getattr_static(strategy, member, absent) is not absent

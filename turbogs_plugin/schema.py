@@ -37,7 +37,10 @@ def build_dataclass(cls: type[T], mapping: Mapping[str, Any], where: str) -> T:
     """
     if not isinstance(mapping, Mapping):
         raise InputError(f"{where}: expected a mapping of keys, got {mapping!r}")
-    hints = typing.get_type_hints(cls)
+    try:
+        hints = typing.get_type_hints(cls)
+    except Exception as error:  # whatever the names of a third party's types lead to
+        raise InputError(f"{where}: a type of {cls.__name__}'s fields cannot be resolved: {error}") from error
     init_fields = {field.name: field for field in fields(cls) if field.init}
     for key in mapping:
         if key not in init_fields:
@@ -48,8 +51,8 @@ def build_dataclass(cls: type[T], mapping: Mapping[str, Any], where: str) -> T:
     values = {key: convert(value, hints[key], f"{where}.{key}") for key, value in mapping.items()}
     try:
         return cls(**values)
-    except InputError as error:
-        raise InputError(f"{where}: {error}") from None
+    except (ValueError, TypeError) as error:
+        raise InputError(f"{where}: {error}") from error
 
 
 def dataclass_mapping(instance: Any) -> dict[str, Any]:
