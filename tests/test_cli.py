@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pycolmap
@@ -13,6 +14,7 @@ import torch
 from framework_runs import TINY, tiny_capture
 from PIL import Image
 
+from turbogs_plugin import run, scene
 from turbogs_plugin.trainer import Trainer
 
 QUICK = ("train.iterations=2", "train.sh_degree=0", "train.evaluate_at=[]")
@@ -146,15 +148,14 @@ def test_a_broken_capture_is_refused(turbogs, copy, tmp_path, damage, words):
         (["scene.test_every=1"], ["test_every"]),
         (["--factor", "0"], ["factor"]),
         (["report.lpips_weights=absent.pth"], ["absent.pth"]),
+        (["--max-memory", ""], ["--max-memory ''", "leave it out"]),
+        (["--time-budget", ""], ["--time-budget ''", "leave it out"]),
+        (["scene.path=elsewhere"], ["scene.path", "leave the override out"]),
     ],
     ids=lambda value: value[-1] if isinstance(value, list) else None,
 )
 def test_a_bad_setting_is_refused(turbogs, capture, tmp_path, arguments, words):
-    options = [argument for argument in arguments if argument.startswith("--")]
-    flags = arguments if options else []
-    overrides = [] if options else arguments
-    result = turbogs("train", capture, "--out", tmp_path / "run", "--device", "cpu", *flags, *overrides)
-    assert_refused(result, *words)
+    assert_refused(turbogs("train", capture, "--out", tmp_path / "run", "--device", "cpu", *arguments), *words)
     assert not (tmp_path / "run").exists()
 
 
@@ -182,6 +183,71 @@ def test_an_output_folder_with_other_files_is_left_alone(turbogs, capture, tmp_p
     assert_refused(turbogs("train", capture, "--out", tmp_path / "thesis.tex", *QUICK), "is a file")
     assert_refused(turbogs("train", capture, "--out", tmp_path / "thesis.tex" / "run", *QUICK), "cannot be made")
     assert tree(tmp_path) == {"thesis.tex": b"mine"}
+
+
+@pytest.mark.parametrize("out", ["/proc/run", "dangling", "dangling/run"])
+def test_an_output_folder_that_cannot_be_made_is_refused_before_anything_is_computed(
+    turbogs, capture, tmp_path, monkeypatch, out
+):
+    (tmp_path / "dangling").symlink_to("nowhere")
+    monkeypatch.setattr(run, "load_scene", lambda *_: pytest.fail("the capture was loaded"))
+    assert_refused(turbogs("train", capture, "--out", tmp_path / out, *QUICK), out, "cannot be made", "choose")
+    assert [path.name for path in tmp_path.iterdir()] == ["dangling"]
+
+
+@pytest.mark.parametrize("error", [OSError(28, "No space left on device"), PermissionError(13, "Denied", "/place")])
+def test_what_the_system_refuses_is_one_line(turbogs, tmp_path, monkeypatch, error):
+    def refused(path):
+        raise error
+
+    monkeypatch.setattr(scene, "write_demo_capture", refused)
+    words = [error.strerror, *filter(None, [error.filename])]
+    assert_refused(turbogs("demo", tmp_path / "demo"), *words, "choose another place or make room")
+
+
+@pytest.mark.parametrize(
+    "order",
+    [
+        "plan SCENE train.seed=5 --config demo --device cpu train.iterations=7",
+        "plan SCENE --config demo train.seed=5 --device cpu train.iterations=7",
+        "plan SCENE --config demo --device cpu train.iterations=7 train.seed=5",
+        "plan --config demo --device cpu SCENE train.iterations=7 train.seed=5",
+    ],
+)
+def test_overrides_stand_anywhere(turbogs, capture, monkeypatch, order):
+    seen = []
+    monkeypatch.setattr(run, "plan_run", lambda config: seen.append(config.train) or SimpleNamespace(text=str))
+    code, _, error = turbogs(*order.replace("SCENE", str(capture)).split())
+    assert code == 0, error
+    assert [(train.seed, train.iterations) for train in seen] == [(5, 7)]
+
+
+def test_what_follows_an_option_is_no_override(turbogs, capture, tmp_path):
+    (tmp_path / "a.b=c").write_text("mine")
+    assert_refused(turbogs("train", capture, "--out", tmp_path / "a.b=c", *QUICK), "a.b=c", "is a file")
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        ("compare --out OUT", ["compare needs RUN"]),
+        ("compare a b --out OUT --psnr -5", ["--psnr -5"]),
+        ("compare a b --out OUT --psnr 20 nan", ["--psnr 20.0 nan"]),
+        ("ablate components --scene a --out OUT --psnr inf", ["--psnr inf"]),
+        ("bench step --photos 3 --size 0 48", ["--size 0 48"]),
+        ("bench step --photos 3 --size -5 48", ["--size -5 48"]),
+        ("bench step --photos 3 --pixel-budget -1", ["--pixel-budget -1"]),
+        ("bench step --photos 3 --pixel-budget inf", ["--pixel-budget inf"]),
+        ("bench step --photos 3 --out /proc/x.json", ["--out '/proc/x.json' cannot be made"]),
+        ("bench raster --rates 0", ["--rates 0"]),
+        ("bench raster --rates 0.5 -1", ["--rates 0.5 -1"]),
+        ("bench raster --rates nan", ["--rates nan"]),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_numbers_and_places_that_mean_nothing_are_refused(turbogs, tmp_path, call, words):
+    assert_refused(turbogs(*call.replace("OUT", str(tmp_path / "out")).split()), *words)
+    assert not list(tmp_path.iterdir())
 
 
 def test_incomplete_and_contradictory_calls(turbogs, capture, tmp_path):

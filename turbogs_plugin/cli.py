@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
+import math
+import re
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -12,6 +16,8 @@ from tyro.conf import Positional, UseAppendAction, arg
 from turbogs_plugin.errors import InputError, TrainingStopped
 
 app = tyro.extras.SubcommandApp()
+
+OVERRIDE = re.compile(r"\w+(\.\w+)+=.*", re.DOTALL)
 
 Device = Literal["auto", "cpu", "cuda"]
 
@@ -187,6 +193,7 @@ def ablate(
     from turbogs_plugin.ablation import commands
     from turbogs_plugin.ablation.sweep import SweepOptions
 
+    _require_positive("--psnr", psnr)
     ablations = [text for text in names if "=" not in text]
     overrides = tuple(text for text in names if "=" in text)
     if merge:
@@ -218,6 +225,9 @@ def compare(
     """
     from turbogs_plugin.ablation import commands
 
+    if not runs:
+        raise InputError("compare needs RUN RUN ...: folders of runs")
+    _require_positive("--psnr", psnr)
     return commands.compare(runs, out, psnr)
 
 
@@ -270,9 +280,11 @@ def bench(
     from turbogs_plugin.bench.step import StepBench
     from turbogs_plugin.run import resolve_device
 
-    for name, values in (("gaussians", gaussians), ("views", views), ("repeats", (repeats,))):
+    for name, values in (("gaussians", gaussians), ("views", views), ("repeats", (repeats,)), ("size", size)):
         if not values or min(values) < 1:
             raise InputError(f"--{name} {' '.join(map(str, values))}: each must be at least 1")
+    _require_positive("--rates", rates, most=1.0)
+    _require_positive("--pixel-budget", (pixel_budget,))
     if training is not None and training < 0:
         raise InputError(f"--training {training}: it must be at least 0")
     if training is not None and ply:
@@ -320,6 +332,9 @@ def _budget(max_gaussians: int | None, max_memory: str | None, time_budget: str 
     """The options of a budget as overrides."""
     if max_gaussians is not None and max_gaussians < 1:
         raise InputError(f"--max-gaussians {max_gaussians}: it must be at least 1; leave it out for no limit")
+    for option, amount in (("--max-memory", max_memory), ("--time-budget", time_budget)):
+        if amount == "":
+            raise InputError(f"{option} '': write an amount; leave it out for no limit")
     given = {"max_gaussians": max_gaussians, "max_memory": max_memory, "time": time_budget}
     return tuple(
         f"budget.{name}={value if name == 'max_gaussians' else repr(value)}"
@@ -328,10 +343,18 @@ def _budget(max_gaussians: int | None, max_memory: str | None, time_budget: str 
     )
 
 
+def _require_positive(option: str, values: Sequence[float], most: float = math.inf) -> None:
+    if not all(0 < value <= most and math.isfinite(value) for value in values):
+        limit = f"at most {most:g}" if math.isfinite(most) else "finite"
+        raise InputError(f"{option} {' '.join(map(str, values))}: it must be more than 0 and {limit}")
+
+
 def _settings(scene: Path, overrides: tuple[str, ...], config: str | None, factor: int | None, device: Device | None):
     """The configuration that a command line asks for."""
     from turbogs_plugin.config import DEFAULT_CONFIG, load_config
 
+    if any(override.partition("=")[0].strip() == "scene.path" for override in overrides):
+        raise InputError(f"scene.path is '{scene}', as SCENE says: leave the override out")
     settings = load_config(DEFAULT_CONFIG if config is None else config, overrides)
     settings.scene.path = str(scene)
     if factor is not None:
@@ -354,13 +377,35 @@ def _tell(outcome) -> int:
     return 0
 
 
+def _gathered(arguments: list[str]) -> list[str]:
+    """Arguments with later overrides brought before the first option, where a word besides the verb stands there.
+
+    What follows an option is its value, whatever it looks like.
+    """
+    first = next((place for place, text in enumerate(arguments) if text.startswith("-")), 0)
+    if first < 2:
+        return arguments
+    overrides, rest = [], arguments[first : first + 1]
+    for before, text in itertools.pairwise(arguments[first:]):
+        (overrides if OVERRIDE.fullmatch(text) and not before.startswith("-") else rest).append(text)
+    return [*arguments[:first], *overrides, *rest]
+
+
 def main() -> None:
     """The `turbogs` command. Exit codes: 2 bad input, 1 a run that could not go on, 128 + n stopped by signal n."""
     try:
-        code = app.cli(prog="turbogs", description="TurboGS: train 3D Gaussian Splatting on few, well chosen pixels.")
+        code = app.cli(
+            prog="turbogs",
+            description="TurboGS: train 3D Gaussian Splatting on few, well chosen pixels.",
+            args=_gathered(sys.argv[1:]),
+        )
     except (InputError, TrainingStopped) as error:
         print(f"turbogs: error: {' '.join(str(error).split())}", file=sys.stderr)
         code = 2 if isinstance(error, InputError) else 1
+    except OSError as error:
+        place = "" if error.filename is None else f"'{error.filename}': "
+        print(f"turbogs: error: {place}{error.strerror or error}; choose another place or make room", file=sys.stderr)
+        code = 2
     except KeyboardInterrupt:
         print("turbogs: interrupted", file=sys.stderr)
         code = 130

@@ -3,9 +3,32 @@
 from __future__ import annotations
 
 import os
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import BinaryIO
+
+from turbogs_plugin.errors import InputError
+
+
+def require_writable(folder: Path, given: str) -> None:
+    """Try whether a folder, or the nearest one above it that is there, takes new entries; nothing stays behind.
+
+    Args:
+        given: what names the place, for the message.
+
+    Raises:
+        InputError: it does not.
+    """
+    place = folder.absolute()
+    while not os.path.lexists(place):
+        place = place.parent
+    try:
+        with tempfile.TemporaryDirectory(dir=place):
+            pass
+    except OSError as error:
+        reason = error.strerror if place.is_dir() else "not a folder"
+        raise InputError(f"{given} cannot be made in '{place}' ({reason}): choose a folder to write to") from None
 
 
 def write_atomically(path: Path, write: Callable[[BinaryIO], None]) -> None:
@@ -19,7 +42,7 @@ def write_atomically(path: Path, write: Callable[[BinaryIO], None]) -> None:
         write: is given the open file.
 
     Raises:
-        OSError: from the disk; then nothing is left behind.
+        OSError: from the disk, with the name of the file; then nothing is left behind.
     """
     temporary = path.with_name(f".{path.name}.part")
     try:
@@ -28,8 +51,10 @@ def write_atomically(path: Path, write: Callable[[BinaryIO], None]) -> None:
             file.flush()
             os.fsync(file.fileno())
         os.replace(temporary, path)
-    except BaseException:
+    except BaseException as error:
         temporary.unlink(missing_ok=True)
+        if isinstance(error, OSError) and error.filename is None:  # of a write, which knows no name
+            error.filename = str(path)
         raise
     _sync_folder(path.parent)
 

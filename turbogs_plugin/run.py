@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import operator
-import os
 import signal
 import sys
 from collections.abc import Iterator
@@ -22,7 +21,7 @@ from turbogs_plugin.clock import TrainingClock
 from turbogs_plugin.config import Config, resolve
 from turbogs_plugin.errors import InputError, TrainingStopped
 from turbogs_plugin.evaluation import Metrics, evaluate, load_lpips, peak_memory_bytes
-from turbogs_plugin.files import write_text_atomically
+from turbogs_plugin.files import require_writable, write_text_atomically
 from turbogs_plugin.gaussians import save_ply
 from turbogs_plugin.offload import place_views
 from turbogs_plugin.pacing import Pace, pace_of
@@ -78,9 +77,7 @@ class RunFolder:
             raise InputError(f"--out '{self.path}' is a file: choose a folder")
         if self.path.is_dir() and any(self.path.iterdir()):
             raise InputError(f"--out '{self.path}' is not empty: choose a new folder")
-        parent = next(folder for folder in self.path.absolute().parents if folder.exists())
-        if not parent.is_dir() or not os.access(parent, os.W_OK):
-            raise InputError(f"--out '{self.path}' cannot be made: '{parent}' is not a folder one can write to")
+        require_writable(self.path, f"--out '{self.path}'")
 
     def read_config(self) -> Config:
         """The resolved configuration of the run. Raises `InputError` where this is no run."""

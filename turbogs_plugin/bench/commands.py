@@ -16,7 +16,7 @@ from turbogs_plugin.bench.large_capture import synthetic_scene
 from turbogs_plugin.bench.raster import RasterBench, other_build
 from turbogs_plugin.bench.step import StepBench
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.files import write_text_atomically
+from turbogs_plugin.files import require_writable, write_text_atomically
 from turbogs_plugin.provenance import provenance
 from turbogs_plugin.scene import load_scene
 from turbogs_plugin.scene.load import FEWEST_VIEWS
@@ -71,8 +71,11 @@ def run_raster(bench: RasterBench, scene: Path | None, factor: int, device: torc
 
 def _require_new(out: Path | None) -> None:
     """A place to write to, known before anything is measured. An older result of the same name is replaced."""
-    if out is not None and (out.is_dir() or not out.absolute().parent.is_dir()):
+    if out is None:
+        return
+    if out.is_dir() or not out.absolute().parent.is_dir():
         raise InputError(f"--out '{out}': name a file in a folder that exists")
+    require_writable(out.parent, f"--out '{out}'")
 
 
 def _report(what: str, measured: dict[str, Any], device: torch.device) -> dict[str, Any]:
