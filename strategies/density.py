@@ -8,11 +8,11 @@ from typing import Any, Literal, TypeVar
 
 import numpy as np
 import torch
-from gsplat.utils import normalized_quat_to_rotmat
 from torch import Tensor
-from torch.nn.functional import logsigmoid, normalize
+from torch.nn.functional import logsigmoid
 
 from turbogs_plugin.errors import InputError, require
+from turbogs_plugin.rendering.projection import rotation_matrices
 from turbogs_plugin.spatial_order import spatial_order
 from turbogs_plugin.types import Gaussians, GaussianStats, RowUpdate, Step
 
@@ -331,7 +331,7 @@ class ErrorDrivenDensity:
     def _halves(self, gaussians: Gaussians, index: Tensor, step: Step) -> tuple[Tensor, Tensor]:
         """([2 n, 3] means, [2 n, 3] log scales) of what the Gaussians `index` [n] are split into."""
         means, scales = gaussians.means[index], gaussians.scales[index]
-        rotations = normalized_quat_to_rotmat(normalize(gaussians.quats[index], dim=-1))  # [n, 3, 3]
+        rotations = rotation_matrices(gaussians.quats[index])  # [n, 3, 3]
         if self.split == "sample":
             generator = np.random.Generator(np.random.Philox(np.random.SeedSequence([step.seed, step.iteration])))
             # Drawn on the host: the same numbers on every device.

@@ -227,6 +227,20 @@ def test_split_along_the_long_axis_keeps_mean_and_covariance():
         assert np.linalg.norm(offset) > 0.7 * math.exp(float(gaussians.scales[i].max()))
 
 
+@pytest.mark.parametrize("split", ["sample", "long_axis"])
+@pytest.mark.parametrize("size", [1e-15, 1e-3, 1e3, 1e25])
+def test_a_split_goes_along_the_axes_that_are_drawn_whatever_the_quaternions_norm(split, size):
+    gaussians = make_gaussians(20, seed=6, dtype=torch.float32)
+
+    def means() -> torch.Tensor:
+        density = controlled(gaussians, busy_stats(20), percent_dense=0.0, split=split, **QUIET)
+        return density.update(gaussians, FULL).apply(gaussians).means
+
+    expected = means()
+    gaussians.quats *= size
+    torch.testing.assert_close(means(), expected)
+
+
 def test_split_is_a_function_of_seed_and_iteration():
     gaussians = make_gaussians(20)
 
