@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, fields
 from typing import Any, Literal
 
@@ -64,6 +65,12 @@ class GsplatDefaultDensity:
         for name in ("refine_every", "reset_every"):
             require(getattr(self, name) >= 1, name, getattr(self, name), "at least 1")
         require(0 <= self.prune_opa < 0.5, "prune_opa", self.prune_opa, "at least 0 and less than 0.5")
+        for name in (
+            *("grow_grad2d", "grow_scale3d", "grow_scale2d", "prune_scale3d", "prune_scale2d"),
+            *("refine_scale2d_stop_iter", "refine_start_iter", "pause_refine_after_reset"),
+        ):
+            value = getattr(self, name)
+            require(math.isfinite(value) and value >= 0, name, value, "a finite number >= 0")
 
     @property
     def stats(self) -> GaussianStats | None:

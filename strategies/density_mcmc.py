@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -51,7 +52,9 @@ class GsplatMcmcDensity:
     def __post_init__(self) -> None:
         for name in ("cap_max", "refine_every"):
             require(getattr(self, name) >= 1, name, getattr(self, name), "at least 1")
-        require(self.noise_lr >= 0, "noise_lr", self.noise_lr, "0 or more")
+        for name in ("noise_lr", "refine_start_iter"):
+            value = getattr(self, name)
+            require(math.isfinite(value) and value >= 0, name, value, "a finite number >= 0")
         require(0 < self.min_opacity < 1, "min_opacity", self.min_opacity, "more than 0 and less than 1")
 
     @property
@@ -78,17 +81,21 @@ class GsplatMcmcDensity:
         return None
 
     def _refine(self, gaussians: Gaussians, usable: Tensor, step: Step) -> RowUpdate:
-        """Relocation, growth and noise, on copies: relocation writes into the tensors that it is given."""
+        """Relocation, growth and noise, on copies: relocation writes into the tensors that it is given.
+
+        What is relocated takes over its new place's parameters but keeps its own row's state, as in gsplat; what is
+        added comes from the row that it was copied from, which gsplat finds as it copies row numbers along.
+        """
+        rows = torch.arange(len(gaussians), device=gaussians.device)
         opacities = torch.where(usable, gaussians.opacities, DEAD_LOGIT)
         copies = {name: value.clone() for name, value in gaussians.items()} | {"opacities": opacities}
-        params, optimizers = self._run_gsplat(copies, step.refine_until, step)
-        count = len(params["means"])
-        source = torch.arange(count, device=gaussians.device)
+        params, optimizers = self._run_gsplat(copies | {"source_row": rows.clone()}, step.refine_until, step)
+        added = params.pop("source_row").data[len(rows) :]
         return RowUpdate(
-            torch.where(source < len(gaussians), source, 0),
+            torch.cat([rows, added]),
             touched_rows(optimizers["means"], params["means"]),
             {name: value.data for name, value in params.items()},
-            num_cloned=count - len(gaussians),
+            num_cloned=len(added),
         )
 
     def _add_noise(self, gaussians: Gaussians, step: Step) -> None:

@@ -141,7 +141,13 @@ def test_one_is_left_when_gsplat_would_leave_none():
     assert len(density.stats.view_counts) == 1
 
 
-@pytest.mark.parametrize("values", [{"opacity_reset": "never"}, {"refine_every": 0}, {"prune_opa": 0.6}])
+@pytest.mark.parametrize(
+    "values",
+    [
+        *({"opacity_reset": "never"}, {"refine_every": 0}, {"prune_opa": 0.6}, {"grow_grad2d": -1.0}),
+        *({"refine_start_iter": -1}, {"prune_scale3d": float("inf")}, {"grow_scale2d": float("nan")}),
+    ],
+)
 def test_refuses(values):
     with pytest.raises(InputError, match=next(iter(values))):
         GsplatDefaultDensity(**values)
