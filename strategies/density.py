@@ -217,13 +217,16 @@ class ErrorDrivenDensity:
         return densify, self.final_keep < 1 and after > 0 and after % self.final_every == 0
 
     def _last_event(self, step: Step) -> int:
-        """Iteration of the last event of the run, after which no statistics are needed."""
+        """Iteration after which no statistics are needed: that of the last event, or where densification ends.
+
+        Not that of the last densification: a time budget may move the end, and room for another one, until it is there.
+        """
         rest = max(0, step.total - 1 - step.refine_until)
         if self.final_keep < 1 and rest >= self.final_every:
             return step.refine_until + rest // self.final_every * self.final_every
         if self.stopped_at:
             return self.stopped_at
-        return step.refine_until // self.refine_every * self.refine_every
+        return step.refine_until
 
     def _error_is_flat(self) -> bool:
         """Take the present window's error into the record; whether it has stopped falling."""

@@ -170,14 +170,23 @@ def test_events_are_when_the_table_says():
     assert counted == list(range(821))
 
 
-@pytest.mark.parametrize(("total", "final_keep", "last"), [(900, 1.0, 400), (500, 0.9, 400), (900, 0.9, 820)])
-def test_statistics_end_with_the_last_event(total, final_keep, last):
+@pytest.mark.parametrize(("total", "final_keep", "last"), [(900, 1.0, 420), (500, 0.9, 420), (900, 0.9, 820)])
+def test_statistics_end_with_densification_or_the_last_event(total, final_keep, last):
     gaussians = make_gaussians(5)
     density = ErrorDrivenDensity(refine_every=50, final_every=100, final_keep=final_keep)
     density.setup(gaussians)
     for iteration in range(total):
         density.update(gaussians, Step(iteration, total, 420))
         assert (density.stats is None) == (iteration >= last), iteration
+
+
+def test_an_end_that_moves_on_has_room_for_another_event():
+    """As a time budget moves it, before it is there: 420, which the event at 400 is the last one of, becomes 460."""
+    gaussians = make_gaussians(5)
+    density = ErrorDrivenDensity(refine_every=50, final_keep=1.0, opacity_decay=0.1)
+    density.setup(gaussians)
+    events = [t for t in range(500) if density.update(gaussians, Step(t, 900, 420 if t < 410 else 460))]
+    assert events[-2:] == [400, 450]
 
 
 def test_final_pruning_keeps_the_difficult_and_the_unseen():
