@@ -54,6 +54,15 @@ def test_values_and_gradients_are_those_of_the_rasterizer(scene):
     torch.testing.assert_close(info["radii"], expected.radii)
 
 
+@pytest.mark.parametrize("retain_graph", [False, True])
+def test_a_second_backward_is_refused(scene, retain_graph):
+    splats, cameras, samples = scene
+    colors, alphas, _ = sparse_rasterization(**arguments(splats, cameras), samples=samples, sh_degree=1)
+    colors.sum().backward(retain_graph=retain_graph)
+    with pytest.raises(InputError, match="sum the losses first"):
+        alphas.sum().backward()
+
+
 def test_info_has_gsplats_keys_and_shapes(scene):
     splats, cameras, samples = scene
     _, _, info = sparse_rasterization(**arguments(splats, cameras), samples=samples, sh_degree=1)

@@ -95,7 +95,8 @@ def sparse_rasterization(
         "gaussian_stats" is in it after: the pass's `GaussianStats` with their error sums, and "loss_shares", [N].
 
     Raises:
-        InputError: a wrong shape, an option without support here, or cameras that a gradient is wanted of.
+        InputError: a wrong shape, an option without support here, or cameras that a gradient is wanted of; and from
+            a second backward of one pass.
     """
     _check_options(gsplat_options)
     given = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "colors": colors}
@@ -231,12 +232,17 @@ class _Pass(torch.autograd.Function):
     def forward(ctx, rendered: Rendered, samples: PixelSamples, info: _Info, means2d: Tensor, *parameters: Tensor):
         # Weakly, as the host puts what we return into `info`: the graph would keep itself alive.
         ctx.rendered, ctx.samples, ctx.info = rendered, samples, weakref.ref(info)
-        ctx.count = means2d.shape[1]
+        ctx.count, ctx.spent = means2d.shape[1], False
         return rendered.colors.clone(), rendered.alphas.clone()
 
     @staticmethod
     @once_differentiable
     def backward(ctx, color_gradients: Tensor, alpha_gradients: Tensor):
+        if ctx.spent:
+            raise InputError(
+                "backward of one sparse_rasterization a second time: sum the losses first, or render again"
+            )
+        ctx.spent = True
         info = ctx.info()
         errors = None if info is None else _sample_errors(info, ctx.samples)
         stats = GaussianStats.zeros(ctx.count, color_gradients.device)
