@@ -18,6 +18,8 @@ from turbogs_plugin.types import PixelSamples
 
 PHOTO_BYTES = 3
 """Of a pixel."""
+SMALLEST_SIDE = 4
+"""Pixels that a reduction leaves of a photo's shorter side: a cell's."""
 MEMORY_SHARE = 0.8
 """Photos may take this share of the machine's memory."""
 
@@ -97,8 +99,20 @@ def pixel_offsets(sizes: np.ndarray) -> np.ndarray:
 
 
 def reduced_sizes(sizes: np.ndarray, factor: int) -> np.ndarray:
-    """[V, 2] int64: sizes divided by `factor`, to the nearest pixel and at least 1."""
-    return np.maximum(1, np.floor(sizes / factor + 0.5)).astype(np.int64)
+    """[V, 2] int64: sizes divided by `factor`, to the nearest pixel.
+
+    Raises:
+        InputError: the factor leaves a side of less than `SMALLEST_SIDE`.
+    """
+    reduced = np.floor(sizes / factor + 0.5).astype(np.int64)
+    if factor > 1 and reduced.min() < SMALLEST_SIDE:
+        width, height = sizes[sizes.min(axis=1).argmin()].tolist()
+        largest = max(1, int(min(width, height) / (SMALLEST_SIDE - 0.5)))
+        raise InputError(
+            f"--factor {factor} leaves too little of photos of {width}x{height}: the largest that keeps "
+            f"{SMALLEST_SIDE} pixels a side is {largest}"
+        )
+    return reduced
 
 
 def photo_size(path: Path) -> tuple[int, int]:
