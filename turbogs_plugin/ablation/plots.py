@@ -8,6 +8,7 @@ from pathlib import Path
 import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.patheffects import withStroke
 from matplotlib.transforms import Bbox
 
 from turbogs_plugin.ablation.summary import SceneSummary, VariantRow
@@ -16,9 +17,10 @@ from turbogs_plugin.report.plots import STYLE
 COLORS = ("#1f5fa8", "#d1495b", "#2e8b57", "#e08e0b", "#7a4fa3", "#17919e", "#8c5a3c", "#5c6670")
 DASHES = ("-", "--", ":", "-.")
 BASELINE_COLOR = "black"
+OTHER_COLOR = "0.75"
 LABEL_SIZE = 8
-BANDS_UP_TO = 10
-"""Spreads are shaded for so many variants; more would cover each other."""
+TOLD_APART_UP_TO = 10
+"""So many variants have a colour and a shaded spread each; of more, only the baseline and the Pareto front have."""
 
 SHOWN_BELOW = 4.0
 """dB below the worst final result at which the PSNR plot ends: what comes before is over in a moment."""
@@ -47,16 +49,28 @@ def told_apart(summary: SceneSummary) -> tuple[list[VariantRow], str]:
 
 
 def plot_curves(path: Path, summary: SceneSummary) -> None:
-    """PSNR and mean absolute error against seconds: mean over seeds, their spread shaded where there is room."""
+    """PSNR and mean absolute error against seconds: mean over seeds, their spread shaded.
+
+    Of more variants than can be told apart, those that are neither the baseline nor on the Pareto front are thin and
+    grey behind these; the front's plot has their names.
+    """
     styles, (rows, failed) = _styles(summary), told_apart(summary)
+    few = len(rows) <= TOLD_APART_UP_TO
+    named, others = [], []
+    for row in rows:
+        (named if few or row.on_front or row.name == summary.baseline else others).append(row)
     with matplotlib.rc_context({**STYLE, "lines.markersize": 3.5}):
-        figure = Figure(figsize=(12.0, 5.2 + 0.16 * max(0, len(rows) - 8)), layout="constrained")
+        figure = Figure(figsize=(12.0, 5.2), layout="constrained")
         for axes, name in zip(figure.subplots(1, 2), ("psnr", "l1"), strict=True):
-            for row in rows:
+            for row in others:
+                curve = getattr(row, f"{name}_curve")
+                label = f"{len(others)} others" if row is others[0] else None
+                axes.plot(curve.seconds, curve.mean, color=OTHER_COLOR, linewidth=0.8, label=label)
+            for row in named:
                 curve = getattr(row, f"{name}_curve")
                 color, dash = styles[row.name]
                 axes.plot(curve.seconds, curve.mean, dash, marker="o", color=color, label=row.name)
-                if row.psnr.count > 1 and len(rows) <= BANDS_UP_TO:
+                if row.psnr.count > 1:
                     axes.fill_between(curve.seconds, curve.low, curve.high, color=color, alpha=0.15, linewidth=0)
             axes.set_xlabel("training time in seconds (evaluation excluded)")
             axes.set_xlim(left=0)
@@ -138,6 +152,7 @@ def _label_points(axes: Axes, rows: list[VariantRow]) -> None:
             textcoords="figure pixels",
             va="center",
             fontsize=LABEL_SIZE,
+            path_effects=[withStroke(linewidth=2.5, foreground="white")],  # error bars and the front pass behind
             arrowprops={"arrowstyle": "-", "color": "0.7", "linewidth": 0.6, "shrinkA": 0, "shrinkB": 3},
             annotation_clip=False,
         )

@@ -21,7 +21,8 @@ class Reach:
         psnr: in dB.
         seconds: over seeds; inf where a seed never reached it.
         reached: seeds that did.
-        ratio: mean seconds over the baseline's; NaN where one of the two did not reach it with every seed.
+        ratio: mean seconds over the baseline's; NaN where one of the two did not reach it with every seed, or began
+            there.
     """
 
     psnr: float
@@ -117,7 +118,8 @@ def _summarise_scene(study: Study, scene: str, targets: Sequence[float]) -> Scen
         reaches = []
         for number, target in enumerate(targets):
             spread = times[name][number]
-            ratio = spread.mean / times[baseline][number].mean if baseline else math.nan
+            against = times[baseline][number].mean if baseline else math.nan
+            ratio = spread.mean / against if against > 0 else math.nan
             reached = sum(math.isfinite(seconds_to_reach(cell.history, target)) for cell in results)
             reaches.append(Reach(target, spread, reached, ratio if 0 < ratio < math.inf else math.nan))
         rows.append(
