@@ -79,7 +79,7 @@ def test_a_full_disk_keeps_the_newest_checkpoint(tmp_path, monkeypatch, room):
         whole_write(path, lambda file: write(DiskFull(file, room)))
 
     monkeypatch.setattr(checkpoint, "write_atomically", limited)
-    with pytest.raises(TrainingStopped, match=r"iteration 2: .*could not be written.*iteration-000001"):
+    with pytest.raises(TrainingStopped, match=r"iteration 2: .*not be written.*\(No space left on device\).*--resume"):
         save_checkpoint(tmp_path, 2, state(2.0))
     assert sorted(os.listdir(tmp_path)) == before
     assert_newest(tmp_path, 1.0)
@@ -162,6 +162,8 @@ def test_a_torn_temporary_file_is_no_checkpoint(tmp_path):
     path = save_checkpoint(tmp_path, 1, state(1.0))
     (tmp_path / ".iteration-000002.pt.part").write_bytes(path.read_bytes()[:100])
     assert latest_checkpoint(tmp_path) == path
+    save_checkpoint(tmp_path, 3, state(3.0))
+    assert {file.name for file in tmp_path.iterdir()} == {path.name, "iteration-000003.pt", "latest"}
 
 
 @pytest.mark.parametrize("name", ["../iteration-000001.pt", "/etc/passwd", "iteration-000009.pt", "", "latest"])
@@ -241,6 +243,21 @@ def test_an_atomic_write_leaves_the_old_text_on_failure(tmp_path):
     with pytest.raises(ValueError):
         files.write_atomically(target, fail)
     assert target.read_text() == "old" and os.listdir(tmp_path) == ["text"]
+
+
+def test_a_model_on_a_full_disk_is_refused_for_what_it_is(tmp_path):
+    model = gaussians.gaussians_from_points(torch.rand(500, 3), torch.zeros(500, 3, dtype=torch.uint8), 0, 1.0)
+    (tmp_path / ".model.ply.part").symlink_to("/dev/full")
+    with pytest.raises(InputError, match=r"model\.ply: No space left on device; .*make room"):
+        gaussians.save_ply(model, tmp_path / "model.ply")
+    assert not os.listdir(tmp_path)
+
+
+def test_a_failed_write_names_its_file(tmp_path):
+    (tmp_path / ".text.part").symlink_to("/dev/full")
+    with pytest.raises(OSError) as failed:
+        files.write_text_atomically(tmp_path / "text", "new")
+    assert failed.value.filename == str(tmp_path / "text")
 
 
 def test_a_model_is_written_as_atomically_as_a_checkpoint(tmp_path, monkeypatch):

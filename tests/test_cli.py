@@ -1,5 +1,6 @@
 """The command line: bad input is one line on stderr, exit code 2, and nothing written."""
 
+import re
 import shutil
 import signal
 import subprocess
@@ -15,6 +16,7 @@ from framework_runs import TINY, tiny_capture
 from PIL import Image
 
 from turbogs_plugin import run, scene
+from turbogs_plugin.outputs import distinct_stems
 from turbogs_plugin.trainer import Trainer
 
 QUICK = ("train.iterations=2", "train.sh_degree=0", "train.evaluate_at=[]")
@@ -271,7 +273,51 @@ def test_a_run_without_or_with_a_broken_checkpoint(turbogs, finished, tmp_path):
     for arguments in (["eval", broken], ["export", broken], ["train", "--resume", broken]):
         assert_refused(turbogs(*arguments), "cannot be used", checkpoint.name)
     shutil.rmtree(broken / "checkpoints")
-    assert_refused(turbogs("eval", broken), "no checkpoint yet")
+    assert_refused(turbogs("eval", broken), "no checkpoint yet", f"turbogs train --resume {broken}")
+
+
+def without_section(text: str) -> str:
+    return text[: text.index("\nbudget:") + 1]
+
+
+def without_field(text: str) -> str:
+    return text.replace("  initial_size: 1.0\n", "")
+
+
+def without_nested_field(text: str) -> str:
+    return re.sub(r"    opacities: .*\n", "", text, count=1)
+
+
+@pytest.mark.parametrize(
+    ("cut", "missing"),
+    [
+        (without_section, "'budget'"),
+        (without_field, "'train.initial_size'"),
+        (without_nested_field, "'optimizer.learning_rates.opacities'"),
+    ],
+)
+def test_a_run_whose_configuration_was_cut_is_refused(turbogs, finished, tmp_path, cut, missing):
+    broken = Path(shutil.copytree(finished, tmp_path / "broken"))
+    text = (broken / "config.yaml").read_text()
+    (broken / "config.yaml").write_text(cut(text))
+    assert cut(text) != text
+    for arguments in (["eval", broken], ["train", "--resume", broken]):
+        assert_refused(turbogs(*arguments), "config.yaml", f"lacks {missing}")
+
+
+def test_a_run_whose_capture_moved_says_where_to_tell(turbogs, finished, capture, tmp_path):
+    moved = Path(shutil.copytree(finished, tmp_path / "moved"))
+    file = moved / "config.yaml"
+    file.write_text(file.read_text().replace(str(capture), str(tmp_path / "gone")))
+    for arguments in (["eval", moved], ["render", moved], ["train", "--resume", moved]):
+        assert_refused(turbogs(*arguments), tmp_path / "gone", f"edit scene.path in {file}")
+    file.write_text(file.read_text().replace(str(tmp_path / "gone"), str(capture)))
+    assert turbogs("eval", moved)[0] == 0
+
+
+def test_renders_keep_the_names_of_photos_apart():
+    names = ["a.png", "a.jpg", "b/c.png", "b__c.png", "a-2.png", "d.png"]
+    assert distinct_stems(names) == ["a", "a-2", "b__c", "b__c-2", "a-2-2", "d"]
 
 
 def test_a_finished_run_is_evaluated_rendered_and_exported(turbogs, finished, tmp_path):

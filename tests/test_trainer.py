@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -163,6 +164,23 @@ def test_a_run_killed_without_notice_resumes_bit_for_bit(capture, whole, tmp_pat
     assert_identical(saved(whole.folder.path), saved(tmp_path / "run"))
 
 
+def test_a_run_outside_the_main_thread_is_the_same(capture, whole, tmp_path):
+    with ThreadPoolExecutor(1) as pool:
+        pool.submit(run.train, tiny_config(capture), tmp_path / "run").result()
+    assert_identical(saved(whole.folder.path), saved(tmp_path / "run"))
+
+
+def test_sigterm_before_training_ends_the_process_without_a_trace(capture):
+    """pycolmap brings a handler that prints one."""
+    code = (
+        "import os, signal, sys; from turbogs_plugin import run; from turbogs_plugin.config import load_config\n"
+        "run.load_scene = lambda *_: os.kill(os.getpid(), signal.SIGTERM)\n"
+        "run.open_scene(load_config())"
+    )
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert (ended.returncode, ended.stdout, ended.stderr) == (-signal.SIGTERM, "", "")
+
+
 def test_a_run_without_a_checkpoint_starts_again(capture, whole, tmp_path, monkeypatch):
     def die(trainer):
         raise MemoryError
@@ -231,8 +249,9 @@ def test_the_disk_fills_up(capture, tmp_path, monkeypatch):
         raise OSError(28, "No space left on device")
 
     stop_after(monkeypatch, 8, lambda trainer: monkeypatch.setattr("turbogs_plugin.files.os.fsync", full))
-    with pytest.raises(TrainingStopped, match=r"iteration 10: .*No space left.*iteration-000005\.pt"):
+    with pytest.raises(TrainingStopped, match=r"iteration 10: .*No space left.*iteration-000005\.pt") as stopped:
         run.train(tiny_config(capture), tmp_path / "run")
+    assert str(stopped.value).count("iteration-000005") == 1
     monkeypatch.undo()
     assert saved(tmp_path / "run")["iteration"] == 5
 

@@ -51,11 +51,16 @@ def save_checkpoint(folder: Path, iteration: int, state: dict[str, Any]) -> Path
         folder.mkdir(parents=True, exist_ok=True)
         write_atomically(path, lambda file: torch.save({"format": FORMAT, **state}, file))
         write_text_atomically(folder / "latest", path.name)
-    except (OSError, RuntimeError) as error:  # torch reports a failed write as RuntimeError
-        reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error).splitlines()[0]
+    except (OSError, RuntimeError) as error:
+        # On a failed write torch raises a RuntimeError about positions in the file.
+        cause = error.__context__ if isinstance(error.__context__, OSError) else error
+        reason = getattr(cause, "strerror", None) or str(cause).splitlines()[0]
         raise TrainingStopped(
-            f"iteration {iteration}: the checkpoint could not be written to '{folder}' ({reason}); {_kept(folder)}"
+            f"iteration {iteration}: the checkpoint could not be written to '{folder}' ({reason}): "
+            "once it can be, go on with --resume"
         ) from error
+    for leftover in folder.glob(".iteration-*.pt.part"):  # of a killed process
+        leftover.unlink(missing_ok=True)
     others = [file for file in folder.iterdir() if _NAME.fullmatch(file.name) and file != path]
     for old in sorted(others, key=_iteration_of)[: len(others) - (KEPT - 1)]:
         old.unlink(missing_ok=True)
@@ -139,14 +144,6 @@ def _plan(tensor: Tensor) -> str:
 
 def _iteration_of(file: Path) -> int:
     return int(_NAME.fullmatch(file.name).group(1))
-
-
-def _kept(folder: Path) -> str:
-    try:
-        kept = latest_checkpoint(folder)
-    except InputError:
-        kept = None
-    return f"the last one is '{kept}'" if kept else "no checkpoint was saved before"
 
 
 def _require_plain(value: Any, place: str) -> None:

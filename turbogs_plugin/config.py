@@ -287,6 +287,26 @@ def resolve(mapping: Mapping[str, Any]) -> Config:
     return Config(**sections)
 
 
+def resolve_complete(mapping: Mapping[str, Any], where: str) -> Config:
+    """`resolve` of a mapping that `Config.to_mapping` made. Raises `InputError` where a part of it is missing."""
+    config = resolve(mapping)
+    missing = _first_missing(config.to_mapping(), mapping)
+    if missing:
+        raise InputError(f"'{where}' lacks '{missing}': it is not as it was written; bring it back, or train anew")
+    return config
+
+
+def _first_missing(complete: Mapping[str, Any], given: Mapping[str, Any]) -> str:
+    """Dotted place of the first key that is not given; empty where all are."""
+    for key, value in complete.items():
+        if key not in given:
+            return key
+        below = _first_missing(value, given[key]) if isinstance(value, Mapping) else ""
+        if below:
+            return f"{key}.{below}"
+    return ""
+
+
 def apply_overrides(mapping: Mapping[str, Any], overrides: Sequence[str]) -> dict[str, Any]:
     """`mapping` with ``section.key=value`` on top; a new ``section.type=name`` starts that section afresh."""
     result, named = dict(mapping), set()

@@ -168,12 +168,13 @@ def save_ply(gaussians: Gaussians, path: str | Path, frame: Frame | None = None)
 
     def write(file: BinaryIO) -> None:
         file.write("\n".join([*header, "end_header\n"]).encode())
-        table.tofile(file)
+        file.write(table.tobytes())
 
     try:
         write_atomically(path, write)
     except OSError as error:
-        raise InputError(f"cannot write {path}: {error.strerror or error}") from error
+        reason = error.strerror or error
+        raise InputError(f"cannot write {path}: {reason}; choose another place or make room") from error
 
 
 def load_ply(path: str | Path, frame: Frame | None = None) -> Gaussians:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,8 +16,8 @@ from turbogs_plugin.offload import place_views
 from turbogs_plugin.report.history import Evaluation
 from turbogs_plugin.report.pages import ERRORS, number, table
 from turbogs_plugin.report.plots import to_uint8
-from turbogs_plugin.run import SavedModel, load_model, resolve_device
-from turbogs_plugin.scene import PosedImages, load_scene
+from turbogs_plugin.run import SavedModel, load_model, open_scene, resolve_device
+from turbogs_plugin.scene import PosedImages
 
 
 def history_table(history: list[Evaluation]) -> str:
@@ -54,11 +55,23 @@ def render_run(path: Path, split: str, device_name: str) -> Path:
     views = replace(views, cameras=views.cameras.to(model.gaussians.device))
     folder = model.folder.renders / split
     folder.mkdir(parents=True, exist_ok=True)
-    for view_id, name in enumerate(views.names):
+    for view_id, name in enumerate(distinct_stems(views.names)):
         image = render_view(model.gaussians, views, view_id, model.sh_degree, model.config.raster)
-        flat_name = Path(name).with_suffix(".png").as_posix().replace("/", "__")
-        Image.fromarray(to_uint8(image)).save(folder / flat_name)
+        Image.fromarray(to_uint8(image)).save(folder / f"{name}.png")
     return folder
+
+
+def distinct_stems(names: Sequence[str]) -> list[str]:
+    """Names of photos without folders and suffixes; one that came before gets a number."""
+    stems: dict[str, None] = {}
+    for name in names:
+        flat = stem = Path(name).with_suffix("").as_posix().replace("/", "__")
+        number = 1
+        while stem in stems:
+            number += 1
+            stem = f"{flat}-{number}"
+        stems[stem] = None
+    return list(stems)
 
 
 def export_run(path: Path, file_format: str, out: Path | None, drop_bands: float | None = None) -> str:
@@ -90,6 +103,5 @@ def export_run(path: Path, file_format: str, out: Path | None, drop_bands: float
 def _open(path: Path, device_name: str, split: str) -> tuple[SavedModel, PosedImages]:
     """A run's newest model on a device, and the views of a split on the CPU."""
     model = load_model(path, resolve_device(device_name))
-    scene = model.config.scene
-    loaded = load_scene(scene.path, scene.factor, scene.test_every)
-    return model, loaded.test if split == "test" else loaded.train
+    scene = open_scene(model.config, model.folder)
+    return model, scene.test if split == "test" else scene.train

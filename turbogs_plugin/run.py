@@ -5,8 +5,9 @@ from __future__ import annotations
 import operator
 import signal
 import sys
+import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import FrameType, TracebackType
@@ -18,7 +19,7 @@ from turbogs_plugin.calibration import budget_text, hold_to, within_budget
 from turbogs_plugin.capture_state import capture_difference, capture_state, frame_of_state
 from turbogs_plugin.checkpoint import latest_checkpoint, load_checkpoint, require_like, save_checkpoint
 from turbogs_plugin.clock import TrainingClock
-from turbogs_plugin.config import Config, resolve
+from turbogs_plugin.config import Config, resolve_complete
 from turbogs_plugin.errors import InputError, TrainingStopped
 from turbogs_plugin.evaluation import Metrics, evaluate, load_lpips, peak_memory_bytes
 from turbogs_plugin.files import require_writable, write_text_atomically
@@ -80,10 +81,10 @@ class RunFolder:
         require_writable(self.path, f"--out '{self.path}'")
 
     def read_config(self) -> Config:
-        """The resolved configuration of the run. Raises `InputError` where this is no run."""
+        """The resolved configuration of the run. Raises `InputError` where this is no run, or part of it is missing."""
         if not self.config.is_file():
             raise InputError(f"'{self.path}' holds no run: there is no config.yaml")
-        return resolve(read_yaml(self.config))
+        return resolve_complete(read_yaml(self.config), str(self.config))
 
     def read_plan(self) -> Plan | None:
         """What was planned when the run began, if it is there. Raises `InputError` where it cannot be read."""
@@ -127,6 +128,25 @@ def resolve_device(name: str, remedy: str = "use --device cpu, or see 'turbogs d
     return torch.device("cuda" if name != "cpu" and torch.cuda.is_available() else "cpu")
 
 
+def open_scene(config: Config, folder: RunFolder | None = None) -> Scene:
+    """The capture of a configuration.
+
+    Args:
+        folder: of the run that names the capture, where the user does not.
+
+    Raises:
+        InputError: no usable capture there.
+    """
+    settings = config.scene
+    if folder is not None and not Path(settings.path).exists():
+        raise InputError(
+            f"capture '{settings.path}' of the run in '{folder.path}' is not there: bring it back, or edit scene.path "
+            f"in {folder.config}"
+        )
+    _keep_sigterm()
+    return load_scene(settings.path, settings.factor, settings.test_every)
+
+
 def plan_run(config: Config) -> Plan:
     """What `train` would decide here and now.
 
@@ -134,7 +154,7 @@ def plan_run(config: Config) -> Plan:
         InputError: anything wrong with the input.
     """
     device = resolve_device(config.train.device)
-    return _plan(config, load_scene(config.scene.path, config.scene.factor, config.scene.test_every), device)
+    return _plan(config, open_scene(config), device)
 
 
 def _plan(config: Config, scene: Scene, device: torch.device) -> Plan:
@@ -152,7 +172,7 @@ def train(config: Config, out: Path) -> Outcome:
     folder = RunFolder(out)
     folder.require_new()
     device = resolve_device(config.train.device)
-    scene = load_scene(config.scene.path, config.scene.factor, config.scene.test_every)
+    scene = open_scene(config)
     load_lpips(config.report.lpips_weights, device)
     plan = _plan(config, scene, device)
     remedy = "use plan.photos_on=host and plan.maps_on=host, --max-gaussians or a larger --factor"
@@ -185,7 +205,7 @@ def resume(path: Path) -> Outcome:
     checkpoint = latest_checkpoint(folder.checkpoints)
     state = None if checkpoint is None else load_checkpoint(checkpoint)
     device = resolve_device(config.train.device, "go on with this run where there is a GPU, or see 'turbogs doctor'")
-    scene = load_scene(config.scene.path, config.scene.factor, config.scene.test_every)
+    scene = open_scene(config, folder)
     load_lpips(config.report.lpips_weights, device)
     limit = config.budget.memory_bytes()
     if limit is not None:
@@ -225,7 +245,7 @@ def load_model(path: Path, device: torch.device) -> SavedModel:
     config = folder.read_config()
     checkpoint = latest_checkpoint(folder.checkpoints)
     if checkpoint is None:
-        raise InputError(f"'{path}' has no checkpoint yet")
+        raise InputError(f"'{path}' has no checkpoint yet: let the run go on with  turbogs train --resume {path}")
     state = load_checkpoint(checkpoint)
     try:
         frame = frame_of_state(state)
@@ -237,7 +257,10 @@ def load_model(path: Path, device: torch.device) -> SavedModel:
 
 
 class _Interrupts:
-    """Turns SIGINT and SIGTERM into a wish to stop after this iteration; a second one stops at once."""
+    """Turns SIGINT and SIGTERM into a wish to stop after this iteration; a second one stops at once.
+
+    Only in the main thread: in others, Python lets nobody handle signals, and they are left as they are.
+    """
 
     SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
@@ -245,7 +268,8 @@ class _Interrupts:
         self.signal: int | None = None
 
     def __enter__(self) -> _Interrupts:
-        self._previous = {number: signal.signal(number, self._handle) for number in self.SIGNALS}
+        handled = self.SIGNALS if _in_main_thread() else ()
+        self._previous = {number: signal.signal(number, self._handle) for number in handled}
         return self
 
     def __exit__(
@@ -258,6 +282,18 @@ class _Interrupts:
         if self.signal is not None:
             raise KeyboardInterrupt
         self.signal = number
+
+
+def _keep_sigterm() -> None:
+    """Give SIGTERM the handler that Python knows of: pycolmap, when imported, installs one that prints a C++ trace."""
+    with suppress(ImportError):
+        import pycolmap  # noqa: F401  # now, so that it does not come later
+    if _in_main_thread():
+        signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM) or signal.SIG_DFL)
+
+
+def _in_main_thread() -> bool:
+    return threading.current_thread() is threading.main_thread()
 
 
 @dataclass
