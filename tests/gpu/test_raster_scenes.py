@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 from raster_cases import (
+    FORWARD_BOUND,
     GPU_ONLY,
     RECORD_COLUMNS,
     Case,
@@ -60,11 +61,15 @@ def test_colors_and_gradients(case):
     assert_forward_close(got.colors, wanted.colors, "colors")
     assert_forward_close(got.alphas, wanted.alphas, "alphas")
     difference = got.colors.double().cpu() - wanted.colors
-    beyond = difference[(difference.abs() > 1e-4).any(dim=1)].sum(dim=1)  # a flip moves all channels of its sample
+    flipped = (difference.abs() > FORWARD_BOUND).any(dim=1)  # a flip moves all channels of its sample
+    beyond = difference[flipped].sum(dim=1)
     if len(beyond) >= 20:  # symmetric: neither draws more than the other
         assert 0.2 <= (beyond > 0).double().mean() <= 0.8
 
+    # Four of 8568 samples moved the gradient of sh0 by 1.5e-3 of its norm, the others all gradients by 4e-6 to 1e-4;
+    # so they do where the reference itself runs in float32.
     values = upstream(case)
+    values["color_gradients"][flipped] = 0.0
     del values["depth_gradients"], values["alpha_gradients"]
     stats = GaussianStats.zeros(len(case.gaussians), "cuda")
     wanted_stats = GaussianStats.zeros(len(case.gaussians), "cpu").map(torch.Tensor.double)
