@@ -174,7 +174,7 @@ def test_sigterm_before_training_ends_the_process_without_a_trace(capture):
     """pycolmap brings a handler that prints one."""
     code = (
         "import os, signal, sys; from turbogs_plugin import run; from turbogs_plugin.config import load_config\n"
-        "run.load_scene = lambda *_: os.kill(os.getpid(), signal.SIGTERM)\n"
+        "run.load_scene = lambda *_: (__import__('pycolmap'), os.kill(os.getpid(), signal.SIGTERM))\n"
         "run.open_scene(load_config())"
     )
     ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)

@@ -19,10 +19,10 @@ from turbogs_plugin.calibration import budget_text, hold_to, within_budget
 from turbogs_plugin.capture_state import capture_difference, capture_state, frame_of_state
 from turbogs_plugin.checkpoint import latest_checkpoint, load_checkpoint, require_like, save_checkpoint
 from turbogs_plugin.clock import TrainingClock
-from turbogs_plugin.config import Config, resolve_complete
+from turbogs_plugin.config import Config
 from turbogs_plugin.errors import InputError, TrainingStopped
 from turbogs_plugin.evaluation import Metrics, evaluate, load_lpips, peak_memory_bytes
-from turbogs_plugin.files import require_writable, write_text_atomically
+from turbogs_plugin.files import write_text_atomically
 from turbogs_plugin.gaussians import save_ply
 from turbogs_plugin.offload import place_views
 from turbogs_plugin.pacing import Pace, pace_of
@@ -30,70 +30,10 @@ from turbogs_plugin.plan import Plan, make_plan
 from turbogs_plugin.progress import TrainingProgress
 from turbogs_plugin.report.history import Evaluation, append_evaluation, rewind_history
 from turbogs_plugin.report.pages import RunRecord, write_report
+from turbogs_plugin.run_folder import RunFolder
 from turbogs_plugin.scene import Frame, PosedImages, Scene, load_scene
 from turbogs_plugin.trainer import Trainer, gaussians_of_state
 from turbogs_plugin.types import Gaussians
-from turbogs_plugin.yaml_text import read_yaml
-
-
-@dataclass(frozen=True)
-class RunFolder:
-    """Where the parts of a run are."""
-
-    path: Path
-
-    @property
-    def config(self) -> Path:
-        return self.path / "config.yaml"
-
-    @property
-    def plan(self) -> Path:
-        return self.path / "plan.json"
-
-    @property
-    def history(self) -> Path:
-        return self.path / "history.jsonl"
-
-    @property
-    def checkpoints(self) -> Path:
-        return self.path / "checkpoints"
-
-    @property
-    def report(self) -> Path:
-        return self.path / "report.md"
-
-    @property
-    def model(self) -> Path:
-        return self.path / "model.ply"
-
-    @property
-    def renders(self) -> Path:
-        return self.path / "renders"
-
-    def require_new(self) -> None:
-        """Raises `InputError` where the folder holds anything, or cannot be made."""
-        if self.config.exists():
-            raise InputError(f"'{self.path}' holds another run: choose a new --out, or go on with --resume {self.path}")
-        if self.path.exists() and not self.path.is_dir():
-            raise InputError(f"--out '{self.path}' is a file: choose a folder")
-        if self.path.is_dir() and any(self.path.iterdir()):
-            raise InputError(f"--out '{self.path}' is not empty: choose a new folder")
-        require_writable(self.path, f"--out '{self.path}'")
-
-    def read_config(self) -> Config:
-        """The resolved configuration of the run. Raises `InputError` where this is no run, or part of it is missing."""
-        if not self.config.is_file():
-            raise InputError(f"'{self.path}' holds no run: there is no config.yaml")
-        return resolve_complete(read_yaml(self.config), str(self.config))
-
-    def read_plan(self) -> Plan | None:
-        """What was planned when the run began, if it is there. Raises `InputError` where it cannot be read."""
-        try:
-            return Plan.from_json(self.plan.read_text(encoding="utf-8"))
-        except FileNotFoundError:
-            return None
-        except (OSError, UnicodeDecodeError, InputError) as error:
-            raise InputError(f"cannot read the plan '{self.plan}': {error}") from None
 
 
 @dataclass
