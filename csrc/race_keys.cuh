@@ -1,4 +1,4 @@
-// Random words and the keys of the pixel sampler, to the bit as strategies/philox.py and pixel_sampling.py define them: single-
+// Random words and the keys of the pixel sampler, to the bit as strategies/philox.py and pixel_draws.py define them: single-
 // precision operations that are rounded one by one.
 //
 // A unit's random words depend on the seed, the iteration and its place alone. In a race its key is weight over an exponential

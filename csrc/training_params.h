@@ -86,7 +86,7 @@ struct SampleView {
 
 enum class SampleUnit : int { kPixel = 0, kCell = 1, kTile = 2 };
 
-// The pixel sampler; strategies/pixel_sampling.py defines the draw, bit for bit.
+// The pixel sampler; strategies/pixel_draws.py defines the draw, bit for bit.
 struct SamplePixelsParams {
     SampleUnit unit;
     int num_views;             // K

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, fields
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal
 
 import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import logsigmoid
+from turbogs_plugin.strategies.density_rows import finite_rows, leave_one, loaded_rows
 
 from turbogs_plugin.errors import InputError, require
 from turbogs_plugin.rendering.projection import rotation_matrices
@@ -351,37 +352,6 @@ class ErrorDrivenDensity:
         return (means + offsets).reshape(-1, 3), (scales - shrink).repeat(2, 1)
 
 
-RowsType = TypeVar("RowsType")  # a dataclass of [N] tensors
-
-
-def loaded_rows(name: str, saved: dict[str, Tensor] | None, present: RowsType | None) -> RowsType | None:
-    """What a state holds of Gaussians, as copies on the device of what is there, which must be of as many.
-
-    Args:
-        name: of the entry, for the error.
-        saved: name of a field -> [N], or None where the saved run needed them no more.
-        present: what `setup` made.
-    """
-    if saved is None:
-        return None
-    if present is None:
-        raise InputError(f"density {name}: nothing to load into, call setup with the model of the saved run first")
-    like = getattr(present, fields(present)[0].name)
-    for key, value in saved.items():
-        if value.shape != like.shape:
-            raise InputError(
-                f"density {name}.{key} has shape {tuple(value.shape)}, expected {tuple(like.shape)}: "
-                "load the state together with its own model"
-            )
-    return type(present)(**{key: value.to(like.device, copy=True) for key, value in saved.items()})
-
-
-def finite_rows(gaussians: Gaussians) -> Tensor:
-    """[N] bool: every parameter of the Gaussian is finite, and so are its variances, that its halves may be, too."""
-    values = [value for _, value in gaussians.items()] + [(2 * gaussians.scales).exp()]
-    return torch.stack([torch.isfinite(value.reshape(len(value), -1)).all(dim=-1) for value in values]).all(dim=0)
-
-
 def _quantile(values: Tensor, mask: Tensor, fraction: float) -> Tensor:
     """The value at rank ``floor(fraction * n)`` of the n masked values [N] in ascending order; 0 if there are none.
 
@@ -400,15 +370,6 @@ def _first(keys: Tensor, mask: Tensor, count: int) -> Tensor:
     chosen = torch.zeros_like(mask)
     chosen[order[:count]] = True
     return chosen & mask
-
-
-def leave_one(pruned: Tensor, gaussians: Gaussians) -> Tensor:
-    """The mask [N], without the most opaque (finite) Gaussian where it would leave none."""
-    if not bool(pruned.all()):
-        return pruned
-    pruned = pruned.clone()
-    pruned[torch.where(finite_rows(gaussians), gaussians.opacities, -torch.inf).argmax()] = False
-    return pruned
 
 
 def _decayed(logits: Tensor, decay: float) -> Tensor:

@@ -8,7 +8,8 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from turbogs_plugin.strategies.density import ErrorDrivenDensity, finite_rows, leave_one, loaded_rows
+from turbogs_plugin.strategies.density import ErrorDrivenDensity
+from turbogs_plugin.strategies.density_rows import finite_rows, leave_one, loaded_rows
 
 from turbogs_plugin.errors import require
 from turbogs_plugin.types import Gaussians, GaussianStats, RowUpdate, Step

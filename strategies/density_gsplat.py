@@ -11,7 +11,7 @@ import torch
 from gsplat.strategy import DefaultStrategy
 from gsplat.strategy.ops import reset_opa
 from torch import Tensor
-from turbogs_plugin.strategies.density import finite_rows, loaded_rows
+from turbogs_plugin.strategies.density_rows import finite_rows, loaded_rows
 
 from turbogs_plugin.errors import require
 from turbogs_plugin.types import Gaussians, GaussianStats, RowUpdate, Step

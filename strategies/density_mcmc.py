@@ -10,8 +10,8 @@ import numpy as np
 import torch
 from gsplat.strategy import MCMCStrategy
 from torch import Tensor
-from turbogs_plugin.strategies.density import finite_rows
 from turbogs_plugin.strategies.density_gsplat import marking_optimizer, touched_rows
+from turbogs_plugin.strategies.density_rows import finite_rows
 from turbogs_plugin.strategies.learning_rates import LearningRates
 
 from turbogs_plugin.errors import InputError, require

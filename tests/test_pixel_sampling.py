@@ -5,12 +5,8 @@ import pytest
 import torch
 from sampling_cases import SIGMAS, SIZES, UNITS, pixels_by_tile, random_maps, step
 from turbogs_plugin.strategies.philox import PURPOSE_PIXELS, exponentials, random_words
-from turbogs_plugin.strategies.pixel_sampling import (
-    DensePixelSampler,
-    DrawRule,
-    ErrorGuidedPixelSampler,
-    RandomPixelSampler,
-)
+from turbogs_plugin.strategies.pixel_draws import DrawRule
+from turbogs_plugin.strategies.pixel_sampling import DensePixelSampler, ErrorGuidedPixelSampler, RandomPixelSampler
 from turbogs_plugin.strategies.schedule import SinusoidalSchedule
 from turbogs_plugin.strategies.view_sampling import RandomViewSampler
 

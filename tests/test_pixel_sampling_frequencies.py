@@ -7,13 +7,8 @@ import pytest
 import torch
 from sampling_cases import SIGMAS, UNITS, random_maps, step
 from turbogs_plugin.strategies.philox import PURPOSE_PIXELS, random_words
-from turbogs_plugin.strategies.pixel_sampling import (
-    DrawRule,
-    ErrorGuidedPixelSampler,
-    RandomPixelSampler,
-    Units,
-    draw_units,
-)
+from turbogs_plugin.strategies.pixel_draws import DrawRule, Units, draw_units
+from turbogs_plugin.strategies.pixel_sampling import ErrorGuidedPixelSampler, RandomPixelSampler
 
 from turbogs_plugin.error_maps import ErrorMaps
 

@@ -52,6 +52,11 @@ def scale_iterations(mapping: dict[str, dict[str, Any]], iterations: int) -> Non
                 least = min(value, SHORTEST_INTERVAL) if section == "density" else 1
                 mapping[section][name] = max(least, round(value * factor))
     mapping["train"]["iterations"] = iterations
-    exponent = min(REGROWTH, density.get("refine_every", REGROWTH)) / min(REGROWTH, interval)
-    if density.get("opacity_decay", 0.0) and exponent != 1.0:
-        density["opacity_decay"] = 1.0 - (1.0 - density["opacity_decay"]) ** exponent
+    if density.get("opacity_decay", 0.0):
+        density["opacity_decay"] = decay_at(density["opacity_decay"], interval, density["refine_every"])
+
+
+def decay_at(decay: float, interval: int, other: int) -> float:
+    """Share of the opacities that events `other` iterations apart take where events `interval` apart take `decay`."""
+    before, after = min(REGROWTH, interval), min(REGROWTH, other)
+    return decay if before == after else 1.0 - (1.0 - decay) ** (after / before)

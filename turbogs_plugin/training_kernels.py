@@ -34,7 +34,7 @@ from turbogs_plugin.types import (
 
 if TYPE_CHECKING:
     from turbogs_plugin.rendering.cuda import CudaScreenGradients
-    from turbogs_plugin.strategies.pixel_sampling import DrawRule
+    from turbogs_plugin.strategies.pixel_draws import DrawRule
     from turbogs_plugin.strategies.update_rule import GaussianMoments, UpdateRule
 
 MAX_VIEWS = 128

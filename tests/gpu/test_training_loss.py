@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 from turbogs_plugin.strategies.loss import CharbonnierLoss, CharbonnierNccLoss, SparseSsimLoss
-from turbogs_plugin.strategies.pixel_sampling import DrawRule, draw_pixels
+from turbogs_plugin.strategies.pixel_draws import DrawRule, draw_pixels
 
 from turbogs_plugin import kernels, training_kernels
 from turbogs_plugin.error_maps import ErrorMaps

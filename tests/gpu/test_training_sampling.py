@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 from turbogs_plugin.strategies.philox import PURPOSE_PIXELS, exponentials, random_words
-from turbogs_plugin.strategies.pixel_sampling import WEIGHT_FLOOR, DrawRule, draw_pixels
+from turbogs_plugin.strategies.pixel_draws import WEIGHT_FLOOR, DrawRule, draw_pixels
 
 from turbogs_plugin import kernels, training_kernels
 

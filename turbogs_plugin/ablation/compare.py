@@ -12,7 +12,7 @@ from turbogs_plugin.ablation.grid import Ablation
 from turbogs_plugin.ablation.results import CellResult, Study
 from turbogs_plugin.config import SceneConfig
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.lengths import ITERATION_FIELDS, REGROWTH
+from turbogs_plugin.lengths import ITERATION_FIELDS, REGROWTH, decay_at
 from turbogs_plugin.report.history import read_history
 from turbogs_plugin.run import RunFolder
 
@@ -87,8 +87,8 @@ def _without(mapping: dict[str, Any]) -> dict[str, Any]:
     if sections["budget"]["time"]:
         density = sections["density"]
         if density.get("opacity_decay"):  # it goes along with the length, by the interval of its events
-            events = REGROWTH / min(REGROWTH, density.get("refine_every", REGROWTH))
-            density["opacity_decay"] = round(1.0 - (1.0 - density["opacity_decay"]) ** events, 9)
+            decay = decay_at(density["opacity_decay"], density["refine_every"], REGROWTH)
+            density["opacity_decay"] = round(decay, 9)
         for section, keys in FITTED.items():
             for key in keys:
                 sections[section].pop(key, None)
