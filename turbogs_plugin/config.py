@@ -292,7 +292,7 @@ def resolve_complete(mapping: Mapping[str, Any], where: str) -> Config:
     config = resolve(mapping)
     missing = _first_missing(config.to_mapping(), mapping)
     if missing:
-        raise InputError(f"'{where}' lacks '{missing}': it is not as it was written; bring it back, or train anew")
+        raise InputError(f"'{where}' lacks '{missing}', which this version writes: bring the file back, or train anew")
     return config
 
 
