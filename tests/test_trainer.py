@@ -173,11 +173,10 @@ def test_a_run_outside_the_main_thread_is_the_same(capture, whole, tmp_path):
 def test_sigterm_before_training_ends_the_process_without_a_trace(capture):
     """pycolmap brings a handler that prints one."""
     code = (
-        "import os, signal, sys; from turbogs_plugin import run; from turbogs_plugin.config import load_config\n"
-        "run.load_scene = lambda *_: (__import__('pycolmap'), os.kill(os.getpid(), signal.SIGTERM))\n"
-        "run.open_scene(load_config())"
+        "import os, signal, sys; from turbogs_plugin.scene import load_scene\n"
+        "load_scene(sys.argv[1]); os.kill(os.getpid(), signal.SIGTERM)"
     )
-    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    ended = subprocess.run([sys.executable, "-c", code, str(capture)], capture_output=True, text=True)
     assert (ended.returncode, ended.stdout, ended.stderr) == (-signal.SIGTERM, "", "")
 
 

@@ -7,7 +7,7 @@ import signal
 import sys
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import FrameType, TracebackType
@@ -83,7 +83,6 @@ def open_scene(config: Config, folder: RunFolder | None = None) -> Scene:
             f"capture '{settings.path}' of the run in '{folder.path}' is not there: bring it back, or edit scene.path "
             f"in {folder.config}"
         )
-    _keep_sigterm()
     return load_scene(settings.path, settings.factor, settings.test_every)
 
 
@@ -208,7 +207,7 @@ class _Interrupts:
         self.signal: int | None = None
 
     def __enter__(self) -> _Interrupts:
-        handled = self.SIGNALS if _in_main_thread() else ()
+        handled = self.SIGNALS if threading.current_thread() is threading.main_thread() else ()
         self._previous = {number: signal.signal(number, self._handle) for number in handled}
         return self
 
@@ -222,18 +221,6 @@ class _Interrupts:
         if self.signal is not None:
             raise KeyboardInterrupt
         self.signal = number
-
-
-def _keep_sigterm() -> None:
-    """Give SIGTERM the handler that Python knows of: pycolmap, when imported, installs one that prints a C++ trace."""
-    with suppress(ImportError):
-        import pycolmap  # noqa: F401  # now, so that it does not come later
-    if _in_main_thread():
-        signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM) or signal.SIG_DFL)
-
-
-def _in_main_thread() -> bool:
-    return threading.current_thread() is threading.main_thread()
 
 
 @dataclass

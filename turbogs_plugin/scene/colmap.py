@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import itertools
+import signal
+import threading
 from pathlib import Path
+from types import ModuleType
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -19,6 +22,18 @@ MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0")
 """Where a scene's reconstruction may lie, in order of preference."""
 
 FILES = ("cameras", "images", "points3D")
+
+
+def load_pycolmap() -> ModuleType:
+    """The module: other kinds of captures need neither its time to load nor its presence.
+
+    SIGTERM keeps the handler that Python knows of: pycolmap brings one that prints a trace of C++.
+    """
+    import pycolmap
+
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM) or signal.SIG_DFL)
+    return pycolmap
 
 
 def find_model(scene: Path) -> tuple[Path, str] | None:
@@ -42,8 +57,7 @@ def read_colmap(scene: Path, model: Path, suffix: str) -> Capture:
     """
     if suffix == ".bin":
         check_binary_model(model)
-    import pycolmap  # here: other kinds of captures need neither its time to load nor its presence
-
+    pycolmap = load_pycolmap()
     reconstruction = pycolmap.Reconstruction()
     try:
         (reconstruction.read_binary if suffix == ".bin" else reconstruction.read_text)(model)

@@ -17,6 +17,7 @@ import numpy as np
 from PIL import Image
 
 from turbogs_plugin.errors import InputError
+from turbogs_plugin.scene.colmap import load_pycolmap
 
 if TYPE_CHECKING:
     import pycolmap
@@ -252,8 +253,7 @@ def _reconstruct(
     visible = inside & (np.abs(local[..., 2] - seen_depths) < 0.02 * seen_depths)  # [V, M]
     visible &= visible.sum(axis=0) >= 2
 
-    import pycolmap
-
+    pycolmap = load_pycolmap()
     reconstruction = pycolmap.Reconstruction()
     camera = pycolmap.Camera(
         camera_id=1, model="PINHOLE", width=width, height=height, params=[focal, focal, width / 2, height / 2]
