@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -12,7 +11,7 @@ from torch.optim.adam import adam
 from turbogs_plugin.strategies.learning_rates import LearningRates
 from turbogs_plugin.strategies.update_rule import check_moments_config, check_state, clipped, finite_gradients
 
-from turbogs_plugin.errors import require
+from turbogs_plugin.errors import require_not_negative
 from turbogs_plugin.rendering.rendered import ScreenGradients
 from turbogs_plugin.types import PARAMETER_NAMES, GaussianGradients, Gaussians, RowUpdate, Step
 
@@ -57,9 +56,7 @@ class DenseAdam:
 
     def __post_init__(self) -> None:
         check_moments_config(self.beta1, self.beta2, self.eps)
-        for name in ("opacity_reg", "scale_reg"):
-            value = getattr(self, name)
-            require(math.isfinite(value) and value >= 0, name, value, "a finite number >= 0")
+        require_not_negative(self, "opacity_reg", "scale_reg")
 
     def setup(self, gaussians: Gaussians) -> None:
         self.exp_avg, self.exp_avg_sq = (gaussians.map(torch.zeros_like) for _ in range(2))

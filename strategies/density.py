@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn.functional import logsigmoid
 from turbogs_plugin.strategies.density_rows import finite_rows, leave_one, loaded_rows
 
-from turbogs_plugin.errors import InputError, require
+from turbogs_plugin.errors import InputError, require, require_not_negative
 from turbogs_plugin.rendering.projection import rotation_matrices
 from turbogs_plugin.spatial_order import spatial_order
 from turbogs_plugin.types import Gaussians, GaussianStats, RowUpdate, Step
@@ -140,12 +140,11 @@ class ErrorDrivenDensity:
             require(0 < getattr(self, name) <= 1, name, getattr(self, name), "more than 0 and at most 1")
         for name in ("prune_opacity", "prune_score_fraction", "opacity_decay", "stop_when_flat"):
             require(0 <= getattr(self, name) < 1, name, getattr(self, name), "at least 0 and less than 1")
-        for name in (
+        require_not_negative(
+            self,
             *("lambda_base", "refine_from", "grad_threshold", "absgrad_threshold", "percent_dense", "target_gaussians"),
             *("max_gaussians", "prune_world_size", "prune_screen_size", "prune_size_from", "spare_beyond"),
-        ):
-            value = getattr(self, name)
-            require(math.isfinite(value) and value >= 0, name, value, "a finite number >= 0")
+        )
         if (self.growth == "budget") != (self.target_gaussians > 0):
             raise InputError(
                 f"growth = {self.growth!r} with target_gaussians = {self.target_gaussians}: "

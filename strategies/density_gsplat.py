@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field, fields
 from typing import Any, Literal
 
@@ -13,7 +12,7 @@ from gsplat.strategy.ops import reset_opa
 from torch import Tensor
 from turbogs_plugin.strategies.density_rows import finite_rows, loaded_rows
 
-from turbogs_plugin.errors import require
+from turbogs_plugin.errors import require, require_not_negative
 from turbogs_plugin.types import Gaussians, GaussianStats, RowUpdate, Step
 
 
@@ -65,12 +64,11 @@ class GsplatDefaultDensity:
         for name in ("refine_every", "reset_every"):
             require(getattr(self, name) >= 1, name, getattr(self, name), "at least 1")
         require(0 <= self.prune_opa < 0.5, "prune_opa", self.prune_opa, "at least 0 and less than 0.5")
-        for name in (
+        require_not_negative(
+            self,
             *("grow_grad2d", "grow_scale3d", "grow_scale2d", "prune_scale3d", "prune_scale2d"),
             *("refine_scale2d_stop_iter", "refine_start_iter", "pause_refine_after_reset"),
-        ):
-            value = getattr(self, name)
-            require(math.isfinite(value) and value >= 0, name, value, "a finite number >= 0")
+        )
 
     @property
     def stats(self) -> GaussianStats | None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -14,7 +13,7 @@ from turbogs_plugin.strategies.density_gsplat import marking_optimizer, touched_
 from turbogs_plugin.strategies.density_rows import finite_rows
 from turbogs_plugin.strategies.learning_rates import LearningRates
 
-from turbogs_plugin.errors import InputError, require
+from turbogs_plugin.errors import InputError, require, require_not_negative
 from turbogs_plugin.types import Gaussians, GaussianStats, RowUpdate, Step
 
 DEAD_LOGIT = -50.0
@@ -52,9 +51,7 @@ class GsplatMcmcDensity:
     def __post_init__(self) -> None:
         for name in ("cap_max", "refine_every"):
             require(getattr(self, name) >= 1, name, getattr(self, name), "at least 1")
-        for name in ("noise_lr", "refine_start_iter"):
-            value = getattr(self, name)
-            require(math.isfinite(value) and value >= 0, name, value, "a finite number >= 0")
+        require_not_negative(self, "noise_lr", "refine_start_iter")
         require(0 < self.min_opacity < 1, "min_opacity", self.min_opacity, "more than 0 and less than 1")
 
     @property

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -26,7 +25,7 @@ from turbogs_plugin.strategies.update_rule import (
     updatable,
 )
 
-from turbogs_plugin.errors import require
+from turbogs_plugin.errors import require, require_not_negative
 from turbogs_plugin.rendering.rendered import ScreenGradients
 from turbogs_plugin.types import Gaussians, RowUpdate, Step
 
@@ -89,9 +88,7 @@ class MomentLMOptimizer:
         choices = {"units": ("balanced", "paper"), "rows": ("views", "summed"), "solver": tuple(_SOLVERS)}
         for name, allowed in choices.items():
             require(getattr(self, name) in allowed, name, getattr(self, name), f"one of {', '.join(allowed)}")
-        for name in ("curvature", "max_step"):
-            value = getattr(self, name)
-            require(math.isfinite(value) and value >= 0, name, value, "a finite number >= 0")
+        require_not_negative(self, "curvature", "max_step")
 
     def setup(self, gaussians: Gaussians) -> None:
         self.moments = GaussianMoments.zeros(gaussians)
