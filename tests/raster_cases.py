@@ -10,7 +10,7 @@ from rendering_scenes import make_cameras, make_gaussians, thin_out
 from torch import Tensor
 
 from turbogs_plugin import kernels
-from turbogs_plugin.rendering import dense_samples
+from turbogs_plugin.rendering import dense_samples, rasterize_reference
 from turbogs_plugin.types import Cameras, Gaussians, PixelSamples
 
 GPU_ONLY = [
@@ -21,6 +21,7 @@ GPU_ONLY = [
 FORWARD_BOUND = 1e-4
 FLIP_SHARE = 1e-3  # of the samples may lie on a threshold
 COSINE_BOUND, GRADIENT_BOUND = 0.9999, 1e-3
+STEADY_MOVES, STEADY_SIZE = 3, 2e-7
 
 RECORD_COLUMNS = {
     "mean": slice(0, 2),
@@ -109,6 +110,28 @@ def assert_forward_close(got: Tensor, wanted: Tensor, what: str) -> None:
     assert difference.abs().max() <= 0.05 * wanted.abs().max().clamp(min=1.0), f"{what}: {difference.abs().max():.2e}"
 
 
+def steady_samples(case: Case) -> Tensor:
+    """[P] bool on the CPU: samples whose colors do not hang on a decision that float32 may make otherwise.
+
+    The decisions are whether alpha reaches alpha_min, where transmittance ends, and which of two splats is in front. In
+    float64, parameters are moved by about three times the rounding of float32, to and fro, so that what stands on an
+    edge falls to either side. Only the reference is asked: no error of what is tested can hide here.
+    """
+    gaussians, cameras = case.gpu_gaussians.map(Tensor.double), case.gpu_cameras.to(dtype=torch.float64)
+    wanted = rasterize_reference(gaussians, cameras, case.gpu_samples).colors
+    distances = gaussians.means.norm(dim=1, keepdim=True) + cameras.centers.norm(dim=1).amax()
+    steady = torch.ones(len(wanted), dtype=torch.bool, device=wanted.device)
+    generator = torch.Generator(wanted.device).manual_seed(0)
+    for _ in range(STEADY_MOVES):
+        moves = gaussians.map(lambda value: torch.empty_like(value).normal_(generator=generator))
+        for size in (STEADY_SIZE, -STEADY_SIZE):
+            moved = Gaussians(**{name: value * (1 + size * getattr(moves, name)) for name, value in gaussians.items()})
+            moved.means = gaussians.means + size * distances * moves.means
+            change = rasterize_reference(moved, cameras, case.gpu_samples).colors - wanted
+            steady &= (change.abs() <= FORWARD_BOUND / 2).all(dim=1)
+    return steady.cpu()
+
+
 def gradient_errors(got: Tensor, wanted: Tensor) -> tuple[float, float]:
     """(cosine, relative L2)."""
     got, wanted = got.double().cpu().flatten(), wanted.double().flatten()
@@ -116,15 +139,13 @@ def gradient_errors(got: Tensor, wanted: Tensor) -> tuple[float, float]:
     return float(cosine), float((got - wanted).norm() / wanted.norm().clamp(min=1e-300))
 
 
-def assert_gradients_close(got: Tensor, wanted: Tensor, what: str) -> None:
+def assert_gradients_close(got: Tensor, wanted: Tensor, what: str, bound: float = GRADIENT_BOUND) -> None:
     """Cosine, relative L2, and the magnitude of rows."""
     if wanted.norm() == 0:
         assert got.abs().max() == 0, what
         return
     cosine, relative = gradient_errors(got, wanted)
-    assert cosine >= COSINE_BOUND and relative <= GRADIENT_BOUND, (
-        f"{what}: cosine {cosine:.6f}, relative {relative:.2e}"
-    )
+    assert cosine >= COSINE_BOUND and relative <= bound, f"{what}: cosine {cosine:.6f}, relative {relative:.2e}"
     rows, wanted_rows = got.double().cpu().flatten(0, -2).norm(dim=-1), wanted.double().flatten(0, -2).norm(dim=-1)
     large = wanted_rows > 1e-3 * wanted_rows.max()
     ratio = rows[large] / wanted_rows[large]

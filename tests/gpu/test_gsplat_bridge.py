@@ -208,7 +208,7 @@ class Surgery:
 
 
 def trainings(monkeypatch):
-    """Name of the rasterizer -> a training with it, from options of DefaultStrategy to its result."""
+    """Name of the rasterizer -> a training with it, from options of DefaultStrategy and a seed to its result."""
     folder = os.environ.get("TURBOGS_SCENE")
     if not folder:
         pytest.skip("set TURBOGS_SCENE to the folder of a scene")
@@ -222,10 +222,10 @@ def trainings(monkeypatch):
         colors, _, info = host.dense_rasterization(**host.splat_arguments(splats), **views, packed=False, **render)
         return torch.nn.functional.l1_loss(colors, batch.pixels), info
 
-    def train(name, forward, options):
-        torch.manual_seed(0)
-        result = host.train(scene, 1000, DefaultStrategy(**options), forward=forward)
-        host.report(name, result)
+    def train(name, forward, options, seed=0):
+        torch.manual_seed(seed)
+        result = host.train(scene, 1000, DefaultStrategy(**options), forward=forward, seed=seed)
+        host.report(f"{name}, seed {seed}", result)
         return result
 
     forwards = {"gsplat": host.l1_of_images, "ours": with_our_rasterizer}
@@ -233,22 +233,23 @@ def trainings(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("options", "runs", "bound"),
+    ("options", "seeds", "bound"),
     [
         # Measured: 0.003 dB.
         pytest.param({"refine_start_iter": 10**9}, 1, 0.02, id="without densification"),
-        # From one seed gsplat itself ends anywhere within 0.11 dB: its sums have no order, and one Gaussian more moves
-        # all random numbers after it: so means of three runs each. Measured: 0.02 dB, later 0.22 and 0.15, which fails.
-        pytest.param({}, 3, 0.1, id="with densification"),
+        # Each pair from one seed. A pair says nothing at this level: gsplat against itself, its points moved by 1e-6 of
+        # their values, differs by 0.17 dB (standard deviation), ours against gsplat by 0.15. Measured over 27 seeds:
+        # means 0.005 dB apart, standard error 0.03.
+        pytest.param({}, 16, 0.1, id="with densification"),
     ],
 )
-def test_our_rasterizer_trains_as_gsplats_does(monkeypatch, options, runs, bound):
-    """r = 1, gsplat's DefaultStrategy and torch's Adam, 1000 steps from one seed: test PSNR within 0.1 dB."""
+def test_our_rasterizer_trains_as_gsplats_does(monkeypatch, options, seeds, bound):
+    """r = 1, gsplat's DefaultStrategy and torch's Adam, 1000 steps, same seeds: mean test PSNR within 0.1 dB."""
     means = {}
     for name, train in trainings(monkeypatch).items():
-        results = [train(options) for _ in range(runs)]
+        results = [train(options, seed) for seed in range(seeds)]
         assert all(result.last_psnr > result.first_psnr + 3 for result in results)
-        means[name] = sum(result.last_psnr for result in results) / runs
+        means[name] = sum(result.last_psnr for result in results) / seeds
     assert abs(means["ours"] - means["gsplat"]) <= bound
 
 

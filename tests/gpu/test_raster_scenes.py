@@ -11,12 +11,14 @@ import torch
 from raster_cases import (
     FORWARD_BOUND,
     GPU_ONLY,
+    GRADIENT_BOUND,
     RECORD_COLUMNS,
     Case,
     assert_forward_close,
     assert_gradients_close,
     on_gpu,
     samples_to,
+    steady_samples,
     upstream,
 )
 
@@ -31,6 +33,8 @@ pytestmark = GPU_ONLY
 
 SAMPLES_A_TILE = 4
 VIEWS = (3, 20)
+LEAST_STEADY = 0.98
+LARGEST_BIAS = 2e-6  # mean of what is lighter and what is darker
 
 
 @pytest.fixture(scope="module", params=["fox", "caliterra"])
@@ -55,30 +59,38 @@ def case(request) -> Case:
     )
 
 
-def test_colors_and_gradients(case):
+@pytest.fixture(scope="module")
+def steady(case) -> torch.Tensor:
+    return steady_samples(case)
+
+
+def test_colors(case, steady):
+    """Every sample agrees whose color no decision hangs on; the others are few, and neither lighter nor darker."""
     got = rasterize(case.gpu_gaussians, case.gpu_cameras, case.gpu_samples)
     wanted = rasterize_reference(case.gaussians, case.cameras, case.samples)
     assert_forward_close(got.colors, wanted.colors, "colors")
     assert_forward_close(got.alphas, wanted.alphas, "alphas")
-    beyond = (got.colors.double().cpu() - wanted.colors)[(got.colors.double().cpu() - wanted.colors).abs() > 1e-4]
-    if len(beyond) >= 20:  # symmetric: neither draws more than the other
-        assert 0.2 <= (beyond > 0).double().mean() <= 0.8
-
-    values = upstream(case)
-    assert_all_gradients_close(case, got, wanted, values)
+    differences = got.colors.double().cpu() - wanted.colors
+    assert steady.double().mean() >= LEAST_STEADY
+    assert differences[steady].abs().max() <= FORWARD_BOUND
+    assert differences.mean().abs() <= LARGEST_BIAS
 
 
-def test_gradients_of_samples_whose_colors_agree(case):
-    """Without the samples that a threshold decided otherwise: in float32 the reference flips some as well."""
+@pytest.mark.parametrize(
+    ("of_all", "bound"),
+    [
+        pytest.param(False, GRADIENT_BOUND, id="of steady samples"),
+        # A few samples decided otherwise are more than 1e-3 of a gradient: of 24 models, 10 were beyond it, by up to
+        # 4.6e-3, and 9 of the reference in float32, by up to 7e-3. Of steady samples, all 24 were within.
+        pytest.param(True, 1e-2, id="of all samples"),
+    ],
+)
+def test_gradients(case, steady, of_all, bound):
+    """On the screen and of every parameter, from gradients of the colors."""
     got = rasterize(case.gpu_gaussians, case.gpu_cameras, case.gpu_samples)
     wanted = rasterize_reference(case.gaussians, case.cameras, case.samples)
     values = upstream(case)
-    values["color_gradients"][((got.colors.double().cpu() - wanted.colors).abs() > FORWARD_BOUND).any(dim=1)] = 0.0
-    assert_all_gradients_close(case, got, wanted, values)
-
-
-def assert_all_gradients_close(case, got, wanted, values):
-    """Those of the screen and of every parameter, from gradients of the colors."""
+    values["color_gradients"][~(steady | of_all)] = 0.0
     del values["depth_gradients"], values["alpha_gradients"]
     stats = GaussianStats.zeros(len(case.gaussians), "cuda")
     wanted_stats = GaussianStats.zeros(len(case.gaussians), "cpu").map(torch.Tensor.double)
@@ -86,8 +98,9 @@ def assert_all_gradients_close(case, got, wanted, values):
     records, wanted_records = got.full_records(), wanted.full_records()
     for name, column in RECORD_COLUMNS.items():
         if name != "depth":
-            assert_gradients_close(records[..., column], wanted_records[..., column], name)
+            assert_gradients_close(records[..., column], wanted_records[..., column], name, bound)
     gradients, wanted_gradients = got.parameter_gradients(rows=True), wanted.parameter_gradients(rows=True)
     for name, _ in case.gaussians.items():
         ours, theirs = getattr(gradients, name), getattr(wanted_gradients, name)
-        assert_gradients_close(ours.reshape(*theirs.shape[:2], -1), theirs.reshape(*theirs.shape[:2], -1), name)
+        shape = (*theirs.shape[:2], -1)
+        assert_gradients_close(ours.reshape(shape), theirs.reshape(shape), name, bound)
