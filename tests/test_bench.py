@@ -263,6 +263,25 @@ def test_other_builds_get_the_models_that_this_one_times(turbogs, capture, tmp_p
     assert report["model"] == report["other_builds"]["other.so"]["model"] == "trained for 0 iterations"
 
 
+def test_this_build_is_measured_as_the_others_are(turbogs, capture, tmp_path, monkeypatch):
+    library, out, measured = tmp_path / "other.so", tmp_path / "raster.json", []
+    library.touch()
+    monkeypatch.setattr(commands.kernels, "available", lambda: True)
+    monkeypatch.setattr(commands.kernels, "library_path", lambda: tmp_path / "this.so")
+    monkeypatch.setattr(RasterBench, "run", lambda *_: {"passes": [], "gsplat": []})
+
+    def other_build(path, command):
+        measured.append(path.name)
+        return {"passes": [], "gsplat": []}
+
+    monkeypatch.setattr(commands, "other_build", other_build)
+    options = ["--scene", capture, "--gaussians", 150, "--training", 0, *RASTER_PASSES, "--library", library]
+    code, _, error = turbogs("bench", "raster", *options, "--out", out)
+    assert code == 0, error
+    assert measured == ["this.so", "other.so"]
+    assert list(json.loads(out.read_text())["other_builds"]) == [commands.AGAIN, "other.so"]
+
+
 def test_another_build_measures_in_a_process_of_its_own(monkeypatch, tmp_path):
     def run(arguments, env, **options):
         assert env["TURBOGS_LIBRARY"] == str((tmp_path / "other.so").resolve())
