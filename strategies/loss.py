@@ -227,14 +227,14 @@ class CharbonnierNccLoss:
 
     Args:
         epsilon: of the Charbonnier term.
-        ncc_weight: factor of the structure term; 1 in the paper, which costs quality in tiles of little texture.
+        ncc_weight: factor of the structure term; 1 in the paper.
         structure: `ncc` or `contrast`.
         variance_constant: c, variance below which a tile counts as flat; SSIM's by default. NCC's floor is c / 2.
         gate: scale the term by the gate.
     """
 
     epsilon: float = 1e-3
-    ncc_weight: float = 0.2
+    ncc_weight: float = 0.4
     structure: str = "ncc"
     variance_constant: float = STRUCTURE_CONSTANT
     gate: bool = False
