@@ -84,7 +84,9 @@ class ErrorDrivenDensity:
         max_gaussians: never more than this; an initial model that has more is cut to it at the first event, easiest
             first, those of `spare_beyond` last. 0: no cap.
         prune_opacity: less opaque ones are pruned.
-        prune_world_size: pruned where the largest standard deviation exceeds this * scene extent. 0: off.
+        prune_world_size: pruned where the largest standard deviation exceeds this * `prune_world_reference`. 0: off.
+        prune_world_reference: the scene extent, as in 3DGS (`extent`); or, for what is farther than that from the
+            cameras' centre, its distance from there (`distance`): nothing is then too large for being far.
         prune_screen_size: pruned where the screen radius exceeds this * the larger side of the image. 0: off, as in
             3DGS in effect.
         prune_size_from: both size rules begin at this progress; 3DGS has 3000 / 15000.
@@ -117,6 +119,7 @@ class ErrorDrivenDensity:
     max_gaussians: int = 0
     prune_opacity: float = 0.005
     prune_world_size: float = 0.1
+    prune_world_reference: Literal["extent", "distance"] = "extent"
     prune_screen_size: float = 0.0
     prune_size_from: float = 0.2
     prune_score_fraction: float = 0.0
@@ -131,7 +134,12 @@ class ErrorDrivenDensity:
     _stats: GaussianStats | None = field(init=False, repr=False, default=None)
 
     def __post_init__(self) -> None:
-        choices = {"score": ("balanced", "raw"), "split": ("sample", "long_axis"), "growth": ("threshold", "budget")}
+        choices = {
+            "score": ("balanced", "raw"),
+            "split": ("sample", "long_axis"),
+            "growth": ("threshold", "budget"),
+            "prune_world_reference": ("extent", "distance"),
+        }
         for name, allowed in choices.items():
             require(getattr(self, name) in allowed, name, getattr(self, name), f"one of {', '.join(allowed)}")
         for name in ("refine_every", "final_every"):
@@ -257,7 +265,7 @@ class ErrorDrivenDensity:
         big = torch.zeros_like(seen)
         if step.progress >= self.prune_size_from:
             if self.prune_world_size > 0:
-                big |= largest > self.prune_world_size * extent
+                big |= largest > self.prune_world_size * self._world_reference(gaussians, extent)
             if self.prune_screen_size > 0:
                 big |= stats.max_radii > self.prune_screen_size
         pruned = leave_one((hopeless | (big & ~(candidates & ~small))) & ~spared, gaussians)
@@ -273,6 +281,12 @@ class ErrorDrivenDensity:
             if excess > 0:  # then nothing was chosen
                 pruned = pruned | self._easiest(score, seen, ~pruned, spared, excess)
         return self._compose(gaussians, candidates & small, candidates & ~small, pruned, spared, step)
+
+    def _world_reference(self, gaussians: Gaussians, extent: float) -> Tensor | float:
+        """[N], or the same for all: what `prune_world_size` is a share of."""
+        if self.prune_world_reference == "extent":
+            return extent
+        return gaussians.means.norm(dim=-1).clamp(min=extent)
 
     def _spared(self, gaussians: Gaussians, finite: Tensor, extent: float) -> Tensor:
         """[N] bool: the finite ones that lie beyond `spare_beyond`."""

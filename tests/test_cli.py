@@ -1,5 +1,6 @@
 """The command line: bad input is one line on stderr, exit code 2, and nothing written."""
 
+import os
 import re
 import shutil
 import signal
@@ -199,7 +200,7 @@ def test_an_output_folder_that_cannot_be_made_is_refused_before_anything_is_comp
 
 @pytest.mark.parametrize("error", [OSError(28, "No space left on device"), PermissionError(13, "Denied", "/place")])
 def test_what_the_system_refuses_is_one_line(turbogs, tmp_path, monkeypatch, error):
-    def refused(path):
+    def refused(path, horizon):
         raise error
 
     monkeypatch.setattr(scene, "write_demo_capture", refused)
@@ -374,3 +375,12 @@ def test_a_run_that_cannot_go_on_is_one_line_and_exit_code_1(turbogs, capture, t
     code, out, err = turbogs("train", capture, "--out", tmp_path / "run", "--device", "cpu", *QUICK)
     errors = [line for line in err.splitlines() if line.startswith("turbogs: error:")]
     assert code == 1 and out == "" and len(errors) == 1 and "not finite" in errors[0]
+
+
+def test_a_reader_that_stops_early_is_no_error():
+    reader, writer = os.pipe()
+    os.close(reader)
+    command = [sys.executable, "-m", "turbogs_plugin.cli", "doctor"]
+    ended = subprocess.run(command, stdout=writer, stderr=subprocess.PIPE, text=True, check=False)
+    os.close(writer)
+    assert (ended.returncode, ended.stderr) == (141, "")

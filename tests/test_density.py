@@ -84,6 +84,7 @@ def test_scores_equal_the_equation(kind, iteration):
         {"top_fraction": 0.8, "prune_score_fraction": 0.1, "score": "raw"},
         {"prune_world_size": 0.02, "prune_screen_size": 0.15, "prune_opacity": 0.3},
         {"prune_world_size": 0.02, "prune_screen_size": 0.15, "prune_size_from": 0.9},  # not yet
+        {"prune_world_size": 0.02, "prune_world_reference": "distance"},
         {"max_gaussians": 220},
         {"max_gaussians": 150},
         {"growth": "budget", "target_gaussians": 260},
@@ -103,7 +104,7 @@ def test_event_equals_plain_loops(seed, config):
     ranked = sorted(score[i] for i in range(count) if seen[i])
     easy_limit = ranked[math.floor(density.prune_score_fraction * len(ranked) + 1e-6)]
     hard_limit = ranked[math.floor((1 - density.top_fraction) * len(ranked) + 1e-6)]
-    clones, splits, prunes, huge = set(), set(), set(), set()
+    clones, splits, prunes, huge, spared_by_distance = set(), set(), set(), set(), False
     for i in range(count):
         views = max(1.0, float(stats.view_counts[i]))
         largest = math.exp(float(gaussians.scales[i].max()))
@@ -111,8 +112,12 @@ def test_event_equals_plain_loops(seed, config):
         passes = float(stats.grad_sums[i]) / views > 2e-4 or float(stats.absgrad_sums[i]) / views > 4e-4
         transparent = 1 / (1 + math.exp(-float(gaussians.opacities[i]))) < density.prune_opacity
         easy = density.prune_score_fraction > 0 and seen[i] and score[i] < easy_limit
+        reference = 2.0
+        if density.prune_world_reference == "distance":
+            reference = max(reference, math.dist(gaussians.means[i], (0, 0, 0)))
+            spared_by_distance |= density.prune_world_size * 2.0 < largest <= density.prune_world_size * reference
         if FULL.progress >= density.prune_size_from and (
-            largest > density.prune_world_size * 2.0
+            largest > density.prune_world_size * reference
             or (density.prune_screen_size and stats.max_radii[i] > density.prune_screen_size)
         ):
             huge.add(i)
@@ -124,6 +129,7 @@ def test_event_equals_plain_loops(seed, config):
             prunes.add(i)
         elif passes and seen[i] and score[i] >= hard_limit:
             clones.add(i)
+    assert spared_by_distance == (density.prune_world_reference == "distance")  # or the case shows nothing
     limits = [density.max_gaussians] if density.max_gaussians else []
     if density.growth == "budget":
         limits.append(math.floor(count + (density.target_gaussians - count) * (1200 - 200) / (3500 - 200)))

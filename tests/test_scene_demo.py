@@ -32,6 +32,15 @@ def test_points_lie_where_photos_have_their_colour(capture):
     assert (seen - scene.point_colors[shown] / 255).abs().mean(dim=1).median() < 0.05
 
 
+def test_with_a_horizon_it_is_seen_as_far_as_the_sky(tmp_path, capture):
+    folder = write_demo_capture(tmp_path / "outdoors", views=12, width=80, height=60, horizon=True)
+    scene = load_scene(folder)
+    distances = scene.points.norm(dim=1) / scene.extent
+    assert (distances < 1).float().mean() > 0.2 and (distances > 10).sum() > 20
+    assert all((scene.train.photos.image(view).sum(dim=-1) > 0).all() for view in range(len(scene.train)))  # no black
+    assert (load_scene(capture).points.norm(dim=1) / scene.extent).max() < 2
+
+
 def test_tracks_are_consistent(capture):
     model = pycolmap.Reconstruction(capture / "sparse/0")
     assert model.compute_mean_track_length() > 3

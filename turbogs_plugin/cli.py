@@ -13,7 +13,8 @@ from typing import Annotated, Literal
 import tyro
 from tyro.conf import Positional, UseAppendAction, arg
 
-from turbogs_plugin.errors import InputError, TrainingStopped
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.exit_codes import exit_code
 
 app = tyro.extras.SubcommandApp()
 
@@ -307,15 +308,16 @@ def bench(
 
 
 @app.command
-def demo(path: Positional[Path], /) -> int:
+def demo(path: Positional[Path], /, horizon: bool = False) -> int:
     """Write a small synthetic capture to try things on: a textured scene as a COLMAP dataset.
 
     Args:
         path: new folder.
+        horizon: a scene outdoors, seen as far as the sky.
     """
     from turbogs_plugin.scene import write_demo_capture
 
-    print(f"capture  {write_demo_capture(path)}")
+    print(f"capture  {write_demo_capture(path, horizon=horizon)}")
     return 0
 
 
@@ -392,24 +394,9 @@ def _gathered(arguments: list[str]) -> list[str]:
 
 
 def main() -> None:
-    """The `turbogs` command. Exit codes: 2 bad input, 1 a run that could not go on, 128 + n stopped by signal n."""
-    try:
-        code = app.cli(
-            prog="turbogs",
-            description="TurboGS: train 3D Gaussian Splatting on few, well chosen pixels.",
-            args=_gathered(sys.argv[1:]),
-        )
-    except (InputError, TrainingStopped) as error:
-        print(f"turbogs: error: {' '.join(str(error).split())}", file=sys.stderr)
-        code = 2 if isinstance(error, InputError) else 1
-    except OSError as error:
-        place = "" if error.filename is None else f"'{error.filename}': "
-        print(f"turbogs: error: {place}{error.strerror or error}; choose another place or make room", file=sys.stderr)
-        code = 2
-    except KeyboardInterrupt:
-        print("turbogs: interrupted", file=sys.stderr)
-        code = 130
-    sys.exit(code)
+    """The `turbogs` command."""
+    description = "TurboGS: train 3D Gaussian Splatting on few, well chosen pixels."
+    sys.exit(exit_code(lambda: app.cli(prog="turbogs", description=description, args=_gathered(sys.argv[1:]))))
 
 
 if __name__ == "__main__":

@@ -30,6 +30,10 @@ RAYS_PER_SIDE = 3
 LIGHT = np.array([0.45, -0.25, 0.86], dtype=np.float32)
 AMBIENT = 0.55
 ORBIT_RADIUS, ORBIT_HEIGHT, ORBIT_SWING = 3.6, 1.9, 0.5
+LOOK_AT, LOOK_AT_WITH_HORIZON = 0.25, 1.3
+"""Height of what the cameras look at."""
+HORIZON, SKY, HOUSES = 55.0, 60.0, 40
+"""Radii of the ground and the sky, and how many solids stand in between."""
 FOCAL = 1.15
 """Focal length in image widths: 47 degrees across."""
 POINT_NOISE = 0.004
@@ -142,6 +146,41 @@ def demo_solids(random: np.random.Generator) -> list[Solid]:
     ]
 
 
+def sky(radius: float, **placed) -> Solid:
+    """A sphere seen from inside, as bright everywhere."""
+
+    def intersect(origin: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        along = directions @ origin
+        return np.sqrt(along**2 - (origin @ origin - radius**2)) - along
+
+    return Solid(intersect, lambda points: np.broadcast_to(LIGHT, points.shape), **placed)
+
+
+def horizon_solids(random: np.random.Generator) -> list[Solid]:
+    """What is around the table: ground, sky, and boxes and spheres from 2 to 12 camera distances away."""
+    random = np.random.default_rng(random.integers(1 << 32))
+    grass, shades = (
+        noise(size, np.float32(first), np.float32(second), random)
+        for size, first, second in ((1.0, (0.2, 0.35, 0.1), (0.45, 0.55, 0.25)), (8.0, (-0.1,) * 3, (0.1,) * 3))
+    )
+    clouds = noise(30.0, np.float32((0.55, 0.7, 0.95)), np.float32((0.9, 0.92, 0.95)), random)
+    origin = np.zeros(3, dtype=np.float32)
+    below = np.array([0, 0, -0.02], dtype=np.float32)
+    solids = [
+        disc(HORIZON, texture=lambda points: np.clip(grass(points) + shades(points), 0, 1), position=below),
+        sky(SKY, texture=clouds, position=origin),
+    ]
+    for number in range(HOUSES):
+        distance, angle = random.uniform(1.7, 12.5) * ORBIT_RADIUS, random.uniform(0, 2 * np.pi)
+        height = random.uniform(0.06, 0.16) * distance
+        first, second = random.uniform(0.1, 0.95, (2, 3)).astype(np.float32)
+        texture = checker(0.25 * height, first, second) if number % 3 else noise(0.8 * height, first, second, random)
+        position = np.array([distance * np.cos(angle), distance * np.sin(angle), height], dtype=np.float32)
+        placed = {"texture": texture, "position": position, "turn": float(random.uniform(0, np.pi))}
+        solids.append(box((0.6 * height, 0.5 * height, height), **placed) if number % 2 else sphere(height, **placed))
+    return solids
+
+
 def cast(solids: list[Solid], origin: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """[R, 3] colours and [R] distances of what rays see; black at infinity where they see nothing."""
     nearest = np.full(len(directions), np.inf, dtype=np.float32)
@@ -159,12 +198,12 @@ def cast(solids: list[Solid], origin: np.ndarray, directions: np.ndarray) -> tup
     return colors, nearest
 
 
-def orbit_pose(angle: float) -> np.ndarray:
+def orbit_pose(angle: float, look_at: float = LOOK_AT) -> np.ndarray:
     """[3, 4] float64 world to camera, on a ring about the table that swings in height, looking at the middle."""
     center = np.array(
         [ORBIT_RADIUS * np.cos(angle), ORBIT_RADIUS * np.sin(angle), ORBIT_HEIGHT + ORBIT_SWING * np.sin(3 * angle)]
     )
-    forward = np.array([0.0, 0.0, 0.25]) - center
+    forward = np.array([0.0, 0.0, look_at]) - center
     forward /= np.linalg.norm(forward)
     right = np.cross(forward, [0.0, 0.0, 1.0])
     right /= np.linalg.norm(right)
@@ -172,10 +211,15 @@ def orbit_pose(angle: float) -> np.ndarray:
     return np.concatenate([rotation, -rotation @ center[:, None]], axis=1)
 
 
-def write_demo_capture(path: str | Path, seed: int = 0, views: int = 32, width: int = 160, height: int = 120) -> Path:
+def write_demo_capture(
+    path: str | Path, seed: int = 0, views: int = 32, width: int = 160, height: int = 120, horizon: bool = False
+) -> Path:
     """Write the demo capture to the new folder `path`: ``images/*.png`` and ``sparse/0``.
 
     The same arguments give the same pixels, cameras and points.
+
+    Args:
+        horizon: the table stands outdoors, and the cameras see as far as the sky.
 
     Raises:
         InputError: `path` is there already, or fewer than 3 views or an image without area are asked for.
@@ -187,19 +231,22 @@ def write_demo_capture(path: str | Path, seed: int = 0, views: int = 32, width: 
         raise InputError(f"the demo capture was asked for {views} views of {width}x{height}: at least 3 of 1x1 needed")
     partial = target.with_name(f"{target.name}.partial-{os.getpid()}")
     try:
-        _write(partial, np.random.default_rng(seed), views, width, height)
+        _write(partial, np.random.default_rng(seed), views, width, height, horizon)
         os.replace(partial, target)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
     return target
 
 
-def _write(folder: Path, random: np.random.Generator, views: int, width: int, height: int) -> None:
+def _write(folder: Path, random: np.random.Generator, views: int, width: int, height: int, horizon: bool) -> None:
     solids = demo_solids(random)
+    if horizon:
+        solids += horizon_solids(random)
+    look_at = LOOK_AT_WITH_HORIZON if horizon else LOOK_AT
     (folder / "images").mkdir(parents=True)
     (folder / "sparse" / "0").mkdir(parents=True)
     focal = FOCAL * width
-    poses = np.stack([orbit_pose(2 * np.pi * view / views) for view in range(views)])  # [V, 3, 4]
+    poses = np.stack([orbit_pose(2 * np.pi * view / views, look_at) for view in range(views)])  # [V, 3, 4]
     side = RAYS_PER_SIDE
     x, y = np.meshgrid((np.arange(width * side) + 0.5) / side, (np.arange(height * side) + 0.5) / side)
     rays = np.stack([(x - width / 2) / focal, (y - height / 2) / focal, np.ones_like(x)], axis=-1)
