@@ -80,17 +80,35 @@ def test_colors(case, steady):
     ("of_all", "bound"),
     [
         pytest.param(False, GRADIENT_BOUND, id="of steady samples"),
-        # A few samples decided otherwise are more than 1e-3 of a gradient: of 24 models, 10 were beyond it, by up to
-        # 4.6e-3, and 9 of the reference in float32, by up to 7e-3. Of steady samples, all 24 were within.
-        pytest.param(True, 1e-2, id="of all samples"),
+        pytest.param(True, 10 * GRADIENT_BOUND, id="of all samples"),
     ],
 )
 def test_gradients(case, steady, of_all, bound):
-    """On the screen and of every parameter, from gradients of the colors."""
     got = rasterize(case.gpu_gaussians, case.gpu_cameras, case.gpu_samples)
     wanted = rasterize_reference(case.gaussians, case.cameras, case.samples)
     values = upstream(case)
     values["color_gradients"][~(steady | of_all)] = 0.0
+    assert_all_gradients_close(case, got, wanted, values, bound)
+
+
+@pytest.mark.xfail(
+    strict=False,
+    reason="a few samples decided otherwise are more than 1e-3 of a gradient, and one pair of splats decides several "
+    "alike: of 24 models 10 fail here, and 9 of the reference in float32 (docs/results/h200)",
+)
+def test_all_samples_are_as_close_as_the_steady_ones(case):
+    """The bound that float32 keeps on some models only."""
+    got = rasterize(case.gpu_gaussians, case.gpu_cameras, case.gpu_samples)
+    wanted = rasterize_reference(case.gaussians, case.cameras, case.samples)
+    differences = got.colors.double().cpu() - wanted.colors
+    beyond = differences[differences.abs() > FORWARD_BOUND]
+    if len(beyond) >= 20:  # symmetric: neither draws more than the other
+        assert 0.2 <= (beyond > 0).double().mean() <= 0.8
+    assert_all_gradients_close(case, got, wanted, upstream(case), GRADIENT_BOUND)
+
+
+def assert_all_gradients_close(case, got, wanted, values, bound):
+    """On the screen and of every parameter, from gradients of the colors."""
     del values["depth_gradients"], values["alpha_gradients"]
     stats = GaussianStats.zeros(len(case.gaussians), "cuda")
     wanted_stats = GaussianStats.zeros(len(case.gaussians), "cpu").map(torch.Tensor.double)
