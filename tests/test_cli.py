@@ -384,3 +384,10 @@ def test_a_reader_that_stops_early_is_no_error():
     ended = subprocess.run(command, stdout=writer, stderr=subprocess.PIPE, text=True, check=False)
     os.close(writer)
     assert (ended.returncode, ended.stderr) == (141, "")
+
+
+def test_the_demo_has_a_horizon_where_it_is_asked_for(turbogs, tmp_path, monkeypatch):
+    asked = []
+    monkeypatch.setattr(scene, "write_demo_capture", lambda path, horizon: asked.append(horizon) or path)
+    assert turbogs("demo", tmp_path / "in")[0] == turbogs("demo", tmp_path / "out", "--horizon")[0] == 0
+    assert asked == [False, True]
