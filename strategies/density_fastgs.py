@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
@@ -11,7 +10,7 @@ from torch import Tensor
 from turbogs_plugin.strategies.density import ErrorDrivenDensity
 from turbogs_plugin.strategies.density_rows import finite_rows, leave_one, loaded_rows
 
-from turbogs_plugin.errors import require
+from turbogs_plugin.errors import require, require_not_negative
 from turbogs_plugin.types import Gaussians, GaussianStats, RowUpdate, Step
 
 
@@ -88,8 +87,7 @@ class FastGsDensity:
 
     def __post_init__(self) -> None:
         require(self.prune_every >= 1, "prune_every", self.prune_every, "at least 1")
-        valid = math.isfinite(self.error_threshold) and self.error_threshold >= 0
-        require(valid, "error_threshold", self.error_threshold, "a finite number >= 0")
+        require_not_negative(self, "error_threshold")
         for name in ("consistency", "blame_threshold"):
             require(0 < getattr(self, name) <= 1, name, getattr(self, name), "more than 0 and at most 1")
         # Carries the events out; which Gaussians may be densified is said by the gradients it is shown.

@@ -18,7 +18,7 @@ from omegaconf import OmegaConf
 
 from turbogs_plugin import registry
 from turbogs_plugin.amounts import parse_bytes, parse_seconds
-from turbogs_plugin.errors import InputError, require
+from turbogs_plugin.errors import InputError, require, require_not_negative
 from turbogs_plugin.rendering.rendered import RasterSettings
 from turbogs_plugin.schema import build_dataclass, dataclass_mapping, nearest
 from turbogs_plugin.yaml_text import parse_yaml, read_yaml
@@ -92,7 +92,7 @@ class TrainConfig:
         require(self.sh_interval >= 1, "sh_interval", self.sh_interval, "at least 1")
         require(0 < self.initial_opacity < 1, "initial_opacity", self.initial_opacity, "more than 0 and less than 1")
         require(0 < self.initial_size <= 100, "initial_size", self.initial_size, "more than 0 and at most 100")
-        require(0 <= self.distant_size < math.inf, "distant_size", self.distant_size, "a finite number >= 0")
+        require_not_negative(self, "distant_size")
         for value in self.evaluate_at:
             require(0 < value <= 1, "evaluate_at", value, "fractions within (0, 1]")
         require(self.checkpoint_every >= 0, "checkpoint_every", self.checkpoint_every, "at least 0")
