@@ -5,7 +5,7 @@ from __future__ import annotations
 import tyro
 from gsplat_host import demo_scene, report, train
 from sparse_pixels import SparseForward
-from turbogs_plugin.strategies.moment_lm import MomentLMOptimizer
+from turbogs_plugin.strategies.optimizers.moment_lm import MomentLMOptimizer
 
 from turbogs_plugin.gsplat_bridge import SharedOptimizer, TurboDensityStrategy
 from turbogs_plugin.scene import load_scene

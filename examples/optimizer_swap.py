@@ -6,8 +6,8 @@ import torch
 import tyro
 from gsplat import DefaultStrategy
 from gsplat_host import demo_scene, l1_of_images_with_errors, report, train
-from turbogs_plugin.strategies.adam import SparseAdam
-from turbogs_plugin.strategies.moment_lm import MomentLMOptimizer
+from turbogs_plugin.strategies.optimizers.moment_lm import MomentLMOptimizer
+from turbogs_plugin.strategies.optimizers.sparse_adam import SparseAdam
 
 from turbogs_plugin.gsplat_bridge import SharedOptimizer, TurboDensityStrategy
 from turbogs_plugin.scene import load_scene

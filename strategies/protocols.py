@@ -12,8 +12,8 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from torch import Tensor
 
+from turbogs_plugin.engine.rendered import ScreenGradients
 from turbogs_plugin.error_maps import ErrorMaps
-from turbogs_plugin.rendering.rendered import ScreenGradients
 from turbogs_plugin.types import (
     Cameras,
     Gaussians,

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 import torch
-from turbogs_plugin.strategies.philox import MASK, PURPOSE_STACK, PURPOSE_VIEWS, philox4x32
 
+from turbogs_plugin.engine.reference.philox import MASK, PURPOSE_STACK, PURPOSE_VIEWS, philox4x32
 from turbogs_plugin.errors import require
 from turbogs_plugin.types import Cameras, Step
 

@@ -13,12 +13,13 @@ import numpy as np
 import pycolmap
 import pytest
 import torch
-from framework_runs import TINY, tiny_capture
+from helpers.framework_runs import TINY, tiny_capture
 from PIL import Image
 
-from turbogs_plugin import run, scene
-from turbogs_plugin.outputs import distinct_stems
-from turbogs_plugin.trainer import Trainer
+from turbogs_plugin import scene
+from turbogs_plugin.report.outputs import distinct_stems
+from turbogs_plugin.train import run
+from turbogs_plugin.train.trainer import Trainer
 
 QUICK = ("train.iterations=2", "train.sh_degree=0", "train.evaluate_at=[]")
 

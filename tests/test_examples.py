@@ -11,11 +11,11 @@ import pytest
 import tomllib
 import torch
 
-from turbogs_plugin import registry, run
-from turbogs_plugin.config import load_config
+from turbogs_plugin.config.configuration import load_config, registry
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.report.history import read_history
 from turbogs_plugin.scene import load_scene, write_demo_capture
+from turbogs_plugin.train import run
+from turbogs_plugin.train.history import read_history
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 PACKAGE = EXAMPLES / "third_party_strategy"

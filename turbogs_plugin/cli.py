@@ -62,7 +62,7 @@ def train(
         time_budget: seconds of training to end after: 20s, 2m (budget.time). The schedule is fitted to it, and
             the pixels of an iteration or the number of Gaussians.
     """
-    from turbogs_plugin import run
+    from turbogs_plugin.train import run
 
     budget = _budget(max_gaussians, max_memory, time_budget)
     if resume is not None:
@@ -99,7 +99,7 @@ def plan(
         max_memory: as in train.
         time_budget: as in train.
     """
-    from turbogs_plugin.run import plan_run
+    from turbogs_plugin.train.run import plan_run
 
     budget = _budget(max_gaussians, max_memory, time_budget)
     print(plan_run(_settings(scene, (*overrides, *budget), config, factor, device)).text())
@@ -114,7 +114,7 @@ def evaluate(run: Positional[Path], /, *, device: Device = "auto") -> int:
         run: folder of the run.
         device: where to render.
     """
-    from turbogs_plugin.outputs import evaluate_run
+    from turbogs_plugin.report.outputs import evaluate_run
 
     print(evaluate_run(run, device))
     return 0
@@ -129,7 +129,7 @@ def render(run: Positional[Path], /, *, split: Literal["test", "train"] = "test"
         split: which cameras.
         device: where to render.
     """
-    from turbogs_plugin.outputs import render_run
+    from turbogs_plugin.report.outputs import render_run
 
     print(f"renders  {render_run(run, split, device)}")
     return 0
@@ -153,7 +153,7 @@ def export(
         drop_bands: leave out the highest bands of spherical harmonics, as many as together have at most this share of
             the colours' energy, e.g. 1e-4.
     """
-    from turbogs_plugin.outputs import export_run
+    from turbogs_plugin.report.outputs import export_run
 
     print(f"model  {export_run(run, format, out, drop_bands)}")
     return 0
@@ -191,8 +191,8 @@ def ablate(
         merge: put these studies together in --out and write the report again, without training.
         device: where to train.
     """
-    from turbogs_plugin.ablation import commands
-    from turbogs_plugin.ablation.sweep import SweepOptions
+    from turbogs_plugin.study import commands
+    from turbogs_plugin.study.sweep import SweepOptions
 
     _require_positive("--psnr", psnr)
     ablations = [text for text in names if "=" not in text]
@@ -224,7 +224,7 @@ def compare(
         out: new folder for the report.
         psnr: test PSNRs whose time is asked for; from the first run's result where absent.
     """
-    from turbogs_plugin.ablation import commands
+    from turbogs_plugin.study import commands
 
     if not runs:
         raise InputError("compare needs RUN RUN ...: folders of runs")
@@ -279,7 +279,7 @@ def bench(
     from turbogs_plugin.bench.models import TRAINING_ITERATIONS
     from turbogs_plugin.bench.raster import RasterBench
     from turbogs_plugin.bench.step import StepBench
-    from turbogs_plugin.run import resolve_device
+    from turbogs_plugin.train.run import resolve_device
 
     for name, values in (("gaussians", gaussians), ("views", views), ("repeats", (repeats,)), ("size", size)):
         if not values or min(values) < 1:
@@ -353,7 +353,7 @@ def _require_positive(option: str, values: Sequence[float], most: float = math.i
 
 def _settings(scene: Path, overrides: tuple[str, ...], config: str | None, factor: int | None, device: Device | None):
     """The configuration that a command line asks for."""
-    from turbogs_plugin.config import DEFAULT_CONFIG, load_config
+    from turbogs_plugin.config.configuration import DEFAULT_CONFIG, load_config
 
     if any(override.partition("=")[0].strip() == "scene.path" for override in overrides):
         raise InputError(f"scene.path is '{scene}', as SCENE says: leave the override out")
@@ -368,7 +368,7 @@ def _settings(scene: Path, overrides: tuple[str, ...], config: str | None, facto
 
 def _tell(outcome) -> int:
     """Print how a training call ended; its exit code."""
-    from turbogs_plugin.outputs import history_table
+    from turbogs_plugin.report.outputs import history_table
 
     folder = outcome.folder
     if outcome.signal is not None:

@@ -49,7 +49,7 @@ def _driver() -> str:
 
 
 def _kernels() -> tuple[str, list[str]]:
-    from turbogs_plugin import kernels
+    from turbogs_plugin.engine.cuda import library as kernels
 
     if kernels.available():
         return f"loaded from {kernels.library_path()}, for {', '.join(kernels.architectures())}", []

@@ -13,14 +13,14 @@ from pathlib import Path
 import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
-from framework_runs import tiny_capture, tiny_config
-from raster_cases import samples_to
-from rendering_scenes import make_cameras, make_gaussians
+from helpers.framework_runs import tiny_capture, tiny_config
+from helpers.raster_cases import samples_to
+from helpers.rendering_scenes import make_cameras, make_gaussians
 from test_raster_sorting import stacked_case, wide_case
 
-from turbogs_plugin.rendering import dense_samples, rasterize, rasterize_differentiable
+from turbogs_plugin.engine.rendering import dense_samples, rasterize, rasterize_differentiable
 from turbogs_plugin.scene import load_scene, write_demo_capture
-from turbogs_plugin.trainer import Trainer
+from turbogs_plugin.train.trainer import Trainer
 from turbogs_plugin.types import GaussianStats
 
 DEVICE = "cuda"

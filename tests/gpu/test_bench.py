@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 import torch
-from framework_runs import tiny_capture
+from helpers.framework_runs import tiny_capture
 
-from turbogs_plugin import kernels
-from turbogs_plugin.ablation.cell import scene_on
 from turbogs_plugin.bench.raster import STAGES, RasterBench
 from turbogs_plugin.bench.step import StepBench
+from turbogs_plugin.engine.cuda import library as kernels
 from turbogs_plugin.scene import load_scene
+from turbogs_plugin.study.cell import scene_on
 
 pytestmark = [
     pytest.mark.gpu,

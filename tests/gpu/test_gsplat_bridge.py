@@ -11,16 +11,16 @@ from pathlib import Path
 import gsplat.strategy.default
 import pytest
 import torch
-from bridge_host import HEIGHT, RATES, WIDTH, arguments, make_cameras, make_splats
 from gsplat import DefaultStrategy, MCMCStrategy, rasterization
-from raster_cases import GPU_ONLY
-from turbogs_plugin.strategies.adam import SparseAdam
-from turbogs_plugin.strategies.density_mcmc import GsplatMcmcDensity
-from turbogs_plugin.strategies.moment_lm import MomentLMOptimizer
+from helpers.bridge_host import HEIGHT, RATES, WIDTH, arguments, make_cameras, make_splats
+from helpers.raster_cases import GPU_ONLY
+from turbogs_plugin.strategies.density.mcmc import GsplatMcmcDensity
+from turbogs_plugin.strategies.optimizers.moment_lm import MomentLMOptimizer
+from turbogs_plugin.strategies.optimizers.sparse_adam import SparseAdam
 
+from turbogs_plugin.engine.rendering import dense_samples
 from turbogs_plugin.gsplat_bridge import SharedOptimizer, TurboDensityStrategy, sparse_rasterization
 from turbogs_plugin.gsplat_bridge.gaussian_errors import iteration_stats, loss_shares
-from turbogs_plugin.rendering import dense_samples
 from turbogs_plugin.scene import load_scene
 from turbogs_plugin.types import PARAMETER_NAMES, Gaussians, GaussianStats, Step
 

@@ -6,15 +6,16 @@ import gc
 import pytest
 import torch
 
-from turbogs_plugin import calibration, kernels
 from turbogs_plugin.bench.large_capture import synthetic_scene
-from turbogs_plugin.config import Config, load_config
+from turbogs_plugin.config.configuration import Config, load_config
+from turbogs_plugin.engine.cuda import library as kernels
 from turbogs_plugin.error_maps import AGE_MAX
-from turbogs_plugin.evaluation import evaluate
-from turbogs_plugin.offload import place_views
 from turbogs_plugin.plan import make_plan
 from turbogs_plugin.scene import Scene
-from turbogs_plugin.trainer import Trainer
+from turbogs_plugin.scene.offload import place_views
+from turbogs_plugin.train import calibration
+from turbogs_plugin.train.evaluate import evaluate
+from turbogs_plugin.train.trainer import Trainer
 
 pytestmark = [
     pytest.mark.gpu,

@@ -5,12 +5,14 @@ from dataclasses import replace
 
 import pytest
 import torch
-from raster_cases import GPU_ONLY, make_case, on_gpu, samples_to, upstream
+from helpers.raster_cases import GPU_ONLY, make_case, on_gpu, samples_to, upstream
 
+from turbogs_plugin.engine.cuda import raster as cuda
+from turbogs_plugin.engine.cuda import workspace
+from turbogs_plugin.engine.cuda.workspace import Workspace
+from turbogs_plugin.engine.reference.projection import SPAN_MAX
+from turbogs_plugin.engine.rendering import rasterize_reference
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.rendering import cuda, rasterize_reference, workspace
-from turbogs_plugin.rendering.projection import SPAN_MAX
-from turbogs_plugin.rendering.workspace import Workspace
 from turbogs_plugin.types import PARAMETER_NAMES
 
 pytestmark = GPU_ONLY

@@ -3,11 +3,12 @@
 import gsplat
 import pytest
 import torch
-from raster_cases import GPU_ONLY, assert_gradients_close, make_case
-from rendering_scenes import thin_out
+from helpers.raster_cases import GPU_ONLY, assert_gradients_close, make_case
+from helpers.rendering_scenes import thin_out
 
-from turbogs_plugin.rendering import cuda, dense_samples
-from turbogs_plugin.rendering.cuda_autograd import rasterize_differentiable_cuda
+from turbogs_plugin.engine.cuda import raster as cuda
+from turbogs_plugin.engine.cuda.autograd import rasterize_differentiable_cuda
+from turbogs_plugin.engine.rendering import dense_samples
 
 pytestmark = GPU_ONLY
 SIZE = (250, 170)

@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from raster_cases import (
+from helpers.raster_cases import (
     GPU_ONLY,
     RECORD_COLUMNS,
     assert_forward_close,
@@ -12,9 +12,10 @@ from raster_cases import (
     upstream,
 )
 
-from turbogs_plugin.rendering import cuda, rasterize_reference
-from turbogs_plugin.rendering import rasterize_differentiable as differentiable_reference
-from turbogs_plugin.rendering.cuda_autograd import rasterize_differentiable_cuda
+from turbogs_plugin.engine.cuda import raster as cuda
+from turbogs_plugin.engine.cuda.autograd import rasterize_differentiable_cuda
+from turbogs_plugin.engine.rendering import rasterize_differentiable as differentiable_reference
+from turbogs_plugin.engine.rendering import rasterize_reference
 from turbogs_plugin.types import GaussianStats
 
 pytestmark = GPU_ONLY

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from raster_cases import (
+from helpers.raster_cases import (
     FORWARD_BOUND,
     GPU_ONLY,
     GRADIENT_BOUND,
@@ -23,10 +23,10 @@ from raster_cases import (
 )
 
 from turbogs_plugin.bench.models import tile_samples, train
-from turbogs_plugin.config import load_config
-from turbogs_plugin.rendering import rasterize, rasterize_reference
+from turbogs_plugin.config.configuration import load_config
+from turbogs_plugin.engine.rendering import rasterize, rasterize_reference
 from turbogs_plugin.scene import load_scene
-from turbogs_plugin.trainer import Trainer
+from turbogs_plugin.train.trainer import Trainer
 from turbogs_plugin.types import GaussianStats
 
 pytestmark = GPU_ONLY

@@ -5,10 +5,11 @@ from itertools import pairwise
 
 import pytest
 import torch
-from raster_cases import GPU_ONLY, make_case, samples_to
-from rendering_scenes import make_cameras, make_gaussians
+from helpers.raster_cases import GPU_ONLY, make_case, samples_to
+from helpers.rendering_scenes import make_cameras, make_gaussians
 
-from turbogs_plugin.rendering import cuda, dense_samples
+from turbogs_plugin.engine.cuda import raster as cuda
+from turbogs_plugin.engine.rendering import dense_samples
 
 pytestmark = GPU_ONLY
 

@@ -5,18 +5,18 @@ import math
 
 import pytest
 import torch
-from framework_runs import assert_iterations_wait_for_nothing, tiny_capture, tiny_config
-from helpers_optim import make_gaussians as optimizer_gaussians
-from raster_cases import FORWARD_BOUND, GPU_ONLY, GRADIENT_BOUND
-from raster_extremes import CASES, NAMES, TWO_VIEWS, assert_within, compare, random_scene, render
-from tolerances import TOLERANCES
-from turbogs_plugin.strategies.density import ErrorDrivenDensity
+from helpers.framework_runs import assert_iterations_wait_for_nothing, tiny_capture, tiny_config
+from helpers.optimizers import make_gaussians as optimizer_gaussians
+from helpers.raster_cases import FORWARD_BOUND, GPU_ONLY, GRADIENT_BOUND
+from helpers.raster_extremes import CASES, NAMES, TWO_VIEWS, assert_within, compare, random_scene, render
+from helpers.tolerances import TOLERANCES
+from turbogs_plugin.strategies.density.error_driven import ErrorDrivenDensity
 
+from turbogs_plugin.engine.rendering import dense_samples, rasterize
 from turbogs_plugin.errors import TrainingStopped
-from turbogs_plugin.rendering import dense_samples, rasterize
-from turbogs_plugin.run import train
 from turbogs_plugin.scene import load_scene
-from turbogs_plugin.trainer import Trainer
+from turbogs_plugin.train.run import train
+from turbogs_plugin.train.trainer import Trainer
 from turbogs_plugin.types import GaussianStats, Step
 
 pytestmark = GPU_ONLY

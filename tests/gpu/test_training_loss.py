@@ -3,12 +3,13 @@
 import numpy as np
 import pytest
 import torch
-from turbogs_plugin.strategies.loss import CharbonnierLoss, CharbonnierNccLoss, SparseSsimLoss
-from turbogs_plugin.strategies.pixel_draws import DrawRule, draw_pixels
+from turbogs_plugin.strategies.losses.losses import CharbonnierLoss, CharbonnierNccLoss, SparseSsimLoss
 
-from turbogs_plugin import kernels, training_kernels
+from turbogs_plugin.engine.cuda import library as kernels
+from turbogs_plugin.engine.cuda import training as training_kernels
+from turbogs_plugin.engine.cuda.training import LossTerms, MapUpdate
+from turbogs_plugin.engine.reference.draws import DrawRule, draw_pixels
 from turbogs_plugin.error_maps import ErrorMaps
-from turbogs_plugin.training_kernels import LossTerms, MapUpdate
 from turbogs_plugin.types import PixelSamples, Step
 
 pytestmark = [

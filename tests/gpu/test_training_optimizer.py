@@ -5,18 +5,19 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 import torch
-from rendering_scenes import make_cameras, make_gaussians
-from turbogs_plugin.strategies.adam import SparseAdam
+from helpers.rendering_scenes import make_cameras, make_gaussians
 from turbogs_plugin.strategies.learning_rates import LearningRates
-from turbogs_plugin.strategies.moment_lm import MomentLMOptimizer
+from turbogs_plugin.strategies.optimizers.moment_lm import MomentLMOptimizer
+from turbogs_plugin.strategies.optimizers.sparse_adam import SparseAdam
 
-from turbogs_plugin import kernels, training_kernels
+from turbogs_plugin.engine.cuda import library as kernels
+from turbogs_plugin.engine.cuda import raster as cuda
+from turbogs_plugin.engine.cuda import training as training_kernels
+from turbogs_plugin.engine.cuda.raster import CudaScreenGradients
+from turbogs_plugin.engine.reference.projection import drawable_rows, project_rows
+from turbogs_plugin.engine.reference.raster import ROW_PARAMETERS, ReferenceScreenGradients
+from turbogs_plugin.engine.rendered import DEFAULT_SETTINGS
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.rendering import cuda
-from turbogs_plugin.rendering.cuda import CudaScreenGradients
-from turbogs_plugin.rendering.projection import drawable_rows, project_rows
-from turbogs_plugin.rendering.reference import ROW_PARAMETERS, ReferenceScreenGradients
-from turbogs_plugin.rendering.rendered import DEFAULT_SETTINGS
 from turbogs_plugin.types import Cameras, GaussianGradients, Gaussians, GaussianStats, PixelSamples, Step
 
 pytestmark = [

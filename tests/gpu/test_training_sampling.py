@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 import torch
-from turbogs_plugin.strategies.philox import PURPOSE_PIXELS, exponentials, random_words
-from turbogs_plugin.strategies.pixel_draws import WEIGHT_FLOOR, DrawRule, draw_pixels
 
-from turbogs_plugin import kernels, training_kernels
+from turbogs_plugin.engine.cuda import library as kernels
+from turbogs_plugin.engine.cuda import training as training_kernels
+from turbogs_plugin.engine.reference.draws import WEIGHT_FLOOR, DrawRule, draw_pixels
+from turbogs_plugin.engine.reference.philox import PURPOSE_PIXELS, exponentials, random_words
 
 pytestmark = [
     pytest.mark.gpu,

@@ -12,12 +12,12 @@ import pytest
 import torch
 from gsplat.cuda._torch_impl import _quat_scale_to_covar_preci
 from gsplat.strategy import ops
-from helpers_optim import all_finite, clone, equal, fill, make_gaussians, random_stats
+from helpers.optimizers import all_finite, clone, equal, fill, make_gaussians, random_stats
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from turbogs_plugin.strategies.density_fastgs import FastGsDensity
-from turbogs_plugin.strategies.density_gsplat import GsplatDefaultDensity
-from turbogs_plugin.strategies.density_mcmc import GsplatMcmcDensity
+from turbogs_plugin.strategies.density.fastgs import FastGsDensity
+from turbogs_plugin.strategies.density.gsplat_default import GsplatDefaultDensity
+from turbogs_plugin.strategies.density.mcmc import GsplatMcmcDensity
 from turbogs_plugin.strategies.learning_rates import LearningRates
 
 from turbogs_plugin.types import PARAMETER_NAMES, Gaussians, GaussianStats, Step

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 import torch
-from helpers_optim import all_finite, make_gaussians
+from helpers.optimizers import all_finite, make_gaussians
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from turbogs_plugin.strategies.density import ErrorDrivenDensity
+from turbogs_plugin.strategies.density.error_driven import ErrorDrivenDensity
 
 from turbogs_plugin.types import Step
 

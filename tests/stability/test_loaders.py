@@ -14,14 +14,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from framework_runs import tiny_capture, tiny_config
+from helpers.framework_runs import tiny_capture, tiny_config
 
-from turbogs_plugin import run
-from turbogs_plugin.checkpoint import latest_checkpoint, load_checkpoint, save_checkpoint
-from turbogs_plugin.config import load_config
+from turbogs_plugin.config.configuration import load_config
+from turbogs_plugin.config.yaml_text import parse_yaml
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene import load_scene
-from turbogs_plugin.yaml_text import parse_yaml
+from turbogs_plugin.train import run
+from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint, save_checkpoint
 
 MEMORY = 64 * 2**20
 """Python and numpy may allocate this much for files of less than a megabyte."""

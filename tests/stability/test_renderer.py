@@ -5,12 +5,12 @@ from __future__ import annotations
 
 import pytest
 import torch
+from helpers.raster_extremes import CASES, NAMES, TWO_VIEWS, assert_within, compare, lens, random_scene, render
+from helpers.tolerances import TOLERANCES
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from raster_extremes import CASES, NAMES, TWO_VIEWS, assert_within, compare, lens, random_scene, render
-from tolerances import TOLERANCES
 
-from turbogs_plugin.rendering import dense_samples, rasterize
+from turbogs_plugin.engine.rendering import dense_samples, rasterize
 from turbogs_plugin.types import GaussianStats
 
 

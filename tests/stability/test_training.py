@@ -10,17 +10,17 @@ import numpy as np
 import pycolmap
 import pytest
 import torch
-from framework_runs import TINY, tiny_capture
+from helpers.framework_runs import TINY, tiny_capture
+from helpers.tolerances import PSNR_BOUND
 from PIL import Image
-from tolerances import PSNR_BOUND
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from turbogs_plugin import run
-from turbogs_plugin.checkpoint import latest_checkpoint, load_checkpoint
-from turbogs_plugin.config import Config, load_config
+from turbogs_plugin.config.configuration import Config, load_config
 from turbogs_plugin.errors import TrainingStopped
 from turbogs_plugin.scene import load_scene
-from turbogs_plugin.trainer import Trainer
+from turbogs_plugin.train import run
+from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint
+from turbogs_plugin.train.trainer import Trainer
 
 
 @pytest.fixture(scope="module")

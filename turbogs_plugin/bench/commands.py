@@ -11,16 +11,16 @@ from typing import Any
 
 import torch
 
-from turbogs_plugin import kernels
-from turbogs_plugin.ablation.cell import scene_on
 from turbogs_plugin.bench.large_capture import synthetic_scene
 from turbogs_plugin.bench.raster import RasterBench, other_build
 from turbogs_plugin.bench.step import StepBench
+from turbogs_plugin.engine.cuda import library as kernels
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.files import require_writable, write_text_atomically
-from turbogs_plugin.provenance import provenance
+from turbogs_plugin.report.provenance import provenance
 from turbogs_plugin.scene import load_scene
 from turbogs_plugin.scene.load import FEWEST_VIEWS
+from turbogs_plugin.study.cell import scene_on
 
 AGAIN = "this build, in a process of its own"
 """What other builds compare with: where the models were trained the same kernels take up to 10 % less or more."""

@@ -10,7 +10,7 @@ import math
 
 import torch
 
-from turbogs_plugin.rendering.cuda import CudaRendered
+from turbogs_plugin.engine.cuda.raster import CudaRendered
 from turbogs_plugin.types import PixelSamples
 
 FORWARD_INSTRUCTIONS, BACKWARD_INSTRUCTIONS = 23, 75

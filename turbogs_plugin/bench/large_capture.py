@@ -6,8 +6,8 @@ import numpy as np
 import torch
 
 from turbogs_plugin.bench.models import ring_cameras, surface_gaussians
-from turbogs_plugin.gaussians import SH_C0
-from turbogs_plugin.rendering import render_images
+from turbogs_plugin.engine.rendering import render_images
+from turbogs_plugin.model.gaussians import SH_C0
 from turbogs_plugin.scene import Frame, PosedImages, Scene
 from turbogs_plugin.scene.photos import Photos
 from turbogs_plugin.types import Cameras

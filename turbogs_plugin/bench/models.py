@@ -11,10 +11,10 @@ import torch
 from gsplat.utils import normalized_quat_to_rotmat
 from torch.nn.functional import normalize
 
-from turbogs_plugin.config import Config, load_config, resolve
+from turbogs_plugin.config.configuration import Config, load_config, resolve
 from turbogs_plugin.scene import Scene
 from turbogs_plugin.tiles import TILE_PIXELS, pixel_table
-from turbogs_plugin.trainer import Trainer
+from turbogs_plugin.train.trainer import Trainer
 from turbogs_plugin.types import Cameras, Gaussians, PixelSamples, TileGrid
 
 TRAINING_ITERATIONS = 1500

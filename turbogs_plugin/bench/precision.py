@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from turbogs_plugin.bench.models import ring_cameras, surface_gaussians, tile_samples
-from turbogs_plugin.rendering import rasterize, rasterize_reference
+from turbogs_plugin.engine.rendering import rasterize, rasterize_reference
 
 COLUMNS = {"mean": slice(0, 2), "conic": slice(2, 5), "color": slice(5, 8), "opacity": slice(8, 9)}
 """Of the screen gradients' records."""

@@ -16,8 +16,6 @@ from typing import Any
 
 import torch
 
-from turbogs_plugin import kernels
-from turbogs_plugin.ablation.cell import scene_on
 from turbogs_plugin.bench.clocks import Mark, Summary, back_to_back, copy_bandwidth, measure, summary
 from turbogs_plugin.bench.floors import raster_counts, raster_floors
 from turbogs_plugin.bench.gsplat_dense import bench_gsplat
@@ -30,11 +28,13 @@ from turbogs_plugin.bench.models import (
     trained_model,
 )
 from turbogs_plugin.bench.precision import precision
+from turbogs_plugin.engine.cuda import library as kernels
+from turbogs_plugin.engine.rendering import Rendered, Workspace, rasterize
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.evaluation import free_device_memory
-from turbogs_plugin.gaussians import load_ply, save_ply
-from turbogs_plugin.rendering import Rendered, Workspace, rasterize
+from turbogs_plugin.model.gaussians import load_ply, save_ply
 from turbogs_plugin.scene import Scene
+from turbogs_plugin.study.cell import scene_on
+from turbogs_plugin.train.evaluate import free_device_memory
 from turbogs_plugin.types import Cameras, Gaussians, GaussianStats
 
 STAGES = {

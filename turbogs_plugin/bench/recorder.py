@@ -9,11 +9,11 @@ from typing import Any
 
 import torch
 
-from turbogs_plugin import kernels
-from turbogs_plugin import trainer as trainer_module
 from turbogs_plugin.bench.clocks import Mark, Summary, summary
-from turbogs_plugin.rendering import Rendered
-from turbogs_plugin.trainer import Trainer
+from turbogs_plugin.engine.cuda import library as kernels
+from turbogs_plugin.engine.rendering import Rendered
+from turbogs_plugin.train import trainer as trainer_module
+from turbogs_plugin.train.trainer import Trainer
 from turbogs_plugin.types import PixelSamples
 
 STEPS = ("budget", "GVS", "EPS", "gather", "FWD", "L", "E", "gather+L+E", "BWD", "solve+update", "EDC")

@@ -16,11 +16,11 @@ from turbogs_plugin.bench.clocks import BLOCKS, Mark, back_to_back, copy_bandwid
 from turbogs_plugin.bench.floors import raster_counts, step_floors
 from turbogs_plugin.bench.models import adopt, changed, resized, train, trained_model
 from turbogs_plugin.bench.recorder import StepRecorder, recorded
-from turbogs_plugin.config import Config, load_config
-from turbogs_plugin.gaussians import load_ply
-from turbogs_plugin.rendering.cuda import CudaRendered
+from turbogs_plugin.config.configuration import Config, load_config
+from turbogs_plugin.engine.cuda.raster import CudaRendered
+from turbogs_plugin.model.gaussians import load_ply
 from turbogs_plugin.scene import Scene
-from turbogs_plugin.trainer import Trainer
+from turbogs_plugin.train.trainer import Trainer
 from turbogs_plugin.types import Gaussians, Step
 
 NO_EVENTS = 1 << 20

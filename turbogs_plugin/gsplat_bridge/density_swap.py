@@ -15,7 +15,7 @@ from torch import Tensor
 from turbogs_plugin.errors import InputError, require
 from turbogs_plugin.gsplat_bridge.gaussian_errors import iteration_stats
 from turbogs_plugin.gsplat_bridge.host import GEOMETRY, GROUND_TRUTH, PREDICTION, host_gaussians, require_keys
-from turbogs_plugin.strategies.density import ErrorDrivenDensity
+from turbogs_plugin.strategies.density.error_driven import ErrorDrivenDensity
 from turbogs_plugin.types import GaussianStats, RowUpdate, Step
 
 _STATS = tuple(field.name for field in fields(GaussianStats))

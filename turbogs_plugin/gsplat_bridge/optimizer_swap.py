@@ -20,12 +20,12 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
+from turbogs_plugin.engine.rendering import ScreenGradients
+from turbogs_plugin.engine.update_rule import COLUMNS, GaussianMoments, check_moments_config
 from turbogs_plugin.errors import InputError, require
 from turbogs_plugin.gsplat_bridge.gaussian_errors import loss_shares
 from turbogs_plugin.gsplat_bridge.host import host_gaussians
-from turbogs_plugin.rendering import ScreenGradients
 from turbogs_plugin.strategies.learning_rates import ParameterRates
-from turbogs_plugin.strategies.update_rule import COLUMNS, GaussianMoments, check_moments_config
 from turbogs_plugin.types import PARAMETER_NAMES, GaussianGradients, Gaussians, Step
 
 COUNT = "step"

@@ -11,12 +11,12 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from turbogs_plugin.engine.reference.compositing import ABSOLUTE, MEAN
+from turbogs_plugin.engine.rendering import RasterSettings, Rendered, rasterize
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.gaussians import SH_C0
 from turbogs_plugin.gsplat_bridge.gaussian_errors import residuals
 from turbogs_plugin.gsplat_bridge.host import GROUND_TRUTH, LOSS_SHARES, PREDICTION, STATISTICS
-from turbogs_plugin.rendering import RasterSettings, Rendered, rasterize
-from turbogs_plugin.rendering.compositing import ABSOLUTE, MEAN
+from turbogs_plugin.model.gaussians import SH_C0
 from turbogs_plugin.types import (
     PARAMETER_NAMES,
     TILE_SIZE,

@@ -11,9 +11,9 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from turbogs_plugin.budget import images_per_iteration
-from turbogs_plugin.config import Config
-from turbogs_plugin.lengths import scale_iterations
+from turbogs_plugin.config.configuration import Config
+from turbogs_plugin.config.scaling import scale_iterations
+from turbogs_plugin.plan.budget import images_per_iteration
 from turbogs_plugin.plan.facts import SceneFacts
 
 ONE_SIDED = 0.95

@@ -8,12 +8,12 @@ from dataclasses import asdict, dataclass
 
 import torch
 
-from turbogs_plugin.config import PLANNED_SETTINGS, Config, resolve
+from turbogs_plugin.config.configuration import PLANNED_SETTINGS, Config, resolve
+from turbogs_plugin.config.schema import build_dataclass
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.plan.decisions import RULES, Decision, mebibytes
 from turbogs_plugin.plan.facts import SceneFacts, gather_facts
 from turbogs_plugin.scene import Scene
-from turbogs_plugin.schema import build_dataclass
 
 
 @dataclass(frozen=True)

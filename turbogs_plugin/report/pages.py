@@ -12,13 +12,13 @@ from pathlib import Path
 
 import torch
 
-from turbogs_plugin.config import Config
-from turbogs_plugin.evaluation import Metrics, render_view
+from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.files import write_text_atomically
 from turbogs_plugin.plan import Plan
-from turbogs_plugin.report.history import Evaluation
 from turbogs_plugin.report.plots import ERROR_FULL_SCALE, plot_against_seconds, save_strip
 from turbogs_plugin.scene import PosedImages
+from turbogs_plugin.train.evaluate import Metrics, render_view
+from turbogs_plugin.train.history import Evaluation
 from turbogs_plugin.types import Gaussians
 from turbogs_plugin.version import __version__
 

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 from torch import Tensor
 
-from turbogs_plugin.report.history import Evaluation
+from turbogs_plugin.train.history import Evaluation
 
 STYLE = {
     "figure.dpi": 120,

@@ -1,0 +1,391 @@
+"""Error-driven density control (paper section 3.8), and none."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, fields
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import logsigmoid
+from turbogs_plugin.strategies.density.row_order import spatial_order
+from turbogs_plugin.strategies.density.rows import finite_rows, leave_one, loaded_rows
+
+from turbogs_plugin.engine.reference.projection import rotation_matrices
+from turbogs_plugin.errors import InputError, require, require_not_negative
+from turbogs_plugin.types import Gaussians, GaussianStats, RowUpdate, Step
+
+SPLIT_SHRINK = 1.6
+"""A split divides standard deviations by this (3DGS)."""
+
+FLAT_EVENTS = 5
+"""Events of density control over which `stop_when_flat` looks at the error's fall."""
+
+EPS = 1e-12
+"""Keeps divisions defined; the least weight a drawn splat can have in a pixel is 1e-4 / 255."""
+
+
+@dataclass
+class NoDensity:
+    """The set of Gaussians stays as it is."""
+
+    @property
+    def stats(self) -> GaussianStats | None:
+        return None
+
+    def setup(self, gaussians: Gaussians) -> None:
+        pass
+
+    def update(self, gaussians: Gaussians, step: Step) -> RowUpdate | None:
+        return None
+
+    def state_dict(self) -> dict[str, Any]:
+        return {}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        pass
+
+
+@dataclass
+class ErrorDrivenDensity:
+    """Densify where the screen gradient is high and the sampled pixels say the Gaussian is difficult; prune where a
+    Gaussian is transparent, huge or easy. There is no reset of opacities.
+
+    Of the statistics of the window since the last event, with W the sum of weights of a Gaussian,
+
+        e = E / (W + eps),  d = D / (W + eps),  s = e + lambda_base * anneal * d
+
+    is its difficulty. A Gaussian with W = 0, or with non-finite statistics, was not seen: it has no score, and is
+    neither densified nor pruned by score. Equal scores stand or fall together, except where a budget must choose
+    (then the lower row goes first). After densification, rows are in the order of space (`spatial_order`).
+
+    Until `Step.refine_until`, every `refine_every` iterations from `refine_from` on, one event clones, splits and
+    prunes. A Gaussian that is due for pruning is not densified; one that is too big but chosen to be split is not
+    pruned, while one that a budget or cap denies its split is. Afterwards, every `final_every` iterations, one only
+    prunes. At least one Gaussian is always left.
+
+    Args:
+        lambda_base: weight of the distance term.
+        score: as in the equation (`raw`), or with e and d each divided by its mean over the seen (`balanced`), so
+            that both count: d is of order 1 and e of order 0.1.
+        refine_from, refine_every: first iteration and interval of densification (tau_from, Delta_dens).
+        grad_threshold, absgrad_threshold: of the mean over views of the screen gradient and of its absolute variant
+            (tau_grad, tau_grad_abs), in gsplat's units. Either suffices.
+        top_fraction: share of the seen, the most difficult, that may be densified (eta_topk).
+        percent_dense: clone where 3 * largest standard deviation <= this * scene extent, else split (rho_dense).
+        split: two draws from the Gaussian, all axes divided by 1.6 as in 3DGS (`sample`); or two halves along its
+            longest axis, which is divided by 1.6, so placed that the pair has the parent's mean and covariance
+            (`long_axis`).
+        growth: every candidate is taken (`threshold`), or the number of Gaussians follows a straight line from the
+            initial one to `target_gaussians` at `refine_until`, the most difficult candidates first (`budget`).
+        target_gaussians: end of that line. `budget` only.
+        max_gaussians: never more than this; an initial model that has more is cut to it at the first event, easiest
+            first, those of `spare_beyond` last. 0: no cap.
+        prune_opacity: less opaque ones are pruned.
+        prune_world_size: pruned where the largest standard deviation exceeds this * `prune_world_reference`. 0: off.
+        prune_world_reference: the scene extent, as in 3DGS (`extent`); or, for what is farther than that from the
+            cameras' centre, its distance from there (`distance`): nothing is then too large for being far.
+        prune_screen_size: pruned where the screen radius exceeds this * the larger side of the image. 0: off, as in
+            3DGS in effect.
+        prune_size_from: both size rules begin at this progress; 3DGS has 3000 / 15000.
+        prune_score_fraction: share of the seen, the easiest, that each densification event prunes. Off by default: the
+            paper gives no value, and what has little error may be what is rendered well.
+        opacity_decay: share of its opacity that every Gaussian loses at each densification event. What the photos need
+            grows back, what they do not falls below `prune_opacity`; a gentle substitute for 3DGS's reset.
+        spare_beyond: Gaussians farther from the cameras' centre than this * scene extent are neither decayed nor pruned
+            (unless they are not finite, or `max_gaussians` leaves no other choice): a backdrop behind the scene, which
+            few photos see. 0: none.
+        final_every, final_keep: interval of the final pruning, and the share of the seen that each one keeps, the
+            most difficult (Delta_prune, eta_final). 1 keeps all.
+        stop_when_flat: densification ends early, at the first event where the error has fallen by less than this share
+            of itself over the last `FLAT_EVENTS` events. The error of a window is the mean over what its samples saw of
+            e, weighted by w; as the sampling's rate rises, it falls a little by itself, so the rule waits rather than
+            hurries. 0: never.
+    """
+
+    lambda_base: float = 0.8
+    score: Literal["balanced", "raw"] = "balanced"
+    refine_from: int = 200
+    refine_every: int = 100
+    grad_threshold: float = 2e-4
+    absgrad_threshold: float = 4e-4
+    top_fraction: float = 0.5
+    percent_dense: float = 0.01
+    split: Literal["sample", "long_axis"] = "sample"
+    growth: Literal["threshold", "budget"] = "threshold"
+    target_gaussians: int = 0
+    max_gaussians: int = 0
+    prune_opacity: float = 0.005
+    prune_world_size: float = 0.1
+    prune_world_reference: Literal["extent", "distance"] = "extent"
+    prune_screen_size: float = 0.0
+    prune_size_from: float = 0.2
+    prune_score_fraction: float = 0.0
+    opacity_decay: float = 0.0
+    spare_beyond: float = 0.0
+    final_every: int = 500
+    final_keep: float = 0.95
+    stop_when_flat: float = 0.0
+    initial_count: int = field(init=False, default=0)
+    window_errors: list[float] = field(init=False, repr=False, default_factory=list)
+    stopped_at: int = field(init=False, repr=False, default=0)
+    _stats: GaussianStats | None = field(init=False, repr=False, default=None)
+
+    def __post_init__(self) -> None:
+        choices = {
+            "score": ("balanced", "raw"),
+            "split": ("sample", "long_axis"),
+            "growth": ("threshold", "budget"),
+            "prune_world_reference": ("extent", "distance"),
+        }
+        for name, allowed in choices.items():
+            require(getattr(self, name) in allowed, name, getattr(self, name), f"one of {', '.join(allowed)}")
+        for name in ("refine_every", "final_every"):
+            require(getattr(self, name) >= 1, name, getattr(self, name), "at least 1")
+        for name in ("top_fraction", "final_keep"):
+            require(0 < getattr(self, name) <= 1, name, getattr(self, name), "more than 0 and at most 1")
+        for name in ("prune_opacity", "prune_score_fraction", "opacity_decay", "stop_when_flat"):
+            require(0 <= getattr(self, name) < 1, name, getattr(self, name), "at least 0 and less than 1")
+        require_not_negative(
+            self,
+            *("lambda_base", "refine_from", "grad_threshold", "absgrad_threshold", "percent_dense", "target_gaussians"),
+            *("max_gaussians", "prune_world_size", "prune_screen_size", "prune_size_from", "spare_beyond"),
+        )
+        if (self.growth == "budget") != (self.target_gaussians > 0):
+            raise InputError(
+                f"growth = {self.growth!r} with target_gaussians = {self.target_gaussians}: "
+                "a budget needs a target above 0, and a target is only used by growth: budget"
+            )
+
+    @property
+    def stats(self) -> GaussianStats | None:
+        return self._stats
+
+    def setup(self, gaussians: Gaussians) -> None:
+        self.initial_count = len(gaussians)
+        self._stats = GaussianStats.zeros(len(gaussians), gaussians.device)
+
+    @torch.no_grad()
+    def update(self, gaussians: Gaussians, step: Step) -> RowUpdate | None:
+        densify, final = self._due(step)
+        update = None
+        if densify and self._stats is not None and self.stop_when_flat > 0 and self._error_is_flat():
+            self.stopped_at, densify = step.iteration, False
+            self._stats.zero_()
+        if self._stats is not None and (densify or final) and len(gaussians) > 0:
+            score, seen = self.scores(step)
+            event = self._refine if densify else self._final_prune
+            update = event(gaussians, score, seen, step)
+            count = len(gaussians) if update is None else len(update.source)
+            self._stats = GaussianStats.zeros(count, gaussians.device)
+        if step.iteration >= self._last_event(step):
+            self._stats = None
+        return update
+
+    def state_dict(self) -> dict[str, Any]:
+        stats = None if self._stats is None else {f.name: getattr(self._stats, f.name) for f in fields(self._stats)}
+        state = {"initial_count": self.initial_count, "stats": stats}
+        if self.stop_when_flat > 0:
+            window_errors = torch.tensor(self.window_errors, dtype=torch.float64)
+            state |= {"window_errors": window_errors, "stopped_at": self.stopped_at}
+        return state
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        if self.stop_when_flat > 0 and "window_errors" not in state:
+            raise InputError(
+                f"stop_when_flat = {self.stop_when_flat:g}, but the saved run had it at 0 and kept no record of its "
+                "error: continue it with stop_when_flat = 0, or start a new run"
+            )
+        self._stats = loaded_rows("stats", state["stats"], self._stats)
+        self.initial_count = state["initial_count"]
+        if self.stop_when_flat > 0:
+            self.window_errors = state["window_errors"].tolist()
+            self.stopped_at = state["stopped_at"]
+
+    def scores(self, step: Step) -> tuple[Tensor, Tensor]:
+        """([N] score, [N] bool seen) of the present window; the score of what was not seen is 0 and means nothing."""
+        stats = self._stats
+        weights = stats.weight_sums
+        seen = (weights > 0) & torch.isfinite(weights + stats.error_sums + stats.distance_sums)
+        errors, distances = (
+            torch.where(seen, sums / (weights + EPS), 0.0) for sums in (stats.error_sums, stats.distance_sums)
+        )
+        if self.score == "balanced":
+            count = seen.sum().clamp(min=1)
+            errors, distances = (value / (value.sum() / count + EPS) for value in (errors, distances))
+        return errors + self.lambda_base * step.anneal * distances, seen
+
+    def _due(self, step: Step) -> tuple[bool, bool]:
+        """Whether this iteration densifies, and whether it prunes finally."""
+        iteration, after = step.iteration, step.iteration - step.refine_until
+        densify = after <= 0 and iteration >= self.refine_from and iteration % self.refine_every == 0
+        densify = densify and not self.stopped_at
+        return densify, self.final_keep < 1 and after > 0 and after % self.final_every == 0
+
+    def _last_event(self, step: Step) -> int:
+        """Iteration after which no statistics are needed: that of the last event, or where densification ends.
+
+        Not that of the last densification: a time budget may move the end, and room for another one, until it is there.
+        """
+        rest = max(0, step.total - 1 - step.refine_until)
+        if self.final_keep < 1 and rest >= self.final_every:
+            return step.refine_until + rest // self.final_every * self.final_every
+        if self.stopped_at:
+            return self.stopped_at
+        return step.refine_until
+
+    def _error_is_flat(self) -> bool:
+        """Take the present window's error into the record; whether it has stopped falling."""
+        stats = self._stats
+        valid = torch.isfinite(stats.error_sums + stats.weight_sums)
+        sums = torch.stack([stats.error_sums, stats.weight_sums]).where(valid, 0.0).double().sum(dim=1)
+        error, weight = sums.tolist()  # events wait for the device anyway
+        if weight == 0:
+            return False  # nothing was seen, which says nothing
+        self.window_errors = [*self.window_errors[-FLAT_EVENTS:], error / weight]
+        before, now = self.window_errors[0], self.window_errors[-1]
+        return len(self.window_errors) > FLAT_EVENTS and before - now < self.stop_when_flat * before
+
+    def _refine(self, gaussians: Gaussians, score: Tensor, seen: Tensor, step: Step) -> RowUpdate | None:
+        stats, extent = self._stats, step.scene_extent
+        views = stats.view_counts.clamp(min=1)
+        passes = (stats.grad_sums / views > self.grad_threshold) | (stats.absgrad_sums / views > self.absgrad_threshold)
+        finite = finite_rows(gaussians)
+        spared = self._spared(gaussians, finite, extent)
+        hopeless = ~finite | (torch.sigmoid(gaussians.opacities) < self.prune_opacity)
+        if self.prune_score_fraction > 0:
+            hopeless |= seen & (score < _quantile(score, seen, self.prune_score_fraction))
+        difficult = seen & (score >= _quantile(score, seen, 1 - self.top_fraction))
+        candidates = passes & difficult & ~hopeless
+
+        largest = gaussians.scales.amax(dim=-1).exp()  # [N]
+        small = 3 * largest <= self.percent_dense * extent
+        big = torch.zeros_like(seen)
+        if step.progress >= self.prune_size_from:
+            if self.prune_world_size > 0:
+                big |= largest > self.prune_world_size * self._world_reference(gaussians, extent)
+            if self.prune_screen_size > 0:
+                big |= stats.max_radii > self.prune_screen_size
+        pruned = leave_one((hopeless | (big & ~(candidates & ~small))) & ~spared, gaussians)
+        candidates &= ~pruned
+        allowed = self._allowed_growth(int((~pruned).sum()), step)
+        if allowed is not None:
+            chosen = _first(score, candidates, allowed)
+            denied = candidates & ~chosen
+            candidates = chosen
+            pruned = leave_one(pruned | (big & denied & ~spared), gaussians)  # makes room for the next event
+        if self.max_gaussians > 0:
+            excess = int((~pruned).sum()) - self.max_gaussians
+            if excess > 0:  # then nothing was chosen
+                pruned = pruned | self._easiest(score, seen, ~pruned, spared, excess)
+        return self._compose(gaussians, candidates & small, candidates & ~small, pruned, spared, step)
+
+    def _world_reference(self, gaussians: Gaussians, extent: float) -> Tensor | float:
+        """[N], or the same for all: what `prune_world_size` is a share of."""
+        if self.prune_world_reference == "extent":
+            return extent
+        return gaussians.means.norm(dim=-1).clamp(min=extent)
+
+    def _spared(self, gaussians: Gaussians, finite: Tensor, extent: float) -> Tensor:
+        """[N] bool: the finite ones that lie beyond `spare_beyond`."""
+        if self.spare_beyond == 0:
+            return torch.zeros_like(finite)
+        return finite & (gaussians.means.norm(dim=-1) > self.spare_beyond * extent)
+
+    def _easiest(self, score: Tensor, seen: Tensor, present: Tensor, spared: Tensor, count: int) -> Tensor:
+        """[N] bool: the easiest `count` of those `present`, the spared ones only for what the others leave to take."""
+        # The unseen count as average: nothing says that they are easy.
+        average = torch.where(seen, score, 0.0).sum() / seen.sum().clamp(min=1)
+        ease = -torch.where(seen, score, average)
+        taken = _first(ease, present & ~spared, count)
+        return taken | _first(ease, present & spared, count - int(taken.sum()))
+
+    def _allowed_growth(self, count: int, step: Step) -> int | None:
+        """How many Gaussians may be added to `count`, or None for any number."""
+        limits = []
+        if self.max_gaussians > 0:
+            limits.append(self.max_gaussians)
+        if self.growth == "budget":
+            ramp = (step.iteration - self.refine_from) / max(1, step.refine_until - self.refine_from)
+            line = self.initial_count + (self.target_gaussians - self.initial_count) * min(1.0, max(0.0, ramp))
+            limits.append(math.floor(line))
+        return max(0, min(limits) - count) if limits else None
+
+    def _final_prune(self, gaussians: Gaussians, score: Tensor, seen: Tensor, step: Step) -> RowUpdate | None:
+        finite = finite_rows(gaussians)
+        easy = seen & (score < _quantile(score, seen, 1 - self.final_keep))
+        pruned = leave_one(~finite | easy & ~self._spared(gaussians, finite, step.scene_extent), gaussians)
+        if not pruned.any():
+            return None
+        source = torch.nonzero(~pruned).squeeze(-1)
+        return RowUpdate(source, torch.zeros_like(source, dtype=torch.bool), {}, num_pruned=int(pruned.sum()))
+
+    def _compose(
+        self, gaussians: Gaussians, cloned: Tensor, split: Tensor, pruned: Tensor, spared: Tensor, step: Step
+    ) -> RowUpdate | None:
+        """One change out of masks [N]: the rest, the clones, and both halves of the split, in the order of space."""
+        rest, copies, halves = (torch.nonzero(mask).squeeze(-1) for mask in (~(pruned | split), cloned, split))
+        if len(rest) == len(gaussians) and len(copies) == 0 and self.opacity_decay == 0:
+            return None
+        source = torch.cat([rest, copies, halves, halves])
+        fresh = torch.arange(len(source), device=source.device) >= len(rest)
+        values = {}
+        if len(halves):
+            values = {"means": gaussians.means[source], "scales": gaussians.scales[source]}
+            values["means"][-2 * len(halves) :], values["scales"][-2 * len(halves) :] = self._halves(
+                gaussians, halves, step
+            )
+        if self.opacity_decay > 0:
+            opacities = torch.where(spared, gaussians.opacities, _decayed(gaussians.opacities, self.opacity_decay))
+            values["opacities"] = opacities[source]
+        counts = {"num_cloned": len(copies), "num_split": len(halves), "num_pruned": int(pruned.sum())}
+        # What is seen together is then read together: splats of a tile are gathered, and added to, by row.
+        order = spatial_order(values.get("means", gaussians.means[source]), step.scene_extent)
+        return RowUpdate(source, fresh, values, **counts).reordered(order)
+
+    def _halves(self, gaussians: Gaussians, index: Tensor, step: Step) -> tuple[Tensor, Tensor]:
+        """([2 n, 3] means, [2 n, 3] log scales) of what the Gaussians `index` [n] are split into."""
+        means, scales = gaussians.means[index], gaussians.scales[index]
+        rotations = rotation_matrices(gaussians.quats[index])  # [n, 3, 3]
+        if self.split == "sample":
+            generator = np.random.Generator(np.random.Philox(np.random.SeedSequence([step.seed, step.iteration])))
+            # Drawn on the host: the same numbers on every device.
+            draws = torch.from_numpy(generator.standard_normal((2, len(index), 3))).to(means)
+            offsets = torch.einsum("nij,bnj->bni", rotations, scales.exp() * draws)
+            shrink = torch.full_like(scales, math.log(SPLIT_SHRINK))
+        else:
+            axis = torch.nn.functional.one_hot(scales.argmax(dim=-1), 3).to(scales)  # [n, 3]
+            # A pair at +-a of deviation b has variance a^2 + b^2; b = sigma / 1.6, so a^2 = sigma^2 (1 - 1 / 1.6^2).
+            distance = math.sqrt(1 - SPLIT_SHRINK**-2)
+            offset = torch.einsum("nij,nj->ni", rotations, scales.exp() * axis * distance)
+            offsets = torch.stack([offset, -offset])
+            shrink = axis * math.log(SPLIT_SHRINK)
+        return (means + offsets).reshape(-1, 3), (scales - shrink).repeat(2, 1)
+
+
+def _quantile(values: Tensor, mask: Tensor, fraction: float) -> Tensor:
+    """The value at rank ``floor(fraction * n)`` of the n masked values [N] in ascending order; 0 if there are none.
+
+    `value < it` then holds for that many, fewer where they tie with it.
+    """
+    chosen = values[mask]
+    if len(chosen) == 0:
+        return values.new_zeros(())
+    rank = min(len(chosen) - 1, math.floor(fraction * len(chosen) + 1e-6))  # 1 - 0.9 of 10 is 1
+    return chosen.sort().values[rank]
+
+
+def _first(keys: Tensor, mask: Tensor, count: int) -> Tensor:
+    """[N] bool: those `count` of the mask (or all, if fewer) with the largest keys; of equal ones the lower rows."""
+    order = torch.argsort(torch.where(mask, keys, -torch.inf), descending=True, stable=True)
+    chosen = torch.zeros_like(mask)
+    chosen[order[:count]] = True
+    return chosen & mask
+
+
+def _decayed(logits: Tensor, decay: float) -> Tensor:
+    """Logits of opacities times (1 - decay), by logarithms, so that no opacity rounds to 0 or 1 on the way."""
+    log_opacity = logsigmoid(logits) + math.log1p(-decay)
+    return log_opacity - torch.log(-torch.expm1(log_opacity))

@@ -1,0 +1,128 @@
+"""gsplat's MCMCStrategy behind our protocol, for comparison, without an edit to gsplat. Needs a GPU, as its ops do."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import torch
+from gsplat.strategy import MCMCStrategy
+from torch import Tensor
+from turbogs_plugin.strategies.density.gsplat_default import marking_optimizer, touched_rows
+from turbogs_plugin.strategies.density.rows import finite_rows
+from turbogs_plugin.strategies.learning_rates import LearningRates
+
+from turbogs_plugin.errors import InputError, require, require_not_negative
+from turbogs_plugin.types import Gaussians, GaussianStats, RowUpdate, Step
+
+DEAD_LOGIT = -50.0
+"""Opacity of Gaussians that are to be relocated whatever they are."""
+
+LARGEST_LOG_SCALE = 40.0
+"""Larger Gaussians are relocated: noise in proportion to their covariance could overflow in float32."""
+
+
+@dataclass
+class GsplatMcmcDensity:
+    """gsplat's relocation, growth and noise (Kheradmand et al. 2024), run on our parameters.
+
+    The noise on the means, which is part of every iteration, is added in place. What makes the method's dead Gaussians
+    in the first place are terms of opacity and scale in the objective (0.01 each in gsplat's trainer): those are
+    `DenseAdam`'s `opacity_reg` and `scale_reg`, as ``configs/mcmc.yaml`` sets them. It stops relocating and growing at
+    `Step.refine_until` (its `refine_stop_iter`).
+
+    Unlike gsplat, which would fail or train on with NaN: a Gaussian that is not finite, or endlessly large, counts as
+    dead; noise that is not finite is left out; and an event that finds nothing alive relocates and adds none.
+
+    Args:
+        cap_max, noise_lr, refine_start_iter, refine_every, min_opacity: as in `gsplat.MCMCStrategy`.
+        learning_rates: those of the optimizer; the noise follows the means' rate of the next iteration, as in gsplat's
+            trainer, whose schedulers step first.
+    """
+
+    cap_max: int = 1_000_000
+    noise_lr: float = 5e5
+    refine_start_iter: int = 500
+    refine_every: int = 100
+    min_opacity: float = 0.005
+    learning_rates: LearningRates = field(default_factory=LearningRates)
+
+    def __post_init__(self) -> None:
+        for name in ("cap_max", "refine_every"):
+            require(getattr(self, name) >= 1, name, getattr(self, name), "at least 1")
+        require_not_negative(self, "noise_lr", "refine_start_iter")
+        require(0 < self.min_opacity < 1, "min_opacity", self.min_opacity, "more than 0 and less than 1")
+
+    @property
+    def stats(self) -> GaussianStats | None:
+        return None
+
+    def setup(self, gaussians: Gaussians) -> None:
+        if gaussians.device.type != "cuda":
+            raise InputError(
+                "density.type 'mcmc' needs a GPU, as gsplat's relocation does: use gsplat_default on a CPU"
+            )
+
+    @torch.no_grad()
+    def update(self, gaussians: Gaussians, step: Step) -> RowUpdate | None:
+        iteration = step.iteration
+        due = self.refine_start_iter < iteration < step.refine_until and iteration % self.refine_every == 0
+        if len(gaussians) == 0:
+            return None
+        if due:
+            usable = finite_rows(gaussians) & (gaussians.scales.amax(dim=-1) <= LARGEST_LOG_SCALE)
+            if bool((usable & (torch.sigmoid(gaussians.opacities) > self.min_opacity)).any()):
+                return self._refine(gaussians, usable, step)
+        self._add_noise(gaussians, step)
+        return None
+
+    def _refine(self, gaussians: Gaussians, usable: Tensor, step: Step) -> RowUpdate:
+        """Relocation, growth and noise, on copies: relocation writes into the tensors that it is given.
+
+        What is relocated takes over its new place's parameters but keeps its own row's state, as in gsplat; what is
+        added comes from the row that it was copied from, which gsplat finds as it copies row numbers along.
+        """
+        rows = torch.arange(len(gaussians), device=gaussians.device)
+        opacities = torch.where(usable, gaussians.opacities, DEAD_LOGIT)
+        copies = {name: value.clone() for name, value in gaussians.items()} | {"opacities": opacities}
+        params, optimizers = self._run_gsplat(copies | {"source_row": rows.clone()}, step.refine_until, step)
+        added = params.pop("source_row").data[len(rows) :]
+        return RowUpdate(
+            torch.cat([rows, added]),
+            touched_rows(optimizers["means"], params["means"]),
+            {name: value.data for name, value in params.items()},
+            num_cloned=len(added),
+        )
+
+    def _add_noise(self, gaussians: Gaussians, step: Step) -> None:
+        """Noise on the means, in place, where it is finite."""
+        before = gaussians.means.clone()
+        self._run_gsplat(dict(gaussians.items()), 0, step)
+        finite = gaussians.means.isfinite().all(dim=-1, keepdim=True)
+        gaussians.means.copy_(torch.where(finite, gaussians.means, before))
+
+    def _run_gsplat(self, values: dict[str, Tensor], refine_until: int, step: Step) -> tuple[dict, dict]:
+        """gsplat's strategy on these parameters: what became of them, and the optimizers that mark rows it has made."""
+        strategy = MCMCStrategy(
+            cap_max=self.cap_max,
+            noise_lr=self.noise_lr,
+            refine_start_iter=self.refine_start_iter,
+            refine_stop_iter=refine_until,
+            refine_every=self.refine_every,
+            min_opacity=self.min_opacity,
+        )
+        params = {name: torch.nn.Parameter(value, requires_grad=False) for name, value in values.items()}
+        optimizers = {name: marking_optimizer(params[name]) for name in params}
+        rate = self.learning_rates.at(replace(step, iteration=step.iteration + 1)).means
+        device = params["means"].device
+        with torch.random.fork_rng(devices=[device] if device.type == "cuda" else []):
+            torch.manual_seed(int(np.random.SeedSequence([step.seed, step.iteration]).generate_state(1)[0]))
+            strategy.step_post_backward(params, optimizers, strategy.initialize_state(), step.iteration, {}, lr=rate)
+        return params, optimizers
+
+    def state_dict(self) -> dict[str, Any]:
+        return {}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        pass

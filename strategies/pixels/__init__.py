@@ -1,0 +1,1 @@
+"""Which pixels of the chosen views are rendered."""

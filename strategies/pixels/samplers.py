@@ -1,0 +1,127 @@
+"""Which pixels of the chosen views are rendered (paper section 3.5): the samplers over the draw of `pixel_draws`."""
+
+from __future__ import annotations
+
+import math
+import operator
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from torch import Tensor
+
+from turbogs_plugin.engine.cuda import library as kernels
+from turbogs_plugin.engine.cuda import training as training_kernels
+from turbogs_plugin.engine.reference.draws import UNITS, DrawRule, draw_pixels
+from turbogs_plugin.error_maps import ErrorMaps
+from turbogs_plugin.errors import InputError, require
+from turbogs_plugin.tiles import dense_pixels
+from turbogs_plugin.types import PixelSamples, Step
+
+ViewIds = Sequence[int] | int | np.ndarray | Tensor
+"""Views as a sampler takes them; see `view_numbers`."""
+
+
+def view_numbers(view_ids: ViewIds, maps: ErrorMaps) -> tuple[int, ...]:
+    """The views of a batch as plain numbers on the host.
+
+    Args:
+        view_ids: K training views; a single one may be given as its number. For those of a tensor on another device
+            the host waits, once; whoever has them on the host gives them from there.
+
+    Raises:
+        InputError: not whole numbers, none, one that the maps do not have, or one of them twice.
+    """
+    plain = view_ids.tolist() if isinstance(view_ids, (Tensor, np.ndarray)) else view_ids
+    try:
+        numbers = tuple(operator.index(view) for view in (plain if isinstance(plain, Iterable) else (plain,)))
+    except TypeError:
+        numbers = ()
+    if not numbers or min(numbers) < 0 or max(numbers) >= len(maps.sizes):
+        raise InputError(
+            f"view_ids = {plain!r} is not valid: give whole numbers of views from 0 to {len(maps.sizes) - 1}"
+        )
+    if len(set(numbers)) < len(numbers):  # its pixels would be updated twice, and the sum of its errors be wrong
+        raise InputError(f"view_ids = {plain!r} is not valid: a batch has each view once")
+    return numbers
+
+
+def _sample(rule: DrawRule, maps: ErrorMaps, view_ids: ViewIds, rate: float, step: Step) -> PixelSamples:
+    require(0 < rate < math.inf, "rate", rate, "finite and above 0")
+    require(isinstance(step, Step), "step", step, "a Step, as Step(iteration=0, total=1000, refine_until=500) is")
+    view_ids = view_numbers(view_ids, maps)
+    maps.fetch(view_ids)
+    views = np.asarray(view_ids, dtype=np.int64)
+    draw = training_kernels.sample_pixels if maps.errors.is_cuda and kernels.available() else draw_pixels
+    return draw(
+        maps.errors,
+        maps.stamps,
+        step.iteration - maps.stamp_base,
+        maps.offsets[views],
+        maps.sizes[views],
+        view_ids,
+        rate,
+        rule,
+        step.seed,
+        step.iteration,
+    )
+
+
+@dataclass
+class ErrorGuidedPixelSampler:
+    """The paper's sampler: hard units by error, stable ones by age, the rest by both (`pixel_draws`).
+
+    Args:
+        hard_ratio, stable_ratio: r_hard and r_stable, shares of the units drawn in each tile.
+        mixed: what draws the remaining share, which the paper names but does not define: `error_age`, the mean of
+            the two normalised distributions, or `uniform`.
+        unit: `pixel` (the paper), `cell` (4x4 pixels of a tile), or `tile` (whole tiles of a view).
+        importance: a of the importance weights ``p^-a``, 0 (none, as in the paper's runs) to 1 (unbiased).
+    """
+
+    hard_ratio: float = 0.4
+    stable_ratio: float = 0.3
+    mixed: str = "error_age"
+    unit: str = "pixel"
+    importance: float = 0.0
+
+    def __post_init__(self) -> None:
+        require(0 <= self.hard_ratio <= 1, "hard_ratio", self.hard_ratio, "between 0 and 1")
+        allowed = f"between 0 and 1 - hard_ratio ({1 - self.hard_ratio:g})"
+        require(0 <= self.stable_ratio <= 1 - self.hard_ratio + 1e-9, "stable_ratio", self.stable_ratio, allowed)
+        require(self.mixed in ("error_age", "uniform"), "mixed", self.mixed, "error_age or uniform")
+        require(self.unit in UNITS, "unit", self.unit, f"one of {', '.join(UNITS)}")
+        require(0 <= self.importance <= 1, "importance", self.importance, "between 0 and 1")
+
+    def sample(self, maps: ErrorMaps, view_ids: ViewIds, rate: float, step: Step) -> PixelSamples:
+        """Draw the fraction `rate` (r) of the units of each tile, or of the tiles of each view (of `view_numbers`)."""
+        uniform = self.mixed == "uniform"
+        rule = DrawRule(self.unit, self.hard_ratio, self.stable_ratio, uniform, self.importance)
+        return _sample(rule, maps, view_ids, rate, step)
+
+
+@dataclass
+class RandomPixelSampler:
+    """Uniformly random units of each tile (or tiles of each view), without replacement.
+
+    Args:
+        unit: as in `ErrorGuidedPixelSampler`.
+    """
+
+    unit: str = "pixel"
+
+    def __post_init__(self) -> None:
+        require(self.unit in UNITS, "unit", self.unit, f"one of {', '.join(UNITS)}")
+
+    def sample(self, maps: ErrorMaps, view_ids: ViewIds, rate: float, step: Step) -> PixelSamples:
+        """Draw the fraction `rate` of the units; of the maps, only the sizes matter."""
+        return _sample(DrawRule(self.unit, 0.0, 0.0, True, 0.0), maps, view_ids, rate, step)
+
+
+@dataclass
+class DensePixelSampler:
+    """Every pixel of the chosen views, whatever the rate."""
+
+    def sample(self, maps: ErrorMaps, view_ids: ViewIds, rate: float, step: Step) -> PixelSamples:
+        view_ids = view_numbers(view_ids, maps)
+        return dense_pixels(view_ids, maps.sizes[np.asarray(view_ids, dtype=np.int64)], maps.errors.device)

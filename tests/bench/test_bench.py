@@ -1,0 +1,322 @@
+"""Benches on the reference path: what they measure adds up, and they say what they ran on."""
+
+import json
+import math
+import time
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from helpers.framework_runs import tiny_capture, tiny_config
+
+from turbogs_plugin.bench import commands, floors
+from turbogs_plugin.bench import raster as raster_module
+from turbogs_plugin.bench.clocks import Mark, back_to_back, measure, summary
+from turbogs_plugin.bench.commands import raster_lines, step_lines
+from turbogs_plugin.bench.models import (
+    resized,
+    ring_cameras,
+    spread_views,
+    surface_gaussians,
+    tile_samples,
+    trained_model,
+)
+from turbogs_plugin.bench.precision import precision
+from turbogs_plugin.bench.raster import RasterBench
+from turbogs_plugin.bench.recorder import STEPS, StepRecorder, recorded
+from turbogs_plugin.bench.step import tensor_bytes
+from turbogs_plugin.engine.rendering import rasterize
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.model.gaussians import load_ply, save_ply
+from turbogs_plugin.scene import load_scene
+from turbogs_plugin.train import trainer as trainer_module
+from turbogs_plugin.train.trainer import Trainer
+
+CPU = torch.device("cpu")
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory):
+    return tiny_capture(tmp_path_factory.mktemp("bench"))
+
+
+def test_clocks_measure_what_passes():
+    took = measure(lambda: time.sleep(0.01), 3, CPU)
+    assert 10 <= took["p10_ms"] <= took["median_ms"] <= took["p90_ms"] < 200
+    assert back_to_back(lambda: time.sleep(0.005), 2, CPU)["median_ms"] >= 5
+    assert summary([3.0, 1.0, 2.0])["median_ms"] == 2.0
+    first = Mark(CPU)
+    time.sleep(0.01)
+    assert first.until(Mark(CPU)) >= 10
+
+
+def test_the_recorder_marks_the_trainers_own_steps_and_leaves_no_trace(capture):
+    config = tiny_config(capture)
+    plain, watched = (Trainer(config, load_scene(capture), CPU) for _ in range(2))
+    before = {name: set(vars(getattr(watched, name))) for name in ("schedule", "optimizer", "density", "maps")}
+    rasterize, loss = trainer_module.rasterize, watched.loss
+    recorder = StepRecorder(CPU)
+    for trainer in (plain, watched):
+        trainer.initialise_maps()
+    with recorded(watched, recorder) as iteration:
+        for _ in range(3):
+            iteration()
+    for _ in range(3):
+        plain.step()
+    for (_, one), (_, other) in zip(plain.gaussians.items(), watched.gaussians.items(), strict=True):
+        assert torch.equal(one, other)
+    assert trainer_module.rasterize is rasterize and watched.loss is loss
+    assert before == {name: set(vars(getattr(watched, name))) for name in before}
+    steps = recorder.summaries()
+    assert set(steps) == {"iteration", *STEPS} - {"gather+L+E"}
+    assert all(len(spans) == 3 for spans in recorder.spans.values())
+    for number in range(3):
+        whole = recorder.spans["iteration"][number]
+        parts = sum(a.until(b) for name in steps if name != "iteration" for a, b in [recorder.spans[name][number]])
+        assert 0.5 * whole[0].until(whole[1]) < parts <= whole[0].until(whole[1])
+
+
+@pytest.mark.parametrize("count", [150, 300, 1000])
+def test_a_resized_model_covers_what_it_did(count):
+    model = surface_gaussians(300, CPU)
+    other = resized(model, count)
+    assert len(other) == count and all(value.isfinite().all() for _, value in other.items())
+    area = lambda gaussians: (2 * gaussians.scales.mean(dim=1)).exp().sum().item()  # noqa: E731
+    assert area(other) == pytest.approx(area(model), rel=0.35)
+    if count == 300:
+        assert all(torch.equal(a, b) for (_, a), (_, b) in zip(model.items(), other.items(), strict=True))
+
+
+def test_samples_are_distinct_pixels_in_order():
+    sizes = np.array([[40, 33], [40, 33]])
+    samples = tile_samples(sizes, 0.2, CPU, seed=1)
+    assert len(samples) == 2 * 9 * 51
+    for start, end in zip(samples.tile_offsets[:-1].tolist(), samples.tile_offsets[1:].tolist(), strict=True):
+        held = samples.pixel_ids[start:end]
+        held = held[held >= 0]
+        assert len(held.unique()) == len(held) > 0
+
+
+def test_views_are_spread():
+    assert spread_views(3, 43) == [0, 21, 42] and spread_views(5, 2) == [0, 1]
+
+
+def test_cameras_look_at_the_model():
+    cameras = ring_cameras(3, 64, 48, CPU)
+    center = cameras.viewmats[:, :3, 3]
+    assert torch.allclose(center[:, :2], torch.zeros(3, 2), atol=1e-5) and (center[:, 2] > 0).all()
+
+
+def test_contributions_are_the_set_bits_of_the_walked_masks():
+    # Two tiles of 40 and 5 pairs, one chunk each: buckets of 32, so 2 and 1; tile t's masks begin at start // 32 + t.
+    forward = SimpleNamespace(
+        tile_starts=torch.tensor([0, 40, 45], dtype=torch.int32),
+        bucket_counts=torch.tensor([2, 1], dtype=torch.int32),
+        chunks=1,
+        masks=torch.tensor([0b1011, -1, 0b1, 0b11111], dtype=torch.int32),
+    )
+    forward.masks[2] = 0b1  # tile 1 begins at 40 // 32 + 1 = 2
+    counts = floors.count_contributions(SimpleNamespace(_forward=forward))
+    assert counts == {"walked": 96, "contributing": 3 + 32 + 1}
+
+
+def test_floors_grow_with_counts_and_fall_with_bandwidth(monkeypatch):
+    properties = SimpleNamespace(multi_processor_count=132, clock_rate=1_980_000)
+    monkeypatch.setattr(torch.cuda, "get_device_properties", lambda device: properties)
+    counts = {
+        "tiles": 5_000,
+        "gaussians": 150_000, "instances": 450_000, "visible": 300_000, "pairs": 900_000, "samples": 1_200_000,
+        "items": 15_000, "walked": 3_000_000, "contributing": 1_000_000, "pixels": 3_800_000, "touched": 120_000,
+    }  # fmt: skip
+    usual = floors.step_floors(counts, 4e12)
+    assert set(usual) == {"EPS", "FWD", "gather+L+E", "BWD", "solve+update"}
+    assert usual["solve+update"] == pytest.approx(
+        1e3 * (64 * 300_000 + 8 * 450_000 + 6 * 4 * 59 * 120_000) / 4e12, rel=1e-9
+    )
+    assert usual["BWD"] >= 1e3 * 1_000_000 * 3 * 56 / (4 * 132 * 1.98e9)
+    more = floors.step_floors({name: 2 * value for name, value in counts.items()}, 4e12)
+    slower = floors.step_floors(counts, 1e12)
+    assert all(more[name] > usual[name] for name in usual) and all(slower[name] >= usual[name] for name in usual)
+
+
+def test_bytes_of_nested_tensors():
+    assert tensor_bytes({"a": torch.zeros(3), "b": [torch.zeros(2, dtype=torch.float16), 1], "c": None}) == 16
+
+
+def test_the_reference_is_as_exact_as_single_precision():
+    errors = precision(CPU)
+    assert errors["forward_mean"] < 1e-5 and errors["forward_beyond_1e-4"] < 1e-2
+    assert all(errors[f"{name}_gradient"] < 1e-2 for name in ("mean", "conic", "color", "opacity"))
+
+
+def test_the_arguments_for_another_build_read_back_as_the_same_bench():
+    bench = RasterBench((10, 20), (3,), (), 1.0, (64, 48), 2)
+    assert bench.arguments() == [
+        *("--gaussians", "10", "20", "--views", "3", "--pixel-budget", "1.0", "--size", "64", "48", "--repeats", "2"),
+    ]
+
+
+def test_bench_step_says_what_it_measured_on(turbogs, capture, tmp_path):
+    out = tmp_path / "step.json"
+    arguments = ["bench", "step", "train.sh_degree=1", "--scene", capture, "--gaussians", 500, "--views", 3, 2]
+    code, printed, _ = turbogs(*arguments, "--training", 4, "--repeats", 2, "--out", out, "--device", "cpu")
+    assert code == 0 and str(out) in printed and "M=500 K=3" in printed
+    report = json.loads(out.read_text())
+    assert report["device"] == "cpu" and "reference" in report["provenance"]["kernels"]
+    assert report["provenance"]["software"]["torch"] == torch.__version__
+    assert [entry["views"] for entry in report["passes"]] == [3, 2]
+    for entry in report["passes"]:
+        assert set(entry["steps"]) == {"iteration", *STEPS} - {"gather+L+E"}
+        assert entry["counts"]["gaussians"] == 500 and 0 < entry["counts"]["touched"] <= 500
+        assert entry["counts"]["pixels"] == entry["views"] * 48 * 40
+        assert entry["memory_bytes"]["parameters"] == 500 * 4 * (14 + 9) and entry["memory_bytes"]["peak"] is None
+        assert entry["lost_iterations"] == 0 and entry["floors_ms"] is None
+        assert entry["wall"]["median_ms"] > 0 and entry["density_event"]["every"] == 100
+    assert len(step_lines(report)) == 2
+
+
+def test_bench_raster_says_what_it_measured_on(turbogs, tmp_path):
+    out = tmp_path / "raster.json"
+    arguments = ["--gaussians", 300, "--views", 2, "--rates", 0.1, "--size", 48, 32, "--repeats", 2]
+    code, printed, _ = turbogs("bench", "raster", *arguments, "--out", out, "--device", "cpu")
+    assert code == 0 and "r=0.50" in printed and "r=0.10" in printed
+    report = json.loads(out.read_text())
+    assert report["gsplat"][0]["reason"] and report["other_builds"] == {}
+    assert [(entry["rate"], entry["density_sums"]) for entry in report["passes"]] == [
+        (0.5, False), (0.1, False), (0.5, True),
+    ]  # fmt: skip
+    assert all(math.isfinite(entry["forward_backward"]["median_ms"]) for entry in report["passes"])
+    assert len(raster_lines(report)) == 4
+    assert (report["scene"], report["image_size"], report["model"]) == (None, [48, 32], "synthetic")
+
+
+RASTER_PASSES = ("--views", 2, "--rates", 0.1, "--repeats", 1, "--device", "cpu")
+
+
+def visible(model, cameras) -> int:
+    """Gaussians that one of two views of the capture sees."""
+    chosen = cameras.select(spread_views(2, len(cameras)))
+    radii = rasterize(model, chosen, tile_samples(chosen.sizes, 0.1, CPU, seed=0)).projected().radii
+    return int((radii > 0).all(dim=-1).any(dim=0).sum())
+
+
+def test_bench_raster_times_models_trained_on_the_scene(turbogs, capture, tmp_path):
+    out, sizes = tmp_path / "raster.json", (150, 300)
+    options = ["--scene", capture, "--gaussians", *sizes, "--training", 3, *RASTER_PASSES]
+    code, _, error = turbogs("bench", "raster", *options, "--out", out)
+    assert code == 0, error
+    report = json.loads(out.read_text())
+    assert (report["scene"], report["image_size"]) == ("capture", [48, 40])
+    assert report["model"] == "trained for 3 iterations"
+    assert [entry["gaussians"] for entry in report["gsplat"]] == list(sizes)
+    scene = load_scene(capture)
+    for count in sizes:
+        seen = {entry["counts"]["visible_gaussians"] for entry in report["passes"] if entry["gaussians"] == count}
+        assert seen == {visible(trained_model(scene, count, 3, CPU, ()), scene.train.cameras)}
+        assert seen != {visible(surface_gaussians(count, CPU), scene.train.cameras)}
+
+
+def test_bench_raster_times_the_models_of_files(turbogs, capture, tmp_path):
+    out, scene, files = tmp_path / "raster.json", load_scene(capture), []
+    for count in (40, 90):
+        files.append(tmp_path / f"model-{count}.ply")
+        save_ply(surface_gaussians(count, CPU), files[-1], scene.frame)
+    code, _, error = turbogs("bench", "raster", "--scene", capture, "--ply", *files, *RASTER_PASSES, "--out", out)
+    assert code == 0, error
+    report = json.loads(out.read_text())
+    assert report["model"] == "model-40.ply, model-90.ply"
+    assert [entry["gaussians"] for entry in report["passes"]] == 3 * [40] + 3 * [90]
+    seen = [visible(load_ply(file, scene.frame), scene.train.cameras) for file in files]
+    assert [entry["counts"]["visible_gaussians"] for entry in report["passes"]] == 3 * seen[:1] + 3 * seen[1:]
+
+
+def test_other_builds_get_the_models_that_this_one_times(turbogs, capture, tmp_path, monkeypatch):
+    library, out, timed, handed_on = tmp_path / "other.so", tmp_path / "raster.json", [], []
+    library.touch()
+    measure_one = RasterBench._measure
+
+    def watched(bench, model, *others):
+        timed.append(model)
+        return measure_one(bench, model, *others)
+
+    def other_build(path, command):
+        assert path == library and "--training" not in command
+        files = command[command.index("--ply") + 1 :][:2]
+        handed_on.extend(load_ply(file, load_scene(capture).frame) for file in files)
+        assert (
+            len(json.loads(out.read_text())["passes"]) == 6
+        )  # what is measured is kept, whatever becomes of this build
+        return {"model": "files", "passes": [], "gsplat": []}
+
+    monkeypatch.setattr(RasterBench, "_measure", watched)
+    monkeypatch.setattr(commands, "other_build", other_build)
+    options = ["--scene", capture, "--gaussians", 150, 200, "--training", 0, *RASTER_PASSES, "--library", library]
+    code, output, error = turbogs("bench", "raster", *options, "--out", out)
+    assert code == 0, error
+    assert output.splitlines()[-2:] == ["other.so:", f"json  {out}"]
+    assert [len(model) for model in handed_on] == [150, 200] and len(timed) == 6
+    for mine, theirs in zip(timed[::3], handed_on, strict=True):
+        assert all(torch.equal(a, b) for (_, a), (_, b) in zip(mine.items(), theirs.items(), strict=True))
+    report = json.loads(out.read_text())
+    assert report["model"] == report["other_builds"]["other.so"]["model"] == "trained for 0 iterations"
+
+
+def test_this_build_is_measured_as_the_others_are(turbogs, capture, tmp_path, monkeypatch):
+    library, out, measured = tmp_path / "other.so", tmp_path / "raster.json", []
+    library.touch()
+    monkeypatch.setattr(commands.kernels, "available", lambda: True)
+    monkeypatch.setattr(commands.kernels, "library_path", lambda: tmp_path / "this.so")
+    monkeypatch.setattr(RasterBench, "run", lambda *_: {"passes": [], "gsplat": []})
+
+    def other_build(path, command):
+        measured.append(path.name)
+        return {"passes": [], "gsplat": []}
+
+    monkeypatch.setattr(commands, "other_build", other_build)
+    options = ["--scene", capture, "--gaussians", 150, "--training", 0, *RASTER_PASSES, "--library", library]
+    code, _, error = turbogs("bench", "raster", *options, "--out", out)
+    assert code == 0, error
+    assert measured == ["this.so", "other.so"]
+    assert list(json.loads(out.read_text())["other_builds"]) == [commands.AGAIN, "other.so"]
+
+
+def test_another_build_measures_in_a_process_of_its_own(monkeypatch, tmp_path):
+    def run(arguments, env, **options):
+        assert env["TURBOGS_LIBRARY"] == str((tmp_path / "other.so").resolve())
+        code, words = (0, "") if "--views" in arguments else (2, "warning\nturbogs: error: no views\n")
+        Path(arguments[arguments.index("--out") + 1]).write_text('{"passes": []}', encoding="utf-8")
+        return SimpleNamespace(returncode=code, stderr=words)
+
+    monkeypatch.setattr(raster_module.subprocess, "run", run)
+    assert raster_module.other_build(tmp_path / "other.so", ["--views", "2"]) == {"passes": []}
+    with pytest.raises(InputError, match=r"other\.so.*no views"):
+        raster_module.other_build(tmp_path / "other.so", [])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "word"),
+    [
+        (["step"], "--scene"),
+        (["step", "--scene", "absent"], "no such scene"),
+        (["step", "--photos", "1"], "--photos 1: at least 3"),
+        (["step", "--photos", "2"], "--photos 2: at least 3"),
+        (["step", "--scene", "CAPTURE", "loss.nonsense=1"], "nonsense"),
+        (["raster", "loss.type=charbonnier"], "section.key"),
+        (["raster", "--views", "0"], "--views"),
+        (["raster", "--ply", "absent.ply"], "--scene"),
+        (["raster", "--out", "absent/bench.json"], "absent"),
+        (["raster", "--training", "5"], "--scene"),
+        (["raster", "--scene", "CAPTURE", "--training", "5", "--ply", "model.ply"], "--training"),
+        (["raster", "--scene", "CAPTURE", "--training", "-1"], "--training"),
+        (["raster", "--scene", "CAPTURE", "--ply", "absent.ply"], "absent.ply"),
+        (["raster", "--library", "absent.so"], "absent.so"),
+        (["step", "--scene", "CAPTURE", "--ply", "one.ply", "two.ply"], "--ply"),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else None,
+)
+def test_bad_calls_are_refused(turbogs, capture, arguments, word):
+    given = [capture if argument == "CAPTURE" else argument for argument in arguments]
+    code, out, err = turbogs("bench", *given, "--device", "cpu")
+    assert code == 2 and out == "" and word in err and err.count("\n") == 1

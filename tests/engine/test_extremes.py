@@ -1,0 +1,188 @@
+"""Stiff and extreme Gaussians, cameras and images: finite outputs and gradients, and the stated behaviour."""
+
+import numpy as np
+import pytest
+import torch
+from helpers.rendering_scenes import make_cameras, make_gaussians
+
+from turbogs_plugin.engine.rendering import dense_samples, rasterize
+from turbogs_plugin.types import Gaussians, GaussianStats
+
+NAN, INFINITY = float("nan"), float("inf")
+
+
+def render_and_check(gaussians: Gaussians, cameras):
+    """Render and go back with every gradient and statistic; all finite."""
+    samples = dense_samples(cameras)
+    rendered = rasterize(gaussians, cameras, samples, with_depth=True)
+    stats = GaussianStats.zeros(len(gaussians), "cpu")
+    ones = torch.ones_like(rendered.alphas)
+    screen = rendered.backward(torch.ones_like(rendered.colors), ones, stats, ones, ones)
+    gradients = screen.parameter_gradients(rows=True)
+    for value in (rendered.colors, rendered.alphas, rendered.depths, *vars(gradients).values(), *vars(stats).values()):
+        assert value.isfinite().all()
+    assert (rendered.alphas >= 0).all() and (rendered.alphas <= 1 + 1e-6).all()
+    return rendered, gradients
+
+
+def scene(count: int = 20, dtype=torch.float32) -> Gaussians:
+    return make_gaussians(count, dtype=dtype)
+
+
+def needles(gaussians):
+    gaussians.scales[:] = torch.tensor([3.0, -10.8, -10.8])
+
+
+def huge(gaussians):
+    gaussians.scales[:] = 20.0
+
+
+def tiny(gaussians):
+    gaussians.scales[:] = -20.0
+
+
+def mixed_scales(gaussians):
+    gaussians.scales[:] = torch.tensor([20.0, -20.0, 0.0])
+
+
+def overflowing_scales(gaussians):
+    gaussians.scales[::2] = 200.0
+    gaussians.scales[1::2] = -200.0
+
+
+def zero_quaternions(gaussians):
+    gaussians.quats[:] = 0.0
+
+
+def tiny_quaternions(gaussians):
+    gaussians.quats *= 1e-20
+
+
+def huge_quaternions(gaussians):
+    gaussians.quats *= 1e20
+
+
+def opaque(gaussians):
+    gaussians.opacities[:] = 50.0
+
+
+def transparent(gaussians):
+    gaussians.opacities[:] = -50.0
+
+
+def far_away(gaussians):
+    gaussians.means *= 1e6
+
+
+def far_colors(gaussians):
+    gaussians.sh0 *= 1e6
+    gaussians.shN *= 1e6
+
+
+CASES = [
+    needles, huge, tiny, mixed_scales, overflowing_scales, zero_quaternions, tiny_quaternions, huge_quaternions,
+    opaque, transparent, far_away, far_colors,
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.__name__)
+def test_extreme_parameters_stay_finite(case, dtype):
+    gaussians = scene(dtype=dtype)
+    case(gaussians)
+    rendered, gradients = render_and_check(gaussians, make_cameras([(37, 29), (20, 50)], dtype))
+    if case in (transparent, huge, mixed_scales):  # too faint, or beyond SPAN_MAX
+        assert float(rendered.alphas.max()) == 0 and not gradients.touched.any()
+    if case in (needles, tiny, opaque, zero_quaternions, tiny_quaternions, huge_quaternions):
+        assert gradients.touched.any()
+
+
+@pytest.mark.parametrize("offset", [0.0, -1.0, 1e-3, 0.0100001, 1e-30], ids=lambda value: f"z={value}")
+def test_gaussians_at_and_behind_the_camera(offset):
+    gaussians, cameras = scene(), make_cameras([(32, 32)], torch.float32)
+    direction = cameras.directions[0]
+    gaussians.means[::2] = cameras.centers[0] + offset * direction
+    _, gradients = render_and_check(gaussians, cameras)
+    if offset < 0.01:
+        assert not gradients.touched[::2].any()
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [(name, value) for name in ("means", "quats", "scales", "sh0", "shN") for value in (NAN, INFINITY, -INFINITY)]
+    + [("opacities", NAN), ("opacities", -INFINITY)],
+)
+def test_one_broken_gaussian_leaves_the_others_untouched(name, value):
+    gaussians, cameras = scene(), make_cameras([(32, 32)], torch.float32)
+    expected = rasterize(gaussians.map(lambda tensor: tensor[1:]), cameras, dense_samples(cameras))
+    getattr(gaussians, name)[0].fill_(value)
+    rendered, gradients = render_and_check(gaussians, cameras)
+    torch.testing.assert_close(rendered.colors, expected.colors)
+    assert not gradients.touched[0]
+
+
+@pytest.mark.parametrize("count", [0, 1])
+@pytest.mark.parametrize("size", [(1, 1), (3, 2), (17, 33), (2000, 1)])
+def test_few_gaussians_and_odd_images(count, size):
+    gaussians, cameras = scene(count), make_cameras([size], torch.float32)
+    gaussians.means[:] = 0.0
+    gaussians.opacities[:] = 2.0
+    rendered, gradients = render_and_check(gaussians, cameras)
+    assert len(rendered.colors) == size[0] * size[1]
+    assert bool((rendered.alphas > 0).any()) == (count == 1)
+    assert gradients.means.shape == (1, count, 3)
+
+
+def test_everything_behind_the_camera():
+    cameras = make_cameras([(16, 16)], torch.float32)
+    gaussians = scene()
+    gaussians.means[:] = cameras.centers[0] - cameras.directions[0]
+    rendered, gradients = render_and_check(gaussians, cameras)
+    assert float(rendered.alphas.max()) == 0 and not gradients.touched.any()
+
+
+def test_a_gaussian_in_a_pixel_centre_shows_its_opacity():
+    gaussians, cameras = scene(1), make_cameras([(9, 9)], torch.float32)
+    cameras.viewmats[0] = torch.eye(4)
+    cameras.Ks[0, :2, 2] = 4.5
+    gaussians.means[0] = torch.tensor([0.0, 0.0, 3.0])
+    gaussians.opacities[0] = 1.0
+    rendered, _ = render_and_check(gaussians, cameras)
+    samples = dense_samples(cameras)
+    center = (samples.pixel_ids == 4 * 9 + 4).nonzero()[0, 0]
+    np.testing.assert_allclose(rendered.alphas[center], 1 / (1 + np.exp(-1.0)), rtol=1e-6)
+
+
+@pytest.mark.parametrize("degrees", [5.0, 170.0])
+@pytest.mark.parametrize("center", [-500.0, 16.0, 2000.0])
+def test_extreme_lenses(degrees, center):
+    gaussians, cameras = scene(50), make_cameras([(32, 32)], torch.float32)
+    cameras.Ks[0, 0, 0] = cameras.Ks[0, 1, 1] = 16 / np.tan(np.radians(degrees) / 2)
+    cameras.Ks[0, 0, 2] = center
+    render_and_check(gaussians, cameras)
+
+
+def test_many_splats_on_one_pixel():
+    gaussians, cameras = scene(20000), make_cameras([(1, 1)], torch.float32)
+    gaussians.means *= 1e-3
+    gaussians.opacities[:] = -5.0
+    rendered, _ = render_and_check(gaussians, cameras)
+    assert float(rendered.alphas[0]) > 0.999
+
+
+def test_equal_depths_render_the_same_every_time_and_in_order():
+    """All at one place: the first listed is in front."""
+    cameras = make_cameras([(16, 16)], torch.float32)
+    gaussians = scene(30)
+    for name in ("means", "quats", "scales", "opacities"):
+        getattr(gaussians, name)[:] = getattr(gaussians, name)[:1].clone()
+    gaussians.means[:], gaussians.opacities[:], gaussians.shN[:] = 0.0, 3.0, 0.0
+    gaussians.sh0[:] = -10.0
+    gaussians.sh0[0] = 5.0
+    samples = dense_samples(cameras)
+    first = rasterize(gaussians, cameras, samples)
+    again = rasterize(gaussians, cameras, samples)
+    assert torch.equal(first.colors, again.colors)
+    assert float(first.colors.max()) > 0.8
+    behind = gaussians.map(lambda value: value.flip(0))
+    assert float(rasterize(behind, cameras, samples).colors.max()) < 0.1

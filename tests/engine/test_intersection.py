@@ -1,0 +1,105 @@
+"""Exact tile intersection: nothing that contributes is lost, nothing else is kept."""
+
+import numpy as np
+import pytest
+import torch
+from helpers.rendering_scenes import make_cameras, make_gaussians, thin_out
+
+from turbogs_plugin.engine.reference.intersection import intersect_tiles, smallest_exponents, spread
+from turbogs_plugin.engine.reference.projection import drawable_rows, project_rows
+from turbogs_plugin.engine.rendering import RasterSettings, dense_samples
+
+SETTINGS = RasterSettings()
+
+
+def pairs_of(gaussians, cameras, samples):
+    rows = drawable_rows(gaussians, cameras, SETTINGS)
+    parameters = [value[rows.gaussians] for name, value in gaussians.items() if name != "shN"]
+    splats = project_rows(rows, *parameters, gaussians.shN, cameras, 0, SETTINGS)
+    return rows, splats, intersect_tiles(rows, splats, samples, SETTINGS)
+
+
+def contributing(rows, splats, samples, tile: int) -> torch.Tensor:
+    """[R] bool by brute force: alpha reaches the threshold at some pixel of the tile."""
+    grid, tile_id = samples.grid, int(samples.tile_ids[tile])
+    view = int(np.searchsorted(grid.offsets, tile_id, side="right")) - 1
+    line, column = divmod(tile_id - int(grid.offsets[view]), int(grid.shapes[view, 0]))
+    width, height = samples.sizes[view]
+    y, x = torch.meshgrid(
+        torch.arange(16 * line, min(16 * line + 16, height)),
+        torch.arange(16 * column, min(16 * column + 16, width)),
+        indexing="ij",
+    )
+    centers = torch.stack([x, y], dim=-1).reshape(-1, 2) + 0.5
+    dx, dy = (splats.means2d[:, None] - centers.to(splats.means2d.dtype)).unbind(dim=-1)
+    a, b, c = splats.conics[:, :, None].unbind(dim=1)
+    sigma = 0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy
+    alpha = splats.opacities[:, None] * torch.exp(-sigma)
+    return ((alpha >= SETTINGS.alpha_min) & (sigma >= 0)).any(dim=1) & (rows.views == view)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("shape", ["round", "needles"])
+def test_no_contribution_is_lost_and_order_is_by_depth(dtype, shape):
+    gaussians = make_gaussians(300, dtype=dtype, degree=0, spread=1.5)
+    if shape == "needles":
+        gaussians.scales[:, 0] += 6
+        gaussians.scales[:, 1:] -= 5
+    cameras = make_cameras([(70, 45), (33, 64)], dtype)
+    samples = thin_out(dense_samples(cameras), 0.2)
+    rows, splats, pairs = pairs_of(gaussians, cameras, samples)
+    assert len(samples.tile_ids) < len(samples.grid)
+    found, needed = 0, 0
+    for tile, listed in enumerate(pairs.rows.split(pairs.tile_counts.tolist())):
+        expected = contributing(rows, splats, samples, tile).nonzero()[:, 0]
+        assert set(expected.tolist()) <= set(listed.tolist())
+        keys = list(zip(splats.depths[listed].tolist(), rows.gaussians[listed].tolist(), strict=True))
+        assert keys == sorted(keys)
+        assert len(set(listed.tolist())) == len(listed)
+        found, needed = found + len(listed), needed + len(expected)
+    # What is kept without contributing lies between two pixel centres.
+    assert needed > 200
+    assert found <= 1.1 * needed + 5
+
+
+def test_smallest_exponents_are_the_minimum_over_the_rectangle():
+    generator = torch.Generator().manual_seed(0)
+    factors = torch.randn(400, 2, 2, generator=generator, dtype=torch.float64)
+    matrices = factors @ factors.transpose(1, 2) + 0.01 * torch.eye(2, dtype=torch.float64)
+    conics = torch.stack([matrices[:, 0, 0], matrices[:, 0, 1], matrices[:, 1, 1]], dim=-1)
+    low = 4 * torch.randn(400, 2, generator=generator, dtype=torch.float64)
+    high = low + 3 * torch.rand(400, 2, generator=generator, dtype=torch.float64)
+    shares = torch.linspace(0, 1, 201, dtype=torch.float64)
+    x = low[:, :1] + shares * (high - low)[:, :1]
+    y = low[:, 1:] + shares * (high - low)[:, 1:]
+    a, b, c = conics[:, :, None, None].unbind(dim=1)
+    grid = 0.5 * (a * x[:, :, None] ** 2 + c * y[:, None] ** 2) + b * x[:, :, None] * y[:, None]
+    brute = grid.amin(dim=(1, 2))
+    found = smallest_exponents(conics, low, high)
+    assert (found <= brute + 1e-9).all()
+    assert (found >= brute - 0.02 * (1 + brute)).all()  # the brute search has a step
+
+
+def test_pairs_cover_every_row_once_when_summed():
+    gaussians, cameras = make_gaussians(50, degree=0), make_cameras([(70, 45)])
+    _, splats, pairs = pairs_of(gaussians, cameras, dense_samples(cameras))
+    values = torch.empty(len(pairs.rows), 1, dtype=torch.float64)
+    values[pairs.slots, 0] = (pairs.rows + 1).double()
+    counts = torch.bincount(pairs.rows, minlength=len(splats.depths))
+    expected = counts * torch.arange(1, len(counts) + 1)
+    assert torch.equal(pairs.sum_by_row(values)[:, 0], expected.double())
+
+
+def test_equal_depths_keep_the_order_of_the_gaussians():
+    gaussians, cameras = make_gaussians(40, degree=0), make_cameras([(32, 32)])
+    gaussians.means[:] = gaussians.means[0]
+    rows, splats, pairs = pairs_of(gaussians, cameras, dense_samples(cameras))
+    assert len(set(splats.depths.tolist())) == 1
+    for listed in pairs.rows.split(pairs.tile_counts.tolist()):
+        assert (rows.gaussians[listed].diff() > 0).all()
+
+
+def test_spread():
+    owners, number = spread(torch.tensor([2, 0, 3]))
+    assert owners.tolist() == [0, 0, 2, 2, 2]
+    assert number.tolist() == [0, 1, 0, 1, 2]

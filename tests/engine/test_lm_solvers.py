@@ -1,0 +1,158 @@
+"""The batched solvers of small damped systems, against extended precision."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from turbogs_plugin.engine.reference.lm_solvers import (
+    ROW_LIMIT,
+    scaled_rows,
+    solve_float64,
+    solve_low_rank,
+    solve_raw_cholesky,
+    solve_scaled_cholesky,
+)
+
+STABLE = [solve_scaled_cholesky, solve_low_rank]
+
+
+def systems(views: int, size: int, decades: float, length: float, seed: int = 0, count: int = 40, dtype=torch.float64):
+    """Systems whose damping spans `decades` orders of magnitude and whose scaled rows have about this length."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def uniform(*shape):
+        return torch.rand(*shape, generator=generator, dtype=torch.float64) * 2 - 1
+
+    damping = 10 ** (decades * 0.5 * uniform(count, size))
+    rows = uniform(views, count, size) * damping.sqrt() * length
+    rhs = uniform(count, size) * damping.sqrt()
+    weights = 0.5 + 0.5 * uniform(views, count).abs()
+    return tuple(value.to(dtype) for value in (rows, weights, damping, rhs))
+
+
+def exact(rows, weights, damping, rhs) -> np.ndarray:
+    """[n, D] by Gaussian elimination with pivots, in numpy's extended precision, after scaling."""
+    rows, weights, damping, rhs = (
+        value.double().numpy().astype(np.longdouble) for value in (rows, weights, damping, rhs)
+    )
+    answers = []
+    for i in range(len(rhs)):
+        scale = 1 / np.sqrt(damping[i])
+        matrix = np.eye(len(scale), dtype=np.longdouble)
+        for k in range(len(rows)):
+            matrix += weights[k, i] * np.outer(rows[k, i] * scale, rows[k, i] * scale)
+        target = (rhs[i] * scale).copy()
+        for column in range(len(scale)):
+            pivot = column + np.abs(matrix[column:, column]).argmax()
+            matrix[[column, pivot]], target[[column, pivot]] = matrix[[pivot, column]], target[[pivot, column]]
+            for row in range(column + 1, len(scale)):
+                factor = matrix[row, column] / matrix[column, column]
+                matrix[row] -= factor * matrix[column]
+                target[row] -= factor * target[column]
+        for row in reversed(range(len(scale))):
+            target[row] = (target[row] - matrix[row, row + 1 :] @ target[row + 1 :]) / matrix[row, row]
+        answers.append(target * scale)
+    return np.array(answers)
+
+
+def scaled_error(solution, expected, damping, rhs) -> float:
+    """Largest error of the scaled unknown, over the length of the step without rows."""
+    root = damping.double().numpy() ** 0.5
+    error = np.linalg.norm((solution.double().numpy() - expected.astype(float)) * root, axis=-1)
+    return float((error / np.linalg.norm(rhs.double().numpy() / root, axis=-1)).max())
+
+
+@pytest.mark.parametrize("views", [1, 3, 10])
+@pytest.mark.parametrize("size", [1, 4, 10])
+@pytest.mark.parametrize("solve", [*STABLE, solve_raw_cholesky, solve_float64])
+def test_well_conditioned(views, size, solve):
+    problem = systems(views, size, decades=1, length=2)
+    expected = exact(*problem)
+    np.testing.assert_allclose(solve(*problem).numpy(), expected.astype(float), rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("views", [1, 3, 10])
+@pytest.mark.parametrize("solve", STABLE)
+@pytest.mark.parametrize("decades", [8, 16, 30])
+def test_stiff_in_float32(views, solve, decades):
+    """Condition numbers to 1e30 of the unscaled system cost nothing: only the scaled one's counts, 1e4 here."""
+    problem = systems(views, 10, decades=decades, length=30, dtype=torch.float32)
+    assert scaled_error(solve(*problem), exact(*problem), problem[2], problem[3]) < 2e-3
+
+
+def test_stiffness_alone_does_not_hurt_raw_cholesky():
+    """Cholesky is invariant to scaling: what the scaled form buys is the two failures below."""
+    problem = systems(3, 10, decades=16, length=30, dtype=torch.float32)
+    assert scaled_error(solve_raw_cholesky(*problem), exact(*problem), problem[2], problem[3]) < 2e-3
+
+
+@pytest.mark.parametrize("failure", ["damping below rounding", "overflow"])
+def test_raw_cholesky_fails_where_the_scaled_one_does_not(failure):
+    """Rows so long that 1 + |u|^2 rounds to |u|^2, and gradients whose squares leave float32."""
+    if failure == "overflow":
+        rows, weights, damping, rhs = systems(3, 10, decades=4, length=5, dtype=torch.float32)
+        problem = rows * 1e18, weights, damping * 1e36, rhs * 1e18
+        tolerance = 1e-4
+    else:
+        problem = systems(3, 10, decades=16, length=1e6, dtype=torch.float32)
+        tolerance = 1e-2  # the rows are cut at ROW_LIMIT
+    expected = exact(*problem)
+    raw = solve_raw_cholesky(*problem)
+    assert torch.isnan(raw).any() or scaled_error(raw, expected, problem[2], problem[3]) > 0.1
+    for solve in STABLE:
+        assert scaled_error(solve(*problem), expected, problem[2], problem[3]) < tolerance
+
+
+@pytest.mark.parametrize("solve", STABLE)
+def test_parallel_rows_are_one_row(solve):
+    rows, weights, damping, rhs = systems(1, 10, decades=4, length=5)
+    many = rows.repeat(6, 1, 1), weights.repeat(6, 1) / 6, damping, rhs
+    torch.testing.assert_close(solve(*many), solve(rows, weights, damping, rhs), rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("solve", STABLE)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_extremes_stay_finite(solve, dtype):
+    """Rows, weights and damping at the ends of what the optimizer can hand over, in every combination."""
+    rows = torch.tensor([0.0, 1e-38, 1e-17, 1.0, 1e17], dtype=dtype)
+    weights = torch.tensor([0.0, 1e-38, 1.0, torch.finfo(torch.float32).max], dtype=dtype)
+    damping = torch.tensor([1e-20, 1e-4, 1.0, 1e23, 1e36], dtype=dtype)
+    rhs = torch.tensor([0.0, 1e-30, 1e18], dtype=dtype)
+    first, second, w, d1, d2, b = torch.meshgrid(rows, rows, weights, damping, damping, rhs, indexing="ij")
+    row = torch.stack([first, second, first], dim=-1).reshape(1, -1, 3).repeat(5, 1, 1)
+    solution = solve(
+        row,
+        w.reshape(1, -1).repeat(5, 1),
+        torch.stack([d1, d2, d2], dim=-1).reshape(-1, 3),
+        torch.stack([b, -b, b], dim=-1).reshape(-1, 3),
+    )
+    assert torch.isfinite(solution).all()
+    assert (
+        scaled_rows(row, w.reshape(1, -1).repeat(5, 1), torch.ones_like(row[0])).norm(dim=-1) <= 1.001 * ROW_LIMIT
+    ).all()
+
+
+@pytest.mark.parametrize("views", [1, 10, 32])
+@pytest.mark.parametrize("solve", STABLE)
+def test_worst_condition_that_the_limit_admits(views, solve):
+    """Endless rows, all parallel, or all but parallel: cut at the limit, they leave every pivot positive in float32."""
+    generator = torch.Generator().manual_seed(views)
+    rows = torch.randn(1, 500, 10, generator=generator).repeat(views, 1, 1)
+    rows[:, 250:] += 1e-3 * torch.randn(views, 250, 10, generator=generator)
+    rows *= ROW_LIMIT / rows.norm(dim=-1, keepdim=True)  # the longest that need no cut, so that the answer is known
+    weights, damping = torch.ones(views, 500), torch.ones(500, 10)
+    rhs = torch.randn(500, 10, generator=generator)
+    problem = rows, weights, damping, rhs
+    bound = 3 * torch.finfo(torch.float32).eps * views * ROW_LIMIT**2  # rounding times condition
+    assert scaled_error(solve(*problem), exact(*problem), damping, rhs) < bound
+    endless = solve(rows * 1e12, weights, damping, rhs)
+    assert torch.isfinite(endless).all()
+    assert (endless.norm(dim=-1) <= (1 + bound) * rhs.norm(dim=-1)).all()
+
+
+@pytest.mark.parametrize("solve", STABLE)
+def test_no_systems(solve):
+    empty = torch.zeros(3, 0, 10), torch.zeros(3, 0), torch.ones(0, 10), torch.zeros(0, 10)
+    assert solve(*empty).shape == (0, 10)

@@ -1,0 +1,126 @@
+"""Projection and spherical harmonics against gsplat's own torch references."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from gsplat.cuda._torch_impl import _fully_fused_projection, _quat_scale_to_covar_preci, _spherical_harmonics
+from helpers.rendering_scenes import make_cameras, make_gaussians
+
+from turbogs_plugin.engine.reference.projection import drawable_rows, project_rows, rotation_matrices
+from turbogs_plugin.engine.reference.spherical_harmonics import basis, evaluate, num_bands, unit_directions
+from turbogs_plugin.engine.rendering import RasterSettings
+from turbogs_plugin.types import Gaussians
+
+SETTINGS = RasterSettings()
+
+
+def project(gaussians: Gaussians, cameras, degree: int = 3, settings: RasterSettings = SETTINGS):
+    rows = drawable_rows(gaussians, cameras, settings)
+    parameters = [value[rows.gaussians] for name, value in gaussians.items() if name != "shN"]
+    return rows, project_rows(rows, *parameters, gaussians.shN, cameras, degree, settings)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_spherical_harmonics_are_gsplats(degree):
+    generator = torch.Generator().manual_seed(degree)
+    offsets = torch.randn(50, 3, generator=generator, dtype=torch.float64)
+    coefficients = torch.randn(50, 16, 3, generator=generator, dtype=torch.float64)
+    ours = evaluate(coefficients[:, :1], coefficients[:, 1:], unit_directions(offsets), degree)
+    theirs = _spherical_harmonics(degree, offsets, coefficients)
+    torch.testing.assert_close(ours, theirs, rtol=0, atol=1e-13)
+
+
+def test_spherical_harmonics_are_orthonormal():
+    """Integrals over the sphere by Gauss-Legendre in z and the trapezoid rule in the angle, exact at these degrees."""
+    heights, weights = np.polynomial.legendre.leggauss(8)
+    angles = 2 * np.pi * np.arange(16) / 16
+    z, angle = np.meshgrid(heights, angles, indexing="ij")
+    ring = np.sqrt(1 - z**2)
+    directions = torch.tensor(np.stack([ring * np.cos(angle), ring * np.sin(angle), z], axis=-1).reshape(-1, 3))
+    values = basis(directions, 3).numpy()
+    area = np.repeat(weights, 16) * 2 * np.pi / 16
+    np.testing.assert_allclose(values.T @ (area[:, None] * values), np.eye(num_bands(3)), atol=1e-9)
+
+
+def test_direction_of_no_offset_is_zero_with_no_gradient():
+    offsets = torch.zeros(2, 3, dtype=torch.float64)
+    offsets[1, 0] = 2.0
+    offsets.requires_grad_()
+    directions = unit_directions(offsets)
+    directions.sum().backward()
+    assert directions[0].tolist() == [0, 0, 0]
+    assert offsets.grad[0].tolist() == [0, 0, 0]
+    np.testing.assert_allclose(offsets.grad[1], [0, 0.5, 0.5])
+
+
+@pytest.mark.parametrize("spread", [1.0, 6.0], ids=["inside", "mostly outside the image"])
+def test_projection_and_its_gradients_are_gsplats(spread):
+    """Wide spread puts most means where the Jacobian's clamp acts."""
+    gaussians = make_gaussians(200, spread=spread).map(lambda value: value.clone().requires_grad_())
+    cameras = make_cameras([(48, 32), (48, 32)])
+    rows, splats = project(gaussians, cameras)
+
+    covariances, _ = _quat_scale_to_covar_preci(gaussians.quats, gaussians.scales.exp(), compute_preci=False)
+    _, means2d, depths, conics, _ = _fully_fused_projection(
+        gaussians.means, covariances, cameras.viewmats, cameras.Ks, 48, 32
+    )
+    for ours, theirs in ((splats.means2d, means2d), (splats.depths, depths), (splats.conics, conics)):
+        torch.testing.assert_close(ours, rows.gather(theirs), rtol=1e-9, atol=1e-11)
+
+    generator = torch.Generator().manual_seed(5)
+    upstream = [torch.randn(value.shape, generator=generator, dtype=torch.float64) for value in (means2d, conics)]
+    leaves = (gaussians.means, gaussians.quats, gaussians.scales)
+    ours = torch.autograd.grad((splats.means2d, splats.conics), leaves, [rows.gather(value) for value in upstream])
+    theirs = torch.autograd.grad(
+        (rows.gather(means2d), rows.gather(conics)), leaves, [rows.gather(value) for value in upstream]
+    )
+    for our, their in zip(ours, theirs, strict=True):
+        torch.testing.assert_close(our, their, rtol=1e-8, atol=1e-8 * float(their.abs().max()))
+
+
+def test_radii_follow_the_opacity_and_the_image():
+    """The rules of gsplat's fused kernel, one row at a time."""
+    gaussians, cameras = make_gaussians(300, spread=3.0), make_cameras([(48, 32), (20, 70)])
+    rows, splats = project(gaussians, cameras)
+    shown = 0
+    for row, (view, index) in enumerate(zip(rows.views.tolist(), rows.gaussians.tolist(), strict=True)):
+        opacity = 1 / (1 + math.exp(-float(gaussians.opacities[index])))
+        a, b, c = splats.conics[row].tolist()
+        covariance = np.linalg.inv(np.array([[a, b], [b, c]]))
+        extent = min(3.33, math.sqrt(2 * math.log(255 * opacity)))
+        expected = np.ceil(extent * np.sqrt(np.diag(covariance)))
+        mean, size = splats.means2d[row].numpy(), cameras.sizes[view]
+        if np.any(mean + expected <= 0) or np.any(mean - expected >= size):
+            expected[:] = 0
+        assert splats.radii[row].tolist() == expected.tolist()
+        shown += expected.any()
+    assert 50 < shown < len(rows.views) - 50
+
+
+def test_rows_are_those_that_can_be_drawn():
+    gaussians, cameras = make_gaussians(100, spread=4.0), make_cameras([(48, 32), (20, 70)])
+    settings = RasterSettings(near_plane=2.0, far_plane=6.0)
+    rows = drawable_rows(gaussians, cameras, settings)
+    drawn = torch.zeros(rows.shape, dtype=torch.bool)
+    drawn[rows.views, rows.gaussians] = True
+    points = (
+        torch.einsum("kij,nj->kni", cameras.viewmats[:, :3, :3], gaussians.means) + cameras.viewmats[:, None, :3, 3]
+    )
+    expected = (points[..., 2] >= 2) & (points[..., 2] <= 6) & (gaussians.opacities.sigmoid() >= 1 / 255)
+    assert torch.equal(drawn, expected)
+    assert torch.equal(rows.flat, rows.flat.sort().values)
+
+
+def test_rotation_matrices_of_any_norm():
+    generator = torch.Generator().manual_seed(0)
+    quats = torch.randn(20, 4, generator=generator)
+    expected = rotation_matrices(quats)
+    torch.testing.assert_close(expected @ expected.transpose(1, 2), torch.eye(3).expand(20, 3, 3), rtol=0, atol=1e-6)
+    for scale in (1e-20, 1e20):
+        torch.testing.assert_close(rotation_matrices(scale * quats), expected, rtol=0, atol=1e-6)
+    zero = torch.zeros(1, 4, requires_grad=True)
+    assert torch.equal(rotation_matrices(zero)[0], torch.eye(3))
+    rotation_matrices(zero).sum().backward()
+    assert zero.grad.isfinite().all()

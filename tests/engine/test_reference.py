@@ -1,0 +1,352 @@
+"""The reference rasterizer against loops over pixels and splats, and its gradients against autograd and differences."""
+
+import numpy as np
+import pytest
+import torch
+from gsplat.cuda._torch_impl import _spherical_harmonics
+from helpers.rendering_scenes import loop_render, make_cameras, make_gaussians, thin_out
+
+from turbogs_plugin.engine.reference import compositing, projection
+from turbogs_plugin.engine.rendered import ALPHA_MIN_LOWEST
+from turbogs_plugin.engine.rendering import (
+    RasterSettings,
+    dense_samples,
+    rasterize,
+    rasterize_differentiable,
+    render_images,
+)
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.types import PARAMETER_NAMES, Gaussians, GaussianStats, PixelSamples, cell_order
+
+SIZES = [(37, 29), (20, 50)]
+ACTIVATED = {"opaque": 5.0, "as made": 0.0}
+
+
+def gsplat_colors(gaussians, cameras, degree: int = 3) -> np.ndarray:
+    directions = gaussians.means[None] - cameras.centers[:, None]
+    coefficients = torch.cat([gaussians.sh0, gaussians.shN], dim=1)[None].expand(len(cameras), -1, -1, -1)
+    return (_spherical_harmonics(degree, directions, coefficients) + 0.5).clamp(min=0).numpy()
+
+
+def upstream(samples: PixelSamples, seed: int = 0, dtype=torch.float64) -> tuple[torch.Tensor, ...]:
+    """Gradients of colours, alphas and depths, and errors; made-up values in empty slots too."""
+    generator = torch.Generator().manual_seed(seed)
+    count = len(samples)
+    colors = torch.randn(count, 3, generator=generator, dtype=torch.float64)
+    alphas, depths = torch.randn(2, count, generator=generator, dtype=torch.float64)
+    return tuple(value.to(dtype) for value in (colors, alphas, depths, colors.abs().sum(dim=1)))
+
+
+@pytest.mark.parametrize("opacity", ACTIVATED)
+def test_render_and_sums_equal_the_loops(opacity, monkeypatch):
+    """Both sides of every threshold occur; the slices are short so that several are needed."""
+    monkeypatch.setattr(compositing, "SLICE_SPLATS", 7)
+    gaussians, cameras = make_gaussians(40), make_cameras(SIZES)
+    gaussians.opacities += ACTIVATED[opacity]
+    samples = thin_out(dense_samples(cameras), 0.3, empty_slots=2)
+    color_gradients, _, _, errors = upstream(samples)
+    errors = torch.where(samples.filled, errors, 0)
+    expected = loop_render(gaussians, cameras, samples, gsplat_colors(gaussians, cameras), errors.numpy())
+    assert expected.margin > 1e-10  # no decision hangs on a rounding
+    if opacity == "opaque":
+        assert (1 - expected.alphas).min() < 0.1
+
+    rendered = rasterize(gaussians, cameras, samples, with_depth=True)
+    np.testing.assert_allclose(rendered.colors, expected.colors, atol=1e-13)
+    np.testing.assert_allclose(rendered.alphas, expected.alphas, atol=1e-13)
+    np.testing.assert_allclose(rendered.depths, expected.depths, atol=1e-12)
+    assert (rendered.colors[~samples.filled] == 0).all() and (rendered.alphas[~samples.filled] == 0).all()
+
+    record = rendered.backward(color_gradients, errors).full_records()
+    np.testing.assert_allclose(record[..., compositing.ERROR_SUM], expected.error_sums, atol=1e-11)
+    np.testing.assert_allclose(record[..., compositing.DISTANCE_SUM], expected.distance_sums, atol=1e-11)
+    np.testing.assert_allclose(record[..., compositing.WEIGHT_SUM], expected.weight_sums, atol=1e-11)
+
+
+def test_pixels_end_before_the_splat_that_would_bring_them_to_the_limit():
+    """Ten opaque splats in a row: 1e-3 is left after the first; the second would leave 1e-6, so it is not drawn."""
+    gaussians, cameras = make_gaussians(10, degree=0), make_cameras([(1, 1)])
+    cameras.Ks[:, :2, 2] = 0.5
+    ray = cameras.directions[0]
+    gaussians.means[:] = cameras.centers[0] + torch.arange(2.0, 12.0, dtype=torch.float64)[:, None] * ray
+    gaussians.opacities[:] = 8.0  # sigmoid 0.9997
+    rendered = rasterize(gaussians, cameras, dense_samples(cameras), with_depth=True)
+    np.testing.assert_allclose(rendered.alphas, [0.999])
+    np.testing.assert_allclose(rendered.depths, [2.0])
+    gradients = rendered.backward(torch.ones_like(rendered.colors)).parameter_gradients(rows=False)
+    assert gradients.touched.tolist() == [True] + [False] * 9
+    assert float(gradients.opacities.abs().max()) == 0  # cut at alpha_max: no gradient
+
+
+def test_projected_is_what_was_drawn():
+    gaussians, cameras = make_gaussians(60, spread=3.0), make_cameras(SIZES)
+    samples = dense_samples(cameras)
+    projected = rasterize(gaussians, cameras, samples).projected()
+    output = rasterize_differentiable(gaussians, cameras, samples)
+    shown = (output.radii > 0).any(dim=-1)
+    assert 0 < int(shown.sum()) < shown.numel()
+    pairs = {"means2d": "means2d", "conics": "conics", "depths": "depths_per_gaussian", "opacities": "opacities"}
+    for ours, theirs in pairs.items():
+        assert torch.equal(getattr(projected, ours)[shown], getattr(output, theirs)[shown])
+        assert (getattr(projected, ours)[~shown] == 0).all()
+    assert torch.equal(projected.radii, output.radii)
+
+
+def test_what_lies_behind_the_end_of_a_pixel_has_no_gradient_at_all():
+    """In float32 too, where the sums of what is left behind are not exactly zero."""
+    gaussians, cameras = make_gaussians(200, dtype=torch.float32, spread=0.3), make_cameras([(32, 32)], torch.float32)
+    gaussians.opacities[:] = 5.0
+    samples = dense_samples(cameras)
+    colors, alphas, depths, errors = upstream(samples, dtype=torch.float32)
+    rendered = rasterize(gaussians, cameras, samples, with_depth=True)
+    gradients = rendered.backward(colors, errors, None, alphas, depths).parameter_gradients(rows=True)
+    assert 10 < int(gradients.touched.sum()) < 190
+    for name in PARAMETER_NAMES[:-1]:
+        assert float(getattr(gradients, name)[:, ~gradients.touched].abs().max()) == 0
+
+
+def test_gradcheck_through_everything():
+    gaussians, cameras = make_gaussians(5, seed=3), make_cameras([(9, 7), (8, 18)])
+    gaussians.sh0.add_(1.5)  # away from the clamp of colours at zero
+    samples = thin_out(dense_samples(cameras), 0.25, empty_slots=1)
+
+    def render(*parameters):
+        output = rasterize_differentiable(Gaussians(*parameters), cameras, samples, with_depth=True)
+        return output.colors, output.alphas, output.depths
+
+    errors = np.zeros(len(samples))
+    margin = loop_render(gaussians, cameras, samples, gsplat_colors(gaussians, cameras), errors).margin
+    assert margin > 1e-5
+    parameters = [value.clone().requires_grad_() for _, value in gaussians.items()]
+    assert torch.autograd.gradcheck(render, parameters, eps=1e-7, atol=1e-6)
+
+
+@pytest.mark.parametrize("opacity", ACTIVATED)
+def test_backward_equals_autograd_and_rows_sum_to_it(opacity):
+    gaussians, cameras = make_gaussians(60), make_cameras(SIZES)
+    gaussians.opacities += ACTIVATED[opacity]
+    samples = thin_out(dense_samples(cameras), 0.4, empty_slots=3)
+    colors, alphas, depths, errors = upstream(samples)
+    rendered = rasterize(gaussians, cameras, samples, with_depth=True)
+
+    def gradients(rows):
+        return rendered.backward(colors, errors, None, alphas, depths).parameter_gradients(rows)
+
+    leaves = gaussians.map(lambda value: value.clone().requires_grad_())
+    output = rasterize_differentiable(leaves, cameras, samples, with_depth=True)
+    loss = (output.colors * colors).sum(dim=1) + output.alphas * alphas + output.depths * depths
+    loss[samples.filled].sum().backward()
+
+    by_view = gradients(rows=True)
+    rendered = rasterize(gaussians, cameras, samples)
+    total = gradients(rows=False)
+    for name in PARAMETER_NAMES:
+        expected = getattr(leaves, name).grad
+        scale = float(expected.abs().max())
+        assert scale > 0
+        torch.testing.assert_close(total.summed(name), expected, rtol=0, atol=1e-12 * scale)
+        torch.testing.assert_close(by_view.summed(name), expected, rtol=0, atol=1e-12 * scale)
+        if name != "shN":
+            assert getattr(by_view, name).shape == (2, *expected.shape)
+            assert getattr(total, name).shape == (1, *expected.shape)
+    torch.testing.assert_close(by_view.view_losses.sum(dim=0), total.view_losses[0])
+
+
+def test_each_view_row_is_the_gradient_of_that_view_alone():
+    gaussians, cameras = make_gaussians(30), make_cameras(SIZES)
+    samples = dense_samples(cameras)
+    colors, _, _, errors = upstream(samples)
+    rows = rasterize(gaussians, cameras, samples).backward(colors, errors).parameter_gradients(rows=True)
+    for view in range(2):
+        mine = samples.view_of_slot() == view
+        alone = rasterize(gaussians, cameras.select([view]), dense_samples(cameras, [view]))
+        expected = alone.backward(colors[mine], errors[mine]).parameter_gradients(rows=True)
+        for name in PARAMETER_NAMES[:-1]:
+            torch.testing.assert_close(getattr(rows, name)[view], getattr(expected, name)[0])
+        share = mine.double().mean()
+        torch.testing.assert_close(rows.view_losses[view], expected.view_losses[0] * share)
+
+
+def test_absolute_gradients_are_summed_pixel_by_pixel():
+    """One pixel at a time the absolute gradient is the gradient's absolute value."""
+    gaussians, cameras = make_gaussians(20), make_cameras([(6, 5)])
+    samples = dense_samples(cameras)
+    colors, _, _, _ = upstream(samples)
+
+    def means_gradient(upstream_gradient):
+        output = rasterize_differentiable(leaves, cameras, samples)
+        output.colors.backward(upstream_gradient)
+        return output.means2d.grad, output.means2d.absgrad
+
+    leaves = gaussians.map(lambda value: value.clone().requires_grad_())
+    total, absolute = means_gradient(colors)
+    single = torch.stack(
+        [means_gradient(torch.where(torch.arange(len(samples))[:, None] == slot, colors, 0))[0] for slot in range(30)]
+    )
+    torch.testing.assert_close(single.sum(dim=0), total)
+    torch.testing.assert_close(single.abs().sum(dim=0), absolute)
+    assert (absolute > total.abs() + 1e-6).any()
+
+
+def test_statistics_are_added_once_as_documented():
+    gaussians, cameras = make_gaussians(30), make_cameras(SIZES)
+    samples = thin_out(dense_samples(cameras), 0.5)
+    colors, _, _, errors = upstream(samples)
+    stats = GaussianStats.zeros(30, "cpu").map(lambda value: value + 1)
+    screen = rasterize(gaussians, cameras, samples).backward(colors, errors, stats)
+    gradients = screen.parameter_gradients(rows=True)
+    record = screen.full_records()
+    half = torch.as_tensor(np.array(SIZES)) * 0.5 * 2  # K = 2
+    output = rasterize_differentiable(gaussians, cameras, samples)
+    shown = (output.radii > 0).all(dim=-1)
+    expected = {
+        "error_sums": record[..., 11].sum(dim=0),
+        "distance_sums": record[..., 12].sum(dim=0),
+        "weight_sums": record[..., 13].sum(dim=0),
+        "grad_sums": (record[..., 0:2] * half[:, None]).norm(dim=-1).sum(dim=0),
+        "absgrad_sums": (record[..., 9:11] * half[:, None]).norm(dim=-1).sum(dim=0),
+        "view_counts": shown.double().sum(dim=0),
+    }
+    for name, value in expected.items():
+        torch.testing.assert_close(getattr(stats, name).double(), 1 + value, rtol=1e-6, atol=1e-6, msg=name)
+    largest = (output.radii.amax(dim=-1) / torch.tensor([[37.0], [50.0]])).amax(dim=0)
+    torch.testing.assert_close(stats.max_radii, largest.clamp(min=1))
+    assert torch.equal(gradients.touched, record[..., 13].sum(dim=0) > 0)
+    torch.testing.assert_close(gradients.view_losses, record[..., 11] / len(samples))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_sparse_equals_dense_at_the_same_pixels(dtype):
+    gaussians, cameras = make_gaussians(80, dtype=dtype), make_cameras(SIZES, dtype)
+    samples = thin_out(dense_samples(cameras), 0.2, empty_slots=1)
+    rendered = rasterize(gaussians, cameras, samples, with_depth=True)
+    images = render_images(gaussians, cameras)
+    x, y = samples.coordinates().unbind(dim=-1)
+    views = samples.view_of_slot()
+    for slot in samples.filled.nonzero()[:, 0].tolist():
+        colors, alphas = images[views[slot]]
+        assert colors.dtype == dtype
+        torch.testing.assert_close(rendered.colors[slot], colors[y[slot], x[slot]])
+        torch.testing.assert_close(rendered.alphas[slot], alphas[y[slot], x[slot]])
+
+
+def test_float32_is_close_to_float64():
+    """Thresholds may fall differently in rounding, at a cost of at most about alpha_min at that pixel."""
+    gaussians, cameras = make_gaussians(200, spread=1.5), make_cameras([(64, 48)])
+    samples = dense_samples(cameras)
+    colors, _, _, errors = upstream(samples)
+    double = rasterize(gaussians, cameras, samples)
+    single = rasterize(gaussians.map(torch.Tensor.float), cameras.to(dtype=torch.float32), samples)
+    difference = (single.colors - double.colors).abs()
+    assert float(difference.quantile(0.99)) < 2e-6
+    assert float(difference.max()) < 0.02
+    expected = double.backward(colors, errors).parameter_gradients(rows=False)
+    found = single.backward(colors.float(), errors.float()).parameter_gradients(rows=False)
+    for name in PARAMETER_NAMES:
+        ours, theirs = found.summed(name).double(), expected.summed(name)
+        assert float((ours - theirs).norm() / theirs.norm()) < 1e-3, name
+
+
+def test_block_and_slice_sizes_do_not_matter(monkeypatch):
+    gaussians, cameras = make_gaussians(60), make_cameras(SIZES)
+    gaussians.opacities += 3
+    samples = thin_out(dense_samples(cameras), 0.4)
+    colors, alphas, depths, errors = upstream(samples)
+
+    def everything():
+        rendered = rasterize(gaussians, cameras, samples, with_depth=True)
+        record = rendered.backward(colors, errors, None, alphas, depths).full_records()
+        return rendered.colors, rendered.alphas, rendered.depths, record
+
+    expected = everything()
+    for block, piece in ((1, 1), (500, 3), (1 << 22, 1000)):
+        monkeypatch.setitem(compositing.BLOCK_ELEMENTS, "cpu", block)
+        monkeypatch.setattr(compositing, "SLICE_SPLATS", piece)
+        for ours, theirs in zip(everything(), expected, strict=True):
+            torch.testing.assert_close(ours, theirs, rtol=1e-10, atol=1e-10)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2])
+def test_lower_degrees_use_their_bands_alone(degree):
+    gaussians, cameras = make_gaussians(30), make_cameras([(20, 20)])
+    samples = dense_samples(cameras)
+    bands = (degree + 1) ** 2 - 1
+    cut = gaussians.map(torch.clone)
+    cut.shN[:, bands:] = 0
+    rendered = rasterize(gaussians, cameras, samples, sh_degree=degree)
+    torch.testing.assert_close(rendered.colors, rasterize(cut, cameras, samples).colors)
+    gradients = rendered.backward(torch.ones_like(rendered.colors)).parameter_gradients(rows=False)
+    assert gradients.shN.shape == gaussians.shN.shape
+    assert (gradients.shN[:, bands:] == 0).all()
+
+
+@pytest.mark.parametrize("degree", [-1, 2])
+def test_a_degree_that_the_model_lacks_is_an_error(degree):
+    gaussians, cameras = make_gaussians(3, degree=1), make_cameras([(4, 4)])
+    with pytest.raises(ValueError, match="degrees 0 to 1"):
+        rasterize(gaussians, cameras, dense_samples(cameras), sh_degree=degree)
+
+
+def test_negative_exponents_are_skipped():
+    """A conic that rounding made indefinite draws nothing where its exponent is negative, as in gsplat."""
+    centers = torch.tensor([[[1.0, 1.0], [1.0, -1.0], [0.0, 0.0]]], dtype=torch.float64)
+    means, conic = torch.zeros(1, 2, dtype=torch.float64), torch.tensor([[1.0, 2.0, 1.0]], dtype=torch.float64)
+    ones = torch.ones(1, dtype=torch.float64)
+    table = compositing.splat_table(means, conic, ones.expand(1, 3), 0.5 * ones, ones)
+    row = torch.zeros(1, 1, dtype=torch.int64)
+    start = torch.ones(1, 3, 1, dtype=torch.float64)
+    piece = compositing.composite_slice(table, row, row == 0, centers, start, RasterSettings())
+    np.testing.assert_allclose(piece.weights[0, :, 0], [0.5 * np.exp(-3), 0, 0.5])
+
+
+def test_settings_are_used():
+    gaussians, cameras = make_gaussians(40), make_cameras([(24, 24)])
+    samples = dense_samples(cameras)
+    colors = gsplat_colors(gaussians, cameras)
+    settings = RasterSettings(eps2d=1.0, near_plane=3.5, far_plane=5.0, alpha_min=0.02, alpha_max=0.5)
+    expected = loop_render(gaussians, cameras, samples, colors, np.zeros(len(samples)), settings)
+    rendered = rasterize(gaussians, cameras, samples, settings=settings)
+    np.testing.assert_allclose(rendered.colors, expected.colors, atol=1e-13)
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"eps2d": -0.1},
+        {"eps2d": np.inf},
+        {"near_plane": 0.0},
+        {"near_plane": np.nan},
+        {"near_plane": 2.0, "far_plane": 2.0},
+        {"far_plane": np.nan},
+        {"alpha_min": 0.0039},
+        {"alpha_min": 0.5, "alpha_max": 0.5},
+        {"alpha_max": 1.0},
+        {"transmittance_min": 0.0},
+        {"transmittance_min": 1.0},
+    ],
+    ids=str,
+)
+def test_settings_out_of_bounds_are_refused(values):
+    with pytest.raises(InputError, match=f"{list(values)[-1]} = "):
+        RasterSettings(**values)
+
+
+def test_settings_of_gsplat_are_taken():
+    """Its defaults, and bounds that are allowed themselves."""
+    RasterSettings(eps2d=0.3, near_plane=0.01, far_plane=1e10, alpha_min=1 / 255, alpha_max=0.99)
+    RasterSettings(eps2d=0.0, far_plane=np.inf, alpha_min=ALPHA_MIN_LOWEST)
+    assert pytest.approx(projection.EXTENT_MAX) == (-2 * np.log(ALPHA_MIN_LOWEST)) ** 0.5
+
+
+def test_dense_samples_are_every_pixel_in_cell_order():
+    cameras = make_cameras([(37, 29), (5, 16), (16, 32)])
+    samples = dense_samples(cameras, [2, 0])
+    assert samples.view_ids == (2, 0) and samples.sizes.tolist() == [[16, 32], [37, 29]]
+    assert sorted(samples.pixel_ids[: 16 * 32].tolist()) == list(range(16 * 32))
+    assert sorted(samples.pixel_ids[16 * 32 :].tolist()) == list(range(37 * 29))
+    x, y = samples.coordinates().unbind(dim=-1)
+    ranks = cell_order(x % 16, y % 16)
+    assert (x[samples.view_of_slot() == 0] < 16).all()
+    for first, last in zip(samples.tile_offsets[:-1].tolist(), samples.tile_offsets[1:].tolist(), strict=True):
+        assert (ranks[first:last].diff() > 0).all()
+        assert len(set(zip((x[first:last] // 16).tolist(), (y[first:last] // 16).tolist(), strict=True))) == 1

@@ -1,0 +1,422 @@
+"""Error-driven density control as a gsplat strategy."""
+
+import inspect
+from dataclasses import dataclass, field
+
+import pytest
+import torch
+import tyro
+from gsplat import DefaultStrategy, MCMCStrategy
+from helpers.bridge_host import SURGERY, Host, make_splats, surgery
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from turbogs_plugin.strategies.density.error_driven import ErrorDrivenDensity
+from turbogs_plugin.strategies.optimizers.moment_lm import MomentLMOptimizer
+
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.gsplat_bridge import SharedOptimizer, TurboDensityStrategy, apply_row_update
+from turbogs_plugin.gsplat_bridge.gaussian_errors import iteration_stats
+from turbogs_plugin.types import PARAMETER_NAMES, Gaussians, GaussianStats, RowUpdate, Step
+
+SOON = {"refine_start_iter": 2, "refine_every": 3, "refine_stop_iter": 5, "grow_grad2d": 1e-6}
+
+
+def test_it_is_a_default_strategy_with_its_fields_and_hooks():
+    strategy = TurboDensityStrategy()
+    assert isinstance(strategy, DefaultStrategy) and strategy.absgrad is True
+    for name in ("refine_start_iter", "refine_stop_iter", "reset_every", "refine_every"):
+        setattr(strategy, name, getattr(strategy, name) * 2)  # as trainers do with their steps_scaler
+        assert getattr(strategy, name) == 2 * getattr(DefaultStrategy(), name)
+    for hook in ("step_pre_backward", "step_post_backward"):
+        theirs = inspect.signature(getattr(DefaultStrategy, hook)).parameters
+        assert list(inspect.signature(getattr(TurboDensityStrategy, hook)).parameters)[: len(theirs)] == list(theirs)
+
+
+@dataclass
+class TrainerConfig:
+    """As in gsplat's trainer, whose command line is made by tyro from the type and the default."""
+
+    strategy: DefaultStrategy | MCMCStrategy = field(default_factory=DefaultStrategy)
+
+
+def test_its_fields_are_on_the_command_line_of_gsplats_trainer():
+    configs = {"default": ("named", TrainerConfig(strategy=TurboDensityStrategy(verbose=True)))}
+    arguments = ["default", "--strategy.refine-every", "7", "--strategy.top-fraction", "0.3"]
+    strategy = tyro.extras.overridable_config_cli(configs, args=arguments).strategy
+    assert strategy == TurboDensityStrategy(verbose=True, refine_every=7, top_fraction=0.3)
+
+
+@pytest.mark.parametrize("tells_errors", [False, True])
+def test_it_trains_and_says_once_what_drives_it(tells_errors, capsys):
+    host = Host(TurboDensityStrategy(**SOON), tells_errors=tells_errors)
+    losses = host.train(16)
+    assert losses[-1] < losses[0]
+    assert len(host.splats["means"]) > 40
+    host.assert_rows_match()
+    said = [line for line in capsys.readouterr().out.splitlines() if "TurboDensityStrategy" in line]
+    assert len(said) == 1
+    assert ("error-driven, by info['prediction']" in said[0]) == tells_errors
+    assert ("ranked by screen gradients" in said[0]) != tells_errors
+
+
+def test_the_error_decides_who_is_densified():
+    """All pass the gradient threshold; with a budget share of a tenth, only those of largest mean error grow."""
+    host = Host(TurboDensityStrategy(**SOON, top_fraction=0.1, lambda_base=0.0, prune_opa=0.0), tells_errors=True)
+    sums = torch.zeros(2, 40)
+    for step in range(4):
+        before = host.splats["sh0"].detach().flatten(1).clone()  # [40, 3]
+        host.step(step)
+        stats, _ = iteration_stats(host.info, 40)
+        sums += torch.stack([stats.error_sums, stats.weight_sums])
+    hardest = (sums[0] / sums[1].clamp(min=1e-12)).topk(4).indices
+    # Halves have their parent's colour, which one step of training has hardly changed.
+    after = host.splats["sh0"].detach().flatten(1)
+    assert len(after) == 44
+    rows_of = torch.cdist(after, before).argmin(dim=1).bincount(minlength=40)
+    assert (rows_of == 2).nonzero().flatten().tolist() == sorted(hardest.tolist())
+
+
+def test_schedule_events_happen_where_gsplats_do(monkeypatch):
+    events = {}
+    for cls in (DefaultStrategy, TurboDensityStrategy):
+        host = Host(cls(refine_start_iter=3, refine_every=3, refine_stop_iter=12, grow_grad2d=1e-9))
+        counts = [len(host.splats["means"])]
+        for step in range(16):
+            host.step(step)
+            counts.append(len(host.splats["means"]))
+        events[cls] = [step for step in range(16) if counts[step + 1] != counts[step]]
+    assert events[TurboDensityStrategy] == events[DefaultStrategy] == [6, 9]
+
+
+EVENT = 3
+"""The step of the only event of `FIELDS`' runs."""
+
+BASE = {
+    "refine_start_iter": 2,
+    "refine_every": 3,
+    "grow_grad2d": 0.02,
+    "grow_absgrad2d": 0.02,
+    "grow_scale3d": 0.17,
+    "top_fraction": 0.5,
+}
+BASE_OF_CONTROLLER = {
+    "refine_from": 3,
+    "refine_every": 3,
+    "grad_threshold": 0.02,
+    "absgrad_threshold": 0.02,
+    "percent_dense": 0.51,  # of three standard deviations
+    "top_fraction": 0.5,
+    "lambda_base": 0.8,
+    "score": "balanced",
+    "split": "sample",
+    "max_gaussians": 0,
+    "prune_opacity": 0.005,
+    "prune_world_size": 0.1,
+    "prune_screen_size": 0.0,
+    "prune_size_from": 0.2,  # gsplat's 3000 of 15 000
+    "prune_score_fraction": 0.0,
+    "opacity_decay": 0.0,
+    "final_every": 500,
+    "final_keep": 1.0,
+}
+FIELDS = {
+    "base": ({}, {}),
+    "grow_grad2d": ({"grow_grad2d": 0.001}, {"grad_threshold": 0.001}),
+    "absgrad": ({"absgrad": False}, {}),
+    "grow_absgrad2d": ({"grow_absgrad2d": 0.05}, {"absgrad_threshold": 0.05}),
+    "grow_scale3d": ({"grow_scale3d": 0.2}, {"percent_dense": 0.6}),
+    "scene_scale": ({}, {}),
+    "seed": ({"seed": 7}, {}),
+    "top_fraction": ({"top_fraction": 0.2}, {"top_fraction": 0.2}),
+    "lambda_base": ({"lambda_base": 5.0}, {"lambda_base": 5.0}),
+    "score": ({"score": "raw"}, {"score": "raw"}),
+    "split": ({"split": "long_axis"}, {"split": "long_axis"}),
+    "max_gaussians": ({"max_gaussians": 45}, {"max_gaussians": 45}),
+    "prune_opa": ({"prune_opa": 0.4}, {"prune_opacity": 0.4}),
+    "prune_scale3d": ({"prune_scale3d": 0.16, "reset_every": 1}, {"prune_world_size": 0.16, "prune_size_from": 0.0}),
+    "prune_scale2d": (
+        {"prune_scale2d": 0.2, "refine_scale2d_stop_iter": 4, "reset_every": 1, "prune_scale3d": 0.0},
+        {"prune_screen_size": 0.2, "prune_size_from": 0.0, "prune_world_size": 0.0},
+    ),
+    "refine_scale2d_stop_iter": (
+        {"prune_scale2d": 0.2, "refine_scale2d_stop_iter": 3, "reset_every": 1, "prune_scale3d": 0.0},
+        {"prune_screen_size": 0.0, "prune_size_from": 0.0, "prune_world_size": 0.0},
+    ),
+    "prune_score_fraction": ({"prune_score_fraction": 0.3}, {"prune_score_fraction": 0.3}),
+    "opacity_decay": ({"opacity_decay": 0.1}, {"opacity_decay": 0.1}),
+    "final_keep": (
+        {"refine_stop_iter": 2, "final_every": 2, "final_keep": 0.7},
+        {"final_every": 2, "final_keep": 0.7},
+    ),
+}
+"""Field -> values of the strategy's fields, and the controller's by which the same happens."""
+
+
+def controlled(options, before, window, seed, extent, refine_until):
+    """The Gaussians after the event by an `ErrorDrivenDensity` with exactly these options."""
+    controller = ErrorDrivenDensity(**options)
+    controller.setup(before)
+    controller.load_state_dict({"initial_count": len(before), "stats": window})
+    update = controller.update(before, Step(EVENT, 10**6, refine_until, seed, extent))
+    return before if update is None else update.apply(before)
+
+
+def differ(some: Gaussians, other: Gaussians) -> bool:
+    return any(
+        not torch.equal(value, other_value)
+        for (_, value), (_, other_value) in zip(some.items(), other.items(), strict=True)
+    )
+
+
+@pytest.mark.parametrize("name", FIELDS)
+@pytest.mark.parametrize("tells_errors", [False, True])
+def test_an_event_is_the_controllers_with_these_values(name, tells_errors):
+    """And what a field changes, it changes: with the base's values the controller does something else."""
+    fields, options = FIELDS[name]
+    strategy = TurboDensityStrategy(**{**BASE, **fields})
+    host = Host(strategy, tells_errors=tells_errors)
+    extent = host.state["scene_scale"] = 1.2 if name == "scene_scale" else 1.0
+    seen, before = [], {}
+    step_post_backward = strategy.step_post_backward
+
+    def watched(params, info, **rest):
+        seen.append(iteration_stats(info, 40)[0].map(torch.clone))
+        before.update({key: value.detach().clone() for key, value in params.items()})
+        step_post_backward(params=params, info=info, **rest)
+
+    strategy.step_post_backward = watched
+    host.train(EVENT + 1)
+
+    window = {key: sum(getattr(stats, key) for stats in seen) for key in GaussianStats.__dataclass_fields__}
+    window["max_radii"] = torch.stack([stats.max_radii for stats in seen]).amax(dim=0)
+    if not tells_errors:
+        assert not window["error_sums"].any() and not window["weight_sums"].any()
+        window |= {"error_sums": window["grad_sums"], "weight_sums": window["view_counts"]}
+    without_absolute = {**window, "absgrad_sums": torch.zeros(40)}
+    before = Gaussians(**{key: before[key] for key in PARAMETER_NAMES})
+    until = fields.get("refine_stop_iter", 15_000) - 1
+    used = window if strategy.absgrad else without_absolute
+    expected = controlled({**BASE_OF_CONTROLLER, **options}, before, used, strategy.seed, extent, until)
+    after = Gaussians(**{key: host.splats[key].detach() for key in PARAMETER_NAMES})
+    for (key, value), (_, wanted) in zip(after.items(), expected.items(), strict=True):
+        torch.testing.assert_close(value, wanted, msg=lambda text, key=key: f"{key}: {text}")
+    assert all(len(host.state[key]) == len(after) and not host.state[key].any() for key in window)
+    if name not in (
+        ("base", "refine_scale2d_stop_iter")
+        if tells_errors
+        else ("base", "refine_scale2d_stop_iter", "lambda_base", "score")
+    ):
+        assert differ(after, controlled(BASE_OF_CONTROLLER, before, window, 0, 1.0, 14_999))
+
+
+def test_no_opacity_is_reset():
+    """gsplat resets where step % reset_every == 0; here, the optimizers apart, no step changes an opacity."""
+    fields = {"refine_start_iter": 1, "refine_every": 2, "reset_every": 2, "grow_grad2d": 1.0}
+    strategy = TurboDensityStrategy(**fields, grow_absgrad2d=1.0, prune_scale3d=0.0)
+    host = Host(strategy)
+    trained = []
+    step_post_backward = strategy.step_post_backward
+
+    def watched(params, **rest):
+        trained.append(params["opacities"].detach().clone())
+        step_post_backward(params=params, **rest)
+        assert torch.equal(params["opacities"], trained[-1])
+
+    strategy.step_post_backward = watched
+    host.train(9)
+    assert not torch.equal(trained[0], trained[-1])
+    assert host.optimizers["opacities"].state[host.splats["opacities"]]["exp_avg"].any()
+
+
+def test_final_pruning_keeps_its_share():
+    host = Host(TurboDensityStrategy(refine_stop_iter=4, refine_start_iter=9, final_every=3, final_keep=0.8))
+    assert (host.train(6), len(host.splats["means"]))[1] == 40
+    host.step(6)  # three after the last step of refinement
+    assert 32 <= len(host.splats["means"]) < 40
+    host.assert_rows_match()
+
+
+@pytest.mark.parametrize("tells_errors", [False, True])
+def test_a_host_in_double_precision_trains(tells_errors):
+    splats = {name: torch.nn.Parameter(value.detach().double()) for name, value in make_splats().items()}
+    host = Host(TurboDensityStrategy(**SOON), tells_errors=tells_errors, splats=torch.nn.ParameterDict(splats))
+    host.cameras, host.pixels = host.cameras.to(dtype=torch.float64), host.pixels.double()
+    host.train(6)
+    assert len(host.splats["means"]) > 40
+    assert {value.dtype for value in host.splats.values()} == {torch.float64}
+    host.assert_rows_match()
+
+
+@settings(max_examples=12, deadline=None)
+@given(
+    st.lists(st.sampled_from([*SURGERY, "step"]), min_size=1, max_size=6),
+    st.integers(0, 99),
+)
+def test_rows_match_after_any_sequence(operations, seed):
+    generator = torch.Generator().manual_seed(seed)
+    host = Host(TurboDensityStrategy(**{**SOON, "refine_stop_iter": 100}))
+    host.step(0)
+    for number, operation in enumerate(operations, start=1):
+        if operation == "step":
+            host.step(number)
+        else:
+            surgery(operation, host, generator)
+        host.assert_rows_match()
+    host.step(9)
+    host.assert_rows_match()
+
+
+def tag_rows(host: Host) -> None:
+    """Row i has i + 1 as its colour, in every optimizer state and in every statistic."""
+    tags = torch.arange(1.0, 1.0 + len(host.splats["means"]))
+    host.splats["sh0"].data[:] = tags[:, None, None]
+    for name, parameter in host.splats.items():
+        for key, value in host.optimizers[name].state[parameter].items():
+            if key != "step":
+                value[:] = tags.reshape(-1, *[1] * (value.dim() - 1))
+    for value in host.state.values():
+        if isinstance(value, torch.Tensor):
+            value[:] = tags
+
+
+@pytest.mark.parametrize("optimizer", ["torch", "shared"])
+@settings(max_examples=15, deadline=None)
+@given(st.lists(st.sampled_from([*SURGERY, "update"]), min_size=1, max_size=8), st.integers(0, 99))
+def test_rows_keep_what_is_theirs(optimizer, operations, seed):
+    """After any sequence, what a row has is its own or, where the row is new or was reset, zero; some is its own."""
+    generator = torch.Generator().manual_seed(seed)
+    shared = SharedOptimizer(MomentLMOptimizer())
+    host = Host(TurboDensityStrategy(), torch.optim.Adam if optimizer == "torch" else shared)
+    host.step(0)
+    tag_rows(host)
+    for operation in operations:
+        count = len(host.splats["means"])
+        if operation == "update":
+            source = torch.randint(count, (count + 3,), generator=generator)
+            fresh = torch.rand(count + 3, generator=generator) < 0.2
+            apply_row_update(RowUpdate(source, fresh, {}), host.splats, host.optimizers, host.state)
+        else:
+            surgery(operation, host, generator)
+    host.assert_rows_match()
+    tags = host.splats["sh0"].detach()[:, 0, 0]
+    kept = {}
+    for name, parameter in host.splats.items():
+        for key, value in host.optimizers[name].state[parameter].items():
+            if key != "step":
+                kept[name, key] = value
+    kept |= {("statistics", key): value for key, value in host.state.items() if isinstance(value, torch.Tensor)}
+    for place, value in kept.items():
+        rows = value.flatten(1) if value.dim() > 1 else value[:, None]
+        assert ((rows == tags[:, None]) | (rows == 0)).all(), place
+    assert torch.equal(kept["means", "exp_avg"][:, 0] != 0, kept["quats", "exp_avg_sq"][:, 3] != 0)
+    if "update" not in operations:
+        assert torch.equal(host.state["grad_sums"], tags)  # gsplat copies running state to new rows
+
+
+def test_a_row_update_moves_parameters_state_and_statistics_alike():
+    host = Host(TurboDensityStrategy(refine_start_iter=1000))
+    host.train(2)
+    old = {name: value.detach().clone() for name, value in host.splats.items()}
+    old_state = {name: host.optimizers[name].state[host.splats[name]]["exp_avg"].clone() for name in old}
+    old_sums = host.state["grad_sums"].clone()
+    source = torch.tensor([5, 0, 7, 7, 39])
+    fresh = torch.tensor([False, False, False, True, True])
+    opacities = torch.arange(5.0)
+    update = RowUpdate(source, fresh, {"opacities": opacities}, reset=("sh0",))
+    apply_row_update(update, host.splats, host.optimizers, host.state)
+    host.assert_rows_match()
+    for name in PARAMETER_NAMES:
+        expected = opacities if name == "opacities" else old[name][source]
+        torch.testing.assert_close(host.splats[name].detach(), expected)
+        expected = old_state[name][source]
+        expected[fresh] = 0
+        state = host.optimizers[name].state[host.splats[name]]["exp_avg"]
+        torch.testing.assert_close(state, torch.zeros_like(expected) if name == "sh0" else expected)
+        assert host.splats[name].requires_grad
+    expected = old_sums[source]
+    expected[fresh] = 0
+    torch.testing.assert_close(host.state["grad_sums"], expected)
+
+
+def test_parameters_of_a_host_of_its_own_follow():
+    """A host with its own colour model: no sh0 or shN, but features."""
+    host = Host(TurboDensityStrategy(**SOON))
+    host.train(2)
+    names = ("means", "scales", "quats", "opacities")
+    splats = torch.nn.ParameterDict({name: host.splats[name] for name in names})
+    splats["features"] = torch.nn.Parameter(torch.arange(40.0)[:, None])
+    optimizers = {name: torch.optim.Adam([splats[name]]) for name in splats}
+    host.strategy.step_post_backward(splats, optimizers, host.state, 3, host.info, packed=False, scene=None)
+    assert len(splats["means"]) == len(splats["features"]) > 40
+
+
+def test_what_is_missing_is_named():
+    host = Host(TurboDensityStrategy(**SOON))
+    common = (host.splats, host.optimizers)
+    with pytest.raises(InputError, match=r"info has no 'means2d'"):
+        host.strategy.step_pre_backward(*common, host.state, 0, {})
+    host.step(0)
+    with pytest.raises(InputError, match=r"without its state"):
+        host.strategy.step_post_backward(*common, None, 0, host.info)
+    with pytest.raises(InputError, match=r"the state has no 'driven_by', .*initialize_state"):
+        host.strategy.step_post_backward(*common, DefaultStrategy().initialize_state(), 0, host.info)
+    without_radii = {key: value for key, value in host.info.items() if key != "radii"}
+    with pytest.raises(InputError, match=r"info has no 'radii'"):
+        host.strategy.step_post_backward(*common, host.state, 0, without_radii)
+    with pytest.raises(InputError, match=r"'opacities' has shape \(40, 1\): expected \[N\] with N = 40"):
+        bad = {**host.splats, "opacities": torch.nn.Parameter(torch.zeros(40, 1))}
+        host.strategy.step_post_backward(bad, host.optimizers, host.state, 0, host.info)
+    host.info["means2d"].grad = None
+    with pytest.raises(InputError, match=r"means2d'\] has no gradient"):
+        host.strategy.step_post_backward(*common, host.state, 0, host.info)
+
+
+@pytest.mark.parametrize("tells_errors", [False, True])
+def test_info_of_another_model_is_refused(tells_errors):
+    host = Host(TurboDensityStrategy(**SOON), tells_errors=tells_errors)
+    host.step(0)
+    message = r"info is of 40 Gaussians, the parameters are (7|80): pass the info of this step's rasterization"
+    for rows in (torch.arange(7), torch.arange(80) % 40):
+        other = {name: torch.nn.Parameter(value.detach()[rows]) for name, value in host.splats.items()}
+        with pytest.raises(InputError, match=message):
+            host.strategy.step_post_backward(other, host.optimizers, host.strategy.initialize_state(), 1, host.info)
+    with pytest.raises(InputError, match="info is None"):
+        host.strategy.step_post_backward(host.splats, host.optimizers, host.state, 1, None)
+
+
+def test_changes_in_mid_run_are_refused():
+    host = Host(TurboDensityStrategy(**SOON))
+    host.step(0)
+    host.tells_errors = True
+    with pytest.raises(InputError, match="was gradient-driven so far, this step's info is error-driven"):
+        host.step(1)
+    host = Host(TurboDensityStrategy(**SOON))
+    host.step(0)
+    host.state["grad_sums"] = host.state["grad_sums"][:7]
+    with pytest.raises(InputError, match=r"state\['grad_sums'\] has 7 rows, the parameters 40"):
+        host.step(1)
+
+
+def test_absgrad_must_be_there_or_off():
+    host = Host(TurboDensityStrategy(**SOON))
+    host.step(0)
+    del host.info["means2d"].absgrad
+    with pytest.raises(InputError, match="no absgrad: render with absgrad=True"):
+        host.strategy.step_post_backward(host.splats, host.optimizers, host.state, 1, host.info)
+    assert Host(TurboDensityStrategy(**SOON, absgrad=False)).train(4)
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [("revised_opacity", True), ("pause_refine_after_reset", 5), ("top_fraction", 0.0), ("split", "x")],
+)
+def test_invalid_fields_are_refused(field, value):
+    with pytest.raises(InputError, match=field):
+        TurboDensityStrategy(**{field: value})
+
+
+def test_gsplats_own_strategy_trains_on_our_rasterizer():
+    host = Host(DefaultStrategy(**SOON, absgrad=True))
+    losses = host.train(20)
+    assert losses[-1] < losses[0] and len(host.splats["means"]) > 40
+    host.assert_rows_match()

@@ -1,0 +1,94 @@
+"""What gsplat's DefaultStrategy takes from our `info` is what gsplat's own formulas give it at the same Gaussians.
+
+The other side is gsplat's torch reference of the projection, its kernels' rule for radii, and compositing written out
+here for autograd, pixel by pixel in float64.
+"""
+
+import pytest
+import torch
+from gsplat import DefaultStrategy
+from gsplat.cuda._torch_impl import _fully_fused_projection, _quat_scale_to_covar_preci, _spherical_harmonics
+from helpers.bridge_host import HEIGHT, WIDTH, arguments, make_cameras, make_splats
+
+from turbogs_plugin.engine.rendering import dense_samples
+from turbogs_plugin.gsplat_bridge import gather_pixels, sparse_rasterization
+
+ALPHA_MIN, ALPHA_MAX, TRANSMITTANCE_MIN, EXTENT_MAX = 1 / 255, 0.999, 1e-4, 3.33
+
+
+def gsplat_radii(means2d, depths, conics, opacities):
+    """[C, N, 2] as in gsplat's projection kernel: opacity-aware half-widths, 0 where nothing of it is on the image."""
+    a, b, c = conics.unbind(-1)
+    variances = torch.stack([c, a], -1) / (a * c - b * b)[..., None]
+    extents = (2 * (opacities / ALPHA_MIN).clamp(min=1e-12).log()).clamp(min=0).sqrt().clamp(max=EXTENT_MAX)
+    radii = (extents[..., None] * variances.sqrt()).ceil()
+    size = means2d.new_tensor([WIDTH, HEIGHT])
+    inside = ((means2d + radii > 0) & (means2d - radii < size)).all(-1)
+    drawn = inside & (depths >= 0.01) & (opacities >= ALPHA_MIN)
+    return torch.where(drawn[..., None], radii, 0).int()
+
+
+def gsplat_info(splats, cameras, pixels):
+    """`info` after the backward pass of a mean absolute difference."""
+    given = {name: value.detach().double() for name, value in arguments(splats, cameras).items() if name[0] not in "wh"}
+    viewmats, opacities = given["viewmats"], given["opacities"]
+    covariances, _ = _quat_scale_to_covar_preci(given["quats"], given["scales"], compute_preci=False)
+    _, means2d, depths, conics, _ = _fully_fused_projection(
+        given["means"], covariances, viewmats, given["Ks"], WIDTH, HEIGHT
+    )
+    opacities = opacities.expand(depths.shape)
+    radii = gsplat_radii(means2d, depths, conics, opacities)
+    directions = given["means"] - torch.inverse(viewmats)[:, None, :3, 3]
+    colors = (_spherical_harmonics(1, directions, given["colors"].expand(len(viewmats), -1, -1, -1)) + 0.5).clamp(min=0)
+
+    y, x = torch.meshgrid(torch.arange(HEIGHT), torch.arange(WIDTH), indexing="ij")
+    centers = torch.stack([x, y], -1).reshape(-1, 1, 2) + 0.5  # [H * W, 1, 2]
+    per_pixel, total = [], 0.0
+    for view in range(len(viewmats)):
+        # One leaf of means for each pixel: its gradients are the terms of which means2d.grad and absgrad are sums.
+        leaf = means2d[view].expand(HEIGHT * WIDTH, -1, -1).clone().requires_grad_()  # [H * W, N, 2]
+        per_pixel.append(leaf)
+        order = depths[view].argsort()
+        dx, dy = (leaf - centers).unbind(-1)
+        a, b, c = conics[view].unbind(-1)
+        sigma = torch.where((radii[view] > 0).all(-1), 0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy, 1e3)
+        alpha = opacities[view] * torch.exp(-sigma)
+        alpha = alpha.clamp(max=ALPHA_MAX) * (alpha >= ALPHA_MIN)
+        alpha = alpha[:, order]
+        behind = (1 - alpha).cumprod(-1)
+        alpha = alpha * (behind > TRANSMITTANCE_MIN)
+        weights = alpha * torch.cat([torch.ones_like(behind[:, :1]), behind[:, :-1]], -1)
+        image = weights @ colors[view, order]
+        total = total + (image - pixels[view].reshape(-1, 3)).abs().sum()
+    terms = torch.stack(torch.autograd.grad(total / pixels.numel(), per_pixel))  # [C, H * W, N, 2]
+    means2d = means2d.float().requires_grad_()
+    means2d.grad, means2d.absgrad = terms.sum(1).float(), terms.abs().sum(1).float()
+    sizes = {"width": WIDTH, "height": HEIGHT, "n_cameras": len(viewmats)}
+    return {"means2d": means2d, "radii": radii, "gaussian_ids": None, **sizes}
+
+
+@pytest.mark.parametrize("absgrad", [False, True])
+@pytest.mark.parametrize("views", [1, 3])
+def test_default_strategys_statistics_are_gsplats(views, absgrad):
+    splats, cameras = make_splats(60), make_cameras(views)
+    with torch.no_grad():
+        splats["opacities"][:4] = torch.tensor([-7.0, -5.6, -5.5, 8.0])  # below and at the threshold, and opaque
+        splats["means"][4:8, 2] = torch.tensor([-2.998, -2.995, -2.9, -4.0])  # at and behind the near plane
+        splats["means"][8:12, 0] = torch.tensor([2.0, -2.0, 2.4, 6.0])  # at the edge of the image and past it
+    samples = dense_samples(cameras)
+    pixels = torch.rand(views, HEIGHT, WIDTH, 3, generator=torch.Generator().manual_seed(2))
+    colors, _, ours = sparse_rasterization(**arguments(splats, cameras), samples=samples, sh_degree=1, absgrad=absgrad)
+    torch.nn.functional.l1_loss(colors, gather_pixels(pixels, samples)).backward()
+    theirs = gsplat_info(splats, cameras, pixels.double())
+
+    assert torch.equal(ours["radii"], theirs["radii"])
+    assert 0 < (ours["radii"] > 0).all(-1).sum() < views * 60
+    strategy = DefaultStrategy(absgrad=absgrad, refine_scale2d_stop_iter=1)
+    states = [strategy.initialize_state() for _ in range(2)]
+    for state, info in zip(states, (ours, theirs), strict=True):
+        strategy._update_state(splats, state, info)
+    assert torch.equal(states[0]["count"], states[1]["count"])
+    torch.testing.assert_close(states[0]["radii"], states[1]["radii"])
+    expected = states[1]["grad2d"]
+    assert expected.max() > 0
+    torch.testing.assert_close(states[0]["grad2d"], expected, rtol=2e-4, atol=2e-5 * float(expected.max()))

@@ -1,0 +1,336 @@
+"""Sparse Adam and moment-damped LM behind gsplat's dict of optimizers."""
+
+import copy
+import itertools
+
+import pytest
+import torch
+from gsplat import DefaultStrategy
+from helpers.bridge_host import RATES, SURGERY, Host, make_splats, surgery
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from turbogs_plugin.strategies.optimizers.dense_adam import DenseAdam
+from turbogs_plugin.strategies.optimizers.moment_lm import MomentLMOptimizer
+from turbogs_plugin.strategies.optimizers.sparse_adam import SparseAdam
+
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.gsplat_bridge import SharedOptimizer, TurboDensityStrategy
+from turbogs_plugin.types import PARAMETER_NAMES
+
+RULES = {"adam": SparseAdam, "lm": MomentLMOptimizer}
+ADAM = torch.optim.Adam
+LATE = {"refine_start_iter": 1000}
+
+
+def members_of(splats, optimizer, eps=1e-15, betas=(0.9, 0.999)):
+    shared = SharedOptimizer(optimizer)
+    return {
+        name: shared([{"params": splats[name], "lr": RATES[name], "name": name}], eps=eps, betas=betas)
+        for name in splats
+    }
+
+
+def set_gradients(splats, seed):
+    generator = torch.Generator().manual_seed(seed)
+    for name in PARAMETER_NAMES:
+        splats[name].grad = torch.randn(splats[name].shape, generator=generator)
+
+
+@pytest.mark.parametrize("options", [{"eps": 1e-15, "betas": (0.9, 0.999)}, {"eps": 1e-3, "betas": (0.8, 0.95)}])
+@pytest.mark.parametrize("rule", RULES)
+def test_without_shares_of_the_loss_it_is_adam(rule, options):
+    ours, theirs = make_splats(), make_splats()
+    members = members_of(ours, RULES[rule](), **options)
+    adams = {
+        name: torch.optim.Adam([{"params": theirs[name], "lr": RATES[name]}], **options) for name in PARAMETER_NAMES
+    }
+    for seed in range(4):
+        set_gradients(ours, seed)
+        set_gradients(theirs, seed)
+        for optimizer in [*members.values(), *adams.values()]:
+            optimizer.step()
+    for name in PARAMETER_NAMES:
+        torch.testing.assert_close(ours[name], theirs[name], rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_new_rows_step_as_torchs_adam_lets_them(rule):
+    """gsplat's operations give a new Gaussian moments of zero and leave the count: its correction is the run's."""
+    ours, theirs = (Host(DefaultStrategy(**LATE), optimizer) for optimizer in (SharedOptimizer(RULES[rule]()), ADAM))
+    for seed in range(6):
+        for host in (ours, theirs):
+            set_gradients(host.splats, seed)
+            for optimizer in host.optimizers.values():
+                optimizer.step()
+            if seed == 3:
+                for operation in ("duplicate", "remove"):
+                    surgery(operation, host, torch.Generator().manual_seed(1))
+    for name in PARAMETER_NAMES:
+        torch.testing.assert_close(ours.splats[name], theirs.splats[name], rtol=1e-5, atol=1e-6)
+
+
+def test_untouched_rows_stay():
+    splats = make_splats()
+    members = members_of(splats, SparseAdam())
+    for seed in range(2):
+        before = {name: splats[name].detach().clone() for name in PARAMETER_NAMES}
+        set_gradients(splats, seed)
+        for name in PARAMETER_NAMES:
+            splats[name].grad[10:] *= 1 - seed  # all in the first step, ten in the second
+        for member in members.values():
+            member.step()
+    for name in PARAMETER_NAMES:
+        assert torch.equal(splats[name][10:], before[name][10:])
+        assert not torch.equal(splats[name][:10], before[name][:10])
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_any_order_gives_the_same_and_nothing_moves_before_the_last(rule):
+    results = []
+    for order in itertools.islice(itertools.permutations(PARAMETER_NAMES), 0, 720, 97):
+        splats = make_splats()
+        members = members_of(splats, RULES[rule]())
+        for seed in range(2):
+            set_gradients(splats, seed)
+            before = {name: splats[name].detach().clone() for name in order}
+            for name in order[:-1]:
+                members[name].step()
+                members[name].zero_grad(set_to_none=bool(seed))
+                assert all(torch.equal(splats[name], before[name]) for name in order)
+            members[order[-1]].step()
+            members[order[-1]].zero_grad()
+            assert all(not torch.equal(splats[name], before[name]) for name in order)
+        results.append(splats)
+    for splats in results[1:]:
+        assert all(torch.equal(splats[name], results[0][name]) for name in PARAMETER_NAMES)
+
+
+def test_shares_of_the_loss_change_the_step():
+    """LM in front of our strategy, which shows it `info`: another step than Adam's, and the loss falls."""
+    plain = Host(TurboDensityStrategy(**LATE), SharedOptimizer(SparseAdam()), tells_errors=True)
+    damped = Host(TurboDensityStrategy(**LATE), SharedOptimizer(MomentLMOptimizer()), tells_errors=True)
+    for host in (plain, damped):
+        losses = host.train(6)
+        assert losses[-1] < losses[0]
+    assert not torch.allclose(plain.splats["means"], damped.splats["means"], atol=1e-5)
+
+
+def test_a_loss_of_another_scale_damps_lm_alone(monkeypatch):
+    """As the document says: shares are those of a mean L1 error, whatever multiplies the host's loss."""
+    mean_difference = torch.nn.functional.l1_loss
+    moved = {}
+    for rule, scale in itertools.product(RULES, (1.0, 1000.0)):
+        monkeypatch.setattr(torch.nn.functional, "l1_loss", lambda a, b, scale=scale: scale * mean_difference(a, b))
+        host = Host(TurboDensityStrategy(**LATE), SharedOptimizer(RULES[rule]()), tells_errors=True)
+        before = host.splats["means"].detach().clone()
+        host.train(10)
+        moved[rule, scale] = float((host.splats["means"].detach() - before).norm())
+    assert moved["adam", 1000.0] == pytest.approx(moved["adam", 1.0], rel=1e-2)
+    assert moved["lm", 1000.0] / moved["lm", 1.0] == pytest.approx(0.36, abs=0.05)
+    assert moved["lm", 1.0] == pytest.approx(moved["adam", 1.0], rel=0.1)
+
+
+def test_it_says_once_that_it_lacks_shares(capsys):
+    host = Host(DefaultStrategy(**LATE), SharedOptimizer(MomentLMOptimizer()))
+    host.train(3)
+    assert capsys.readouterr().out.count("steps are Adam's") == 1
+    Host(DefaultStrategy(**LATE), SharedOptimizer(SparseAdam())).train(2)
+    assert capsys.readouterr().out == ""
+
+
+def test_observe_alone_gives_shares_under_any_strategy(capsys):
+    host = Host(DefaultStrategy(**LATE), SharedOptimizer(MomentLMOptimizer()), tells_errors=True)
+    step_pre_backward = host.strategy.step_pre_backward
+
+    def with_observe(**arguments):
+        step_pre_backward(**arguments)
+        host.optimizers["means"].observe(arguments["info"])
+
+    host.strategy.step_pre_backward = with_observe
+    host.train(2)
+    assert "Adam" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_schedulers_set_the_rate_of_the_next_step(rule):
+    moves = []
+    for gamma in (1.0, 0.5):
+        splats = make_splats()
+        members = members_of(splats, RULES[rule]())
+        scheduler = torch.optim.lr_scheduler.ExponentialLR(members["means"], gamma=gamma)
+        for _ in range(2):
+            set_gradients(splats, 0)
+            before = splats["means"].detach().clone()
+            for member in members.values():
+                member.step()
+            scheduler.step()
+        moves.append((splats["means"].detach() - before).norm())
+    assert moves[1] / moves[0] == pytest.approx(0.5, rel=1e-3)
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_state_dicts_resume_exactly(rule):
+    splats = make_splats()
+    members = members_of(splats, RULES[rule]())
+    for seed in range(2):
+        set_gradients(splats, seed)
+        for member in members.values():
+            member.step()
+    saved = {name: copy.deepcopy(member.state_dict()) for name, member in members.items()}
+    other = make_splats(seed=5)
+    resumed = members_of(other, RULES[rule]())
+    for name in PARAMETER_NAMES:
+        other[name].data.copy_(splats[name])
+        resumed[name].load_state_dict(saved[name])
+    for model, optimizers in ((splats, members), (other, resumed)):
+        set_gradients(model, 9)
+        for member in optimizers.values():
+            member.step()
+    assert all(torch.equal(splats[name], other[name]) for name in PARAMETER_NAMES)
+    assert resumed["means"].state[other["means"]]["step"].item() == 3
+
+
+@settings(max_examples=12, deadline=None)
+@given(
+    st.sampled_from(list(RULES)),
+    st.lists(st.sampled_from([*SURGERY, "step"]), min_size=1, max_size=6),
+    st.integers(0, 99),
+)
+def test_rows_match_after_any_sequence(rule, operations, seed):
+    generator = torch.Generator().manual_seed(seed)
+    host = Host(DefaultStrategy(**LATE), SharedOptimizer(RULES[rule]()))
+    host.step(0)
+    for number, operation in enumerate(operations, start=1):
+        if operation == "step":
+            host.step(number)
+        else:
+            surgery(operation, host, generator)
+        host.assert_rows_match()
+    host.step(9)
+    host.assert_rows_match()
+
+
+def test_surgery_moves_the_state_of_each_row_with_it():
+    """Rows are told apart by their first moments; new ones begin at zero, a reset clears opacities' alone."""
+    host = Host(DefaultStrategy(**LATE), SharedOptimizer(MomentLMOptimizer()))
+    host.train(3)
+    moments = host.optimizers["means"].state[host.splats["means"]]["exp_avg"].clone()
+    generator = torch.Generator().manual_seed(3)
+    mask = torch.rand(40, generator=generator) < 0.3
+    kept = moments[~mask]
+    generator.manual_seed(3)
+    surgery("split", host, generator)
+    state = host.optimizers["means"].state[host.splats["means"]]
+    torch.testing.assert_close(state["exp_avg"][: len(kept)], kept)
+    assert not state["exp_avg"][len(kept) :].any()
+    assert state["step"].item() == 3
+    surgery("reset", host, generator)
+    assert not host.optimizers["opacities"].state[host.splats["opacities"]]["exp_avg"].any()
+    assert host.optimizers["means"].state[host.splats["means"]]["exp_avg"].any()
+    host.step(4)
+
+
+def test_a_row_that_is_not_finite_is_left_out_and_counted():
+    splats = make_splats()
+    members = members_of(splats, MomentLMOptimizer())
+    set_gradients(splats, 0)
+    splats["quats"].grad[4] = float("nan")
+    before = splats["means"].detach().clone()
+    for member in members.values():
+        member.step()
+    assert torch.equal(splats["means"][4], before[4]) and not torch.equal(splats["means"][5], before[5])
+    assert int(members["means"].shared.skipped) == 1
+
+
+def test_a_missing_gradient_is_zero_and_none_at_all_is_no_step():
+    splats = make_splats()
+    members = members_of(splats, SparseAdam())
+    for member in members.values():
+        member.step()
+    assert not members["means"].state[splats["means"]]
+    set_gradients(splats, 0)
+    splats["shN"].grad = None
+    before = splats["shN"].detach().clone()
+    for member in members.values():
+        member.step()
+    assert torch.equal(splats["shN"], before)
+
+
+def test_mistakes_are_named():
+    splats = make_splats()
+    members = members_of(splats, SparseAdam())
+    set_gradients(splats, 0)
+    members["means"].step()
+    with pytest.raises(InputError, match=r"'means' was stepped twice: expected, .* a step of quats, scales"):
+        members["means"].step()
+    for name in PARAMETER_NAMES[1:-1]:
+        members[name].step()
+    members["shN"].param_groups[0]["betas"] = (0.8, 0.9)
+    with pytest.raises(InputError, match="betas differ between the members"):
+        members["shN"].step()
+
+    members = members_of(splats, SparseAdam())
+    with pytest.raises(InputError, match="no visibility mask"):
+        members["means"].step(torch.ones(40, dtype=torch.bool))
+    splats["quats"].grad = torch.zeros_like(splats["quats"]).to_sparse()
+    with pytest.raises(InputError, match="gradient of 'quats' is sparse"):
+        members["quats"].step()
+
+    for wrong in (SparseAdam, DenseAdam(), ADAM):
+        with pytest.raises(InputError, match=r"SharedOptimizer takes SparseAdam\(\) or .*: got (Sparse|Dense)?Adam"):
+            SharedOptimizer(wrong)
+
+    members = members_of(splats, MomentLMOptimizer())
+    set_gradients(splats, 0)
+    members["means"].observe({"loss_shares": torch.ones(7)})
+    with pytest.raises(InputError, match="info is of 7 Gaussians, the parameters are 40"):
+        for member in members.values():
+            member.step()
+
+    shared = SharedOptimizer(SparseAdam())
+    with pytest.raises(InputError, match=r"got groups named \['features'\]"):
+        shared([{"params": splats["means"], "lr": 1e-3, "name": "features"}])
+    shared([{"params": splats["means"], "lr": 1e-3, "name": "means"}])
+    with pytest.raises(InputError, match="'means' already"):
+        shared([{"params": splats["means"], "lr": 1e-3, "name": "means"}])
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "message"),
+    [("eps", 0.0, "eps = 0.0"), ("betas", (0.9, 1.5), "beta2 = 1.5"), ("betas", (1.0, 0.999), "beta1 = 1.0")],
+)
+@pytest.mark.parametrize("rule", RULES)
+def test_options_that_adam_cannot_use_are_refused_before_anything_moves(rule, option, value, message):
+    splats = make_splats()
+    members = members_of(splats, RULES[rule](), **{option: value})
+    set_gradients(splats, 0)
+    with pytest.raises(InputError, match=message):
+        for member in members.values():
+            member.step()
+    assert all(torch.equal(splats[name], value) for name, value in make_splats().items())
+    assert not any(member.state for member in members.values())
+    rule_used = members["means"].shared.optimizer
+    assert (rule_used.beta1, rule_used.beta2, rule_used.eps) == (RULES[rule].beta1, RULES[rule].beta2, RULES[rule].eps)
+
+
+def test_rows_removed_behind_its_back_are_refused():
+    host = Host(DefaultStrategy(**LATE), SharedOptimizer(SparseAdam()))
+    host.step(0)
+    for name, member in host.optimizers.items():
+        shorter = torch.nn.Parameter(host.splats[name].detach()[:7])
+        member.state[shorter] = member.state.pop(host.splats[name])
+        member.param_groups[0]["params"] = [shorter]
+        host.splats[name] = shorter
+    with pytest.raises(InputError, match=r"state 'exp_avg' of 'means' has shape \(40, 3\), expected \(7, 3\)"):
+        host.step(1)
+
+
+def test_all_swaps_together():
+    host = Host(
+        TurboDensityStrategy(refine_start_iter=2, refine_every=3, refine_stop_iter=5, grow_grad2d=1e-6),
+        SharedOptimizer(MomentLMOptimizer()),
+        tells_errors=True,
+    )
+    losses = host.train(16)
+    assert losses[-1] < losses[0] and len(host.splats["means"]) > 40
+    host.assert_rows_match()

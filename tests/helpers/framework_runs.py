@@ -1,0 +1,64 @@
+"""A tiny capture and a tiny configuration for tests of whole runs."""
+
+from pathlib import Path
+
+import torch
+
+from turbogs_plugin.config.configuration import Config, load_config
+from turbogs_plugin.scene import write_demo_capture
+from turbogs_plugin.train.trainer import Trainer
+
+TINY = (
+    "train.iterations=14",
+    "train.refine_until=9",
+    "train.sh_degree=2",
+    "train.sh_interval=4",
+    "train.evaluate_at=[0.5]",
+    "train.checkpoint_every=5",
+    "schedule.min_views=2",
+    "schedule.max_views=4",
+    "density.refine_from=2",
+    "density.refine_every=3",
+    "density.final_every=2",
+    "density.grad_threshold=1e-6",
+    "density.opacity_decay=0.2",
+)
+
+
+def tiny_capture(folder: Path) -> Path:
+    """8 photos of 48x40, of which 7 train."""
+    return write_demo_capture(folder / "capture", views=8, width=48, height=40)
+
+
+def tiny_config(capture: Path, *overrides: str) -> Config:
+    """14 iterations with three densifications, two final prunings and three SH degrees."""
+    config = load_config("turbogs", [*TINY, "train.device=cpu", *overrides])
+    config.scene.path = str(capture)
+    return config
+
+
+def assert_identical(a, b, place: str = "state") -> None:
+    """Nested states, to the last bit and type."""
+    if isinstance(a, dict):
+        assert a.keys() == b.keys(), place
+        for key in a:
+            assert_identical(a[key], b[key], f"{place}.{key}")
+    elif isinstance(a, torch.Tensor):
+        assert a.dtype == b.dtype and torch.equal(a, b), place
+    else:
+        assert a == b, place
+
+
+def assert_iterations_wait_for_nothing(trainer: Trainer) -> None:
+    """After some iterations, further ones never make the host wait for the GPU, and none of them is lost."""
+    trainer.initialise_maps()
+    for _ in range(5):
+        trainer.step()
+    torch.cuda.synchronize()
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        for _ in range(3):
+            trainer.step()
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    assert int(trainer.nonfinite_losses) == int(trainer.optimizer.skipped) == 0

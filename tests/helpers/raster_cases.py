@@ -1,0 +1,152 @@
+"""What the tests of the CUDA rasterizer share: scenes in float32 on the GPU and their twins in float64 on the CPU."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import pytest
+import torch
+from helpers.rendering_scenes import make_cameras, make_gaussians, thin_out
+from torch import Tensor
+
+from turbogs_plugin.engine.cuda import library as kernels
+from turbogs_plugin.engine.rendering import dense_samples, rasterize_reference
+from turbogs_plugin.types import Cameras, Gaussians, PixelSamples
+
+GPU_ONLY = [
+    pytest.mark.gpu,
+    pytest.mark.skipif(not kernels.available(), reason=kernels.unavailable_reason() or "available"),
+]
+
+FORWARD_BOUND = 1e-4
+FLIP_SHARE = 1e-3  # of the samples may lie on a threshold
+COSINE_BOUND, GRADIENT_BOUND = 0.9999, 1e-3
+STEADY_MOVES, STEADY_SIZE = 3, 2e-7
+
+RECORD_COLUMNS = {
+    "mean": slice(0, 2),
+    "conic": slice(2, 5),
+    "color": slice(5, 8),
+    "opacity": slice(8, 9),
+    "absolute": slice(9, 11),
+    "error_sum": slice(11, 12),
+    "distance_sum": slice(12, 13),
+    "weight_sum": slice(13, 14),
+    "depth": slice(14, 15),
+}
+
+
+@dataclass
+class Case:
+    """A scene twice: float64 on the CPU, and the same numbers, rounded to float32 beforehand, on the GPU."""
+
+    gaussians: Gaussians
+    cameras: Cameras
+    samples: PixelSamples
+    gpu_gaussians: Gaussians
+    gpu_cameras: Cameras
+    gpu_samples: PixelSamples
+
+
+def samples_to(samples: PixelSamples, device: torch.device | str) -> PixelSamples:
+    names = ("pixel_ids", "tile_ids", "tile_offsets")
+    return replace(samples, **{name: getattr(samples, name).to(device) for name in names})
+
+
+def make_case(
+    sizes: list[tuple[int, int]],
+    count: int,
+    rate: float = 1.0,
+    seed: int = 0,
+    empty_slots: int = 0,
+    log_scale: float = 0.0,
+    device: str = "cuda",
+) -> Case:
+    """Random Gaussians seen by cameras of these image sizes.
+
+    Args:
+        rate: share of each tile's pixels; below 1 some tiles have no samples at all.
+        log_scale: added to the logarithms of the scales.
+    """
+    gaussians = make_gaussians(count, seed, torch.float32)
+    gaussians.scales += log_scale
+    cameras = make_cameras(sizes, torch.float32)
+    samples = dense_samples(cameras)
+    if rate < 1:
+        samples = thin_out(samples, rate, seed, empty_slots)
+    return Case(
+        gaussians.map(Tensor.double),
+        cameras.to(dtype=torch.float64),
+        samples,
+        gaussians.map(lambda value: value.to(device)),
+        cameras.to(device),
+        samples_to(samples, device),
+    )
+
+
+def upstream(case: Case, seed: int = 0) -> dict[str, Tensor]:
+    """Random gradients and errors at the samples, float64 on the CPU, zero in empty slots."""
+    generator = torch.Generator().manual_seed(seed)
+    count, filled = len(case.samples), case.samples.filled
+    values = {
+        "color_gradients": torch.randn(count, 3, generator=generator),
+        "pixel_errors": torch.rand(count, generator=generator),
+        "alpha_gradients": torch.randn(count, generator=generator),
+        "depth_gradients": torch.randn(count, generator=generator),
+    }
+    return {name: (value * filled.reshape(-1, *[1] * (value.dim() - 1))).double() for name, value in values.items()}
+
+
+def on_gpu(values: dict[str, Tensor], device: str = "cuda") -> dict[str, Tensor]:
+    return {name: value.float().to(device) for name, value in values.items()}
+
+
+def assert_forward_close(got: Tensor, wanted: Tensor, what: str) -> None:
+    """Within the bound, except where a threshold decided otherwise: few samples, and of both signs."""
+    difference = (got.double().cpu() - wanted).flatten()
+    flips = difference.abs() > FORWARD_BOUND * wanted.abs().flatten().clamp(min=1.0)
+    assert flips.double().mean() <= FLIP_SHARE, f"{what}: {int(flips.sum())} of {len(flips)} beyond the bound"
+    # A flip at alpha_min moves a pixel by 1/255 of a colour at most, times a few.
+    assert difference.abs().max() <= 0.05 * wanted.abs().max().clamp(min=1.0), f"{what}: {difference.abs().max():.2e}"
+
+
+def steady_samples(case: Case) -> Tensor:
+    """[P] bool on the CPU: samples whose colors do not hang on a decision that float32 may make otherwise.
+
+    The decisions are whether alpha reaches alpha_min, where transmittance ends, and which of two splats is in front. In
+    float64, parameters are moved by about three times the rounding of float32, to and fro, so that what stands on an
+    edge falls to either side. Only the reference is asked: no error of what is tested can hide here.
+    """
+    gaussians, cameras = case.gpu_gaussians.map(Tensor.double), case.gpu_cameras.to(dtype=torch.float64)
+    wanted = rasterize_reference(gaussians, cameras, case.gpu_samples).colors
+    distances = gaussians.means.norm(dim=1, keepdim=True) + cameras.centers.norm(dim=1).amax()
+    steady = torch.ones(len(wanted), dtype=torch.bool, device=wanted.device)
+    generator = torch.Generator(wanted.device).manual_seed(0)
+    for _ in range(STEADY_MOVES):
+        moves = gaussians.map(lambda value: torch.empty_like(value).normal_(generator=generator))
+        for size in (STEADY_SIZE, -STEADY_SIZE):
+            moved = Gaussians(**{name: value * (1 + size * getattr(moves, name)) for name, value in gaussians.items()})
+            moved.means = gaussians.means + size * distances * moves.means
+            change = rasterize_reference(moved, cameras, case.gpu_samples).colors - wanted
+            steady &= (change.abs() <= FORWARD_BOUND / 2).all(dim=1)
+    return steady.cpu()
+
+
+def gradient_errors(got: Tensor, wanted: Tensor) -> tuple[float, float]:
+    """(cosine, relative L2)."""
+    got, wanted = got.double().cpu().flatten(), wanted.double().flatten()
+    cosine = torch.dot(got, wanted) / (got.norm() * wanted.norm()).clamp(min=1e-300)
+    return float(cosine), float((got - wanted).norm() / wanted.norm().clamp(min=1e-300))
+
+
+def assert_gradients_close(got: Tensor, wanted: Tensor, what: str, bound: float = GRADIENT_BOUND) -> None:
+    """Cosine, relative L2, and the magnitude of rows."""
+    if wanted.norm() == 0:
+        assert got.abs().max() == 0, what
+        return
+    cosine, relative = gradient_errors(got, wanted)
+    assert cosine >= COSINE_BOUND and relative <= bound, f"{what}: cosine {cosine:.6f}, relative {relative:.2e}"
+    rows, wanted_rows = got.double().cpu().flatten(0, -2).norm(dim=-1), wanted.double().flatten(0, -2).norm(dim=-1)
+    large = wanted_rows > 1e-3 * wanted_rows.max()
+    ratio = rows[large] / wanted_rows[large]
+    assert (ratio - 1).abs().quantile(0.99) <= 10 * GRADIENT_BOUND, f"{what}: row magnitudes differ"

@@ -1,0 +1,170 @@
+"""History, metrics, plots and the page."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+from helpers.framework_runs import tiny_capture, tiny_config
+from PIL import Image
+
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.report.pages import number, table
+from turbogs_plugin.report.plots import ERROR_FULL_SCALE, GAP, error_picture, plot_against_seconds, save_strip
+from turbogs_plugin.train import run
+from turbogs_plugin.train.evaluate import Metrics, ViewMetrics, compare, load_lpips, peak_memory_bytes
+from turbogs_plugin.train.history import Evaluation, append_evaluation, read_history, rewind_history
+from turbogs_plugin.train.progress import TrainingProgress, describe_nonfinite
+
+FIELDS = {"iteration", "train_seconds", "psnr", "ssim", "l1", "num_gaussians", "memory_bytes"}
+
+
+def evaluation(iteration: int = 10, **changes) -> Evaluation:
+    return Evaluation(iteration, 1.5, 20.0 + iteration / 100, 0.8, 0.05, 1000, 2**20, **changes)
+
+
+def test_a_line_has_every_field_and_reads_back(tmp_path):
+    path = tmp_path / "history.jsonl"
+    written = [evaluation(0), evaluation(10, nonfinite_losses=2)]
+    for line in written:
+        append_evaluation(path, line)
+    assert all(set(json.loads(line)) >= FIELDS for line in path.read_text().splitlines())
+    assert read_history(path) == written
+
+
+def test_the_worst_view_is_recorded():
+    views = [ViewMetrics("a", 31.0, 0.9, 0.01), ViewMetrics("b", 18.5, 0.7, 0.1), ViewMetrics("c", 33.0, 0.9, 0.01)]
+    assert Metrics(views, 10.0).worst_psnr == 18.5
+    assert math.isnan(Metrics([*views, ViewMetrics("d", math.nan, 0.9, 0.01)], 10.0).worst_psnr)
+
+
+def test_nan_is_null(tmp_path):
+    line = Evaluation(1, 1.0, 20.0, math.nan, 0.1, 1, 1)
+    append_evaluation(tmp_path / "h", line)
+    assert json.loads((tmp_path / "h").read_text())["ssim"] is None
+    assert math.isnan(read_history(tmp_path / "h")[0].ssim)
+
+
+def test_a_line_cut_short_is_left_out_and_a_wrong_one_is_named(tmp_path):
+    path = tmp_path / "history.jsonl"
+    append_evaluation(path, evaluation(1))
+    whole = path.read_text()
+    path.write_text(whole + whole[:20])
+    assert read_history(path) == [evaluation(1)]
+    path.write_text("nonsense\n" + whole)
+    with pytest.raises(InputError, match="line 1"):
+        read_history(path)
+
+
+def test_a_resumed_run_says_the_rest_again(tmp_path):
+    path = tmp_path / "history.jsonl"
+    for iteration in (0, 10, 20, 30):
+        append_evaluation(path, evaluation(iteration))
+    assert [line.iteration for line in rewind_history(path, 20)] == [0, 10, 20]
+    assert [line.iteration for line in read_history(path)] == [0, 10, 20]
+
+
+def test_errors_of_an_image_by_numpy():
+    generator = torch.Generator().manual_seed(0)
+    photo = torch.rand(24, 20, 3, generator=generator)
+    image = (photo + 0.1 * torch.randn(24, 20, 3, generator=generator)).clamp(0, 1)
+    metrics = compare("view", image, photo)
+    difference = image.double().numpy() - photo.double().numpy()
+    assert metrics.psnr == pytest.approx(-10 * np.log10((difference**2).mean()), abs=1e-4)
+    assert metrics.l1 == pytest.approx(np.abs(difference).mean(), abs=1e-6)
+    assert metrics.ssim == pytest.approx(_ssim(image.double().numpy(), photo.double().numpy()), abs=1e-4)
+
+
+def _ssim(x: np.ndarray, y: np.ndarray) -> float:
+    """SSIM of Wang et al. 2004 at every pixel, the image mirrored at its borders (as torchmetrics has it)."""
+    axis = np.arange(11) - 5
+    window = np.exp(-(axis**2) / (2 * 1.5**2))
+    window = np.outer(window, window) / window.sum() ** 2
+
+    def blur(values: np.ndarray) -> np.ndarray:
+        values = np.pad(values, ((5, 5), (5, 5), (0, 0)), mode="reflect")
+        views = np.lib.stride_tricks.sliding_window_view(values, (11, 11), axis=(0, 1))
+        return np.einsum("hwcij,ij->hwc", views, window)
+
+    mean_x, mean_y = blur(x), blur(y)
+    var_x, var_y, cov = blur(x * x) - mean_x**2, blur(y * y) - mean_y**2, blur(x * y) - mean_x * mean_y
+    c1, c2 = 0.01**2, 0.03**2
+    return float(
+        ((2 * mean_x * mean_y + c1) * (2 * cov + c2) / ((mean_x**2 + mean_y**2 + c1) * (var_x + var_y + c2))).mean()
+    )
+
+
+def test_an_exact_image_and_a_small_one():
+    photo = torch.rand(12, 12, 3)
+    assert compare("view", photo, photo).psnr == 100.0
+    assert math.isnan(compare("view", photo[:8], photo[:8]).ssim)
+
+
+def test_lpips_says_why_it_is_missing(tmp_path, monkeypatch):
+    monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
+    function, reason = load_lpips(None, torch.device("cpu"))
+    assert function is None and reason
+    with pytest.raises(InputError, match="no such file"):
+        load_lpips(str(tmp_path / "absent.pth"), torch.device("cpu"))
+
+
+def test_memory_is_that_of_this_process():
+    assert 50 * 2**20 < peak_memory_bytes(torch.device("cpu")) < 2**40
+
+
+def test_a_strip_is_photo_render_and_error(tmp_path):
+    photo, image = torch.zeros(5, 7, 3), torch.zeros(5, 7, 3)
+    image[2, 3] = 1.0
+    save_strip(tmp_path / "strip.png", photo, image)
+    strip = np.asarray(Image.open(tmp_path / "strip.png"))
+    assert strip.shape == (5, 3 * 7 + 2 * GAP, 3)
+    assert (strip[:, 7 : 7 + GAP] == 255).all()
+    assert strip[2, 3].tolist() == [0, 0, 0] and strip[2, 7 + GAP + 3].tolist() == [255, 255, 255]
+    assert strip[2, 2 * (7 + GAP) + 3].sum() > 500 > strip[0, 2 * (7 + GAP)].sum()
+
+
+def test_the_error_map_saturates_at_full_scale():
+    photo = torch.zeros(1, 3, 3)
+    image = torch.tensor([0.0, ERROR_FULL_SCALE, 1.0])[None, :, None].expand(1, 3, 3)
+    picture = error_picture(photo, image)
+    assert (picture[0, 1] == picture[0, 2]).all() and not (picture[0, 0] == picture[0, 1]).all()
+
+
+@pytest.mark.parametrize("count", [1, 2, 12])
+def test_plots_of_any_length(tmp_path, count):
+    plot_against_seconds(tmp_path / "p.png", [evaluation(i) for i in range(count)], "psnr", "test PSNR in dB", "scene")
+    width, height = Image.open(tmp_path / "p.png").size
+    assert width > 600 and height > 400
+
+
+def test_tables():
+    assert table(("a", "b"), [(1, 2)]).splitlines() == ["| a | b |", "| --- | --- |", "| 1 | 2 |"]
+    assert number(1.23456, 2) == "1.23" and number(math.nan, 2) == "not computed"
+
+
+def test_progress_is_a_line_an_evaluation_where_there_is_no_terminal(capsys):
+    with TrainingProgress(100) as progress:
+        progress.advance(1, 5)
+        progress.evaluated(evaluation(10, skipped_updates=3))
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 1
+    assert "10/100" in lines[0] and "20.10 dB" in lines[0] and "3 skipped updates" in lines[0]
+    assert describe_nonfinite(evaluation()) == ""
+
+
+def test_progress_bar_on_a_terminal(capsys, monkeypatch):
+    monkeypatch.setattr("sys.stderr.isatty", lambda: True, raising=False)
+    with TrainingProgress(100) as progress:
+        progress.evaluated(evaluation(10))
+        progress.advance(50, 1234)
+    shown = capsys.readouterr().err
+    assert "50/100" in shown and "20.10" in shown and "1,234" in shown
+
+
+@pytest.mark.parametrize("strips", [0, 1])
+def test_no_more_strips_than_asked_for(tmp_path, strips):
+    config = tiny_config(tiny_capture(tmp_path), "train.iterations=1", "scene.test_every=4", f"report.strips={strips}")
+    folder = run.train(config, tmp_path / "run").folder
+    assert len(list((folder.path / "report").glob("test-*.png"))) == strips
+    assert f"{strips} of 2 are shown" in folder.report.read_text()

@@ -1,0 +1,302 @@
+"""COLMAP captures: what is read, in which frame, at which size; and what is refused, with which words."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+import torch
+from PIL import Image
+
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.scene import load_scene
+from turbogs_plugin.types import PixelSamples
+
+SCENES = Path(os.environ.get("TURBOGS_SCENES", Path(__file__).resolve().parents[3] / "shared" / "scenes"))
+
+
+def rotation(angle: float) -> np.ndarray:
+    cos, sin = np.cos(angle), np.sin(angle)
+    return np.array([[cos, 0, sin], [0, 1, 0], [-sin, 0, cos]])
+
+
+def write_capture(
+    folder: Path,
+    *,
+    views: int = 9,
+    cameras: tuple[tuple[str, int, int, list[float]], ...] = (("PINHOLE", 40, 24, [50.0, 52.0, 21.0, 11.0]),),
+    shift: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    scale: float = 1.0,
+    model: str = "sparse/0",
+    suffix: str = ".bin",
+    nested: bool = False,
+    num_points: int = 20,
+) -> Path:
+    """A capture whose view i has camera ``i % len(cameras)`` at ``scale * (i, 0, -5) + shift``, turned a little, and
+    photos whose pixel (x, y) is (6x, 6y, 20i)."""
+    reconstruction = pycolmap.Reconstruction()
+    for number, (kind, width, height, params) in enumerate(cameras, start=1):
+        reconstruction.add_camera_with_trivial_rig(
+            pycolmap.Camera(camera_id=number, model=kind, width=width, height=height, params=params)
+        )
+    random = np.random.default_rng(0)
+    for view in range(views):
+        number = view % len(cameras)
+        name = (f"left/{view % 2}/" if nested else "") + f"photo{view:02d}.png"
+        turn = rotation(0.1 * view)
+        center = scale * np.array([view, 0.0, -5.0]) + shift
+        pose = pycolmap.Rigid3d(np.concatenate([turn, -(turn @ center)[:, None]], axis=1))
+        image = pycolmap.Image(name, np.zeros((num_points, 2)), camera_id=number + 1, image_id=view + 1)
+        reconstruction.add_image_with_trivial_frame(image, pose)
+        width, height = cameras[number][1:3]
+        x, y = np.meshgrid(np.arange(width), np.arange(height))
+        path = folder / "images" / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        pixels = np.stack([6 * x, 6 * y, np.full_like(x, 20 * view)], axis=-1).astype(np.uint8)
+        Image.fromarray(pixels).save(path)
+    for point in range(num_points):
+        track = pycolmap.Track([pycolmap.TrackElement(1, point), pycolmap.TrackElement(2, point)])
+        xyz = scale * random.normal(size=3) + shift
+        reconstruction.add_point3D(xyz, track, np.array([point, 2, 3], dtype=np.uint8))
+    (folder / model).mkdir(parents=True)
+    {".bin": reconstruction.write_binary, ".txt": reconstruction.write_text}[suffix](folder / model)
+    return folder
+
+
+@pytest.mark.parametrize("suffix", [".bin", ".txt"])
+@pytest.mark.parametrize("model", ["sparse/0", "sparse", "colmap/sparse/0"])
+def test_reads_cameras_points_and_photos(tmp_path, model, suffix):
+    scene = load_scene(write_capture(tmp_path / "cup", model=model, suffix=suffix))
+    assert scene.name == "cup"
+    assert scene.test.names == ("photo00.png", "photo08.png")
+    assert scene.train.names == tuple(f"photo{view:02d}.png" for view in range(1, 8))
+    assert scene.points.shape == (20, 3) and scene.points.dtype == torch.float32
+    assert scene.point_colors.dtype == torch.uint8 and scene.point_colors[:, 0].tolist() == list(range(20))
+    centers = scene.frame.restore_points(scene.train.cameras.centers.numpy())
+    np.testing.assert_allclose(centers, [[view, 0, -5] for view in range(1, 8)], atol=1e-5)
+    for view, viewmat in zip(range(1, 8), scene.train.cameras.viewmats, strict=True):
+        np.testing.assert_allclose(viewmat[:3, :3], rotation(0.1 * view), atol=1e-6)
+    np.testing.assert_array_equal(scene.train.cameras.sizes, [[40, 24]] * 7)
+    np.testing.assert_allclose(scene.train.cameras.Ks[2], [[50, 0, 21], [0, 52, 11], [0, 0, 1]])
+    image = scene.train.photos.image(3)
+    assert image.shape == (24, 40, 3)
+    np.testing.assert_allclose(image[5, 7] * 255, [42, 30, 80], atol=1e-4)
+
+
+def test_extent_is_1_1_times_the_radius_of_the_training_cameras(tmp_path):
+    scene = load_scene(write_capture(tmp_path / "cup"))
+    centers = scene.train.cameras.centers
+    radius = (centers - centers.mean(dim=0)).norm(dim=1).max()
+    assert scene.extent == pytest.approx(1.1 * radius.item(), rel=1e-5)
+    assert scene.frame.scale == pytest.approx(1.1 * 3.0)  # cameras 1 .. 7 on a line: 3 on either side
+
+
+def test_cameras_that_turn_on_the_spot_have_an_extent(tmp_path):
+    folder = write_capture(tmp_path / "cup", scale=1e-12, shift=(1.0, 0.0, 0.0))
+    model = pycolmap.Reconstruction(folder / "sparse/0")
+    for point in model.points3D.values():
+        point.xyz = [1.0, 0.0, 7.0]
+    model.write_binary(folder / "sparse/0")
+    scene = load_scene(folder)
+    assert scene.extent == 1.0
+    assert scene.frame.scale == pytest.approx(1.1 * 7.0)
+
+
+@pytest.mark.parametrize("scale", [1e-4, 1.0, 1e4])
+def test_place_and_unit_of_the_capture_do_not_matter(tmp_path, scale):
+    """Means at 10^6 from the origin and any unit give the same normalised scene as near the origin."""
+    near = load_scene(write_capture(tmp_path / "near"))
+    far = load_scene(write_capture(tmp_path / "far", scale=scale, shift=(1e6, -2e6, 3e5)))
+    # A float64 at 2e6 resolves 2e-10, and the poses hold sums of products of such numbers.
+    tolerance = 1e-6 + 5e-9 / scale
+    np.testing.assert_allclose(far.points, near.points, atol=tolerance)
+    np.testing.assert_allclose(far.train.cameras.viewmats, near.train.cameras.viewmats, atol=tolerance)
+    assert far.frame.scale == pytest.approx(scale * near.frame.scale, rel=tolerance)
+
+
+def test_projections_are_those_of_the_capture(tmp_path):
+    folder = write_capture(tmp_path / "cup", shift=(5e5, 4e6, 100.0))
+    scene = load_scene(folder)
+    model = pycolmap.Reconstruction(folder / "sparse/0")
+    image = model.find_image_with_name("photo03.png")
+    view = scene.train.names.index("photo03.png")
+    points = [point.xyz for _, point in sorted(model.points3D.items())]
+    local = scene.points @ scene.train.cameras.viewmats[view, :3, :3].T + scene.train.cameras.viewmats[view, :3, 3]
+    pixels = local @ scene.train.cameras.Ks[view].T
+    pixels = (pixels[:, :2] / pixels[:, 2:]).numpy()
+    for xyz, depth, pixel in zip(points, local[:, 2], pixels, strict=True):
+        if depth > 0:
+            np.testing.assert_allclose(pixel, image.project_point(xyz), atol=2e-3)
+    assert (local[:, 2] > 0).sum() > 5
+
+
+def test_several_cameras_sizes_and_nested_folders(tmp_path):
+    cameras = (("PINHOLE", 40, 24, [50.0, 52.0, 21.0, 11.0]), ("SIMPLE_PINHOLE", 16, 33, [30.0, 8.0, 16.0]))
+    scene = load_scene(write_capture(tmp_path / "cup", cameras=cameras, nested=True, views=10))
+    # In name order the even photos (folder left/0, camera 0) come first.
+    assert scene.test.names == ("left/0/photo00.png", "left/1/photo07.png")
+    assert scene.train.names[0] == "left/0/photo02.png" and len(scene.train) == 8
+    sizes = {name: size.tolist() for name, size in zip(scene.train.names, scene.train.cameras.sizes, strict=True)}
+    assert sizes["left/0/photo04.png"] == [40, 24] and sizes["left/1/photo05.png"] == [16, 33]
+    view = scene.train.names.index("left/1/photo05.png")
+    np.testing.assert_allclose(scene.train.cameras.Ks[view], [[30, 0, 8], [0, 30, 16], [0, 0, 1]])
+    assert scene.train.photos.image(view).shape == (33, 16, 3)
+    np.testing.assert_allclose(scene.train.photos.image(view)[20, 3] * 255, [18, 120, 100], atol=1e-4)
+
+
+def test_gather_takes_the_pixels_of_the_samples(tmp_path):
+    cameras = (("PINHOLE", 40, 24, [50.0, 52.0, 21.0, 11.0]), ("SIMPLE_PINHOLE", 16, 33, [30.0, 8.0, 16.0]))
+    photos = load_scene(write_capture(tmp_path / "cup", cameras=cameras)).train.photos  # view i is photo i + 1
+    samples = PixelSamples(
+        view_ids=(5, 0),
+        sizes=photos.sizes[[5, 0]],
+        pixel_ids=torch.tensor([41, -1, 17, -1], dtype=torch.int32),
+        tile_ids=torch.tensor([0, 6], dtype=torch.int32),  # view 5 is 40x24: 3 x 2 tiles
+        tile_offsets=torch.tensor([0, 2, 4], dtype=torch.int32),
+    )
+    expected = [[6, 6, 120], [0, 0, 0], [6, 6, 20], [0, 0, 0]]  # (1, 1) of photo 6; (1, 1) of photo 1
+    np.testing.assert_allclose(photos.gather(samples) * 255, expected, atol=1e-4)
+
+
+def test_factor_scales_intrinsics_by_the_actual_sizes(tmp_path):
+    cameras = (("PINHOLE", 42, 25, [50.0, 52.0, 21.0, 11.0]),)
+    scene = load_scene(write_capture(tmp_path / "cup", cameras=cameras), factor=4)
+    assert scene.train.cameras.sizes[0].tolist() == [11, 6]  # 10.5 and 6.25 to the nearest
+    expected = [[50 * 11 / 42, 0, 21 * 11 / 42], [0, 52 * 6 / 25, 11 * 6 / 25], [0, 0, 1]]
+    np.testing.assert_allclose(scene.train.cameras.Ks[0], expected, rtol=1e-6)
+    assert scene.train.photos.image(0).shape == (6, 11, 3)
+
+
+def test_photos_are_reduced_by_area_averaging(tmp_path):
+    scene = load_scene(write_capture(tmp_path / "cup"), factor=2)
+    # Pixel (x, y) covers 2x, 2x + 1: 6 * (2x + 0.5), rounded to a byte.
+    np.testing.assert_allclose(scene.train.photos.image(0)[3, 5] * 255, [63, 39, 20], atol=0.51)
+
+
+@pytest.mark.parametrize("case", ["used", "one is missing", "wrong size"])
+def test_reduced_copies_are_used_only_where_all_fit(tmp_path, case):
+    folder = write_capture(tmp_path / "cup")
+    (folder / "images_2").mkdir()
+    for view in range(9):
+        Image.new("RGB", (20, 12), (1, 2, 3)).save(folder / "images_2" / f"photo{view:02d}.png")
+    if case == "one is missing":
+        (folder / "images_2" / "photo04.png").unlink()
+    elif case == "wrong size":
+        Image.new("RGB", (17, 12), (1, 2, 3)).save(folder / "images_2" / "photo04.png")
+    scene = load_scene(folder, factor=2)
+    assert (scene.train.photos.colors[0].tolist() == [1, 2, 3]) is (case == "used")
+    assert scene.train.cameras.sizes[0].tolist() == [20, 12]
+
+
+def replace_photo(folder: Path, content: bytes) -> None:
+    (folder / "images" / "photo03.png").write_bytes(content)
+
+
+def truncate_photo(folder: Path) -> None:
+    path = folder / "images" / "photo03.png"
+    path.write_bytes(path.read_bytes()[:60])
+
+
+def wrong_size(folder: Path) -> None:
+    Image.new("RGB", (41, 24)).save(folder / "images" / "photo03.png")
+
+
+def deep_photo(folder: Path) -> None:
+    Image.fromarray(np.full((24, 40), 3000, dtype=np.uint16)).save(folder / "images" / "photo03.png")
+
+
+def remove_photos(folder: Path) -> None:
+    for view in range(2, 7):
+        (folder / "images" / f"photo{view:02d}.png").unlink()
+
+
+def remove_model(folder: Path) -> None:
+    (folder / "sparse/0/points3D.bin").unlink()
+
+
+@pytest.mark.parametrize(
+    ("damage", "words"),
+    [
+        (remove_model, "neither a COLMAP reconstruction"),
+        (remove_photos, r"5 of 9 photos are missing in .*images: photo02.png, photo03.png, photo04.png, \.\.\."),
+        (lambda folder: replace_photo(folder, b"\xff"), "cannot read the photo .*photo03.png"),
+        (lambda folder: replace_photo(folder, b""), "cannot read the photo .*photo03.png"),
+        (truncate_photo, "cannot read the photo .*photo03.png"),
+        (wrong_size, "photo03.png is 41x24 but its camera is 40x24"),
+        (deep_photo, "photo03.png has more than 8 bits a channel"),
+    ],
+)
+def test_bad_files_are_named(tmp_path, damage, words):
+    folder = write_capture(tmp_path / "cup")
+    damage(folder)
+    with pytest.raises(InputError, match=words) as caught:
+        load_scene(folder)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("capture", "arguments", "words"),
+    [
+        ({"views": 2}, {}, "has 2 images: at least 3"),
+        ({"num_points": 0}, {}, "no 3D points"),
+        ({}, {"test_every": 1}, "every image of .* would be a test image"),
+        ({}, {"test_every": 0}, "test_every is 0"),
+        ({}, {"factor": 0}, "factor is 0"),
+        ({}, {"factor": 2.5}, "factor is 2.5"),
+        (
+            {"cameras": (("OPENCV", 40, 24, [50.0, 50.0, 20.0, 12.0, 0.1, 0.0, 0.0, 0.0]),)},
+            {},
+            "OPENCV, a model with lens distortion: undistort with 'colmap image_undistorter",
+        ),
+        ({"cameras": (("PINHOLE", 40, 24, [np.nan, 52.0, 21.0, 11.0]),)}, {}, "intrinsics|VerifyParams"),
+    ],
+)
+def test_bad_captures_are_refused(tmp_path, capture, arguments, words):
+    folder = write_capture(tmp_path / "cup", **capture)
+    with pytest.raises(InputError, match=words) as caught:
+        load_scene(folder, **arguments)
+    assert "\n" not in str(caught.value)
+
+
+def test_points_beyond_float32_are_refused(tmp_path):
+    folder = write_capture(tmp_path / "cup")
+    model = pycolmap.Reconstruction(folder / "sparse/0")
+    model.points3D[3].xyz = [1e60, 0, 0]
+    model.write_binary(folder / "sparse/0")
+    with pytest.raises(InputError, match="1 of 20 3D points lie too far"):
+        load_scene(folder)
+
+
+def test_no_such_scene(tmp_path):
+    with pytest.raises(InputError, match="no such scene"):
+        load_scene(tmp_path / "absent")
+
+
+def test_a_model_without_images_is_refused(tmp_path):
+    (tmp_path / "sparse/0").mkdir(parents=True)
+    pycolmap.Reconstruction().write_binary(tmp_path / "sparse/0")
+    with pytest.raises(InputError, match="no images with a pose"):
+        load_scene(tmp_path)
+
+
+def test_transparent_photos_are_composited_over_black(tmp_path):
+    folder = write_capture(tmp_path / "cup")
+    Image.new("RGBA", (40, 24), (200, 100, 50, 51)).save(folder / "images" / "photo01.png")
+    np.testing.assert_allclose(load_scene(folder).train.photos.colors[0], [40, 20, 10], atol=1)
+
+
+@pytest.mark.skipif(not (SCENES / "fox").is_dir(), reason=f"no real captures in {SCENES}")
+def test_real_capture():
+    scene = load_scene(SCENES / "fox", factor=4)
+    assert (len(scene.train), len(scene.test), len(scene.points)) == (43, 7, 14713)
+    assert scene.train.photos.sizes.tolist() == [[210, 375]] * 43
+    # Points are where photos have their colour: most project to a pixel of about their own.
+    cameras, image = scene.train.cameras, scene.train.photos.image(20)
+    local = scene.points @ cameras.viewmats[20, :3, :3].T + cameras.viewmats[20, :3, 3]
+    pixels = local @ cameras.Ks[20].T
+    pixels = (pixels[:, :2] / pixels[:, 2:]).floor().long()
+    shown = (local[:, 2] > 0) & (pixels >= 0).all(dim=1) & (pixels < torch.tensor([210, 375])).all(dim=1)
+    differences = image[pixels[shown, 1], pixels[shown, 0]] - scene.point_colors[shown] / 255
+    shifted = image[pixels[shown, 1], 209 - pixels[shown, 0]] - scene.point_colors[shown] / 255
+    assert differences.abs().mean(dim=1).median() < 0.6 * shifted.abs().mean(dim=1).median()

@@ -1,0 +1,71 @@
+"""The synthetic capture of `bench step`, and the way of one that does not fit, at a size that does."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from turbogs_plugin.bench.large_capture import synthetic_scene
+from turbogs_plugin.config.configuration import load_config
+from turbogs_plugin.plan import make_plan
+from turbogs_plugin.scene import Scene
+from turbogs_plugin.scene.offload import place_views
+from turbogs_plugin.train.evaluate import evaluate
+from turbogs_plugin.train.trainer import Trainer
+
+CPU = torch.device("cpu")
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return synthetic_scene(10, 48, 32, CPU, gaussians=400)
+
+
+def test_a_synthetic_scene_is_one_like_any_other(scene):
+    assert (len(scene.train), len(scene.test)) == (8, 2)
+    assert scene.train.photos.colors.shape == (8 * 48 * 32, 3) and scene.train.photos.colors.dtype == torch.uint8
+    assert len(set(scene.train.names) | set(scene.test.names)) == 10
+    assert len(scene.points) == len(scene.point_colors) == 100
+    centers = scene.train.cameras.centers
+    assert scene.extent == pytest.approx(1.1 * float((centers - centers.mean(dim=0)).norm(dim=1).max()))
+    photos = scene.train.photos.colors.float().view(8, -1)
+    assert float(photos.std()) > 10.0  # something is to be seen,
+    assert min(float((photos[a] - photos[a - 1]).abs().mean()) for a in range(8)) > 2.0  # from every camera another
+    again = synthetic_scene(10, 48, 32, CPU, gaussians=400)
+    assert torch.equal(again.train.photos.colors, scene.train.photos.colors)
+
+
+def test_it_trains_from_host_memory(scene):
+    """The path of the capture that exceeds a GPU's limit: plan, windows, training, evaluation."""
+    overrides = ["train.iterations=12", "schedule.max_views=2", "schedule.min_views=2", "train.sh_degree=0"]
+    overrides += ["plan.maps_on=host", "plan.photos_on=host", "plan.sh_degree=keep", "density.type=none"]
+    asked = load_config("turbogs", overrides)
+    config = make_plan(asked, scene, CPU).apply(asked)
+    trainer = Trainer(config, scene, CPU)
+    trainer.initialise_maps()
+    first = trainer.maps.mean()
+    test = place_views(scene.test, CPU, config.plan.photos_on)
+    before = evaluate(trainer.gaussians, test, 0, config.raster).psnr
+    for _ in range(12):
+        trainer.step()
+    assert trainer.maps.mean() < first
+    assert evaluate(trainer.gaussians, test, 0, config.raster).psnr > before
+    assert trainer.maps.window_bytes == 4 * (4 * 48 * 32 + 1)
+    assert trainer.views.photos.window_bytes == 3 * (4 * 48 * 32 + 1)
+    assert np.array_equal(trainer.maps.offsets, trainer.views.photos.offsets)
+
+
+def test_bench_step_tells_what_offload_costs(turbogs, tmp_path):
+    out = tmp_path / "step.json"
+    options = ["--photos", 6, "--size", 20, 16, "--gaussians", 60, "--views", 2, "--repeats", 1, "--training", 0]
+    code, printed, error = turbogs("bench", "step", *options, "--offload", "--device", "cpu", "--out", out)
+    assert code == 0, error
+    (entry,) = json.loads(out.read_text())["passes"]
+    assert list(entry["offload"]) == ["photos", "maps", "both"]
+    both = entry["offload"]["both"]
+    assert both["wall"]["median_ms"] > 0
+    assert both["bytes_in"] == 2 * 20 * 16 * 7 and both["bytes_out"] == 2 * 20 * 16 * 4
+    assert both["window_bytes"] == 7 * (4 * 20 * 16 + 1)
+    assert entry["offload"]["maps"]["bytes_in"] == 2 * 20 * 16 * 4
+    assert "both in host memory: wall" in printed

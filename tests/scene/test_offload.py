@@ -1,0 +1,263 @@
+"""Maps and photos in host memory: the bits of resident ones, whatever travels when."""
+
+import random
+from collections import deque
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from helpers.framework_runs import assert_identical, tiny_capture, tiny_config
+from turbogs_plugin.strategies.pixels.samplers import ErrorGuidedPixelSampler
+
+from turbogs_plugin.error_maps import AGE_MAX, ErrorMaps
+from turbogs_plugin.report import outputs
+from turbogs_plugin.scene import Scene, load_scene, offload
+from turbogs_plugin.scene.offload import ABSENT, OffloadedErrorMaps, OffloadedPhotos, ViewWindow
+from turbogs_plugin.scene.photos import Photos, pixel_offsets
+from turbogs_plugin.train import run
+from turbogs_plugin.train.trainer import Trainer
+from turbogs_plugin.types import Step
+
+SIZES = np.array([[21, 17], [5, 40], [16, 16], [1, 1], [33, 9], [20, 20], [7, 7]])
+CPU = torch.device("cpu")
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory) -> Path:
+    return tiny_capture(tmp_path_factory.mktemp("offload"))
+
+
+@pytest.fixture(scope="module")
+def scene(capture) -> Scene:
+    return load_scene(capture)
+
+
+def trainer_of(scene: Scene, capture: Path, maps: bool, photos: bool, *overrides: str) -> Trainer:
+    """A trainer with these two in host memory."""
+    places = [f"plan.{name}_on={'host' if host else 'device'}" for name, host in (("maps", maps), ("photos", photos))]
+    return Trainer(tiny_config(capture, *places, *overrides), scene, CPU)
+
+
+@pytest.mark.parametrize(
+    ("maps", "photos", "unit"),
+    [(True, True, "pixel"), (True, True, "tile"), (True, False, "pixel"), (False, True, "pixel")],
+)
+def test_training_is_bit_for_bit_that_of_resident_maps_and_photos(scene, capture, maps, photos, unit):
+    overrides = (f"pixel_sampler.unit={unit}", "schedule.max_views=2")
+    resident, offloaded = (
+        trainer_of(scene, capture, *places, *overrides) for places in ((False, False), (maps, photos))
+    )
+    for trainer in (resident, offloaded):
+        trainer.initialise_maps()
+    assert_identical(resident.state_dict(), offloaded.state_dict())
+    for _ in range(9):
+        resident.step()
+        offloaded.step()
+    assert_identical(resident.state_dict(), offloaded.state_dict())
+    if maps:
+        assert len(offloaded.maps.errors) < len(resident.maps.errors)  # a window, not all of it
+    if photos:
+        assert len(offloaded.views.photos.colors) < len(resident.views.photos.colors)
+    if maps and photos:
+        places = offloaded.maps.offsets
+        assert np.array_equal(places, offloaded.views.photos.offsets)  # so that one kernel can use both,
+        assert len(offloaded.maps.errors) == len(offloaded.views.photos.colors)  # which it checks
+        assert (places != ABSENT).sum() == 4
+
+
+def test_a_run_stops_with_resident_maps_and_goes_on_with_offloaded_ones(scene, capture):
+    whole, first, second = (trainer_of(scene, capture, host, host) for host in (False, False, True))
+    for trainer in (whole, first):
+        trainer.initialise_maps()
+    for _ in range(6):
+        whole.step()
+        first.step()
+    second.load_state_dict(first.state_dict())
+    for iteration in range(6):
+        whole.step()
+        second.step()
+        if iteration == 2:
+            second.state_dict()  # a checkpoint in between changes nothing
+    assert_identical(whole.state_dict(), second.state_dict())
+
+
+def test_a_whole_run_leaves_the_same_model(capture, tmp_path):
+    models = []
+    for place in ("device", "host"):
+        config = tiny_config(capture, f"plan.maps_on={place}", f"plan.photos_on={place}")
+        outcome = run.train(config, tmp_path / place)
+        assert outcome.folder.read_config().plan.maps_on == place
+        models.append(outcome.folder.model.read_bytes())
+    assert models[0] == models[1]
+
+
+@pytest.mark.parametrize("place", ["device", "host"])
+def test_photos_stay_in_host_memory_when_a_run_is_looked_at(capture, tmp_path, monkeypatch, place):
+    """Evaluated, where it was planned so, with the same errors; rendered, always."""
+    config = tiny_config(capture, f"plan.photos_on={place}", "train.iterations=2")
+    outcome = run.train(config, tmp_path / "run")
+    to, moved = Photos.to, []
+    monkeypatch.setattr(Photos, "to", lambda photos, device: moved.append(device) or to(photos, device))
+    table = outputs.evaluate_run(tmp_path / "run", "cpu")
+    assert f"{outcome.history[-1].psnr:.4f}" in table
+    assert moved == ([] if place == "host" else [CPU])
+    outputs.render_run(tmp_path / "run", "train", "cpu")
+    assert len(moved) == (place == "device")
+
+
+def test_the_initial_colour_is_that_of_the_photos(scene, capture):
+    sh0 = [trainer_of(scene, capture, False, photos).gaussians.sh0 for photos in (False, True)]
+    assert torch.equal(*sh0)
+
+
+def test_maps_of_both_kinds_say_the_same():
+    """Through everything that `ErrorMaps` offers, and over the turn of the stamps' range."""
+    generator = torch.Generator().manual_seed(3)
+    images = [torch.rand(height, width, generator=generator) for width, height in SIZES.tolist()]
+    both = [kind.from_images(images, beta=0.3) for kind in (ErrorMaps, OffloadedErrorMaps)]
+    sampler, choose = ErrorGuidedPixelSampler(), random.Random(1)
+    for iteration in [*range(20), AGE_MAX - 1, AGE_MAX + 30, *range(2 * AGE_MAX + 60, 2 * AGE_MAX + 70)]:
+        step = Step(iteration, 10**6, 10**6, seed=4)
+        views = tuple(choose.sample(range(len(SIZES)), choose.randint(1, 3)))
+        samples = [sampler.sample(maps, views, 0.3, step) for maps in both]
+        assert torch.equal(samples[0].pixel_ids, samples[1].pixel_ids)
+        errors = torch.rand(len(samples[0]), generator=generator) * 3
+        errors[::5] = torch.nan
+        for maps, drawn in zip(both, samples, strict=True):
+            maps.update(drawn, errors, step)
+        if iteration % 3 == 0:
+            view = choose.randrange(len(SIZES))
+            assert torch.equal(both[0].ages(view, step), both[1].ages(view, step))
+            assert both[0].mean() == both[1].mean()
+    assert both[0].stamp_base == both[1].stamp_base == 2 * AGE_MAX + 60
+    assert_identical(both[0].state_dict(), both[1].state_dict())
+
+
+def test_photos_of_both_kinds_are_the_same():
+    colors = torch.randint(0, 256, (int(SIZES.prod(axis=1).sum()), 3), dtype=torch.uint8)
+    resident = Photos(colors, SIZES)
+    offloaded = OffloadedPhotos(resident, CPU)
+    assert offloaded.stored is colors and offloaded.to("cpu") is offloaded and len(offloaded) == len(SIZES)
+    for view in (4, 0, 6, 6, 2, 1, 3, 5):
+        assert torch.equal(resident.image(view), offloaded.image(view))
+
+
+class Machine:
+    """A GPU's streams, simulated: of those that may go on, chance says which one does."""
+
+    def __init__(self, seed: int) -> None:
+        self.choose = random.Random(seed)
+        self.streams: dict[str, deque] = {"compute": deque()}
+
+    def enqueue(self, stream: str, work) -> None:
+        self.streams.setdefault(stream, deque()).append(work)
+
+    def record(self, stream: str):
+        event = {"done": False}
+        self.enqueue(stream, lambda: event.update(done=True))
+        return _Event(event)
+
+    def wait(self, stream: str, events) -> None:
+        for event in events:
+            self.enqueue(stream, event)
+
+    def run(self, steps: int | None = None) -> None:
+        """So much of what is enqueued; None: all of it."""
+        while steps is None or steps > 0:
+            ready = [
+                queue
+                for queue in self.streams.values()
+                if queue and not (isinstance(queue[0], _Event) and not queue[0].state["done"])
+            ]
+            if not ready:
+                assert not any(self.streams.values()), "the streams wait for each other"
+                return
+            work = self.choose.choice(ready).popleft()
+            if not isinstance(work, _Event):
+                work()
+            steps = None if steps is None else steps - 1
+
+
+class _Event:
+    def __init__(self, state: dict) -> None:
+        self.state = state
+
+
+@pytest.fixture
+def machine(monkeypatch):
+    """The copies of `offload` go through a simulated machine."""
+
+    def make(seed: int) -> Machine:
+        machine = Machine(seed)
+        names = iter("abcdefgh")
+
+        class Stream:
+            def __init__(self, device) -> None:
+                self.name, self.latest = next(names), []
+
+            def wait(self, events) -> None:
+                machine.wait(self.name, events)
+
+            def copy(self, target, source) -> None:
+                machine.enqueue(self.name, lambda: target.copy_(source))
+
+            def mark(self):
+                self.latest = [machine.record(self.name)]
+                return self.latest
+
+        monkeypatch.setattr(offload, "_CopyStream", Stream)
+        monkeypatch.setattr(offload, "_mark", lambda device: [machine.record("compute")])
+        monkeypatch.setattr(offload, "_wait", lambda device, events: machine.wait("compute", events))
+        monkeypatch.setattr(offload, "synchronize", lambda device: machine.run())
+        return machine
+
+    return make
+
+
+@pytest.mark.parametrize("written", [True, False])
+@pytest.mark.parametrize("seed", range(20))
+def test_no_copy_is_too_early_or_too_late(machine, seed, written):
+    """Work on the window, and copies in and out, in any order that the events allow: what a plain array gives."""
+    gpu, choose = machine(seed), random.Random(seed)
+    starts = pixel_offsets(SIZES)
+    truth = torch.arange(int(starts[-1]), dtype=torch.int64)
+    window = ViewWindow((truth.clone(),), SIZES, CPU, written=written)
+    seen = []
+
+    def work(place: int, start: int, end: int, amount: int) -> None:
+        array = window.arrays[0]  # as the kernels get it: the waiting is enqueued before the work
+        expected = truth[start:end].clone()
+
+        def change() -> None:
+            inside = array[place : place + end - start]
+            seen.append(torch.equal(inside, expected))
+            inside += amount if written else 0
+
+        gpu.enqueue("compute", change)
+        truth[start:end] += amount if written else 0
+
+    for turn in range(60):
+        views = choose.sample(range(len(SIZES)), choose.choice([1, 1, 2, 3]))
+        window.fetch(views)
+        for view in views:
+            start, end = starts[view : view + 2].tolist()
+            work(int(window.offsets[view]), start, end, 1000 * turn + view)
+        gpu.run(choose.choice([0, 0, 3, 10, 40]))
+        if turn % 20 == 19:
+            assert torch.equal(window.flush()[0], truth)
+        if turn == 30 and written:
+            window.change_all(0, lambda values: -values)
+            truth.neg_()
+    assert torch.equal(window.flush()[0], truth)
+    assert all(seen) and len(seen) > 60
+
+
+def test_nothing_waits_for_the_device_once_the_window_has_its_size(machine):
+    """Until somebody asks for the whole maps, the simulated device may stand still for ever."""
+    gpu = machine(0)
+    window = ViewWindow((torch.zeros(int(SIZES.prod(axis=1).sum())),), SIZES, CPU, written=True)
+    window.fetch([0, 1])
+    gpu.run = None  # any waiting would call it
+    for turn in range(50):
+        window.fetch([turn % 7, (turn + 1 + turn // 7 % 6) % 7])

@@ -1,0 +1,214 @@
+"""Dense Adam is torch.optim.Adam as a gsplat trainer uses it, through gsplat's own surgery too."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from gsplat.strategy.ops import duplicate, remove, reset_opa
+from helpers.optimizers import (
+    STEP,
+    all_finite,
+    assert_resumed_is_bit_identical,
+    clone,
+    equal,
+    make_gaussians,
+    make_gradients,
+)
+from turbogs_plugin.strategies.learning_rates import LearningRates
+from turbogs_plugin.strategies.optimizers.dense_adam import DenseAdam
+
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.types import PARAMETER_NAMES, RowUpdate, Step
+
+RATES = LearningRates(batch_scale=1.0)
+
+
+class Reference:
+    """gsplat's side: a dict of parameters, a dict of torch.optim.Adam, and its operations on rows."""
+
+    def __init__(self, gaussians) -> None:
+        self.params = {name: torch.nn.Parameter(value.clone()) for name, value in gaussians.items()}
+        self.optimizers = {
+            name: torch.optim.Adam([{"params": p}], lr=getattr(RATES.at(STEP), name), eps=1e-15)
+            for name, p in self.params.items()
+        }
+
+    def step(self, gradients, regularizer=None) -> None:
+        for name, p in self.params.items():
+            p.grad = gradients.gradients.summed(name).clone()
+        if regularizer is not None:
+            regularizer(self.params).backward()
+        for optimizer in self.optimizers.values():
+            optimizer.step()
+
+    def surgery(self, operation, **options) -> None:
+        operation(params=self.params, optimizers=self.optimizers, state={}, **options)
+
+    def assert_equals(self, gaussians, rtol=1e-10) -> None:
+        for name, value in gaussians.items():
+            torch.testing.assert_close(value, self.params[name].data, rtol=rtol, atol=1e-12, msg=name)
+
+
+def follow(update: RowUpdate, gaussians, optimizer: DenseAdam):
+    optimizer.apply(update)
+    return update.apply(gaussians)
+
+
+def leave_untouched(gradients, seed: int):
+    """The gradients of an iteration that touched about half of the Gaussians."""
+    touched = torch.rand(len(gradients.gradients.touched), generator=torch.Generator().manual_seed(seed)) < 0.5
+    touched[0] = True
+    for name in PARAMETER_NAMES:
+        value = getattr(gradients.gradients, name)
+        value[(slice(None), ~touched) if name != "shN" else ~touched] = 0
+    gradients.gradients.touched = touched
+    return gradients
+
+
+def test_equals_torch_adam_through_gsplats_surgery():
+    gaussians = make_gaussians(9)
+    reference, optimizer = Reference(gaussians), DenseAdam(RATES)
+    optimizer.setup(gaussians)
+    for seed in range(24):
+        gradients = leave_untouched(make_gradients(3, len(gaussians), seed), seed)
+        optimizer.step(gaussians, gradients, STEP)
+        reference.step(gradients)
+        reference.assert_equals(gaussians)
+        count = len(gaussians)
+        if seed == 6:
+            mask = torch.arange(count) % 3 == 1
+            reference.surgery(duplicate, mask=mask)
+            source = torch.cat([torch.arange(count), torch.where(mask)[0]])
+            gaussians = follow(RowUpdate(source, torch.arange(len(source)) >= count, {}), gaussians, optimizer)
+        if seed == 12:
+            mask = torch.arange(count) % 4 == 0
+            reference.surgery(remove, mask=mask)
+            source = torch.where(~mask)[0]
+            gaussians = follow(RowUpdate(source, torch.zeros_like(source, dtype=torch.bool), {}), gaussians, optimizer)
+        if seed == 18:
+            reference.surgery(reset_opa, value=0.3)
+            values = {"opacities": gaussians.opacities.clamp(max=torch.logit(torch.tensor(0.3)).item())}
+            same = torch.arange(count)
+            update = RowUpdate(same, torch.zeros(count, dtype=torch.bool), values, reset=("opacities",))
+            gaussians = follow(update, gaussians, optimizer)
+    assert int(optimizer.skipped) == 0
+
+
+def test_regularizers_are_those_of_gsplats_loss():
+    """gsplat's trainer adds the means of opacities and scales to its loss; autograd says what follows."""
+    gaussians = make_gaussians(9)
+    reference, optimizer = Reference(gaussians), DenseAdam(RATES, opacity_reg=0.02, scale_reg=0.03)
+    optimizer.setup(gaussians)
+
+    def regularizer(params):
+        return 0.02 * torch.sigmoid(params["opacities"]).abs().mean() + 0.03 * torch.exp(params["scales"]).abs().mean()
+
+    for seed in range(10):
+        gradients = leave_untouched(make_gradients(1, 9, seed), seed)
+        optimizer.step(gaussians, gradients, STEP)
+        reference.step(gradients, regularizer)
+    reference.assert_equals(gaussians)
+    plain = DenseAdam(RATES)
+    other = make_gaussians(9)
+    plain.setup(other)
+    plain.step(other, leave_untouched(make_gradients(1, 9, 0), 0), STEP)
+    assert not torch.equal(other.opacities, gaussians.opacities)
+
+
+def test_the_untouched_go_on_and_new_ones_leap():
+    gaussians = make_gaussians(3)
+    optimizer = DenseAdam(RATES)
+    optimizer.setup(gaussians)
+    gradients = make_gradients(1, 3)
+    for _ in range(2000):
+        optimizer.step(gaussians, gradients, STEP)
+    update = RowUpdate(torch.tensor([0, 1, 1]), torch.tensor([False, False, True]), {})
+    gaussians = follow(update, gaussians, optimizer)
+    before = clone(gaussians)
+    gradients.gradients.means[:, 2] = gradients.gradients.means[:, 1]
+    gradients.gradients.means[:, 0] = 0.0
+    optimizer.step(gaussians, gradients, STEP)
+    moved = (gaussians.means - before.means).abs() / RATES.at(STEP).means
+    torch.testing.assert_close(moved[0], torch.full((3,), 0.9, dtype=torch.float64), rtol=1e-3, atol=0)
+    torch.testing.assert_close(moved[1], torch.full((3,), 1.0, dtype=torch.float64), rtol=1e-3, atol=0)
+    correction = math.sqrt(1 - 0.999**2001)
+    torch.testing.assert_close(moved[2], torch.full((3,), math.sqrt(10) * correction, dtype=torch.float64))
+
+
+def test_an_iteration_that_touched_nothing_changes_nothing():
+    gaussians = make_gaussians(4)
+    optimizer = DenseAdam(RATES, opacity_reg=0.01)
+    optimizer.setup(gaussians)
+    optimizer.step(gaussians, make_gradients(2, 4), STEP)
+    before, state = clone(gaussians), {name: value.clone() for name, value in optimizer.state_dict().items()}
+    gradients = make_gradients(2, 4, size=0.0)
+    gradients.gradients.touched[:] = False
+    optimizer.step(gaussians, gradients, STEP)
+    assert equal(gaussians, before)
+    assert all(torch.equal(value, state[name]) for name, value in optimizer.state_dict().items())
+
+
+@pytest.mark.parametrize("name", PARAMETER_NAMES)
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+def test_a_non_finite_gradient_counts_as_untouched(name, bad):
+    clean, dirty = make_gaussians(5), make_gaussians(5)
+    optimizers = [DenseAdam(RATES), DenseAdam(RATES)]
+    for index, gaussians in enumerate((clean, dirty)):
+        optimizers[index].setup(gaussians)
+        optimizers[index].step(gaussians, make_gradients(3, 5), STEP)
+        gradients = make_gradients(3, 5, seed=2)
+        if index == 0:
+            for parameter in PARAMETER_NAMES:
+                value = getattr(gradients.gradients, parameter)
+                (value[2] if parameter == "shN" else value[:, 2]).fill_(0.0)
+        else:
+            value = getattr(gradients.gradients, name)
+            (value[2] if name == "shN" else value[1, 2]).fill_(bad)
+        optimizers[index].step(gaussians, gradients, STEP)
+    assert equal(clean, dirty)
+    assert [int(optimizer.skipped) for optimizer in optimizers] == [0, 1]
+
+
+def test_survives_any_finite_gradient_and_scale():
+    sizes = torch.tensor([0.0, 1e-38, 1e-20, 1.0, 1e20, 3e38])
+    gaussians = make_gaussians(len(sizes), dtype=torch.float32)
+    gaussians.scales[:] = torch.tensor([-200.0, -20.0, 0.0, 20.0, 88.0, 200.0])[:, None]
+    optimizer = DenseAdam(RATES, opacity_reg=0.01, scale_reg=0.01)
+    optimizer.setup(gaussians)
+    for seed in range(30):
+        gradients = make_gradients(10, len(sizes), seed, torch.float32, size=1.0)
+        for name in PARAMETER_NAMES:
+            value = getattr(gradients.gradients, name)
+            value.sign_().mul_(sizes.reshape(-1, *[1] * (value.dim() - (1 if name == "shN" else 2))))
+        optimizer.step(gaussians, gradients, STEP)
+    assert all_finite(gaussians)
+    assert all(bool(value.isfinite().all()) for value in optimizer.state_dict().values())
+
+
+def test_resumed_is_bit_identical_and_another_models_state_is_refused():
+    assert_resumed_is_bit_identical(DenseAdam)
+    first = DenseAdam()
+    first.setup(make_gaussians(6, dtype=torch.float32))
+    other = DenseAdam()
+    other.setup(make_gaussians(5))
+    with pytest.raises(InputError, match=r"exp_avg.means: found shape \(6, 3\), expected shape \(5, 3\)"):
+        other.load_state_dict(first.state_dict())
+    with pytest.raises(InputError, match="nothing"):
+        other.load_state_dict({})
+
+
+def test_no_gaussians():
+    gaussians, optimizer = make_gaussians(0), DenseAdam(opacity_reg=0.01, scale_reg=0.01)
+    optimizer.setup(gaussians)
+    optimizer.step(gaussians, make_gradients(2, 0), Step(0, 10, 10))
+    assert len(gaussians) == 0
+
+
+@pytest.mark.parametrize(
+    "values", [{"beta1": 1.0}, {"eps": 0.0}, {"opacity_reg": -1.0}, {"scale_reg": math.nan}, {"scale_reg": math.inf}]
+)
+def test_refuses(values):
+    with pytest.raises(InputError, match=next(iter(values))):
+        DenseAdam(**values)

@@ -1,0 +1,514 @@
+"""Error-driven density control (paper section 3.8) against numpy and closed forms, and at its edges."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from helpers.optimizers import STEP, all_finite, fill, make_gaussians, make_gradients, random_stats
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from turbogs_plugin.strategies.density import error_driven as density_module
+from turbogs_plugin.strategies.density.error_driven import ErrorDrivenDensity, NoDensity
+from turbogs_plugin.strategies.density.fastgs import FastGsDensity
+from turbogs_plugin.strategies.density.gsplat_default import GsplatDefaultDensity
+from turbogs_plugin.strategies.density.row_order import spatial_order
+from turbogs_plugin.strategies.optimizers.moment_lm import MomentLMOptimizer
+
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.types import GaussianStats, Step
+
+FULL = Step(1200, 5000, 3500, seed=3, scene_extent=2.0)  # past `prune_size_from`
+QUIET = {"prune_world_size": 0.0, "prune_opacity": 0.0}
+
+
+@pytest.fixture(autouse=True, scope="module")
+def rows_in_the_order_of_their_making():
+    """Without the order of space, which a test below holds to be all the difference."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(density_module, "spatial_order", lambda means, extent: torch.arange(len(means)))
+        yield
+
+
+def controlled(gaussians, stats: GaussianStats | None = None, **config) -> ErrorDrivenDensity:
+    density = ErrorDrivenDensity(**config)
+    density.setup(gaussians)
+    if stats is not None:
+        fill(density.stats, stats)
+    return density
+
+
+def busy_stats(count: int) -> GaussianStats:
+    """Every Gaussian seen, equally difficult, and passing the gradient threshold."""
+    stats = GaussianStats.zeros(count, "cpu")
+    for name in ("error_sums", "distance_sums", "weight_sums", "grad_sums", "view_counts"):
+        getattr(stats, name).fill_(1.0)
+    return stats
+
+
+def rotation(quat: np.ndarray) -> np.ndarray:
+    w, x, y, z = quat / np.linalg.norm(quat)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+@pytest.mark.parametrize("kind", ["raw", "balanced"])
+@pytest.mark.parametrize("iteration", [0, 1750, 3500, 4000])
+def test_scores_equal_the_equation(kind, iteration):
+    gaussians, stats = make_gaussians(60), random_stats(60, seed=2)
+    score, seen = controlled(gaussians, stats, score=kind).scores(Step(iteration, 5000, 3500))
+    weights = stats.weight_sums.numpy().astype(float)
+    expected_seen = weights > 0
+    errors = stats.error_sums.numpy()[expected_seen] / weights[expected_seen]
+    distances = stats.distance_sums.numpy()[expected_seen] / weights[expected_seen]
+    if kind == "balanced":
+        errors, distances = errors / errors.mean(), distances / distances.mean()
+    expected = errors + 0.8 * (1 - min(iteration / 3500, 1)) * distances
+    assert 0 < expected_seen.sum() < 60
+    assert (seen.numpy() == expected_seen).all()
+    np.testing.assert_allclose(score.numpy()[expected_seen], expected, rtol=1e-5)
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize(
+    "config",
+    [
+        {},
+        {"top_fraction": 0.8, "prune_score_fraction": 0.1, "score": "raw"},
+        {"prune_world_size": 0.02, "prune_screen_size": 0.15, "prune_opacity": 0.3},
+        {"prune_world_size": 0.02, "prune_screen_size": 0.15, "prune_size_from": 0.9},  # not yet
+        {"prune_world_size": 0.02, "prune_world_reference": "distance"},
+        {"max_gaussians": 220},
+        {"max_gaussians": 150},
+        {"growth": "budget", "target_gaussians": 260},
+        {"prune_world_size": 0.02, "max_gaussians": 220},  # no room for the huge: neither split nor kept
+        {"prune_world_size": 0.02, "max_gaussians": 150},
+        {"prune_world_size": 0.02, "prune_screen_size": 0.15, "growth": "budget", "target_gaussians": 20},
+    ],
+)
+def test_event_equals_plain_loops(seed, config):
+    """Who is cloned, split and pruned, one Gaussian at a time."""
+    count = 200
+    gaussians, stats = make_gaussians(count, seed), random_stats(count, seed)
+    density = controlled(gaussians, stats, percent_dense=0.04, **config)
+    score, seen = (value.tolist() for value in density.scores(FULL))
+    update = density.update(gaussians, FULL)
+
+    ranked = sorted(score[i] for i in range(count) if seen[i])
+    easy_limit = ranked[math.floor(density.prune_score_fraction * len(ranked) + 1e-6)]
+    hard_limit = ranked[math.floor((1 - density.top_fraction) * len(ranked) + 1e-6)]
+    clones, splits, prunes, huge, spared_by_distance = set(), set(), set(), set(), False
+    for i in range(count):
+        views = max(1.0, float(stats.view_counts[i]))
+        largest = math.exp(float(gaussians.scales[i].max()))
+        small = 3 * largest <= 0.04 * 2.0
+        passes = float(stats.grad_sums[i]) / views > 2e-4 or float(stats.absgrad_sums[i]) / views > 4e-4
+        transparent = 1 / (1 + math.exp(-float(gaussians.opacities[i]))) < density.prune_opacity
+        easy = density.prune_score_fraction > 0 and seen[i] and score[i] < easy_limit
+        reference = 2.0
+        if density.prune_world_reference == "distance":
+            reference = max(reference, math.dist(gaussians.means[i], (0, 0, 0)))
+            spared_by_distance |= density.prune_world_size * 2.0 < largest <= density.prune_world_size * reference
+        if FULL.progress >= density.prune_size_from and (
+            largest > density.prune_world_size * reference
+            or (density.prune_screen_size and stats.max_radii[i] > density.prune_screen_size)
+        ):
+            huge.add(i)
+        if transparent or easy:
+            prunes.add(i)
+        elif passes and seen[i] and score[i] >= hard_limit and not small:
+            splits.add(i)
+        elif i in huge:
+            prunes.add(i)
+        elif passes and seen[i] and score[i] >= hard_limit:
+            clones.add(i)
+    assert spared_by_distance == (density.prune_world_reference == "distance")  # or the case shows nothing
+    limits = [density.max_gaussians] if density.max_gaussians else []
+    if density.growth == "budget":
+        limits.append(math.floor(count + (density.target_gaussians - count) * (1200 - 200) / (3500 - 200)))
+    if limits:
+        room = max(0, min(limits) - (count - len(prunes)))
+        chosen = sorted(clones | splits, key=lambda i: (-score[i], i))[:room]
+        denied = splits - set(chosen)
+        clones, splits = clones & set(chosen), splits & set(chosen)
+        prunes |= denied & huge
+        if density.prune_world_size == 0.02:
+            assert denied & huge  # or the case shows nothing
+    if density.max_gaussians:
+        average = sum(score[i] for i in range(count) if seen[i]) / sum(seen)
+        rest = sorted(set(range(count)) - prunes, key=lambda i: (score[i] if seen[i] else average, i))
+        prunes |= set(rest[: max(0, len(rest) - density.max_gaussians)])
+
+    assert (update.num_cloned, update.num_split, update.num_pruned) == (len(clones), len(splits), len(prunes))
+    rest = [i for i in range(count) if i not in prunes | splits]
+    assert update.source.tolist() == rest + sorted(clones) + sorted(splits) + sorted(splits)
+    assert update.fresh.tolist() == [False] * len(rest) + [True] * (len(clones) + 2 * len(splits))
+    after = update.apply(gaussians)
+    assert torch.equal(after.sh0[:, 0, 0].long(), update.source)
+    if density.max_gaussians:
+        assert len(after) <= density.max_gaussians
+    assert len(density.stats.weight_sums) == len(after)
+    assert not density.stats.weight_sums.any()
+    assert len(splits) + len(prunes) > 0
+
+
+def test_events_are_when_the_table_says():
+    gaussians = make_gaussians(30)
+    density = ErrorDrivenDensity(refine_every=50, final_every=100, opacity_decay=0.01, final_keep=0.9)
+    density.setup(gaussians)
+    events, counted = [], []
+    for iteration in range(900):
+        if density.stats is not None:
+            counted.append(iteration)
+            density.stats.weight_sums += 1
+            density.stats.error_sums += torch.arange(len(gaussians)) + 1.0
+        if update := density.update(gaussians, Step(iteration, 900, 420)):
+            events.append(iteration)
+            gaussians = update.apply(gaussians)
+    assert events == [200, 250, 300, 350, 400, 520, 620, 720, 820]
+    assert counted == list(range(821))
+
+
+@pytest.mark.parametrize(("total", "final_keep", "last"), [(900, 1.0, 420), (500, 0.9, 420), (900, 0.9, 820)])
+def test_statistics_end_with_densification_or_the_last_event(total, final_keep, last):
+    gaussians = make_gaussians(5)
+    density = ErrorDrivenDensity(refine_every=50, final_every=100, final_keep=final_keep)
+    density.setup(gaussians)
+    for iteration in range(total):
+        density.update(gaussians, Step(iteration, total, 420))
+        assert (density.stats is None) == (iteration >= last), iteration
+
+
+def test_an_end_that_moves_on_has_room_for_another_event():
+    """As a time budget moves it, before it is there: 420, which the event at 400 is the last one of, becomes 460."""
+    gaussians = make_gaussians(5)
+    density = ErrorDrivenDensity(refine_every=50, final_keep=1.0, opacity_decay=0.1)
+    density.setup(gaussians)
+    events = [t for t in range(500) if density.update(gaussians, Step(t, 900, 420 if t < 410 else 460))]
+    assert events[-2:] == [400, 450]
+
+
+def test_final_pruning_keeps_the_difficult_and_the_unseen():
+    gaussians, stats = make_gaussians(100), random_stats(100, seed=4)
+    density = controlled(gaussians, stats, final_keep=0.8)
+    step = Step(4000, 5000, 3500)
+    score, seen = density.scores(step)
+    update = density.update(gaussians, step)
+    kept = set(update.source.tolist())
+    assert all(i in kept for i in range(100) if not seen[i])
+    order = sorted((i for i in range(100) if seen[i]), key=lambda i: float(score[i]))
+    dropped = math.floor(0.2 * len(order) + 1e-6)
+    assert kept.isdisjoint(order[:dropped]) and kept.issuperset(order[dropped:])
+    assert update.num_pruned == dropped == 100 - len(kept)
+
+
+def test_split_draws_from_the_gaussian():
+    """20,000 equal Gaussians: mean and covariance of the halves' centres, and 3DGS's smaller axes."""
+    one = make_gaussians(1, seed=5)
+    gaussians = one.map(lambda value: value.repeat(20_000, *[1] * (value.dim() - 1)))
+    density = controlled(gaussians, busy_stats(20_000), percent_dense=0.0, **QUIET)
+    update = density.update(gaussians, FULL)
+    after = update.apply(gaussians)
+    assert update.num_split == 20_000 and len(after) == 40_000
+    turn = rotation(one.quats[0].numpy())
+    covariance = turn @ np.diag(np.exp(2 * one.scales[0].numpy())) @ turn.T
+    offsets = (after.means - one.means).numpy()
+    root = np.linalg.inv(np.linalg.cholesky(covariance))
+    np.testing.assert_allclose(np.cov((offsets @ root.T).T), np.eye(3), atol=0.03)
+    np.testing.assert_allclose((offsets @ root.T).mean(axis=0), 0, atol=0.02)
+    torch.testing.assert_close(after.scales, (one.scales - math.log(1.6)).expand(40_000, 3))
+
+
+def test_split_along_the_long_axis_keeps_mean_and_covariance():
+    gaussians = make_gaussians(50, seed=6)
+    density = controlled(gaussians, busy_stats(50), percent_dense=0.0, split="long_axis", **QUIET)
+    after = density.update(gaussians, FULL).apply(gaussians)
+    assert len(after) == 100
+    for i in range(50):
+        means = after.means[[i, i + 50]].numpy()
+        turn = rotation(gaussians.quats[i].numpy())
+        expected = turn @ np.diag(np.exp(2 * gaussians.scales[i].numpy())) @ turn.T
+        half = turn @ np.diag(np.exp(2 * after.scales[i].numpy())) @ turn.T
+        offset = (means[0] - means[1]) / 2
+        np.testing.assert_allclose(means.mean(axis=0), gaussians.means[i].numpy(), rtol=1e-12)
+        np.testing.assert_allclose(half + np.outer(offset, offset), expected, rtol=1e-10, atol=1e-14)
+        assert np.linalg.norm(offset) > 0.7 * math.exp(float(gaussians.scales[i].max()))
+
+
+@pytest.mark.parametrize("split", ["sample", "long_axis"])
+@pytest.mark.parametrize("size", [1e-15, 1e-3, 1e3, 1e25])
+def test_a_split_goes_along_the_axes_that_are_drawn_whatever_the_quaternions_norm(split, size):
+    gaussians = make_gaussians(20, seed=6, dtype=torch.float32)
+
+    def means() -> torch.Tensor:
+        density = controlled(gaussians, busy_stats(20), percent_dense=0.0, split=split, **QUIET)
+        return density.update(gaussians, FULL).apply(gaussians).means
+
+    expected = means()
+    gaussians.quats *= size
+    torch.testing.assert_close(means(), expected)
+
+
+def test_split_is_a_function_of_seed_and_iteration():
+    gaussians = make_gaussians(20)
+
+    def means(seed: int, iteration: int) -> torch.Tensor:
+        torch.rand(7)  # whatever else draws numbers
+        density = controlled(gaussians, busy_stats(20), percent_dense=0.0, **QUIET)
+        return density.update(gaussians, Step(iteration, 5000, 3500, seed=seed)).apply(gaussians).means
+
+    assert torch.equal(means(1, 300), means(1, 300))
+    assert not torch.equal(means(1, 300), means(2, 300))
+    assert not torch.equal(means(1, 300), means(1, 400))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_opacity_decay(dtype):
+    gaussians = make_gaussians(6, dtype=dtype)
+    gaussians.opacities[:] = torch.tensor([-200.0, -50.0, -2.0, 0.0, 3.0, 60.0], dtype=dtype)
+    stats = busy_stats(6)
+    stats.grad_sums.zero_()  # nothing is densified
+    gaussians.means[:] = gaussians.means / gaussians.means.norm(dim=1, keepdim=True)
+    gaussians.means[3] *= 2.0 * 10.1  # of an extent of 2
+    density = controlled(gaussians, stats, opacity_decay=0.1, spare_beyond=10.0, **QUIET)
+    update = density.update(gaussians, FULL)
+    expected = 0.9 * torch.sigmoid(gaussians.opacities.double())
+    expected[3] = 0.5
+    result = torch.sigmoid(update.apply(gaussians).opacities.double())
+    torch.testing.assert_close(result, expected, rtol=1e-5, atol=0)
+    assert torch.isfinite(update.values["opacities"]).all() and not update.fresh.any()
+
+
+def test_equal_scores_stand_together():
+    """With a budget the lower rows win; without one all densify, and none counts as easy."""
+    gaussians = make_gaussians(10)
+    for config, expected in (({"top_fraction": 0.5}, 10), ({"max_gaussians": 13}, 3)):
+        density = controlled(gaussians, busy_stats(10), prune_score_fraction=0.3, percent_dense=0.0, **QUIET, **config)
+        update = density.update(gaussians, FULL)
+        assert (update.num_split, update.num_pruned) == (expected, 0)
+        assert sorted(set(update.source[update.fresh].tolist())) == list(range(expected))
+    density = controlled(gaussians, busy_stats(10), final_keep=0.5)
+    assert density.update(gaussians, Step(4000, 5000, 3500)) is None
+
+
+@pytest.mark.parametrize("config", [{}, {"prune_score_fraction": 0.5}, {"growth": "budget", "target_gaussians": 99}])
+@pytest.mark.parametrize("step", [FULL, Step(4000, 5000, 3500)])
+def test_nothing_was_visible(config, step):
+    """A window without samples: no scores, so nothing is densified, nor pruned as easy."""
+    gaussians = make_gaussians(10)
+    gaussians.opacities[3] = -9
+    density = controlled(gaussians, **config)
+    density.stats.grad_sums += 1.0
+    density.stats.view_counts += 1.0
+    update = density.update(gaussians, step)
+    if step is FULL:
+        assert update.source.tolist() == [0, 1, 2, 4, 5, 6, 7, 8, 9]
+    else:
+        assert update is None
+
+
+@pytest.mark.parametrize("step", [FULL, Step(4000, 5000, 3500)])
+def test_everything_is_due_for_pruning(step):
+    """The most opaque finite one stays."""
+    gaussians = make_gaussians(5)
+    gaussians.opacities[:] = torch.tensor([-9.0, -8.0, -7.0, 5.0, -10.0])
+    gaussians.means[[3] if step is FULL else [0, 1, 2, 3, 4]] = math.nan
+    density = controlled(gaussians, busy_stats(5))
+    update = density.update(gaussians, step)
+    assert update.source.tolist() == ([2] if step is FULL else [0])
+    assert len(density.stats.weight_sums) == 1
+
+
+def test_one_or_no_gaussian():
+    for count in (0, 1):
+        gaussians = make_gaussians(count)
+        density = controlled(gaussians, busy_stats(count), **QUIET)
+        update = density.update(gaussians, FULL)
+        assert (update is None) if count == 0 else len(update.source) == 2
+
+
+def test_non_finite_rows_go_and_non_finite_statistics_are_unseen():
+    gaussians, stats = make_gaussians(6), busy_stats(6)
+    gaussians.shN[1, 0, 0] = math.inf
+    gaussians.quats[4, 2] = math.nan
+    stats.error_sums[2] = math.nan
+    stats.grad_sums[0] = math.nan
+    density = controlled(gaussians, stats, percent_dense=0.0, **QUIET)
+    update = density.update(gaussians, FULL)
+    after = update.apply(gaussians)
+    assert update.source.tolist() == [0, 2, 3, 5, 3, 5]
+    assert all_finite(after)
+
+
+def test_no_density():
+    density = NoDensity()
+    gaussians = make_gaussians(3)
+    density.setup(gaussians)
+    density.load_state_dict(density.state_dict())
+    assert density.stats is None and density.update(gaussians, FULL) is None
+
+
+@given(
+    seed=st.integers(0, 10_000),
+    split=st.sampled_from(["sample", "long_axis"]),
+    cap=st.sampled_from([0, 25, 60]),
+    decay=st.sampled_from([0.0, 0.2]),
+    gsplat=st.booleans(),
+)
+@settings(max_examples=40, deadline=None)
+def test_state_statistics_and_parameters_stay_together(seed, split, cap, decay, gsplat):
+    """Random sequences of clone, split, prune, decay and reset: equal first dimensions, every row its Gaussian's."""
+    gaussians = make_gaussians(40, seed, dtype=torch.float32)
+    optimizer = MomentLMOptimizer()
+    optimizer.setup(gaussians)
+    if gsplat:
+        density = GsplatDefaultDensity(refine_start_iter=100, reset_every=300, prune_opa=0.2, grow_scale3d=0.02)
+    else:
+        density = ErrorDrivenDensity(
+            split=split, max_gaussians=cap, opacity_decay=decay, prune_opacity=0.2, prune_score_fraction=0.05
+        )
+    density.setup(gaussians)
+    for iteration in (200, 300, 400, 500, 1000):
+        moments = optimizer.moments
+        tags = gaussians.sh0[:, 0, 0].clone()  # which of the first Gaussians a row descends from
+        moments.exp_avg[:, 0], moments.exp_avg_shN[:, 0] = tags, tags
+        moments.steps[:] = tags.int() + 1
+        if density.stats is not None:
+            fill(density.stats, random_stats(len(gaussians), seed + iteration))
+        update = density.update(gaussians, Step(iteration, 1600, 500, seed, scene_extent=1.0))
+        if update is not None:
+            before = len(gaussians)
+            gaussians = update.apply(gaussians)
+            optimizer.apply(update)
+            assert int(update.source.max()) < before and len(gaussians) >= 1
+            if not gsplat and cap:
+                assert len(gaussians) <= max(cap, 0)
+            moments, tags = optimizer.moments, gaussians.sh0[:, 0, 0]
+            expected = torch.where(update.fresh, 0.0, tags)
+            assert torch.equal(moments.exp_avg[:, 0], expected) and torch.equal(moments.exp_avg_shN[:, 0], expected)
+            assert torch.equal(moments.steps, tags.int() + 1)
+        assert all(len(value) == len(gaussians) for _, value in gaussians.items())
+        assert all(len(v) == len(gaussians) for k, v in optimizer.state_dict().items() if k != "skipped")
+        if density.stats is not None:
+            assert {len(v) for v in vars(density.stats).values()} == {len(gaussians)}
+        assert all_finite(gaussians)
+        optimizer.step(gaussians, make_gradients(2, len(gaussians), iteration, torch.float32), STEP)
+
+
+@pytest.mark.parametrize("cls", [ErrorDrivenDensity, GsplatDefaultDensity])
+def test_resumed_is_bit_identical(cls):
+    gaussians, stats = make_gaussians(30, dtype=torch.float32), random_stats(30, seed=1)
+    step = Step(800, 5000, 3500, seed=2, scene_extent=0.5)
+    first, second = cls(), cls()
+    first.setup(gaussians)
+    fill(first.stats, stats)
+    state = {k: v if k != "stats" else {n: t.clone() for n, t in v.items()} for k, v in first.state_dict().items()}
+    second.setup(gaussians)
+    second.load_state_dict(state)
+    one, two = first.update(gaussians, step), second.update(gaussians, step)
+    assert torch.equal(one.source, two.source) and torch.equal(one.values["means"], two.values["means"])
+    first.update(gaussians, Step(4999, 5000, 3500))
+    second.load_state_dict(first.state_dict())
+    assert first.stats is None and second.stats is None
+
+
+@pytest.mark.parametrize("cls", [ErrorDrivenDensity, GsplatDefaultDensity, FastGsDensity])
+def test_statistics_of_another_model_are_refused(cls):
+    small, large, never_set_up = cls(), cls(), cls()
+    small.setup(make_gaussians(3))
+    large.setup(make_gaussians(4))
+    with pytest.raises(InputError, match=r"\(4,\), expected \(3,\)"):
+        small.load_state_dict(large.state_dict())
+    assert len(small.stats.weight_sums) == 3
+    with pytest.raises(InputError, match="setup"):
+        never_set_up.load_state_dict(large.state_dict())
+
+
+def test_a_run_without_a_record_of_its_error_cannot_go_on_with_one():
+    saved, resumed = controlled(make_gaussians(3)), controlled(make_gaussians(3), stop_when_flat=0.01)
+    with pytest.raises(InputError, match="stop_when_flat = 0, or"):
+        resumed.load_state_dict(saved.state_dict())
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"score": "best"},
+        {"split": "thrice"},
+        {"growth": "budget"},
+        {"target_gaussians": 5},
+        {"refine_every": 0},
+        {"top_fraction": 0.0},
+        {"final_keep": 1.5},
+        {"opacity_decay": 1.0},
+        {"max_gaussians": -1},
+        {"lambda_base": math.nan},
+    ],
+)
+def test_refuses(values):
+    with pytest.raises(InputError, match=next(iter(values))):
+        ErrorDrivenDensity(**values)
+
+
+def test_what_lies_beyond_is_spared_unless_it_is_not_finite():
+    gaussians = make_gaussians(5)
+    gaussians.means[:] = torch.tensor([[1.0, 0, 0], [30.0, 0, 0], [30.0, 0, 0], [30.0, 0, 0], [torch.inf, 0, 0]])
+    gaussians.opacities[:] = torch.tensor([-9.0, -9.0, 3.0, 3.0, 3.0])  # the first two are transparent
+    gaussians.scales[:] = torch.tensor([-5.0, -5.0, 5.0, -5.0, -5.0])[:, None]  # the third is huge
+    gaussians.quats[3] = torch.nan
+    stats = busy_stats(5)
+    stats.grad_sums.zero_()
+    for spare_beyond, kept in ((10.0, [1, 2]), (0.0, [2])):
+        density = controlled(
+            gaussians, stats, spare_beyond=spare_beyond, prune_world_size=0.0 if spare_beyond == 0 else 0.1
+        )
+        assert density.update(gaussians, FULL).source.tolist() == kept
+    stats.error_sums[1:3] = 0.0  # the easiest
+    density = controlled(gaussians, stats, spare_beyond=10.0, final_keep=0.1)
+    assert {1, 2} <= set(density.update(gaussians, Step(4000, 5000, 3500, scene_extent=2.0)).source.tolist())
+
+
+def test_a_held_cap_does_not_keep_the_huge():
+    """Huge and difficult where nothing may grow: they are pruned, all but the backdrop."""
+    gaussians = make_gaussians(40)
+    gaussians.means[:] = torch.nn.functional.normalize(gaussians.means, dim=1)
+    gaussians.scales[:] = -6.0
+    gaussians.scales[:5] = 3.0
+    gaussians.means[4] *= 100.0
+    density = controlled(gaussians, busy_stats(40), max_gaussians=40, spare_beyond=10.0)
+    update = density.update(gaussians, FULL)
+    assert update.source.tolist() == list(range(4, 40)) and update.num_pruned == 4
+    alone = gaussians.map(lambda value: value[:2])
+    density = controlled(alone, busy_stats(2), max_gaussians=2)
+    assert len(density.update(alone, FULL).source) == 1  # never none
+
+
+@pytest.mark.parametrize(("cap", "kept"), [(8, [2, 3, 4, 5, 6, 7, 8, 9]), (2, [8, 9])])
+def test_the_cap_takes_the_backdrop_last(cap, kept):
+    gaussians, stats = make_gaussians(10), busy_stats(10)
+    gaussians.means[:] = torch.nn.functional.normalize(gaussians.means, dim=1)
+    gaussians.means[6:] *= 100.0
+    stats.error_sums[:] = torch.tensor([0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 0.1, 0.2, 0.3, 0.4])  # the backdrop is easiest
+    density = controlled(gaussians, stats, max_gaussians=cap, spare_beyond=10.0, **QUIET)
+    assert density.update(gaussians, FULL).source.tolist() == kept
+
+
+@pytest.mark.parametrize("split", ["sample", "long_axis"])
+def test_rows_end_in_the_order_of_space(monkeypatch, split):
+    gaussians, stats = make_gaussians(80), random_stats(80, seed=4)
+    config = {"split": split, "opacity_decay": 0.1, "prune_opacity": 0.3}
+    made = controlled(gaussians, stats, **config).update(gaussians, FULL)
+    expected = made.reordered(spatial_order(made.apply(gaussians).means, FULL.scene_extent))
+    monkeypatch.setattr(density_module, "spatial_order", spatial_order)
+    update = controlled(gaussians, stats, **config).update(gaussians, FULL)
+    assert made.num_split > 0 and not torch.equal(update.source, made.source)
+    assert torch.equal(update.source, expected.source) and torch.equal(update.fresh, expected.fresh)
+    for name, value in update.apply(gaussians).items():
+        assert torch.equal(value, getattr(expected.apply(gaussians), name)), name

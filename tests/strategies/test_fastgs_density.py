@@ -1,0 +1,129 @@
+"""Multi-view-consistent density control: votes, events, and the GPU-only sibling's refusal."""
+
+import pytest
+import torch
+from helpers.bridge_host import make_splats
+from turbogs_plugin.strategies.density.fastgs import FastGsDensity
+from turbogs_plugin.strategies.density.mcmc import GsplatMcmcDensity
+
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.types import Gaussians, Step
+
+COUNT = 8
+
+
+@pytest.fixture
+def gaussians() -> Gaussians:
+    return Gaussians(**{name: value.detach() for name, value in make_splats(COUNT).items()})
+
+
+def look(
+    density: FastGsDensity, errors: list[float], weights: list[float] | None = None, gradient: float = 1.0
+) -> None:
+    """Fill in what the backward pass of one iteration would."""
+    stats = density.stats
+    weights = torch.tensor(weights or [1.0] * COUNT)
+    stats.weight_sums += weights
+    stats.error_sums += torch.tensor(errors) * weights
+    stats.grad_sums += gradient * (weights > 0)
+    stats.view_counts += weights > 0
+
+
+def run_looks(density: FastGsDensity, gaussians: Gaussians, looks: list[list[float]], first: int = 1):
+    """The updates of iterations `first`, `first` + 1, ... with these errors."""
+    updates = []
+    for iteration, errors in enumerate(looks, start=first):
+        look(density, errors)
+        updates.append(density.update(gaussians, Step(iteration, 1000, 500)))
+    return updates
+
+
+LOW, HIGH = 0.1, 0.9
+OFTEN = [HIGH, LOW, LOW, LOW, LOW, LOW, LOW, LOW]
+ONCE = [HIGH, HIGH, LOW, LOW, LOW, LOW, LOW, LOW]
+
+
+def test_only_what_most_looks_mark_is_densified(gaussians):
+    """Gaussian 0 stands out in all four looks, Gaussian 1 in one: only 0 is split, though all gradients are high."""
+    density = FastGsDensity(refine_from=4, refine_every=4, consistency=0.5, prune_opacity=0.0, prune_world_size=0.0)
+    density.setup(gaussians)
+    *before, update = run_looks(density, gaussians, [OFTEN, ONCE, OFTEN, OFTEN])
+    assert before == [None, None, None]
+    assert update.num_split == 1 and update.num_cloned == update.num_pruned == 0
+    assert sorted(update.source.tolist()) == [0, 0, 1, 2, 3, 4, 5, 6, 7]
+    assert sorted(update.source[update.fresh].tolist()) == [0, 0]
+    assert len(density.stats.weight_sums) == 9 and not density.stats.weight_sums.any()
+    lenient = FastGsDensity(refine_from=4, refine_every=4, consistency=0.25, prune_opacity=0.0, prune_world_size=0.0)
+    lenient.setup(gaussians)
+    assert run_looks(lenient, gaussians, [OFTEN, ONCE, OFTEN, OFTEN])[-1].num_split == 2
+
+
+@pytest.mark.parametrize(("error_threshold", "splits"), [(2.9, 2), (3.1, 0)])
+def test_a_mark_is_an_error_of_so_many_means(gaussians, error_threshold, splits):
+    """The two Gaussians of `ONCE` that stand out have three times the mean error."""
+    always = {"prune_opacity": 0.0, "prune_world_size": 0.0, "error_threshold": error_threshold}
+    density = FastGsDensity(refine_from=2, refine_every=2, **always)
+    density.setup(gaussians)
+    update = run_looks(density, gaussians, [ONCE, ONCE])[-1]
+    assert (0 if update is None else update.num_split) == splits
+
+
+def test_looks_that_did_not_see_it_do_not_count(gaussians):
+    density = FastGsDensity(refine_from=4, refine_every=4, prune_opacity=0.0, prune_world_size=0.0)
+    density.setup(gaussians)
+    unseen = [0.0] + [1.0] * (COUNT - 1)
+    for iteration in range(1, 5):
+        look(density, OFTEN, None if iteration == 1 else unseen)
+        update = density.update(gaussians, Step(iteration, 1000, 500))
+    assert update.num_split == 1
+
+
+def test_a_low_gradient_is_not_densified(gaussians):
+    density = FastGsDensity(refine_from=1, refine_every=1, prune_opacity=0.0, prune_world_size=0.0)
+    density.setup(gaussians)
+    look(density, OFTEN, gradient=1e-6)
+    assert density.update(gaussians, Step(1, 1000, 500)) is None
+
+
+def test_after_densification_the_most_blamed_go(gaussians):
+    density = FastGsDensity(prune_every=3, prune_opacity=0.0, blame_threshold=0.9)
+    density.setup(gaussians)
+    updates = run_looks(density, gaussians, [OFTEN, ONCE, OFTEN], first=501)
+    assert updates[:2] == [None, None]
+    assert updates[2].source.tolist() == list(range(1, COUNT))
+    assert updates[2].num_pruned == 1 and not updates[2].fresh.any()
+
+
+def test_a_resumed_window_goes_on_exactly(gaussians):
+    straight, first, second = (FastGsDensity(refine_from=4, refine_every=4, prune_world_size=0.0) for _ in range(3))
+    for density in (straight, first, second):
+        density.setup(gaussians)
+    expected = run_looks(straight, gaussians, [OFTEN, ONCE, OFTEN, OFTEN])[-1]
+    run_looks(first, gaussians, [OFTEN, ONCE])
+    second.load_state_dict(first.state_dict())
+    actual = run_looks(second, gaussians, [OFTEN, OFTEN], first=3)[-1]
+    assert torch.equal(actual.source, expected.source)
+    assert torch.equal(actual.values["means"], expected.values["means"])
+    other = FastGsDensity()
+    other.setup(gaussians.map(lambda value: value[:3]))
+    with pytest.raises(InputError, match=r"has shape \(8,\), expected \(3,\)"):
+        other.load_state_dict(first.state_dict())
+
+
+def test_statistics_end_with_the_last_event(gaussians):
+    density = FastGsDensity(prune_every=300)
+    density.setup(gaussians)
+    assert density.update(gaussians, Step(801, 1000, 500)) is None
+    assert density.stats is None
+    assert density.update(gaussians, Step(802, 1000, 500)) is None
+
+
+@pytest.mark.parametrize(("field", "value"), [("consistency", 0.0), ("error_threshold", -1.0), ("prune_every", 0)])
+def test_invalid_fields_are_refused(field, value):
+    with pytest.raises(InputError, match=field):
+        FastGsDensity(**{field: value})
+
+
+def test_mcmc_says_that_it_needs_a_gpu(gaussians):
+    with pytest.raises(InputError, match="'mcmc' needs a GPU"):
+        GsplatMcmcDensity().setup(gaussians)

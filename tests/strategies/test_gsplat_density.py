@@ -1,0 +1,153 @@
+"""gsplat's DefaultStrategy behind our protocol gives what gsplat gives when it is run by itself."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from gsplat.strategy import DefaultStrategy
+from gsplat.strategy.ops import reset_opa
+from helpers.optimizers import make_gaussians
+from turbogs_plugin.strategies.density.gsplat_default import GsplatDefaultDensity
+
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.types import RowUpdate, Step
+
+COUNT, VIEWS, SIZE = 80, 3, (64, 48)
+
+
+def screen(seed: int) -> SimpleNamespace:
+    """Screen gradients and radii of a batch, as gsplat's `info` has them."""
+    generator = torch.Generator().manual_seed(seed)
+    gradients = torch.randn(VIEWS, COUNT, 2, generator=generator) * 3e-6
+    # One radius in all views that see a Gaussian: of several, gsplat 1.5.3 keeps the last one, not the largest.
+    radii = torch.randint(1, 12, (COUNT, 1), generator=generator) * (
+        torch.rand(VIEWS, COUNT, 1, generator=generator) < 0.7
+    )
+    return SimpleNamespace(
+        gradients=gradients,
+        absolute=gradients.abs() * 1.5,
+        radii=radii.repeat(1, 1, 2),
+    )
+
+
+def gsplats_own(gaussians, batch, step: Step, config: dict, repaired: bool):
+    """(parameters, Adam states) after gsplat's strategy ran on them with optimizers that have a past."""
+    params = {name: torch.nn.Parameter(value.clone()) for name, value in gaussians.items()}
+    optimizers = {name: torch.optim.Adam([p], lr=1e-3) for name, p in params.items()}
+    for name, p in params.items():
+        p.grad = torch.sin(torch.arange(p.numel(), dtype=p.dtype)).reshape(p.shape)
+        optimizers[name].step()
+        with torch.no_grad():
+            p.copy_(getattr(gaussians, name))
+    before = {name: optimizers[name].state[p]["exp_avg"].clone() for name, p in params.items()}
+    strategy = DefaultStrategy(**config, refine_stop_iter=step.refine_until)
+    state = strategy.initialize_state(step.scene_extent)
+    means2d = SimpleNamespace(grad=batch.gradients, absgrad=batch.absolute)
+    info = {"width": SIZE[0], "height": SIZE[1], "n_cameras": VIEWS, "gaussian_ids": None}
+    info |= {"radii": batch.radii, "means2d": means2d}
+    torch.manual_seed(int(np.random.SeedSequence([step.seed, step.iteration]).generate_state(1)[0]))
+    strategy.step_post_backward(params, optimizers, state, step.iteration, info)
+    if repaired and step.iteration % strategy.reset_every == 0:
+        reset_opa(params, optimizers, state, strategy.prune_opa * 2)
+    after = {name: optimizers[name].state[p]["exp_avg"] for name, p in params.items()}
+    return {name: p.data for name, p in params.items()}, before, after
+
+
+def ours(gaussians, batch, step: Step, config: dict, opacity_reset: str) -> RowUpdate | None:
+    density = GsplatDefaultDensity(**config, opacity_reset=opacity_reset)
+    density.setup(gaussians)
+    scale = torch.tensor(SIZE) * 0.5 * VIEWS  # the units that GaussianStats promises
+    visible = (batch.radii > 0).all(dim=-1).float()
+    density.stats.grad_sums += ((batch.gradients * scale).norm(dim=-1) * visible).sum(dim=0)
+    density.stats.absgrad_sums += ((batch.absolute * scale).norm(dim=-1) * visible).sum(dim=0)
+    density.stats.view_counts += visible.sum(dim=0)
+    density.stats.max_radii += (batch.radii.amax(dim=-1) * visible).amax(dim=0) / max(SIZE)
+    update = density.update(gaussians, step)
+    count = COUNT if update is None else len(update.source)
+    assert {len(value) for value in vars(density.stats).values()} == {count}
+    return update
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(
+    ("config", "iteration"),
+    [
+        ({}, 600),
+        ({"absgrad": True, "grow_grad2d": 4e-4}, 600),
+        ({"refine_scale2d_stop_iter": 5000, "grow_scale2d": 0.1}, 3100),
+        ({"refine_scale2d_stop_iter": 5000, "prune_scale2d": 0.05}, 3100),
+        ({"pause_refine_after_reset": 99}, 3100),
+        ({"revised_opacity": True, "prune_opa": 0.2}, 700),
+        ({"prune_opa": 0.1}, 3000),
+    ],
+)
+@pytest.mark.parametrize("opacity_reset", ["repaired", "as_shipped"])
+def test_equals_gsplat(seed, config, iteration, opacity_reset):
+    config = {"grow_scale3d": 0.02, **config}
+    gaussians, batch = make_gaussians(COUNT, seed, dtype=torch.float32), screen(seed)
+    step = Step(iteration, 30_000, 15_000, seed=seed, scene_extent=1.3)
+    expected, state_before, state_after = gsplats_own(gaussians, batch, step, config, opacity_reset == "repaired")
+    update = ours(gaussians, batch, step, config, opacity_reset)
+    assert update.num_split > 0 and update.num_cloned > 0
+    after = update.apply(gaussians)
+    for name, value in expected.items():
+        assert torch.equal(getattr(after, name), value), name
+        moments = update.apply_state(state_before[name])
+        if name in update.reset:
+            moments.zero_()
+        assert torch.equal(moments, state_after[name]), name
+    was_reset = opacity_reset == "repaired" and iteration == 3000
+    assert update.reset == (("opacities",) if was_reset else ())
+    assert not was_reset or torch.sigmoid(after.opacities).max() <= 2 * config["prune_opa"] + 1e-6
+
+
+def test_leaves_global_random_numbers_alone():
+    gaussians, batch = make_gaussians(COUNT, dtype=torch.float32), screen(0)
+    torch.manual_seed(5)
+    expected = torch.rand(3)
+    torch.manual_seed(5)
+    assert ours(gaussians, batch, Step(600, 30_000, 15_000, scene_extent=1.3), {}, "repaired") is not None
+    assert torch.equal(torch.rand(3), expected)
+
+
+def test_refinement_pauses_after_a_reset():
+    gaussians, batch = make_gaussians(COUNT, dtype=torch.float32), screen(0)
+    step = Step(3100, 30_000, 15_000, scene_extent=1.3)
+    assert ours(gaussians, batch, step, {"pause_refine_after_reset": 101}, "repaired") is None
+
+
+def test_nothing_to_do_and_the_end():
+    gaussians = make_gaussians(10, dtype=torch.float32)
+    density = GsplatDefaultDensity(prune_opa=0.0, prune_scale3d=1e9)
+    density.setup(gaussians)
+    for iteration in (0, 1, 550, 600):
+        assert density.update(gaussians, Step(iteration, 1000, 800)) is None
+    assert density.stats is not None
+    assert density.update(gaussians, Step(800, 1000, 800)) is None
+    assert density.stats is None
+    assert density.update(gaussians, Step(900, 1000, 800)) is None
+
+
+def test_one_is_left_when_gsplat_would_leave_none():
+    gaussians = make_gaussians(6, dtype=torch.float32)
+    gaussians.opacities[:] = torch.tensor([-9.0, -8.0, -7.0, -6.0, -10.0, -11.0])
+    density = GsplatDefaultDensity()
+    density.setup(gaussians)
+    update = density.update(gaussians, Step(600, 1000, 800))
+    assert update.source.tolist() == [3] and update.num_pruned == 5
+    assert len(density.stats.view_counts) == 1
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        *({"opacity_reset": "never"}, {"refine_every": 0}, {"prune_opa": 0.6}, {"grow_grad2d": -1.0}),
+        *({"refine_start_iter": -1}, {"prune_scale3d": float("inf")}, {"grow_scale2d": float("nan")}),
+    ],
+)
+def test_refuses(values):
+    with pytest.raises(InputError, match=next(iter(values))):
+        GsplatDefaultDensity(**values)

@@ -1,0 +1,338 @@
+"""Losses against independent computations in numpy and finite differences, the sign, the bounds, and the extremes."""
+
+import itertools
+
+import numpy as np
+import pytest
+import torch
+from turbogs_plugin.strategies.losses.losses import CharbonnierLoss, CharbonnierNccLoss, SparseSsimLoss
+
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.types import PixelSamples
+
+EVERY = [
+    CharbonnierLoss(),
+    CharbonnierNccLoss(),
+    CharbonnierNccLoss(ncc_weight=1.0, variance_constant=1e-6),
+    CharbonnierNccLoss(ncc_weight=1.0, gate=True),
+    CharbonnierNccLoss(ncc_weight=1.0, structure="contrast"),
+    CharbonnierNccLoss(ncc_weight=0.5, structure="contrast", gate=True, variance_constant=1e-4),
+    SparseSsimLoss(),
+    SparseSsimLoss(ssim_weight=1.0),
+]
+STRUCTURED = [loss for loss in EVERY if isinstance(loss, CharbonnierNccLoss)]
+
+
+def make_samples(counts, empty=(), weights=None):
+    """Tiles of a 16-pixel-high strip with so many slots each; the last `empty[tile]` of a tile are empty."""
+    counts = np.asarray(counts)
+    ids = np.concatenate([np.arange(count) + 16 * tile for tile, count in enumerate(counts)])
+    offsets = np.concatenate([[0], np.cumsum(counts)])
+    for tile, number in enumerate(empty):
+        ids[offsets[tile + 1] - number : offsets[tile + 1]] = -1
+    return PixelSamples(
+        (0,),
+        np.array([[16 * len(counts), 16]]),
+        torch.as_tensor(ids, dtype=torch.int32),
+        torch.arange(len(counts), dtype=torch.int32),
+        torch.as_tensor(offsets, dtype=torch.int32),
+        weights,
+    )
+
+
+def random_case(seed=0, counts=(5, 9, 1, 26, 3), empty=(1, 0, 0, 4, 2), weighted=False, dtype=torch.float64):
+    generator = torch.Generator().manual_seed(seed)
+    slots = sum(counts)
+    weights = torch.rand(slots, generator=generator) + 0.2 if weighted else None
+    samples = make_samples(counts, empty, weights)
+    if weighted:
+        samples.weights /= samples.weights[samples.filled].mean()
+    colors, targets = torch.rand(2, slots, 3, generator=generator, dtype=torch.float64).to(dtype)
+    return colors, 0.5 * colors + 0.5 * targets, samples
+
+
+def tiles_of(samples):
+    """Filled slots of each tile."""
+    offsets, ids = samples.tile_offsets.tolist(), samples.pixel_ids.tolist()
+    return [[p for p in range(a, b) if ids[p] >= 0] for a, b in itertools.pairwise(offsets)]
+
+
+def expected_similarity(loss, x, y, w):
+    """S of one tile and channel, from numpy's weighted moments."""
+    omega = w / w.sum()
+    mean_x, mean_y = omega @ x, omega @ y
+    var_x, var_y, cov = omega @ (x - mean_x) ** 2, omega @ (y - mean_y) ** 2, omega @ ((x - mean_x) * (y - mean_y))
+    if isinstance(loss, SparseSsimLoss):
+        c1, c2 = 0.01**2, 0.03**2
+        luminance = (2 * mean_x * mean_y + c1) / (mean_x**2 + mean_y**2 + c1)
+        return luminance * (2 * cov + c2) / (var_x + var_y + c2), 1.0
+    c = loss.variance_constant
+    gate = var_y / (var_y + c) if loss.gate else 1.0
+    if loss.structure == "contrast":
+        return (2 * cov + c) / (var_x + var_y + c), gate
+    return (cov + c / 2) / np.sqrt((var_x + c / 2) * (var_y + c / 2)), gate
+
+
+def expected_balance(loss, colors, targets, samples):
+    """lambda of each tile, with the gradient of S by central differences of `expected_similarity`."""
+    if isinstance(loss, SparseSsimLoss):
+        return [1.0] * len(samples.tile_ids)
+    w = np.ones(len(samples)) if samples.weights is None else samples.weights.double().numpy()
+    factors = []
+    for slots in tiles_of(samples):
+        omega = w[slots] / w[slots].sum()
+        norm_l1 = norm_structure = 0.0
+        for channel in range(3):
+            x, y = colors[slots, channel], targets[slots, channel]
+            norm_l1 += omega @ (np.abs(x - y) / np.sqrt((x - y) ** 2 + loss.epsilon**2))
+            for i in range(len(slots)):
+                step = np.zeros(len(slots))
+                step[i] = 1e-6
+                up, down = (expected_similarity(loss, x + s, y, w[slots])[0] for s in (step, -step))
+                norm_structure += abs(up - down) / 2e-6  # = omega_i |g_i|
+        factors.append(min(1.0, norm_l1 / (norm_structure + 1e-8)))
+    return factors
+
+
+def expected_loss(loss, colors, targets, samples, balance):
+    """The loss by the equations, tile by tile, with the balance given."""
+    w = np.ones(len(samples)) if samples.weights is None else samples.weights.double().numpy()
+    filled = [slot for slots in tiles_of(samples) for slot in slots]
+    d = colors[filled] - targets[filled]
+    l1 = (w[filled, None] * (np.sqrt(d**2 + loss.epsilon**2) - loss.epsilon)).mean()
+    if isinstance(loss, CharbonnierLoss):
+        return l1
+    weight, base = (
+        (loss.ssim_weight, 1 - loss.ssim_weight) if isinstance(loss, SparseSsimLoss) else (loss.ncc_weight, 1)
+    )
+    structure = 0.0
+    for slots, factor in zip(tiles_of(samples), balance, strict=True):
+        for channel in range(3):
+            similarity, gate = expected_similarity(loss, colors[slots, channel], targets[slots, channel], w[slots])
+            structure += factor * gate * (1 - similarity) / 3
+    return base * l1 + weight * structure / len(samples.tile_ids)
+
+
+@pytest.mark.parametrize("weighted", [False, True])
+@pytest.mark.parametrize("loss", EVERY, ids=repr)
+def test_value_and_gradient_are_the_equations(loss, weighted):
+    """Value in closed form; gradient by central differences with the balance frozen."""
+    colors, targets, samples = random_case(weighted=weighted)
+    result = loss(colors, targets, samples)
+    x, y = colors.numpy(), targets.numpy()
+    balance = [1.0] * 5 if isinstance(loss, CharbonnierLoss) else expected_balance(loss, x, y, samples)
+    assert result.loss.item() == pytest.approx(expected_loss(loss, x, y, samples, balance), rel=1e-6)
+    assert result.color_gradients.dtype == torch.float64
+    numeric = np.zeros_like(x)
+    for place in np.ndindex(x.shape):
+        moved = [x.copy(), x.copy()]
+        moved[0][place] += 1e-6
+        moved[1][place] -= 1e-6
+        up, down = (expected_loss(loss, value, y, samples, balance) for value in moved)
+        numeric[place] = (up - down) / 2e-6
+    assert result.color_gradients.numpy() == pytest.approx(numeric, rel=1e-4, abs=1e-8)
+    assert np.abs(numeric).max() > 1e-3
+
+
+@pytest.mark.parametrize("loss", EVERY, ids=repr)
+def test_empty_slots_have_no_part(loss):
+    colors, targets, samples = random_case(weighted=True)
+    result = loss(colors, targets, samples)
+    empty = ~samples.filled
+    assert (result.color_gradients[empty] == 0).all()
+    assert (result.pixel_errors[empty] == 0).all()
+    colors[empty], targets[empty] = torch.nan, torch.inf
+    again = loss(colors, targets, samples)
+    assert torch.equal(result.color_gradients, again.color_gradients)
+    assert result.loss == again.loss
+
+
+def test_pixel_errors_are_l1_norms():
+    colors, targets, samples = random_case()
+    result = CharbonnierNccLoss()(colors, targets, samples)
+    expected = torch.where(samples.filled, (colors - targets).abs().sum(dim=1), 0.0)
+    assert result.pixel_errors.dtype == torch.float32
+    assert torch.allclose(result.pixel_errors, expected.float(), rtol=1e-6)
+
+
+@pytest.mark.parametrize("structure", ["ncc", "contrast"])
+def test_a_step_against_the_gradient_raises_the_correlation(structure):
+    """The appendix's minus would lower it."""
+    generator = torch.Generator().manual_seed(4)
+    samples = make_samples([40])
+    targets = torch.rand(40, 3, generator=generator, dtype=torch.float64)
+    colors = torch.rand(40, 3, generator=generator, dtype=torch.float64)
+    l1_only = CharbonnierLoss()(colors, targets, samples).color_gradients
+    loss = CharbonnierNccLoss(ncc_weight=1.0, structure=structure)
+    structure_part = loss(colors, targets, samples).color_gradients - l1_only
+
+    def correlations(values):
+        return np.array([np.corrcoef(values[:, c], targets[:, c])[0, 1] for c in range(3)])
+
+    assert (correlations(colors - structure_part) > correlations(colors) + 1e-4).all()
+    assert (correlations(colors + structure_part) < correlations(colors) - 1e-4).all()
+
+
+def test_textured_tiles_have_the_papers_ncc():
+    """Far above the floor, 1 - S is one minus numpy's correlation coefficient, and ignores gain and offset."""
+    generator = torch.Generator().manual_seed(5)
+    targets = torch.rand(64, 3, generator=generator, dtype=torch.float64)
+    noise = torch.rand(64, 3, generator=generator, dtype=torch.float64)
+    samples = make_samples([64])
+    loss = CharbonnierNccLoss(ncc_weight=1.0, variance_constant=1e-9)
+    plain = CharbonnierLoss()
+    for colors in (targets * 0.5 + 0.5 * noise, 3.0 * targets + 0.7 * noise - 0.4):
+        structure = loss(colors, targets, samples).loss - plain(colors, targets, samples).loss
+        factor = expected_balance(loss, colors.numpy(), targets.numpy(), samples)[0]
+        expected = np.mean([1 - np.corrcoef(colors[:, c], targets[:, c])[0, 1] for c in range(3)])
+        assert structure.item() == pytest.approx(factor * expected, rel=1e-5)
+
+
+# --- extremes -------------------------------------------------------------------------------------------------------
+
+
+def gradient_bound(loss, samples):
+    """The docstrings' bound of each entry, [P, 1]."""
+    weights = torch.ones(len(samples)) if samples.weights is None else samples.weights
+    l1 = weights[:, None] / (3 * samples.filled.sum())
+    return l1 + getattr(loss, "ncc_weight", 0.0) / len(samples.tile_ids)
+
+
+def extreme_tiles():
+    """Name -> (colours, targets) of a tile of 30 samples."""
+    generator = torch.Generator().manual_seed(6)
+    noise, texture = torch.rand(2, 30, 3, generator=generator)
+    flat = torch.full((30, 3), 0.3)
+    return {
+        "both constant": (flat + 0.2, flat),
+        "truth constant": (noise, flat),
+        "truth constant, prediction nearly": (flat + 1e-5 * noise, flat),
+        "prediction constant": (flat, texture),
+        "clipped white": (torch.ones(30, 3) + 0.1 * noise, torch.ones(30, 3)),
+        "black": (torch.zeros(30, 3), torch.zeros(30, 3)),
+        "values of 1e4": (1e4 * noise, texture),
+        "values of 1e4 on one pixel": (flat + 1e4 * torch.eye(30)[:, :1], texture),
+        "constant 1e4": (flat + 1e4, flat),
+        "almost equal": (texture + 1e-7 * noise, texture),
+        "inverted": (1 - texture, texture),
+        "quantised": (noise, (texture * 2 / 255).round() / 2),
+    }
+
+
+@pytest.mark.parametrize("weighted", [False, True])
+@pytest.mark.parametrize("count", [1, 2, 30])
+@pytest.mark.parametrize("name", list(extreme_tiles()))
+@pytest.mark.parametrize("loss", STRUCTURED, ids=repr)
+def test_gradients_stay_below_the_stated_bound(loss, name, count, weighted):
+    colors, targets = (values[:count] for values in extreme_tiles()[name])
+    samples = make_samples([count], weights=torch.linspace(0.1, 1.9, count) if weighted else None)
+    result = loss(colors, targets, samples)
+    assert torch.isfinite(result.loss)
+    assert torch.isfinite(result.color_gradients).all()
+    assert (result.color_gradients.abs() <= gradient_bound(loss, samples) * 1.001).all()
+
+
+@pytest.mark.parametrize("name", list(extreme_tiles()))
+@pytest.mark.parametrize("ssim_weight", [0.2, 1.0])
+def test_ssim_stays_finite(name, ssim_weight):
+    colors, targets = extreme_tiles()[name]
+    result = SparseSsimLoss(ssim_weight=ssim_weight)(colors, targets, make_samples([30]))
+    assert torch.isfinite(result.loss)
+    assert torch.isfinite(result.color_gradients).all()
+    assert result.color_gradients.abs().max() < 30
+
+
+@pytest.mark.parametrize("loss", STRUCTURED, ids=repr)
+@pytest.mark.parametrize("level", [0.0, 0.1, 0.7, 1.0, 1e4])
+def test_one_sample_and_constant_tiles_get_the_l1_gradient_alone(loss, level):
+    samples = make_samples([1, 17])
+    targets = torch.full((18, 3), level)
+    colors = targets + 0.123
+    plain = CharbonnierLoss()(colors, targets, samples)
+    result = loss(colors, targets, samples)
+    assert torch.equal(result.color_gradients, plain.color_gradients)
+    assert result.loss.item() == pytest.approx(plain.loss.item(), abs=1e-6)
+
+
+@pytest.mark.parametrize("structure", ["ncc", "contrast"])
+def test_the_gate_closes_where_the_truth_is_constant(structure):
+    """A noisy prediction of a flat wall: without the gate it is smoothed, with it l1 alone is left."""
+    colors, targets = extreme_tiles()["truth constant"]
+    samples = make_samples([30])
+    plain = CharbonnierLoss()(colors, targets, samples).color_gradients
+    opened, closed = (
+        CharbonnierNccLoss(ncc_weight=1.0, structure=structure, gate=gate)(colors, targets, samples).color_gradients
+        for gate in (False, True)
+    )
+    assert torch.equal(closed, plain)
+    assert ((opened - plain) * (colors - colors.mean(dim=0))).sum() > 1e-4
+
+
+@pytest.mark.parametrize("loss", EVERY, ids=repr)
+@pytest.mark.parametrize("scale", [1.0, 1e4])
+def test_truth_has_no_loss_and_no_gradient(loss, scale):
+    _, targets, samples = random_case(dtype=torch.float32)
+    result = loss(scale * targets, scale * targets, samples)
+    assert abs(result.loss.item()) < 1e-6
+    limit = 1e-6 if isinstance(loss, SparseSsimLoss) else 0.0
+    assert result.color_gradients.abs().max() <= limit
+    assert (result.pixel_errors == 0).all()
+
+
+@pytest.mark.parametrize("loss", EVERY, ids=repr)
+def test_half_precision_input_is_computed_in_single(loss):
+    colors, targets, samples = random_case(dtype=torch.float16)
+    result = loss(colors, targets, samples)
+    expected = loss(colors.float(), targets.float(), samples)
+    assert result.color_gradients.dtype == torch.float32
+    assert torch.equal(result.color_gradients, expected.color_gradients)
+    reference = loss(colors.double(), targets.double(), samples).color_gradients.float()
+    assert torch.allclose(result.color_gradients, reference, rtol=1e-3, atol=1e-7)
+
+
+@pytest.mark.parametrize("loss", EVERY, ids=repr)
+@pytest.mark.parametrize("bad", [torch.nan, torch.inf])
+def test_a_colour_that_is_not_finite_spoils_nothing(loss, bad):
+    colors, targets, samples = random_case()
+    colors[0, 1] = bad
+    result = loss(colors, targets, samples)
+    assert torch.isfinite(result.loss)
+    assert torch.isfinite(result.color_gradients).all()
+    assert (result.color_gradients[0] == 0).all()
+    assert result.pixel_errors[0] == 0
+
+
+@pytest.mark.parametrize("loss", EVERY, ids=repr)
+def test_loss_does_not_depend_on_the_order_of_tiles(loss):
+    colors, targets, samples = random_case(counts=(6, 6, 6), empty=())
+    order = torch.arange(18).view(3, 6).flip(0).reshape(-1)
+    result, flipped = loss(colors, targets, samples), loss(colors[order], targets[order], samples)
+    assert result.loss.item() == pytest.approx(flipped.loss.item(), rel=1e-12)
+    assert torch.allclose(result.color_gradients[order], flipped.color_gradients, rtol=1e-10, atol=1e-14)
+
+
+def test_without_a_single_filled_slot_the_loss_is_zero():
+    result = CharbonnierNccLoss()(torch.zeros(4, 3), torch.zeros(4, 3), make_samples([4], empty=[4]))
+    assert result.loss.abs() < 1e-6
+    assert (result.color_gradients == 0).all()
+
+
+@pytest.mark.parametrize(
+    ("make", "named"),
+    [
+        (lambda: CharbonnierLoss(epsilon=0.0), "epsilon"),
+        (lambda: CharbonnierNccLoss(ncc_weight=-0.1), "ncc_weight"),
+        (lambda: CharbonnierNccLoss(structure="cosine"), "structure"),
+        (lambda: CharbonnierNccLoss(variance_constant=0.0), "variance_constant"),
+        (lambda: CharbonnierNccLoss(epsilon=float("nan")), "epsilon"),
+        (lambda: SparseSsimLoss(ssim_weight=1.1), "ssim_weight"),
+    ],
+)
+def test_invalid_values_are_named(make, named):
+    with pytest.raises(InputError, match=named):
+        make()
+
+
+def test_wrong_shapes_are_named():
+    with pytest.raises(ValueError, match=r"\(3, 3\) and \(4, 3\), expected \(4, 3\)"):
+        CharbonnierLoss()(torch.zeros(3, 3), torch.zeros(4, 3), make_samples([4]))

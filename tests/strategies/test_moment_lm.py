@@ -1,0 +1,269 @@
+"""Moment-damped LM (paper section 3.9): against numpy, in its limits, and at its worst inputs."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from helpers.optimizers import STEP, all_finite, clone, equal, make_gaussians, make_gradients, scaled
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from turbogs_plugin.strategies.learning_rates import LearningRates
+from turbogs_plugin.strategies.optimizers.moment_lm import MomentLMOptimizer
+from turbogs_plugin.strategies.optimizers.sparse_adam import SparseAdam
+
+from turbogs_plugin.errors import InputError
+
+NAMES = ("means", "scales", "quats", "sh0", "opacities")
+WIDTHS = (3, 3, 4, 3, 1)
+
+
+def packed(tensors: dict) -> np.ndarray:
+    """[..., 14] out of the five parameters' arrays, in the order of the blocks."""
+    return np.concatenate([tensors[name].numpy().reshape(*tensors["opacities"].shape, -1) for name in NAMES], axis=-1)
+
+
+def expected_delta(rows, losses, mean, square, steps, optimizer) -> np.ndarray:
+    """[14] one Gaussian's change by the equation, with dense solves in float64."""
+    rates = optimizer.learning_rates.at(STEP)
+    eta = np.repeat([getattr(rates, name) for name in NAMES], WIDTHS)
+    delta = np.zeros(14)
+    if optimizer.units == "balanced":
+        mean, square = mean / (1 - optimizer.beta1**steps), square / (1 - optimizer.beta2**steps)
+        damping = (np.sqrt(square) + optimizer.eps) / eta
+        weights = optimizer.curvature / losses
+    else:
+        damping, weights = np.sqrt(square) + optimizer.eps, np.ones_like(losses)
+    for block in (slice(0, 10), slice(10, 14)):
+        matrix = np.diag(damping[block]) + sum(
+            w * np.outer(row[block], row[block]) for w, row in zip(weights, rows, strict=True)
+        )
+        delta[block] = np.linalg.solve(matrix, -mean[block])
+    if optimizer.units == "balanced" and optimizer.max_step > 0:
+        bound = np.maximum(optimizer.max_step * eta, np.abs(mean / damping))
+        delta = np.clip(delta, -bound, bound)
+    return delta
+
+
+@pytest.mark.parametrize("views", [1, 3, 12])
+@pytest.mark.parametrize("solver", ["cholesky", "low_rank"])
+@pytest.mark.parametrize(
+    "config",
+    [
+        {},
+        {"max_step": 0.0},
+        {"max_step": 0.3, "curvature": 1.0},
+        {"rows": "summed", "max_step": 0.0},
+        {"units": "paper"},
+        {"units": "paper", "rows": "summed"},
+    ],
+)
+def test_equals_numpy(views, solver, config):
+    count = 5
+    gaussians = make_gaussians(count)
+    optimizer = MomentLMOptimizer(solver=solver, **config)
+    optimizer.setup(gaussians)
+    mean, square = np.zeros((count, 14)), np.zeros((count, 14))
+    damped = 0
+    for iteration in range(4):
+        gradients = make_gradients(views, count, seed=iteration).gradients
+        rows, losses = packed({name: getattr(gradients, name) for name in NAMES}), gradients.view_losses.numpy()
+        gradient = rows.sum(axis=0)
+        mean, square = 0.9 * mean + 0.1 * gradient, 0.999 * square + 0.001 * gradient**2
+        if optimizer.rows == "summed":
+            rows, losses = rows.sum(axis=0, keepdims=True), losses.sum(axis=0, keepdims=True)
+        before = packed(dict(clone(gaussians).items()))
+        optimizer.step(gaussians, make_gradients(views, count, seed=iteration), STEP)
+        change = packed(dict(gaussians.items())) - before
+        for i in range(count):
+            expected = expected_delta(rows[:, i], losses[:, i], mean[i], square[i], iteration + 1, optimizer)
+            np.testing.assert_allclose(change[i], expected, rtol=1e-6, atol=1e-13)
+        adam = SparseAdam()
+        damped += not np.allclose(change, adam.learning_rates.at(STEP).means, rtol=0.1)
+    assert damped
+
+
+def test_rows_matter():
+    """The views' rows and their sum are different models of the same gradient."""
+    results = []
+    for rows in ("views", "summed"):
+        gaussians = make_gaussians(4)
+        optimizer = MomentLMOptimizer(rows=rows)
+        optimizer.setup(gaussians)
+        optimizer.step(gaussians, make_gradients(3, 4), STEP)
+        results.append(gaussians.means)
+    assert not torch.allclose(*results, rtol=1e-12, atol=0)
+
+
+def test_consistent_gradients_take_the_gauss_newton_step():
+    """One view, L = r^2 / 2, rates that would overshoot a thousandfold: the linear model of the residual ends at zero,
+    g . delta = -2 L, but for the damping's share (Sherman-Morrison, and m = g at the first step)."""
+    rates = LearningRates(means=0.5, means_final=0.5, scales=1, quats=1, opacities=50, sh0=50, batch_scale=1)
+    eta = np.repeat([getattr(rates.at(STEP), name) for name in NAMES], WIDTHS)
+    gaussians = make_gaussians(6)
+    before = clone(gaussians)
+    optimizer = MomentLMOptimizer(rates, max_step=0.0)
+    optimizer.setup(gaussians)
+    gradients = make_gradients(1, 6)
+    gradients.gradients.view_losses.fill_(1e-6)
+    optimizer.step(gaussians, gradients, STEP)
+    change = packed(dict(gaussians.items())) - packed(dict(before.items()))
+    rows = packed({name: getattr(gradients.gradients, name)[0] for name in NAMES})
+    for block in (slice(0, 10), slice(10, 14)):
+        overshoot = (np.abs(rows) * eta)[:, block].sum(axis=-1) / 2e-6  # |u|^2
+        assert ((overshoot > 200) & (overshoot < 1e4)).all()
+        predicted = (rows * change)[:, block].sum(axis=-1)
+        np.testing.assert_allclose(predicted, -2e-6 * overshoot / (1 + overshoot), rtol=1e-9)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("without", ["no shares", "no curvature", "no gradient"])
+def test_without_rows_it_is_adam_to_the_last_bit(dtype, without):
+    lm_gaussians, adam_gaussians = make_gaussians(9, dtype=dtype), make_gaussians(9, dtype=dtype)
+    lm = MomentLMOptimizer(eps=1e-15, curvature=0.0 if without == "no curvature" else 0.5)
+    adam = SparseAdam(eps=1e-15)
+    lm.setup(lm_gaussians)
+    adam.setup(adam_gaussians)
+    for seed in range(8):
+        gradients = make_gradients(3, 9, seed, dtype)
+        if without == "no shares" or seed == 0:
+            gradients.gradients.view_losses.zero_()
+        if without == "no gradient" and seed > 0:
+            gradients = scaled(gradients, 0.0)
+            gradients.gradients.view_losses.fill_(0.1)
+        lm.step(lm_gaussians, gradients, STEP)
+        adam.step(adam_gaussians, gradients, STEP)
+    assert equal(lm_gaussians, adam_gaussians)
+
+
+def test_tends_to_adam_as_curvature_vanishes():
+    lm_gaussians, adam_gaussians = make_gaussians(9), make_gaussians(9)
+    lm, adam = MomentLMOptimizer(curvature=1e-12), SparseAdam()
+    lm.setup(lm_gaussians)
+    adam.setup(adam_gaussians)
+    lm.step(lm_gaussians, make_gradients(3, 9), STEP)
+    adam.step(adam_gaussians, make_gradients(3, 9), STEP)
+    torch.testing.assert_close(lm_gaussians.means, adam_gaussians.means, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("solver", ["cholesky", "low_rank"])
+@pytest.mark.parametrize("factor", [1e-6, 1e6])
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 2e-5), (torch.float64, 1e-8)])
+def test_scale_of_the_loss_does_not_matter(solver, factor, dtype, tolerance):
+    """Twenty steps of gradients about 1e-5 (1e-11 to 10 when scaled), relative to the way that was gone. What is left
+    is eps = 1e-20 against 1e-11."""
+    paths = []
+    for scale in (1.0, factor):
+        gaussians = make_gaussians(20, dtype=dtype)
+        start = clone(gaussians)
+        optimizer = MomentLMOptimizer(solver=solver)
+        optimizer.setup(gaussians)
+        for seed in range(20):
+            optimizer.step(gaussians, scaled(make_gradients(3, 20, seed, dtype), scale), STEP)
+        paths.append({name: value - getattr(start, name) for name, value in gaussians.items()})
+    for name in NAMES:
+        first, second = (path[name] for path in paths)
+        assert (first - second).norm() <= tolerance * first.norm(), name
+
+
+def test_scale_of_the_loss_does_matter_in_the_papers_units():
+    paths = []
+    for scale in (1.0, 1e3):
+        gaussians = make_gaussians(5)
+        optimizer = MomentLMOptimizer(units="paper")
+        optimizer.setup(gaussians)
+        optimizer.step(gaussians, scaled(make_gradients(3, 5, size=1e-2), scale), STEP)
+        paths.append(gaussians.means)
+    assert not torch.allclose(*paths, rtol=1e-2)
+
+
+@given(
+    st.lists(st.floats(-30, 30), min_size=14, max_size=14),
+    st.integers(1, 4),
+    st.sampled_from(["cholesky", "low_rank"]),
+    st.sampled_from([torch.float32, torch.float64]),
+    st.floats(-40, 30),
+    st.integers(0, 5),
+)
+@settings(max_examples=100, deadline=None)
+def test_any_mixture_of_magnitudes_within_a_block(exponents, views, solver, dtype, loss_exponent, seed):
+    """1e-30 to 1e30 side by side, rows parallel or not, any share of the loss: finite, no longer than the bound."""
+    gaussians = make_gaussians(3, dtype=dtype)
+    start = clone(gaussians)
+    optimizer = MomentLMOptimizer(solver=solver)
+    optimizer.setup(gaussians)
+    gradients = make_gradients(views, 3, seed, dtype, size=1.0)
+    sizes = torch.tensor([10.0**e for e in exponents], dtype=dtype)
+    for name, columns in zip(NAMES, sizes.split(WIDTHS), strict=True):
+        value = getattr(gradients.gradients, name)
+        if seed == 0:
+            value[:] = value[:1]  # parallel rows
+        value.mul_(columns if name != "opacities" else columns[0])
+    gradients.gradients.view_losses.fill_(10.0**loss_exponent)
+    for _ in range(3):
+        before = clone(gaussians)
+        optimizer.step(gaussians, gradients, STEP)
+        assert all_finite(gaussians)
+        for name in NAMES:
+            rate = getattr(optimizer.learning_rates.at(STEP), name)
+            change = (getattr(gaussians, name) - getattr(before, name)).abs()
+            # Adam's own bound for equal gradients is the rate; parameters of size 10 round to 1e-6 in float32.
+            assert change.max() <= rate * (1 + 1e-4) + 2e-6, name
+    assert not equal(start, gaussians)
+    assert int(optimizer.skipped) == 0
+
+
+def test_coupling_cannot_run_away():
+    """Two views that disagree on one parameter only: its own sum is zero, the coupling alone would move it far."""
+    moves = {}
+    for max_step in (0.0, 1.0):
+        gaussians = make_gaussians(1)
+        before = gaussians.quats.clone()
+        optimizer = MomentLMOptimizer(max_step=max_step)
+        optimizer.setup(gaussians)
+        gradients = make_gradients(2, 1)
+        for name in NAMES:
+            getattr(gradients.gradients, name).zero_()
+        gradients.gradients.means[:, 0, 0] = torch.tensor([1.0, 0.5], dtype=torch.float64)
+        gradients.gradients.quats[:, 0, 1] = torch.tensor([1e-6, -1e-6], dtype=torch.float64)
+        gradients.gradients.view_losses.fill_(1e-6)
+        optimizer.step(gaussians, gradients, STEP)
+        moves[max_step] = float((gaussians.quats - before).abs().max() / optimizer.learning_rates.at(STEP).quats)
+    assert moves[0.0] > 100
+    assert moves[1.0] <= 1 + 1e-9
+
+
+def test_zero_rates_hold_parameters():
+    rates = LearningRates(means=0, means_final=0, quats=0)
+    gaussians = make_gaussians(5, dtype=torch.float32)
+    before = clone(gaussians)
+    optimizer = MomentLMOptimizer(rates)
+    optimizer.setup(gaussians)
+    optimizer.step(gaussians, make_gradients(3, 5, dtype=torch.float32), STEP)
+    assert torch.equal(gaussians.means, before.means) and torch.equal(gaussians.quats, before.quats)
+    assert not torch.equal(gaussians.scales, before.scales) and all_finite(gaussians)
+
+
+@pytest.mark.parametrize("share", [math.nan, math.inf, -1.0, 0.0, 1e-45, 1e38])
+def test_a_useless_share_of_the_loss(share):
+    """A share that says nothing drops its row; one that is tiny only stops the motion along it."""
+    gaussians = make_gaussians(2, dtype=torch.float32)
+    optimizer = MomentLMOptimizer()
+    optimizer.setup(gaussians)
+    gradients = make_gradients(3, 2, dtype=torch.float32)
+    gradients.gradients.view_losses[1, 0] = share
+    gradients.gradients.opacities[1], gradients.gradients.sh0[1] = 0.0, 0.0  # this view: no row for the second block
+    optimizer.step(gaussians, gradients, STEP)
+    assert all_finite(gaussians)
+    assert int(optimizer.skipped) == 0
+
+
+@pytest.mark.parametrize(
+    "values",
+    [{"units": "metres"}, {"rows": "pixels"}, {"solver": "qr"}, {"curvature": -1.0}, {"max_step": math.inf}],
+)
+def test_refuses(values):
+    with pytest.raises(InputError, match=next(iter(values))):
+        MomentLMOptimizer(**values)

@@ -1,0 +1,183 @@
+"""Pixel samplers: exact probabilities of what is drawn, and importance weights."""
+
+import itertools
+
+import numpy as np
+import pytest
+import torch
+from helpers.sampling_cases import SIGMAS, UNITS, random_maps, step
+from turbogs_plugin.strategies.pixels.samplers import ErrorGuidedPixelSampler, RandomPixelSampler
+
+from turbogs_plugin.engine.reference.draws import DrawRule, Units, draw_units
+from turbogs_plugin.engine.reference.philox import PURPOSE_PIXELS, random_words
+from turbogs_plugin.error_maps import ErrorMaps
+
+# --- probabilities --------------------------------------------------------------------------------------------------
+
+
+def successive(weights, count, left):
+    """{frozenset: probability} of `count` draws without replacement from `left`, by enumeration."""
+    sets = {}
+    for order in itertools.permutations(sorted(left), min(count, len(left))):
+        total, probability = sum(weights[i] for i in left), 1.0
+        for index in order:
+            probability *= weights[index] / total
+            total -= weights[index]
+        sets[frozenset(order)] = sets.get(frozenset(order), 0.0) + probability
+    return sets
+
+
+def oldest(ages, count, left):
+    """{frozenset: probability} of the `count` oldest of `left`, ties at random."""
+    ranked = sorted((ages[i] for i in left), reverse=True)[:count]
+    if not ranked:
+        return {frozenset(): 1.0}
+    sure = {i for i in left if ages[i] > ranked[-1]}
+    tied = [i for i in left if ages[i] == ranked[-1]]
+    choices = list(itertools.combinations(tied, count - len(sure)))
+    return {frozenset(sure | set(choice)): 1 / len(choices) for choice in choices}
+
+
+def exact_sets(errors, ages, stages, uniform=False):
+    """{frozenset: probability} of the whole draw."""
+    errors, ages = np.asarray(errors, dtype=float), np.asarray(ages, dtype=float)
+    mixed = np.ones(len(errors)) if uniform else errors / errors.sum() + ages / ages.sum()
+    everything = frozenset(range(len(errors)))
+    result = {}
+    for first, p1 in successive(errors, stages[0], everything).items():
+        for second, p2 in oldest(ages, stages[1], everything - first).items():
+            for third, p3 in successive(mixed, stages[2], everything - first - second).items():
+                drawn = first | second | third
+                result[drawn] = result.get(drawn, 0.0) + p1 * p2 * p3
+    return result
+
+
+def drawn_units(sampler, rate, views, size, errors, ages, units):
+    """[views, units] bool: what is drawn in as many equal views; `units` gives the unit of each pixel of a view."""
+    maps = ErrorMaps(np.tile(size, (views, 1)))
+    for view in range(views):
+        maps.initialise(view, torch.as_tensor(errors, dtype=torch.float32)[units])
+    maps.stamps.copy_((50 - torch.as_tensor(ages)[units]).repeat(views))
+    samples = sampler.sample(maps, tuple(range(views)), rate, step(50))
+    filled = samples.filled
+    drawn = torch.zeros(views, len(errors), dtype=torch.bool)
+    drawn[samples.view_of_slot()[filled], units[samples.pixel_ids[filled].long()]] = True
+    return drawn.numpy()
+
+
+def assert_frequencies(drawn, exact):
+    """Frequencies of single units and of whole sets against exact probabilities."""
+    trials = len(drawn)
+    inclusion = np.zeros(drawn.shape[1])
+    for members, probability in exact.items():
+        inclusion[list(members)] += probability
+    spread = np.sqrt(inclusion * (1 - inclusion) / trials)
+    assert (np.abs(drawn.mean(axis=0) - inclusion) <= SIGMAS * spread + 1e-9).all()
+    counts = dict.fromkeys(exact, 0)
+    for row in drawn:
+        counts[frozenset(np.flatnonzero(row))] += 1
+    for members, probability in exact.items():
+        spread = np.sqrt(probability * (1 - probability) / trials)
+        assert abs(counts[members] / trials - probability) <= SIGMAS * spread + 1 / trials
+
+
+ERRORS = [0.125, 0.5, 1.0, 2.0, 0.25, 0.0625]
+AGES = [3, 9, 9, 2, 9, 4]
+STAGED = [
+    (1.0, 0.0, "error_age", (3, 0, 0)),
+    (0.0, 1.0, "error_age", (0, 3, 0)),
+    (0.0, 0.0, "error_age", (0, 0, 3)),
+    (0.0, 0.0, "uniform", (0, 0, 3)),
+    (0.4, 0.3, "error_age", (1, 1, 1)),
+    (0.4, 0.3, "uniform", (1, 1, 1)),
+]
+
+
+@pytest.mark.parametrize(("hard", "stable", "mixed", "stages"), STAGED)
+def test_pixel_frequencies_are_exact(hard, stable, mixed, stages):
+    """1,500 views of 3x2 pixels, 3 drawn of each."""
+    sampler = ErrorGuidedPixelSampler(hard, stable, mixed)
+    drawn = drawn_units(sampler, 3.5 / 256, 1500, (3, 2), ERRORS, AGES, torch.arange(6))
+    assert (drawn.sum(axis=1) == 3).all()
+    assert_frequencies(drawn, exact_sets(ERRORS, AGES, stages, mixed == "uniform"))
+
+
+@pytest.mark.parametrize("unit", ["cell", "tile"])
+@pytest.mark.parametrize(("hard", "stable", "mixed", "stages"), STAGED[::2])
+def test_larger_units_are_drawn_by_their_sums(unit, hard, stable, mixed, stages):
+    """Six cells of a tile, or six tiles of a view, of equal pixels."""
+    side = {"cell": 4, "tile": 16}[unit]
+    y, x = np.mgrid[0 : 2 * side, 0 : 3 * side]
+    units = torch.as_tensor((y // side * 3 + x // side).reshape(-1))
+    rate = {"cell": 3 / 16, "tile": 3 / 6}[unit]
+    sampler = ErrorGuidedPixelSampler(hard, stable, mixed, unit)
+    drawn = drawn_units(sampler, rate, 600, (3 * side, 2 * side), ERRORS, AGES, units)
+    assert (drawn.sum(axis=1) == 3).all()
+    assert_frequencies(drawn, exact_sets(ERRORS, AGES, stages, mixed == "uniform"))
+
+
+def test_cell_with_one_bad_pixel_counts_its_sum_and_its_oldest():
+    errors, stamps = torch.zeros(256), torch.full((256,), 9)
+    errors[17 * 2] = 1.0  # (2, 2): the first cell
+    maps = ErrorMaps(np.array([[16, 16]]))
+    maps.initialise(0, errors)
+    stamps[12 * 16 + 12] = 0  # the last cell
+    maps.stamps.copy_(stamps)
+    samples = ErrorGuidedPixelSampler(0.5, 0.5, unit="cell").sample(maps, (0,), 2 / 16, step(10))
+    cells = set(((samples.coordinates() // 4) @ torch.tensor([1, 4])).tolist())
+    assert cells == {0, 15}
+
+
+def test_random_pixels_are_uniform():
+    drawn = drawn_units(RandomPixelSampler(), 2.5 / 256, 3000, (3, 2), ERRORS, AGES, torch.arange(6))
+    assert_frequencies(drawn, exact_sets([1] * 6, [1] * 6, (0, 0, 2), True))
+
+
+# --- importance weights ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("stages", "columns", "wanted", "tolerance"),
+    [((1.0, 0.0), 12, 5, 0.0), ((0.0, 1.0), 12, 5, 0.0), ((0.0, 0.0), 12, 5, 0.0), ((0.4, 0.3), 64, 16, 0.02)],
+)
+def test_weights_make_sums_unbiased(stages, columns, wanted, tolerance):
+    """Sums of 1 and of v over the drawn, divided by p, against the sums over all: exact for a single stage, and within
+    2 % where three follow one another (they are combined as if independent)."""
+    rows = 20_000
+    generator = torch.Generator().manual_seed(3)
+    errors = torch.rand(columns, generator=generator, dtype=torch.float64).half().double()
+    values = torch.rand(columns, generator=generator, dtype=torch.float64)
+    place = torch.arange(rows * columns).view(rows, columns)
+    # Draws by age alone are unbiased only where ages are equal: a pixel too young has no chance at all.
+    ages = torch.randint(1, 2 if stages[1] == 1.0 else 4, (rows, columns), generator=generator)
+    exist = torch.ones_like(ages, dtype=torch.bool)
+    words = random_words(place, 0, PURPOSE_PIXELS, 0, 0)
+    units = Units(errors.expand(rows, columns), ages, exist, words, np.array([wanted]))
+    drawn, probabilities = draw_units(units, DrawRule("pixel", *stages, False, 1.0))
+    assert (drawn.sum(dim=1) == wanted).all()
+    assert (probabilities[drawn] > 0).all()
+    assert (probabilities[drawn] <= 1).all()
+    for quantity in (torch.ones(columns, dtype=torch.float64), values):
+        estimates = torch.where(drawn, quantity / probabilities.double(), 0.0).sum(dim=1)
+        error = abs(estimates.mean() - quantity.sum())
+        assert error < SIGMAS * estimates.std() / rows**0.5 + tolerance * quantity.sum()
+
+
+@pytest.mark.parametrize("unit", UNITS)
+@pytest.mark.parametrize("importance", [0.25, 1.0])
+def test_weights_have_mean_one_and_same_draw(unit, importance):
+    maps, views = random_maps(), (4, 0, 3)
+    plain = ErrorGuidedPixelSampler(unit=unit).sample(maps, views, 0.2, step(95))
+    weighted = ErrorGuidedPixelSampler(unit=unit, importance=importance).sample(maps, views, 0.2, step(95))
+    assert torch.equal(plain.pixel_ids, weighted.pixel_ids)
+    weights = weighted.weights
+    assert weights.dtype == torch.float32
+    assert (weights[weighted.filled] > 0).all()
+    assert (weights[~weighted.filled] == 0).all()
+    assert weights[weighted.filled].mean().item() == pytest.approx(1, abs=1e-5)
+    assert weights[weighted.filled].std() > 0.01
+
+
+def test_weights_are_one_where_everything_is_drawn():
+    samples = ErrorGuidedPixelSampler(importance=1.0).sample(random_maps(), (0, 2), 1.0, step(3))
+    assert (samples.weights == 1).all()

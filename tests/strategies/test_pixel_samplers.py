@@ -1,0 +1,327 @@
+"""Pixel samplers: the documented bits, the layout, and the extremes."""
+
+import numpy as np
+import pytest
+import torch
+from helpers.sampling_cases import SIGMAS, SIZES, UNITS, pixels_by_tile, random_maps, step
+from turbogs_plugin.strategies.pixels.samplers import DensePixelSampler, ErrorGuidedPixelSampler, RandomPixelSampler
+from turbogs_plugin.strategies.schedule import SinusoidalSchedule
+from turbogs_plugin.strategies.view_sampling import RandomViewSampler
+
+from turbogs_plugin.engine.reference.draws import DrawRule
+from turbogs_plugin.engine.reference.philox import PURPOSE_PIXELS, exponentials, random_words
+from turbogs_plugin.error_maps import AGE_MAX, ErrorMaps
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.types import TILE_SIZE, Cameras, cell_order
+
+# --- layout ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("rate", [1e-6, 0.1, 1 / 3, 1.0, 7.0])
+@pytest.mark.parametrize("unit", UNITS)
+@pytest.mark.parametrize("sampler", [ErrorGuidedPixelSampler, RandomPixelSampler])
+def test_layout(sampler, unit, rate):
+    maps, views = random_maps(), (3, 0, 4, 2)
+    samples = sampler(unit=unit).sample(maps, views, rate, step(100))
+    assert samples.view_ids == views
+    assert samples.sizes.tolist() == SIZES[list(views)].tolist()
+    assert samples.weights is None
+    offsets, grid = samples.tile_offsets, samples.grid
+    assert offsets[0] == 0
+    assert offsets[-1] == len(samples)
+    assert (samples.tile_ids[1:] > samples.tile_ids[:-1]).all()
+    assert [t.dtype for t in (samples.pixel_ids, samples.tile_ids, offsets)] == [torch.int32] * 3
+
+    filled, coordinates = samples.filled, samples.coordinates()
+    view_of_slot, tile_of_slot = samples.view_of_slot(), samples.tile_of_slot()
+    places = torch.stack([view_of_slot, samples.pixel_ids.long()], dim=1)[filled]
+    assert len(torch.unique(places, dim=0)) == len(places), "a pixel was drawn twice"
+    width, height = torch.as_tensor(samples.sizes)[view_of_slot].unbind(dim=1)
+    assert (samples.pixel_ids < width * height).all()
+    x, y = coordinates.unbind(dim=1)
+    columns = torch.as_tensor(grid.shapes[:, 0])[view_of_slot]
+    tiles = torch.as_tensor(grid.offsets[:-1])[view_of_slot] + (y // TILE_SIZE) * columns + x // TILE_SIZE
+    assert (tiles == samples.tile_ids[tile_of_slot])[filled].all()
+    ranks = torch.where(filled, cell_order(x % TILE_SIZE, y % TILE_SIZE), TILE_SIZE**2)  # empty slots come last
+    same_tile = tile_of_slot[1:] == tile_of_slot[:-1]
+    rising = (ranks[1:] > ranks[:-1]) | ~filled[1:]
+    assert (rising & (filled[:-1] | ~filled[1:]) | ~same_tile).all()
+
+
+SAMPLERS = [ErrorGuidedPixelSampler(), RandomPixelSampler(), DensePixelSampler()]
+
+
+@pytest.mark.parametrize("sampler", SAMPLERS, ids=lambda sampler: type(sampler).__name__)
+@pytest.mark.parametrize(
+    "views",
+    [[2, 0], torch.tensor([2, 0]), [torch.tensor(2), torch.tensor(0)], np.array([2, 0]), (np.int64(2), np.int64(0))],
+)
+def test_views_may_come_in_any_form(sampler, views):
+    expected = sampler.sample(random_maps(), (2, 0), 0.1, step(4))
+    samples = sampler.sample(random_maps(), views, 0.1, step(4))
+    assert samples.view_ids == (2, 0) and all(type(view) is int for view in samples.view_ids)
+    assert torch.equal(samples.pixel_ids, expected.pixel_ids)
+    for one in (2, torch.tensor(2), np.int64(2)):
+        assert sampler.sample(random_maps(), one, 0.1, step(4)).view_ids == (2,)
+
+
+@pytest.mark.parametrize("sampler", SAMPLERS, ids=lambda sampler: type(sampler).__name__)
+@pytest.mark.parametrize("views", [(5,), (0, -1), -1, (), (0.5,), torch.tensor([0.0, 1.0]), None, "01", [[0, 1]]])
+def test_views_that_are_none_are_refused(sampler, views):
+    assert len(SIZES) == 5
+    with pytest.raises(InputError, match=r"view_ids = .* from 0 to 4"):
+        sampler.sample(random_maps(), views, 0.1, step(4))
+
+
+@pytest.mark.parametrize("sampler", SAMPLERS, ids=lambda sampler: type(sampler).__name__)
+@pytest.mark.parametrize("views", [(2, 2), torch.tensor([0, 3, 0])])
+def test_a_view_twice_is_refused(sampler, views):
+    """`ErrorMaps.update` would count its pixels' changes twice."""
+    with pytest.raises(InputError, match=r"view_ids = .* each view once"):
+        sampler.sample(random_maps(), views, 0.1, step(4))
+
+
+@pytest.mark.parametrize(("rate", "wanted"), [(1e-6, 1), (0.1, 25), (1 / 3, 85), (1.0, 256), (3.0, 256)])
+def test_counts_of_pixels(rate, wanted):
+    samples = ErrorGuidedPixelSampler().sample(random_maps(), (0, 2), rate, step(1))
+    extents = [256, 256, 5 * 16, 16 * 5, 16 * 5, 5 * 5, 1]  # 37x21, then 1x1
+    assert [len(pixels) for pixels in pixels_by_tile(samples).values()] == [min(wanted, n) for n in extents]
+    assert samples.filled.all()
+
+
+@pytest.mark.parametrize(("rate", "wanted"), [(1e-6, 1), (0.1, 2), (1 / 3, 5), (1.0, 16)])
+def test_counts_of_cells(rate, wanted):
+    samples = ErrorGuidedPixelSampler(unit="cell").sample(random_maps(), (4, 0), rate, step(1))
+    width = {**dict.fromkeys(range(12), 64), **dict.fromkeys(range(12, 18), 37)}
+    for tile, pixels in pixels_by_tile(samples).items():
+        cells = {(pixel // width[tile] // 4, pixel % width[tile] // 4) for pixel in pixels}
+        available = 16 if tile < 14 else {14: 8, 15: 8, 16: 8, 17: 4}[tile]
+        assert len(cells) == min(wanted, available)
+        if tile < 12:
+            assert len(pixels) == 16 * wanted
+    slots = (samples.tile_offsets[1:] - samples.tile_offsets[:-1]).tolist()
+    assert slots[12:] == [
+        min(16 * min(wanted, cells), n)
+        for cells, n in zip([16, 16, 8, 8, 8, 4], [256, 256, 80, 80, 80, 25], strict=True)
+    ]
+
+
+@pytest.mark.parametrize(("rate", "tiles"), [(1e-6, (1, 1)), (0.34, (4, 2)), (1.0, (12, 6))])
+def test_counts_of_tiles(rate, tiles):
+    samples = ErrorGuidedPixelSampler(unit="tile").sample(random_maps(), (4, 0), rate, step(1))
+    ids = samples.tile_ids
+    assert ((ids < 12).sum(), (ids >= 12).sum()) == tiles
+    extents = [256] * 12 + [256, 256, 80, 80, 80, 25]
+    assert {tile: len(pixels) for tile, pixels in pixels_by_tile(samples).items()} == {
+        tile: extents[tile] for tile in ids.tolist()
+    }
+    assert len(samples) == 256 * len(ids)
+
+
+def test_dense_is_every_pixel_as_the_rasterizer_orders_them():
+    from turbogs_plugin.engine.rendering import dense_samples
+
+    maps, views = random_maps(), (4, 0, 2)
+    samples = DensePixelSampler().sample(maps, views, 0.01, step(3))
+    cameras = Cameras(torch.eye(4).repeat(5, 1, 1), torch.eye(3).repeat(5, 1, 1), SIZES)
+    expected = dense_samples(cameras, views)
+    for name in ("pixel_ids", "tile_ids", "tile_offsets"):
+        assert torch.equal(getattr(samples, name), getattr(expected, name))
+    full = ErrorGuidedPixelSampler().sample(maps, views, 1.0, step(3))
+    assert torch.equal(full.pixel_ids, samples.pixel_ids)
+
+
+@pytest.mark.parametrize("unit", UNITS)
+def test_a_view_gets_the_same_pixels_in_any_batch(unit):
+    maps, sampler = random_maps(), ErrorGuidedPixelSampler(unit=unit)
+    together = sampler.sample(maps, (4, 1, 0), 0.2, step(8))
+    alone = sampler.sample(maps, (0,), 0.2, step(8))
+    assert torch.equal(together.pixel_ids[together.view_of_slot() == 2], alone.pixel_ids)
+
+
+@pytest.mark.parametrize("unit", UNITS)
+def test_draws_depend_on_seed_and_iteration_alone(unit):
+    maps, sampler = random_maps(), ErrorGuidedPixelSampler(unit=unit)
+    draws = [sampler.sample(maps, (4, 0), 0.2, step(*at)) for at in [(8, 1), (8, 1), (9, 1), (8, 2), (8, 1 + 2**32)]]
+    keys = [(tuple(draw.pixel_ids.tolist()), tuple(draw.tile_ids.tolist())) for draw in draws]
+    assert keys[0] == keys[1]
+    assert len(set(keys)) == 4
+
+
+# --- the definition, bit by bit -------------------------------------------------------------------------------------
+
+
+def documented_draw(errors, ages, place, view, rule, wanted, seed, iteration):
+    """The module's text for one tile in plain Python: the set of ranks drawn. Arrays are in `cell_order`."""
+    f32, floor = np.float32, np.float32(2.0**-100)
+    x = [w.numpy() for w in random_words(torch.as_tensor(place), view, PURPOSE_PIXELS, seed, iteration)]
+    races = [exponentials(torch.as_tensor(word)).numpy() for word in x]
+    total_error, total_age = f32(errors.astype(np.float64).sum()), f32(ages.sum())
+    hard, stable, mixed = rule.stages(wanted)
+    drawn = set()
+
+    def take(count, key):
+        left = [rank for rank in range(len(errors)) if rank not in drawn]
+        drawn.update(sorted(left, key=lambda rank: (-key(rank), rank))[:count])
+
+    def mixture(rank):
+        by_error = f32(errors[rank]) / total_error if total_error > 0 else f32(0)
+        by_age = f32(ages[rank]) / total_age if total_age > 0 else f32(0)
+        return f32(1) if rule.mixed_uniform else by_error + by_age
+
+    take(hard, lambda rank: max(f32(errors[rank]), floor) / races[0][rank])
+    take(stable, lambda rank: int(ages[rank]) << 24 | int(x[1][rank]) >> 8)
+    take(mixed, lambda rank: max(mixture(rank), floor) / races[2][rank])
+    return drawn
+
+
+@pytest.mark.parametrize("mixed", ["error_age", "uniform"])
+@pytest.mark.parametrize("view", [0, 1])
+def test_draw_is_the_documented_one(view, mixed):
+    maps = random_maps()
+    sampler = ErrorGuidedPixelSampler(mixed=mixed)
+    rule = DrawRule("pixel", 0.4, 0.3, mixed == "uniform", 0.0)
+    for iteration in (100, 101):
+        samples = sampler.sample(maps, (view,), 0.2, step(iteration, seed=5))
+        width, height = SIZES[view]
+        for tile, pixels in pixels_by_tile(samples).items():
+            columns = -(-width // TILE_SIZE)
+            ys, xs = np.mgrid[0:16, 0:16].reshape(2, -1)
+            order = np.argsort(cell_order(torch.as_tensor(xs), torch.as_tensor(ys)).numpy())
+            ys, xs = ys[order] + tile // columns * 16, xs[order] + tile % columns * 16
+            inside = (xs < width) & (ys < height)
+            ids = (ys * width + xs)[inside]
+            flat = maps.offsets[view] + ids
+            ages = np.minimum(iteration - maps.stamps.numpy()[flat].astype(np.int64), AGE_MAX)
+            wanted = min(51, len(ids))
+            drawn = documented_draw(maps.errors.numpy()[flat], ages, ids, view, rule, wanted, 5, iteration)
+            if wanted < len(ids):
+                assert set(ids[list(drawn)]) == set(pixels)
+            else:
+                assert set(pixels) == set(ids)
+
+
+# --- extremes -------------------------------------------------------------------------------------------------------
+
+
+def many_tiles(errors, iteration=0, sampler=None, rate=0.1):
+    """How often each place of a tile is drawn, [256] in row order, over 400 equal tiles."""
+    image = torch.as_tensor(errors).reshape(16, 16).repeat(20, 20)
+    maps = ErrorMaps.from_images([image])
+    samples = (sampler or ErrorGuidedPixelSampler()).sample(maps, (0,), rate, step(iteration))
+    x, y = (samples.coordinates() % 16).unbind(dim=1)
+    return torch.bincount(y * 16 + x, minlength=256).numpy(), samples
+
+
+@pytest.mark.parametrize("iteration", [0, 70_000])
+@pytest.mark.parametrize("value", [0.0, 65504.0, float("nan"), float("inf"), 6e-8])
+def test_tiles_of_one_error_are_drawn_uniformly(value, iteration):
+    """All-zero, saturated, NaN-seeded, denormal; all ages equal or saturated: no stripe, no pixel left out."""
+    counts, samples = many_tiles(torch.full((256,), value), iteration)
+    assert counts.sum() == 400 * 25
+    p = 25 / 256
+    assert (np.abs(counts - 400 * p) < SIGMAS * np.sqrt(400 * p * (1 - p))).all()
+    assert samples.filled.all()
+
+
+def test_one_hot_tile_always_gives_the_hot_pixel_and_else_is_uniform():
+    errors = torch.zeros(256)
+    errors[77] = 1e-3
+    counts, _ = many_tiles(errors)
+    assert counts[77] == 400
+    p = 24 / 255
+    others = np.delete(counts, 77)
+    assert (np.abs(others - 400 * p) < SIGMAS * np.sqrt(400 * p * (1 - p))).all()
+
+
+def test_smallest_error_comes_before_zero_errors():
+    errors = torch.zeros(256)
+    errors[100:110] = 6e-8
+    counts, _ = many_tiles(errors, sampler=ErrorGuidedPixelSampler(1.0, 0.0))
+    assert (counts[100:110] == 400).all()
+
+
+def test_one_pixel_a_tile():
+    errors = torch.zeros(256)
+    errors[3] = 1.0
+    counts, samples = many_tiles(errors, iteration=3, rate=1e-9)
+    assert len(samples) == 400
+    assert 0.4 < counts[3] / 400 < 0.6  # the mixed stage's one: half by error, half by (equal) age
+
+
+def test_ages_past_sixteen_bits_still_rank():
+    maps = ErrorMaps.from_images(torch.rand(1, 16, 16))
+    sampler, visited = ErrorGuidedPixelSampler(0.0, 1.0), 60_000
+    first = sampler.sample(maps, (0,), 0.5, step(visited))
+    maps.update(first, torch.rand(len(first)), step(visited))
+    second = sampler.sample(maps, (0,), 0.5, step(visited + 32_766))  # one iteration before the visited saturate
+    assert not set(first.pixel_ids.tolist()) & set(second.pixel_ids.tolist())
+    third = sampler.sample(maps, (0,), 0.5, step(visited + 140_000))  # all saturated: at random
+    assert 40 < len(set(first.pixel_ids.tolist()) & set(third.pixel_ids.tolist())) < 88
+
+
+@pytest.mark.parametrize("unit", UNITS)
+def test_every_pixel_is_revisited(unit):
+    """The stable share alone reaches every unit within ceil(units / stable) iterations, whatever the errors."""
+    maps = ErrorMaps(np.array([[64, 64]]))
+    errors = torch.zeros(64 * 64)
+    errors[:300] = 3.0
+    maps.initialise(0, errors)
+    rate = {"pixel": 0.1, "cell": 0.2, "tile": 0.2}[unit]  # 25 of 256, or 3 of 16: stable 8, or 1
+    iterations = {"pixel": 256 // 8, "cell": 16, "tile": 16}[unit]
+    for t in range(iterations):
+        samples = ErrorGuidedPixelSampler(unit=unit).sample(maps, (0,), rate, step(t))
+        maps.update(samples, maps.errors[maps.flat_pixels(samples)], step(t))
+    assert maps.ages(0, step(iterations)).max() <= iterations
+
+
+def test_two_views_with_ten_asked():
+    maps = random_maps(SIZES[[0, 4]])
+    views = RandomViewSampler()
+    cameras = Cameras(torch.eye(4).repeat(2, 1, 1), torch.eye(3).repeat(2, 1, 1), maps.sizes)
+    views.setup(cameras, 1.0)
+    budget = SinusoidalSchedule(min_views=3, max_views=10).query(step(0), 0.1, 0.1, 2)
+    chosen = views.select(budget.views, maps.view_means(), step(0))
+    samples = ErrorGuidedPixelSampler().sample(maps, chosen, budget.rate, step(0))
+    assert sorted(chosen) == [0, 1]
+    assert samples.filled.all()
+
+
+def test_random_sampler_reads_no_errors():
+    maps = random_maps()
+    before = RandomPixelSampler().sample(maps, (0, 4), 0.3, step(2))
+    maps.initialise(0, torch.rand(37 * 21) * 100)
+    after = RandomPixelSampler().sample(maps, (0, 4), 0.3, step(2))
+    assert torch.equal(before.pixel_ids, after.pixel_ids)
+
+
+@pytest.mark.parametrize(
+    ("values", "named"),
+    [
+        ({"hard_ratio": 1.2}, "hard_ratio"),
+        ({"hard_ratio": 0.8, "stable_ratio": 0.3}, "stable_ratio"),
+        ({"stable_ratio": -0.1}, "stable_ratio"),
+        ({"mixed": "age"}, "mixed"),
+        ({"unit": "warp"}, "unit"),
+        ({"importance": 1.5}, "importance"),
+        ({"importance": float("nan")}, "importance"),
+    ],
+)
+def test_invalid_values_are_named(values, named):
+    with pytest.raises(InputError, match=named):
+        ErrorGuidedPixelSampler(**values)
+
+
+@pytest.mark.parametrize("sampler", SAMPLERS[:2], ids=lambda sampler: type(sampler).__name__)
+@pytest.mark.parametrize(
+    ("rate", "at", "named"),
+    [*((rate, step(0), f"rate = {rate}") for rate in (0.0, float("nan"), float("inf"))), (0.1, 7, "step = 7.*a Step")],
+)
+def test_invalid_rates_and_steps_are_named(sampler, rate, at, named):
+    with pytest.raises(InputError, match=named):
+        sampler.sample(random_maps(), (0,), rate, at)
+
+
+def test_an_invalid_unit_is_named():
+    with pytest.raises(InputError, match="unit"):
+        RandomPixelSampler(unit="cells")

@@ -1,0 +1,218 @@
+"""Learning rates, sparse Adam, and the state that all optimizers share."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from helpers.optimizers import (
+    STEP,
+    all_finite,
+    assert_resumed_is_bit_identical,
+    clone,
+    equal,
+    make_gaussians,
+    make_gradients,
+)
+from turbogs_plugin.strategies.learning_rates import LearningRates
+from turbogs_plugin.strategies.optimizers.moment_lm import MomentLMOptimizer
+from turbogs_plugin.strategies.optimizers.sparse_adam import SparseAdam
+
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.types import PARAMETER_NAMES, RowUpdate, Step
+
+OPTIMIZERS = [SparseAdam, MomentLMOptimizer]
+
+
+def test_rates_at_start_middle_and_end():
+    rates = LearningRates(means=1e-2, means_final=1e-4, batch_scale=3.0)
+    for iteration, expected in ((0, 1e-2), (500, 1e-3), (1000, 1e-4), (2000, 1e-4)):
+        at = rates.at(Step(iteration, 1000, 700, scene_extent=5.0))
+        assert at.means == pytest.approx(3 * 5 * expected)
+        assert at.scales == pytest.approx(3 * rates.scales)
+    assert LearningRates(means=0, means_final=0).at(STEP).means == 0
+
+
+@pytest.mark.parametrize("values", [{"scales": -1.0}, {"shN": math.nan}, {"means": 0.0}, {"batch_scale": math.inf}])
+def test_rates_refuse(values):
+    with pytest.raises(InputError, match=next(iter(values))):
+        LearningRates(**values)
+
+
+@pytest.mark.parametrize("cls", OPTIMIZERS)
+@pytest.mark.parametrize("values", [{"beta1": 1.0}, {"beta2": -0.1}, {"eps": 0.0}, {"eps": math.nan}])
+def test_optimizers_refuse(cls, values):
+    with pytest.raises(InputError, match=next(iter(values))):
+        cls(**values)
+
+
+def test_equals_torch_adam():
+    gaussians = make_gaussians(7)
+    rates = LearningRates(batch_scale=1.0)
+    reference = {name: torch.nn.Parameter(value.clone()) for name, value in gaussians.items()}
+    adam = torch.optim.Adam(
+        [{"params": [p], "lr": getattr(rates.at(STEP), name)} for name, p in reference.items()], eps=1e-15
+    )
+    optimizer = SparseAdam(rates)
+    optimizer.setup(gaussians)
+    for seed in range(20):
+        gradients = make_gradients(3, 7, seed)
+        optimizer.step(gaussians, gradients, STEP)
+        for name, p in reference.items():
+            p.grad = gradients.gradients.summed(name)
+        adam.step()
+    for name, value in gaussians.items():
+        torch.testing.assert_close(value, reference[name].data, rtol=1e-12, atol=1e-12)
+
+
+def test_first_step_is_the_rate_in_float32():
+    """The bias correction cancels: 1 - 0.999 computed as a difference would be off by 5e-5."""
+    gaussians = make_gaussians(50, dtype=torch.float32)
+    before = clone(gaussians)
+    gaussians.opacities.zero_()
+    optimizer = SparseAdam()
+    optimizer.setup(gaussians)
+    optimizer.step(gaussians, make_gradients(2, 50, dtype=torch.float32), STEP)
+    rate = optimizer.learning_rates.at(STEP).opacities
+    torch.testing.assert_close(gaussians.opacities.abs(), torch.full((50,), rate), rtol=1e-6, atol=0)
+    assert not torch.equal(before.means, gaussians.means)
+
+
+@pytest.mark.parametrize("cls", OPTIMIZERS)
+def test_untouched_rows_stand_still_and_count_their_own_steps(cls):
+    """A Gaussian touched in iterations 0 and 2 ends where one does that knows of these two only."""
+    sparse, dense = make_gaussians(4), make_gaussians(4)
+    sparse_optimizer, dense_optimizer = cls(), cls()
+    sparse_optimizer.setup(sparse)
+    dense_optimizer.setup(dense)
+    for iteration in range(3):
+        gradients = make_gradients(2, 4, seed=iteration)
+        if iteration != 1:
+            dense_optimizer.step(dense, gradients, STEP)
+        gradients.gradients.touched[1] = iteration != 1
+        before = clone(sparse)
+        sparse_optimizer.step(sparse, gradients, STEP)
+        if iteration == 1:
+            assert all(torch.equal(value[1], getattr(before, name)[1]) for name, value in sparse.items())
+            assert not torch.equal(sparse.means[0], before.means[0])
+    for name, value in sparse.items():
+        assert torch.equal(value[1], getattr(dense, name)[1])
+    assert sparse_optimizer.moments.steps.tolist() == [3, 2, 3, 3]
+
+
+@pytest.mark.parametrize("cls", OPTIMIZERS)
+@pytest.mark.parametrize("name", PARAMETER_NAMES)
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+def test_non_finite_gradient_skips_one_gaussian(cls, name, bad):
+    clean, dirty = make_gaussians(5), make_gaussians(5)
+    gradients = make_gradients(3, 5)
+    optimizers = [cls(), cls()]
+    optimizers[0].setup(clean)
+    optimizers[0].step(clean, gradients, STEP)
+    start = clone(dirty)
+    value = getattr(gradients.gradients, name)
+    (value[2] if name == "shN" else value[1, 2]).fill_(bad)
+    optimizers[1].setup(dirty)
+    optimizers[1].step(dirty, gradients, STEP)
+    for parameter in PARAMETER_NAMES:
+        result, expected = getattr(dirty, parameter), getattr(clean, parameter).clone()
+        expected[2] = getattr(start, parameter)[2]
+        assert torch.equal(result, expected), parameter
+    assert int(optimizers[1].skipped) == 1
+    assert int(optimizers[0].skipped) == 0
+    assert optimizers[1].moments.steps.tolist() == [1, 1, 0, 1, 1]
+
+
+@pytest.mark.parametrize("cls", OPTIMIZERS)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_survives_any_finite_gradient(cls, dtype):
+    """Up to the largest float, in runs long enough for the moments to fill; the state stays finite too."""
+    sizes = torch.tensor([0.0, 1e-38, 1e-30, 1e-20, 1e-10, 1.0, 1e10, 1e20, 1e30, 3e38], dtype=dtype)
+    gaussians = make_gaussians(len(sizes), dtype=dtype)
+    optimizer = cls()
+    optimizer.setup(gaussians)
+    for seed in range(30):
+        gradients = make_gradients(10, len(sizes), seed, dtype, size=1.0)
+        for name in PARAMETER_NAMES:
+            value = getattr(gradients.gradients, name)
+            value.sign_().mul_(sizes.reshape(-1, *[1] * (value.dim() - (1 if name == "shN" else 2))))
+        gradients.gradients.view_losses = torch.rand_like(gradients.gradients.view_losses) * sizes.clamp(max=1e30)
+        optimizer.step(gaussians, gradients, STEP)
+    assert all_finite(gaussians)
+    assert all(bool(torch.isfinite(v).all()) for v in optimizer.state_dict().values())
+
+
+@pytest.mark.parametrize("cls", OPTIMIZERS)
+def test_no_gaussians_and_nothing_touched(cls):
+    for count in (0, 3):
+        gaussians = make_gaussians(count)
+        before = clone(gaussians)
+        optimizer = cls()
+        optimizer.setup(gaussians)
+        gradients = make_gradients(2, count)
+        gradients.gradients.touched[:] = False
+        optimizer.step(gaussians, gradients, STEP)
+        assert equal(gaussians, before)
+
+
+@pytest.mark.parametrize("cls", OPTIMIZERS)
+def test_state_follows_rows(cls):
+    gaussians = make_gaussians(5)
+    optimizer = cls()
+    optimizer.setup(gaussians)
+    for seed in range(3):
+        optimizer.step(gaussians, make_gradients(2, 5, seed), STEP)
+    old = {name: value.clone() for name, value in optimizer.state_dict().items()}
+    source, fresh = torch.tensor([4, 0, 0, 2]), torch.tensor([False, False, True, False])
+    optimizer.apply(RowUpdate(source, fresh, {}, reset=("opacities", "shN")))
+    for name, value in optimizer.state_dict().items():
+        if name == "skipped":
+            continue
+        expected = old[name][source]
+        if name == "steps":
+            assert torch.equal(value, expected), "a new row has its source's count"
+            continue
+        expected[2] = 0
+        if name in ("exp_avg", "exp_avg_sq"):
+            expected[:, 13] = 0
+        elif name.endswith("shN"):
+            expected.zero_()
+        assert torch.equal(value, expected), name
+
+
+@pytest.mark.parametrize("cls", OPTIMIZERS)
+def test_resumed_is_bit_identical(cls):
+    assert_resumed_is_bit_identical(cls)
+
+
+def test_state_of_another_model_is_refused():
+    optimizer, other = SparseAdam(), SparseAdam()
+    optimizer.setup(make_gaussians(4))
+    other.setup(make_gaussians(5))
+    before = optimizer.moments.exp_avg
+    with pytest.raises(InputError, match=r"exp_avg.*\(5, 14\).*\(4, 14\)"):
+        optimizer.load_state_dict(other.state_dict())
+    with pytest.raises(InputError, match="nothing"):
+        optimizer.load_state_dict({})
+    assert optimizer.moments.exp_avg is before
+
+
+@pytest.mark.parametrize("cls", OPTIMIZERS)
+def test_fused_step_takes_over(cls):
+    """A kernel gets the parameters, the moments and the rule, and nothing else happens."""
+    calls = []
+
+    class Fused:
+        def fused_step(self, *arguments):
+            calls.append(arguments)
+
+    gaussians = make_gaussians(3)
+    before = clone(gaussians)
+    optimizer = cls()
+    optimizer.setup(gaussians)
+    optimizer.step(gaussians, Fused(), STEP)
+    ((given, moments, rule),) = calls
+    assert given is gaussians and moments is optimizer.moments and rule == optimizer.rule(STEP)
+    assert (rule.lm is None) == (cls is SparseAdam)
+    assert torch.equal(gaussians.means, before.means)

@@ -1,0 +1,245 @@
+"""Ablations: the grid, statistics over seeds, and the summary."""
+
+import math
+import re
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from matplotlib.figure import Figure
+
+from turbogs_plugin.config.configuration import PLANNED_SETTINGS, load_config
+from turbogs_plugin.config.scaling import with_iterations
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.study.grid import Ablation, ablation_names, alike_at, load_ablation, variant_config
+from turbogs_plugin.study.plots import OTHER_COLOR, plot_curves, plot_front, told_apart
+from turbogs_plugin.study.results import CellResult, Study
+from turbogs_plugin.study.statistics import Curve, Spread, differ, pareto_front, seconds_to_reach
+from turbogs_plugin.study.summary import summarise
+from turbogs_plugin.train.history import Evaluation
+
+
+def entry(iteration: int, seconds: float, psnr: float, count: int = 100) -> Evaluation:
+    return Evaluation(iteration, seconds, psnr, 0.8, 0.1, count, 2**20)
+
+
+def cell(variant: str, seed: int, *entries: Evaluation, scene: str = "fox") -> CellResult:
+    config = load_config("turbogs", [f"train.seed={seed}", f"train.iterations={entries[-1].iteration}"])
+    return CellResult(scene, variant, seed, config.to_mapping(), 0.0, list(entries), fps=100.0)
+
+
+# The grid
+
+
+@pytest.mark.parametrize("name", ablation_names())
+def test_every_packaged_ablation_resolves_and_its_variants_differ(name):
+    ablation = load_ablation(name)
+    texts = {variant: variant_config(ablation, variant, 3, (), None).to_yaml() for variant in ablation.variants}
+    assert len(set(texts.values())) == len(texts)
+    assert all("seed: 3" in text for text in texts.values())
+
+
+def test_the_tables_of_the_paper_are_there():
+    assert set(ablation_names()) >= {"components", "replacements", "optimizer", "views", "hard_ratio", "schedule"}
+    components = load_ablation("components")
+    assert list(components.variants)[:5] == ["3dgs", "+err-sps", "+geo-vs", "+sparse-ncc", "+err-dp"]
+    assert variant_config(components, "turbogs", 0, (), None).to_yaml() == load_config("turbogs").to_yaml()
+
+
+@pytest.mark.parametrize("name", ablation_names())
+def test_what_a_variant_does_not_name_is_as_in_the_base(name):
+    """A new type starts its section afresh: an option that both types have must not change unnoticed."""
+    ablation = load_ablation(name)
+    base = _flat(load_config(ablation.base).to_mapping())
+    for variant, overrides in ablation.variants.items():
+        named = {override.partition("=")[0] for override in overrides}
+        mapping = _flat(variant_config(ablation, variant, 0, (), None).to_mapping())
+        kept = {f"plan.{name}" for name, settings in PLANNED_SETTINGS.items() if named & set(settings)}
+        changed = {key for key, value in mapping.items() if key in base and base[key] != value} - named - kept
+        assert changed <= DEFAULTS_THAT_DIFFER.get(variant, set()), variant
+
+
+DEFAULTS_THAT_DIFFER = {
+    "3dgs": {"optimizer.learning_rates.final_factor", "optimizer.eps"},
+    "sparse-adam": {"optimizer.eps"},
+}
+"""A type's own values, where a variant is meant to have them."""
+
+
+def _flat(mapping: dict, place: str = "") -> dict:
+    result = {}
+    for key, value in mapping.items():
+        result |= _flat(value, f"{place}{key}.") if isinstance(value, dict) else {f"{place}{key}": value}
+    return result
+
+
+def test_another_length_scales_what_counts_iterations_and_nothing_else():
+    config = load_config("turbogs")
+    before = config.to_yaml()
+    short = with_iterations(config, 500)
+    assert config.to_yaml() == before
+    assert (short.train.iterations, short.train.refine_until, short.train.sh_interval) == (500, 350, 30)
+    changed = {key for key, value in short.density.items() if value != config.density[key]}
+    assert changed == {"refine_from", "refine_every", "final_every", "opacity_decay"}
+    assert (short.density["refine_from"], short.density["refine_every"], short.density["final_every"]) == (20, 10, 50)
+    assert with_iterations(config, 50).density["refine_every"] == 10
+    same = with_iterations(config, config.train.iterations)
+    same.plan.iterations = config.plan.iterations
+    assert same.to_yaml() == before
+    assert short.plan.iterations == "keep", "a length that was asked for is not the plan's to change"
+
+
+def test_events_that_come_sooner_take_less_of_the_opacities():
+    config = load_config("turbogs")
+    left = 1.0 - config.density["opacity_decay"]
+    decays = {count: with_iterations(config, count).density["opacity_decay"] for count in (1000, 2500, 4000)}
+    assert decays == {1000: pytest.approx(1.0 - left**0.4), 2500: 1.0 - left, 4000: 1.0 - left}
+    there_and_back = with_iterations(with_iterations(config, 1000), 5000)
+    assert there_and_back.density["opacity_decay"] == pytest.approx(1.0 - left)
+
+
+@pytest.mark.parametrize(
+    ("text", "word"),
+    [
+        ("title: x\nvariants: {}", "at least one"),
+        ("title: x\nvariants: {a/b: []}", "a/b"),
+        ("title: x\nvariants: {..: []}", ".."),
+        ("title: x\nvariants: {full: []}\nbaseline: ful", "did you mean 'full'"),
+        ("title: x\nvariant: {a: []}", "variants"),
+        ("variants: {a: []}", "title"),
+        ("title: x\nvariants: {1: []}", "name 1 is not text: put it in quotes, '1'"),
+        ("title: x\nvariants: {a: []}\nnotes: {true: b}", "name True is not text"),
+        ("title: x\nvariants: {a: train.seed=1}", "list"),
+    ],
+)
+def test_a_bad_ablation_is_refused(tmp_path, text, word):
+    path = tmp_path / "a.yaml"
+    path.write_text(text)
+    with pytest.raises(InputError, match=re.escape(word)):
+        load_ablation(str(path))
+
+
+def test_a_variant_that_does_not_resolve_is_named():
+    ablation = Ablation("x", {"good": [], "bad": ["loss.nonsense=1"]})
+    with pytest.raises(InputError, match=r"variant 'bad'.*nonsense"):
+        variant_config(ablation, "bad", 0, (), None)
+
+
+def test_a_common_length_leaves_out_what_it_makes_a_copy():
+    ablation = load_ablation("leave_out")
+    alike = {"looks-50": "nothing", "looks-75": "nothing"}
+    assert alike_at(ablation, list(ablation.variants), (), 1000) == alike
+    assert alike_at(ablation, ["nothing", "plan", "looks-75"], (), 1000) == {"looks-75": "nothing"}
+    for name in set(ablation_names()) - {"leave_out"}:
+        assert alike_at(load_ablation(name), list(load_ablation(name).variants), (), 1000) == {}
+    same = Ablation("x", {"long": ["train.iterations=5000"], "a": [], "b": [], "last": ["plan.looks=5"]}, baseline="a")
+    assert alike_at(same, list(same.variants), ("plan.iterations=auto",), 1000) == {"last": "a"}
+
+
+# Statistics
+
+
+def test_spreads_and_when_two_are_different():
+    first, second = Spread.of([30.0, 30.2]), Spread.of([30.3, 30.5])
+    assert (first.mean, first.low, first.high, first.count) == (pytest.approx(30.1), 30.0, 30.2, 2)
+    assert differ(first, second) is True and differ(second, first) is True
+    assert differ(first, Spread.of([30.2, 31.0])) is False
+    assert differ(first, Spread.of([35.0])) is None
+    assert differ(first, Spread.of([math.nan, 35.0])) is None
+    assert math.isnan(Spread.of([1.0, math.nan]).mean)
+
+
+def test_time_to_a_psnr_is_linear_between_evaluations():
+    history = [entry(0, 0.5, 10.0), entry(10, 2.5, 20.0), entry(20, 4.5, 18.0), entry(30, 6.5, 24.0)]
+    assert seconds_to_reach(history, 9.0) == 0.5
+    assert seconds_to_reach(history, 15.0) == pytest.approx(1.5)
+    assert seconds_to_reach(history, 19.0) == pytest.approx(2.3)
+    assert seconds_to_reach(history, 21.0) == pytest.approx(5.5)
+    assert seconds_to_reach(history, 24.1) == math.inf
+
+
+def test_a_curve_pairs_common_iterations_and_the_ends():
+    early = [entry(0, 0.0, 10.0), entry(10, 2.0, 20.0), entry(17, 3.0, 21.0)]
+    late = [entry(0, 1.0, 12.0), entry(10, 4.0, 22.0), entry(19, 5.0, 25.0)]
+    curve = Curve.of([early, late], "psnr")
+    np.testing.assert_allclose(curve.seconds, [0.5, 3.0, 4.0])
+    np.testing.assert_allclose([curve.mean, curve.low, curve.high], [[11, 21, 23], [10, 20, 21], [12, 22, 25]])
+
+
+@given(st.lists(st.tuples(st.integers(0, 5), st.integers(0, 5)), min_size=1, max_size=12))
+def test_the_front_is_what_nothing_beats(points):
+    front = pareto_front([(float(x), float(y)) for x, y in points])
+    for (seconds, quality), on_front in zip(points, front, strict=True):
+        beaten = any(x <= seconds and y >= quality and (x < seconds or y > quality) for x, y in points)
+        assert on_front is not beaten
+
+
+def test_nan_is_not_on_the_front():
+    assert pareto_front([(1.0, math.nan), (2.0, 20.0)]) == [False, True]
+
+
+def test_a_summary_of_known_numbers():
+    study = Study(
+        Ablation("x", {"base": [], "fast": [], "slow": []}),
+        [
+            cell("base", 0, entry(0, 0.0, 10.0), entry(100, 10.0, 30.0, 1000)),
+            cell("base", 1, entry(0, 0.0, 10.0), entry(100, 12.0, 30.2, 1200)),
+            cell("fast", 0, entry(0, 0.0, 10.0), entry(100, 5.0, 31.0)),
+            cell("fast", 1, entry(0, 0.0, 10.0), entry(100, 5.0, 31.0)),
+            cell("slow", 0, entry(0, 0.0, 10.0), entry(100, 20.0, 30.1)),
+            cell("slow", 1, entry(0, 0.0, 10.0), entry(100, 20.0, 20.0)),
+        ],
+    )
+    (summary,) = summarise(study, [20.0, 30.5])
+    base, fast, slow = summary.rows
+    assert (base.seconds.mean, base.gaussians.mean) == (11.0, 1100.0)
+    assert fast.psnr_difference == pytest.approx(0.9) and fast.psnr_differs is True and fast.seconds_differ is True
+    assert slow.psnr_differs is False
+    assert [row.on_front for row in summary.rows] == [False, True, False]
+    of_base = (10.0 * 10 / 20.0 + 12.0 * 10 / 20.2) / 2
+    assert base.reaches[0].seconds.mean == pytest.approx(of_base) and base.reaches[0].ratio == pytest.approx(1.0)
+    assert fast.reaches[0].ratio == pytest.approx(5.0 * 10 / 21.0 / of_base)
+    assert (slow.reaches[0].reached, slow.reaches[1].reached) == (2, 0)
+    assert math.isnan(fast.reaches[1].ratio)  # the baseline never got there
+    (begun,) = summarise(study, [9.0])
+    assert [(row.reaches[0].reached, math.isnan(row.reaches[0].ratio)) for row in begun.rows] == [(2, True)] * 3
+    (default,) = summarise(study)
+    assert default.targets == [29.0, 29.5, 30.0]
+
+
+def test_a_variant_that_failed_does_not_set_the_scale_of_the_plots():
+    results = {"good": 31.0, "fair": 24.0, "lost": 9.5, "unknown": math.nan}
+    cells = [cell(name, 0, entry(0, 0.0, 5.0), entry(100, 10.0, psnr)) for name, psnr in results.items()]
+    (summary,) = summarise(Study(Ablation("x", {name: [] for name in results}), cells), [20.0])
+    shown, words = told_apart(summary)
+    assert [row.name for row in shown] == ["good", "fair", "unknown"]
+    assert words == "Not in the plot: lost (9.5 dB in 10.0 s)"
+
+
+@pytest.mark.parametrize(("count", "grey"), [(10, 0), (11, 9)])
+def test_of_many_variants_the_baseline_and_the_front_stand_out(monkeypatch, tmp_path, count, grey):
+    names = [f"v{number}" for number in range(count)]
+    cells = [cell(name, 0, entry(0, 0.0, 20.0), entry(100, 10.0 + n, 30.0 - n / 10)) for n, name in enumerate(names)]
+    study = Study(Ablation("x", {name: [] for name in names}, baseline="v5"), cells)
+    (summary,) = summarise(study, [20.0])
+    figures = []
+    monkeypatch.setattr(Figure, "savefig", lambda figure, path: figures.append(figure))
+    plot_curves(tmp_path / "curves.png", summary)
+    for axes in figures[0].axes:
+        lines = axes.get_lines()
+        assert [line.get_color() for line in lines[:grey]] == [OTHER_COLOR] * grey
+        named = [line.get_label() for line in lines[grey:]]
+        assert named == (["v0", "v5"] if grey else names)
+    legend = [text.get_text() for text in figures[0].legends[0].get_texts()]
+    assert legend == ([f"{grey} others", "v0", "v5"] if grey else names)
+
+
+def test_names_of_points_are_kept_clear_of_what_is_behind(monkeypatch, tmp_path):
+    cells = [cell(name, 0, entry(0, 0.0, 20.0), entry(100, 10.0, 30.0)) for name in ("a", "b")]
+    (summary,) = summarise(Study(Ablation("x", {"a": [], "b": []}), cells), [20.0])
+    figures = []
+    monkeypatch.setattr(Figure, "savefig", lambda figure, path: figures.append(figure))
+    plot_front(tmp_path / "front.png", summary)
+    texts = figures[0].axes[0].texts
+    assert [text.get_text() for text in texts] == ["a", "b"] and all(text.get_path_effects() for text in texts)

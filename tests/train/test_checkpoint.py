@@ -1,0 +1,282 @@
+"""Checkpoints: never half-written, never executed."""
+
+import os
+import pickle
+import zipfile
+
+import pytest
+import torch
+
+from turbogs_plugin import files
+from turbogs_plugin.errors import InputError, TrainingStopped
+from turbogs_plugin.model import gaussians
+from turbogs_plugin.train import checkpoint
+from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint, save_checkpoint
+
+
+def state(value: float = 1.0) -> dict:
+    return {
+        "tensors": {"a": torch.full((50, 3), value), "half": torch.ones(3, dtype=torch.float16)},
+        "numbers": [1, 2.5, True, None, "text"],
+        "pair": (1, 2),
+    }
+
+
+def assert_newest(folder, value: float) -> None:
+    assert torch.equal(load_checkpoint(latest_checkpoint(folder))["tensors"]["a"], state(value)["tensors"]["a"])
+
+
+def test_what_goes_in_comes_out(tmp_path):
+    path = save_checkpoint(tmp_path / "new", 7, state())
+    assert latest_checkpoint(tmp_path / "new") == path
+    loaded = load_checkpoint(path)
+    assert loaded["numbers"] == state()["numbers"] and loaded["pair"] == (1, 2)
+    assert all(torch.equal(loaded["tensors"][name], value) for name, value in state()["tensors"].items())
+
+
+@pytest.mark.parametrize("iterations", [(5,), (5, 100), (1, 5, 100), (995_000, 997_500, 1_000_000, 1_002_500)])
+def test_only_the_newest_two_stay(tmp_path, iterations):
+    """After each save, also from the iteration on that has a digit more."""
+    for count, iteration in enumerate(iterations, start=1):
+        save_checkpoint(tmp_path, iteration, state(iteration))
+        kept = {f"iteration-{number:06d}.pt" for number in iterations[max(0, count - 2) : count]}
+        assert {file.name for file in tmp_path.iterdir()} == kept | {"latest"}
+        assert_newest(tmp_path, iteration)
+
+
+def test_the_one_just_written_stays_beside_leftovers_of_a_later_iteration(tmp_path):
+    for name in ("iteration-000010.pt", "iteration-000011.pt"):
+        (tmp_path / name).touch()
+    save_checkpoint(tmp_path, 6, state(6.0))
+    assert_newest(tmp_path, 6.0)
+
+
+def test_no_checkpoint_is_none(tmp_path):
+    assert latest_checkpoint(tmp_path) is None
+
+
+class DiskFull:
+    """Stands for a file on a disk with room for so many bytes."""
+
+    def __init__(self, file, room: int) -> None:
+        self.file, self.room = file, room
+
+    def write(self, data) -> int:
+        self.room -= len(data)
+        if self.room < 0:
+            raise OSError(28, "No space left on device")
+        return self.file.write(data)
+
+    def __getattr__(self, name):
+        return getattr(self.file, name)
+
+
+@pytest.mark.parametrize("room", [0, 1, 100, 1500, 2500])
+def test_a_full_disk_keeps_the_newest_checkpoint(tmp_path, monkeypatch, room):
+    save_checkpoint(tmp_path, 1, state(1.0))
+    before = sorted(os.listdir(tmp_path))
+    whole_write = files.write_atomically
+
+    def limited(path, write):
+        whole_write(path, lambda file: write(DiskFull(file, room)))
+
+    monkeypatch.setattr(checkpoint, "write_atomically", limited)
+    with pytest.raises(TrainingStopped, match=r"iteration 2: .*not be written.*\(No space left on device\).*--resume"):
+        save_checkpoint(tmp_path, 2, state(2.0))
+    assert sorted(os.listdir(tmp_path)) == before
+    assert_newest(tmp_path, 1.0)
+
+
+class Killed(BaseException):
+    """Stands for a kill: nothing after it runs, not even the removal of temporary files."""
+
+
+@pytest.mark.parametrize("call", range(1, 9))
+def test_a_kill_between_any_two_steps_keeps_a_whole_checkpoint(tmp_path, monkeypatch, call):
+    save_checkpoint(tmp_path, 1, state(1.0))
+    save_checkpoint(tmp_path, 2, state(2.0))
+    calls = []
+
+    def killing(module, name):
+        original = getattr(module, name)
+
+        def step(*arguments, **options):
+            calls.append(name)
+            if len(calls) >= call:
+                raise Killed
+            return original(*arguments, **options)
+
+        monkeypatch.setattr(module, name, step)
+
+    killing(os, "fsync")
+    killing(os, "replace")
+    killing(files.Path, "unlink")
+    try:
+        save_checkpoint(tmp_path, 3, state(3.0))
+        survived = True
+    except Killed:
+        survived = False
+    monkeypatch.undo()
+    assert survived == (call == 8)
+    newest = latest_checkpoint(tmp_path)
+    assert newest.name in ("iteration-000002.pt", "iteration-000003.pt")
+    assert_newest(tmp_path, int(newest.stem[-1]))
+    save_checkpoint(tmp_path, 4, state(4.0))
+    assert_newest(tmp_path, 4.0)
+
+
+@pytest.mark.parametrize(("number", "room"), [(1, 0), (1, 2000), (2, 0), (2, 5)])
+def test_a_kill_in_the_middle_of_a_write_keeps_a_whole_checkpoint(tmp_path, monkeypatch, number, room):
+    """The checkpoint is the first file that is written, the pointer the second."""
+    save_checkpoint(tmp_path, 1, state(1.0))
+    opened = []
+
+    class Torn(DiskFull):
+        def write(self, data) -> int:
+            if len(data) > self.room:
+                self.file.write(data[: self.room])
+                raise Killed
+            self.room -= len(data)
+            return self.file.write(data)
+
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *_) -> None:
+            self.file.close()
+
+    def torn_open(path, mode):
+        opened.append(path)
+        return Torn(open(path, mode), room if len(opened) == number else 10**9)
+
+    def killed(*_, **__):
+        raise Killed
+
+    monkeypatch.setattr(files, "open", torn_open, raising=False)
+    monkeypatch.setattr(files.Path, "unlink", killed)
+    with pytest.raises((Killed, TrainingStopped)):
+        save_checkpoint(tmp_path, 2, state(2.0))
+    monkeypatch.undo()
+    assert_newest(tmp_path, 1.0)
+
+
+def test_a_torn_temporary_file_is_no_checkpoint(tmp_path):
+    path = save_checkpoint(tmp_path, 1, state(1.0))
+    (tmp_path / ".iteration-000002.pt.part").write_bytes(path.read_bytes()[:100])
+    assert latest_checkpoint(tmp_path) == path
+    save_checkpoint(tmp_path, 3, state(3.0))
+    assert {file.name for file in tmp_path.iterdir()} == {path.name, "iteration-000003.pt", "latest"}
+
+
+@pytest.mark.parametrize("name", ["../iteration-000001.pt", "/etc/passwd", "iteration-000009.pt", "", "latest"])
+def test_a_pointer_elsewhere_is_refused(tmp_path, name):
+    save_checkpoint(tmp_path, 1, state())
+    (tmp_path / "latest").write_text(name)
+    with pytest.raises(InputError, match="names no checkpoint"):
+        latest_checkpoint(tmp_path)
+
+
+class Exploit:
+    def __reduce__(self):
+        return os.mkdir, ("exploited",)
+
+
+def test_code_in_a_checkpoint_does_not_run(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    torch.save({"format": checkpoint.FORMAT, "x": Exploit()}, "iteration-000001.pt")
+    with pytest.raises(InputError, match="cannot be used"):
+        load_checkpoint(tmp_path / "iteration-000001.pt")
+    (tmp_path / "bare.pt").write_bytes(pickle.dumps(Exploit()))
+    with pytest.raises(InputError, match="cannot be used"):
+        load_checkpoint(tmp_path / "bare.pt")
+    assert not (tmp_path / "exploited").exists()
+
+
+def test_a_tensor_larger_than_its_storage_is_refused(tmp_path):
+    torch.save({"format": checkpoint.FORMAT, "x": torch.zeros(1).expand(2**40)}, tmp_path / "huge.pt")
+    with pytest.raises(InputError, match="not stored whole"):
+        load_checkpoint(tmp_path / "huge.pt")
+
+
+def test_a_compressed_archive_is_refused(tmp_path):
+    path = save_checkpoint(tmp_path, 1, state())
+    bomb = tmp_path / "bomb.pt"
+    with zipfile.ZipFile(path) as source, zipfile.ZipFile(bomb, "w", zipfile.ZIP_DEFLATED) as target:
+        for entry in source.namelist():
+            target.writestr(entry, source.read(entry))
+    with pytest.raises(InputError, match="compressed"):
+        load_checkpoint(bomb)
+
+
+@pytest.mark.parametrize("keep", [0, 1, 100, 0.5, 0.99])
+def test_a_truncated_file_is_refused(tmp_path, keep):
+    path = save_checkpoint(tmp_path, 1, state())
+    data = path.read_bytes()
+    path.write_bytes(data[: keep if isinstance(keep, int) else int(keep * len(data))])
+    with pytest.raises(InputError, match="cannot be used"):
+        load_checkpoint(path)
+
+
+def test_an_absent_file_and_another_format_are_refused(tmp_path):
+    with pytest.raises(InputError, match="cannot read checkpoint"):
+        load_checkpoint(tmp_path / "absent.pt")
+    torch.save({"format": 999}, tmp_path / "other.pt")
+    with pytest.raises(InputError, match="not a checkpoint of this version"):
+        load_checkpoint(tmp_path / "other.pt")
+
+
+@pytest.mark.parametrize(
+    "value", [object(), {1, 2}, torch.nn.Parameter(torch.ones(1)), {"a": [lambda: 0]}, {(1, 2): 3}]
+)
+def test_only_plain_values_are_saved(tmp_path, value):
+    with pytest.raises(TypeError, match=r"state\.x"):
+        save_checkpoint(tmp_path, 1, {"x": value})
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_atomic_write_leaves_the_old_text_on_failure(tmp_path):
+    target = tmp_path / "text"
+    files.write_text_atomically(target, "old")
+
+    def fail(file):
+        file.write(b"new")
+        raise ValueError
+
+    with pytest.raises(ValueError):
+        files.write_atomically(target, fail)
+    assert target.read_text() == "old" and os.listdir(tmp_path) == ["text"]
+
+
+def test_a_model_on_a_full_disk_is_refused_for_what_it_is(tmp_path):
+    model = gaussians.gaussians_from_points(torch.rand(500, 3), torch.zeros(500, 3, dtype=torch.uint8), 0, 1.0)
+    (tmp_path / ".model.ply.part").symlink_to("/dev/full")
+    with pytest.raises(InputError, match=r"model\.ply: No space left on device; .*make room"):
+        gaussians.save_ply(model, tmp_path / "model.ply")
+    assert not os.listdir(tmp_path)
+
+
+def test_a_failed_write_names_its_file(tmp_path):
+    (tmp_path / ".text.part").symlink_to("/dev/full")
+    with pytest.raises(OSError) as failed:
+        files.write_text_atomically(tmp_path / "text", "new")
+    assert failed.value.filename == str(tmp_path / "text")
+
+
+def test_a_model_is_written_as_atomically_as_a_checkpoint(tmp_path, monkeypatch):
+    """A full disk leaves the old one, and what a killed process left behind does not stay."""
+    target = tmp_path / "model.ply"
+    model = gaussians.gaussians_from_points(torch.rand(5, 3), torch.zeros(5, 3, dtype=torch.uint8), 0, 1.0)
+    target.write_text("old")
+    (tmp_path / ".model.ply.part").write_text("torn")
+    whole_write = files.write_atomically
+
+    def limited(path, write):
+        whole_write(path, lambda file: write(DiskFull(file, 10)))
+
+    with monkeypatch.context() as context:
+        context.setattr(gaussians, "write_atomically", limited)
+        with pytest.raises(InputError, match=r"cannot write .*model\.ply: No space left"):
+            gaussians.save_ply(model, target)
+    assert target.read_text() == "old" and os.listdir(tmp_path) == ["model.ply"]
+    gaussians.save_ply(model, target)
+    assert len(gaussians.load_ply(target)) == 5 and os.listdir(tmp_path) == ["model.ply"]

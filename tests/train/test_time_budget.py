@@ -1,0 +1,280 @@
+"""Whole runs within budgets."""
+
+import math
+import os
+import signal
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from helpers.framework_runs import tiny_capture, tiny_config
+
+from turbogs_plugin.config.configuration import TrainConfig, resolve
+from turbogs_plugin.errors import InputError, TrainingStopped
+from turbogs_plugin.plan.budget import IterationCost
+from turbogs_plugin.scene import load_scene, write_demo_capture
+from turbogs_plugin.train import pace as pacing
+from turbogs_plugin.train import run
+from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint, require_like
+from turbogs_plugin.train.history import read_history
+from turbogs_plugin.train.trainer import Trainer
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory) -> Path:
+    return tiny_capture(tmp_path_factory.mktemp("budget"))
+
+
+@pytest.fixture
+def counts(monkeypatch) -> list[int]:
+    """Numbers of Gaussians, at the start and after every iteration of every trainer."""
+    seen: list[int] = []
+    setup, step = Trainer.initialise_maps, Trainer.step
+
+    def initialising(trainer):
+        seen.append(len(trainer.gaussians))
+        setup(trainer)
+
+    def stepping(trainer):
+        step(trainer)
+        seen.append(len(trainer.gaussians))
+
+    monkeypatch.setattr(Trainer, "initialise_maps", initialising)
+    monkeypatch.setattr(Trainer, "step", stepping)
+    return seen
+
+
+def test_a_time_budget_holds_on_the_demo_capture(turbogs, tmp_path):
+    """Within a tenth, with a schedule that completes and a model that has learned."""
+    capture, out = write_demo_capture(tmp_path / "demo"), tmp_path / "run"
+    options = ["--config", "demo", "--out", out, "--device", "cpu", "--time-budget", "10s", "train.evaluate_at=[0.5]"]
+    code, _, error = turbogs("train", capture, *options)
+    assert code == 0, error
+    start, middle, end = read_history(out / "history.jsonl")
+    assert end.train_seconds == pytest.approx(10.0, rel=0.1)
+    assert 4.5 <= middle.train_seconds <= 7.0
+    assert end.psnr > start.psnr + 3.0
+    state = load_checkpoint(latest_checkpoint(out / "checkpoints"))
+    assert state["trainer"]["iteration"] == state["pace"]["iterations"] == end.iteration
+    assert state["pace"]["refine_until"] < end.iteration
+    assert (out / "report.md").is_file() and "10s of training: about" in error
+
+
+def test_a_time_too_short_is_refused_with_one_that_is_not(turbogs, capture, tmp_path):
+    code, _, error = turbogs("train", capture, "--out", tmp_path / "run", "--device", "cpu", "--time-budget", "0.01s")
+    assert code != 0 and "too short" in error and "or more" in error
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_run_by_time_goes_on_after_a_stop(capture, tmp_path, monkeypatch):
+    """The clock goes on as well: stopped and resumed, it ends with its time, and evaluates nothing twice."""
+    step = Trainer.step
+
+    def stopping(trainer):
+        step(trainer)
+        if trainer.iteration == 5 and trainer.config.density["type"] != "none":  # not while calibrating
+            os.kill(os.getpid(), signal.SIGINT)
+
+    config = tiny_config(capture, "budget.time=4s", "budget.max_gaussians=2000", "train.evaluate_at=[0.3, 0.6]")
+    monkeypatch.setattr(Trainer, "step", stopping)
+    first = run.train(config, tmp_path / "run")
+    assert first.signal == signal.SIGINT
+    monkeypatch.setattr(Trainer, "step", step)
+    second = run.resume(tmp_path / "run")
+    assert second.signal is None
+    assert second.history[-1].train_seconds == pytest.approx(4.0, rel=0.1)
+    assert len(second.history) == 4
+    assert [entry.iteration for entry in second.history] == sorted({entry.iteration for entry in second.history})
+
+
+@pytest.mark.parametrize("cap", [400, 1200])
+@pytest.mark.parametrize("overrides", [(), ("density.growth=budget", "density.target_gaussians=4000")])
+def test_a_cap_is_never_exceeded(capture, tmp_path, counts, cap, overrides):
+    """By the initial model neither, where the capture has more points than that; and the cap is what stops growth."""
+    points = len(load_scene(capture).points)
+    config = tiny_config(capture, f"budget.max_gaussians={cap}", *overrides)
+    outcome = run.train(config, tmp_path / "run")
+    assert max(counts) <= cap
+    assert counts[0] == min(points, cap)
+    assert cap < points or max(counts) > points
+    assert all(entry.num_gaussians <= cap for entry in outcome.history)
+    assert run.load_model(tmp_path / "run", torch.device("cpu")).config.density["max_gaussians"] == cap
+
+
+def test_the_points_of_a_smaller_model_are_spread_over_all(capture):
+    scene = load_scene(capture)
+    trainer = Trainer(tiny_config(capture, "budget.max_gaussians=100"), scene, torch.device("cpu"))
+    places = (scene.points[None] - trainer.gaussians.means[:, None]).abs().sum(dim=-1).argmin(dim=1).numpy()
+    assert len(places) == len(set(places)) == 100 and places[-1] == len(scene.points) - 1
+    assert np.diff(places).max() <= 2 * np.diff(places).min()
+
+
+def test_a_cap_without_room_beside_the_backdrop_is_refused(capture):
+    config = tiny_config(capture, "budget.max_gaussians=3000", "train.backdrop=true")
+    with pytest.raises(InputError, match="no room beside the 3000"):
+        Trainer(config, load_scene(capture), torch.device("cpu"))
+
+
+def test_a_limit_of_a_gpus_memory_says_nothing_of_a_cpu(capture, tmp_path):
+    with pytest.raises(InputError, match="--max-memory limits the memory of a GPU"):
+        run.train(tiny_config(capture, "budget.max_memory=2GiB"), tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_scene_that_does_not_fit_is_refused(capture, tmp_path, monkeypatch):
+    def full(trainer, *arguments):
+        raise torch.cuda.OutOfMemoryError("CUDA out of memory")
+
+    monkeypatch.setattr(Trainer, "__init__", full)
+    with pytest.raises(InputError, match="'capture' does not fit into the device's memory"):
+        run.train(tiny_config(capture), tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.fixture
+def stopped(capture, tmp_path, monkeypatch) -> Path:
+    """The folder of a run with a checkpoint of its fifth iteration."""
+    with monkeypatch.context() as context:
+        step = Trainer.step
+
+        def stopping(trainer):
+            step(trainer)
+            if trainer.iteration == 5:
+                os.kill(os.getpid(), signal.SIGINT)
+
+        context.setattr(Trainer, "step", stopping)
+        run.train(tiny_config(capture), tmp_path / "run")
+    return tmp_path / "run"
+
+
+def change_config(folder: Path, **sections: dict) -> None:
+    """Of a run."""
+    config = run.RunFolder(folder).read_config()
+    mapping = config.to_mapping()
+    for name, fields in sections.items():
+        mapping[name] |= fields
+    (folder / "config.yaml").write_text(resolve(mapping).to_yaml())
+
+
+@pytest.mark.parametrize("place", [(Trainer, "__init__"), (Trainer, "load_state_dict"), (run, "place_views")])
+def test_a_run_that_no_longer_fits_is_not_resumed(stopped, monkeypatch, place):
+    def full(*arguments):
+        raise torch.cuda.OutOfMemoryError("CUDA out of memory")
+
+    monkeypatch.setattr(*place, full)
+    with pytest.raises(InputError, match="'capture' does not fit into the device's memory: end what else"):
+        run.resume(stopped)
+
+
+def test_test_photos_that_do_not_fit_are_refused(capture, tmp_path, monkeypatch):
+    def full(*arguments):
+        raise torch.cuda.OutOfMemoryError("CUDA out of memory")
+
+    monkeypatch.setattr(run, "place_views", full)
+    with pytest.raises(InputError, match=r"'capture' does not fit into the device's memory: use plan.photos_on=host"):
+        run.train(tiny_config(capture), tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_resumed_run_is_held_to_its_memory(stopped, monkeypatch):
+    """Before anything of it is on the device."""
+    change_config(stopped, budget={"max_memory": "2GiB"})
+    held = []
+    build = Trainer.__init__
+
+    def building(trainer, *arguments):
+        assert held == [(2**31, torch.device("cpu"))]
+        build(trainer, *arguments)
+
+    monkeypatch.setattr(run, "hold_to", lambda *arguments: held.append(arguments))
+    monkeypatch.setattr(Trainer, "__init__", building)
+    assert run.resume(stopped).signal is None
+
+
+def test_a_run_of_a_gpu_is_not_told_to_resume_on_a_cpu(turbogs, stopped, monkeypatch):
+    change_config(stopped, train={"device": "cuda"})
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    code, _, error = turbogs("train", "--resume", stopped)
+    assert code == 2 and "go on with this run where there is a GPU" in error and "--device" not in error
+
+
+def test_memory_that_is_spent_names_what_may_fit(capture, tmp_path, monkeypatch):
+    def full(trainer):
+        raise torch.cuda.OutOfMemoryError("CUDA out of memory")
+
+    monkeypatch.setattr(Trainer, "step", full)
+    with pytest.raises(TrainingStopped, match=r"too small for \d+ Gaussians; try --max-gaussians \d+; no checkpoint"):
+        run.train(tiny_config(capture), tmp_path / "run")
+
+
+@pytest.mark.parametrize("every", [0, 1, 4, 5, 10, 11])
+def test_stops_by_iterations_evaluate_and_save_where_asked(every):
+    train = TrainConfig(iterations=10, evaluate_at=(0.3, 0.5), checkpoint_every=every)
+    pace, iteration, dues = pacing.IterationPace(train), 0, {}
+    while iteration < pace.iterations:
+        iteration = pace.next_mark(iteration, 0.0)
+        dues[iteration] = pace.reached(iteration, 0.0, 10)
+    saves = {*range(every, 10, every), 10} if every else {10}
+    assert {iteration for iteration, due in dues.items() if due.save} == saves
+    assert {iteration for iteration, due in dues.items() if due.evaluate} == {3, 5, 10}
+    assert dues.keys() == saves | {3, 5, 10}
+
+
+def test_a_long_run_takes_no_memory_for_its_stops():
+    pace = pacing.IterationPace(TrainConfig(iterations=2**20, checkpoint_every=1, evaluate_at=()))
+    assert sum(sys.getsizeof(value) for value in vars(pace).values()) < 1000
+    assert pace.next_mark(2**19, 0.0) == 2**19 + 1
+
+
+def test_stops_by_time_evaluate_once_a_fraction_and_save_at_intervals():
+    train = TrainConfig(iterations=100, refine_until=70, evaluate_at=(0.25, 0.5), checkpoint_every=40)
+    pace = pacing.TimePace(train, 10.0, IterationCost(0.1, 0.0), cap=0)
+    pace.start(0, 0.0, 10)
+    iteration, seconds, dues = 0, 0.0, []
+    while iteration < pace.iterations:
+        mark = pace.next_mark(iteration, seconds)
+        seconds += 0.05 * (mark - iteration)  # twice as fast as planned
+        iteration = mark
+        dues.append((iteration, seconds, pace.reached(iteration, seconds, 10)))
+        assert train.iterations == pace.iterations
+    evaluated = [seconds for _, seconds, due in dues if due.evaluate]
+    assert evaluated == pytest.approx([2.5, 5.0, 10.0], abs=0.31)
+    saved = [iteration for iteration, _, due in dues if due.save]
+    assert len(saved) == 200 // 40 and saved[-1] == pace.iterations == pytest.approx(200, abs=2)
+    assert train.refine_until == pytest.approx(140, abs=3)
+
+
+def paced(stop_after: float = math.inf) -> list[tuple[int, float, int, int]]:
+    """(iteration, seconds, iterations planned, end of density control) at each stop of a run of 20 s, whose model grows
+    to 20 times its size; stopped and resumed once."""
+
+    def pace_and_train(cost: IterationCost | None) -> tuple[pacing.TimePace, TrainConfig]:
+        train = TrainConfig(iterations=5000, refine_until=3500)
+        return pacing.TimePace(train, 20.0, cost, cap=0), train
+
+    cost = IterationCost(1e-3, 1e-8)
+    pace, train = pace_and_train(cost)
+    iteration, seconds, gaussians, stops = 0, 0.0, 20_000, []
+    pace.start(iteration, seconds, gaussians)
+    while iteration < pace.iterations:
+        mark = pace.next_mark(iteration, seconds)
+        while iteration < mark:
+            seconds += cost.at(gaussians)
+            iteration += 1
+            gaussians += 100 * (iteration < train.refine_until)
+        pace.reached(iteration, seconds, gaussians)
+        stops.append((iteration, seconds, pace.iterations, train.refine_until))
+        if seconds > stop_after:
+            state, stop_after = pace.state_dict(), math.inf
+            pace, train = pace_and_train(None)  # a resumed run is not calibrated
+            require_like(state, pace.state_dict(), "pace")
+            pace.load_state_dict(state)
+            pace.start(iteration, seconds, gaussians)
+    return stops
+
+
+@pytest.mark.parametrize("seconds", [0.1, 4.0, 15.0])
+def test_the_plan_of_a_resumed_run_goes_on_where_it_was(seconds):
+    assert paced(stop_after=seconds) == paced()

@@ -1,0 +1,387 @@
+"""Runs from end to end: the order of Algorithm 1, stops and resumes, and runs that cannot go on."""
+
+import json
+import math
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+import torch
+from helpers.framework_runs import TINY, assert_identical, tiny_capture, tiny_config
+from PIL import Image
+
+from turbogs_plugin.config.configuration import load_config, resolve
+from turbogs_plugin.config.yaml_text import parse_yaml
+from turbogs_plugin.errors import InputError, TrainingStopped
+from turbogs_plugin.model.gaussians import load_ply
+from turbogs_plugin.scene import load_scene
+from turbogs_plugin.scene.fingerprint import capture_difference, capture_state
+from turbogs_plugin.train import run
+from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint
+from turbogs_plugin.train.evaluate import render_view
+from turbogs_plugin.train.history import read_history
+from turbogs_plugin.train.trainer import Trainer
+from turbogs_plugin.types import RowUpdate
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory) -> Path:
+    return tiny_capture(tmp_path_factory.mktemp("trainer"))
+
+
+@pytest.fixture(scope="module")
+def whole(capture, tmp_path_factory) -> run.Outcome:
+    """A run never stopped."""
+    return run.train(tiny_config(capture), tmp_path_factory.mktemp("runs") / "whole")
+
+
+def saved(folder: Path) -> dict:
+    return load_checkpoint(latest_checkpoint(folder / "checkpoints"))["trainer"]
+
+
+def stop_after(monkeypatch, iteration: int, action) -> None:
+    """Run `action` within the step that finishes this many iterations."""
+    step = Trainer.step
+
+    def stepping(trainer):
+        step(trainer)
+        if trainer.iteration == iteration:
+            action(trainer)
+
+    monkeypatch.setattr(Trainer, "step", stepping)
+
+
+def test_a_run_leaves_everything_that_it_promises(whole, capture):
+    folder = whole.folder
+    history = [json.loads(line) for line in folder.history.read_text().splitlines()]
+    assert [line["iteration"] for line in history] == [0, 7, 14]
+    for line in history:
+        assert {"train_seconds", "psnr", "ssim", "l1", "num_gaussians", "memory_bytes"} <= set(line)
+        assert all(np.isfinite(value) for value in line.values())
+    assert history[-1]["psnr"] > history[0]["psnr"] + 1.0
+    assert [line["train_seconds"] for line in history] == sorted(line["train_seconds"] for line in history)
+    assert history[-1]["nonfinite_losses"] == history[-1]["skipped_updates"] == 0
+
+    page = folder.report.read_text()
+    for promised in ("psnr.png", "l1.png", "test-000.png", "iterations: 14", "gsplat", "LPIPS was not computed", "FPS"):
+        assert promised in page
+    for name in ("psnr.png", "l1.png", "test-000.png"):
+        Image.open(folder.path / "report" / name).verify()
+    asked = tiny_config(capture)
+    assert resolve(parse_yaml(folder.config.read_text(), "config")) == run.plan_run(asked).apply(asked)
+
+
+def test_the_number_of_gaussians_changed_and_every_part_followed(whole):
+    state = saved(whole.folder.path)
+    counts = {evaluation.num_gaussians for evaluation in whole.history}
+    assert len(counts) > 1
+    count = whole.history[-1].num_gaussians
+    assert all(len(value) == count for value in state["gaussians"].values())
+    assert len(state["optimizer"]["steps"]) == count
+
+
+def test_the_exported_model_is_the_trained_one_in_the_capture_frame(whole, capture):
+    exported = load_ply(whole.folder.model)
+    trained = saved(whole.folder.path)["gaussians"]
+    frame = load_scene(capture).frame
+    expected = frame.restore_points(trained["means"].double().numpy())
+    assert np.allclose(exported.means.double().numpy(), expected, atol=1e-5 * abs(expected).max())
+    assert torch.equal(exported.sh0, trained["sh0"])
+
+
+def test_the_saved_model_renders_what_the_last_evaluation_saw(whole, capture):
+    model = run.load_model(whole.folder.path, torch.device("cpu"))
+    test = load_scene(capture).test
+    image = render_view(model.gaussians, test, 0, model.sh_degree, model.config.raster)
+    mse = (image - test.photos.image(0)).square().mean().item()
+    assert -10 * np.log10(mse) == pytest.approx(whole.history[-1].psnr, abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("iteration", "number"),
+    [(iteration, signal.SIGINT) for iteration in (1, 2, 3, 5, 6, 9, 10, 12)] + [(7, signal.SIGTERM)],
+)
+def test_a_stopped_run_resumes_bit_for_bit(capture, whole, tmp_path, monkeypatch, iteration, number):
+    with monkeypatch.context() as context:
+        stop_after(context, iteration, lambda trainer: os.kill(os.getpid(), number))
+        outcome = run.train(tiny_config(capture), tmp_path / "run")
+    assert outcome.signal == number
+    assert saved(tmp_path / "run")["iteration"] == iteration
+    resumed = run.resume(tmp_path / "run")
+    assert resumed.signal is None
+    assert_identical(saved(whole.folder.path), saved(tmp_path / "run"))
+    for a, b in zip(read_history(whole.folder.history), read_history(resumed.folder.history), strict=True):
+        assert (a.iteration, a.psnr, a.ssim, a.l1, a.num_gaussians) == (
+            b.iteration,
+            b.psnr,
+            b.ssim,
+            b.l1,
+            b.num_gaussians,
+        )
+
+
+def test_a_run_stopped_before_its_first_iteration_resumes_bit_for_bit(capture, whole, tmp_path, monkeypatch):
+    initialise = Trainer.initialise_maps
+
+    def interrupted(trainer):
+        initialise(trainer)
+        signal.raise_signal(signal.SIGINT)
+
+    with monkeypatch.context() as context:
+        context.setattr(Trainer, "initialise_maps", interrupted)
+        assert run.train(tiny_config(capture), tmp_path / "run").signal == signal.SIGINT
+    assert saved(tmp_path / "run")["iteration"] == 0
+    resumed = run.resume(tmp_path / "run")
+    assert_identical(saved(whole.folder.path), saved(tmp_path / "run"))
+    assert [evaluation.iteration for evaluation in resumed.history] == [0, 7, 14]
+
+
+def test_a_run_killed_without_notice_resumes_bit_for_bit(capture, whole, tmp_path):
+    """SIGKILL once the second checkpoint is there, wherever the process then is."""
+    options = [*TINY, "train.checkpoint_every=2"]
+    command = [sys.executable, "-m", "turbogs_plugin.cli", "train", str(capture), "--out", str(tmp_path / "run")]
+    process = subprocess.Popen(
+        [*command, "--device", "cpu", *options], stderr=subprocess.DEVNULL, env={**os.environ, "OMP_NUM_THREADS": "1"}
+    )
+    deadline = time.monotonic() + 120
+    while process.poll() is None and time.monotonic() < deadline:
+        latest = latest_checkpoint(tmp_path / "run" / "checkpoints")
+        if latest is not None and latest.stem >= "iteration-000004":
+            break
+        time.sleep(0.002)
+    process.kill()
+    process.wait()
+    assert 4 <= saved(tmp_path / "run")["iteration"] < 14
+    run.resume(tmp_path / "run")
+    assert_identical(saved(whole.folder.path), saved(tmp_path / "run"))
+
+
+def test_a_run_outside_the_main_thread_is_the_same(capture, whole, tmp_path):
+    with ThreadPoolExecutor(1) as pool:
+        pool.submit(run.train, tiny_config(capture), tmp_path / "run").result()
+    assert_identical(saved(whole.folder.path), saved(tmp_path / "run"))
+
+
+def test_sigterm_before_training_ends_the_process_without_a_trace(capture):
+    """pycolmap brings a handler that prints one."""
+    code = (
+        "import os, signal, sys; from turbogs_plugin.scene import load_scene\n"
+        "load_scene(sys.argv[1]); os.kill(os.getpid(), signal.SIGTERM)"
+    )
+    ended = subprocess.run([sys.executable, "-c", code, str(capture)], capture_output=True, text=True)
+    assert (ended.returncode, ended.stdout, ended.stderr) == (-signal.SIGTERM, "", "")
+
+
+def test_a_run_without_a_checkpoint_starts_again(capture, whole, tmp_path, monkeypatch):
+    def die(trainer):
+        raise MemoryError
+
+    with monkeypatch.context() as context:
+        stop_after(context, 2, die)
+        with pytest.raises(MemoryError):
+            run.train(tiny_config(capture), tmp_path / "run")
+    run.resume(tmp_path / "run")
+    assert_identical(saved(whole.folder.path), saved(tmp_path / "run"))
+
+
+def test_resuming_a_finished_run_changes_nothing_of_it(capture, whole):
+    before = saved(whole.folder.path)
+    history = whole.folder.history.read_text()
+    assert run.resume(whole.folder.path).signal is None
+    assert_identical(before, saved(whole.folder.path))
+    assert whole.folder.history.read_text() == history
+
+
+def test_two_seeds_differ_and_one_does_not(capture, whole, tmp_path):
+    run.train(tiny_config(capture), tmp_path / "same")
+    assert_identical(saved(whole.folder.path), saved(tmp_path / "same"))
+    run.train(tiny_config(capture, "train.seed=1"), tmp_path / "other")
+    assert not torch.equal(saved(whole.folder.path)["maps"]["errors"], saved(tmp_path / "other")["maps"]["errors"])
+
+
+def test_a_model_that_is_not_finite_is_never_saved(capture, tmp_path, monkeypatch):
+    def spoil(trainer):
+        trainer.gaussians.means[3] = torch.nan
+
+    stop_after(monkeypatch, 10, spoil)
+    with pytest.raises(TrainingStopped, match=r"iteration 10: means of 1 of \d+ Gaussians.*iteration-000005\.pt"):
+        run.train(tiny_config(capture), tmp_path / "run")
+    assert saved(tmp_path / "run")["iteration"] == 5
+    assert all(value.isfinite().all() for value in saved(tmp_path / "run")["gaussians"].values())
+
+
+def test_a_model_without_gaussians_ends_the_run_with_a_reason(capture, tmp_path, monkeypatch):
+    def all_gone(trainer):
+        nobody = torch.zeros(0, dtype=torch.int64)
+        trainer.follow(RowUpdate(nobody, nobody.bool(), {}))
+
+    stop_after(monkeypatch, 7, all_gone)
+    with pytest.raises(TrainingStopped, match=r"iteration 7: .*every Gaussian.*iteration-000005\.pt"):
+        run.train(tiny_config(capture), tmp_path / "run")
+
+
+def test_non_finite_losses_are_counted(capture, tmp_path, monkeypatch):
+    spoiled = []
+
+    def spoil(trainer):
+        trainer.views.photos.colors = trainer.views.photos.colors.float()
+        trainer.views.photos.colors[:] = torch.nan
+        spoiled.append(trainer)
+
+    stop_after(monkeypatch, 10, spoil)
+    outcome = run.train(tiny_config(capture), tmp_path / "run")
+    assert spoiled and outcome.history[-1].nonfinite_losses == 4
+    assert all(value.isfinite().all() for value in saved(tmp_path / "run")["gaussians"].values())
+    assert "non-finite loss: 4" in outcome.folder.report.read_text()
+
+
+def test_the_disk_fills_up(capture, tmp_path, monkeypatch):
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    stop_after(monkeypatch, 8, lambda trainer: monkeypatch.setattr("turbogs_plugin.files.os.fsync", full))
+    with pytest.raises(TrainingStopped, match=r"iteration 10: .*No space left.*iteration-000005\.pt") as stopped:
+        run.train(tiny_config(capture), tmp_path / "run")
+    assert str(stopped.value).count("iteration-000005") == 1
+    monkeypatch.undo()
+    assert saved(tmp_path / "run")["iteration"] == 5
+
+
+def test_weights_of_lpips_are_found_from_another_folder(capture, tmp_path, monkeypatch):
+    """And where they are gone, that is said before anything is trained."""
+    (tmp_path / "here").mkdir()
+    (tmp_path / "here" / "w.pth").touch()
+    monkeypatch.setattr("turbogs_plugin.train.evaluate._load_lpips", lambda file, device: None)
+    with monkeypatch.context() as context:
+        context.chdir(tmp_path / "here")
+        stop_after(context, 5, lambda trainer: os.kill(os.getpid(), signal.SIGINT))
+        run.train(tiny_config(capture, "report.lpips_weights=w.pth"), tmp_path / "run")
+    monkeypatch.chdir(tmp_path)
+    with monkeypatch.context() as context:
+        stop_after(context, 6, lambda trainer: os.kill(os.getpid(), signal.SIGINT))
+        assert run.resume(tmp_path / "run").signal == signal.SIGINT
+    (tmp_path / "here" / "w.pth").unlink()
+    with pytest.raises(InputError, match=r"lpips_weights: no such file '.*here/w\.pth'"):
+        run.resume(tmp_path / "run")
+    assert saved(tmp_path / "run")["iteration"] == 6
+
+
+def test_a_checkpoint_of_another_capture_is_refused(capture, whole, tmp_path):
+    other = tiny_capture(tmp_path)
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "config.yaml").write_text(tiny_config(other, "scene.factor=2").to_yaml())
+    (tmp_path / "run" / "checkpoints").symlink_to(whole.folder.checkpoints)
+    with pytest.raises(InputError, match="has other sizes of train images than when the run"):
+        run.resume(tmp_path / "run")
+
+
+def moved(by: pycolmap.Sim3d):
+    return lambda reconstruction: reconstruction.transform(by)
+
+
+def zoomed(reconstruction) -> None:
+    for camera in reconstruction.cameras.values():
+        camera.params = camera.params * [1.01, 1.01, 1, 1]
+
+
+def renamed(reconstruction) -> None:
+    """Two photos change places."""
+    images = sorted(reconstruction.images.values(), key=lambda image: image.name)
+    images[1].name, images[2].name = images[2].name, images[1].name
+
+
+TURN, STAY = pycolmap.Rotation3d(np.array([0.0, 0.0, 0.01, 1.0])), pycolmap.Rotation3d()
+
+
+@pytest.mark.parametrize(
+    ("change", "difference"),
+    [
+        (moved(pycolmap.Sim3d(1.0, TURN, np.zeros(3))), "other poses of train images"),
+        (moved(pycolmap.Sim3d(2.0, STAY, np.zeros(3))), "other coordinates"),
+        (moved(pycolmap.Sim3d(1.0, STAY, np.ones(3))), "other coordinates"),
+        (zoomed, "other intrinsics of train images"),
+        (renamed, "other poses of train images"),
+    ],
+    ids=["turned", "scaled", "moved", "zoomed", "renamed"],
+)
+def test_a_capture_made_anew_since_the_run_began_is_refused(whole, tmp_path, change, difference):
+    model = tiny_capture(tmp_path) / "sparse" / "0"
+    shutil.copytree(whole.folder.path, tmp_path / "run")
+    config = whole.folder.read_config()
+    config.scene.path = str(tmp_path / "capture")
+    (tmp_path / "run" / "config.yaml").write_text(config.to_yaml())
+    run.resume(tmp_path / "run")  # the same capture elsewhere
+    reconstruction = pycolmap.Reconstruction(model)
+    change(reconstruction)
+    reconstruction.write_binary(model)
+    before = latest_checkpoint(tmp_path / "run" / "checkpoints").read_bytes()
+    with pytest.raises(InputError, match=rf"capture '.*capture' has {difference} than .*run' began: .*another --out"):
+        run.resume(tmp_path / "run")
+    assert latest_checkpoint(tmp_path / "run" / "checkpoints").read_bytes() == before
+
+
+def test_a_capture_read_with_other_rounding_is_the_same(capture):
+    saved, present = (capture_state(load_scene(capture)) for _ in range(2))
+    for views in (present["train_views"], present["test_views"]):
+        views["viewmats"] += 2e-6
+        views["Ks"] *= 1 + 2e-6
+    assert capture_difference(saved, present) == ""
+    present["test_views"]["viewmats"][0, 0, 3] += 2e-5
+    assert capture_difference(saved, present) == "other poses of test images"
+
+
+@pytest.mark.parametrize(("size", "expected"), [(0.0, 40.0), (0.3, 0.3 * 14.0)])
+def test_what_is_far_is_kept_from_growing(capture, size, expected):
+    config = tiny_config(capture, f"train.distant_size={size}", "density.refine_from=100")
+    trainer = Trainer(config, load_scene(capture), torch.device("cpu"))
+    trainer.initialise_maps()
+    far = trainer.gaussians.means.norm(dim=1).argmax()
+    trainer.gaussians.means[far] *= 15.0 * trainer.extent / trainer.gaussians.means[far].norm()
+    trainer.gaussians.scales[far] = math.log(40.0 * trainer.extent)
+    trainer.step()
+    assert torch.allclose(trainer.gaussians.scales[far].exp(), torch.tensor(expected * trainer.extent), rtol=0.05)
+
+
+def test_the_trainer_names_no_strategy():
+    from turbogs_plugin.config import registry
+    from turbogs_plugin.train import trainer
+
+    source = Path(trainer.__file__).read_text()
+    classes = [path.rpartition(":")[2] for kind in registry.BUILT_IN.values() for path in kind.values()]
+    assert not [name for name in classes if name in source]
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        ("schedule.type=fixed", "view_sampler.type=random", "pixel_sampler.type=random", "loss.type=charbonnier"),
+        ("schedule.type=linear", "loss.type=sparse_ssim", "optimizer.type=sparse_adam", "density.type=none"),
+        ("schedule.type=exponential", "pixel_sampler.type=dense", "density.type=gsplat_default"),
+        ("pixel_sampler.unit=cell", "pixel_sampler.importance=0.5", "optimizer.rows=summed", "density.score=raw"),
+        ("pixel_sampler.unit=tile", "train.sh_degree=0", "train.backdrop=true"),
+    ],
+    ids=lambda overrides: overrides[0],
+)
+def test_every_alternative_trains(capture, tmp_path, overrides):
+    kinds = [override.partition(".")[0] for override in overrides if ".type=" in override]
+    kept = [option for option in TINY if option.partition(".")[0] not in kinds]
+    config = load_config("turbogs", [*kept, "train.device=cpu", "train.iterations=5", *overrides])
+    config.scene.path = str(capture)
+    outcome = run.train(config, tmp_path / "run")
+    assert outcome.history[-1].psnr > outcome.history[0].psnr
+
+
+def test_the_paper_taken_literally_stays_finite(capture, tmp_path):
+    config = load_config("turbogs-paper", [*TINY, "train.device=cpu"])
+    config.scene.path = str(capture)
+    outcome = run.train(config, tmp_path / "run")
+    assert outcome.history[-1].nonfinite_losses == 0
+    assert all(value.isfinite().all() for value in saved(tmp_path / "run")["gaussians"].values())

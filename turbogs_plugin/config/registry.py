@@ -1,0 +1,134 @@
+"""Names of strategies to classes: our own, and those that others register by entry point.
+
+A third party adds to its ``pyproject.toml``::
+
+    [project.entry-points."turbogs.pixel_sampler"]
+    my_sampler = "my_package.samplers:MySampler"
+
+and a YAML names it by ``pixel_sampler: {type: my_sampler, ...}``. Nothing is imported before it is named.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any
+
+from turbogs_plugin.config.schema import build_dataclass, nearest
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.strategies import protocols
+
+BUILT_IN: dict[str, dict[str, str]] = {
+    "schedule": {
+        "sinusoidal": "turbogs_plugin.strategies.schedule:SinusoidalSchedule",
+        "linear": "turbogs_plugin.strategies.schedule:LinearSchedule",
+        "exponential": "turbogs_plugin.strategies.schedule:ExponentialSchedule",
+        "fixed": "turbogs_plugin.strategies.schedule:FixedSchedule",
+    },
+    "view_sampler": {
+        "geometry_aware": "turbogs_plugin.strategies.view_sampling:GeometryAwareViewSampler",
+        "random": "turbogs_plugin.strategies.view_sampling:RandomViewSampler",
+    },
+    "pixel_sampler": {
+        "error_guided": "turbogs_plugin.strategies.pixels.samplers:ErrorGuidedPixelSampler",
+        "random": "turbogs_plugin.strategies.pixels.samplers:RandomPixelSampler",
+        "dense": "turbogs_plugin.strategies.pixels.samplers:DensePixelSampler",
+    },
+    "loss": {
+        "charbonnier_ncc": "turbogs_plugin.strategies.losses.losses:CharbonnierNccLoss",
+        "charbonnier": "turbogs_plugin.strategies.losses.losses:CharbonnierLoss",
+        "sparse_ssim": "turbogs_plugin.strategies.losses.losses:SparseSsimLoss",
+    },
+    "density": {
+        "error_driven": "turbogs_plugin.strategies.density.error_driven:ErrorDrivenDensity",
+        "none": "turbogs_plugin.strategies.density.error_driven:NoDensity",
+        "gsplat_default": "turbogs_plugin.strategies.density.gsplat_default:GsplatDefaultDensity",
+        "mcmc": "turbogs_plugin.strategies.density.mcmc:GsplatMcmcDensity",
+        "fastgs": "turbogs_plugin.strategies.density.fastgs:FastGsDensity",
+    },
+    "optimizer": {
+        "moment_lm": "turbogs_plugin.strategies.optimizers.moment_lm:MomentLMOptimizer",
+        "sparse_adam": "turbogs_plugin.strategies.optimizers.sparse_adam:SparseAdam",
+        "adam": "turbogs_plugin.strategies.optimizers.dense_adam:DenseAdam",
+    },
+}
+"""Kind -> name -> "module:class". The first of a kind is the one that a config without that section gets."""
+
+KINDS = tuple(BUILT_IN)
+
+PROTOCOLS: dict[str, type] = {
+    "schedule": protocols.SamplingSchedule,
+    "view_sampler": protocols.ViewSampler,
+    "pixel_sampler": protocols.PixelSampler,
+    "loss": protocols.SparseLoss,
+    "density": protocols.DensityController,
+    "optimizer": protocols.GaussianOptimizer,
+}
+
+
+def known_types(kind: str) -> dict[str, str]:
+    """Every name of a kind -> "module:class". A name of ours cannot be taken over by an entry point."""
+    plugged_in = {point.name: point.value for point in entry_points(group=f"turbogs.{kind}")}
+    return {**plugged_in, **BUILT_IN[kind]}
+
+
+def default_type(kind: str) -> str:
+    """The name that a config without a section of this kind gets."""
+    return next(iter(BUILT_IN[kind]))
+
+
+def strategy_class(kind: str, name: str) -> type:
+    """The class behind a name.
+
+    Raises:
+        InputError: an unknown name (naming the nearest and all that are known), one whose module cannot be imported,
+            or one of something else than a dataclass.
+    """
+    known = known_types(kind)
+    if not isinstance(name, str) or name not in known:
+        raise InputError(f"unknown {kind}.type '{name}': {nearest(name, known)}")
+    place = f"{kind}.type '{name}' ({known[name]})"
+    try:
+        found = EntryPoint(name, known[name], f"turbogs.{kind}").load()
+    except (Exception, SystemExit) as error:  # another's module can do anything as it is imported
+        reason = " ".join(f"{type(error).__name__}: {error}".split())
+        raise InputError(f"{place} cannot be imported: {reason}") from error
+    if not (isinstance(found, type) and is_dataclass(found)):
+        raise InputError(f"{place} is not a dataclass, whose init fields would be its configuration")
+    return found
+
+
+def build(kind: str, mapping: Mapping[str, Any]) -> Any:
+    """A new strategy from ``{"type": name, **its init fields}``.
+
+    Raises:
+        InputError: an unknown kind, type or key, a wrong type of a value, one out of range, or a class without what
+            its kind's protocol has.
+    """
+    if kind not in BUILT_IN:
+        raise InputError(f"unknown kind of strategy '{kind}': {nearest(kind, KINDS)}")
+    if not isinstance(mapping, Mapping):
+        raise InputError(f"{kind}: expected a mapping with a 'type', got {mapping!r}")
+    options = dict(mapping)
+    name = options.pop("type", default_type(kind))
+    strategy = build_dataclass(strategy_class(kind, name), options, kind)
+    missing = [member for member in _members(PROTOCOLS[kind]) if not _has(strategy, member)]
+    if missing:
+        raise InputError(
+            f"{kind}.type '{name}' ({known_types(kind)[name]}) is no {PROTOCOLS[kind].__name__}: "
+            f"it lacks {', '.join(missing)}"
+        )
+    return strategy
+
+
+def _members(protocol: type) -> list[str]:
+    return [name for name in vars(protocol) if not name.startswith("_") or name == "__call__"]
+
+
+def _has(strategy: Any, member: str) -> bool:
+    """Whether the attribute is there, or a field of run-time state. Nothing is read: that may need `setup`."""
+    absent = object()
+    known = {field.name for field in fields(strategy)}
+    return member in known or inspect.getattr_static(strategy, member, absent) is not absent

@@ -1,0 +1,62 @@
+"""Runs of another length: what counts iterations goes along."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from turbogs_plugin.config.configuration import Config, resolve
+from turbogs_plugin.errors import InputError
+
+ITERATION_FIELDS = {
+    "train": ("refine_until", "sh_interval"),
+    "density": (
+        *("refine_from", "refine_every", "final_every", "prune_every"),
+        *("refine_start_iter", "refine_scale2d_stop_iter"),
+    ),
+}
+"""Settings that count iterations: a run of another length scales them. Not gsplat's `reset_every`: what a reset of
+opacities takes away grows back at the rate of the optimizer, however short the run."""
+
+SHORTEST_INTERVAL = 10
+"""Scaling makes no interval of density control shorter: its statistics need a window of some iterations."""
+
+REGROWTH = 50
+"""Iterations in which opacities grow back what an event of density control takes; one that comes sooner takes less."""
+
+
+def with_iterations(config: Config, iterations: int) -> Config:
+    """The configuration for a run of exactly this length, with everything scaled that counts iterations."""
+    mapping = config.to_mapping()
+    scale_iterations(mapping, iterations)
+    mapping["plan"]["iterations"] = "keep"
+    return resolve(mapping)
+
+
+def scale_iterations(mapping: dict[str, dict[str, Any]], iterations: int) -> None:
+    """Change the sections of a complete configuration to this length.
+
+    Intervals of density control stay at `SHORTEST_INTERVAL` or above; 0 stays 0.
+
+    Raises:
+        InputError: no iterations.
+    """
+    if iterations < 1:
+        raise InputError(f"a run has at least one iteration, not {iterations}")
+    factor = iterations / mapping["train"]["iterations"]
+    density = mapping["density"]
+    interval = density.get("refine_every", REGROWTH)
+    for section, names in ITERATION_FIELDS.items():
+        for name in names:
+            value = mapping[section].get(name, 0)
+            if value:
+                least = min(value, SHORTEST_INTERVAL) if section == "density" else 1
+                mapping[section][name] = max(least, round(value * factor))
+    mapping["train"]["iterations"] = iterations
+    if density.get("opacity_decay", 0.0):
+        density["opacity_decay"] = decay_at(density["opacity_decay"], interval, density["refine_every"])
+
+
+def decay_at(decay: float, interval: int, other: int) -> float:
+    """Share of the opacities that events `other` iterations apart take where events `interval` apart take `decay`."""
+    before, after = min(REGROWTH, interval), min(REGROWTH, other)
+    return decay if before == after else 1.0 - (1.0 - decay) ** (after / before)

@@ -1,0 +1,1 @@
+"""The CUDA engine: the reference's twin on the kernels of csrc/."""

@@ -1,0 +1,291 @@
+"""Front-to-back compositing of splats at sampled pixels, and its gradient.
+
+Tiles with like numbers of splats go together into a block ``[B tiles, S samples, G splats]`` of bounded size, padded to
+a rectangle, so that a block's intermediate arrays stay in cache; the splats of deep tiles are taken in slices. Slices
+end early where every pixel of the block is opaque.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+from torch.nn.functional import threshold_
+
+from turbogs_plugin.engine.reference.intersection import TilePairs
+from turbogs_plugin.engine.rendered import RasterSettings
+from turbogs_plugin.types import PixelSamples
+
+BLOCK_ELEMENTS = {"cpu": 1 << 18, "cuda": 1 << 24}
+"""Elements of one intermediate array of a block."""
+
+SLICE_SPLATS = 128
+"""Splats of a tile that are composited at a time."""
+
+ALPHA_TINY = 1e-10
+"""Smallest alpha by which a depth is divided, as in gsplat."""
+
+RECORD_WIDTH = 16
+MEAN, CONIC, COLOR, OPACITY, ABSOLUTE, ERROR_SUM, DISTANCE_SUM, WEIGHT_SUM, DEPTH = (
+    slice(0, 2), slice(2, 5), slice(5, 8), 8, slice(9, 11), 11, 12, 13, 14,
+)  # fmt: skip
+"""Columns of a screen-gradient record: the gradients of the projected mean, conic (a, b, c), colour and opacity, the
+sums of the absolute gradients of the mean at each pixel, sum of e * w, D * w and w, and the gradient of the depth."""
+
+
+@dataclass
+class Block:
+    """B tiles. `samples`: [B, S] slots, P where padded. `start`, `count`: [B] the tiles' range of pairs."""
+
+    samples: Tensor
+    start: Tensor
+    count: Tensor
+    depth: int  # largest count
+
+
+@dataclass
+class Compositor:
+    """What compositing needs beside the splats: which pairs, which pixels.
+
+    Args:
+        pairs: the M pairs of the T tiles.
+        samples: the P samples.
+        settings: thresholds.
+    """
+
+    pairs: TilePairs
+    samples: PixelSamples
+    settings: RasterSettings
+
+    def __post_init__(self) -> None:
+        self.device = self.pairs.rows.device
+        self.tile_counts = self.pairs.tile_counts.cpu()
+
+    def blocks(self) -> Iterator[Block]:
+        """All tiles that have both samples and pairs, those with the most pairs first."""
+        counts, order = self.tile_counts.sort(descending=True, stable=True)
+        counts = counts.tolist()
+        offsets = self.samples.tile_offsets.long()
+        sample_counts = offsets.diff()[order.to(self.device)]
+        host_sample_counts = sample_counts.tolist()
+        sample_starts = offsets[:-1][order.to(self.device)]
+        pair_counts = self.tile_counts[order].to(self.device)
+        pair_starts = (self.pairs.tile_counts.cumsum(0) - self.pairs.tile_counts)[order.to(self.device)]
+        limit = BLOCK_ELEMENTS[self.device.type]
+
+        begin = 0
+        while begin < len(counts) and counts[begin] > 0:
+            depth, most_samples, end = counts[begin], 0, begin
+            while end < len(counts) and counts[end] > 0:
+                most = max(most_samples, host_sample_counts[end])
+                if end > begin and (end + 1 - begin) * most * min(depth, SLICE_SPLATS) > limit:
+                    break
+                most_samples, end = most, end + 1
+            number = torch.arange(most_samples, device=self.device)
+            slots = sample_starts[begin:end, None] + number
+            slots = slots.masked_fill_(number >= sample_counts[begin:end, None], len(self.samples))
+            yield Block(slots, pair_starts[begin:end], pair_counts[begin:end], depth)
+            begin = end
+
+    def slices(self, block: Block) -> Iterator[tuple[Tensor, Tensor]]:
+        """Pair numbers [B, G] of the block's splats, front to back, and where they are real."""
+        for first in range(0, block.depth, SLICE_SPLATS):
+            number = torch.arange(first, min(first + SLICE_SPLATS, block.depth), device=self.device)
+            real = number < block.count[:, None]
+            yield torch.where(real, block.start[:, None] + number, 0), real
+
+    def pixel_centers(self, dtype: torch.dtype) -> Tensor:
+        """[P + 1, 2], the last of them padding."""
+        centers = self.samples.coordinates().to(dtype) + 0.5
+        return torch.cat([centers, centers.new_zeros(1, 2)])
+
+
+@dataclass
+class Slice:
+    """One slice of a block, [B, S, G] unless told: what the forward pass knows of it and the backward pass needs."""
+
+    rows: Tensor  # [B, G]
+    real: Tensor  # [B, G]
+    features: Tensor  # [B, 5, G] red, green, blue, 1, depth
+    conics: Tensor  # [3, B, 1, G]
+    opacities: Tensor  # [B, 1, G]
+    dx: Tensor
+    dy: Tensor
+    sigma: Tensor
+    alpha: Tensor  # zero where the splat is skipped or the pixel has ended
+    clamped: Tensor | None  # alpha was cut at alpha_max; None: nowhere
+    weights: Tensor
+    transmittance: Tensor  # [B, S, 1] behind the slice, zero where the pixel has ended
+
+
+def composite_slice(
+    table: Tensor,
+    rows: Tensor,
+    real: Tensor,
+    centers: Tensor,
+    transmittance: Tensor,
+    settings: RasterSettings,
+) -> Slice:
+    """Weights of a slice's splats.
+
+    Args:
+        table: [10, R] mean x, y; conic a, b, c; opacity; red, green, blue; depth.
+        rows, real: [B, G].
+        centers: [B, S, 2] pixel centres.
+        transmittance: [B, S, 1] before the slice.
+    """
+    count, splats = rows.shape
+    fields = table.index_select(1, rows.flatten()).reshape(10, count, 1, splats)
+    a, b, c = conics = fields[2:5]
+    opacities = fields[5] * real[:, None]
+    features = torch.cat([fields[6:9], torch.ones_like(fields[9:]), fields[9:]])[:, :, 0].transpose(0, 1).contiguous()
+
+    dx, dy = fields[0] - centers[:, :, :1], fields[1] - centers[:, :, 1:]
+    sigma = (0.5 * c * dy).mul_(dy)
+    sigma.addcmul_((0.5 * a * dx).addcmul_(b.expand_as(dx), dy), dx)
+    threshold_(sigma, -torch.finfo(sigma.dtype).tiny, torch.finfo(sigma.dtype).max / 4)  # negative: skipped
+    alpha = sigma.neg().exp_().mul_(opacities)
+    clamped = alpha > settings.alpha_max if bool((opacities > settings.alpha_max).any()) else None
+    if clamped is not None:
+        alpha.clamp_(max=settings.alpha_max)
+    at_least = torch.nextafter(alpha.new_tensor(settings.alpha_min), alpha.new_tensor(0.0)).item()
+    threshold_(alpha, at_least, 0.0)
+
+    through = torch.empty(count, centers.shape[1], splats + 1, dtype=alpha.dtype, device=alpha.device)
+    through[:, :, :1] = transmittance
+    torch.sub(1, alpha, out=through[:, :, 1:])
+    through = through.cumprod(dim=-1)
+    weights = alpha * through[:, :, :-1]
+    behind = through[:, :, -1:].clone()
+    if bool((behind <= settings.transmittance_min).any()):
+        ended = through[:, :, 1:] <= settings.transmittance_min
+        weights.masked_fill_(ended, 0)
+        alpha.masked_fill_(ended, 0)
+        threshold_(behind, settings.transmittance_min, 0.0)
+    return Slice(rows, real, features, conics, opacities, dx, dy, sigma, alpha, clamped, weights, behind)
+
+
+def splat_table(means2d: Tensor, conics: Tensor, colors: Tensor, opacities: Tensor, depths: Tensor) -> Tensor:
+    """[10, R], channel by channel."""
+    columns = [means2d, conics, opacities[:, None], colors, depths[:, None]]
+    return torch.cat(columns, dim=1).T.contiguous()
+
+
+def composite(compositor: Compositor, table: Tensor) -> Tensor:
+    """Composite all samples.
+
+    Returns:
+        [P, 5]: sums of weight times red, green, blue, 1 and depth. Zero in empty slots.
+    """
+    samples, settings = compositor.samples, compositor.settings
+    centers = compositor.pixel_centers(table.dtype)
+    sums = table.new_zeros(len(samples) + 1, 5)
+    for block in compositor.blocks():
+        block_centers = centers[block.samples]  # [B, S, 2]
+        transmittance = torch.ones_like(block_centers[:, :, :1])
+        total = table.new_zeros(*block.samples.shape, 5)
+        for rows, real in compositor.slices(block):
+            piece = composite_slice(table, compositor.pairs.rows[rows], real, block_centers, transmittance, settings)
+            total.baddbmm_(piece.weights, piece.features.transpose(1, 2))
+            transmittance = piece.transmittance
+            if not transmittance.any():
+                break
+        sums[block.samples] = total
+    return sums[:-1] * samples.filled[:, None]
+
+
+def composite_backward(
+    compositor: Compositor, table: Tensor, sums: Tensor, gradients: Tensor, pixel_errors: Tensor | None
+) -> Tensor:
+    """Take the gradients of `composite` to the splats.
+
+    The weights are composited a second time, front to back; what lies behind a splat is the pixel's total less what has
+    been seen of it, so nothing is divided by a small transmittance.
+
+    Args:
+        table, sums: what `composite` took and gave.
+        gradients: [P, 5], d loss / d sums.
+        pixel_errors: [P] or None for zeros.
+
+    Returns:
+        [R, RECORD_WIDTH], see `MEAN` and its like.
+    """
+    samples, settings, pairs = compositor.samples, compositor.settings, compositor.pairs
+    filled = samples.filled[:, None]
+    errors = torch.zeros_like(sums[:, :1]) if pixel_errors is None else pixel_errors[:, None].to(sums.dtype)
+    # Red, green, blue, alpha, depth, error, 1. Zero in the padding slot and in empty ones.
+    upstream = torch.cat(
+        [torch.where(filled, torch.cat([gradients, errors], dim=1), 0.0), filled.to(sums.dtype)], dim=1
+    )
+    upstream = torch.cat([upstream, upstream.new_zeros(1, 7)])
+    totals = torch.cat([(upstream[:-1, :5] * sums).sum(dim=1, keepdim=True), sums.new_zeros(1, 1)])
+    centers = compositor.pixel_centers(table.dtype)
+    records = table.new_zeros(len(pairs.rows), RECORD_WIDTH)
+    for block in compositor.blocks():
+        block_centers, block_upstream = centers[block.samples], upstream[block.samples]  # [B, S, 2], [B, S, 7]
+        behind = totals[block.samples]  # [B, S, 1] what the splats to come will contribute
+        transmittance = torch.ones_like(behind)
+        for numbers, real in compositor.slices(block):
+            piece = composite_slice(table, pairs.rows[numbers], real, block_centers, transmittance, settings)
+            record, behind = _slice_backward(piece, block_upstream, behind)
+            records[pairs.slots[numbers[real]]] = record[real]
+            transmittance = piece.transmittance
+            if not transmittance.any():
+                break
+    return pairs.sum_by_row(records)
+
+
+def _slice_backward(piece: Slice, upstream: Tensor, behind: Tensor) -> tuple[Tensor, Tensor]:
+    """Records [B, G, RECORD_WIDTH] of a slice, and `behind` after it."""
+    contribution = torch.bmm(upstream[:, :, :5], piece.features).mul_(piece.weights)  # [B, S, G]
+    seen = contribution.cumsum(dim=-1)
+    after = behind - seen[:, :, -1:]
+    # d loss / d sigma = -alpha * d loss / d alpha
+    slope = seen.sub_(behind).mul_(piece.alpha).div_(1 - piece.alpha).add_(contribution).neg_()
+    if piece.clamped is not None:
+        slope.masked_fill_(piece.clamped, 0)
+    a, b, c = piece.conics
+    slope_x, slope_y = slope * piece.dx, slope * piece.dy
+    record = slope.new_zeros(RECORD_WIDTH, slope.shape[0], slope.shape[2])
+    first = (slope_x.sum(dim=1), slope_y.sum(dim=1))
+    record[0] = a[:, 0] * first[0] + b[:, 0] * first[1]
+    record[1] = b[:, 0] * first[0] + c[:, 0] * first[1]
+    record[ABSOLUTE.start] = (a * slope_x).addcmul_(b.expand_as(slope_x), slope_y).abs_().sum(dim=1)
+    record[ABSOLUTE.start + 1] = (b * slope_x).addcmul_(c.expand_as(slope_x), slope_y).abs_().sum(dim=1)
+    record[CONIC.start + 1] = (slope_x * piece.dy).sum(dim=1)
+    record[CONIC.start] = 0.5 * slope_x.mul_(piece.dx).sum(dim=1)
+    record[CONIC.start + 2] = 0.5 * slope_y.mul_(piece.dy).sum(dim=1)
+    opacities = piece.opacities[:, 0]
+    record[OPACITY] = torch.where(opacities > 0, -slope.sum(dim=1) / opacities, 0.0)
+    weighted = torch.bmm(upstream.transpose(1, 2), piece.weights)  # [B, 7, G]
+    record[COLOR] = weighted[:, :3].transpose(0, 1)
+    record[DEPTH], record[ERROR_SUM], record[WEIGHT_SUM] = weighted[:, 4], weighted[:, 5], weighted[:, 6]
+    # In place: the exponents are not needed after this.
+    distances = piece.sigma.mul_(2).sqrt_().mul_(piece.weights)
+    record[DISTANCE_SUM] = torch.bmm(upstream[:, :, 6:].transpose(1, 2), distances)[:, 0]
+    return record.permute(1, 2, 0), after
+
+
+class Composite(torch.autograd.Function):
+    """`composite` in autograd, with the projected means as [K, N, 2]: after a backward pass their attribute `absgrad`
+    holds the absolute gradients, as in gsplat. The other splat arrays have one entry a row."""
+
+    @staticmethod
+    def forward(ctx, compositor, means2d, rows, conics, colors, opacities, depths):
+        table = splat_table(rows.gather(means2d), conics, colors, opacities, depths)
+        sums = composite(compositor, table)
+        ctx.compositor, ctx.rows = compositor, rows
+        ctx.save_for_backward(means2d, table, sums)
+        return sums
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, gradients):
+        means2d, table, sums = ctx.saved_tensors
+        record = composite_backward(ctx.compositor, table, sums, gradients, None)
+        means2d.absgrad = ctx.rows.scatter(record[:, ABSOLUTE])
+        mean_gradients = ctx.rows.scatter(record[:, MEAN])
+        return None, mean_gradients, None, *(record[:, column] for column in (CONIC, COLOR, OPACITY, DEPTH))

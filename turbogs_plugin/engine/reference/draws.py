@@ -1,0 +1,305 @@
+"""The draw of pixels, cells or tiles by which the samplers choose what is rendered (paper section 3.5).
+
+Within every 16x16 tile of the K views, N units are drawn without replacement in three stages, each from what the
+stages before it left: the *hard* share by error, the *stable* share by age, the *mixed* rest by both. A unit is a pixel
+(the paper's), a 4x4 cell, or, drawn among the tiles of a view instead of within a tile, a whole tile.
+
+The draw is defined down to the bit, so that `draw_pixels` here and its CUDA twin return equal sets:
+
+1. Of each unit: its error E, float32 (the error of a pixel; of a cell or tile the exact sum of its pixels' errors,
+   rounded once; sums of halves are exact in float64), and its age A, an integer (the largest age of its pixels; they
+   are drawn together, so their ages differ only in maps that were once drawn by another unit).
+2. Four random words ``x0 .. x3`` of each unit (layout in `philox`): the place is the pixel id ``y * width + x``, the id
+   of the cell's first pixel, or the tile's number within its view; the purpose says which of the three.
+3. Each stage ranks the units not yet drawn by a 64-bit key, and takes the largest; keys are distinct, for their low
+   20 bits are ``2^20 - 1 - rank``, so among equals the lower rank goes first. The rank is the pixel's `cell_order`, the
+   cell's number in its tile, row by row, or the tile's number in its view. The high bits are:
+
+   - hard: the bits, as an integer, of the float32 ``max(E, 2^-100) / exponential(x0)``, an exponential race: taking the
+     largest is the multinomial draw without replacement, with the probabilities E / sum(E). Zero errors come
+     after all others, and among themselves at random: a tile without error is drawn uniformly;
+   - stable: ``A << 24 | x1 >> 8``, the largest age, ties at random;
+   - mixed: the bits of ``max(M, 2^-100) / exponential(x2)`` with ``M = E / S + A / B``, the two divisions and the sum
+     each rounded to float32; S and B are the exact sums of E and A over the tile (over the view for unit = tile),
+     whether drawn or not, rounded to float32; a quotient by zero counts as 0. For `mixed` = uniform, M = 1.
+
+Importance weights are ``w = p^-a`` over their mean, with p the probability that a unit is drawn given the keys of the
+others ("rank conditioning", Cohen and Kaplan 2007: dividing by it makes a single stage exactly unbiased). In a stage,
+tau is the least key with which the unit would have been taken: for a unit that the stage takes, the largest key it
+leaves (none where it takes all there are); for any other, drawn before or not at all, the smallest key it takes. With
+the high bits of tau as what they stand for, the chance of a race is ``1 - exp(-max(E or M, 2^-100) / tau)``, of the
+stable stage ``clamp(((A + 1) << 24) - tau, 0, 2^24) / 2^24``, and 1 without a tau; a stage that takes nothing has none.
+Together, ``p = 1 - (1 - p_hard) (1 - p_stable) (1 - p_mixed)``, and 1 where all units of a row are drawn.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from turbogs_plugin.engine.reference.philox import (
+    PURPOSE_CELLS,
+    PURPOSE_PIXELS,
+    PURPOSE_TILES,
+    Words,
+    exponentials,
+    random_words,
+)
+from turbogs_plugin.error_maps import AGE_MAX
+from turbogs_plugin.tiles import CELL_SIDE, TILE_CELLS, TILE_PIXELS, compact, pixel_table, tile_extents
+from turbogs_plugin.types import CELL_HEIGHT, CELL_WIDTH, TILE_SIZE, PixelSamples, TileGrid
+
+UNITS = ("pixel", "cell", "tile")
+
+RANK_BITS = 20
+AGE_TIE_BITS = 24
+WEIGHT_FLOOR = 2.0**-100
+"""Below every positive weight by so much that a unit of no weight never wins against one that has some."""
+
+
+@dataclass(frozen=True)
+class DrawRule:
+    """How units are drawn; the samplers' configuration in the form that `draw_pixels` takes.
+
+    Args:
+        unit: one of `UNITS`.
+        hard, stable: shares of the units drawn by error and by age; the mixed stage draws the rest.
+        mixed_uniform: the mixed stage ignores error and age.
+        importance: a of the weights ``p^-a``; 0 for no weights.
+    """
+
+    unit: str
+    hard: float
+    stable: float
+    mixed_uniform: bool
+    importance: float
+
+    def wanted(self, rate: float, units: int) -> int:
+        """Units to draw of so many: ``max(1, floor(rate * units))``, the paper's N_pix where they are the 256 pixels.
+
+        Of the 16 cells of a tile, the nearest number: rounding down would lose up to half of a small budget.
+        """
+        slack = 0.5 if self.unit == "cell" else 0.0
+        return min(units, max(1, math.floor(rate * units + slack)))
+
+    def stages(self, wanted: int) -> tuple[int, int, int]:
+        """Units of the hard, stable and mixed stage; halves round up."""
+        hard = min(wanted, math.floor(self.hard * wanted + 0.5))
+        stable = min(wanted - hard, math.floor(self.stable * wanted + 0.5))
+        return hard, stable, wanted - hard - stable
+
+
+@dataclass(frozen=True)
+class Units:
+    """The units of a draw: R rows of U units, each row drawn by itself.
+
+    Args:
+        errors: [R, U] float64, exact sums; 0 where there is no unit.
+        ages: [R, U] integers; 0 where there is no unit.
+        exist: [R, U] bool: rows of cut tiles, and of views with fewer tiles than others, have gaps.
+        words: four [R, U] int64 random words.
+        counts: [R] or [1] int64 on the host, units to draw from each row.
+    """
+
+    errors: Tensor
+    ages: Tensor
+    exist: Tensor
+    words: Words
+    counts: np.ndarray
+
+
+def draw_units(units: Units, rule: DrawRule) -> tuple[Tensor, Tensor | None]:
+    """Draw from each row, in the three stages of the module's text.
+
+    Returns:
+        [R, U] bool, the units drawn; and their inclusion probabilities p, [R, U] float32 (meaningless where not
+        drawn), or None where the rule has no importance weights.
+    """
+    device = units.errors.device
+    stages = np.array([rule.stages(int(count)) for count in units.counts], dtype=np.int64)  # [R, 3]
+    ranks = (1 << RANK_BITS) - 1 - torch.arange(units.exist.shape[1], device=device)  # [U]
+    errors, ages = units.errors.float(), units.ages.long()
+    if rule.mixed_uniform:
+        mixed = torch.ones_like(errors)
+    else:
+        error_sums, age_sums = units.errors.sum(dim=1, keepdim=True), ages.sum(dim=1, keepdim=True)
+        mixed = _share(errors, error_sums.float()) + _share(ages.float(), age_sums.float())
+
+    drawn = torch.zeros_like(units.exist)
+    missed = torch.ones_like(errors)  # probability of not being drawn
+    for stage, weights, words in ((0, errors, units.words[0]), (1, None, units.words[1]), (2, mixed, units.words[2])):
+        counts = stages[:, stage]
+        if not counts.any():
+            continue
+        if weights is None:
+            primary = (ages << AGE_TIE_BITS) | (words >> (32 - AGE_TIE_BITS))
+        else:
+            weights = weights.clamp(min=WEIGHT_FLOOR)
+            primary = (weights / exponentials(words)).view(torch.int32).long()
+        keys = torch.where(units.exist & ~drawn, (primary << RANK_BITS) | ranks, -1)
+        takes = torch.as_tensor(counts, device=device)[:, None].expand(len(keys), 1)
+        largest = keys.topk(min(int(counts.max()) + 1, keys.shape[1]), dim=1).values
+        largest = torch.nn.functional.pad(largest, (0, 1), value=-1)  # a stage may take all there are
+        largest_left = largest.gather(1, takes)
+        taken = keys > largest_left
+        drawn |= taken
+        if rule.importance:
+            smallest_taken = largest.gather(1, (takes - 1).clamp(min=0))
+            tau = torch.where(taken, largest_left, smallest_taken) >> RANK_BITS  # -1 for none
+            if weights is None:
+                chance = (((ages + 1) << AGE_TIE_BITS) - tau).clamp(0, 1 << AGE_TIE_BITS) * 2.0**-AGE_TIE_BITS
+            else:
+                threshold = tau.to(torch.int32).view(torch.float32)
+                chance = torch.where(tau < 0, 1.0, -torch.expm1(-weights / threshold))
+            missed = missed * (1.0 - chance * (takes > 0))
+    if not rule.importance:
+        return drawn, None
+    complete = (drawn | ~units.exist).all(dim=1, keepdim=True)
+    return drawn, torch.where(complete, 1.0, 1.0 - missed)
+
+
+def _share(values: Tensor, sums: Tensor) -> Tensor:
+    """``values / sums``, 0 where the sum is 0."""
+    return torch.where(sums > 0, values / sums, 0.0)
+
+
+def draw_pixels(
+    errors: Tensor,
+    stamps: Tensor,
+    now: int,
+    starts: np.ndarray,
+    sizes: np.ndarray,
+    view_ids: tuple[int, ...],
+    rate: float,
+    rule: DrawRule,
+    seed: int,
+    iteration: int,
+) -> PixelSamples:
+    """Draw the samples of K views; the definition of the CUDA twin (see the module's text).
+
+    Args:
+        errors: [X] float16, finite, 0 or more.
+        stamps: [X] int16; ``min(now - stamp, AGE_MAX)`` is a pixel's age.
+        starts: [K] int64, the first flat pixel of each view.
+        sizes: [K, 2] int64 (width, height).
+        view_ids: K training views.
+        rate: r, the fraction of units to draw, above 0.
+
+    Returns:
+        Samples whose every count is known without reading anything back from the device. Slots of a tile: min(N, its
+        pixels) for unit = pixel; 16 for each drawn cell, at most its pixels, for cell; 256 for tile.
+    """
+    device = errors.device
+    table = pixel_table(sizes, device)  # [T, 256]
+    inside = table >= 0
+    tile_views = np.repeat(np.arange(len(view_ids)), TileGrid(sizes).shapes.prod(axis=1))  # [T]
+    flat = torch.as_tensor(starts[tile_views], device=device)[:, None] + table.clamp(min=0)
+    pixel_errors = torch.where(inside, errors[flat].double(), 0.0)  # [T, 256]
+    pixel_ages = torch.where(inside, (now - stamps[flat].int()).clamp(0, AGE_MAX), 0)
+    view_numbers = torch.as_tensor(np.asarray(view_ids, dtype=np.int64)[tile_views], device=device)[:, None]  # [T, 1]
+
+    def words(place: Tensor, purpose: int) -> Words:
+        return random_words(place.clamp(min=0).long(), view_numbers, purpose, seed, iteration)
+
+    draw = {"pixel": _draw_by_pixel, "cell": _draw_by_cell, "tile": _draw_by_tile}[rule.unit]
+    return draw(_Batch(view_ids, sizes, table, pixel_errors, pixel_ages, words), rate, rule)
+
+
+@dataclass(frozen=True)
+class _Batch:
+    """The tiles of K views with all their pixels; `words` gives the random words of places [T, ...]."""
+
+    view_ids: tuple[int, ...]
+    sizes: np.ndarray
+    table: Tensor  # [T, 256] int32
+    errors: Tensor  # [T, 256] float64
+    ages: Tensor  # [T, 256] int32
+    words: Callable[[Tensor, int], Words]
+
+    def all_tiles(self) -> Tensor:
+        return torch.arange(len(self.table), dtype=torch.int32, device=self.table.device)
+
+
+def _draw_by_pixel(batch: _Batch, rate: float, rule: DrawRule) -> PixelSamples:
+    wanted = rule.wanted(rate, TILE_PIXELS)
+    words = batch.words(batch.table, PURPOSE_PIXELS)
+    units = Units(batch.errors, batch.ages, batch.table >= 0, words, np.array([wanted]))
+    drawn, probabilities = draw_units(units, rule)
+    widths, heights = tile_extents(batch.sizes)
+    slots = np.minimum(wanted, widths * heights)
+    weights = _importance_weights(probabilities, rule)
+    return compact(batch.view_ids, batch.sizes, batch.table, drawn, batch.all_tiles(), slots, weights, full=True)
+
+
+def _draw_by_cell(batch: _Batch, rate: float, rule: DrawRule) -> PixelSamples:
+    wanted = rule.wanted(rate, TILE_CELLS)
+    first_pixels = _cells_of(batch.table)[:, :, 0]  # [T, 16]
+    units = Units(
+        _cells_of(batch.errors).sum(dim=2),
+        _cells_of(batch.ages).amax(dim=2),
+        first_pixels >= 0,
+        batch.words(first_pixels, PURPOSE_CELLS),
+        np.array([wanted]),
+    )
+    drawn, probabilities = draw_units(units, rule)
+    widths, heights = tile_extents(batch.sizes)
+    cells = np.minimum(wanted, -(-widths // CELL_SIDE) * -(-heights // CELL_SIDE))
+    slots = np.minimum(cells * CELL_SIDE**2, widths * heights)
+    mask = _pixels_of(drawn) & (batch.table >= 0)
+    weights = _importance_weights(probabilities, rule)
+    weights = None if weights is None else _pixels_of(weights)
+    return compact(batch.view_ids, batch.sizes, batch.table, mask, batch.all_tiles(), slots, weights)
+
+
+def _draw_by_tile(batch: _Batch, rate: float, rule: DrawRule) -> PixelSamples:
+    device = batch.table.device
+    tiles = TileGrid(batch.sizes).shapes.prod(axis=1)  # [K]
+    # Views are rows of a draw, as long as the longest; `places` are their tiles in the padded array.
+    places = torch.as_tensor(np.flatnonzero(np.arange(tiles.max()) < tiles[:, None]), device=device)  # [T]
+    counts = np.array([rule.wanted(rate, int(count)) for count in tiles])
+
+    def padded(values: Tensor) -> Tensor:  # [T] -> [K, longest]
+        rows = values.new_zeros(len(tiles) * int(tiles.max()))
+        rows[places] = values
+        return rows.view(len(tiles), -1)
+
+    numbers = (places % int(tiles.max()))[:, None]  # [T, 1] within the view
+    units = Units(
+        padded(batch.errors.sum(dim=1)),
+        padded(batch.ages.amax(dim=1)),
+        padded(torch.ones_like(places, dtype=torch.bool)),
+        tuple(padded(word[:, 0]) for word in batch.words(numbers, PURPOSE_TILES)),
+        counts,
+    )
+    drawn, probabilities = draw_units(units, rule)
+    # Their number is known here; a boolean index would ask the device for it.
+    order = torch.argsort(drawn.reshape(-1)[places].to(torch.int8), stable=True, descending=True)
+    tile_ids = order[: counts.sum()]
+    table = batch.table[tile_ids]
+    weights = _importance_weights(probabilities, rule)
+    weights = None if weights is None else weights.reshape(-1)[places][tile_ids, None].expand(table.shape)
+    slots = np.full(len(tile_ids), TILE_PIXELS)
+    return compact(batch.view_ids, batch.sizes, table, table >= 0, tile_ids.int(), slots, weights)
+
+
+def _importance_weights(probabilities: Tensor | None, rule: DrawRule) -> Tensor | None:
+    return None if probabilities is None else probabilities.clamp(min=2.0**-24) ** -rule.importance
+
+
+def _cells_of(values: Tensor) -> Tensor:
+    """[T, 256] in `cell_order` -> [T, 16, 16]: the 4x4 cells of a tile row by row, their pixels row by row."""
+    blocks = TILE_SIZE // CELL_HEIGHT * (TILE_SIZE // CELL_WIDTH)
+    split = values.view(-1, blocks, CELL_HEIGHT, CELL_WIDTH // CELL_SIDE, CELL_SIDE)
+    return split.transpose(2, 3).reshape(-1, TILE_CELLS, CELL_SIDE**2)
+
+
+def _pixels_of(cells: Tensor) -> Tensor:
+    """[T, 16] of cells -> [T, 256] of their pixels in `cell_order`."""
+    blocks = TILE_SIZE // CELL_HEIGHT * (TILE_SIZE // CELL_WIDTH)
+    wide = cells.view(-1, blocks, 1, CELL_WIDTH // CELL_SIDE, 1)
+    return wide.expand(-1, -1, CELL_HEIGHT, -1, CELL_SIDE).reshape(-1, TILE_PIXELS)

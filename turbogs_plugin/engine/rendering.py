@@ -1,0 +1,125 @@
+"""Rendering at sampled pixels: one function, `rasterize`, whose tensors' device decides what runs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from turbogs_plugin.engine.cuda import library as kernels
+from turbogs_plugin.engine.cuda.autograd import rasterize_differentiable_cuda
+from turbogs_plugin.engine.cuda.raster import rasterize_cuda
+from turbogs_plugin.engine.cuda.workspace import Workspace
+from turbogs_plugin.engine.reference.raster import (
+    DifferentiableRender,
+    rasterize_differentiable_reference,
+    rasterize_reference,
+)
+from turbogs_plugin.engine.rendered import DEFAULT_SETTINGS, RasterSettings, Rendered, ScreenGradients
+from turbogs_plugin.tiles import dense_pixels
+from turbogs_plugin.types import Cameras, Gaussians, PixelSamples
+
+__all__ = [
+    "DEFAULT_SETTINGS",
+    "DifferentiableRender",
+    "RasterSettings",
+    "Rendered",
+    "ScreenGradients",
+    "Workspace",
+    "dense_samples",
+    "rasterize",
+    "rasterize_differentiable",
+    "rasterize_differentiable_reference",
+    "rasterize_reference",
+    "render_images",
+]
+
+
+def rasterize(
+    gaussians: Gaussians,
+    cameras: Cameras,
+    samples: PixelSamples,
+    *,
+    sh_degree: int | None = None,
+    settings: RasterSettings = DEFAULT_SETTINGS,
+    with_depth: bool = False,
+    workspace: Workspace | None = None,
+) -> Rendered:
+    """Render samples of K views with gsplat's conventions, on a black background.
+
+    Args:
+        gaussians: the model. On a CUDA device the kernels run where they are compiled, else the torch reference.
+        cameras: the K views of the batch, in the order of `samples.view_ids`.
+        samples: the pixels.
+        sh_degree: highest degree of spherical harmonics used; all there are where None.
+        settings: thresholds and planes.
+        with_depth: also give expected depths.
+        workspace: with the kernels, memory to use again and no waiting for the GPU; see `Workspace` for what the caller
+            then owes.
+    """
+    if gaussians.device.type == "cuda" and kernels.available():
+        return rasterize_cuda(
+            gaussians,
+            cameras,
+            samples,
+            sh_degree=sh_degree,
+            settings=settings,
+            with_depth=with_depth,
+            workspace=workspace,
+        )
+    return rasterize_reference(
+        gaussians, cameras, samples, sh_degree=sh_degree, settings=settings, with_depth=with_depth
+    )
+
+
+def rasterize_differentiable(
+    gaussians: Gaussians,
+    cameras: Cameras,
+    samples: PixelSamples,
+    *,
+    sh_degree: int | None = None,
+    settings: RasterSettings = DEFAULT_SETTINGS,
+    with_depth: bool = False,
+) -> DifferentiableRender:
+    """`rasterize` under torch autograd, for losses written in plain torch; the arguments are the same.
+
+    After a backward pass `means2d` has `.grad` and, as in gsplat with ``absgrad=True``, `.absgrad`.
+    """
+    on_gpu = gaussians.device.type == "cuda" and kernels.available()
+    function = rasterize_differentiable_cuda if on_gpu else rasterize_differentiable_reference
+    return function(gaussians, cameras, samples, sh_degree=sh_degree, settings=settings, with_depth=with_depth)
+
+
+def dense_samples(cameras: Cameras, view_ids: Sequence[int] | None = None) -> PixelSamples:
+    """Every pixel of every tile of some views, in cell order, without empty slots.
+
+    Args:
+        cameras: all V cameras.
+        view_ids: which of them; all where None.
+    """
+    view_ids = tuple(range(len(cameras)) if view_ids is None else view_ids)
+    return dense_pixels(view_ids, cameras.sizes[list(view_ids)], cameras.viewmats.device)
+
+
+@torch.no_grad()
+def render_images(
+    gaussians: Gaussians,
+    cameras: Cameras,
+    sh_degree: int | None = None,
+    settings: RasterSettings = DEFAULT_SETTINGS,
+) -> list[tuple[Tensor, Tensor]]:
+    """Whole images, view after view so that memory does not grow with their number.
+
+    Returns:
+        For each camera the colours [H, W, 3], not clamped above, and alphas [H, W].
+    """
+    images = []
+    for view, (width, height) in enumerate(cameras.sizes.tolist()):
+        samples = dense_samples(cameras, [view])
+        rendered = rasterize(gaussians, cameras.select([view]), samples, sh_degree=sh_degree, settings=settings)
+        places = samples.pixel_ids.long()
+        colors = torch.empty_like(rendered.colors).index_copy_(0, places, rendered.colors)
+        alphas = torch.empty_like(rendered.alphas).index_copy_(0, places, rendered.alphas)
+        images.append((colors.reshape(height, width, 3), alphas.reshape(height, width)))
+    return images

@@ -1,0 +1,1 @@
+"""The model: Gaussians made from points, and to and from files."""

@@ -1,0 +1,43 @@
+"""Which bands of spherical harmonics a model needs, by the energy of its colours."""
+
+from __future__ import annotations
+
+import torch
+
+from turbogs_plugin.errors import require
+from turbogs_plugin.model.gaussians import SH_C0
+from turbogs_plugin.types import Gaussians
+
+
+def band_energy(gaussians: Gaussians) -> list[float]:
+    """Share of each degree, 0 first, in the energy of a model's colours.
+
+    The harmonics are orthonormal, so a Gaussian's colour squared, over all directions and channels, is the sum of its
+    squared coefficients, that of degree 0 with the offset of 0.5 that colours have. Gaussians count by their opacity;
+    those that are not finite do not.
+    """
+    constant = gaussians.sh0.double() + 0.5 / SH_C0  # [N, 1, 3]
+    squares = torch.cat([constant, gaussians.shN.double()], dim=1).square().sum(dim=2)  # [N, (degree + 1)^2]
+    weighted = torch.sigmoid(gaussians.opacities.double())[:, None] * squares
+    energies = weighted[weighted.isfinite().all(dim=1)].sum(dim=0)
+    degrees = [energies[degree**2 : (degree + 1) ** 2].sum() for degree in range(gaussians.sh_degree + 1)]
+    total = float(energies.sum())
+    return [float(energy) / total if total > 0 else 0.0 for energy in degrees]
+
+
+def drop_faint_bands(gaussians: Gaussians, threshold: float) -> Gaussians:
+    """The model without its highest degrees, as many as together have at most this share of its colours' energy.
+
+    Args:
+        gaussians: the model; its means and shapes are shared with the result.
+        threshold: 0 .. 1; 0 drops what is zero. Colours change by about the root of it, relative to themselves: 1e-4 is
+            1 %.
+
+    Raises:
+        InputError: a threshold out of range.
+    """
+    require(0 <= threshold < 1, "threshold", threshold, "at least 0 and less than 1")
+    shares = band_energy(gaussians)
+    degree = next(degree for degree in range(len(shares)) if sum(shares[degree + 1 :]) <= threshold)
+    kept = {**dict(gaussians.items()), "shN": gaussians.shN[:, : (degree + 1) ** 2 - 1].contiguous()}
+    return Gaussians(**kept)

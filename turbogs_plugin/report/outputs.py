@@ -1,0 +1,107 @@
+"""What one can get out of a finished or stopped run: its error, its views, its model."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from PIL import Image
+
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.model.gaussians import save_ply
+from turbogs_plugin.model.harmonics import band_energy, drop_faint_bands
+from turbogs_plugin.report.pages import ERRORS, number, table
+from turbogs_plugin.report.plots import to_uint8
+from turbogs_plugin.scene import PosedImages
+from turbogs_plugin.scene.offload import place_views
+from turbogs_plugin.train.evaluate import evaluate, load_lpips, render_view
+from turbogs_plugin.train.history import Evaluation
+from turbogs_plugin.train.run import SavedModel, load_model, open_scene, resolve_device
+
+
+def history_table(history: list[Evaluation]) -> str:
+    """Error against seconds, for a terminal."""
+    lines = [f"{'iteration':>9}  {'seconds':>8}  {'PSNR':>6}  {'SSIM':>6}  {'L1':>6}  {'Gaussians':>9}"]
+    for evaluation in history:
+        lines.append(
+            f"{evaluation.iteration:>9}  {evaluation.train_seconds:>8.1f}  {evaluation.psnr:>6.2f}  "
+            f"{evaluation.ssim:>6.4f}  {evaluation.l1:>6.4f}  {evaluation.num_gaussians:>9}"
+        )
+    return "\n".join(lines)
+
+
+def evaluate_run(path: Path, device_name: str) -> str:
+    """Errors of a run's newest model on each test view, as a table."""
+    model, views = _open(path, device_name, "test")
+    views = place_views(views, model.gaussians.device, model.config.plan.photos_on)
+    lpips, reason = load_lpips(model.config.report.lpips_weights, model.gaussians.device)
+    metrics = evaluate(model.gaussians, views, model.sh_degree, model.config.raster, lpips)
+    rows = [
+        (view.name, number(view.psnr, 2), number(view.ssim, 4), number(view.l1, 4), number(view.lpips, 4))
+        for view in [*metrics.views]
+    ]
+    means = (f"mean of {len(rows)}", *(number(metrics.mean(name), 4) for name in ("psnr", "ssim", "l1", "lpips")))
+    note = f"\nLPIPS was not computed: {reason}" if reason else ""
+    return (
+        table(("view", *ERRORS, "LPIPS (VGG)"), [*rows, means])
+        + f"\n\niteration {model.iteration}, {len(model.gaussians)} Gaussians, {metrics.fps:.1f} views a second{note}"
+    )
+
+
+def render_run(path: Path, split: str, device_name: str) -> Path:
+    """Write the views of a split, rendered from a run's newest model, as PNGs; their folder."""
+    model, views = _open(path, device_name, split)
+    views = replace(views, cameras=views.cameras.to(model.gaussians.device))
+    folder = model.folder.renders / split
+    folder.mkdir(parents=True, exist_ok=True)
+    for view_id, name in enumerate(distinct_stems(views.names)):
+        image = render_view(model.gaussians, views, view_id, model.sh_degree, model.config.raster)
+        Image.fromarray(to_uint8(image)).save(folder / f"{name}.png")
+    return folder
+
+
+def distinct_stems(names: Sequence[str]) -> list[str]:
+    """Names of photos without folders and suffixes; one that came before gets a number."""
+    stems: dict[str, None] = {}
+    for name in names:
+        flat = stem = Path(name).with_suffix("").as_posix().replace("/", "__")
+        number = 1
+        while stem in stems:
+            number += 1
+            stem = f"{flat}-{number}"
+        stems[stem] = None
+    return list(stems)
+
+
+def export_run(path: Path, file_format: str, out: Path | None, drop_bands: float | None = None) -> str:
+    """Write a run's newest model; what was written, in words.
+
+    Args:
+        path: folder of the run.
+        file_format: ply, the only one yet.
+        out: new file; None: the model in the run's folder.
+        drop_bands: threshold of `drop_faint_bands`; None: all bands are written.
+    """
+    if drop_bands is not None and not 0 <= drop_bands < 1:
+        raise InputError(f"--drop-bands {drop_bands}: it must be a share, at least 0 and less than 1")
+    if out is not None and out.exists():
+        raise InputError(f"--out '{out}' exists: choose a new file")
+    model = load_model(path, resolve_device("cpu"))
+    target = model.folder.model if out is None else out
+    gaussians = model.gaussians if drop_bands is None else drop_faint_bands(model.gaussians, drop_bands)
+    save_ply(gaussians, target, model.frame)
+    if drop_bands is None:
+        return f"{target}"
+    before, after = model.gaussians.sh_degree, gaussians.sh_degree
+    if before == after:
+        return f"{target} (degree {before} stays: it has {band_energy(model.gaussians)[-1]:.2g} of the colours' energy)"
+    share = sum(band_energy(model.gaussians)[after + 1 :])
+    return f"{target} (degree {before} -> {after}, without {share:.2g} of the colours' energy)"
+
+
+def _open(path: Path, device_name: str, split: str) -> tuple[SavedModel, PosedImages]:
+    """A run's newest model on a device, and the views of a split on the CPU."""
+    model = load_model(path, resolve_device(device_name))
+    scene = open_scene(model.config, model.folder)
+    return model, scene.test if split == "test" else scene.train

@@ -1,0 +1,62 @@
+"""What a measurement depends on besides its inputs: machine, versions, kernels, commit."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+from dataclasses import dataclass
+from pathlib import Path
+
+from turbogs_plugin.engine.cuda import library as kernels
+from turbogs_plugin.report.pages import hardware, software
+
+COMMIT_VARIABLE = "TURBOGS_COMMIT"
+"""Environment variable that names the commit where the sources are a copy without their history."""
+
+MODIFIED = "-modified"
+"""End of the commit of sources that differ from it."""
+
+
+@dataclass
+class Provenance:
+    """Where a measurement was made and with what.
+
+    Args:
+        machine: in words.
+        software: name -> version.
+        kernels: the CUDA library that ran, or why the torch reference did.
+        commit: of the sources, or "" where unknown.
+    """
+
+    machine: str
+    software: dict[str, str]
+    kernels: str
+    commit: str
+
+
+def provenance(device_type: str) -> Provenance:
+    """Of this process, computing on `cpu` or `cuda`."""
+    if device_type == "cuda" and kernels.available():
+        engine = f"{kernels.library_path().name} for {', '.join(kernels.architectures())}"
+    else:
+        reason = kernels.unavailable_reason() if device_type == "cuda" else "the device is the CPU"
+        engine = f"none, the torch reference ran: {reason}"
+    return Provenance(hardware(device_type), dict(software()), engine, source_commit())
+
+
+def source_commit() -> str:
+    """The commit of these sources, with `MODIFIED` at its end where they differ from it; "" without a history."""
+    if named := os.environ.get(COMMIT_VARIABLE):
+        return named
+    root = Path(__file__).resolve().parents[2]
+    if not (root / ".git").exists():
+        return ""
+    commands = (["rev-parse", "--short=12", "HEAD"], ["status", "--porcelain", "--untracked-files=no"])
+    try:
+        commit, changes = (
+            subprocess.run(["git", "-C", root, *command], capture_output=True, text=True, timeout=20, check=True).stdout
+            for command in commands
+        )
+    except (OSError, subprocess.SubprocessError):
+        return ""
+    return commit.strip() + (MODIFIED if changes.strip() else "")

@@ -1,0 +1,116 @@
+"""Any runs side by side, as an ablation of them: runs that differ in nothing but the seed are seeds of one variant."""
+
+from __future__ import annotations
+
+import itertools
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from turbogs_plugin.config.configuration import SceneConfig
+from turbogs_plugin.config.scaling import ITERATION_FIELDS, REGROWTH, decay_at
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.study.grid import Ablation
+from turbogs_plugin.study.results import CellResult, Study
+from turbogs_plugin.train.history import read_history
+from turbogs_plugin.train.run import RunFolder
+
+FITTED = {
+    "train": ("iterations", *ITERATION_FIELDS["train"]),
+    "density": ITERATION_FIELDS["density"],
+    "schedule": ("pixel_budget",),
+}
+"""Section -> settings that calibration chooses where there is a time budget."""
+
+
+def study_of_runs(paths: Sequence[Path]) -> Study:
+    """The runs' histories as cells. The first run's variant is the baseline; variants have the first run's name.
+
+    Raises:
+        InputError: no run there, one without an evaluation, or the same run twice.
+    """
+    variants: list[tuple[dict[str, Any], str]] = []  # configuration without the seed and the place, and its name
+    results: list[CellResult] = []
+    folders = [RunFolder(path) for path in paths]
+    configs = [folder.read_config() for folder in folders]
+    scenes = _scene_names([config.scene for config in configs])
+    for path, folder, config, scene in zip(paths, folders, configs, scenes, strict=True):
+        history = read_history(folder.history)
+        if not history:
+            raise InputError(f"'{path}' has no evaluation yet")
+        mapping = config.to_mapping()
+        shared = _without(mapping)
+        name = next((name for known, name in variants if known == shared), None)
+        if name is None:
+            name = _new_name(path, {taken for _, taken in variants})
+            variants.append((shared, name))
+        result = CellResult(scene, name, config.train.seed, mapping, time_budget=0.0, history=history)
+        if any(other.key == result.key for other in results):
+            raise InputError(f"'{path}' is the same run as another one: {result.key}")
+        # A CPU run records the peak of its process, which is its own.
+        result.peak_bytes = history[-1].memory_bytes
+        result.lpips_reason = "a run's history does not record it; see the runs' own reports"
+        results.append(result)
+    ablation = Ablation(
+        title=f"Comparison of {len(paths)} runs",
+        variants={name: _differences(variants[0][0], shared) for shared, name in variants},
+        base=str(variants[0][1]),
+    )
+    return Study(ablation, results)
+
+
+def _scene_names(scenes: Sequence[SceneConfig]) -> list[str]:
+    """The captures' names, with what tells those of one name apart: parent folders, the factor, the test views."""
+    names = []
+    for scene in scenes:
+        path = Path(scene.path)
+        alike = [other for other in scenes if Path(other.path).name == path.name]
+        folders = {Path(other.path).parts for other in alike}
+        depth = next(n for n in itertools.count(1) if len({parts[-n:] for parts in folders}) == len(folders))
+        name = "-".join(part for part in path.parts[-depth:] if part != path.anchor)
+        for setting in ("factor", "test_every"):
+            if len({getattr(other, setting) for other in alike}) > 1:
+                name += f"-{setting}-{getattr(scene, setting)}"
+        names.append(name)
+    return names
+
+
+def _without(mapping: dict[str, Any]) -> dict[str, Any]:
+    """What makes two runs seeds of one variant: all but the seed, the photos, and what is only reported or kept.
+
+    A time budget fits the length and the pixels of an iteration to the machine, to each seed its own: not that either.
+    """
+    sections = {name: dict(section) for name, section in mapping.items() if name not in ("report", "scene")}
+    for key in ("seed", "checkpoint_every", "evaluate_at"):
+        sections["train"].pop(key)
+    if sections["budget"]["time"]:
+        density = sections["density"]
+        if density.get("opacity_decay"):  # it goes along with the length, by the interval of its events
+            decay = decay_at(density["opacity_decay"], density["refine_every"], REGROWTH)
+            density["opacity_decay"] = round(decay, 9)
+        for section, keys in FITTED.items():
+            for key in keys:
+                sections[section].pop(key, None)
+    return sections
+
+
+def _new_name(path: Path, taken: set[str]) -> str:
+    """The folder's name, made fit for a variant and unique."""
+    name = re.sub(r"[^A-Za-z0-9_+.-]", "-", path.resolve().name)[:40].lstrip("._-") or "run"
+    if name not in taken:
+        return name
+    return next(f"{name}-{number}" for number in range(2, len(taken) + 3) if f"{name}-{number}" not in taken)
+
+
+def _differences(base: dict[str, Any], other: dict[str, Any], place: str = "") -> list[str]:
+    """Overrides that lead from one configuration to another."""
+    found = []
+    for key, value in other.items():
+        path = f"{place}.{key}" if place else key
+        before = base.get(key) if isinstance(base, dict) else None
+        if isinstance(value, dict):
+            found += _differences(before if isinstance(before, dict) else {}, value, path)
+        elif value != before:
+            found.append(f"{path}={value}")
+    return found

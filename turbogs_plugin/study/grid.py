@@ -1,0 +1,158 @@
+"""What an ablation is: named variants of a configuration, over scenes and seeds.
+
+A YAML in ``configs/ablations/``::
+
+    title: Optimizer
+    base: turbogs            # configuration that the variants change
+    baseline: moment-lm      # the variant that the others are compared with; the first one where absent
+    variants:
+      moment-lm: []
+      sparse-adam: [optimizer.type=sparse_adam]
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from turbogs_plugin.config.configuration import Config, load_config
+from turbogs_plugin.config.scaling import with_iterations
+from turbogs_plugin.config.schema import build_dataclass, nearest
+from turbogs_plugin.config.yaml_text import parse_yaml, read_yaml
+from turbogs_plugin.errors import InputError
+
+_NAME = re.compile(r"[A-Za-z0-9+][A-Za-z0-9_+.-]{0,47}")
+
+
+@dataclass
+class Ablation:
+    """Named variants.
+
+    Args:
+        title: of the table.
+        variants: name -> overrides ``section.key=value`` of the base configuration. Names become file names.
+        base: a packaged configuration or a YAML file.
+        baseline: the variant that the others are compared with; the first one where empty.
+        notes: name -> what a reader should know of a variant.
+    """
+
+    title: str
+    variants: dict[str, list[str]]
+    base: str = "turbogs"
+    baseline: str = ""
+    notes: dict[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if not self.variants:
+            raise InputError("variants: at least one is needed")
+        for name in self.variants:
+            if not _NAME.fullmatch(str(name)):
+                raise InputError(f"variant '{name}': a name has up to 48 letters, digits, '.', '_', '+' and '-'")
+        self.baseline = self.baseline or next(iter(self.variants))
+        for name in (self.baseline, *self.notes):
+            self.require_variant(name)
+
+    def require_variant(self, name: str) -> None:
+        """Raises `InputError` where there is no such variant."""
+        if name not in self.variants:
+            raise InputError(f"no variant '{name}': {nearest(name, self.variants)}")
+
+    def only(self, names: Sequence[str]) -> list[str]:
+        """These variants and the baseline, in the ablation's order; all variants where none is named."""
+        for name in names:
+            self.require_variant(name)
+        return [name for name in self.variants if not names or name in (*names, self.baseline)]
+
+
+@dataclass(frozen=True)
+class CellKey:
+    """One training of a grid. `scene`: the capture's name."""
+
+    scene: str
+    variant: str
+    seed: int
+
+    @property
+    def file(self) -> Path:
+        """Where its result is, relative to the cells' folder."""
+        return Path(self.scene) / f"{self.variant}--seed{self.seed}.json"
+
+    def __str__(self) -> str:
+        return f"{self.scene}, {self.variant}, seed {self.seed}"
+
+
+def ablation_names() -> list[str]:
+    """Names of the ablations that come with TurboGS."""
+    folder = resources.files("turbogs_plugin.configs.ablations")
+    return sorted(entry.name[: -len(".yaml")] for entry in folder.iterdir() if entry.name.endswith(".yaml"))
+
+
+def load_ablation(name_or_file: str) -> Ablation:
+    """The ablation of a packaged name or a YAML file.
+
+    Raises:
+        InputError: an unknown name, an unreadable file, or one that is not an ablation.
+    """
+    if name_or_file in ablation_names():
+        folder = resources.files("turbogs_plugin.configs.ablations")
+        text = (folder / f"{name_or_file}.yaml").read_text(encoding="utf-8")
+        mapping: dict[str, Any] = parse_yaml(text, name_or_file)
+    elif Path(name_or_file).suffix in (".yaml", ".yml") or Path(name_or_file).is_file():
+        mapping = read_yaml(Path(name_or_file))
+    else:
+        raise InputError(
+            f"unknown ablation '{name_or_file}': {nearest(name_or_file, ablation_names())}, or a .yaml file"
+        )
+    return build_dataclass(Ablation, mapping, f"ablation '{name_or_file}'")
+
+
+def alike_at(ablation: Ablation, variants: Sequence[str], overrides: Sequence[str], steps: int) -> dict[str, str]:
+    """Of these variants, those that a common length leaves without a difference -> the one that they would repeat.
+
+    A length that is asked for is not the plan's to change, so that a variant about `plan.looks` would be another one
+    under its own name. Which variants are the same at their own lengths as well is the ablation's affair.
+
+    Raises:
+        InputError: naming the variant, whatever is wrong with its configuration.
+    """
+
+    def text(variant: str, length: int | None) -> str:
+        mapping = variant_config(ablation, variant, 0, overrides, length).to_mapping()
+        if mapping["plan"]["iterations"] == "keep":
+            del mapping["plan"]["looks"]
+        return json.dumps(mapping, sort_keys=True)
+
+    alike: dict[str, str] = {}
+    first: dict[str, str] = {}
+    for variant in sorted(variants, key=lambda name: name != ablation.baseline):
+        known = first.setdefault(text(variant, steps), variant)
+        if known != variant and text(known, None) != text(variant, None):
+            alike[variant] = known
+    return alike
+
+
+def variant_config(ablation: Ablation, variant: str, seed: int, overrides: Sequence[str], steps: int | None) -> Config:
+    """The configuration of a variant.
+
+    Args:
+        overrides: of all variants, on top of the variant's own.
+        steps: iterations; None: the configuration's own number.
+
+    Raises:
+        InputError: naming the variant, whatever is wrong with its configuration.
+    """
+    try:
+        config = load_config(ablation.base, [*ablation.variants[variant], *overrides, f"train.seed={seed}"])
+    except InputError as error:
+        raise InputError(f"variant '{variant}': {error}") from None
+    if config.budget.time or config.budget.max_memory:
+        raise InputError(
+            f"variant '{variant}': budget.time and budget.max_memory are of single runs; "
+            "cells are compared at equal lengths, or end by --time-budget"
+        )
+    return config if steps is None else with_iterations(config, steps)

@@ -1,0 +1,214 @@
+"""The report of a study: ``report.md``, ``report.html``, ``table.csv``, and the plots as PNGs."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Sequence
+from dataclasses import fields
+from pathlib import Path
+
+from turbogs_plugin.files import write_text_atomically
+from turbogs_plugin.study.document import Block, Heading, Paragraph, Picture, Table, to_html, to_markdown
+from turbogs_plugin.study.plots import plot_curves, plot_front
+from turbogs_plugin.study.results import CellResult, Study
+from turbogs_plugin.study.statistics import Spread
+from turbogs_plugin.study.summary import Reach, SceneSummary, VariantRow, summarise
+from turbogs_plugin.study.timing import TIMING_RULES
+
+MIB = 2**20
+
+HOW_TO_READ = (
+    "A number is the mean over seeds, the smallest and the largest in brackets where they matter. Two variants are "
+    "called different only where these ranges do not overlap; with one seed that stays open. A star marks the Pareto "
+    "front: no other variant is at least as fast and as good."
+)
+
+
+def write_study(folder: Path, study: Study, targets: Sequence[float] = ()) -> Path:
+    """Write the report of a study into a folder that exists; the HTML page.
+
+    Args:
+        targets: PSNRs whose time is asked for; none: from the baseline's result.
+    """
+    summaries = summarise(study, targets)
+    blocks = _header(study)
+    for summary in summaries:
+        blocks += _scene(folder, study, summary)
+    if study.failures:
+        blocks += [
+            Heading("Cells without a result"),
+            Table(
+                ("cell", "reason"), [(str(failure.key), failure.reason) for failure in study.failures], numeric=False
+            ),
+        ]
+    blocks += _settings(study)
+    write_text_atomically(folder / "table.csv", table_csv(study, summaries))
+    write_text_atomically(folder / "report.md", to_markdown(study.ablation.title, blocks, folder))
+    page = folder / "report.html"
+    write_text_atomically(page, to_html(study.ablation.title, blocks))
+    return page
+
+
+def _header(study: Study) -> list[Block]:
+    results = study.results
+    # The plan may have made them other than configured, a time budget fewer.
+    lengths = sorted({result.final.iteration for result in results if not result.stopped_early})
+    budgets = sorted({result.time_budget for result in results} - {0.0})
+    warmups = sorted({result.warmup_iterations for result in results})
+    budget = f", at most {_listing(budgets)} s of training" if budgets else ""
+    warmup = (
+        f"Before the clock starts, {_listing(warmups)} iterations of the same configuration, scaled to that length, "
+        "train a model that is thrown away."
+        if any(warmups)
+        else "Without warm-up."
+    )
+    blocks: list[Block] = [
+        Paragraph(f"{_listing(lengths) or 'As many'} iterations{budget}. {TIMING_RULES} {warmup}"),
+        Paragraph(HOW_TO_READ),
+    ]
+    missing = sorted({result.lpips_reason for result in results if result.lpips_reason})
+    blocks += [Paragraph(f"LPIPS was not computed: {reason}.") for reason in missing]
+    return [*blocks, *_machines(results)]
+
+
+def _machines(results: Sequence[CellResult]) -> list[Block]:
+    made = []
+    for result in results:
+        if result.provenance not in made:
+            made.append(result.provenance)
+    recorded = [entry for entry in made if entry is not None]
+    rows = [
+        (
+            entry.machine,
+            entry.kernels,
+            entry.commit or "unknown",
+            ", ".join(f"{name} {version}" for name, version in entry.software.items()),
+        )
+        for entry in recorded
+    ]
+    blocks: list[Block] = [Table(("machine", "kernels", "commit", "software"), rows, numeric=False)] if rows else []
+    if None in made:
+        blocks.append(Paragraph("The machine is not recorded for every run; seconds compare only within one machine."))
+    if len({entry.machine for entry in recorded}) > 1:
+        blocks.append(Paragraph("Cells are from different machines: their seconds do not compare."))
+    return blocks
+
+
+def _scene(folder: Path, study: Study, summary: SceneSummary) -> list[Block]:
+    curves, front = (folder / f"{summary.scene}-{name}.png" for name in ("curves", "pareto"))
+    plot_curves(curves, summary)
+    plot_front(front, summary)
+    against = f" against {summary.baseline}" if summary.baseline else ""
+    header = (
+        *("variant", "front", "seeds", "time in s", f"time{against}", "PSNR in dB", f"PSNR{against}"),
+        *("worst view in dB", "SSIM", "LPIPS (VGG)", "Gaussians", "FPS", "peak MiB"),
+    )
+    reach_header = ["variant"]
+    for target in summary.targets:
+        reach_header += [f"s to {target:.1f} dB", f"ratio{against}"]
+    blocks: list[Block] = [
+        Heading(summary.scene),
+        Table(header, [_result_line(row, summary) for row in summary.rows]),
+        Picture(curves, f"{summary.scene}: error against seconds of training"),
+        Picture(front, f"{summary.scene}: final PSNR against training time"),
+        Heading(f"Time to reach a PSNR on {summary.scene}", 3),
+        Table(reach_header, [_reach_line(row) for row in summary.rows]),
+    ]
+    early = [f"{row.name} (at {_listing(sorted(row.iterations))})" for row in summary.rows if row.iterations]
+    if early:
+        blocks.append(Paragraph(f"Stopped by the time budget, at iteration: {', '.join(early)}."))
+    return blocks
+
+
+def _result_line(row: VariantRow, summary: SceneSummary) -> tuple[str, ...]:
+    base = summary.row(summary.baseline)
+    is_base = base is None or row.name == base.name
+    ratio = "" if is_base else f"x {row.seconds.mean / base.seconds.mean:.2f}{_verdict(row.seconds_differ)}"
+    difference = "" if is_base else f"{row.psnr_difference:+.2f}{_verdict(row.psnr_differs)}"
+    return (
+        row.name,
+        "★" if row.on_front else "",
+        str(len(row.seeds)),
+        spread_text(row.seconds, 1),
+        ratio,
+        spread_text(row.psnr, 2),
+        difference,
+        spread_text(row.worst_psnr, 2, "not recorded"),
+        spread_text(row.ssim, 4),
+        spread_text(row.lpips, 4),
+        f"{row.gaussians.mean:.0f}",
+        "not recorded" if math.isnan(row.fps.mean) else f"{row.fps.mean:.0f}",
+        "not measured" if math.isnan(row.peak_bytes.mean) else f"{row.peak_bytes.mean / MIB:.0f}",
+    )
+
+
+def _verdict(different: bool | None) -> str:
+    return {None: " (open)", True: " (different)", False: " (overlap)"}[different]
+
+
+def _reach_line(row: VariantRow) -> list[str]:
+    line = [row.name]
+    for reach in row.reaches:
+        line += [_reach_text(reach), "" if math.isnan(reach.ratio) else f"x {reach.ratio:.2f}"]
+    return line
+
+
+def _reach_text(reach: Reach) -> str:
+    if reach.reached == 0:
+        return "not reached"
+    if reach.reached < reach.seconds.count:
+        return f"{reach.reached} of {reach.seconds.count} seeds"
+    return spread_text(reach.seconds, 2)
+
+
+def spread_text(spread: Spread, digits: int, absent: str = "not computed") -> str:
+    """``mean [low, high]``; the mean alone for one seed."""
+    if math.isnan(spread.mean):
+        return absent
+    if spread.count == 1:
+        return f"{spread.mean:.{digits}f}"
+    return f"{spread.mean:.{digits}f} [{spread.low:.{digits}f}, {spread.high:.{digits}f}]"
+
+
+def _settings(study: Study) -> list[Block]:
+    ablation = study.ablation
+    tried = {result.variant for result in study.results} | {failure.key.variant for failure in study.failures}
+    rows = [
+        (name, ", ".join(overrides) or "as the base", ablation.notes.get(name, ""))
+        for name, overrides in ablation.variants.items()
+        if name in tried
+    ]
+    return [
+        Heading("Variants"),
+        Paragraph(f"Overrides of the configuration '{ablation.base}'. The resolved ones are in the cells' JSON files."),
+        Table(("variant", "overrides", "note"), rows, numeric=False),
+    ]
+
+
+def table_csv(study: Study, summaries: Sequence[SceneSummary]) -> str:
+    """All numbers of the tables, unrounded; empty where not computed or not measured, ``inf`` where never reached."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    spreads = [field.name for field in fields(VariantRow) if field.type == "Spread"]
+    header = ["scene", "variant", "seeds", "pareto", "psnr_differs_from_baseline", "seconds_differ_from_baseline"]
+    header += [f"{name}_{part}" for name in spreads for part in ("mean", "low", "high")]
+    most = max((len(summary.targets) for summary in summaries), default=0)
+    for number in range(most):
+        header += [f"target_{number}_psnr", f"target_{number}_seconds", f"target_{number}_ratio"]
+    writer.writerow(header)
+    for summary in summaries:
+        for row in summary.rows:
+            line = [summary.scene, row.name, len(row.seeds), row.on_front, row.psnr_differs, row.seconds_differ]
+            for name in spreads:
+                spread = getattr(row, name)
+                line += [spread.mean, spread.low, spread.high]
+            for reach in row.reaches:
+                line += [reach.psnr, reach.seconds.mean, reach.ratio]
+            writer.writerow(["" if value is None or value != value else value for value in line])
+    return text.getvalue()
+
+
+def _listing(values: Sequence[float]) -> str:
+    return ", ".join(f"{value:g}" for value in values)

@@ -1,0 +1,158 @@
+"""Pictures of a study: error against seconds of every variant in one plot, and the Pareto front."""
+
+from __future__ import annotations
+
+import itertools
+from pathlib import Path
+
+import matplotlib
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patheffects import withStroke
+from matplotlib.transforms import Bbox
+
+from turbogs_plugin.report.plots import STYLE
+from turbogs_plugin.study.summary import SceneSummary, VariantRow
+
+COLORS = ("#1f5fa8", "#d1495b", "#2e8b57", "#e08e0b", "#7a4fa3", "#17919e", "#8c5a3c", "#5c6670")
+DASHES = ("-", "--", ":", "-.")
+BASELINE_COLOR = "black"
+OTHER_COLOR = "0.75"
+LABEL_SIZE = 8
+TOLD_APART_UP_TO = 10
+"""So many variants have a colour and a shaded spread each; of more, only the baseline and the Pareto front have."""
+
+SHOWN_BELOW = 4.0
+"""dB below the worst final result at which the PSNR plot ends: what comes before is over in a moment."""
+SHOWN_ABOVE = 1.6
+"""Times the worst final error, at which that plot ends: 4 dB as well."""
+FAILED_BELOW = 8.0
+"""dB below the best final result at which a variant has failed: it is named below a plot to the scale of the others."""
+
+
+def _styles(summary: SceneSummary) -> dict[str, tuple[str, str]]:
+    """Variant -> (colour, dash): black for the baseline, else one of each combination."""
+    combinations = ((color, dash) for dash, color in itertools.product(DASHES, COLORS))
+    return {
+        row.name: (BASELINE_COLOR, "-") if row.name == summary.baseline else style
+        for row, style in zip(summary.rows, itertools.cycle(combinations), strict=False)
+    }
+
+
+def told_apart(summary: SceneSummary) -> tuple[list[VariantRow], str]:
+    """The variants that set a plot's scale, and a line that names those that failed ("" for none)."""
+    floor = max(row.psnr.mean for row in summary.rows) - FAILED_BELOW
+    failed = [row for row in summary.rows if row.psnr.mean < floor]
+    shown = [row for row in summary.rows if not row.psnr.mean < floor]  # NaN is shown
+    words = (f"{row.name} ({row.psnr.mean:.1f} dB in {row.seconds.mean:.1f} s)" for row in failed)
+    return shown, "Not in the plot: " + ", ".join(words) if failed else ""
+
+
+def plot_curves(path: Path, summary: SceneSummary) -> None:
+    """PSNR and mean absolute error against seconds: mean over seeds, their spread shaded.
+
+    Of more variants than can be told apart, those that are neither the baseline nor on the Pareto front are thin and
+    grey behind these; the front's plot has their names.
+    """
+    styles, (rows, failed) = _styles(summary), told_apart(summary)
+    few = len(rows) <= TOLD_APART_UP_TO
+    named, others = [], []
+    for row in rows:
+        (named if few or row.on_front or row.name == summary.baseline else others).append(row)
+    with matplotlib.rc_context({**STYLE, "lines.markersize": 3.5}):
+        figure = Figure(figsize=(12.0, 5.2), layout="constrained")
+        for axes, name in zip(figure.subplots(1, 2), ("psnr", "l1"), strict=True):
+            for row in others:
+                curve = getattr(row, f"{name}_curve")
+                label = f"{len(others)} others" if row is others[0] else None
+                axes.plot(curve.seconds, curve.mean, color=OTHER_COLOR, linewidth=0.8, label=label)
+            for row in named:
+                curve = getattr(row, f"{name}_curve")
+                color, dash = styles[row.name]
+                axes.plot(curve.seconds, curve.mean, dash, marker="o", color=color, label=row.name)
+                if row.psnr.count > 1:
+                    axes.fill_between(curve.seconds, curve.low, curve.high, color=color, alpha=0.15, linewidth=0)
+            axes.set_xlabel("training time in seconds (evaluation excluded)")
+            axes.set_xlim(left=0)
+        psnr_axes, l1_axes = figure.axes
+        floor = min(row.psnr.mean for row in rows) - SHOWN_BELOW
+        psnr_axes.set(ylabel="test PSNR in dB", title=f"{summary.scene}: PSNR")
+        psnr_axes.set_ylim(bottom=max(floor, psnr_axes.get_ylim()[0]))
+        l1_axes.set(ylabel="mean absolute error on test views (0 .. 1)", title="mean absolute error")
+        ceiling = SHOWN_ABOVE * max(row.l1_curve.mean[-1] for row in rows)
+        floor = 0.9 * min(min(row.l1_curve.mean) for row in rows)
+        l1_axes.set_ylim(bottom=floor, top=min(ceiling, l1_axes.get_ylim()[1]))
+        handles, labels = psnr_axes.get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside right center", frameon=False, fontsize=9)
+        figure.supxlabel(failed, fontsize=9)
+        figure.savefig(path)
+
+
+def plot_front(path: Path, summary: SceneSummary) -> None:
+    """Final PSNR against training time: a point a variant with the seeds' spreads, the Pareto front marked."""
+    styles, (rows, failed) = _styles(summary), told_apart(summary)
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(8.6, 5.2), layout="constrained")
+        axes = figure.add_subplot()
+        for row in rows:
+            axes.errorbar(
+                row.seconds.mean,
+                row.psnr.mean,
+                xerr=[[row.seconds.mean - row.seconds.low], [row.seconds.high - row.seconds.mean]],
+                yerr=[[row.psnr.mean - row.psnr.low], [row.psnr.high - row.psnr.mean]],
+                fmt="*" if row.on_front else "o",
+                markersize=13 if row.on_front else 6,
+                color=styles[row.name][0],
+                elinewidth=1.0,
+                alpha=0.9,
+            )
+        front = sorted((row for row in rows if row.on_front), key=lambda row: row.seconds.mean)
+        axes.step(
+            [row.seconds.mean for row in front],
+            [row.psnr.mean for row in front],
+            where="post",
+            color="grey",
+            linewidth=1.2,
+            zorder=0,
+            label="Pareto front (stars)",
+        )
+        axes.set(
+            xlabel="training time in seconds (evaluation excluded)",
+            ylabel="final test PSNR in dB",
+            title=f"{summary.scene}: error against time",
+        )
+        axes.margins(x=0.18, y=0.12)
+        axes.legend(loc="lower right", frameon=False, fontsize=9)
+        figure.supxlabel(failed, fontsize=9)
+        _label_points(axes, rows)
+        figure.savefig(path)
+
+
+def _label_points(axes: Axes, rows: list[VariantRow]) -> None:
+    """Names beside their points, each where it meets no other name and no other point, if there is such a place."""
+    axes.figure.draw_without_rendering()  # so that places in pixels are those of the picture
+    points = axes.transData.transform([(row.seconds.mean, row.psnr.mean) for row in rows])
+    pixels = axes.figure.dpi / 72.0
+    height = 1.3 * LABEL_SIZE * pixels
+    taken = [Bbox.from_bounds(x - 7, y - 7, 14, 14) for x, y in points]
+    for row, (x, y) in zip(rows, points, strict=True):
+        width = 0.62 * LABEL_SIZE * pixels * len(row.name)
+        places = [
+            Bbox.from_bounds(x + right, y + up - height / 2, width, height)
+            for up in (0.0, height, -height, 2 * height, -2 * height, 3 * height, -3 * height)
+            for right in (12.0, -12.0 - width)
+        ]
+        place = min(places, key=lambda box: sum(box.overlaps(other) for other in taken))
+        taken.append(place)
+        axes.annotate(
+            row.name,
+            (x, y),
+            xycoords="figure pixels",
+            xytext=(place.x0, (place.y0 + place.y1) / 2),
+            textcoords="figure pixels",
+            va="center",
+            fontsize=LABEL_SIZE,
+            path_effects=[withStroke(linewidth=2.5, foreground="white")],  # error bars and the front pass behind
+            arrowprops={"arrowstyle": "-", "color": "0.7", "linewidth": 0.6, "shrinkA": 0, "shrinkB": 3},
+            annotation_clip=False,
+        )

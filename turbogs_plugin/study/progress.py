@@ -1,0 +1,89 @@
+"""What a sweep shows: a line a cell with the time left, and on a terminal a bar of the present one."""
+
+from __future__ import annotations
+
+import sys
+import time
+from types import TracebackType
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn
+
+from turbogs_plugin.study.grid import CellKey
+from turbogs_plugin.study.results import CellResult, Failure
+from turbogs_plugin.train.progress import REFRESH_SECONDS
+
+
+class SweepProgress:
+    """Shows cells as they finish, on stderr.
+
+    Args:
+        total: cells to train.
+        kept: cells that were there already.
+    """
+
+    def __init__(self, total: int, kept: int) -> None:
+        self.total, self.done = total, 0
+        self._started = time.perf_counter()
+        self._next_refresh = 0.0
+        self._bar: Progress | None = None
+        if kept:
+            self._say(f"{kept} finished cells are kept")
+        if sys.stderr.isatty():
+            columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[left]}"))
+            self._bar = Progress(*columns, console=Console(stderr=True), auto_refresh=False, transient=True)
+            self._task = self._bar.add_task("", total=None, left="")
+
+    def __enter__(self) -> SweepProgress:
+        if self._bar is not None:
+            self._bar.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        if self._bar is not None:
+            self._bar.stop()
+
+    def begin(self, key: CellKey) -> None:
+        """Called before a cell."""
+        if self._bar is not None:
+            self._bar.reset(self._task, total=None, description=str(key), left=self._left())
+
+    def advance(self, iteration: int, total: int) -> None:
+        """Called after every iteration; cheap."""
+        if self._bar is None or time.perf_counter() < self._next_refresh:
+            return
+        self._next_refresh = time.perf_counter() + REFRESH_SECONDS
+        self._bar.update(self._task, completed=iteration, total=total)
+        self._bar.refresh()
+
+    def finished(self, result: CellResult) -> None:
+        """Called after a cell."""
+        final = result.final
+        early = f", stopped by the time budget at iteration {final.iteration}" if result.stopped_early else ""
+        self._count(
+            f"{result.key}: {final.psnr:.2f} dB in {final.train_seconds:.1f} s, {final.num_gaussians} Gaussians{early}"
+        )
+
+    def failed(self, failure: Failure) -> None:
+        """Called after a cell that broke."""
+        self._count(f"{failure.key}: FAILED: {failure.reason}")
+
+    def _count(self, text: str) -> None:
+        self.done += 1
+        left = self._left()
+        self._say(f"[{self.done}/{self.total}] {text}" + (f"; {left}" if left else ""))
+
+    def _left(self) -> str:
+        """From the mean time of the cells so far, all they needed included."""
+        if not self.done or self.done == self.total:
+            return ""
+        seconds = round((time.perf_counter() - self._started) / self.done * (self.total - self.done))
+        return f"about {seconds // 60} min {seconds % 60:02d} s left"
+
+    def _say(self, text: str) -> None:
+        if self._bar is not None:
+            self._bar.console.print(text, markup=False, highlight=False)
+        else:
+            print(text, file=sys.stderr, flush=True)

@@ -1,0 +1,94 @@
+"""Numbers over seeds: means and spreads, when two are different, time to reach an error, and the Pareto front."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from turbogs_plugin.train.history import Evaluation
+
+
+@dataclass(frozen=True)
+class Spread:
+    """A quantity over seeds.
+
+    Args:
+        mean, low, high: of the seeds' values; NaN where there is none.
+        count: seeds.
+    """
+
+    mean: float
+    low: float
+    high: float
+    count: int
+
+    @classmethod
+    def of(cls, values: Iterable[float]) -> Spread:
+        """NaN in any value makes all NaN: a mean over some of the seeds would be compared with means over all."""
+        values = list(values)
+        if not values or any(math.isnan(value) for value in values):
+            return cls(math.nan, math.nan, math.nan, len(values))
+        return cls(math.fsum(values) / len(values), min(values), max(values), len(values))
+
+
+def differ(first: Spread, second: Spread) -> bool | None:
+    """Whether the seeds' spreads [low, high] do not overlap; None where fewer than two seeds leave that open."""
+    if min(first.count, second.count) < 2 or math.isnan(first.mean + second.mean):
+        return None
+    return first.high < second.low or second.high < first.low
+
+
+def seconds_to_reach(history: Sequence[Evaluation], psnr: float) -> float:
+    """Seconds of training after which a run first reached this test PSNR, linear between evaluations; inf if never."""
+    for before, after in zip([None, *history], history, strict=False):
+        if after.psnr >= psnr:
+            if before is None:
+                return after.train_seconds
+            share = (psnr - before.psnr) / (after.psnr - before.psnr)
+            return before.train_seconds + share * (after.train_seconds - before.train_seconds)
+    return math.inf
+
+
+@dataclass(frozen=True)
+class Curve:
+    """One measure against seconds over seeds, at the iterations that every seed evaluated.
+
+    Args:
+        seconds: [E] mean over seeds.
+        mean, low, high: [E] of the measure.
+    """
+
+    seconds: np.ndarray
+    mean: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+
+    @classmethod
+    def of(cls, histories: Sequence[Sequence[Evaluation]], name: str) -> Curve:
+        """Of a field of `Evaluation`. Where a time budget ended seeds at different iterations, the ends are paired."""
+        common = set.intersection(*({entry.iteration for entry in history} for history in histories))
+        rows = [[entry for entry in history if entry.iteration in common] for history in histories]
+        if any(history[-1].iteration not in common for history in histories):
+            rows = [[*row, history[-1]] for row, history in zip(rows, histories, strict=True)]
+        values = np.array([[getattr(entry, name) for entry in row] for row in rows])  # [seeds, E]
+        seconds = np.array([[entry.train_seconds for entry in row] for row in rows])
+        return cls(seconds.mean(axis=0), values.mean(axis=0), values.min(axis=0), values.max(axis=0))
+
+
+def pareto_front(points: Sequence[tuple[float, float]]) -> list[bool]:
+    """For each (seconds, quality) whether no other is at least as fast and as good, and better in one of the two.
+
+    A point with NaN is not on the front and keeps nobody from it.
+    """
+
+    def beats(first: tuple[float, float], second: tuple[float, float]) -> bool:
+        return first[0] <= second[0] and first[1] >= second[1] and first != second
+
+    valid = [not math.isnan(seconds + quality) for seconds, quality in points]
+    return [
+        valid[number] and not any(beats(other, point) for other, good in zip(points, valid, strict=True) if good)
+        for number, point in enumerate(points)
+    ]

@@ -1,0 +1,232 @@
+"""Carries a grid out: variants x scenes x seeds in one process, resumable, with the scene loaded once."""
+
+from __future__ import annotations
+
+import gc
+import itertools
+import json
+import math
+import traceback
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from turbogs_plugin.config.configuration import Config
+from turbogs_plugin.errors import InputError, TrainingStopped
+from turbogs_plugin.report.provenance import COMMIT_VARIABLE, MODIFIED, Provenance
+from turbogs_plugin.scene import Scene, load_scene
+from turbogs_plugin.study.cell import capture_digest, train_cell
+from turbogs_plugin.study.grid import Ablation, CellKey, variant_config
+from turbogs_plugin.study.progress import SweepProgress
+from turbogs_plugin.study.results import CellResult, Failure, StudyFolder
+from turbogs_plugin.train.evaluate import synchronize
+from turbogs_plugin.train.run import resolve_device
+
+UNCOMPARED = (("scene", "path"), ("train", "device"))
+"""Settings that may differ between a kept cell and the present call: where things are, not what is computed."""
+
+
+@dataclass
+class SweepOptions:
+    """How a grid is carried out.
+
+    Args:
+        scenes: folders of captures, of different names.
+        seeds: of each variant.
+        overrides: ``section.key=value`` of all variants.
+        steps: iterations of every cell; None: the configurations' own.
+        time_budget: seconds of training after which a cell stops; 0: none.
+        device: auto, cpu or cuda.
+        reuse: other studies; a cell of the same settings, made by the same sources on the same machine, is taken from
+            them. Tables share variants, the baseline above all.
+    """
+
+    scenes: Sequence[Path]
+    seeds: Sequence[int] = (0,)
+    overrides: Sequence[str] = ()
+    steps: int | None = None
+    time_budget: float = 0.0
+    device: str = "auto"
+    reuse: Sequence[Path] = ()
+
+    def __post_init__(self) -> None:
+        scenes = [path.resolve() for path in self.scenes]
+        for what, values in (("scenes", [str(path) for path in scenes]), ("seeds", list(self.seeds))):
+            if not values or len(set(values)) != len(values):
+                raise InputError(f"{what}: one or more different ones are needed, got {values}")
+        for first, second in itertools.combinations(scenes, 2):
+            if first.name == second.name:
+                raise InputError(f"scenes: two folders are called '{first.name}', {first} and {second}: rename one")
+        if not 0 <= self.time_budget < math.inf:
+            raise InputError(f"the time budget is {self.time_budget}: it must be 0 (none) or a number of seconds")
+
+
+def run_sweep(
+    ablation: Ablation,
+    variants: Sequence[str],
+    options: SweepOptions,
+    here: Provenance,
+    folder: StudyFolder,
+    siblings: Sequence[StudyFolder] = (),
+) -> None:
+    """Train the cells that are not there yet and keep each result as it comes.
+
+    A cell that breaks is kept as a failure and the rest goes on; the same call tries it again.
+
+    Args:
+        ablation: all of it is what the study is of.
+        variants: of it, the ones to train now.
+        here: machine and sources, as they were when the process began.
+        siblings: studies by this very process, whose cells of the same settings are taken.
+
+    Raises:
+        InputError: anything wrong with the input (then nothing was trained), or a cell made by another configuration.
+        TrainingStopped: the GPU can no longer be used by this process.
+    """
+    folder.require_usable()
+    finished = folder.read_results()
+    for result in finished.values():
+        if result.variant not in ablation.variants:
+            raise InputError(f"'{folder.path}' has a cell of another ablation ({result.key}): choose a new --out")
+    device = resolve_device(options.device)
+    reusable = _reusable_cells(options, here, siblings)
+    grid: dict[str, list[tuple[CellKey, Config]]] = {}
+    taken: list[CellResult] = []
+    kept = 0
+    # All scenes are read before anything is trained, so that a wrong one is known at once.
+    loaded: dict[str, Scene] = {}
+    for path in options.scenes:
+        name = path.resolve().name
+        configs = _scene_configs(ablation, variants, options, path.resolve(), device)
+        settings = next(iter(configs.values())).scene
+        scene = load_scene(path, settings.factor, settings.test_every)
+        capture = capture_digest(scene)
+        grid[name] = []
+        for key, config in configs.items():
+            known = reusable.get((name, capture, _comparable(config.to_mapping())))
+            if key in finished:
+                _require_same(finished[key], config, options.time_budget)
+                kept += 1
+            elif known is not None:
+                taken.append(replace(known, variant=key.variant))
+            else:
+                grid[name].append((key, config))
+        _require_capture(finished.values(), name, capture)
+        if grid[name]:
+            loaded[name] = scene
+        del scene  # photos take room
+    folder.write_ablation(ablation)
+    for result in taken:
+        folder.write(result)
+    with SweepProgress(sum(map(len, grid.values())), kept + len(taken)) as progress:
+        for name, cells in grid.items():
+            if cells:
+                _train_scene(cells, loaded.pop(name), device, here, options.time_budget, folder, progress)
+
+
+def _scene_configs(
+    ablation: Ablation, variants: Sequence[str], options: SweepOptions, scene: Path, device: torch.device
+) -> dict[CellKey, Config]:
+    """The cells of a scene, seed after seed. Raises `InputError` where they would not share its photos."""
+    configs: dict[CellKey, Config] = {}
+    for seed in options.seeds:
+        for variant in variants:
+            config = variant_config(ablation, variant, seed, options.overrides, options.steps)
+            config.scene.path, config.train.device = str(scene), device.type
+            configs[CellKey(scene.name, variant, seed)] = config
+            if config.scene != next(iter(configs.values())).scene:
+                raise InputError(f"variant '{variant}' changes the scene's photos, which all variants share")
+    return configs
+
+
+def _train_scene(
+    cells: list[tuple[CellKey, Config]],
+    scene: Scene,
+    device: torch.device,
+    here: Provenance,
+    time_budget: float,
+    folder: StudyFolder,
+    progress: SweepProgress,
+) -> None:
+    for key, config in cells:
+        progress.begin(key)
+        try:
+            result = train_cell(key.variant, config, scene, device, here, time_budget, progress.advance)
+        except Exception as error:  # whatever a variant breaks by, the other cells go on
+            failure = Failure(key, _reason(error))
+            folder.write_failure(failure)
+            progress.failed(failure)
+            # Its traceback holds the broken model.
+            del error
+            _require_working(device)
+        else:
+            folder.write(result)
+            progress.finished(result)
+
+
+def _require_capture(results: Iterable[CellResult], scene: str, capture: str) -> None:
+    for result in results:
+        if result.scene == scene and result.capture not in ("", capture):
+            raise InputError(
+                f"the cell '{result.key}' has other photos or cameras than '{scene}' has now: choose a new --out"
+            )
+
+
+def _require_same(present: CellResult, config: Config, time_budget: float) -> None:
+    made, wanted = (_sections(mapping) for mapping in (present.config, config.to_mapping()))
+    if made != wanted or present.time_budget != time_budget:
+        sections = [name for name in wanted if made.get(name) != wanted[name]] or ["the time budget"]
+        raise InputError(
+            f"the cell '{present.key}' was made with other settings ({', '.join(sections)}): choose a new --out"
+        )
+
+
+def _reusable_cells(
+    options: SweepOptions, here: Provenance, siblings: Sequence[StudyFolder]
+) -> dict[tuple[str, str, str], CellResult]:
+    """(scene, capture, settings) -> a result of another study that a cell of these settings would repeat."""
+    if options.reuse and (not here.commit or here.commit.endswith(MODIFIED)):
+        raise InputError(f"--reuse needs sources of a known commit, without changes; {COMMIT_VARIABLE} may name it")
+    folders = [*map(StudyFolder, options.reuse), *siblings]
+    results = [result for folder in folders for result in folder.read_study().results]
+    return {
+        (result.scene, result.capture, _comparable(result.config)): result
+        for result in results
+        if result.capture and (result.time_budget, result.provenance) == (options.time_budget, here)
+    }
+
+
+def _comparable(mapping: dict[str, Any]) -> str:
+    """What decides a result, as text to compare."""
+    return json.dumps(_sections(mapping), sort_keys=True)
+
+
+def _sections(mapping: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    sections = {name: dict(section) for name, section in mapping.items()}
+    for section, name in UNCOMPARED:
+        sections[section].pop(name, None)
+    return sections
+
+
+def _reason(error: Exception) -> str:
+    """One line: what happened, and where unless the message is written for the user."""
+    text = " ".join(str(error).split()) or "no message"
+    if isinstance(error, InputError | TrainingStopped):
+        return text
+    frame = traceback.extract_tb(error.__traceback__)[-1]
+    return f"{type(error).__name__}: {text[:500]} ({Path(frame.filename).name}:{frame.lineno})"
+
+
+def _require_working(device: torch.device) -> None:
+    """After a failure: free its memory, and see whether the GPU still answers this process."""
+    gc.collect()
+    try:
+        synchronize(device)
+    except RuntimeError as error:
+        reason = str(error).splitlines()[0]
+        raise TrainingStopped(f"the GPU no longer answers this process ({reason}): the same command goes on") from None
+    if device.type == "cuda":
+        torch.cuda.empty_cache()

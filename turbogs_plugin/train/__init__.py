@@ -1,0 +1,1 @@
+"""Training: Algorithm 1, the one loop around it, and what a run keeps."""

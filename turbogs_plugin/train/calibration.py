@@ -1,0 +1,260 @@
+"""What budgets change before a run: memory, the cap on Gaussians; time, how long the run is and how many pixels an
+iteration has, by iterations timed on this machine."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import torch
+
+from turbogs_plugin.config.configuration import Config, resolve
+from turbogs_plugin.config.scaling import with_iterations
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.plan.budget import (
+    CAPS,
+    FEWEST_GAUSSIANS,
+    RAISES,
+    IterationCost,
+    MemoryDemand,
+    expected_gaussians,
+    fit_to_time,
+    growth_cap,
+    images_per_iteration,
+    pixel_budget_range,
+    pixels_for_time,
+    with_cap,
+    with_pixel_budget,
+)
+from turbogs_plugin.scene import Scene
+from turbogs_plugin.train.evaluate import free_device_memory, synchronize
+from turbogs_plugin.train.trainer import Trainer
+
+CALIBRATION_SHARE = 0.04
+"""Of the time budget, for the measurements that the first plan rests on: half for lambda as configured."""
+CALIBRATION_SECONDS = 5.0
+"""Never more than that, as further measurements would say no more."""
+WARMUP_ITERATIONS = {"cuda": 20, "cpu": 1}
+"""Not measured: they load code and find the sizes of buffers."""
+FEWEST_MEASURED = {"cuda": 20, "cpu": 2}
+LARGEST_OVERHEAD = 0.7
+"""Share of a time budget that may go before the first iteration."""
+MEMORY_SHARE = 0.5
+"""Of a GPU's free memory, what a run without a limit may come to with more pixels than configured."""
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """What was measured of a scene on this machine before its training.
+
+    Args:
+        seconds: that the measurement took.
+        initialisation: seconds of `Trainer.initialise_maps`, extrapolated from one view.
+        cost: of an iteration with `pixel_budget`.
+        gaussians: at the start.
+        configured_pixel_budget, pixel_budget: lambda as it was, and as chosen to fill the time.
+    """
+
+    seconds: float
+    initialisation: float
+    cost: IterationCost
+    gaussians: int
+    configured_pixel_budget: float
+    pixel_budget: float
+
+    @property
+    def before(self) -> float:
+        """Seconds of training that pass before the first iteration."""
+        return self.seconds + self.initialisation
+
+
+def within_budget(config: Config, scene: Scene, device: torch.device) -> tuple[Config, Calibration | None]:
+    """The configuration that keeps its budgets, and what was measured for it where time is one of them.
+
+    Args:
+        config: its places of maps and photos are decided.
+
+    Raises:
+        InputError: nothing fits, naming what would.
+    """
+    if config.budget.max_gaussians:
+        config = with_cap(config, config.budget.max_gaussians)
+    limit, seconds = config.budget.memory_bytes(), config.budget.seconds()
+    if limit is not None:
+        hold_to(limit, device)
+        config = with_cap(config, _memory_demand(config, scene).gaussians(limit))
+    if seconds is None:
+        return config, None
+    measured = calibrate(config, scene, device, seconds)
+    if measured.pixel_budget > measured.configured_pixel_budget:
+        config = with_pixel_budget(config, measured.pixel_budget)
+        if limit is not None:
+            config = with_cap(config, _memory_demand(config, scene).gaussians(limit))
+    iterations, cap = _fit(config, seconds - measured.before, measured.cost, measured.gaussians)
+    if cap != growth_cap(config, measured.gaussians):
+        config = with_cap(config, cap)
+    return with_iterations(config, iterations), measured
+
+
+def budget_text(config: Config, measured: Calibration | None) -> str:
+    """What the budgets came to, for a terminal; empty where there are none.
+
+    Args:
+        config: as `within_budget` gave it.
+    """
+    parts = []
+    if config.budget.max_gaussians:
+        parts.append(f"at most {config.budget.max_gaussians} Gaussians")
+    if config.budget.max_memory:
+        parts.append(f"{config.budget.max_memory} of device memory")
+    if measured is not None:
+        cost = 1e3 * measured.cost.at(measured.gaussians)
+        configured, chosen = measured.configured_pixel_budget, measured.pixel_budget
+        raised = f" with schedule.pixel_budget {chosen:g} instead of {configured:g}" if chosen > configured else ""
+        parts.append(
+            f"{config.budget.time} of training: about {config.train.iterations} iterations{raised}, for one "
+            f"takes {cost:.3g} ms with {measured.gaussians} Gaussians (measured in {measured.seconds:.1f} s)"
+        )
+    return f"budget: {'; '.join(parts)}" if parts else ""
+
+
+def hold_to(limit: int, device: torch.device) -> None:
+    """Hold torch to a limit of device memory, for the rest of the process.
+
+    Raises:
+        InputError: the device is no GPU.
+    """
+    if device.type != "cuda":
+        raise InputError("--max-memory limits the memory of a GPU: leave it out with --device cpu")
+    total = torch.cuda.get_device_properties(device).total_memory
+    torch.cuda.set_per_process_memory_fraction(min(1.0, limit / total))
+
+
+def _memory_demand(config: Config, scene: Scene) -> MemoryDemand:
+    train, test = scene.train.cameras.sizes.prod(axis=1), scene.test.cameras.sizes.prod(axis=1)
+    largest = int(max(train.max(), test.max()))
+    return MemoryDemand.of(config, int(train.sum()), int(test.sum()), largest, len(train))
+
+
+def _fit(config: Config, seconds: float, cost: IterationCost, gaussians: int) -> tuple[int, int]:
+    """`fit_to_time` of a configuration: (iterations, cap)."""
+    train = config.train
+    share = min(1.0, train.refine_until / train.iterations)
+    keeps_cap = config.density["type"] in CAPS
+    return fit_to_time(seconds, cost, gaussians, growth_cap(config, gaussians), train.iterations, share, keeps_cap)
+
+
+def calibrate(config: Config, scene: Scene, device: torch.device, seconds: float) -> Calibration:
+    """Measure what an iteration costs; where more than the configured ones would fit, with more pixels too.
+
+    Args:
+        seconds: of the time budget. `CALIBRATION_SHARE` of them are for this, at most `CALIBRATION_SECONDS`; more where
+            the fewest iterations that are measured take longer.
+
+    Raises:
+        InputError: too much of the time would pass before the first iteration.
+    """
+    started = time.perf_counter()
+    measured = _measure(config, scene, device, seconds, started)
+    free_device_memory(device)
+    return replace(measured, seconds=time.perf_counter() - started)
+
+
+@torch.no_grad()
+def _measure(config: Config, scene: Scene, device: torch.device, seconds: float, started: float) -> Calibration:
+    """`calibrate`, but for what cleaning up takes."""
+    trial = _Trial(config, scene, device)
+    gaussians, share = trial.gaussians, 0.5 * min(CALIBRATION_SHARE * seconds, CALIBRATION_SECONDS)
+    initialisation, cost = trial.initialisation(), trial.cost(share)
+    before = time.perf_counter() - started + initialisation
+    if before > LARGEST_OVERHEAD * seconds:
+        raise InputError(
+            f"--time-budget {config.budget.time} is too short here: {before:.1f} s pass before the first iteration; "
+            f"allow {math.ceil(before / LARGEST_OVERHEAD)}s or more"
+        )
+    configured, largest = pixel_budget_range(config, len(scene.train))
+    largest = min(largest, configured + _room_for_images(config, scene, device, gaussians))
+    # What more iterations overfit is photos that are looked at often already.
+    images = images_per_iteration(config, len(scene.train))
+    wanted = max(config.train.iterations, math.ceil(config.plan.looks * len(scene.train) / images))
+    # A measured iteration with more pixels takes at most about seconds / iterations.
+    fewest = WARMUP_ITERATIONS[device.type] + FEWEST_MEASURED[device.type]
+    raises = min(RAISES, max(1, int(CALIBRATION_SHARE * wanted / fewest)))
+    costs = {configured: cost}
+
+    def fitting(pixel_budget: float) -> int:
+        if pixel_budget not in costs:
+            # One size of model says it: of two measurements each, the noise of their slopes would decide.
+            costs[pixel_budget] = cost.times(trial.seconds_with(pixel_budget, share / RAISES) / cost.at(gaussians))
+        left = seconds - initialisation - (time.perf_counter() - started)
+        return _fit(config, left, costs[pixel_budget], gaussians)[0]
+
+    chosen = pixels_for_time(configured, largest, wanted, raises, fitting)
+    return Calibration(time.perf_counter() - started, initialisation, costs[chosen], gaussians, configured, chosen)
+
+
+def _room_for_images(config: Config, scene: Scene, device: torch.device, gaussians: int) -> float:
+    """How much lambda may rise before it takes memory from the Gaussians that are expected."""
+    limit = config.budget.memory_bytes()
+    if limit is None and device.type != "cuda":
+        return math.inf
+    if limit is None:
+        limit = int(MEMORY_SHARE * (torch.cuda.mem_get_info(device)[0] + torch.cuda.memory_reserved(device)))
+    expected = max(FEWEST_GAUSSIANS, expected_gaussians(gaussians, growth_cap(config, gaussians)))
+    return _memory_demand(config, scene).more_images(limit, expected)
+
+
+class _Trial:
+    """Iterations before training, to time them: with a model that does not grow, all bands in use."""
+
+    def __init__(self, config: Config, scene: Scene, device: torch.device) -> None:
+        self._config = resolve({**config.to_mapping(), "density": {"type": "none"}})
+        self._trainer = Trainer(self._config, scene, device)
+        self._model = self._trainer.gaussians
+        self._device = device
+
+    @property
+    def gaussians(self) -> int:
+        return len(self._model)
+
+    def initialisation(self) -> float:
+        """Seconds of `Trainer.initialise_maps`, from one view."""
+        self._trainer.initialise_map(0)  # loads code
+        view = _seconds_of(lambda: self._trainer.initialise_map(0), 1, 0.0, self._device)
+        return view * len(self._trainer.views)
+
+    def cost(self, seconds: float) -> IterationCost:
+        """Of an iteration as configured: the line through what half the model and all of it take."""
+        half, whole = (self._timed(stride, 0.5 * seconds) for stride in (2, 1))
+        return IterationCost.through(half, whole)
+
+    def seconds_with(self, pixel_budget: float, seconds: float) -> float:
+        """Of an iteration with this lambda and the whole model."""
+        self._trainer.schedule = with_pixel_budget(self._config, pixel_budget).build("schedule")
+        return self._timed(1, seconds)[1]
+
+    def _timed(self, stride: int, seconds: float) -> tuple[int, float]:
+        """(Gaussians, seconds of an iteration) with every `stride`-th of the initial model."""
+        trainer, train = self._trainer, self._config.train
+        trainer.gaussians = self._model.map(lambda value: value[::stride].clone())
+        trainer.optimizer.setup(trainer.gaussians)
+        # About half way, views and rates of a schedule are what they are in the mean.
+        trainer.iteration = max(train.sh_degree * train.sh_interval, train.iterations // 2)
+        for _ in range(WARMUP_ITERATIONS[self._device.type]):
+            trainer.step()
+        cost = _seconds_of(trainer.step, FEWEST_MEASURED[self._device.type], seconds, self._device)
+        trainer.repeat_lost(wait=True)
+        return len(trainer.gaussians), cost
+
+
+def _seconds_of(function: Callable[[], None], fewest: int, seconds: float, device: torch.device) -> float:
+    """Of one call: the mean over as many as fit into `seconds`, at least `fewest`."""
+    synchronize(device)
+    started, calls = time.perf_counter(), 0
+    while calls < fewest or time.perf_counter() - started < seconds:
+        function()
+        calls += 1
+    synchronize(device)
+    return (time.perf_counter() - started) / calls

@@ -1,0 +1,200 @@
+"""Test error of a model: PSNR, SSIM, mean absolute error, LPIPS where its weights are at hand, and rendering speed."""
+
+from __future__ import annotations
+
+import gc
+import importlib.util
+import math
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+from torchmetrics.functional.image import structural_similarity_index_measure
+
+from turbogs_plugin.engine.rendering import RasterSettings, render_images
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.scene import PosedImages
+from turbogs_plugin.types import Gaussians
+
+SSIM_SIDE = 11
+"""Side of SSIM's Gaussian window; a smaller image has none."""
+
+PSNR_LIMIT = 100.0
+"""PSNR of an exact match, in dB."""
+
+VGG16_FILE = "vgg16-397923af.pth"
+"""The name under which torchvision looks for the backbone of LPIPS."""
+
+
+@dataclass
+class ViewMetrics:
+    """Errors of one test view; `ssim` and `lpips` are NaN where they cannot be computed."""
+
+    name: str
+    psnr: float
+    ssim: float
+    l1: float
+    lpips: float = math.nan
+
+
+@dataclass
+class Metrics:
+    """Errors of a model over its test views: means of the views' values.
+
+    Args:
+        views: each test view.
+        fps: test views rendered a second, one after the other.
+    """
+
+    views: list[ViewMetrics]
+    fps: float
+
+    def mean(self, name: str) -> float:
+        """The mean over views of `psnr`, `ssim`, `l1` or `lpips`; NaN where a view has none."""
+        return math.fsum(getattr(view, name) for view in self.views) / len(self.views)
+
+    @property
+    def psnr(self) -> float:
+        return self.mean("psnr")
+
+    @property
+    def worst_psnr(self) -> float:
+        """Of the worst view: a mean hides that something covers one of them. NaN where a view has none."""
+        values = [view.psnr for view in self.views]
+        return math.nan if any(map(math.isnan, values)) else min(values)
+
+    @property
+    def ssim(self) -> float:
+        return self.mean("ssim")
+
+    @property
+    def l1(self) -> float:
+        return self.mean("l1")
+
+    @property
+    def lpips(self) -> float:
+        return self.mean("lpips")
+
+
+@torch.no_grad()
+def evaluate(
+    gaussians: Gaussians,
+    views: PosedImages,
+    sh_degree: int | None = None,
+    settings: RasterSettings | None = None,
+    lpips: Callable[[Tensor, Tensor], float] | None = None,
+) -> Metrics:
+    """Render every view, one at a time, and compare it with its photo.
+
+    Args:
+        gaussians: the model, on the views' device.
+        views: cameras and photos.
+        sh_degree: bands in use; None: all.
+        settings: of the rasterizer.
+        lpips: from `load_lpips`, where wanted.
+    """
+    metrics, seconds = [], 0.0
+    for view_id, name in enumerate(views.names):
+        synchronize(gaussians.device)
+        started = time.perf_counter()
+        image = render_view(gaussians, views, view_id, sh_degree, settings)
+        synchronize(gaussians.device)
+        seconds += time.perf_counter() - started
+        photo = views.photos.image(view_id)
+        metrics.append(compare(name, image, photo))
+        if lpips is not None:
+            metrics[-1].lpips = lpips(image, photo)
+    return Metrics(metrics, fps=len(metrics) / seconds)
+
+
+@torch.no_grad()
+def render_view(
+    gaussians: Gaussians,
+    views: PosedImages,
+    view_id: int,
+    sh_degree: int | None = None,
+    settings: RasterSettings | None = None,
+) -> Tensor:
+    """[H, W, 3] float32, 0 .. 1: the model seen by one of the cameras."""
+    cameras = views.cameras.select([view_id])
+    image, _ = render_images(gaussians, cameras, sh_degree, settings or RasterSettings())[0]
+    return image.clamp(0.0, 1.0)
+
+
+def compare(name: str, image: Tensor, photo: Tensor) -> ViewMetrics:
+    """Errors of an image against a photo, both [H, W, 3] float, 0 .. 1. SSIM has its usual Gaussian window of 11."""
+    mse = (image - photo).square().mean().item()
+    psnr = min(PSNR_LIMIT, -10.0 * math.log10(mse)) if mse > 0 else PSNR_LIMIT if mse == 0 else math.nan
+    ssim = math.nan
+    if min(image.shape[:2]) >= SSIM_SIDE:
+        pair = [picture.permute(2, 0, 1)[None] for picture in (image, photo)]  # [1, 3, H, W]
+        ssim = structural_similarity_index_measure(*pair, data_range=1.0, kernel_size=SSIM_SIDE, sigma=1.5).item()
+    return ViewMetrics(name, psnr, ssim, (image - photo).abs().mean().item())
+
+
+def load_lpips(weights: str | None, device: torch.device) -> tuple[Callable[[Tensor, Tensor], float] | None, str]:
+    """LPIPS (VGG16) where torchvision and the backbone's weights are on this machine. Nothing is downloaded.
+
+    Args:
+        weights: local file with torchvision's VGG16 weights; None: torch's own cache is looked at.
+        device: where to compute.
+
+    Returns:
+        A function of two [H, W, 3] images, or None; and the reason for None.
+
+    Raises:
+        InputError: `weights` names no readable file.
+    """
+    if weights is not None and not Path(weights).is_file():
+        raise InputError(f"report.lpips_weights: no such file '{weights}'")
+    if importlib.util.find_spec("torchvision") is None:
+        return None, "torchvision, which has the network, is not installed"
+    file = Path(weights) if weights else Path(torch.hub.get_dir()) / "checkpoints" / VGG16_FILE
+    if not file.is_file():
+        return None, f"its weights are not on this machine; name a local {VGG16_FILE} in report.lpips_weights"
+    return _load_lpips(file, device), ""
+
+
+def _load_lpips(file: Path, device: torch.device) -> Callable[[Tensor, Tensor], float]:
+    from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
+
+    cache = torch.hub.get_dir()
+    with tempfile.TemporaryDirectory() as folder:  # torchvision takes the file from a cache in which it is found
+        (Path(folder) / "checkpoints").mkdir()
+        (Path(folder) / "checkpoints" / VGG16_FILE).symlink_to(file.resolve())
+        torch.hub.set_dir(folder)
+        try:
+            network = LearnedPerceptualImagePatchSimilarity(net_type="vgg", normalize=True).to(device)
+        except (RuntimeError, OSError, KeyError, EOFError) as error:
+            raise InputError(f"report.lpips_weights: '{file}' does not hold VGG16's weights: {error}") from None
+        finally:
+            torch.hub.set_dir(cache)
+    return lambda image, photo: network(image.permute(2, 0, 1)[None], photo.permute(2, 0, 1)[None]).item()
+
+
+def synchronize(device: torch.device) -> None:
+    """Wait for the GPU, so that a clock read next counts what was asked for."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+
+
+def free_device_memory(device: torch.device) -> None:
+    """Give back to a GPU what nothing refers to any more, so that what comes next is measured by itself."""
+    if device.type == "cuda":
+        gc.collect()
+        torch.cuda.empty_cache()
+
+
+def peak_memory_bytes(device: torch.device) -> int:
+    """Peak of the tensors' memory on a GPU, or of this process on a CPU."""
+    if device.type == "cuda":
+        return torch.cuda.max_memory_allocated(device)
+    import resource  # not on Windows
+
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else peak * 1024

@@ -1,0 +1,72 @@
+"""Where the parts of a run are on the disk."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from turbogs_plugin.config.configuration import Config, resolve_complete
+from turbogs_plugin.config.yaml_text import read_yaml
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.files import require_writable
+from turbogs_plugin.plan import Plan
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """Where the parts of a run are."""
+
+    path: Path
+
+    @property
+    def config(self) -> Path:
+        return self.path / "config.yaml"
+
+    @property
+    def plan(self) -> Path:
+        return self.path / "plan.json"
+
+    @property
+    def history(self) -> Path:
+        return self.path / "history.jsonl"
+
+    @property
+    def checkpoints(self) -> Path:
+        return self.path / "checkpoints"
+
+    @property
+    def report(self) -> Path:
+        return self.path / "report.md"
+
+    @property
+    def model(self) -> Path:
+        return self.path / "model.ply"
+
+    @property
+    def renders(self) -> Path:
+        return self.path / "renders"
+
+    def require_new(self) -> None:
+        """Raises `InputError` where the folder holds anything, or cannot be made."""
+        if self.config.exists():
+            raise InputError(f"'{self.path}' holds another run: choose a new --out, or go on with --resume {self.path}")
+        if self.path.exists() and not self.path.is_dir():
+            raise InputError(f"--out '{self.path}' is a file: choose a folder")
+        if self.path.is_dir() and any(self.path.iterdir()):
+            raise InputError(f"--out '{self.path}' is not empty: choose a new folder")
+        require_writable(self.path, f"--out '{self.path}'")
+
+    def read_config(self) -> Config:
+        """The resolved configuration of the run. Raises `InputError` where this is no run, or part of it is missing."""
+        if not self.config.is_file():
+            raise InputError(f"'{self.path}' holds no run: there is no config.yaml")
+        return resolve_complete(read_yaml(self.config), str(self.config))
+
+    def read_plan(self) -> Plan | None:
+        """What was planned when the run began, if it is there. Raises `InputError` where it cannot be read."""
+        try:
+            return Plan.from_json(self.plan.read_text(encoding="utf-8"))
+        except FileNotFoundError:
+            return None
+        except (OSError, UnicodeDecodeError, InputError) as error:
+            raise InputError(f"cannot read the plan '{self.plan}': {error}") from None

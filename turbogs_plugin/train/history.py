@@ -1,0 +1,101 @@
+"""``history.jsonl``: one line an evaluation, the record of error against run time."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.files import write_text_atomically
+
+if TYPE_CHECKING:
+    from turbogs_plugin.train.evaluate import Metrics
+    from turbogs_plugin.train.trainer import Trainer
+
+
+@dataclass
+class Evaluation:
+    """One evaluation.
+
+    Args:
+        iteration: finished iterations.
+        train_seconds: of training until then, without loading, evaluation, checkpoints and report.
+        psnr, ssim, l1: means over the test views; `ssim` is NaN where the images are too small for it.
+        num_gaussians: N.
+        memory_bytes: peak of the GPU's tensors, or of the process on a CPU.
+        nonfinite_losses: iterations so far whose loss was not finite.
+        skipped_updates: Gaussians' updates left out so far because their gradient was not finite.
+        worst_psnr: of the worst test view; NaN in what was written before it was recorded.
+    """
+
+    iteration: int
+    train_seconds: float
+    psnr: float
+    ssim: float
+    l1: float
+    num_gaussians: int
+    memory_bytes: int
+    nonfinite_losses: int = 0
+    skipped_updates: int = 0
+    worst_psnr: float = math.nan
+
+    @classmethod
+    def of(cls, trainer: Trainer, metrics: Metrics, train_seconds: float, memory_bytes: int) -> Evaluation:
+        """Where a run stands, with what its model came to on the test views. Waits for the GPU."""
+        return cls(
+            iteration=trainer.iteration,
+            train_seconds=train_seconds,
+            psnr=metrics.psnr,
+            ssim=metrics.ssim,
+            l1=metrics.l1,
+            num_gaussians=len(trainer.gaussians),
+            memory_bytes=memory_bytes,
+            nonfinite_losses=int(trainer.nonfinite_losses),
+            skipped_updates=int(trainer.optimizer.skipped),
+            worst_psnr=metrics.worst_psnr,
+        )
+
+    def to_json(self) -> str:
+        """One line; NaN is written as null."""
+        return json.dumps({name: None if value != value else value for name, value in asdict(self).items()})
+
+
+def append_evaluation(path: Path, evaluation: Evaluation) -> None:
+    """Add one line to a history."""
+    with open(path, "a", encoding="utf-8") as file:
+        file.write(evaluation.to_json() + "\n")
+
+
+def read_history(path: Path) -> list[Evaluation]:
+    """All complete lines of a history; a last line cut short by a kill is left out.
+
+    Raises:
+        InputError: unreadable, or a line that is not an evaluation.
+    """
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
+    except FileNotFoundError:
+        return []
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"cannot read '{path}': {error}") from None
+    names = {field.name for field in fields(Evaluation)}
+    evaluations = []
+    for number, line in enumerate(lines, start=1):
+        if number == len(lines) and not line.endswith("\n"):
+            break
+        try:
+            values = {name: value for name, value in json.loads(line).items() if name in names}
+            evaluations.append(Evaluation(**{name: math.nan if v is None else v for name, v in values.items()}))
+        except (ValueError, TypeError, AttributeError):
+            raise InputError(f"'{path}' line {number} is not an evaluation") from None
+    return evaluations
+
+
+def rewind_history(path: Path, iteration: int) -> list[Evaluation]:
+    """Drop what a history says of iterations after this one, as a resumed run will say it again."""
+    kept = [evaluation for evaluation in read_history(path) if evaluation.iteration <= iteration]
+    write_text_atomically(path, "".join(evaluation.to_json() + "\n" for evaluation in kept))
+    return kept

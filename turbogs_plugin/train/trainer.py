@@ -1,0 +1,257 @@
+"""Algorithm 1 of the paper: what one iteration of training is, and the state that iterations change.
+
+Everything around it (the clock, evaluation, checkpoints, interrupts, the report) is in `turbogs_plugin.train.run`.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from turbogs_plugin.config.configuration import Config
+from turbogs_plugin.engine.cuda import library as kernels
+from turbogs_plugin.engine.rendering import Rendered, Workspace, rasterize, render_images
+from turbogs_plugin.engine.supervision import supervise
+from turbogs_plugin.errors import TrainingStopped
+from turbogs_plugin.model.gaussians import (
+    BACKDROP_COUNT,
+    RESTRAIN_EVERY,
+    backdrop_gaussians,
+    gaussians_from_points,
+    restrain_distant,
+)
+from turbogs_plugin.plan.budget import chosen_points
+from turbogs_plugin.scene import Scene
+from turbogs_plugin.scene.offload import place_maps, place_views
+from turbogs_plugin.types import PARAMETER_NAMES, Gaussians, PixelSamples, RowUpdate, Step
+
+COLOR_STRIDE = 97
+"""Every so many pixels count for the mean colour of the photos; coprime to usual widths."""
+
+
+class Trainer:
+    """The Gaussians, the error maps and the strategies of one run.
+
+    Args:
+        config: of the run.
+        scene: on any device.
+        device: where everything is computed and kept.
+    """
+
+    def __init__(self, config: Config, scene: Scene, device: torch.device) -> None:
+        self.config = config
+        self.views = place_views(scene.train, device, config.plan.photos_on)
+        self.extent = scene.extent
+        self.schedule = config.build("schedule")
+        self.view_sampler = config.build("view_sampler")
+        self.pixel_sampler = config.build("pixel_sampler")
+        self.loss = config.build("loss")
+        self.optimizer = config.build("optimizer")
+        self.density = config.build("density")
+        self.maps = place_maps(self.views.cameras.sizes, device, config.plan.maps_on, config.maps.beta)
+        self.gaussians = initial_gaussians(scene, config).map(lambda tensor: tensor.to(device))
+        self.view_sampler.setup(self.views.cameras, scene.extent)
+        self.optimizer.setup(self.gaussians)
+        self.density.setup(self.gaussians)
+        on_kernels = device.type == "cuda" and kernels.available()
+        self.workspace = Workspace(device) if on_kernels else None
+        self.iteration = 0
+        self.first_repeatable = 0
+        self.initial_error = 0.0
+        self.nonfinite_losses = torch.zeros((), dtype=torch.int64, device=device)
+
+    def initialise_maps(self) -> None:
+        """The errors of a dense render of the initial Gaussians, Algorithm 1's initialization."""
+        for view_id in range(len(self.views)):
+            self.initialise_map(view_id)
+        self.initial_error = self.maps.mean()
+
+    def initialise_map(self, view_id: int) -> None:
+        """The errors of one view."""
+        camera = self.views.cameras.select([view_id])
+        image, _ = render_images(self.gaussians, camera, self.sh_degree, self.config.raster)[0]
+        errors = (image - self.views.photos.image(view_id)).abs().sum(dim=-1)  # [H, W]
+        self.maps.initialise(view_id, errors.reshape(-1))
+
+    def step(self) -> None:
+        """One iteration, in the paper's order."""
+        self.repeat_lost()
+        step = self.now
+        view_errors = self.maps.view_means()
+
+        # 1) Sampling parameters: how many views, and which share of their pixels
+        budget = self.schedule.query(step, view_errors.mean().item(), self.initial_error, len(self.views))
+
+        # 2) View selection
+        view_ids = self.view_sampler.select(budget.views, view_errors, step)
+
+        # 3) Pixel sampling
+        samples = self.pixel_sampler.sample(self.maps, view_ids, budget.rate, step)
+
+        # 4) Ground truth at the samples
+        truth = self.views.photos.at(samples)
+
+        # 5) Sparse forward rendering
+        rendered = self.render(view_ids, samples)
+
+        # 6) Sparse loss and its gradients, and 7) EMA update of the error maps
+        loss = supervise(self.loss, rendered.colors, truth, self.maps, step, self.overflow, self.nonfinite_losses)
+
+        # 8) Backward to the Gaussians; step 11's back-projection of errors happens in the same pass
+        gradients = rendered.backward(loss.color_gradients, loss.pixel_errors, self.density.stats)
+
+        # 9) and 10) Solve for the updates and apply them
+        self.optimizer.step(self.gaussians, gradients, step)
+
+        # 11) Error-driven density control
+        self.follow(self.density.update(self.gaussians, step))
+        if self.config.train.distant_size > 0 and self.iteration % RESTRAIN_EVERY == 0:
+            restrain_distant(self.gaussians, self.extent, self.config.train.distant_size)
+
+        self.iteration += 1
+
+    def render(self, view_ids: tuple[int, ...], samples: PixelSamples) -> Rendered:
+        """The present model at the samples of some training views."""
+        return rasterize(
+            self.gaussians,
+            self.views.cameras.select(view_ids),
+            samples,
+            sh_degree=self.sh_degree,
+            settings=self.config.raster,
+            workspace=self.workspace,
+        )
+
+    def follow(self, update: RowUpdate | None) -> None:
+        """Let model and optimizer follow a change of the set of Gaussians."""
+        if update is None:
+            return
+        if len(update.source) == 0:
+            raise TrainingStopped(f"iteration {self.iteration}: density control removed every Gaussian")
+        self.gaussians = update.apply(self.gaussians)
+        self.optimizer.apply(update)
+        self.first_repeatable = self.iteration + 1
+
+    def step_towards(self, mark: int) -> None:
+        """One iteration. The one that reaches `mark` waits for the GPU, so that none is missing there."""
+        self.step()
+        if self.iteration == mark:
+            self.repeat_lost(wait=True)
+
+    def repeat_lost(self, wait: bool = False) -> None:
+        """Go back by the iterations that did nothing because the rasterizer's workspace was too small for them.
+
+        Never behind a change of the set of Gaussians, which would be made twice: iterations lost just before one are
+        not repeated.
+
+        Args:
+            wait: for the GPU, to know of all of them.
+
+        Raises:
+            InputError: an iteration has more pairs of a tile and a splat than a pass can have.
+        """
+        if self.workspace is not None:
+            lost = self.workspace.take_lost(wait)
+            self.iteration = max(self.iteration - lost, min(self.first_repeatable, self.iteration))
+
+    @property
+    def overflow(self) -> Tensor | None:
+        """[1] int32 on the device, not 0 while iterations do nothing; None where that cannot be."""
+        return None if self.workspace is None else self.workspace.overflow
+
+    @property
+    def now(self) -> Step:
+        """Where training stands."""
+        train = self.config.train
+        return Step(self.iteration, train.iterations, train.refine_until, train.seed, self.extent)
+
+    @property
+    def sh_degree(self) -> int:
+        """Degree of the bands in use."""
+        return self.config.train.sh_degree_at(self.iteration)
+
+    def require_finite(self) -> None:
+        """Stop a run whose model is lost.
+
+        Raises:
+            TrainingStopped: a parameter is not finite, which no further iteration would repair.
+        """
+        for name, tensor in self.gaussians.items():
+            bad = int((~tensor.isfinite()).reshape(len(tensor), -1).any(dim=1).sum()) if tensor.numel() else 0
+            if bad:
+                raise TrainingStopped(
+                    f"iteration {self.iteration}: {name} of {bad} of {len(tensor)} Gaussians are not finite"
+                )
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that iterations change, as plain tensors and numbers."""
+        return {
+            "iteration": self.iteration,
+            "initial_error": self.initial_error,
+            "nonfinite_losses": int(self.nonfinite_losses),
+            "gaussians": dict(self.gaussians.items()),
+            "maps": self.maps.state_dict(),
+            "view_sampler": self.view_sampler.state_dict(),
+            "optimizer": self.optimizer.state_dict(),
+            "density": self.density.state_dict(),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Take over what `state_dict` gave, in a trainer of the same configuration and scene.
+
+        A state that nobody vouches for is first compared with the present one (`checkpoint.require_like`).
+
+        Raises:
+            ValueError: the parts of the state do not fit each other or this trainer.
+        """
+        device = self.gaussians.device
+        if not 0 <= state["iteration"] <= self.config.train.iterations or state["nonfinite_losses"] < 0:
+            raise ValueError(f"iteration {state['iteration']} with {state['nonfinite_losses']} non-finite losses")
+        self.iteration = state["iteration"]
+        self.initial_error = state["initial_error"]
+        self.nonfinite_losses.fill_(state["nonfinite_losses"])
+        self.gaussians = gaussians_of_state(state, device)
+        self.maps.load_state_dict(state["maps"])
+        self.view_sampler.load_state_dict(state["view_sampler"])
+        self.optimizer.setup(self.gaussians)
+        self.optimizer.load_state_dict(state["optimizer"])
+        self.density.setup(self.gaussians)
+        self.density.load_state_dict(state["density"])
+
+
+def initial_gaussians(scene: Scene, config: Config) -> Gaussians:
+    """The model that training starts from: the capture's points, and a backdrop where one is wanted.
+
+    Of more points than `budget.max_gaussians` has room for, that many are taken, evenly in their order.
+    """
+    train = config.train
+    rows = chosen_points(len(scene.points), config.budget.max_gaussians, BACKDROP_COUNT if train.backdrop else 0)
+    points, colors = scene.points[rows], scene.point_colors[rows]
+    gaussians = gaussians_from_points(
+        points, colors, train.sh_degree, scene.extent, train.initial_opacity, train.initial_size
+    )
+    if not train.backdrop:
+        return gaussians
+    color = scene.train.photos.stored[::COLOR_STRIDE].float().mean(dim=0).cpu() / 255.0
+    backdrop = backdrop_gaussians(color, train.sh_degree, scene.extent)
+    return Gaussians(**{name: torch.cat([tensor, getattr(backdrop, name)]) for name, tensor in gaussians.items()})
+
+
+def gaussians_of_state(state: dict[str, Any], device: torch.device) -> Gaussians:
+    """The model in a checkpoint's state.
+
+    Raises:
+        ValueError: not the parameters of one model, or not finite.
+    """
+    gaussians = Gaussians(**{name: state["gaussians"][name].to(device) for name in PARAMETER_NAMES})
+    count, bands = len(gaussians), gaussians.shN.shape[1]
+    shapes = ((count, 3), (count, 4), (count, 3), (count,), (count, 1, 3), (count, bands, 3))
+    for (name, value), shape in zip(gaussians.items(), shapes, strict=True):
+        if value.shape != shape or value.dtype != torch.float32:
+            raise ValueError(f"gaussians.{name} has shape {tuple(value.shape)} where {shape} was expected")
+        if not value.isfinite().all():
+            raise ValueError(f"gaussians.{name} is not finite")
+    if bands not in (0, 3, 8, 15):
+        raise ValueError(f"gaussians.shN has {bands} bands")
+    return gaussians
