@@ -9,8 +9,8 @@ import tyro
 from gsplat import DefaultStrategy
 from gsplat_host import Batch, demo_scene, report, splat_arguments, train
 from torch import Tensor
-from turbogs_plugin.strategies.losses.losses import CharbonnierNccLoss
-from turbogs_plugin.strategies.pixels.samplers import ErrorGuidedPixelSampler
+from turbogs_plugin.strategies.losses import CharbonnierNccLoss
+from turbogs_plugin.strategies.pixel_sampling import ErrorGuidedPixelSampler
 
 from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.gsplat_bridge import gather_pixels, sparse_loss, sparse_rasterization

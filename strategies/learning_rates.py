@@ -5,20 +5,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, fields
 
+from turbogs_plugin.engine.rules import ParameterRates
 from turbogs_plugin.errors import InputError, require
 from turbogs_plugin.types import Step
-
-
-@dataclass(frozen=True)
-class ParameterRates:
-    """The rate of each parameter at one iteration, in the parameter's own units per step."""
-
-    means: float
-    quats: float
-    scales: float
-    opacities: float
-    sh0: float
-    shN: float
 
 
 @dataclass

@@ -12,10 +12,12 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from torch import Tensor
 
-from turbogs_plugin.engine.rendered import ScreenGradients
+from turbogs_plugin.engine.moments import GaussianMoments
+from turbogs_plugin.engine.rules import LossTerms, UpdateRule
 from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.types import (
     Cameras,
+    GaussianGradients,
     Gaussians,
     GaussianStats,
     LossOutput,
@@ -65,6 +67,11 @@ class PixelSampler(Protocol):
 class SparseLoss(Protocol):
     """A loss on sampled pixels with its own gradient (section 3.7)."""
 
+    @property
+    def terms(self) -> LossTerms | None:
+        """The loss as a rule, which an engine evaluates together with the error maps; None: it is called."""
+        ...
+
     def __call__(self, colors: Tensor, targets: Tensor, samples: PixelSamples) -> LossOutput:
         """`colors`, `targets`: [P, 3], both 0 .. 1 in range for photos; `colors` may exceed it."""
         ...
@@ -95,7 +102,21 @@ class DensityController(Protocol):
 
 @runtime_checkable
 class GaussianOptimizer(Protocol):
-    """Turns gradients into a step of the parameters, in place (section 3.9)."""
+    """Turns gradients into a step of the parameters, in place (section 3.9).
+
+    An optimizer whose `rule` is None is stepped by its own code, and its `moments` are None. Any other has both, and an
+    engine makes the step, together with the backward pass that the gradients come from.
+    """
+
+    @property
+    def moments(self) -> GaussianMoments | None:
+        """The state that a rule's step changes."""
+        ...
+
+    @property
+    def per_view(self) -> bool:
+        """Whether `step` wants the gradients of each view, not only their sum."""
+        ...
 
     @property
     def skipped(self) -> Tensor:
@@ -106,8 +127,12 @@ class GaussianOptimizer(Protocol):
         """Allocate state for these Gaussians; called once before training, and after a resume."""
         ...
 
-    def step(self, gaussians: Gaussians, gradients: ScreenGradients, step: Step) -> None:
-        """Update `gaussians` in place. Takes the per-view or the summed gradients, as it needs."""
+    def rule(self, step: Step) -> UpdateRule | None:
+        """The step of this iteration as a rule, or None."""
+        ...
+
+    def step(self, gaussians: Gaussians, gradients: GaussianGradients, step: Step) -> None:
+        """Update `gaussians` in place by gradients of each view or their sum."""
         ...
 
     def apply(self, update: RowUpdate) -> None:

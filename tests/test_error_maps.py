@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from turbogs_plugin.strategies.pixels.samplers import RandomPixelSampler
+from turbogs_plugin.strategies.pixel_sampling import RandomPixelSampler
 
 from turbogs_plugin.error_maps import AGE_MAX, ErrorMaps
 from turbogs_plugin.errors import InputError

@@ -74,9 +74,9 @@ def test_every_module_and_public_name_imports(name):
 
 
 def test_strategies_are_one_set_of_classes_under_one_name():
-    from turbogs_plugin.strategies.losses.losses import CharbonnierLoss
+    from turbogs_plugin.strategies.losses import CharbonnierLoss
 
-    assert CharbonnierLoss.__module__ == "turbogs_plugin.strategies.losses.losses"
+    assert CharbonnierLoss.__module__ == "turbogs_plugin.strategies.losses"
     found = subprocess.run(
         [sys.executable, "-c", "import importlib.util; print(importlib.util.find_spec('strategies'))"],
         cwd="/",

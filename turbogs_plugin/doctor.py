@@ -49,8 +49,9 @@ def _driver() -> str:
 
 
 def _kernels() -> tuple[str, list[str]]:
-    from turbogs_plugin.engine.cuda import library as kernels
+    from turbogs_plugin.engine import compiled_kernels
 
-    if kernels.available():
-        return f"loaded from {kernels.library_path()}, for {', '.join(kernels.architectures())}", []
-    return "not usable", [f"kernels: {kernels.unavailable_reason()}"]
+    kernels = compiled_kernels()
+    if kernels.unavailable:
+        return "not usable", [f"kernels: {kernels.unavailable}"]
+    return f"loaded from {kernels.path}, for {', '.join(kernels.architectures)}", []

@@ -250,6 +250,13 @@ class GaussianGradients:
         value = getattr(self, name)
         return value if name == "shN" else value.sum(dim=0)
 
+    def over_views(self) -> GaussianGradients:
+        """The same with one row, the sum of all; itself where it has one."""
+        if len(self.view_losses) == 1:
+            return self
+        sums = {name: value.sum(dim=0, keepdim=True) for name, value in vars(self).items()}
+        return replace(self, **(sums | {"shN": self.shN, "touched": self.touched}))
+
 
 @dataclass
 class GaussianStats:

@@ -10,8 +10,8 @@ from torch import Tensor
 from torch.optim.adam import adam
 from turbogs_plugin.strategies.learning_rates import LearningRates
 
-from turbogs_plugin.engine.rendered import ScreenGradients
-from turbogs_plugin.engine.update_rule import check_moments_config, check_state, clipped, finite_gradients
+from turbogs_plugin.engine.moments import check_moments_config, check_state
+from turbogs_plugin.engine.reference.update import clipped, finite_gradients
 from turbogs_plugin.errors import require_not_negative
 from turbogs_plugin.types import PARAMETER_NAMES, GaussianGradients, Gaussians, RowUpdate, Step
 
@@ -49,6 +49,8 @@ class DenseAdam:
     eps: float = 1e-15
     opacity_reg: float = 0.0
     scale_reg: float = 0.0
+    moments = None  # those of an `UpdateRule`; its own are torch's
+    per_view = False
     exp_avg: Gaussians = field(init=False, repr=False)
     exp_avg_sq: Gaussians = field(init=False, repr=False)
     counts: Tensor = field(init=False, repr=False)
@@ -63,17 +65,19 @@ class DenseAdam:
         self.counts = torch.zeros(len(PARAMETER_NAMES), device=gaussians.device)  # one each, as torch's kernel wants
         self.skipped = torch.zeros((), dtype=torch.int64, device=gaussians.device)
 
+    def rule(self, step: Step) -> None:
+        """None: no engine has a pass for it."""
+
     @torch.no_grad()
-    def step(self, gaussians: Gaussians, gradients: ScreenGradients, step: Step) -> None:
-        parameter_gradients = gradients.parameter_gradients(rows=False)
-        finite = finite_gradients(parameter_gradients)
-        touched = parameter_gradients.touched
+    def step(self, gaussians: Gaussians, gradients: GaussianGradients, step: Step) -> None:
+        gradients = gradients.over_views()
+        finite, touched = finite_gradients(gradients), gradients.touched
         self.skipped += (touched & ~finite).sum()
         rates = self.learning_rates.at(step)
         # Torch's way of leaving an iteration out without asking the device.
         nothing = (~touched.any()).to(torch.float32)
         for count, (name, parameter) in zip(self.counts.unbind(), gaussians.items(), strict=True):
-            gradient = _of_finite(parameter_gradients, name, finite)
+            gradient = _of_finite(gradients, name, finite)
             if name == "opacities" and self.opacity_reg > 0:
                 opacity = torch.sigmoid(parameter)
                 gradient += self.opacity_reg / max(1, parameter.numel()) * opacity * (1 - opacity)

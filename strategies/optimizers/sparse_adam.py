@@ -5,23 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
-import torch
+from torch import Tensor
 from turbogs_plugin.strategies.learning_rates import LearningRates
 
-from turbogs_plugin.engine.rendered import ScreenGradients
-from turbogs_plugin.engine.update_rule import (
-    GaussianMoments,
-    UpdateRule,
-    add_packed,
-    add_shN,
-    advance,
-    check_moments_config,
-    clipped,
-    packed_rows,
-    take_fused_step,
-    updatable,
-)
-from turbogs_plugin.types import Gaussians, RowUpdate, Step
+from turbogs_plugin.engine.moments import GaussianMoments, check_moments_config
+from turbogs_plugin.engine.reference.update import apply_update
+from turbogs_plugin.engine.rules import UpdateRule
+from turbogs_plugin.types import GaussianGradients, Gaussians, RowUpdate, Step
 
 
 @dataclass
@@ -47,31 +37,24 @@ class SparseAdam:
     def __post_init__(self) -> None:
         check_moments_config(self.beta1, self.beta2, self.eps)
 
-    def setup(self, gaussians: Gaussians) -> None:
-        self.moments = GaussianMoments.zeros(gaussians)
+    @property
+    def per_view(self) -> bool:
+        return False
 
     @property
-    def skipped(self) -> torch.Tensor:
+    def skipped(self) -> Tensor:
         """[] int64 on the device: updates left out because of a non-finite gradient."""
         return self.moments.skipped
+
+    def setup(self, gaussians: Gaussians) -> None:
+        self.moments = GaussianMoments.zeros(gaussians)
 
     def rule(self, step: Step) -> UpdateRule:
         """The rule of this iteration's step."""
         return UpdateRule(self.learning_rates.at(step), self.beta1, self.beta2, self.eps)
 
-    @torch.no_grad()
-    def step(self, gaussians: Gaussians, gradients: ScreenGradients, step: Step) -> None:
-        rule, moments = self.rule(step), self.moments
-        if take_fused_step(gaussians, gradients, moments, rule):
-            return
-        parameter_gradients = gradients.parameter_gradients(rows=False)
-        index = updatable(parameter_gradients, moments)
-        moments.steps[index] += 1
-        steps = moments.steps[index]
-        gradient = packed_rows(parameter_gradients, index).sum(dim=0)
-        terms = advance(moments.exp_avg, moments.exp_avg_sq, gradient, index, steps, rule)
-        add_packed(gaussians, index, terms.delta(rule.packed_rates(gradient)))
-        step_shN(gaussians, parameter_gradients.shN, moments, index, steps, rule)
+    def step(self, gaussians: Gaussians, gradients: GaussianGradients, step: Step) -> None:
+        apply_update(self.rule(step), gaussians, gradients, self.moments)
 
     def apply(self, update: RowUpdate) -> None:
         self.moments.apply(update)
@@ -81,22 +64,3 @@ class SparseAdam:
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         self.moments.load_state_dict(state)
-
-
-def step_shN(
-    gaussians: Gaussians,
-    gradient: torch.Tensor,
-    moments: GaussianMoments,
-    index: torch.Tensor,
-    steps: torch.Tensor,
-    rule: UpdateRule,
-) -> None:
-    """Adam's step of the higher bands (appendix, second half of the LM equation), which no block takes in.
-
-    Args:
-        gradient: [N, B, 3].
-        index: [n] the Gaussians to update; steps: [n] their step counts, this one included.
-    """
-    gradient = clipped(gradient[index].flatten(1))
-    terms = advance(moments.exp_avg_shN, moments.exp_avg_sq_shN, gradient, index, steps, rule)
-    add_shN(gaussians, index, terms.delta(rule.rates.shN))

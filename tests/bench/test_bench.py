@@ -27,11 +27,11 @@ from turbogs_plugin.bench.precision import precision
 from turbogs_plugin.bench.raster import RasterBench
 from turbogs_plugin.bench.recorder import STEPS, StepRecorder, recorded
 from turbogs_plugin.bench.step import tensor_bytes
+from turbogs_plugin.engine import CompiledKernels
 from turbogs_plugin.engine.rendering import rasterize
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.model.gaussians import load_ply, save_ply
 from turbogs_plugin.scene import load_scene
-from turbogs_plugin.train import trainer as trainer_module
 from turbogs_plugin.train.trainer import Trainer
 
 CPU = torch.device("cpu")
@@ -56,7 +56,7 @@ def test_the_recorder_marks_the_trainers_own_steps_and_leaves_no_trace(capture):
     config = tiny_config(capture)
     plain, watched = (Trainer(config, load_scene(capture), CPU) for _ in range(2))
     before = {name: set(vars(getattr(watched, name))) for name in ("schedule", "optimizer", "density", "maps")}
-    rasterize, loss = trainer_module.rasterize, watched.loss
+    engine, loss = watched.engine, watched.loss
     recorder = StepRecorder(CPU)
     for trainer in (plain, watched):
         trainer.initialise_maps()
@@ -67,10 +67,10 @@ def test_the_recorder_marks_the_trainers_own_steps_and_leaves_no_trace(capture):
         plain.step()
     for (_, one), (_, other) in zip(plain.gaussians.items(), watched.gaussians.items(), strict=True):
         assert torch.equal(one, other)
-    assert trainer_module.rasterize is rasterize and watched.loss is loss
+    assert watched.engine is engine and watched.loss is loss
     assert before == {name: set(vars(getattr(watched, name))) for name in before}
     steps = recorder.summaries()
-    assert set(steps) == {"iteration", *STEPS} - {"gather+L+E"}
+    assert set(steps) == {"iteration", *STEPS}
     assert all(len(spans) == 3 for spans in recorder.spans.values())
     for number in range(3):
         whole = recorder.spans["iteration"][number]
@@ -168,7 +168,7 @@ def test_bench_step_says_what_it_measured_on(turbogs, capture, tmp_path):
     assert report["provenance"]["software"]["torch"] == torch.__version__
     assert [entry["views"] for entry in report["passes"]] == [3, 2]
     for entry in report["passes"]:
-        assert set(entry["steps"]) == {"iteration", *STEPS} - {"gather+L+E"}
+        assert set(entry["steps"]) == {"iteration", *STEPS}
         assert entry["counts"]["gaussians"] == 500 and 0 < entry["counts"]["touched"] <= 500
         assert entry["counts"]["pixels"] == entry["views"] * 48 * 40
         assert entry["memory_bytes"]["parameters"] == 500 * 4 * (14 + 9) and entry["memory_bytes"]["peak"] is None
@@ -266,8 +266,7 @@ def test_other_builds_get_the_models_that_this_one_times(turbogs, capture, tmp_p
 def test_this_build_is_measured_as_the_others_are(turbogs, capture, tmp_path, monkeypatch):
     library, out, measured = tmp_path / "other.so", tmp_path / "raster.json", []
     library.touch()
-    monkeypatch.setattr(commands.kernels, "available", lambda: True)
-    monkeypatch.setattr(commands.kernels, "library_path", lambda: tmp_path / "this.so")
+    monkeypatch.setattr(commands, "compiled_kernels", lambda: CompiledKernels(tmp_path / "this.so", ("sm_90",), ""))
     monkeypatch.setattr(RasterBench, "run", lambda *_: {"passes": [], "gsplat": []})
 
     def other_build(path, command):

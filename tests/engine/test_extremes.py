@@ -17,8 +17,10 @@ def render_and_check(gaussians: Gaussians, cameras):
     rendered = rasterize(gaussians, cameras, samples, with_depth=True)
     stats = GaussianStats.zeros(len(gaussians), "cpu")
     ones = torch.ones_like(rendered.alphas)
-    screen = rendered.backward(torch.ones_like(rendered.colors), ones, stats, ones, ones)
-    gradients = screen.parameter_gradients(rows=True)
+    screen = rendered.backward(
+        torch.ones_like(rendered.colors), ones, with_statistics=True, alpha_gradients=ones, depth_gradients=ones
+    )
+    gradients = screen.parameter_gradients(rows=True, stats=stats)
     for value in (rendered.colors, rendered.alphas, rendered.depths, *vars(gradients).values(), *vars(stats).values()):
         assert value.isfinite().all()
     assert (rendered.alphas >= 0).all() and (rendered.alphas <= 1 + 1e-6).all()

@@ -99,7 +99,9 @@ def test_what_lies_behind_the_end_of_a_pixel_has_no_gradient_at_all():
     samples = dense_samples(cameras)
     colors, alphas, depths, errors = upstream(samples, dtype=torch.float32)
     rendered = rasterize(gaussians, cameras, samples, with_depth=True)
-    gradients = rendered.backward(colors, errors, None, alphas, depths).parameter_gradients(rows=True)
+    gradients = rendered.backward(colors, errors, alpha_gradients=alphas, depth_gradients=depths).parameter_gradients(
+        rows=True
+    )
     assert 10 < int(gradients.touched.sum()) < 190
     for name in PARAMETER_NAMES[:-1]:
         assert float(getattr(gradients, name)[:, ~gradients.touched].abs().max()) == 0
@@ -130,7 +132,9 @@ def test_backward_equals_autograd_and_rows_sum_to_it(opacity):
     rendered = rasterize(gaussians, cameras, samples, with_depth=True)
 
     def gradients(rows):
-        return rendered.backward(colors, errors, None, alphas, depths).parameter_gradients(rows)
+        return rendered.backward(colors, errors, alpha_gradients=alphas, depth_gradients=depths).parameter_gradients(
+            rows
+        )
 
     leaves = gaussians.map(lambda value: value.clone().requires_grad_())
     output = rasterize_differentiable(leaves, cameras, samples, with_depth=True)
@@ -193,8 +197,8 @@ def test_statistics_are_added_once_as_documented():
     samples = thin_out(dense_samples(cameras), 0.5)
     colors, _, _, errors = upstream(samples)
     stats = GaussianStats.zeros(30, "cpu").map(lambda value: value + 1)
-    screen = rasterize(gaussians, cameras, samples).backward(colors, errors, stats)
-    gradients = screen.parameter_gradients(rows=True)
+    screen = rasterize(gaussians, cameras, samples).backward(colors, errors, with_statistics=True)
+    gradients = screen.parameter_gradients(rows=True, stats=stats)
     record = screen.full_records()
     half = torch.as_tensor(np.array(SIZES)) * 0.5 * 2  # K = 2
     output = rasterize_differentiable(gaussians, cameras, samples)
@@ -255,7 +259,7 @@ def test_block_and_slice_sizes_do_not_matter(monkeypatch):
 
     def everything():
         rendered = rasterize(gaussians, cameras, samples, with_depth=True)
-        record = rendered.backward(colors, errors, None, alphas, depths).full_records()
+        record = rendered.backward(colors, errors, alpha_gradients=alphas, depth_gradients=depths).full_records()
         return rendered.colors, rendered.alphas, rendered.depths, record
 
     expected = everything()

@@ -59,8 +59,8 @@ def draw(gaussians, cameras, samples) -> None:
     rendered = rasterize(gaussians, cameras.to(DEVICE), samples_to(samples, DEVICE))
     stats = GaussianStats.zeros(len(gaussians), DEVICE)
     ones = torch.ones_like(rendered.colors)
-    gradients = rendered.backward(ones, pixel_errors=ones[:, 0].contiguous(), stats=stats)
-    assert gradients.parameter_gradients(rows=True).means.isfinite().all()
+    gradients = rendered.backward(ones, pixel_errors=ones[:, 0].contiguous(), with_statistics=True)
+    assert gradients.parameter_gradients(rows=True, stats=stats).means.isfinite().all()
 
 
 def main() -> None:

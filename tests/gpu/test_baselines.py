@@ -3,7 +3,7 @@
 import pytest
 import torch
 from helpers.framework_runs import assert_iterations_wait_for_nothing, tiny_capture
-from helpers.optimizers import STEP, FixedGradients, clone, equal, make_gaussians, make_gradients
+from helpers.optimizers import STEP, clone, equal, make_gaussians, make_gradients
 from helpers.raster_cases import GPU_ONLY
 from turbogs_plugin.strategies.density.mcmc import GsplatMcmcDensity
 from turbogs_plugin.strategies.learning_rates import LearningRates
@@ -22,18 +22,16 @@ RATES = LearningRates(scales=0.1, quats=0.05, opacities=0.2, sh0=0.1, shN=0.05, 
 """Large, so that a step is not lost in the rounding of the parameters."""
 
 
-def on_device(gradients: FixedGradients) -> FixedGradients:
+def on_device(gradients: GaussianGradients) -> GaussianGradients:
     """In float32 where they are of floats."""
-    values = {name: value.to(DEVICE) for name, value in vars(gradients.gradients).items()}
-    return FixedGradients(
-        GaussianGradients(**{name: v.float() if v.is_floating_point() else v for name, v in values.items()})
-    )
+    values = {name: value.to(DEVICE) for name, value in vars(gradients).items()}
+    return GaussianGradients(**{name: v.float() if v.is_floating_point() else v for name, v in values.items()})
 
 
-def gradients_of(seed: int) -> FixedGradients:
+def gradients_of(seed: int) -> GaussianGradients:
     gradients = make_gradients(2, COUNT, seed)
     untouched = torch.rand(COUNT, generator=torch.Generator().manual_seed(seed)) < 0.4
-    for name, value in vars(gradients.gradients).items():
+    for name, value in vars(gradients).items():
         if name == "touched":
             value[untouched] = False
         else:
@@ -75,7 +73,7 @@ def test_an_iteration_that_is_to_be_done_again_changes_nothing():
     optimizer.step(gaussians, on_device(gradients_of(0)), STEP)
     before, state = clone(gaussians), {name: value.clone() for name, value in optimizer.state_dict().items()}
     nothing = make_gradients(1, COUNT, size=0.0)
-    nothing.gradients.touched[:] = False
+    nothing.touched[:] = False
     optimizer.step(gaussians, on_device(nothing), STEP)
     assert equal(gaussians, before)
     assert all(torch.equal(value, state[name]) for name, value in optimizer.state_dict().items())

@@ -96,8 +96,10 @@ def test_maps_follow_through_checkpoints_and_the_turn_of_the_stamps(scene):
 def test_iterations_that_do_nothing_leave_the_maps_alone(scene, monkeypatch):
     trainer = trained(scene, "host", "host", 10, *EVENTS)
     before = copy.deepcopy(trainer.maps.state_dict())
-    trainer.workspace.status[1] = 1  # as after an overflow
-    monkeypatch.setattr(trainer.workspace, "take_lost", lambda wait=False: 0)  # of which the host does not know yet
+    trainer.engine.workspace.status[1] = 1  # as after an overflow
+    monkeypatch.setattr(
+        trainer.engine.workspace, "take_lost", lambda wait=False: 0
+    )  # of which the host does not know yet
     trainer.step()
     trainer.step()
     after = trainer.maps.state_dict()

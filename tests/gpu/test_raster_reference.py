@@ -74,8 +74,7 @@ def test_screen_records(case, with_depth):
     values = upstream(case)
     if not with_depth:
         del values["depth_gradients"]
-    stats = GaussianStats.zeros(len(case.gaussians), "cuda")
-    records = got.backward(**on_gpu(values), stats=stats).full_records()
+    records = got.backward(**on_gpu(values), with_statistics=True).full_records()
     wanted_records = wanted.backward(**values).full_records()
     for name, column in RECORD_COLUMNS.items():
         assert_gradients_close(records[..., column], wanted_records[..., column], name)
@@ -88,8 +87,8 @@ def test_parameter_gradients(case):
     del values["depth_gradients"]
     stats = GaussianStats.zeros(len(case.gaussians), "cuda")
     wanted_stats = GaussianStats.zeros(len(case.gaussians), "cpu").map(torch.Tensor.double)
-    gradients = got.backward(**on_gpu(values), stats=stats).parameter_gradients(rows=True)
-    wanted_gradients = wanted.backward(**values, stats=wanted_stats).parameter_gradients(rows=True)
+    gradients = got.backward(**on_gpu(values), with_statistics=True).parameter_gradients(True, stats)
+    wanted_gradients = wanted.backward(**values, with_statistics=True).parameter_gradients(True, wanted_stats)
     for name, _ in case.gaussians.items():
         ours, theirs = getattr(gradients, name), getattr(wanted_gradients, name)
         assert_gradients_close(ours.reshape(*theirs.shape[:2], -1), theirs.reshape(*theirs.shape[:2], -1), name)
@@ -131,8 +130,7 @@ def test_every_division_of_the_work_gives_the_same(warps, monkeypatch):
     monkeypatch.setattr(cuda, "warps_per_tile", lambda slots, tiles: warps)
     got = cuda.rasterize_cuda(case.gpu_gaussians, case.gpu_cameras, case.gpu_samples)
     assert_forward_close(got.colors, wanted.colors, "colors")
-    stats = GaussianStats.zeros(len(case.gaussians), "cuda")
-    records, plain = (got.backward(**on_gpu(values), stats=window).full_records() for window in (stats, None))
+    records, plain = (got.backward(**on_gpu(values), with_statistics=asked).full_records() for asked in (True, False))
     wanted_records = wanted.backward(**values).full_records()
     for name, column in RECORD_COLUMNS.items():
         assert_gradients_close(records[..., column], wanted_records[..., column], name)

@@ -112,12 +112,16 @@ def assert_all_gradients_close(case, got, wanted, values, bound):
     del values["depth_gradients"], values["alpha_gradients"]
     stats = GaussianStats.zeros(len(case.gaussians), "cuda")
     wanted_stats = GaussianStats.zeros(len(case.gaussians), "cpu").map(torch.Tensor.double)
-    got, wanted = got.backward(**on_gpu(values), stats=stats), wanted.backward(**values, stats=wanted_stats)
+    got, wanted = (
+        got.backward(**on_gpu(values), with_statistics=True),
+        wanted.backward(**values, with_statistics=True),
+    )
     records, wanted_records = got.full_records(), wanted.full_records()
     for name, column in RECORD_COLUMNS.items():
         if name != "depth":
             assert_gradients_close(records[..., column], wanted_records[..., column], name, bound)
-    gradients, wanted_gradients = got.parameter_gradients(rows=True), wanted.parameter_gradients(rows=True)
+    gradients = got.parameter_gradients(rows=True, stats=stats)
+    wanted_gradients = wanted.parameter_gradients(rows=True, stats=wanted_stats)
     for name, _ in case.gaussians.items():
         ours, theirs = getattr(gradients, name), getattr(wanted_gradients, name)
         shape = (*theirs.shape[:2], -1)

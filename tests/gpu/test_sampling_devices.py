@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 import torch
-from turbogs_plugin.strategies.losses.losses import CharbonnierLoss, CharbonnierNccLoss, SparseSsimLoss
-from turbogs_plugin.strategies.pixels.samplers import DensePixelSampler, ErrorGuidedPixelSampler, RandomPixelSampler
+from turbogs_plugin.strategies.losses import CharbonnierLoss, CharbonnierNccLoss, SparseSsimLoss
+from turbogs_plugin.strategies.pixel_sampling import DensePixelSampler, ErrorGuidedPixelSampler, RandomPixelSampler
 
 from turbogs_plugin.engine.reference.philox import exponentials
 from turbogs_plugin.error_maps import ErrorMaps

@@ -59,7 +59,9 @@ def test_any_gaussian_among_ordinary_ones_stays_finite(size, place, norm):
     samples, stats = dense_samples(cameras), GaussianStats.zeros(len(gaussians), "cuda")
     rendered = rasterize(gaussians, cameras, samples)
     ones = torch.ones_like(rendered.alphas)
-    gradients = rendered.backward(torch.ones_like(rendered.colors), ones, stats).parameter_gradients(rows=True)
+    gradients = rendered.backward(torch.ones_like(rendered.colors), ones, with_statistics=True).parameter_gradients(
+        True, stats
+    )
     assert rendered.colors.isfinite().all() and rendered.alphas.isfinite().all()
     assert all(value.isfinite().all() for value in (*vars(gradients).values(), *vars(stats).values()))
     for name in NAMES[:-1]:

@@ -76,13 +76,13 @@ class Scene:
         with torch.enable_grad():
             return leaves, project_rows(self.rows, *leaves, cameras, self.degree, DEFAULT_SETTINGS)
 
-    def reference(self, stats=None):
+    def reference(self):
         """The screen gradients of the reference in float64."""
         leaves, splats = self.project(self.gaussians.map(lambda value: value.double()), torch.float64)
         records = self.rows.gather(self.records.double())
-        return ReferenceScreenGradients(self.rows, splats, leaves, records, self.samples, stats)
+        return ReferenceScreenGradients(self.rows, splats, leaves, records, self.samples, True)
 
-    def screen(self, gaussians=None, stats=None, overflow=None):
+    def screen(self, gaussians=None, overflow=None):
         """Those of the kernels; the records are copied, as a step may overwrite them. Off screen they hold anything."""
         gaussians = gaussians or self.on_device()
         on_screen = (self.radii > 0).any(dim=-1, keepdim=True)
@@ -99,22 +99,12 @@ class Scene:
             settings=DEFAULT_SETTINGS,
             records=torch.where(on_screen, self.records, torch.nan).to(DEVICE, copy=True),
             radii=self.radii.to(DEVICE),
-            stats=stats,
+            with_statistics=True,
             overflow=overflow,
         )
 
     def on_device(self):
         return self.gaussians.map(lambda value: value.to(DEVICE, copy=True))
-
-
-class Fixed:
-    """`ScreenGradients` made before."""
-
-    def __init__(self, gradients: GaussianGradients):
-        self.gradients = gradients
-
-    def parameter_gradients(self, rows: bool) -> GaussianGradients:
-        return self.gradients
 
 
 def doubled(value):
@@ -135,8 +125,8 @@ def test_gradients_are_the_reference_s(degree, used_degree, rows):
     scene = Scene(degree=degree, used_degree=used_degree)
     count = len(scene.gaussians)
     expected_stats, stats = GaussianStats.zeros(count, "cpu"), GaussianStats.zeros(count, DEVICE)
-    expected = scene.reference(expected_stats).parameter_gradients(rows)
-    found = training_kernels.projection_backward(scene.screen(stats=stats), rows)
+    expected = scene.reference().parameter_gradients(rows, expected_stats)
+    found = scene.screen().parameter_gradients(rows, stats)
     for name in (*ROW_PARAMETERS, "shN", "view_losses"):
         value, wanted = getattr(found, name), getattr(expected, name)
         assert value.shape == wanted.shape, name
@@ -157,9 +147,9 @@ def test_statistics_are_added_to():
     scene = Scene(count=40)
     stats = GaussianStats.zeros(40, DEVICE)
     for _ in range(2):
-        training_kernels.projection_backward(scene.screen(stats=stats), rows=False)
+        scene.screen().parameter_gradients(False, stats)
     once = GaussianStats.zeros(40, DEVICE)
-    training_kernels.projection_backward(scene.screen(stats=once), rows=False)
+    scene.screen().parameter_gradients(False, once)
     for field in fields(GaussianStats):
         factor = 1 if field.name == "max_radii" else 2
         torch.testing.assert_close(getattr(stats, field.name), factor * getattr(once, field.name))
@@ -168,9 +158,9 @@ def test_statistics_are_added_to():
 def twin_step(optimizer, gaussians, scene):
     """The torch twin's step in float64, from the kernels' own gradients."""
     rows = getattr(optimizer, "rows", "summed") == "views"
-    gradients = training_kernels.projection_backward(scene.screen(), rows)
+    gradients = scene.screen().parameter_gradients(rows)
     values = {field.name: doubled(getattr(gradients, field.name)) for field in fields(GaussianGradients)}
-    optimizer.step(gaussians, Fixed(GaussianGradients(**values)), STEP)
+    optimizer.step(gaussians, GaussianGradients(**values), STEP)
 
 
 @pytest.mark.parametrize("name", OPTIMIZERS)
@@ -284,12 +274,12 @@ def test_overflow_changes_nothing():
     optimizer.setup(gaussians)
     stats = GaussianStats.zeros(50, DEVICE)
     overflow = torch.ones(1, dtype=torch.int32, device=DEVICE)
-    screen = scene.screen(gaussians, stats=stats, overflow=overflow)
-    training_kernels.fused_step(screen, gaussians, optimizer.moments, optimizer.rule(STEP))
+    screen = scene.screen(gaussians, overflow=overflow)
+    training_kernels.fused_step(screen, gaussians, optimizer.moments, optimizer.rule(STEP), stats)
     for parameter, value in gaussians.items():
         assert torch.equal(value.cpu(), getattr(scene.gaussians, parameter)), parameter
     assert not optimizer.moments.steps.any() and not stats.view_counts.any()
-    gradients = training_kernels.projection_backward(scene.screen(overflow=overflow), rows=True)
+    gradients = scene.screen(overflow=overflow).parameter_gradients(True)
     assert not gradients.means.any() and not gradients.touched.any()
 
 
@@ -305,7 +295,7 @@ def test_any_number_of_gaussians(count):
     training_kernels.fused_step(scene.screen(gaussians), gaussians, optimizer.moments, optimizer.rule(STEP))
     touched = (scene.records[..., 13] > 0).any(dim=0)
     assert torch.equal(optimizer.moments.steps.cpu().bool(), touched)
-    assert len(training_kernels.projection_backward(scene.screen(), rows=True).touched) == count
+    assert len(scene.screen().parameter_gradients(True).touched) == count
 
 
 def test_wrong_tensors_are_named():
@@ -321,14 +311,13 @@ def test_wrong_tensors_are_named():
 
 
 def test_more_views_than_the_kernels_take_are_refused():
-    scene = Scene(count=20, views=training_kernels.MAX_VIEWS + 1)
+    scene = Scene(count=20, views=cuda.MAX_VIEWS + 1)
     gaussians, optimizer = scene.on_device(), OPTIMIZERS["lm"]
     optimizer.setup(gaussians)
     with pytest.raises(InputError, match="views, got 129"):
         training_kernels.fused_step(scene.screen(gaussians), gaussians, optimizer.moments, optimizer.rule(STEP))
     with pytest.raises(InputError, match="views, got 129"):
-        training_kernels.projection_backward(scene.screen(), rows=False)
-    assert cuda.MAX_VIEWS == training_kernels.MAX_VIEWS
+        scene.screen().parameter_gradients(False)
 
 
 def test_side_stream():

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 from helpers.bridge_host import HEIGHT, WIDTH, arguments, make_cameras, make_splats
-from turbogs_plugin.strategies.losses.losses import CharbonnierLoss, CharbonnierNccLoss
-from turbogs_plugin.strategies.pixels.samplers import RandomPixelSampler
+from turbogs_plugin.strategies.losses import CharbonnierLoss, CharbonnierNccLoss
+from turbogs_plugin.strategies.pixel_sampling import RandomPixelSampler
 
 from turbogs_plugin.engine.rendering import dense_samples, rasterize_differentiable
 from turbogs_plugin.error_maps import ErrorMaps

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import fields
 
 import torch
 from torch import Tensor
@@ -35,51 +35,31 @@ def clone(gaussians: Gaussians) -> Gaussians:
     return gaussians.map(lambda value: value.clone())
 
 
-@dataclass
-class FixedGradients:
-    """`ScreenGradients` that were known before."""
-
-    gradients: GaussianGradients
-
-    def parameter_gradients(self, rows: bool) -> GaussianGradients:
-        if rows:
-            return self.gradients
-        summed = {}
-        for field in fields(self.gradients):
-            value = getattr(self.gradients, field.name)
-            summed[field.name] = value if field.name in ("shN", "touched") else value.sum(dim=0, keepdim=True)
-        return GaussianGradients(**summed)
-
-
 def make_gradients(
     views: int, count: int, seed: int = 1, dtype=torch.float64, bands: int = 3, size: float = 1e-5
-) -> FixedGradients:
+) -> GaussianGradients:
     """Random gradients of about `size` in every view, all Gaussians touched, loss shares of about `size`."""
     generator = torch.Generator().manual_seed(seed)
 
     def normal(*shape: int) -> Tensor:
         return size * torch.randn(*shape, generator=generator, dtype=dtype)
 
-    return FixedGradients(
-        GaussianGradients(
-            means=100 * normal(views, count, 3),
-            quats=normal(views, count, 4),
-            scales=10 * normal(views, count, 3),
-            opacities=normal(views, count),
-            sh0=normal(views, count, 1, 3),
-            shN=normal(count, bands, 3),
-            touched=torch.ones(count, dtype=torch.bool),
-            view_losses=normal(views, count).abs() * 0.1,
-        )
+    return GaussianGradients(
+        means=100 * normal(views, count, 3),
+        quats=normal(views, count, 4),
+        scales=10 * normal(views, count, 3),
+        opacities=normal(views, count),
+        sh0=normal(views, count, 1, 3),
+        shN=normal(count, bands, 3),
+        touched=torch.ones(count, dtype=torch.bool),
+        view_losses=normal(views, count).abs() * 0.1,
     )
 
 
-def scaled(gradients: FixedGradients, factor: float) -> FixedGradients:
+def scaled(gradients: GaussianGradients, factor: float) -> GaussianGradients:
     """The gradients of a loss that is `factor` times as large."""
-    values = {field.name: getattr(gradients.gradients, field.name) for field in fields(GaussianGradients)}
-    return FixedGradients(
-        GaussianGradients(**{name: v if name == "touched" else v * factor for name, v in values.items()})
-    )
+    values = {field.name: getattr(gradients, field.name) for field in fields(GaussianGradients)}
+    return GaussianGradients(**{name: v if name == "touched" else v * factor for name, v in values.items()})
 
 
 def random_stats(count: int, seed: int, seen: float = 0.8) -> GaussianStats:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from helpers.framework_runs import assert_identical, tiny_capture, tiny_config
-from turbogs_plugin.strategies.pixels.samplers import ErrorGuidedPixelSampler
+from turbogs_plugin.strategies.pixel_sampling import ErrorGuidedPixelSampler
 
 from turbogs_plugin.error_maps import AGE_MAX, ErrorMaps
 from turbogs_plugin.report import outputs

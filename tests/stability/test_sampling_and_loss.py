@@ -4,8 +4,8 @@ import numpy as np
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from turbogs_plugin.strategies.losses.losses import CharbonnierNccLoss, SparseSsimLoss
-from turbogs_plugin.strategies.pixels.samplers import ErrorGuidedPixelSampler
+from turbogs_plugin.strategies.losses import CharbonnierNccLoss, SparseSsimLoss
+from turbogs_plugin.strategies.pixel_sampling import ErrorGuidedPixelSampler
 
 from turbogs_plugin.error_maps import AGE_MAX, ErrorMaps
 from turbogs_plugin.types import PixelSamples, Step

@@ -37,7 +37,7 @@ class Reference:
 
     def step(self, gradients, regularizer=None) -> None:
         for name, p in self.params.items():
-            p.grad = gradients.gradients.summed(name).clone()
+            p.grad = gradients.summed(name).clone()
         if regularizer is not None:
             regularizer(self.params).backward()
         for optimizer in self.optimizers.values():
@@ -58,12 +58,12 @@ def follow(update: RowUpdate, gaussians, optimizer: DenseAdam):
 
 def leave_untouched(gradients, seed: int):
     """The gradients of an iteration that touched about half of the Gaussians."""
-    touched = torch.rand(len(gradients.gradients.touched), generator=torch.Generator().manual_seed(seed)) < 0.5
+    touched = torch.rand(len(gradients.touched), generator=torch.Generator().manual_seed(seed)) < 0.5
     touched[0] = True
     for name in PARAMETER_NAMES:
-        value = getattr(gradients.gradients, name)
+        value = getattr(gradients, name)
         value[(slice(None), ~touched) if name != "shN" else ~touched] = 0
-    gradients.gradients.touched = touched
+    gradients.touched = touched
     return gradients
 
 
@@ -127,8 +127,8 @@ def test_the_untouched_go_on_and_new_ones_leap():
     update = RowUpdate(torch.tensor([0, 1, 1]), torch.tensor([False, False, True]), {})
     gaussians = follow(update, gaussians, optimizer)
     before = clone(gaussians)
-    gradients.gradients.means[:, 2] = gradients.gradients.means[:, 1]
-    gradients.gradients.means[:, 0] = 0.0
+    gradients.means[:, 2] = gradients.means[:, 1]
+    gradients.means[:, 0] = 0.0
     optimizer.step(gaussians, gradients, STEP)
     moved = (gaussians.means - before.means).abs() / RATES.at(STEP).means
     torch.testing.assert_close(moved[0], torch.full((3,), 0.9, dtype=torch.float64), rtol=1e-3, atol=0)
@@ -144,7 +144,7 @@ def test_an_iteration_that_touched_nothing_changes_nothing():
     optimizer.step(gaussians, make_gradients(2, 4), STEP)
     before, state = clone(gaussians), {name: value.clone() for name, value in optimizer.state_dict().items()}
     gradients = make_gradients(2, 4, size=0.0)
-    gradients.gradients.touched[:] = False
+    gradients.touched[:] = False
     optimizer.step(gaussians, gradients, STEP)
     assert equal(gaussians, before)
     assert all(torch.equal(value, state[name]) for name, value in optimizer.state_dict().items())
@@ -161,10 +161,10 @@ def test_a_non_finite_gradient_counts_as_untouched(name, bad):
         gradients = make_gradients(3, 5, seed=2)
         if index == 0:
             for parameter in PARAMETER_NAMES:
-                value = getattr(gradients.gradients, parameter)
+                value = getattr(gradients, parameter)
                 (value[2] if parameter == "shN" else value[:, 2]).fill_(0.0)
         else:
-            value = getattr(gradients.gradients, name)
+            value = getattr(gradients, name)
             (value[2] if name == "shN" else value[1, 2]).fill_(bad)
         optimizers[index].step(gaussians, gradients, STEP)
     assert equal(clean, dirty)
@@ -180,7 +180,7 @@ def test_survives_any_finite_gradient_and_scale():
     for seed in range(30):
         gradients = make_gradients(10, len(sizes), seed, torch.float32, size=1.0)
         for name in PARAMETER_NAMES:
-            value = getattr(gradients.gradients, name)
+            value = getattr(gradients, name)
             value.sign_().mul_(sizes.reshape(-1, *[1] * (value.dim() - (1 if name == "shN" else 2))))
         optimizer.step(gaussians, gradients, STEP)
     assert all_finite(gaussians)

@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pytest
 import torch
-from turbogs_plugin.strategies.losses.losses import CharbonnierLoss, CharbonnierNccLoss, SparseSsimLoss
+from turbogs_plugin.strategies.losses import CharbonnierLoss, CharbonnierNccLoss, SparseSsimLoss
 
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.types import PixelSamples

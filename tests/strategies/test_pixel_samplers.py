@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 from helpers.sampling_cases import SIGMAS, SIZES, UNITS, pixels_by_tile, random_maps, step
-from turbogs_plugin.strategies.pixels.samplers import DensePixelSampler, ErrorGuidedPixelSampler, RandomPixelSampler
+from turbogs_plugin.strategies.pixel_sampling import DensePixelSampler, ErrorGuidedPixelSampler, RandomPixelSampler
 from turbogs_plugin.strategies.schedule import SinusoidalSchedule
 from turbogs_plugin.strategies.view_sampling import RandomViewSampler
 

@@ -60,7 +60,7 @@ def test_equals_torch_adam():
         gradients = make_gradients(3, 7, seed)
         optimizer.step(gaussians, gradients, STEP)
         for name, p in reference.items():
-            p.grad = gradients.gradients.summed(name)
+            p.grad = gradients.summed(name)
         adam.step()
     for name, value in gaussians.items():
         torch.testing.assert_close(value, reference[name].data, rtol=1e-12, atol=1e-12)
@@ -90,7 +90,7 @@ def test_untouched_rows_stand_still_and_count_their_own_steps(cls):
         gradients = make_gradients(2, 4, seed=iteration)
         if iteration != 1:
             dense_optimizer.step(dense, gradients, STEP)
-        gradients.gradients.touched[1] = iteration != 1
+        gradients.touched[1] = iteration != 1
         before = clone(sparse)
         sparse_optimizer.step(sparse, gradients, STEP)
         if iteration == 1:
@@ -111,7 +111,7 @@ def test_non_finite_gradient_skips_one_gaussian(cls, name, bad):
     optimizers[0].setup(clean)
     optimizers[0].step(clean, gradients, STEP)
     start = clone(dirty)
-    value = getattr(gradients.gradients, name)
+    value = getattr(gradients, name)
     (value[2] if name == "shN" else value[1, 2]).fill_(bad)
     optimizers[1].setup(dirty)
     optimizers[1].step(dirty, gradients, STEP)
@@ -135,9 +135,9 @@ def test_survives_any_finite_gradient(cls, dtype):
     for seed in range(30):
         gradients = make_gradients(10, len(sizes), seed, dtype, size=1.0)
         for name in PARAMETER_NAMES:
-            value = getattr(gradients.gradients, name)
+            value = getattr(gradients, name)
             value.sign_().mul_(sizes.reshape(-1, *[1] * (value.dim() - (1 if name == "shN" else 2))))
-        gradients.gradients.view_losses = torch.rand_like(gradients.gradients.view_losses) * sizes.clamp(max=1e30)
+        gradients.view_losses = torch.rand_like(gradients.view_losses) * sizes.clamp(max=1e30)
         optimizer.step(gaussians, gradients, STEP)
     assert all_finite(gaussians)
     assert all(bool(torch.isfinite(v).all()) for v in optimizer.state_dict().values())
@@ -151,7 +151,7 @@ def test_no_gaussians_and_nothing_touched(cls):
         optimizer = cls()
         optimizer.setup(gaussians)
         gradients = make_gradients(2, count)
-        gradients.gradients.touched[:] = False
+        gradients.touched[:] = False
         optimizer.step(gaussians, gradients, STEP)
         assert equal(gaussians, before)
 
@@ -196,23 +196,3 @@ def test_state_of_another_model_is_refused():
     with pytest.raises(InputError, match="nothing"):
         optimizer.load_state_dict({})
     assert optimizer.moments.exp_avg is before
-
-
-@pytest.mark.parametrize("cls", OPTIMIZERS)
-def test_fused_step_takes_over(cls):
-    """A kernel gets the parameters, the moments and the rule, and nothing else happens."""
-    calls = []
-
-    class Fused:
-        def fused_step(self, *arguments):
-            calls.append(arguments)
-
-    gaussians = make_gaussians(3)
-    before = clone(gaussians)
-    optimizer = cls()
-    optimizer.setup(gaussians)
-    optimizer.step(gaussians, Fused(), STEP)
-    ((given, moments, rule),) = calls
-    assert given is gaussians and moments is optimizer.moments and rule == optimizer.rule(STEP)
-    assert (rule.lm is None) == (cls is SparseAdam)
-    assert torch.equal(gaussians.means, before.means)

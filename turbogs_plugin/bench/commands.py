@@ -14,7 +14,7 @@ import torch
 from turbogs_plugin.bench.large_capture import synthetic_scene
 from turbogs_plugin.bench.raster import RasterBench, other_build
 from turbogs_plugin.bench.step import StepBench
-from turbogs_plugin.engine.cuda import library as kernels
+from turbogs_plugin.engine import compiled_kernels
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.files import require_writable, write_text_atomically
 from turbogs_plugin.report.provenance import provenance
@@ -66,8 +66,8 @@ def run_raster(bench: RasterBench, scene: Path | None, factor: int, device: torc
         _save(report, out)  # a build that fails takes nothing away
         _tell(raster_lines(measured), out)
         builds = {library.name: library for library in bench.libraries}
-        if builds and kernels.available():
-            builds = {AGAIN: kernels.library_path(), **builds}
+        if builds and not compiled_kernels().unavailable:
+            builds = {AGAIN: compiled_kernels().path, **builds}
         for name, library in builds.items():
             measured = other_build(library, command)
             report["other_builds"][name] = {**measured, **model}

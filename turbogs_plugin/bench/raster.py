@@ -28,8 +28,10 @@ from turbogs_plugin.bench.models import (
     trained_model,
 )
 from turbogs_plugin.bench.precision import precision
-from turbogs_plugin.engine.cuda import library as kernels
-from turbogs_plugin.engine.rendering import Rendered, Workspace, rasterize
+from turbogs_plugin.engine import engine_of
+from turbogs_plugin.engine.cuda.library import LIBRARY_VARIABLE
+from turbogs_plugin.engine.cuda.raster import CudaRendered
+from turbogs_plugin.engine.rendered import Rendered
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.model.gaussians import load_ply, save_ply
 from turbogs_plugin.scene import Scene
@@ -192,17 +194,17 @@ class RasterBench:
     ) -> dict[str, Any]:
         """One (model, views, rate): stages, totals, counts, floors and memory."""
         samples = tile_samples(cameras.sizes, rate, device, seed=1)
-        on_kernels = device.type == "cuda" and kernels.available()
-        workspace = Workspace(device) if on_kernels else None
+        engine = engine_of(device, for_training=True)
         gradients = torch.randn(len(samples), 3, device=device) / len(samples)
         errors = torch.rand(len(samples), device=device)
         stats = GaussianStats.zeros(len(model), device) if density else None
 
         def render() -> Rendered:
-            return rasterize(model, cameras, samples, workspace=workspace)
+            return engine.render(model, cameras, samples)
 
         def whole() -> None:
-            render().backward(gradients, errors, stats).parameter_gradients(rows=False)
+            screen = render().backward(gradients, errors, with_statistics=density)
+            screen.parameter_gradients(rows=False, stats=stats)
 
         measured: dict[str, Any] = {
             "gaussians": len(model),
@@ -211,7 +213,7 @@ class RasterBench:
             "density_sums": density,
             "samples": len(samples),
         }
-        if not on_kernels:
+        if not isinstance(render(), CudaRendered):
             visible = (render().projected().radii > 0).any(dim=-1).any(dim=0)  # [N]
             return {
                 **measured,
@@ -235,8 +237,8 @@ class RasterBench:
             **self._totals(whole, device),
             "counts": counts,
             "floors_ms": raster_floors(counts, bandwidth),
-            "lost_passes": workspace.take_lost(wait=True),
-            "workspace_bytes": workspace.bytes_held(),
+            "lost_passes": engine.settle(wait=True),
+            "workspace_bytes": engine.bytes_held,
             "peak_bytes": torch.cuda.max_memory_allocated(device),
         }
 
@@ -252,7 +254,7 @@ def other_build(library: Path, command: Sequence[str]) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "bench.json"
         arguments = [sys.executable, "-m", "turbogs_plugin.cli", "bench", "raster", *command, "--out", str(out)]
-        environment = {**os.environ, kernels.LIBRARY_VARIABLE: str(library.resolve())}
+        environment = {**os.environ, LIBRARY_VARIABLE: str(library.resolve())}
         ended = subprocess.run(arguments, env=environment, capture_output=True, text=True, check=False)
         if ended.returncode:
             raise InputError(f"library '{library}': {ended.stderr.strip().splitlines()[-1]}")

@@ -10,15 +10,14 @@ from typing import Any
 import torch
 
 from turbogs_plugin.bench.clocks import Mark, Summary, summary
-from turbogs_plugin.engine.cuda import library as kernels
-from turbogs_plugin.engine.rendering import Rendered
-from turbogs_plugin.train import trainer as trainer_module
+from turbogs_plugin.engine import Engine
+from turbogs_plugin.engine.rendered import Rendered
 from turbogs_plugin.train.trainer import Trainer
-from turbogs_plugin.types import PixelSamples
+from turbogs_plugin.types import Cameras, Gaussians, PixelSamples
 
-STEPS = ("budget", "GVS", "EPS", "gather", "FWD", "L", "E", "gather+L+E", "BWD", "solve+update", "EDC")
-"""The paper's names, in the order of an iteration: sampling parameters, view and pixel sampling, ground truth, forward,
-loss, error maps, backward, optimizer, density control. The kernels do three of them at once."""
+STEPS = ("budget", "GVS", "EPS", "FWD", "gather+L+E", "BWD", "solve+update", "EDC")
+"""The paper's names, in the order of an iteration: sampling parameters, view and pixel sampling, forward, ground truth
+with loss and error maps, backward to the screen, backward to the parameters with the optimizer, density control."""
 
 
 class StepRecorder:
@@ -57,38 +56,49 @@ class StepRecorder:
         }
 
 
+class TimedEngine:
+    """Another engine whose every call is recorded; what it renders records its backward pass too.
+
+    Args:
+        engine: of the trainer.
+    """
+
+    def __init__(self, engine: Engine, recorder: StepRecorder) -> None:
+        self._engine, self._recorder = engine, recorder
+        self.draw, self.evaluate, self.learn, self.settle = engine.draw, engine.evaluate, engine.learn, engine.settle
+        self.supervise = recorder.timed("gather+L+E", engine.supervise)
+        self.update = recorder.timed("solve+update", engine.update)
+        self._render = recorder.timed("FWD", engine.render)
+
+    def render(self, gaussians: Gaussians, cameras: Cameras, samples: PixelSamples, **options: Any) -> Rendered:
+        rendered = self._render(gaussians, cameras, samples, **options)
+        self._recorder.rendered, self._recorder.samples = rendered, samples
+        rendered.backward = self._recorder.timed("BWD", rendered.backward)
+        return rendered
+
+    @property
+    def bytes_held(self) -> int:
+        return self._engine.bytes_held
+
+
 @contextmanager
 def recorded(trainer: Trainer, recorder: StepRecorder) -> Iterator[Callable[[], None]]:
     """While entered, the steps of this trainer's iterations are recorded; gives its iteration."""
     timed = recorder.timed
-    at_once = recorder.device.type == "cuda" and kernels.available() and hasattr(trainer.loss, "kernel_terms")
-
-    def rasterize(gaussians, cameras, samples, **keywords) -> Rendered:
-        rendered = original(gaussians, cameras, samples, **keywords)
-        rendered.backward = timed("BWD", rendered.backward)
-        recorder.rendered, recorder.samples = rendered, samples
-        return rendered
-
-    original = trainer_module.rasterize
     replacements = [
+        (trainer, "engine", TimedEngine(trainer.engine, recorder)),
         (trainer.schedule, "query", timed("budget", trainer.schedule.query)),
         (trainer.view_sampler, "select", timed("GVS", trainer.view_sampler.select)),
         (trainer.pixel_sampler, "sample", timed("EPS", trainer.pixel_sampler.sample)),
-        (trainer_module, "rasterize", timed("FWD", rasterize)),
-        (trainer.optimizer, "step", timed("solve+update", trainer.optimizer.step)),
         (trainer.density, "update", timed("EDC", trainer.density.update)),
     ]
-    if at_once:
-        replacements.append((trainer_module, "supervise", timed("gather+L+E", trainer_module.supervise)))
-    else:
-        replacements += [
-            (trainer.views.photos, "gather", timed("gather", trainer.views.photos.gather)),
-            (trainer, "loss", timed("L", trainer.loss)),
-            (trainer.maps, "update", timed("E", trainer.maps.update)),
-        ]
+    if trainer.loss.terms is None:  # its own code is not the engine's
+        replacements.append((trainer, "supervise", timed("gather+L+E", trainer.supervise)))
+    if trainer.optimizer.rule(trainer.now) is None:
+        replacements.append((trainer, "update", timed("solve+update", trainer.update)))
     with ExitStack() as stack:
-        for owner, name, function in replacements:
-            stack.enter_context(_replaced(owner, name, function))
+        for owner, name, replacement in replacements:
+            stack.enter_context(_replaced(owner, name, replacement))
         yield timed("iteration", trainer.step)
 
 

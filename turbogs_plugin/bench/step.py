@@ -241,7 +241,7 @@ def memory(trainer: Trainer, scene: Scene, held: int, device: torch.device) -> d
         "density_statistics": tensor_bytes(trainer.density.state_dict()),
         "error_maps": tensor_bytes([trainer.maps.errors, trainer.maps.stamps]),
         "training_photos": tensor_bytes(trainer.views.photos.colors),
-        "raster_workspace": 0 if trainer.workspace is None else trainer.workspace.bytes_held(),
+        "raster_workspace": trainer.engine.bytes_held,
     }
     if device.type != "cuda":
         return {**stored, "temporary": None, "peak": None}

@@ -32,14 +32,14 @@ BUILT_IN: dict[str, dict[str, str]] = {
         "random": "turbogs_plugin.strategies.view_sampling:RandomViewSampler",
     },
     "pixel_sampler": {
-        "error_guided": "turbogs_plugin.strategies.pixels.samplers:ErrorGuidedPixelSampler",
-        "random": "turbogs_plugin.strategies.pixels.samplers:RandomPixelSampler",
-        "dense": "turbogs_plugin.strategies.pixels.samplers:DensePixelSampler",
+        "error_guided": "turbogs_plugin.strategies.pixel_sampling:ErrorGuidedPixelSampler",
+        "random": "turbogs_plugin.strategies.pixel_sampling:RandomPixelSampler",
+        "dense": "turbogs_plugin.strategies.pixel_sampling:DensePixelSampler",
     },
     "loss": {
-        "charbonnier_ncc": "turbogs_plugin.strategies.losses.losses:CharbonnierNccLoss",
-        "charbonnier": "turbogs_plugin.strategies.losses.losses:CharbonnierLoss",
-        "sparse_ssim": "turbogs_plugin.strategies.losses.losses:SparseSsimLoss",
+        "charbonnier_ncc": "turbogs_plugin.strategies.losses:CharbonnierNccLoss",
+        "charbonnier": "turbogs_plugin.strategies.losses:CharbonnierLoss",
+        "sparse_ssim": "turbogs_plugin.strategies.losses:SparseSsimLoss",
     },
     "density": {
         "error_driven": "turbogs_plugin.strategies.density.error_driven:ErrorDrivenDensity",

@@ -1,1 +1,51 @@
-"""What computes: one protocol, a torch reference and its CUDA twin, and the place that picks one."""
+"""What computes: a protocol, the torch reference, its CUDA twin, and the one place that picks one.
+
+`Engine` is the seam: strategies say what is to be done (`rules`), an engine does it on one device. Nobody outside this
+package asks which device it is.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from turbogs_plugin.engine.cuda import library
+from turbogs_plugin.engine.cuda.engine import CudaEngine
+from turbogs_plugin.engine.protocol import Engine
+from turbogs_plugin.engine.reference.engine import ReferenceEngine
+
+__all__ = ["CompiledKernels", "Engine", "compiled_kernels", "engine_of"]
+
+
+@dataclass(frozen=True)
+class CompiledKernels:
+    """The compiled library of kernels, for whoever reports on it.
+
+    Args:
+        path: where it is looked for.
+        architectures: what it holds code for: ``sm_90``, ..., or PTX, ``compute_90``.
+        unavailable: why it cannot run here, in one line; "" where it does.
+    """
+
+    path: Path
+    architectures: tuple[str, ...]
+    unavailable: str
+
+
+def compiled_kernels() -> CompiledKernels:
+    """The library that `engine_of` takes for CUDA tensors, or why it takes the reference."""
+    return CompiledKernels(library.library_path(), library.architectures(), library.unavailable_reason())
+
+
+def engine_of(device: torch.device, for_training: bool = False) -> Engine:
+    """The engine for tensors on a device: the kernels where they are compiled and run, else the torch reference.
+
+    Args:
+        for_training: one that keeps its memory from pass to pass and never waits for the GPU. What it renders is valid
+            until its next pass, and its caller must ask `Engine.settle` before each iteration.
+    """
+    if device.type == "cuda" and library.available():
+        return CudaEngine(device if for_training else None)
+    return ReferenceEngine()

@@ -34,19 +34,29 @@ class Projected:
 class ScreenGradients(Protocol):
     """Gradients on the screen, not yet taken back to the parameters.
 
-    The parameters' gradients are made when asked for, so that an optimizer with a kernel of its own can fuse that
-    step with its update and the gradients of the higher bands never reach memory. The window of statistics given to
-    `Rendered.backward` is added to exactly once, by whichever of the two happens.
+    They are taken there when asked for, so that an engine can fuse that step with the optimizer's update: then the
+    gradients of the higher bands never reach memory.
     """
 
-    def parameter_gradients(self, rows: bool) -> GaussianGradients:
-        """The gradients of the parameters: one row per view (`rows`), or their sum. May be called once."""
+    def parameter_gradients(self, rows: bool, stats: GaussianStats | None = None) -> GaussianGradients:
+        """The gradients of the parameters: one row per view (`rows`), or their sum. May be called once.
+
+        Args:
+            stats: the window of density control, which this pass is added to; only of a backward pass
+                ``with_statistics``.
+        """
         ...
 
     def full_records(self) -> Tensor:
         """[K, N, 16] the gradients on the screen: of the projected mean in columns 0-1, of its absolute value per pixel
-        in 9-10, which need a window of statistics; zero where a Gaussian is not drawn."""
+        in 9-10, which need a pass ``with_statistics``; zero where a Gaussian is not drawn."""
         ...
+
+
+def require_statistics(with_statistics: bool, stats: GaussianStats | None) -> None:
+    """Raise `ValueError` where statistics are wanted of a backward pass that did not sum them up."""
+    if stats is not None and not with_statistics:
+        raise ValueError("statistics of a pass without them: call Rendered.backward(..., with_statistics=True)")
 
 
 class Rendered(Protocol):
@@ -70,7 +80,8 @@ class Rendered(Protocol):
         self,
         color_gradients: Tensor,
         pixel_errors: Tensor | None = None,
-        stats: GaussianStats | None = None,
+        *,
+        with_statistics: bool = False,
         alpha_gradients: Tensor | None = None,
         depth_gradients: Tensor | None = None,
     ) -> ScreenGradients:
@@ -78,8 +89,8 @@ class Rendered(Protocol):
 
         Args:
             color_gradients: [P, 3] d loss / d colors.
-            pixel_errors: [P] the errors that the density sums carry to the Gaussians; zeros where None.
-            stats: the window that receives this pass's statistics, where wanted.
+            pixel_errors: [P] the errors that are carried to the Gaussians; zeros where None.
+            with_statistics: also sum up what `GaussianStats` has (absolute gradients, distances).
             alpha_gradients, depth_gradients: [P], where the loss has such terms.
         """
         ...

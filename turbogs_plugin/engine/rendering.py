@@ -1,4 +1,4 @@
-"""Rendering at sampled pixels: one function, `rasterize`, whose tensors' device decides what runs."""
+"""Rendering at sampled pixels and of whole images, by the engine of the Gaussians' device."""
 
 from __future__ import annotations
 
@@ -7,10 +7,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from turbogs_plugin.engine import engine_of
 from turbogs_plugin.engine.cuda import library as kernels
 from turbogs_plugin.engine.cuda.autograd import rasterize_differentiable_cuda
-from turbogs_plugin.engine.cuda.raster import rasterize_cuda
-from turbogs_plugin.engine.cuda.workspace import Workspace
 from turbogs_plugin.engine.reference.raster import (
     DifferentiableRender,
     rasterize_differentiable_reference,
@@ -26,7 +25,6 @@ __all__ = [
     "RasterSettings",
     "Rendered",
     "ScreenGradients",
-    "Workspace",
     "dense_samples",
     "rasterize",
     "rasterize_differentiable",
@@ -44,31 +42,9 @@ def rasterize(
     sh_degree: int | None = None,
     settings: RasterSettings = DEFAULT_SETTINGS,
     with_depth: bool = False,
-    workspace: Workspace | None = None,
 ) -> Rendered:
-    """Render samples of K views with gsplat's conventions, on a black background.
-
-    Args:
-        gaussians: the model. On a CUDA device the kernels run where they are compiled, else the torch reference.
-        cameras: the K views of the batch, in the order of `samples.view_ids`.
-        samples: the pixels.
-        sh_degree: highest degree of spherical harmonics used; all there are where None.
-        settings: thresholds and planes.
-        with_depth: also give expected depths.
-        workspace: with the kernels, memory to use again and no waiting for the GPU; see `Workspace` for what the caller
-            then owes.
-    """
-    if gaussians.device.type == "cuda" and kernels.available():
-        return rasterize_cuda(
-            gaussians,
-            cameras,
-            samples,
-            sh_degree=sh_degree,
-            settings=settings,
-            with_depth=with_depth,
-            workspace=workspace,
-        )
-    return rasterize_reference(
+    """Render samples of K views by the engine of the Gaussians' device; see `Engine.render`."""
+    return engine_of(gaussians.device).render(
         gaussians, cameras, samples, sh_degree=sh_degree, settings=settings, with_depth=with_depth
     )
 

@@ -20,12 +20,11 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
-from turbogs_plugin.engine.rendering import ScreenGradients
-from turbogs_plugin.engine.update_rule import COLUMNS, GaussianMoments, check_moments_config
+from turbogs_plugin.engine.moments import COLUMNS, GaussianMoments, check_moments_config
+from turbogs_plugin.engine.rules import ParameterRates
 from turbogs_plugin.errors import InputError, require
 from turbogs_plugin.gsplat_bridge.gaussian_errors import loss_shares
 from turbogs_plugin.gsplat_bridge.host import host_gaussians
-from turbogs_plugin.strategies.learning_rates import ParameterRates
 from turbogs_plugin.types import PARAMETER_NAMES, GaussianGradients, Gaussians, Step
 
 COUNT = "step"
@@ -44,7 +43,7 @@ class BlockOptimizer(Protocol):
     eps: float
     moments: GaussianMoments
 
-    def step(self, gaussians: Gaussians, gradients: ScreenGradients, step: Step) -> None: ...
+    def step(self, gaussians: Gaussians, gradients: GaussianGradients, step: Step) -> None: ...
 
 
 class SharedOptimizer:
@@ -120,7 +119,7 @@ class SharedOptimizer:
         self._take_options()
         moments = self._pack(gaussians)
         self.optimizer.moments = moments
-        self.optimizer.step(gaussians, _Summed(gradients, self._shares(gaussians, info)), Step(0, 1, 1))
+        self.optimizer.step(gaussians, _one_row(gradients, self._shares(gaussians, info)), Step(0, 1, 1))
         self._unpack(moments)
 
     def _take_options(self) -> None:
@@ -272,18 +271,13 @@ class _FixedRates:
         return self.rates
 
 
-class _Summed:
-    """Autograd's gradients as `ScreenGradients`: one row, the sum over views.
+def _one_row(gradients: dict[str, Tensor], shares: Tensor) -> GaussianGradients:
+    """Autograd's gradients as one row, the sum over views.
 
     Args:
         gradients: name -> [N, ...].
         shares: [1, N].
     """
-
-    def __init__(self, gradients: dict[str, Tensor], shares: Tensor) -> None:
-        self.gradients, self.shares = gradients, shares
-
-    def parameter_gradients(self, rows: bool) -> GaussianGradients:
-        touched = [(value.unsqueeze(-1).flatten(1) != 0).any(dim=1) for value in self.gradients.values()]
-        one_row = {name: value if name == "shN" else value[None] for name, value in self.gradients.items()}
-        return GaussianGradients(**one_row, touched=torch.stack(touched).any(dim=0), view_losses=self.shares)
+    touched = [(value.unsqueeze(-1).flatten(1) != 0).any(dim=1) for value in gradients.values()]
+    rows = {name: value if name == "shN" else value[None] for name, value in gradients.items()}
+    return GaussianGradients(**rows, touched=torch.stack(touched).any(dim=0), view_losses=shares)

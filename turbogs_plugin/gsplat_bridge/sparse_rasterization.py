@@ -247,10 +247,10 @@ class _Pass(torch.autograd.Function):
         errors = None if info is None else _sample_errors(info, ctx.samples)
         stats = GaussianStats.zeros(ctx.count, color_gradients.device)
         screen = ctx.rendered.backward(
-            color_gradients.contiguous(), errors, stats, alpha_gradients=alpha_gradients.contiguous()
+            color_gradients.contiguous(), errors, with_statistics=True, alpha_gradients=alpha_gradients.contiguous()
         )
         records = screen.full_records()
-        gradients = screen.parameter_gradients(rows=False)
+        gradients = screen.parameter_gradients(rows=False, stats=stats)
         if info is not None:
             info["means2d"].absgrad = records[..., ABSOLUTE].clone()
             if errors is not None:

@@ -7,7 +7,7 @@ import subprocess
 from dataclasses import dataclass
 from pathlib import Path
 
-from turbogs_plugin.engine.cuda import library as kernels
+from turbogs_plugin.engine import compiled_kernels
 from turbogs_plugin.report.pages import hardware, software
 
 COMMIT_VARIABLE = "TURBOGS_COMMIT"
@@ -36,10 +36,10 @@ class Provenance:
 
 def provenance(device_type: str) -> Provenance:
     """Of this process, computing on `cpu` or `cuda`."""
-    if device_type == "cuda" and kernels.available():
-        engine = f"{kernels.library_path().name} for {', '.join(kernels.architectures())}"
-    else:
-        reason = kernels.unavailable_reason() if device_type == "cuda" else "the device is the CPU"
+    kernels = compiled_kernels()
+    reason = kernels.unavailable if device_type == "cuda" else "the device is the CPU"
+    engine = f"{kernels.path.name} for {', '.join(kernels.architectures)}"
+    if reason:
         engine = f"none, the torch reference ran: {reason}"
     return Provenance(hardware(device_type), dict(software()), engine, source_commit())
 

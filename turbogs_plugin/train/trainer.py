@@ -11,9 +11,9 @@ import torch
 from torch import Tensor
 
 from turbogs_plugin.config.configuration import Config
-from turbogs_plugin.engine.cuda import library as kernels
-from turbogs_plugin.engine.rendering import Rendered, Workspace, rasterize, render_images
-from turbogs_plugin.engine.supervision import supervise
+from turbogs_plugin.engine import engine_of
+from turbogs_plugin.engine.rendered import Rendered, ScreenGradients
+from turbogs_plugin.engine.rendering import render_images
 from turbogs_plugin.errors import TrainingStopped
 from turbogs_plugin.model.gaussians import (
     BACKDROP_COUNT,
@@ -25,7 +25,8 @@ from turbogs_plugin.model.gaussians import (
 from turbogs_plugin.plan.budget import chosen_points
 from turbogs_plugin.scene import Scene
 from turbogs_plugin.scene.offload import place_maps, place_views
-from turbogs_plugin.types import PARAMETER_NAMES, Gaussians, PixelSamples, RowUpdate, Step
+from turbogs_plugin.scene.photos import PhotoSamples
+from turbogs_plugin.types import PARAMETER_NAMES, Gaussians, GaussianStats, LossOutput, PixelSamples, RowUpdate, Step
 
 COLOR_STRIDE = 97
 """Every so many pixels count for the mean colour of the photos; coprime to usual widths."""
@@ -55,8 +56,7 @@ class Trainer:
         self.view_sampler.setup(self.views.cameras, scene.extent)
         self.optimizer.setup(self.gaussians)
         self.density.setup(self.gaussians)
-        on_kernels = device.type == "cuda" and kernels.available()
-        self.workspace = Workspace(device) if on_kernels else None
+        self.engine = engine_of(device, for_training=True)
         self.iteration = 0
         self.first_repeatable = 0
         self.initial_error = 0.0
@@ -97,13 +97,14 @@ class Trainer:
         rendered = self.render(view_ids, samples)
 
         # 6) Sparse loss and its gradients, and 7) EMA update of the error maps
-        loss = supervise(self.loss, rendered.colors, truth, self.maps, step, self.overflow, self.nonfinite_losses)
+        loss = self.supervise(rendered.colors, truth, step)
 
-        # 8) Backward to the Gaussians; step 11's back-projection of errors happens in the same pass
-        gradients = rendered.backward(loss.color_gradients, loss.pixel_errors, self.density.stats)
+        # 8) Backward to the screen, with the errors that step 11 wants at the Gaussians
+        stats = self.density.stats
+        screen = rendered.backward(loss.color_gradients, loss.pixel_errors, with_statistics=stats is not None)
 
-        # 9) and 10) Solve for the updates and apply them
-        self.optimizer.step(self.gaussians, gradients, step)
+        # 9) and 10) Backward to the parameters, solve for their updates and apply them; `stats` get this iteration's
+        self.update(screen, stats, step)
 
         # 11) Error-driven density control
         self.follow(self.density.update(self.gaussians, step))
@@ -114,14 +115,31 @@ class Trainer:
 
     def render(self, view_ids: tuple[int, ...], samples: PixelSamples) -> Rendered:
         """The present model at the samples of some training views."""
-        return rasterize(
+        return self.engine.render(
             self.gaussians,
             self.views.cameras.select(view_ids),
             samples,
             sh_degree=self.sh_degree,
             settings=self.config.raster,
-            workspace=self.workspace,
         )
+
+    def supervise(self, colors: Tensor, truth: PhotoSamples, step: Step) -> LossOutput:
+        """Loss and error maps: at once where the loss is a rule, else by the loss's own code."""
+        terms, samples = self.loss.terms, truth.samples
+        if terms is not None:
+            return self.engine.supervise(terms, colors, truth, self.maps, step, self.nonfinite_losses)
+        loss = self.loss(colors, truth.colors(), samples)
+        self.engine.learn(self.maps, samples, colors, loss, step, self.nonfinite_losses)
+        return loss
+
+    def update(self, screen: ScreenGradients, stats: GaussianStats | None, step: Step) -> None:
+        """Gradients, statistics and step: at once where the optimizer has a rule, else by the optimizer's own code."""
+        rule = self.optimizer.rule(step)
+        if rule is not None:
+            self.engine.update(rule, screen, self.gaussians, self.optimizer.moments, stats)
+        else:
+            gradients = screen.parameter_gradients(self.optimizer.per_view, stats)
+            self.optimizer.step(self.gaussians, gradients, step)
 
     def follow(self, update: RowUpdate | None) -> None:
         """Let model and optimizer follow a change of the set of Gaussians."""
@@ -140,25 +158,19 @@ class Trainer:
             self.repeat_lost(wait=True)
 
     def repeat_lost(self, wait: bool = False) -> None:
-        """Go back by the iterations that did nothing because the rasterizer's workspace was too small for them.
+        """Go back by the iterations that did nothing because the engine had too little room for them.
 
-        Never behind a change of the set of Gaussians, which would be made twice: iterations lost just before one are
-        not repeated.
+        It never rewinds past a change of the set of Gaussians, which would then be made twice: iterations that were
+        lost just before one are not repeated.
 
         Args:
             wait: for the GPU, to know of all of them.
 
         Raises:
-            InputError: an iteration has more pairs of a tile and a splat than a pass can have.
+            InputError: an iteration has more intersections of a tile and a splat than a pass can have.
         """
-        if self.workspace is not None:
-            lost = self.workspace.take_lost(wait)
-            self.iteration = max(self.iteration - lost, min(self.first_repeatable, self.iteration))
-
-    @property
-    def overflow(self) -> Tensor | None:
-        """[1] int32 on the device, not 0 while iterations do nothing; None where that cannot be."""
-        return None if self.workspace is None else self.workspace.overflow
+        lost = self.engine.settle(wait)
+        self.iteration = max(self.iteration - lost, min(self.first_repeatable, self.iteration))
 
     @property
     def now(self) -> Step:

@@ -11,7 +11,7 @@ from torch.autograd.function import once_differentiable
 from turbogs_plugin.engine.cuda.raster import CudaRendered, CudaScreenGradients, rasterize_cuda
 from turbogs_plugin.engine.reference.raster import DifferentiableRender
 from turbogs_plugin.engine.rendered import DEFAULT_SETTINGS, RasterSettings
-from turbogs_plugin.types import Cameras, Gaussians, GaussianStats, PixelSamples
+from turbogs_plugin.types import Cameras, Gaussians, PixelSamples
 
 
 @dataclass
@@ -66,7 +66,7 @@ class _Composite(torch.autograd.Function):
             color_gradients = torch.zeros_like(rendered.colors)
         screen = rendered.backward(
             color_gradients,
-            stats=GaussianStats.zeros(means2d.shape[1], means2d.device),  # for the absolute sums
+            with_statistics=True,  # for the absolute sums
             alpha_gradients=alpha_gradients,
             depth_gradients=depth_gradients,
         )

@@ -7,22 +7,19 @@ with one it never waits (see `workspace.py`).
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, NamedTuple
+from dataclasses import dataclass, field, fields
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from turbogs_plugin.engine.cuda import library as kernels
-from turbogs_plugin.engine.cuda import training as training_kernels
+from turbogs_plugin.engine.cuda import library
 from turbogs_plugin.engine.cuda.workspace import COUNT_MAX, Workspace, require_possible, round_capacity
-from turbogs_plugin.engine.rendered import DEFAULT_SETTINGS, Projected, RasterSettings
+from turbogs_plugin.engine.moments import COLUMNS, ROW_WIDTH
+from turbogs_plugin.engine.rendered import DEFAULT_SETTINGS, Projected, RasterSettings, require_statistics
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.types import Cameras, GaussianGradients, Gaussians, GaussianStats, PixelSamples
-
-if TYPE_CHECKING:
-    from turbogs_plugin.engine.update_rule import GaussianMoments, UpdateRule
+from turbogs_plugin.types import PARAMETER_NAMES, Cameras, GaussianGradients, Gaussians, GaussianStats, PixelSamples
 
 MAX_VIEWS = 128
 MAX_DEGREE = 3
@@ -62,8 +59,7 @@ def _check(gaussians: Gaussians, cameras: Cameras, samples: PixelSamples, degree
                 raise InputError(f"{name} must be {dtype} on {device}, got {tensor.dtype} on {tensor.device}")
     if not 0 <= degree <= min(MAX_DEGREE, gaussians.sh_degree):
         raise InputError(f"sh_degree must be 0 .. {min(MAX_DEGREE, gaussians.sh_degree)} for this model, got {degree}")
-    if not 1 <= len(cameras) <= MAX_VIEWS:
-        raise InputError(f"a pass takes 1 .. {MAX_VIEWS} views, got {len(cameras)}")
+    require_views(len(cameras))
     if not np.array_equal(cameras.sizes, samples.sizes):
         raise InputError("cameras and samples differ in their image sizes: select the cameras of samples.view_ids")
 
@@ -108,10 +104,10 @@ class CudaScreenGradients:
         settings: of the pass.
         records: [K, N, 16] float32: 0-1 d/dmean2d, 2-4 d/dconic (b's entry counts both off-diagonal ones), 5-7 d/dcolor
             after the clamp at 0, 8 d/dopacity after the sigmoid, 9-10 sums of |d/dmean2d| per pixel, 11 sum e * w,
-            12 sum D * w, 13 sum w, 14 d/ddepth; 9, 10 and 12 are 0 without `stats`. Where a Gaussian is off screen, a
-            record may hold anything.
+            12 sum D * w, 13 sum w, 14 d/ddepth; 9, 10 and 12 are 0 without `with_statistics`. Where a Gaussian is off
+            screen, a record may hold anything.
         radii: [K, N, 2] int32, zero where off screen.
-        stats: the window to add to, if any.
+        with_statistics: whether 9, 10 and 12 were summed up.
         overflow: [1] int32 on the device, or None; where not 0 the pass drew nothing and nothing may change.
     """
 
@@ -122,24 +118,73 @@ class CudaScreenGradients:
     settings: RasterSettings
     records: Tensor
     radii: Tensor
-    stats: GaussianStats | None
-    overflow: Tensor | None
+    with_statistics: bool = False
+    overflow: Tensor | None = None
 
     def full_records(self) -> Tensor:
         """[K, N, 16] the records, zero where a Gaussian is off screen."""
         return torch.where((self.radii > 0).any(dim=-1, keepdim=True), self.records, 0.0)
 
-    def parameter_gradients(self, rows: bool) -> GaussianGradients:
-        """The gradients of the parameters: one row per view (`rows`), or their sum. May be called once."""
-        return training_kernels.projection_backward(self, rows)
+    def parameter_gradients(self, rows: bool, stats: GaussianStats | None = None) -> GaussianGradients:
+        """The gradients of the parameters: one row per view (`rows`), or their sum. May be called once.
 
-    def fused_step(self, gaussians: Gaussians, moments: GaussianMoments, rule: UpdateRule) -> None:
-        """Take the gradients to the parameters and make one optimizer step of them, in one kernel.
-
-        Args:
-            gaussians: the model that was drawn; changed in place, as is `moments`.
+        The fields that have rows are views of one packed [K, N, 14] tensor. After an overflow they are zero.
         """
-        training_kernels.fused_step(self, gaussians, moments, rule)
+        library.require()
+        count, bands = len(self.gaussians), self.gaussians.shN.shape[1]
+        num_rows = len(self.cameras) if rows else 1
+        # The kernel writes every entry, unless an overflow keeps it from running.
+        new = torch.empty if self.overflow is None else torch.zeros
+        device = self.records.device
+        packed = new(num_rows, count, ROW_WIDTH, device=device)
+        shN = new(count, bands, 3, device=device)
+        touched = new(count, dtype=torch.bool, device=device)
+        view_losses = new(num_rows, count, device=device)
+        torch.ops.turbogs.projection_backward(*self.operator_arguments(stats), packed, shN, touched, view_losses)
+        return GaussianGradients(
+            means=packed[..., COLUMNS["means"]],
+            scales=packed[..., COLUMNS["scales"]],
+            quats=packed[..., COLUMNS["quats"]],
+            sh0=packed[..., COLUMNS["sh0"]].unsqueeze(-2),
+            opacities=packed[..., COLUMNS["opacities"]].squeeze(-1),
+            shN=shN,
+            touched=touched,
+            view_losses=view_losses,
+        )
+
+    def operator_arguments(self, stats: GaussianStats | None) -> tuple:
+        """What the operators that take these gradients to the parameters have in common."""
+        require_views(len(self.cameras))
+        require_statistics(self.with_statistics, stats)
+        return (
+            [getattr(self.gaussians, name).detach() for name in PARAMETER_NAMES],
+            self.cameras.viewmats.contiguous(),
+            self.cameras.Ks.contiguous(),
+            self.cameras.sizes.reshape(-1).tolist(),
+            self.records,
+            self.radii,
+            [] if stats is None else [getattr(stats, field.name) for field in fields(stats)],
+            self.sh_degree,
+            self.settings.eps2d,
+            count_filled(self.samples),
+            len(self.samples),
+            self.overflow,
+        )
+
+
+def count_filled(samples: PixelSamples) -> Tensor | None:
+    """[1] int32 on the device: the filled slots; None where all are."""
+    if not samples.has_empty_slots:
+        return None
+    count = torch.zeros(1, dtype=torch.int32, device=samples.pixel_ids.device)
+    torch.ops.turbogs.count_filled(samples.pixel_ids, count)
+    return count
+
+
+def require_views(count: int) -> None:
+    """Raise `InputError` where a batch has no view, or more than the kernels take."""
+    if not 1 <= count <= MAX_VIEWS:
+        raise InputError(f"a batch takes 1 .. {MAX_VIEWS} views, got {count}")
 
 
 @dataclass
@@ -179,7 +224,8 @@ class CudaRendered:
         self,
         color_gradients: Tensor,
         pixel_errors: Tensor | None = None,
-        stats: GaussianStats | None = None,
+        *,
+        with_statistics: bool = False,
         alpha_gradients: Tensor | None = None,
         depth_gradients: Tensor | None = None,
     ) -> CudaScreenGradients:
@@ -212,7 +258,7 @@ class CudaRendered:
             ready.get("depth_gradients"),
             ready.get("pixel_errors"),
             records,
-            stats is not None,
+            with_statistics,
             self._cleared,
         )
         self._cleared = False
@@ -224,7 +270,7 @@ class CudaRendered:
             settings=self._settings,
             records=records.view(*self._radii.shape[:2], RECORD_FLOATS),
             radii=self._radii,
-            stats=stats,
+            with_statistics=with_statistics,
             overflow=self._buffers.overflow if isinstance(self._buffers, Workspace) else None,
         )
 
@@ -248,7 +294,7 @@ def rasterize_cuda(
     Raises:
         InputError: no kernels here, a tensor of wrong dtype or device, or more pairs than a pass can have.
     """
-    kernels.require()
+    library.require()
     degree = gaussians.sh_degree if sh_degree is None else sh_degree
     _check(gaussians, cameras, samples, degree)
     gaussians = gaussians.map(_prepared)

@@ -34,7 +34,6 @@ Together, ``p = 1 - (1 - p_hard) (1 - p_stable) (1 - p_mixed)``, and 1 where all
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -50,48 +49,15 @@ from turbogs_plugin.engine.reference.philox import (
     exponentials,
     random_words,
 )
+from turbogs_plugin.engine.rules import DrawRule
 from turbogs_plugin.error_maps import AGE_MAX
 from turbogs_plugin.tiles import CELL_SIDE, TILE_CELLS, TILE_PIXELS, compact, pixel_table, tile_extents
 from turbogs_plugin.types import CELL_HEIGHT, CELL_WIDTH, TILE_SIZE, PixelSamples, TileGrid
-
-UNITS = ("pixel", "cell", "tile")
 
 RANK_BITS = 20
 AGE_TIE_BITS = 24
 WEIGHT_FLOOR = 2.0**-100
 """Below every positive weight by so much that a unit of no weight never wins against one that has some."""
-
-
-@dataclass(frozen=True)
-class DrawRule:
-    """How units are drawn; the samplers' configuration in the form that `draw_pixels` takes.
-
-    Args:
-        unit: one of `UNITS`.
-        hard, stable: shares of the units drawn by error and by age; the mixed stage draws the rest.
-        mixed_uniform: the mixed stage ignores error and age.
-        importance: a of the weights ``p^-a``; 0 for no weights.
-    """
-
-    unit: str
-    hard: float
-    stable: float
-    mixed_uniform: bool
-    importance: float
-
-    def wanted(self, rate: float, units: int) -> int:
-        """Units to draw of so many: ``max(1, floor(rate * units))``, the paper's N_pix where they are the 256 pixels.
-
-        Of the 16 cells of a tile, the nearest number: rounding down would lose up to half of a small budget.
-        """
-        slack = 0.5 if self.unit == "cell" else 0.0
-        return min(units, max(1, math.floor(rate * units + slack)))
-
-    def stages(self, wanted: int) -> tuple[int, int, int]:
-        """Units of the hard, stable and mixed stage; halves round up."""
-        hard = min(wanted, math.floor(self.hard * wanted + 0.5))
-        stable = min(wanted - hard, math.floor(self.stable * wanted + 0.5))
-        return hard, stable, wanted - hard - stable
 
 
 @dataclass(frozen=True)

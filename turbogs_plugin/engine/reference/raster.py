@@ -12,7 +12,7 @@ from turbogs_plugin.engine.reference import compositing
 from turbogs_plugin.engine.reference.compositing import ALPHA_TINY, Composite, Compositor
 from turbogs_plugin.engine.reference.intersection import intersect_tiles
 from turbogs_plugin.engine.reference.projection import Rows, Splats, drawable_rows, project_rows
-from turbogs_plugin.engine.rendered import DEFAULT_SETTINGS, Projected, RasterSettings
+from turbogs_plugin.engine.rendered import DEFAULT_SETTINGS, Projected, RasterSettings, require_statistics
 from turbogs_plugin.types import Cameras, GaussianGradients, Gaussians, GaussianStats, PixelSamples
 
 ROW_PARAMETERS = ("means", "quats", "scales", "opacities", "sh0")
@@ -43,7 +43,7 @@ class ReferenceScreenGradients:
         leaves: the parameters' rows, in the order of `ROW_PARAMETERS`, and `shN`.
         records: [R, RECORD_WIDTH], see `compositing`.
         samples: of the pass.
-        stats: the window to add to, if any.
+        with_statistics: whether the pass was asked for them.
     """
 
     rows: Rows
@@ -51,14 +51,15 @@ class ReferenceScreenGradients:
     leaves: list[Tensor]
     records: Tensor
     samples: PixelSamples
-    stats: GaussianStats | None
+    with_statistics: bool = False
 
     def full_records(self) -> Tensor:
         """[K, N, RECORD_WIDTH], zero where a Gaussian is not drawn."""
         return self.rows.scatter(self.records)
 
-    def parameter_gradients(self, rows: bool) -> GaussianGradients:
+    def parameter_gradients(self, rows: bool, stats: GaussianStats | None = None) -> GaussianGradients:
         """The gradients of the parameters: one row per view (`rows`), or their sum. May be called once."""
+        require_statistics(self.with_statistics, stats)
         records, splats = self.records, self.splats
         outputs = (splats.means2d, splats.conics, splats.colors, splats.opacities, splats.depths)
         columns = (compositing.MEAN, compositing.CONIC, compositing.COLOR, compositing.OPACITY, compositing.DEPTH)
@@ -71,8 +72,8 @@ class ReferenceScreenGradients:
         )
         filled = self.samples.filled.sum().clamp(min=1)
         losses = place(records[:, compositing.ERROR_SUM] / filled)
-        if self.stats is not None:
-            self._add_statistics(self.stats)
+        if stats is not None:
+            self._add_statistics(stats)
         return GaussianGradients(**named, shN=gradients[-1], touched=weights > 0, view_losses=losses)
 
     def _sum_over_views(self, values: Tensor) -> Tensor:
@@ -130,7 +131,8 @@ class ReferenceRendered:
         self,
         color_gradients: Tensor,
         pixel_errors: Tensor | None = None,
-        stats: GaussianStats | None = None,
+        *,
+        with_statistics: bool = False,
         alpha_gradients: Tensor | None = None,
         depth_gradients: Tensor | None = None,
     ) -> ReferenceScreenGradients:
@@ -147,7 +149,7 @@ class ReferenceRendered:
         ).to(self._sums.dtype)
         records = compositing.composite_backward(self._compositor, self._table, self._sums, gradients, pixel_errors)
         return ReferenceScreenGradients(
-            self._rows, self._splats, self._leaves, records, self._compositor.samples, stats
+            self._rows, self._splats, self._leaves, records, self._compositor.samples, with_statistics
         )
 
 

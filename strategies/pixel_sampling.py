@@ -1,4 +1,4 @@
-"""Which pixels of the chosen views are rendered (paper section 3.5): the samplers over the draw of `pixel_draws`."""
+"""Which pixels of the chosen views are rendered (paper section 3.5): samplers, as rules that every engine draws by."""
 
 from __future__ import annotations
 
@@ -10,9 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from torch import Tensor
 
-from turbogs_plugin.engine.cuda import library as kernels
-from turbogs_plugin.engine.cuda import training as training_kernels
-from turbogs_plugin.engine.reference.draws import UNITS, DrawRule, draw_pixels
+from turbogs_plugin.engine import engine_of
+from turbogs_plugin.engine.rules import UNITS, DrawRule
 from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.errors import InputError, require
 from turbogs_plugin.tiles import dense_pixels
@@ -49,27 +48,12 @@ def view_numbers(view_ids: ViewIds, maps: ErrorMaps) -> tuple[int, ...]:
 def _sample(rule: DrawRule, maps: ErrorMaps, view_ids: ViewIds, rate: float, step: Step) -> PixelSamples:
     require(0 < rate < math.inf, "rate", rate, "finite and above 0")
     require(isinstance(step, Step), "step", step, "a Step, as Step(iteration=0, total=1000, refine_until=500) is")
-    view_ids = view_numbers(view_ids, maps)
-    maps.fetch(view_ids)
-    views = np.asarray(view_ids, dtype=np.int64)
-    draw = training_kernels.sample_pixels if maps.errors.is_cuda and kernels.available() else draw_pixels
-    return draw(
-        maps.errors,
-        maps.stamps,
-        step.iteration - maps.stamp_base,
-        maps.offsets[views],
-        maps.sizes[views],
-        view_ids,
-        rate,
-        rule,
-        step.seed,
-        step.iteration,
-    )
+    return engine_of(maps.errors.device).draw(rule, maps, view_numbers(view_ids, maps), rate, step)
 
 
 @dataclass
 class ErrorGuidedPixelSampler:
-    """The paper's sampler: hard units by error, stable ones by age, the rest by both (`pixel_draws`).
+    """The paper's sampler: hard units by error, stable ones by age, the rest by both (`engine.reference.draws`).
 
     Args:
         hard_ratio, stable_ratio: r_hard and r_stable, shares of the units drawn in each tile.

@@ -1,0 +1,134 @@
+"""Losses on sampled pixels (paper section 3.7), as `LossTerms` that every engine can evaluate.
+
+Every loss here is a mean over all filled samples of the K views together, or over the tiles that hold them, so its
+gradients are as large as those of a dense mean loss. Formulas: `turbogs_plugin.engine.reference.losses`.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from turbogs_plugin.engine import engine_of
+from turbogs_plugin.engine.rules import STRUCTURE_CONSTANT, LossTerms
+from turbogs_plugin.errors import require
+from turbogs_plugin.types import LossOutput, PixelSamples
+
+STRUCTURES = ("ncc", "contrast")
+"""Structure terms of `CharbonnierNccLoss`."""
+
+
+class RuleLoss:
+    """A loss that its terms describe: called alone, it is evaluated by the engine of the colours' device."""
+
+    terms: LossTerms
+
+    def __call__(self, colors: Tensor, targets: Tensor, samples: PixelSamples) -> LossOutput:
+        return engine_of(colors.device).evaluate(self.terms, colors, targets, samples)
+
+
+def _check_epsilon(epsilon: float) -> None:
+    require(math.isfinite(epsilon) and epsilon > 0, "epsilon", epsilon, "a finite number above 0")
+
+
+@dataclass
+class CharbonnierLoss(RuleLoss):
+    """The Charbonnier l1 term alone: mean over filled samples and channels of ``w (sqrt(d^2 + eps^2) - eps)``.
+
+    l1(p) is the mean over the three channels, not their sum: so it has the size of a dense L1 loss in gsplat.
+    Each entry of the gradient is at most ``w / (3 n)``, n the number of filled samples.
+
+    Args:
+        epsilon: residuals below it are treated quadratically.
+    """
+
+    epsilon: float = 1e-3
+
+    def __post_init__(self) -> None:
+        _check_epsilon(self.epsilon)
+
+    @property
+    def terms(self) -> LossTerms:
+        """This loss as engines take it."""
+        return LossTerms(self.epsilon)
+
+
+@dataclass
+class CharbonnierNccLoss(RuleLoss):
+    """Charbonnier l1 plus a gradient-balanced structure term of each tile (equations of section 3.7)::
+
+        L = l1 + ncc_weight * mean over tiles of lambda * mean over channels of gate * (1 - S)
+        lambda = clip(mean |grad l1| / (mean |grad S| + 1e-8), 0, 1)
+
+    with S = `correlation` or `contrast`. The two means of the balance are over the tile's samples (by their shares), of
+    the L1 norms over channels of ``d / sqrt(d^2 + eps^2)`` and of g: the appendix's printed gradients, which without
+    1 / n compare the two terms as they enter L. lambda is constant in the backward pass. The structure term's
+    gradient is *added*: the appendix's minus would lower the correlation.
+
+    The gate ``s_y^2 / (s_y^2 + c)`` of the truth's own variance comes after the balance, which would undo it.
+
+    However the tile looks, each entry of the gradient is at most ``w / (3 n) + ncc_weight / T`` (n filled samples, T
+    tiles): the balance keeps the structure term's gradients in a tile, in sum, below those of l1. Where x = y, and for
+    the structure term in tiles of one sample or constant in both, it is exactly 0.
+
+    Args:
+        epsilon: of the Charbonnier term.
+        ncc_weight: factor of the structure term; 1 in the paper.
+        structure: `ncc` or `contrast`.
+        variance_constant: c, variance below which a tile counts as flat; SSIM's by default. NCC's floor is c / 2.
+        gate: scale the term by the gate.
+    """
+
+    epsilon: float = 1e-3
+    ncc_weight: float = 0.4
+    structure: str = "ncc"
+    variance_constant: float = STRUCTURE_CONSTANT
+    gate: bool = False
+
+    def __post_init__(self) -> None:
+        _check_epsilon(self.epsilon)
+        valid = math.isfinite(self.ncc_weight) and self.ncc_weight >= 0
+        require(valid, "ncc_weight", self.ncc_weight, "finite and 0 or more")
+        require(self.structure in STRUCTURES, "structure", self.structure, f"one of {', '.join(STRUCTURES)}")
+        valid = math.isfinite(self.variance_constant) and self.variance_constant > 0
+        require(valid, "variance_constant", self.variance_constant, "a finite number above 0")
+
+    @property
+    def terms(self) -> LossTerms:
+        """This loss as engines take it."""
+        return LossTerms(
+            self.epsilon,
+            structure=self.structure,
+            structure_weight=self.ncc_weight,
+            variance_constant=self.variance_constant,
+            balance=True,
+            gate=self.gate,
+        )
+
+
+@dataclass
+class SparseSsimLoss(RuleLoss):
+    """``(1 - ssim_weight) * l1 + ssim_weight * mean over tiles and channels of (1 - SSIM)``, 3DGS' mixture.
+
+    SSIM's statistics are those of a tile's samples, taken as one window.
+
+    Args:
+        epsilon: of the Charbonnier term.
+        ssim_weight: 0 .. 1.
+    """
+
+    epsilon: float = 1e-3
+    ssim_weight: float = 0.2
+
+    def __post_init__(self) -> None:
+        _check_epsilon(self.epsilon)
+        require(0 <= self.ssim_weight <= 1, "ssim_weight", self.ssim_weight, "between 0 and 1")
+
+    @property
+    def terms(self) -> LossTerms:
+        """This loss as engines take it."""
+        return LossTerms(
+            self.epsilon, l1_weight=1.0 - self.ssim_weight, structure="ssim", structure_weight=self.ssim_weight
+        )

@@ -1,1 +1,0 @@
-"""Which pixels of the chosen views are rendered."""

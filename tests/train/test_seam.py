@@ -1,0 +1,133 @@
+"""The trainer and its engine: what is carried out at once, and what strategies without a rule are given instead."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+
+import pytest
+import torch
+from helpers.framework_runs import tiny_capture, tiny_config
+from turbogs_plugin.strategies.losses import CharbonnierNccLoss
+from turbogs_plugin.strategies.optimizers.moment_lm import MomentLMOptimizer
+from turbogs_plugin.strategies.optimizers.sparse_adam import SparseAdam
+
+from turbogs_plugin.engine.reference.update import apply_update
+from turbogs_plugin.scene import load_scene
+from turbogs_plugin.train.trainer import Trainer
+
+CPU = torch.device("cpu")
+
+
+@dataclass
+class OwnCodeLoss:
+    """A third party's loss: no terms, the same numbers."""
+
+    inner: CharbonnierNccLoss = field(default_factory=CharbonnierNccLoss)
+    terms = None
+
+    def __call__(self, colors, targets, samples):
+        return self.inner(colors, targets, samples)
+
+
+class OwnCode:
+    """A third party's optimizer around one of ours: no rule, the same step. `calls`: times that one iteration steps."""
+
+    moments, calls = None, 1
+
+    def __init__(self, inner):
+        self.inner, self.per_view, self.seen = inner, inner.per_view, []
+
+    def rule(self, step):
+        return None
+
+    def step(self, gaussians, gradients, step):
+        self.seen.append(gradients)
+        for _ in range(self.calls):
+            self.inner.step(gaussians, gradients, step)
+
+    def setup(self, gaussians):
+        self.inner.setup(gaussians)
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory):
+    return tiny_capture(tmp_path_factory.mktemp("seam"))
+
+
+def make_trainer(capture):
+    trainer = Trainer(tiny_config(capture), load_scene(capture), CPU)
+    trainer.initialise_maps()
+    return trainer
+
+
+def run(trainer, iterations=3):
+    for _ in range(iterations):
+        trainer.step()
+    return trainer
+
+
+def assert_equal(one, other):
+    for name, value in one.gaussians.items():
+        assert torch.equal(value, getattr(other.gaussians, name)), name
+    for name in ("errors", "stamps", "view_sums"):
+        assert torch.equal(getattr(one.maps, name), getattr(other.maps, name)), name
+    for item in fields(one.density.stats):
+        assert torch.equal(getattr(one.density.stats, item.name), getattr(other.density.stats, item.name)), item.name
+
+
+def test_a_loss_of_its_own_code_trains_as_its_rule_would(capture):
+    ruled, coded = make_trainer(capture), make_trainer(capture)
+    coded.loss = OwnCodeLoss(ruled.loss)
+    assert_equal(run(ruled), run(coded))
+
+
+@pytest.mark.parametrize("make", [MomentLMOptimizer, SparseAdam])
+def test_an_optimizer_of_its_own_code_trains_as_its_rule_would(capture, make):
+    ruled, coded = make_trainer(capture), make_trainer(capture)
+    for trainer, optimizer in ((ruled, make()), (coded, OwnCode(make()))):
+        trainer.optimizer = optimizer
+        optimizer.setup(trainer.gaussians)
+    assert_equal(run(ruled), run(coded))
+    rows = {len(gradients.view_losses) for gradients in coded.optimizer.seen}
+    assert rows == {1} if make is SparseAdam else max(rows) > 1
+
+
+@pytest.mark.parametrize("calls", [0, 2])
+def test_statistics_are_written_once_whatever_the_optimizer_does(capture, calls):
+    """It may leave an iteration out or make two steps of it: the density window gets each backward pass once."""
+    usual, odd = make_trainer(capture), make_trainer(capture)
+    odd.optimizer = OwnCode(MomentLMOptimizer())
+    odd.optimizer.calls = calls
+    odd.optimizer.setup(odd.gaussians)
+    run(usual, 1)
+    run(odd, 1)
+    assert float(usual.density.stats.view_counts.sum()) > 0
+    for item in fields(usual.density.stats):
+        found, expected = getattr(odd.density.stats, item.name), getattr(usual.density.stats, item.name)
+        assert torch.equal(found, expected), item.name
+
+
+def test_the_engine_gets_rule_moments_and_statistics(capture, monkeypatch):
+    trainer, calls = make_trainer(capture), []
+    engine = type(trainer.engine)
+
+    def update(self, *arguments):
+        calls.append(arguments)
+
+    monkeypatch.setattr(engine, "update", update)
+    stats, step, before = trainer.density.stats, trainer.now, trainer.gaussians.means.clone()
+    trainer.step()
+    ((rule, screen, gaussians, moments, given),) = calls
+    assert rule == trainer.optimizer.rule(step) and moments is trainer.optimizer.moments and given is stats
+    assert gaussians is trainer.gaussians and torch.equal(gaussians.means, before)
+    apply_update(rule, gaussians, screen.parameter_gradients(rule.per_view, stats), moments)
+    assert not torch.equal(gaussians.means, before)
+
+
+def test_statistics_need_a_pass_that_sums_them_up(capture):
+    trainer = make_trainer(capture)
+    samples = trainer.pixel_sampler.sample(trainer.maps, (0, 1), 0.2, trainer.now)
+    rendered = trainer.render((0, 1), samples)
+    screen = rendered.backward(torch.ones_like(rendered.colors))
+    with pytest.raises(ValueError, match="with_statistics"):
+        screen.parameter_gradients(rows=True, stats=trainer.density.stats)

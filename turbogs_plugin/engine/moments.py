@@ -1,0 +1,104 @@
+"""The state of Adam and of moment-damped LM: first and second moments of every Gaussian, and how they are laid out."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from turbogs_plugin.errors import InputError, require
+from turbogs_plugin.types import Gaussians, RowUpdate
+
+COLUMNS = {
+    "means": slice(0, 3),
+    "scales": slice(3, 6),
+    "quats": slice(6, 10),
+    "sh0": slice(10, 13),
+    "opacities": slice(13, 14),
+}
+"""Where each parameter lies in a packed row."""
+
+ROW_WIDTH = 14
+"""Numbers of a packed row: all parameters but the higher bands."""
+
+
+@dataclass
+class GaussianMoments:
+    """Adam's state of N Gaussians.
+
+    Args:
+        exp_avg, exp_avg_sq: [N, 14], the order of `COLUMNS`.
+        exp_avg_shN, exp_avg_sq_shN: [N, B * 3].
+        steps: [N] int32, updates that each Gaussian and the ones it was made of have had. Its bias correction counts
+            these. A new Gaussian has moments of zero and its source's count, as with torch's Adam and gsplat's surgery.
+            So its moments are hardly corrected, and its first steps are 3 to 6 times the rate. That is intended: it
+            finds its place by them.
+        skipped: [] int64, updates left out because of a non-finite gradient, since the start of the run. Stays on the
+            device: reading it is a synchronisation.
+    """
+
+    exp_avg: Tensor
+    exp_avg_sq: Tensor
+    exp_avg_shN: Tensor
+    exp_avg_sq_shN: Tensor
+    steps: Tensor
+    skipped: Tensor
+
+    @classmethod
+    def zeros(cls, gaussians: Gaussians) -> GaussianMoments:
+        """State of Gaussians that were never updated, in their dtype and on their device."""
+        count, coefficients = len(gaussians), gaussians.shN.shape[1] * 3
+        return cls(
+            *(gaussians.means.new_zeros(count, ROW_WIDTH) for _ in range(2)),
+            *(gaussians.means.new_zeros(count, coefficients) for _ in range(2)),
+            torch.zeros(count, dtype=torch.int32, device=gaussians.device),
+            torch.zeros((), dtype=torch.int64, device=gaussians.device),
+        )
+
+    def __len__(self) -> int:
+        return self.steps.shape[0]
+
+    def apply(self, update: RowUpdate) -> None:
+        """Follow a change of the set of Gaussians."""
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if field.name == "steps":
+                self.steps = value[update.source]
+            elif field.name != "skipped":
+                setattr(self, field.name, update.apply_state(value))
+        for name in update.reset:
+            for moment in ("exp_avg", "exp_avg_sq"):
+                if name == "shN":
+                    getattr(self, f"{moment}_shN").zero_()
+                else:
+                    getattr(self, moment)[:, COLUMNS[name]] = 0
+
+    def state_dict(self) -> dict[str, Any]:
+        return {field.name: getattr(self, field.name) for field in fields(self)}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Take a saved state. Raises `InputError` where it is not one of as many Gaussians and bands as this."""
+        check_state(state, self.state_dict())
+        for field in fields(self):
+            present = getattr(self, field.name)
+            setattr(self, field.name, state[field.name].to(device=present.device, dtype=present.dtype, copy=True))
+
+
+def check_state(saved: dict[str, Any], present: dict[str, Tensor]) -> None:
+    """Raise `InputError` where a saved state lacks a tensor of the present one, or has it of another shape."""
+    for name, value in present.items():
+        if name not in saved or saved[name].shape != value.shape:
+            found = f"shape {tuple(saved[name].shape)}" if name in saved else "nothing"
+            raise InputError(
+                f"optimizer state {name}: found {found}, expected shape {tuple(value.shape)}; is it of another model?"
+            )
+
+
+def check_moments_config(beta1: float, beta2: float, eps: float) -> None:
+    """Raise `InputError` for values that Adam cannot use."""
+    for name, beta in (("beta1", beta1), ("beta2", beta2)):
+        require(0 <= beta < 1, name, beta, "at least 0 and less than 1")
+    require(math.isfinite(eps) and eps >= 1e-20, "eps", eps, "a finite number >= 1e-20")

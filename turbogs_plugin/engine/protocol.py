@@ -1,0 +1,133 @@
+"""The seam between what is to be done and how a device does it."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from torch import Tensor
+
+from turbogs_plugin.engine.moments import GaussianMoments
+from turbogs_plugin.engine.rendered import DEFAULT_SETTINGS, RasterSettings, Rendered, ScreenGradients
+from turbogs_plugin.engine.rules import DrawRule, LossTerms, UpdateRule
+from turbogs_plugin.error_maps import ErrorMaps
+from turbogs_plugin.scene.photos import PhotoSamples
+from turbogs_plugin.types import Cameras, Gaussians, GaussianStats, LossOutput, PixelSamples, Step
+
+
+class Engine(Protocol):
+    """What computes, on the device of the tensors that it is given.
+
+    It knows rules, never strategies. `ReferenceEngine` defines every result; any other engine gives the same, to
+    rounding. An engine made for training may run ahead of the host: see `settle`.
+    """
+
+    def draw(self, rule: DrawRule, maps: ErrorMaps, view_ids: tuple[int, ...], rate: float, step: Step) -> PixelSamples:
+        """Draw the samples of an iteration.
+
+        Args:
+            maps: of all views.
+            view_ids: K training views.
+            rate: r, the fraction of units to draw, above 0.
+            step: gives seed and iteration, on which alone the random numbers depend, and ages.
+        """
+        ...
+
+    def render(
+        self,
+        gaussians: Gaussians,
+        cameras: Cameras,
+        samples: PixelSamples,
+        *,
+        sh_degree: int | None = None,
+        settings: RasterSettings = DEFAULT_SETTINGS,
+        with_depth: bool = False,
+    ) -> Rendered:
+        """Render samples of K views with gsplat's conventions, on a black background.
+
+        Args:
+            cameras: the K views of the batch, in the order of `samples.view_ids`.
+            sh_degree: highest degree of spherical harmonics used; all there are where None.
+            settings: thresholds and planes.
+            with_depth: also give expected depths.
+        """
+        ...
+
+    def evaluate(self, terms: LossTerms, colors: Tensor, targets: Tensor, samples: PixelSamples) -> LossOutput:
+        """The loss of rendered samples and its gradient. `colors`, `targets`: [P, 3]."""
+        ...
+
+    def supervise(
+        self,
+        terms: LossTerms,
+        colors: Tensor,
+        truth: PhotoSamples,
+        maps: ErrorMaps,
+        step: Step,
+        nonfinite_losses: Tensor | None = None,
+    ) -> LossOutput:
+        """`evaluate` against the photos, and `learn` from it, at once.
+
+        Args:
+            colors: [P, 3] rendered.
+            truth: the photos at the samples, on the device of `colors`.
+            maps, step, nonfinite_losses: see `learn`.
+        """
+        ...
+
+    def learn(
+        self,
+        maps: ErrorMaps,
+        samples: PixelSamples,
+        colors: Tensor,
+        output: LossOutput,
+        step: Step,
+        nonfinite_losses: Tensor | None = None,
+    ) -> None:
+        """Let the error maps learn the errors of an iteration, whatever loss gave them.
+
+        A sample whose colour or error is not finite changes nothing: neither the error of its pixel nor its age.
+
+        Args:
+            maps: updated in place.
+            colors: [P, 3] rendered.
+            step: gives the stamp.
+            nonfinite_losses: [] int64 on the device; 1 is added if the loss is not finite.
+        """
+        ...
+
+    def update(
+        self,
+        rule: UpdateRule,
+        screen: ScreenGradients,
+        gaussians: Gaussians,
+        moments: GaussianMoments,
+        stats: GaussianStats | None,
+    ) -> None:
+        """Take gradients from the screen to the parameters, and make one step of them.
+
+        Args:
+            rule: which step.
+            screen: of a backward pass of this engine, which is used up.
+            gaussians: the model that was rendered; changed in place, as is `moments`.
+            stats: the window of density control; this pass is added to it. None where none is needed.
+        """
+        ...
+
+    def settle(self, wait: bool = False) -> int:
+        """How many of the latest iterations did nothing and must be done again, for lack of room on the device.
+
+        Until the host asks, all that follows such an iteration does nothing either: no map, parameter, moment or
+        statistic changes. Whoever trains asks before each iteration.
+
+        Args:
+            wait: for the device, so as to know of all; else only what is known already counts.
+
+        Raises:
+            InputError: an iteration has more intersections of a tile and a splat than a pass can have.
+        """
+        ...
+
+    @property
+    def bytes_held(self) -> int:
+        """Memory that is kept from one iteration to the next."""
+        ...

@@ -1,0 +1,205 @@
+"""Losses on sampled pixels in torch, each with its own gradient: the definition of what `LossTerms` mean (paper section
+3.7 and appendix).
+
+Every loss is a mean over all filled samples of the K views together, or over the tiles that hold them, so its gradients
+are as large as those of a dense mean loss. Half-precision colours are computed with in single precision, and get
+single-precision gradients. A sample whose colour is not finite contributes no loss and no gradient, and its error is 0;
+it still counts in the mean. With autograd upstream: ``colors.backward(out.color_gradients)``.
+
+Notation, per tile and channel: n samples x (prediction) and y (truth) with importance weights w; their shares
+``omega = w / sum(w)`` (1 / n without weights) define means, variances s_x^2, s_y^2 and covariance s_xy, all biased.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from turbogs_plugin.engine.rules import LUMINANCE_CONSTANT, STRUCTURE_CONSTANT, LossTerms
+from turbogs_plugin.types import LossOutput, PixelSamples
+
+BALANCE_EPSILON = 1e-8
+"""Keeps the balance of a structure term without gradient defined (the paper's equation of lambda)."""
+
+
+def sparse_loss(colors: Tensor, targets: Tensor, samples: PixelSamples, terms: LossTerms) -> LossOutput:
+    """The loss of some samples and its gradient::
+
+        L = l1_weight * l1 + structure_weight * mean over tiles of f * mean over channels of (1 - S)
+        f = lambda (with `balance`) * gate (with `gate`)
+        lambda = clip(mean |grad l1| / (mean |grad S| + 1e-8), 0, 1)
+
+    l1 is the Charbonnier term of `_Problem`, S the similarity named by `structure`. The two means of the balance are
+    over the tile's samples (by their shares), of the L1 norms over channels of ``d / sqrt(d^2 + eps^2)`` and of g: the
+    appendix's printed gradients, which without 1 / n compare the two terms as they enter L. lambda is constant in the
+    backward pass. The gate ``s_y^2 / (s_y^2 + c)`` of the truth's own variance comes after the balance, which would
+    undo it.
+
+    Args:
+        colors, targets: [P, 3].
+        samples: the P slots.
+        terms: which loss.
+    """
+    problem = _Problem(colors, targets, samples, terms.epsilon)
+    loss, gradients = terms.l1_weight * problem.loss, terms.l1_weight * problem.gradients
+    if terms.structure == "none":
+        return LossOutput(loss, gradients, problem.pixel_errors)
+    groups = problem.groups
+    moments = TileMoments.of(groups, problem.colors, problem.targets)
+    similarity, slopes = SIMILARITIES[terms.structure](moments, groups, terms.variance_constant)
+    factors = torch.ones_like(similarity[:, :1])  # [T, 1]
+    if terms.balance:
+        norms = torch.stack([problem.slopes.abs().sum(dim=1), slopes.abs().sum(dim=1)], dim=1)
+        norm_l1, norm_structure = groups.mean(norms).unbind(dim=1)
+        factors = (norm_l1 / (norm_structure + BALANCE_EPSILON)).clamp(max=1.0)[:, None]
+    if terms.gate:
+        factors = factors * (moments.variance_y / (moments.variance_y + terms.variance_constant))
+    factors = factors * (terms.structure_weight / (3 * groups.tiles))
+    loss = loss + (factors * (1.0 - similarity)).sum()
+    gradients = gradients - groups.spread(factors.expand_as(similarity)) * groups.shares * slopes
+    return LossOutput(loss, gradients, problem.pixel_errors)
+
+
+class TileGroups:
+    """The samples of each tile, with their weights.
+
+    Attributes:
+        weights: [P, 1], 0 in slots without a part.
+        shares: [P, 1], omega: the weights over their sum in the tile.
+        tiles: T.
+        filled: scalar tensor, the number of filled slots, at least 1.
+    """
+
+    def __init__(self, samples: PixelSamples, used: Tensor) -> None:
+        """`used`: [P], 1 for the slots that have a part, 0 for the others, in the dtype of the computation."""
+        self.tile_of_slot = samples.tile_of_slot()
+        self.tiles = len(samples.tile_ids)
+        self.first_slots = samples.tile_offsets[:-1].long().clamp(max=max(0, len(samples) - 1))  # [T]
+        self.filled = samples.filled.sum().clamp(min=1).to(used.dtype)
+        self.weights = (used if samples.weights is None else used * samples.weights)[:, None]
+        totals = self.sum(self.weights)
+        self.shares = self.weights / torch.where(totals > 0, totals, 1.0)[self.tile_of_slot]
+
+    def sum(self, values: Tensor) -> Tensor:
+        """[P, C] -> [T, C]: sums over the slots of each tile."""
+        return values.new_zeros(self.tiles, values.shape[1]).index_add_(0, self.tile_of_slot, values)
+
+    def mean(self, values: Tensor) -> Tensor:
+        """[P, C] -> [T, C]: means under the shares."""
+        return self.sum(self.shares * values)
+
+    def spread(self, values: Tensor) -> Tensor:
+        """[T, C] -> [P, C]: each slot gets its tile's value."""
+        return values[self.tile_of_slot]
+
+
+@dataclass
+class TileMoments:
+    """First and second moments of prediction (x) and truth (y) of each tile and channel.
+
+    Args:
+        mean_x, mean_y, variance_x, variance_y, covariance: [T, C].
+        offset_x, offset_y: [P, C], the samples minus their tile's mean.
+    """
+
+    mean_x: Tensor
+    mean_y: Tensor
+    variance_x: Tensor
+    variance_y: Tensor
+    covariance: Tensor
+    offset_x: Tensor
+    offset_y: Tensor
+
+    @classmethod
+    def of(cls, groups: TileGroups, colors: Tensor, targets: Tensor) -> TileMoments:
+        """Two passes, about the tile's first sample: a constant tile has variance 0 exactly, at any brightness."""
+        first_x, first_y = colors[groups.first_slots], targets[groups.first_slots]
+        relative_x, relative_y = colors - groups.spread(first_x), targets - groups.spread(first_y)
+        mean_x, mean_y = groups.mean(torch.cat([relative_x, relative_y], dim=1)).chunk(2, dim=1)
+        offset_x, offset_y = relative_x - groups.spread(mean_x), relative_y - groups.spread(mean_y)
+        products = torch.cat([offset_x * offset_x, offset_y * offset_y, offset_x * offset_y], dim=1)
+        variance_x, variance_y, covariance = groups.mean(products).chunk(3, dim=1)
+        return cls(mean_x + first_x, mean_y + first_y, variance_x, variance_y, covariance, offset_x, offset_y)
+
+
+Similarity = tuple[Tensor, Tensor]
+"""Similarity S of each tile and channel, [T, C], at most 1; and g, [P, C], with d S / d x = omega * g."""
+
+
+def correlation(moments: TileMoments, groups: TileGroups, constant: float) -> Similarity:
+    """NCC with a variance floor f = constant / 2, the structure term of SSIM::
+
+        S = (s_xy + f) / sqrt((s_x^2 + f) (s_y^2 + f))
+        g = (y - mean_y) / sqrt((s_x^2 + f) (s_y^2 + f)) - S (x - mean_x) / (s_x^2 + f)
+
+    Where variances exceed f this is the paper's NCC. With the floor in numerator and denominator, S = 1 and g = 0
+    where x = y and where a tile has one sample or is constant in both, and ``|omega g| <= 1.5 sqrt(omega / f)``.
+    """
+    floor = 0.5 * constant
+    scale_x, scale_y = (moments.variance_x + floor).sqrt(), (moments.variance_y + floor).sqrt()
+    similarity = (moments.covariance + floor) / scale_x / scale_y
+    slope_y, slope_x = 1.0 / scale_x / scale_y, similarity / scale_x / scale_x
+    return similarity, moments.offset_y * groups.spread(slope_y) - moments.offset_x * groups.spread(slope_x)
+
+
+def contrast(moments: TileMoments, groups: TileGroups, constant: float) -> Similarity:
+    """The contrast-structure term of SSIM, with c = constant::
+
+        S = (2 s_xy + c) / (s_x^2 + s_y^2 + c)
+        g = 2 ((y - mean_y) - S (x - mean_x)) / (s_x^2 + s_y^2 + c)
+
+    Unlike a correlation it also sees the scale of the contrast. ``|omega g| <= 2 sqrt(omega / c)``.
+    """
+    denominator = moments.variance_x + moments.variance_y + constant
+    similarity = (2.0 * moments.covariance + constant) / denominator
+    slope_y, slope_x = 2.0 / denominator, 2.0 * similarity / denominator
+    return similarity, moments.offset_y * groups.spread(slope_y) - moments.offset_x * groups.spread(slope_x)
+
+
+def ssim(moments: TileMoments, groups: TileGroups, constant: float) -> Similarity:
+    """SSIM of each tile's samples taken as one window: the luminance term times `contrast`, both with SSIM's own
+    constants whatever `constant` is."""
+    structure, structure_gradients = contrast(moments, groups, STRUCTURE_CONSTANT)
+    mean_x, mean_y = moments.mean_x, moments.mean_y
+    denominator = mean_x * mean_x + mean_y * mean_y + LUMINANCE_CONSTANT
+    luminance = (2.0 * mean_x * mean_y + LUMINANCE_CONSTANT) / denominator
+    luminance_slope = 2.0 * (mean_y - luminance * mean_x) / denominator
+    gradients = structure_gradients * groups.spread(luminance) + groups.spread(structure * luminance_slope)
+    return structure * luminance, gradients
+
+
+SIMILARITIES: dict[str, Callable[[TileMoments, TileGroups, float], Similarity]] = {
+    "ncc": correlation,
+    "contrast": contrast,
+    "ssim": ssim,
+}
+"""Name of a structure term -> its definition. Those of `strategies.losses` are named alike."""
+
+
+class _Problem:
+    """What all losses start from: inputs in the precision of the computation, and the Charbonnier term.
+
+    The term is ``mean over filled samples of w * mean over channels of (sqrt(d^2 + eps^2) - eps)``, d = x - y: the
+    paper's up to a constant, so that it is 0 at d = 0. `slopes` [P, 3] is ``d / sqrt(d^2 + eps^2)``.
+    """
+
+    def __init__(self, colors: Tensor, targets: Tensor, samples: PixelSamples, epsilon: float) -> None:
+        expected = (len(samples), 3)
+        if colors.shape != expected or targets.shape != expected:
+            shapes = f"{tuple(colors.shape)} and {tuple(targets.shape)}"
+            raise ValueError(f"colors and targets have shapes {shapes}, expected {expected} as there are slots")
+        dtype = torch.promote_types(torch.promote_types(colors.dtype, targets.dtype), torch.float32)
+        used = samples.filled & torch.isfinite(colors).all(dim=1)
+        self.colors = torch.where(used[:, None], colors.detach().to(dtype), 0.0)
+        self.targets = torch.where(used[:, None], targets.detach().to(dtype), 0.0)
+        self.groups = groups = TileGroups(samples, used.to(dtype))
+        differences = self.colors - self.targets
+        self.pixel_errors = differences.abs().sum(dim=1).float()
+        roots = torch.sqrt(differences * differences + epsilon * epsilon)
+        self.slopes = differences / roots
+        values = differences * self.slopes * (roots / (roots + epsilon))  # d^2 / (root + eps) = root - eps
+        self.loss = (groups.weights * values).sum() / (3.0 * groups.filled)
+        self.gradients = self.slopes * (groups.weights / (3.0 * groups.filled))

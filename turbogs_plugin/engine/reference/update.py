@@ -1,0 +1,195 @@
+"""One step of the parameters in torch: the definition of what an `UpdateRule` means (paper section 3.9 and appendix).
+
+A step is a function of (parameters, gradients, `GaussianMoments`, `UpdateRule`). A Gaussian that no sample touched
+keeps its parameters, moments and step count; so does one with a gradient that is not finite, which is counted.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from turbogs_plugin.engine.moments import COLUMNS, GaussianMoments
+from turbogs_plugin.engine.reference.lm_solvers import solve_low_rank
+from turbogs_plugin.engine.rules import ParameterRates, UpdateRule
+from turbogs_plugin.types import GaussianGradients, Gaussians
+
+GEOMETRY, APPEARANCE = slice(0, 10), slice(10, 14)
+"""The two blocks of a packed row that moment-damped LM solves."""
+
+GRADIENT_LIMIT = 1e17
+"""Gradients are cut here, so that the square of a sum over up to 100 views stays finite in float32 (largest 3.4e38)."""
+
+
+@torch.no_grad()
+def apply_update(
+    rule: UpdateRule, gaussians: Gaussians, gradients: GaussianGradients, moments: GaussianMoments
+) -> None:
+    """Make one step of `rule`: changes `gaussians` and `moments` in place.
+
+    Args:
+        gradients: of each view, or their sum; what the rule needs summed is summed here.
+    """
+    index = updatable(gradients, moments)
+    moments.steps[index] += 1
+    steps = moments.steps[index]
+    rows = packed_rows(gradients, index)  # [K, n, 14]
+    losses = gradients.view_losses[:, index]  # [K, n]
+    gradient = rows.sum(dim=0)
+    terms = advance(moments.exp_avg, moments.exp_avg_sq, gradient, index, steps, rule)
+    if rule.lm is None:
+        delta = terms.delta(packed_rates(rule.rates, gradient))
+    else:
+        if not rule.per_view:
+            rows, losses = gradient[None], losses.sum(dim=0, keepdim=True)
+        if rule.lm.units == "balanced":
+            delta = balanced_delta(rows, losses, terms, rule)
+        else:
+            delta = paper_delta(rows, moments.exp_avg[index], moments.exp_avg_sq[index], rule)
+    add_packed(gaussians, index, delta)
+    step_shN(gaussians, gradients.shN, moments, index, steps, rule)
+
+
+def packed_rates(rates: ParameterRates, like: Tensor) -> Tensor:
+    """[14] the rates in the order of a packed row, in the dtype and on the device of `like`."""
+    values = [getattr(rates, name) for name, s in COLUMNS.items() for _ in range(s.stop - s.start)]
+    return torch.tensor(values, dtype=like.dtype, device=like.device)
+
+
+def packed_rows(gradients: GaussianGradients, index: Tensor) -> Tensor:
+    """[K, n, 14] gradients of the Gaussians `index` [n] in the order of `COLUMNS`, cut at `GRADIENT_LIMIT`."""
+    columns = [getattr(gradients, name)[:, index].flatten(2) for name in ("means", "scales", "quats", "sh0")]
+    columns.append(gradients.opacities[:, index].unsqueeze(-1))
+    return clipped(torch.cat(columns, dim=-1))
+
+
+def clipped(gradient: Tensor) -> Tensor:
+    """The gradient cut at `GRADIENT_LIMIT`."""
+    return gradient.clamp(-GRADIENT_LIMIT, GRADIENT_LIMIT)
+
+
+def finite_gradients(gradients: GaussianGradients) -> Tensor:
+    """[N] bool: every gradient of the Gaussian is finite, in every view."""
+    finite = torch.isfinite(gradients.shN.flatten(1)).all(dim=-1)
+    for name in COLUMNS:
+        value = getattr(gradients, name)
+        finite &= torch.isfinite(value).unsqueeze(-1).flatten(2).all(dim=-1).all(dim=0)
+    return finite
+
+
+def updatable(gradients: GaussianGradients, moments: GaussianMoments) -> Tensor:
+    """[n] int64: the touched Gaussians whose every gradient is finite; the others are added to `moments.skipped`."""
+    finite = finite_gradients(gradients)
+    moments.skipped += (gradients.touched & ~finite).sum()
+    return torch.nonzero(gradients.touched & finite).squeeze(-1)
+
+
+@dataclass
+class AdamTerms:
+    """What an update of n Gaussians is made of: bias-corrected m, and sqrt(v) + eps of bias-corrected v; [n, D]."""
+
+    mean: Tensor
+    denominator: Tensor
+
+    def delta(self, rates: Tensor | float) -> Tensor:
+        """[n, D] Adam's change of the parameters."""
+        return -(rates * (self.mean / self.denominator))
+
+
+def advance(
+    exp_avg: Tensor, exp_avg_sq: Tensor, gradient: Tensor, index: Tensor, steps: Tensor, rule: UpdateRule
+) -> AdamTerms:
+    """Move the moments of the Gaussians `index` [n] on by their gradients [n, D]. `steps`: [n], this one included.
+
+    1 - beta is formed in double, and the bias correction 1 - beta^t as -expm1(t log beta): either difference taken in
+    float32 would be off by 5e-5 of itself for beta = 0.999.
+    """
+    mean = torch.lerp(exp_avg[index], gradient, 1 - rule.beta1)
+    square = torch.lerp(exp_avg_sq[index], gradient * gradient, 1 - rule.beta2)
+    exp_avg[index], exp_avg_sq[index] = mean, square
+    count = steps.to(gradient.dtype).unsqueeze(-1)  # [n, 1]
+    mean_correction = -torch.expm1(count * math.log(rule.beta1)) if rule.beta1 > 0 else 1.0
+    square_correction = -torch.expm1(count * math.log(rule.beta2)) if rule.beta2 > 0 else 1.0
+    return AdamTerms(mean / mean_correction, torch.sqrt(square / square_correction) + rule.eps)
+
+
+def balanced_delta(rows: Tensor, losses: Tensor, terms: AdamTerms, rule: UpdateRule) -> Tensor:
+    """[n, 14] change of the parameters by the unit-consistent form.
+
+    Args:
+        rows: [K, n, 14] gradients of each view.
+        losses: [K, n] the Gaussian's share of the loss in each view. A row whose share is zero or not finite says
+            nothing of curvature and is left out.
+        terms: of the bias-corrected moments, [n, 14].
+    """
+    rates = packed_rates(rule.rates, rows)
+    adam = terms.delta(rates)
+    has_share = (losses > 0) & torch.isfinite(losses)
+    largest = torch.finfo(rows.dtype).max
+    weights = torch.where(has_share, (rule.lm.curvature / losses).clamp(max=largest), 0.0).to(rows.dtype)
+    # A rate of zero holds its parameter: no coupling may move it, so it gets the damping of the largest float's root.
+    damping = terms.denominator / rates.clamp(min=torch.finfo(rows.dtype).tiny ** 0.5)
+    delta = torch.cat([_solve(rows, weights, damping, terms.mean, block) for block in (GEOMETRY, APPEARANCE)], -1)
+    if rule.lm.max_step > 0:
+        bound = torch.maximum(rule.lm.max_step * rates, adam.abs())
+        delta = torch.maximum(torch.minimum(delta, bound), -bound)
+    # Without rows the solution is Adam's step; taking that one as it is makes them equal to the last bit.
+    has_rows = torch.stack([_any_row(rows, weights, block) for block in (GEOMETRY, APPEARANCE)], dim=-1)  # [n, 2]
+    sizes = torch.tensor([10, 4], device=rows.device)
+    takes_solution = torch.repeat_interleave(has_rows, sizes, dim=-1, output_size=14) & (rates > 0)
+    return torch.where(takes_solution, delta, adam)
+
+
+def paper_delta(rows: Tensor, mean: Tensor, square: Tensor, rule: UpdateRule) -> Tensor:
+    """[n, 14] change of the parameters by the printed equation.
+
+    Args:
+        rows: [K, n, 14] gradients of each view, the rows of J.
+        mean, square: [n, 14] the moments m and v, without bias correction, as the equation has them.
+    """
+    weights = torch.ones_like(rows[..., 0])
+    damping = torch.sqrt(square) + rule.eps
+    return torch.cat([_solve(rows, weights, damping, mean, block) for block in (GEOMETRY, APPEARANCE)], -1)
+
+
+def _solve(rows: Tensor, weights: Tensor, damping: Tensor, mean: Tensor, block: slice) -> Tensor:
+    return -solve_low_rank(rows[..., block], weights, damping[:, block], mean[:, block])
+
+
+def _any_row(rows: Tensor, weights: Tensor, block: slice) -> Tensor:
+    """[n] bool: some view has a row for this block."""
+    return ((rows[..., block] != 0).any(dim=-1) & (weights > 0)).any(dim=0)
+
+
+def add_packed(gaussians: Gaussians, index: Tensor, delta: Tensor) -> None:
+    """Add [n, 14] changes to the Gaussians `index`, in place."""
+    for name, columns in COLUMNS.items():
+        value = getattr(gaussians, name)
+        value.index_add_(0, index, delta[:, columns].reshape(-1, *value.shape[1:]))
+
+
+def step_shN(
+    gaussians: Gaussians,
+    gradient: Tensor,
+    moments: GaussianMoments,
+    index: Tensor,
+    steps: Tensor,
+    rule: UpdateRule,
+) -> None:
+    """Adam's step of the higher bands (appendix, second half of the LM equation), which no block takes in.
+
+    Args:
+        gradient: [N, B, 3].
+        index: [n] the Gaussians to update; steps: [n] their step counts, this one included.
+    """
+    gradient = clipped(gradient[index].flatten(1))
+    terms = advance(moments.exp_avg_shN, moments.exp_avg_sq_shN, gradient, index, steps, rule)
+    add_shN(gaussians, index, terms.delta(rule.rates.shN))
+
+
+def add_shN(gaussians: Gaussians, index: Tensor, delta: Tensor) -> None:
+    """Add [n, B * 3] changes to the higher bands of the Gaussians `index`, in place."""
+    gaussians.shN.index_add_(0, index, delta.reshape(len(index), *gaussians.shN.shape[1:]))

@@ -1,0 +1,123 @@
+"""Rules: what a strategy wants done, as plain values that every engine can carry out.
+
+A strategy that is described by a rule needs no code for a device: the engine of the device has it. The torch reference
+(`turbogs_plugin.engine.reference`) defines what each rule means; its CUDA twin does the same in fewer passes.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+UNITS = ("pixel", "cell", "tile")
+"""What a draw chooses: single pixels, cells of 4x4 pixels, or whole tiles of 16x16."""
+
+STRUCTURES = ("none", "ncc", "contrast", "ssim")
+"""Similarities of a tile's samples that a loss may have beside its l1 term."""
+
+LUMINANCE_CONSTANT = 0.01**2
+STRUCTURE_CONSTANT = 0.03**2
+"""SSIM's two constants, for colours of 0 .. 1."""
+
+
+@dataclass(frozen=True)
+class DrawRule:
+    """How the samples of an iteration are drawn (paper section 3.5); `engine.reference.draws` defines the draw.
+
+    Args:
+        unit: one of `UNITS`.
+        hard, stable: shares of the units drawn by error and by age; the mixed stage draws the rest.
+        mixed_uniform: the mixed stage ignores error and age.
+        importance: a of the weights ``p^-a``; 0 for no weights.
+    """
+
+    unit: str
+    hard: float
+    stable: float
+    mixed_uniform: bool
+    importance: float
+
+    def wanted(self, rate: float, units: int) -> int:
+        """Units to draw of so many: ``max(1, floor(rate * units))``, the paper's N_pix where they are the 256 pixels.
+
+        Of the 16 cells of a tile it is the nearest number: rounding down would lose up to half of a small budget.
+        """
+        slack = 0.5 if self.unit == "cell" else 0.0
+        return min(units, max(1, math.floor(rate * units + slack)))
+
+    def stages(self, wanted: int) -> tuple[int, int, int]:
+        """Units of the hard, stable and mixed stage; halves round up."""
+        hard = min(wanted, math.floor(self.hard * wanted + 0.5))
+        stable = min(wanted - hard, math.floor(self.stable * wanted + 0.5))
+        return hard, stable, wanted - hard - stable
+
+
+@dataclass(frozen=True)
+class LossTerms:
+    """A loss on samples (paper section 3.7); `engine.reference.losses` defines its value and gradient.
+
+    Args:
+        epsilon: of the Charbonnier term.
+        l1_weight: factor of that term.
+        structure: one of `STRUCTURES`.
+        structure_weight: factor of the mean over tiles and channels of 1 - S, S the similarity.
+        variance_constant: c of `ncc` and `contrast`.
+        balance: scale the structure term by the paper's lambda.
+        gate: scale it by the truth's variance.
+    """
+
+    epsilon: float
+    l1_weight: float = 1.0
+    structure: str = "none"
+    structure_weight: float = 0.0
+    variance_constant: float = STRUCTURE_CONSTANT
+    balance: bool = False
+    gate: bool = False
+
+
+@dataclass(frozen=True)
+class ParameterRates:
+    """The learning rate of each parameter at one iteration, in the parameter's own units per step."""
+
+    means: float
+    quats: float
+    scales: float
+    opacities: float
+    sh0: float
+    shN: float
+
+
+@dataclass(frozen=True)
+class MomentLMParams:
+    """What moment-damped LM needs beyond Adam; see `MomentLMOptimizer` for the meaning of each."""
+
+    units: Literal["balanced", "paper"]
+    rows: Literal["views", "summed"]
+    curvature: float
+    max_step: float
+
+
+@dataclass(frozen=True)
+class UpdateRule:
+    """One step of the parameters (paper section 3.9); `engine.reference.update` defines it.
+
+    It is Adam, or with `lm` moment-damped LM on two blocks of each Gaussian and Adam on the higher bands.
+
+    Args:
+        rates: learning rate of each parameter at this iteration.
+        beta1, beta2: decay of the moments.
+        eps: added to sqrt(v), after the bias correction of v.
+        lm: None for Adam.
+    """
+
+    rates: ParameterRates
+    beta1: float
+    beta2: float
+    eps: float
+    lm: MomentLMParams | None = None
+
+    @property
+    def per_view(self) -> bool:
+        """Whether the rule asks for the gradients of each view, or for their sum alone."""
+        return self.lm is not None and self.lm.rows == "views"
