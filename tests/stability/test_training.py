@@ -226,13 +226,13 @@ def test_the_guard_reads_nothing_within_a_step(capture):
     trainer = Trainer(config, load_scene(capture), torch.device("cpu"))
     trainer.initialise_maps()
     losses = []
-    compute = trainer.loss
+    supervise = trainer.supervise
 
     def remembered(*arguments):
-        losses.append(compute(*arguments))
+        losses.append(supervise(*arguments))
         return losses[-1]
 
-    trainer.loss = remembered
+    trainer.supervise = remembered
     with Reads(lambda: [trainer.nonfinite_losses, trainer.optimizer.skipped, *(o.loss for o in losses)]) as reads:
         for _ in range(5):
             trainer.step()
