@@ -7,8 +7,10 @@ from turbogs_plugin.strategies.losses import CharbonnierLoss, CharbonnierNccLoss
 
 from turbogs_plugin.engine.cuda import library as kernels
 from turbogs_plugin.engine.cuda import training as training_kernels
-from turbogs_plugin.engine.cuda.training import LossTerms, MapUpdate
-from turbogs_plugin.engine.reference.draws import DrawRule, draw_pixels
+from turbogs_plugin.engine.cuda.training import MapUpdate
+from turbogs_plugin.engine.reference.draws import draw_pixels
+from turbogs_plugin.engine.reference.losses import sparse_loss
+from turbogs_plugin.engine.rules import DrawRule
 from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.types import PixelSamples, Step
 
@@ -22,13 +24,10 @@ SIZES = np.array([(40, 33), (20, 17), (64, 48)], dtype=np.int64)
 STEP = Step(iteration=12, total=100, refine_until=70, seed=3)
 
 CASES = {
-    "l1": (CharbonnierLoss(), LossTerms(1e-3)),
-    "ncc": (CharbonnierNccLoss(), LossTerms(1e-3, 1.0, "ncc", 0.2, 9e-4, True)),
-    "contrast": (
-        CharbonnierNccLoss(structure="contrast", gate=True, ncc_weight=1.0),
-        LossTerms(1e-3, 1.0, "contrast", 1.0, 9e-4, True, True),
-    ),
-    "ssim": (SparseSsimLoss(), LossTerms(1e-3, 0.8, "ssim", 0.2)),
+    "l1": CharbonnierLoss(),
+    "ncc": CharbonnierNccLoss(),
+    "contrast": CharbonnierNccLoss(structure="contrast", gate=True, ncc_weight=1.0),
+    "ssim": SparseSsimLoss(),
 }
 
 
@@ -73,10 +72,10 @@ def relative(found, expected):
 @pytest.mark.parametrize("name", CASES)
 @pytest.mark.parametrize(("rate", "unit", "importance"), [(0.1, "pixel", 0.5), (0.3, "cell", 0.0), (1.0, "tile", 1.0)])
 def test_equals_the_twin(name, rate, unit, importance):
-    loss, terms = CASES[name]
+    terms = CASES[name].terms
     samples = make_samples(rate, unit, importance)
     colors, targets, photos, starts = make_colors(samples)
-    expected = loss(colors.double(), targets.double(), samples)
+    expected = sparse_loss(colors.double(), targets.double(), samples, terms)
     for truth, extra in ((targets, {}), (photos, {"starts": starts})):
         found = training_kernels.sparse_loss(colors.to(DEVICE), truth.to(DEVICE), to_device(samples), terms, **extra)
         assert float(found.loss) == pytest.approx(float(expected.loss), rel=1e-5)
@@ -92,7 +91,7 @@ def test_maps_follow(rate):
     colors, targets, _, _ = make_colors(samples)
     maps, twin = make_maps(DEVICE), make_maps("cpu")
     found = training_kernels.sparse_loss(
-        colors.to(DEVICE), targets.to(DEVICE), to_device(samples), CASES["ncc"][1], update=MapUpdate(maps, STEP)
+        colors.to(DEVICE), targets.to(DEVICE), to_device(samples), CASES["ncc"].terms, update=MapUpdate(maps, STEP)
     )
     twin.update(samples, found.pixel_errors.cpu(), STEP)
     assert torch.equal(maps.errors.cpu(), twin.errors)
@@ -112,7 +111,7 @@ def test_bad_colors_stay_out(bad):
         colors.to(DEVICE),
         targets.to(DEVICE),
         to_device(samples),
-        CASES["ncc"][1],
+        CASES["ncc"].terms,
         update=MapUpdate(maps, STEP),
     )
     assert torch.isfinite(found.loss)
@@ -131,12 +130,12 @@ def test_side_stream_and_half_colors():
     samples = make_samples(0.3, "cell")
     colors, targets, _, _ = make_colors(samples)
     colors, targets, samples = colors.half().to(DEVICE), targets.to(DEVICE), to_device(samples)
-    expected = training_kernels.sparse_loss(colors, targets, samples, CASES["ncc"][1])
+    expected = training_kernels.sparse_loss(colors, targets, samples, CASES["ncc"].terms)
     stream = torch.cuda.Stream()
     stream.wait_stream(torch.cuda.current_stream())
     with torch.cuda.stream(stream):
         torch.cuda._sleep(50_000_000)  # work on the default stream would overtake this
-        found = training_kernels.sparse_loss(colors + 0, targets + 0, samples, CASES["ncc"][1])
+        found = training_kernels.sparse_loss(colors + 0, targets + 0, samples, CASES["ncc"].terms)
     stream.synchronize()
     assert torch.equal(found.color_gradients, expected.color_gradients)
     assert torch.equal(found.pixel_errors, expected.pixel_errors)
@@ -151,6 +150,6 @@ def test_lost_losses_are_counted_once():
     for value, expected in ((0.5, 0), (1e38, 1), (0.5, 1), (1e38, 2)):
         colors[::7] = value
         found = training_kernels.sparse_loss(
-            colors.to(DEVICE), targets.to(DEVICE), to_device(samples), CASES["l1"][1], nonfinite_losses=counter
+            colors.to(DEVICE), targets.to(DEVICE), to_device(samples), CASES["l1"].terms, nonfinite_losses=counter
         )
         assert int(counter) == expected and bool(torch.isfinite(found.loss)) == (value == 0.5)
