@@ -56,7 +56,7 @@ def train(
         config: name of a packaged configuration or a .yaml file; turbogs where absent.
         factor: scale photos down by this.
         device: where to train; auto takes a GPU where there is one.
-        max_gaussians: never more than this (budget.max_gaussians).
+        max_gaussians: never more than this (density.max_gaussians).
         max_memory: of the GPU, never more than this for tensors: 2GiB, 1500MB (budget.max_memory). Photos and error
             maps move to the host if need be, then the number of Gaussians is limited.
         time_budget: seconds of training to end after: 20s, 2m (budget.time). The schedule is fitted to it, and
@@ -64,14 +64,15 @@ def train(
     """
     from turbogs_plugin.train import run
 
-    budget = _budget(max_gaussians, max_memory, time_budget)
+    budget = _budget(max_memory, time_budget)
     if resume is not None:
-        if scene or overrides or budget or any(option is not None for option in (out, config, factor, device)):
+        others = (out, config, factor, device, max_gaussians)
+        if scene or overrides or budget or any(option is not None for option in others):
             raise InputError("--resume goes on by the run's own configuration: give it nothing else")
         return _tell(run.resume(resume))
     if scene is None or out is None:
         raise InputError("train needs a SCENE and --out RUN, or --resume RUN")
-    return _tell(run.train(_settings(scene, (*overrides, *budget), config, factor, device), out))
+    return _tell(run.train(_settings(scene, (*overrides, *budget), config, factor, device, max_gaussians), out))
 
 
 @app.command
@@ -87,11 +88,11 @@ def plan(
     max_memory: Memory = None,
     time_budget: Time = None,
 ) -> int:
-    """Print what training on a capture would leave out, and because of which numbers, without training.
+    """Print what a run on a capture would decide of the settings that are `auto`, and why, without training.
 
     Args:
         scene: as in train, and so are all others.
-        overrides: a decision is forced by plan.NAME=VALUE.
+        overrides: as in train; train.sh_degree=auto leaves a setting to the plan, any other value forces it.
         config: as in train.
         factor: as in train.
         device: as in train.
@@ -101,8 +102,8 @@ def plan(
     """
     from turbogs_plugin.train.run import plan_run
 
-    budget = _budget(max_gaussians, max_memory, time_budget)
-    print(plan_run(_settings(scene, (*overrides, *budget), config, factor, device)).text())
+    budget = _budget(max_memory, time_budget)
+    print(plan_run(_settings(scene, (*overrides, *budget), config, factor, device, max_gaussians)).text())
     return 0
 
 
@@ -330,19 +331,13 @@ def doctor() -> int:
     return 0
 
 
-def _budget(max_gaussians: int | None, max_memory: str | None, time_budget: str | None) -> tuple[str, ...]:
+def _budget(max_memory: str | None, time_budget: str | None) -> tuple[str, ...]:
     """The options of a budget as overrides."""
-    if max_gaussians is not None and max_gaussians < 1:
-        raise InputError(f"--max-gaussians {max_gaussians}: it must be at least 1; leave it out for no limit")
     for option, amount in (("--max-memory", max_memory), ("--time-budget", time_budget)):
         if amount == "":
             raise InputError(f"{option} '': write an amount; leave it out for no limit")
-    given = {"max_gaussians": max_gaussians, "max_memory": max_memory, "time": time_budget}
-    return tuple(
-        f"budget.{name}={value if name == 'max_gaussians' else repr(value)}"
-        for name, value in given.items()
-        if value is not None
-    )
+    given = {"max_memory": max_memory, "time": time_budget}
+    return tuple(f"budget.{name}={value!r}" for name, value in given.items() if value is not None)
 
 
 def _require_positive(option: str, values: Sequence[float], most: float = math.inf) -> None:
@@ -351,13 +346,25 @@ def _require_positive(option: str, values: Sequence[float], most: float = math.i
         raise InputError(f"{option} {' '.join(map(str, values))}: it must be more than 0 and {limit}")
 
 
-def _settings(scene: Path, overrides: tuple[str, ...], config: str | None, factor: int | None, device: Device | None):
+def _settings(
+    scene: Path,
+    overrides: tuple[str, ...],
+    config: str | None,
+    factor: int | None,
+    device: Device | None,
+    max_gaussians: int | None,
+):
     """The configuration that a command line asks for."""
     from turbogs_plugin.config.configuration import DEFAULT_CONFIG, load_config
+    from turbogs_plugin.plan.caps import with_cap
 
+    if max_gaussians is not None and max_gaussians < 1:
+        raise InputError(f"--max-gaussians {max_gaussians}: it must be at least 1; leave it out for no limit")
     if any(override.partition("=")[0].strip() == "scene.path" for override in overrides):
         raise InputError(f"scene.path is '{scene}', as SCENE says: leave the override out")
     settings = load_config(DEFAULT_CONFIG if config is None else config, overrides)
+    if max_gaussians is not None:
+        settings = with_cap(settings, max_gaussians)
     settings.scene.path = str(scene)
     if factor is not None:
         settings.scene.factor = factor

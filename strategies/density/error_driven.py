@@ -29,7 +29,16 @@ EPS = 1e-12
 
 @dataclass
 class NoDensity:
-    """The set of Gaussians stays as it is."""
+    """The set of Gaussians stays as it is.
+
+    Args:
+        max_gaussians: cap on the points that a model begins with. 0: no cap.
+    """
+
+    max_gaussians: int = 0
+
+    def __post_init__(self) -> None:
+        require_not_negative(self, "max_gaussians")
 
     @property
     def stats(self) -> GaussianStats | None:
@@ -58,12 +67,12 @@ class ErrorDrivenDensity:
         e = E / (W + eps),  d = D / (W + eps),  s = e + lambda_base * anneal * d
 
     is its difficulty. A Gaussian with W = 0, or with non-finite statistics, was not seen: it has no score, and is
-    neither densified nor pruned by score. Equal scores stand or fall together, except where a budget must choose
+    neither densified nor pruned by score. Equal scores stand or fall together, except where a cap must choose
     (then the lower row goes first). After densification, rows are in the order of space (`spatial_order`).
 
     Until `Step.refine_until`, every `refine_every` iterations from `refine_from` on, one event clones, splits and
     prunes. A Gaussian that is due for pruning is not densified; one that is too big but chosen to be split is not
-    pruned, while one that a budget or cap denies its split is. Afterwards, every `final_every` iterations, one only
+    pruned, while one that the cap denies its split is. Afterwards, every `final_every` iterations, one only
     prunes. At least one Gaussian is always left.
 
     Args:
@@ -78,9 +87,6 @@ class ErrorDrivenDensity:
         split: two draws from the Gaussian, all axes divided by 1.6 as in 3DGS (`sample`); or two halves along its
             longest axis, which is divided by 1.6, so placed that the pair has the parent's mean and covariance
             (`long_axis`).
-        growth: every candidate is taken (`threshold`), or the number of Gaussians follows a straight line from the
-            initial one to `target_gaussians` at `refine_until`, the most difficult candidates first (`budget`).
-        target_gaussians: end of that line. `budget` only.
         max_gaussians: never more than this; an initial model that has more is cut to it at the first event, easiest
             first, those of `spare_beyond` last. 0: no cap.
         prune_opacity: less opaque ones are pruned.
@@ -114,8 +120,6 @@ class ErrorDrivenDensity:
     top_fraction: float = 0.5
     percent_dense: float = 0.01
     split: Literal["sample", "long_axis"] = "sample"
-    growth: Literal["threshold", "budget"] = "threshold"
-    target_gaussians: int = 0
     max_gaussians: int = 0
     prune_opacity: float = 0.005
     prune_world_size: float = 0.1
@@ -128,7 +132,6 @@ class ErrorDrivenDensity:
     final_every: int = 500
     final_keep: float = 0.95
     stop_when_flat: float = 0.0
-    initial_count: int = field(init=False, default=0)
     window_errors: list[float] = field(init=False, repr=False, default_factory=list)
     stopped_at: int = field(init=False, repr=False, default=0)
     _stats: GaussianStats | None = field(init=False, repr=False, default=None)
@@ -137,7 +140,6 @@ class ErrorDrivenDensity:
         choices = {
             "score": ("balanced", "raw"),
             "split": ("sample", "long_axis"),
-            "growth": ("threshold", "budget"),
             "prune_world_reference": ("extent", "distance"),
         }
         for name, allowed in choices.items():
@@ -150,21 +152,15 @@ class ErrorDrivenDensity:
             require(0 <= getattr(self, name) < 1, name, getattr(self, name), "at least 0 and less than 1")
         require_not_negative(
             self,
-            *("lambda_base", "refine_from", "grad_threshold", "absgrad_threshold", "percent_dense", "target_gaussians"),
+            *("lambda_base", "refine_from", "grad_threshold", "absgrad_threshold", "percent_dense"),
             *("max_gaussians", "prune_world_size", "prune_screen_size", "prune_size_from", "spare_beyond"),
         )
-        if (self.growth == "budget") != (self.target_gaussians > 0):
-            raise InputError(
-                f"growth = {self.growth!r} with target_gaussians = {self.target_gaussians}: "
-                "a budget needs a target above 0, and a target is only used by growth: budget"
-            )
 
     @property
     def stats(self) -> GaussianStats | None:
         return self._stats
 
     def setup(self, gaussians: Gaussians) -> None:
-        self.initial_count = len(gaussians)
         self._stats = GaussianStats.zeros(len(gaussians), gaussians.device)
 
     @torch.no_grad()
@@ -186,7 +182,7 @@ class ErrorDrivenDensity:
 
     def state_dict(self) -> dict[str, Any]:
         stats = None if self._stats is None else {f.name: getattr(self._stats, f.name) for f in fields(self._stats)}
-        state = {"initial_count": self.initial_count, "stats": stats}
+        state = {"stats": stats}
         if self.stop_when_flat > 0:
             window_errors = torch.tensor(self.window_errors, dtype=torch.float64)
             state |= {"window_errors": window_errors, "stopped_at": self.stopped_at}
@@ -199,7 +195,6 @@ class ErrorDrivenDensity:
                 "error: continue it with stop_when_flat = 0, or start a new run"
             )
         self._stats = loaded_rows("stats", state["stats"], self._stats)
-        self.initial_count = state["initial_count"]
         if self.stop_when_flat > 0:
             self.window_errors = state["window_errors"].tolist()
             self.stopped_at = state["stopped_at"]
@@ -270,13 +265,11 @@ class ErrorDrivenDensity:
                 big |= stats.max_radii > self.prune_screen_size
         pruned = leave_one((hopeless | (big & ~(candidates & ~small))) & ~spared, gaussians)
         candidates &= ~pruned
-        allowed = self._allowed_growth(int((~pruned).sum()), step)
-        if allowed is not None:
-            chosen = _first(score, candidates, allowed)
+        if self.max_gaussians > 0:
+            chosen = _first(score, candidates, max(0, self.max_gaussians - int((~pruned).sum())))
             denied = candidates & ~chosen
             candidates = chosen
             pruned = leave_one(pruned | (big & denied & ~spared), gaussians)  # makes room for the next event
-        if self.max_gaussians > 0:
             excess = int((~pruned).sum()) - self.max_gaussians
             if excess > 0:  # then nothing was chosen
                 pruned = pruned | self._easiest(score, seen, ~pruned, spared, excess)
@@ -301,17 +294,6 @@ class ErrorDrivenDensity:
         ease = -torch.where(seen, score, average)
         taken = _first(ease, present & ~spared, count)
         return taken | _first(ease, present & spared, count - int(taken.sum()))
-
-    def _allowed_growth(self, count: int, step: Step) -> int | None:
-        """How many Gaussians may be added to `count`, or None for any number."""
-        limits = []
-        if self.max_gaussians > 0:
-            limits.append(self.max_gaussians)
-        if self.growth == "budget":
-            ramp = (step.iteration - self.refine_from) / max(1, step.refine_until - self.refine_from)
-            line = self.initial_count + (self.target_gaussians - self.initial_count) * min(1.0, max(0.0, ramp))
-            limits.append(math.floor(line))
-        return max(0, min(limits) - count) if limits else None
 
     def _final_prune(self, gaussians: Gaussians, score: Tensor, seen: Tensor, step: Step) -> RowUpdate | None:
         finite = finite_rows(gaussians)

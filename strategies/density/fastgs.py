@@ -158,7 +158,7 @@ class FastGsDensity:
         shown = replace(window, grad_sums=window.grad_sums * agreed, absgrad_sums=window.absgrad_sums * agreed)
         self._events.setup(gaussians)
         stats = {item.name: getattr(shown, item.name) for item in fields(GaussianStats)}
-        self._events.load_state_dict({"initial_count": len(gaussians), "stats": stats})
+        self._events.load_state_dict({"stats": stats})
         return self._events.update(gaussians, step)
 
     def _prune(self, gaussians: Gaussians) -> RowUpdate | None:

@@ -36,12 +36,13 @@ class GsplatMcmcDensity:
     dead; noise that is not finite is left out; and an event that finds nothing alive relocates and adds none.
 
     Args:
-        cap_max, noise_lr, refine_start_iter, refine_every, min_opacity: as in `gsplat.MCMCStrategy`.
+        max_gaussians: `cap_max` of `gsplat.MCMCStrategy`.
+        noise_lr, refine_start_iter, refine_every, min_opacity: as in `gsplat.MCMCStrategy`.
         learning_rates: those of the optimizer; the noise follows the means' rate of the next iteration, as in gsplat's
             trainer, whose schedulers step first.
     """
 
-    cap_max: int = 1_000_000
+    max_gaussians: int = 1_000_000
     noise_lr: float = 5e5
     refine_start_iter: int = 500
     refine_every: int = 100
@@ -49,7 +50,7 @@ class GsplatMcmcDensity:
     learning_rates: LearningRates = field(default_factory=LearningRates)
 
     def __post_init__(self) -> None:
-        for name in ("cap_max", "refine_every"):
+        for name in ("max_gaussians", "refine_every"):
             require(getattr(self, name) >= 1, name, getattr(self, name), "at least 1")
         require_not_negative(self, "noise_lr", "refine_start_iter")
         require(0 < self.min_opacity < 1, "min_opacity", self.min_opacity, "more than 0 and less than 1")
@@ -105,7 +106,7 @@ class GsplatMcmcDensity:
     def _run_gsplat(self, values: dict[str, Tensor], refine_until: int, step: Step) -> tuple[dict, dict]:
         """gsplat's strategy on these parameters: what became of them, and the optimizers that mark rows it has made."""
         strategy = MCMCStrategy(
-            cap_max=self.cap_max,
+            cap_max=self.max_gaussians,
             noise_lr=self.noise_lr,
             refine_start_iter=self.refine_start_iter,
             refine_stop_iter=refine_until,

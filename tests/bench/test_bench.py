@@ -53,7 +53,7 @@ def test_clocks_measure_what_passes():
 
 
 def test_the_recorder_marks_the_trainers_own_steps_and_leaves_no_trace(capture):
-    config = tiny_config(capture)
+    config = tiny_config(capture).without_plan()
     plain, watched = (Trainer(config, load_scene(capture), CPU) for _ in range(2))
     before = {name: set(vars(getattr(watched, name))) for name in ("schedule", "optimizer", "density", "maps")}
     engine, loss = watched.engine, watched.loss

@@ -31,8 +31,8 @@ def test_the_names_of_the_issue_are_packaged():
 
 def test_the_table_of_the_paper():
     fast, big = load_config("turbogs"), load_config("turbogs-big")
-    assert (fast.train.iterations, fast.train.refine_until) == (5000, 3500)
-    assert (big.train.iterations, big.train.refine_until) == (8000, 6000)
+    assert (fast.train.base_iterations, fast.train.refine_until) == (5000, 3500)
+    assert (big.train.base_iterations, big.train.refine_until) == (8000, 6000)
     for config in (fast, big):
         assert config.schedule["type"] == "sinusoidal"
         assert (config.schedule["min_views"], config.schedule["max_views"], config.schedule["alpha"]) == (3, 10, 3.0)

@@ -38,7 +38,7 @@ NINE_VIEWS = ("schedule.min_views=9", "schedule.max_views=9")
 
 def train(capture: Path, *overrides: str, iterations: int | None = None) -> Trainer:
     """The iterations of a tiny run, or the first of them."""
-    config = tiny_config(capture, f"train.device={DEVICE}", *overrides)
+    config = tiny_config(capture, f"train.device={DEVICE}", *overrides).without_plan()
     trainer = Trainer(config, load_scene(capture), torch.device(DEVICE))
     trainer.initialise_maps()
     for iteration in range(1, (iterations or config.train.iterations) + 1):

@@ -84,7 +84,7 @@ def test_mcmc_relocates_what_is_not_finite_or_endless(bad):
     gaussians = make_gaussians(COUNT, dtype=torch.float32).map(lambda value: value.to(DEVICE))
     gaussians.opacities[:] = 1.0
     gaussians.means[3], gaussians.quats[4], gaussians.scales[5], gaussians.scales[6] = bad, bad, bad, 60.0
-    density = GsplatMcmcDensity(cap_max=COUNT + 7)
+    density = GsplatMcmcDensity(max_gaussians=COUNT + 7)
     density.setup(gaussians)
     result = density.update(gaussians, Step(600, 5000, 3500)).apply(gaussians)
     assert len(result) == COUNT + 7
@@ -104,7 +104,7 @@ def test_mcmc_moves_means_by_its_noise(noise_lr):
 SOON = {
     "3dgs": ("density.refine_start_iter=9", "density.refine_every=10", "density.reset_every=15"),
     "3dgs-as-shipped": ("density.refine_start_iter=9", "density.refine_every=10"),
-    "mcmc": ("density.refine_start_iter=9", "density.refine_every=10", "density.cap_max=2000"),
+    "mcmc": ("density.refine_start_iter=9", "density.refine_every=10", "density.max_gaussians=2000"),
     "fastgs": ("density.refine_from=10", "density.refine_every=10", "density.prune_every=20"),
 }
 
@@ -122,4 +122,4 @@ def test_baselines_train(tmp_path, name):
 def test_a_baseline_waits_for_nothing_between_events(tmp_path):
     scene = load_scene(tiny_capture(tmp_path))
     config = load_config("3dgs", ["train.device=cuda", "density.refine_start_iter=1000"])
-    assert_iterations_wait_for_nothing(Trainer(config, scene, torch.device("cuda")))
+    assert_iterations_wait_for_nothing(Trainer(config.without_plan(), scene, torch.device("cuda")))

@@ -163,7 +163,7 @@ def test_relocation_works_on_shared_optimizers(rule):
 
 def test_mcmc_behind_our_protocol():
     gaussians = Gaussians(**{name: value.detach().clone() for name, value in splats_on_gpu().items()})
-    density = GsplatMcmcDensity(cap_max=COUNT + 12, refine_start_iter=1, refine_every=5, min_opacity=0.3)
+    density = GsplatMcmcDensity(max_gaussians=COUNT + 12, refine_start_iter=1, refine_every=5, min_opacity=0.3)
     density.setup(gaussians)
     before = gaussians.means.clone()
     assert density.update(gaussians, Step(3, 100, 50)) is None

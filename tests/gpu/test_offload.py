@@ -43,7 +43,7 @@ models that learn differ in their last bits.)"""
 
 
 def trained(scene: Scene, maps: str, photos: str, iterations: int, *overrides: str) -> Trainer:
-    config = config_of(f"plan.maps_on={maps}", f"plan.photos_on={photos}", *overrides)
+    config = config_of(f"train.maps_place={maps}", f"train.photos_place={photos}", *overrides).without_plan()
     trainer = Trainer(config, scene, GPU)
     trainer.initialise_maps()
     run(trainer, iterations)
@@ -127,9 +127,9 @@ def test_a_capture_larger_than_the_limit_trains_within_it():
     try:
         plan = make_plan(asked, scene, GPU, memory_limit=limit)
         config, _ = calibration.within_budget(plan.apply(asked), scene, GPU)
-        assert (config.plan.maps_on, config.plan.photos_on) == ("host", "host")
+        assert (config.train.maps_place, config.train.photos_place) == ("host", "host")
         with pytest.raises(torch.cuda.OutOfMemoryError):
-            Trainer(config_of("plan.maps_on=device", "plan.photos_on=device"), scene, GPU)
+            Trainer(config_of("train.maps_place=device", "train.photos_place=device").without_plan(), scene, GPU)
         gc.collect()
         torch.cuda.empty_cache()
         torch.cuda.reset_peak_memory_stats()
@@ -139,12 +139,12 @@ def test_a_capture_larger_than_the_limit_trains_within_it():
         run(trainer, 30)
         metrics = evaluate(trainer.gaussians, place_views(scene.test, GPU, "host"), trainer.sh_degree, config.raster)
         assert torch.cuda.max_memory_reserved() <= limit
-        assert len(trainer.gaussians) <= config.budget.max_gaussians
+        assert len(trainer.gaussians) <= config.density["max_gaussians"]
         trainer.maps._means.restart()
         assert trainer.maps.mean() < first
         print(
             f"\nallocated at most {torch.cuda.max_memory_allocated() / 2**30:.2f} GiB, reserved "
-            f"{torch.cuda.max_memory_reserved() / 2**30:.2f} GiB of {LIMIT}; cap {config.budget.max_gaussians}, "
+            f"{torch.cuda.max_memory_reserved() / 2**30:.2f} GiB of {LIMIT}; cap {config.density['max_gaussians']}, "
             f"{len(trainer.gaussians)} Gaussians; PSNR {metrics.psnr:.2f}"
         )
     finally:

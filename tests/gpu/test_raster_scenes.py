@@ -44,6 +44,7 @@ def case(request) -> Case:
     if "TURBOGS_SCENES" not in os.environ or not folder.is_dir():
         pytest.skip(f"set TURBOGS_SCENES to the folder that holds {request.param}")
     config = load_config("turbogs", ["train.iterations=5000", f"train.backdrop={request.param == 'caliterra'}"])
+    config = config.without_plan()
     trainer = Trainer(config, load_scene(folder), torch.device("cuda"))
     trainer.initialise_maps()
     train(trainer, 1000)

@@ -97,4 +97,4 @@ def test_the_guard_waits_for_nothing(tmp_path):
     """Between two events of density control, no iteration makes the host wait for the GPU."""
     scene = load_scene(tiny_capture(tmp_path))
     config = tiny_config(tmp_path / "capture", "train.device=cuda", "density.refine_from=1000")
-    assert_iterations_wait_for_nothing(Trainer(config, scene, torch.device("cuda")))
+    assert_iterations_wait_for_nothing(Trainer(config.without_plan(), scene, torch.device("cuda")))

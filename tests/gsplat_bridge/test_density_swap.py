@@ -156,7 +156,7 @@ def controlled(options, before, window, seed, extent, refine_until):
     """The Gaussians after the event by an `ErrorDrivenDensity` with exactly these options."""
     controller = ErrorDrivenDensity(**options)
     controller.setup(before)
-    controller.load_state_dict({"initial_count": len(before), "stats": window})
+    controller.load_state_dict({"stats": window})
     update = controller.update(before, Step(EVENT, 10**6, refine_until, seed, extent))
     return before if update is None else update.apply(before)
 

@@ -39,13 +39,13 @@ def test_a_synthetic_scene_is_one_like_any_other(scene):
 def test_it_trains_from_host_memory(scene):
     """The path of the capture that exceeds a GPU's limit: plan, windows, training, evaluation."""
     overrides = ["train.iterations=12", "schedule.max_views=2", "schedule.min_views=2", "train.sh_degree=0"]
-    overrides += ["plan.maps_on=host", "plan.photos_on=host", "plan.sh_degree=keep", "density.type=none"]
+    overrides += ["train.maps_place=host", "train.photos_place=host", "density.type=none"]
     asked = load_config("turbogs", overrides)
     config = make_plan(asked, scene, CPU).apply(asked)
     trainer = Trainer(config, scene, CPU)
     trainer.initialise_maps()
     first = trainer.maps.mean()
-    test = place_views(scene.test, CPU, config.plan.photos_on)
+    test = place_views(scene.test, CPU, config.train.photos_place)
     before = evaluate(trainer.gaussians, test, 0, config.raster).psnr
     for _ in range(12):
         trainer.step()

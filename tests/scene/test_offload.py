@@ -35,8 +35,10 @@ def scene(capture) -> Scene:
 
 def trainer_of(scene: Scene, capture: Path, maps: bool, photos: bool, *overrides: str) -> Trainer:
     """A trainer with these two in host memory."""
-    places = [f"plan.{name}_on={'host' if host else 'device'}" for name, host in (("maps", maps), ("photos", photos))]
-    return Trainer(tiny_config(capture, *places, *overrides), scene, CPU)
+    places = [
+        f"train.{name}_place={'host' if host else 'device'}" for name, host in (("maps", maps), ("photos", photos))
+    ]
+    return Trainer(tiny_config(capture, *places, *overrides).without_plan(), scene, CPU)
 
 
 @pytest.mark.parametrize(
@@ -85,9 +87,9 @@ def test_a_run_stops_with_resident_maps_and_goes_on_with_offloaded_ones(scene, c
 def test_a_whole_run_leaves_the_same_model(capture, tmp_path):
     models = []
     for place in ("device", "host"):
-        config = tiny_config(capture, f"plan.maps_on={place}", f"plan.photos_on={place}")
+        config = tiny_config(capture, f"train.maps_place={place}", f"train.photos_place={place}")
         outcome = run.train(config, tmp_path / place)
-        assert outcome.folder.read_config().plan.maps_on == place
+        assert outcome.folder.read_config().train.maps_place == place
         models.append(outcome.folder.model.read_bytes())
     assert models[0] == models[1]
 
@@ -95,7 +97,7 @@ def test_a_whole_run_leaves_the_same_model(capture, tmp_path):
 @pytest.mark.parametrize("place", ["device", "host"])
 def test_photos_stay_in_host_memory_when_a_run_is_looked_at(capture, tmp_path, monkeypatch, place):
     """Evaluated, where it was planned so, with the same errors; rendered, always."""
-    config = tiny_config(capture, f"plan.photos_on={place}", "train.iterations=2")
+    config = tiny_config(capture, f"train.photos_place={place}", "train.iterations=2")
     outcome = run.train(config, tmp_path / "run")
     to, moved = Photos.to, []
     monkeypatch.setattr(Photos, "to", lambda photos, device: moved.append(device) or to(photos, device))

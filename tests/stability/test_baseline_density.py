@@ -223,7 +223,7 @@ def test_cap_reached():
     gaussians = make_gaussians(40, dtype=torch.float32)
     gaussians.opacities[::4] = -9.0
     for cap in (1, 40, 41):
-        result = follow(GsplatMcmcDensity(cap_max=cap), clone(gaussians))
+        result = follow(GsplatMcmcDensity(max_gaussians=cap), clone(gaussians))
         assert len(result) == max(40, cap)
         assert (torch.sigmoid(result.opacities) > 0.0049).all()  # the dead have moved
 

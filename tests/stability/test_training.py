@@ -223,7 +223,7 @@ class Reads(TorchDispatchMode):
 def test_the_guard_reads_nothing_within_a_step(capture):
     """Events are counted where the tensors are; only an evaluation reads the counts."""
     config = small_config(capture)
-    trainer = Trainer(config, load_scene(capture), torch.device("cpu"))
+    trainer = Trainer(config.without_plan(), load_scene(capture), torch.device("cpu"))
     trainer.initialise_maps()
     losses = []
     supervise = trainer.supervise

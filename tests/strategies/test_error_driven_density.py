@@ -87,10 +87,9 @@ def test_scores_equal_the_equation(kind, iteration):
         {"prune_world_size": 0.02, "prune_world_reference": "distance"},
         {"max_gaussians": 220},
         {"max_gaussians": 150},
-        {"growth": "budget", "target_gaussians": 260},
         {"prune_world_size": 0.02, "max_gaussians": 220},  # no room for the huge: neither split nor kept
         {"prune_world_size": 0.02, "max_gaussians": 150},
-        {"prune_world_size": 0.02, "prune_screen_size": 0.15, "growth": "budget", "target_gaussians": 20},
+        {"prune_world_size": 0.02, "prune_screen_size": 0.15, "max_gaussians": 20},
     ],
 )
 def test_event_equals_plain_loops(seed, config):
@@ -130,18 +129,14 @@ def test_event_equals_plain_loops(seed, config):
         elif passes and seen[i] and score[i] >= hard_limit:
             clones.add(i)
     assert spared_by_distance == (density.prune_world_reference == "distance")  # or the case shows nothing
-    limits = [density.max_gaussians] if density.max_gaussians else []
-    if density.growth == "budget":
-        limits.append(math.floor(count + (density.target_gaussians - count) * (1200 - 200) / (3500 - 200)))
-    if limits:
-        room = max(0, min(limits) - (count - len(prunes)))
+    if density.max_gaussians:
+        room = max(0, density.max_gaussians - (count - len(prunes)))
         chosen = sorted(clones | splits, key=lambda i: (-score[i], i))[:room]
         denied = splits - set(chosen)
         clones, splits = clones & set(chosen), splits & set(chosen)
         prunes |= denied & huge
         if density.prune_world_size == 0.02:
             assert denied & huge  # or the case shows nothing
-    if density.max_gaussians:
         average = sum(score[i] for i in range(count) if seen[i]) / sum(seen)
         rest = sorted(set(range(count)) - prunes, key=lambda i: (score[i] if seen[i] else average, i))
         prunes |= set(rest[: max(0, len(rest) - density.max_gaussians)])
@@ -287,7 +282,7 @@ def test_opacity_decay(dtype):
 
 
 def test_equal_scores_stand_together():
-    """With a budget the lower rows win; without one all densify, and none counts as easy."""
+    """With a cap the lower rows win; without one all densify, and none counts as easy."""
     gaussians = make_gaussians(10)
     for config, expected in (({"top_fraction": 0.5}, 10), ({"max_gaussians": 13}, 3)):
         density = controlled(gaussians, busy_stats(10), prune_score_fraction=0.3, percent_dense=0.0, **QUIET, **config)
@@ -298,7 +293,7 @@ def test_equal_scores_stand_together():
     assert density.update(gaussians, Step(4000, 5000, 3500)) is None
 
 
-@pytest.mark.parametrize("config", [{}, {"prune_score_fraction": 0.5}, {"growth": "budget", "target_gaussians": 99}])
+@pytest.mark.parametrize("config", [{}, {"prune_score_fraction": 0.5}, {"max_gaussians": 99}])
 @pytest.mark.parametrize("step", [FULL, Step(4000, 5000, 3500)])
 def test_nothing_was_visible(config, step):
     """A window without samples: no scores, so nothing is densified, nor pruned as easy."""
@@ -442,8 +437,6 @@ def test_a_run_without_a_record_of_its_error_cannot_go_on_with_one():
     [
         {"score": "best"},
         {"split": "thrice"},
-        {"growth": "budget"},
-        {"target_gaussians": 5},
         {"refine_every": 0},
         {"top_fraction": 0.0},
         {"final_keep": 1.5},

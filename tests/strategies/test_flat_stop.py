@@ -130,7 +130,7 @@ def test_a_run_that_stops_early_has_fewer_gaussians(tmp_path):
     counts = []
     for stop in (0.0, 0.99):
         overrides = ("train.iterations=24", "train.refine_until=24", "density.refine_every=2", "density.final_keep=1")
-        config = tiny_config(capture, *overrides, f"density.stop_when_flat={stop}")
+        config = tiny_config(capture, *overrides, f"density.stop_when_flat={stop}").without_plan()
         trainer = Trainer(config, scene, torch.device("cpu"))
         trainer.initialise_maps()
         while trainer.iteration < 18:

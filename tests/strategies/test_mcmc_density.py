@@ -30,7 +30,7 @@ def test_what_is_added_has_the_step_count_of_what_it_was_copied_from():
     optimizer.setup(gaussians)
     optimizer.moments.steps[:] = torch.arange(COUNT) + 1
     optimizer.moments.exp_avg[:] = 1.0
-    update = GsplatMcmcDensity(cap_max=COUNT + ADDED).update(gaussians, Step(600, 5000, 3500))
+    update = GsplatMcmcDensity(max_gaussians=COUNT + ADDED).update(gaussians, Step(600, 5000, 3500))
     after = update.apply(gaussians)
     optimizer.apply(update)
     assert len(after) == COUNT + ADDED
@@ -42,7 +42,13 @@ def test_what_is_added_has_the_step_count_of_what_it_was_copied_from():
 
 @pytest.mark.parametrize(
     "values",
-    [{"noise_lr": -1.0}, {"noise_lr": float("inf")}, {"refine_start_iter": -1}, {"cap_max": 0}, {"min_opacity": 0.0}],
+    [
+        {"noise_lr": -1.0},
+        {"noise_lr": float("inf")},
+        {"refine_start_iter": -1},
+        {"max_gaussians": 0},
+        {"min_opacity": 0.0},
+    ],
 )
 def test_refuses(values):
     with pytest.raises(InputError, match=next(iter(values))):

@@ -15,6 +15,7 @@ from helpers.framework_runs import TINY, tiny_capture
 from turbogs_plugin.config.configuration import load_config
 from turbogs_plugin.config.scaling import with_iterations
 from turbogs_plugin.errors import InputError
+from turbogs_plugin.plan.decisions import RULES, Verdict
 from turbogs_plugin.report import provenance as provenance_module
 from turbogs_plugin.report.provenance import provenance
 from turbogs_plugin.scene import load_scene, write_demo_capture
@@ -176,11 +177,9 @@ def test_variants_of_one_study_may_be_trained_by_several_calls(turbogs, capture,
 
 
 def test_a_variant_that_steps_make_a_copy_is_left_out_and_said(turbogs, capture, tmp_path):
-    looks, out = tmp_path / "looks.yaml", tmp_path / "study"
-    looks.write_text(
-        "title: Looks\nvariants: {nothing: [plan.iterations=keep], few: [plan.iterations=auto, plan.looks=5]}"
-    )
-    code, _, err = turbogs(*call(looks, capture, out))
+    epochs, out = tmp_path / "epochs.yaml", tmp_path / "study"
+    epochs.write_text("title: Epochs\nvariants: {nothing: [train.iterations=5000], few: [train.epochs=5]}")
+    code, _, err = turbogs(*call(epochs, capture, out))
     assert code == 0 and "left out" in err and "few (as nothing)" in err and "[1/1]" in err
     assert [result.variant for result in StudyFolder(out).read_study().results] == ["nothing"]
 
@@ -194,6 +193,18 @@ def test_a_study_of_another_ablation_is_refused_before_training(turbogs, small, 
     code, _, err = turbogs(*call(other, capture, out))
     assert code == 2 and "another ablation" in err and "full" in err
     assert {path: path.read_bytes() for path in out.rglob("*") if path.is_file()} == before
+
+
+def test_a_study_of_an_earlier_version_is_refused_by_a_line_that_says_so(
+    turbogs, small, capture, tmp_path, monkeypatch
+):
+    out = tmp_path / "study"
+    assert turbogs(*call(small, capture, out, "--only", "full"))[0] == 0
+    cell = out / "cells/capture/full--seed0.json"
+    cell.write_text(cell.read_text().replace('"budget": {', '"budget": {"max_gaussians": 0, '))
+    monkeypatch.setattr(Trainer, "step", lambda trainer: pytest.fail("trained"))
+    code, _, err = turbogs(*call(small, capture, out))
+    assert code == 2 and err.count("\n") == 1 and "of an earlier version (budget.max_gaussians is now density." in err
 
 
 def test_studies_are_merged_and_reported_again_without_training(turbogs, small, capture, tmp_path, monkeypatch):
@@ -332,7 +343,9 @@ def test_runs_are_compared(turbogs, capture, tmp_path):
 def a_run(folder: Path, iterations: int, *overrides: str) -> Path:
     """What `compare` reads of a run."""
     folder.mkdir()
-    (folder / "config.yaml").write_text(with_iterations(load_config("turbogs", overrides), iterations).to_yaml())
+    (folder / "config.yaml").write_text(
+        with_iterations(load_config("turbogs", overrides).without_plan(), iterations).to_yaml()
+    )
     append_evaluation(folder / "history.jsonl", Evaluation(iterations, 20.0, 30.0, 0.8, 0.1, 100, 2**20))
     return folder
 
@@ -374,13 +387,14 @@ def test_runs_of_one_time_budget_are_seeds_however_long_they_came_out(tmp_path):
     assert study.ablation.variants["longer"] == ["budget.time=30s"]
 
 
-def test_the_bar_of_a_cell_has_the_planned_length(tmp_path):
+def test_the_bar_of_a_cell_has_the_planned_length(tmp_path, monkeypatch):
     scene = load_scene(tiny_capture(tmp_path))
-    config = load_config("turbogs", [*TINY, "plan.iterations=6"])
+    monkeypatch.setitem(RULES, "train.iterations", lambda facts, config: Verdict(6, "few"))
+    config = load_config("turbogs", [*TINY, "train.iterations=auto", "train.base_iterations=14"])
     told = []
     advance = lambda iteration, total: told.append((iteration, total))  # noqa: E731
     train_cell("short", config, scene, torch.device("cpu"), provenance("cpu"), progress=advance)
-    assert told == [(iteration, 6) for iteration in range(1, 7)] and config.train.iterations == 14
+    assert told == [(iteration, 6) for iteration in range(1, 7)] and config.train.iterations == "auto"
 
 
 @pytest.mark.parametrize(
@@ -424,6 +438,6 @@ def test_budgets_of_single_runs_are_refused(budget):
 
 def test_a_cell_keeps_a_cap_on_gaussians(tmp_path):
     scene = load_scene(tiny_capture(tmp_path))
-    config = load_config("turbogs", [*TINY, "budget.max_gaussians=90"])
+    config = load_config("turbogs", [*TINY, "density.max_gaussians=90"])
     result = train_cell("capped", config, scene, torch.device("cpu"), provenance("cpu"))
     assert [evaluation.num_gaussians <= 90 for evaluation in result.history] == [True] * 3

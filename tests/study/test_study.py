@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from matplotlib.figure import Figure
 
-from turbogs_plugin.config.configuration import PLANNED_SETTINGS, load_config
+from turbogs_plugin.config.configuration import load_config
 from turbogs_plugin.config.scaling import with_iterations
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.study.grid import Ablation, ablation_names, alike_at, load_ablation, variant_config
@@ -55,8 +55,7 @@ def test_what_a_variant_does_not_name_is_as_in_the_base(name):
     for variant, overrides in ablation.variants.items():
         named = {override.partition("=")[0] for override in overrides}
         mapping = _flat(variant_config(ablation, variant, 0, (), None).to_mapping())
-        kept = {f"plan.{name}" for name, settings in PLANNED_SETTINGS.items() if named & set(settings)}
-        changed = {key for key, value in mapping.items() if key in base and base[key] != value} - named - kept
+        changed = {key for key, value in mapping.items() if key in base and base[key] != value} - named
         assert changed <= DEFAULTS_THAT_DIFFER.get(variant, set()), variant
 
 
@@ -84,10 +83,19 @@ def test_another_length_scales_what_counts_iterations_and_nothing_else():
     assert changed == {"refine_from", "refine_every", "final_every", "opacity_decay"}
     assert (short.density["refine_from"], short.density["refine_every"], short.density["final_every"]) == (20, 10, 50)
     assert with_iterations(config, 50).density["refine_every"] == 10
-    same = with_iterations(config, config.train.iterations)
-    same.plan.iterations = config.plan.iterations
+    same = with_iterations(config, config.train.base_iterations)
+    assert same.train.iterations == config.train.base_iterations, "a length asked for is not the plan's to change"
+    same.train.iterations = config.train.iterations
     assert same.to_yaml() == before
-    assert short.plan.iterations == "keep", "a length that was asked for is not the plan's to change"
+
+
+def test_what_counts_iterations_is_written_for_the_length_that_is_set_or_else_the_base():
+    auto, number = load_config("turbogs"), load_config("turbogs", ["train.iterations=1000"])
+    assert (auto.train.written_iterations, number.train.written_iterations) == (5000, 1000)
+    assert number.train.refine_until == auto.train.refine_until, "a number scales nothing"
+    assert with_iterations(auto, 500).train.refine_until == 350
+    assert with_iterations(number, 500).train.refine_until == 1750
+    assert with_iterations(with_iterations(auto, 500), 250).train.refine_until == 175
 
 
 def test_events_that_come_sooner_take_less_of_the_opacities():
@@ -128,13 +136,15 @@ def test_a_variant_that_does_not_resolve_is_named():
 
 def test_a_common_length_leaves_out_what_it_makes_a_copy():
     ablation = load_ablation("leave_out")
-    alike = {"looks-50": "nothing", "looks-75": "nothing"}
+    alike = {"epochs-50": "nothing", "epochs-75": "nothing"}
     assert alike_at(ablation, list(ablation.variants), (), 1000) == alike
-    assert alike_at(ablation, ["nothing", "plan", "looks-75"], (), 1000) == {"looks-75": "nothing"}
+    assert alike_at(ablation, ["nothing", "plan", "epochs-75"], (), 1000) == {"epochs-75": "nothing"}
     for name in set(ablation_names()) - {"leave_out"}:
         assert alike_at(load_ablation(name), list(load_ablation(name).variants), (), 1000) == {}
-    same = Ablation("x", {"long": ["train.iterations=5000"], "a": [], "b": [], "last": ["plan.looks=5"]}, baseline="a")
-    assert alike_at(same, list(same.variants), ("plan.iterations=auto",), 1000) == {"last": "a"}
+    same = Ablation(
+        "x", {"long": ["train.iterations=5000"], "a": [], "b": [], "last": ["train.epochs=5"]}, baseline="a"
+    )
+    assert alike_at(same, list(same.variants), (), 1000) == {"long": "a", "last": "a"}
 
 
 # Statistics

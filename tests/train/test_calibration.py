@@ -7,16 +7,10 @@ import torch
 from helpers.framework_runs import tiny_capture, tiny_config
 
 from turbogs_plugin.config.configuration import load_config
-from turbogs_plugin.plan.budget import (
-    EXPECTED_GROWTH,
-    TOLERANCE,
-    IterationCost,
-    MemoryDemand,
-    growth_cap,
-    pixel_budget_range,
-    pixels_for_time,
-    with_pixel_budget,
-)
+from turbogs_plugin.plan.caps import EXPECTED_GROWTH, growth_cap
+from turbogs_plugin.plan.memory import MemoryDemand
+from turbogs_plugin.plan.pixels import TOLERANCE, pixel_budget_range, pixels_for_time, with_pixel_budget
+from turbogs_plugin.plan.time import IterationCost
 from turbogs_plugin.scene import Scene, load_scene
 from turbogs_plugin.train import calibration, run
 
@@ -143,8 +137,8 @@ class SyntheticTrial:
 
 def planned(scene: Scene, monkeypatch, *overrides: str):
     monkeypatch.setattr(calibration, "_Trial", SyntheticTrial)
-    config = tiny_config(Path("capture"), "schedule.max_views=7", "train.iterations=300", "plan.looks=40", *overrides)
-    return calibration.within_budget(config, scene, CPU)
+    config = tiny_config(Path("capture"), "schedule.max_views=7", "train.iterations=300", "train.epochs=40", *overrides)
+    return calibration.within_budget(config.without_plan(), scene, CPU)
 
 
 @pytest.mark.parametrize(
@@ -154,7 +148,7 @@ def planned(scene: Scene, monkeypatch, *overrides: str):
         (8, (), 3.0, 320),
         (30, (), 7.0, 660),
         (8, ("pixel_sampler.type=dense",), 1.0, 530),
-        (8, ("plan.looks=60",), 1.47, 460),  # of 7 views: too few of 300 iterations, so 420 first
+        (8, ("train.epochs=60",), 1.47, 460),  # of 7 views: too few of 300 iterations, so 420 first
     ],
 )
 def test_a_configuration_for_its_time(scene, monkeypatch, seconds, overrides, pixel_budget, iterations):
@@ -184,13 +178,13 @@ def test_pixels_and_gaussians_share_the_memory(scene, monkeypatch):
         config, _ = planned(scene, monkeypatch, f"budget.max_memory='{limit}'", "budget.time=30s")
         assert config.schedule["pixel_budget"] == pytest.approx(raised, abs=2e-3)
         needed = calibration._memory_demand(config, scene)
-        cap = config.budget.max_gaussians
-        assert config.density["max_gaussians"] == cap == (limit - needed.fixed) // needed.per_gaussian
+        cap = config.density["max_gaussians"]
+        assert cap == (limit - needed.fixed) // needed.per_gaussian
         assert room < 0 or cap == pytest.approx(expected, rel=0.01)
 
 
 def test_iterations_are_timed_with_the_lambda_asked_for(scene):
-    config = tiny_config(Path("capture"), "schedule.min_views=7", "schedule.max_views=7")
+    config = tiny_config(Path("capture"), "schedule.min_views=7", "schedule.max_views=7").without_plan()
     trial = calibration._Trial(config, scene, CPU)
     rates, sampler = [], trial._trainer.pixel_sampler
     draw = sampler.sample
@@ -208,8 +202,8 @@ def test_a_run_with_time_for_more_looks_at_more_pixels(tmp_path, monkeypatch):
     monkeypatch.setattr(
         calibration, "CALIBRATION_SHARE", 0.3
     )  # so few iterations are a long time to measure for otherwise
-    overrides = ("budget.time=6s", "budget.max_gaussians=1200", "schedule.min_views=7", "schedule.max_views=7")
-    lengths = ("train.iterations=30", "train.refine_until=20", "plan.looks=4")
+    overrides = ("budget.time=6s", "density.max_gaussians=1200", "schedule.min_views=7", "schedule.max_views=7")
+    lengths = ("train.iterations=30", "train.refine_until=20", "train.epochs=4")
     outcome = run.train(tiny_config(tiny_capture(tmp_path), *overrides, *lengths), tmp_path / "run")
     end = outcome.history[-1]
     assert end.train_seconds == pytest.approx(6.0, rel=0.1)

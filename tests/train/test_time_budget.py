@@ -13,7 +13,7 @@ from helpers.framework_runs import tiny_capture, tiny_config
 
 from turbogs_plugin.config.configuration import TrainConfig, resolve
 from turbogs_plugin.errors import InputError, TrainingStopped
-from turbogs_plugin.plan.budget import IterationCost
+from turbogs_plugin.plan.time import IterationCost
 from turbogs_plugin.scene import load_scene, write_demo_capture
 from turbogs_plugin.train import pace as pacing
 from turbogs_plugin.train import run
@@ -77,7 +77,7 @@ def test_a_run_by_time_goes_on_after_a_stop(capture, tmp_path, monkeypatch):
         if trainer.iteration == 5 and trainer.config.density["type"] != "none":  # not while calibrating
             os.kill(os.getpid(), signal.SIGINT)
 
-    config = tiny_config(capture, "budget.time=4s", "budget.max_gaussians=2000", "train.evaluate_at=[0.3, 0.6]")
+    config = tiny_config(capture, "budget.time=4s", "density.max_gaussians=2000", "train.evaluate_at=[0.3, 0.6]")
     monkeypatch.setattr(Trainer, "step", stopping)
     first = run.train(config, tmp_path / "run")
     assert first.signal == signal.SIGINT
@@ -90,11 +90,10 @@ def test_a_run_by_time_goes_on_after_a_stop(capture, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("cap", [400, 1200])
-@pytest.mark.parametrize("overrides", [(), ("density.growth=budget", "density.target_gaussians=4000")])
-def test_a_cap_is_never_exceeded(capture, tmp_path, counts, cap, overrides):
+def test_a_cap_is_never_exceeded(capture, tmp_path, counts, cap):
     """By the initial model neither, where the capture has more points than that; and the cap is what stops growth."""
     points = len(load_scene(capture).points)
-    config = tiny_config(capture, f"budget.max_gaussians={cap}", *overrides)
+    config = tiny_config(capture, f"density.max_gaussians={cap}")
     outcome = run.train(config, tmp_path / "run")
     assert max(counts) <= cap
     assert counts[0] == min(points, cap)
@@ -105,14 +104,14 @@ def test_a_cap_is_never_exceeded(capture, tmp_path, counts, cap, overrides):
 
 def test_the_points_of_a_smaller_model_are_spread_over_all(capture):
     scene = load_scene(capture)
-    trainer = Trainer(tiny_config(capture, "budget.max_gaussians=100"), scene, torch.device("cpu"))
+    trainer = Trainer(tiny_config(capture, "density.max_gaussians=100").without_plan(), scene, torch.device("cpu"))
     places = (scene.points[None] - trainer.gaussians.means[:, None]).abs().sum(dim=-1).argmin(dim=1).numpy()
     assert len(places) == len(set(places)) == 100 and places[-1] == len(scene.points) - 1
     assert np.diff(places).max() <= 2 * np.diff(places).min()
 
 
 def test_a_cap_without_room_beside_the_backdrop_is_refused(capture):
-    config = tiny_config(capture, "budget.max_gaussians=3000", "train.backdrop=true")
+    config = tiny_config(capture, "density.max_gaussians=3000", "train.backdrop=true").without_plan()
     with pytest.raises(InputError, match="no room beside the 3000"):
         Trainer(config, load_scene(capture), torch.device("cpu"))
 
@@ -173,7 +172,9 @@ def test_test_photos_that_do_not_fit_are_refused(capture, tmp_path, monkeypatch)
         raise torch.cuda.OutOfMemoryError("CUDA out of memory")
 
     monkeypatch.setattr(run, "place_views", full)
-    with pytest.raises(InputError, match=r"'capture' does not fit into the device's memory: use plan.photos_on=host"):
+    with pytest.raises(
+        InputError, match=r"'capture' does not fit into the device's memory: use train.photos_place=host"
+    ):
         run.train(tiny_config(capture), tmp_path / "run")
     assert not (tmp_path / "run").exists()
 

@@ -277,7 +277,7 @@ def test_weights_of_lpips_are_found_from_another_folder(capture, tmp_path, monke
 def test_a_checkpoint_of_another_capture_is_refused(capture, whole, tmp_path):
     other = tiny_capture(tmp_path)
     (tmp_path / "run").mkdir()
-    (tmp_path / "run" / "config.yaml").write_text(tiny_config(other, "scene.factor=2").to_yaml())
+    (tmp_path / "run" / "config.yaml").write_text(tiny_config(other, "scene.factor=2").without_plan().to_yaml())
     (tmp_path / "run" / "checkpoints").symlink_to(whole.folder.checkpoints)
     with pytest.raises(InputError, match="has other sizes of train images than when the run"):
         run.resume(tmp_path / "run")
@@ -341,7 +341,7 @@ def test_a_capture_read_with_other_rounding_is_the_same(capture):
 @pytest.mark.parametrize(("size", "expected"), [(0.0, 40.0), (0.3, 0.3 * 14.0)])
 def test_what_is_far_is_kept_from_growing(capture, size, expected):
     config = tiny_config(capture, f"train.distant_size={size}", "density.refine_from=100")
-    trainer = Trainer(config, load_scene(capture), torch.device("cpu"))
+    trainer = Trainer(config.without_plan(), load_scene(capture), torch.device("cpu"))
     trainer.initialise_maps()
     far = trainer.gaussians.means.norm(dim=1).argmax()
     trainer.gaussians.means[far] *= 15.0 * trainer.extent / trainer.gaussians.means[far].norm()

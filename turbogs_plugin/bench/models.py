@@ -29,8 +29,8 @@ def trained_model(
 ) -> Gaussians:
     """A model of `count` Gaussians, trained briefly.
 
-    It grows by density control with a budget, is brought to the exact size by `resized`, and settles without density
-    control.
+    It grows by density control, to at most so many, is brought to the exact size by `resized`, and settles without
+    density control.
 
     Args:
         iterations: in all; 0: the initial model, resized.
@@ -43,9 +43,9 @@ def trained_model(
             *overrides,
             *(f"train.iterations={growing}", f"train.refine_until={round(0.9 * growing)}"),
             f"train.sh_interval={max(1, growing // 5)}",
-            *("density.type=error_driven", "density.growth=budget", f"density.target_gaussians={count}"),
+            *("density.type=error_driven", f"density.max_gaussians={count}"),
         ],
-    )
+    ).without_plan()
     trainer = Trainer(config, scene, device)
     if iterations:
         train(trainer, growing)

@@ -150,8 +150,8 @@ class StepBench:
         """What is in host memory -> time of an iteration back to back, bytes of the windows, bytes that travel."""
         results = {}
         for name, hosted in OFFLOADED.items():
-            places = {f"{what}_on": "host" if what in hosted else "device" for what in ("maps", "photos")}
-            trainer = Trainer(changed(config, plan=places), scene, device)
+            places = {f"{what}_place": "host" if what in hosted else "device" for what in ("maps", "photos")}
+            trainer = Trainer(changed(config, train=places), scene, device)
             adopt(trainer, model)
             trainer.iteration = config.train.sh_degree
             train(trainer, WARMUP_ITERATIONS if device.type == "cuda" else 2)
@@ -171,7 +171,7 @@ class StepBench:
         return results
 
     def _config(self, views: int) -> Config:
-        config = load_config("turbogs", self.overrides)
+        config = load_config("turbogs", self.overrides).without_plan()
         rates = config.optimizer["learning_rates"]
         return changed(
             config,
@@ -201,7 +201,7 @@ def density_event(
 
     None where the density control has no such events.
     """
-    usual = load_config("turbogs", overrides)
+    usual = load_config("turbogs", overrides).without_plan()
     if "refine_from" not in usual.density:
         return None
     interval = usual.density["refine_every"]

@@ -1,217 +1,42 @@
 """The configuration of a run: dataclasses <- YAML <- dotted overrides.
 
-A YAML has one section a part. Sections of our own (`scene`, `train`, `maps`, `raster`, `report`, `plan`, `budget`)
-hold the fields of the dataclass below; a section of a strategy holds its ``type`` and the fields of that strategy's
-dataclass. Defaults live in those dataclasses and nowhere else. ``base: NAME_OR_FILE`` puts a YAML on top of another.
+A YAML has one section a part. Sections of our own (`scene`, `train`, `maps`, `raster`, `report`, `budget`) hold the
+fields of a dataclass of `turbogs_plugin.config.sections`; a section of a strategy holds its ``type`` and the fields of
+that strategy's dataclass. Defaults live in those dataclasses and nowhere else. ``base: NAME_OR_FILE`` puts a YAML on
+top of another. Some settings may be ``auto`` (`turbogs_plugin.config.auto`): the plan of a run decides them.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from importlib import resources
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from omegaconf import OmegaConf
 
 from turbogs_plugin.config import registry
+from turbogs_plugin.config.auto import AUTO, AUTO_SETTINGS, concrete, undecided
+from turbogs_plugin.config.old_spellings import old_spelling
 from turbogs_plugin.config.schema import build_dataclass, dataclass_mapping, nearest
-from turbogs_plugin.config.units import parse_bytes, parse_seconds
+from turbogs_plugin.config.sections import BudgetConfig, MapsConfig, ReportConfig, SceneConfig, TrainConfig
 from turbogs_plugin.config.yaml_text import parse_yaml, read_yaml
 from turbogs_plugin.engine.rendered import RasterSettings
-from turbogs_plugin.errors import InputError, require, require_not_negative
+from turbogs_plugin.errors import InputError
 
 DEFAULT_CONFIG = "turbogs"
 """The packaged configuration that a run without ``--config`` takes."""
 
 BASE_DEPTH_LIMIT = 8
-LONGEST_TIME = 100 * 3600.0
-"""Seconds of a time budget: the iterations that fit can be counted (less than 2^31) even where one takes 0.2 ms."""
-
-
-@dataclass
-class SceneConfig:
-    """Which photos.
-
-    Args:
-        path: the capture's folder; the command line sets it.
-        factor: photos are scaled down by this.
-        test_every: every n-th image in name order tests.
-    """
-
-    path: str = ""
-    factor: int = 1
-    test_every: int = 8
-
-    def __post_init__(self) -> None:
-        require(self.factor >= 1, "factor", self.factor, "at least 1")
-        require(self.test_every >= 2, "test_every", self.test_every, "at least 2")
-
-
-@dataclass
-class TrainConfig:
-    """The run itself.
-
-    Args:
-        iterations: T.
-        refine_until: tau_until, the last iteration of density control, which also ends the annealing of the sampling.
-        seed: of all randomness.
-        device: auto (CUDA where there is one), cpu, or cuda.
-        sh_degree: highest degree of the spherical harmonics.
-        sh_interval: iterations between two bands; the run starts with band 0.
-        initial_opacity, initial_size: of the Gaussians that training starts with; the size in mean distances to the
-            three nearest points. 3DGS has 0.1 and 1, gsplat's MCMC preset 0.5 and 0.1.
-        backdrop: start with a far sphere of Gaussians in the photos' mean colour behind the scene.
-        distant_size: largest standard deviation of a Gaussian beyond 2 scene extents, over its distance from the
-            cameras (`restrain_distant`). 0: no bound.
-        evaluate_at: when to evaluate, as fractions of T; the start and the end are always evaluated.
-        checkpoint_every: iterations between checkpoints; the end always has one. 0: only the end.
-    """
-
-    iterations: int = 5000
-    refine_until: int = 3500
-    seed: int = 0
-    device: str = "auto"
-    sh_degree: int = 3
-    sh_interval: int = 1000
-    initial_opacity: float = 0.1
-    initial_size: float = 1.0
-    backdrop: bool = False
-    distant_size: float = 0.0
-    evaluate_at: tuple[float, ...] = (0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
-    checkpoint_every: int = 2500
-
-    def __post_init__(self) -> None:
-        require(1 <= self.iterations < 2**31, "iterations", self.iterations, "within 1 .. 2^31 - 1")
-        require(self.refine_until >= 0, "refine_until", self.refine_until, "at least 0")
-        require(0 <= self.seed < 2**31, "seed", self.seed, "within 0 .. 2^31 - 1")
-        require(self.device in ("auto", "cpu", "cuda"), "device", self.device, "auto, cpu or cuda")
-        require(0 <= self.sh_degree <= 3, "sh_degree", self.sh_degree, "within 0 .. 3")
-        require(self.sh_interval >= 1, "sh_interval", self.sh_interval, "at least 1")
-        require(0 < self.initial_opacity < 1, "initial_opacity", self.initial_opacity, "more than 0 and less than 1")
-        require(0 < self.initial_size <= 100, "initial_size", self.initial_size, "more than 0 and at most 100")
-        require_not_negative(self, "distant_size")
-        for value in self.evaluate_at:
-            require(0 < value <= 1, "evaluate_at", value, "fractions within (0, 1]")
-        require(self.checkpoint_every >= 0, "checkpoint_every", self.checkpoint_every, "at least 0")
-
-    def evaluation_iterations(self) -> set[int]:
-        """Counts of finished iterations after which to evaluate."""
-        return {0, self.iterations, *(max(1, round(part * self.iterations)) for part in self.evaluate_at)}
-
-    def sh_degree_at(self, iteration: int) -> int:
-        """Degree of the bands in use at an iteration."""
-        return min(self.sh_degree, iteration // self.sh_interval)
-
-
-@dataclass
-class MapsConfig:
-    """The error maps. `beta`: EMA weight of a new error."""
-
-    beta: float = 0.4
-
-    def __post_init__(self) -> None:
-        require(0 < self.beta <= 1, "beta", self.beta, "within (0, 1]")
-
-
-@dataclass
-class ReportConfig:
-    """The report.
-
-    Args:
-        lpips_weights: a local file with the backbone's weights (torchvision's VGG16), or null: LPIPS is not computed.
-        strips: test views shown as pictures, at most.
-    """
-
-    lpips_weights: str | None = None
-    strips: int = 8
-
-    def __post_init__(self) -> None:
-        require(self.strips >= 0, "strips", self.strips, "at least 0")
-
-
-@dataclass
-class PlanConfig:
-    """What the plan of a run may decide by looking at scene and machine (`turbogs_plugin.plan`).
-
-    ``auto`` leaves it to the plan, ``keep`` leaves the settings as they are elsewhere in the configuration, and a value
-    forces it. A YAML or override that gives such a setting itself turns the decision about it, made below it, to
-    ``keep`` (`PLANNED_SETTINGS`): what one says, no plan changes.
-
-    Args:
-        backdrop: `train.backdrop`.
-        ncc: whether the loss has its structure term (true), or is Charbonnier alone (false).
-        views: ``all``: every training view in every iteration, with no schedule and no selection.
-        sh_degree: `train.sh_degree`.
-        optimizer: `optimizer.type`.
-        iterations: `train.iterations`, with all that counts iterations. ``auto``: as many as make `looks`.
-        looks: at each training pixel in the mean, which is iterations times images an iteration over views.
-        maps_on: where error and age maps are: on the device, or in pinned memory of the host. It changes no result.
-        photos_on: the same of the photos.
-    """
-
-    backdrop: bool | Literal["auto", "keep"] = "keep"
-    ncc: bool | Literal["auto", "keep"] = "keep"
-    views: Literal["auto", "keep", "all"] = "keep"
-    sh_degree: int | Literal["auto", "keep"] = "keep"
-    optimizer: Literal["auto", "keep", "moment_lm", "sparse_adam"] = "keep"
-    iterations: int | Literal["auto", "keep"] = "keep"
-    looks: float = 60.0
-    maps_on: Literal["auto", "device", "host"] = "auto"
-    photos_on: Literal["auto", "device", "host"] = "auto"
-
-    def __post_init__(self) -> None:
-        if self.sh_degree not in ("auto", "keep"):
-            require(0 <= self.sh_degree <= 3, "sh_degree", self.sh_degree, "within 0 .. 3")
-        if self.iterations not in ("auto", "keep"):
-            require(1 <= self.iterations < 2**31, "iterations", self.iterations, "within 1 .. 2^31 - 1")
-        require(math.isfinite(self.looks) and self.looks > 0, "looks", self.looks, "a finite number above 0")
-
-
-PLANNED_SETTINGS: dict[str, tuple[str, ...]] = {
-    "backdrop": ("train.backdrop",),
-    "ncc": ("loss.type", "loss.ncc_weight", "loss.structure", "loss.gate"),
-    "views": ("schedule.type", "schedule.min_views", "schedule.max_views", "schedule.views", "view_sampler.type"),
-    "sh_degree": ("train.sh_degree",),
-    "iterations": ("train.iterations",),
-    "optimizer": ("optimizer.type", "optimizer.units", "optimizer.rows", "optimizer.curvature", "optimizer.max_step"),
-}
-"""Decision of `PlanConfig` -> the settings it is about."""
-
-
-@dataclass
-class BudgetConfig:
-    """What the run may take (`turbogs_plugin.plan.budget`).
-
-    Args:
-        max_gaussians: never more than this; 0: no cap.
-        max_memory: of the device, for instance 2GiB; empty: no limit.
-        time: seconds of training to end after, for instance 20s or 2m; empty: `train.iterations` decide.
-    """
-
-    max_gaussians: int = 0
-    max_memory: str = ""
-    time: str = ""
-
-    def __post_init__(self) -> None:
-        require(self.max_gaussians >= 0, "max_gaussians", self.max_gaussians, "at least 0")
-        self.memory_bytes()
-        require((self.seconds() or 0.0) <= LONGEST_TIME, "time", self.time, "at most 100h")
-
-    def memory_bytes(self) -> int | None:
-        """`max_memory`, or None for no limit. Raises `InputError` where it is no amount."""
-        return parse_bytes(self.max_memory) if self.max_memory else None
-
-    def seconds(self) -> float | None:
-        """`time`, or None for no limit. Raises `InputError` where it is no amount."""
-        return parse_seconds(self.time) if self.time else None
 
 
 @dataclass
 class Config:
-    """Everything that decides a run. The strategies' sections are complete: `type` and every init field."""
+    """Everything that decides a run. The strategies' sections are complete: `type` and every init field.
+
+    Settings that are ``auto`` are decided by the plan of a run (`turbogs_plugin.plan.Plan.apply`).
+    """
 
     scene: SceneConfig
     train: TrainConfig
@@ -224,12 +49,29 @@ class Config:
     maps: MapsConfig
     raster: RasterSettings
     report: ReportConfig = field(default_factory=ReportConfig)
-    plan: PlanConfig = field(default_factory=PlanConfig)
     budget: BudgetConfig = field(default_factory=BudgetConfig)
 
     def build(self, kind: str) -> Any:
-        """A new strategy of this kind."""
-        return registry.build(kind, getattr(self, kind))
+        """A new strategy of this kind. RuntimeError where its type is left to a plan."""
+        section = getattr(self, kind)
+        if concrete(kind, section) is not section:
+            raise RuntimeError(f"{kind}.type is {AUTO}: a strategy is built from what a plan has decided")
+        return registry.build(kind, section)
+
+    def require_decided(self) -> None:
+        """RuntimeError, for it is an error of ours, where a setting is left to a plan: no run can go by that."""
+        left = undecided(self.to_mapping())
+        if left:
+            raise RuntimeError(f"{', '.join(left)}: {AUTO}, but a run goes by what a plan has decided")
+
+    def without_plan(self) -> Config:
+        """This configuration, decided for a run that looks at neither scene nor machine, as those of benchmarks do."""
+        mapping = self.to_mapping()
+        for setting in undecided(mapping):
+            section, key = setting.split(".")
+            value = AUTO_SETTINGS[setting]
+            mapping[section][key] = self.train.base_iterations if value is None else value
+        return resolve(mapping)
 
     def to_mapping(self) -> dict[str, Any]:
         """Plain YAML values, every field written out, in sections that may be changed."""
@@ -241,7 +83,7 @@ class Config:
         }
 
     def to_yaml(self) -> str:
-        """The resolved configuration: read back, it gives this very configuration."""
+        """Every setting; read back, it gives this very configuration."""
         return OmegaConf.to_yaml(OmegaConf.create(self.to_mapping()))
 
 
@@ -251,7 +93,6 @@ SECTION_CLASSES = {
     "maps": MapsConfig,
     "raster": RasterSettings,
     "report": ReportConfig,
-    "plan": PlanConfig,
     "budget": BudgetConfig,
 }
 
@@ -274,6 +115,9 @@ def load_config(name_or_file: str = DEFAULT_CONFIG, overrides: Sequence[str] = (
 
 def resolve(mapping: Mapping[str, Any]) -> Config:
     """The complete, checked configuration of a mapping of sections; absent sections have their defaults."""
+    old = old_spelling(mapping)
+    if old:
+        raise InputError(old)
     for section in mapping:
         if section not in SECTION_CLASSES and section not in registry.KINDS:
             raise InputError(f"unknown section '{section}': {nearest(section, [*SECTION_CLASSES, *registry.KINDS])}")
@@ -282,17 +126,27 @@ def resolve(mapping: Mapping[str, Any]) -> Config:
     }
     for kind in registry.KINDS:
         section = mapping.get(kind, {})
-        strategy = registry.build(kind, section)
+        strategy = registry.build(kind, concrete(kind, section))
         sections[kind] = {"type": section.get("type", registry.default_type(kind)), **dataclass_mapping(strategy)}
     return Config(**sections)
 
 
 def resolve_complete(mapping: Mapping[str, Any], where: str) -> Config:
-    """`resolve` of a mapping that `Config.to_mapping` made. Raises `InputError` where a part of it is missing."""
+    """`resolve` of the mapping that a run has written, in which all is decided.
+
+    Raises:
+        InputError: a part of it is missing or left to a plan, or an earlier version wrote it.
+    """
+    old = old_spelling(mapping)
+    if old:
+        raise InputError(f"'{where}' is of an earlier version, whose runs are not read: {old}; train anew")
     config = resolve(mapping)
     missing = _first_missing(config.to_mapping(), mapping)
     if missing:
         raise InputError(f"'{where}' lacks '{missing}', which this version writes: bring the file back, or train anew")
+    left = undecided(mapping)
+    if left:
+        raise InputError(f"'{where}' has {AUTO} for {', '.join(left)}, which a run decides: bring the file back")
     return config
 
 
@@ -309,7 +163,7 @@ def _first_missing(complete: Mapping[str, Any], given: Mapping[str, Any]) -> str
 
 def apply_overrides(mapping: Mapping[str, Any], overrides: Sequence[str]) -> dict[str, Any]:
     """`mapping` with ``section.key=value`` on top; a new ``section.type=name`` starts that section afresh."""
-    result, named = dict(mapping), set()
+    result = dict(mapping)
     for override in sorted(overrides, key=lambda text: ".type=" not in text):  # types first, the rest in order
         path, separator, text = override.partition("=")
         keys = path.strip().split(".")
@@ -322,8 +176,7 @@ def apply_overrides(mapping: Mapping[str, Any], overrides: Sequence[str]) -> dic
         for key in reversed(keys):
             nested = {key: nested}
         result = _merge(result, nested)
-        named.add(".".join(keys[:2]))
-    return _yield_plan(result, named)
+    return result
 
 
 def _load_mapping(name_or_file: str, depth: int = 0) -> dict[str, Any]:
@@ -339,25 +192,7 @@ def _load_mapping(name_or_file: str, depth: int = 0) -> dict[str, Any]:
     base = mapping.pop("base", None)
     if base is None:
         return mapping
-    named = {f"{section}.{key}" for section, value in mapping.items() if isinstance(value, Mapping) for key in value}
-    return _yield_plan(_merge(_load_mapping(str(base), depth + 1), mapping), named)
-
-
-def _yield_plan(merged: dict[str, Any], named: set[str]) -> dict[str, Any]:
-    """`merged`, with no plan for what its uppermost layer says itself.
-
-    Args:
-        named: ``section.key`` of everything in that layer.
-    """
-    plan = merged.get("plan")
-    if not isinstance(plan, Mapping):
-        return merged
-    kept = {
-        decision: "keep"
-        for decision, settings in PLANNED_SETTINGS.items()
-        if decision in plan and f"plan.{decision}" not in named and not named.isdisjoint(settings)
-    }
-    return {**merged, "plan": {**plan, **kept}}
+    return _merge(_load_mapping(str(base), depth + 1), mapping)
 
 
 def _merge(under: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
@@ -372,7 +207,8 @@ def _merge(under: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
     return result
 
 
-def _changes_type(section: str, below: Mapping[str, Any], value: Mapping[str, Any]) -> bool:
-    if section not in registry.KINDS or "type" not in value:
+def _changes_type(kind: str, below: Mapping[str, Any], value: Mapping[str, Any]) -> bool:
+    if kind not in registry.KINDS or "type" not in value:
         return False
-    return value["type"] != below.get("type", registry.default_type(section))
+    default = registry.default_type(kind)
+    return concrete(kind, value)["type"] != concrete(kind, below).get("type", default)

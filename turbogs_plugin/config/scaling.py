@@ -1,4 +1,4 @@
-"""Runs of another length: what counts iterations goes along."""
+"""Scaling of schedules: in a run of another length, what counts iterations goes along."""
 
 from __future__ import annotations
 
@@ -27,22 +27,24 @@ REGROWTH = 50
 def with_iterations(config: Config, iterations: int) -> Config:
     """The configuration for a run of exactly this length, with everything scaled that counts iterations."""
     mapping = config.to_mapping()
-    scale_iterations(mapping, iterations)
-    mapping["plan"]["iterations"] = "keep"
+    scale_iterations(mapping, config.train.written_iterations, iterations)
     return resolve(mapping)
 
 
-def scale_iterations(mapping: dict[str, dict[str, Any]], iterations: int) -> None:
-    """Change the sections of a complete configuration to this length.
+def scale_iterations(mapping: dict[str, dict[str, Any]], written: int, iterations: int) -> None:
+    """Change the sections of a complete configuration from one length to another.
 
     Intervals of density control stay at `SHORTEST_INTERVAL` or above; 0 stays 0.
+
+    Args:
+        written: the length that the sections are written for (`TrainConfig.written_iterations`).
 
     Raises:
         InputError: no iterations.
     """
     if iterations < 1:
         raise InputError(f"a run has at least one iteration, not {iterations}")
-    factor = iterations / mapping["train"]["iterations"]
+    factor = iterations / written
     density = mapping["density"]
     interval = density.get("refine_every", REGROWTH)
     for section, names in ITERATION_FIELDS.items():
@@ -51,7 +53,7 @@ def scale_iterations(mapping: dict[str, dict[str, Any]], iterations: int) -> Non
             if value:
                 least = min(value, SHORTEST_INTERVAL) if section == "density" else 1
                 mapping[section][name] = max(least, round(value * factor))
-    mapping["train"]["iterations"] = iterations
+    mapping["train"]["iterations"] = mapping["train"]["base_iterations"] = iterations
     if density.get("opacity_decay", 0.0):
         density["opacity_decay"] = decay_at(density["opacity_decay"], interval, density["refine_every"])
 

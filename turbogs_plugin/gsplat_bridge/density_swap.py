@@ -123,7 +123,7 @@ class TurboDensityStrategy(DefaultStrategy):
             return
         controller = self._controller(step)
         controller.setup(gaussians)
-        controller.load_state_dict({"initial_count": len(gaussians), "stats": {name: state[name] for name in _STATS}})
+        controller.load_state_dict({"stats": {name: state[name] for name in _STATS}})
         # The end of the run is not known here; the controller needs it only to stop taking statistics.
         now = Step(step, sys.maxsize, self.refine_stop_iter - 1, self.seed, state["scene_scale"])
         update = controller.update(gaussians, now)

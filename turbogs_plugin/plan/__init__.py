@@ -1,4 +1,7 @@
-"""What a run leaves out because its scene and machine do not need it: facts, decisions, and the plan made of them."""
+"""What a run decides by its scene and machine: facts, the settings that are ``auto``, and the plan made of both.
+
+Beside it what runs within limits: the cap on Gaussians, pixels an iteration, memory, and time.
+"""
 
 from turbogs_plugin.plan.decisions import Decision
 from turbogs_plugin.plan.facts import SceneFacts, gather_facts

@@ -8,10 +8,12 @@ from dataclasses import asdict, dataclass
 
 import torch
 
-from turbogs_plugin.config.configuration import PLANNED_SETTINGS, Config, resolve
+from turbogs_plugin.config.auto import of_type
+from turbogs_plugin.config.configuration import Config, resolve
+from turbogs_plugin.config.scaling import scale_iterations
 from turbogs_plugin.config.schema import build_dataclass
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.plan.decisions import RULES, Decision, mebibytes
+from turbogs_plugin.plan.decisions import RULES, Decision, decide, mebibytes
 from turbogs_plugin.plan.facts import SceneFacts, gather_facts
 from turbogs_plugin.scene import Scene
 
@@ -23,25 +25,32 @@ class Plan:
     facts: SceneFacts
     decisions: tuple[Decision, ...]
 
-    def value(self, name: str) -> bool | int | str:
-        """What was decided about a field of `PlanConfig`."""
-        return next(decision.value for decision in self.decisions if decision.name == name)
+    def value(self, setting: str) -> bool | int | str:
+        """What ``section.key`` is in the run."""
+        return next(decision.value for decision in self.decisions if decision.setting == setting)
 
     def apply(self, config: Config) -> Config:
-        """The configuration with every decision carried out. It leaves nothing to decide, so that a plan of it is this
-        very configuration."""
+        """The configuration with everything decided. It leaves nothing to decide, so that a plan of it is this very
+        configuration."""
         mapping = config.to_mapping()
         for decision in self.decisions:
-            if decision.made != "kept":
-                RULES[decision.name].apply(mapping, decision.value, self.facts)
-            mapping["plan"][decision.name] = "keep" if decision.name in PLANNED_SETTINGS else decision.value
+            section, key = decision.setting.split(".")
+            if decision.made == "set":
+                continue
+            if key == "type":
+                mapping[section] = of_type(section, mapping[section], decision.value, decision.options)
+            elif decision.setting == "train.iterations":
+                scale_iterations(mapping, config.train.base_iterations, decision.value)
+            else:
+                mapping[section][key] = decision.value
         return resolve(mapping)
 
     def text(self) -> str:
         """For a terminal: the facts, and a line a decision."""
-        width = max(len(decision.text) for decision in self.decisions)
+        name = max(len(decision.setting) for decision in self.decisions)
+        value = max(len(decision.text) for decision in self.decisions)
         lines = [
-            f"  {decision.name:<10} {decision.text:<{width}}  {decision.made:<6}  {decision.reason}"
+            f"  {decision.setting:<{name}} {decision.text:<{value}}  {decision.made:<4}  {decision.reason}"
             for decision in self.decisions
         ]
         facts = textwrap.fill(self.facts_text(), 118, initial_indent="plan for ", subsequent_indent="  ")
@@ -90,7 +99,7 @@ def make_plan(
     """Look at scene and machine, and decide what the configuration leaves to decide.
 
     Args:
-        config: its `plan` section says what that is.
+        config: what is ``auto`` in it is decided.
         scene: loaded.
         device: where training is to be.
         memory_limit: bytes of the device that must not be exceeded.
@@ -102,4 +111,4 @@ def make_plan(
 
 def plan_from_facts(facts: SceneFacts, config: Config) -> Plan:
     """The plan that these facts lead to."""
-    return Plan(facts, tuple(rule.decide(facts, config) for rule in RULES.values()))
+    return Plan(facts, tuple(decide(setting, facts, config) for setting in RULES))

@@ -34,7 +34,7 @@ def history_table(history: list[Evaluation]) -> str:
 def evaluate_run(path: Path, device_name: str) -> str:
     """Errors of a run's newest model on each test view, as a table."""
     model, views = _open(path, device_name, "test")
-    views = place_views(views, model.gaussians.device, model.config.plan.photos_on)
+    views = place_views(views, model.gaussians.device, model.config.train.photos_place)
     lpips, reason = load_lpips(model.config.report.lpips_weights, model.gaussians.device)
     metrics = evaluate(model.gaussians, views, model.sh_degree, model.config.raster, lpips)
     rows = [

@@ -212,5 +212,5 @@ finite: {last.skipped_updates}.
 def _plan(plan: Plan | None) -> str:
     if plan is None:
         return "The run's folder holds no plan."
-    rows = ((decision.name, decision.text, decision.made, decision.reason) for decision in plan.decisions)
-    return f"{plan.facts_text()}.\n\n{table(('decision', 'value', 'made', 'reason'), rows)}"
+    rows = ((decision.setting, decision.text, decision.made, decision.reason) for decision in plan.decisions)
+    return f"{plan.facts_text()}.\n\n{table(('setting', 'value', 'made', 'reason'), rows)}"

@@ -262,16 +262,16 @@ class OffloadedErrorMaps(ErrorMaps):
         self._window.change_all(1, function)
 
 
-def place_views(views: PosedImages, device: torch.device, photos_on: str) -> PosedImages:
+def place_views(views: PosedImages, device: torch.device, place: str) -> PosedImages:
     """Views whose cameras are on the device, and their photos there or, for ``host``, in host memory with a window."""
-    if photos_on != "host":
+    if place != "host":
         return views.to(device)
     return replace(views, cameras=views.cameras.to(device), photos=OffloadedPhotos(views.photos, device))
 
 
-def place_maps(sizes: np.ndarray, device: torch.device, maps_on: str, beta: float) -> ErrorMaps:
+def place_maps(sizes: np.ndarray, device: torch.device, place: str, beta: float) -> ErrorMaps:
     """New maps on the device or, for ``host``, in host memory with a window. Arguments as those of `ErrorMaps`."""
-    return (OffloadedErrorMaps if maps_on == "host" else ErrorMaps)(sizes, device, beta=beta)
+    return (OffloadedErrorMaps if place == "host" else ErrorMaps)(sizes, device, beta=beta)
 
 
 class _CopyStream:

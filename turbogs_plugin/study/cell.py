@@ -13,7 +13,6 @@ import torch
 from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.config.scaling import with_iterations
 from turbogs_plugin.plan import make_plan
-from turbogs_plugin.plan.budget import with_cap
 from turbogs_plugin.report.provenance import Provenance
 from turbogs_plugin.scene import PosedImages, Scene
 from turbogs_plugin.scene.offload import place_views
@@ -74,9 +73,7 @@ def train_cell(
         TrainingStopped: the model is lost.
     """
     asked, config = config, make_plan(config, scene, device).apply(config)
-    if config.budget.max_gaussians:
-        config = with_cap(config, config.budget.max_gaussians)
-    test = place_views(scene.test, device, config.plan.photos_on)
+    test = place_views(scene.test, device, config.train.photos_place)
     warmup = min(WARMUP_ITERATIONS[device.type], config.train.iterations)
     warm_up(config, scene, test, device, warmup)
     lpips, lpips_reason = load_lpips(config.report.lpips_weights, device)

@@ -8,8 +8,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from turbogs_plugin.config.configuration import SceneConfig
 from turbogs_plugin.config.scaling import ITERATION_FIELDS, REGROWTH, decay_at
+from turbogs_plugin.config.sections import SceneConfig
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.study.grid import Ablation
 from turbogs_plugin.study.results import CellResult, Study
@@ -17,7 +17,7 @@ from turbogs_plugin.train.history import read_history
 from turbogs_plugin.train.run import RunFolder
 
 FITTED = {
-    "train": ("iterations", *ITERATION_FIELDS["train"]),
+    "train": ("iterations", "base_iterations", *ITERATION_FIELDS["train"]),
     "density": ITERATION_FIELDS["density"],
     "schedule": ("pixel_budget",),
 }

@@ -20,6 +20,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
+from turbogs_plugin.config.auto import AUTO
 from turbogs_plugin.config.configuration import Config, load_config
 from turbogs_plugin.config.scaling import with_iterations
 from turbogs_plugin.config.schema import build_dataclass, nearest
@@ -114,8 +115,8 @@ def load_ablation(name_or_file: str) -> Ablation:
 def alike_at(ablation: Ablation, variants: Sequence[str], overrides: Sequence[str], steps: int) -> dict[str, str]:
     """Of these variants, those that a common length leaves without a difference -> the one that they would repeat.
 
-    A length that is asked for is not the plan's to change, so that a variant about `plan.looks` would be another one
-    under its own name. Which variants are the same at their own lengths as well is the ablation's affair.
+    A length that is asked for is not the plan's to change, so that a variant about `train.epochs` would be another
+    one under its own name. Which variants are the same at their own lengths as well is the ablation's affair.
 
     Raises:
         InputError: naming the variant, whatever is wrong with its configuration.
@@ -123,8 +124,8 @@ def alike_at(ablation: Ablation, variants: Sequence[str], overrides: Sequence[st
 
     def text(variant: str, length: int | None) -> str:
         mapping = variant_config(ablation, variant, 0, overrides, length).to_mapping()
-        if mapping["plan"]["iterations"] == "keep":
-            del mapping["plan"]["looks"]
+        if mapping["train"]["iterations"] != AUTO:
+            del mapping["train"]["epochs"], mapping["train"]["base_iterations"]
         return json.dumps(mapping, sort_keys=True)
 
     alike: dict[str, str] = {}

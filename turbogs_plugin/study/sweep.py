@@ -15,6 +15,7 @@ from typing import Any
 import torch
 
 from turbogs_plugin.config.configuration import Config
+from turbogs_plugin.config.old_spellings import old_spelling
 from turbogs_plugin.errors import InputError, TrainingStopped
 from turbogs_plugin.report.provenance import COMMIT_VARIABLE, MODIFIED, Provenance
 from turbogs_plugin.scene import Scene, load_scene
@@ -176,6 +177,9 @@ def _require_capture(results: Iterable[CellResult], scene: str, capture: str) ->
 
 
 def _require_same(present: CellResult, config: Config, time_budget: float) -> None:
+    old = old_spelling(present.config)
+    if old:
+        raise InputError(f"the cell '{present.key}' is of an earlier version ({old}): choose a new --out")
     made, wanted = (_sections(mapping) for mapping in (present.config, config.to_mapping()))
     if made != wanted or present.time_budget != time_budget:
         sections = [name for name in wanted if made.get(name) != wanted[name]] or ["the time budget"]

@@ -10,24 +10,27 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from turbogs_plugin.config.configuration import Config, resolve
+from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.config.scaling import with_iterations
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.plan.budget import (
-    CAPS,
+from turbogs_plugin.plan.caps import (
     FEWEST_GAUSSIANS,
-    RAISES,
-    IterationCost,
-    MemoryDemand,
+    cap_of,
     expected_gaussians,
-    fit_to_time,
     growth_cap,
+    keeps_cap,
+    lowered_cap,
+    without_growth,
+)
+from turbogs_plugin.plan.memory import MemoryDemand
+from turbogs_plugin.plan.pixels import (
+    RAISES,
     images_per_iteration,
     pixel_budget_range,
     pixels_for_time,
-    with_cap,
     with_pixel_budget,
 )
+from turbogs_plugin.plan.time import IterationCost, fit_to_time
 from turbogs_plugin.scene import Scene
 from turbogs_plugin.train.evaluate import free_device_memory, synchronize
 from turbogs_plugin.train.trainer import Trainer
@@ -79,22 +82,20 @@ def within_budget(config: Config, scene: Scene, device: torch.device) -> tuple[C
     Raises:
         InputError: nothing fits, naming what would.
     """
-    if config.budget.max_gaussians:
-        config = with_cap(config, config.budget.max_gaussians)
     limit, seconds = config.budget.memory_bytes(), config.budget.seconds()
     if limit is not None:
         hold_to(limit, device)
-        config = with_cap(config, _memory_demand(config, scene).gaussians(limit))
+        config = lowered_cap(config, _memory_demand(config, scene).gaussians(limit))
     if seconds is None:
         return config, None
     measured = calibrate(config, scene, device, seconds)
     if measured.pixel_budget > measured.configured_pixel_budget:
         config = with_pixel_budget(config, measured.pixel_budget)
         if limit is not None:
-            config = with_cap(config, _memory_demand(config, scene).gaussians(limit))
+            config = lowered_cap(config, _memory_demand(config, scene).gaussians(limit))
     iterations, cap = _fit(config, seconds - measured.before, measured.cost, measured.gaussians)
     if cap != growth_cap(config, measured.gaussians):
-        config = with_cap(config, cap)
+        config = lowered_cap(config, cap)
     return with_iterations(config, iterations), measured
 
 
@@ -105,8 +106,8 @@ def budget_text(config: Config, measured: Calibration | None) -> str:
         config: as `within_budget` gave it.
     """
     parts = []
-    if config.budget.max_gaussians:
-        parts.append(f"at most {config.budget.max_gaussians} Gaussians")
+    if cap_of(config):
+        parts.append(f"at most {cap_of(config)} Gaussians")
     if config.budget.max_memory:
         parts.append(f"{config.budget.max_memory} of device memory")
     if measured is not None:
@@ -142,8 +143,8 @@ def _fit(config: Config, seconds: float, cost: IterationCost, gaussians: int) ->
     """`fit_to_time` of a configuration: (iterations, cap)."""
     train = config.train
     share = min(1.0, train.refine_until / train.iterations)
-    keeps_cap = config.density["type"] in CAPS
-    return fit_to_time(seconds, cost, gaussians, growth_cap(config, gaussians), train.iterations, share, keeps_cap)
+    cap = growth_cap(config, gaussians)
+    return fit_to_time(seconds, cost, gaussians, cap, train.iterations, share, keeps_cap(config))
 
 
 def calibrate(config: Config, scene: Scene, device: torch.device, seconds: float) -> Calibration:
@@ -178,7 +179,7 @@ def _measure(config: Config, scene: Scene, device: torch.device, seconds: float,
     largest = min(largest, configured + _room_for_images(config, scene, device, gaussians))
     # What more iterations overfit is photos that are looked at often already.
     images = images_per_iteration(config, len(scene.train))
-    wanted = max(config.train.iterations, math.ceil(config.plan.looks * len(scene.train) / images))
+    wanted = max(config.train.iterations, math.ceil(config.train.epochs * len(scene.train) / images))
     # A measured iteration with more pixels takes at most about seconds / iterations.
     fewest = WARMUP_ITERATIONS[device.type] + FEWEST_MEASURED[device.type]
     raises = min(RAISES, max(1, int(CALIBRATION_SHARE * wanted / fewest)))
@@ -210,7 +211,7 @@ class _Trial:
     """Iterations before training, to time them: with a model that does not grow, all bands in use."""
 
     def __init__(self, config: Config, scene: Scene, device: torch.device) -> None:
-        self._config = resolve({**config.to_mapping(), "density": {"type": "none"}})
+        self._config = without_growth(config)
         self._trainer = Trainer(self._config, scene, device)
         self._model = self._trainer.gaussians
         self._device = device

@@ -20,7 +20,7 @@ from torch import Tensor
 from turbogs_plugin.errors import InputError, TrainingStopped
 from turbogs_plugin.files import write_atomically, write_text_atomically
 
-FORMAT = 1
+FORMAT = 2
 KEPT = 2
 """Checkpoints that stay on the disk: the newest and one before it."""
 

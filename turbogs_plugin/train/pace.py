@@ -5,8 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from turbogs_plugin.config.configuration import Config, TrainConfig
-from turbogs_plugin.plan.budget import IterationCost, TimePlan
+from turbogs_plugin.config.configuration import Config
+from turbogs_plugin.config.sections import TrainConfig
+from turbogs_plugin.plan.caps import cap_of
+from turbogs_plugin.plan.time import IterationCost, TimePlan
 
 
 @dataclass(frozen=True)
@@ -125,4 +127,4 @@ def pace_of(config: Config, cost: IterationCost | None = None) -> Pace:
     seconds = config.budget.seconds()
     if seconds is None:
         return IterationPace(config.train)
-    return TimePace(config.train, seconds, cost, config.budget.max_gaussians)
+    return TimePace(config.train, seconds, cost, cap_of(config))

@@ -114,7 +114,7 @@ def train(config: Config, out: Path) -> Outcome:
     scene = open_scene(config)
     load_lpips(config.report.lpips_weights, device)
     plan = _plan(config, scene, device)
-    remedy = "use plan.photos_on=host and plan.maps_on=host, --max-gaussians or a larger --factor"
+    remedy = "use train.photos_place=host and train.maps_place=host, --max-gaussians or a larger --factor"
     with _fitting(scene, remedy):
         config, calibration = within_budget(plan.apply(config), scene, device)
         trainer = Trainer(config, scene, device)
@@ -239,7 +239,7 @@ class _Session:
 
     def __post_init__(self) -> None:
         self.device = self.trainer.gaussians.device
-        self.test: PosedImages = place_views(self.scene.test, self.device, self.config.plan.photos_on)
+        self.test: PosedImages = place_views(self.scene.test, self.device, self.config.train.photos_place)
         self.clock = TrainingClock(self.device)
 
     def run(self) -> Outcome:

@@ -22,7 +22,7 @@ from turbogs_plugin.model.gaussians import (
     gaussians_from_points,
     restrain_distant,
 )
-from turbogs_plugin.plan.budget import chosen_points
+from turbogs_plugin.plan.caps import cap_of, chosen_points
 from turbogs_plugin.scene import Scene
 from turbogs_plugin.scene.offload import place_maps, place_views
 from turbogs_plugin.scene.photos import PhotoSamples
@@ -36,14 +36,15 @@ class Trainer:
     """The Gaussians, the error maps and the strategies of one run.
 
     Args:
-        config: of the run.
+        config: of the run, in which a plan has decided what was ``auto``.
         scene: on any device.
         device: where everything is computed and kept.
     """
 
     def __init__(self, config: Config, scene: Scene, device: torch.device) -> None:
+        config.require_decided()
         self.config = config
-        self.views = place_views(scene.train, device, config.plan.photos_on)
+        self.views = place_views(scene.train, device, config.train.photos_place)
         self.extent = scene.extent
         self.schedule = config.build("schedule")
         self.view_sampler = config.build("view_sampler")
@@ -51,7 +52,7 @@ class Trainer:
         self.loss = config.build("loss")
         self.optimizer = config.build("optimizer")
         self.density = config.build("density")
-        self.maps = place_maps(self.views.cameras.sizes, device, config.plan.maps_on, config.maps.beta)
+        self.maps = place_maps(self.views.cameras.sizes, device, config.train.maps_place, config.maps.beta)
         self.gaussians = initial_gaussians(scene, config).map(lambda tensor: tensor.to(device))
         self.view_sampler.setup(self.views.cameras, scene.extent)
         self.optimizer.setup(self.gaussians)
@@ -235,10 +236,10 @@ class Trainer:
 def initial_gaussians(scene: Scene, config: Config) -> Gaussians:
     """The model that training starts from: the capture's points, and a backdrop where one is wanted.
 
-    Of more points than `budget.max_gaussians` has room for, that many are taken, evenly in their order.
+    Of more points than `density.max_gaussians` has room for, that many are taken, evenly in their order.
     """
     train = config.train
-    rows = chosen_points(len(scene.points), config.budget.max_gaussians, BACKDROP_COUNT if train.backdrop else 0)
+    rows = chosen_points(len(scene.points), cap_of(config), BACKDROP_COUNT if train.backdrop else 0)
     points, colors = scene.points[rows], scene.point_colors[rows]
     gaussians = gaussians_from_points(
         points, colors, train.sh_degree, scene.extent, train.initial_opacity, train.initial_size

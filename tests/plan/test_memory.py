@@ -1,0 +1,86 @@
+"""The cap on Gaussians, and what a run takes of the device's memory."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from turbogs_plugin.config.configuration import load_config, resolve
+from turbogs_plugin.config.units import parse_bytes
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.plan.caps import FEWEST_GAUSSIANS, cap_of, lowered_cap, with_cap, without_growth
+from turbogs_plugin.plan.memory import MemoryDemand
+
+
+@pytest.mark.parametrize("kind", ["error_driven", "mcmc", "none"])
+def test_a_cap_is_a_setting_of_the_density_control(kind):
+    capped = with_cap(load_config("turbogs", [f"density.type={kind}"]), 5000)
+    assert capped == load_config("turbogs", [f"density.type={kind}", "density.max_gaussians=5000"])
+    assert capped.density["max_gaussians"] == cap_of(capped) == capped.build("density").max_gaussians == 5000
+    assert resolve(capped.to_mapping()) == capped
+    assert with_cap(capped, 7000).density["max_gaussians"] == 7000, "what is asked for last is set"
+    assert lowered_cap(capped, 7000) == capped
+    assert lowered_cap(capped, 700).density["max_gaussians"] == 700
+    still = without_growth(capped)
+    assert (still.density, cap_of(still)) == ({"type": "none", "max_gaussians": 5000}, 5000)
+
+
+def test_no_cap_is_lowered_to_any():
+    free = load_config("turbogs")
+    assert cap_of(free) == cap_of(without_growth(free)) == 0
+    assert lowered_cap(free, 700).density["max_gaussians"] == 700
+
+
+@pytest.mark.parametrize("kind", ["gsplat_default", "fastgs"])
+def test_a_cap_that_nobody_would_keep_is_refused(turbogs, tmp_path, kind):
+    config = load_config("turbogs", [f"density.type={kind}"])
+    assert cap_of(config) == 0
+    words = f"density.type {kind} keeps no cap on Gaussians: use one of error_driven, mcmc, none"
+    with pytest.raises(InputError, match=words):
+        lowered_cap(config, 10)
+    options = [f"density.type={kind}", "--out", tmp_path / "run", "--max-gaussians", 10]
+    code, _, err = turbogs("train", tmp_path, *options)
+    assert code == 2 and words in err
+
+
+def demand(*overrides: str) -> MemoryDemand:
+    config = load_config("turbogs", ["schedule.max_views=10", "train.sh_degree=3", *overrides])
+    return MemoryDemand.of(config, pixels=200 * 8_294_400, test_pixels=25 * 8_294_400, largest=8_294_400, num_views=200)
+
+
+def test_memory_is_what_is_kept_and_what_is_done_with_it():
+    resident, maps, both = (
+        demand(*(f"train.{name}_place=host" for name in names)) for names in ([], ["maps"], ["maps", "photos"])
+    )
+    assert resident.per_gaussian == both.per_gaussian == 2 * (59 * 4 * 3 + 4 + 28) + 230 * 10
+    assert resident.fixed - maps.fixed == 4 * (200 - 20) * 8_294_400
+    assert maps.fixed - both.fixed == 3 * (225 - 22) * 8_294_400
+    assert demand("train.sh_degree=0").per_gaussian == resident.per_gaussian - 2 * 45 * 12
+
+
+def test_no_measured_peak_is_above_the_prediction():
+    """Nor far below: the measured iterations have neither an event of density control nor an evaluation in them."""
+    report = json.loads((Path(__file__).parents[2] / "docs/results/h200/bench-step.json").read_text())
+    width, height = report["image_size"]
+    assert len(report["passes"]) >= 4
+    for entry in report["passes"]:
+        fixed = ("schedule.type=fixed", f"schedule.views={entry['views']}", "train.sh_degree=3")
+        pixels, views = width * height, report["training_views"]
+        memory = MemoryDemand.of(load_config("turbogs", fixed), pixels * views, 0, pixels, views)
+        predicted = memory.fixed + memory.per_gaussian * entry["gaussians"]
+        assert 1.0 <= predicted / entry["memory_bytes"]["peak"] <= 1.6
+
+
+@pytest.mark.parametrize("limit", [2**33, 2**34])
+def test_as_many_gaussians_as_fit(limit):
+    memory = demand("train.maps_place=host", "train.photos_place=host")
+    count = memory.gaussians(limit)
+    assert memory.fixed + count * memory.per_gaussian <= limit < memory.fixed + (count + 1) * memory.per_gaussian
+
+
+def test_too_little_memory_says_how_much_would_do():
+    memory = demand()
+    with pytest.raises(InputError, match="leaves no room for a model") as refused:
+        memory.gaussians(2**31)
+    wanted = parse_bytes(str(refused.value).split(" take ")[1].split(" here")[0])
+    assert memory.gaussians(wanted) >= FEWEST_GAUSSIANS

@@ -1,0 +1,42 @@
+"""Settings of earlier versions: a configuration with one of them is refused by a line that names what is there now."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from turbogs_plugin.config import registry
+
+NOW: dict[str, str] = {
+    "plan.backdrop": "is now train.backdrop",
+    "plan.ncc": "is now loss.type: auto, charbonnier_ncc or charbonnier",
+    "plan.views": "is now schedule.type: auto, or fixed with schedule.views",
+    "plan.sh_degree": "is now train.sh_degree",
+    "plan.optimizer": "is now optimizer.type",
+    "plan.iterations": "is now train.iterations, where auto leaves it to the plan and a number scales nothing",
+    "plan.looks": "is now train.epochs",
+    "plan.maps_on": "is now train.maps_place",
+    "plan.photos_on": "is now train.photos_place",
+    "budget.max_gaussians": "is now density.max_gaussians",
+    "density.cap_max": "is now density.max_gaussians",
+    "density.growth": "is gone: density.max_gaussians caps the number of Gaussians",
+    "density.target_gaussians": "is gone: density.max_gaussians caps the number of Gaussians",
+}
+"""Setting of an earlier version -> what became of it."""
+
+
+def old_spelling(mapping: Mapping[str, Any]) -> str:
+    """What became of the first setting of an earlier version in a mapping of sections; empty where there is none."""
+    for setting, now in NOW.items():
+        section, key = setting.split(".")
+        values = mapping.get(section)
+        if isinstance(values, Mapping) and key in values and _is_ours(section, values):
+            return f"{setting} {now}"
+    return ""
+
+
+def _is_ours(section: str, values: Mapping[str, Any]) -> bool:
+    """Whether the section's keys are ours to name: not those of a strategy of somebody else's."""
+    if section not in registry.KINDS:
+        return True
+    return values.get("type", registry.default_type(section)) in registry.BUILT_IN[section]

@@ -1,0 +1,164 @@
+"""The sections of a configuration that are no strategy's: what they hold, their defaults, and what is refused."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+from turbogs_plugin.config.units import parse_bytes, parse_seconds
+from turbogs_plugin.errors import require, require_not_negative
+
+LONGEST_TIME = 100 * 3600.0
+"""Seconds of a time budget: the iterations that fit can be counted (less than 2^31) even where one takes 0.2 ms."""
+
+Auto = Literal["auto"]
+"""A value that leaves the setting to the plan of a run, which looks at scene and machine (`turbogs_plugin.plan`)."""
+
+Place = Literal["auto", "device", "host"]
+"""Where large tensors are: on the device, or in pinned memory of the host, from where a window of them travels."""
+
+
+@dataclass
+class SceneConfig:
+    """Which photos.
+
+    Args:
+        path: the capture's folder; the command line sets it.
+        factor: photos are scaled down by this.
+        test_every: every n-th image in name order tests.
+    """
+
+    path: str = ""
+    factor: int = 1
+    test_every: int = 8
+
+    def __post_init__(self) -> None:
+        require(self.factor >= 1, "factor", self.factor, "at least 1")
+        require(self.test_every >= 2, "test_every", self.test_every, "at least 2")
+
+
+@dataclass
+class TrainConfig:
+    """The run itself.
+
+    Args:
+        iterations: T. A number scales nothing. ``auto``: as many as `epochs` take, and all settings that count
+            iterations (`turbogs_plugin.config.scaling`) are scaled from `base_iterations` to that length.
+        epochs: how often each training pixel is looked at in the mean: iterations times images an iteration over
+            training views. Used where `iterations` is ``auto``, and by a time budget that is longer than that.
+        base_iterations: the length for which the settings that count iterations are written. Used where `iterations`
+            is ``auto``.
+        refine_until: tau_until, the last iteration of density control, which also ends the annealing of the sampling.
+        seed: of all randomness.
+        device: auto (CUDA where there is one), cpu, or cuda.
+        maps_place, photos_place: where error and age maps, and where the photos are. It changes no result.
+        sh_degree: highest degree of the spherical harmonics.
+        sh_interval: iterations between two bands; the run starts with band 0.
+        initial_opacity, initial_size: of the Gaussians that training starts with; the size in mean distances to the
+            three nearest points. 3DGS has 0.1 and 1, gsplat's MCMC preset 0.5 and 0.1.
+        backdrop: start with a far sphere of Gaussians in the photos' mean colour behind the scene.
+        distant_size: largest standard deviation of a Gaussian beyond 2 scene extents, over its distance from the
+            cameras (`restrain_distant`). 0: no bound.
+        evaluate_at: when to evaluate, as fractions of T; the start and the end are always evaluated.
+        checkpoint_every: iterations between checkpoints; the end always has one. 0: only the end.
+    """
+
+    iterations: int | Auto = 5000
+    epochs: float = 60.0
+    base_iterations: int = 5000
+    refine_until: int = 3500
+    seed: int = 0
+    device: str = "auto"
+    maps_place: Place = "auto"
+    photos_place: Place = "auto"
+    sh_degree: int | Auto = 3
+    sh_interval: int = 1000
+    initial_opacity: float = 0.1
+    initial_size: float = 1.0
+    backdrop: bool | Auto = False
+    distant_size: float = 0.0
+    evaluate_at: tuple[float, ...] = (0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
+    checkpoint_every: int = 2500
+
+    def __post_init__(self) -> None:
+        for name in ("iterations", "base_iterations"):
+            value = getattr(self, name)
+            require(value == "auto" or 1 <= value < 2**31, name, value, "within 1 .. 2^31 - 1")
+        require(math.isfinite(self.epochs) and self.epochs > 0, "epochs", self.epochs, "a finite number above 0")
+        require(self.refine_until >= 0, "refine_until", self.refine_until, "at least 0")
+        require(0 <= self.seed < 2**31, "seed", self.seed, "within 0 .. 2^31 - 1")
+        require(self.device in ("auto", "cpu", "cuda"), "device", self.device, "auto, cpu or cuda")
+        valid = self.sh_degree == "auto" or 0 <= self.sh_degree <= 3
+        require(valid, "sh_degree", self.sh_degree, "within 0 .. 3")
+        require(self.sh_interval >= 1, "sh_interval", self.sh_interval, "at least 1")
+        require(0 < self.initial_opacity < 1, "initial_opacity", self.initial_opacity, "more than 0 and less than 1")
+        require(0 < self.initial_size <= 100, "initial_size", self.initial_size, "more than 0 and at most 100")
+        require_not_negative(self, "distant_size")
+        for value in self.evaluate_at:
+            require(0 < value <= 1, "evaluate_at", value, "fractions within (0, 1]")
+        require(self.checkpoint_every >= 0, "checkpoint_every", self.checkpoint_every, "at least 0")
+
+    @property
+    def written_iterations(self) -> int:
+        """The length of run that the settings which count iterations are written for."""
+        return self.base_iterations if self.iterations == "auto" else self.iterations
+
+    def evaluation_iterations(self) -> set[int]:
+        """Counts of finished iterations after which to evaluate."""
+        return {0, self.iterations, *(max(1, round(part * self.iterations)) for part in self.evaluate_at)}
+
+    def sh_degree_at(self, iteration: int) -> int:
+        """Degree of the bands in use at an iteration."""
+        return min(self.sh_degree, iteration // self.sh_interval)
+
+
+@dataclass
+class MapsConfig:
+    """The error maps. `beta`: EMA weight of a new error."""
+
+    beta: float = 0.4
+
+    def __post_init__(self) -> None:
+        require(0 < self.beta <= 1, "beta", self.beta, "within (0, 1]")
+
+
+@dataclass
+class ReportConfig:
+    """The report.
+
+    Args:
+        lpips_weights: a local file with the backbone's weights (torchvision's VGG16), or null: LPIPS is not computed.
+        strips: test views shown as pictures, at most.
+    """
+
+    lpips_weights: str | None = None
+    strips: int = 8
+
+    def __post_init__(self) -> None:
+        require(self.strips >= 0, "strips", self.strips, "at least 0")
+
+
+@dataclass
+class BudgetConfig:
+    """What the run may take besides Gaussians, whose cap is the density control's `max_gaussians`.
+
+    Args:
+        max_memory: of the device, for instance 2GiB; empty: no limit.
+        time: seconds of training to end after, for instance 20s or 2m; empty: `train.iterations` decide.
+    """
+
+    max_memory: str = ""
+    time: str = ""
+
+    def __post_init__(self) -> None:
+        self.memory_bytes()
+        require((self.seconds() or 0.0) <= LONGEST_TIME, "time", self.time, "at most 100h")
+
+    def memory_bytes(self) -> int | None:
+        """`max_memory`, or None for no limit. Raises `InputError` where it is no amount."""
+        return parse_bytes(self.max_memory) if self.max_memory else None
+
+    def seconds(self) -> float | None:
+        """`time`, or None for no limit. Raises `InputError` where it is no amount."""
+        return parse_seconds(self.time) if self.time else None

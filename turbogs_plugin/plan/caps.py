@@ -1,0 +1,75 @@
+"""The cap on the number of Gaussians, which is the `max_gaussians` of the density control and nowhere else."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from turbogs_plugin.config.configuration import Config, resolve
+from turbogs_plugin.errors import InputError
+
+FEWEST_GAUSSIANS = 1000
+"""Fewer are no model of a capture."""
+
+EXPECTED_GROWTH = 12.0
+"""Final Gaussians per initial one, before anything is known of the scene: 17 on fox, 12 on caliterra."""
+
+
+def keeps_cap(config: Config) -> bool:
+    """Whether the density control has a cap to set."""
+    return "max_gaussians" in config.density
+
+
+def cap_of(config: Config) -> int:
+    """Never more Gaussians than this; 0: no cap."""
+    return config.density.get("max_gaussians", 0)
+
+
+def with_cap(config: Config, cap: int) -> Config:
+    """The configuration with this cap.
+
+    Raises:
+        InputError: its density control keeps no cap.
+    """
+    if not keeps_cap(config):
+        kind = config.density["type"]
+        raise InputError(f"density.type {kind} keeps no cap on Gaussians: use one of error_driven, mcmc, none")
+    return resolve({**config.to_mapping(), "density": {**config.density, "max_gaussians": cap}})
+
+
+def lowered_cap(config: Config, cap: int) -> Config:
+    """The configuration with never more Gaussians than `cap`, or its own cap if that is less. Raises as `with_cap`."""
+    return with_cap(config, min(cap, cap_of(config) or cap))
+
+
+def without_growth(config: Config) -> Config:
+    """The configuration with the initial model, cut to the cap, in the place of one that grows to it."""
+    return resolve({**config.to_mapping(), "density": {"type": "none", "max_gaussians": cap_of(config)}})
+
+
+def growth_cap(config: Config, initial: int) -> int:
+    """How many Gaussians there can be at most; 0: any number. A model that does not grow has its initial number."""
+    return initial if config.density["type"] == "none" else cap_of(config)
+
+
+def expected_gaussians(initial: int, cap: int) -> float:
+    """How many there will be at the end, before anything is known of the scene. A `cap` of 0 is none."""
+    return max(initial, min(EXPECTED_GROWTH * initial, cap or math.inf))
+
+
+def chosen_points(count: int, cap: int, others: int) -> slice | np.ndarray:
+    """Which of `count` points a model begins with: all, or as many as leave room for `others` under a cap, evenly.
+
+    Args:
+        cap: never more Gaussians; 0: no cap.
+        others: Gaussians that are no points of the capture.
+
+    Raises:
+        InputError: there is no room.
+    """
+    if not cap or count + others <= cap:
+        return slice(None)
+    if cap <= others:
+        raise InputError(f"density.max_gaussians {cap} leaves no room beside the {others} of the backdrop: allow more")
+    return np.linspace(0, count - 1, cap - others).round().astype(np.int64)
