@@ -25,10 +25,6 @@ class Plan:
     facts: SceneFacts
     decisions: tuple[Decision, ...]
 
-    def value(self, setting: str) -> bool | int | str:
-        """What ``section.key`` is in the run."""
-        return next(decision.value for decision in self.decisions if decision.setting == setting)
-
     def apply(self, config: Config) -> Config:
         """The configuration with everything decided. It leaves nothing to decide, so that a plan of it is this very
         configuration."""
