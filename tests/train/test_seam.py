@@ -55,7 +55,7 @@ def capture(tmp_path_factory):
 
 
 def make_trainer(capture):
-    trainer = Trainer(tiny_config(capture), load_scene(capture), CPU)
+    trainer = Trainer(tiny_config(capture).without_plan(), load_scene(capture), CPU)
     trainer.initialise_maps()
     return trainer
 

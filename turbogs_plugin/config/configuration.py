@@ -62,7 +62,10 @@ class Config:
         """RuntimeError, for it is an error of ours, where a setting is left to a plan: no run can go by that."""
         left = undecided(self.to_mapping())
         if left:
-            raise RuntimeError(f"{', '.join(left)}: {AUTO}, but a run goes by what a plan has decided")
+            raise RuntimeError(
+                f"{', '.join(left)}: {AUTO}, but a run goes by what a plan has decided: "
+                "use make_plan(config, scene, device).apply(config), or config.without_plan()"
+            )
 
     def without_plan(self) -> Config:
         """This configuration, decided for a run that looks at neither scene nor machine, as those of benchmarks do."""

@@ -19,6 +19,7 @@ NOW: dict[str, str] = {
     "plan.photos_on": "is now train.photos_place",
     "budget.max_gaussians": "is now density.max_gaussians",
     "density.cap_max": "is now density.max_gaussians",
+    "optimizer.solver": "is gone: each engine has its own solver",
     "density.growth": "is gone: density.max_gaussians caps the number of Gaussians",
     "density.target_gaussians": "is gone: density.max_gaussians caps the number of Gaussians",
 }
