@@ -19,6 +19,11 @@ class RunFolder:
     path: Path
 
     @property
+    def asked(self) -> Path:
+        """The configuration as it was asked for: `config` is what plan and budgets made of it."""
+        return self.path / "asked.yaml"
+
+    @property
     def config(self) -> Path:
         return self.path / "config.yaml"
 
@@ -61,6 +66,12 @@ class RunFolder:
         if not self.config.is_file():
             raise InputError(f"'{self.path}' holds no run: there is no config.yaml")
         return resolve_complete(read_yaml(self.config), str(self.config))
+
+    def read_asked(self) -> Config:
+        """The configuration that was asked for. Raises `InputError` where it is missing or incomplete."""
+        if not self.asked.is_file():
+            raise InputError(f"'{self.path}' has no {self.asked.name}, which says what was asked for: train anew")
+        return resolve_complete(read_yaml(self.asked), str(self.asked))
 
     def read_plan(self) -> Plan | None:
         """What was planned when the run began, if it is there. Raises `InputError` where it cannot be read."""
