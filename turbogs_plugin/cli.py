@@ -219,7 +219,7 @@ def compare(
     out: Path,
     psnr: Annotated[tuple[float, ...], arg(metavar="DB ...")] = (),
 ) -> int:
-    """Report any runs side by side; runs that differ in nothing but the seed count as one variant.
+    """Report any runs side by side; runs that were asked the same, but for the seed, count as one variant.
 
     Args:
         runs: folders of runs; the first one is what the others are compared with.

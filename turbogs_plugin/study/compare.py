@@ -1,4 +1,4 @@
-"""Any runs side by side, as an ablation of them: runs that differ in nothing but the seed are seeds of one variant."""
+"""Any runs side by side, as an ablation of them: runs that were asked the same are seeds of one variant."""
 
 from __future__ import annotations
 
