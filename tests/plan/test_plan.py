@@ -310,6 +310,5 @@ def test_the_ablation_of_leave_outs_plans_each_cell(turbogs, capture, tmp_path):
     assert set(psnr) == {"nothing", *variants}
     assert psnr["host-maps"] == psnr["host-photos"] == psnr["nothing"]
     assert len({psnr[name] for name in ("nothing", "plan", "all-views", "no-ncc")}) == 4
-    assert cells["plan"]["config"]["plan"]["optimizer"] == "auto", (
-        "what was asked for is kept, so that a call can go on"
-    )
+    assert cells["plan"]["asked"]["plan"]["optimizer"] == "auto", "so that a call can go on"
+    assert cells["plan"]["config"]["plan"]["optimizer"] == "keep" and "optimizer" not in cells["nothing"]["asked"]
