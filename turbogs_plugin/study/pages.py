@@ -59,7 +59,8 @@ def _header(study: Study) -> list[Block]:
     budgets = sorted({result.time_budget for result in results} - {""}, key=parse_seconds)
     warmups = sorted({result.warmup_iterations for result in results})
     length = [f"{_listing(lengths)} iterations"] if lengths else []
-    length += [f"as many iterations as fit into {', '.join(budgets)} of training, calibration included"] if budgets else []
+    if budgets:
+        length.append(f"as many iterations as fit into {', '.join(budgets)} of training, calibration included")
     said = ", or ".join(length)
     warmup = (
         f"Before the clock starts, {_listing(warmups)} iterations of the same configuration, scaled to that length, "
