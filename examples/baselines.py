@@ -10,6 +10,7 @@ import tyro
 
 from turbogs_plugin.config.configuration import load_config
 from turbogs_plugin.config.scaling import with_iterations
+from turbogs_plugin.report.pages import write_report
 from turbogs_plugin.scene.demo import write_demo_capture
 from turbogs_plugin.train import run
 
@@ -32,7 +33,7 @@ def main(scene: str = "", output: str = "", iterations: int = 300, configs: tupl
                 continue
             config = with_iterations(load_config(name), iterations)
             config.scene.path = path
-            last = run.train(config, Path(output or folder) / name).history[-1]
+            last = run.train(config, Path(output or folder) / name, write_report).history[-1]
             print(f"{name}: {last.psnr:.2f} dB, {last.num_gaussians} Gaussians, {last.train_seconds:.1f} s")
 
 

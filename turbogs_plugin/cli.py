@@ -62,6 +62,7 @@ def train(
         time_budget: seconds of training to end after: 20s, 2m (budget.time). The schedule is fitted to it, and
             the pixels of an iteration or the number of Gaussians.
     """
+    from turbogs_plugin.report.pages import write_report
     from turbogs_plugin.train import run
 
     budget = _budget(max_memory, time_budget)
@@ -69,10 +70,11 @@ def train(
         others = (out, config, factor, device, max_gaussians)
         if scene or overrides or budget or any(option is not None for option in others):
             raise InputError("--resume goes on by the run's own configuration: give it nothing else")
-        return _tell(run.resume(resume))
+        return _tell(run.resume(resume, write_report))
     if scene is None or out is None:
         raise InputError("train needs a SCENE and --out RUN, or --resume RUN")
-    return _tell(run.train(_settings(scene, (*overrides, *budget), config, factor, device, max_gaussians), out))
+    settings = _settings(scene, (*overrides, *budget), config, factor, device, max_gaussians)
+    return _tell(run.train(settings, out, write_report))
 
 
 @app.command
@@ -169,7 +171,7 @@ def ablate(
     scene: Annotated[UseAppendAction[tuple[Path, ...]], arg(metavar="SCENE")] = (),
     seeds: Annotated[tuple[int, ...], arg(metavar="N ...")] = (0,),
     steps: Count = None,
-    time_budget: Annotated[float, arg(metavar="SECONDS")] = 0.0,
+    time_budget: Time = None,
     only: Annotated[tuple[str, ...], arg(metavar="VARIANT ...")] = (),
     psnr: Annotated[tuple[float, ...], arg(metavar="DB ...")] = (),
     reuse: Annotated[tuple[Path, ...], arg(metavar="STUDY ...")] = (),
@@ -185,7 +187,7 @@ def ablate(
         scene: folder of a capture; may be given several times.
         seeds: of each variant; two at least, or nothing can be called different.
         steps: iterations of every cell; what counts iterations is scaled with them.
-        time_budget: seconds of training after which a cell stops; 0 for none.
+        time_budget: of every cell, as in train.
         only: these variants and the baseline.
         psnr: test PSNRs whose time is asked for; from the baseline's result where absent.
         reuse: take cells of the same settings from these studies where machine and sources are the same.
@@ -197,16 +199,17 @@ def ablate(
 
     _require_positive("--psnr", psnr)
     ablations = [text for text in names if "=" not in text]
-    overrides = tuple(text for text in names if "=" in text)
+    budget = _budget(None, time_budget)
+    overrides = (*(text for text in names if "=" in text), *budget)
     if merge:
-        if names or scene or only:
+        if names or scene or only or budget:
             raise InputError("--merge trains nothing: give it --out and --psnr alone")
         return commands.merge(merge, out, psnr)
     if not ablations or not scene:
         raise InputError("ablate needs NAME_OR_FILE and --scene SCENE, or --merge STUDY ...")
     if only and len(ablations) > 1:
         raise InputError("--only names variants of one ablation: give it one NAME_OR_FILE")
-    options = SweepOptions(scene, seeds, overrides, steps, time_budget, device, reuse)
+    options = SweepOptions(scene, seeds, overrides, steps, device, reuse)
     return commands.ablate(ablations, options, out, only, psnr)
 
 
@@ -218,7 +221,7 @@ def compare(
     out: Path,
     psnr: Annotated[tuple[float, ...], arg(metavar="DB ...")] = (),
 ) -> int:
-    """Report any runs side by side; runs that differ in nothing but the seed count as one variant.
+    """Report any runs side by side; runs that were asked the same, but for the seed, count as one variant.
 
     Args:
         runs: folders of runs; the first one is what the others are compared with.

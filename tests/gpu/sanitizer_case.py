@@ -20,6 +20,7 @@ from test_raster_sorting import stacked_case, wide_case
 
 from turbogs_plugin.engine.rendering import dense_samples, rasterize, rasterize_differentiable
 from turbogs_plugin.scene import load_scene, write_demo_capture
+from turbogs_plugin.train.loop import TrainingLoop
 from turbogs_plugin.train.trainer import Trainer
 from turbogs_plugin.types import GaussianStats
 
@@ -41,8 +42,9 @@ def train(capture: Path, *overrides: str, iterations: int | None = None) -> Trai
     config = tiny_config(capture, f"train.device={DEVICE}", *overrides).without_plan()
     trainer = Trainer(config, load_scene(capture), torch.device(DEVICE))
     trainer.initialise_maps()
+    loop = TrainingLoop(trainer)
     for iteration in range(1, (iterations or config.train.iterations) + 1):
-        trainer.step_towards(iteration)
+        loop.advance(iteration)
     trainer.require_finite()
     return trainer
 

@@ -15,6 +15,7 @@ from turbogs_plugin.scene import Scene
 from turbogs_plugin.scene.offload import place_views
 from turbogs_plugin.train import calibration
 from turbogs_plugin.train.evaluate import evaluate
+from turbogs_plugin.train.loop import TrainingLoop
 from turbogs_plugin.train.trainer import Trainer
 
 pytestmark = [
@@ -51,9 +52,7 @@ def trained(scene: Scene, maps: str, photos: str, iterations: int, *overrides: s
 
 
 def run(trainer: Trainer, iterations: int) -> None:
-    end = trainer.iteration + iterations
-    while trainer.iteration < end:
-        trainer.step_towards(end)
+    TrainingLoop(trainer).advance(trainer.iteration + iterations)
 
 
 def assert_same_maps(a: Trainer, b: Trainer) -> None:

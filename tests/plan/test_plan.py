@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import re
+import signal
 
 import pytest
 import torch
@@ -16,6 +17,7 @@ from turbogs_plugin.errors import InputError
 from turbogs_plugin.plan import Plan, SceneFacts
 from turbogs_plugin.plan.decisions import RULES
 from turbogs_plugin.plan.plan import plan_from_facts
+from turbogs_plugin.report.pages import write_report
 from turbogs_plugin.scene import load_scene
 from turbogs_plugin.train import run
 from turbogs_plugin.train.trainer import Trainer
@@ -283,13 +285,13 @@ def test_a_planned_run_tells_its_plan_and_resumes_bit_for_bit(turbogs, capture, 
     def interrupted(trainer):
         step(trainer)
         if trainer.iteration == 7:
-            run.signal.raise_signal(run.signal.SIGINT)
+            signal.raise_signal(signal.SIGINT)
 
     monkeypatch.setattr(Trainer, "step", interrupted)
     assert turbogs("train", capture, *short, *decided, "--out", stopped, "--device", "cpu")[0] == 130
     monkeypatch.undo()
     monkeypatch.setattr(run, "make_plan", None)  # a resumed run must not plan again
-    run.resume(stopped)
+    run.resume(stopped, write_report)
     states = [torch.load(folder / "checkpoints" / "iteration-000014.pt")["trainer"] for folder in (whole, stopped)]
     for name, tensor in states[0]["gaussians"].items():
         assert torch.equal(tensor, states[1]["gaussians"][name]), name
@@ -305,7 +307,7 @@ def test_a_spoiled_plan_is_named_and_a_missing_one_is_not_missed(capture, tmp_pa
     with pytest.raises(InputError, match=r"plan\.json"):
         run.resume(folder.path)
     folder.plan.unlink()
-    run.resume(folder.path)
+    run.resume(folder.path, write_report)
     assert "holds no plan" in folder.report.read_text()
 
 
@@ -320,6 +322,7 @@ def test_the_ablation_of_leave_outs_plans_each_cell(turbogs, capture, tmp_path):
     assert set(psnr) == {"nothing", *variants}
     assert psnr["host-maps"] == psnr["host-photos"] == psnr["nothing"]
     assert len({psnr[name] for name in ("nothing", "plan", "all-views", "no-ncc")}) == 4
-    assert cells["plan"]["config"]["optimizer"]["type"] == "auto", (
-        "what was asked for is kept, so that a call can go on"
+    assert cells["plan"]["asked"]["optimizer"]["type"] == "auto", "so that a call can go on"
+    assert (
+        cells["plan"]["config"]["optimizer"]["type"] == "sparse_adam" and "optimizer" not in cells["nothing"]["asked"]
     )

@@ -2,6 +2,7 @@
 
 import json
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from helpers.framework_runs import tiny_capture, tiny_config
 from PIL import Image
 
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.report.pages import number, table
+from turbogs_plugin.report.pages import number, table, write_report
 from turbogs_plugin.report.plots import ERROR_FULL_SCALE, GAP, error_picture, plot_against_seconds, save_strip
 from turbogs_plugin.train import run
 from turbogs_plugin.train.evaluate import Metrics, ViewMetrics, compare, load_lpips, peak_memory_bytes
@@ -143,10 +144,15 @@ def test_tables():
     assert number(1.23456, 2) == "1.23" and number(math.nan, 2) == "not computed"
 
 
+def training(iteration: int, gaussians: int) -> SimpleNamespace:
+    """What progress looks at of a loop: so far of 100 iterations, with so many Gaussians."""
+    return SimpleNamespace(trainer=SimpleNamespace(iteration=iteration, iterations=100, gaussians=range(gaussians)))
+
+
 def test_progress_is_a_line_an_evaluation_where_there_is_no_terminal(capsys):
     with TrainingProgress(100) as progress:
-        progress.advance(1, 5)
-        progress.evaluated(evaluation(10, skipped_updates=3))
+        progress.advanced(training(1, 5))
+        progress.evaluated(training(10, 5), evaluation(10, skipped_updates=3))
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 1
     assert "10/100" in lines[0] and "20.10 dB" in lines[0] and "3 skipped updates" in lines[0]
@@ -156,8 +162,8 @@ def test_progress_is_a_line_an_evaluation_where_there_is_no_terminal(capsys):
 def test_progress_bar_on_a_terminal(capsys, monkeypatch):
     monkeypatch.setattr("sys.stderr.isatty", lambda: True, raising=False)
     with TrainingProgress(100) as progress:
-        progress.evaluated(evaluation(10))
-        progress.advance(50, 1234)
+        progress.evaluated(training(10, 5), evaluation(10))
+        progress.advanced(training(50, 1234))
     shown = capsys.readouterr().err
     assert "50/100" in shown and "20.10" in shown and "1,234" in shown
 
@@ -165,6 +171,6 @@ def test_progress_bar_on_a_terminal(capsys, monkeypatch):
 @pytest.mark.parametrize("strips", [0, 1])
 def test_no_more_strips_than_asked_for(tmp_path, strips):
     config = tiny_config(tiny_capture(tmp_path), "train.iterations=1", "scene.test_every=4", f"report.strips={strips}")
-    folder = run.train(config, tmp_path / "run").folder
+    folder = run.train(config, tmp_path / "run", write_report).folder
     assert len(list((folder.path / "report").glob("test-*.png"))) == strips
     assert f"{strips} of 2 are shown" in folder.report.read_text()

@@ -17,6 +17,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from turbogs_plugin.config.configuration import Config, load_config
 from turbogs_plugin.errors import TrainingStopped
+from turbogs_plugin.report.pages import write_report
 from turbogs_plugin.scene import load_scene
 from turbogs_plugin.train import run
 from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint
@@ -60,7 +61,7 @@ def small_config(capture: Path, *overrides: str) -> Config:
 
 def train_to_the_end(capture: Path, out: Path, *overrides: str) -> run.Outcome:
     """A run that ends with a finite model and without an event."""
-    outcome = run.train(small_config(capture, *overrides), out)
+    outcome = run.train(small_config(capture, *overrides), out, write_report)
     assert all(value.isfinite().all() for value in saved_model(out).values())
     assert outcome.history[-1].nonfinite_losses == outcome.history[-1].skipped_updates == 0
     assert all(np.isfinite([evaluation.psnr, evaluation.l1]).all() for evaluation in outcome.history)
@@ -254,7 +255,7 @@ def test_events_are_shown_while_they_happen_and_in_the_report(capture, tmp_path,
         step(trainer)
 
     monkeypatch.setattr(Trainer, "step", spoiled)
-    outcome = run.train(small_config(capture), tmp_path / "run")
+    outcome = run.train(small_config(capture), tmp_path / "run", write_report)
     lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("iteration")]
     assert lines[-1].endswith("2 non-finite losses, 4 skipped updates") and "skipped" not in lines[0]
     page = outcome.folder.report.read_text()

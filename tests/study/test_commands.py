@@ -5,7 +5,9 @@ import itertools
 import json
 import re
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -23,7 +25,10 @@ from turbogs_plugin.study.cell import capture_digest, train_cell
 from turbogs_plugin.study.compare import study_of_runs
 from turbogs_plugin.study.grid import load_ablation, variant_config
 from turbogs_plugin.study.results import CellResult, StudyFolder
-from turbogs_plugin.train.history import Evaluation, append_evaluation
+from turbogs_plugin.train import calibration, clock
+from turbogs_plugin.train.folder import RunFolder
+from turbogs_plugin.train.history import Evaluation, append_evaluation, read_history
+from turbogs_plugin.train.loop import Listener, TrainingLoop
 from turbogs_plugin.train.trainer import Trainer
 
 SMALL = """
@@ -116,15 +121,15 @@ def test_a_cell_of_other_settings_is_not_mixed_in(turbogs, small, capture, tmp_p
     changed.insert(2, "loss.ncc_weight=0.1")
     code, _, err = turbogs(*changed)
     assert code == 2 and "other settings (loss)" in err
-    code, _, err = turbogs(*call(small, capture, out, "--only", "full", "--time-budget", "1"))
-    assert code == 2 and "time budget" in err
+    code, _, err = turbogs(*call(small, capture, out, "--only", "full", "--time-budget", "1s"))
+    assert code == 2 and "other settings (budget)" in err
     assert {path: path.read_bytes() for path in out.rglob("*") if path.is_file()} == before
 
 
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"time_budget": None}, "full--seed0.json.*time_budget: expected a number"),
+        ({"asked": None}, "full--seed0.json.*asked: expected a mapping"),
         ({"variant": 1}, "full--seed0.json.*variant: expected text"),
         ({"seed": "0"}, "full--seed0.json.*seed: expected a whole number"),
         ({"variant": "other"}, "other--seed0.json.*no variant"),
@@ -133,21 +138,55 @@ def test_a_cell_of_other_settings_is_not_mixed_in(turbogs, small, capture, tmp_p
 def test_a_cell_that_cannot_be_used_is_named_by_its_file(small, tmp_path, changes, words):
     folder = StudyFolder(tmp_path / "study")
     folder.write_ablation(load_ablation(str(small)))
-    folder.write(CellResult("fox", "full", 0, {}, 0.0, [Evaluation(4, 1.0, 30.0, 0.8, 0.1, 100, 2**20)]))
+    folder.write(CellResult("fox", "full", 0, {}, [Evaluation(4, 1.0, 30.0, 0.8, 0.1, 100, 2**20)]))
     path = folder.cells / "fox" / "full--seed0.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | changes))
     with pytest.raises(InputError, match=words):
         folder.read_study()
 
 
-def test_a_time_budget_ends_a_cell(turbogs, small, capture, tmp_path):
+@pytest.fixture
+def machine(monkeypatch) -> None:
+    """By the clock of training, an iteration takes 1/8 s, a view's first map 1/16 s, and all else nothing."""
+    now, step, initialise = [0.0], Trainer.step, Trainer.initialise_map
+
+    def taking(function, seconds):
+        def taken(*arguments):
+            function(*arguments)
+            now[0] += seconds
+
+        return taken
+
+    monkeypatch.setattr(Trainer, "step", taking(step, 0.125))
+    monkeypatch.setattr(Trainer, "initialise_map", taking(initialise, 0.0625))
+    for module in (clock, calibration):
+        monkeypatch.setattr(module, "time", SimpleNamespace(perf_counter=lambda: now[0]))
+
+
+@pytest.mark.parametrize(
+    "length", [("train.iterations=30",), ("train.iterations=8", "train.epochs=2")], ids=["short", "long"]
+)
+def test_a_cell_with_a_time_budget_is_trained_as_a_run_with_one(turbogs, machine, small, capture, tmp_path, length):
+    """Fewer iterations than configured, or more pixels: the same numbers, and the same resolved configuration."""
+    budget = ("--time-budget", "3s", "--device", "cpu")
+    settings = (*TINY, *length)
+    code, _, err = turbogs("train", capture, *settings, "--out", tmp_path / "run", *budget)
+    assert code == 0, err
     out = tmp_path / "study"
-    arguments = call(small, capture, out, "--only", "full", "--time-budget", "0.001")
-    arguments[arguments.index("4")] = "400"
-    assert turbogs(*arguments)[0] == 0
-    result = StudyFolder(out).read_study().results[0]
-    assert result.stopped_early and 1 <= result.final.iteration < 4
-    assert "Stopped by the time budget" in (out / "report.md").read_text()
+    code, _, err = turbogs("ablate", small, *settings, "--scene", capture, "--out", out, "--only", "full", *budget)
+    assert code == 0, err
+    (cell,) = StudyFolder(out).read_study().results
+    assert cell.time_budget == "3s" and 2.5 < cell.final.train_seconds < 3.5
+    errors = ("iteration", "train_seconds", "psnr", "ssim", "l1", "num_gaussians")
+    run_history = read_history(tmp_path / "run" / "history.jsonl")
+    assert [[getattr(entry, name) for name in errors] for entry in cell.history] == [
+        [getattr(entry, name) for name in errors] for entry in run_history
+    ]
+    assert cell.config == RunFolder(tmp_path / "run").read_config().to_mapping()
+    assert cell.config["train"]["iterations"] != cell.asked["train"]["iterations"] == int(length[0].partition("=")[2])
+    assert "s many iterations as fit into 3s of training" in (out / "report.md").read_text()
+    code, _, err = turbogs("ablate", small, *settings, "--scene", capture, "--out", out, "--only", "full", *budget)
+    assert code == 0 and "1 finished cells are kept" in err
 
 
 def test_an_interrupted_sweep_reports_what_is_there(turbogs, small, capture, tmp_path, monkeypatch):
@@ -340,12 +379,12 @@ def test_runs_are_compared(turbogs, capture, tmp_path):
     assert code == 2 and "same run" in err
 
 
-def a_run(folder: Path, iterations: int, *overrides: str) -> Path:
-    """What `compare` reads of a run."""
+def a_run(folder: Path, iterations: int, *overrides: str, fitted: Sequence[str] = ()) -> Path:
+    """What `compare` reads of a run. `fitted`: settings that a budget changed, besides the number of iterations."""
     folder.mkdir()
-    (folder / "config.yaml").write_text(
-        with_iterations(load_config("turbogs", overrides).without_plan(), iterations).to_yaml()
-    )
+    (folder / "asked.yaml").write_text(load_config("turbogs", overrides).to_yaml())
+    resolved = with_iterations(load_config("turbogs", [*overrides, *fitted]).without_plan(), iterations)
+    (folder / "config.yaml").write_text(resolved.to_yaml())
     append_evaluation(folder / "history.jsonl", Evaluation(iterations, 20.0, 30.0, 0.8, 0.1, 100, 2**20))
     return folder
 
@@ -367,24 +406,31 @@ def test_captures_that_share_a_name_are_kept_apart(tmp_path, second, names):
     assert study.scenes == names and list(study.ablation.variants) == ["x"]
 
 
-def test_runs_of_one_time_budget_are_seeds_however_long_they_came_out(tmp_path):
-    def run(name: str, seed: int, time: str, iterations: int, pixel_budget: float, *overrides: str) -> Path:
-        settings = [f"train.seed={seed}", f"budget.time={time}", f"schedule.pixel_budget={pixel_budget}", *overrides]
-        return a_run(tmp_path / name, iterations, *settings)
+def test_runs_that_were_asked_the_same_are_seeds_whatever_plan_and_budgets_made_of_it(tmp_path):
+    """Lengths, pixels and caps that a time budget fits to each seed are no variants of their own."""
 
+    def run(name: str, seed: int, iterations: int, *overrides: str, fitted: Sequence[str] = ()) -> Path:
+        return a_run(tmp_path / name, iterations, f"train.seed={seed}", *overrides, fitted=fitted)
+
+    capped = ("density.max_gaussians=9000",)
     runs = [
-        run("a", 0, "20s", 2600, 1.0),
-        run("b", 1, "20s", 2471, 1.5),
-        run("longer", 0, "30s", 2600, 1.0),
-        run("other", 0, "20s", 2600, 1.0, "density.prune_opacity=0.02"),
-        run("free", 0, "''", 2600, 1.0),
-        run("free-2", 1, "''", 2471, 1.0),
+        run("a", 0, 2600, "budget.time=20s"),
+        run("b", 1, 2471, "budget.time=20s", fitted=["schedule.pixel_budget=1.5"]),
+        run("c", 2, 1500, "budget.time=20s", fitted=capped),
+        run("capped", 0, 1500, "budget.time=20s", *capped),
+        run("longer", 0, 2600, "budget.time=30s"),
+        run("other", 0, 2600, "budget.time=20s", "density.prune_opacity=0.02"),
+        run("free", 0, 2600),
+        run("free-2", 1, 2471),
     ]
     study = study_of_runs(runs)
     assert {name: len(study.of("", name)) for name in study.ablation.variants} == {
-        "a": 2, "longer": 1, "other": 1, "free": 1, "free-2": 1,
+        "a": 3, "capped": 1, "longer": 1, "other": 1, "free": 2,
     }  # fmt: skip
     assert study.ablation.variants["longer"] == ["budget.time=30s"]
+    (tmp_path / "a" / "asked.yaml").unlink()
+    with pytest.raises(InputError, match=r"asked\.yaml"):
+        study_of_runs(runs)
 
 
 def test_the_bar_of_a_cell_has_the_planned_length(tmp_path, monkeypatch):
@@ -392,8 +438,12 @@ def test_the_bar_of_a_cell_has_the_planned_length(tmp_path, monkeypatch):
     monkeypatch.setitem(RULES, "train.iterations", lambda facts, config: Verdict(6, "few"))
     config = load_config("turbogs", [*TINY, "train.iterations=auto", "train.base_iterations=14"])
     told = []
-    advance = lambda iteration, total: told.append((iteration, total))  # noqa: E731
-    train_cell("short", config, scene, torch.device("cpu"), provenance("cpu"), progress=advance)
+
+    class Bar(Listener):
+        def advanced(self, loop: TrainingLoop) -> None:
+            told.append((loop.trainer.iteration, loop.trainer.iterations))
+
+    train_cell("short", config, scene, torch.device("cpu"), provenance("cpu"), [Bar()])
     assert told == [(iteration, 6) for iteration in range(1, 7)] and config.train.iterations == "auto"
 
 
@@ -412,8 +462,8 @@ def test_the_bar_of_a_cell_has_the_planned_length(tmp_path, monkeypatch):
             ["x/CAPTURE and", "y/"],
         ),
         *(
-            (["ablate", "components", "--scene", "CAPTURE", "--out", "X", "--time-budget", time], ["time budget"])
-            for time in ("-1", "nan", "inf")
+            (["ablate", "components", "--scene", "CAPTURE", "--out", "X", "--time-budget", time], ["amount of time"])
+            for time in ("0", "nan", "inf")
         ),
         (["ablate", "components", "--scene", "CAPTURE", "--out", "CAPTURE"], ["not empty"]),
         (["ablate", "--merge", "CAPTURE", "--out", "X"], ["holds no ablation"]),
@@ -430,10 +480,9 @@ def test_bad_calls_are_refused(turbogs, capture, tmp_path, arguments, words):
     assert not (tmp_path / "x").exists()
 
 
-@pytest.mark.parametrize("budget", ["budget.time=20s", "budget.max_memory=2GiB"])
-def test_budgets_of_single_runs_are_refused(budget):
-    with pytest.raises(InputError, match=r"variant 'moment-lm'.*--time-budget"):
-        variant_config(load_ablation("optimizer"), "moment-lm", 0, (budget,), None)
+def test_a_limit_of_memory_which_is_of_a_process_is_refused():
+    with pytest.raises(InputError, match=r"variant 'moment-lm'.*max_memory.*max_gaussians"):
+        variant_config(load_ablation("optimizer"), "moment-lm", 0, ("budget.max_memory=2GiB",), None)
 
 
 def test_a_cell_keeps_a_cap_on_gaussians(tmp_path):

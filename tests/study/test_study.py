@@ -26,7 +26,7 @@ def entry(iteration: int, seconds: float, psnr: float, count: int = 100) -> Eval
 
 def cell(variant: str, seed: int, *entries: Evaluation, scene: str = "fox") -> CellResult:
     config = load_config("turbogs", [f"train.seed={seed}", f"train.iterations={entries[-1].iteration}"])
-    return CellResult(scene, variant, seed, config.to_mapping(), 0.0, list(entries), fps=100.0)
+    return CellResult(scene, variant, seed, config.to_mapping(), list(entries), fps=100.0)
 
 
 # The grid
@@ -171,9 +171,17 @@ def test_time_to_a_psnr_is_linear_between_evaluations():
 
 def test_a_curve_pairs_common_iterations_and_the_ends():
     early = [entry(0, 0.0, 10.0), entry(10, 2.0, 20.0), entry(17, 3.0, 21.0)]
-    late = [entry(0, 1.0, 12.0), entry(10, 4.0, 22.0), entry(19, 5.0, 25.0)]
+    late = [entry(0, 1.0, 12.0), entry(8, 3.0, 16.0), entry(10, 4.0, 22.0), entry(19, 5.0, 25.0)]
     curve = Curve.of([early, late], "psnr")
     np.testing.assert_allclose(curve.seconds, [0.5, 3.0, 4.0])
+    np.testing.assert_allclose([curve.mean, curve.low, curve.high], [[11, 21, 23], [10, 20, 21], [12, 22, 25]])
+
+
+def test_a_curve_of_runs_by_time_pairs_evaluations_in_their_order():
+    first = [entry(0, 0.0, 10.0), entry(9, 2.0, 20.0), entry(17, 4.0, 21.0)]
+    second = [entry(0, 0.0, 12.0), entry(10, 2.0, 22.0), entry(19, 4.0, 25.0)]
+    curve = Curve.of([first, second], "psnr")
+    np.testing.assert_allclose(curve.seconds, [0.0, 2.0, 4.0])
     np.testing.assert_allclose([curve.mean, curve.low, curve.high], [[11, 21, 23], [10, 20, 21], [12, 22, 25]])
 
 

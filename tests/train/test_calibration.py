@@ -11,6 +11,7 @@ from turbogs_plugin.plan.caps import EXPECTED_GROWTH, growth_cap
 from turbogs_plugin.plan.memory import MemoryDemand
 from turbogs_plugin.plan.pixels import TOLERANCE, pixel_budget_range, pixels_for_time, with_pixel_budget
 from turbogs_plugin.plan.time import IterationCost
+from turbogs_plugin.report.pages import write_report
 from turbogs_plugin.scene import Scene, load_scene
 from turbogs_plugin.train import calibration, run
 
@@ -204,7 +205,7 @@ def test_a_run_with_time_for_more_looks_at_more_pixels(tmp_path, monkeypatch):
     )  # so few iterations are a long time to measure for otherwise
     overrides = ("budget.time=6s", "density.max_gaussians=1200", "schedule.min_views=7", "schedule.max_views=7")
     lengths = ("train.iterations=30", "train.refine_until=20", "train.epochs=4")
-    outcome = run.train(tiny_config(tiny_capture(tmp_path), *overrides, *lengths), tmp_path / "run")
+    outcome = run.train(tiny_config(tiny_capture(tmp_path), *overrides, *lengths), tmp_path / "run", write_report)
     end = outcome.history[-1]
     assert end.train_seconds == pytest.approx(6.0, rel=0.1)
     assert 0.7 * 30 <= end.iteration <= 1.5 * 30

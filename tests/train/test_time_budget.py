@@ -239,24 +239,23 @@ def test_stops_by_time_evaluate_once_a_fraction_and_save_at_intervals():
         seconds += 0.05 * (mark - iteration)  # twice as fast as planned
         iteration = mark
         dues.append((iteration, seconds, pace.reached(iteration, seconds, 10)))
-        assert train.iterations == pace.iterations
     evaluated = [seconds for _, seconds, due in dues if due.evaluate]
     assert evaluated == pytest.approx([2.5, 5.0, 10.0], abs=0.31)
     saved = [iteration for iteration, _, due in dues if due.save]
     assert len(saved) == 200 // 40 and saved[-1] == pace.iterations == pytest.approx(200, abs=2)
-    assert train.refine_until == pytest.approx(140, abs=3)
+    assert pace.refine_until == pytest.approx(140, abs=3)
+    assert (train.iterations, train.refine_until) == (100, 70), "the configuration stays what was resolved"
 
 
 def paced(stop_after: float = math.inf) -> list[tuple[int, float, int, int]]:
     """(iteration, seconds, iterations planned, end of density control) at each stop of a run of 20 s, whose model grows
     to 20 times its size; stopped and resumed once."""
 
-    def pace_and_train(cost: IterationCost | None) -> tuple[pacing.TimePace, TrainConfig]:
-        train = TrainConfig(iterations=5000, refine_until=3500)
-        return pacing.TimePace(train, 20.0, cost, cap=0), train
+    def new_pace(cost: IterationCost | None) -> pacing.TimePace:
+        return pacing.TimePace(TrainConfig(iterations=5000, refine_until=3500), 20.0, cost, cap=0)
 
     cost = IterationCost(1e-3, 1e-8)
-    pace, train = pace_and_train(cost)
+    pace = new_pace(cost)
     iteration, seconds, gaussians, stops = 0, 0.0, 20_000, []
     pace.start(iteration, seconds, gaussians)
     while iteration < pace.iterations:
@@ -264,12 +263,12 @@ def paced(stop_after: float = math.inf) -> list[tuple[int, float, int, int]]:
         while iteration < mark:
             seconds += cost.at(gaussians)
             iteration += 1
-            gaussians += 100 * (iteration < train.refine_until)
+            gaussians += 100 * (iteration < pace.refine_until)
         pace.reached(iteration, seconds, gaussians)
-        stops.append((iteration, seconds, pace.iterations, train.refine_until))
+        stops.append((iteration, seconds, pace.iterations, pace.refine_until))
         if seconds > stop_after:
             state, stop_after = pace.state_dict(), math.inf
-            pace, train = pace_and_train(None)  # a resumed run is not calibrated
+            pace = new_pace(None)  # a resumed run is not calibrated
             require_like(state, pace.state_dict(), "pace")
             pace.load_state_dict(state)
             pace.start(iteration, seconds, gaussians)

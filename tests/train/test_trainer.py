@@ -22,6 +22,7 @@ from turbogs_plugin.config.configuration import load_config, resolve
 from turbogs_plugin.config.yaml_text import parse_yaml
 from turbogs_plugin.errors import InputError, TrainingStopped
 from turbogs_plugin.model.gaussians import load_ply
+from turbogs_plugin.report.pages import write_report
 from turbogs_plugin.scene import load_scene
 from turbogs_plugin.scene.fingerprint import capture_difference, capture_state
 from turbogs_plugin.train import run
@@ -40,7 +41,7 @@ def capture(tmp_path_factory) -> Path:
 @pytest.fixture(scope="module")
 def whole(capture, tmp_path_factory) -> run.Outcome:
     """A run never stopped."""
-    return run.train(tiny_config(capture), tmp_path_factory.mktemp("runs") / "whole")
+    return run.train(tiny_config(capture), tmp_path_factory.mktemp("runs") / "whole", write_report)
 
 
 def saved(folder: Path) -> dict:
@@ -237,7 +238,7 @@ def test_non_finite_losses_are_counted(capture, tmp_path, monkeypatch):
         spoiled.append(trainer)
 
     stop_after(monkeypatch, 10, spoil)
-    outcome = run.train(tiny_config(capture), tmp_path / "run")
+    outcome = run.train(tiny_config(capture), tmp_path / "run", write_report)
     assert spoiled and outcome.history[-1].nonfinite_losses == 4
     assert all(value.isfinite().all() for value in saved(tmp_path / "run")["gaussians"].values())
     assert "non-finite loss: 4" in outcome.folder.report.read_text()

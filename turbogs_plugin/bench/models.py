@@ -14,6 +14,7 @@ from torch.nn.functional import normalize
 from turbogs_plugin.config.configuration import Config, load_config, resolve
 from turbogs_plugin.scene import Scene
 from turbogs_plugin.tiles import TILE_PIXELS, pixel_table
+from turbogs_plugin.train.loop import TrainingLoop
 from turbogs_plugin.train.trainer import Trainer
 from turbogs_plugin.types import Cameras, Gaussians, PixelSamples, TileGrid
 
@@ -80,9 +81,7 @@ def adopt(trainer: Trainer, gaussians: Gaussians) -> None:
 
 def train(trainer: Trainer, iterations: int) -> None:
     """So many more iterations, those repeated that were lost to an overflow."""
-    end = trainer.iteration + iterations
-    while trainer.iteration < end:
-        trainer.step_towards(end)
+    TrainingLoop(trainer).advance(trainer.iteration + iterations)
 
 
 def resized(gaussians: Gaussians, count: int, seed: int = 0) -> Gaussians:

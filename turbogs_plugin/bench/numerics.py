@@ -31,7 +31,7 @@ from turbogs_plugin.engine.reference.lm_solvers import (
 from turbogs_plugin.files import write_atomically, write_text_atomically
 from turbogs_plugin.report.pages import hardware, software, table
 from turbogs_plugin.report.plots import STYLE
-from turbogs_plugin.train.evaluate import synchronize
+from turbogs_plugin.train.clock import synchronize
 from turbogs_plugin.train.run import resolve_device
 
 Problem = tuple[Tensor, Tensor, Tensor, Tensor]

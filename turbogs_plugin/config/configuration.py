@@ -135,10 +135,10 @@ def resolve(mapping: Mapping[str, Any]) -> Config:
 
 
 def resolve_complete(mapping: Mapping[str, Any], where: str) -> Config:
-    """`resolve` of the mapping that a run has written, in which all is decided.
+    """`resolve` of the mapping that a run has written.
 
     Raises:
-        InputError: a part of it is missing or left to a plan, or an earlier version wrote it.
+        InputError: a part of it is missing, or an earlier version wrote it.
     """
     old = old_spelling(mapping)
     if old:
@@ -147,6 +147,12 @@ def resolve_complete(mapping: Mapping[str, Any], where: str) -> Config:
     missing = _first_missing(config.to_mapping(), mapping)
     if missing:
         raise InputError(f"'{where}' lacks '{missing}', which this version writes: bring the file back, or train anew")
+    return config
+
+
+def resolve_decided(mapping: Mapping[str, Any], where: str) -> Config:
+    """`resolve_complete` of a mapping in which all is decided. Raises `InputError` where a part is left to a plan."""
+    config = resolve_complete(mapping, where)
     left = undecided(mapping)
     if left:
         raise InputError(f"'{where}' has {AUTO} for {', '.join(left)}, which a run decides: bring the file back")

@@ -6,74 +6,41 @@ import math
 import os
 import platform
 from collections.abc import Iterable
-from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 import torch
 
-from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.files import write_text_atomically
 from turbogs_plugin.plan import Plan
 from turbogs_plugin.report.plots import ERROR_FULL_SCALE, plot_against_seconds, save_strip
-from turbogs_plugin.scene import PosedImages
-from turbogs_plugin.train.evaluate import Metrics, render_view
-from turbogs_plugin.train.history import Evaluation
-from turbogs_plugin.types import Gaussians
+from turbogs_plugin.train.evaluate import Metrics, evaluate, load_lpips, render_view
+from turbogs_plugin.train.run import FinishedRun
 from turbogs_plugin.version import __version__
 
 ERRORS = ("PSNR in dB", "SSIM", "mean absolute error")
 PACKAGES = ("torch", "gsplat", "numpy", "pycolmap", "torchmetrics")
 
 
-@dataclass
-class RunRecord:
-    """What a report tells of a finished run.
-
-    Args:
-        folder: of the run; the report goes there.
-        scene: name of the capture.
-        config: resolved.
-        plan: that the run followed; None where its folder holds none.
-        history: every evaluation.
-        metrics: of the final model.
-        lpips_reason: why LPIPS was not computed; empty where it was.
-        num_train_views: V.
-    """
-
-    folder: Path
-    scene: str
-    config: Config
-    plan: Plan | None
-    history: list[Evaluation]
-    metrics: Metrics
-    lpips_reason: str
-    num_train_views: int
-
-
-def write_report(record: RunRecord, gaussians: Gaussians, test: PosedImages, sh_degree: int) -> Path:
+def write_report(run: FinishedRun) -> Path:
     """Write ``report.md`` and its pictures (in ``report/``) into the run's folder.
-
-    Args:
-        record: of the run.
-        gaussians: the final model.
-        test: the test views, on the model's device.
-        sh_degree: bands in use.
 
     Returns:
         The page.
     """
-    pictures = record.folder / "report"
+    trainer, config = run.trainer, run.trainer.config
+    lpips, lpips_reason = load_lpips(config.report.lpips_weights, trainer.device)
+    metrics = evaluate(trainer.gaussians, run.test, trainer.sh_degree, config.raster, lpips)
+    pictures = run.folder.path / "report"
     pictures.mkdir(exist_ok=True)
     for name, label in (("psnr", "test PSNR in dB"), ("l1", "mean absolute error on test views (0 .. 1)")):
-        plot_against_seconds(pictures / f"{name}.png", record.history, name, label, record.scene)
-    shown = min(len(test), record.config.report.strips)
+        plot_against_seconds(pictures / f"{name}.png", run.history, name, label, run.scene.name)
+    shown = min(len(run.test), config.report.strips)
     for view_id in range(shown):
-        image = render_view(gaussians, test, view_id, sh_degree, record.config.raster)
-        save_strip(pictures / f"test-{view_id:03d}.png", test.photos.image(view_id), image)
-    page = record.folder / "report.md"
-    write_text_atomically(page, _page(record, shown))
-    return page
+        image = render_view(trainer.gaussians, run.test, view_id, trainer.sh_degree, config.raster)
+        save_strip(pictures / f"test-{view_id:03d}.png", run.test.photos.image(view_id), image)
+    write_text_atomically(run.folder.report, _page(run, metrics, lpips_reason, shown))
+    return run.folder.report
 
 
 def table(header: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
@@ -118,9 +85,16 @@ def _processor_name() -> str:
     return names[0] if names else platform.processor() or platform.machine()
 
 
-def _page(record: RunRecord, shown: int) -> str:
-    last = record.history[-1]
-    metrics, train = record.metrics, record.config.train
+def _page(run: FinishedRun, metrics: Metrics, lpips_reason: str, shown: int) -> str:
+    """The page.
+
+    Args:
+        metrics: of the final model.
+        lpips_reason: why LPIPS was not computed; empty where it was.
+        shown: test views with a picture.
+    """
+    last = run.history[-1]
+    config = run.trainer.config
     views = [
         (view.name, number(view.psnr, 2), number(view.ssim, 4), number(view.l1, 4), number(view.lpips, 4))
         for view in metrics.views
@@ -140,7 +114,7 @@ def _page(record: RunRecord, shown: int) -> str:
             )
         ],
     )
-    lpips = f"\nLPIPS was not computed: {record.lpips_reason}.\n" if record.lpips_reason else ""
+    lpips = f"\nLPIPS was not computed: {lpips_reason}.\n" if lpips_reason else ""
     history = table(
         ("iteration", "training in s", *ERRORS, "Gaussians", "peak memory in MiB"),
         (
@@ -153,16 +127,16 @@ def _page(record: RunRecord, shown: int) -> str:
                 evaluation.num_gaussians,
                 f"{evaluation.memory_bytes / 2**20:.0f}",
             )
-            for evaluation in record.history
+            for evaluation in run.history
         ),
     )
     strips = "\n\n".join(
         f"{view.name}: {view.psnr:.2f} dB\n\n![{view.name}](report/test-{view_id:03d}.png)"
         for view_id, view in enumerate(metrics.views[:shown])
     )
-    return f"""# {record.scene}
+    return f"""# {run.scene.name}
 
-{train.iterations} iterations on {record.num_train_views} training views, seed {train.seed}; measured on
+{last.iteration} iterations on {len(run.scene.train)} training views, seed {config.train.seed}; measured on
 {len(metrics.views)} test views.
 
 {result}
@@ -188,7 +162,7 @@ From left to right: photo, render, error (mean absolute difference over RGB: bla
 
 ## Plan
 
-{_plan(record.plan)}
+{_plan(run.plan)}
 
 ## Numerical events
 
@@ -197,14 +171,14 @@ finite: {last.skipped_updates}.
 
 ## Machine
 
-{hardware(train.device)}, {platform.system()} {platform.machine()}.
+{hardware(config.train.device)}, {platform.system()} {platform.machine()}.
 
 {table(("software", "version"), software())}
 
 ## Configuration
 
 ```yaml
-{record.config.to_yaml().rstrip()}
+{config.to_yaml().rstrip()}
 ```
 """
 

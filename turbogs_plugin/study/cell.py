@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -12,15 +12,15 @@ import torch
 
 from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.config.scaling import with_iterations
-from turbogs_plugin.plan import make_plan
 from turbogs_plugin.report.provenance import Provenance
 from turbogs_plugin.scene import PosedImages, Scene
 from turbogs_plugin.scene.offload import place_views
 from turbogs_plugin.study.results import CellResult
 from turbogs_plugin.study.timing import PeakMemory
-from turbogs_plugin.train.clock import TrainingClock
-from turbogs_plugin.train.evaluate import Metrics, evaluate, free_device_memory, load_lpips, peak_memory_bytes
-from turbogs_plugin.train.history import Evaluation
+from turbogs_plugin.train.evaluate import evaluate, free_device_memory, load_lpips, peak_memory_bytes
+from turbogs_plugin.train.evaluations import Evaluations
+from turbogs_plugin.train.loop import Listener, TrainingLoop
+from turbogs_plugin.train.run import new_loop, plan_scene
 from turbogs_plugin.train.trainer import Trainer
 
 WARMUP_ITERATIONS = {"cuda": 20, "cpu": 2}
@@ -55,65 +55,43 @@ def train_cell(
     scene: Scene,
     device: torch.device,
     made_by: Provenance,
-    time_budget: float = 0.0,
-    progress: Callable[[int, int], None] = lambda iteration, total: None,
+    listeners: Sequence[Listener] = (),
 ) -> CellResult:
-    """Train one variant.
+    """Train one variant, as `turbogs train` would: by a plan for the scene, within the budgets of the configuration.
 
     Args:
         variant: its name.
-        config: resolved. Its plan is made here, by the scene; the result keeps the configuration that was asked for.
+        config: as asked for. The result keeps it as it was resolved.
         scene: in host memory; the plan says what of it goes to the device.
         device: where to train.
         made_by: machine and sources, as they were when the process began.
-        time_budget: seconds of training after which to stop; 0: none.
-        progress: is told the number of finished iterations, and of all by the plan.
+        listeners: to the training.
 
     Raises:
+        InputError: a budget is too small.
         TrainingStopped: the model is lost.
     """
-    asked, config = config, make_plan(config, scene, device).apply(config)
-    test = place_views(scene.test, device, config.train.photos_place)
-    warmup = min(WARMUP_ITERATIONS[device.type], config.train.iterations)
-    warm_up(config, scene, test, device, warmup)
+    planned = plan_scene(config, scene, device).apply(config)
+    test = place_views(scene.test, device, planned.train.photos_place)
+    warmup = min(WARMUP_ITERATIONS[device.type], planned.train.iterations)
+    warm_up(planned, scene, test, device, warmup)
     lpips, lpips_reason = load_lpips(config.report.lpips_weights, device)
-    total, marks = config.train.iterations, config.train.evaluation_iterations()
-    memory, clock = PeakMemory(device), TrainingClock(device)
-    trainer = Trainer(config, scene, device)
-    history: list[Evaluation] = []
-
-    def measure(final: bool) -> Metrics:
-        memory.pause()
-        trainer.require_finite()
-        metrics = evaluate(trainer.gaussians, test, trainer.sh_degree, config.raster, lpips if final else None)
-        history.append(Evaluation.of(trainer, metrics, clock.seconds, memory.peak or peak_memory_bytes(device)))
-        memory.resume()
-        return metrics
-
-    with clock:
-        trainer.initialise_maps()
-    metrics = measure(final=False)
-    in_time = True
-    while trainer.iteration < total and in_time:
-        mark = min(iteration for iteration in marks if iteration > trainer.iteration)
-        with clock:
-            while trainer.iteration < mark and in_time:
-                trainer.step_towards(mark)
-                in_time = not time_budget or clock.now() < time_budget
-                if not in_time:
-                    trainer.repeat_lost(wait=True)
-                progress(trainer.iteration, total)
-        metrics = measure(final=trainer.iteration == total or not in_time)
+    memory = PeakMemory(device)
+    loop, _ = new_loop(planned, scene, device)
+    evaluations = Evaluations(test, lpips, lambda: memory.peak or peak_memory_bytes(device))
+    loop.listeners = [evaluations, memory, *listeners]
+    loop.run()
+    resolved, asked = loop.trainer.config.to_mapping(), config.to_mapping()
     return CellResult(
         scene=scene.name,
         variant=variant,
         seed=config.train.seed,
-        config=asked.to_mapping(),
-        time_budget=time_budget,
-        history=history,
-        lpips=math.nan if lpips is None else metrics.lpips,
+        config=resolved,
+        asked={name: section for name, section in asked.items() if section != resolved[name]},
+        history=evaluations.history,
+        lpips=math.nan if lpips is None else evaluations.metrics.lpips,
         lpips_reason=lpips_reason,
-        fps=metrics.fps,
+        fps=evaluations.metrics.fps,
         peak_bytes=memory.peak,
         warmup_iterations=warmup,
         provenance=made_by,
@@ -124,9 +102,7 @@ def train_cell(
 def warm_up(config: Config, scene: Scene, test: PosedImages, device: torch.device, iterations: int) -> None:
     """Train and evaluate a model that is thrown away, with every kind of event that the configuration has."""
     trainer = Trainer(with_iterations(config, iterations), scene, device)
-    trainer.initialise_maps()
-    while trainer.iteration < iterations:
-        trainer.step_towards(iterations)
+    TrainingLoop(trainer).run()
     evaluate(trainer.gaussians, test, trainer.sh_degree, config.raster)
     del trainer
     free_device_memory(device)

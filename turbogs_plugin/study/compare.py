@@ -1,4 +1,4 @@
-"""Any runs side by side, as an ablation of them: runs that differ in nothing but the seed are seeds of one variant."""
+"""Any runs side by side, as an ablation of them: runs that were asked the same are seeds of one variant."""
 
 from __future__ import annotations
 
@@ -8,29 +8,24 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from turbogs_plugin.config.scaling import ITERATION_FIELDS, REGROWTH, decay_at
 from turbogs_plugin.config.sections import SceneConfig
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.study.grid import Ablation
 from turbogs_plugin.study.results import CellResult, Study
+from turbogs_plugin.train.folder import RunFolder
 from turbogs_plugin.train.history import read_history
-from turbogs_plugin.train.run import RunFolder
-
-FITTED = {
-    "train": ("iterations", "base_iterations", *ITERATION_FIELDS["train"]),
-    "density": ITERATION_FIELDS["density"],
-    "schedule": ("pixel_budget",),
-}
-"""Section -> settings that calibration chooses where there is a time budget."""
 
 
 def study_of_runs(paths: Sequence[Path]) -> Study:
     """The runs' histories as cells. The first run's variant is the baseline; variants have the first run's name.
 
+    What was asked for makes a variant: what plan and budgets make of it differs from machine to machine and from seed
+    to seed.
+
     Raises:
         InputError: no run there, one without an evaluation, or the same run twice.
     """
-    variants: list[tuple[dict[str, Any], str]] = []  # configuration without the seed and the place, and its name
+    variants: list[tuple[dict[str, Any], str]] = []  # what was asked for without the seed and the place, and its name
     results: list[CellResult] = []
     folders = [RunFolder(path) for path in paths]
     configs = [folder.read_config() for folder in folders]
@@ -39,13 +34,13 @@ def study_of_runs(paths: Sequence[Path]) -> Study:
         history = read_history(folder.history)
         if not history:
             raise InputError(f"'{path}' has no evaluation yet")
-        mapping = config.to_mapping()
-        shared = _without(mapping)
+        resolved, asked = config.to_mapping(), folder.read_asked().to_mapping()
+        shared = _shared(asked, config.train.device)
         name = next((name for known, name in variants if known == shared), None)
         if name is None:
             name = _new_name(path, {taken for _, taken in variants})
             variants.append((shared, name))
-        result = CellResult(scene, name, config.train.seed, mapping, time_budget=0.0, history=history)
+        result = CellResult(scene, name, config.train.seed, resolved, history, asked)
         if any(other.key == result.key for other in results):
             raise InputError(f"'{path}' is the same run as another one: {result.key}")
         # A CPU run records the peak of its process, which is its own.
@@ -76,22 +71,16 @@ def _scene_names(scenes: Sequence[SceneConfig]) -> list[str]:
     return names
 
 
-def _without(mapping: dict[str, Any]) -> dict[str, Any]:
+def _shared(asked: dict[str, Any], device: str) -> dict[str, Any]:
     """What makes two runs seeds of one variant: all but the seed, the photos, and what is only reported or kept.
 
-    A time budget fits the length and the pixels of an iteration to the machine, to each seed its own: not that either.
+    Args:
+        device: that was taken.
     """
-    sections = {name: dict(section) for name, section in mapping.items() if name not in ("report", "scene")}
+    sections = {name: dict(section) for name, section in asked.items() if name not in ("report", "scene")}
     for key in ("seed", "checkpoint_every", "evaluate_at"):
         sections["train"].pop(key)
-    if sections["budget"]["time"]:
-        density = sections["density"]
-        if density.get("opacity_decay"):  # it goes along with the length, by the interval of its events
-            decay = decay_at(density["opacity_decay"], density["refine_every"], REGROWTH)
-            density["opacity_decay"] = round(decay, 9)
-        for section, keys in FITTED.items():
-            for key in keys:
-                sections[section].pop(key, None)
+    sections["train"]["device"] = device
     return sections
 
 

@@ -151,9 +151,9 @@ def variant_config(ablation: Ablation, variant: str, seed: int, overrides: Seque
         config = load_config(ablation.base, [*ablation.variants[variant], *overrides, f"train.seed={seed}"])
     except InputError as error:
         raise InputError(f"variant '{variant}': {error}") from None
-    if config.budget.time or config.budget.max_memory:
+    if config.budget.max_memory:
         raise InputError(
-            f"variant '{variant}': budget.time and budget.max_memory are of single runs; "
-            "cells are compared at equal lengths, or end by --time-budget"
+            f"variant '{variant}': budget.max_memory holds a whole process, which here trains all cells: "
+            "leave it out, or limit density.max_gaussians"
         )
     return config if steps is None else with_iterations(config, steps)

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
 
+from turbogs_plugin.config.units import parse_seconds
 from turbogs_plugin.files import write_text_atomically
 from turbogs_plugin.study.document import Block, Heading, Paragraph, Picture, Table, to_html, to_markdown
 from turbogs_plugin.study.plots import plot_curves, plot_front
@@ -53,11 +54,14 @@ def write_study(folder: Path, study: Study, targets: Sequence[float] = ()) -> Pa
 
 def _header(study: Study) -> list[Block]:
     results = study.results
-    # The plan may have made them other than configured, a time budget fewer.
-    lengths = sorted({result.final.iteration for result in results if not result.stopped_early})
-    budgets = sorted({result.time_budget for result in results} - {0.0})
+    # The plan may have made them other than configured.
+    lengths = sorted({result.final.iteration for result in results if not result.time_budget})
+    budgets = sorted({result.time_budget for result in results} - {""}, key=parse_seconds)
     warmups = sorted({result.warmup_iterations for result in results})
-    budget = f", at most {_listing(budgets)} s of training" if budgets else ""
+    length = [f"{_listing(lengths)} iterations"] if lengths else []
+    if budgets:
+        length.append(f"as many iterations as fit into {', '.join(budgets)} of training, calibration included")
+    said = ", or ".join(length)
     warmup = (
         f"Before the clock starts, {_listing(warmups)} iterations of the same configuration, scaled to that length, "
         "train a model that is thrown away."
@@ -65,7 +69,7 @@ def _header(study: Study) -> list[Block]:
         else "Without warm-up."
     )
     blocks: list[Block] = [
-        Paragraph(f"{_listing(lengths) or 'As many'} iterations{budget}. {TIMING_RULES} {warmup}"),
+        Paragraph(f"{said[:1].upper()}{said[1:]}. {TIMING_RULES} {warmup}"),
         Paragraph(HOW_TO_READ),
     ]
     missing = sorted({result.lpips_reason for result in results if result.lpips_reason})
@@ -116,9 +120,9 @@ def _scene(folder: Path, study: Study, summary: SceneSummary) -> list[Block]:
         Heading(f"Time to reach a PSNR on {summary.scene}", 3),
         Table(reach_header, [_reach_line(row) for row in summary.rows]),
     ]
-    early = [f"{row.name} (at {_listing(sorted(row.iterations))})" for row in summary.rows if row.iterations]
-    if early:
-        blocks.append(Paragraph(f"Stopped by the time budget, at iteration: {', '.join(early)}."))
+    fitted = [f"{row.name} ({_listing(sorted(row.iterations))})" for row in summary.rows if row.iterations]
+    if fitted:
+        blocks.append(Paragraph(f"Iterations that fit into the time budget, of each seed: {', '.join(fitted)}."))
     return blocks
 
 

@@ -11,10 +11,11 @@ from rich.progress import BarColumn, Progress, TextColumn
 
 from turbogs_plugin.study.grid import CellKey
 from turbogs_plugin.study.results import CellResult, Failure
+from turbogs_plugin.train.loop import Listener, TrainingLoop
 from turbogs_plugin.train.progress import REFRESH_SECONDS
 
 
-class SweepProgress:
+class SweepProgress(Listener):
     """Shows cells as they finish, on stderr.
 
     Args:
@@ -50,20 +51,18 @@ class SweepProgress:
         if self._bar is not None:
             self._bar.reset(self._task, total=None, description=str(key), left=self._left())
 
-    def advance(self, iteration: int, total: int) -> None:
-        """Called after every iteration; cheap."""
+    def advanced(self, loop: TrainingLoop) -> None:
         if self._bar is None or time.perf_counter() < self._next_refresh:
             return
         self._next_refresh = time.perf_counter() + REFRESH_SECONDS
-        self._bar.update(self._task, completed=iteration, total=total)
+        self._bar.update(self._task, completed=loop.trainer.iteration, total=loop.trainer.iterations)
         self._bar.refresh()
 
     def finished(self, result: CellResult) -> None:
         """Called after a cell."""
         final = result.final
-        early = f", stopped by the time budget at iteration {final.iteration}" if result.stopped_early else ""
         self._count(
-            f"{result.key}: {final.psnr:.2f} dB in {final.train_seconds:.1f} s, {final.num_gaussians} Gaussians{early}"
+            f"{result.key}: {final.psnr:.2f} dB in {final.train_seconds:.1f} s, {final.num_gaussians} Gaussians"
         )
 
     def failed(self, failure: Failure) -> None:

@@ -24,8 +24,8 @@ class CellResult:
 
     Args:
         scene, variant, seed: which.
-        config: its resolved configuration.
-        time_budget: seconds after which training was to stop; 0: none.
+        config: its configuration, as plan and budgets resolved it.
+        asked: the sections of it that were asked for otherwise, as they were asked for.
         history: every evaluation, the last one of the final model.
         lpips: NaN where it was not computed.
         lpips_reason: why not; empty where it was.
@@ -40,8 +40,8 @@ class CellResult:
     variant: str
     seed: int
     config: dict[str, Any]
-    time_budget: float
     history: list[Evaluation]
+    asked: dict[str, dict[str, Any]] = field(default_factory=dict)
     lpips: float = math.nan
     lpips_reason: str = ""
     fps: float = math.nan
@@ -60,9 +60,14 @@ class CellResult:
         return self.history[-1]
 
     @property
-    def stopped_early(self) -> bool:
-        """The time budget ended it."""
-        return 0 < self.time_budget <= self.final.train_seconds
+    def asked_config(self) -> dict[str, Any]:
+        """The configuration that was asked for: by it a finished cell is recognised."""
+        return {**self.config, **self.asked}
+
+    @property
+    def time_budget(self) -> str:
+        """As it was written, for instance 20s; empty where there is none."""
+        return self.config["budget"]["time"]
 
 
 @dataclass
@@ -212,7 +217,7 @@ def _read_result(path: Path) -> CellResult:
             raise ValueError("without an evaluation")
         made = mapping["provenance"]
         mapping["provenance"] = None if made is None else Provenance(**made)
-        for name in ("scene", "variant", "seed", "time_budget"):
+        for name in ("scene", "variant", "seed", "asked"):
             mapping[name] = convert(mapping[name], _HINTS[name], name)
         mapping.update(history=history, lpips=_number(mapping["lpips"]), fps=_number(mapping["fps"]))
         return CellResult(**mapping)

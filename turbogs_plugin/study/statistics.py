@@ -68,11 +68,14 @@ class Curve:
 
     @classmethod
     def of(cls, histories: Sequence[Sequence[Evaluation]], name: str) -> Curve:
-        """Of a field of `Evaluation`. Where a time budget ended seeds at different iterations, the ends are paired."""
+        """Of a field of `Evaluation`. Where a time budget ended seeds at different iterations, equally many evaluations
+        are paired in their order, which are at the same fractions of the time; of others, the ends are paired."""
         common = set.intersection(*({entry.iteration for entry in history} for history in histories))
         rows = [[entry for entry in history if entry.iteration in common] for history in histories]
         if any(history[-1].iteration not in common for history in histories):
             rows = [[*row, history[-1]] for row, history in zip(rows, histories, strict=True)]
+            if len({len(history) for history in histories}) == 1:
+                rows = histories
         values = np.array([[getattr(entry, name) for entry in row] for row in rows])  # [seeds, E]
         seconds = np.array([[entry.train_seconds for entry in row] for row in rows])
         return cls(seconds.mean(axis=0), values.mean(axis=0), values.min(axis=0), values.max(axis=0))

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from turbogs_plugin.study.results import CellResult, Study
+from turbogs_plugin.study.results import Study
 from turbogs_plugin.study.statistics import Curve, Spread, differ, pareto_front, seconds_to_reach
 
 TARGET_STEP = 0.5
@@ -39,7 +39,7 @@ class VariantRow:
         name: of the variant.
         seconds, psnr, worst_psnr, ssim, l1, lpips, gaussians, fps, peak_bytes: over seeds; NaN where not computed or
             not measured.
-        iterations: of the seeds, where the time budget stopped some, else empty.
+        iterations: of the seeds, where a time budget decided them, else empty.
         psnr_difference: mean PSNR minus the baseline's.
         psnr_differs, seconds_differ: whether the seeds' spreads are apart from the baseline's; None where that is open.
         reaches: time to each target.
@@ -135,7 +135,7 @@ def _summarise_scene(study: Study, scene: str, targets: Sequence[float]) -> Scen
                 gaussians=Spread.of(cell.final.num_gaussians for cell in results),
                 fps=Spread.of(cell.fps for cell in results),
                 peak_bytes=Spread.of(math.nan if cell.peak_bytes is None else cell.peak_bytes for cell in results),
-                iterations=_early_ends(results),
+                iterations=[cell.final.iteration for cell in results if cell.time_budget],
                 psnr_difference=psnr.mean - reference_psnr.mean,
                 psnr_differs=differ(psnr, reference_psnr),
                 seconds_differ=differ(seconds, reference_seconds),
@@ -148,7 +148,3 @@ def _summarise_scene(study: Study, scene: str, targets: Sequence[float]) -> Scen
     for row, on_front in zip(rows, pareto_front([(row.seconds.mean, row.psnr.mean) for row in rows]), strict=True):
         row.on_front = on_front
     return SceneSummary(scene, baseline, list(targets), rows)
-
-
-def _early_ends(results: Sequence[CellResult]) -> list[int]:
-    return [cell.final.iteration for cell in results] if any(cell.stopped_early for cell in results) else []

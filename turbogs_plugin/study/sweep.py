@@ -5,7 +5,6 @@ from __future__ import annotations
 import gc
 import itertools
 import json
-import math
 import traceback
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -23,7 +22,7 @@ from turbogs_plugin.study.cell import capture_digest, train_cell
 from turbogs_plugin.study.grid import Ablation, CellKey, variant_config
 from turbogs_plugin.study.progress import SweepProgress
 from turbogs_plugin.study.results import CellResult, Failure, StudyFolder
-from turbogs_plugin.train.evaluate import synchronize
+from turbogs_plugin.train.clock import synchronize
 from turbogs_plugin.train.run import resolve_device
 
 UNCOMPARED = (("scene", "path"), ("train", "device"))
@@ -39,7 +38,6 @@ class SweepOptions:
         seeds: of each variant.
         overrides: ``section.key=value`` of all variants.
         steps: iterations of every cell; None: the configurations' own.
-        time_budget: seconds of training after which a cell stops; 0: none.
         device: auto, cpu or cuda.
         reuse: other studies; a cell of the same settings, made by the same sources on the same machine, is taken from
             them. Tables share variants, the baseline above all.
@@ -49,7 +47,6 @@ class SweepOptions:
     seeds: Sequence[int] = (0,)
     overrides: Sequence[str] = ()
     steps: int | None = None
-    time_budget: float = 0.0
     device: str = "auto"
     reuse: Sequence[Path] = ()
 
@@ -61,8 +58,6 @@ class SweepOptions:
         for first, second in itertools.combinations(scenes, 2):
             if first.name == second.name:
                 raise InputError(f"scenes: two folders are called '{first.name}', {first} and {second}: rename one")
-        if not 0 <= self.time_budget < math.inf:
-            raise InputError(f"the time budget is {self.time_budget}: it must be 0 (none) or a number of seconds")
 
 
 def run_sweep(
@@ -109,7 +104,7 @@ def run_sweep(
         for key, config in configs.items():
             known = reusable.get((name, capture, _comparable(config.to_mapping())))
             if key in finished:
-                _require_same(finished[key], config, options.time_budget)
+                _require_same(finished[key], config)
                 kept += 1
             elif known is not None:
                 taken.append(replace(known, variant=key.variant))
@@ -125,7 +120,7 @@ def run_sweep(
     with SweepProgress(sum(map(len, grid.values())), kept + len(taken)) as progress:
         for name, cells in grid.items():
             if cells:
-                _train_scene(cells, loaded.pop(name), device, here, options.time_budget, folder, progress)
+                _train_scene(cells, loaded.pop(name), device, here, folder, progress)
 
 
 def _scene_configs(
@@ -148,14 +143,13 @@ def _train_scene(
     scene: Scene,
     device: torch.device,
     here: Provenance,
-    time_budget: float,
     folder: StudyFolder,
     progress: SweepProgress,
 ) -> None:
     for key, config in cells:
         progress.begin(key)
         try:
-            result = train_cell(key.variant, config, scene, device, here, time_budget, progress.advance)
+            result = train_cell(key.variant, config, scene, device, here, [progress])
         except Exception as error:  # whatever a variant breaks by, the other cells go on
             failure = Failure(key, _reason(error))
             folder.write_failure(failure)
@@ -176,13 +170,13 @@ def _require_capture(results: Iterable[CellResult], scene: str, capture: str) ->
             )
 
 
-def _require_same(present: CellResult, config: Config, time_budget: float) -> None:
+def _require_same(present: CellResult, config: Config) -> None:
     old = old_spelling(present.config)
     if old:
         raise InputError(f"the cell '{present.key}' is of an earlier version ({old}): choose a new --out")
-    made, wanted = (_sections(mapping) for mapping in (present.config, config.to_mapping()))
-    if made != wanted or present.time_budget != time_budget:
-        sections = [name for name in wanted if made.get(name) != wanted[name]] or ["the time budget"]
+    made, wanted = (_sections(mapping) for mapping in (present.asked_config, config.to_mapping()))
+    if made != wanted:
+        sections = [name for name in wanted if made.get(name) != wanted[name]]
         raise InputError(
             f"the cell '{present.key}' was made with other settings ({', '.join(sections)}): choose a new --out"
         )
@@ -197,9 +191,9 @@ def _reusable_cells(
     folders = [*map(StudyFolder, options.reuse), *siblings]
     results = [result for folder in folders for result in folder.read_study().results]
     return {
-        (result.scene, result.capture, _comparable(result.config)): result
+        (result.scene, result.capture, _comparable(result.asked_config)): result
         for result in results
-        if result.capture and (result.time_budget, result.provenance) == (options.time_budget, here)
+        if result.capture and result.provenance == here
     }
 
 

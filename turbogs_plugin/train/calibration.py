@@ -4,8 +4,8 @@ iteration has, by iterations timed on this machine."""
 from __future__ import annotations
 
 import math
+import sys
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
@@ -32,7 +32,9 @@ from turbogs_plugin.plan.pixels import (
 )
 from turbogs_plugin.plan.time import IterationCost, fit_to_time
 from turbogs_plugin.scene import Scene
-from turbogs_plugin.train.evaluate import free_device_memory, synchronize
+from turbogs_plugin.train.clock import TrainingClock
+from turbogs_plugin.train.evaluate import free_device_memory
+from turbogs_plugin.train.loop import Listener, TrainingLoop
 from turbogs_plugin.train.trainer import Trainer
 
 CALIBRATION_SHARE = 0.04
@@ -223,8 +225,9 @@ class _Trial:
     def initialisation(self) -> float:
         """Seconds of `Trainer.initialise_maps`, from one view."""
         self._trainer.initialise_map(0)  # loads code
-        view = _seconds_of(lambda: self._trainer.initialise_map(0), 1, 0.0, self._device)
-        return view * len(self._trainer.views)
+        with TrainingClock(self._device) as clock:
+            self._trainer.initialise_map(0)
+        return clock.seconds * len(self._trainer.views)
 
     def cost(self, seconds: float) -> IterationCost:
         """Of an iteration as configured: the line through what half the model and all of it take."""
@@ -243,19 +246,21 @@ class _Trial:
         trainer.optimizer.setup(trainer.gaussians)
         # About half way, views and rates of a schedule are what they are in the mean.
         trainer.iteration = max(train.sh_degree * train.sh_interval, train.iterations // 2)
-        for _ in range(WARMUP_ITERATIONS[self._device.type]):
-            trainer.step()
-        cost = _seconds_of(trainer.step, FEWEST_MEASURED[self._device.type], seconds, self._device)
-        trainer.repeat_lost(wait=True)
-        return len(trainer.gaussians), cost
+        TrainingLoop(trainer).advance(trainer.iteration + WARMUP_ITERATIONS[self._device.type])
+        enough = _Enough(FEWEST_MEASURED[self._device.type], seconds)
+        loop = TrainingLoop(trainer, listeners=[enough])
+        loop.advance(sys.maxsize)
+        return len(trainer.gaussians), loop.clock.seconds / enough.iterations
 
 
-def _seconds_of(function: Callable[[], None], fewest: int, seconds: float, device: torch.device) -> float:
-    """Of one call: the mean over as many as fit into `seconds`, at least `fewest`."""
-    synchronize(device)
-    started, calls = time.perf_counter(), 0
-    while calls < fewest or time.perf_counter() - started < seconds:
-        function()
-        calls += 1
-    synchronize(device)
-    return (time.perf_counter() - started) / calls
+class _Enough(Listener):
+    """Stops when so many iterations were made and so many seconds have passed."""
+
+    def __init__(self, fewest: int, seconds: float) -> None:
+        self.iterations = 0
+        self._fewest, self._seconds = fewest, seconds
+
+    def advanced(self, loop: TrainingLoop) -> None:
+        self.iterations += 1
+        if self.iterations >= self._fewest and loop.clock.now() >= self._seconds:
+            loop.stop()

@@ -1,4 +1,4 @@
-"""The clock that training is measured by, in a run as in an ablation."""
+"""The clock of training: what counts as time, in a run as in an ablation."""
 
 from __future__ import annotations
 
@@ -7,15 +7,23 @@ from types import TracebackType
 
 import torch
 
-from turbogs_plugin.train.evaluate import synchronize
+
+def synchronize(device: torch.device) -> None:
+    """Wait for the GPU, so that a clock read next counts what was asked for; nothing on a CPU."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
 
 
 class TrainingClock:
-    """Seconds of training. Entered for training alone; waits for the GPU at both ends."""
+    """Seconds of training. Entered for training alone; waits for the GPU at both ends.
 
-    def __init__(self, device: torch.device) -> None:
+    Args:
+        seconds: of training that passed before.
+    """
+
+    def __init__(self, device: torch.device, seconds: float = 0.0) -> None:
         self.device = device
-        self.seconds = 0.0
+        self.seconds = seconds
 
     def __enter__(self) -> TrainingClock:
         synchronize(self.device)

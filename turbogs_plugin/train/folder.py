@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from turbogs_plugin.config.configuration import Config, resolve_complete
+from turbogs_plugin.config.configuration import Config, resolve_complete, resolve_decided
 from turbogs_plugin.config.yaml_text import read_yaml
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.files import require_writable
@@ -17,6 +17,11 @@ class RunFolder:
     """Where the parts of a run are."""
 
     path: Path
+
+    @property
+    def asked(self) -> Path:
+        """The configuration as it was asked for: `config` is what plan and budgets made of it."""
+        return self.path / "asked.yaml"
 
     @property
     def config(self) -> Path:
@@ -60,7 +65,13 @@ class RunFolder:
         """The resolved configuration of the run. Raises `InputError` where this is no run, or part of it is missing."""
         if not self.config.is_file():
             raise InputError(f"'{self.path}' holds no run: there is no config.yaml")
-        return resolve_complete(read_yaml(self.config), str(self.config))
+        return resolve_decided(read_yaml(self.config), str(self.config))
+
+    def read_asked(self) -> Config:
+        """The configuration that was asked for. Raises `InputError` where it is missing or incomplete."""
+        if not self.asked.is_file():
+            raise InputError(f"'{self.path}' has no {self.asked.name}, which says what was asked for: train anew")
+        return resolve_complete(read_yaml(self.asked), str(self.asked))
 
     def read_plan(self) -> Plan | None:
         """What was planned when the run began, if it is there. Raises `InputError` where it cannot be read."""

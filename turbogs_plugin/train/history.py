@@ -6,14 +6,9 @@ import json
 import math
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.files import write_text_atomically
-
-if TYPE_CHECKING:
-    from turbogs_plugin.train.evaluate import Metrics
-    from turbogs_plugin.train.trainer import Trainer
 
 
 @dataclass
@@ -41,22 +36,6 @@ class Evaluation:
     nonfinite_losses: int = 0
     skipped_updates: int = 0
     worst_psnr: float = math.nan
-
-    @classmethod
-    def of(cls, trainer: Trainer, metrics: Metrics, train_seconds: float, memory_bytes: int) -> Evaluation:
-        """Where a run stands, with what its model came to on the test views. Waits for the GPU."""
-        return cls(
-            iteration=trainer.iteration,
-            train_seconds=train_seconds,
-            psnr=metrics.psnr,
-            ssim=metrics.ssim,
-            l1=metrics.l1,
-            num_gaussians=len(trainer.gaussians),
-            memory_bytes=memory_bytes,
-            nonfinite_losses=int(trainer.nonfinite_losses),
-            skipped_updates=int(trainer.optimizer.skipped),
-            worst_psnr=metrics.worst_psnr,
-        )
 
     def to_json(self) -> str:
         """One line; NaN is written as null."""

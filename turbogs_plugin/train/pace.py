@@ -27,6 +27,11 @@ class Pace(Protocol):
         """T, as known now."""
         ...
 
+    @property
+    def refine_until(self) -> int:
+        """The last iteration of density control, as known now."""
+        ...
+
     def start(self, iteration: int, seconds: float, gaussians: int) -> None:
         """Training begins or goes on, with so many finished iterations and seconds of training."""
         ...
@@ -49,6 +54,7 @@ class IterationPace:
 
     def __init__(self, train: TrainConfig) -> None:
         self.iterations = train.iterations
+        self.refine_until = train.refine_until
         self._evaluations = train.evaluation_iterations()
         self._save_every = train.checkpoint_every or self.iterations
 
@@ -71,19 +77,17 @@ class IterationPace:
 
 
 class TimePace:
-    """As many iterations as fit into a time; `train.iterations` and `train.refine_until` follow the plan.
-
-    Evaluations are at the configured fractions of the time.
+    """As many iterations as fit into a time. Evaluations are at the configured fractions of the time.
 
     Args:
-        train: of the run, whose lengths are changed as the run goes.
+        train: of the run; its iterations and its end of density control are what is planned first.
         seconds: of training, what came before the first iteration included.
         cost: of an iteration, from the calibration; without one, growth is not foreseen.
         cap: never more Gaussians than that; 0: none.
     """
 
     def __init__(self, train: TrainConfig, seconds: float, cost: IterationCost | None, cap: int) -> None:
-        self._train = train
+        self._save_every = train.checkpoint_every
         self._fractions = sorted({*train.evaluate_at, 1.0})
         self._plan = TimePlan(seconds, train.iterations, train.refine_until, cost or IterationCost(1.0, 0.0), cap)
         self._evaluated = 0
@@ -91,7 +95,11 @@ class TimePace:
 
     @property
     def iterations(self) -> int:
-        return self._train.iterations
+        return self._plan.iterations
+
+    @property
+    def refine_until(self) -> int:
+        return self._plan.refine_until
 
     def start(self, iteration: int, seconds: float, gaussians: int) -> None:
         self._plan.start(iteration, seconds, gaussians)
@@ -101,8 +109,7 @@ class TimePace:
 
     def reached(self, iteration: int, seconds: float, gaussians: int) -> Due:
         self._plan.replan(iteration, seconds, gaussians)
-        self._follow()
-        finished, every = iteration >= self.iterations, self._train.checkpoint_every
+        finished, every = iteration >= self.iterations, self._save_every
         passed = sum(fraction <= seconds / self._plan.seconds for fraction in self._fractions)
         save = finished or bool(every and iteration // every > self._saved // every)
         due = Due(finished or passed > self._evaluated, save)
@@ -116,10 +123,6 @@ class TimePace:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         self._plan.load_state_dict(state)
         self._evaluated, self._saved = state["evaluated"], state["saved"]
-        self._follow()
-
-    def _follow(self) -> None:
-        self._train.iterations, self._train.refine_until = self._plan.iterations, self._plan.refine_until
 
 
 def pace_of(config: Config, cost: IterationCost | None = None) -> Pace:

@@ -10,21 +10,21 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from turbogs_plugin.train.history import Evaluation
+from turbogs_plugin.train.loop import Listener, TrainingLoop
 
 REFRESH_SECONDS = 0.1
 """Between two updates of the bar, so that it costs a fast iteration nothing."""
 
 
-class TrainingProgress:
+class TrainingProgress(Listener):
     """Shows iteration, test PSNR, number of Gaussians and time left on stderr.
 
     Args:
-        total: T; may be set anew, where a run goes by time.
+        total: T, as known at first.
         iteration: where the run begins.
     """
 
     def __init__(self, total: int, iteration: int = 0) -> None:
-        self.total = total
         self._next_refresh = 0.0
         self._bar = None
         if sys.stderr.isatty():
@@ -53,22 +53,22 @@ class TrainingProgress:
         if self._bar is not None:
             self._bar.stop()
 
-    def advance(self, iteration: int, num_gaussians: int) -> None:
-        """Called after every iteration; cheap."""
+    def advanced(self, loop: TrainingLoop) -> None:
         if self._bar is None or time.perf_counter() < self._next_refresh:
             return
         self._next_refresh = time.perf_counter() + REFRESH_SECONDS
-        self._bar.update(self._task, completed=iteration, total=self.total, gaussians=f"{num_gaussians:,}")
+        trainer = loop.trainer
+        gaussians = f"{len(trainer.gaussians):,}"
+        self._bar.update(self._task, completed=trainer.iteration, total=trainer.iterations, gaussians=gaussians)
         self._bar.refresh()
 
-    def evaluated(self, evaluation: Evaluation) -> None:
-        """Called after every evaluation."""
-        warning = describe_nonfinite(evaluation)
+    def evaluated(self, loop: TrainingLoop, evaluation: Evaluation) -> None:
+        warning, total = describe_nonfinite(evaluation), loop.trainer.iterations
         if self._bar is not None:
             self._bar.update(
                 self._task,
                 completed=evaluation.iteration,
-                total=self.total,
+                total=total,
                 psnr=f"{evaluation.psnr:.2f}",
                 gaussians=f"{evaluation.num_gaussians:,}",
                 warning=warning,
@@ -76,7 +76,7 @@ class TrainingProgress:
             self._bar.refresh()
             return
         print(
-            f"iteration {evaluation.iteration:>{len(str(self.total))}}/{self.total}  "
+            f"iteration {evaluation.iteration:>{len(str(total))}}/{total}  "
             f"{evaluation.train_seconds:7.1f} s  test PSNR {evaluation.psnr:5.2f} dB  SSIM {evaluation.ssim:.4f}  "
             f"{evaluation.num_gaussians} Gaussians" + (f"  {warning}" if warning else ""),
             file=sys.stderr,

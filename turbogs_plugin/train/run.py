@@ -1,16 +1,13 @@
-"""A run and its folder: training with a clock, evaluations, checkpoints and a report, from the start or from a stop."""
+"""A run and its folder: training with evaluations and checkpoints, from the start or from a stop, to a saved model."""
 
 from __future__ import annotations
 
 import operator
-import signal
 import sys
-import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from types import FrameType, TracebackType
 from typing import Any
 
 import torch
@@ -20,17 +17,18 @@ from turbogs_plugin.errors import InputError, TrainingStopped
 from turbogs_plugin.files import write_text_atomically
 from turbogs_plugin.model.gaussians import save_ply
 from turbogs_plugin.plan import Plan, make_plan
-from turbogs_plugin.report.pages import RunRecord, write_report
 from turbogs_plugin.scene import Frame, PosedImages, Scene, load_scene
 from turbogs_plugin.scene.fingerprint import capture_difference, capture_state, frame_of_state
 from turbogs_plugin.scene.offload import place_views
-from turbogs_plugin.train.calibration import budget_text, hold_to, within_budget
+from turbogs_plugin.train.calibration import Calibration, budget_text, hold_to, within_budget
 from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint, require_like, save_checkpoint
-from turbogs_plugin.train.clock import TrainingClock
-from turbogs_plugin.train.evaluate import Metrics, evaluate, load_lpips, peak_memory_bytes
+from turbogs_plugin.train.evaluate import load_lpips
+from turbogs_plugin.train.evaluations import Evaluations
 from turbogs_plugin.train.folder import RunFolder
 from turbogs_plugin.train.history import Evaluation, append_evaluation, rewind_history
-from turbogs_plugin.train.pace import Pace, pace_of
+from turbogs_plugin.train.interrupts import Interrupts
+from turbogs_plugin.train.loop import Listener, TrainingLoop
+from turbogs_plugin.train.pace import pace_of
 from turbogs_plugin.train.progress import TrainingProgress
 from turbogs_plugin.train.trainer import Trainer, gaussians_of_state
 from turbogs_plugin.types import Gaussians
@@ -43,6 +41,28 @@ class Outcome:
     folder: RunFolder
     history: list[Evaluation]
     signal: int | None = None
+
+
+@dataclass
+class FinishedRun:
+    """A run at its end, for who reports on it.
+
+    Args:
+        plan: that the run followed; None where its folder holds none.
+        trainer: with the final model.
+        test: the test views, on the trainer's device.
+        history: every evaluation.
+    """
+
+    folder: RunFolder
+    plan: Plan | None
+    scene: Scene
+    trainer: Trainer
+    test: PosedImages
+    history: list[Evaluation]
+
+
+ReportWriter = Callable[[FinishedRun], object]
 
 
 @dataclass
@@ -93,16 +113,38 @@ def plan_run(config: Config) -> Plan:
         InputError: anything wrong with the input.
     """
     device = resolve_device(config.train.device)
-    return _plan(config, open_scene(config), device)
+    return plan_scene(config, open_scene(config), device)
 
 
-def _plan(config: Config, scene: Scene, device: torch.device) -> Plan:
+def plan_scene(config: Config, scene: Scene, device: torch.device) -> Plan:
+    """The plan of a loaded scene, within the budgets of the configuration."""
     limit, seconds = config.budget.memory_bytes(), config.budget.seconds()
     return make_plan(config, scene, device, memory_limit=limit, time_budget=seconds)
 
 
-def train(config: Config, out: Path) -> Outcome:
+def new_loop(config: Config, scene: Scene, device: torch.device) -> tuple[TrainingLoop, Calibration | None]:
+    """A training within its budgets, which has not begun: of a run as of a cell of a study.
+
+    Args:
+        config: its plan is carried out. That of the trainer is the one fitted to the budgets.
+
+    Returns:
+        The loop, without listeners; and what was measured for a time budget, which is in the loop's seconds.
+
+    Raises:
+        InputError: a budget is too small, naming what would do.
+    """
+    config, calibration = within_budget(config, scene, device)
+    trainer = Trainer(config, scene, device)
+    pace = pace_of(config, calibration and calibration.cost)
+    return TrainingLoop(trainer, pace, seconds=calibration.seconds if calibration else 0.0), calibration
+
+
+def train(config: Config, out: Path, report: ReportWriter | None = None) -> Outcome:
     """Train from the start into a new folder, by a plan that is told first.
+
+    Args:
+        report: is handed the run when it is finished; `turbogs_plugin.report.pages.write_report` writes its page.
 
     Raises:
         InputError: anything wrong with the input; then nothing was written.
@@ -113,26 +155,27 @@ def train(config: Config, out: Path) -> Outcome:
     device = resolve_device(config.train.device)
     scene = open_scene(config)
     load_lpips(config.report.lpips_weights, device)
-    plan = _plan(config, scene, device)
+    plan = plan_scene(config, scene, device)
     remedy = "use train.photos_place=host and train.maps_place=host, --max-gaussians or a larger --factor"
     with _fitting(scene, remedy):
-        config, calibration = within_budget(plan.apply(config), scene, device)
-        trainer = Trainer(config, scene, device)
-        _make_independent(config, device)
-        pace = pace_of(config, calibration and calibration.cost)
-        session = _Session(folder, config, plan, scene, trainer, pace)
-    session.clock.seconds = calibration.seconds if calibration else 0.0
-    print("\n".join(filter(None, [plan.text(), budget_text(config, calibration)])), file=sys.stderr)
+        loop, calibration = new_loop(_independent(plan.apply(config), device), scene, device)
+        session = _Session(folder, plan, scene, loop)
+    resolved = loop.trainer.config
+    print("\n".join(filter(None, [plan.text(), budget_text(resolved, calibration)])), file=sys.stderr)
     folder.path.mkdir(parents=True, exist_ok=True)
     write_text_atomically(folder.plan, plan.to_json())
-    write_text_atomically(folder.config, config.to_yaml())
-    return session.run()
+    write_text_atomically(folder.asked, config.to_yaml())
+    write_text_atomically(folder.config, resolved.to_yaml())
+    return session.run(report)
 
 
-def resume(path: Path) -> Outcome:
+def resume(path: Path, report: ReportWriter | None = None) -> Outcome:
     """Go on with a stopped run from its newest checkpoint, by its own configuration, in which all is decided.
 
     On a CPU, the result is bit for bit that of a run never stopped.
+
+    Args:
+        report: as in `train`.
 
     Raises:
         InputError: no run there, an unusable checkpoint, a capture that is no longer what it was, or a machine that
@@ -150,11 +193,12 @@ def resume(path: Path) -> Outcome:
     if limit is not None:
         hold_to(limit, device)
     with _fitting(scene, "end what else is in that memory, or go on with this run where there is more"):
-        session = _Session(folder, config, plan, scene, Trainer(config, scene, device), pace_of(config))
+        loop = TrainingLoop(Trainer(config, scene, device), pace_of(config))
+        session = _Session(folder, plan, scene, loop)
         if state is not None:
             session.load_state_dict(state, str(checkpoint))
-    session.history = rewind_history(folder.history, session.trainer.iteration if state is not None else -1)
-    return session.run()
+    session.evaluations.history = rewind_history(folder.history, loop.trainer.iteration if session.resumed else -1)
+    return session.run(report)
 
 
 @contextmanager
@@ -166,12 +210,13 @@ def _fitting(scene: Scene, remedy: str) -> Iterator[None]:
         raise InputError(f"'{scene.name}' does not fit into the device's memory: {remedy}") from None
 
 
-def _make_independent(config: Config, device: torch.device) -> None:
-    """Write into a run's configuration what else would depend on where it is resumed from."""
+def _independent(config: Config, device: torch.device) -> Config:
+    """The configuration, with what else would depend on where the run is resumed from written into it."""
     config.scene.path = str(Path(config.scene.path).resolve())
     if config.report.lpips_weights is not None:
         config.report.lpips_weights = str(Path(config.report.lpips_weights).resolve())
     config.train.device = device.type
+    return config
 
 
 def load_model(path: Path, device: torch.device) -> SavedModel:
@@ -195,82 +240,31 @@ def load_model(path: Path, device: torch.device) -> SavedModel:
         raise InputError(f"checkpoint '{checkpoint}' is not one of a run: {error}") from None
 
 
-class _Interrupts:
-    """Turns SIGINT and SIGTERM into a wish to stop after this iteration; a second one stops at once.
+class _Session(Listener):
+    """One process's share of a run: keeps in the folder what the loop comes to."""
 
-    Only in the main thread: in others, Python lets nobody handle signals, and they are left as they are.
-    """
+    def __init__(self, folder: RunFolder, plan: Plan | None, scene: Scene, loop: TrainingLoop) -> None:
+        self.folder, self.plan, self.scene, self.loop = folder, plan, scene, loop
+        self.trainer = loop.trainer
+        test = place_views(scene.test, self.trainer.device, self.trainer.config.train.photos_place)
+        self.evaluations = Evaluations(test)
+        self.resumed = False
+        self.saved_at = -1
 
-    SIGNALS = (signal.SIGINT, signal.SIGTERM)
-
-    def __init__(self) -> None:
-        self.signal: int | None = None
-
-    def __enter__(self) -> _Interrupts:
-        handled = self.SIGNALS if threading.current_thread() is threading.main_thread() else ()
-        self._previous = {number: signal.signal(number, self._handle) for number in handled}
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        for number, handler in self._previous.items():
-            signal.signal(number, handler)
-
-    def _handle(self, number: int, frame: FrameType | None) -> None:
-        if self.signal is not None:
-            raise KeyboardInterrupt
-        self.signal = number
-
-
-@dataclass
-class _Session:
-    """One process's share of a run."""
-
-    folder: RunFolder
-    config: Config
-    plan: Plan | None
-    scene: Scene
-    trainer: Trainer
-    pace: Pace
-    history: list[Evaluation] = field(default_factory=list)
-    resumed: bool = False
-    saved_at: int = -1
-
-    def __post_init__(self) -> None:
-        self.device = self.trainer.gaussians.device
-        self.test: PosedImages = place_views(self.scene.test, self.device, self.config.train.photos_place)
-        self.clock = TrainingClock(self.device)
-
-    def run(self) -> Outcome:
+    def run(self, report: ReportWriter | None) -> Outcome:
         """Train to the end, or until a signal; both end with a checkpoint."""
-        trainer, pace = self.trainer, self.pace
+        loop, trainer = self.loop, self.trainer
         try:
-            with _Interrupts() as interrupts, TrainingProgress(pace.iterations, trainer.iteration) as progress:
-                if not self.resumed:
-                    with self.clock:
-                        trainer.initialise_maps()
-                if not self.history:
-                    self._evaluate(progress)
-                pace.start(trainer.iteration, self.clock.seconds, len(trainer.gaussians))
-                while trainer.iteration < pace.iterations and interrupts.signal is None:
-                    mark = pace.next_mark(trainer.iteration, self.clock.seconds)
-                    with self.clock:
-                        while trainer.iteration < mark and interrupts.signal is None:
-                            trainer.step_towards(mark)
-                            progress.advance(trainer.iteration, len(trainer.gaussians))
-                    due = pace.reached(trainer.iteration, self.clock.seconds, len(trainer.gaussians))
-                    progress.total = pace.iterations
-                    if due.evaluate:
-                        self._evaluate(progress)
-                    if due.save:
-                        self._save()
-                trainer.repeat_lost(wait=True)  # a stop between marks must not count iterations that did nothing
-                if interrupts.signal is not None and trainer.iteration != self.saved_at:
+            with (
+                Interrupts(loop.stop) as interrupts,
+                TrainingProgress(trainer.iterations, trainer.iteration) as progress,
+            ):
+                loop.listeners = [self.evaluations, self, progress]
+                loop.run(self.resumed)
+                if loop.stopped and trainer.iteration != self.saved_at:
                     self._save()
-            finished = trainer.iteration == pace.iterations
-            if finished:
-                self._finish()
+            if loop.finished:
+                self._finish(report)
         except TrainingStopped as stop:
             raise TrainingStopped(f"{stop}; {self._last_good()}") from stop
         except torch.cuda.OutOfMemoryError as error:
@@ -278,72 +272,55 @@ class _Session:
                 f"iteration {trainer.iteration}: the device's memory was too small for {len(trainer.gaussians)} "
                 f"Gaussians; try --max-gaussians {round(0.7 * len(trainer.gaussians))}; {self._last_good()}"
             ) from error
-        return Outcome(self.folder, self.history, None if finished else interrupts.signal)
+        return Outcome(self.folder, self.evaluations.history, None if loop.finished else interrupts.signal)
+
+    def evaluated(self, loop: TrainingLoop, evaluation: Evaluation) -> None:
+        append_evaluation(self.folder.history, evaluation)
+
+    def checkpoint_due(self, loop: TrainingLoop) -> None:
+        self._save()
 
     def state_dict(self) -> dict[str, Any]:
         return {
             "trainer": self.trainer.state_dict(),
-            "train_seconds": self.clock.seconds,
-            "pace": self.pace.state_dict(),
+            "train_seconds": self.loop.clock.seconds,
+            "pace": self.loop.pace.state_dict(),
             **capture_state(self.scene),
         }
 
     def load_state_dict(self, state: dict[str, Any], source: str) -> None:
-        present = self.state_dict()
+        present, loop = self.state_dict(), self.loop
         try:
             require_like(state, present, "state")
             difference = capture_difference(state, present)
             if not difference:
-                self.pace.load_state_dict(state["pace"])
+                loop.pace.load_state_dict(state["pace"])
+                self.trainer.set_length(loop.pace.iterations, loop.pace.refine_until)
                 self.trainer.load_state_dict(state["trainer"])
-                self.clock.seconds = state["train_seconds"]
+                loop.clock.seconds = state["train_seconds"]
                 self.resumed = True
         except torch.cuda.OutOfMemoryError:  # a RuntimeError, which says nothing of the checkpoint
             raise
         except (KeyError, TypeError, AttributeError, IndexError, ArithmeticError, RuntimeError, ValueError) as error:
             raise InputError(f"checkpoint '{source}' does not fit this run and its capture: {error}") from None
         if difference:
+            path = self.trainer.config.scene.path
             raise InputError(
-                f"capture '{self.config.scene.path}' has {difference} than when the run in '{self.folder.path}' began: "
+                f"capture '{path}' has {difference} than when the run in '{self.folder.path}' began: "
                 "bring that state of it back, or train anew with another --out"
             )
-
-    def _evaluate(self, progress: TrainingProgress) -> None:
-        trainer = self.trainer
-        trainer.require_finite()
-        metrics = evaluate(trainer.gaussians, self.test, trainer.sh_degree, self.config.raster)
-        memory = peak_memory_bytes(self.device)
-        evaluation = Evaluation.of(trainer, metrics, self.clock.seconds, memory)
-        self.history.append(evaluation)
-        append_evaluation(self.folder.history, evaluation)
-        progress.evaluated(evaluation)
 
     def _save(self) -> None:
         self.trainer.require_finite()
         save_checkpoint(self.folder.checkpoints, self.trainer.iteration, self.state_dict())
         self.saved_at = self.trainer.iteration
 
-    def _finish(self) -> None:
-        """The model as a .ply and the report."""
-        trainer = self.trainer
-        save_ply(trainer.gaussians, self.folder.model, self.scene.frame)
-        lpips, lpips_reason = load_lpips(self.config.report.lpips_weights, self.device)
-        final: Metrics = evaluate(trainer.gaussians, self.test, trainer.sh_degree, self.config.raster, lpips)
-        write_report(
-            RunRecord(
-                folder=self.folder.path,
-                scene=self.scene.name,
-                config=self.config,
-                plan=self.plan,
-                history=self.history,
-                metrics=final,
-                lpips_reason=lpips_reason,
-                num_train_views=len(self.scene.train),
-            ),
-            trainer.gaussians,
-            self.test,
-            trainer.sh_degree,
-        )
+    def _finish(self, report: ReportWriter | None) -> None:
+        """The model as a .ply, and the report."""
+        save_ply(self.trainer.gaussians, self.folder.model, self.scene.frame)
+        if report is not None:
+            evaluations = self.evaluations
+            report(FinishedRun(self.folder, self.plan, self.scene, self.trainer, evaluations.test, evaluations.history))
 
     def _last_good(self) -> str:
         checkpoint = latest_checkpoint(self.folder.checkpoints)

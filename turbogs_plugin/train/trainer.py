@@ -1,6 +1,6 @@
 """Algorithm 1 of the paper: what one iteration of training is, and the state that iterations change.
 
-Everything around it (the clock, evaluation, checkpoints, interrupts, the report) is in `turbogs_plugin.train.run`.
+What makes iteration after iteration is in `turbogs_plugin.train.loop`.
 """
 
 from __future__ import annotations
@@ -58,6 +58,7 @@ class Trainer:
         self.optimizer.setup(self.gaussians)
         self.density.setup(self.gaussians)
         self.engine = engine_of(device, for_training=True)
+        self.set_length(config.train.iterations, config.train.refine_until)
         self.iteration = 0
         self.first_repeatable = 0
         self.initial_error = 0.0
@@ -152,11 +153,9 @@ class Trainer:
         self.optimizer.apply(update)
         self.first_repeatable = self.iteration + 1
 
-    def step_towards(self, mark: int) -> None:
-        """One iteration. The one that reaches `mark` waits for the GPU, so that none is missing there."""
-        self.step()
-        if self.iteration == mark:
-            self.repeat_lost(wait=True)
+    def set_length(self, iterations: int, refine_until: int) -> None:
+        """T and the last iteration of density control: as configured, until a run that goes by time says otherwise."""
+        self.iterations, self.refine_until = iterations, refine_until
 
     def repeat_lost(self, wait: bool = False) -> None:
         """Go back by the iterations that did nothing because the engine had too little room for them.
@@ -176,8 +175,12 @@ class Trainer:
     @property
     def now(self) -> Step:
         """Where training stands."""
-        train = self.config.train
-        return Step(self.iteration, train.iterations, train.refine_until, train.seed, self.extent)
+        return Step(self.iteration, self.iterations, self.refine_until, self.config.train.seed, self.extent)
+
+    @property
+    def device(self) -> torch.device:
+        """Where everything is computed and kept."""
+        return self.gaussians.device
 
     @property
     def sh_degree(self) -> int:
@@ -213,18 +216,18 @@ class Trainer:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Take over what `state_dict` gave, in a trainer of the same configuration and scene.
 
-        A state that nobody vouches for is first compared with the present one (`checkpoint.require_like`).
+        A state that nobody vouches for is first compared with the present one (`checkpoint.require_like`). Of a run
+        that goes by time, `set_length` comes first.
 
         Raises:
             ValueError: the parts of the state do not fit each other or this trainer.
         """
-        device = self.gaussians.device
-        if not 0 <= state["iteration"] <= self.config.train.iterations or state["nonfinite_losses"] < 0:
+        if not 0 <= state["iteration"] <= self.iterations or state["nonfinite_losses"] < 0:
             raise ValueError(f"iteration {state['iteration']} with {state['nonfinite_losses']} non-finite losses")
         self.iteration = state["iteration"]
         self.initial_error = state["initial_error"]
         self.nonfinite_losses.fill_(state["nonfinite_losses"])
-        self.gaussians = gaussians_of_state(state, device)
+        self.gaussians = gaussians_of_state(state, self.device)
         self.maps.load_state_dict(state["maps"])
         self.view_sampler.load_state_dict(state["view_sampler"])
         self.optimizer.setup(self.gaussians)

@@ -1,0 +1,153 @@
+"""The one loop: what it tells whom and when, iterations lost at a mark or a stop, and what its imports load."""
+
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+import turbogs_plugin.train
+from turbogs_plugin.config.configuration import TrainConfig
+from turbogs_plugin.train.loop import Listener, TrainingLoop
+from turbogs_plugin.train.pace import IterationPace
+
+
+class CountingTrainer:
+    """Iterations that do nothing. `lost`: numbers of those that are found lost as soon as the GPU is waited for."""
+
+    device = torch.device("cpu")
+
+    def __init__(self, iterations: int, lost: tuple[int, ...] = (), **settings) -> None:
+        train = TrainConfig(iterations=iterations, refine_until=iterations, **settings)
+        self.config = SimpleNamespace(train=train)
+        self.iteration = 0
+        self.steps: list[int] = []
+        self.gaussians = range(10)
+        self.initialised = False
+        self._lost = set(lost)
+        self._unnoticed = 0
+
+    def initialise_maps(self) -> None:
+        self.initialised = True
+
+    def step(self) -> None:
+        self.iteration += 1
+        self.steps.append(self.iteration)
+        if self._unnoticed or self.iteration in self._lost:
+            self._lost.discard(self.iteration)
+            self._unnoticed += 1
+
+    def repeat_lost(self, wait: bool = False) -> None:
+        assert wait
+        self.iteration -= self._unnoticed
+        self._unnoticed = 0
+
+    def set_length(self, iterations: int, refine_until: int) -> None:
+        self.length = (iterations, refine_until)
+
+
+class Diary(Listener):
+    def __init__(self) -> None:
+        self.lines: list[tuple[str, int]] = []
+
+    def begun(self, loop: TrainingLoop) -> None:
+        assert loop.trainer.initialised
+        self.lines.append(("begun", loop.trainer.iteration))
+
+    def evaluation_due(self, loop: TrainingLoop) -> None:
+        self.lines.append(("evaluation", loop.trainer.iteration))
+
+    def checkpoint_due(self, loop: TrainingLoop) -> None:
+        self.lines.append(("checkpoint", loop.trainer.iteration))
+
+
+class StopAt(Listener):
+    def __init__(self, iteration: int) -> None:
+        self.iteration = iteration
+
+    def advanced(self, loop: TrainingLoop) -> None:
+        if loop.trainer.iteration == self.iteration:
+            loop.stop()
+
+
+def test_an_evaluation_comes_before_the_checkpoint_of_the_same_place():
+    trainer, diary = CountingTrainer(6, evaluate_at=(0.5,), checkpoint_every=3), Diary()
+    loop = TrainingLoop(trainer, listeners=[diary])
+    loop.run()
+    assert diary.lines == [("begun", 0), *(("evaluation", 3), ("checkpoint", 3)), ("evaluation", 6), ("checkpoint", 6)]
+    assert loop.finished and not loop.stopped and trainer.steps == [1, 2, 3, 4, 5, 6]
+    assert trainer.length == (6, 6)
+
+
+@pytest.mark.parametrize("lost", [(3,), (2,), (1,), (6,)])
+def test_no_iteration_is_missing_at_a_mark(lost):
+    """All from the lost one up to the mark are repeated before anything is said to be due there."""
+    trainer, diary = CountingTrainer(6, lost, evaluate_at=(0.5,), checkpoint_every=0), Diary()
+    TrainingLoop(trainer, listeners=[diary]).run()
+    mark = 3 if lost[0] <= 3 else 6
+    repeated = list(range(lost[0], mark + 1))
+    assert trainer.steps == [*range(1, mark + 1), *repeated, *range(mark + 1, 7)]
+    assert diary.lines == [("begun", 0), ("evaluation", 3), ("evaluation", 6), ("checkpoint", 6)]
+
+
+def test_no_iteration_is_missing_at_a_stop():
+    """Back at a place that was evaluated and saved before, it is not evaluated and saved again."""
+    trainer, diary = CountingTrainer(9, lost=(4,), evaluate_at=(1 / 3,), checkpoint_every=3), Diary()
+    loop = TrainingLoop(trainer, listeners=[diary, StopAt(5)])
+    loop.run()
+    assert loop.stopped and not loop.finished and trainer.iteration == 3
+    assert diary.lines == [("begun", 0), ("evaluation", 3), ("checkpoint", 3)]
+
+
+def test_a_stop_before_the_first_iteration_makes_none():
+    trainer = CountingTrainer(6)
+    loop = TrainingLoop(trainer)
+    loop.stop()
+    loop.run()
+    assert trainer.initialised and trainer.steps == [] and not loop.finished
+
+
+def test_a_resumed_training_keeps_its_maps():
+    trainer = CountingTrainer(6)
+    trainer.iteration = 4
+    TrainingLoop(trainer).run(resumed=True)
+    assert not trainer.initialised and trainer.steps == [5, 6]
+
+
+def test_only_training_is_on_the_clock(monkeypatch):
+    """An hour of evaluations takes no time; an iteration takes a second, and so do the maps."""
+    now = [0.0]
+    monkeypatch.setattr("turbogs_plugin.train.clock.time", SimpleNamespace(perf_counter=lambda: now[0]))
+
+    def pass_time(seconds: float) -> None:
+        now[0] += seconds
+
+    class Slow(Listener):
+        def begun(self, loop: TrainingLoop) -> None:
+            pass_time(3600.0)
+
+        evaluation_due = checkpoint_due = begun
+
+    trainer = CountingTrainer(6, evaluate_at=(0.5,))
+    step, initialise = trainer.step, trainer.initialise_maps
+    trainer.step = lambda: (step(), pass_time(1.0))
+    trainer.initialise_maps = lambda: (initialise(), pass_time(1.0))
+    loop = TrainingLoop(trainer, IterationPace(trainer.config.train), [Slow()], seconds=2.0)
+    loop.run()
+    assert loop.clock.seconds == 2.0 + 1.0 + 6.0
+
+
+def test_the_trainer_and_the_loop_load_no_metrics_and_no_plots():
+    code = (
+        "import sys, turbogs_plugin.train.trainer, turbogs_plugin.train.loop\n"
+        "print([name for name in ('torchmetrics', 'matplotlib', 'rich') if name in sys.modules])"
+    )
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout == "[]\n"
+
+
+@pytest.mark.parametrize("room", ["report", "study", "bench", "gsplat_bridge", "cli"])
+def test_training_imports_nothing_that_is_above_it(room):
+    files = sorted(Path(turbogs_plugin.train.__file__).parent.glob("*.py"))
+    assert files and not [file.name for file in files if f" turbogs_plugin.{room}" in file.read_text()]

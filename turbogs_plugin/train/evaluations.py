@@ -1,0 +1,69 @@
+"""Where evaluations of a training are made: at its beginning, and wherever its pace wants one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from torch import Tensor
+
+from turbogs_plugin.scene import PosedImages
+from turbogs_plugin.train.evaluate import Metrics, evaluate, peak_memory_bytes
+from turbogs_plugin.train.history import Evaluation
+from turbogs_plugin.train.loop import Listener, TrainingLoop
+
+
+class Evaluations(Listener):
+    """Measures the model and tells all listeners of it.
+
+    Args:
+        test: the test views, on the trainer's device.
+        lpips: from `load_lpips`, for the evaluation at the end; None: without.
+        peak_memory: bytes to record; None: the peak of the process so far.
+
+    Attributes:
+        history: every evaluation.
+        metrics: of the newest one.
+    """
+
+    def __init__(
+        self,
+        test: PosedImages,
+        lpips: Callable[[Tensor, Tensor], float] | None = None,
+        peak_memory: Callable[[], int] | None = None,
+    ) -> None:
+        self.test = test
+        self.history: list[Evaluation] = []
+        self.metrics: Metrics | None = None
+        self._lpips = lpips
+        self._peak_memory = peak_memory
+
+    def begun(self, loop: TrainingLoop) -> None:
+        if not self.history:
+            self._evaluate(loop)
+
+    def evaluation_due(self, loop: TrainingLoop) -> None:
+        self._evaluate(loop)
+
+    def _evaluate(self, loop: TrainingLoop) -> None:
+        for listener in loop.listeners:
+            listener.evaluating(loop)
+        trainer = loop.trainer
+        trainer.require_finite()
+        lpips = self._lpips if loop.finished else None
+        metrics = evaluate(trainer.gaussians, self.test, trainer.sh_degree, trainer.config.raster, lpips)
+        evaluation = Evaluation(
+            iteration=trainer.iteration,
+            train_seconds=loop.clock.seconds,
+            psnr=metrics.psnr,
+            ssim=metrics.ssim,
+            l1=metrics.l1,
+            num_gaussians=len(trainer.gaussians),
+            memory_bytes=self._peak_memory() if self._peak_memory else peak_memory_bytes(trainer.device),
+            nonfinite_losses=int(trainer.nonfinite_losses),
+            skipped_updates=int(trainer.optimizer.skipped),
+            worst_psnr=metrics.worst_psnr,
+        )
+        self.history.append(evaluation)
+        self.metrics = metrics
+        for listener in loop.listeners:
+            listener.evaluated(loop, evaluation)

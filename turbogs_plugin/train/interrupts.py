@@ -1,0 +1,41 @@
+"""SIGINT and SIGTERM while training: the run is stopped and saved."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Callable
+from types import FrameType, TracebackType
+
+
+class Interrupts:
+    """Turns SIGINT and SIGTERM into a wish to stop after this iteration; a second one stops at once.
+
+    Only in the main thread: in others, Python lets nobody handle signals, and they are left as they are.
+
+    Args:
+        stop: is called at the first signal.
+    """
+
+    SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+    def __init__(self, stop: Callable[[], None]) -> None:
+        self.signal: int | None = None
+        self._stop = stop
+
+    def __enter__(self) -> Interrupts:
+        handled = self.SIGNALS if threading.current_thread() is threading.main_thread() else ()
+        self._previous = {number: signal.signal(number, self._handle) for number in handled}
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        for number, handler in self._previous.items():
+            signal.signal(number, handler)
+
+    def _handle(self, number: int, frame: FrameType | None) -> None:
+        if self.signal is not None:
+            raise KeyboardInterrupt
+        self.signal = number
+        self._stop()

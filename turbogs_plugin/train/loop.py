@@ -1,0 +1,114 @@
+"""The one loop of all training: of runs, of the cells of a study, of calibration, and of models that are timed.
+
+The loop takes a trainer from mark to mark of a pace, on a clock. All else that happens in a training listens to it:
+evaluations, checkpoints, progress, records, stops.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from turbogs_plugin.train.clock import TrainingClock
+from turbogs_plugin.train.history import Evaluation
+from turbogs_plugin.train.pace import IterationPace, Pace
+from turbogs_plugin.train.trainer import Trainer
+
+
+class Listener:
+    """Hears of a training what concerns it: a listener overrides the methods that it needs."""
+
+    def begun(self, loop: TrainingLoop) -> None:
+        """The error maps are there, and this process has made no iteration yet."""
+
+    def advanced(self, loop: TrainingLoop) -> None:
+        """An iteration was made. The clock runs, so this has to be cheap."""
+
+    def evaluation_due(self, loop: TrainingLoop) -> None:
+        """The pace wants an evaluation here."""
+
+    def evaluating(self, loop: TrainingLoop) -> None:
+        """An evaluation begins."""
+
+    def evaluated(self, loop: TrainingLoop, evaluation: Evaluation) -> None:
+        """An evaluation was made."""
+
+    def checkpoint_due(self, loop: TrainingLoop) -> None:
+        """The pace wants a checkpoint here; an evaluation that was due at the same place has been made."""
+
+
+class TrainingLoop:
+    """Trains by a pace, on a clock.
+
+    Args:
+        trainer: new, or with a state loaded.
+        pace: where to stop on the way, and where it ends; None: after the configured iterations.
+        listeners: are told in this order.
+        seconds: of training that passed before.
+    """
+
+    def __init__(
+        self, trainer: Trainer, pace: Pace | None = None, listeners: Iterable[Listener] = (), seconds: float = 0.0
+    ) -> None:
+        self.trainer = trainer
+        self.pace = pace or IterationPace(trainer.config.train)
+        self.listeners = list(listeners)
+        self.clock = TrainingClock(trainer.device, seconds)
+        self.stopped = False
+
+    def run(self, resumed: bool = False) -> None:
+        """Train to the end, or until `stop`.
+
+        Args:
+            resumed: the trainer's state was loaded: its error maps are there.
+
+        Raises:
+            TrainingStopped: the model is lost.
+        """
+        trainer, pace, clock = self.trainer, self.pace, self.clock
+        if not resumed:
+            with clock:
+                trainer.initialise_maps()
+        for listener in self.listeners:
+            listener.begun(self)
+        pace.start(trainer.iteration, clock.seconds, len(trainer.gaussians))
+        while not (self.finished or self.stopped):
+            mark = pace.next_mark(trainer.iteration, clock.seconds)
+            self.advance(mark)
+            if trainer.iteration == mark:
+                self._arrive()
+
+    def advance(self, mark: int) -> None:
+        """Train until so many iterations are finished, or until `stop`."""
+        with self.clock:
+            while self._is_short_of(mark):
+                self.trainer.step()
+                for listener in self.listeners:
+                    listener.advanced(self)
+
+    def stop(self) -> None:
+        """Stop after the present iteration."""
+        self.stopped = True
+
+    @property
+    def finished(self) -> bool:
+        """Whether the end is reached."""
+        return self.trainer.iteration >= self.pace.iterations
+
+    def _is_short_of(self, mark: int) -> bool:
+        """Whether to go on towards a mark. Where not, the GPU is waited for and lost iterations are taken back, so that
+        none is missing at a mark or a stop."""
+        if self.trainer.iteration >= mark or self.stopped:
+            self.trainer.repeat_lost(wait=True)
+        return self.trainer.iteration < mark and not self.stopped
+
+    def _arrive(self) -> None:
+        """At a mark: the pace says how long the run is now, and what is due."""
+        trainer, pace = self.trainer, self.pace
+        due = pace.reached(trainer.iteration, self.clock.seconds, len(trainer.gaussians))
+        trainer.set_length(pace.iterations, pace.refine_until)
+        if due.evaluate:
+            for listener in self.listeners:
+                listener.evaluation_due(self)
+        if due.save:
+            for listener in self.listeners:
+                listener.checkpoint_due(self)
