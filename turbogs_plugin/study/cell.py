@@ -62,7 +62,7 @@ def train_cell(
 
     Args:
         variant: its name.
-        config: resolved. Its plan is made here, by the scene; the result keeps the configuration that was asked for.
+        config: as asked for. Its plan is made here, by the scene; the result keeps this one and the resolved one.
         scene: in host memory; the plan says what of it goes to the device.
         device: where to train.
         made_by: machine and sources, as they were when the process began.
@@ -104,13 +104,15 @@ def train_cell(
                     trainer.repeat_lost(wait=True)
                 progress(trainer.iteration, total)
         metrics = measure(final=trainer.iteration == total or not in_time)
+    resolved = config.to_mapping()
     return CellResult(
         scene=scene.name,
         variant=variant,
         seed=config.train.seed,
-        config=asked.to_mapping(),
+        config=resolved,
         time_budget=time_budget,
         history=history,
+        asked={name: section for name, section in asked.to_mapping().items() if section != resolved[name]},
         lpips=math.nan if lpips is None else metrics.lpips,
         lpips_reason=lpips_reason,
         fps=metrics.fps,

@@ -20,9 +20,10 @@ from turbogs_plugin.errors import InputError, TrainingStopped
 from turbogs_plugin.report.provenance import COMMIT_VARIABLE, MODIFIED, Provenance
 from turbogs_plugin.scene import Scene, load_scene
 from turbogs_plugin.study.cell import capture_digest, train_cell
+from turbogs_plugin.study.folder import StudyFolder
 from turbogs_plugin.study.grid import Ablation, CellKey, variant_config
 from turbogs_plugin.study.progress import SweepProgress
-from turbogs_plugin.study.results import CellResult, Failure, StudyFolder
+from turbogs_plugin.study.results import CellResult, Failure
 from turbogs_plugin.train.evaluate import synchronize
 from turbogs_plugin.train.run import resolve_device
 
@@ -177,10 +178,10 @@ def _require_capture(results: Iterable[CellResult], scene: str, capture: str) ->
 
 
 def _require_same(present: CellResult, config: Config, time_budget: float) -> None:
-    old = old_spelling(present.config)
+    old = old_spelling(present.asked_config)
     if old:
         raise InputError(f"the cell '{present.key}' is of an earlier version ({old}): choose a new --out")
-    made, wanted = (_sections(mapping) for mapping in (present.config, config.to_mapping()))
+    made, wanted = (_sections(mapping) for mapping in (present.asked_config, config.to_mapping()))
     if made != wanted or present.time_budget != time_budget:
         sections = [name for name in wanted if made.get(name) != wanted[name]] or ["the time budget"]
         raise InputError(
@@ -197,7 +198,7 @@ def _reusable_cells(
     folders = [*map(StudyFolder, options.reuse), *siblings]
     results = [result for folder in folders for result in folder.read_study().results]
     return {
-        (result.scene, result.capture, _comparable(result.config)): result
+        (result.scene, result.capture, _comparable(result.asked_config)): result
         for result in results
         if result.capture and (result.time_budget, result.provenance) == (options.time_budget, here)
     }
