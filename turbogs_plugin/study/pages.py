@@ -189,7 +189,7 @@ def _settings(study: Study) -> list[Block]:
         for name, overrides in ablation.variants.items()
         if name in tried
     ]
-    kept = "as resolved and as asked for" if all(result.resolved for result in study.results) else "as asked for"
+    kept = "as resolved" if all(result.resolved for result in study.results) else "as asked for"
     return [
         Heading("Variants"),
         Paragraph(
