@@ -208,7 +208,7 @@ def test_a_study_of_an_earlier_version_is_refused_by_a_line_that_says_so(
     out = tmp_path / "study"
     assert turbogs(*call(small, capture, out, "--only", "full"))[0] == 0
     cell = out / "cells/capture/full--seed0.json"
-    cell.write_text(cell.read_text().replace('"budget": {', '"budget": {"max_gaussians": 0, '))
+    cell.write_text(cell.read_text().replace('"budget.time":', '"budget.max_gaussians": 0, "budget.time":'))
     monkeypatch.setattr(Trainer, "step", lambda trainer: pytest.fail("trained"))
     code, _, err = turbogs(*call(small, capture, out))
     assert code == 2 and err.count("\n") == 1 and "of an earlier version (budget.max_gaussians is now density." in err
