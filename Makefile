@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 
-.PHONY: demo ablation test lint kernels install clean
+.PHONY: demo ablation pages test lint kernels install clean
 
 # One thread: the demo's tensors are small, and a second thread gains nothing but waits where the machine is shared.
 demo: export OMP_NUM_THREADS := 1
@@ -22,6 +22,10 @@ ablation: demo/capture
 
 demo/capture: | $(INSTALLED)
 	$(BIN)/turbogs demo $@
+
+# The page and the plots of every study in docs/, from its results.json; a second run changes nothing.
+pages: $(INSTALLED)
+	$(BIN)/turbogs report $(patsubst %/,%,$(dir $(wildcard docs/results/*/results.json)))
 
 test: $(INSTALLED)
 	$(BIN)/python -m pytest

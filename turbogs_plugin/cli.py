@@ -191,7 +191,7 @@ def ablate(
         only: these variants and the baseline.
         psnr: test PSNRs whose time is asked for; from the baseline's result where absent.
         reuse: take cells of the same settings from these studies where machine and sources are the same.
-        merge: put these studies together in --out and write the report again, without training.
+        merge: put these studies together in --out and write the report, without training.
         device: where to train.
     """
     from turbogs_plugin.study import commands
@@ -234,6 +234,27 @@ def compare(
         raise InputError("compare needs RUN RUN ...: folders of runs")
     _require_positive("--psnr", psnr)
     return commands.compare(runs, out, psnr)
+
+
+@app.command
+def report(
+    studies: Annotated[Positional[tuple[Path, ...]], arg(metavar="STUDY ...")],
+    /,
+    *,
+    psnr: Annotated[tuple[float, ...], arg(metavar="DB ...")] = (),
+) -> int:
+    """Write the report of studies again, from their results.json. A plot whose data did not change is left as it is.
+
+    Args:
+        studies: folders of studies.
+        psnr: test PSNRs whose time is asked for; those of the last report where absent.
+    """
+    from turbogs_plugin.study import commands
+
+    if not studies:
+        raise InputError("report needs STUDY ...: folders of studies")
+    _require_positive("--psnr", psnr)
+    return commands.report(studies, psnr)
 
 
 @app.command

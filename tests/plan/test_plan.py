@@ -19,6 +19,7 @@ from turbogs_plugin.plan.decisions import RULES
 from turbogs_plugin.plan.plan import plan_from_facts
 from turbogs_plugin.report.pages import write_report
 from turbogs_plugin.scene import load_scene
+from turbogs_plugin.study.folder import StudyFolder
 from turbogs_plugin.train import run
 from turbogs_plugin.train.trainer import Trainer
 
@@ -317,12 +318,13 @@ def test_the_ablation_of_leave_outs_plans_each_cell(turbogs, capture, tmp_path):
     options = ["--steps", 4, "--device", "cpu", "--scene", capture, "--out", tmp_path / "study"]
     code, _, err = turbogs("ablate", "leave_out", "train.evaluate_at=[]", *options, "--only", *variants)
     assert code == 0, err
-    cells = {path.stem.partition("--")[0]: json.loads(path.read_text()) for path in tmp_path.rglob("*--seed0.json")}
-    psnr = {name: cell["history"][-1]["psnr"] for name, cell in cells.items()}
-    assert set(psnr) == {"nothing", *variants}
-    assert psnr["host-maps"] == psnr["host-photos"] == psnr["nothing"]
-    assert len({psnr[name] for name in ("nothing", "plan", "all-views", "no-ncc")}) == 4
-    assert cells["plan"]["asked"]["optimizer"]["type"] == "auto", "so that a call can go on"
-    assert (
-        cells["plan"]["config"]["optimizer"]["type"] == "sparse_adam" and "optimizer" not in cells["nothing"]["asked"]
+    cells = {cell.variant: cell for cell in StudyFolder(tmp_path / "study").read_study().results}
+    measures = ("psnr", "worst_psnr", "ssim", "l1", "num_gaussians")
+    final = {name: [getattr(cell.final, measure) for measure in measures] for name, cell in cells.items()}
+    assert set(final) == {"nothing", *variants}
+    assert final["host-maps"] == final["host-photos"] == final["nothing"]
+    assert len({final[name][0] for name in ("nothing", "plan", "all-views", "no-ncc")}) == 4
+    assert cells["plan"].config["optimizer"]["type"] == "sparse_adam" and "optimizer" not in cells["nothing"].asked
+    assert cells["plan"].asked_config["optimizer"]["type"] == "auto", (
+        "what was asked for is kept, so that a call can go on"
     )

@@ -23,8 +23,10 @@ from turbogs_plugin.report.provenance import provenance
 from turbogs_plugin.scene import load_scene, write_demo_capture
 from turbogs_plugin.study.cell import capture_digest, train_cell
 from turbogs_plugin.study.compare import study_of_runs
+from turbogs_plugin.study.folder import StudyFolder
 from turbogs_plugin.study.grid import load_ablation, variant_config
-from turbogs_plugin.study.results import CellResult, StudyFolder
+from turbogs_plugin.study.results import CellResult
+from turbogs_plugin.study.results_file import DECIMALS
 from turbogs_plugin.train import calibration, clock
 from turbogs_plugin.train.folder import RunFolder
 from turbogs_plugin.train.history import Evaluation, append_evaluation, read_history
@@ -68,15 +70,17 @@ def test_a_sweep_is_complete_and_goes_on_where_it_stopped(turbogs, small, captur
     assert "[4/4]" in err and "left" in err
     cells = sorted(out.glob("cells/capture/*.json"))
     assert [path.name for path in cells] == [f"{name}--seed{n}.json" for name in ("full", "random") for n in (0, 1)]
-    first = json.loads(cells[0].read_text())
-    assert first["history"][-1]["iteration"] == 4 and first["warmup_iterations"] == 2
-    assert first["provenance"]["machine"] and first["config"]["train"]["iterations"] == 4
+    results = StudyFolder(out).read_study().results
+    first = results[0]
+    assert first.final.iteration == 4 and first.warmup_iterations == 2
+    assert first.provenance.machine and first.config["train"]["iterations"] == 4
+    assert first.config["scene"]["path"] == "capture", "where a capture lies is no part of a result"
 
     rows = list(csv.DictReader((out / "table.csv").open()))
     assert [row["variant"] for row in rows] == ["full", "random"]
-    mean = np.mean([json.loads(path.read_text())["history"][-1]["psnr"] for path in cells[2:]])
+    mean = np.mean([result.final.psnr for result in results[2:]])
     assert float(rows[1]["psnr_mean"]) == pytest.approx(mean) and rows[1]["lpips_mean"] == ""
-    worst = [json.loads(path.read_text())["history"][-1]["worst_psnr"] for path in cells[2:]]
+    worst = [result.final.worst_psnr for result in results[2:]]
     assert float(rows[1]["worst_psnr_low"]) == pytest.approx(min(worst)) and min(worst) < mean
 
     page, markdown = (out / "report.html").read_text(), (out / "report.md").read_text()
@@ -132,7 +136,9 @@ def test_a_cell_of_other_settings_is_not_mixed_in(turbogs, small, capture, tmp_p
         ({"asked": None}, "full--seed0.json.*asked: expected a mapping"),
         ({"variant": 1}, "full--seed0.json.*variant: expected text"),
         ({"seed": "0"}, "full--seed0.json.*seed: expected a whole number"),
-        ({"variant": "other"}, "other--seed0.json.*no variant"),
+        ({"variant": "other"}, "full--seed0.json.*no variant"),
+        ({"history": {}}, "full--seed0.json.*history: key 'iteration' is missing"),
+        ({"provenance": 7}, "full--seed0.json.*no provenance 7"),
     ],
 )
 def test_a_cell_that_cannot_be_used_is_named_by_its_file(small, tmp_path, changes, words):
@@ -140,7 +146,9 @@ def test_a_cell_that_cannot_be_used_is_named_by_its_file(small, tmp_path, change
     folder.write_ablation(load_ablation(str(small)))
     folder.write(CellResult("fox", "full", 0, {}, [Evaluation(4, 1.0, 30.0, 0.8, 0.1, 100, 2**20)]))
     path = folder.cells / "fox" / "full--seed0.json"
-    path.write_text(json.dumps(json.loads(path.read_text()) | changes))
+    document = json.loads(path.read_text())
+    document["cells"][0] |= changes
+    path.write_text(json.dumps(document))
     with pytest.raises(InputError, match=words):
         folder.read_study()
 
@@ -178,9 +186,11 @@ def test_a_cell_with_a_time_budget_is_trained_as_a_run_with_one(turbogs, machine
     (cell,) = StudyFolder(out).read_study().results
     assert cell.time_budget == "3s" and 2.5 < cell.final.train_seconds < 3.5
     errors = ("iteration", "train_seconds", "psnr", "ssim", "l1", "num_gaussians")
+    decimals = [DECIMALS.get(name, 0) for name in errors]  # to which a study keeps them
     run_history = read_history(tmp_path / "run" / "history.jsonl")
     assert [[getattr(entry, name) for name in errors] for entry in cell.history] == [
-        [getattr(entry, name) for name in errors] for entry in run_history
+        [round(getattr(entry, name), places) for name, places in zip(errors, decimals, strict=True)]
+        for entry in run_history
     ]
     assert cell.config == RunFolder(tmp_path / "run").read_config().to_mapping()
     assert cell.config["train"]["iterations"] != cell.asked["train"]["iterations"] == int(length[0].partition("=")[2])
@@ -211,7 +221,7 @@ def test_variants_of_one_study_may_be_trained_by_several_calls(turbogs, capture,
         assert code == 0 and "report.html" in printed, err
         assert [row["variant"] for row in csv.DictReader((out / "table.csv").open())] == there
         assert ("loss.type=charbonnier" in (out / "report.md").read_text()) is (variant == "l1")
-    assert list(StudyFolder(out).read_ablation().variants) == ["full", "random", "l1"]
+    assert list(StudyFolder(out).read_study().ablation.variants) == ["full", "random", "l1"]
     assert turbogs("ablate", "--merge", out, "--out", tmp_path / "merged")[0] == 0
 
 
@@ -240,7 +250,7 @@ def test_a_study_of_an_earlier_version_is_refused_by_a_line_that_says_so(
     out = tmp_path / "study"
     assert turbogs(*call(small, capture, out, "--only", "full"))[0] == 0
     cell = out / "cells/capture/full--seed0.json"
-    cell.write_text(cell.read_text().replace('"budget": {', '"budget": {"max_gaussians": 0, '))
+    cell.write_text(cell.read_text().replace('"budget.time":', '"budget.max_gaussians": 0, "budget.time":'))
     monkeypatch.setattr(Trainer, "step", lambda trainer: pytest.fail("trained"))
     code, _, err = turbogs(*call(small, capture, out))
     assert code == 2 and err.count("\n") == 1 and "of an earlier version (budget.max_gaussians is now density." in err
@@ -260,7 +270,7 @@ def test_studies_are_merged_and_reported_again_without_training(turbogs, small, 
     assert turbogs("ablate", "--merge", out, "--out", out, "--psnr", "5")[0] == 0
     assert (out / "table.csv").read_bytes() == before
     other = tmp_path / "b" / "cells/capture/full--seed1.json"
-    other.write_text(other.read_text().replace('"fps": ', '"fps": 1'))
+    other.write_text(other.read_text().replace('"fps":', '"fps":1'))
     code, _, err = turbogs("ablate", "--merge", *parts, out, "--out", tmp_path / "c")
     assert code == 2 and "two different results" in err
 
@@ -304,10 +314,10 @@ def test_a_cell_of_an_unknown_capture_is_kept_and_merged_but_not_reused(turbogs,
     monkeypatch.setenv("TURBOGS_COMMIT", "one")
     old = tmp_path / "old"
     assert turbogs(*call(small, capture, old, "--only", "full"))[0] == 0
-    (path,) = old.glob("cells/*/*.json")
-    mapping = json.loads(path.read_text())
-    assert mapping.pop("capture") == capture_digest(load_scene(capture))
-    path.write_text(json.dumps(mapping))
+    for path in (*old.glob("cells/*/*.json"), old / "results.json"):
+        document = json.loads(path.read_text())
+        assert document["captures"] == {"capture": capture_digest(load_scene(capture))}
+        path.write_text(json.dumps(document | {"captures": {}}))
     code, _, err = turbogs(*call(small, capture, old, "--only", "full"))
     assert code == 0 and "1 finished cells are kept" in err
     assert turbogs("ablate", "--merge", old, "--out", tmp_path / "merged")[0] == 0
@@ -466,8 +476,10 @@ def test_the_bar_of_a_cell_has_the_planned_length(tmp_path, monkeypatch):
             for time in ("0", "nan", "inf")
         ),
         (["ablate", "components", "--scene", "CAPTURE", "--out", "CAPTURE"], ["not empty"]),
-        (["ablate", "--merge", "CAPTURE", "--out", "X"], ["holds no ablation"]),
+        (["ablate", "--merge", "CAPTURE", "--out", "X"], ["holds no study"]),
         (["compare", "CAPTURE", "--out", "X"], ["holds no run"]),
+        (["report", "CAPTURE"], ["holds no study"]),
+        (["report", "CAPTURE", "--psnr", "-1"], ["--psnr"]),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else None,
 )

@@ -2,18 +2,18 @@
 
 import math
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from matplotlib.figure import Figure
 
 from turbogs_plugin.config.configuration import load_config
 from turbogs_plugin.config.scaling import with_iterations
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.study.grid import Ablation, ablation_names, alike_at, load_ablation, variant_config
-from turbogs_plugin.study.plots import OTHER_COLOR, plot_curves, plot_front, told_apart
+from turbogs_plugin.study.plots import OTHER_COLOR, draw_curves, draw_front, told_apart
 from turbogs_plugin.study.results import CellResult, Study
 from turbogs_plugin.study.statistics import Curve, Spread, differ, pareto_front, seconds_to_reach
 from turbogs_plugin.study.summary import summarise
@@ -209,7 +209,7 @@ def test_a_summary_of_known_numbers():
             cell("slow", 1, entry(0, 0.0, 10.0), entry(100, 20.0, 20.0)),
         ],
     )
-    (summary,) = summarise(study, [20.0, 30.5])
+    (summary,) = summarise(replace(study, targets=[20.0, 30.5]))
     base, fast, slow = summary.rows
     assert (base.seconds.mean, base.gaussians.mean) == (11.0, 1100.0)
     assert fast.psnr_difference == pytest.approx(0.9) and fast.psnr_differs is True and fast.seconds_differ is True
@@ -220,7 +220,7 @@ def test_a_summary_of_known_numbers():
     assert fast.reaches[0].ratio == pytest.approx(5.0 * 10 / 21.0 / of_base)
     assert (slow.reaches[0].reached, slow.reaches[1].reached) == (2, 0)
     assert math.isnan(fast.reaches[1].ratio)  # the baseline never got there
-    (begun,) = summarise(study, [9.0])
+    (begun,) = summarise(replace(study, targets=[9.0]))
     assert [(row.reaches[0].reached, math.isnan(row.reaches[0].ratio)) for row in begun.rows] == [(2, True)] * 3
     (default,) = summarise(study)
     assert default.targets == [29.0, 29.5, 30.0]
@@ -229,35 +229,30 @@ def test_a_summary_of_known_numbers():
 def test_a_variant_that_failed_does_not_set_the_scale_of_the_plots():
     results = {"good": 31.0, "fair": 24.0, "lost": 9.5, "unknown": math.nan}
     cells = [cell(name, 0, entry(0, 0.0, 5.0), entry(100, 10.0, psnr)) for name, psnr in results.items()]
-    (summary,) = summarise(Study(Ablation("x", {name: [] for name in results}), cells), [20.0])
+    (summary,) = summarise(Study(Ablation("x", {name: [] for name in results}), cells, targets=[20.0]))
     shown, words = told_apart(summary)
     assert [row.name for row in shown] == ["good", "fair", "unknown"]
     assert words == "Not in the plot: lost (9.5 dB in 10.0 s)"
 
 
 @pytest.mark.parametrize(("count", "grey"), [(10, 0), (11, 9)])
-def test_of_many_variants_the_baseline_and_the_front_stand_out(monkeypatch, tmp_path, count, grey):
+def test_of_many_variants_the_baseline_and_the_front_stand_out(count, grey):
     names = [f"v{number}" for number in range(count)]
     cells = [cell(name, 0, entry(0, 0.0, 20.0), entry(100, 10.0 + n, 30.0 - n / 10)) for n, name in enumerate(names)]
-    study = Study(Ablation("x", {name: [] for name in names}, baseline="v5"), cells)
-    (summary,) = summarise(study, [20.0])
-    figures = []
-    monkeypatch.setattr(Figure, "savefig", lambda figure, path: figures.append(figure))
-    plot_curves(tmp_path / "curves.png", summary)
-    for axes in figures[0].axes:
+    study = Study(Ablation("x", {name: [] for name in names}, baseline="v5"), cells, targets=[20.0])
+    (summary,) = summarise(study)
+    figure = draw_curves(summary)
+    for axes in figure.axes:
         lines = axes.get_lines()
         assert [line.get_color() for line in lines[:grey]] == [OTHER_COLOR] * grey
         named = [line.get_label() for line in lines[grey:]]
         assert named == (["v0", "v5"] if grey else names)
-    legend = [text.get_text() for text in figures[0].legends[0].get_texts()]
+    legend = [text.get_text() for text in figure.legends[0].get_texts()]
     assert legend == ([f"{grey} others", "v0", "v5"] if grey else names)
 
 
-def test_names_of_points_are_kept_clear_of_what_is_behind(monkeypatch, tmp_path):
+def test_names_of_points_are_kept_clear_of_what_is_behind():
     cells = [cell(name, 0, entry(0, 0.0, 20.0), entry(100, 10.0, 30.0)) for name in ("a", "b")]
-    (summary,) = summarise(Study(Ablation("x", {"a": [], "b": []}), cells), [20.0])
-    figures = []
-    monkeypatch.setattr(Figure, "savefig", lambda figure, path: figures.append(figure))
-    plot_front(tmp_path / "front.png", summary)
-    texts = figures[0].axes[0].texts
+    (summary,) = summarise(Study(Ablation("x", {"a": [], "b": []}), cells, targets=[20.0]))
+    texts = draw_front(summary).axes[0].texts
     assert [text.get_text() for text in texts] == ["a", "b"] and all(text.get_path_effects() for text in texts)

@@ -61,7 +61,7 @@ def train_cell(
 
     Args:
         variant: its name.
-        config: as asked for. The result keeps it as it was resolved.
+        config: as asked for. The result keeps this one and the resolved one.
         scene: in host memory; the plan says what of it goes to the device.
         device: where to train.
         made_by: machine and sources, as they were when the process began.

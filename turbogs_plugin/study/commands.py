@@ -1,4 +1,4 @@
-"""What `turbogs ablate` and `turbogs compare` do."""
+"""What `turbogs ablate`, `turbogs compare` and `turbogs report` do."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from pathlib import Path
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.report.provenance import Provenance, provenance
 from turbogs_plugin.study.compare import study_of_runs
+from turbogs_plugin.study.folder import StudyFolder, merged
 from turbogs_plugin.study.grid import Ablation, alike_at, load_ablation
-from turbogs_plugin.study.pages import write_study
-from turbogs_plugin.study.results import StudyFolder, merge_studies
+from turbogs_plugin.study.pages import write_report
 from turbogs_plugin.study.sweep import SweepOptions, run_sweep
 from turbogs_plugin.train.run import resolve_device
 
@@ -62,9 +62,8 @@ def _study(
     try:
         run_sweep(ablation, variants, options, here, folder, siblings)
     finally:
-        # Not after a refusal, which leaves no cells.
-        if any(folder.cells.glob("*/*.json")):
-            print(f"report  {write_study(folder.path, folder.read_study(), targets)}")
+        if folder.read_results():  # after a refusal there may be none
+            print(f"report  {write_report(folder, targets)}")
     failures = folder.read_study().failures
     for failure in failures:
         print(f"failed  {failure.key}: {failure.reason}")
@@ -72,14 +71,15 @@ def _study(
 
 
 def merge(sources: Sequence[Path], out: Path, targets: Sequence[float]) -> int:
-    """Put studies together and write the report again, without training."""
+    """Put studies together and write the report, without training. What `out` holds of a study stays in it."""
     folder = StudyFolder(out)
     folder.require_usable()
-    merge_studies([StudyFolder(source) for source in sources], folder)
-    study = folder.read_study()
+    paths = [*sources, out] if folder.file.is_file() else sources
+    study = merged([StudyFolder(path) for path in paths])
     if not study.results:
         raise InputError("there are no finished cells to report on")
-    print(f"report  {write_study(out, study, targets)}")
+    folder.write_study(study)
+    print(f"report  {write_report(folder, targets)}")
     return 0
 
 
@@ -87,7 +87,17 @@ def compare(runs: Sequence[Path], out: Path, targets: Sequence[float]) -> int:
     """Write a report of any runs side by side into a new folder."""
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(f"--out '{out}' is there and not empty: choose a new folder")
-    study = study_of_runs(runs)
-    out.mkdir(parents=True, exist_ok=True)
-    print(f"report  {write_study(out, study, targets)}")
+    folder = StudyFolder(out)
+    folder.write_study(study_of_runs(runs))
+    print(f"report  {write_report(folder, targets)}")
+    return 0
+
+
+def report(studies: Sequence[Path], targets: Sequence[float]) -> int:
+    """Write the reports of studies again, from what is in their folders."""
+    for path in studies:
+        folder = StudyFolder(path)
+        if not folder.read_study().results:
+            raise InputError(f"'{path}' has no finished cells to report on")
+        print(f"report  {write_report(folder, targets or None)}")
     return 0

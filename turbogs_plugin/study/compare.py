@@ -10,6 +10,7 @@ from typing import Any
 
 from turbogs_plugin.config.sections import SceneConfig
 from turbogs_plugin.errors import InputError
+from turbogs_plugin.study.difference import ABSENT, difference, flattened
 from turbogs_plugin.study.grid import Ablation
 from turbogs_plugin.study.results import CellResult, Study
 from turbogs_plugin.train.folder import RunFolder
@@ -49,7 +50,7 @@ def study_of_runs(paths: Sequence[Path]) -> Study:
         results.append(result)
     ablation = Ablation(
         title=f"Comparison of {len(paths)} runs",
-        variants={name: _differences(variants[0][0], shared) for shared, name in variants},
+        variants={name: _overrides(variants[0][0], shared) for shared, name in variants},
         base=str(variants[0][1]),
     )
     return Study(ablation, results)
@@ -92,14 +93,7 @@ def _new_name(path: Path, taken: set[str]) -> str:
     return next(f"{name}-{number}" for number in range(2, len(taken) + 3) if f"{name}-{number}" not in taken)
 
 
-def _differences(base: dict[str, Any], other: dict[str, Any], place: str = "") -> list[str]:
+def _overrides(base: dict[str, Any], other: dict[str, Any]) -> list[str]:
     """Overrides that lead from one configuration to another."""
-    found = []
-    for key, value in other.items():
-        path = f"{place}.{key}" if place else key
-        before = base.get(key) if isinstance(base, dict) else None
-        if isinstance(value, dict):
-            found += _differences(before if isinstance(before, dict) else {}, value, path)
-        elif value != before:
-            found.append(f"{path}={value}")
-    return found
+    changes = difference(flattened(base), flattened(other))
+    return [f"{path}={value}" for path, value in changes.items() if path != ABSENT]

@@ -33,7 +33,9 @@ class Table:
 
 @dataclass(frozen=True)
 class Picture:
-    file: Path
+    """`file`: its name, beside the page."""
+
+    file: str
     text: str
 
 
@@ -53,8 +55,8 @@ img { max-width: 100%; } p { max-width: 60rem; }
 """
 
 
-def to_markdown(title: str, blocks: Sequence[Block], folder: Path) -> str:
-    """Markdown; pictures by their path relative to `folder`."""
+def to_markdown(title: str, blocks: Sequence[Block]) -> str:
+    """Markdown, for a file beside the pictures."""
     parts = [f"# {title}"]
     for block in blocks:
         if isinstance(block, Heading):
@@ -64,12 +66,12 @@ def to_markdown(title: str, blocks: Sequence[Block], folder: Path) -> str:
         elif isinstance(block, Table):
             parts.append(table(block.header, [[_cell(value) for value in row] for row in block.rows]))
         else:
-            parts.append(f"![{block.text}]({block.file.relative_to(folder).as_posix()})")
+            parts.append(f"![{block.text}]({block.file})")
     return "\n\n".join(parts) + "\n"
 
 
-def to_html(title: str, blocks: Sequence[Block]) -> str:
-    """One HTML file with its pictures in it, which opens from the disk and asks for nothing else."""
+def to_html(title: str, blocks: Sequence[Block], folder: Path) -> str:
+    """One HTML file with the pictures of `folder` in it, which opens from the disk and asks for nothing else."""
     body = [f"<h1>{html.escape(title)}</h1>"]
     for block in blocks:
         if isinstance(block, Heading):
@@ -79,7 +81,7 @@ def to_html(title: str, blocks: Sequence[Block]) -> str:
         elif isinstance(block, Table):
             body.append(_html_table(block))
         else:
-            data = base64.b64encode(block.file.read_bytes()).decode("ascii")
+            data = base64.b64encode((folder / block.file).read_bytes()).decode("ascii")
             body.append(f'<p><img alt="{html.escape(block.text)}" src="data:image/png;base64,{data}"></p>')
     return (
         f'<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n<title>{html.escape(title)}</title>\n'

@@ -6,13 +6,14 @@ import csv
 import io
 import math
 from collections.abc import Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 
 from turbogs_plugin.config.units import parse_seconds
 from turbogs_plugin.files import write_text_atomically
 from turbogs_plugin.study.document import Block, Heading, Paragraph, Picture, Table, to_html, to_markdown
-from turbogs_plugin.study.plots import plot_curves, plot_front
+from turbogs_plugin.study.folder import StudyFolder
+from turbogs_plugin.study.plots import PLOTS, write_plots
 from turbogs_plugin.study.results import CellResult, Study
 from turbogs_plugin.study.statistics import Spread
 from turbogs_plugin.study.summary import Reach, SceneSummary, VariantRow, summarise
@@ -27,16 +28,33 @@ HOW_TO_READ = (
 )
 
 
-def write_study(folder: Path, study: Study, targets: Sequence[float] = ()) -> Path:
-    """Write the report of a study into a folder that exists; the HTML page.
+def write_report(folder: StudyFolder, targets: Sequence[float] | None = None) -> Path:
+    """Write ``results.json`` of all that is there, and from it the report; the HTML page.
 
     Args:
-        targets: PSNRs whose time is asked for; none: from the baseline's result.
+        targets: PSNRs in dB whose time is asked for; empty: they follow from the baseline's result; None: those of the
+            last report.
     """
-    summaries = summarise(study, targets)
+    study = folder.read_study()
+    folder.write_study(study if targets is None else replace(study, targets=list(targets)))
+    study = folder.read_study()  # with the digits that the file keeps
+    summaries = summarise(study)
+    for summary in summaries:
+        write_plots(folder.path, summary)
+    blocks = report_blocks(study, summaries)
+    title = study.ablation.title
+    write_text_atomically(folder.path / "table.csv", table_csv(summaries))
+    write_text_atomically(folder.path / "report.md", to_markdown(title, blocks))
+    page = folder.path / "report.html"
+    write_text_atomically(page, to_html(title, blocks, folder.path))
+    return page
+
+
+def report_blocks(study: Study, summaries: Sequence[SceneSummary]) -> list[Block]:
+    """The page."""
     blocks = _header(study)
     for summary in summaries:
-        blocks += _scene(folder, study, summary)
+        blocks += _scene(summary)
     if study.failures:
         blocks += [
             Heading("Cells without a result"),
@@ -44,12 +62,7 @@ def write_study(folder: Path, study: Study, targets: Sequence[float] = ()) -> Pa
                 ("cell", "reason"), [(str(failure.key), failure.reason) for failure in study.failures], numeric=False
             ),
         ]
-    blocks += _settings(study)
-    write_text_atomically(folder / "table.csv", table_csv(study, summaries))
-    write_text_atomically(folder / "report.md", to_markdown(study.ablation.title, blocks, folder))
-    page = folder / "report.html"
-    write_text_atomically(page, to_html(study.ablation.title, blocks))
-    return page
+    return blocks + _settings(study)
 
 
 def _header(study: Study) -> list[Block]:
@@ -100,10 +113,7 @@ def _machines(results: Sequence[CellResult]) -> list[Block]:
     return blocks
 
 
-def _scene(folder: Path, study: Study, summary: SceneSummary) -> list[Block]:
-    curves, front = (folder / f"{summary.scene}-{name}.png" for name in ("curves", "pareto"))
-    plot_curves(curves, summary)
-    plot_front(front, summary)
+def _scene(summary: SceneSummary) -> list[Block]:
     against = f" against {summary.baseline}" if summary.baseline else ""
     header = (
         *("variant", "front", "seeds", "time in s", f"time{against}", "PSNR in dB", f"PSNR{against}"),
@@ -115,8 +125,7 @@ def _scene(folder: Path, study: Study, summary: SceneSummary) -> list[Block]:
     blocks: list[Block] = [
         Heading(summary.scene),
         Table(header, [_result_line(row, summary) for row in summary.rows]),
-        Picture(curves, f"{summary.scene}: error against seconds of training"),
-        Picture(front, f"{summary.scene}: final PSNR against training time"),
+        *(Picture(f"{summary.scene}-{plot.name}.png", f"{summary.scene}: {plot.text}") for plot in PLOTS),
         Heading(f"Time to reach a PSNR on {summary.scene}", 3),
         Table(reach_header, [_reach_line(row) for row in summary.rows]),
     ]
@@ -184,14 +193,17 @@ def _settings(study: Study) -> list[Block]:
         for name, overrides in ablation.variants.items()
         if name in tried
     ]
+    kept = "as resolved" if all(result.resolved for result in study.results) else "as asked for"
     return [
         Heading("Variants"),
-        Paragraph(f"Overrides of the configuration '{ablation.base}'. The resolved ones are in the cells' JSON files."),
+        Paragraph(
+            f"Overrides of the configuration '{ablation.base}'. results.json has every cell's configuration, {kept}."
+        ),
         Table(("variant", "overrides", "note"), rows, numeric=False),
     ]
 
 
-def table_csv(study: Study, summaries: Sequence[SceneSummary]) -> str:
+def table_csv(summaries: Sequence[SceneSummary]) -> str:
     """All numbers of the tables, unrounded; empty where not computed or not measured, ``inf`` where never reached."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")

@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
+import hashlib
+import io
 import itertools
+import json
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import matplotlib
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 from matplotlib.transforms import Bbox
+from PIL import Image, PngImagePlugin
 
+from turbogs_plugin.files import write_atomically
 from turbogs_plugin.report.plots import STYLE
 from turbogs_plugin.study.summary import SceneSummary, VariantRow
 
@@ -28,6 +36,65 @@ SHOWN_ABOVE = 1.6
 """Times the worst final error, at which that plot ends: 4 dB as well."""
 FAILED_BELOW = 8.0
 """dB below the best final result at which a variant has failed: it is named below a plot to the scale of the others."""
+
+DRAWING = 1
+"""Raised by whoever changes how a plot looks: a plot of the same data is not drawn again."""
+DATA_KEY = "data"
+"""Text in a plot's PNG: the digest of what it shows."""
+PALETTE = 128
+"""Colours of a plot's PNG: a third of the bytes, and no difference that can be seen."""
+
+
+@dataclass(frozen=True)
+class Plot:
+    """One kind of plot.
+
+    Args:
+        name: end of its file's name.
+        text: what it shows.
+        draw: makes it.
+    """
+
+    name: str
+    text: str
+    draw: Callable[[SceneSummary], Figure]
+
+
+def write_plots(folder: Path, summary: SceneSummary) -> None:
+    """Draw what is not there yet, or is there of other data: ``SCENE-NAME.png`` for each of `PLOTS`."""
+    digest = plot_digest(summary)
+    for plot in PLOTS:
+        path = folder / f"{summary.scene}-{plot.name}.png"
+        if shown_digest(path) == digest:
+            continue
+        text = PngImagePlugin.PngInfo()
+        text.add_text(DATA_KEY, digest)
+        drawn = io.BytesIO()
+        with matplotlib.rc_context(STYLE):  # also at the end, where ticks get their labels
+            plot.draw(summary).savefig(drawn, format="png")
+        picture = (
+            Image.open(drawn).convert("RGB").quantize(PALETTE, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
+        )
+        write_atomically(path, lambda file: picture.save(file, "PNG", optimize=True, pnginfo=text))  # noqa: B023
+
+
+def plot_digest(summary: SceneSummary) -> str:
+    """Of all that the plots show, and of the way in which they show it."""
+    rows = [
+        (row.name, row.on_front, *map(asdict, (row.seconds, row.psnr, row.psnr_curve, row.l1_curve)))
+        for row in summary.rows
+    ]
+    text = json.dumps([DRAWING, summary.scene, summary.baseline, rows], default=np.ndarray.tolist)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def shown_digest(path: Path) -> str:
+    """The `plot_digest` of what a PNG shows; "" where it does not say, or is no picture."""
+    try:
+        with Image.open(path) as picture:
+            return picture.info.get(DATA_KEY, "")
+    except OSError:
+        return ""
 
 
 def _styles(summary: SceneSummary) -> dict[str, tuple[str, str]]:
@@ -48,7 +115,7 @@ def told_apart(summary: SceneSummary) -> tuple[list[VariantRow], str]:
     return shown, "Not in the plot: " + ", ".join(words) if failed else ""
 
 
-def plot_curves(path: Path, summary: SceneSummary) -> None:
+def draw_curves(summary: SceneSummary) -> Figure:
     """PSNR and mean absolute error against seconds: mean over seeds, their spread shaded.
 
     Of more variants than can be told apart, those that are neither the baseline nor on the Pareto front are thin and
@@ -59,73 +126,77 @@ def plot_curves(path: Path, summary: SceneSummary) -> None:
     named, others = [], []
     for row in rows:
         (named if few or row.on_front or row.name == summary.baseline else others).append(row)
-    with matplotlib.rc_context({**STYLE, "lines.markersize": 3.5}):
-        figure = Figure(figsize=(12.0, 5.2), layout="constrained")
-        for axes, name in zip(figure.subplots(1, 2), ("psnr", "l1"), strict=True):
-            for row in others:
-                curve = getattr(row, f"{name}_curve")
-                label = f"{len(others)} others" if row is others[0] else None
-                axes.plot(curve.seconds, curve.mean, color=OTHER_COLOR, linewidth=0.8, label=label)
-            for row in named:
-                curve = getattr(row, f"{name}_curve")
-                color, dash = styles[row.name]
-                axes.plot(curve.seconds, curve.mean, dash, marker="o", color=color, label=row.name)
-                if row.psnr.count > 1:
-                    axes.fill_between(curve.seconds, curve.low, curve.high, color=color, alpha=0.15, linewidth=0)
-            axes.set_xlabel("training time in seconds (evaluation excluded)")
-            axes.set_xlim(left=0)
-        psnr_axes, l1_axes = figure.axes
-        floor = min(row.psnr.mean for row in rows) - SHOWN_BELOW
-        psnr_axes.set(ylabel="test PSNR in dB", title=f"{summary.scene}: PSNR")
-        psnr_axes.set_ylim(bottom=max(floor, psnr_axes.get_ylim()[0]))
-        l1_axes.set(ylabel="mean absolute error on test views (0 .. 1)", title="mean absolute error")
-        ceiling = SHOWN_ABOVE * max(row.l1_curve.mean[-1] for row in rows)
-        floor = 0.9 * min(min(row.l1_curve.mean) for row in rows)
-        l1_axes.set_ylim(bottom=floor, top=min(ceiling, l1_axes.get_ylim()[1]))
-        handles, labels = psnr_axes.get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside right center", frameon=False, fontsize=9)
-        figure.supxlabel(failed, fontsize=9)
-        figure.savefig(path)
+    figure = Figure(figsize=(12.0, 5.2), layout="constrained")
+    for axes, name in zip(figure.subplots(1, 2), ("psnr", "l1"), strict=True):
+        for row in others:
+            curve = getattr(row, f"{name}_curve")
+            label = f"{len(others)} others" if row is others[0] else None
+            axes.plot(curve.seconds, curve.mean, color=OTHER_COLOR, linewidth=0.8, label=label)
+        for row in named:
+            curve = getattr(row, f"{name}_curve")
+            color, dash = styles[row.name]
+            axes.plot(curve.seconds, curve.mean, dash, marker="o", markersize=3.5, color=color, label=row.name)
+            if row.psnr.count > 1:
+                axes.fill_between(curve.seconds, curve.low, curve.high, color=color, alpha=0.15, linewidth=0)
+        axes.set_xlabel("training time in seconds (evaluation excluded)")
+        axes.set_xlim(left=0)
+    psnr_axes, l1_axes = figure.axes
+    floor = min(row.psnr.mean for row in rows) - SHOWN_BELOW
+    psnr_axes.set(ylabel="test PSNR in dB", title=f"{summary.scene}: PSNR")
+    psnr_axes.set_ylim(bottom=max(floor, psnr_axes.get_ylim()[0]))
+    l1_axes.set(ylabel="mean absolute error on test views (0 .. 1)", title="mean absolute error")
+    ceiling = SHOWN_ABOVE * max(row.l1_curve.mean[-1] for row in rows)
+    floor = 0.9 * min(min(row.l1_curve.mean) for row in rows)
+    l1_axes.set_ylim(bottom=floor, top=min(ceiling, l1_axes.get_ylim()[1]))
+    handles, labels = psnr_axes.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside right center", frameon=False, fontsize=9)
+    figure.supxlabel(failed, fontsize=9)
+    return figure
 
 
-def plot_front(path: Path, summary: SceneSummary) -> None:
+def draw_front(summary: SceneSummary) -> Figure:
     """Final PSNR against training time: a point a variant with the seeds' spreads, the Pareto front marked."""
     styles, (rows, failed) = _styles(summary), told_apart(summary)
-    with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(8.6, 5.2), layout="constrained")
-        axes = figure.add_subplot()
-        for row in rows:
-            axes.errorbar(
-                row.seconds.mean,
-                row.psnr.mean,
-                xerr=[[row.seconds.mean - row.seconds.low], [row.seconds.high - row.seconds.mean]],
-                yerr=[[row.psnr.mean - row.psnr.low], [row.psnr.high - row.psnr.mean]],
-                fmt="*" if row.on_front else "o",
-                markersize=13 if row.on_front else 6,
-                color=styles[row.name][0],
-                elinewidth=1.0,
-                alpha=0.9,
-            )
-        front = sorted((row for row in rows if row.on_front), key=lambda row: row.seconds.mean)
-        axes.step(
-            [row.seconds.mean for row in front],
-            [row.psnr.mean for row in front],
-            where="post",
-            color="grey",
-            linewidth=1.2,
-            zorder=0,
-            label="Pareto front (stars)",
+    figure = Figure(figsize=(8.6, 5.2), layout="constrained")
+    axes = figure.add_subplot()
+    for row in rows:
+        axes.errorbar(
+            row.seconds.mean,
+            row.psnr.mean,
+            xerr=[[row.seconds.mean - row.seconds.low], [row.seconds.high - row.seconds.mean]],
+            yerr=[[row.psnr.mean - row.psnr.low], [row.psnr.high - row.psnr.mean]],
+            fmt="*" if row.on_front else "o",
+            markersize=13 if row.on_front else 6,
+            color=styles[row.name][0],
+            elinewidth=1.0,
+            alpha=0.9,
         )
-        axes.set(
-            xlabel="training time in seconds (evaluation excluded)",
-            ylabel="final test PSNR in dB",
-            title=f"{summary.scene}: error against time",
-        )
-        axes.margins(x=0.18, y=0.12)
-        axes.legend(loc="lower right", frameon=False, fontsize=9)
-        figure.supxlabel(failed, fontsize=9)
-        _label_points(axes, rows)
-        figure.savefig(path)
+    front = sorted((row for row in rows if row.on_front), key=lambda row: row.seconds.mean)
+    axes.step(
+        [row.seconds.mean for row in front],
+        [row.psnr.mean for row in front],
+        where="post",
+        color="grey",
+        linewidth=1.2,
+        zorder=0,
+        label="Pareto front (stars)",
+    )
+    axes.set(
+        xlabel="training time in seconds (evaluation excluded)",
+        ylabel="final test PSNR in dB",
+        title=f"{summary.scene}: error against time",
+    )
+    axes.margins(x=0.18, y=0.12)
+    axes.legend(loc="lower right", frameon=False, fontsize=9)
+    figure.supxlabel(failed, fontsize=9)
+    _label_points(axes, rows)
+    return figure
+
+
+PLOTS = (
+    Plot("curves", "error against seconds of training", draw_curves),
+    Plot("pareto", "final PSNR against training time", draw_front),
+)
 
 
 def _label_points(axes: Axes, rows: list[VariantRow]) -> None:

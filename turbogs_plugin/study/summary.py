@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from turbogs_plugin.study.results import Study
+from turbogs_plugin.study.results import CellResult, Study
 from turbogs_plugin.study.statistics import Curve, Spread, differ, pareto_front, seconds_to_reach
 
 TARGET_STEP = 0.5
@@ -85,66 +85,65 @@ class SceneSummary:
         return next((row for row in self.rows if row.name == name), None)
 
 
-def summarise(study: Study, targets: Sequence[float] = ()) -> list[SceneSummary]:
-    """The rows of each scene.
-
-    Args:
-        targets: PSNRs whose time is asked for; none: the baseline's result, and `TARGET_STEP` and twice that below it.
-    """
-    return [_summarise_scene(study, scene, targets) for scene in study.scenes]
+def summarise(study: Study) -> list[SceneSummary]:
+    """The rows of each scene."""
+    return [_summarise_scene(study, scene) for scene in study.scenes]
 
 
-def _summarise_scene(study: Study, scene: str, targets: Sequence[float]) -> SceneSummary:
-    cells = {name: study.of(scene, name) for name in study.ablation.variants}
-    cells = {name: results for name, results in cells.items() if results}
+def _summarise_scene(study: Study, scene: str) -> SceneSummary:
+    cells = {name: results for name in study.ablation.variants if (results := study.of(scene, name))}
     baseline = study.ablation.baseline if study.ablation.baseline in cells else ""
-    if not targets:
-        reference = cells[baseline] if baseline else next(iter(cells.values()))
-        result = Spread.of(cell.final.psnr for cell in reference).low
-        targets = [math.floor(10 * result) / 10 - step * TARGET_STEP for step in (2, 1, 0)]
-    times = {
-        name: [Spread.of(seconds_to_reach(cell.history, psnr) for cell in results) for psnr in targets]
-        for name, results in cells.items()
-    }
-    reference = cells.get(baseline, [])
-    reference_psnr, reference_seconds = (
-        Spread.of(getattr(cell.final, name) for cell in reference) for name in ("psnr", "train_seconds")
-    )
-    rows = []
-    for name, results in cells.items():
-        psnr, seconds = (
-            Spread.of(getattr(cell.final, field) for cell in results) for field in ("psnr", "train_seconds")
-        )
-        reaches = []
-        for number, target in enumerate(targets):
-            spread = times[name][number]
-            against = times[baseline][number].mean if baseline else math.nan
-            ratio = spread.mean / against if against > 0 else math.nan
-            reached = sum(math.isfinite(seconds_to_reach(cell.history, target)) for cell in results)
-            reaches.append(Reach(target, spread, reached, ratio if 0 < ratio < math.inf else math.nan))
-        rows.append(
-            VariantRow(
-                name=name,
-                seeds=[cell.seed for cell in results],
-                seconds=seconds,
-                psnr=psnr,
-                worst_psnr=Spread.of(cell.final.worst_psnr for cell in results),
-                ssim=Spread.of(cell.final.ssim for cell in results),
-                l1=Spread.of(cell.final.l1 for cell in results),
-                lpips=Spread.of(cell.lpips for cell in results),
-                gaussians=Spread.of(cell.final.num_gaussians for cell in results),
-                fps=Spread.of(cell.fps for cell in results),
-                peak_bytes=Spread.of(math.nan if cell.peak_bytes is None else cell.peak_bytes for cell in results),
-                iterations=[cell.final.iteration for cell in results if cell.time_budget],
-                psnr_difference=psnr.mean - reference_psnr.mean,
-                psnr_differs=differ(psnr, reference_psnr),
-                seconds_differ=differ(seconds, reference_seconds),
-                reaches=reaches,
-                on_front=False,
-                psnr_curve=Curve.of([cell.history for cell in results], "psnr"),
-                l1_curve=Curve.of([cell.history for cell in results], "l1"),
-            )
-        )
+    targets = study.targets or _default_targets(cells[baseline] if baseline else next(iter(cells.values())))
+    rows = [_row(name, results, cells.get(baseline, []), targets) for name, results in cells.items()]
     for row, on_front in zip(rows, pareto_front([(row.seconds.mean, row.psnr.mean) for row in rows]), strict=True):
         row.on_front = on_front
-    return SceneSummary(scene, baseline, list(targets), rows)
+    return SceneSummary(scene, baseline, targets, rows)
+
+
+def _default_targets(reference: Sequence[CellResult]) -> list[float]:
+    """What every seed of these reached, rounded down, and `TARGET_STEP` and twice that below it."""
+    reached = _spread(reference, "psnr").low
+    return [math.floor(10 * reached) / 10 - step * TARGET_STEP for step in (2, 1, 0)]
+
+
+def _row(name: str, results: Sequence[CellResult], base: Sequence[CellResult], targets: Sequence[float]) -> VariantRow:
+    psnr, seconds = _spread(results, "psnr"), _spread(results, "train_seconds")
+    base_psnr, base_seconds = _spread(base, "psnr"), _spread(base, "train_seconds")
+    return VariantRow(
+        name=name,
+        seeds=[cell.seed for cell in results],
+        seconds=seconds,
+        psnr=psnr,
+        worst_psnr=_spread(results, "worst_psnr"),
+        ssim=_spread(results, "ssim"),
+        l1=_spread(results, "l1"),
+        lpips=Spread.of(cell.lpips for cell in results),
+        gaussians=_spread(results, "num_gaussians"),
+        fps=Spread.of(cell.fps for cell in results),
+        peak_bytes=Spread.of(math.nan if cell.peak_bytes is None else cell.peak_bytes for cell in results),
+        iterations=_fitted_lengths(results),
+        psnr_difference=psnr.mean - base_psnr.mean,
+        psnr_differs=differ(psnr, base_psnr),
+        seconds_differ=differ(seconds, base_seconds),
+        reaches=[_reach(results, base, target) for target in targets],
+        on_front=False,
+        psnr_curve=Curve.of([cell.history for cell in results], "psnr"),
+        l1_curve=Curve.of([cell.history for cell in results], "l1"),
+    )
+
+
+def _spread(results: Sequence[CellResult], measure: str) -> Spread:
+    """Of a field of `Evaluation`, at the final models."""
+    return Spread.of(getattr(cell.final, measure) for cell in results)
+
+
+def _reach(results: Sequence[CellResult], base: Sequence[CellResult], target: float) -> Reach:
+    times, base_times = ([seconds_to_reach(cell.history, target) for cell in cells] for cells in (results, base))
+    seconds, against = Spread.of(times), Spread.of(base_times).mean
+    ratio = seconds.mean / against if against > 0 else math.nan
+    reached = sum(map(math.isfinite, times))
+    return Reach(target, seconds, reached, ratio if 0 < ratio < math.inf else math.nan)
+
+
+def _fitted_lengths(results: Sequence[CellResult]) -> list[int]:
+    return [cell.final.iteration for cell in results if cell.time_budget]

@@ -19,9 +19,10 @@ from turbogs_plugin.errors import InputError, TrainingStopped
 from turbogs_plugin.report.provenance import COMMIT_VARIABLE, MODIFIED, Provenance
 from turbogs_plugin.scene import Scene, load_scene
 from turbogs_plugin.study.cell import capture_digest, train_cell
+from turbogs_plugin.study.folder import StudyFolder
 from turbogs_plugin.study.grid import Ablation, CellKey, variant_config
 from turbogs_plugin.study.progress import SweepProgress
-from turbogs_plugin.study.results import CellResult, Failure, StudyFolder
+from turbogs_plugin.study.results import CellResult, Failure
 from turbogs_plugin.train.clock import synchronize
 from turbogs_plugin.train.run import resolve_device
 
@@ -171,7 +172,7 @@ def _require_capture(results: Iterable[CellResult], scene: str, capture: str) ->
 
 
 def _require_same(present: CellResult, config: Config) -> None:
-    old = old_spelling(present.config)
+    old = old_spelling(present.asked_config)
     if old:
         raise InputError(f"the cell '{present.key}' is of an earlier version ({old}): choose a new --out")
     made, wanted = (_sections(mapping) for mapping in (present.asked_config, config.to_mapping()))

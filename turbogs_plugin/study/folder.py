@@ -1,0 +1,124 @@
+"""Where a study is on the disk."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from turbogs_plugin.config.schema import nearest
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.files import write_text_atomically
+from turbogs_plugin.study.grid import Ablation, CellKey
+from turbogs_plugin.study.results import CellResult, Failure, Study
+from turbogs_plugin.study.results_file import study_from_json, study_to_json
+
+
+class StudyFolder:
+    """``results.json``, and the page and plots beside it.
+
+    Where a study is trained, each cell also has a file of the same form from the moment that it ends,
+    ``cells/SCENE/VARIANT--seedN.json``: no finished cell is lost, whatever stops the process. These files go into
+    ``results.json`` whenever that is written; nothing else needs them.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.file = path / "results.json"
+        self.cells = path / "cells"
+
+    def require_usable(self) -> None:
+        """Raises `InputError` where the folder holds anything but a study, or cannot be one."""
+        if self.path.exists() and not self.path.is_dir():
+            raise InputError(f"--out '{self.path}' is a file: choose a folder")
+        if self.path.is_dir() and any(self.path.iterdir()) and not self.file.is_file():
+            raise InputError(f"--out '{self.path}' is not empty and holds no study: choose a new folder")
+
+    def write_ablation(self, ablation: Ablation) -> None:
+        """Begin a study, or go on with one whose variants may have become more."""
+        study = self.read_study() if self.file.is_file() else Study(ablation, [])
+        self.write_study(replace(study, ablation=ablation))
+
+    def write(self, result: CellResult) -> None:
+        """Keep a result; a failure of the same cell is forgotten."""
+        self._write_cell(result.key, Study(_ablation_of(result.key), [result]))
+
+    def write_failure(self, failure: Failure) -> None:
+        """Keep the reason why a cell has no result."""
+        self._write_cell(failure.key, Study(_ablation_of(failure.key), [], [failure]))
+
+    def write_study(self, study: Study) -> None:
+        """Write ``results.json``."""
+        self.path.mkdir(parents=True, exist_ok=True)
+        write_text_atomically(self.file, study_to_json(study))
+
+    def read_results(self) -> dict[CellKey, CellResult]:
+        """The finished cells; none where there is no study."""
+        return {result.key: result for result in self.read_study().results} if self.file.is_file() else {}
+
+    def read_study(self) -> Study:
+        """Everything that is there, variants in the order of the ablation, scenes and seeds sorted.
+
+        Raises:
+            InputError: no study, or a file that is wrong, which is named.
+        """
+        if not self.file.is_file():
+            raise InputError(f"'{self.path}' holds no study: there is no {self.file.name}")
+        study = study_from_json(self.file)
+        results: dict[CellKey, CellResult] = {}
+        failures: dict[CellKey, Failure] = {}
+        for path in (self.file, *sorted(self.cells.glob("*/*.json"))):
+            part = study if path == self.file else study_from_json(path)
+            for result in part.results:
+                if result.variant not in study.ablation.variants:
+                    hint = nearest(result.variant, study.ablation.variants)
+                    raise InputError(f"'{path}' is of no variant of the ablation: '{result.variant}', {hint}")
+                results[result.key] = result
+            failures |= {failure.key: failure for failure in part.failures}
+        order = {name: number for number, name in enumerate(study.ablation.variants)}
+        return replace(
+            study,
+            results=sorted(results.values(), key=lambda result: (result.scene, order[result.variant], result.seed)),
+            failures=[failure for key, failure in failures.items() if key not in results],
+        )
+
+    def _write_cell(self, key: CellKey, study: Study) -> None:
+        path = self.cells / key.file
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_text_atomically(path, study_to_json(study))
+
+
+def _ablation_of(key: CellKey) -> Ablation:
+    """A cell's file is a study of that cell alone."""
+    return Ablation(title=str(key), variants={key.variant: []})
+
+
+def merged(folders: Sequence[StudyFolder]) -> Study:
+    """The cells of several studies as one; title and baseline are the first one's.
+
+    Raises:
+        InputError: a folder without a study, a variant with two meanings, two different results of one cell, or two
+            captures of one name.
+    """
+    studies = [folder.read_study() for folder in folders]
+    ablation = studies[0].ablation
+    for other in (study.ablation for study in studies[1:]):
+        for name, overrides in other.variants.items():
+            if (ablation.base, ablation.variants.get(name, overrides)) != (other.base, overrides):
+                raise InputError(f"variant '{name}' has two meanings in what is to be merged")
+            ablation.variants.setdefault(name, overrides)
+        ablation.notes = {**other.notes, **ablation.notes}
+    results: dict[CellKey, CellResult] = {}
+    captures: dict[str, str] = {}
+    for result in (result for study in studies for result in study.results):
+        if result.capture and captures.setdefault(result.scene, result.capture) != result.capture:
+            raise InputError(f"two different captures are called '{result.scene}' in what is to be merged")
+        if not _equal(results.setdefault(result.key, result), result):
+            raise InputError(f"two different results of the cell {result.key}")
+    return Study(ablation, list(results.values()))
+
+
+def _equal(first: CellResult, second: CellResult) -> bool:
+    """Whether a file would say the same of both."""
+    ablation = _ablation_of(first.key)
+    return study_to_json(Study(ablation, [first])) == study_to_json(Study(ablation, [second]))
