@@ -71,5 +71,8 @@ def chosen_points(count: int, cap: int, others: int) -> slice | np.ndarray:
     if not cap or count + others <= cap:
         return slice(None)
     if cap <= others:
-        raise InputError(f"density.max_gaussians {cap} leaves no room beside the {others} of the backdrop: allow more")
+        raise InputError(
+            f"density.max_gaussians {cap} leaves no room beside the {others} of the backdrop: allow more, or leave the "
+            "backdrop out by train.backdrop=false"
+        )
     return np.linspace(0, count - 1, cap - others).round().astype(np.int64)
