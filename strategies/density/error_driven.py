@@ -1,4 +1,4 @@
-"""Error-driven density control (paper section 3.8), and none."""
+"""Error-driven density control (paper section 3.8)."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import logsigmoid
-from turbogs_plugin.strategies.density.row_order import spatial_order
 from turbogs_plugin.strategies.density.rows import finite_rows, leave_one, loaded_rows
 
 from turbogs_plugin.engine.reference.projection import rotation_matrices
@@ -28,36 +27,6 @@ EPS = 1e-12
 
 
 @dataclass
-class NoDensity:
-    """The set of Gaussians stays as it is.
-
-    Args:
-        max_gaussians: cap on the points that a model begins with. 0: no cap.
-    """
-
-    max_gaussians: int = 0
-
-    def __post_init__(self) -> None:
-        require_not_negative(self, "max_gaussians")
-
-    @property
-    def stats(self) -> GaussianStats | None:
-        return None
-
-    def setup(self, gaussians: Gaussians) -> None:
-        pass
-
-    def update(self, gaussians: Gaussians, step: Step) -> RowUpdate | None:
-        return None
-
-    def state_dict(self) -> dict[str, Any]:
-        return {}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        pass
-
-
-@dataclass
 class ErrorDrivenDensity:
     """Densify where the screen gradient is high and the sampled pixels say the Gaussian is difficult; prune where a
     Gaussian is transparent, huge or easy. There is no reset of opacities.
@@ -68,7 +37,7 @@ class ErrorDrivenDensity:
 
     is its difficulty. A Gaussian with W = 0, or with non-finite statistics, was not seen: it has no score, and is
     neither densified nor pruned by score. Equal scores stand or fall together, except where a cap must choose
-    (then the lower row goes first). After densification, rows are in the order of space (`spatial_order`).
+    (then the lower row goes first).
 
     Until `Step.refine_until`, every `refine_every` iterations from `refine_from` on, one event clones, splits and
     prunes. A Gaussian that is due for pruning is not densified; one that is too big but chosen to be split is not
@@ -174,11 +143,14 @@ class ErrorDrivenDensity:
             score, seen = self.scores(step)
             event = self._refine if densify else self._final_prune
             update = event(gaussians, score, seen, step)
-            count = len(gaussians) if update is None else len(update.source)
-            self._stats = GaussianStats.zeros(count, gaussians.device)
+            self._stats.zero_()
         if step.iteration >= self._last_event(step):
             self._stats = None
         return update
+
+    def apply(self, update: RowUpdate) -> None:
+        if self._stats is not None:
+            self._stats = self._stats.map(update.apply_state)
 
     def state_dict(self) -> dict[str, Any]:
         stats = None if self._stats is None else {f.name: getattr(self._stats, f.name) for f in fields(self._stats)}
@@ -307,7 +279,7 @@ class ErrorDrivenDensity:
     def _compose(
         self, gaussians: Gaussians, cloned: Tensor, split: Tensor, pruned: Tensor, spared: Tensor, step: Step
     ) -> RowUpdate | None:
-        """One change out of masks [N]: the rest, the clones, and both halves of the split, in the order of space."""
+        """One change out of masks [N]: the rest, the clones, and both halves of the split, in this order."""
         rest, copies, halves = (torch.nonzero(mask).squeeze(-1) for mask in (~(pruned | split), cloned, split))
         if len(rest) == len(gaussians) and len(copies) == 0 and self.opacity_decay == 0:
             return None
@@ -323,9 +295,7 @@ class ErrorDrivenDensity:
             opacities = torch.where(spared, gaussians.opacities, _decayed(gaussians.opacities, self.opacity_decay))
             values["opacities"] = opacities[source]
         counts = {"num_cloned": len(copies), "num_split": len(halves), "num_pruned": int(pruned.sum())}
-        # What is seen together is then read together: splats of a tile are gathered, and added to, by row.
-        order = spatial_order(values.get("means", gaussians.means[source]), step.scene_extent)
-        return RowUpdate(source, fresh, values, **counts).reordered(order)
+        return RowUpdate(source, fresh, values, **counts)
 
     def _halves(self, gaussians: Gaussians, index: Tensor, step: Step) -> tuple[Tensor, Tensor]:
         """([2 n, 3] means, [2 n, 3] log scales) of what the Gaussians `index` [n] are split into."""

@@ -117,13 +117,17 @@ class FastGsDensity:
         update = None
         if after <= 0 and step.iteration >= self.refine_from and step.iteration % self.refine_every == 0:
             update = self._densify(gaussians, step)
-            self._restart(len(gaussians) if update is None else len(update.source), gaussians.device)
+            self._restart(len(gaussians), gaussians.device)
         elif after > 0 and after % self.prune_every == 0:
             update = self._prune(gaussians)
-            self._restart(len(gaussians) if update is None else len(update.source), gaussians.device)
+            self._restart(len(gaussians), gaussians.device)
         if after > 0 and step.iteration + self.prune_every - after % self.prune_every >= step.total:
             self._look = self._window = self._votes = None  # no event is left in this run
         return update
+
+    def apply(self, update: RowUpdate) -> None:
+        if self._look is not None:  # a window starts anew at each event
+            self._restart(len(update.source), update.source.device)
 
     def state_dict(self) -> dict[str, Any]:
         parts = {"look": self._look, "window": self._window, "votes": self._votes}

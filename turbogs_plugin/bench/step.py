@@ -19,6 +19,7 @@ from turbogs_plugin.bench.recorder import StepRecorder, recorded
 from turbogs_plugin.config.configuration import Config, load_config
 from turbogs_plugin.engine.cuda.raster import CudaRendered
 from turbogs_plugin.model.gaussians import load_ply
+from turbogs_plugin.model.row_order import in_order_of_space
 from turbogs_plugin.scene import Scene
 from turbogs_plugin.train.trainer import Trainer
 from turbogs_plugin.types import Gaussians, Step
@@ -221,8 +222,10 @@ def density_event(
         first = Mark(device)
         update = density.update(trainer.gaussians, due)
         if update is not None:
+            update = in_order_of_space(update, trainer.gaussians, due)
             after = len(update.apply(trainer.gaussians))
             optimizer.apply(update)
+            density.apply(update)
         wait(device)
         spans.append(first.host_until(Mark(device)))
     return {"wall": summary(spans), "every": interval, "gaussians_after": after}

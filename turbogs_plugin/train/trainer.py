@@ -22,6 +22,7 @@ from turbogs_plugin.model.gaussians import (
     gaussians_from_points,
     restrain_distant,
 )
+from turbogs_plugin.model.row_order import in_order_of_space
 from turbogs_plugin.plan.caps import cap_of, chosen_points
 from turbogs_plugin.scene import Scene
 from turbogs_plugin.scene.offload import place_maps, place_views
@@ -143,13 +144,15 @@ class Trainer:
             self.optimizer.step(self.gaussians, gradients, step)
 
     def follow(self, update: RowUpdate | None) -> None:
-        """Let model and optimizer follow a change of the set of Gaussians."""
+        """Let model, optimizer and density control follow a change of the set of Gaussians, in the order of space."""
         if update is None:
             return
         if len(update.source) == 0:
             raise TrainingStopped(f"iteration {self.iteration}: density control removed every Gaussian")
+        update = in_order_of_space(update, self.gaussians, self.now)
         self.gaussians = update.apply(self.gaussians)
         self.optimizer.apply(update)
+        self.density.apply(update)
         self.first_repeatable = self.iteration + 1
 
     def step_towards(self, mark: int) -> None:
