@@ -20,7 +20,7 @@ from torch import Tensor
 
 from turbogs_plugin.engine import rendering
 from turbogs_plugin.gsplat_bridge import sparse_rasterization
-from turbogs_plugin.model.gaussians import gaussians_from_points
+from turbogs_plugin.model.initial import gaussians_from_points
 from turbogs_plugin.scene import Scene, load_scene
 from turbogs_plugin.scene.demo import write_demo_capture
 from turbogs_plugin.types import Cameras, Gaussians

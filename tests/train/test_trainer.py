@@ -21,7 +21,7 @@ from PIL import Image
 from turbogs_plugin.config.configuration import load_config, resolve
 from turbogs_plugin.config.yaml_text import parse_yaml
 from turbogs_plugin.errors import InputError, TrainingStopped
-from turbogs_plugin.model.gaussians import load_ply
+from turbogs_plugin.model.ply import load_ply
 from turbogs_plugin.model.row_order import spatial_order
 from turbogs_plugin.scene import load_scene
 from turbogs_plugin.scene.fingerprint import capture_difference, capture_state

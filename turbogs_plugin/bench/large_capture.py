@@ -7,10 +7,9 @@ import torch
 
 from turbogs_plugin.bench.models import ring_cameras, surface_gaussians
 from turbogs_plugin.engine.rendering import render_images
-from turbogs_plugin.model.gaussians import SH_C0
 from turbogs_plugin.scene import Frame, PosedImages, Scene
 from turbogs_plugin.scene.photos import Photos
-from turbogs_plugin.types import Cameras
+from turbogs_plugin.types import SH_C0, Cameras
 
 POINT_NOISE = 0.01
 """Standard deviation of the points' noise; the cameras are 3 from the centre."""

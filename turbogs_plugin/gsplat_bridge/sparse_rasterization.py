@@ -16,9 +16,9 @@ from turbogs_plugin.engine.rendering import RasterSettings, Rendered, rasterize
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.gsplat_bridge.gaussian_errors import residuals
 from turbogs_plugin.gsplat_bridge.host import GROUND_TRUTH, LOSS_SHARES, PREDICTION, STATISTICS
-from turbogs_plugin.model.gaussians import SH_C0
 from turbogs_plugin.types import (
     PARAMETER_NAMES,
+    SH_C0,
     TILE_SIZE,
     Cameras,
     Gaussians,

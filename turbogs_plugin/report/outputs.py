@@ -9,8 +9,8 @@ from pathlib import Path
 from PIL import Image
 
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.model.gaussians import save_ply
 from turbogs_plugin.model.harmonics import band_energy, drop_faint_bands
+from turbogs_plugin.model.ply import save_ply
 from turbogs_plugin.report.pages import ERRORS, number, table
 from turbogs_plugin.report.plots import to_uint8
 from turbogs_plugin.scene import PosedImages

@@ -15,13 +15,8 @@ from turbogs_plugin.engine import engine_of
 from turbogs_plugin.engine.rendered import Rendered, ScreenGradients
 from turbogs_plugin.engine.rendering import render_images
 from turbogs_plugin.errors import TrainingStopped
-from turbogs_plugin.model.gaussians import (
-    BACKDROP_COUNT,
-    RESTRAIN_EVERY,
-    backdrop_gaussians,
-    gaussians_from_points,
-    restrain_distant,
-)
+from turbogs_plugin.model.distant import RESTRAIN_EVERY, restrain_distant
+from turbogs_plugin.model.initial import BACKDROP_COUNT, backdrop_gaussians, gaussians_from_points
 from turbogs_plugin.model.row_order import in_order_of_space
 from turbogs_plugin.plan.caps import cap_of, chosen_points
 from turbogs_plugin.scene import Scene
@@ -110,8 +105,6 @@ class Trainer:
 
         # 11) Error-driven density control
         self.follow(self.density.update(self.gaussians, step))
-        if self.config.train.distant_size > 0 and self.iteration % RESTRAIN_EVERY == 0:
-            restrain_distant(self.gaussians, self.extent, self.config.train.distant_size)
 
         self.iteration += 1
 
@@ -144,16 +137,21 @@ class Trainer:
             self.optimizer.step(self.gaussians, gradients, step)
 
     def follow(self, update: RowUpdate | None) -> None:
-        """Let model, optimizer and density control follow a change of the set of Gaussians, in the order of space."""
-        if update is None:
-            return
-        if len(update.source) == 0:
-            raise TrainingStopped(f"iteration {self.iteration}: density control removed every Gaussian")
-        update = in_order_of_space(update, self.gaussians, self.now)
-        self.gaussians = update.apply(self.gaussians)
-        self.optimizer.apply(update)
-        self.density.apply(update)
-        self.first_repeatable = self.iteration + 1
+        """What is done after density control has proposed a change of the set of Gaussians, or none.
+
+        Model, optimizer and controller follow the change, in the order of space. Then what is far away is kept from
+        growing, which no part of the paper does.
+        """
+        if update is not None:
+            if len(update.source) == 0:
+                raise TrainingStopped(f"iteration {self.iteration}: density control removed every Gaussian")
+            update = in_order_of_space(update, self.gaussians, self.now)
+            self.gaussians = update.apply(self.gaussians)
+            self.optimizer.apply(update)
+            self.density.apply(update)
+            self.first_repeatable = self.iteration + 1
+        if self.config.train.distant_size > 0 and self.iteration % RESTRAIN_EVERY == 0:
+            restrain_distant(self.gaussians, self.extent, self.config.train.distant_size)
 
     def step_towards(self, mark: int) -> None:
         """One iteration. The one that reaches `mark` waits for the GPU, so that none is missing there."""
