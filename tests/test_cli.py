@@ -243,6 +243,8 @@ def test_what_follows_an_option_is_no_override(turbogs, capture, tmp_path):
         ("bench step --photos 3 --pixel-budget -1", ["--pixel-budget -1"]),
         ("bench step --photos 3 --pixel-budget inf", ["--pixel-budget inf"]),
         ("bench step --photos 3 --out /proc/x.json", ["--out '/proc/x.json' cannot be made"]),
+        ("bench numerics", ["needs --out FOLDER"]),
+        ("bench numerics loss.type=charbonnier --out /proc/x", ["takes --device besides"]),
         ("bench raster --rates 0", ["--rates 0"]),
         ("bench raster --rates 0.5 -1", ["--rates 0.5 -1"]),
         ("bench raster --rates nan", ["--rates nan"]),

@@ -235,7 +235,7 @@ def compare(
 
 @app.command
 def bench(
-    what: Annotated[Positional[Literal["step", "raster"]], arg(metavar="step|raster")],
+    what: Annotated[Positional[Literal["step", "raster", "numerics"]], arg(metavar="step|raster|numerics")],
     overrides: Overrides = (),
     /,
     *,
@@ -253,12 +253,14 @@ def bench(
     library: Annotated[tuple[Path, ...], arg(metavar="FILE ...")] = (),
     factor: Annotated[int, arg(metavar="N")] = 1,
     device: Device = "auto",
-    out: Annotated[Path | None, arg(metavar="FILE")] = None,
+    out: Annotated[Path | None, arg(metavar="FILE_OR_FOLDER")] = None,
 ) -> int:
-    """Time an iteration of training step by step, or the rasterizer stage by stage, beside what the machine allows.
+    """Time an iteration of training step by step, or the rasterizer stage by stage, beside what the machine allows; or
+    measure how exact and how fast the optimizer's solvers are on stiff systems.
 
     Args:
-        what: step: from sampling to update; raster: forward and backward, beside gsplat's dense ones.
+        what: step: from sampling to update; raster: forward and backward, beside gsplat's dense ones; numerics: the
+            solvers of moment-damped LM, which takes --out and --device alone.
         overrides: step: changes of the configuration whose strategies are timed.
         scene: a capture, for its cameras and photos; where absent, all is synthetic, the models of raster as well.
         ply: a trained model in place of those trained here; raster: one or more, timed at their own sizes.
@@ -274,7 +276,7 @@ def bench(
         library: raster: other builds of the kernels, measured the same way.
         factor: scale photos down by this.
         device: what to time.
-        out: JSON file; standard output where absent.
+        out: JSON file; standard output where absent. numerics: folder for its table, plot and JSON.
     """
     from turbogs_plugin.bench import commands
     from turbogs_plugin.bench.models import TRAINING_ITERATIONS
@@ -293,6 +295,10 @@ def bench(
         raise InputError("--ply names a trained model: leave --training out")
     iterations = TRAINING_ITERATIONS if training is None else training
     where = resolve_device(device)
+    if what == "numerics":
+        if out is None or overrides or scene is not None or ply or library:
+            raise InputError("bench numerics needs --out FOLDER, and takes --device besides")
+        return commands.run_numerics(where, out)
     if what == "step":
         if len(ply) > 1:
             raise InputError("bench step takes one --ply, at the sizes of --gaussians")

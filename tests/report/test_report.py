@@ -10,8 +10,8 @@ from helpers.framework_runs import tiny_capture, tiny_config
 from PIL import Image
 
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.report.pages import number, table
 from turbogs_plugin.report.plots import ERROR_FULL_SCALE, GAP, error_picture, plot_against_seconds, save_strip
+from turbogs_plugin.report.tables import number, table
 from turbogs_plugin.train import run
 from turbogs_plugin.train.evaluate import Metrics, ViewMetrics, compare, load_lpips, peak_memory_bytes
 from turbogs_plugin.train.history import Evaluation, append_evaluation, read_history, rewind_history

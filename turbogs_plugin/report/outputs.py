@@ -11,8 +11,8 @@ from PIL import Image
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.model.harmonics import band_energy, drop_faint_bands
 from turbogs_plugin.model.ply import save_ply
-from turbogs_plugin.report.pages import ERRORS, number, table
 from turbogs_plugin.report.plots import to_uint8
+from turbogs_plugin.report.tables import ERRORS, number, table
 from turbogs_plugin.scene import PosedImages
 from turbogs_plugin.scene.offload import place_views
 from turbogs_plugin.train.evaluate import evaluate, load_lpips, render_view
