@@ -13,8 +13,7 @@ from typing import Annotated, Literal
 import tyro
 from tyro.conf import Positional, UseAppendAction, arg
 
-from turbogs_plugin.errors import InputError
-from turbogs_plugin.exit_codes import exit_code
+from turbogs_plugin.errors import InputError, exit_code
 
 app = tyro.extras.SubcommandApp()
 

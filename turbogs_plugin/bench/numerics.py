@@ -26,7 +26,7 @@ from turbogs_plugin.files import write_atomically, write_text_atomically
 from turbogs_plugin.report.machine import hardware, software
 from turbogs_plugin.report.plots import STYLE
 from turbogs_plugin.report.tables import table
-from turbogs_plugin.train.evaluate import synchronize
+from turbogs_plugin.train.clock import synchronize
 
 Problem = tuple[Tensor, Tensor, Tensor, Tensor]
 """rows [K, n, D], weights [K, n], damping [n, D], rhs [n, D], as the solvers take them."""

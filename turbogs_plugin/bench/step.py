@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from turbogs_plugin.bench.clocks import BLOCKS, Mark, back_to_back, copy_bandwidth, keep_busy, summary, wait
+from turbogs_plugin.bench.clocks import BLOCKS, Mark, back_to_back, copy_bandwidth, keep_busy, summary
 from turbogs_plugin.bench.floors import raster_counts, step_floors
 from turbogs_plugin.bench.models import adopt, changed, resized, train, trained_model
 from turbogs_plugin.bench.recorder import StepRecorder, recorded
@@ -21,6 +21,7 @@ from turbogs_plugin.engine.cuda.raster import CudaRendered
 from turbogs_plugin.model.ply import load_ply
 from turbogs_plugin.model.row_order import in_order_of_space
 from turbogs_plugin.scene import Scene
+from turbogs_plugin.train.clock import synchronize
 from turbogs_plugin.train.trainer import Trainer
 from turbogs_plugin.types import Gaussians, Step
 
@@ -108,7 +109,7 @@ class StepBench:
             for _ in range(self.repeats):
                 keep_busy(device)
                 iteration()
-            wait(device)
+            synchronize(device)
             steps = recorder.summaries()
             stored = memory(trainer, scene, held, device)
             updates = trainer.optimizer.state_dict()["steps"].clone()
@@ -191,7 +192,7 @@ class StepBench:
         for _ in range(self.repeats):
             trainer.step()
             marks.append(Mark(device))
-        wait(device)
+        synchronize(device)
         return summary([first.until(last) for first, last in itertools.pairwise(marks)])
 
 
@@ -218,7 +219,7 @@ def density_event(
         density, optimizer = usual.build("density"), copy.deepcopy(trainer.optimizer)
         density.setup(trainer.gaussians)
         density.load_state_dict(trainer.density.state_dict())
-        wait(device)
+        synchronize(device)
         first = Mark(device)
         update = density.update(trainer.gaussians, due)
         if update is not None:
@@ -226,7 +227,7 @@ def density_event(
             after = len(update.apply(trainer.gaussians))
             optimizer.apply(update)
             density.apply(update)
-        wait(device)
+        synchronize(device)
         spans.append(first.host_until(Mark(device)))
     return {"wall": summary(spans), "every": interval, "gaussians_after": after}
 

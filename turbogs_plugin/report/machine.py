@@ -8,7 +8,7 @@ from importlib.metadata import PackageNotFoundError, version
 
 import torch
 
-from turbogs_plugin.version import __version__
+from turbogs_plugin import __version__
 
 PACKAGES = ("torch", "gsplat", "numpy", "pycolmap", "torchmetrics")
 

@@ -29,7 +29,7 @@ from torch import Tensor
 from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.scene import PosedImages
 from turbogs_plugin.scene.photos import Photos, pixel_offsets
-from turbogs_plugin.train.evaluate import synchronize
+from turbogs_plugin.train.clock import synchronize
 
 SETS = 2
 """Sets of slots: one that the device works on, one that travels."""

@@ -23,7 +23,7 @@ from turbogs_plugin.study.cell import capture_digest, train_cell
 from turbogs_plugin.study.grid import Ablation, CellKey, variant_config
 from turbogs_plugin.study.progress import SweepProgress
 from turbogs_plugin.study.results import CellResult, Failure, StudyFolder
-from turbogs_plugin.train.evaluate import synchronize
+from turbogs_plugin.train.clock import synchronize
 from turbogs_plugin.train.run import resolve_device
 
 UNCOMPARED = (("scene", "path"), ("train", "device"))

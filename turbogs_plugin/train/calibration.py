@@ -32,7 +32,8 @@ from turbogs_plugin.plan.pixels import (
 )
 from turbogs_plugin.plan.time import IterationCost, fit_to_time
 from turbogs_plugin.scene import Scene
-from turbogs_plugin.train.evaluate import free_device_memory, synchronize
+from turbogs_plugin.train.clock import synchronize
+from turbogs_plugin.train.evaluate import free_device_memory
 from turbogs_plugin.train.trainer import Trainer
 
 CALIBRATION_SHARE = 0.04

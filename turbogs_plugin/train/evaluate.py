@@ -19,6 +19,7 @@ from torchmetrics.functional.image import structural_similarity_index_measure
 from turbogs_plugin.engine.rendering import RasterSettings, render_images
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene import PosedImages
+from turbogs_plugin.train.clock import synchronize
 from turbogs_plugin.types import Gaussians
 
 SSIM_SIDE = 11
@@ -175,12 +176,6 @@ def _load_lpips(file: Path, device: torch.device) -> Callable[[Tensor, Tensor], 
         finally:
             torch.hub.set_dir(cache)
     return lambda image, photo: network(image.permute(2, 0, 1)[None], photo.permute(2, 0, 1)[None]).item()
-
-
-def synchronize(device: torch.device) -> None:
-    """Wait for the GPU, so that a clock read next counts what was asked for."""
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)
 
 
 def free_device_memory(device: torch.device) -> None:
