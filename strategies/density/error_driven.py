@@ -6,18 +6,14 @@ import math
 from dataclasses import dataclass, field, fields
 from typing import Any, Literal
 
-import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import logsigmoid
-from turbogs_plugin.strategies.density.rows import finite_rows, leave_one, loaded_rows
+from turbogs_plugin.strategies.density.rows import finite_rows, leave_one, loaded_rows, removal
+from turbogs_plugin.strategies.density.splitting import split_in_two
 
-from turbogs_plugin.engine.reference.projection import rotation_matrices
 from turbogs_plugin.errors import InputError, require, require_not_negative
 from turbogs_plugin.types import Gaussians, GaussianStats, RowUpdate, Step
-
-SPLIT_SHRINK = 1.6
-"""A split divides standard deviations by this (3DGS)."""
 
 FLAT_EVENTS = 5
 """Events of density control over which `stop_when_flat` looks at the error's fall."""
@@ -270,11 +266,7 @@ class ErrorDrivenDensity:
     def _final_prune(self, gaussians: Gaussians, score: Tensor, seen: Tensor, step: Step) -> RowUpdate | None:
         finite = finite_rows(gaussians)
         easy = seen & (score < _quantile(score, seen, 1 - self.final_keep))
-        pruned = leave_one(~finite | easy & ~self._spared(gaussians, finite, step.scene_extent), gaussians)
-        if not pruned.any():
-            return None
-        source = torch.nonzero(~pruned).squeeze(-1)
-        return RowUpdate(source, torch.zeros_like(source, dtype=torch.bool), {}, num_pruned=int(pruned.sum()))
+        return removal(leave_one(~finite | easy & ~self._spared(gaussians, finite, step.scene_extent), gaussians))
 
     def _compose(
         self, gaussians: Gaussians, cloned: Tensor, split: Tensor, pruned: Tensor, spared: Tensor, step: Step
@@ -288,33 +280,13 @@ class ErrorDrivenDensity:
         values = {}
         if len(halves):
             values = {"means": gaussians.means[source], "scales": gaussians.scales[source]}
-            values["means"][-2 * len(halves) :], values["scales"][-2 * len(halves) :] = self._halves(
-                gaussians, halves, step
-            )
+            means, scales = split_in_two(gaussians, halves, self.split, step)
+            values["means"][-2 * len(halves) :], values["scales"][-2 * len(halves) :] = means, scales
         if self.opacity_decay > 0:
             opacities = torch.where(spared, gaussians.opacities, _decayed(gaussians.opacities, self.opacity_decay))
             values["opacities"] = opacities[source]
         counts = {"num_cloned": len(copies), "num_split": len(halves), "num_pruned": int(pruned.sum())}
         return RowUpdate(source, fresh, values, **counts)
-
-    def _halves(self, gaussians: Gaussians, index: Tensor, step: Step) -> tuple[Tensor, Tensor]:
-        """([2 n, 3] means, [2 n, 3] log scales) of what the Gaussians `index` [n] are split into."""
-        means, scales = gaussians.means[index], gaussians.scales[index]
-        rotations = rotation_matrices(gaussians.quats[index])  # [n, 3, 3]
-        if self.split == "sample":
-            generator = np.random.Generator(np.random.Philox(np.random.SeedSequence([step.seed, step.iteration])))
-            # Drawn on the host: the same numbers on every device.
-            draws = torch.from_numpy(generator.standard_normal((2, len(index), 3))).to(means)
-            offsets = torch.einsum("nij,bnj->bni", rotations, scales.exp() * draws)
-            shrink = torch.full_like(scales, math.log(SPLIT_SHRINK))
-        else:
-            axis = torch.nn.functional.one_hot(scales.argmax(dim=-1), 3).to(scales)  # [n, 3]
-            # A pair at +-a of deviation b has variance a^2 + b^2; b = sigma / 1.6, so a^2 = sigma^2 (1 - 1 / 1.6^2).
-            distance = math.sqrt(1 - SPLIT_SHRINK**-2)
-            offset = torch.einsum("nij,nj->ni", rotations, scales.exp() * axis * distance)
-            offsets = torch.stack([offset, -offset])
-            shrink = axis * math.log(SPLIT_SHRINK)
-        return (means + offsets).reshape(-1, 3), (scales - shrink).repeat(2, 1)
 
 
 def _quantile(values: Tensor, mask: Tensor, fraction: float) -> Tensor:

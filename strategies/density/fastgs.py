@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 from turbogs_plugin.strategies.density.error_driven import ErrorDrivenDensity
-from turbogs_plugin.strategies.density.rows import finite_rows, leave_one, loaded_rows
+from turbogs_plugin.strategies.density.rows import finite_rows, leave_one, loaded_rows, removal
 
 from turbogs_plugin.errors import require, require_not_negative
 from turbogs_plugin.types import Gaussians, GaussianStats, RowUpdate, Step
@@ -173,10 +173,4 @@ class FastGsDensity:
         if bool(blamed.all()):  # all alike: this tells none from another
             blamed = torch.zeros_like(blamed)
         transparent = torch.sigmoid(gaussians.opacities) < self.prune_opacity
-        pruned = leave_one(blamed | transparent | ~finite_rows(gaussians), gaussians)
-        source = torch.nonzero(~pruned).squeeze(-1)
-        if len(source) == len(gaussians):
-            return None
-        return RowUpdate(
-            source, torch.zeros_like(source, dtype=torch.bool), {}, num_pruned=len(gaussians) - len(source)
-        )
+        return removal(leave_one(blamed | transparent | ~finite_rows(gaussians), gaussians))
