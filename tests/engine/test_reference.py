@@ -291,6 +291,13 @@ def test_a_degree_that_the_model_lacks_is_an_error(degree):
         rasterize(gaussians, cameras, dense_samples(cameras), sh_degree=degree)
 
 
+@pytest.mark.parametrize("degree", [None, 3])
+def test_a_degree_that_no_engine_evaluates_is_refused_by_name(degree):
+    gaussians, cameras = make_gaussians(3, degree=4), make_cameras([(4, 4)])
+    with pytest.raises(InputError, match="of degree 4: the largest that is rendered is 3"):
+        rasterize(gaussians, cameras, dense_samples(cameras), sh_degree=degree)
+
+
 def test_negative_exponents_are_skipped():
     """A conic that rounding made indefinite draws nothing where its exponent is negative, as in gsplat."""
     centers = torch.tensor([[[1.0, 1.0], [1.0, -1.0], [0.0, 0.0]]], dtype=torch.float64)

@@ -13,6 +13,7 @@ from turbogs_plugin.engine.reference.compositing import ALPHA_TINY, Composite, C
 from turbogs_plugin.engine.reference.intersection import intersect_tiles
 from turbogs_plugin.engine.reference.projection import Rows, Splats, drawable_rows, project_rows
 from turbogs_plugin.engine.rendered import DEFAULT_SETTINGS, Projected, RasterSettings, require_statistics
+from turbogs_plugin.engine.shared import used_degree
 from turbogs_plugin.types import Cameras, GaussianGradients, Gaussians, GaussianStats, PixelSamples
 
 ROW_PARAMETERS = ("means", "quats", "scales", "opacities", "sh0")
@@ -22,15 +23,6 @@ ROW_PARAMETERS = ("means", "quats", "scales", "opacities", "sh0")
 def expected_depths(sums: Tensor) -> Tensor:
     """[P, 5] sums -> [P] expected depth, 0 where nothing was hit. Differentiable."""
     return sums[:, 4] / sums[:, 3].clamp(min=ALPHA_TINY)
-
-
-def used_degree(gaussians: Gaussians, sh_degree: int | None) -> int:
-    """The degree of spherical harmonics to evaluate; ValueError where the model does not hold it."""
-    if sh_degree is None:
-        return gaussians.sh_degree
-    if not 0 <= sh_degree <= gaussians.sh_degree:
-        raise ValueError(f"sh_degree is {sh_degree}, but these Gaussians hold degrees 0 to {gaussians.sh_degree}")
-    return sh_degree
 
 
 @dataclass
