@@ -8,27 +8,18 @@ import torch
 from torch import Tensor
 
 from turbogs_plugin.engine import engine_of
-from turbogs_plugin.engine.cuda import library as kernels
-from turbogs_plugin.engine.cuda.autograd import rasterize_differentiable_cuda
-from turbogs_plugin.engine.reference.raster import (
-    DifferentiableRender,
-    rasterize_differentiable_reference,
-    rasterize_reference,
-)
+from turbogs_plugin.engine.reference.raster import rasterize_reference
 from turbogs_plugin.engine.rendered import DEFAULT_SETTINGS, RasterSettings, Rendered, ScreenGradients
 from turbogs_plugin.tiles import dense_pixels
 from turbogs_plugin.types import Cameras, Gaussians, PixelSamples
 
 __all__ = [
     "DEFAULT_SETTINGS",
-    "DifferentiableRender",
     "RasterSettings",
     "Rendered",
     "ScreenGradients",
     "dense_samples",
     "rasterize",
-    "rasterize_differentiable",
-    "rasterize_differentiable_reference",
     "rasterize_reference",
     "render_images",
 ]
@@ -47,24 +38,6 @@ def rasterize(
     return engine_of(gaussians.device).render(
         gaussians, cameras, samples, sh_degree=sh_degree, settings=settings, with_depth=with_depth
     )
-
-
-def rasterize_differentiable(
-    gaussians: Gaussians,
-    cameras: Cameras,
-    samples: PixelSamples,
-    *,
-    sh_degree: int | None = None,
-    settings: RasterSettings = DEFAULT_SETTINGS,
-    with_depth: bool = False,
-) -> DifferentiableRender:
-    """`rasterize` under torch autograd, for losses written in plain torch; the arguments are the same.
-
-    After a backward pass `means2d` has `.grad` and, as in gsplat with ``absgrad=True``, `.absgrad`.
-    """
-    on_gpu = gaussians.device.type == "cuda" and kernels.available()
-    function = rasterize_differentiable_cuda if on_gpu else rasterize_differentiable_reference
-    return function(gaussians, cameras, samples, sh_degree=sh_degree, settings=settings, with_depth=with_depth)
 
 
 def dense_samples(cameras: Cameras, view_ids: Sequence[int] | None = None) -> PixelSamples:
