@@ -121,17 +121,27 @@ def evaluate(run: Positional[Path], /, *, device: Device = "auto") -> int:
 
 
 @app.command
-def render(run: Positional[Path], /, *, split: Literal["test", "train"] = "test", device: Device = "auto") -> int:
+def render(
+    run: Positional[Path],
+    /,
+    *,
+    split: Literal["test", "train"] = "test",
+    depth: bool = False,
+    device: Device = "auto",
+) -> int:
     """Render the newest model of a run from its cameras, as PNGs in the run's folder.
 
     Args:
         run: folder of the run.
         split: which cameras.
+        depth: also write depth images: .npy (float32, along the camera's axis, in the capture's own units; 0 where
+            nothing was hit) and .png (near is bright).
         device: where to render.
     """
     from turbogs_plugin.report.outputs import render_run
 
-    print(f"renders  {render_run(run, split, device)}")
+    for name, folder in zip(("renders", "depths"), render_run(run, split, device, depth), strict=False):
+        print(f"{name:<8} {folder}")
     return 0
 
 

@@ -15,7 +15,7 @@ from turbogs_plugin.engine.rendering import (
     RasterSettings,
     dense_samples,
     rasterize,
-    render_images,
+    render_image,
 )
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.types import PARAMETER_NAMES, Gaussians, GaussianStats, PixelSamples, cell_order
@@ -249,14 +249,14 @@ def test_sparse_equals_dense_at_the_same_pixels(dtype):
     gaussians, cameras = make_gaussians(80, dtype=dtype), make_cameras(SIZES, dtype)
     samples = thin_out(dense_samples(cameras), 0.2, empty_slots=1)
     rendered = rasterize(gaussians, cameras, samples, with_depth=True)
-    images = render_images(gaussians, cameras)
+    images = [render_image(gaussians, cameras, view, with_depth=True) for view in range(2)]
     x, y = samples.coordinates().unbind(dim=-1)
     views = samples.view_of_slot()
     for slot in samples.filled.nonzero()[:, 0].tolist():
-        colors, alphas = images[views[slot]]
-        assert colors.dtype == dtype
-        torch.testing.assert_close(rendered.colors[slot], colors[y[slot], x[slot]])
-        torch.testing.assert_close(rendered.alphas[slot], alphas[y[slot], x[slot]])
+        image = images[views[slot]]
+        for name in ("colors", "alphas", "depths"):
+            assert getattr(image, name).dtype == dtype
+            torch.testing.assert_close(getattr(rendered, name)[slot], getattr(image, name)[y[slot], x[slot]])
 
 
 def test_float32_is_close_to_float64():

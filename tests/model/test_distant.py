@@ -5,7 +5,7 @@ import pytest
 import torch
 from helpers.models import random_gaussians
 
-from turbogs_plugin.engine.rendering import render_images
+from turbogs_plugin.engine.rendering import render_image
 from turbogs_plugin.model.distant import DISTANT, restrain_distant
 from turbogs_plugin.types import Cameras
 
@@ -30,6 +30,6 @@ def test_what_lies_beside_a_camera_covers_none_of_its_view(depth):
     gaussians.means[0], gaussians.quats[0] = torch.tensor([25.0, 0.0, depth]), torch.tensor([1.0, 0.0, 0.0, 0.0])
     gaussians.scales[0], gaussians.opacities[0] = torch.tensor([45.0, 32.0, 0.4]).log(), 10.0
     camera = Cameras(torch.eye(4)[None], torch.tensor([[[80.0, 0, 48], [0, 80, 32], [0, 0, 1]]]), np.array([[96, 64]]))
-    assert render_images(gaussians, camera)[0][1][32, 48] > 0.8
+    assert render_image(gaussians, camera).alphas[32, 48] > 0.8
     restrain_distant(gaussians, extent=1.0, size=0.3)
-    assert render_images(gaussians, camera)[0][1][32, 48] < 0.01
+    assert render_image(gaussians, camera).alphas[32, 48] < 0.01

@@ -13,7 +13,7 @@ from torch import Tensor
 from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.engine import engine_of
 from turbogs_plugin.engine.rendered import Rendered, ScreenGradients
-from turbogs_plugin.engine.rendering import render_images
+from turbogs_plugin.engine.rendering import render_image
 from turbogs_plugin.errors import TrainingStopped
 from turbogs_plugin.model.distant import RESTRAIN_EVERY, restrain_distant
 from turbogs_plugin.model.initial import BACKDROP_COUNT, backdrop_gaussians, gaussians_from_points
@@ -67,9 +67,10 @@ class Trainer:
 
     def initialise_map(self, view_id: int) -> None:
         """The errors of one view."""
-        camera = self.views.cameras.select([view_id])
-        image, _ = render_images(self.gaussians, camera, self.sh_degree, self.config.raster)[0]
-        errors = (image - self.views.photos.image(view_id)).abs().sum(dim=-1)  # [H, W]
+        image = render_image(
+            self.gaussians, self.views.cameras, view_id, sh_degree=self.sh_degree, settings=self.config.raster
+        )
+        errors = (image.colors - self.views.photos.image(view_id)).abs().sum(dim=-1)  # [H, W]
         self.maps.initialise(view_id, errors.reshape(-1))
 
     def step(self) -> None:
