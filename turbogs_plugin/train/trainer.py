@@ -22,7 +22,16 @@ from turbogs_plugin.plan.caps import cap_of, chosen_points
 from turbogs_plugin.scene import Scene
 from turbogs_plugin.scene.offload import place_maps, place_views
 from turbogs_plugin.scene.photos import PhotoSamples
-from turbogs_plugin.types import PARAMETER_NAMES, Gaussians, GaussianStats, LossOutput, PixelSamples, RowUpdate, Step
+from turbogs_plugin.types import (
+    LARGEST_SH_DEGREE,
+    PARAMETER_NAMES,
+    Gaussians,
+    GaussianStats,
+    LossOutput,
+    PixelSamples,
+    RowUpdate,
+    Step,
+)
 
 COLOR_STRIDE = 97
 """Every so many pixels count for the mean colour of the photos; coprime to usual widths."""
@@ -267,6 +276,6 @@ def gaussians_of_state(state: dict[str, Any], device: torch.device) -> Gaussians
             raise ValueError(f"gaussians.{name} has shape {tuple(value.shape)} where {shape} was expected")
         if not value.isfinite().all():
             raise ValueError(f"gaussians.{name} is not finite")
-    if bands not in (0, 3, 8, 15):
+    if bands not in [(degree + 1) ** 2 - 1 for degree in range(LARGEST_SH_DEGREE + 1)]:
         raise ValueError(f"gaussians.shN has {bands} bands")
     return gaussians
