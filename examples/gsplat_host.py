@@ -20,7 +20,7 @@ from torch import Tensor
 
 from turbogs_plugin.engine import rendering
 from turbogs_plugin.gsplat_bridge import sparse_rasterization
-from turbogs_plugin.model.gaussians import gaussians_from_points
+from turbogs_plugin.model.initial import gaussians_from_points
 from turbogs_plugin.scene import Scene, load_scene
 from turbogs_plugin.scene.demo import write_demo_capture
 from turbogs_plugin.types import Cameras, Gaussians
@@ -176,11 +176,10 @@ def train(
 def mean_psnr(scene: Scene, splats: torch.nn.ParameterDict) -> float:
     """Mean PSNR over the test views, by our rasterizer."""
     gaussians = Gaussians(**dict(splats.items()))
-    images = rendering.render_images(gaussians, scene.test.cameras.to(gaussians.device))
-    errors = [
-        (image.clamp(0, 1).cpu() - scene.test.photos.image(view)).square().mean()
-        for view, (image, _) in enumerate(images)
-    ]
+    cameras, errors = scene.test.cameras.to(gaussians.device), []
+    for view in range(len(cameras)):
+        image = rendering.render_image(gaussians, cameras, view).colors.clamp(0, 1).cpu()
+        errors.append((image - scene.test.photos.image(view)).square().mean())
     return float((-10.0 * torch.stack(errors).log10()).mean())
 
 

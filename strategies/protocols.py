@@ -91,8 +91,12 @@ class DensityController(Protocol):
         ...
 
     def update(self, gaussians: Gaussians, step: Step) -> RowUpdate | None:
-        """Called after every optimizer step; a change of the set of Gaussians, or None. Follows its own change
-        with its own statistics."""
+        """Called after every optimizer step: proposes a change of the set of Gaussians, or None for none."""
+        ...
+
+    def apply(self, update: RowUpdate) -> None:
+        """Follow the change with its own state by Gaussian, row by row. Called after model and optimizer followed; the
+        rows may be in another order than in what `update` proposed."""
         ...
 
     def state_dict(self) -> dict[str, Any]: ...

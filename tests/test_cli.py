@@ -17,6 +17,8 @@ from helpers.framework_runs import TINY, tiny_capture
 from PIL import Image
 
 from turbogs_plugin import scene
+from turbogs_plugin.engine.rendering import render_image
+from turbogs_plugin.model.ply import load_ply
 from turbogs_plugin.report.outputs import distinct_stems
 from turbogs_plugin.train import run
 from turbogs_plugin.train.trainer import Trainer
@@ -243,6 +245,8 @@ def test_what_follows_an_option_is_no_override(turbogs, capture, tmp_path):
         ("bench step --photos 3 --pixel-budget -1", ["--pixel-budget -1"]),
         ("bench step --photos 3 --pixel-budget inf", ["--pixel-budget inf"]),
         ("bench step --photos 3 --out /proc/x.json", ["--out '/proc/x.json' cannot be made"]),
+        ("bench numerics", ["needs --out FOLDER"]),
+        ("bench numerics loss.type=charbonnier --out /proc/x", ["takes --device besides"]),
         ("bench raster --rates 0", ["--rates 0"]),
         ("bench raster --rates 0.5 -1", ["--rates 0.5 -1"]),
         ("bench raster --rates nan", ["--rates nan"]),
@@ -331,6 +335,24 @@ def test_a_finished_run_is_evaluated_rendered_and_exported(turbogs, finished, tm
     code, out, _ = turbogs("export", finished, "--format", "ply", "--out", tmp_path / "mine.ply")
     assert code == 0 and (tmp_path / "mine.ply").read_bytes() == (finished / "model.ply").read_bytes()
     assert_refused(turbogs("export", finished, "--out", tmp_path / "mine.ply"), "exists")
+
+
+def test_depth_images_are_in_the_captures_own_units(turbogs, capture, finished):
+    """As the exported model and the capture's own cameras, which are in these units, give them."""
+    code, out, _ = turbogs("render", finished, "--depth", "--device", "cpu")
+    folder = finished / "renders" / "test-depth"
+    assert code == 0 and str(folder) in out
+    loaded, model = scene.load_scene(capture), load_ply(finished / "model.ply")
+    cameras, frame = loaded.test.cameras, loaded.frame
+    center = torch.from_numpy(frame.center).float()
+    assert abs(frame.scale - 1) > 0.1  # or the units show nothing
+    cameras.viewmats[:, :3, 3] = cameras.viewmats[:, :3, 3] * frame.scale - cameras.viewmats[:, :3, :3] @ center
+    for view, stem in enumerate(distinct_stems(loaded.test.names)):
+        depths = np.load(folder / f"{stem}.npy")
+        assert depths.dtype == np.float32 and depths.shape == (40, 48)
+        expected = render_image(model, cameras, view, with_depth=True).depths.numpy()
+        assert np.median(np.abs(depths - expected)) < 1e-4 * np.median(expected)
+        assert Image.open(folder / f"{stem}.png").size == (48, 40)
 
 
 def test_an_exported_file_that_cannot_be_written_is_refused(turbogs, finished, tmp_path):

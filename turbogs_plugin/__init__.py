@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from turbogs_plugin.version import __version__
+__version__ = "0.1.0"
 
 # `strategies/` and `configs/` live beside this package in a checkout and inside it once installed.
 # Without an install (a machine with no network), the checkout's root takes the installed layout's place.

@@ -13,8 +13,7 @@ from typing import Annotated, Literal
 import tyro
 from tyro.conf import Positional, UseAppendAction, arg
 
-from turbogs_plugin.errors import InputError
-from turbogs_plugin.exit_codes import exit_code
+from turbogs_plugin.errors import InputError, exit_code
 
 app = tyro.extras.SubcommandApp()
 
@@ -124,17 +123,27 @@ def evaluate(run: Positional[Path], /, *, device: Device = "auto") -> int:
 
 
 @app.command
-def render(run: Positional[Path], /, *, split: Literal["test", "train"] = "test", device: Device = "auto") -> int:
+def render(
+    run: Positional[Path],
+    /,
+    *,
+    split: Literal["test", "train"] = "test",
+    depth: bool = False,
+    device: Device = "auto",
+) -> int:
     """Render the newest model of a run from its cameras, as PNGs in the run's folder.
 
     Args:
         run: folder of the run.
         split: which cameras.
+        depth: also write depth images: .npy (float32, along the camera's axis, in the capture's own units; 0 where
+            nothing was hit) and .png (near is bright).
         device: where to render.
     """
     from turbogs_plugin.report.outputs import render_run
 
-    print(f"renders  {render_run(run, split, device)}")
+    for name, folder in zip(("renders", "depths"), render_run(run, split, device, depth), strict=False):
+        print(f"{name:<8} {folder}")
     return 0
 
 
@@ -259,7 +268,7 @@ def report(
 
 @app.command
 def bench(
-    what: Annotated[Positional[Literal["step", "raster"]], arg(metavar="step|raster")],
+    what: Annotated[Positional[Literal["step", "raster", "numerics"]], arg(metavar="step|raster|numerics")],
     overrides: Overrides = (),
     /,
     *,
@@ -277,12 +286,14 @@ def bench(
     library: Annotated[tuple[Path, ...], arg(metavar="FILE ...")] = (),
     factor: Annotated[int, arg(metavar="N")] = 1,
     device: Device = "auto",
-    out: Annotated[Path | None, arg(metavar="FILE")] = None,
+    out: Annotated[Path | None, arg(metavar="FILE_OR_FOLDER")] = None,
 ) -> int:
-    """Time an iteration of training step by step, or the rasterizer stage by stage, beside what the machine allows.
+    """Time an iteration of training step by step, or the rasterizer stage by stage, beside what the machine allows; or
+    measure how exact and how fast the optimizer's solvers are on stiff systems.
 
     Args:
-        what: step: from sampling to update; raster: forward and backward, beside gsplat's dense ones.
+        what: step: from sampling to update; raster: forward and backward, beside gsplat's dense ones; numerics: the
+            solvers of moment-damped LM, which takes --out and --device alone.
         overrides: step: changes of the configuration whose strategies are timed.
         scene: a capture, for its cameras and photos; where absent, all is synthetic, the models of raster as well.
         ply: a trained model in place of those trained here; raster: one or more, timed at their own sizes.
@@ -298,7 +309,7 @@ def bench(
         library: raster: other builds of the kernels, measured the same way.
         factor: scale photos down by this.
         device: what to time.
-        out: JSON file; standard output where absent.
+        out: JSON file; standard output where absent. numerics: folder for its table, plot and JSON.
     """
     from turbogs_plugin.bench import commands
     from turbogs_plugin.bench.models import TRAINING_ITERATIONS
@@ -317,6 +328,10 @@ def bench(
         raise InputError("--ply names a trained model: leave --training out")
     iterations = TRAINING_ITERATIONS if training is None else training
     where = resolve_device(device)
+    if what == "numerics":
+        if out is None or overrides or scene is not None or ply or library:
+            raise InputError("bench numerics needs --out FOLDER, and takes --device besides")
+        return commands.run_numerics(where, out)
     if what == "step":
         if len(ply) > 1:
             raise InputError("bench step takes one --ply, at the sizes of --gaussians")

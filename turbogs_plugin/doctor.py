@@ -8,7 +8,7 @@ import subprocess
 
 import torch
 
-from turbogs_plugin.report.pages import hardware, software
+from turbogs_plugin.report.machine import hardware, software
 
 
 def diagnosis() -> str:

@@ -1,6 +1,12 @@
-"""The one exception that means "your input, not our code"."""
+"""What ends a command: the two exceptions that mean "your input" and "this run", and the exit codes."""
+
+from __future__ import annotations
 
 import math
+import os
+import signal
+import sys
+from collections.abc import Callable
 
 
 class InputError(ValueError):
@@ -28,3 +34,24 @@ def require_not_negative(instance: object, *fields: str) -> None:
     for field in fields:
         value = getattr(instance, field)
         require(math.isfinite(value) and value >= 0, field, value, "a finite number >= 0")
+
+
+def exit_code(command: Callable[[], int]) -> int:
+    """Run a command: 2 for bad input, 1 for a run that could not go on, 128 + n where signal n stopped it."""
+    try:
+        code = command()
+        sys.stdout.flush()
+        return code
+    except (InputError, TrainingStopped) as error:
+        print(f"turbogs: error: {' '.join(str(error).split())}", file=sys.stderr)
+        return 2 if isinstance(error, InputError) else 1
+    except BrokenPipeError:  # whoever read the output, `head` for one, has had enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 128 + signal.SIGPIPE
+    except OSError as error:
+        place = "" if error.filename is None else f"'{error.filename}': "
+        print(f"turbogs: error: {place}{error.strerror or error}; choose another place or make room", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("turbogs: interrupted", file=sys.stderr)
+        return 128 + signal.SIGINT

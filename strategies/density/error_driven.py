@@ -1,4 +1,4 @@
-"""Error-driven density control (paper section 3.8), and none."""
+"""Error-driven density control (paper section 3.8)."""
 
 from __future__ import annotations
 
@@ -6,55 +6,20 @@ import math
 from dataclasses import dataclass, field, fields
 from typing import Any, Literal
 
-import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import logsigmoid
-from turbogs_plugin.strategies.density.row_order import spatial_order
-from turbogs_plugin.strategies.density.rows import finite_rows, leave_one, loaded_rows
+from turbogs_plugin.strategies.density.rows import finite_rows, leave_one, loaded_rows, removal
+from turbogs_plugin.strategies.density.splitting import split_in_two
 
-from turbogs_plugin.engine.reference.projection import rotation_matrices
 from turbogs_plugin.errors import InputError, require, require_not_negative
 from turbogs_plugin.types import Gaussians, GaussianStats, RowUpdate, Step
-
-SPLIT_SHRINK = 1.6
-"""A split divides standard deviations by this (3DGS)."""
 
 FLAT_EVENTS = 5
 """Events of density control over which `stop_when_flat` looks at the error's fall."""
 
 EPS = 1e-12
 """Keeps divisions defined; the least weight a drawn splat can have in a pixel is 1e-4 / 255."""
-
-
-@dataclass
-class NoDensity:
-    """The set of Gaussians stays as it is.
-
-    Args:
-        max_gaussians: cap on the points that a model begins with. 0: no cap.
-    """
-
-    max_gaussians: int = 0
-
-    def __post_init__(self) -> None:
-        require_not_negative(self, "max_gaussians")
-
-    @property
-    def stats(self) -> GaussianStats | None:
-        return None
-
-    def setup(self, gaussians: Gaussians) -> None:
-        pass
-
-    def update(self, gaussians: Gaussians, step: Step) -> RowUpdate | None:
-        return None
-
-    def state_dict(self) -> dict[str, Any]:
-        return {}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        pass
 
 
 @dataclass
@@ -68,7 +33,7 @@ class ErrorDrivenDensity:
 
     is its difficulty. A Gaussian with W = 0, or with non-finite statistics, was not seen: it has no score, and is
     neither densified nor pruned by score. Equal scores stand or fall together, except where a cap must choose
-    (then the lower row goes first). After densification, rows are in the order of space (`spatial_order`).
+    (then the lower row goes first).
 
     Until `Step.refine_until`, every `refine_every` iterations from `refine_from` on, one event clones, splits and
     prunes. A Gaussian that is due for pruning is not densified; one that is too big but chosen to be split is not
@@ -174,11 +139,14 @@ class ErrorDrivenDensity:
             score, seen = self.scores(step)
             event = self._refine if densify else self._final_prune
             update = event(gaussians, score, seen, step)
-            count = len(gaussians) if update is None else len(update.source)
-            self._stats = GaussianStats.zeros(count, gaussians.device)
+            self._stats.zero_()
         if step.iteration >= self._last_event(step):
             self._stats = None
         return update
+
+    def apply(self, update: RowUpdate) -> None:
+        if self._stats is not None:
+            self._stats = self._stats.map(update.apply_state)
 
     def state_dict(self) -> dict[str, Any]:
         stats = None if self._stats is None else {f.name: getattr(self._stats, f.name) for f in fields(self._stats)}
@@ -298,16 +266,12 @@ class ErrorDrivenDensity:
     def _final_prune(self, gaussians: Gaussians, score: Tensor, seen: Tensor, step: Step) -> RowUpdate | None:
         finite = finite_rows(gaussians)
         easy = seen & (score < _quantile(score, seen, 1 - self.final_keep))
-        pruned = leave_one(~finite | easy & ~self._spared(gaussians, finite, step.scene_extent), gaussians)
-        if not pruned.any():
-            return None
-        source = torch.nonzero(~pruned).squeeze(-1)
-        return RowUpdate(source, torch.zeros_like(source, dtype=torch.bool), {}, num_pruned=int(pruned.sum()))
+        return removal(leave_one(~finite | easy & ~self._spared(gaussians, finite, step.scene_extent), gaussians))
 
     def _compose(
         self, gaussians: Gaussians, cloned: Tensor, split: Tensor, pruned: Tensor, spared: Tensor, step: Step
     ) -> RowUpdate | None:
-        """One change out of masks [N]: the rest, the clones, and both halves of the split, in the order of space."""
+        """One change out of masks [N]: the rest, the clones, and both halves of the split, in this order."""
         rest, copies, halves = (torch.nonzero(mask).squeeze(-1) for mask in (~(pruned | split), cloned, split))
         if len(rest) == len(gaussians) and len(copies) == 0 and self.opacity_decay == 0:
             return None
@@ -316,35 +280,13 @@ class ErrorDrivenDensity:
         values = {}
         if len(halves):
             values = {"means": gaussians.means[source], "scales": gaussians.scales[source]}
-            values["means"][-2 * len(halves) :], values["scales"][-2 * len(halves) :] = self._halves(
-                gaussians, halves, step
-            )
+            means, scales = split_in_two(gaussians, halves, self.split, step)
+            values["means"][-2 * len(halves) :], values["scales"][-2 * len(halves) :] = means, scales
         if self.opacity_decay > 0:
             opacities = torch.where(spared, gaussians.opacities, _decayed(gaussians.opacities, self.opacity_decay))
             values["opacities"] = opacities[source]
         counts = {"num_cloned": len(copies), "num_split": len(halves), "num_pruned": int(pruned.sum())}
-        # What is seen together is then read together: splats of a tile are gathered, and added to, by row.
-        order = spatial_order(values.get("means", gaussians.means[source]), step.scene_extent)
-        return RowUpdate(source, fresh, values, **counts).reordered(order)
-
-    def _halves(self, gaussians: Gaussians, index: Tensor, step: Step) -> tuple[Tensor, Tensor]:
-        """([2 n, 3] means, [2 n, 3] log scales) of what the Gaussians `index` [n] are split into."""
-        means, scales = gaussians.means[index], gaussians.scales[index]
-        rotations = rotation_matrices(gaussians.quats[index])  # [n, 3, 3]
-        if self.split == "sample":
-            generator = np.random.Generator(np.random.Philox(np.random.SeedSequence([step.seed, step.iteration])))
-            # Drawn on the host: the same numbers on every device.
-            draws = torch.from_numpy(generator.standard_normal((2, len(index), 3))).to(means)
-            offsets = torch.einsum("nij,bnj->bni", rotations, scales.exp() * draws)
-            shrink = torch.full_like(scales, math.log(SPLIT_SHRINK))
-        else:
-            axis = torch.nn.functional.one_hot(scales.argmax(dim=-1), 3).to(scales)  # [n, 3]
-            # A pair at +-a of deviation b has variance a^2 + b^2; b = sigma / 1.6, so a^2 = sigma^2 (1 - 1 / 1.6^2).
-            distance = math.sqrt(1 - SPLIT_SHRINK**-2)
-            offset = torch.einsum("nij,nj->ni", rotations, scales.exp() * axis * distance)
-            offsets = torch.stack([offset, -offset])
-            shrink = axis * math.log(SPLIT_SHRINK)
-        return (means + offsets).reshape(-1, 3), (scales - shrink).repeat(2, 1)
+        return RowUpdate(source, fresh, values, **counts)
 
 
 def _quantile(values: Tensor, mask: Tensor, fraction: float) -> Tensor:

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 from turbogs_plugin.strategies.density.error_driven import ErrorDrivenDensity
-from turbogs_plugin.strategies.density.rows import finite_rows, leave_one, loaded_rows
+from turbogs_plugin.strategies.density.rows import finite_rows, leave_one, loaded_rows, removal
 
 from turbogs_plugin.errors import require, require_not_negative
 from turbogs_plugin.types import Gaussians, GaussianStats, RowUpdate, Step
@@ -117,13 +117,17 @@ class FastGsDensity:
         update = None
         if after <= 0 and step.iteration >= self.refine_from and step.iteration % self.refine_every == 0:
             update = self._densify(gaussians, step)
-            self._restart(len(gaussians) if update is None else len(update.source), gaussians.device)
+            self._restart(len(gaussians), gaussians.device)
         elif after > 0 and after % self.prune_every == 0:
             update = self._prune(gaussians)
-            self._restart(len(gaussians) if update is None else len(update.source), gaussians.device)
+            self._restart(len(gaussians), gaussians.device)
         if after > 0 and step.iteration + self.prune_every - after % self.prune_every >= step.total:
             self._look = self._window = self._votes = None  # no event is left in this run
         return update
+
+    def apply(self, update: RowUpdate) -> None:
+        if self._look is not None:  # a window starts anew at each event
+            self._restart(len(update.source), update.source.device)
 
     def state_dict(self) -> dict[str, Any]:
         parts = {"look": self._look, "window": self._window, "votes": self._votes}
@@ -169,10 +173,4 @@ class FastGsDensity:
         if bool(blamed.all()):  # all alike: this tells none from another
             blamed = torch.zeros_like(blamed)
         transparent = torch.sigmoid(gaussians.opacities) < self.prune_opacity
-        pruned = leave_one(blamed | transparent | ~finite_rows(gaussians), gaussians)
-        source = torch.nonzero(~pruned).squeeze(-1)
-        if len(source) == len(gaussians):
-            return None
-        return RowUpdate(
-            source, torch.zeros_like(source, dtype=torch.bool), {}, num_pruned=len(gaussians) - len(source)
-        )
+        return removal(leave_one(blamed | transparent | ~finite_rows(gaussians), gaussians))

@@ -98,7 +98,11 @@ class GsplatDefaultDensity:
             reset_opa(params, optimizers, state, self.prune_opa * 2.0)
         if len(state["source_row"]) == 0:
             return self._keep_one(gaussians, usable)
-        return self._follow(gaussians, params, optimizers, state)
+        return self._change(gaussians, params, optimizers, state)
+
+    def apply(self, update: RowUpdate) -> None:
+        if self._stats is not None:
+            self._stats = self._stats.map(update.apply_state)
 
     def state_dict(self) -> dict[str, Any]:
         if self._stats is None:
@@ -125,20 +129,19 @@ class GsplatDefaultDensity:
 
     def _keep_one(self, gaussians: Gaussians, usable: Tensor) -> RowUpdate | None:
         """What there is instead of a model of nothing: the most opaque Gaussian of those that are `usable` [M]."""
-        self._stats = GaussianStats.zeros(1, gaussians.device)
+        self._stats.zero_()
         if len(gaussians) == 1:
             return None
         source = usable[gaussians.opacities[usable].argmax()] if len(usable) else usable.new_zeros(())
         return RowUpdate(source.reshape(1), usable.new_zeros(1, dtype=torch.bool), {}, num_pruned=len(gaussians) - 1)
 
-    def _follow(self, gaussians: Gaussians, params: dict, optimizers: dict, state: dict) -> RowUpdate | None:
+    def _change(self, gaussians: Gaussians, params: dict, optimizers: dict, state: dict) -> RowUpdate | None:
+        """What gsplat has done, as one change."""
         source = state["source_row"]
         fresh, opacity_fresh = (touched_rows(optimizers[name], params[name]) for name in ("means", "opacities"))
         was_reset = bool(opacity_fresh.all()) and not bool(fresh.all())
-        self._stats = GaussianStats.zeros(len(source), gaussians.device)
-        gradients = "absgrad_sums" if self.absgrad else "grad_sums"
-        setattr(self._stats, gradients, state["grad2d"])
-        self._stats.view_counts, self._stats.max_radii = state["count"], state["radii"]
+        if not bool(state["count"].any()):  # gsplat starts a new window after a refinement
+            self._stats.zero_()
         unchanged = len(source) == len(gaussians) and not was_reset and not bool(fresh.any())
         if unchanged:
             return None

@@ -78,6 +78,9 @@ class GsplatMcmcDensity:
         self._add_noise(gaussians, step)
         return None
 
+    def apply(self, update: RowUpdate) -> None:
+        pass
+
     def _refine(self, gaussians: Gaussians, usable: Tensor, step: Step) -> RowUpdate:
         """Relocation, growth and noise, on copies: relocation writes into the tensors that it is given.
 

@@ -1,4 +1,4 @@
-"""What the controllers of density share: which Gaussians are usable, one that always stays, statistics from a state."""
+"""What density controllers share: usable Gaussians, one that always stays, a removal, statistics of a state."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.types import Gaussians
+from turbogs_plugin.types import Gaussians, RowUpdate
 
 RowsType = TypeVar("RowsType")  # a dataclass of [N] tensors
 
@@ -49,3 +49,11 @@ def leave_one(pruned: Tensor, gaussians: Gaussians) -> Tensor:
     pruned = pruned.clone()
     pruned[torch.where(finite_rows(gaussians), gaussians.opacities, -torch.inf).argmax()] = False
     return pruned
+
+
+def removal(pruned: Tensor) -> RowUpdate | None:
+    """The change that leaves out the Gaussians of the mask [N]; None where there are none."""
+    source = torch.nonzero(~pruned).squeeze(-1)
+    if len(source) == len(pruned):
+        return None
+    return RowUpdate(source, torch.zeros_like(source, dtype=torch.bool), {}, num_pruned=len(pruned) - len(source))

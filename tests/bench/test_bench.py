@@ -30,7 +30,7 @@ from turbogs_plugin.bench.step import tensor_bytes
 from turbogs_plugin.engine import CompiledKernels
 from turbogs_plugin.engine.rendering import rasterize
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.model.gaussians import load_ply, save_ply
+from turbogs_plugin.model.ply import load_ply, save_ply
 from turbogs_plugin.scene import load_scene
 from turbogs_plugin.train.trainer import Trainer
 

@@ -5,7 +5,8 @@ import json
 import numpy as np
 import torch
 
-from turbogs_plugin.bench.numerics import FAMILIES, SOLVERS, bench_solvers, make_problem, scaled_errors, solve_exactly
+from turbogs_plugin.bench import numerics
+from turbogs_plugin.bench.numerics import FAMILIES, SOLVERS, make_problem, scaled_errors, solve_exactly
 
 
 def test_the_exact_solution_solves_the_system():
@@ -30,10 +31,12 @@ def test_an_error_is_that_of_the_scaled_unknown():
     np.testing.assert_allclose(scaled_errors(off, exact, problem), [0.25] * 4 + [np.inf], rtol=1e-6)
 
 
-def test_everything_is_measured_and_written(tmp_path):
-    record = json.loads(
-        bench_solvers(tmp_path / "new", torch.device("cpu"), count=20, batch=100, repeats=1).read_text()
-    )
+def test_everything_is_measured_and_written(turbogs, tmp_path, monkeypatch):
+    for name, value in (("SYSTEMS", 20), ("BATCH", 100), ("REPEATS", 1)):
+        monkeypatch.setattr(numerics, name, value)
+    code, out, _ = turbogs("bench", "numerics", "--out", tmp_path / "new", "--device", "cpu")
+    record = json.loads((tmp_path / "new" / "solvers.json").read_text())
+    assert code == 0 and "all fail" in out and str(tmp_path / "new") in out
     assert len(record["results"]) == 2 * len(FAMILIES) * len(SOLVERS)
     assert all(result["nanoseconds"] > 0 for result in record["results"])
     worst = {name: max(r["failed"] for r in record["results"] if r["solver"] == name) for name in SOLVERS}

@@ -128,5 +128,5 @@ def test_what_is_no_sampler_is_refused(monkeypatch, attribute, options, words):
 
 def test_all_that_a_class_lacks_is_named(monkeypatch):
     _plug_in(monkeypatch, "half", "third_party_samplers:Half")
-    with pytest.raises(InputError, match=r"is no DensityController: it lacks stats, state_dict, load_state_dict"):
+    with pytest.raises(InputError, match="is no DensityController: it lacks stats, apply, state_dict, load_state_dict"):
         registry.build("density", {"type": "half"})

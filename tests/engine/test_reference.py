@@ -4,16 +4,18 @@ import numpy as np
 import pytest
 import torch
 from gsplat.cuda._torch_impl import _spherical_harmonics
+from helpers.gsplat_torch import gsplat_torch_render
 from helpers.rendering_scenes import loop_render, make_cameras, make_gaussians, thin_out
+from torch.autograd.function import once_differentiable
 
+from turbogs_plugin.engine.autograd import rasterize_differentiable
 from turbogs_plugin.engine.reference import compositing, projection
 from turbogs_plugin.engine.rendered import ALPHA_MIN_LOWEST
 from turbogs_plugin.engine.rendering import (
     RasterSettings,
     dense_samples,
     rasterize,
-    rasterize_differentiable,
-    render_images,
+    render_image,
 )
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.types import PARAMETER_NAMES, Gaussians, GaussianStats, PixelSamples, cell_order
@@ -82,14 +84,15 @@ def test_projected_is_what_was_drawn():
     gaussians, cameras = make_gaussians(60, spread=3.0), make_cameras(SIZES)
     samples = dense_samples(cameras)
     projected = rasterize(gaussians, cameras, samples).projected()
-    output = rasterize_differentiable(gaussians, cameras, samples)
-    shown = (output.radii > 0).any(dim=-1)
+    rows = projection.drawable_rows(gaussians, cameras, RasterSettings())
+    drawn = [getattr(gaussians, name)[rows.gaussians] for name in PARAMETER_NAMES[:-1]]
+    splats = projection.project_rows(rows, *drawn, gaussians.shN, cameras, 3, RasterSettings())
+    shown = (projected.radii > 0).any(dim=-1)
     assert 0 < int(shown.sum()) < shown.numel()
-    pairs = {"means2d": "means2d", "conics": "conics", "depths": "depths_per_gaussian", "opacities": "opacities"}
-    for ours, theirs in pairs.items():
-        assert torch.equal(getattr(projected, ours)[shown], getattr(output, theirs)[shown])
-        assert (getattr(projected, ours)[~shown] == 0).all()
-    assert torch.equal(projected.radii, output.radii)
+    for name in ("means2d", "conics", "depths", "opacities"):
+        assert torch.equal(getattr(projected, name)[shown], rows.scatter(getattr(splats, name))[shown])
+        assert (getattr(projected, name)[~shown] == 0).all()
+    assert torch.equal(projected.radii, rows.scatter(splats.radii))
 
 
 def test_what_lies_behind_the_end_of_a_pixel_has_no_gradient_at_all():
@@ -107,24 +110,44 @@ def test_what_lies_behind_the_end_of_a_pixel_has_no_gradient_at_all():
         assert float(getattr(gradients, name)[:, ~gradients.touched].abs().max()) == 0
 
 
+class RenderAgain(torch.autograd.Function):
+    """A pass whose backward renders again: `gradcheck` goes backward many times, which one pass refuses."""
+
+    @staticmethod
+    def forward(ctx, cameras, samples, *parameters):
+        ctx.cameras, ctx.samples = cameras, samples
+        ctx.save_for_backward(*parameters)
+        return RenderAgain.render(cameras, samples, parameters)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, *gradients):
+        leaves = [value.detach().requires_grad_() for value in ctx.saved_tensors]
+        with torch.enable_grad():
+            outputs = RenderAgain.render(ctx.cameras, ctx.samples, leaves)
+        return None, None, *torch.autograd.grad(outputs, leaves, gradients)
+
+    @staticmethod
+    def render(cameras, samples, parameters):
+        output = rasterize_differentiable(Gaussians(*parameters), cameras, samples, with_depth=True)
+        return output.colors, output.alphas, output.depths
+
+
 def test_gradcheck_through_everything():
     gaussians, cameras = make_gaussians(5, seed=3), make_cameras([(9, 7), (8, 18)])
     gaussians.sh0.add_(1.5)  # away from the clamp of colours at zero
     samples = thin_out(dense_samples(cameras), 0.25, empty_slots=1)
 
-    def render(*parameters):
-        output = rasterize_differentiable(Gaussians(*parameters), cameras, samples, with_depth=True)
-        return output.colors, output.alphas, output.depths
-
     errors = np.zeros(len(samples))
     margin = loop_render(gaussians, cameras, samples, gsplat_colors(gaussians, cameras), errors).margin
     assert margin > 1e-5
     parameters = [value.clone().requires_grad_() for _, value in gaussians.items()]
-    assert torch.autograd.gradcheck(render, parameters, eps=1e-7, atol=1e-6)
+    assert torch.autograd.gradcheck(RenderAgain.apply, (cameras, samples, *parameters), eps=1e-7, atol=1e-6)
 
 
 @pytest.mark.parametrize("opacity", ACTIVATED)
-def test_backward_equals_autograd_and_rows_sum_to_it(opacity):
+def test_values_and_gradients_are_those_of_gsplats_torch_code_and_rows_sum_to_them(opacity):
+    """By autograd through gsplat's projection; depth is along the camera's axis, as there."""
     gaussians, cameras = make_gaussians(60), make_cameras(SIZES)
     gaussians.opacities += ACTIVATED[opacity]
     samples = thin_out(dense_samples(cameras), 0.4, empty_slots=3)
@@ -137,8 +160,10 @@ def test_backward_equals_autograd_and_rows_sum_to_it(opacity):
         )
 
     leaves = gaussians.map(lambda value: value.clone().requires_grad_())
-    output = rasterize_differentiable(leaves, cameras, samples, with_depth=True)
-    loss = (output.colors * colors).sum(dim=1) + output.alphas * alphas + output.depths * depths
+    outputs = gsplat_torch_render(leaves, cameras, samples)
+    for ours, theirs in zip((rendered.colors, rendered.alphas, rendered.depths), outputs, strict=True):
+        torch.testing.assert_close(ours, theirs, rtol=0, atol=1e-13)
+    loss = (outputs[0] * colors).sum(dim=1) + outputs[1] * alphas + outputs[2] * depths
     loss[samples.filled].sum().backward()
 
     by_view = gradients(rows=True)
@@ -201,8 +226,8 @@ def test_statistics_are_added_once_as_documented():
     gradients = screen.parameter_gradients(rows=True, stats=stats)
     record = screen.full_records()
     half = torch.as_tensor(np.array(SIZES)) * 0.5 * 2  # K = 2
-    output = rasterize_differentiable(gaussians, cameras, samples)
-    shown = (output.radii > 0).all(dim=-1)
+    radii = rasterize(gaussians, cameras, samples).projected().radii
+    shown = (radii > 0).all(dim=-1)
     expected = {
         "error_sums": record[..., 11].sum(dim=0),
         "distance_sums": record[..., 12].sum(dim=0),
@@ -213,7 +238,7 @@ def test_statistics_are_added_once_as_documented():
     }
     for name, value in expected.items():
         torch.testing.assert_close(getattr(stats, name).double(), 1 + value, rtol=1e-6, atol=1e-6, msg=name)
-    largest = (output.radii.amax(dim=-1) / torch.tensor([[37.0], [50.0]])).amax(dim=0)
+    largest = (radii.amax(dim=-1) / torch.tensor([[37.0], [50.0]])).amax(dim=0)
     torch.testing.assert_close(stats.max_radii, largest.clamp(min=1))
     assert torch.equal(gradients.touched, record[..., 13].sum(dim=0) > 0)
     torch.testing.assert_close(gradients.view_losses, record[..., 11] / len(samples))
@@ -224,14 +249,14 @@ def test_sparse_equals_dense_at_the_same_pixels(dtype):
     gaussians, cameras = make_gaussians(80, dtype=dtype), make_cameras(SIZES, dtype)
     samples = thin_out(dense_samples(cameras), 0.2, empty_slots=1)
     rendered = rasterize(gaussians, cameras, samples, with_depth=True)
-    images = render_images(gaussians, cameras)
+    images = [render_image(gaussians, cameras, view, with_depth=True) for view in range(2)]
     x, y = samples.coordinates().unbind(dim=-1)
     views = samples.view_of_slot()
     for slot in samples.filled.nonzero()[:, 0].tolist():
-        colors, alphas = images[views[slot]]
-        assert colors.dtype == dtype
-        torch.testing.assert_close(rendered.colors[slot], colors[y[slot], x[slot]])
-        torch.testing.assert_close(rendered.alphas[slot], alphas[y[slot], x[slot]])
+        image = images[views[slot]]
+        for name in ("colors", "alphas", "depths"):
+            assert getattr(image, name).dtype == dtype
+            torch.testing.assert_close(getattr(rendered, name)[slot], getattr(image, name)[y[slot], x[slot]])
 
 
 def test_float32_is_close_to_float64():
@@ -288,6 +313,13 @@ def test_lower_degrees_use_their_bands_alone(degree):
 def test_a_degree_that_the_model_lacks_is_an_error(degree):
     gaussians, cameras = make_gaussians(3, degree=1), make_cameras([(4, 4)])
     with pytest.raises(ValueError, match="degrees 0 to 1"):
+        rasterize(gaussians, cameras, dense_samples(cameras), sh_degree=degree)
+
+
+@pytest.mark.parametrize("degree", [None, 3])
+def test_a_degree_that_no_engine_evaluates_is_refused_by_name(degree):
+    gaussians, cameras = make_gaussians(3, degree=4), make_cameras([(4, 4)])
+    with pytest.raises(InputError, match="of degree 4: the largest that is rendered is 3"):
         rasterize(gaussians, cameras, dense_samples(cameras), sh_degree=degree)
 
 

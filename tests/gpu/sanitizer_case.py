@@ -18,7 +18,8 @@ from helpers.raster_cases import samples_to
 from helpers.rendering_scenes import make_cameras, make_gaussians
 from test_raster_sorting import stacked_case, wide_case
 
-from turbogs_plugin.engine.rendering import dense_samples, rasterize, rasterize_differentiable
+from turbogs_plugin.engine.autograd import rasterize_differentiable
+from turbogs_plugin.engine.rendering import dense_samples, rasterize
 from turbogs_plugin.scene import load_scene, write_demo_capture
 from turbogs_plugin.train.loop import TrainingLoop
 from turbogs_plugin.train.trainer import Trainer

@@ -163,6 +163,9 @@ def test_wrong_input_says_what_was_wanted(case):
             render(replace(case, **change))
     with pytest.raises(InputError, match="sh_degree"):
         render(case, sh_degree=4)
+    fourth = replace(good, shN=good.shN.new_zeros(len(good), 24, 3))
+    with pytest.raises(InputError, match="of degree 4: the largest that is rendered is 3"):
+        render(replace(case, gpu_gaussians=fourth))
     rendered = render(case)
     with pytest.raises(InputError, match="color_gradients"):
         rendered.backward(torch.zeros(3, 3, device="cuda"))

@@ -12,9 +12,8 @@ from helpers.raster_cases import (
     upstream,
 )
 
+from turbogs_plugin.engine.autograd import rasterize_differentiable
 from turbogs_plugin.engine.cuda import raster as cuda
-from turbogs_plugin.engine.cuda.autograd import rasterize_differentiable_cuda
-from turbogs_plugin.engine.rendering import rasterize_differentiable as differentiable_reference
 from turbogs_plugin.engine.rendering import rasterize_reference
 from turbogs_plugin.types import GaussianStats
 
@@ -104,10 +103,10 @@ def test_autograd(case):
     values = upstream(case)
     renders = (
         (
-            rasterize_differentiable_cuda(gpu, case.gpu_cameras, case.gpu_samples, with_depth=True),
+            rasterize_differentiable(gpu, case.gpu_cameras, case.gpu_samples, with_depth=True),
             on_gpu(values),
         ),
-        (differentiable_reference(cpu, case.cameras, case.samples, with_depth=True), values),
+        (rasterize_differentiable(cpu, case.cameras, case.samples, with_depth=True), values),
     )
     for render, weights in renders:
         loss = (render.colors.square() * weights["color_gradients"]).sum()

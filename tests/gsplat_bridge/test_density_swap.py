@@ -16,6 +16,7 @@ from turbogs_plugin.strategies.optimizers.moment_lm import MomentLMOptimizer
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.gsplat_bridge import SharedOptimizer, TurboDensityStrategy, apply_row_update
 from turbogs_plugin.gsplat_bridge.gaussian_errors import iteration_stats
+from turbogs_plugin.model.row_order import in_order_of_space
 from turbogs_plugin.types import PARAMETER_NAMES, Gaussians, GaussianStats, RowUpdate, Step
 
 SOON = {"refine_start_iter": 2, "refine_every": 3, "refine_stop_iter": 5, "grow_grad2d": 1e-6}
@@ -153,12 +154,13 @@ FIELDS = {
 
 
 def controlled(options, before, window, seed, extent, refine_until):
-    """The Gaussians after the event by an `ErrorDrivenDensity` with exactly these options."""
+    """The Gaussians after the event by an `ErrorDrivenDensity` with exactly these options, in the order of space."""
     controller = ErrorDrivenDensity(**options)
     controller.setup(before)
     controller.load_state_dict({"stats": window})
-    update = controller.update(before, Step(EVENT, 10**6, refine_until, seed, extent))
-    return before if update is None else update.apply(before)
+    step = Step(EVENT, 10**6, refine_until, seed, extent)
+    update = controller.update(before, step)
+    return before if update is None else in_order_of_space(update, before, step).apply(before)
 
 
 def differ(some: Gaussians, other: Gaussians) -> bool:

@@ -7,10 +7,12 @@ import numpy as np
 import pytest
 import torch
 from helpers.bridge_host import HEIGHT, WIDTH, arguments, make_cameras, make_splats
+from helpers.gsplat_torch import gsplat_torch_render
 from turbogs_plugin.strategies.losses import CharbonnierLoss, CharbonnierNccLoss
 from turbogs_plugin.strategies.pixel_sampling import RandomPixelSampler
 
-from turbogs_plugin.engine.rendering import dense_samples, rasterize_differentiable
+from turbogs_plugin.engine.autograd import rasterize_differentiable
+from turbogs_plugin.engine.rendering import dense_samples
 from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.gsplat_bridge import gather_pixels, sparse_loss, sparse_rasterization
@@ -51,7 +53,32 @@ def test_values_and_gradients_are_those_of_the_rasterizer(scene):
         torch.testing.assert_close(splats[name].grad, expected_splats[name].grad, atol=1e-4, rtol=1e-3)
     torch.testing.assert_close(info["means2d"].grad, expected.means2d.grad, atol=1e-4, rtol=1e-3)
     torch.testing.assert_close(info["means2d"].absgrad, expected.means2d.absgrad, atol=1e-4, rtol=1e-3)
-    torch.testing.assert_close(info["radii"], expected.radii)
+    torch.testing.assert_close(info["radii"], expected.projected.radii)
+
+
+@pytest.mark.parametrize("render_mode", ["ED", "RGB+ED"])
+def test_depths_and_their_gradients_are_those_of_gsplats_torch_code(scene, render_mode):
+    """Expected z along the camera's axis, as Ks has it; a background has no depth."""
+    splats, cameras, samples = scene
+    given = {**arguments(splats, cameras), "samples": samples, "sh_degree": 1, "backgrounds": torch.full((2, 3), 0.5)}
+    shown, _, _ = sparse_rasterization(**given, render_mode=render_mode)
+    weights = torch.randn(shown.shape, generator=torch.Generator().manual_seed(0))
+    (shown * weights).sum().backward()
+    expected_splats = make_splats()
+    raw = Gaussians(**{name: expected_splats[name] for name in PARAMETER_NAMES})
+    colors, alphas, depths = gsplat_torch_render(raw, cameras, samples, sh_degree=1)
+    colors = (colors + 0.5 * (1 - alphas[:, None])) * samples.filled[:, None]
+    expected = depths[:, None] if render_mode == "ED" else torch.cat([colors, depths[:, None]], dim=1)
+    (expected * weights).sum().backward()
+    assert shown.shape == (len(samples), 1 if render_mode == "ED" else 4) and depths.max() > 1.0
+    torch.testing.assert_close(shown, expected, atol=1e-5, rtol=1e-4)
+    for name in PARAMETER_NAMES:
+        reference = expected_splats[name].grad
+        if render_mode == "ED" and name in ("sh0", "shN"):
+            assert not splats[name].grad.any() and (reference is None or not reference.any())
+        else:
+            assert reference.norm() > 0
+            torch.testing.assert_close(splats[name].grad, reference, atol=2e-4, rtol=1e-3)
 
 
 @pytest.mark.parametrize("retain_graph", [False, True])
@@ -214,7 +241,7 @@ def test_gather_pixels(scene):
 
 REFUSED = [
     ({"packed": True}, r"packed=True is not supported, only False"),
-    ({"render_mode": "RGB+ED"}, r"render_mode='RGB\+ED' is not supported"),
+    ({"render_mode": "D"}, r"render_mode='D' is not supported, only 'RGB', 'ED', 'RGB\+ED'"),
     ({"pack": False}, r"no option 'pack'"),
     ({"scales": torch.ones(3, 3)}, r"scales has shape \(3, 3\): expected \[40, 3\]"),
     ({"opacities": torch.ones(40, 1)}, r"opacities has shape \(40, 1\): expected \[40\]"),

@@ -9,8 +9,8 @@ from helpers.framework_runs import tiny_capture, tiny_config
 
 from turbogs_plugin.engine.reference.spherical_harmonics import evaluate
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.model.gaussians import load_ply
 from turbogs_plugin.model.harmonics import band_energy, drop_faint_bands
+from turbogs_plugin.model.ply import load_ply
 from turbogs_plugin.train import run
 from turbogs_plugin.types import Gaussians
 

@@ -11,8 +11,16 @@ from helpers.framework_runs import tiny_capture, tiny_config
 from PIL import Image
 
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.report.pages import number, table, write_report
-from turbogs_plugin.report.plots import ERROR_FULL_SCALE, GAP, error_picture, plot_against_seconds, save_strip
+from turbogs_plugin.report.pages import write_report
+from turbogs_plugin.report.plots import (
+    ERROR_FULL_SCALE,
+    GAP,
+    depth_picture,
+    error_picture,
+    plot_against_seconds,
+    save_strip,
+)
+from turbogs_plugin.report.tables import number, table
 from turbogs_plugin.train import run
 from turbogs_plugin.train.evaluate import Metrics, ViewMetrics, compare, load_lpips, peak_memory_bytes
 from turbogs_plugin.train.history import Evaluation, append_evaluation, read_history, rewind_history
@@ -174,3 +182,12 @@ def test_no_more_strips_than_asked_for(tmp_path, strips):
     folder = run.train(config, tmp_path / "run", write_report).folder
     assert len(list((folder.path / "report").glob("test-*.png"))) == strips
     assert f"{strips} of 2 are shown" in folder.report.read_text()
+
+
+def test_a_depth_picture_is_bright_where_near_and_black_where_nothing_is():
+    depths = np.array([[1.0, 2.0, 5.0, 100.0, 0.0]], dtype=np.float32).repeat(30, axis=0)
+    brightness = depth_picture(depths).sum(axis=2)[0].tolist()
+    assert brightness[:4] == sorted(brightness[:4], reverse=True) and len(set(brightness)) == 5
+    assert brightness[3] > 0 == brightness[4]
+    assert not depth_picture(np.zeros((2, 3), dtype=np.float32)).any()
+    assert depth_picture(np.full((2, 3), 4.0, dtype=np.float32)).any()  # one depth everywhere

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.model.gaussians import load_ply, save_ply
+from turbogs_plugin.model.ply import load_ply, save_ply
 from turbogs_plugin.scene import write_demo_capture
 from turbogs_plugin.scene.colmap import read_colmap
 from turbogs_plugin.types import Gaussians

@@ -72,6 +72,8 @@ def follow(density, gaussians: Gaussians, step: Step = EVENT) -> Gaussians:
     """The model after the event; the window, if there is one, has as many rows."""
     update = density.update(gaussians, step)
     result = gaussians if update is None else update.apply(gaussians)
+    if update is not None:
+        density.apply(update)
     if density.stats is not None:
         assert all(len(getattr(density.stats, item.name)) == len(result) for item in fields(GaussianStats))
     if update is not None:

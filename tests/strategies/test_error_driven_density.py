@@ -10,11 +10,10 @@ import torch
 from helpers.optimizers import STEP, all_finite, fill, make_gaussians, make_gradients, random_stats
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from turbogs_plugin.strategies.density import error_driven as density_module
-from turbogs_plugin.strategies.density.error_driven import ErrorDrivenDensity, NoDensity
+from turbogs_plugin.strategies.density.error_driven import ErrorDrivenDensity
 from turbogs_plugin.strategies.density.fastgs import FastGsDensity
 from turbogs_plugin.strategies.density.gsplat_default import GsplatDefaultDensity
-from turbogs_plugin.strategies.density.row_order import spatial_order
+from turbogs_plugin.strategies.density.none import NoDensity
 from turbogs_plugin.strategies.optimizers.moment_lm import MomentLMOptimizer
 
 from turbogs_plugin.errors import InputError
@@ -22,14 +21,6 @@ from turbogs_plugin.types import GaussianStats, Step
 
 FULL = Step(1200, 5000, 3500, seed=3, scene_extent=2.0)  # past `prune_size_from`
 QUIET = {"prune_world_size": 0.0, "prune_opacity": 0.0}
-
-
-@pytest.fixture(autouse=True, scope="module")
-def rows_in_the_order_of_their_making():
-    """Without the order of space, which a test below holds to be all the difference."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(density_module, "spatial_order", lambda means, extent: torch.arange(len(means)))
-        yield
 
 
 def controlled(gaussians, stats: GaussianStats | None = None, **config) -> ErrorDrivenDensity:
@@ -149,6 +140,7 @@ def test_event_equals_plain_loops(seed, config):
     assert torch.equal(after.sh0[:, 0, 0].long(), update.source)
     if density.max_gaussians:
         assert len(after) <= density.max_gaussians
+    density.apply(update)
     assert len(density.stats.weight_sums) == len(after)
     assert not density.stats.weight_sums.any()
     assert len(splits) + len(prunes) > 0
@@ -167,6 +159,7 @@ def test_events_are_when_the_table_says():
         if update := density.update(gaussians, Step(iteration, 900, 420)):
             events.append(iteration)
             gaussians = update.apply(gaussians)
+            density.apply(update)
     assert events == [200, 250, 300, 350, 400, 520, 620, 720, 820]
     assert counted == list(range(821))
 
@@ -318,6 +311,7 @@ def test_everything_is_due_for_pruning(step):
     density = controlled(gaussians, busy_stats(5))
     update = density.update(gaussians, step)
     assert update.source.tolist() == ([2] if step is FULL else [0])
+    density.apply(update)
     assert len(density.stats.weight_sums) == 1
 
 
@@ -359,7 +353,8 @@ def test_no_density():
 )
 @settings(max_examples=40, deadline=None)
 def test_state_statistics_and_parameters_stay_together(seed, split, cap, decay, gsplat):
-    """Random sequences of clone, split, prune, decay and reset: equal first dimensions, every row its Gaussian's."""
+    """Random sequences of clone, split, prune, decay and reset, in any order of rows: equal first dimensions, every row
+    its Gaussian's."""
     gaussians = make_gaussians(40, seed, dtype=torch.float32)
     optimizer = MomentLMOptimizer()
     optimizer.setup(gaussians)
@@ -380,8 +375,11 @@ def test_state_statistics_and_parameters_stay_together(seed, split, cap, decay, 
         update = density.update(gaussians, Step(iteration, 1600, 500, seed, scene_extent=1.0))
         if update is not None:
             before = len(gaussians)
+            order = torch.randperm(len(update.source), generator=torch.Generator().manual_seed(seed))
+            update = update.reordered(order)
             gaussians = update.apply(gaussians)
             optimizer.apply(update)
+            density.apply(update)
             assert int(update.source.max()) < before and len(gaussians) >= 1
             if not gsplat and cap:
                 assert len(gaussians) <= max(cap, 0)
@@ -491,17 +489,3 @@ def test_the_cap_takes_the_backdrop_last(cap, kept):
     stats.error_sums[:] = torch.tensor([0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 0.1, 0.2, 0.3, 0.4])  # the backdrop is easiest
     density = controlled(gaussians, stats, max_gaussians=cap, spare_beyond=10.0, **QUIET)
     assert density.update(gaussians, FULL).source.tolist() == kept
-
-
-@pytest.mark.parametrize("split", ["sample", "long_axis"])
-def test_rows_end_in_the_order_of_space(monkeypatch, split):
-    gaussians, stats = make_gaussians(80), random_stats(80, seed=4)
-    config = {"split": split, "opacity_decay": 0.1, "prune_opacity": 0.3}
-    made = controlled(gaussians, stats, **config).update(gaussians, FULL)
-    expected = made.reordered(spatial_order(made.apply(gaussians).means, FULL.scene_extent))
-    monkeypatch.setattr(density_module, "spatial_order", spatial_order)
-    update = controlled(gaussians, stats, **config).update(gaussians, FULL)
-    assert made.num_split > 0 and not torch.equal(update.source, made.source)
-    assert torch.equal(update.source, expected.source) and torch.equal(update.fresh, expected.fresh)
-    for name, value in update.apply(gaussians).items():
-        assert torch.equal(value, getattr(expected.apply(gaussians), name)), name

@@ -35,6 +35,8 @@ def run_looks(density: FastGsDensity, gaussians: Gaussians, looks: list[list[flo
     for iteration, errors in enumerate(looks, start=first):
         look(density, errors)
         updates.append(density.update(gaussians, Step(iteration, 1000, 500)))
+        if updates[-1] is not None:
+            density.apply(updates[-1])
     return updates
 
 

@@ -66,6 +66,8 @@ def ours(gaussians, batch, step: Step, config: dict, opacity_reset: str) -> RowU
     density.stats.view_counts += visible.sum(dim=0)
     density.stats.max_radii += (batch.radii.amax(dim=-1) * visible).amax(dim=0) / max(SIZE)
     update = density.update(gaussians, step)
+    if update is not None:
+        density.apply(update)
     count = COUNT if update is None else len(update.source)
     assert {len(value) for value in vars(density.stats).values()} == {count}
     return update
@@ -113,6 +115,21 @@ def test_leaves_global_random_numbers_alone():
     assert torch.equal(torch.rand(3), expected)
 
 
+@pytest.mark.parametrize(("iteration", "kept"), [(600, False), (750, True)])
+def test_a_refinement_starts_a_new_window_and_a_reset_does_not(iteration, kept):
+    """Statistics follow their Gaussian, whatever the order of the rows."""
+    gaussians = make_gaussians(10, dtype=torch.float32)
+    density = GsplatDefaultDensity(reset_every=250, prune_opa=0.0, grow_grad2d=1e9)
+    density.setup(gaussians)
+    density.stats.view_counts += torch.arange(10)
+    gaussians.means[4] = torch.nan  # so that there is a change
+    update = density.update(gaussians, Step(iteration, 1000, 800))
+    update = update.reordered(torch.arange(9).flip(0))
+    density.apply(update)
+    assert update.source.tolist() == [9, 8, 7, 6, 5, 3, 2, 1, 0]
+    assert torch.equal(density.stats.view_counts, update.source.float() if kept else torch.zeros(9))
+
+
 def test_refinement_pauses_after_a_reset():
     gaussians, batch = make_gaussians(COUNT, dtype=torch.float32), screen(0)
     step = Step(3100, 30_000, 15_000, scene_extent=1.3)
@@ -138,6 +155,7 @@ def test_one_is_left_when_gsplat_would_leave_none():
     density.setup(gaussians)
     update = density.update(gaussians, Step(600, 1000, 800))
     assert update.source.tolist() == [3] and update.num_pruned == 5
+    density.apply(update)
     assert len(density.stats.view_counts) == 1
 
 

@@ -9,7 +9,8 @@ import torch
 
 from turbogs_plugin import files
 from turbogs_plugin.errors import InputError, TrainingStopped
-from turbogs_plugin.model import gaussians
+from turbogs_plugin.model import ply
+from turbogs_plugin.model.initial import gaussians_from_points
 from turbogs_plugin.train import checkpoint
 from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint, save_checkpoint
 
@@ -248,10 +249,10 @@ def test_an_atomic_write_leaves_the_old_text_on_failure(tmp_path):
 
 
 def test_a_model_on_a_full_disk_is_refused_for_what_it_is(tmp_path):
-    model = gaussians.gaussians_from_points(torch.rand(500, 3), torch.zeros(500, 3, dtype=torch.uint8), 0, 1.0)
+    model = gaussians_from_points(torch.rand(500, 3), torch.zeros(500, 3, dtype=torch.uint8), 0, 1.0)
     (tmp_path / ".model.ply.part").symlink_to("/dev/full")
     with pytest.raises(InputError, match=r"model\.ply: No space left on device; .*make room"):
-        gaussians.save_ply(model, tmp_path / "model.ply")
+        ply.save_ply(model, tmp_path / "model.ply")
     assert not os.listdir(tmp_path)
 
 
@@ -265,7 +266,7 @@ def test_a_failed_write_names_its_file(tmp_path):
 def test_a_model_is_written_as_atomically_as_a_checkpoint(tmp_path, monkeypatch):
     """A full disk leaves the old one, and what a killed process left behind does not stay."""
     target = tmp_path / "model.ply"
-    model = gaussians.gaussians_from_points(torch.rand(5, 3), torch.zeros(5, 3, dtype=torch.uint8), 0, 1.0)
+    model = gaussians_from_points(torch.rand(5, 3), torch.zeros(5, 3, dtype=torch.uint8), 0, 1.0)
     target.write_text("old")
     (tmp_path / ".model.ply.part").write_text("torn")
     whole_write = files.write_atomically
@@ -274,9 +275,9 @@ def test_a_model_is_written_as_atomically_as_a_checkpoint(tmp_path, monkeypatch)
         whole_write(path, lambda file: write(DiskFull(file, 10)))
 
     with monkeypatch.context() as context:
-        context.setattr(gaussians, "write_atomically", limited)
+        context.setattr(ply, "write_atomically", limited)
         with pytest.raises(InputError, match=r"cannot write .*model\.ply: No space left"):
-            gaussians.save_ply(model, target)
+            ply.save_ply(model, target)
     assert target.read_text() == "old" and os.listdir(tmp_path) == ["model.ply"]
-    gaussians.save_ply(model, target)
-    assert len(gaussians.load_ply(target)) == 5 and os.listdir(tmp_path) == ["model.ply"]
+    ply.save_ply(model, target)
+    assert len(ply.load_ply(target)) == 5 and os.listdir(tmp_path) == ["model.ply"]

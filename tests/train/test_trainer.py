@@ -21,7 +21,8 @@ from PIL import Image
 from turbogs_plugin.config.configuration import load_config, resolve
 from turbogs_plugin.config.yaml_text import parse_yaml
 from turbogs_plugin.errors import InputError, TrainingStopped
-from turbogs_plugin.model.gaussians import load_ply
+from turbogs_plugin.model.ply import load_ply
+from turbogs_plugin.model.row_order import spatial_order
 from turbogs_plugin.report.pages import write_report
 from turbogs_plugin.scene import load_scene
 from turbogs_plugin.scene.fingerprint import capture_difference, capture_state
@@ -227,6 +228,29 @@ def test_a_model_without_gaussians_ends_the_run_with_a_reason(capture, tmp_path,
     stop_after(monkeypatch, 7, all_gone)
     with pytest.raises(TrainingStopped, match=r"iteration 7: .*every Gaussian.*iteration-000005\.pt"):
         run.train(tiny_config(capture), tmp_path / "run")
+
+
+@pytest.mark.parametrize(
+    "density",
+    [
+        ("density.type=error_driven",),
+        ("density.type=gsplat_default", "density.refine_start_iter=2", "density.grow_grad2d=1e-6"),
+        ("density.type=fastgs", "density.refine_from=3", "density.consistency=0.01"),
+    ],
+)
+def test_rows_are_in_the_order_of_space_whatever_added_them(capture, density):
+    shared = [text for text in TINY if not text.startswith("density.")]
+    overrides = [*shared, "train.device=cpu", *density, "density.refine_every=3"]
+    config = load_config("turbogs", [*overrides, *(["density.refine_from=2"] if "error" in density[0] else [])])
+    trainer = Trainer(config, load_scene(capture), torch.device("cpu"))
+    count = len(trainer.gaussians)
+    trainer.initialise_maps()
+    while len(trainer.gaussians) == count:
+        trainer.step()
+    rows = torch.arange(len(trainer.gaussians))
+    assert len(rows) > count
+    assert torch.equal(spatial_order(trainer.gaussians.means, trainer.extent), rows)
+    assert len(trainer.density.stats.weight_sums) == len(rows)
 
 
 def test_non_finite_losses_are_counted(capture, tmp_path, monkeypatch):

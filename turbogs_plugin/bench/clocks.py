@@ -9,6 +9,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import torch
 
+from turbogs_plugin.train.clock import synchronize
+
 BUSY_CYCLES = 20_000_000
 """Clock cycles for which the GPU is kept busy before what is timed, so that the host has enqueued all of it by then."""
 
@@ -47,14 +49,9 @@ class Mark:
 
 def keep_busy(device: torch.device) -> None:
     """Wait for the GPU, then keep it busy for a while; nothing on a CPU."""
+    synchronize(device)
     if device.type == "cuda":
-        torch.cuda.synchronize(device)
         torch.cuda._sleep(BUSY_CYCLES)
-
-
-def wait(device: torch.device) -> None:
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)
 
 
 def measure(function: Callable[[], object], repeats: int, device: torch.device) -> Summary:
@@ -67,19 +64,19 @@ def measure(function: Callable[[], object], repeats: int, device: torch.device) 
         first = Mark(device)
         function()
         spans.append((first, Mark(device)))
-    wait(device)
+    synchronize(device)
     return summary([first.until(last) for first, last in spans])
 
 
 def back_to_back(function: Callable[[], object], repeats: int, device: torch.device) -> Summary:
     """Wall time of a call among calls that follow each other without a pause, as in training; spread over blocks."""
-    wait(device)
+    synchronize(device)
     spans = []
     for _ in range(BLOCKS):
         start = time.perf_counter()
         for _ in range(repeats):
             function()
-        wait(device)
+        synchronize(device)
         spans.append(1e3 * (time.perf_counter() - start) / repeats)
     return summary(spans)
 

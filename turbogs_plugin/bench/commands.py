@@ -1,4 +1,4 @@
-"""What `turbogs bench step` and `turbogs bench raster` do: measure, write JSON, and print the gist."""
+"""What `turbogs bench` does: measure, write the numbers as JSON, and print the gist."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from typing import Any
 import torch
 
 from turbogs_plugin.bench.large_capture import synthetic_scene
+from turbogs_plugin.bench.numerics import bench_solvers, solvers_table
 from turbogs_plugin.bench.raster import RasterBench, other_build
 from turbogs_plugin.bench.step import StepBench
 from turbogs_plugin.engine import compiled_kernels
@@ -74,6 +75,13 @@ def run_raster(bench: RasterBench, scene: Path | None, factor: int, device: torc
             _save(report, out)
             _tell([f"{name}:", *raster_lines(measured)], out)
     return _finish(report, out)
+
+
+def run_numerics(device: torch.device, out: Path) -> int:
+    require_writable(out, f"--out '{out}'")
+    results = bench_solvers(out, device)
+    print(f"{solvers_table(results)}\n\nfolder  {out}")
+    return 0
 
 
 def _require_new(out: Path | None) -> None:

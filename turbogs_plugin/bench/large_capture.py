@@ -6,11 +6,10 @@ import numpy as np
 import torch
 
 from turbogs_plugin.bench.models import ring_cameras, surface_gaussians
-from turbogs_plugin.engine.rendering import render_images
-from turbogs_plugin.model.gaussians import SH_C0
+from turbogs_plugin.engine.rendering import render_image
 from turbogs_plugin.scene import Frame, PosedImages, Scene
 from turbogs_plugin.scene.photos import Photos
-from turbogs_plugin.types import Cameras
+from turbogs_plugin.types import SH_C0, Cameras
 
 POINT_NOISE = 0.01
 """Standard deviation of the points' noise; the cameras are 3 from the centre."""
@@ -39,8 +38,8 @@ def synthetic_scene(
     def photograph(chosen: np.ndarray) -> PosedImages:
         pixels = torch.empty(len(chosen), height, width, 3, dtype=torch.uint8)
         for place, view in enumerate(chosen.tolist()):
-            image, _ = render_images(model, cameras.select([view]))[0]
-            pixels[place].copy_((image.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8))
+            image = render_image(model, cameras, view)
+            pixels[place].copy_((image.colors.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8))
         part = Cameras(cameras.viewmats[chosen].cpu(), cameras.Ks[chosen].cpu(), cameras.sizes[chosen])
         return PosedImages(part, tuple(f"view-{view:04d}" for view in chosen), Photos(pixels.view(-1, 3), part.sizes))
 

@@ -12,6 +12,7 @@ from gsplat.utils import normalized_quat_to_rotmat
 from torch.nn.functional import normalize
 
 from turbogs_plugin.config.configuration import Config, load_config, resolve
+from turbogs_plugin.model.row_order import spatial_order
 from turbogs_plugin.scene import Scene
 from turbogs_plugin.tiles import TILE_PIXELS, pixel_table
 from turbogs_plugin.train.loop import TrainingLoop
@@ -20,6 +21,9 @@ from turbogs_plugin.types import Cameras, Gaussians, PixelSamples, TileGrid
 
 TRAINING_ITERATIONS = 1500
 """Of a model that is trained to be timed, where nothing else is asked for."""
+
+RING_RADIUS = 3.0
+"""Of the synthetic cameras about the origin."""
 
 GROWING_SHARE = 0.8
 """Share of a model's training in which it grows; in the rest it settles at its final size."""
@@ -113,7 +117,8 @@ def ring_cameras(count: int, width: int, height: int, device: torch.device) -> C
     """Cameras on a ring that look at the origin."""
     viewmats = []
     for angle in np.linspace(0, 2 * math.pi, count, endpoint=False):
-        position = torch.tensor([3.0 * math.sin(angle), -0.6, -3.0 * math.cos(angle)], dtype=torch.float64)
+        x, z = RING_RADIUS * math.sin(angle), -RING_RADIUS * math.cos(angle)
+        position = torch.tensor([x, -0.6, z], dtype=torch.float64)
         forward = normalize(-position, dim=0)
         right = normalize(torch.linalg.cross(torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64), forward), dim=0)
         rotation = torch.stack([right, torch.linalg.cross(forward, right), forward])
@@ -147,11 +152,7 @@ def surface_gaussians(count: int, device: torch.device, seed: int = 0) -> Gaussi
         sh0=torch.randn(count, 1, 3, generator=generator),
         shN=0.1 * torch.randn(count, 15, 3, generator=generator),
     )
-    # Neighbours in space are neighbours in memory, as after a Morton sort.
-    cells = ((means - means.amin(dim=0)) / (means.amax(dim=0) - means.amin(dim=0)) * 1023).long()
-    bits = torch.arange(10)
-    code = (((cells[:, None, :] >> bits[:, None]) & 1) << (3 * bits[:, None] + torch.arange(3))).sum(dim=(1, 2))
-    order = code.argsort()
+    order = spatial_order(means, RING_RADIUS)  # as a trained model has them
     return gaussians.map(lambda value: value[order].to(device))
 
 

@@ -1,13 +1,7 @@
-"""Error against time of the solvers of moment-damped LM, as a table and a plot.
-
-    python -m turbogs_plugin.bench.numerics --out docs/results/numerics
-
-Writes ``solvers.json`` (every number and the machine), ``solvers.md`` (the table) and ``solvers.png``.
-"""
+"""Numerical stability: error against time of the solvers of moment-damped LM, on mild and stiff systems."""
 
 from __future__ import annotations
 
-import argparse
 import json
 import statistics
 import time
@@ -29,10 +23,10 @@ from turbogs_plugin.engine.reference.lm_solvers import (
     solve_scaled_cholesky,
 )
 from turbogs_plugin.files import write_atomically, write_text_atomically
-from turbogs_plugin.report.pages import hardware, software, table
+from turbogs_plugin.report.machine import hardware, software
 from turbogs_plugin.report.plots import STYLE
+from turbogs_plugin.report.tables import table
 from turbogs_plugin.train.clock import synchronize
-from turbogs_plugin.train.run import resolve_device
 
 Problem = tuple[Tensor, Tensor, Tensor, Tensor]
 """rows [K, n, D], weights [K, n], damping [n, D], rhs [n, D], as the solvers take them."""
@@ -47,6 +41,15 @@ COLORS = ("#b3261e", "#1f5fa8", "#2e7d32", "#6d6d6d")
 
 SIZE = 10
 """D of the geometry block, the larger of the two."""
+
+SYSTEMS = 2000
+"""Systems of a family whose error is measured."""
+
+BATCH = 100_000
+"""Systems that are solved at once when the time is measured."""
+
+REPEATS = 5
+"""Of the time measurement; the median counts."""
 
 FAILED_ERROR = 1.0
 """A solution that is not finite, or further off than this, is worth less than no step at all."""
@@ -149,25 +152,20 @@ def scaled_errors(solution: Tensor, exact: np.ndarray, problem: Problem) -> np.n
     return np.where(np.isfinite(distance), distance / step, np.inf)
 
 
-def bench_solvers(out: Path, device: torch.device, count: int = 2000, batch: int = 100_000, repeats: int = 5) -> Path:
-    """Measure all solvers on all families, and write the result.
+def bench_solvers(out: Path, device: torch.device) -> list[SolverResult]:
+    """Measure all solvers on all families, and write ``solvers.json`` (every number and the machine), ``solvers.md``
+    (the table) and ``solvers.png``.
 
     Args:
         out: folder for the three files; made where absent.
         device: where the solvers run.
-        count: systems whose error is measured, a family.
-        batch: systems solved at once when the time is measured.
-        repeats: of the time measurement; the median counts.
-
-    Returns:
-        ``solvers.json``.
     """
     out.mkdir(parents=True, exist_ok=True)
     results = []
     for views in (3, 10):
-        times = _nanoseconds(views, device, batch, repeats)
+        times = _nanoseconds(views, device)
         for seed, family in enumerate(FAMILIES):
-            problem = make_problem(family, views, count, seed)
+            problem = make_problem(family, views, SYSTEMS, seed)
             exact = solve_exactly(problem)
             for name, solve in SOLVERS.items():
                 errors = scaled_errors(solve(*(value.to(device) for value in problem)), exact, problem)
@@ -178,29 +176,28 @@ def bench_solvers(out: Path, device: torch.device, count: int = 2000, batch: int
                 failed = float(1 - good.mean())
                 results.append(SolverResult(name, family.name, views, median, largest, failed, times[name]))
     machine = {"hardware": hardware(device.type), "software": dict(software()), "threads": torch.get_num_threads()}
-    settings = {"systems": count, "batch": batch, "repeats": repeats, "size": SIZE}
+    settings = {"systems": SYSTEMS, "batch": BATCH, "repeats": REPEATS, "size": SIZE}
     record = {"machine": machine, "settings": settings, "results": [asdict(result) for result in results]}
-    path = out / "solvers.json"
-    write_text_atomically(path, json.dumps(record, indent=1).replace("NaN", "null") + "\n")
+    write_text_atomically(out / "solvers.json", json.dumps(record, indent=1).replace("NaN", "null") + "\n")
     write_text_atomically(out / "solvers.md", solvers_table(results) + "\n")
     write_atomically(out / "solvers.png", lambda file: _plot(results).savefig(file, format="png"))
-    return path
+    return results
 
 
-def _nanoseconds(views: int, device: torch.device, batch: int, repeats: int) -> dict[str, float]:
+def _nanoseconds(views: int, device: torch.device) -> dict[str, float]:
     """Time a system, by solver. Branch-free solvers take the same time on every family."""
-    problem = tuple(value.to(device) for value in make_problem(FAMILIES[0], views, batch, seed=0))
+    problem = tuple(value.to(device) for value in make_problem(FAMILIES[0], views, BATCH, seed=0))
     times = {}
     for name, solve in SOLVERS.items():
         solve(*problem)
         spans = []
-        for _ in range(repeats):
+        for _ in range(REPEATS):
             synchronize(device)
             started = time.perf_counter()
             solve(*problem)
             synchronize(device)
             spans.append(time.perf_counter() - started)
-        times[name] = 1e9 * statistics.median(spans) / batch
+        times[name] = 1e9 * statistics.median(spans) / BATCH
     return times
 
 
@@ -254,18 +251,3 @@ def _plot(results: list[SolverResult]) -> Figure:
         )
         figure.legend(*figure.axes[0].get_legend_handles_labels(), fontsize=9, loc="outside lower center", ncols=3)
     return figure
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        prog="python -m turbogs_plugin.bench.numerics", description=__doc__.splitlines()[0]
-    )
-    parser.add_argument("--out", type=Path, default=Path("docs/results/numerics"), help="folder for the result")
-    parser.add_argument("--device", default="cpu", choices=("auto", "cpu", "cuda"))
-    arguments = parser.parse_args()
-    path = bench_solvers(arguments.out, resolve_device(arguments.device))
-    print(path.with_suffix(".md").read_text(), end="")
-
-
-if __name__ == "__main__":
-    main()

@@ -33,7 +33,7 @@ from turbogs_plugin.engine.cuda.library import LIBRARY_VARIABLE
 from turbogs_plugin.engine.cuda.raster import CudaRendered
 from turbogs_plugin.engine.rendered import Rendered
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.model.gaussians import load_ply, save_ply
+from turbogs_plugin.model.ply import load_ply, save_ply
 from turbogs_plugin.scene import Scene
 from turbogs_plugin.study.cell import scene_on
 from turbogs_plugin.train.evaluate import free_device_memory

@@ -12,14 +12,16 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from turbogs_plugin.bench.clocks import BLOCKS, Mark, back_to_back, copy_bandwidth, keep_busy, summary, wait
+from turbogs_plugin.bench.clocks import BLOCKS, Mark, back_to_back, copy_bandwidth, keep_busy, summary
 from turbogs_plugin.bench.floors import raster_counts, step_floors
 from turbogs_plugin.bench.models import adopt, changed, resized, train, trained_model
 from turbogs_plugin.bench.recorder import StepRecorder, recorded
 from turbogs_plugin.config.configuration import Config, load_config
 from turbogs_plugin.engine.cuda.raster import CudaRendered
-from turbogs_plugin.model.gaussians import load_ply
+from turbogs_plugin.model.ply import load_ply
+from turbogs_plugin.model.row_order import in_order_of_space
 from turbogs_plugin.scene import Scene
+from turbogs_plugin.train.clock import synchronize
 from turbogs_plugin.train.trainer import Trainer
 from turbogs_plugin.types import Gaussians, Step
 
@@ -107,7 +109,7 @@ class StepBench:
             for _ in range(self.repeats):
                 keep_busy(device)
                 iteration()
-            wait(device)
+            synchronize(device)
             steps = recorder.summaries()
             stored = memory(trainer, scene, held, device)
             updates = trainer.optimizer.state_dict()["steps"].clone()
@@ -190,7 +192,7 @@ class StepBench:
         for _ in range(self.repeats):
             trainer.step()
             marks.append(Mark(device))
-        wait(device)
+        synchronize(device)
         return summary([first.until(last) for first, last in itertools.pairwise(marks)])
 
 
@@ -217,13 +219,15 @@ def density_event(
         density, optimizer = usual.build("density"), copy.deepcopy(trainer.optimizer)
         density.setup(trainer.gaussians)
         density.load_state_dict(trainer.density.state_dict())
-        wait(device)
+        synchronize(device)
         first = Mark(device)
         update = density.update(trainer.gaussians, due)
         if update is not None:
+            update = in_order_of_space(update, trainer.gaussians, due)
             after = len(update.apply(trainer.gaussians))
             optimizer.apply(update)
-        wait(device)
+            density.apply(update)
+        synchronize(device)
         spans.append(first.host_until(Mark(device)))
     return {"wall": summary(spans), "every": interval, "gaussians_after": after}
 

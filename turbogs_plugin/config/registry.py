@@ -43,7 +43,7 @@ BUILT_IN: dict[str, dict[str, str]] = {
     },
     "density": {
         "error_driven": "turbogs_plugin.strategies.density.error_driven:ErrorDrivenDensity",
-        "none": "turbogs_plugin.strategies.density.error_driven:NoDensity",
+        "none": "turbogs_plugin.strategies.density.none:NoDensity",
         "gsplat_default": "turbogs_plugin.strategies.density.gsplat_default:GsplatDefaultDensity",
         "mcmc": "turbogs_plugin.strategies.density.mcmc:GsplatMcmcDensity",
         "fastgs": "turbogs_plugin.strategies.density.fastgs:FastGsDensity",

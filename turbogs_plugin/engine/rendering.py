@@ -3,34 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from turbogs_plugin.engine import engine_of
-from turbogs_plugin.engine.cuda import library as kernels
-from turbogs_plugin.engine.cuda.autograd import rasterize_differentiable_cuda
-from turbogs_plugin.engine.reference.raster import (
-    DifferentiableRender,
-    rasterize_differentiable_reference,
-    rasterize_reference,
-)
+from turbogs_plugin.engine.reference.raster import rasterize_reference
 from turbogs_plugin.engine.rendered import DEFAULT_SETTINGS, RasterSettings, Rendered, ScreenGradients
 from turbogs_plugin.tiles import dense_pixels
 from turbogs_plugin.types import Cameras, Gaussians, PixelSamples
 
 __all__ = [
     "DEFAULT_SETTINGS",
-    "DifferentiableRender",
     "RasterSettings",
     "Rendered",
+    "RenderedImage",
     "ScreenGradients",
     "dense_samples",
     "rasterize",
-    "rasterize_differentiable",
-    "rasterize_differentiable_reference",
     "rasterize_reference",
-    "render_images",
+    "render_image",
 ]
 
 
@@ -49,24 +42,6 @@ def rasterize(
     )
 
 
-def rasterize_differentiable(
-    gaussians: Gaussians,
-    cameras: Cameras,
-    samples: PixelSamples,
-    *,
-    sh_degree: int | None = None,
-    settings: RasterSettings = DEFAULT_SETTINGS,
-    with_depth: bool = False,
-) -> DifferentiableRender:
-    """`rasterize` under torch autograd, for losses written in plain torch; the arguments are the same.
-
-    After a backward pass `means2d` has `.grad` and, as in gsplat with ``absgrad=True``, `.absgrad`.
-    """
-    on_gpu = gaussians.device.type == "cuda" and kernels.available()
-    function = rasterize_differentiable_cuda if on_gpu else rasterize_differentiable_reference
-    return function(gaussians, cameras, samples, sh_degree=sh_degree, settings=settings, with_depth=with_depth)
-
-
 def dense_samples(cameras: Cameras, view_ids: Sequence[int] | None = None) -> PixelSamples:
     """Every pixel of every tile of some views, in cell order, without empty slots.
 
@@ -78,24 +53,42 @@ def dense_samples(cameras: Cameras, view_ids: Sequence[int] | None = None) -> Pi
     return dense_pixels(view_ids, cameras.sizes[list(view_ids)], cameras.viewmats.device)
 
 
+@dataclass(frozen=True)
+class RenderedImage:
+    """A whole view.
+
+    Args:
+        colors: [H, W, 3], not clamped above.
+        alphas: [H, W].
+        depths: [H, W] expected depth along the camera's axis, in the unit of the means; 0 where nothing was hit. None
+            where not asked for.
+    """
+
+    colors: Tensor
+    alphas: Tensor
+    depths: Tensor | None
+
+
 @torch.no_grad()
-def render_images(
+def render_image(
     gaussians: Gaussians,
     cameras: Cameras,
+    view_id: int = 0,
+    *,
     sh_degree: int | None = None,
     settings: RasterSettings = DEFAULT_SETTINGS,
-) -> list[tuple[Tensor, Tensor]]:
-    """Whole images, view after view so that memory does not grow with their number.
+    with_depth: bool = False,
+) -> RenderedImage:
+    """Every pixel of one of the cameras; the other arguments are those of `Engine.render`."""
+    samples = dense_samples(cameras, [view_id])
+    rendered = rasterize(
+        gaussians, cameras.select([view_id]), samples, sh_degree=sh_degree, settings=settings, with_depth=with_depth
+    )
+    width, height = cameras.sizes[view_id].tolist()
+    places = samples.pixel_ids.long()
 
-    Returns:
-        For each camera the colours [H, W, 3], not clamped above, and alphas [H, W].
-    """
-    images = []
-    for view, (width, height) in enumerate(cameras.sizes.tolist()):
-        samples = dense_samples(cameras, [view])
-        rendered = rasterize(gaussians, cameras.select([view]), samples, sh_degree=sh_degree, settings=settings)
-        places = samples.pixel_ids.long()
-        colors = torch.empty_like(rendered.colors).index_copy_(0, places, rendered.colors)
-        alphas = torch.empty_like(rendered.alphas).index_copy_(0, places, rendered.alphas)
-        images.append((colors.reshape(height, width, 3), alphas.reshape(height, width)))
-    return images
+    def image(values: Tensor) -> Tensor:
+        return torch.empty_like(values).index_copy_(0, places, values).reshape(height, width, *values.shape[1:])
+
+    depths = None if rendered.depths is None else image(rendered.depths)
+    return RenderedImage(image(rendered.colors), image(rendered.alphas), depths)

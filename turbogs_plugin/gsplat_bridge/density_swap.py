@@ -15,6 +15,7 @@ from torch import Tensor
 from turbogs_plugin.errors import InputError, require
 from turbogs_plugin.gsplat_bridge.gaussian_errors import iteration_stats
 from turbogs_plugin.gsplat_bridge.host import GEOMETRY, GROUND_TRUTH, PREDICTION, host_gaussians, require_keys
+from turbogs_plugin.model.row_order import in_order_of_space
 from turbogs_plugin.strategies.density.error_driven import ErrorDrivenDensity
 from turbogs_plugin.types import GaussianStats, RowUpdate, Step
 
@@ -128,7 +129,7 @@ class TurboDensityStrategy(DefaultStrategy):
         now = Step(step, sys.maxsize, self.refine_stop_iter - 1, self.seed, state["scene_scale"])
         update = controller.update(gaussians, now)
         if update is not None:
-            apply_row_update(update, params, optimizers, state)
+            apply_row_update(in_order_of_space(update, gaussians, now), params, optimizers, state)
         for name in _STATS:
             state[name].zero_()
         if self.verbose and update is not None:

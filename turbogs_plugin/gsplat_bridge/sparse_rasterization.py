@@ -11,14 +11,13 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from turbogs_plugin.engine.reference.compositing import ABSOLUTE, MEAN
-from turbogs_plugin.engine.rendering import RasterSettings, Rendered, rasterize
+from turbogs_plugin.engine.autograd import DifferentiableRender, rasterize_differentiable
+from turbogs_plugin.engine.rendered import RasterSettings
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.gsplat_bridge.gaussian_errors import residuals
 from turbogs_plugin.gsplat_bridge.host import GROUND_TRUTH, LOSS_SHARES, PREDICTION, STATISTICS
-from turbogs_plugin.model.gaussians import SH_C0
 from turbogs_plugin.types import (
-    PARAMETER_NAMES,
+    SH_C0,
     TILE_SIZE,
     Cameras,
     Gaussians,
@@ -30,12 +29,14 @@ from turbogs_plugin.types import (
 LOGIT_MARGIN = 2.0**-23
 """Opacities are kept this far from 0 and 1, where the logit is infinite. An alpha is cut at 0.999 in any case."""
 
+RENDER_MODES = ("RGB", "ED", "RGB+ED")
+"""Those of gsplat's that there are here: colours, expected depth, or both."""
+
 _ONLY = {
     "packed": False,
     "sparse_grad": False,
     "radius_clip": 0.0,
     "tile_size": TILE_SIZE,
-    "render_mode": "RGB",
     "rasterize_mode": "classic",
     "camera_model": "pinhole",
     "distributed": False,
@@ -69,6 +70,7 @@ def sparse_rasterization(
     sh_degree: int | None = None,
     backgrounds: Tensor | None = None,
     absgrad: bool = False,
+    render_mode: str = "RGB",
     **gsplat_options: Any,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """`gsplat.rasterization` at sampled pixels, connected to autograd.
@@ -82,23 +84,29 @@ def sparse_rasterization(
         sh_degree: highest degree used.
         backgrounds: [C, 3], or None for black.
         absgrad: taken for gsplat's sake; ``info["means2d"].absgrad`` is there after backward either way.
+        render_mode: "RGB", "ED" or "RGB+ED", as in gsplat. ED is the expected depth, the sum of w * z over that of w,
+            with z along the camera's axis as Ks has it (no distance), in the unit of `means`; 0 where nothing was hit.
         gsplat_options: further options of gsplat's function, where they have the value that is supported.
 
     Returns:
-        Colours [P, 3] and alphas [P, 1], in the samples' order and zero in empty slots, and gsplat's `info`, unpacked:
-        means2d [C, N, 2], radii [C, N, 2], depths, opacities [C, N], conics [C, N, 3], ids (None), width, height,
-        tile_size, tile_width, tile_height, n_batches, n_cameras. Gradients reach the five parameters and
-        ``info["means2d"]``, no other entry. The arrays of gsplat's tile intersection are not there: isect_ids,
-        isect_offsets, flatten_ids and tiles_per_gauss are None.
+        Colours [P, 3], or depths [P, 1], or both [P, 4] with the depth last, and alphas [P, 1], in the samples' order
+        and zero in empty slots; and gsplat's `info`, unpacked: means2d [C, N, 2], radii [C, N, 2], depths, opacities
+        [C, N], conics [C, N, 3], ids (None), width, height, tile_size, tile_width, tile_height, n_batches, n_cameras.
+        Gradients reach the five parameters and ``info["means2d"]``, no other entry. The arrays of gsplat's tile
+        intersection are not there: isect_ids, isect_offsets, flatten_ids and tiles_per_gauss are None.
 
-        If "prediction" and "ground_truth" (both [P, 3] or both [C, H, W, 3]) are put into `info` before backward,
-        "gaussian_stats" is in it after: the pass's `GaussianStats` with their error sums, and "loss_shares", [N].
+        If "prediction" and "ground_truth" (colours alone, both [P, 3] or both [C, H, W, 3]) are put into `info` before
+        backward, "gaussian_stats" is in it after: the pass's `GaussianStats` with their error sums, and "loss_shares",
+        [N].
 
     Raises:
         InputError: a wrong shape, an option without support here, or cameras that a gradient is wanted of; and from
             a second backward of one pass.
     """
     _check_options(gsplat_options)
+    if render_mode not in RENDER_MODES:
+        supported = ", ".join(map(repr, RENDER_MODES))
+        raise InputError(f"sparse_rasterization: render_mode={render_mode!r} is not supported, only {supported}")
     given = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "colors": colors}
     given |= {"viewmats": viewmats, "Ks": Ks} | ({} if backgrounds is None else {"backgrounds": backgrounds})
     _check_tensors(given)
@@ -126,19 +134,28 @@ def sparse_rasterization(
         "sh0": colors[:, :1],
         "shN": colors[:, 1:],
     }
-    rendered = rasterize(
-        Gaussians(**{name: value.detach().contiguous() for name, value in parameters.items()}),
-        Cameras(viewmats.detach(), Ks.detach(), samples.sizes),
+    observer = _InfoObserver(samples)
+    render = rasterize_differentiable(
+        Gaussians(**parameters),
+        Cameras(viewmats, Ks, samples.sizes),
         samples,
         sh_degree=sh_degree,
         settings=RasterSettings(eps2d=eps2d, near_plane=near_plane, far_plane=far_plane),
+        with_depth=render_mode != "RGB",
+        observer=observer,
     )
-    info = _info(rendered, len(viewmats), width, height)
-    rendered_colors, alphas = _Pass.apply(rendered, samples, info, info["means2d"], *parameters.values())
+    info = _info(render, len(viewmats), width, height)
+    observer.info = weakref.ref(info)
+    alphas = render.alphas[:, None]  # [P, 1]
+    if render_mode == "ED":
+        return render.depths[:, None], alphas, info
+    rendered_colors = render.colors
     if backgrounds is not None:
         behind = backgrounds[samples.view_of_slot()] * samples.filled[:, None]  # [P, 3]
-        rendered_colors = rendered_colors + (1.0 - alphas[:, None]) * behind
-    return rendered_colors, alphas[:, None], info
+        rendered_colors = rendered_colors + (1.0 - alphas) * behind
+    if render_mode == "RGB+ED":
+        rendered_colors = torch.cat([rendered_colors, render.depths[:, None]], dim=1)
+    return rendered_colors, alphas, info
 
 
 def gather_pixels(images: Tensor, samples: PixelSamples) -> Tensor:
@@ -225,38 +242,24 @@ class _Info(dict):
     """A dict that can be referred to weakly."""
 
 
-class _Pass(torch.autograd.Function):
-    """A `Rendered` pass in autograd. It was made before; here its outputs are tied to what they depend on."""
+class _InfoObserver:
+    """Takes the errors of a backward pass from `info`, and leaves the statistics there."""
 
-    @staticmethod
-    def forward(ctx, rendered: Rendered, samples: PixelSamples, info: _Info, means2d: Tensor, *parameters: Tensor):
-        # Weakly, as the host puts what we return into `info`: the graph would keep itself alive.
-        ctx.rendered, ctx.samples, ctx.info = rendered, samples, weakref.ref(info)
-        ctx.count, ctx.spent = means2d.shape[1], False
-        return rendered.colors.clone(), rendered.alphas.clone()
+    def __init__(self, samples: PixelSamples) -> None:
+        self.samples = samples
+        self.has_errors = False
+        self.info: Callable[[], _Info | None] = lambda: None  # weakly: hosts put what the pass gave into it
 
-    @staticmethod
-    @once_differentiable
-    def backward(ctx, color_gradients: Tensor, alpha_gradients: Tensor):
-        if ctx.spent:
-            raise InputError(
-                "backward of one sparse_rasterization a second time: sum the losses first, or render again"
-            )
-        ctx.spent = True
-        info = ctx.info()
-        errors = None if info is None else _sample_errors(info, ctx.samples)
-        stats = GaussianStats.zeros(ctx.count, color_gradients.device)
-        screen = ctx.rendered.backward(
-            color_gradients.contiguous(), errors, with_statistics=True, alpha_gradients=alpha_gradients.contiguous()
-        )
-        records = screen.full_records()
-        gradients = screen.parameter_gradients(rows=False, stats=stats)
-        if info is not None:
-            info["means2d"].absgrad = records[..., ABSOLUTE].clone()
-            if errors is not None:
-                info[STATISTICS], info[LOSS_SHARES] = stats, gradients.view_losses[0]
-        parameter_gradients = (gradients.summed(name) for name in PARAMETER_NAMES)
-        return None, None, None, records[..., MEAN].clone(), *parameter_gradients
+    def pixel_errors(self) -> Tensor | None:
+        info = self.info()
+        errors = None if info is None else _sample_errors(info, self.samples)
+        self.has_errors = errors is not None
+        return errors
+
+    def passed(self, stats: GaussianStats, view_losses: Tensor) -> None:
+        info = self.info()
+        if info is not None and self.has_errors:
+            info[STATISTICS], info[LOSS_SHARES] = stats, view_losses
 
 
 def _sample_errors(info: dict[str, Any], samples: PixelSamples) -> Tensor | None:
@@ -272,14 +275,13 @@ def _sample_errors(info: dict[str, Any], samples: PixelSamples) -> Tensor | None
     return errors
 
 
-def _info(rendered: Rendered, cameras: int, width: int, height: int) -> _Info:
-    projected = rendered.projected()
+def _info(render: DifferentiableRender, cameras: int, width: int, height: int) -> _Info:
+    projected = render.projected
     absent = ("batch_ids", "camera_ids", "gaussian_ids", "tiles_per_gauss", "isect_ids", "flatten_ids", "isect_offsets")
     return _Info(
         {
             **dict.fromkeys(absent),
-            # A leaf: `retain_grad` of it is allowed and needless.
-            "means2d": projected.means2d.detach().requires_grad_(torch.is_grad_enabled()),
+            "means2d": render.means2d,  # a leaf: `retain_grad` of it is allowed and needless
             "radii": projected.radii,
             "depths": projected.depths,
             "conics": projected.conics,

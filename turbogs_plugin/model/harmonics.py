@@ -5,8 +5,7 @@ from __future__ import annotations
 import torch
 
 from turbogs_plugin.errors import require
-from turbogs_plugin.model.gaussians import SH_C0
-from turbogs_plugin.types import Gaussians
+from turbogs_plugin.types import SH_C0, Gaussians
 
 
 def band_energy(gaussians: Gaussians) -> list[float]:

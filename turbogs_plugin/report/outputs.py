@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 from PIL import Image
 
+from turbogs_plugin.engine.rendering import render_image
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.model.gaussians import save_ply
 from turbogs_plugin.model.harmonics import band_energy, drop_faint_bands
-from turbogs_plugin.report.pages import ERRORS, number, table
-from turbogs_plugin.report.plots import to_uint8
+from turbogs_plugin.model.ply import save_ply
+from turbogs_plugin.report.plots import depth_picture, to_uint8
+from turbogs_plugin.report.tables import ERRORS, number, table
 from turbogs_plugin.scene import PosedImages
 from turbogs_plugin.scene.offload import place_views
-from turbogs_plugin.train.evaluate import evaluate, load_lpips, render_view
+from turbogs_plugin.train.evaluate import evaluate, load_lpips
 from turbogs_plugin.train.history import Evaluation
 from turbogs_plugin.train.run import SavedModel, load_model, open_scene, resolve_device
 
@@ -49,16 +50,39 @@ def evaluate_run(path: Path, device_name: str) -> str:
     )
 
 
-def render_run(path: Path, split: str, device_name: str) -> Path:
-    """Write the views of a split, rendered from a run's newest model, as PNGs; their folder."""
+def render_run(path: Path, split: str, device_name: str, with_depth: bool = False) -> list[Path]:
+    """Write the views of a split, rendered from a run's newest model, as PNGs.
+
+    Args:
+        path: folder of the run.
+        split: test or train.
+        device_name: where to render.
+        with_depth: also write each view's expected depth along the camera's axis, in the capture's own units, 0 where
+            nothing was hit: as ``.npy`` ([H, W] float32) and as a coloured PNG (`depth_picture`).
+
+    Returns:
+        The folder of the views, and with depth that of the depths.
+    """
     model, views = _open(path, device_name, split)
-    views = replace(views, cameras=views.cameras.to(model.gaussians.device))
-    folder = model.folder.renders / split
-    folder.mkdir(parents=True, exist_ok=True)
+    cameras = views.cameras.to(model.gaussians.device)
+    folders = [model.folder.renders / name for name in ([split, f"{split}-depth"] if with_depth else [split])]
+    for folder in folders:
+        folder.mkdir(parents=True, exist_ok=True)
     for view_id, name in enumerate(distinct_stems(views.names)):
-        image = render_view(model.gaussians, views, view_id, model.sh_degree, model.config.raster)
-        Image.fromarray(to_uint8(image)).save(folder / f"{name}.png")
-    return folder
+        image = render_image(
+            model.gaussians,
+            cameras,
+            view_id,
+            sh_degree=model.sh_degree,
+            settings=model.config.raster,
+            with_depth=with_depth,
+        )
+        Image.fromarray(to_uint8(image.colors)).save(folders[0] / f"{name}.png")
+        if with_depth:
+            depths = (image.depths.cpu().double() * model.frame.scale).float().numpy()
+            np.save(folders[1] / f"{name}.npy", depths)
+            Image.fromarray(depth_picture(depths)).save(folders[1] / f"{name}.png")
+    return folders
 
 
 def distinct_stems(names: Sequence[str]) -> list[str]:

@@ -2,24 +2,16 @@
 
 from __future__ import annotations
 
-import math
-import os
 import platform
-from collections.abc import Iterable
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-
-import torch
 
 from turbogs_plugin.files import write_text_atomically
 from turbogs_plugin.plan import Plan
+from turbogs_plugin.report.machine import hardware, software
 from turbogs_plugin.report.plots import ERROR_FULL_SCALE, plot_against_seconds, save_strip
+from turbogs_plugin.report.tables import ERRORS, number, table
 from turbogs_plugin.train.evaluate import Metrics, evaluate, load_lpips, render_view
 from turbogs_plugin.train.run import FinishedRun
-from turbogs_plugin.version import __version__
-
-ERRORS = ("PSNR in dB", "SSIM", "mean absolute error")
-PACKAGES = ("torch", "gsplat", "numpy", "pycolmap", "torchmetrics")
 
 
 def write_report(run: FinishedRun) -> Path:
@@ -41,48 +33,6 @@ def write_report(run: FinishedRun) -> Path:
         save_strip(pictures / f"test-{view_id:03d}.png", run.test.photos.image(view_id), image)
     write_text_atomically(run.folder.report, _page(run, metrics, lpips_reason, shown))
     return run.folder.report
-
-
-def table(header: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
-    """A Markdown table."""
-    header = list(header)
-    lines = [header, ["---"] * len(header), *rows]
-    return "\n".join(f"| {' | '.join(str(cell) for cell in line)} |" for line in lines)
-
-
-def number(value: float, digits: int) -> str:
-    """A number for a table; "not computed" for NaN."""
-    return "not computed" if math.isnan(value) else f"{value:.{digits}f}"
-
-
-def software() -> list[tuple[str, str]]:
-    """(name, version) of what a result depends on."""
-    versions = [("turbogs-plugin", __version__), ("Python", platform.python_version())]
-    for package in PACKAGES:
-        try:
-            versions.append((package, version(package)))
-        except PackageNotFoundError:
-            versions.append((package, "not installed"))
-    return [*versions, ("CUDA of torch", torch.version.cuda or "none")]
-
-
-def hardware(device: str) -> str:
-    """The machine in words."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    processor = f"{_processor_name()}, {cores} cores"
-    if device != "cuda":
-        return processor
-    properties = torch.cuda.get_device_properties(0)
-    return f"{properties.name} ({properties.total_memory / 2**30:.0f} GiB), {processor}"
-
-
-def _processor_name() -> str:
-    try:
-        with open("/proc/cpuinfo", encoding="utf-8") as file:
-            names = [line.split(":", 1)[1].strip() for line in file if line.startswith("model name")]
-    except OSError:
-        names = []
-    return names[0] if names else platform.processor() or platform.machine()
 
 
 def _page(run: FinishedRun, metrics: Metrics, lpips_reason: str, shown: int) -> str:

@@ -26,6 +26,9 @@ STYLE = {
 ERROR_FULL_SCALE = 0.25
 """Mean absolute error over RGB that has the brightest colour of an error map."""
 
+FAINTEST = 0.1
+"""Place of the farthest on the scale of colours of a depth: visibly not black."""
+
 GAP = 6
 """White pixels between the pictures of a strip."""
 
@@ -75,6 +78,22 @@ def error_picture(photo: Tensor, image: Tensor) -> np.ndarray:
     """[H, W, 3] uint8: mean absolute error over RGB, black (none) to bright yellow (`ERROR_FULL_SCALE` and more)."""
     errors = (photo - image).abs().mean(dim=-1).cpu().numpy() / ERROR_FULL_SCALE  # [H, W]
     colors = matplotlib.colormaps["inferno"](errors.clip(0.0, 1.0))[..., :3]
+    return (colors * 255.0).round().astype(np.uint8)
+
+
+def depth_picture(depths: np.ndarray) -> np.ndarray:
+    """[H, W, 3] uint8 of depths [H, W]: near is bright, far is dark, and what has no depth (0) is black.
+
+    The colours are even in 1 / depth, so that what is far takes no more of them than it shows, and go from its 1st to
+    its 99th percentile in this image.
+    """
+    seen = depths > 0
+    if not seen.any():
+        return np.zeros((*depths.shape, 3), dtype=np.uint8)
+    nearness = 1.0 / np.where(seen, depths, 1.0)
+    far, near = np.percentile(nearness[seen], [1, 99])
+    share = ((nearness - far) / max(near - far, np.finfo(np.float32).tiny)).clip(0.0, 1.0)
+    colors = matplotlib.colormaps["inferno"](FAINTEST + (1.0 - FAINTEST) * share)[..., :3] * seen[..., None]
     return (colors * 255.0).round().astype(np.uint8)
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from turbogs_plugin.engine import compiled_kernels
-from turbogs_plugin.report.pages import hardware, software
+from turbogs_plugin.report.machine import hardware, software
 
 COMMIT_VARIABLE = "TURBOGS_COMMIT"
 """Environment variable that names the commit where the sources are a copy without their history."""

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from turbogs_plugin.report.pages import table
+from turbogs_plugin.report.tables import table
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 from torchmetrics.functional.image import structural_similarity_index_measure
 
-from turbogs_plugin.engine.rendering import RasterSettings, render_images
+from turbogs_plugin.engine.rendering import DEFAULT_SETTINGS, RasterSettings, render_image
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene import PosedImages
 from turbogs_plugin.train.clock import synchronize
@@ -122,9 +122,8 @@ def render_view(
     settings: RasterSettings | None = None,
 ) -> Tensor:
     """[H, W, 3] float32, 0 .. 1: the model seen by one of the cameras."""
-    cameras = views.cameras.select([view_id])
-    image, _ = render_images(gaussians, cameras, sh_degree, settings or RasterSettings())[0]
-    return image.clamp(0.0, 1.0)
+    image = render_image(gaussians, views.cameras, view_id, sh_degree=sh_degree, settings=settings or DEFAULT_SETTINGS)
+    return image.colors.clamp(0.0, 1.0)
 
 
 def compare(name: str, image: Tensor, photo: Tensor) -> ViewMetrics:

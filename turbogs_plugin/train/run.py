@@ -15,7 +15,7 @@ import torch
 from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.errors import InputError, TrainingStopped
 from turbogs_plugin.files import write_text_atomically
-from turbogs_plugin.model.gaussians import save_ply
+from turbogs_plugin.model.ply import save_ply
 from turbogs_plugin.plan import Plan, make_plan
 from turbogs_plugin.scene import Frame, PosedImages, Scene, load_scene
 from turbogs_plugin.scene.fingerprint import capture_difference, capture_state, frame_of_state

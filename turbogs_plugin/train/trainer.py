@@ -13,20 +13,25 @@ from torch import Tensor
 from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.engine import engine_of
 from turbogs_plugin.engine.rendered import Rendered, ScreenGradients
-from turbogs_plugin.engine.rendering import render_images
+from turbogs_plugin.engine.rendering import render_image
 from turbogs_plugin.errors import TrainingStopped
-from turbogs_plugin.model.gaussians import (
-    BACKDROP_COUNT,
-    RESTRAIN_EVERY,
-    backdrop_gaussians,
-    gaussians_from_points,
-    restrain_distant,
-)
+from turbogs_plugin.model.distant import RESTRAIN_EVERY, restrain_distant
+from turbogs_plugin.model.initial import BACKDROP_COUNT, backdrop_gaussians, gaussians_from_points
+from turbogs_plugin.model.row_order import in_order_of_space
 from turbogs_plugin.plan.caps import cap_of, chosen_points
 from turbogs_plugin.scene import Scene
 from turbogs_plugin.scene.offload import place_maps, place_views
 from turbogs_plugin.scene.photos import PhotoSamples
-from turbogs_plugin.types import PARAMETER_NAMES, Gaussians, GaussianStats, LossOutput, PixelSamples, RowUpdate, Step
+from turbogs_plugin.types import (
+    LARGEST_SH_DEGREE,
+    PARAMETER_NAMES,
+    Gaussians,
+    GaussianStats,
+    LossOutput,
+    PixelSamples,
+    RowUpdate,
+    Step,
+)
 
 COLOR_STRIDE = 97
 """Every so many pixels count for the mean colour of the photos; coprime to usual widths."""
@@ -72,9 +77,10 @@ class Trainer:
 
     def initialise_map(self, view_id: int) -> None:
         """The errors of one view."""
-        camera = self.views.cameras.select([view_id])
-        image, _ = render_images(self.gaussians, camera, self.sh_degree, self.config.raster)[0]
-        errors = (image - self.views.photos.image(view_id)).abs().sum(dim=-1)  # [H, W]
+        image = render_image(
+            self.gaussians, self.views.cameras, view_id, sh_degree=self.sh_degree, settings=self.config.raster
+        )
+        errors = (image.colors - self.views.photos.image(view_id)).abs().sum(dim=-1)  # [H, W]
         self.maps.initialise(view_id, errors.reshape(-1))
 
     def step(self) -> None:
@@ -110,8 +116,6 @@ class Trainer:
 
         # 11) Error-driven density control
         self.follow(self.density.update(self.gaussians, step))
-        if self.config.train.distant_size > 0 and self.iteration % RESTRAIN_EVERY == 0:
-            restrain_distant(self.gaussians, self.extent, self.config.train.distant_size)
 
         self.iteration += 1
 
@@ -144,14 +148,21 @@ class Trainer:
             self.optimizer.step(self.gaussians, gradients, step)
 
     def follow(self, update: RowUpdate | None) -> None:
-        """Let model and optimizer follow a change of the set of Gaussians."""
-        if update is None:
-            return
-        if len(update.source) == 0:
-            raise TrainingStopped(f"iteration {self.iteration}: density control removed every Gaussian")
-        self.gaussians = update.apply(self.gaussians)
-        self.optimizer.apply(update)
-        self.first_repeatable = self.iteration + 1
+        """What is done after density control has proposed a change of the set of Gaussians, or none.
+
+        Model, optimizer and controller follow the change, in the order of space. Then what is far away is kept from
+        growing, which no part of the paper does.
+        """
+        if update is not None:
+            if len(update.source) == 0:
+                raise TrainingStopped(f"iteration {self.iteration}: density control removed every Gaussian")
+            update = in_order_of_space(update, self.gaussians, self.now)
+            self.gaussians = update.apply(self.gaussians)
+            self.optimizer.apply(update)
+            self.density.apply(update)
+            self.first_repeatable = self.iteration + 1
+        if self.config.train.distant_size > 0 and self.iteration % RESTRAIN_EVERY == 0:
+            restrain_distant(self.gaussians, self.extent, self.config.train.distant_size)
 
     def set_length(self, iterations: int, refine_until: int) -> None:
         """T and the last iteration of density control: as configured, until a run that goes by time says otherwise."""
@@ -268,6 +279,6 @@ def gaussians_of_state(state: dict[str, Any], device: torch.device) -> Gaussians
             raise ValueError(f"gaussians.{name} has shape {tuple(value.shape)} where {shape} was expected")
         if not value.isfinite().all():
             raise ValueError(f"gaussians.{name} is not finite")
-    if bands not in (0, 3, 8, 15):
+    if bands not in [(degree + 1) ** 2 - 1 for degree in range(LARGEST_SH_DEGREE + 1)]:
         raise ValueError(f"gaussians.shN has {bands} bands")
     return gaussians

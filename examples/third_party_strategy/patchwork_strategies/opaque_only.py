@@ -43,6 +43,9 @@ class OpaqueOnlyDensity:
         fresh = torch.zeros_like(kept, dtype=torch.bool)
         return RowUpdate(kept, fresh, {}, num_pruned=len(gaussians) - len(kept))
 
+    def apply(self, update: RowUpdate) -> None:
+        pass  # it keeps nothing by Gaussian
+
     def state_dict(self) -> dict[str, Any]:
         return {}
 

@@ -18,11 +18,11 @@ from turbogs_plugin.engine.cuda import library
 from turbogs_plugin.engine.cuda.workspace import COUNT_MAX, Workspace, require_possible, round_capacity
 from turbogs_plugin.engine.moments import COLUMNS, ROW_WIDTH
 from turbogs_plugin.engine.rendered import DEFAULT_SETTINGS, Projected, RasterSettings, require_statistics
+from turbogs_plugin.engine.shared import used_degree
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.types import PARAMETER_NAMES, Cameras, GaussianGradients, Gaussians, GaussianStats, PixelSamples
 
 MAX_VIEWS = 128
-MAX_DEGREE = 3
 INSTANCE_FLOATS = 12
 CAMERA_FLOATS = 28
 RECORD_FLOATS = 16
@@ -47,7 +47,7 @@ def _prepared(tensor: Tensor) -> Tensor:
     return tensor if tensor.data_ptr() % 16 == 0 else tensor.clone()
 
 
-def _check(gaussians: Gaussians, cameras: Cameras, samples: PixelSamples, degree: int) -> None:
+def _check(gaussians: Gaussians, cameras: Cameras, samples: PixelSamples) -> None:
     device = gaussians.device
     if device.type != "cuda":
         raise InputError(f"rasterize_cuda: the Gaussians are on {device}; move them to a CUDA device")
@@ -57,8 +57,6 @@ def _check(gaussians: Gaussians, cameras: Cameras, samples: PixelSamples, degree
         for name, tensor in tensors:
             if tensor.dtype != dtype or tensor.device != device:
                 raise InputError(f"{name} must be {dtype} on {device}, got {tensor.dtype} on {tensor.device}")
-    if not 0 <= degree <= min(MAX_DEGREE, gaussians.sh_degree):
-        raise InputError(f"sh_degree must be 0 .. {min(MAX_DEGREE, gaussians.sh_degree)} for this model, got {degree}")
     require_views(len(cameras))
     if not np.array_equal(cameras.sizes, samples.sizes):
         raise InputError("cameras and samples differ in their image sizes: select the cameras of samples.view_ids")
@@ -295,8 +293,8 @@ def rasterize_cuda(
         InputError: no kernels here, a tensor of wrong dtype or device, or more pairs than a pass can have.
     """
     library.require()
-    degree = gaussians.sh_degree if sh_degree is None else sh_degree
-    _check(gaussians, cameras, samples, degree)
+    degree = used_degree(gaussians, sh_degree)
+    _check(gaussians, cameras, samples)
     gaussians = gaussians.map(_prepared)
     device = gaussians.device
     buffers = workspace if workspace is not None else _FreshBuffers(device)

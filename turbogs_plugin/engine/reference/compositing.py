@@ -12,7 +12,6 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 from torch.nn.functional import threshold_
 
 from turbogs_plugin.engine.reference.intersection import TilePairs
@@ -267,25 +266,3 @@ def _slice_backward(piece: Slice, upstream: Tensor, behind: Tensor) -> tuple[Ten
     distances = piece.sigma.mul_(2).sqrt_().mul_(piece.weights)
     record[DISTANCE_SUM] = torch.bmm(upstream[:, :, 6:].transpose(1, 2), distances)[:, 0]
     return record.permute(1, 2, 0), after
-
-
-class Composite(torch.autograd.Function):
-    """`composite` in autograd, with the projected means as [K, N, 2]: after a backward pass their attribute `absgrad`
-    holds the absolute gradients, as in gsplat. The other splat arrays have one entry a row."""
-
-    @staticmethod
-    def forward(ctx, compositor, means2d, rows, conics, colors, opacities, depths):
-        table = splat_table(rows.gather(means2d), conics, colors, opacities, depths)
-        sums = composite(compositor, table)
-        ctx.compositor, ctx.rows = compositor, rows
-        ctx.save_for_backward(means2d, table, sums)
-        return sums
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx, gradients):
-        means2d, table, sums = ctx.saved_tensors
-        record = composite_backward(ctx.compositor, table, sums, gradients, None)
-        means2d.absgrad = ctx.rows.scatter(record[:, ABSOLUTE])
-        mean_gradients = ctx.rows.scatter(record[:, MEAN])
-        return None, mean_gradients, None, *(record[:, column] for column in (CONIC, COLOR, OPACITY, DEPTH))

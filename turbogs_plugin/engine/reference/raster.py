@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from turbogs_plugin.engine.reference import compositing
-from turbogs_plugin.engine.reference.compositing import ALPHA_TINY, Composite, Compositor
+from turbogs_plugin.engine.reference.compositing import ALPHA_TINY, Compositor
 from turbogs_plugin.engine.reference.intersection import intersect_tiles
 from turbogs_plugin.engine.reference.projection import Rows, Splats, drawable_rows, project_rows
 from turbogs_plugin.engine.rendered import DEFAULT_SETTINGS, Projected, RasterSettings, require_statistics
+from turbogs_plugin.engine.shared import used_degree
 from turbogs_plugin.types import Cameras, GaussianGradients, Gaussians, GaussianStats, PixelSamples
 
 ROW_PARAMETERS = ("means", "quats", "scales", "opacities", "sh0")
@@ -22,15 +22,6 @@ ROW_PARAMETERS = ("means", "quats", "scales", "opacities", "sh0")
 def expected_depths(sums: Tensor) -> Tensor:
     """[P, 5] sums -> [P] expected depth, 0 where nothing was hit. Differentiable."""
     return sums[:, 4] / sums[:, 3].clamp(min=ALPHA_TINY)
-
-
-def used_degree(gaussians: Gaussians, sh_degree: int | None) -> int:
-    """The degree of spherical harmonics to evaluate; ValueError where the model does not hold it."""
-    if sh_degree is None:
-        return gaussians.sh_degree
-    if not 0 <= sh_degree <= gaussians.sh_degree:
-        raise ValueError(f"sh_degree is {sh_degree}, but these Gaussians hold degrees 0 to {gaussians.sh_degree}")
-    return sh_degree
 
 
 @dataclass
@@ -176,59 +167,3 @@ def rasterize_reference(
         sums = compositing.composite(compositor, table)
         depths = expected_depths(sums) if with_depth else None
     return ReferenceRendered(sums[:, :3], sums[:, 3], depths, sums, table, compositor, rows, splats, leaves)
-
-
-@dataclass
-class DifferentiableRender:
-    """A forward pass connected to autograd.
-
-    Args:
-        colors: [P, 3], alphas: [P], depths: [P] or None; zero in empty slots.
-        means2d: [K, N, 2] pixels. Keeps its gradient; after backward `means2d.absgrad` [K, N, 2] holds the absolute
-            one.
-        conics: [K, N, 3], depths_per_gaussian: [K, N], opacities: [K, N].
-        radii: [K, N, 2] int32, zero where a Gaussian is not drawn. So are the other arrays.
-        sizes: [K, 2] int64 numpy array (width, height).
-    """
-
-    colors: Tensor
-    alphas: Tensor
-    depths: Tensor | None
-    means2d: Tensor
-    conics: Tensor
-    depths_per_gaussian: Tensor
-    opacities: Tensor
-    radii: Tensor
-    sizes: np.ndarray
-
-
-def rasterize_differentiable_reference(
-    gaussians: Gaussians,
-    cameras: Cameras,
-    samples: PixelSamples,
-    *,
-    sh_degree: int | None = None,
-    settings: RasterSettings = DEFAULT_SETTINGS,
-    with_depth: bool = False,
-) -> DifferentiableRender:
-    """Render samples with gradients to `gaussians` through autograd; same arguments as `rasterize`."""
-    degree = used_degree(gaussians, sh_degree)
-    rows = drawable_rows(gaussians, cameras, settings)
-    parameters = [getattr(gaussians, name).index_select(0, rows.gaussians) for name in ROW_PARAMETERS]
-    splats = project_rows(rows, *parameters, gaussians.shN, cameras, degree, settings)
-    means2d = rows.scatter(splats.means2d)
-    if means2d.requires_grad:
-        means2d.retain_grad()
-    compositor = Compositor(intersect_tiles(rows, splats, samples, settings), samples, settings)
-    sums = Composite.apply(compositor, means2d, rows, splats.conics, splats.colors, splats.opacities, splats.depths)
-    return DifferentiableRender(
-        colors=sums[:, :3],
-        alphas=sums[:, 3],
-        depths=expected_depths(sums) if with_depth else None,
-        means2d=means2d,
-        conics=rows.scatter(splats.conics),
-        depths_per_gaussian=rows.scatter(splats.depths),
-        opacities=rows.scatter(splats.opacities),
-        radii=rows.scatter(splats.radii),
-        sizes=samples.sizes,
-    )

@@ -6,7 +6,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-MAX_DEGREE = 3
+from turbogs_plugin.types import SH_C0
 
 
 def num_bands(degree: int) -> int:
@@ -60,7 +60,7 @@ def evaluate(sh0: Tensor, shN: Tensor, directions: Tensor, degree: int) -> Tenso
     Returns:
         [R, 3].
     """
-    colors = 0.2820947917738781 * sh0[:, 0]
+    colors = SH_C0 * sh0[:, 0]
     if degree == 0:
         return colors
     values = basis(directions, degree)  # [R, B]

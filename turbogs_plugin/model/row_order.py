@@ -1,9 +1,11 @@
-"""An order of points along a curve through space, so that what lies close together is close in memory."""
+"""The order of the rows: along a curve through space, so that what lies close together is close in memory."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
+
+from turbogs_plugin.types import Gaussians, RowUpdate, Step
 
 BITS = 21
 """Of a coordinate: three of them fill 63 bits."""
@@ -15,6 +17,23 @@ SPREADS = (
     (2, 0x1249249249249249),
 )
 """Shifts and masks that put two empty bits behind each of 21."""
+
+
+def in_order_of_space(update: RowUpdate, gaussians: Gaussians, step: Step) -> RowUpdate:
+    """The same change with its new rows in the order of space; for whoever applies an update, before it does.
+
+    Splats of a tile are gathered, and added to, by row: what is seen together should be read together. After
+    `Step.refine_until` the change stays as it is: Gaussians are then only removed, which leaves the others in order.
+
+    Args:
+        update: a change of `gaussians`.
+        gaussians: the model before it, about the cameras' centre.
+        step: when.
+    """
+    if step.iteration > step.refine_until:
+        return update
+    means = update.values["means"] if "means" in update.values else gaussians.means[update.source]
+    return update.reordered(spatial_order(means, step.scene_extent))
 
 
 def spatial_order(means: Tensor, extent: float) -> Tensor:

@@ -1,0 +1,60 @@
+"""Rendering in plain torch that autograd differentiates: gsplat's projection and harmonics (its `_torch_impl`), and
+compositing front to back as gsplat documents it. Slow, and no line is shared with what is tested."""
+
+from __future__ import annotations
+
+import torch
+from gsplat.cuda._torch_impl import _fully_fused_projection, _quat_scale_to_covar_preci, _spherical_harmonics
+from torch import Tensor
+
+from turbogs_plugin.engine.rendered import DEFAULT_SETTINGS, RasterSettings
+from turbogs_plugin.types import Cameras, Gaussians, PixelSamples
+
+
+def gsplat_torch_render(
+    gaussians: Gaussians,
+    cameras: Cameras,
+    samples: PixelSamples,
+    sh_degree: int | None = None,
+    settings: RasterSettings = DEFAULT_SETTINGS,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Colours [P, 3], alphas [P] and expected depths [P] at the samples; zero in empty slots."""
+    degree = gaussians.sh_degree if sh_degree is None else sh_degree
+    covars, _ = _quat_scale_to_covar_preci(gaussians.quats, gaussians.scales.exp(), True, False)
+    coefficients = torch.cat([gaussians.sh0, gaussians.shN], dim=1)
+    opacities = torch.sigmoid(gaussians.opacities)
+    places, views = samples.coordinates().to(gaussians.means) + 0.5, samples.view_of_slot()
+    result = gaussians.means.new_zeros(len(samples), 5)
+    for view, (width, height) in enumerate(cameras.sizes.tolist()):
+        radii, means2d, depths, conics, _ = (
+            value[0] if value is not None else None
+            for value in _fully_fused_projection(
+                gaussians.means,
+                covars,
+                cameras.viewmats[view : view + 1],
+                cameras.Ks[view : view + 1],
+                width,
+                height,
+                settings.eps2d,
+                settings.near_plane,
+                settings.far_plane,
+            )
+        )
+        directions = gaussians.means - cameras.centers[view]
+        colors = (_spherical_harmonics(degree, directions, coefficients) + 0.5).clamp(min=0)
+        order = depths.argsort(stable=True)
+        order = order[(radii > 0).all(dim=-1)[order]]
+        slots = torch.nonzero((views == view) & samples.filled).squeeze(-1)
+        dx, dy = (means2d[order] - places[slots][:, None]).unbind(dim=-1)  # [S, n]
+        a, b, c = conics[order].unbind(dim=-1)
+        sigma = 0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy
+        alphas = (opacities[order] * torch.exp(-sigma)).clamp(max=settings.alpha_max)
+        alphas = torch.where((sigma >= 0) & (alphas >= settings.alpha_min), alphas, 0)
+        going = (1 - alphas).cumprod(dim=1) > settings.transmittance_min
+        alphas = torch.where(going, alphas, 0)
+        before = torch.cat([torch.ones_like(alphas[:, :1]), (1 - alphas).cumprod(dim=1)[:, :-1]], dim=1)
+        weights = alphas * before  # [S, n]
+        values = torch.cat([colors[order], depths[order, None], torch.ones_like(depths[order, None])], dim=1)
+        result = result.index_add(0, slots, weights @ values)
+    alphas = result[:, 4]
+    return result[:, :3], alphas, result[:, 3] / alphas.clamp(min=1e-10)

@@ -1,0 +1,81 @@
+"""The Gaussians that training starts from."""
+
+import math
+
+import pytest
+import torch
+
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.model.initial import BACKDROP_RADIUS, backdrop_gaussians, gaussians_from_points
+from turbogs_plugin.types import SH_C0
+
+
+def test_initial_gaussians():
+    points = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3]])
+    colors = torch.tensor([[255, 0, 51]] * 4, dtype=torch.uint8)
+    gaussians = gaussians_from_points(points, colors, sh_degree=2, extent=1.0)
+    assert torch.equal(gaussians.means, points)
+    assert gaussians.scales[0].exp().tolist() == pytest.approx([2.0] * 3)
+    assert gaussians.scales[1].exp().tolist() == pytest.approx([(1 + 5**0.5 + 10**0.5) / 3] * 3)
+    assert gaussians.opacities.sigmoid().tolist() == pytest.approx([0.1] * 4)
+    assert gaussians.quats.tolist() == [[1, 0, 0, 0]] * 4
+    color = gaussians.sh0[0, 0] * 0.5 / math.sqrt(math.pi) + 0.5
+    assert color.tolist() == pytest.approx([1, 0.5 / 255, 0.2], abs=1e-6)
+    assert gaussians.shN.shape == (4, 8, 3) and not gaussians.shN.any()
+    assert all(value.dtype == torch.float32 for _, value in gaussians.items())
+
+
+def test_other_starts():
+    """gsplat's MCMC preset begins with opacities of 0.5 and a tenth of the scales."""
+    points = torch.rand(50, 3, generator=torch.Generator().manual_seed(1))
+    colors = torch.zeros(50, 3, dtype=torch.uint8)
+    plain = gaussians_from_points(points, colors, 1, 1.0)
+    small = gaussians_from_points(points, colors, 1, 1.0, opacity=0.5, size=0.1)
+    torch.testing.assert_close(small.scales, plain.scales - math.log(10))
+    torch.testing.assert_close(torch.sigmoid(small.opacities), torch.full((50,), 0.5))
+
+
+def test_coincident_and_lonely_points_get_a_scale():
+    colors = torch.zeros(5, 3, dtype=torch.uint8)
+    same = gaussians_from_points(torch.ones(5, 3), colors, sh_degree=0, extent=2.0)
+    assert same.scales.exp().flatten().tolist() == pytest.approx([2e-4] * 15)
+    one = gaussians_from_points(torch.ones(1, 3), colors[:1], sh_degree=0, extent=2.0)
+    assert one.scales.exp().flatten().tolist() == pytest.approx([0.02] * 3)
+    assert one.shN.shape == (1, 0, 3)
+
+
+def test_points_that_are_not_finite_are_left_out_and_counted():
+    points = torch.rand(6, 3)
+    points[1, 2], points[4, 0] = torch.nan, torch.inf
+    colors = torch.arange(18, dtype=torch.uint8).view(6, 3)
+    with pytest.warns(UserWarning, match="2 of 6 points are not finite"):
+        gaussians = gaussians_from_points(points, colors, sh_degree=0, extent=1.0)
+    assert torch.equal(gaussians.means, points[[0, 2, 3, 5]])
+    expected = gaussians_from_points(points[[0, 2, 3, 5]], colors[[0, 2, 3, 5]], sh_degree=0, extent=1.0)
+    assert torch.equal(gaussians.sh0, expected.sh0) and torch.equal(gaussians.scales, expected.scales)
+
+
+@pytest.mark.parametrize(
+    ("points", "sh_degree", "extent", "words"),
+    [
+        (torch.zeros(0, 3), 3, 1.0, "no points"),
+        (torch.zeros(2, 3), 4, 1.0, r"sh_degree is 4: it must be 0 \.\. 3"),
+        (torch.zeros(2, 3), 3, 0.0, "extent is 0"),
+        (torch.zeros(2, 3), 3, math.nan, "extent is nan"),
+    ],
+)
+def test_bad_arguments(points, sh_degree, extent, words):
+    with pytest.raises(InputError, match=words):
+        gaussians_from_points(points, torch.zeros_like(points, dtype=torch.uint8), sh_degree, extent)
+
+
+def test_a_backdrop_surrounds_everything_in_its_colour():
+    backdrop = backdrop_gaussians(torch.tensor([0.2, 0.4, 0.6]), sh_degree=2, extent=3.0)
+    assert torch.allclose(backdrop.means.norm(dim=1), torch.tensor(BACKDROP_RADIUS * 3.0))
+    colors = backdrop.sh0[:, 0] * SH_C0 + 0.5
+    assert torch.allclose(colors, torch.tensor([51.0, 102.0, 153.0]) / 255.0, atol=1e-6)
+    assert backdrop.shN.shape[1] == 8
+    directions = torch.nn.functional.normalize(torch.randn(500, 3, generator=torch.Generator().manual_seed(0)), dim=1)
+    # Whatever the direction, the nearest Gaussian's centre is within one standard deviation.
+    nearest = torch.cdist(directions * BACKDROP_RADIUS * 3.0, backdrop.means).amin(dim=1)
+    assert (nearest < backdrop.scales.exp().amin()).all()

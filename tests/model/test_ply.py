@@ -1,0 +1,101 @@
+"""Models to and from .ply."""
+
+import numpy as np
+import pytest
+import torch
+from gsplat import export_splats
+from helpers.models import random_gaussians
+
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.model.ply import load_ply, save_ply
+from turbogs_plugin.scene import Frame
+from turbogs_plugin.scene.ply import read_vertices
+
+
+@pytest.mark.parametrize("sh_degree", [0, 1, 3])
+def test_ply_round_trip_is_exact(tmp_path, sh_degree):
+    gaussians = random_gaussians(sh_degree=sh_degree)
+    save_ply(gaussians, tmp_path / "model.ply")
+    loaded = load_ply(tmp_path / "model.ply")
+    assert loaded.sh_degree == sh_degree
+    for (name, value), (_, back) in zip(gaussians.items(), loaded.items(), strict=True):
+        assert torch.equal(value, back), name
+    assert [path.name for path in tmp_path.iterdir()] == ["model.ply"]
+
+
+def test_ply_has_the_properties_of_3dgs_in_its_order(tmp_path):
+    save_ply(random_gaussians(), tmp_path / "model.ply")
+    header = (tmp_path / "model.ply").read_bytes().split(b"end_header\n")[0].decode().splitlines()
+    assert header[:3] == ["ply", "format binary_little_endian 1.0", "element vertex 40"]
+    names = ["x", "y", "z", "nx", "ny", "nz", *(f"f_dc_{i}" for i in range(3)), *(f"f_rest_{i}" for i in range(45))]
+    names += ["opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
+    assert header[3:] == [f"property float {name}" for name in names]
+
+
+def test_ply_agrees_with_gsplat(tmp_path):
+    gaussians = random_gaussians()
+    save_ply(gaussians, tmp_path / "ours.ply")
+    export_splats(**dict(gaussians.items()), save_to=str(tmp_path / "theirs.ply"))
+    ours, theirs = read_vertices(tmp_path / "ours.ply"), read_vertices(tmp_path / "theirs.ply")
+    assert set(ours.dtype.names) == set(theirs.dtype.names) | {"nx", "ny", "nz"}
+    for name in theirs.dtype.names:
+        np.testing.assert_array_equal(ours[name], theirs[name])
+    for (_, value), (_, back) in zip(gaussians.items(), load_ply(tmp_path / "theirs.ply").items(), strict=True):
+        assert torch.equal(value, back)
+
+
+@pytest.mark.parametrize(
+    ("center", "scale", "position_type"), [((0.1, -0.2, 3.0), 6.0, "<f4"), ((5e5, -4e6, 120.0), 80.0, "<f8")]
+)
+def test_exports_return_to_the_capture_frame(tmp_path, center, scale, position_type):
+    """Positions within 1e-6 of the extent (plus a float's own rounding near the origin), scales times the unit."""
+    gaussians, frame = random_gaussians(), Frame(np.array(center), scale)
+    save_ply(gaussians, tmp_path / "model.ply", frame)
+    vertices = read_vertices(tmp_path / "model.ply")
+    assert vertices["x"].dtype == position_type and vertices["opacity"].dtype == "<f4"
+    positions = np.stack([vertices[axis].astype(np.float64) for axis in "xyz"], axis=1)
+    expected = gaussians.means.double().numpy() * scale + np.array(center)
+    assert np.abs(positions - expected).max() < 1e-6 * scale
+    scales = np.stack([vertices[f"scale_{i}"] for i in range(3)], axis=1)
+    np.testing.assert_allclose(np.exp(scales), gaussians.scales.exp() * scale, rtol=2e-6)
+    back = load_ply(tmp_path / "model.ply", frame)
+    assert (back.means - gaussians.means).abs().max() < 1e-6
+    assert (back.scales - gaussians.scales).abs().max() < 2e-6
+    assert torch.equal(back.quats, gaussians.quats) and torch.equal(back.shN, gaussians.shN)
+
+
+def test_gaussians_that_are_not_finite_are_not_written(tmp_path):
+    gaussians = random_gaussians()
+    gaussians.means[3, 0], gaussians.shN[5, 2, 1], gaussians.opacities[7] = torch.nan, torch.inf, torch.nan
+    with pytest.warns(UserWarning, match="3 of 40 Gaussians are not finite"):
+        save_ply(gaussians, tmp_path / "model.ply")
+    keep = [i for i in range(40) if i not in (3, 5, 7)]
+    assert torch.equal(load_ply(tmp_path / "model.ply").means, gaussians.means[keep])
+
+
+def test_nothing_is_written_over_by_a_failure(tmp_path):
+    path = tmp_path / "model.ply"
+    save_ply(random_gaussians(), path)
+    before = path.read_bytes()
+    with pytest.raises(InputError, match="no Gaussians"):
+        save_ply(random_gaussians(0), path)
+    assert path.read_bytes() == before
+    with pytest.raises(InputError, match=r"cannot write .*absent"):
+        save_ply(random_gaussians(), tmp_path / "absent" / "model.ply")
+
+
+def test_load_refuses_what_is_not_finite_or_not_there(tmp_path):
+    save_ply(random_gaussians(), tmp_path / "model.ply")
+    content = bytearray((tmp_path / "model.ply").read_bytes())
+    content[-4:] = np.float32(np.nan).tobytes()
+    (tmp_path / "model.ply").write_bytes(content)
+    with pytest.raises(InputError, match="1 of 40 Gaussians are not finite"):
+        load_ply(tmp_path / "model.ply")
+    with pytest.raises(InputError, match=r"cannot read .*absent\.ply"):
+        load_ply(tmp_path / "absent.ply")
+
+
+def test_a_degree_that_no_engine_evaluates_is_refused_by_name(tmp_path):
+    save_ply(random_gaussians(sh_degree=4), tmp_path / "model.ply")
+    with pytest.raises(InputError, match=r"model\.ply has 72 properties f_rest_\*: .* degree 0 \.\. 3, the largest"):
+        load_ply(tmp_path / "model.ply")

@@ -1,0 +1,120 @@
+"""A rendering pass under torch autograd, for losses written in plain torch: one wrapper, whatever the engine."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from turbogs_plugin.engine.reference.compositing import ABSOLUTE, MEAN
+from turbogs_plugin.engine.rendered import DEFAULT_SETTINGS, Projected, RasterSettings, Rendered
+from turbogs_plugin.engine.rendering import rasterize
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.types import PARAMETER_NAMES, Cameras, Gaussians, GaussianStats, PixelSamples
+
+
+class PassObserver(Protocol):
+    """Who has a say in the backward pass beside the loss. It must not hold what the pass gave: the graph, which holds
+    the observer, would keep itself alive."""
+
+    def pixel_errors(self) -> Tensor | None:
+        """[P] errors that are to be carried to the Gaussians, asked for as the backward pass begins; None for none."""
+        ...
+
+    def passed(self, stats: GaussianStats, view_losses: Tensor) -> None:
+        """The pass's statistics, and [N] each Gaussian's share of the loss; both of no errors where there were none."""
+        ...
+
+
+@dataclass
+class DifferentiableRender:
+    """A forward pass connected to autograd.
+
+    Args:
+        colors: [P, 3]. alphas: [P]. depths: [P] expected depth along the camera's axis, or None where not asked for.
+            All zero in empty slots.
+        means2d: [K, N, 2] pixels, zero where a Gaussian is not drawn. A leaf: after backward it has ``grad``, and, as
+            in gsplat with ``absgrad=True``, ``absgrad``. No gradient of it reaches the model.
+        projected: the projection that was drawn, without gradients.
+    """
+
+    colors: Tensor
+    alphas: Tensor
+    depths: Tensor | None
+    means2d: Tensor
+    projected: Projected
+
+
+def rasterize_differentiable(
+    gaussians: Gaussians,
+    cameras: Cameras,
+    samples: PixelSamples,
+    *,
+    sh_degree: int | None = None,
+    settings: RasterSettings = DEFAULT_SETTINGS,
+    with_depth: bool = False,
+    observer: PassObserver | None = None,
+) -> DifferentiableRender:
+    """`rasterize` under torch autograd, with gradients to the Gaussians and none to the cameras.
+
+    Args:
+        gaussians: the model, of any tensors that autograd knows.
+        cameras, samples, sh_degree, settings, with_depth: as in `Engine.render`.
+        observer: of the backward pass.
+
+    Raises:
+        InputError: as `Engine.render`; and from a second backward of one pass.
+    """
+    rendered = rasterize(
+        gaussians.map(lambda value: value.detach().contiguous()),
+        Cameras(cameras.viewmats.detach(), cameras.Ks.detach(), cameras.sizes),
+        samples,
+        sh_degree=sh_degree,
+        settings=settings,
+        with_depth=with_depth,
+    )
+    projected = rendered.projected()
+    means2d = projected.means2d.detach().requires_grad_(torch.is_grad_enabled())
+    parameters = (value for _, value in gaussians.items())
+    colors, alphas, depths = _Pass.apply(rendered, observer, means2d, *parameters)
+    return DifferentiableRender(colors, alphas, depths, means2d, projected)
+
+
+class _Pass(torch.autograd.Function):
+    """A `Rendered` pass in autograd. It was made before; here its outputs are tied to what they depend on."""
+
+    @staticmethod
+    def forward(ctx, rendered: Rendered, observer: PassObserver | None, means2d: Tensor, *parameters: Tensor) -> tuple:
+        ctx.rendered, ctx.observer, ctx.means2d, ctx.spent = rendered, observer, means2d, False
+        ctx.set_materialize_grads(False)
+        outputs = (rendered.colors, rendered.alphas, rendered.depths)
+        return tuple(None if value is None else value.clone() for value in outputs)
+
+    @staticmethod
+    @once_differentiable
+    def backward(
+        ctx, color_gradients: Tensor | None, alpha_gradients: Tensor | None, depth_gradients: Tensor | None
+    ) -> tuple:
+        if ctx.spent:
+            raise InputError("backward of one rendering a second time: sum the losses first, or render again")
+        ctx.spent = True
+        errors = None if ctx.observer is None else ctx.observer.pixel_errors()
+        if color_gradients is None:
+            color_gradients = torch.zeros_like(ctx.rendered.colors)
+        given = {"alpha_gradients": alpha_gradients, "depth_gradients": depth_gradients}
+        screen = ctx.rendered.backward(
+            color_gradients.contiguous(),
+            errors,
+            with_statistics=True,  # among them the absolute gradients
+            **{name: None if value is None else value.contiguous() for name, value in given.items()},
+        )
+        records = screen.full_records()
+        stats = GaussianStats.zeros(records.shape[1], records.device)
+        gradients = screen.parameter_gradients(rows=False, stats=stats)
+        ctx.means2d.absgrad = records[..., ABSOLUTE].clone()
+        if ctx.observer is not None:
+            ctx.observer.passed(stats, gradients.view_losses[0])
+        return None, None, records[..., MEAN].clone(), *(gradients.summed(name) for name in PARAMETER_NAMES)

@@ -1,0 +1,95 @@
+"""The Gaussians that training starts from: one a point of the capture, and a backdrop behind them."""
+
+from __future__ import annotations
+
+import math
+import warnings
+
+import torch
+from torch import Tensor
+
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.scene.nearest import mean_neighbor_distances
+from turbogs_plugin.types import LARGEST_SH_DEGREE, SH_C0, Gaussians
+
+INITIAL_OPACITY = 0.1
+"""As in 3DGS."""
+DARKEST = 0.5
+"""Least channel of a new Gaussian's colour, of 255: at exactly 0 the clamp of colours may zero its gradient."""
+SMALLEST_SCALE = 1e-4
+"""Of a new Gaussian, in extents: coincident points would otherwise give a scale of zero."""
+LONELY_SCALE = 0.01
+"""Scale of a Gaussian without neighbours, in extents."""
+BACKDROP_COUNT = 3000
+"""They lie 3.7 degrees apart: enough for one colour, and few beside what a capture has. Detail is for densification."""
+BACKDROP_RADIUS = 20.0
+"""In extents: beyond what a capture shows, near enough that floats tell its Gaussians apart."""
+BACKDROP_OPACITY = 0.88
+"""Several of its Gaussians cover a direction, so that nothing shines through."""
+
+
+def gaussians_from_points(
+    points: Tensor, colors: Tensor, sh_degree: int, extent: float, opacity: float = INITIAL_OPACITY, size: float = 1.0
+) -> Gaussians:
+    """One isotropic Gaussian a point, as 3DGS starts (Kerbl et al. 2023, section 5.1).
+
+    Its scale is `size` times the mean distance to the three nearest points, its colour the point's, black as half a
+    step above it; the higher bands are zero.
+
+    Args:
+        points: [M, 3] float. Points that are not finite are left out, with a warning that counts them.
+        colors: [M, 3] uint8.
+        sh_degree: the degree to make room for, 0 .. 3.
+        extent: the scene's, in the points' unit; bounds the scales from below where points coincide.
+        opacity: of every Gaussian, within (0, 1).
+        size: factor of the scales.
+
+    Raises:
+        InputError: no finite points, a degree out of range, an extent that is not positive.
+    """
+    if not 0 <= sh_degree <= LARGEST_SH_DEGREE:
+        raise InputError(f"sh_degree is {sh_degree}: it must be 0 .. {LARGEST_SH_DEGREE}")
+    if not (math.isfinite(extent) and extent > 0):
+        raise InputError(f"extent is {extent}: it must be finite and positive")
+    finite = points.isfinite().all(dim=1)
+    if not finite.all():
+        warnings.warn(f"{int((~finite).sum())} of {len(points)} points are not finite and left out", stacklevel=2)
+        points, colors = points[finite], colors[finite]
+    count = len(points)
+    if count == 0:
+        raise InputError("there are no points to start from")
+    distances = (
+        mean_neighbor_distances(points, neighbors=3) if count > 1 else points.new_full((1,), LONELY_SCALE * extent)
+    )
+    scales = (size * distances).clamp(min=SMALLEST_SCALE * extent).log()
+    quats = points.new_zeros(count, 4)
+    quats[:, 0] = 1.0
+    return Gaussians(
+        means=points.clone(),
+        quats=quats,
+        scales=scales[:, None].repeat(1, 3),
+        opacities=points.new_full((count,), math.log(opacity / (1.0 - opacity))),
+        sh0=((colors.to(points).clamp(min=DARKEST) / 255.0 - 0.5) / SH_C0)[:, None, :],
+        shN=points.new_zeros(count, (sh_degree + 1) ** 2 - 1, 3),
+    )
+
+
+def backdrop_gaussians(color: Tensor, sh_degree: int, extent: float) -> Gaussians:
+    """A sphere around the scene and all cameras, of one colour: what is seen where the model has nothing.
+
+    Without it, that is black. Its Gaussians lie on a Fibonacci lattice and train like all others.
+
+    Args:
+        color: [3] float, 0 .. 1, for instance the mean of the photos.
+        sh_degree: the degree to make room for, 0 .. 3.
+        extent: the scene's.
+    """
+    index = torch.arange(BACKDROP_COUNT, dtype=torch.float64) + 0.5
+    height = 1.0 - 2.0 * index / BACKDROP_COUNT
+    angle = index * math.pi * (1.0 + math.sqrt(5.0))
+    ring = (1.0 - height * height).sqrt()
+    directions = torch.stack([ring * angle.cos(), ring * angle.sin(), height], dim=1).float()
+    colors = (color.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8).expand(BACKDROP_COUNT, 3)
+    backdrop = gaussians_from_points(directions * BACKDROP_RADIUS * extent, colors, sh_degree, extent)
+    backdrop.opacities.fill_(math.log(BACKDROP_OPACITY / (1.0 - BACKDROP_OPACITY)))
+    return backdrop

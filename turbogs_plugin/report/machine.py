@@ -1,0 +1,43 @@
+"""The machine and the software that a result depends on, in words."""
+
+from __future__ import annotations
+
+import os
+import platform
+from importlib.metadata import PackageNotFoundError, version
+
+import torch
+
+from turbogs_plugin import __version__
+
+PACKAGES = ("torch", "gsplat", "numpy", "pycolmap", "torchmetrics")
+
+
+def software() -> list[tuple[str, str]]:
+    """(name, version) of what a result depends on."""
+    versions = [("turbogs-plugin", __version__), ("Python", platform.python_version())]
+    for package in PACKAGES:
+        try:
+            versions.append((package, version(package)))
+        except PackageNotFoundError:
+            versions.append((package, "not installed"))
+    return [*versions, ("CUDA of torch", torch.version.cuda or "none")]
+
+
+def hardware(device: str) -> str:
+    """The machine in words."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    processor = f"{_processor_name()}, {cores} cores"
+    if device != "cuda":
+        return processor
+    properties = torch.cuda.get_device_properties(0)
+    return f"{properties.name} ({properties.total_memory / 2**30:.0f} GiB), {processor}"
+
+
+def _processor_name() -> str:
+    try:
+        with open("/proc/cpuinfo", encoding="utf-8") as file:
+            names = [line.split(":", 1)[1].strip() for line in file if line.startswith("model name")]
+    except OSError:
+        names = []
+    return names[0] if names else platform.processor() or platform.machine()
