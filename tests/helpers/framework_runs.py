@@ -29,9 +29,13 @@ TINY = (
 
 def tiny_capture(folder: Path) -> Path:
     """8 photos of 48x40, of which 7 train, and some 300 points: every fourth of the demo capture's."""
-    capture = write_demo_capture(folder / "capture", views=8, width=48, height=40)
+    return thin_out_points(write_demo_capture(folder / "capture", views=8, width=48, height=40), 4)
+
+
+def thin_out_points(capture: Path, every: int) -> Path:
+    """The same capture with a share of its points: 1 of `every`."""
     reconstruction = load_pycolmap().Reconstruction(capture / "sparse/0")
-    for point in [point for point in reconstruction.points3D if point % 4]:
+    for point in [point for point in reconstruction.points3D if point % every]:
         reconstruction.delete_point3D(point)
     reconstruction.write_binary(capture / "sparse/0")
     return capture
