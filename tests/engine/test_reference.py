@@ -108,7 +108,7 @@ def test_what_lies_behind_the_end_of_a_pixel_has_no_gradient_at_all():
 def test_gradcheck_through_everything():
     gaussians, cameras = make_gaussians(5, seed=3), make_cameras([(9, 7), (8, 18)])
     gaussians.sh0.add_(1.5)  # away from the clamp of colours at zero
-    samples = thin_out(dense_samples(cameras), 0.25, empty_slots=1)
+    samples = thin_out(dense_samples(cameras), 0.1, empty_slots=1)
 
     def render(*parameters):
         output = rasterize_differentiable(Gaussians(*parameters), cameras, samples, with_depth=True)
