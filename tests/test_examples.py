@@ -4,12 +4,14 @@ The scripts take a GPU where there is one, and so do these tests.
 """
 
 import importlib.util
+import shutil
 import sys
 from pathlib import Path
 
 import pytest
 import tomllib
 import torch
+from helpers.framework_runs import thin_out_points
 
 from turbogs_plugin.config.configuration import load_config, registry
 from turbogs_plugin.errors import InputError
@@ -25,6 +27,12 @@ SCRIPTS = ("density_swap", "optimizer_swap", "sparse_pixels", "all_swaps")
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory) -> Path:
     return write_demo_capture(tmp_path_factory.mktemp("examples") / "demo", views=5, width=32, height=24)
+
+
+@pytest.fixture(scope="module")
+def thin_capture(capture, tmp_path_factory) -> Path:
+    """The same with a quarter of the points."""
+    return thin_out_points(Path(shutil.copytree(capture, tmp_path_factory.mktemp("thin") / "demo")), 4)
 
 
 @pytest.fixture
@@ -68,8 +76,8 @@ def test_image_fitting(example):
     assert fitting.main(iterations=60) > fitting.main(iterations=1) + 3
 
 
-def test_baselines(example, capture, tmp_path, capsys):
-    example("baselines").main(scene=str(capture), output=str(tmp_path / "runs"), iterations=44)
+def test_baselines(example, thin_capture, tmp_path, capsys):
+    example("baselines").main(scene=str(thin_capture), output=str(tmp_path / "runs"), iterations=44)
     lines = capsys.readouterr().out.splitlines()
     said = {line.split(":")[0] for line in lines if " dB, " in line}
     gpu = torch.cuda.is_available()
@@ -100,10 +108,10 @@ def third_party(tmp_path, monkeypatch):
         del sys.modules[name]
 
 
-def test_third_party_strategies_are_named_in_a_yaml(third_party, capture, tmp_path):
+def test_third_party_strategies_are_named_in_a_yaml(third_party, thin_capture, tmp_path):
     overrides = ["train.iterations=5", "train.device=cpu", "density.every=2", "density.least_opacity=0.1"]
     config = load_config(str(PACKAGE / "patchwork.yaml"), overrides)
-    config.scene.path = str(capture)
+    config.scene.path = str(thin_capture)
     assert type(config.build("pixel_sampler")).__name__ == "CheckerboardPixelSampler"
     history = run.train(config, tmp_path / "run").history
     assert history[-1].psnr > history[0].psnr

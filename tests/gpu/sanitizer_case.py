@@ -13,7 +13,7 @@ from pathlib import Path
 import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
-from helpers.framework_runs import tiny_capture, tiny_config
+from helpers.framework_runs import tiny_config
 from helpers.raster_cases import samples_to
 from helpers.rendering_scenes import make_cameras, make_gaussians
 from test_raster_sorting import stacked_case, wide_case
@@ -40,7 +40,8 @@ NINE_VIEWS = ("schedule.min_views=9", "schedule.max_views=9")
 
 def train(capture: Path, *overrides: str, iterations: int | None = None) -> Trainer:
     """The iterations of a tiny run, or the first of them."""
-    config = tiny_config(capture, f"train.device={DEVICE}", *overrides).without_plan()
+    overrides = (f"train.device={DEVICE}", "density.top_fraction=0.9", *overrides)
+    config = tiny_config(capture, *overrides).without_plan()
     trainer = Trainer(config, load_scene(capture), torch.device(DEVICE))
     trainer.initialise_maps()
     loop = TrainingLoop(trainer)
@@ -71,7 +72,7 @@ def main() -> None:
         nine = write_demo_capture(Path(folder, "nine"), views=11, width=48, height=40)  # every 8th is a test view
         trainer = train(nine, *NINE_VIEWS, iterations=1)
         assert len(trainer.views) == 9
-        capture = tiny_capture(Path(folder))
+        capture = write_demo_capture(Path(folder, "eight"), views=8, width=48, height=40)
         for overrides in VARIANTS:
             trainer = train(capture, *overrides)
     cameras = trainer.views.cameras.select([0, 1])

@@ -1,10 +1,14 @@
 """Benches on the GPU: the fused steps are marked, nothing is lost, and floors are below what was measured."""
 
+import json
+import shutil
+
 import numpy as np
 import pytest
 import torch
 from helpers.framework_runs import tiny_capture
 
+from turbogs_plugin.bench.commands import AGAIN
 from turbogs_plugin.bench.raster import STAGES, RasterBench
 from turbogs_plugin.bench.step import StepBench
 from turbogs_plugin.engine.cuda import library as kernels
@@ -59,3 +63,21 @@ def test_the_rasterizer_is_timed_on_models_of_the_scene(tmp_path):
     for entry in report["passes"]:
         assert entry["counts"]["visible_gaussians"] > 0.9 * len(model) and entry["lost_passes"] == 0
     assert np.isfinite(report["gsplat"][0]["packed"]["median_ms"])
+
+
+def test_this_build_is_measured_as_the_others_are(turbogs, tmp_path):
+    """Each in a process of its own, which loads the library that it is about."""
+    other, out = tmp_path / "other.so", tmp_path / "raster.json"
+    shutil.copy(kernels.library_path(), other)
+    options = ["--gaussians", 500, "--views", 2, "--size", 64, 48, "--repeats", 2, "--library", other]
+    code, _, error = turbogs("bench", "raster", *options, "--out", out, "--device", "cuda")
+    assert code == 0, error
+    report = json.loads(out.read_text())
+    builds = report["other_builds"]
+    loaded = {name: build["provenance"]["kernels"].partition(" ")[0] for name, build in builds.items()}
+    assert loaded == {AGAIN: kernels.library_path().name, "other.so": "other.so"}
+    what = ("gaussians", "views", "rate", "density_sums")
+    for build in builds.values():
+        measured, here = ([[entry[name] for name in what] for entry in r["passes"]] for r in (build, report))
+        assert measured == here
+        assert all(set(entry["stages"]) == set(STAGES.values()) for entry in build["passes"])

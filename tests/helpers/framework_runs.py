@@ -6,6 +6,7 @@ import torch
 
 from turbogs_plugin.config.configuration import Config, load_config
 from turbogs_plugin.scene import write_demo_capture
+from turbogs_plugin.scene.colmap import load_pycolmap
 from turbogs_plugin.train.trainer import Trainer
 
 TINY = (
@@ -21,13 +22,23 @@ TINY = (
     "density.refine_every=3",
     "density.final_every=2",
     "density.grad_threshold=1e-6",
+    "density.top_fraction=0.3",
     "density.opacity_decay=0.2",
 )
 
 
 def tiny_capture(folder: Path) -> Path:
-    """8 photos of 48x40, of which 7 train."""
-    return write_demo_capture(folder / "capture", views=8, width=48, height=40)
+    """8 photos of 48x40, of which 7 train, and some 300 points: every fourth of the demo capture's."""
+    return thin_out_points(write_demo_capture(folder / "capture", views=8, width=48, height=40), 4)
+
+
+def thin_out_points(capture: Path, every: int) -> Path:
+    """The same capture with a share of its points: 1 of `every`."""
+    reconstruction = load_pycolmap().Reconstruction(capture / "sparse/0")
+    for point in [point for point in reconstruction.points3D if point % every]:
+        reconstruction.delete_point3D(point)
+    reconstruction.write_binary(capture / "sparse/0")
+    return capture
 
 
 def tiny_config(capture: Path, *overrides: str) -> Config:

@@ -289,7 +289,7 @@ def test_transparent_photos_are_composited_over_black(tmp_path):
 @pytest.mark.skipif(not (SCENES / "fox").is_dir(), reason=f"no real captures in {SCENES}")
 def test_real_capture():
     scene = load_scene(SCENES / "fox", factor=4)
-    assert (len(scene.train), len(scene.test), len(scene.points)) == (43, 7, 14713)
+    assert (len(scene.train), len(scene.test), len(scene.points)) == (43, 7, 15579)
     assert scene.train.photos.sizes.tolist() == [[210, 375]] * 43
     # Points are where photos have their colour: most project to a pixel of about their own.
     cameras, image = scene.train.cameras, scene.train.photos.image(20)

@@ -9,6 +9,7 @@ import numpy as np
 import pycolmap
 import pytest
 import torch
+from helpers.framework_runs import thin_out_points
 
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.model.ply import load_ply, save_ply
@@ -26,6 +27,7 @@ MEMORY = 32 * 2**20
 def capture(tmp_path_factory) -> Path:
     """A capture whose model is there twice: sparse/0 in binary, text as text."""
     folder = write_demo_capture(tmp_path_factory.mktemp("hostile") / "demo", views=4, width=32, height=24)
+    thin_out_points(folder, 8)
     (folder / "text").mkdir()
     pycolmap.Reconstruction(folder / "sparse/0").write_text(folder / "text")
     return folder

@@ -64,24 +64,24 @@ def test_equals_numpy(views, config):
     gaussians = make_gaussians(count)
     optimizer = MomentLMOptimizer(**config)
     optimizer.setup(gaussians)
+    size = 1e-2 if optimizer.units == "paper" else 1e-5  # in the paper's units the coupling fades as gradients do
     mean, square = np.zeros((count, 14)), np.zeros((count, 14))
-    damped = 0
     for iteration in range(4):
-        gradients = make_gradients(views, count, seed=iteration)
+        gradients = make_gradients(views, count, seed=iteration, size=size)
         rows, losses = packed({name: getattr(gradients, name) for name in NAMES}), gradients.view_losses.numpy()
         gradient = rows.sum(axis=0)
         mean, square = 0.9 * mean + 0.1 * gradient, 0.999 * square + 0.001 * gradient**2
         if optimizer.rows == "summed":
             rows, losses = rows.sum(axis=0, keepdims=True), losses.sum(axis=0, keepdims=True)
         before = packed(dict(clone(gaussians).items()))
-        optimizer.step(gaussians, make_gradients(views, count, seed=iteration), STEP)
+        optimizer.step(gaussians, make_gradients(views, count, seed=iteration, size=size), STEP)
         change = packed(dict(gaussians.items())) - before
         for i in range(count):
-            expected = expected_delta(rows[:, i], losses[:, i], mean[i], square[i], iteration + 1, optimizer)
+            moments = mean[i], square[i], iteration + 1, optimizer
+            expected = expected_delta(rows[:, i], losses[:, i], *moments)
             np.testing.assert_allclose(change[i], expected, rtol=1e-6, atol=1e-13)
-        adam = SparseAdam()
-        damped += not np.allclose(change, adam.learning_rates.at(STEP).means, rtol=0.1)
-    assert damped
+            adam = expected_delta(0 * rows[:, i], losses[:, i], *moments)
+            assert np.abs(change[i] / adam - 1).max() > 0.1  # or the rows had no say here
 
 
 def test_rows_matter():

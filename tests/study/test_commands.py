@@ -5,6 +5,7 @@ import itertools
 import json
 import re
 import shutil
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from types import SimpleNamespace
@@ -14,6 +15,7 @@ import pytest
 import torch
 from helpers.framework_runs import TINY, tiny_capture
 
+from turbogs_plugin import cli
 from turbogs_plugin.config.configuration import load_config
 from turbogs_plugin.config.scaling import with_iterations
 from turbogs_plugin.errors import InputError
@@ -61,6 +63,27 @@ SETTINGS = ("train.sh_degree=1", "schedule.min_views=1", "schedule.max_views=2",
 
 def call(small: Path, capture: Path, out: Path, *more) -> list:
     return ["ablate", small, *SETTINGS, "--scene", capture, "--out", out, "--device", "cpu", "--steps", "4", *more]
+
+
+@pytest.fixture(scope="module")
+def trained(capture, tmp_path_factory) -> Path:
+    """The folder of a study with the cell of `full` and seed 0, by the sources of commit "one". Not to be changed."""
+    folder = tmp_path_factory.mktemp("trained")
+    (folder / "small.yaml").write_text(SMALL)
+    arguments = call(folder / "small.yaml", capture, folder / "study", "--only", "full")
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(SystemExit) as end:
+        patch.setenv("TURBOGS_COMMIT", "one")
+        patch.setattr(sys, "argv", ["turbogs", *map(str, arguments)])
+        cli.main()
+    assert not end.value.code
+    return folder / "study"
+
+
+@pytest.fixture
+def study(trained, tmp_path, monkeypatch) -> Path:
+    """A copy of `trained`, to go on with at the same commit."""
+    monkeypatch.setenv("TURBOGS_COMMIT", "one")
+    return Path(shutil.copytree(trained, tmp_path / "study"))
 
 
 def test_a_sweep_is_complete_and_goes_on_where_it_stopped(turbogs, small, capture, tmp_path, monkeypatch):
@@ -117,17 +140,15 @@ def test_a_broken_cell_is_reported_and_tried_again(turbogs, small, capture, tmp_
     assert "no such kernel" not in (out / "report.md").read_text()
 
 
-def test_a_cell_of_other_settings_is_not_mixed_in(turbogs, small, capture, tmp_path):
-    out = tmp_path / "study"
-    assert turbogs(*call(small, capture, out, "--only", "full"))[0] == 0
-    before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
-    changed = [*call(small, capture, out, "--only", "full")]
+def test_a_cell_of_other_settings_is_not_mixed_in(turbogs, small, capture, study):
+    before = {path: path.read_bytes() for path in study.rglob("*") if path.is_file()}
+    changed = [*call(small, capture, study, "--only", "full")]
     changed.insert(2, "loss.ncc_weight=0.1")
     code, _, err = turbogs(*changed)
     assert code == 2 and "other settings (loss)" in err
-    code, _, err = turbogs(*call(small, capture, out, "--only", "full", "--time-budget", "1s"))
+    code, _, err = turbogs(*call(small, capture, study, "--only", "full", "--time-budget", "1s"))
     assert code == 2 and "other settings (budget)" in err
-    assert {path: path.read_bytes() for path in out.rglob("*") if path.is_file()} == before
+    assert {path: path.read_bytes() for path in study.rglob("*") if path.is_file()} == before
 
 
 @pytest.mark.parametrize(
@@ -235,33 +256,27 @@ def test_a_variant_that_steps_make_a_copy_is_left_out_and_said(turbogs, capture,
     assert [result.variant for result in StudyFolder(out).read_study().results] == ["nothing"]
 
 
-def test_a_study_of_another_ablation_is_refused_before_training(turbogs, small, capture, tmp_path, monkeypatch):
-    out, other = tmp_path / "study", tmp_path / "other.yaml"
-    assert turbogs(*call(small, capture, out, "--only", "full"))[0] == 0
-    before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
+def test_a_study_of_another_ablation_is_refused_before_training(turbogs, capture, study, tmp_path, monkeypatch):
+    other = tmp_path / "other.yaml"
+    before = {path: path.read_bytes() for path in study.rglob("*") if path.is_file()}
     other.write_text("title: Other\nvariants: {same: []}\n")
     monkeypatch.setattr(Trainer, "step", lambda trainer: pytest.fail("trained"))
-    code, _, err = turbogs(*call(other, capture, out))
+    code, _, err = turbogs(*call(other, capture, study))
     assert code == 2 and "another ablation" in err and "full" in err
-    assert {path: path.read_bytes() for path in out.rglob("*") if path.is_file()} == before
+    assert {path: path.read_bytes() for path in study.rglob("*") if path.is_file()} == before
 
 
-def test_a_study_of_an_earlier_version_is_refused_by_a_line_that_says_so(
-    turbogs, small, capture, tmp_path, monkeypatch
-):
-    out = tmp_path / "study"
-    assert turbogs(*call(small, capture, out, "--only", "full"))[0] == 0
-    cell = out / "cells/capture/full--seed0.json"
+def test_a_study_of_an_earlier_version_is_refused_by_a_line_that_says_so(turbogs, small, capture, study, monkeypatch):
+    cell = study / "cells/capture/full--seed0.json"
     cell.write_text(cell.read_text().replace('"budget.time":', '"budget.max_gaussians": 0, "budget.time":'))
     monkeypatch.setattr(Trainer, "step", lambda trainer: pytest.fail("trained"))
-    code, _, err = turbogs(*call(small, capture, out))
+    code, _, err = turbogs(*call(small, capture, study))
     assert code == 2 and err.count("\n") == 1 and "of an earlier version (budget.max_gaussians is now density." in err
 
 
-def test_studies_are_merged_and_reported_again_without_training(turbogs, small, capture, tmp_path, monkeypatch):
-    parts = [tmp_path / "a", tmp_path / "b"]
-    for number, part in enumerate(parts):
-        assert turbogs(*call(small, capture, part, "--only", "full", "--seeds", number))[0] == 0
+def test_studies_are_merged_and_reported_again_without_training(turbogs, small, capture, study, tmp_path, monkeypatch):
+    parts = [study, tmp_path / "b"]
+    assert turbogs(*call(small, capture, parts[1], "--only", "full", "--seeds", 1))[0] == 0
     monkeypatch.setattr(Trainer, "step", lambda trainer: pytest.fail("a merge trains nothing"))
     out = tmp_path / "both"
     code, printed, _ = turbogs("ablate", "--merge", *parts, "--out", out, "--psnr", "5")
@@ -277,10 +292,8 @@ def test_studies_are_merged_and_reported_again_without_training(turbogs, small, 
     assert code == 2 and "two different results" in err
 
 
-def test_cells_of_the_same_settings_are_reused_from_another_study(turbogs, small, capture, tmp_path, monkeypatch):
-    first, other = tmp_path / "first", tmp_path / "other.yaml"
-    monkeypatch.setenv("TURBOGS_COMMIT", "one")
-    assert turbogs(*call(small, capture, first, "--only", "full"))[0] == 0
+def test_cells_of_the_same_settings_are_reused_from_another_study(turbogs, capture, study, tmp_path, monkeypatch):
+    first, other = study, tmp_path / "other.yaml"
     other.write_text("title: Other\nvariants: {same: [], l1: [loss.type=charbonnier]}\n")
     code, _, err = turbogs(*call(other, capture, tmp_path / "second", "--reuse", first))
     assert code == 0 and "1 finished cells are kept" in err and "[1/1]" in err
@@ -294,10 +307,8 @@ def test_cells_of_the_same_settings_are_reused_from_another_study(turbogs, small
     assert code == 2 and "known commit" in err and not (tmp_path / "fourth").exists()
 
 
-def test_another_capture_of_the_same_name_is_not_taken_for_the_first(turbogs, small, capture, tmp_path, monkeypatch):
-    monkeypatch.setenv("TURBOGS_COMMIT", "one")
-    first, second = tmp_path / "first", tmp_path / "second"
-    assert turbogs(*call(small, capture, first, "--only", "full"))[0] == 0
+def test_another_capture_of_the_same_name_is_not_taken_for_the_first(turbogs, small, capture, study, tmp_path):
+    first, second = study, tmp_path / "second"
     (tmp_path / "moved").mkdir()
     moved = shutil.copytree(capture, tmp_path / "moved" / capture.name)
     code, _, err = turbogs(*call(small, moved, first, "--only", "full"))
@@ -312,10 +323,8 @@ def test_another_capture_of_the_same_name_is_not_taken_for_the_first(turbogs, sm
     assert code == 2 and "two different captures" in err
 
 
-def test_a_cell_of_an_unknown_capture_is_kept_and_merged_but_not_reused(turbogs, small, capture, tmp_path, monkeypatch):
-    monkeypatch.setenv("TURBOGS_COMMIT", "one")
-    old = tmp_path / "old"
-    assert turbogs(*call(small, capture, old, "--only", "full"))[0] == 0
+def test_a_cell_of_an_unknown_capture_is_kept_and_merged_but_not_reused(turbogs, small, capture, study, tmp_path):
+    old = study
     for path in (*old.glob("cells/*/*.json"), old / "results.json"):
         document = json.loads(path.read_text())
         assert document["captures"] == {"capture": capture_digest(load_scene(capture))}

@@ -5,6 +5,8 @@ from pathlib import Path
 import pytest
 import torch
 from helpers.framework_runs import tiny_capture, tiny_config
+from helpers.simulated_time import SimulatedTime
+from turbogs_plugin.strategies.pixel_sampling import ErrorGuidedPixelSampler
 
 from turbogs_plugin.config.configuration import load_config
 from turbogs_plugin.plan.caps import EXPECTED_GROWTH, growth_cap
@@ -200,10 +202,17 @@ def test_iterations_are_timed_with_the_lambda_asked_for(scene):
 
 def test_a_run_with_time_for_more_looks_at_more_pixels(tmp_path, monkeypatch):
     """It ends with its time after about the configured iterations, and all that a run writes says with which lambda."""
-    monkeypatch.setattr(
-        calibration, "CALIBRATION_SHARE", 0.3
-    )  # so few iterations are a long time to measure for otherwise
-    overrides = ("budget.time=6s", "density.max_gaussians=1200", "schedule.min_views=7", "schedule.max_views=7")
+    clock, draw = SimulatedTime(monkeypatch, tick=1e-6), ErrorGuidedPixelSampler.sample
+
+    def drawing(sampler, *arguments):
+        samples = draw(sampler, *arguments)
+        clock.passes(0.03 * len(samples) / (48 * 40))  # an image
+        return samples
+
+    clock.in_iterations(monkeypatch, lambda trainer: 0.04)
+    monkeypatch.setattr(ErrorGuidedPixelSampler, "sample", drawing)
+    monkeypatch.setattr(calibration, "CALIBRATION_SHARE", 0.3)  # so few iterations take long to measure for otherwise
+    overrides = ("budget.time=6s", "density.max_gaussians=400", "schedule.min_views=7", "schedule.max_views=7")
     lengths = ("train.iterations=30", "train.refine_until=20", "train.epochs=4")
     outcome = run.train(tiny_config(tiny_capture(tmp_path), *overrides, *lengths), tmp_path / "run", write_report)
     end = outcome.history[-1]

@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 import torch
 from helpers.framework_runs import tiny_capture, tiny_config
+from helpers.simulated_time import SimulatedTime
 
 from turbogs_plugin.config.configuration import TrainConfig, resolve
 from turbogs_plugin.errors import InputError, TrainingStopped
 from turbogs_plugin.plan.time import IterationCost
-from turbogs_plugin.scene import load_scene, write_demo_capture
+from turbogs_plugin.scene import load_scene
 from turbogs_plugin.train import pace as pacing
 from turbogs_plugin.train import run
 from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint, require_like
@@ -46,16 +47,25 @@ def counts(monkeypatch) -> list[int]:
     return seen
 
 
-def test_a_time_budget_holds_on_the_demo_capture(turbogs, tmp_path):
+def growing(trainer: Trainer) -> float:
+    """Seconds of an iteration on a machine that is the slower the larger the model."""
+    return 0.1 + 3e-4 * len(trainer.gaussians)
+
+
+def test_a_time_budget_holds(turbogs, capture, tmp_path, monkeypatch):
     """Within a tenth, with a schedule that completes and a model that has learned."""
-    capture, out = write_demo_capture(tmp_path / "demo"), tmp_path / "run"
+    clock = SimulatedTime(monkeypatch, tick=1e-6)
+    clock.in_iterations(monkeypatch, growing)
+    out = tmp_path / "run"
     options = ["--config", "demo", "--out", out, "--device", "cpu", "--time-budget", "10s", "train.evaluate_at=[0.5]"]
+    began = clock.now
     code, _, error = turbogs("train", capture, *options)
     assert code == 0, error
     start, middle, end = read_history(out / "history.jsonl")
     assert end.train_seconds == pytest.approx(10.0, rel=0.1)
+    assert end.train_seconds == pytest.approx(clock.now - began, abs=0.01)  # calibration counts
     assert 4.5 <= middle.train_seconds <= 7.0
-    assert end.psnr > start.psnr + 3.0
+    assert end.psnr > start.psnr + 3.0 and end.num_gaussians > start.num_gaussians
     state = load_checkpoint(latest_checkpoint(out / "checkpoints"))
     assert state["trainer"]["iteration"] == state["pace"]["iterations"] == end.iteration
     assert state["pace"]["refine_until"] < end.iteration
@@ -70,7 +80,9 @@ def test_a_time_too_short_is_refused_with_one_that_is_not(turbogs, capture, tmp_
 
 def test_a_run_by_time_goes_on_after_a_stop(capture, tmp_path, monkeypatch):
     """The clock goes on as well: stopped and resumed, it ends with its time, and evaluates nothing twice."""
-    step = Trainer.step
+    clock = SimulatedTime(monkeypatch, tick=1e-6)
+    clock.in_iterations(monkeypatch, growing)
+    began, step = clock.now, Trainer.step
 
     def stopping(trainer):
         step(trainer)
@@ -85,6 +97,7 @@ def test_a_run_by_time_goes_on_after_a_stop(capture, tmp_path, monkeypatch):
     second = run.resume(tmp_path / "run")
     assert second.signal is None
     assert second.history[-1].train_seconds == pytest.approx(4.0, rel=0.1)
+    assert second.history[-1].train_seconds == pytest.approx(clock.now - began, abs=0.01)
     assert len(second.history) == 4
     assert [entry.iteration for entry in second.history] == sorted({entry.iteration for entry in second.history})
 

@@ -7,7 +7,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -107,31 +106,18 @@ def test_the_saved_model_renders_what_the_last_evaluation_saw(whole, capture):
     assert -10 * np.log10(mse) == pytest.approx(whole.history[-1].psnr, abs=1e-4)
 
 
-@pytest.mark.parametrize(
-    ("iteration", "number"),
-    [(iteration, signal.SIGINT) for iteration in (1, 2, 3, 5, 6, 9, 10, 12)] + [(7, signal.SIGTERM)],
-)
-def test_a_stopped_run_resumes_bit_for_bit(capture, whole, tmp_path, monkeypatch, iteration, number):
-    with monkeypatch.context() as context:
-        stop_after(context, iteration, lambda trainer: os.kill(os.getpid(), number))
-        outcome = run.train(tiny_config(capture), tmp_path / "run")
-    assert outcome.signal == number
-    assert saved(tmp_path / "run")["iteration"] == iteration
-    resumed = run.resume(tmp_path / "run")
-    assert resumed.signal is None
-    assert_identical(saved(whole.folder.path), saved(tmp_path / "run"))
-    for a, b in zip(read_history(whole.folder.history), read_history(resumed.folder.history), strict=True):
-        assert (a.iteration, a.psnr, a.ssim, a.l1, a.num_gaussians) == (
-            b.iteration,
-            b.psnr,
-            b.ssim,
-            b.l1,
-            b.num_gaussians,
-        )
+STOPS = {
+    **dict.fromkeys((1, 2, 3, 5, 6), signal.SIGINT),
+    7: signal.SIGTERM,
+    **dict.fromkeys((9, 10, 12), signal.SIGINT),
+}
+"""Before and after events of density control, at an evaluation, at checkpoints; by Ctrl-C, and once by `kill`."""
 
 
-def test_a_run_stopped_before_its_first_iteration_resumes_bit_for_bit(capture, whole, tmp_path, monkeypatch):
-    initialise = Trainer.initialise_maps
+def test_a_run_stopped_again_and_again_is_the_same_bit_for_bit(capture, whole, tmp_path, monkeypatch):
+    """At every stop, the first before the first iteration, and at its end."""
+    trainer = Trainer(tiny_config(capture), load_scene(capture), torch.device("cpu"))
+    initialise, place = Trainer.initialise_maps, tmp_path / "run"
 
     def interrupted(trainer):
         initialise(trainer)
@@ -139,29 +125,48 @@ def test_a_run_stopped_before_its_first_iteration_resumes_bit_for_bit(capture, w
 
     with monkeypatch.context() as context:
         context.setattr(Trainer, "initialise_maps", interrupted)
-        assert run.train(tiny_config(capture), tmp_path / "run").signal == signal.SIGINT
-    assert saved(tmp_path / "run")["iteration"] == 0
-    resumed = run.resume(tmp_path / "run")
-    assert_identical(saved(whole.folder.path), saved(tmp_path / "run"))
-    assert [evaluation.iteration for evaluation in resumed.history] == [0, 7, 14]
+        assert run.train(tiny_config(capture), place).signal == signal.SIGINT
+    trainer.initialise_maps()
+    assert_identical(trainer.state_dict(), saved(place))
+    for iteration, number in STOPS.items():
+        with monkeypatch.context() as context:
+            stop_after(context, iteration, lambda trainer, number=number: os.kill(os.getpid(), number))
+            assert run.resume(place).signal == number
+        while trainer.iteration < iteration:
+            trainer.step()
+        assert_identical(trainer.state_dict(), saved(place))
+    resumed = run.resume(place)
+    assert resumed.signal is None
+    assert_identical(saved(whole.folder.path), saved(place))
+    histories = (read_history(outcome.folder.history) for outcome in (whole, resumed))
+    numbers = [[(e.iteration, e.psnr, e.ssim, e.l1, e.num_gaussians) for e in history] for history in histories]
+    assert numbers[0] == numbers[1]
+
+
+KILLED = """
+import os, signal
+from turbogs_plugin import cli
+from turbogs_plugin.train.trainer import Trainer
+
+step = Trainer.step
+
+def killed(trainer):
+    step(trainer)
+    if trainer.iteration == 7:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+Trainer.step = killed
+cli.main()
+"""
 
 
 def test_a_run_killed_without_notice_resumes_bit_for_bit(capture, whole, tmp_path):
-    """SIGKILL once the second checkpoint is there, wherever the process then is."""
-    options = [*TINY, "train.checkpoint_every=2"]
-    command = [sys.executable, "-m", "turbogs_plugin.cli", "train", str(capture), "--out", str(tmp_path / "run")]
-    process = subprocess.Popen(
-        [*command, "--device", "cpu", *options], stderr=subprocess.DEVNULL, env={**os.environ, "OMP_NUM_THREADS": "1"}
-    )
-    deadline = time.monotonic() + 120
-    while process.poll() is None and time.monotonic() < deadline:
-        latest = latest_checkpoint(tmp_path / "run" / "checkpoints")
-        if latest is not None and latest.stem >= "iteration-000004":
-            break
-        time.sleep(0.002)
-    process.kill()
-    process.wait()
-    assert 4 <= saved(tmp_path / "run")["iteration"] < 14
+    """Between two checkpoints. What a kill in the midst of one leaves behind: test_checkpoint.py."""
+    options = [*TINY, "train.checkpoint_every=2", "--device", "cpu"]
+    command = [sys.executable, "-c", KILLED, "train", str(capture), "--out", str(tmp_path / "run"), *options]
+    ended = subprocess.run(command, stderr=subprocess.DEVNULL, env={**os.environ, "OMP_NUM_THREADS": "1"})
+    assert ended.returncode == -signal.SIGKILL
+    assert saved(tmp_path / "run")["iteration"] == 6
     run.resume(tmp_path / "run")
     assert_identical(saved(whole.folder.path), saved(tmp_path / "run"))
 
@@ -202,9 +207,7 @@ def test_resuming_a_finished_run_changes_nothing_of_it(capture, whole):
     assert whole.folder.history.read_text() == history
 
 
-def test_two_seeds_differ_and_one_does_not(capture, whole, tmp_path):
-    run.train(tiny_config(capture), tmp_path / "same")
-    assert_identical(saved(whole.folder.path), saved(tmp_path / "same"))
+def test_another_seed_is_another_run(capture, whole, tmp_path):
     run.train(tiny_config(capture, "train.seed=1"), tmp_path / "other")
     assert not torch.equal(saved(whole.folder.path)["maps"]["errors"], saved(tmp_path / "other")["maps"]["errors"])
 
@@ -308,6 +311,20 @@ def test_a_checkpoint_of_another_capture_is_refused(capture, whole, tmp_path):
         run.resume(tmp_path / "run")
 
 
+@pytest.fixture
+def elsewhere(capture, whole, tmp_path) -> Path:
+    """A copy of the capture, of which a copy of the run tells."""
+    shutil.copytree(whole.folder.path, tmp_path / "run")
+    config = whole.folder.read_config()
+    config.scene.path = str(tmp_path / "capture")
+    (tmp_path / "run" / "config.yaml").write_text(config.to_yaml())
+    return shutil.copytree(capture, tmp_path / "capture")
+
+
+def test_a_run_goes_on_where_its_capture_was_moved_to(elsewhere, tmp_path):
+    assert run.resume(tmp_path / "run").signal is None
+
+
 def moved(by: pycolmap.Sim3d):
     return lambda reconstruction: reconstruction.transform(by)
 
@@ -337,16 +354,10 @@ TURN, STAY = pycolmap.Rotation3d(np.array([0.0, 0.0, 0.01, 1.0])), pycolmap.Rota
     ],
     ids=["turned", "scaled", "moved", "zoomed", "renamed"],
 )
-def test_a_capture_made_anew_since_the_run_began_is_refused(whole, tmp_path, change, difference):
-    model = tiny_capture(tmp_path) / "sparse" / "0"
-    shutil.copytree(whole.folder.path, tmp_path / "run")
-    config = whole.folder.read_config()
-    config.scene.path = str(tmp_path / "capture")
-    (tmp_path / "run" / "config.yaml").write_text(config.to_yaml())
-    run.resume(tmp_path / "run")  # the same capture elsewhere
-    reconstruction = pycolmap.Reconstruction(model)
+def test_a_capture_made_anew_since_the_run_began_is_refused(elsewhere, tmp_path, change, difference):
+    reconstruction = pycolmap.Reconstruction(elsewhere / "sparse" / "0")
     change(reconstruction)
-    reconstruction.write_binary(model)
+    reconstruction.write_binary(elsewhere / "sparse" / "0")
     before = latest_checkpoint(tmp_path / "run" / "checkpoints").read_bytes()
     with pytest.raises(InputError, match=rf"capture '.*capture' has {difference} than .*run' began: .*another --out"):
         run.resume(tmp_path / "run")
