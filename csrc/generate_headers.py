@@ -19,7 +19,7 @@ LAUNCHES = ROOT / "turbogs_plugin/engine/cuda/launches.py"
 CONSTANTS = {ROOT / "turbogs_plugin/types.py": ("TILE_SIZE",), ROOT / "turbogs_plugin/tiles.py": ("CELL_SIDE",)}
 """Further numbers, of files that import torch: they are read, not run."""
 
-ENUMERATIONS = {"SAMPLE_UNITS": "SampleUnit", "STRUCTURES": "Structure", "UPDATE_KINDS": "UpdateKind"}
+ENUMERATIONS = {"UNITS": "SampleUnit", "STRUCTURES": "Structure", "UPDATE_KINDS": "UpdateKind"}
 """Their names in C++."""
 
 
@@ -56,12 +56,10 @@ def layout_header(layout: ModuleType) -> str:
             lines.append(f"enum class {ENUMERATIONS[name]} : int {{ {entries} }};")
             lines.append(f"constexpr int kNum{ENUMERATIONS[name]}s = {len(value)};")
         elif isinstance(value, type):
-            columns = {name: entry for base in reversed(value.__mro__) for name, entry in vars(base).items()}
-            columns = {name: entry for name, entry in columns.items() if isinstance(entry, int | slice)}
+            places = {column: place.start for column, place in layout.columns(value).items()}
             lines.append(f"struct {name} {{")
-            for column, entry in columns.items():
-                first = entry.start if isinstance(entry, slice) else entry
-                lines.append(f"    static constexpr int k{camel_case(column)} = {first};")
+            for column, place in {**places, "size": value.SIZE}.items():
+                lines.append(f"    static constexpr int k{camel_case(column)} = {place};")
             lines.append("};")
     return _header(LAYOUT, lines)
 
@@ -70,8 +68,7 @@ def launches_header(layout: ModuleType, launches: ModuleType) -> str:
     lines = []
     for cls in launches.LAUNCHES:
         lines += [f"struct {cls.__name__} {{", f'    static constexpr const char* kName = "{cls.operator}";']
-        kinds = {"Tensors": cls.tensors, "Integers": cls.integers, "Reals": cls.reals}
-        for kind, paths in kinds.items():
+        for kind, paths in zip(("Tensors", "Integers", "Reals"), cls.paths, strict=False):
             names = [path.split(".")[-1] for path in paths]
             lines.append(f"    enum class {kind} {{ {', '.join(names)} }};".replace("{  }", "{}"))
             lines.append(f"    static constexpr size_t kNum{kind} = {len(names)};")

@@ -69,7 +69,6 @@ void sparse_loss(const TensorList& tensors, const IntegerList& integers, const R
     params.loss = in.pointer<double>(T::loss, ScalarType::Double, {});
     params.color_gradients = in.pointer<float>(T::color_gradients, ScalarType::Float, {slots, 3});
     params.pixel_errors = in.pointer<float>(T::pixel_errors, ScalarType::Float, {slots});
-    params.num_nonfinite = in.optional<unsigned long long>(T::num_nonfinite, ScalarType::Long, {});
     params.nonfinite_losses = in.optional<unsigned long long>(T::nonfinite_losses, ScalarType::Long, {});
     params.overflow = in.optional<int32_t>(T::overflow, ScalarType::Int, {1});
     check_launched(launch_sparse_loss(params, in.stream()), "sparse loss");

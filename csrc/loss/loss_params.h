@@ -11,9 +11,9 @@
 
 namespace turbogs {
 
-// Loss on the samples with its gradient, and where maps are given their update; strategies/losses/losses.py and
-// turbogs_plugin/error_maps.py define both. A sample whose colour is not finite counts as an empty slot: no gradient,
-// no error, no visit.
+// Loss on the samples with its gradient, and where maps are given their update;
+// turbogs_plugin/engine/reference/losses.py and turbogs_plugin/error_maps.py define both. A sample whose colour is
+// not finite counts as an empty slot: no gradient, no error, no visit.
 struct SparseLossParams {
     int num_views;  // K
     int num_tiles;  // T
@@ -39,7 +39,6 @@ struct SparseLossParams {
     double* loss;                          // [], zero before the launch
     float* color_gradients;                // [P, 3] out
     float* pixel_errors;                   // [P] out
-    unsigned long long* num_nonfinite;     // [] samples whose colour was not finite are added; or null
     unsigned long long* nonfinite_losses;  // [] 1 is added if the loss is not finite; or null
 
     // Maps of all views; all null where they are not to be updated.

@@ -21,7 +21,7 @@ namespace {
 constexpr int kLossThreads = 128;  // of a block: four tiles, which mostly share a view's sum. Not tuned
 constexpr int kLossBlocks = 7;     // of an SM: 72 registers. With 64 it spills, and with 80 it is no faster
 constexpr int kLossWarps = kLossThreads / kWarpSize;
-constexpr float kBalanceEpsilon = 1e-8f;  // BALANCE_EPSILON of strategies/losses
+constexpr float kBalanceEpsilon = 1e-8f;  // BALANCE_EPSILON of reference/losses.py
 constexpr float kErrorMax = 65504.0f;     // largest finite half
 
 // byte / 255, correctly rounded.
@@ -39,7 +39,7 @@ struct LaneSamples {
 
 template <int kSlots>
 __device__ __forceinline__ void load_samples(const SparseLossParams& params, const SampleView& view, int first, int end,
-                                             LaneSamples<kSlots>& samples, int& nonfinite) {
+                                             LaneSamples<kSlots>& samples) {
     const int lane = this_lane();
 #pragma unroll
     for (int j = 0; j < kSlots; ++j) {
@@ -69,7 +69,6 @@ __device__ __forceinline__ void load_samples(const SparseLossParams& params, con
 #pragma unroll
     for (int j = 0; j < kSlots; ++j) {
         if (is_finite(samples.x[j][0]) && is_finite(samples.x[j][1]) && is_finite(samples.x[j][2])) continue;
-        ++nonfinite;
         samples.pixel[j] = -1;
         samples.weight[j] = 0.0f;
 #pragma unroll
@@ -80,7 +79,6 @@ __device__ __forceinline__ void load_samples(const SparseLossParams& params, con
 // What a tile adds to the loss and to the sum of its view; the lane's part of the latter.
 struct TileTotals {
     double loss = 0.0, view_delta = 0.0;
-    int nonfinite = 0;
 };
 
 // One tile. Up to kWarpSize * kSlots samples stay in registers; of more, each pass loads them again, in as many rounds.
@@ -101,7 +99,7 @@ __device__ __forceinline__ TileTotals tile_loss(const SparseLossParams& params, 
     {
         float sums[8] = {};  // offsets of x 0-2 and y 3-5, weights, norms of the Charbonnier gradients
         for (int start = first; start < end; start += kRound) {
-            load_samples(params, view, start, end, samples, totals.nonfinite);
+            load_samples(params, view, start, end, samples);
             if (start == first) {
 #pragma unroll
                 for (int c = 0; c < 3; ++c) {
@@ -167,8 +165,7 @@ __device__ __forceinline__ TileTotals tile_loss(const SparseLossParams& params, 
     const auto offset_x = [&](int j, int c) { return (samples.x[j][c] - first_x[c]) - mean_x[c]; };
     const auto offset_y = [&](int j, int c) { return (samples.y[j][c] - first_y[c]) - mean_y[c]; };
     const auto load_again = [&](int start) {
-        int counted = 0;
-        if (!resident) load_samples(params, view, start, end, samples, counted);
+        if (!resident) load_samples(params, view, start, end, samples);
     };
     if (structured) {
         // Pass 2: variances and covariances.
@@ -277,10 +274,6 @@ __global__ void __launch_bounds__(kLossThreads, kLossBlocks)
         view = view_of_tile(params.views, params.num_views, params.tile_ids[tile]);
         totals = tile_loss<kSlots>(params, params.views[view], first, end, filled, learns);
         totals.view_delta = warp_sum(totals.view_delta);
-        const uint32_t nonfinite = __reduce_add_sync(kFullWarp, static_cast<uint32_t>(totals.nonfinite));
-        if (lane == 0 && nonfinite != 0u && params.num_nonfinite != nullptr) {
-            atomicAdd(params.num_nonfinite, static_cast<unsigned long long>(nonfinite));
-        }
     }
     if (lane == 0) {
         losses[warp] = totals.loss;

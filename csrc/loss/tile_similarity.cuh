@@ -1,5 +1,5 @@
 // How alike prediction and truth are over the samples of a tile, in one channel: the structure terms of
-// strategies/losses with their gradients, as functions of the tile's moments.
+// turbogs_plugin/engine/reference/losses.py with their gradients, as functions of the tile's moments.
 #pragma once
 
 #include <cuda_runtime.h>

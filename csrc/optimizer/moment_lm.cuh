@@ -1,4 +1,4 @@
-// The rule of a step for one Gaussian (turbogs_plugin/engine/update_rule.py and reference/lm_solvers.py): Adam's
+// The rule of a step for one Gaussian (turbogs_plugin/engine/reference/update.py and lm_solvers.py): Adam's
 // terms, and the damped systems of the 10 parameters of the geometry and the 4 of the appearance.
 //
 // With S the damping's inverse root, (J^T J + damping) x = m becomes (I + S J^T J S) y = S m with x = S y: its pivots

@@ -38,8 +38,8 @@ struct ProjectionBackwardOutputs {
     float* view_losses;  // [K, N] or [1, N]
 };
 
-// One optimizer step, fused with the backward pass of the projection; turbogs_plugin/engine/update_rule.py has the
-// rule.
+// One optimizer step, fused with the backward pass of the projection; turbogs_plugin/engine/reference/update.py
+// defines it.
 struct OptimizerParams {
     UpdateKind kind;
     bool rows_per_view;                       // LM: a row of J for each view, or one of their sum

@@ -136,8 +136,8 @@ struct ForwardParams {
     float* transmittances;        // [P] out, 1 - alpha without the cancellation
     float* depths;                // [P] out, or null
     int32_t* last_intersections;  // [P] out, the last that contributed, counted from the tile's first; -1 none
-    uint32_t* masks;              // [(M / 32 + T + 1) * C] out: a bit for each splat of a bucket that contributed to the
-                                  // item. Bucket j of item (t, c) is word ((tile_starts[t] / 32 + t) + j) * C + c.
+    uint32_t* masks;              // [(M / 32 + T + 1) * C] out: of a bucket a bit for each splat that contributed to
+                                  // the item. Bucket j of item (t, c) is word ((tile_starts[t] / 32 + t) + j) * C + c.
     int32_t* bucket_counts;       // [T, C] out, buckets that the item walked
 };
 

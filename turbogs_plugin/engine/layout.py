@@ -25,14 +25,14 @@ SCAN_TILES = 1024
 SORT_RUN = 512
 """Intersections of a tile that one warp sorts. A tile with more is sorted in runs of so many, which are then merged."""
 
-SAMPLE_UNITS = ("pixel", "cell", "tile")
-"""What a sampler draws. An enumeration of the kernels in this order."""
+UNITS = ("pixel", "cell", "tile")
+"""What a draw chooses: single pixels, cells of 4x4 pixels, or whole tiles of 16x16. The kernels number them so."""
 
 STRUCTURES = ("none", "ncc", "contrast", "ssim")
-"""Structure terms of the loss, likewise."""
+"""Similarities of a tile's samples that a loss may have beside its l1 term. The kernels number them so."""
 
 UPDATE_KINDS = ("adam", "balanced_lm", "paper_lm")
-"""Rules of an update, likewise."""
+"""What a step of the parameters is. The kernels number them so."""
 
 
 class ScreenRecord:
@@ -58,14 +58,14 @@ class ScreenRecord:
 class ParameterRow:
     """Gradients or moments of the parameters of one Gaussian, without the higher bands: a row of float32.
 
-    Columns 0 to 9 (the geometry) and 10 to 13 (the appearance) are the two blocks that moment-damped LM solves.
+    Moment-damped LM solves two blocks of it: the geometry, up to the quaternions, and the appearance.
     """
 
     MEANS = slice(0, 3)
     SCALES = slice(3, 6)
     QUATS = slice(6, 10)
     SH0 = slice(10, 13)
-    OPACITIES = 13
+    OPACITIES = slice(13, 14)
     SIZE = 14
 
 
@@ -113,3 +113,13 @@ class DrawRow(ViewRow):
     WANTED = 5  # tiles to choose; only for unit = tile
     STAGES = slice(6, 9)  # units of the hard, the stable and the mixed stage: of a tile, or for unit = tile of the view
     SIZE = 9
+
+
+def columns(row: type) -> dict[str, slice]:
+    """Where each column of a row lies, by its name in lower case; those of a base class come first."""
+    found = {}
+    for base in reversed(row.__mro__):
+        for name, place in vars(base).items():
+            if name.isupper() and name != "SIZE":
+                found[name.lower()] = place if isinstance(place, slice) else slice(place, place + 1)
+    return found

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from turbogs_plugin.engine.reference.compositing import ABSOLUTE, MEAN
+from turbogs_plugin.engine.layout import ScreenRecord
 from turbogs_plugin.engine.rendering import RasterSettings, Rendered, rasterize
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.gsplat_bridge.gaussian_errors import residuals
@@ -252,11 +252,11 @@ class _Pass(torch.autograd.Function):
         records = screen.full_records()
         gradients = screen.parameter_gradients(rows=False, stats=stats)
         if info is not None:
-            info["means2d"].absgrad = records[..., ABSOLUTE].clone()
+            info["means2d"].absgrad = records[..., ScreenRecord.ABSOLUTE].clone()
             if errors is not None:
                 info[STATISTICS], info[LOSS_SHARES] = stats, gradients.view_losses[0]
         parameter_gradients = (gradients.summed(name) for name in PARAMETER_NAMES)
-        return None, None, None, records[..., MEAN].clone(), *parameter_gradients
+        return None, None, None, records[..., ScreenRecord.MEAN].clone(), *parameter_gradients
 
 
 def _sample_errors(info: dict[str, Any], samples: PixelSamples) -> Tensor | None:

@@ -9,6 +9,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from turbogs_plugin.engine.cuda.raster import CudaRendered, CudaScreenGradients, rasterize_cuda
+from turbogs_plugin.engine.layout import ScreenRecord
 from turbogs_plugin.engine.reference.raster import DifferentiableRender
 from turbogs_plugin.engine.rendered import DEFAULT_SETTINGS, RasterSettings
 from turbogs_plugin.types import Cameras, Gaussians, PixelSamples
@@ -37,7 +38,7 @@ class _Project(torch.autograd.Function):
         screen = shared.screen
         if screen is None:  # only the means were used
             screen = shared.rendered.backward(torch.zeros_like(shared.rendered.colors))
-        screen.records[..., :2] = mean_gradients
+        screen.records[..., ScreenRecord.MEAN] = mean_gradients
         gradients = screen.parameter_gradients(rows=False)
         shared.screen = None
         names = (name for name, _ in screen.gaussians.items())
@@ -72,8 +73,8 @@ class _Composite(torch.autograd.Function):
         )
         ctx.shared.screen = screen
         records = screen.full_records()
-        means2d.absgrad = records[..., 9:11].clone()
-        return None, records[..., :2].clone()
+        means2d.absgrad = records[..., ScreenRecord.ABSOLUTE].clone()
+        return None, records[..., ScreenRecord.MEAN].clone()
 
 
 def rasterize_differentiable_cuda(

@@ -1,4 +1,4 @@
-"""What each operator of csrc/ takes: one class an operator, one field an argument. `library.launch` calls them.
+"""What each operator of csrc/ takes: one class an operator, one field an argument. `library.launch` calls it.
 
 The fields of a launch travel as four lists: its tensors, integers, reals and the rows of its views, each in the order
 of the fields, with those of a nested class in its place. The build makes the same order known to C++
@@ -14,26 +14,37 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
-from operator import attrgetter
-from types import ModuleType
-from typing import TYPE_CHECKING, Protocol
+from types import ModuleType, SimpleNamespace
+from typing import TYPE_CHECKING, ClassVar, Protocol
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-LAUNCHES: list[type] = []
+LAUNCHES: list[type[Launch]] = []
 """All launches, in the order of this file."""
 
 
-def launch(cls: type) -> type:
-    """Register a launch: find its fields, and how to read each list of them from an object at once."""
+class Launch(Protocol):
+    """What `launch` gives a class.
+
+    Attributes:
+        operator: name of the operator.
+        paths: dotted paths of the fields that each of the four lists holds, in their order.
+    """
+
+    operator: ClassVar[str]
+    paths: ClassVar[tuple[list[str], ...]]
+
+    def lists(self) -> tuple[tuple, ...]:
+        """The four lists."""
+        ...
+
+
+def launch(cls: type) -> type[Launch]:
+    """Make a launch of a dataclass."""
     cls.operator = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", cls.__name__).lower()
-    cls.tensors, cls.integers, cls.reals, cls.rows = paths = _paths(cls)
-    for names in paths:
-        fields = [path.split(".")[-1] for path in names]
-        assert len(set(fields)) == len(fields), f"{cls.__name__}: two fields of one name"
-    assert len(cls.rows) <= 1, f"{cls.__name__}: rows of more than one kind"
-    cls.lists = _reader(*paths)
+    cls.paths = _paths(cls)
+    cls.lists = _reader(*cls.paths)
     LAUNCHES.append(cls)
     return cls
 
@@ -52,36 +63,22 @@ def _paths(cls: type, prefix: str = "") -> tuple[list[str], list[str], list[str]
     return paths
 
 
-def _reader(*paths: list[str]) -> Callable[[object], tuple]:
-    """A function that reads the lists from an object."""
-    getters = [_getter(names) for names in paths[:3]]
-    tensors, integers, reals = getters
-    if not paths[3]:
-        return lambda launch: (tensors(launch), integers(launch), reals(launch), ())
-    rows = attrgetter(paths[3][0])
-    return lambda launch: (tensors(launch), integers(launch), reals(launch), rows(launch))
-
-
-def _getter(names: list[str]) -> Callable[[object], tuple]:
-    if len(names) > 1:
-        return attrgetter(*names)
-    if not names:
-        return lambda launch: ()
-    get = attrgetter(names[0])
-    return lambda launch: (get(launch),)
+def _reader(tensors: list[str], integers: list[str], reals: list[str], rows: list[str]) -> Callable[[Launch], tuple]:
+    """A function that reads the lists from a launch; written out and compiled, as it runs for every launch."""
+    lists = ["(" + "".join(f"launch.{path}, " for path in paths) + ")" for paths in (tensors, integers, reals)]
+    return eval(f"lambda launch: ({', '.join(lists)}, {f'launch.{rows[0]}' if rows else '()'})")
 
 
 def interface(layout: ModuleType) -> str:
     """The orders of all fields and the numbers of `layout`, as text. A library built of other sources tells another."""
     lines = []
     for cls in LAUNCHES:
-        lists = (cls.tensors, cls.integers, cls.reals, cls.rows)
-        lines.append(f"{cls.operator}: " + "; ".join(" ".join(names) for names in lists))
+        lines.append(f"{cls.operator}: " + "; ".join(" ".join(names) for names in cls.paths))
     for name, value in vars(layout).items():
         if isinstance(value, type):
-            columns = {k: v for base in reversed(value.__mro__) for k, v in vars(base).items() if k.isupper()}
-            value = " ".join(f"{column}={place}" for column, place in columns.items())
-        if not name.startswith("_"):
+            places = (f"{column} {place.start}:{place.stop}" for column, place in layout.columns(value).items())
+            value = f"{', '.join(places)} of {value.SIZE}"
+        if name[0].isupper():
             lines.append(f"{name}: {value}")
     return "\n".join(lines)
 
@@ -144,13 +141,8 @@ class StatSums(Protocol):
     max_radii: Tensor | None
 
 
-class NoStats:
-    """In place of statistics that are not wanted."""
-
-    error_sums = distance_sums = weight_sums = grad_sums = absgrad_sums = view_counts = max_radii = None
-
-
-NO_STATS = NoStats()
+NO_STATS = SimpleNamespace(**dict.fromkeys(StatSums.__annotations__))
+"""In place of statistics that are not wanted."""
 
 
 @dataclass(slots=True)
@@ -204,7 +196,7 @@ class RasterProject:
 class RasterCountIntersections:
     """Stage 2: where the intersections of each tile begin. Raises `status[1]` where there are too many."""
 
-    lists: TileLists
+    tiles: TileLists
     block_sums: Tensor  # [ceil(T / SCAN_TILES), 2] int64 scratch
     capacity: int  # M
 
@@ -215,7 +207,7 @@ class RasterSortIntersections:
     """Stages 3 and 4: the intersections of each tile, in order of depth."""
 
     splats: Splats
-    lists: TileLists
+    tiles: TileLists
     intersection_keys: Tensor  # [M] int64 scratch
     intersection_ids: Tensor  # [M] int32: the instance of each
     runs: Tensor  # [M / (SORT_RUN / 2), 2] int32 scratch
@@ -272,12 +264,16 @@ class RasterBackward:
 
 @dataclass(slots=True)
 class TileScratch:
-    """Only for unit = tile: an entry for each tile of the batch."""
+    """For unit = tile: an entry for each tile of the batch."""
 
-    tile_errors: Tensor | None = None  # float64
-    tile_ages: Tensor | None = None  # int32
-    tile_keys: Tensor | None = None  # int64
-    tile_missed: Tensor | None = None  # float32
+    tile_errors: Tensor | None  # float64
+    tile_ages: Tensor | None  # int32
+    tile_keys: Tensor | None  # int64
+    tile_missed: Tensor | None  # float32
+
+
+NO_SCRATCH = TileScratch(None, None, None, None)
+"""For the other units."""
 
 
 @launch
@@ -288,7 +284,7 @@ class SamplePixels:
     errors: Tensor  # [X] float16
     stamps: Tensor  # [X] int16
     views: list[int]  # [K] layout.DrawRow
-    unit: int  # of layout.SAMPLE_UNITS
+    unit: int  # of layout.UNITS
     slots_per_tile: int  # of a tile that is not cut; 0 for unit = tile
     mixed_uniform: bool
     importance: float
@@ -330,13 +326,8 @@ class MapArrays(Protocol):
     view_sums: Tensor | None  # [V] float64
 
 
-class NoMaps:
-    """In place of maps that are not to be updated."""
-
-    errors = stamps = view_sums = None
-
-
-NO_MAPS = NoMaps()
+NO_MAPS = SimpleNamespace(**dict.fromkeys(MapArrays.__annotations__))
+"""In place of maps that are not to be updated."""
 
 
 @launch
@@ -358,7 +349,6 @@ class SparseLoss:
     loss: Tensor  # [] float64, zero
     color_gradients: Tensor  # [P, 3] float32
     pixel_errors: Tensor  # [P] float32
-    num_nonfinite: Tensor | None  # [] int64, added to
     nonfinite_losses: Tensor | None  # [] int64, added to
     overflow: Tensor | None  # [1] int32; where not 0 the maps stay as they are
 
