@@ -47,6 +47,7 @@ def camel_case(name: str) -> str:
 
 
 def layout_header(layout: ModuleType) -> str:
+    """Numbers, enumerations, and a struct of the first columns of each row."""
     lines = [f"constexpr int k{camel_case(name)} = {value};" for name, value in constants().items()]
     for name, value in vars(layout).items():
         if isinstance(value, int):
@@ -65,6 +66,7 @@ def layout_header(layout: ModuleType) -> str:
 
 
 def launches_header(layout: ModuleType, launches: ModuleType) -> str:
+    """A struct of each launch, whose enumerations are the places of its fields in the lists that Python sends."""
     lines = []
     for cls in launches.LAUNCHES:
         lines += [f"struct {cls.__name__} {{", f'    static constexpr const char* kName = "{cls.operator}";']

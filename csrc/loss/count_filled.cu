@@ -8,7 +8,7 @@
 namespace turbogs {
 namespace {
 
-// Not tuned: the launch is small.
+// No record of other values: the launch is small.
 constexpr int kCountThreads = 256;
 constexpr int kThreadSlots = 4;
 constexpr int kCountBlocks = 512;  // at most; of larger batches a thread takes more slots

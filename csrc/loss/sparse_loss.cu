@@ -18,7 +18,7 @@
 namespace turbogs {
 namespace {
 
-constexpr int kLossThreads = 128;  // of a block: four tiles, which mostly share a view's sum. Not tuned
+constexpr int kLossThreads = 128;  // of a block: four tiles, which mostly share a view's sum; no record of other values
 constexpr int kLossBlocks = 7;     // of an SM: 72 registers. With 64 it spills, and with 80 it is no faster
 constexpr int kLossWarps = kLossThreads / kWarpSize;
 constexpr float kBalanceEpsilon = 1e-8f;  // BALANCE_EPSILON of reference/losses.py

@@ -6,6 +6,7 @@
 
 namespace turbogs {
 
+// SSIM's, as in turbogs_plugin/engine/rules.py.
 constexpr float kLuminanceConstant = 1e-4f;  // 0.01^2
 constexpr float kSsimConstant = 9e-4f;       // 0.03^2
 

@@ -18,7 +18,7 @@ namespace {
 
 constexpr float kLargeGradient = 1e30f;  // of a colour: beyond, the sums of the harmonics may overflow
 constexpr int kStepBlocks = 3;           // of an SM: up to 168 registers, so that nothing spills
-constexpr int kQuadBatch = 4;            // quads of harmonics that a thread has under way; not tuned by itself
+constexpr int kQuadBatch = 4;            // quads of harmonics that a thread has under way; measured with the rest
 constexpr int kSharedSlots = 4;          // rows of a Gaussian in shared memory; five were slower, 526 us for 485
 
 // A slot: a row, the loss of its view, its view (bits).

@@ -16,7 +16,7 @@ constexpr int kGeometryFirst = ParameterRow::kMeans, kGeometrySize = ParameterRo
 constexpr int kAppearanceFirst = ParameterRow::kSh0, kAppearanceSize = ParameterRow::kSize - kAppearanceFirst;
 
 constexpr float kGradientLimit = 1e17f;  // gradients are cut here, so that the squares of their sums stay finite
-constexpr float kRowLimit = 100.0f;      // longest scaled row, so that a pivot keeps its 1 in single precision
+constexpr float kRowLimit = 100.0f;      // longest scaled row: ROW_LIMIT of lm_solvers.py
 
 __device__ __forceinline__ float clip_gradient(float value) {
     return fminf(fmaxf(value, -kGradientLimit), kGradientLimit);

@@ -13,7 +13,7 @@
 namespace turbogs {
 namespace {
 
-constexpr int kThreadTiles = 8;  // tiles of a thread; not tuned: the two launches are small
+constexpr int kThreadTiles = 8;  // tiles of a thread; no record of other values: the two launches are small
 constexpr int kScanThreads = kScanTiles / kThreadTiles;
 constexpr int kScanWarps = kScanThreads / kWarpSize;
 

@@ -14,13 +14,13 @@
 namespace turbogs {
 namespace {
 
-// Measured together, as one design (docs/performance.md, step 10). None of these was tuned by itself.
+// Measured together, as one design (docs/performance.md, step 10); there is no record of other values of any of them.
 constexpr int kScatterThreads = 256;
 constexpr int kScatterWarps = kScatterThreads / kWarpSize;
 constexpr int kScatterInstances = 2 * kScatterThreads;  // of a block: somewhat less than half of them are on screen
 constexpr int kLargeBox = 3 * kWarpSize;  // tiles of a splat's box beyond which several warps share its intersections
 constexpr int kWindow = 256;              // intersections of such a splat that a warp takes on
-constexpr int kWindowBlocks = 4 * 132;    // four for each SM of an H100 or H200; elsewhere only less even
+constexpr int kWindowBlocks = 4 * 132;    // four for each SM of an H100 or H200; other GPUs share the work less evenly
 constexpr int kUnderWay = 4;              // places that a lane waits for at a time
 
 constexpr uint32_t kNoInstance = 0xFFFFFFFFu;

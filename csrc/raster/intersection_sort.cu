@@ -13,7 +13,7 @@ namespace {
 
 constexpr int kSortWarps = 4;   // of a block; they share nothing
 constexpr int kSortBlocks = 9;  // of an SM: the most that do not spill (56 registers)
-constexpr int kRepairs = 8;     // rounds of swaps before a whole network by whole keys; not tuned, as few are needed
+constexpr int kRepairs = 8;     // rounds of swaps before a whole network by whole keys; no record of other values
 
 struct SortShared {
     uint64_t keys[kSortRun];
@@ -187,8 +187,8 @@ __global__ void __launch_bounds__(kSortWarps* kWarpSize, kSortBlocks)
 
 // ---- Tiles of several runs -------------------------------------------------------------------------------------
 
-constexpr int kMergeBlocks = 4 * 132;  // four for each SM of an H100 or H200; elsewhere only less even
-constexpr int kMergeThreads = 256;     // two keys of a run each; not tuned
+constexpr int kMergeBlocks = 4 * 132;  // four for each SM of an H100 or H200; other GPUs share the work less evenly
+constexpr int kMergeThreads = 256;     // two keys of a run each; no record of other values
 
 // Every key's place among all runs of its tile is the number of smaller keys: its place in its own run, and those
 // found by bisection in the others.

@@ -11,7 +11,7 @@
 
 namespace turbogs {
 
-constexpr int kPhiloxRounds = 10;
+constexpr int kPhiloxRounds = 10;  // Philox4x32-10
 
 // turbogs_plugin/engine/reference/draws.py defines the draw, bit for bit.
 struct SamplePixelsParams {

@@ -11,12 +11,12 @@
 
 namespace turbogs {
 
-constexpr int kPerLane = kTilePixels / kWarpSize;            // pixels of a lane, one of each group
-constexpr int kGroupWidth = 8, kGroupHeight = 4;             // pixels
-constexpr int kRowGroups = kTileSize / kGroupWidth;          // groups beside each other
+constexpr int kPerLane = kTilePixels / kWarpSize;    // pixels of a lane, one of each group
+constexpr int kGroupWidth = 8, kGroupHeight = 4;     // pixels
+constexpr int kRowGroups = kTileSize / kGroupWidth;  // groups beside each other
 static_assert(kGroupWidth * kGroupHeight == kWarpSize, "a lane has one pixel of each group");
 
-constexpr int kSampleThreads = 128;  // of a block; its warps share nothing. Not tuned
+constexpr int kSampleThreads = 128;  // of a block; its warps share nothing. No record of other values
 constexpr int kAgeMax = INT16_MAX;   // AGE_MAX of turbogs_plugin/error_maps.py
 
 // The tile of this warp, and its 8 pixels a lane.

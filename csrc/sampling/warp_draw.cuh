@@ -31,7 +31,7 @@ template <Spread kSpread, int kUnits>
 __device__ __forceinline__ Split split_largest(const uint32_t (&keys)[kUnits], int count, uint32_t guess = 0u) {
     constexpr uint32_t kEnd = 0x7F800000u;  // the bits of infinity: no race's key
     constexpr int kGuesses = 4;  // tries of a race by the rule of its guess, while one end of the range is open
-    constexpr int kHalving = 3;  // of so many tries one halves the range, so that the search ends; not tuned
+    constexpr int kHalving = 3;  // of so many tries one halves the range, so that the search ends; others: no record
     uint32_t available = 0, smallest = 0xFFFFFFFFu, largest = 0;
 #pragma unroll
     for (int j = 0; j < kUnits; ++j) {
