@@ -6,7 +6,7 @@ Environment:
         nothing.
     TURBOGS_CUDA_ARCH: compute capabilities to build for, such as ``90`` or ``80;90``, in place of the GPUs found here;
         8.0 or newer.
-    TURBOGS_EXACT_MATH: ``1`` builds the blending kernels with correctly rounded functions (csrc/blend_math.cuh).
+    TURBOGS_EXACT_MATH: ``1`` builds the kernels with correctly rounded functions (csrc/common/approximate_math.cuh).
 """
 
 from __future__ import annotations
@@ -146,7 +146,7 @@ def plan() -> tuple[str, Toolchain | None]:
 
 
 class BuildCuda(build_ext):
-    """Compiles every csrc/*.cu and csrc/*.cpp with nvcc and links them into one library."""
+    """Compiles every .cu and .cpp below csrc/ with nvcc and links them into one library."""
 
     def build_extension(self, extension: Extension) -> None:
         library = Path(self.get_ext_fullpath(extension.name))
@@ -158,14 +158,20 @@ class BuildCuda(build_ext):
 
     def build_library(self, library: Path) -> None:
         objects_dir = Path(self.build_temp, "csrc").resolve()
-        objects_dir.mkdir(parents=True, exist_ok=True)
-        headers = [*SOURCES.glob("*.h"), *SOURCES.glob("*.cuh"), Path(__file__)]
+        generated = objects_dir / "generated"
+        sys.path.insert(0, str(SOURCES))
+        import generate_headers
+
+        generate_headers.write(generated)
+        headers = [*SOURCES.rglob("*.h"), *SOURCES.rglob("*.cuh"), *generated.iterdir(), Path(__file__)]
         newest_header = max(path.stat().st_mtime for path in headers)
-        sources = sorted(SOURCES.glob("*.cu"), key=lambda path: -path.stat().st_size) + sorted(SOURCES.glob("*.cpp"))
+        sources = sorted(SOURCES.rglob("*.cu"), key=lambda path: -path.stat().st_size) + sorted(SOURCES.rglob("*.cpp"))
 
         def compile_one(source: Path) -> Path:
-            target = objects_dir / (source.name + ".o")
-            command = [*(self.cuda_command() if source.suffix == ".cu" else self.cpp_command()), "-c", str(source)]
+            target = objects_dir / source.relative_to(SOURCES).with_name(source.name + ".o")
+            target.parent.mkdir(parents=True, exist_ok=True)
+            command = self.cuda_command() if source.suffix == ".cu" else self.cpp_command()
+            command += [f"-I{SOURCES}", f"-I{generated}", "-c", str(source)]
             stamp = target.with_suffix(".command")
             text = " ".join(command)
             fresh = target.exists() and target.stat().st_mtime > max(newest_header, source.stat().st_mtime)

@@ -11,7 +11,8 @@ import numpy as np
 from torch import Tensor
 
 from turbogs_plugin.engine import engine_of
-from turbogs_plugin.engine.rules import UNITS, DrawRule
+from turbogs_plugin.engine.layout import UNITS
+from turbogs_plugin.engine.rules import DrawRule
 from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.errors import InputError, require
 from turbogs_plugin.tiles import dense_pixels

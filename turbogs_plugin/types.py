@@ -41,9 +41,6 @@ def cell_order(x: Tensor, y: Tensor) -> Tensor:
 
 PARAMETER_NAMES = ("means", "quats", "scales", "opacities", "sh0", "shN")
 
-LARGEST_SH_DEGREE = 3
-"""Of the spherical harmonics that the engines evaluate."""
-
 SH_C0 = 0.28209479177387814
 """The harmonic of degree 0: colour = SH_C0 * sh0 + 0.5."""
 

@@ -115,7 +115,8 @@ def test_cameras_look_at_the_model():
 
 
 def test_contributions_are_the_set_bits_of_the_walked_masks():
-    # Two tiles of 40 and 5 pairs, one chunk each: buckets of 32, so 2 and 1; tile t's masks begin at start // 32 + t.
+    # Two tiles of 40 and 5 intersections, one chunk each: buckets of 32, so 2 and 1. The masks of tile t begin at
+    # start // 32 + t.
     forward = SimpleNamespace(
         tile_starts=torch.tensor([0, 40, 45], dtype=torch.int32),
         bucket_counts=torch.tensor([2, 1], dtype=torch.int32),
@@ -132,7 +133,7 @@ def test_floors_grow_with_counts_and_fall_with_bandwidth(monkeypatch):
     monkeypatch.setattr(torch.cuda, "get_device_properties", lambda device: properties)
     counts = {
         "tiles": 5_000,
-        "gaussians": 150_000, "instances": 450_000, "visible": 300_000, "pairs": 900_000, "samples": 1_200_000,
+        "gaussians": 150_000, "instances": 450_000, "visible": 300_000, "intersections": 900_000, "samples": 1_200_000,
         "items": 15_000, "walked": 3_000_000, "contributing": 1_000_000, "pixels": 3_800_000, "touched": 120_000,
     }  # fmt: skip
     usual = floors.step_floors(counts, 4e12)

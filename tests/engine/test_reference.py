@@ -9,6 +9,7 @@ from helpers.rendering_scenes import loop_render, make_cameras, make_gaussians, 
 from torch.autograd.function import once_differentiable
 
 from turbogs_plugin.engine.autograd import rasterize_differentiable
+from turbogs_plugin.engine.layout import ScreenRecord
 from turbogs_plugin.engine.reference import compositing, projection
 from turbogs_plugin.engine.rendered import ALPHA_MIN_LOWEST
 from turbogs_plugin.engine.rendering import (
@@ -60,9 +61,9 @@ def test_render_and_sums_equal_the_loops(opacity, monkeypatch):
     assert (rendered.colors[~samples.filled] == 0).all() and (rendered.alphas[~samples.filled] == 0).all()
 
     record = rendered.backward(color_gradients, errors).full_records()
-    np.testing.assert_allclose(record[..., compositing.ERROR_SUM], expected.error_sums, atol=1e-11)
-    np.testing.assert_allclose(record[..., compositing.DISTANCE_SUM], expected.distance_sums, atol=1e-11)
-    np.testing.assert_allclose(record[..., compositing.WEIGHT_SUM], expected.weight_sums, atol=1e-11)
+    np.testing.assert_allclose(record[..., ScreenRecord.ERROR_SUM], expected.error_sums, atol=1e-11)
+    np.testing.assert_allclose(record[..., ScreenRecord.DISTANCE_SUM], expected.distance_sums, atol=1e-11)
+    np.testing.assert_allclose(record[..., ScreenRecord.WEIGHT_SUM], expected.weight_sums, atol=1e-11)
 
 
 def test_pixels_end_before_the_splat_that_would_bring_them_to_the_limit():
@@ -229,19 +230,19 @@ def test_statistics_are_added_once_as_documented():
     radii = rasterize(gaussians, cameras, samples).projected().radii
     shown = (radii > 0).all(dim=-1)
     expected = {
-        "error_sums": record[..., 11].sum(dim=0),
-        "distance_sums": record[..., 12].sum(dim=0),
-        "weight_sums": record[..., 13].sum(dim=0),
-        "grad_sums": (record[..., 0:2] * half[:, None]).norm(dim=-1).sum(dim=0),
-        "absgrad_sums": (record[..., 9:11] * half[:, None]).norm(dim=-1).sum(dim=0),
+        "error_sums": record[..., ScreenRecord.ERROR_SUM].sum(dim=0),
+        "distance_sums": record[..., ScreenRecord.DISTANCE_SUM].sum(dim=0),
+        "weight_sums": record[..., ScreenRecord.WEIGHT_SUM].sum(dim=0),
+        "grad_sums": (record[..., ScreenRecord.MEAN] * half[:, None]).norm(dim=-1).sum(dim=0),
+        "absgrad_sums": (record[..., ScreenRecord.ABSOLUTE] * half[:, None]).norm(dim=-1).sum(dim=0),
         "view_counts": shown.double().sum(dim=0),
     }
     for name, value in expected.items():
         torch.testing.assert_close(getattr(stats, name).double(), 1 + value, rtol=1e-6, atol=1e-6, msg=name)
     largest = (radii.amax(dim=-1) / torch.tensor([[37.0], [50.0]])).amax(dim=0)
     torch.testing.assert_close(stats.max_radii, largest.clamp(min=1))
-    assert torch.equal(gradients.touched, record[..., 13].sum(dim=0) > 0)
-    torch.testing.assert_close(gradients.view_losses, record[..., 11] / len(samples))
+    assert torch.equal(gradients.touched, record[..., ScreenRecord.WEIGHT_SUM].sum(dim=0) > 0)
+    torch.testing.assert_close(gradients.view_losses, record[..., ScreenRecord.ERROR_SUM] / len(samples))
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

@@ -1,11 +1,12 @@
-"""The workspace's bookkeeping of pairs, without a GPU: how much room it asks for, and what it does with counts."""
+"""How much room a workspace asks for, and what it does with counts of intersections, without a GPU."""
 
 import math
 
 import pytest
 import torch
 
-from turbogs_plugin.engine.cuda.workspace import COUNT_MAX, MAX_PAIRS, Workspace, _Pending
+from turbogs_plugin.engine.cuda.workspace import MAX_CAPACITY, Workspace, _Pending
+from turbogs_plugin.engine.layout import INTERSECTIONS_MAX
 from turbogs_plugin.errors import InputError
 
 
@@ -27,9 +28,9 @@ def workspace(monkeypatch):
     return workspace
 
 
-def receive(workspace, pairs, tiles, flag):
+def receive(workspace, intersections, tiles, flag):
     """A pass whose count is back."""
-    values = torch.tensor([pairs, flag], dtype=torch.int32)
+    values = torch.tensor([intersections, flag], dtype=torch.int32)
     workspace._pending.append(_Pending(workspace.passes, tiles, Arrived(), values))
     workspace.passes += 1
 
@@ -41,9 +42,9 @@ def test_room_is_for_what_was_seen_and_a_margin(workspace):
 
 
 def test_the_margin_asks_for_no_more_than_a_pass_takes(workspace):
-    """1.6e9 pairs fit; with the margin they would be more than the kernels count."""
+    """1.6e9 intersections fit; with the margin they would be more than the kernels count."""
     workspace.learn(16_000, tiles=10)
-    assert workspace.capacity(1000, tiles=1_000_000) == MAX_PAIRS <= COUNT_MAX
+    assert workspace.capacity(1000, tiles=1_000_000) == MAX_CAPACITY <= INTERSECTIONS_MAX
 
 
 def test_a_lost_pass_gets_room(workspace):
@@ -59,8 +60,8 @@ def test_a_lost_pass_gets_room(workspace):
 def test_a_pass_that_can_never_fit_is_refused(workspace, wait):
     """Its count has stopped at the largest number; the repetition would be lost again, for ever."""
     workspace.learn(1000, tiles=1)
-    receive(workspace, COUNT_MAX, 1, flag=1)
-    with pytest.raises(InputError, match=r"at most .* pairs of a tile and a splat: take fewer"):
+    receive(workspace, INTERSECTIONS_MAX, 1, flag=1)
+    with pytest.raises(InputError, match=r"at most .* intersections of tiles and splats: take fewer"):
         workspace.take_lost(wait)
     assert workspace.overflowed  # what follows is refused too, until it is lowered
     assert workspace.take_lost() == 1 and workspace.capacity(1000, tiles=1) is not None

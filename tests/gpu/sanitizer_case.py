@@ -52,7 +52,7 @@ def train(capture: Path, *overrides: str, iterations: int | None = None) -> Trai
 
 
 def many_tiles():
-    """1250 tiles, all active: more than one block finds the first pairs of."""
+    """1250 tiles, all active: more than one block finds the first intersections of."""
     cameras = make_cameras([(400, 400), (400, 400)], torch.float32)
     return make_gaussians(60, dtype=torch.float32), cameras, dense_samples(cameras)
 

@@ -7,9 +7,10 @@ import pytest
 import torch
 from helpers.raster_cases import GPU_ONLY, make_case, on_gpu, samples_to, upstream
 
+from turbogs_plugin.engine.cuda import library, workspace
 from turbogs_plugin.engine.cuda import raster as cuda
-from turbogs_plugin.engine.cuda import workspace
 from turbogs_plugin.engine.cuda.workspace import Workspace
+from turbogs_plugin.engine.layout import ScreenRecord
 from turbogs_plugin.engine.reference.projection import SPAN_MAX
 from turbogs_plugin.engine.rendering import rasterize_reference
 from turbogs_plugin.errors import InputError
@@ -37,7 +38,7 @@ def test_no_gaussians(case):
 def test_none_visible(case):
     case.gpu_gaussians.means[:] = case.gpu_gaussians.means.new_tensor([0.0, 1e6, 0.0])
     rendered = render(case)
-    assert int(rendered.num_pairs) == 0 and (rendered.colors == 0).all()
+    assert int(rendered.num_intersections) == 0 and (rendered.colors == 0).all()
     assert (rendered.backward(torch.ones_like(rendered.colors)).full_records() == 0).all()
 
 
@@ -172,8 +173,9 @@ def test_wrong_input_says_what_was_wanted(case):
     with pytest.raises(InputError, match="with_depth"):
         rendered.backward(torch.zeros_like(rendered.colors), depth_gradients=torch.zeros_like(rendered.alphas))
     with pytest.raises(RuntimeError, match=r"pixel_ids must be a contiguous Int"):
-        forward = rendered._forward
-        torch.ops.turbogs.raster_forward(*forward._replace(pixel_ids=forward.pixel_ids.long()))
+        library.launch(replace(rendered._forward, pixel_ids=rendered._forward.pixel_ids.long()))
+    with pytest.raises(RuntimeError, match="raster_forward needs colors"):
+        library.launch(replace(rendered._forward, colors=None))
 
 
 def test_workspace_gives_the_same_and_does_not_wait(case):
@@ -196,7 +198,7 @@ def test_workspace_gives_the_same_and_does_not_wait(case):
 
 def poison_records(memory, case):
     """What passes before may have left in the records."""
-    shape = (len(case.gpu_cameras) * len(case.gpu_gaussians), cuda.RECORD_FLOATS)
+    shape = (len(case.gpu_cameras) * len(case.gpu_gaussians), ScreenRecord.SIZE)
     memory.buffer("records", shape, torch.float32).fill_(math.nan)
 
 
@@ -241,8 +243,7 @@ def test_overflow_is_noticed_and_passes_are_repeated(case, monkeypatch):
     memory = Workspace("cuda")
     render(case, workspace=memory)
     assert memory.take_lost(wait=True) == 0
-    pairs_per_tile = memory._pairs_per_tile
-    memory._pairs_per_tile = 0.3 * pairs_per_tile
+    memory._intersections_per_tile *= 0.3
     lost = render(case, workspace=memory)
     assert (lost.colors == 0).all() and int(memory.overflow) == 1
     records = lost.backward(torch.ones_like(lost.colors)).full_records()

@@ -14,6 +14,7 @@ from helpers.raster_cases import (
 
 from turbogs_plugin.engine.autograd import rasterize_differentiable
 from turbogs_plugin.engine.cuda import raster as cuda
+from turbogs_plugin.engine.layout import ScreenRecord
 from turbogs_plugin.engine.rendering import rasterize_reference
 from turbogs_plugin.types import GaussianStats
 
@@ -77,7 +78,7 @@ def test_screen_records(case, with_depth):
     wanted_records = wanted.backward(**values).full_records()
     for name, column in RECORD_COLUMNS.items():
         assert_gradients_close(records[..., column], wanted_records[..., column], name)
-    assert (records[..., 15] == 0).all()
+    assert (records[..., ScreenRecord.SIZE - 1] == 0).all()
 
 
 def test_parameter_gradients(case):

@@ -1,4 +1,4 @@
-"""Every tile's pairs: each splat that reaches it once, by depth and then by instance, whatever their number."""
+"""Every tile's intersections: each splat that reaches it once, by depth and then by instance, whatever their number."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -39,11 +39,11 @@ def falling_depths(count, generator):
     return torch.linspace(9, 1, count)
 
 
-def pairs_of_tiles(rendered):
+def intersections_of_tiles(rendered):
     """Instances of each active tile, in order."""
     forward = rendered._forward
     starts = forward.tile_starts.tolist()
-    return [forward.pair_ids[begin:end].cpu() for begin, end in pairwise(starts)]
+    return [forward.intersection_ids[begin:end].cpu() for begin, end in pairwise(starts)]
 
 
 def stacked_case(z):
@@ -84,7 +84,7 @@ def render(gaussians, cameras, samples):
 )
 def test_a_tile_is_in_order(depths, count):
     z = depths(count, torch.Generator().manual_seed(count))
-    (got,) = pairs_of_tiles(render(*stacked_case(z)))
+    (got,) = intersections_of_tiles(render(*stacked_case(z)))
     assert torch.equal(got.long(), z.sort(stable=True).indices)
 
 
@@ -95,19 +95,19 @@ def test_tiles_of_many_views_are_in_order():
     rendered, again = (
         cuda.rasterize_cuda(case.gpu_gaussians, case.gpu_cameras, dense_samples(case.gpu_cameras)) for _ in range(2)
     )
-    tiles = pairs_of_tiles(rendered)
-    assert sum(map(len, tiles)) == int(rendered.num_pairs) > 20_000
+    tiles = intersections_of_tiles(rendered)
+    assert sum(map(len, tiles)) == int(rendered.num_intersections) > 20_000
     depths = rendered.projected().depths.flatten().cpu()
     for instances in tiles:
         order = depths[instances.long()]
         later = (order[1:] > order[:-1]) | ((order[1:] == order[:-1]) & (instances[1:] > instances[:-1]))
         assert later.all()
-    assert all(torch.equal(a, b) for a, b in zip(tiles, pairs_of_tiles(again), strict=True))
+    assert all(torch.equal(a, b) for a, b in zip(tiles, intersections_of_tiles(again), strict=True))
 
 
 def test_more_large_splats_than_their_list_has_room_for():
     rendered = render(*wide_case())
-    (got,) = pairs_of_tiles(rendered)
+    (got,) = intersections_of_tiles(rendered)
     drawn = rendered.projected()
     assert torch.equal(got.long(), drawn.depths[0].cpu().sort(stable=True).indices)
     assert (drawn.radii[0] > 2000).all()

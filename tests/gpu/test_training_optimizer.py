@@ -14,6 +14,7 @@ from turbogs_plugin.engine.cuda import library as kernels
 from turbogs_plugin.engine.cuda import raster as cuda
 from turbogs_plugin.engine.cuda import training as training_kernels
 from turbogs_plugin.engine.cuda.raster import CudaScreenGradients
+from turbogs_plugin.engine.layout import ScreenRecord
 from turbogs_plugin.engine.reference.projection import drawable_rows, project_rows
 from turbogs_plugin.engine.reference.raster import ROW_PARAMETERS, ReferenceScreenGradients
 from turbogs_plugin.engine.rendered import DEFAULT_SETTINGS
@@ -61,8 +62,9 @@ class Scene:
         )
         doubled = self.gaussians.map(lambda value: value.double())
         self.rows = drawable_rows(doubled, self.cameras.to(dtype=torch.float64), DEFAULT_SETTINGS)
-        records = size * torch.randn(views, count, 16, generator=generator)
-        records[..., 9:14] = records[..., 9:14].abs()
+        records = size * torch.randn(views, count, ScreenRecord.SIZE, generator=generator)
+        sums = slice(ScreenRecord.ABSOLUTE.start, ScreenRecord.WEIGHT_SUM + 1)
+        records[..., sums] = records[..., sums].abs()
         records[torch.rand(views, count, generator=generator) < 0.3] = 0
         records[:, count // 2 : count // 2 + 7] = 0  # never touched
         _, splats = self.project(doubled, torch.float64)
@@ -215,7 +217,7 @@ def check_fused_step(name, **case):
 
 def test_balanced_step_without_shares_is_adam():
     scene = Scene()
-    scene.records[..., 11] = 0
+    scene.records[..., ScreenRecord.ERROR_SUM] = 0
     stepped = []
     for optimizer in (MomentLMOptimizer(RATES), SparseAdam(RATES, eps=1e-20)):
         gaussians = scene.on_device()
@@ -229,7 +231,7 @@ def test_balanced_step_without_shares_is_adam():
 def test_rows_of_vanishing_loss_are_cut():
     """Shares of the loss down to denormals: the scaled rows would overflow without their limit."""
     scene, optimizer = Scene(), OPTIMIZERS["lm unbound"]
-    scene.records[..., 11] *= 1e-33
+    scene.records[..., ScreenRecord.ERROR_SUM] *= 1e-33
     gaussians, expected = scene.on_device(), scene.gaussians.map(doubled)
     optimizer.setup(expected)
     twin_step(optimizer, expected, scene)
@@ -293,7 +295,7 @@ def test_any_number_of_gaussians(count):
     gaussians, optimizer = scene.on_device(), OPTIMIZERS["lm"]
     optimizer.setup(gaussians)
     training_kernels.fused_step(scene.screen(gaussians), gaussians, optimizer.moments, optimizer.rule(STEP))
-    touched = (scene.records[..., 13] > 0).any(dim=0)
+    touched = (scene.records[..., ScreenRecord.WEIGHT_SUM] > 0).any(dim=0)
     assert torch.equal(optimizer.moments.steps.cpu().bool(), touched)
     assert len(scene.screen().parameter_gradients(True).touched) == count
 

@@ -10,6 +10,7 @@ from helpers.rendering_scenes import make_cameras, make_gaussians, thin_out
 from torch import Tensor
 
 from turbogs_plugin.engine.cuda import library as kernels
+from turbogs_plugin.engine.layout import ScreenRecord, columns
 from turbogs_plugin.engine.rendering import dense_samples, rasterize_reference
 from turbogs_plugin.types import Cameras, Gaussians, PixelSamples
 
@@ -23,17 +24,7 @@ FLIP_SHARE = 1e-3  # of the samples may lie on a threshold
 COSINE_BOUND, GRADIENT_BOUND = 0.9999, 1e-3
 STEADY_MOVES, STEADY_SIZE = 3, 2e-7
 
-RECORD_COLUMNS = {
-    "mean": slice(0, 2),
-    "conic": slice(2, 5),
-    "color": slice(5, 8),
-    "opacity": slice(8, 9),
-    "absolute": slice(9, 11),
-    "error_sum": slice(11, 12),
-    "distance_sum": slice(12, 13),
-    "weight_sum": slice(13, 14),
-    "depth": slice(14, 15),
-}
+RECORD_COLUMNS = columns(ScreenRecord)
 
 
 @dataclass

@@ -11,6 +11,7 @@ import math
 import torch
 
 from turbogs_plugin.engine.cuda.raster import CudaRendered
+from turbogs_plugin.engine.layout import BUCKET, WARP_SIZE
 from turbogs_plugin.types import PixelSamples
 
 FORWARD_INSTRUCTIONS, BACKWARD_INSTRUCTIONS = 23, 75
@@ -31,7 +32,7 @@ def raster_counts(rendered: CudaRendered, samples: PixelSamples) -> Counts:
         "instances": views * gaussians,
         "visible": int(on_screen.sum()),
         "visible_gaussians": int(on_screen.any(dim=0).sum()),
-        "pairs": int(rendered.num_pairs),
+        "intersections": int(rendered.num_intersections),
         "tiles": len(samples.tile_ids),
         "samples": len(samples),
         "items": len(rendered._forward.bucket_counts),
@@ -40,37 +41,38 @@ def raster_counts(rendered: CudaRendered, samples: PixelSamples) -> Counts:
 
 
 def count_contributions(rendered: CudaRendered) -> Counts:
-    """Walked and contributing (splat, work item) pairs of a pass."""
+    """Splats of work items of a pass: those walked, and those that contributed."""
     forward = rendered._forward
     tile_starts, buckets, chunks = forward.tile_starts, forward.bucket_counts.long(), forward.chunks
     items = torch.arange(len(buckets), device=buckets.device)
-    bases = (tile_starts[:-1].long() // 32 + torch.arange(len(tile_starts) - 1, device=buckets.device))[items // chunks]
+    tiles = torch.arange(len(tile_starts) - 1, device=buckets.device)
+    bases = (tile_starts[:-1].long() // BUCKET + tiles)[items // chunks]
     owners = torch.repeat_interleave(items, buckets)
     number = torch.arange(len(owners), device=buckets.device) - (buckets.cumsum(0) - buckets)[owners]
     words = forward.masks[(bases[owners] + number) * chunks + owners % chunks]
-    contributing = sum(int(((words >> bit) & 1).sum()) for bit in range(32))
-    return {"walked": int(buckets.sum()) * 32, "contributing": contributing}
+    contributing = sum(int(((words >> bit) & 1).sum()) for bit in range(BUCKET))
+    return {"walked": int(buckets.sum()) * BUCKET, "contributing": contributing}
 
 
 def raster_floors(counts: Counts, bandwidth: float) -> dict[str, float]:
     """Milliseconds that each stage of the rasterizer cannot beat."""
-    n, kn, visible, pairs, samples = (
-        counts[name] for name in ("gaussians", "instances", "visible", "pairs", "samples")
+    n, kn, visible, intersections, samples = (
+        counts[name] for name in ("gaussians", "instances", "visible", "intersections", "samples")
     )
     properties = torch.cuda.get_device_properties(0)
     issue = 4 * properties.multi_processor_count * 1e3 * getattr(properties, "clock_rate", 1_980_000)  # warps a second
     slots = samples / max(1, counts["items"])
     instructions = {
-        "forward": counts["walked"] * math.ceil(slots / 32) * FORWARD_INSTRUCTIONS,
-        "backward": counts["contributing"] * math.ceil(slots / 32) * BACKWARD_INSTRUCTIONS,
+        "forward": counts["walked"] * math.ceil(slots / WARP_SIZE) * FORWARD_INSTRUCTIONS,
+        "backward": counts["contributing"] * math.ceil(slots / WARP_SIZE) * BACKWARD_INSTRUCTIONS,
     }
     traffic = {
         # parameters in; splats, cleared records and radii out
         "projection": 236 * n + (48 + 64) * visible + 8 * kn,
-        "pair count": 16 * counts["tiles"],
+        "intersection count": 16 * counts["tiles"],
         # radii and splats in; keys out and in; ids out
-        "pair sort": 8 * kn + 32 * visible + 20 * pairs,
-        "forward": 52 * pairs + 32 * samples,
+        "intersection sort": 8 * kn + 32 * visible + 20 * intersections,
+        "forward": 52 * intersections + 32 * samples,
         "backward": (52 + 64) * counts["contributing"] + 32 * samples,
     }
     return {stage: 1e3 * max(size / bandwidth, instructions.get(stage, 0) / issue) for stage, size in traffic.items()}
@@ -92,7 +94,7 @@ def step_floors(counts: Counts, bandwidth: float) -> dict[str, float]:
         # records and radii in; parameters and two moments of the touched in and out
         "solve+update": 64 * counts["visible"] + 8 * counts["instances"] + 3 * 2 * 4 * PARAMETER_FLOATS * touched,
     }
-    front = sum(raster[stage] for stage in ("projection", "pair count", "pair sort", "forward"))
+    front = sum(raster[stage] for stage in ("projection", "intersection count", "intersection sort", "forward"))
     return {
         "EPS": 1e3 * traffic["EPS"] / bandwidth,
         "FWD": front,

@@ -6,10 +6,11 @@ import torch
 from torch import Tensor
 
 from turbogs_plugin.bench.models import ring_cameras, surface_gaussians, tile_samples
+from turbogs_plugin.engine.layout import ScreenRecord, columns
 from turbogs_plugin.engine.rendering import rasterize, rasterize_reference
 
-COLUMNS = {"mean": slice(0, 2), "conic": slice(2, 5), "color": slice(5, 8), "opacity": slice(8, 9)}
-"""Of the screen gradients' records."""
+COLUMNS = ("mean", "conic", "color", "opacity")
+"""Of the records of the screen gradients, those that every pass has."""
 
 THRESHOLD = 1e-4
 """Differences beyond it are counted: a splat at a threshold is drawn by one and not by the other."""
@@ -32,7 +33,8 @@ def precision(device: torch.device) -> dict[str, float]:
         "forward_beyond_1e-4": float((difference.amax(dim=1) > THRESHOLD).double().mean()),
     }
     records, wanted = ours.backward(upstream).full_records(), exact.backward(upstream.double()).full_records()
-    for name, columns in COLUMNS.items():
-        relative = (records[..., columns] - wanted[..., columns]).norm() / wanted[..., columns].norm()
+    for name in COLUMNS:
+        place = columns(ScreenRecord)[name]
+        relative = (records[..., place] - wanted[..., place]).norm() / wanted[..., place].norm()
         errors[f"{name}_gradient"] = float(relative)
     return errors

@@ -41,8 +41,8 @@ from turbogs_plugin.types import Cameras, Gaussians, GaussianStats
 
 STAGES = {
     "raster_project": "projection",
-    "raster_count_pairs": "pair count",
-    "raster_sort_pairs": "pair sort",
+    "raster_count_intersections": "intersection count",
+    "raster_sort_intersections": "intersection sort",
     "raster_forward": "forward",
     "raster_backward": "backward",
     "projection_backward": "projection backward",

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from turbogs_plugin.engine.reference.compositing import ABSOLUTE, MEAN
+from turbogs_plugin.engine.layout import ScreenRecord
 from turbogs_plugin.engine.rendered import DEFAULT_SETTINGS, Projected, RasterSettings, Rendered
 from turbogs_plugin.engine.rendering import rasterize
 from turbogs_plugin.errors import InputError
@@ -114,7 +114,12 @@ class _Pass(torch.autograd.Function):
         records = screen.full_records()
         stats = GaussianStats.zeros(records.shape[1], records.device)
         gradients = screen.parameter_gradients(rows=False, stats=stats)
-        ctx.means2d.absgrad = records[..., ABSOLUTE].clone()
+        ctx.means2d.absgrad = records[..., ScreenRecord.ABSOLUTE].clone()
         if ctx.observer is not None:
             ctx.observer.passed(stats, gradients.view_losses[0])
-        return None, None, records[..., MEAN].clone(), *(gradients.summed(name) for name in PARAMETER_NAMES)
+        return (
+            None,
+            None,
+            records[..., ScreenRecord.MEAN].clone(),
+            *(gradients.summed(name) for name in PARAMETER_NAMES),
+        )

@@ -9,20 +9,18 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from turbogs_plugin.engine.layout import ParameterRow
 from turbogs_plugin.errors import InputError, require
 from turbogs_plugin.types import Gaussians, RowUpdate
 
 COLUMNS = {
-    "means": slice(0, 3),
-    "scales": slice(3, 6),
-    "quats": slice(6, 10),
-    "sh0": slice(10, 13),
-    "opacities": slice(13, 14),
+    "means": ParameterRow.MEANS,
+    "scales": ParameterRow.SCALES,
+    "quats": ParameterRow.QUATS,
+    "sh0": ParameterRow.SH0,
+    "opacities": ParameterRow.OPACITIES,
 }
-"""Where each parameter lies in a packed row."""
-
-ROW_WIDTH = 14
-"""Numbers of a packed row: all parameters but the higher bands."""
+"""Where each parameter lies in a packed row: all parameters but the higher bands."""
 
 
 @dataclass
@@ -52,7 +50,7 @@ class GaussianMoments:
         """State of Gaussians that were never updated, in their dtype and on their device."""
         count, coefficients = len(gaussians), gaussians.shN.shape[1] * 3
         return cls(
-            *(gaussians.means.new_zeros(count, ROW_WIDTH) for _ in range(2)),
+            *(gaussians.means.new_zeros(count, ParameterRow.SIZE) for _ in range(2)),
             *(gaussians.means.new_zeros(count, coefficients) for _ in range(2)),
             torch.zeros(count, dtype=torch.int32, device=gaussians.device),
             torch.zeros((), dtype=torch.int64, device=gaussians.device),

@@ -48,8 +48,7 @@ class ScreenGradients(Protocol):
         ...
 
     def full_records(self) -> Tensor:
-        """[K, N, 16] the gradients on the screen: of the projected mean in columns 0-1, of its absolute value per pixel
-        in 9-10, which need a pass ``with_statistics``; zero where a Gaussian is not drawn."""
+        """[K, N, 16] the gradients on the screen, `layout.ScreenRecord`; zero where a Gaussian is not drawn."""
         ...
 
 

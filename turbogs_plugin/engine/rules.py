@@ -10,12 +10,6 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
-UNITS = ("pixel", "cell", "tile")
-"""What a draw chooses: single pixels, cells of 4x4 pixels, or whole tiles of 16x16."""
-
-STRUCTURES = ("none", "ncc", "contrast", "ssim")
-"""Similarities of a tile's samples that a loss may have beside its l1 term."""
-
 LUMINANCE_CONSTANT = 0.01**2
 STRUCTURE_CONSTANT = 0.03**2
 """SSIM's two constants, for colours of 0 .. 1."""
@@ -26,7 +20,7 @@ class DrawRule:
     """How the samples of an iteration are drawn (paper section 3.5); `engine.reference.draws` defines the draw.
 
     Args:
-        unit: one of `UNITS`.
+        unit: one of `layout.UNITS`.
         hard, stable: shares of the units drawn by error and by age; the mixed stage draws the rest.
         mixed_uniform: the mixed stage ignores error and age.
         importance: a of the weights ``p^-a``; 0 for no weights.
@@ -60,7 +54,7 @@ class LossTerms:
     Args:
         epsilon: of the Charbonnier term.
         l1_weight: factor of that term.
-        structure: one of `STRUCTURES`.
+        structure: one of `layout.STRUCTURES`.
         structure_weight: factor of the mean over tiles and channels of 1 - S, S the similarity.
         variance_constant: c of `ncc` and `contrast`.
         balance: scale the structure term by the paper's lambda.

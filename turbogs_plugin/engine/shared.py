@@ -8,10 +8,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from turbogs_plugin.engine.layout import MAX_SH_DEGREE
 from turbogs_plugin.engine.rules import DrawRule
 from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.types import LARGEST_SH_DEGREE, Gaussians, LossOutput, PixelSamples, Step
+from turbogs_plugin.types import Gaussians, LossOutput, PixelSamples, Step
 
 
 def used_degree(gaussians: Gaussians, sh_degree: int | None) -> int:
@@ -21,10 +22,10 @@ def used_degree(gaussians: Gaussians, sh_degree: int | None) -> int:
         InputError: the model holds more than any engine evaluates, or not what is asked for.
     """
     held = gaussians.sh_degree
-    if held > LARGEST_SH_DEGREE:
+    if held > MAX_SH_DEGREE:
         raise InputError(
             f"these Gaussians hold spherical harmonics of degree {held}: the largest that is rendered is "
-            f"{LARGEST_SH_DEGREE}, so leave the coefficients above it out"
+            f"{MAX_SH_DEGREE}, so leave the coefficients above it out"
         )
     if sh_degree is not None and not 0 <= sh_degree <= held:
         raise InputError(f"sh_degree is {sh_degree}, but these Gaussians hold degrees 0 to {held}")

@@ -8,9 +8,10 @@ import warnings
 import torch
 from torch import Tensor
 
+from turbogs_plugin.engine.layout import MAX_SH_DEGREE
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene.nearest import mean_neighbor_distances
-from turbogs_plugin.types import LARGEST_SH_DEGREE, SH_C0, Gaussians
+from turbogs_plugin.types import SH_C0, Gaussians
 
 INITIAL_OPACITY = 0.1
 """As in 3DGS."""
@@ -47,8 +48,8 @@ def gaussians_from_points(
     Raises:
         InputError: no finite points, a degree out of range, an extent that is not positive.
     """
-    if not 0 <= sh_degree <= LARGEST_SH_DEGREE:
-        raise InputError(f"sh_degree is {sh_degree}: it must be 0 .. {LARGEST_SH_DEGREE}")
+    if not 0 <= sh_degree <= MAX_SH_DEGREE:
+        raise InputError(f"sh_degree is {sh_degree}: it must be 0 .. {MAX_SH_DEGREE}")
     if not (math.isfinite(extent) and extent > 0):
         raise InputError(f"extent is {extent}: it must be finite and positive")
     finite = points.isfinite().all(dim=1)

@@ -11,11 +11,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from turbogs_plugin.engine.layout import MAX_SH_DEGREE
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.files import write_atomically
 from turbogs_plugin.scene.frame import Frame
 from turbogs_plugin.scene.ply import read_vertices
-from turbogs_plugin.types import LARGEST_SH_DEGREE, Gaussians
+from turbogs_plugin.types import Gaussians
 
 POSITION_ERROR = 1e-6
 """Largest rounding of exported positions that the place of the capture may cause, in units of the frame's scale."""
@@ -87,10 +88,10 @@ def load_ply(path: str | Path, frame: Frame | None = None) -> Gaussians:
     frame = frame or Frame(np.zeros(3), 1.0)
     names = set(vertices.dtype.names)
     rest = sum(name.startswith("f_rest_") for name in names)
-    bands = {3 * ((degree + 1) ** 2 - 1): (degree + 1) ** 2 - 1 for degree in range(LARGEST_SH_DEGREE + 1)}
+    bands = {3 * ((degree + 1) ** 2 - 1): (degree + 1) ** 2 - 1 for degree in range(MAX_SH_DEGREE + 1)}
     if rest not in bands:
         raise InputError(
-            f"{path} has {rest} properties f_rest_*: spherical harmonics of degree 0 .. {LARGEST_SH_DEGREE}, the "
+            f"{path} has {rest} properties f_rest_*: spherical harmonics of degree 0 .. {MAX_SH_DEGREE}, the "
             f"largest here, have one of {sorted(bands)}"
         )
     groups = _property_groups(bands[rest])

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.engine import engine_of
+from turbogs_plugin.engine.layout import MAX_SH_DEGREE
 from turbogs_plugin.engine.rendered import Rendered, ScreenGradients
 from turbogs_plugin.engine.rendering import render_image
 from turbogs_plugin.errors import TrainingStopped
@@ -23,7 +24,6 @@ from turbogs_plugin.scene import Scene
 from turbogs_plugin.scene.offload import place_maps, place_views
 from turbogs_plugin.scene.photos import PhotoSamples
 from turbogs_plugin.types import (
-    LARGEST_SH_DEGREE,
     PARAMETER_NAMES,
     Gaussians,
     GaussianStats,
@@ -279,6 +279,6 @@ def gaussians_of_state(state: dict[str, Any], device: torch.device) -> Gaussians
             raise ValueError(f"gaussians.{name} has shape {tuple(value.shape)} where {shape} was expected")
         if not value.isfinite().all():
             raise ValueError(f"gaussians.{name} is not finite")
-    if bands not in [(degree + 1) ** 2 - 1 for degree in range(LARGEST_SH_DEGREE + 1)]:
+    if bands not in [(degree + 1) ** 2 - 1 for degree in range(MAX_SH_DEGREE + 1)]:
         raise ValueError(f"gaussians.shN has {bands} bands")
     return gaussians

@@ -9,6 +9,8 @@ from pathlib import Path
 
 import torch
 
+from turbogs_plugin.engine import layout
+from turbogs_plugin.engine.cuda import launches
 from turbogs_plugin.errors import InputError
 
 LIBRARY_VARIABLE = "TURBOGS_LIBRARY"
@@ -41,7 +43,15 @@ def _load_failure() -> str:
         torch.ops.load_library(str(path))
     except OSError as error:
         return f"{path.name} does not load: {str(error).splitlines()[0]}"
+    if _interface() != launches.interface(layout):
+        return f"{path.name} was built from other sources than this package: build it again"
     return ""
+
+
+def _interface() -> str:
+    """The orders of fields and the sizes that the loaded library was built with."""
+    tell = getattr(torch.ops.turbogs, "interface", None)  # libraries of before had none
+    return "" if tell is None else tell()
 
 
 def _runs_on(architecture: str, capability: tuple[int, int]) -> bool:
@@ -88,6 +98,15 @@ def require() -> None:
     """
     if reason := unavailable_reason():
         raise InputError(f"CUDA kernels: {reason}")
+
+
+def launch(arguments: launches.Launch) -> None:
+    """Call the operator that a launch is for. Enqueued on torch's current stream of its tensors' device.
+
+    Raises:
+        RuntimeError: a tensor is not what the operator takes; the message names it.
+    """
+    getattr(torch.ops.turbogs, arguments.operator)(*arguments.lists())
 
 
 def architectures() -> tuple[str, ...]:

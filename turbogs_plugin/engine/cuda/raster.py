@@ -1,34 +1,37 @@
-"""The rasterizer in CUDA (csrc/), twin of `reference.py`: projection, sort by tile, forward and backward pass.
+"""The rasterizer in CUDA (csrc/raster), twin of `engine.reference.raster`: projection, sort by tile, forward and
+backward pass.
 
-Everything is float32. Without a `Workspace` a pass waits once for the GPU, to learn the number of (tile, splat) pairs;
-with one it never waits (see `workspace.py`).
+Everything is float32. Without a `Workspace` a pass waits once for the GPU, to learn the number of intersections of
+tiles and splats; with one it never waits (see `workspace.py`).
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, fields
-from typing import NamedTuple
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from turbogs_plugin.engine.cuda import library
-from turbogs_plugin.engine.cuda.workspace import COUNT_MAX, Workspace, require_possible, round_capacity
-from turbogs_plugin.engine.moments import COLUMNS, ROW_WIDTH
+from turbogs_plugin.engine.cuda import launches, library
+from turbogs_plugin.engine.cuda.workspace import Workspace, require_possible, round_capacity
+from turbogs_plugin.engine.layout import (
+    BUCKET,
+    INTERSECTIONS_MAX,
+    MAX_VIEWS,
+    SCAN_TILES,
+    SORT_RUN,
+    WARP_SIZE,
+    CameraRow,
+    InstanceRow,
+    ParameterRow,
+    ScreenRecord,
+)
 from turbogs_plugin.engine.rendered import DEFAULT_SETTINGS, Projected, RasterSettings, require_statistics
 from turbogs_plugin.engine.shared import used_degree
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.types import PARAMETER_NAMES, Cameras, GaussianGradients, Gaussians, GaussianStats, PixelSamples
-
-MAX_VIEWS = 128
-INSTANCE_FLOATS = 12
-CAMERA_FLOATS = 28
-RECORD_FLOATS = 16
-WARP = 32
-SCAN_TILES = 1024
-RUN = 512
+from turbogs_plugin.types import Cameras, GaussianGradients, Gaussians, GaussianStats, PixelSamples
 
 
 class _FreshBuffers:
@@ -64,30 +67,7 @@ def _check(gaussians: Gaussians, cameras: Cameras, samples: PixelSamples) -> Non
 
 def warps_per_tile(slots: int, tiles: int) -> int:
     """Work items of a tile, 32 slots each, for tiles of this many slots on average; fuller ones take several rounds."""
-    return max(1, -(-slots // (max(1, tiles) * WARP)))
-
-
-class ForwardArguments(NamedTuple):
-    """Arguments of the forward operator, which the backward operator takes first; see csrc/raster_params.h."""
-
-    cameras: Tensor  # [K, 28]
-    tile_ids: Tensor | None  # [T], None where every tile is active
-    tile_offsets: Tensor  # [T + 1]
-    pixel_ids: Tensor  # [P]
-    tile_starts: Tensor  # [T + 1]
-    pair_ids: Tensor  # [M]
-    instances: Tensor  # [K * N, 12]
-    colors: Tensor  # [P, 3]
-    alphas: Tensor  # [P]
-    transmittances: Tensor  # [P]
-    depths: Tensor | None  # [P]
-    last_pairs: Tensor  # [P]
-    masks: Tensor  # [(M / 32 + T + 1) * chunks]
-    bucket_counts: Tensor  # [T * chunks]
-    chunks: int
-    alpha_min: float
-    alpha_max: float
-    transmittance_min: float
+    return max(1, -(-slots // (max(1, tiles) * WARP_SIZE)))
 
 
 @dataclass
@@ -100,12 +80,9 @@ class CudaScreenGradients:
         samples: of the pass.
         sh_degree: bands that were used.
         settings: of the pass.
-        records: [K, N, 16] float32: 0-1 d/dmean2d, 2-4 d/dconic (b's entry counts both off-diagonal ones), 5-7 d/dcolor
-            after the clamp at 0, 8 d/dopacity after the sigmoid, 9-10 sums of |d/dmean2d| per pixel, 11 sum e * w,
-            12 sum D * w, 13 sum w, 14 d/ddepth; 9, 10 and 12 are 0 without `with_statistics`. Where a Gaussian is off
-            screen, a record may hold anything.
+        records: [K, N, 16] float32, `layout.ScreenRecord`. Where a Gaussian is off screen, a record may hold anything.
         radii: [K, N, 2] int32, zero where off screen.
-        with_statistics: whether 9, 10 and 12 were summed up.
+        with_statistics: whether the columns that only density control asks for were filled.
         overflow: [1] int32 on the device, or None; where not 0 the pass drew nothing and nothing may change.
     """
 
@@ -134,40 +111,50 @@ class CudaScreenGradients:
         # The kernel writes every entry, unless an overflow keeps it from running.
         new = torch.empty if self.overflow is None else torch.zeros
         device = self.records.device
-        packed = new(num_rows, count, ROW_WIDTH, device=device)
-        shN = new(count, bands, 3, device=device)
-        touched = new(count, dtype=torch.bool, device=device)
-        view_losses = new(num_rows, count, device=device)
-        torch.ops.turbogs.projection_backward(*self.operator_arguments(stats), packed, shN, touched, view_losses)
+        backward = launches.ProjectionBackward(
+            screen=self.backward_arguments(stats),
+            rows=new(num_rows, count, ParameterRow.SIZE, device=device),
+            shN_gradients=new(count, bands, 3, device=device),
+            touched=new(count, dtype=torch.bool, device=device),
+            view_losses=new(num_rows, count, device=device),
+        )
+        library.launch(backward)
+        packed = backward.rows
         return GaussianGradients(
-            means=packed[..., COLUMNS["means"]],
-            scales=packed[..., COLUMNS["scales"]],
-            quats=packed[..., COLUMNS["quats"]],
-            sh0=packed[..., COLUMNS["sh0"]].unsqueeze(-2),
-            opacities=packed[..., COLUMNS["opacities"]].squeeze(-1),
-            shN=shN,
-            touched=touched,
-            view_losses=view_losses,
+            means=packed[..., ParameterRow.MEANS],
+            scales=packed[..., ParameterRow.SCALES],
+            quats=packed[..., ParameterRow.QUATS],
+            sh0=packed[..., ParameterRow.SH0].unsqueeze(-2),
+            opacities=packed[..., ParameterRow.OPACITIES].squeeze(-1),
+            shN=backward.shN_gradients,
+            touched=backward.touched,
+            view_losses=backward.view_losses,
         )
 
-    def operator_arguments(self, stats: GaussianStats | None) -> tuple:
-        """What the operators that take these gradients to the parameters have in common."""
+    def backward_arguments(self, stats: GaussianStats | None) -> launches.ScreenBackward:
+        """What the launches that take these gradients to the parameters have in common."""
         require_views(len(self.cameras))
         require_statistics(self.with_statistics, stats)
-        return (
-            [getattr(self.gaussians, name).detach() for name in PARAMETER_NAMES],
-            self.cameras.viewmats.contiguous(),
-            self.cameras.Ks.contiguous(),
-            self.cameras.sizes.reshape(-1).tolist(),
-            self.records,
-            self.radii,
-            [] if stats is None else [getattr(stats, field.name) for field in fields(stats)],
-            self.sh_degree,
-            self.settings.eps2d,
-            count_filled(self.samples),
-            len(self.samples),
-            self.overflow,
+        return launches.ScreenBackward(
+            scene=_scene(self.gaussians, self.cameras, self.sh_degree, self.settings),
+            records=self.records,
+            radii=self.radii,
+            stats=launches.NO_STATS if stats is None else stats,
+            num_filled=count_filled(self.samples),
+            num_slots=len(self.samples),
+            overflow=self.overflow,
         )
+
+
+def _scene(gaussians: Gaussians, cameras: Cameras, sh_degree: int, settings: RasterSettings) -> launches.Scene:
+    return launches.Scene(
+        gaussians=gaussians,
+        viewmats=cameras.viewmats.detach().contiguous(),
+        Ks=cameras.Ks.detach().contiguous(),
+        sizes=cameras.sizes.reshape(-1).tolist(),
+        sh_degree=sh_degree,
+        eps2d=settings.eps2d,
+    )
 
 
 def count_filled(samples: PixelSamples) -> Tensor | None:
@@ -175,7 +162,7 @@ def count_filled(samples: PixelSamples) -> Tensor | None:
     if not samples.has_empty_slots:
         return None
     count = torch.zeros(1, dtype=torch.int32, device=samples.pixel_ids.device)
-    torch.ops.turbogs.count_filled(samples.pixel_ids, count)
+    library.launch(launches.CountFilled(pixel_ids=samples.pixel_ids, num_filled=count))
     return count
 
 
@@ -192,8 +179,8 @@ class CudaRendered:
     colors: Tensor
     alphas: Tensor
     depths: Tensor | None
-    num_pairs: Tensor
-    """[1] int32 on the device: the (tile, splat) pairs of this pass."""
+    num_intersections: Tensor
+    """[1] int32 on the device: the intersections of tiles and splats of this pass."""
     _gaussians: Gaussians = field(repr=False)
     _cameras: Cameras = field(repr=False)
     _samples: PixelSamples = field(repr=False)
@@ -201,19 +188,19 @@ class CudaRendered:
     _settings: RasterSettings = field(repr=False)
     _buffers: _FreshBuffers | Workspace = field(repr=False)
     _radii: Tensor = field(repr=False)  # [K, N, 2]
-    _forward: ForwardArguments = field(repr=False)
+    _forward: launches.RasterForward = field(repr=False)
     _cleared: bool = field(repr=False)  # the projection has cleared the records on screen, for one backward pass
 
     @torch.no_grad()
     def projected(self) -> Projected:
         """The projection that this pass drew."""
-        splats = self._forward.instances.view(*self._radii.shape[:2], INSTANCE_FLOATS)
+        splats = self._forward.instances.view(*self._radii.shape[:2], InstanceRow.SIZE)
         splats = torch.where((self._radii > 0).any(dim=-1, keepdim=True), splats, 0.0)
         return Projected(
-            means2d=splats[..., :2],
-            conics=splats[..., 2:5],
-            depths=splats[..., 6],
-            opacities=splats[..., 5],
+            means2d=splats[..., InstanceRow.MEAN],
+            conics=splats[..., InstanceRow.CONIC],
+            depths=splats[..., InstanceRow.DEPTH],
+            opacities=splats[..., InstanceRow.OPACITY],
             radii=self._radii.clone(),
         )
 
@@ -248,16 +235,18 @@ class CudaRendered:
                 wanted = f"float32 {list(shape)} on {self.colors.device}"
                 raise InputError(f"{name} must be {wanted}, got {value.dtype} {list(value.shape)} on {value.device}")
             ready[name] = value.contiguous()
-        records = self._buffers.buffer("records", (len(self._forward.instances), RECORD_FLOATS), torch.float32)
-        torch.ops.turbogs.raster_backward(
-            *self._forward,
-            ready["color_gradients"],
-            ready.get("alpha_gradients"),
-            ready.get("depth_gradients"),
-            ready.get("pixel_errors"),
-            records,
-            with_statistics,
-            self._cleared,
+        records = self._buffers.buffer("records", (len(self._forward.instances), ScreenRecord.SIZE), torch.float32)
+        library.launch(
+            launches.RasterBackward(
+                forward=self._forward,
+                color_gradients=ready["color_gradients"],
+                alpha_gradients=ready.get("alpha_gradients"),
+                depth_gradients=ready.get("depth_gradients"),
+                pixel_errors=ready.get("pixel_errors"),
+                records=records,
+                with_density_sums=with_statistics,
+                cleared=self._cleared,
+            )
         )
         self._cleared = False
         return CudaScreenGradients(
@@ -266,7 +255,7 @@ class CudaRendered:
             samples=self._samples,
             sh_degree=self._sh_degree,
             settings=self._settings,
-            records=records.view(*self._radii.shape[:2], RECORD_FLOATS),
+            records=records.view(*self._radii.shape[:2], ScreenRecord.SIZE),
             radii=self._radii,
             with_statistics=with_statistics,
             overflow=self._buffers.overflow if isinstance(self._buffers, Workspace) else None,
@@ -290,7 +279,7 @@ def rasterize_cuda(
         workspace: memory to use again, and no waiting for the GPU; see `Workspace` for what the caller then owes.
 
     Raises:
-        InputError: no kernels here, a tensor of wrong dtype or device, or more pairs than a pass can have.
+        InputError: no kernels here, a tensor of wrong dtype or device, or more intersections than a pass can have.
     """
     library.require()
     degree = used_degree(gaussians, sh_degree)
@@ -310,104 +299,92 @@ def rasterize_cuda(
     # A pass over every tile needs no table of the active ones.
     everywhere = num_active == num_tiles
     tile_ids = None if everywhere else samples.tile_ids.contiguous()
-    active_prefix = None if everywhere else integers("active_prefix", num_tiles + 1)
-    packed_cameras = floats("cameras", views, CAMERA_FLOATS)
-    instances = floats("instances", total, INSTANCE_FLOATS)
-    radii = integers("radii", views, count, 2)
-    tile_cursors = integers("tile_cursors", num_active + 1)
+    splats = launches.Splats(
+        cameras=floats("cameras", views, CameraRow.SIZE),
+        instances=floats("instances", total, InstanceRow.SIZE),
+        radii=integers("radii", views, count, 2),
+        active_prefix=None if everywhere else integers("active_prefix", num_tiles + 1),
+    )
+    tiles = launches.TileLists(
+        tile_cursors=integers("tile_cursors", num_active + 1),
+        tile_starts=integers("tile_starts", num_active + 1),
+        status=workspace.status if workspace is not None else torch.zeros(2, dtype=torch.int32, device=device),
+        counters=integers("counters", 2),
+    )
     # With a workspace a backward pass is likely to follow.
-    records = floats("records", total, RECORD_FLOATS) if workspace is not None else None
-    torch.ops.turbogs.raster_project(
-        [value for _, value in gaussians.items()],
-        cameras.viewmats.detach().contiguous(),
-        cameras.Ks.detach().contiguous(),
-        samples.sizes.reshape(-1).tolist(),
-        degree,
-        settings.eps2d,
-        settings.near_plane,
-        settings.far_plane,
-        settings.alpha_min,
-        tile_ids,
-        packed_cameras,
-        active_prefix,
-        instances,
-        radii,
-        tile_cursors,
-        records,
+    records = floats("records", total, ScreenRecord.SIZE) if workspace is not None else None
+    library.launch(
+        launches.RasterProject(
+            scene=_scene(gaussians, cameras, degree, settings),
+            settings=settings,
+            splats=splats,
+            tile_ids=tile_ids,
+            tile_cursors=tiles.tile_cursors,
+            records=records,
+        )
     )
 
-    status = workspace.status if workspace is not None else torch.zeros(2, dtype=torch.int32, device=device)
     capacity = workspace.capacity(count, num_active) if workspace is not None else None
-    tile_starts, counters = integers("tile_starts", num_active + 1), integers("pair_counters", 2)
-    torch.ops.turbogs.raster_count_pairs(
-        tile_cursors,
-        tile_starts,
-        status,
-        counters,
-        integers("block_sums", max(1, math.ceil(num_active / SCAN_TILES)), 2, dtype=torch.int64),
-        COUNT_MAX if capacity is None else capacity,
+    blocks = max(1, math.ceil(num_active / SCAN_TILES))
+    library.launch(
+        launches.RasterCountIntersections(
+            tiles=tiles,
+            block_sums=integers("block_sums", blocks, 2, dtype=torch.int64),
+            capacity=INTERSECTIONS_MAX if capacity is None else capacity,
+        )
     )
     if capacity is None:
-        pairs = int(status[0])
-        require_possible(pairs)
-        capacity = round_capacity(pairs)
+        intersections = int(tiles.status[0])
+        require_possible(intersections)
+        capacity = round_capacity(intersections)
         if workspace is not None:
-            workspace.learn(pairs, num_active)
+            workspace.learn(intersections, num_active)
 
-    pair_ids = integers("pair_ids", capacity)
-    torch.ops.turbogs.raster_sort_pairs(
-        instances,
-        radii,
-        packed_cameras,
-        active_prefix,
-        tile_cursors,
-        tile_starts,
-        status,
-        integers("pair_keys", capacity, dtype=torch.int64),
-        pair_ids,
-        counters,
-        integers("runs", capacity // (RUN // 2), 2),
+    intersection_ids = integers("intersection_ids", capacity)
+    library.launch(
+        launches.RasterSortIntersections(
+            splats=splats,
+            tiles=tiles,
+            intersection_keys=integers("intersection_keys", capacity, dtype=torch.int64),
+            intersection_ids=intersection_ids,
+            runs=integers("runs", capacity // (SORT_RUN // 2), 2),
+        )
     )
     if workspace is not None:
         workspace.send_count(num_active)
 
     chunks = warps_per_tile(slots, num_active)
-    colors = torch.empty(slots, 3, device=device)
-    alphas = torch.empty(slots, device=device)
-    depths = torch.empty(slots, device=device) if with_depth else None
-    forward = ForwardArguments(
-        cameras=packed_cameras,
+    forward = launches.RasterForward(
+        cameras=splats.cameras,
         tile_ids=tile_ids,
         tile_offsets=samples.tile_offsets.contiguous(),
         pixel_ids=samples.pixel_ids.contiguous(),
-        tile_starts=tile_starts,
-        pair_ids=pair_ids,
-        instances=instances,
-        colors=colors,
-        alphas=alphas,
+        tile_starts=tiles.tile_starts,
+        intersection_ids=intersection_ids,
+        instances=splats.instances,
+        colors=torch.empty(slots, 3, device=device),
+        alphas=torch.empty(slots, device=device),
         transmittances=floats("transmittances", slots),
-        depths=depths,
-        last_pairs=integers("last_pairs", slots),
-        masks=integers("masks", (capacity // WARP + num_active + 1) * chunks),
+        depths=torch.empty(slots, device=device) if with_depth else None,
+        last_intersections=integers("last_intersections", slots),
+        masks=integers("masks", (capacity // BUCKET + num_active + 1) * chunks),
         bucket_counts=integers("bucket_counts", num_active * chunks),
         chunks=chunks,
-        alpha_min=settings.alpha_min,
-        alpha_max=settings.alpha_max,
-        transmittance_min=settings.transmittance_min,
+        settings=settings,
     )
-    torch.ops.turbogs.raster_forward(*forward)
+    library.launch(forward)
     return CudaRendered(
-        colors=colors,
-        alphas=alphas,
-        depths=depths,
-        num_pairs=status[:1],
+        colors=forward.colors,
+        alphas=forward.alphas,
+        depths=forward.depths,
+        num_intersections=tiles.status[:1],
         _gaussians=gaussians,
         _cameras=cameras,
         _samples=samples,
         _sh_degree=degree,
         _settings=settings,
         _buffers=buffers,
-        _radii=radii,
+        _radii=splats.radii,
         _forward=forward,
         _cleared=records is not None,
     )

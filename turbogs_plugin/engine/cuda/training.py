@@ -9,17 +9,18 @@ torch's current stream and not waited for. Tensors must be contiguous; one of an
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import astuple, dataclass, fields
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from turbogs_plugin.engine.cuda import library
+from turbogs_plugin.engine.cuda import launches, library
 from turbogs_plugin.engine.cuda.raster import CudaScreenGradients, count_filled, require_views
+from turbogs_plugin.engine.layout import STRUCTURES, UNITS, UPDATE_KINDS
 from turbogs_plugin.engine.moments import GaussianMoments
-from turbogs_plugin.engine.rules import STRUCTURES, UNITS, DrawRule, LossTerms, UpdateRule
+from turbogs_plugin.engine.rules import DrawRule, LossTerms, UpdateRule
 from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.tiles import CELL_SIDE, TILE_CELLS, TILE_PIXELS
 from turbogs_plugin.types import TILE_SIZE, Gaussians, GaussianStats, LossOutput, PixelSamples, Step, TileGrid
@@ -50,22 +51,34 @@ def sample_pixels(
         of_tile = rule.wanted(rate, TILE_PIXELS if rule.unit == "pixel" else TILE_CELLS)
         plan = _plan_within_tiles(sizes.tobytes(), of_tile, rule)
     device = errors.device
-    pixel_ids = torch.empty(plan.slots, dtype=torch.int32, device=device)
-    tile_ids = torch.empty(plan.chosen, dtype=torch.int32, device=device)
-    tile_offsets = torch.empty(plan.chosen + 1, dtype=torch.int32, device=device)
-    weights = torch.empty(plan.slots, device=device) if rule.importance else None
-    scratch = []
+    scratch = launches.NO_SCRATCH
     if rule.unit == "tile":
         dtypes = (torch.float64, torch.int32, torch.int64, torch.float32)
-        scratch = [torch.empty(plan.tiles, dtype=dtype, device=device) for dtype in dtypes]
-    torch.ops.turbogs.sample_pixels(
-        errors, stamps, _view_table(starts, sizes, view_ids, plan.bases, plan.wanted), UNITS.index(rule.unit),
-        plan.stages, plan.slots_per_tile, rule.mixed_uniform, rule.importance, seed, iteration, now,
-        pixel_ids, tile_ids, tile_offsets, weights, scratch,
-    )  # fmt: skip
+        scratch = launches.TileScratch(*(torch.empty(plan.tiles, dtype=dtype, device=device) for dtype in dtypes))
+    draw = launches.SamplePixels(
+        errors=errors,
+        stamps=stamps,
+        views=view_rows(starts, sizes, view_ids, plan.draws),
+        unit=UNITS.index(rule.unit),
+        slots_per_tile=plan.slots_per_tile,
+        mixed_uniform=rule.mixed_uniform,
+        importance=rule.importance,
+        seed=seed,
+        iteration=iteration,
+        now=now,
+        pixel_ids=torch.empty(plan.slots, dtype=torch.int32, device=device),
+        tile_ids=torch.empty(plan.chosen, dtype=torch.int32, device=device),
+        tile_offsets=torch.empty(plan.chosen + 1, dtype=torch.int32, device=device),
+        weights=torch.empty(plan.slots, device=device) if rule.importance else None,
+        scratch=scratch,
+    )
+    library.launch(draw)
+    weights = draw.weights
     if weights is not None:
-        weights = weights * ((pixel_ids >= 0).sum() / weights.sum())
-    return PixelSamples(tuple(view_ids), sizes, pixel_ids, tile_ids, tile_offsets, weights, rule.unit != "pixel")
+        weights = weights * ((draw.pixel_ids >= 0).sum() / weights.sum())
+    return PixelSamples(
+        tuple(view_ids), sizes, draw.pixel_ids, draw.tile_ids, draw.tile_offsets, weights, rule.unit != "pixel"
+    )
 
 
 @dataclass(frozen=True)
@@ -74,18 +87,14 @@ class _DrawPlan:
 
     Args:
         tiles: of all views; chosen: of them, those that hold samples; slots: of all these.
-        bases: [K] the first slot of each view, or for unit = tile its first chosen tile.
-        wanted: [K] for unit = tile the tiles to choose, else 0.
-        stages: units of the three stages; for unit = tile of each view, end to end.
+        draws: [K] what `layout.DrawRow` has beyond `layout.ViewRow`.
         slots_per_tile: of a tile that is not cut; 0 for unit = tile.
     """
 
     tiles: int
     chosen: int
     slots: int
-    bases: list[int]
-    wanted: list[int]
-    stages: list[int]
+    draws: list[tuple[int, ...]]
     slots_per_tile: int
 
 
@@ -96,17 +105,17 @@ def _plan_within_tiles(sizes_bytes: bytes, wanted: int, rule: DrawRule) -> _Draw
     shapes = TileGrid(sizes).shapes
     tiles, slots_per_tile = int(shapes.prod(axis=1).sum()), wanted * (1 if rule.unit == "pixel" else CELL_SIDE**2)
     ends = np.cumsum(_view_slots(sizes, shapes, slots_per_tile, rule.unit)).tolist()
-    bases, unused = [0, *ends[:-1]], [0] * len(sizes)
-    return _DrawPlan(tiles, tiles, ends[-1], bases, unused, list(rule.stages(wanted)), slots_per_tile)
+    draws = [(first, 0, *rule.stages(wanted)) for first in [0, *ends[:-1]]]
+    return _DrawPlan(tiles, tiles, ends[-1], draws, slots_per_tile)
 
 
 def _plan_of_tiles(sizes: np.ndarray, rate: float, rule: DrawRule) -> _DrawPlan:
     """Whole tiles as units."""
     tiles = TileGrid(sizes).shapes.prod(axis=1).tolist()  # [K]
     wanted = [rule.wanted(rate, count) for count in tiles]
-    stages = [number for count in wanted for number in rule.stages(count)]
     ends = np.cumsum(wanted).tolist()
-    return _DrawPlan(sum(tiles), ends[-1], ends[-1] * TILE_PIXELS, [0, *ends[:-1]], wanted, stages, 0)
+    draws = [(first, count, *rule.stages(count)) for first, count in zip([0, *ends[:-1]], wanted, strict=True)]
+    return _DrawPlan(sum(tiles), ends[-1], ends[-1] * TILE_PIXELS, draws, 0)
 
 
 def _view_slots(sizes: np.ndarray, shapes: np.ndarray, slots_per_tile: int, unit: str) -> np.ndarray:
@@ -124,13 +133,13 @@ def _view_slots(sizes: np.ndarray, shapes: np.ndarray, slots_per_tile: int, unit
     return whole_rows + columns * slots(full, height) + slots(width, height)
 
 
-def _view_table(
-    starts: np.ndarray, sizes: np.ndarray, view_ids: Sequence[int], bases: Sequence[int], wanted: Sequence[int]
+def view_rows(
+    starts: np.ndarray, sizes: np.ndarray, view_ids: Sequence[int], draws: Sequence[tuple[int, ...]] | None = None
 ) -> list[int]:
-    """Six numbers for each view, as csrc/training_bindings.cpp reads them."""
+    """A `layout.ViewRow` of each view, or with `draws` a `layout.DrawRow`, end to end."""
     require_views(len(view_ids))
-    columns = zip(starts.tolist(), sizes.tolist(), view_ids, bases, wanted, strict=True)
-    return [number for start, size, *others in columns for number in (start, *size, *others)]
+    columns = zip(starts.tolist(), sizes.tolist(), view_ids, draws or [()] * len(view_ids), strict=True)
+    return [number for start, size, view_id, draw in columns for number in (start, *size, view_id, *draw)]
 
 
 @dataclass
@@ -179,28 +188,36 @@ def sparse_loss(
     colors = colors.detach().float().contiguous()
     device, slots = colors.device, len(samples)
     photos = targets if targets.dtype == torch.uint8 else None
-    maps, beta, stamp = [], 0.0, 0
+    maps, beta, stamp, overflow = launches.NO_MAPS, 0.0, 0, None
     if update is not None:
-        update.maps._rebase(update.step.iteration)
-        maps = [update.maps.errors, update.maps.stamps, update.maps.view_sums]
-        beta, stamp = update.maps.beta, update.step.iteration - update.maps.stamp_base
-        starts = update.maps.offsets[list(samples.view_ids)]
+        maps, overflow = update.maps, update.overflow
+        maps._rebase(update.step.iteration)
+        beta, stamp = maps.beta, update.step.iteration - maps.stamp_base
+        starts = maps.offsets[list(samples.view_ids)]
     if starts is None:
         if photos is not None:
             raise ValueError("photos are gathered from the first flat pixel of each view: give `starts`")
         starts = np.zeros(len(samples.view_ids), dtype=np.int64)
-    unused = [0] * len(starts)
-    loss = torch.zeros((), dtype=torch.float64, device=device)
-    color_gradients, pixel_errors = torch.empty_like(colors), torch.empty(slots, device=device)
-    torch.ops.turbogs.sparse_loss(
-        colors, None if photos is not None else targets.detach().float().contiguous(), photos,
-        samples.pixel_ids, samples.tile_ids, samples.tile_offsets, samples.weights,
-        _view_table(starts, samples.sizes, samples.view_ids, unused, unused), STRUCTURES.index(terms.structure),
-        terms.epsilon, terms.l1_weight, terms.structure_weight, terms.variance_constant, terms.balance, terms.gate,
-        maps, beta, stamp, count_filled(samples), loss, color_gradients, pixel_errors, None, nonfinite_losses,
-        None if update is None else update.overflow,
-    )  # fmt: skip
-    return LossOutput(loss, color_gradients, pixel_errors)
+    loss = launches.SparseLoss(
+        colors=colors,
+        targets=None if photos is not None else targets.detach().float().contiguous(),
+        photos=photos,
+        samples=samples,
+        views=view_rows(starts, samples.sizes, samples.view_ids),
+        structure=STRUCTURES.index(terms.structure),
+        terms=terms,
+        maps=maps,
+        beta=beta,
+        stamp=stamp,
+        num_filled=count_filled(samples),
+        loss=torch.zeros((), dtype=torch.float64, device=device),
+        color_gradients=torch.empty_like(colors),
+        pixel_errors=torch.empty(slots, device=device),
+        nonfinite_losses=nonfinite_losses,
+        overflow=overflow,
+    )
+    library.launch(loss)
+    return LossOutput(loss.loss, loss.color_gradients, loss.pixel_errors)
 
 
 def fused_step(
@@ -221,12 +238,21 @@ def fused_step(
     library.require()
     if any(value.data_ptr() != getattr(screen.gaussians, name).data_ptr() for name, value in gaussians.items()):
         raise ValueError("fused_step: these are not the Gaussians that the gradients were made of")
-    kind, curvature, max_step, rows_per_view = 0, 0.0, 0.0, False
+    kind, curvature, max_step, rows_per_view = "adam", 0.0, 0.0, False
     if rule.lm is not None:
-        kind = 1 if rule.lm.units == "balanced" else 2
+        kind = f"{rule.lm.units}_lm"
         curvature, max_step, rows_per_view = rule.lm.curvature, rule.lm.max_step, rule.lm.rows == "views"
-    state = [getattr(moments, field.name) for field in fields(moments)]
-    torch.ops.turbogs.fused_step(
-        *screen.operator_arguments(stats), state, kind, rows_per_view, list(astuple(rule.rates)), rule.beta1,
-        rule.beta2, rule.eps, curvature, max_step,
-    )  # fmt: skip
+    library.launch(
+        launches.FusedStep(
+            screen=screen.backward_arguments(stats),
+            moments=moments,
+            kind=UPDATE_KINDS.index(kind),
+            rows_per_view=rows_per_view,
+            rates=rule.rates,
+            beta1=rule.beta1,
+            beta2=rule.beta2,
+            eps=rule.eps,
+            curvature=curvature,
+            max_step=max_step,
+        )
+    )

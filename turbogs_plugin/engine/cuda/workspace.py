@@ -1,9 +1,9 @@
 """Memory of the CUDA rasterizer from one pass to the next, and how it does without waiting for the GPU.
 
-The number of (tile, splat) pairs of a pass is known on the GPU only. A `Workspace` gives every pass room for as many
-pairs as earlier passes lead to expect. Each pass sends its true count to the host without waiting, and later passes
-look whether it has come. Where a count exceeds its room, the kernels raise a flag on the device: that pass and all that
-follow it draw nothing and change nothing, until the host learns of it, makes room and lowers the flag
+The number of intersections of tiles and splats of a pass is known on the GPU only. A `Workspace` gives every pass room
+for as many as earlier passes lead to expect. Each pass sends its true count to the host without waiting, and later
+passes look whether it has come. Where a count exceeds its room, the kernels raise a flag on the device: that pass and
+all that follow it draw nothing and change nothing, until the host learns of it, makes room and lowers the flag
 (`Workspace.take_lost`). So a splat is never dropped silently. Whoever lost passes does them again; in training that is
 `Trainer.repeat_lost`, which leaves out those before a change of the set of Gaussians.
 """
@@ -17,13 +17,14 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from turbogs_plugin.engine.layout import INTERSECTIONS_MAX
 from turbogs_plugin.errors import InputError
 
 GROWTH = 1.25
 """A buffer that must grow gets this much more than was asked for."""
 
 MARGIN, EARLY_MARGIN, EARLY_PASSES = 1.15, 1.5, 32
-"""Room for pairs over the largest number expected; the margin of the first passes, which know few views."""
+"""Room for intersections over the largest number expected; the margin of the first passes, which know few views."""
 
 FORGETTING = 0.998
 """What a pass leaves of the largest count per tile, so that a rare peak does not cost sorting for ever."""
@@ -31,29 +32,28 @@ FORGETTING = 0.998
 CAPACITY_STEP = 1 << 14
 """Capacities are multiples of this, so that sizes of scratch memory can be remembered."""
 
-COUNT_MAX = (1 << 31) - 1
-"""The count of pairs stays here where it would be more."""
-
-MAX_PAIRS = COUNT_MAX // CAPACITY_STEP * CAPACITY_STEP
-"""The largest capacity. A count of `COUNT_MAX` is beyond it and therefore raises the flag."""
+MAX_CAPACITY = INTERSECTIONS_MAX // CAPACITY_STEP * CAPACITY_STEP
+"""The largest capacity. A count of `INTERSECTIONS_MAX` is beyond it and therefore raises the flag."""
 
 PENDING_MAX = 8
 """Counts under way; one more waits for the oldest."""
 
 
-def round_capacity(pairs: float) -> int:
-    """The capacity for this many pairs."""
-    return CAPACITY_STEP * max(1, math.ceil(pairs / CAPACITY_STEP))
+def round_capacity(intersections: float) -> int:
+    """The capacity for this many intersections."""
+    return CAPACITY_STEP * max(1, math.ceil(intersections / CAPACITY_STEP))
 
 
-def require_possible(pairs: int) -> None:
-    """Refuse a pass of more pairs than one can have.
+def require_possible(intersections: int) -> None:
+    """Refuse a pass of more intersections than one can have.
 
     Raises:
         InputError: no memory would be room enough.
     """
-    if pairs > MAX_PAIRS:
-        raise InputError(f"a pass takes at most {MAX_PAIRS} pairs of a tile and a splat: take fewer views or tiles")
+    if intersections > MAX_CAPACITY:
+        raise InputError(
+            f"a pass takes at most {MAX_CAPACITY} intersections of tiles and splats: take fewer views or tiles"
+        )
 
 
 @dataclass
@@ -63,7 +63,7 @@ class _Pending:
     number: int
     tiles: int
     event: torch.cuda.Event
-    values: Tensor  # [2] int32, pinned: pairs, overflow flag
+    values: Tensor  # [2] int32, pinned: intersections, overflow flag
 
 
 class Workspace:
@@ -73,7 +73,7 @@ class Workspace:
         device: a CUDA device.
 
     Attributes:
-        status: [2] int32 on the device: pairs of the latest pass; the overflow flag.
+        status: [2] int32 on the device: intersections of the latest pass; the overflow flag.
         passes: passes begun.
     """
 
@@ -85,7 +85,7 @@ class Workspace:
         self._pinned = torch.zeros(PENDING_MAX, 2, dtype=torch.int32).pin_memory()
         self._pending: deque[_Pending] = deque()
         self._gaussians = 0
-        self._pairs_per_tile = 0.0
+        self._intersections_per_tile = 0.0
         self._first_lost: int | None = None
 
     @property
@@ -112,7 +112,7 @@ class Workspace:
         return sum(held.numel() * held.element_size() for held in self._buffers.values())
 
     def capacity(self, gaussians: int, tiles: int) -> int | None:
-        """Room for the pairs of a pass, or None where nothing is known yet.
+        """Room for the intersections of a pass, or None where nothing is known yet.
 
         Raises:
             RuntimeError: an overflow is known and `take_lost` has not been called.
@@ -120,21 +120,21 @@ class Workspace:
         if self.overflowed:
             raise RuntimeError("passes were lost to an overflow: call Workspace.take_lost() and repeat them")
         if gaussians != self._gaussians:
-            self._pairs_per_tile *= gaussians / self._gaussians if self._gaussians else 0.0
+            self._intersections_per_tile *= gaussians / self._gaussians if self._gaussians else 0.0
             self._gaussians = gaussians
-        if self._pairs_per_tile == 0.0:
+        if self._intersections_per_tile == 0.0:
             return None
         margin = EARLY_MARGIN if self.passes < EARLY_PASSES else MARGIN
-        return min(round_capacity(margin * self._pairs_per_tile * tiles), MAX_PAIRS)
+        return min(round_capacity(margin * self._intersections_per_tile * tiles), MAX_CAPACITY)
 
-    def learn(self, pairs: int, tiles: int) -> None:
+    def learn(self, intersections: int, tiles: int) -> None:
         """Take in the true count of a pass.
 
         Raises:
             InputError: a pass cannot have that many.
         """
-        require_possible(pairs)
-        self._pairs_per_tile = max(self._pairs_per_tile * FORGETTING, pairs / max(1, tiles))
+        require_possible(intersections)
+        self._intersections_per_tile = max(self._intersections_per_tile * FORGETTING, intersections / max(1, tiles))
 
     def send_count(self, tiles: int) -> None:
         """Send the count of the pass just enqueued to the host, without waiting."""
@@ -152,14 +152,14 @@ class Workspace:
         """Take in the counts that have arrived.
 
         Raises:
-            InputError: a pass had more pairs than one can have; it drew nothing.
+            InputError: a pass had more intersections than one can have; it drew nothing.
         """
         while self._pending and self._pending[0].event.query():
             arrived = self._pending.popleft()
-            pairs, flag = arrived.values.tolist()
+            intersections, flag = arrived.values.tolist()
             if flag and self._first_lost is None:
                 self._first_lost = arrived.number
-            self.learn(pairs, arrived.tiles)
+            self.learn(intersections, arrived.tiles)
 
     def take_lost(self, wait: bool = False) -> int:
         """Number of passes at the end that did nothing and must be done again; makes room for them and lowers the flag.
@@ -168,7 +168,7 @@ class Workspace:
             wait: for every count under way, as at the end of training; else only what has arrived is looked at.
 
         Raises:
-            InputError: a pass had more pairs than one can have: repeating it is no use.
+            InputError: a pass had more intersections than one can have: repeating it is no use.
         """
         if wait and self._pending:
             self._pending[-1].event.synchronize()

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import threshold_
 
+from turbogs_plugin.engine.layout import ScreenRecord
 from turbogs_plugin.engine.reference.intersection import TilePairs
 from turbogs_plugin.engine.rendered import RasterSettings
 from turbogs_plugin.types import PixelSamples
@@ -26,13 +27,6 @@ SLICE_SPLATS = 128
 
 ALPHA_TINY = 1e-10
 """Smallest alpha by which a depth is divided, as in gsplat."""
-
-RECORD_WIDTH = 16
-MEAN, CONIC, COLOR, OPACITY, ABSOLUTE, ERROR_SUM, DISTANCE_SUM, WEIGHT_SUM, DEPTH = (
-    slice(0, 2), slice(2, 5), slice(5, 8), 8, slice(9, 11), 11, 12, 13, 14,
-)  # fmt: skip
-"""Columns of a screen-gradient record: the gradients of the projected mean, conic (a, b, c), colour and opacity, the
-sums of the absolute gradients of the mean at each pixel, sum of e * w, D * w and w, and the gradient of the depth."""
 
 
 @dataclass
@@ -210,7 +204,7 @@ def composite_backward(
         pixel_errors: [P] or None for zeros.
 
     Returns:
-        [R, RECORD_WIDTH], see `MEAN` and its like.
+        [R, 16], see `layout.ScreenRecord`.
     """
     samples, settings, pairs = compositor.samples, compositor.settings, compositor.pairs
     filled = samples.filled[:, None]
@@ -222,7 +216,7 @@ def composite_backward(
     upstream = torch.cat([upstream, upstream.new_zeros(1, 7)])
     totals = torch.cat([(upstream[:-1, :5] * sums).sum(dim=1, keepdim=True), sums.new_zeros(1, 1)])
     centers = compositor.pixel_centers(table.dtype)
-    records = table.new_zeros(len(pairs.rows), RECORD_WIDTH)
+    records = table.new_zeros(len(pairs.rows), ScreenRecord.SIZE)
     for block in compositor.blocks():
         block_centers, block_upstream = centers[block.samples], upstream[block.samples]  # [B, S, 2], [B, S, 7]
         behind = totals[block.samples]  # [B, S, 1] what the splats to come will contribute
@@ -238,7 +232,7 @@ def composite_backward(
 
 
 def _slice_backward(piece: Slice, upstream: Tensor, behind: Tensor) -> tuple[Tensor, Tensor]:
-    """Records [B, G, RECORD_WIDTH] of a slice, and `behind` after it."""
+    """Records [B, G, 16] of a slice, and `behind` after it."""
     contribution = torch.bmm(upstream[:, :, :5], piece.features).mul_(piece.weights)  # [B, S, G]
     seen = contribution.cumsum(dim=-1)
     after = behind - seen[:, :, -1:]
@@ -248,21 +242,23 @@ def _slice_backward(piece: Slice, upstream: Tensor, behind: Tensor) -> tuple[Ten
         slope.masked_fill_(piece.clamped, 0)
     a, b, c = piece.conics
     slope_x, slope_y = slope * piece.dx, slope * piece.dy
-    record = slope.new_zeros(RECORD_WIDTH, slope.shape[0], slope.shape[2])
+    record = slope.new_zeros(ScreenRecord.SIZE, slope.shape[0], slope.shape[2])
     first = (slope_x.sum(dim=1), slope_y.sum(dim=1))
-    record[0] = a[:, 0] * first[0] + b[:, 0] * first[1]
-    record[1] = b[:, 0] * first[0] + c[:, 0] * first[1]
-    record[ABSOLUTE.start] = (a * slope_x).addcmul_(b.expand_as(slope_x), slope_y).abs_().sum(dim=1)
-    record[ABSOLUTE.start + 1] = (b * slope_x).addcmul_(c.expand_as(slope_x), slope_y).abs_().sum(dim=1)
-    record[CONIC.start + 1] = (slope_x * piece.dy).sum(dim=1)
-    record[CONIC.start] = 0.5 * slope_x.mul_(piece.dx).sum(dim=1)
-    record[CONIC.start + 2] = 0.5 * slope_y.mul_(piece.dy).sum(dim=1)
+    record[ScreenRecord.MEAN.start] = a[:, 0] * first[0] + b[:, 0] * first[1]
+    record[ScreenRecord.MEAN.start + 1] = b[:, 0] * first[0] + c[:, 0] * first[1]
+    record[ScreenRecord.ABSOLUTE.start] = (a * slope_x).addcmul_(b.expand_as(slope_x), slope_y).abs_().sum(dim=1)
+    record[ScreenRecord.ABSOLUTE.start + 1] = (b * slope_x).addcmul_(c.expand_as(slope_x), slope_y).abs_().sum(dim=1)
+    record[ScreenRecord.CONIC.start + 1] = (slope_x * piece.dy).sum(dim=1)
+    record[ScreenRecord.CONIC.start] = 0.5 * slope_x.mul_(piece.dx).sum(dim=1)
+    record[ScreenRecord.CONIC.start + 2] = 0.5 * slope_y.mul_(piece.dy).sum(dim=1)
     opacities = piece.opacities[:, 0]
-    record[OPACITY] = torch.where(opacities > 0, -slope.sum(dim=1) / opacities, 0.0)
+    record[ScreenRecord.OPACITY] = torch.where(opacities > 0, -slope.sum(dim=1) / opacities, 0.0)
     weighted = torch.bmm(upstream.transpose(1, 2), piece.weights)  # [B, 7, G]
-    record[COLOR] = weighted[:, :3].transpose(0, 1)
-    record[DEPTH], record[ERROR_SUM], record[WEIGHT_SUM] = weighted[:, 4], weighted[:, 5], weighted[:, 6]
+    record[ScreenRecord.COLOR] = weighted[:, :3].transpose(0, 1)
+    record[ScreenRecord.DEPTH] = weighted[:, 4]
+    record[ScreenRecord.ERROR_SUM] = weighted[:, 5]
+    record[ScreenRecord.WEIGHT_SUM] = weighted[:, 6]
     # In place: the exponents are not needed after this.
     distances = piece.sigma.mul_(2).sqrt_().mul_(piece.weights)
-    record[DISTANCE_SUM] = torch.bmm(upstream[:, :, 6:].transpose(1, 2), distances)[:, 0]
+    record[ScreenRecord.DISTANCE_SUM] = torch.bmm(upstream[:, :, 6:].transpose(1, 2), distances)[:, 0]
     return record.permute(1, 2, 0), after

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
+from turbogs_plugin.engine.layout import ScreenRecord
 from turbogs_plugin.engine.reference import compositing
 from turbogs_plugin.engine.reference.compositing import ALPHA_TINY, Compositor
 from turbogs_plugin.engine.reference.intersection import intersect_tiles
@@ -32,7 +33,7 @@ class ReferenceScreenGradients:
         rows: which (view, Gaussian) each row is.
         splats: their projection, connected to `leaves` by autograd.
         leaves: the parameters' rows, in the order of `ROW_PARAMETERS`, and `shN`.
-        records: [R, RECORD_WIDTH], see `compositing`.
+        records: [R, 16], see `layout.ScreenRecord`.
         samples: of the pass.
         with_statistics: whether the pass was asked for them.
     """
@@ -45,7 +46,7 @@ class ReferenceScreenGradients:
     with_statistics: bool = False
 
     def full_records(self) -> Tensor:
-        """[K, N, RECORD_WIDTH], zero where a Gaussian is not drawn."""
+        """[K, N, 16], zero where a Gaussian is not drawn."""
         return self.rows.scatter(self.records)
 
     def parameter_gradients(self, rows: bool, stats: GaussianStats | None = None) -> GaussianGradients:
@@ -53,16 +54,16 @@ class ReferenceScreenGradients:
         require_statistics(self.with_statistics, stats)
         records, splats = self.records, self.splats
         outputs = (splats.means2d, splats.conics, splats.colors, splats.opacities, splats.depths)
-        columns = (compositing.MEAN, compositing.CONIC, compositing.COLOR, compositing.OPACITY, compositing.DEPTH)
+        columns = (ScreenRecord.MEAN, ScreenRecord.CONIC, ScreenRecord.COLOR, ScreenRecord.OPACITY, ScreenRecord.DEPTH)
         upstream = [records[:, column] for column in columns]
         gradients = torch.autograd.grad(outputs, self.leaves, upstream, allow_unused=True, materialize_grads=True)
         place = self.rows.scatter if rows else self._sum_over_views
         named = {name: place(value) for name, value in zip(ROW_PARAMETERS, gradients, strict=False)}
         weights = records.new_zeros(self.rows.shape[1]).index_add(
-            0, self.rows.gaussians, records[:, compositing.WEIGHT_SUM]
+            0, self.rows.gaussians, records[:, ScreenRecord.WEIGHT_SUM]
         )
         filled = self.samples.filled.sum().clamp(min=1)
-        losses = place(records[:, compositing.ERROR_SUM] / filled)
+        losses = place(records[:, ScreenRecord.ERROR_SUM] / filled)
         if stats is not None:
             self._add_statistics(stats)
         return GaussianGradients(**named, shN=gradients[-1], touched=weights > 0, view_losses=losses)
@@ -78,11 +79,11 @@ class ReferenceScreenGradients:
         half = 0.5 * len(sizes) * sizes[views]  # [R, 2] from pixels to gsplat's units
         on_screen = (self.splats.radii > 0).any(dim=-1)
         sums = {
-            "error_sums": records[:, compositing.ERROR_SUM],
-            "distance_sums": records[:, compositing.DISTANCE_SUM],
-            "weight_sums": records[:, compositing.WEIGHT_SUM],
-            "grad_sums": (records[:, compositing.MEAN] * half).norm(dim=-1),
-            "absgrad_sums": (records[:, compositing.ABSOLUTE] * half).norm(dim=-1),
+            "error_sums": records[:, ScreenRecord.ERROR_SUM],
+            "distance_sums": records[:, ScreenRecord.DISTANCE_SUM],
+            "weight_sums": records[:, ScreenRecord.WEIGHT_SUM],
+            "grad_sums": (records[:, ScreenRecord.MEAN] * half).norm(dim=-1),
+            "absgrad_sums": (records[:, ScreenRecord.ABSOLUTE] * half).norm(dim=-1),
             "view_counts": on_screen,
         }
         for name, values in sums.items():

@@ -12,12 +12,14 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from turbogs_plugin.engine.layout import ParameterRow
 from turbogs_plugin.engine.moments import COLUMNS, GaussianMoments
 from turbogs_plugin.engine.reference.lm_solvers import solve_low_rank
 from turbogs_plugin.engine.rules import ParameterRates, UpdateRule
 from turbogs_plugin.types import GaussianGradients, Gaussians
 
-GEOMETRY, APPEARANCE = slice(0, 10), slice(10, 14)
+GEOMETRY = slice(ParameterRow.MEANS.start, ParameterRow.QUATS.stop)
+APPEARANCE = slice(ParameterRow.SH0.start, ParameterRow.OPACITIES.stop)
 """The two blocks of a packed row that moment-damped LM solves."""
 
 GRADIENT_LIMIT = 1e17

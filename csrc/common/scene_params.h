@@ -1,0 +1,29 @@
+// What the projection and its backward pass read alike: the Gaussians, and the views of a batch. The parameters of both
+// begin with it, and one function of the bindings fills it (bindings/scene.h).
+#pragma once
+
+#include "common/sizes.h"
+
+namespace turbogs {
+
+struct SceneParams {
+    int num_views;      // K
+    int num_gaussians;  // N
+    int sh_degree;      // degree to evaluate
+    int bands;          // B, harmonics above band 0 that `shN` stores; B >= (sh_degree + 1)^2 - 1
+    float eps2d;        // added to the diagonal of the screen covariance
+
+    const float* means;      // [N, 3]
+    const float* quats;      // [N, 4], not normalised
+    const float* scales;     // [N, 3], logarithms
+    const float* opacities;  // [N], logits
+    const float* sh0;        // [N, 3]
+    const float* shN;        // [N, B, 3]
+
+    const float* viewmats;    // [K, 4, 4]
+    const float* intrinsics;  // [K, 3, 3]
+    int widths[kMaxViews];
+    int heights[kMaxViews];
+};
+
+}  // namespace turbogs

@@ -1,0 +1,99 @@
+"""Makes the C++ headers of what Python and the kernels share. setup.py calls it; nothing that it writes is committed.
+
+- ``layout.h``: the sizes and layouts of turbogs_plugin/engine/layout.py.
+- ``launches.h``: the fields of each launch, from turbogs_plugin/engine/cuda/launches.py, in the order in which Python
+  sends them.
+"""
+
+from __future__ import annotations
+
+import ast
+import importlib.util
+import sys
+from pathlib import Path
+from types import ModuleType
+
+ROOT = Path(__file__).resolve().parent.parent
+LAYOUT = ROOT / "turbogs_plugin/engine/layout.py"
+LAUNCHES = ROOT / "turbogs_plugin/engine/cuda/launches.py"
+CONSTANTS = {ROOT / "turbogs_plugin/types.py": ("TILE_SIZE",), ROOT / "turbogs_plugin/tiles.py": ("CELL_SIDE",)}
+"""Further numbers, of files that import torch: they are read, not run."""
+
+ENUMERATIONS = {"UNITS": "SampleUnit", "STRUCTURES": "Structure", "UPDATE_KINDS": "UpdateKind"}
+"""Their names in C++."""
+
+
+def load(path: Path) -> ModuleType:
+    """A module of one file, without the package around it, which would import torch."""
+    spec = importlib.util.spec_from_file_location(f"turbogs_build_{path.stem}", path)
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+def constants() -> dict[str, int]:
+    """The numbers of `CONSTANTS`."""
+    found = {}
+    for path, names in CONSTANTS.items():
+        for node in ast.parse(path.read_text()).body:
+            if isinstance(node, ast.Assign) and getattr(node.targets[0], "id", None) in names:
+                found[node.targets[0].id] = ast.literal_eval(node.value)
+    return found
+
+
+def camel_case(name: str) -> str:
+    return "".join(part.capitalize() for part in name.split("_"))
+
+
+def layout_header(layout: ModuleType) -> str:
+    """Numbers, enumerations, and a struct of the first columns of each row."""
+    lines = [f"constexpr int k{camel_case(name)} = {value};" for name, value in constants().items()]
+    for name, value in vars(layout).items():
+        if isinstance(value, int):
+            lines.append(f"constexpr int k{camel_case(name)} = {value};")
+        elif name in ENUMERATIONS:
+            entries = ", ".join(f"k{camel_case(entry)}" for entry in value)
+            lines.append(f"enum class {ENUMERATIONS[name]} : int {{ {entries} }};")
+            lines.append(f"constexpr int kNum{ENUMERATIONS[name]}s = {len(value)};")
+        elif isinstance(value, type):
+            places = {column: place.start for column, place in layout.columns(value).items()}
+            lines.append(f"struct {name} {{")
+            for column, place in {**places, "size": value.SIZE}.items():
+                lines.append(f"    static constexpr int k{camel_case(column)} = {place};")
+            lines.append("};")
+    return _header(LAYOUT, lines)
+
+
+def launches_header(layout: ModuleType, launches: ModuleType) -> str:
+    """A struct of each launch, whose enumerations are the places of its fields in the lists that Python sends."""
+    lines = []
+    for cls in launches.LAUNCHES:
+        lines += [f"struct {cls.__name__} {{", f'    static constexpr const char* kName = "{cls.operator}";']
+        for kind, paths in zip(("Tensors", "Integers", "Reals"), cls.paths, strict=False):
+            names = [path.split(".")[-1] for path in paths]
+            lines.append(f"    enum class {kind} {{ {', '.join(names)} }};".replace("{  }", "{}"))
+            lines.append(f"    static constexpr size_t kNum{kind} = {len(names)};")
+            if kind == "Tensors":
+                quoted = ", ".join(f'"{name}"' for name in names)
+                lines.append(f"    static constexpr const char* kTensorNames[] = {{{quoted}}};")
+        lines.append("};")
+    lines += ["", f'constexpr const char* kInterface = R"interface({launches.interface(layout)})interface";']
+    return _header(LAUNCHES, ["namespace launches {", "", *lines, "", "}  // namespace launches"])
+
+
+def _header(source: Path, lines: list[str]) -> str:
+    made = f"// Made by csrc/generate_headers.py of {source.relative_to(ROOT)}."
+    start = [made, "#pragma once", "", "#include <cstddef>", "", "namespace turbogs {", ""]
+    return "\n".join([*start, *lines, "", "}  // namespace turbogs", ""])
+
+
+def write(folder: Path) -> None:
+    """Write the headers; one that is as it should be is left alone, so that nothing is compiled again."""
+    layout, launches = load(LAYOUT), load(LAUNCHES)
+    texts = {"layout.h": layout_header(layout), "launches.h": launches_header(layout, launches)}
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, text in texts.items():
+        path = folder / name
+        if not path.is_file() or path.read_text() != text:
+            path.write_text(text)

@@ -1,0 +1,64 @@
+// Parameters of the kernels of the loss. No torch here. Index spaces as in turbogs_plugin/types.py: K views of the
+// batch, P sample slots, T tiles with samples, X flat pixels of all V training views.
+#pragma once
+
+#include <cuda_runtime.h>
+
+#include <cstdint>
+
+#include "common/sample_view.h"
+#include "common/sizes.h"
+
+namespace turbogs {
+
+// Loss on the samples with its gradient, and where maps are given their update;
+// turbogs_plugin/engine/reference/losses.py and turbogs_plugin/error_maps.py define both. A sample whose colour is
+// not finite counts as an empty slot: no gradient, no error, no visit.
+struct SparseLossParams {
+    int num_views;  // K
+    int num_tiles;  // T
+    int num_slots;  // P
+    SampleView views[kMaxViews];
+    Structure structure;
+    float epsilon;  // of the Charbonnier term
+    float l1_weight;
+    float structure_weight;   // factor of the mean over tiles and channels of 1 - S
+    float variance_constant;  // ncc, contrast
+    bool balance;             // lambda of the paper: structure gradients no larger than those of l1
+    bool gate;                // by the truth's variance
+
+    const int32_t* tile_ids;      // [T]
+    const int32_t* tile_offsets;  // [T + 1]
+    const int32_t* pixel_ids;     // [P]
+    const float* weights;         // [P] or null
+    const float* colors;          // [P, 3]
+    const float* targets;         // [P, 3], or null: then `photos` are gathered
+    const uint8_t* photos;        // [X, 3]
+
+    const int32_t* num_filled;             // [1] filled slots; null where all are
+    double* loss;                          // [], zero before the launch
+    float* color_gradients;                // [P, 3] out
+    float* pixel_errors;                   // [P] out
+    unsigned long long* nonfinite_losses;  // [] 1 is added if the loss is not finite; or null
+
+    // Maps of all views; all null where they are not to be updated.
+    void* errors;             // [X] half
+    int16_t* stamps;          // [X]
+    double* view_sums;        // [V]
+    const int32_t* overflow;  // [1] where not 0, the maps are left alone; or null
+    float ema_old, ema_new;   // 1 - beta and beta, each rounded from double
+    int16_t stamp;
+};
+
+// Adds the filled slots (id >= 0) to `num_filled`.
+struct CountFilledParams {
+    const int32_t* pixel_ids;  // [P]
+    int num_slots;             // P
+    int32_t* num_filled;       // [1]
+};
+
+// Every launcher returns the first CUDA error, and only enqueues work on `stream`.
+cudaError_t launch_count_filled(const CountFilledParams& params, cudaStream_t stream);
+cudaError_t launch_sparse_loss(const SparseLossParams& params, cudaStream_t stream);
+
+}  // namespace turbogs

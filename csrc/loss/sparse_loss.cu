@@ -1,0 +1,320 @@
+// Loss on sampled pixels with its gradient, and the update of the error maps: one pass over the samples in memory, a
+// warp per tile.
+//
+// A lane keeps up to 4 of its tile's samples in registers: colour and truth are read once, the tile's moments are
+// warp sums in two passes about its first sample (a constant tile has variance 0 exactly), and the gradient is
+// written in the last. Larger tiles are read once a pass. Sums of the views are of half-precision numbers in double,
+// exact in any order.
+#include <cfloat>
+
+#include <cuda_fp16.h>
+
+#include "common/approximate_math.cuh"
+#include "common/tiles.cuh"
+#include "common/warp.cuh"
+#include "loss/loss_params.h"
+#include "loss/tile_similarity.cuh"
+
+namespace turbogs {
+namespace {
+
+constexpr int kLossThreads = 128;  // of a block: four tiles, which mostly share a view's sum; no record of other values
+constexpr int kLossBlocks = 7;     // of an SM: 72 registers. With 64 it spills, and with 80 it is no faster
+constexpr int kLossWarps = kLossThreads / kWarpSize;
+constexpr float kBalanceEpsilon = 1e-8f;  // BALANCE_EPSILON of reference/losses.py
+constexpr float kErrorMax = 65504.0f;     // largest finite half
+
+// byte / 255, correctly rounded.
+__device__ __forceinline__ float unit_color(uint8_t byte) {
+    const float value = static_cast<float>(byte), quotient = value * (1.0f / 255.0f);
+    return __fmaf_rn(__fmaf_rn(-quotient, 255.0f, value), 1.0f / 255.0f, quotient);
+}
+
+// What a lane holds of a tile: of each kWarpSize slots one. An empty slot has weight 0 and pixel -1.
+template <int kSlots>
+struct LaneSamples {
+    int pixel[kSlots];
+    float x[kSlots][3], y[kSlots][3], weight[kSlots];
+};
+
+template <int kSlots>
+__device__ __forceinline__ void load_samples(const SparseLossParams& params, const SampleView& view, int first, int end,
+                                             LaneSamples<kSlots>& samples) {
+    const int lane = this_lane();
+#pragma unroll
+    for (int j = 0; j < kSlots; ++j) {
+        const int slot = first + kWarpSize * j + lane;
+        samples.pixel[j] = slot < end ? params.pixel_ids[slot] : -1;
+    }
+#pragma unroll
+    for (int j = 0; j < kSlots; ++j) {
+        const size_t slot = static_cast<size_t>(first + kWarpSize * j + lane);
+        const bool filled = samples.pixel[j] >= 0;
+#pragma unroll
+        for (int c = 0; c < 3; ++c) {
+            samples.x[j][c] = filled ? params.colors[3 * slot + c] : 0.0f;
+            samples.y[j][c] = 0.0f;
+        }
+        samples.weight[j] = filled ? (params.weights != nullptr ? params.weights[slot] : 1.0f) : 0.0f;
+        if (!filled) continue;
+        if (params.targets != nullptr) {
+#pragma unroll
+            for (int c = 0; c < 3; ++c) samples.y[j][c] = params.targets[3 * slot + c];
+        } else {
+            const uint8_t* photo = params.photos + 3 * (view.pixel_base + samples.pixel[j]);
+#pragma unroll
+            for (int c = 0; c < 3; ++c) samples.y[j][c] = unit_color(photo[c]);
+        }
+    }
+#pragma unroll
+    for (int j = 0; j < kSlots; ++j) {
+        if (is_finite(samples.x[j][0]) && is_finite(samples.x[j][1]) && is_finite(samples.x[j][2])) continue;
+        samples.pixel[j] = -1;
+        samples.weight[j] = 0.0f;
+#pragma unroll
+        for (int c = 0; c < 3; ++c) samples.x[j][c] = samples.y[j][c] = 0.0f;
+    }
+}
+
+// What a tile adds to the loss and to the sum of its view; the lane's part of the latter.
+struct TileTotals {
+    double loss = 0.0, view_delta = 0.0;
+};
+
+// One tile. Up to kWarpSize * kSlots samples stay in registers; of more, each pass loads them again, in as many rounds.
+template <int kSlots>
+__device__ __forceinline__ TileTotals tile_loss(const SparseLossParams& params, const SampleView& view, int first,
+                                                int end, float filled, bool learns) {
+    constexpr int kRound = kWarpSize * kSlots;
+    const int lane = this_lane();
+    const bool resident = end - first <= kRound;
+    const bool structured = params.structure != Structure::kNone;
+    const float l1_scale = params.l1_weight / (3.0f * filled), epsilon2 = params.epsilon * params.epsilon;
+    TileTotals totals;
+    LaneSamples<kSlots> samples;
+
+    // Pass 1: Charbonnier term, errors and maps; means, about the first sample.
+    float first_x[3] = {}, first_y[3] = {}, mean_x[3] = {}, mean_y[3] = {};
+    float l1_sum = 0.0f, norm_l1 = 0.0f, inverse_total = 1.0f;
+    {
+        float sums[8] = {};  // offsets of x 0-2 and y 3-5, weights, norms of the Charbonnier gradients
+        for (int start = first; start < end; start += kRound) {
+            load_samples(params, view, start, end, samples);
+            if (start == first) {
+#pragma unroll
+                for (int c = 0; c < 3; ++c) {
+                    first_x[c] = __shfl_sync(kFullWarp, samples.x[0][c], 0);
+                    first_y[c] = __shfl_sync(kFullWarp, samples.y[0][c], 0);
+                }
+            }
+            __half old[kSlots];
+            int64_t flat[kSlots];
+            if (learns) {
+#pragma unroll
+                for (int j = 0; j < kSlots; ++j) {
+                    flat[j] = view.pixel_base + samples.pixel[j];
+                    if (samples.pixel[j] >= 0) old[j] = static_cast<const __half*>(params.errors)[flat[j]];
+                }
+            }
+#pragma unroll
+            for (int j = 0; j < kSlots; ++j) {
+                const int slot = start + kWarpSize * j + lane;
+                float error = 0.0f, value = 0.0f, slope_norm = 0.0f;
+#pragma unroll
+                for (int c = 0; c < 3; ++c) {
+                    const float d = samples.x[j][c] - samples.y[j][c];
+                    const float square = fmaxf(d * d + epsilon2, FLT_MIN);
+                    const float inverse_root = approximate_rsqrt(square), root = square * inverse_root;
+                    const float slope = d * inverse_root;
+                    error = __fadd_rn(error, fabsf(d));
+                    value += d * slope * (root * approximate_reciprocal(root + params.epsilon));
+                    slope_norm += fabsf(slope);
+                    sums[c] += samples.weight[j] * (samples.x[j][c] - first_x[c]);
+                    sums[3 + c] += samples.weight[j] * (samples.y[j][c] - first_y[c]);
+                }
+                l1_sum += samples.weight[j] * value;
+                sums[6] += samples.weight[j];
+                sums[7] += samples.weight[j] * slope_norm;
+                if (slot < end) params.pixel_errors[slot] = error;
+                if (learns && samples.pixel[j] >= 0 && is_finite(error)) {
+                    const float blended =
+                        __fadd_rn(__fmul_rn(__half2float(old[j]), params.ema_old), __fmul_rn(error, params.ema_new));
+                    const __half updated = __float2half_rn(fminf(blended, kErrorMax));
+                    static_cast<__half*>(params.errors)[flat[j]] = updated;
+                    params.stamps[flat[j]] = params.stamp;
+                    totals.view_delta +=
+                        static_cast<double>(__half2float(updated)) - static_cast<double>(__half2float(old[j]));
+                }
+            }
+        }
+        l1_sum = warp_sum(l1_sum);
+        if (structured) {
+            warp_sums(sums);
+            inverse_total = sums[6] > 0.0f ? 1.0f / sums[6] : 1.0f;
+            norm_l1 = sums[7] * inverse_total;
+#pragma unroll
+            for (int c = 0; c < 3; ++c) {
+                mean_x[c] = sums[c] * inverse_total;
+                mean_y[c] = sums[3 + c] * inverse_total;
+            }
+        }
+    }
+    totals.loss = static_cast<double>(l1_sum) * static_cast<double>(l1_scale);
+
+    float factor[3] = {}, at_y[3] = {}, at_x[3] = {}, constant[3] = {};
+    const auto offset_x = [&](int j, int c) { return (samples.x[j][c] - first_x[c]) - mean_x[c]; };
+    const auto offset_y = [&](int j, int c) { return (samples.y[j][c] - first_y[c]) - mean_y[c]; };
+    const auto load_again = [&](int start) {
+        if (!resident) load_samples(params, view, start, end, samples);
+    };
+    if (structured) {
+        // Pass 2: variances and covariances.
+        float sums[8] = {}, last = 0.0f;  // xx 0-2, yy 3-5, xy 6, 7 and `last`
+        for (int start = first; start < end; start += kRound) {
+            load_again(start);
+#pragma unroll
+            for (int j = 0; j < kSlots; ++j) {
+#pragma unroll
+                for (int c = 0; c < 3; ++c) {
+                    const float dx = offset_x(j, c), dy = offset_y(j, c);
+                    sums[c] += samples.weight[j] * (dx * dx);
+                    sums[3 + c] += samples.weight[j] * (dy * dy);
+                    (c < 2 ? sums[6 + c] : last) += samples.weight[j] * (dx * dy);
+                }
+            }
+        }
+        warp_sums(sums);
+        last = warp_sum(last);
+        float variance_y[3];
+#pragma unroll
+        for (int c = 0; c < 3; ++c) {
+            const float xx = sums[c] * inverse_total, yy = sums[3 + c] * inverse_total;
+            const float xy = (c < 2 ? sums[6 + c] : last) * inverse_total;
+            Similarity similarity;
+            if (params.structure == Structure::kNcc) {
+                similarity = correlation(xx, yy, xy, params.variance_constant);
+            } else if (params.structure == Structure::kContrast) {
+                similarity = contrast(xx, yy, xy, params.variance_constant);
+            } else {
+                similarity = ssim(mean_x[c] + first_x[c], mean_y[c] + first_y[c], xx, yy, xy);
+            }
+            variance_y[c] = yy;
+            at_y[c] = similarity.at_y;
+            at_x[c] = similarity.at_x;
+            constant[c] = similarity.constant;
+            factor[c] = 1.0f - similarity.value;
+        }
+        float balance = 1.0f;
+        if (params.balance) {
+            // Pass 3: norms of the structure term's gradients.
+            float norm = 0.0f;
+            for (int start = first; start < end; start += kRound) {
+                load_again(start);
+#pragma unroll
+                for (int j = 0; j < kSlots; ++j) {
+                    float norm_of_sample = 0.0f;
+#pragma unroll
+                    for (int c = 0; c < 3; ++c) {
+                        norm_of_sample += fabsf(offset_y(j, c) * at_y[c] - offset_x(j, c) * at_x[c] + constant[c]);
+                    }
+                    norm += samples.weight[j] * norm_of_sample;
+                }
+            }
+            balance = fminf(norm_l1 / (warp_sum(norm) * inverse_total + kBalanceEpsilon), 1.0f);
+        }
+        float tile_sum = 0.0f;
+#pragma unroll
+        for (int c = 0; c < 3; ++c) {
+            float scale = balance;
+            if (params.gate) scale *= variance_y[c] / (variance_y[c] + params.variance_constant);
+            scale *= params.structure_weight / (3.0f * static_cast<float>(params.num_tiles));
+            tile_sum += scale * factor[c];
+            factor[c] = scale * inverse_total;
+        }
+        totals.loss += static_cast<double>(tile_sum);
+    }
+
+    // Last pass: gradients.
+    for (int start = first; start < end; start += kRound) {
+        load_again(start);
+#pragma unroll
+        for (int j = 0; j < kSlots; ++j) {
+            const int slot = start + kWarpSize * j + lane;
+            if (slot >= end) continue;
+#pragma unroll
+            for (int c = 0; c < 3; ++c) {
+                const float d = samples.x[j][c] - samples.y[j][c];
+                const float l1 = d * approximate_rsqrt(fmaxf(d * d + epsilon2, FLT_MIN)) * l1_scale;
+                const float structure = offset_y(j, c) * at_y[c] - offset_x(j, c) * at_x[c] + constant[c];
+                params.color_gradients[3 * static_cast<size_t>(slot) + c] =
+                    samples.weight[j] * (l1 - factor[c] * structure);
+            }
+        }
+    }
+    return totals;
+}
+
+// A warp per tile; its block adds up what belongs together. Up to kWarpSize * kSlots samples of a tile are held in
+// registers.
+template <int kSlots>
+__global__ void __launch_bounds__(kLossThreads, kLossBlocks)
+    sparse_loss_kernel(const __grid_constant__ SparseLossParams params) {
+    __shared__ double losses[kLossWarps], view_deltas[kLossWarps];
+    __shared__ int views[kLossWarps];
+    const int lane = this_lane(), warp = this_warp();
+    const int tile = blockIdx.x * kLossWarps + warp;
+    const float filled =
+        static_cast<float>(params.num_filled != nullptr ? max(*params.num_filled, 1) : params.num_slots);
+    const bool learns = params.errors != nullptr && (params.overflow == nullptr || *params.overflow == 0);
+
+    TileTotals totals;
+    int view = -1;
+    if (tile < params.num_tiles) {
+        const int first = params.tile_offsets[tile], end = params.tile_offsets[tile + 1];
+        view = view_of_tile(params.views, params.num_views, params.tile_ids[tile]);
+        totals = tile_loss<kSlots>(params, params.views[view], first, end, filled, learns);
+        totals.view_delta = warp_sum(totals.view_delta);
+    }
+    if (lane == 0) {
+        losses[warp] = totals.loss;
+        view_deltas[warp] = totals.view_delta;
+        views[warp] = view;
+    }
+    __syncthreads();
+    if (threadIdx.x == 0) {
+        double loss = 0.0, delta = 0.0;
+        for (int i = 0; i < kLossWarps; ++i) {
+            loss += losses[i];
+            delta += view_deltas[i];
+            const bool last_of_view = i + 1 == kLossWarps || views[i + 1] != views[i];
+            if (last_of_view && delta != 0.0) {
+                atomicAdd(params.view_sums + params.views[views[i]].view_number, delta);
+                delta = 0.0;
+            }
+        }
+        if (loss != 0.0) {
+            const double before = atomicAdd(params.loss, loss);
+            // Once lost, the sum stays so: one block sees it happen.
+            if (params.nonfinite_losses != nullptr && is_finite(before) && !is_finite(before + loss)) {
+                atomicAdd(params.nonfinite_losses, 1ull);
+            }
+        }
+    }
+}
+
+}  // namespace
+
+cudaError_t launch_sparse_loss(const SparseLossParams& params, cudaStream_t stream) {
+    if (params.num_slots == 0 || params.num_tiles == 0) return cudaSuccess;
+    // Slots of a lane, by the average tile: most samplers give every tile as many.
+    const int64_t of_all_lanes = int64_t{kWarpSize} * params.num_tiles;
+    const int64_t slots = (params.num_slots + of_all_lanes - 1) / of_all_lanes;
+    const auto kernel = slots <= 1   ? sparse_loss_kernel<1>
+                        : slots == 2 ? sparse_loss_kernel<2>
+                        : slots == 3 ? sparse_loss_kernel<3>
+                                     : sparse_loss_kernel<4>;
+    kernel<<<blocks_for(params.num_tiles, kLossWarps), kLossThreads, 0, stream>>>(params);
+    return cudaGetLastError();
+}
+
+}  // namespace turbogs

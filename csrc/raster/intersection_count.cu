@@ -1,0 +1,125 @@
+// Stage 2: the first intersection of each tile, and whether all intersections have room.
+//
+// The projection has counted every tile's splats as differences along the rows of tiles: the running sum of those are
+// the splats of each tile, and the running sum of these the first intersections. Two launches make both at once, a
+// block for each kScanTiles tiles and eight tiles a thread. The first leaves for each block the sum of its
+// differences, and its intersections as if no splat came in from the blocks before it. In the second every block sums
+// what the blocks before it left, adds for each splat that comes in the tiles that it goes through, and writes its
+// tiles' first intersections. Sums are 64 bits wide, so that a pass with more intersections than fit is noticed: it
+// leaves every tile empty and raises the flag.
+#include "common/warp.cuh"
+#include "raster/raster_params.h"
+
+namespace turbogs {
+namespace {
+
+constexpr int kThreadTiles = 8;  // tiles of a thread; no record of other values: the two launches are small
+constexpr int kScanThreads = kScanTiles / kThreadTiles;
+constexpr int kScanWarps = kScanThreads / kWarpSize;
+
+// Sum over the block's threads up to and including this one, and over all of them. Barriers inside.
+__device__ __forceinline__ int64_t sum_to_thread(int64_t value, int64_t& total) {
+    __shared__ int64_t warp_sums[kScanWarps];
+    const int lane = this_lane(), warp = this_warp();
+    value = sum_to_lane(value, lane);
+    if (lane == kWarpSize - 1) warp_sums[warp] = value;
+    __syncthreads();
+    total = 0;
+#pragma unroll
+    for (int i = 0; i < kScanWarps; ++i) {
+        if (i < warp) value += warp_sums[i];
+        total += warp_sums[i];
+    }
+    __syncthreads();
+    return value;
+}
+
+// The running sum of a thread's differences, within the thread.
+__device__ __forceinline__ void load_differences(const CountIntersectionsParams& params, int first,
+                                                 int64_t splats[kThreadTiles]) {
+    int64_t sum = 0;
+#pragma unroll
+    for (int i = 0; i < kThreadTiles; ++i) {
+        if (first + i < params.num_active) sum += params.tile_cursors[first + i];
+        splats[i] = sum;
+    }
+}
+
+// Of each block of tiles: the sum of its differences, and its intersections if no splat reached in from the tiles
+// before it.
+__global__ void __launch_bounds__(kScanThreads)
+    sum_tiles_kernel(const __grid_constant__ CountIntersectionsParams params) {
+    const int first = blockIdx.x * kScanTiles + threadIdx.x * kThreadTiles;
+    int64_t splats[kThreadTiles], total_splats, total_intersections;
+    load_differences(params, first, splats);
+    const int64_t before = sum_to_thread(splats[kThreadTiles - 1], total_splats) - splats[kThreadTiles - 1];
+    int64_t intersections = 0;
+#pragma unroll
+    for (int i = 0; i < kThreadTiles; ++i) {
+        if (first + i < params.num_active) intersections += before + splats[i];
+    }
+    sum_to_thread(intersections, total_intersections);
+    if (threadIdx.x == 0) {
+        params.block_sums[2 * blockIdx.x] = total_splats;
+        params.block_sums[2 * blockIdx.x + 1] = total_intersections;
+    }
+}
+
+__global__ void __launch_bounds__(kScanThreads)
+    start_tiles_kernel(const __grid_constant__ CountIntersectionsParams params) {
+    const int block = blockIdx.x, blocks = gridDim.x;
+    // A splat that enters in block i and is not left goes on through all tiles of the blocks between.
+    int64_t splats_before = 0, intersections_before = 0, all_intersections = 0;
+    for (int i = threadIdx.x; i < blocks; i += kScanThreads) {
+        const int64_t splats = params.block_sums[2 * i], intersections = params.block_sums[2 * i + 1];
+        const int last_tiles = params.num_active - (blocks - 1) * kScanTiles;
+        all_intersections +=
+            intersections +
+            (i < blocks - 1 ? splats * (static_cast<int64_t>(blocks - 2 - i) * kScanTiles + last_tiles) : 0);
+        if (i < block) {
+            splats_before += splats;
+            intersections_before += intersections + splats * (static_cast<int64_t>(block - 1 - i) * kScanTiles);
+        }
+    }
+    sum_to_thread(splats_before, splats_before);
+    sum_to_thread(intersections_before, intersections_before);
+    sum_to_thread(all_intersections, all_intersections);
+
+    const int first = block * kScanTiles + threadIdx.x * kThreadTiles;
+    int64_t splats[kThreadTiles], total;
+    load_differences(params, first, splats);
+    splats_before += sum_to_thread(splats[kThreadTiles - 1], total) - splats[kThreadTiles - 1];
+    int64_t intersections = 0;
+#pragma unroll
+    for (int i = 0; i < kThreadTiles; ++i) {
+        if (first + i < params.num_active) intersections += splats_before + splats[i];
+    }
+    int64_t start = intersections_before + sum_to_thread(intersections, total) - intersections;
+    const bool lost = all_intersections > params.capacity || params.status[1] != 0u;
+#pragma unroll
+    for (int i = 0; i < kThreadTiles; ++i) {
+        if (first + i >= params.num_active) break;
+        params.tile_starts[first + i] = lost ? 0u : static_cast<uint32_t>(start);
+        params.tile_cursors[first + i] = static_cast<int32_t>(start);
+        start += splats_before + splats[i];
+    }
+    if (block == 0 && threadIdx.x == 0) {
+        params.counters->num_windows = params.counters->num_runs = 0u;
+        const uint32_t count = static_cast<uint32_t>(min(all_intersections, static_cast<int64_t>(kIntersectionsMax)));
+        params.tile_starts[params.num_active] = lost ? 0u : count;
+        params.status[0] = count;
+        if (lost) params.status[1] = 1u;  // other blocks may read it before or after: they find the same
+    }
+}
+
+}  // namespace
+
+cudaError_t launch_count_intersections(const CountIntersectionsParams& params, cudaStream_t stream) {
+    const int blocks = params.num_active > 0 ? blocks_for(params.num_active, kScanTiles) : 1;
+    sum_tiles_kernel<<<blocks, kScanThreads, 0, stream>>>(params);
+    if (const cudaError_t error = cudaGetLastError()) return error;
+    start_tiles_kernel<<<blocks, kScanThreads, 0, stream>>>(params);
+    return cudaGetLastError();
+}
+
+}  // namespace turbogs

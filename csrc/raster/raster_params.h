@@ -1,0 +1,165 @@
+// Parameters of the raster kernels: plain structs of raw pointers, one for each launcher, passed by value. No torch
+// here.
+//
+// Index spaces: K views of the batch; N Gaussians; an instance is a Gaussian in a view, number view * N + Gaussian (K
+// * N of them, not compacted). T active tiles are those that hold samples: a "tile position" is an index into them, a
+// "tile id" the number of a tile in the batch's TileGrid. P sample slots. An intersection is an instance in an active
+// tile that it reaches; a pass has room for M of them (its "capacity").
+#pragma once
+
+#include <cuda_runtime.h>
+
+#include <cstddef>
+#include <cstdint>
+
+#include "common/camera.cuh"
+#include "common/scene_params.h"
+#include "common/sizes.h"
+
+namespace turbogs {
+
+// A tile with more than kSortRun intersections has at least so many for each of its runs, so this bounds their number.
+constexpr int kLeastOfRun = kSortRun / 2;
+
+// One view as the kernels read it. Written by the projection's launcher.
+struct alignas(16) RasterCamera : Pinhole {
+    int tiles_y;
+    int width, height;   // pixels
+    int tiles_x;
+    int tile_base;       // id of the view's first tile
+    SlopeBounds slopes;  // where the Jacobian is taken
+};
+static_assert(sizeof(RasterCamera) == CameraRow::kSize * sizeof(float), "as layout.py has it");
+
+// A splat on the screen: what the tile stages gather.
+struct alignas(16) Instance {
+    float x, y;  // pixels
+    float conic_a, conic_b;
+    float conic_c;
+    float opacity;  // after the sigmoid
+    float depth;
+    float log_reach;         // log(opacity / alpha_min): sigma beyond which the splat is invisible
+    float red, green, blue;  // after the clamp at 0
+    float inverse_sigma_y;   // 1 / standard deviation along y
+};
+#define TURBOGS_SAME_PLACE(member, column) \
+    static_assert(offsetof(Instance, member) == InstanceRow::column * sizeof(float), "as layout.py has it")
+TURBOGS_SAME_PLACE(x, kMean);
+TURBOGS_SAME_PLACE(conic_a, kConic);
+TURBOGS_SAME_PLACE(opacity, kOpacity);
+TURBOGS_SAME_PLACE(depth, kDepth);
+TURBOGS_SAME_PLACE(log_reach, kLogReach);
+TURBOGS_SAME_PLACE(red, kColor);
+TURBOGS_SAME_PLACE(inverse_sigma_y, kInverseSigmaY);
+#undef TURBOGS_SAME_PLACE
+static_assert(sizeof(Instance) == InstanceRow::kSize * sizeof(float), "as layout.py has it");
+
+// Stage 1. K views of every Gaussian; parameters are read once.
+struct ProjectionParams : SceneParams {
+    int num_tiles;   // tiles of all views
+    int num_active;  // T
+    float near_plane, far_plane, alpha_min;
+    const int32_t* tile_ids;  // [T] ascending, or null where every tile is active
+
+    RasterCamera* cameras;      // [K] out
+    int32_t* active_prefix;     // [num_tiles + 1] out: active tiles with a smaller id; null where every tile is active
+    Instance* instances;        // [K, N] out, where the radius is not 0
+    int2* radii;                // [K, N] out, 0 where off screen
+    int32_t* tile_differences;  // [T + 1] out: splats that reach each active tile, less those of the tile before it
+    float4* records;            // [K, N, 4] set to zero where the radius is not 0, for stage 6; or null
+};
+
+// Lengths of the two lists that stage 3 makes on the way.
+struct IntersectionCounters {
+    uint32_t num_windows, num_runs;
+};
+
+// Stage 2. First intersection of each tile.
+struct CountIntersectionsParams {
+    int num_active;                  // T
+    uint32_t capacity;               // M, or kIntersectionsMax where it is not known yet
+    int32_t* tile_cursors;           // [T + 1] in: the projection's differences; out: first intersection of each tile
+    uint32_t* tile_starts;           // [T + 1] out: the same, and the number of intersections; zeros after an overflow
+    uint32_t* status;                // [2] out: intersections of this pass; a flag that is raised where they exceed the
+                                     // capacity, and stays. No intersection is made while it is up.
+    IntersectionCounters* counters;  // out: zeros
+    int64_t* block_sums;             // [ceil(T / kScanTiles), 2] scratch
+};
+
+// Stage 3. Intersections to their tiles.
+struct ScatterIntersectionsParams {
+    int num_instances;
+    int num_gaussians;
+    int num_active;             // T
+    const Instance* instances;  // [K, N]
+    const int2* radii;          // [K, N]
+    const RasterCamera* cameras;
+    const int32_t* active_prefix;  // or null
+    const uint32_t* tile_starts;   // [T + 1]
+    const uint32_t* status;        // [2]
+    int32_t* tile_cursors;         // [T + 1] in: first intersection of each tile; changed
+    uint64_t* intersection_keys;   // [M] out: depth and instance of each intersection
+    uint32_t capacity;             // M
+    IntersectionCounters* counters;  // in: zeros
+    uint2* windows;                  // [M / 2] scratch: (instance, number) of every window of a large splat
+    int2* runs;                      // [M / kLeastOfRun] out: (tile, number) of every run of a tile that has several
+};
+
+// Stage 4. Every tile's intersections in order of depth, then of the instance.
+struct SortIntersectionsParams {
+    int num_active;               // T
+    uint32_t capacity;            // M
+    const uint32_t* tile_starts;  // [T + 1]
+    const IntersectionCounters* counters;
+    const int2* runs;             // [M / kLeastOfRun]
+    uint64_t* intersection_keys;  // [M] changed
+    uint32_t* intersection_ids;   // [M] out: instance of each intersection
+};
+
+// Stage 5. One warp for each work item = (tile position, chunk): the 32 slots of the tile from chunk * 32 on. Further
+// slots of a tile follow with a stride of `chunks` chunks, so any number of slots is rendered.
+struct ForwardParams {
+    int num_views;
+    int num_active;  // T
+    int chunks;      // C, work items of a tile
+    float alpha_min, alpha_max, transmittance_min;
+    const RasterCamera* cameras;
+    const int32_t* tile_ids;           // [T], or null where every tile is active
+    const int32_t* tile_offsets;       // [T + 1] first slot of each tile
+    const int32_t* pixel_ids;          // [P], -1 empty
+    const uint32_t* tile_starts;       // [T + 1]
+    const uint32_t* intersection_ids;  // [M]
+    const Instance* instances;         // [K, N]
+
+    float* colors;                // [P, 3] out
+    float* alphas;                // [P] out
+    float* transmittances;        // [P] out, 1 - alpha without the cancellation
+    float* depths;                // [P] out, or null
+    int32_t* last_intersections;  // [P] out, the last that contributed, counted from the tile's first; -1 none
+    uint32_t* masks;              // [(M / 32 + T + 1) * C] out: of a bucket a bit for each splat that contributed to
+                                  // the item. Bucket j of item (t, c) is word ((tile_starts[t] / 32 + t) + j) * C + c.
+    int32_t* bucket_counts;       // [T, C] out, buckets that the item walked
+};
+
+// Stage 6. Same work items; gradients on the screen.
+struct BackwardParams {
+    ForwardParams forward;         // as given to stage 5; its outputs are inputs here
+    int num_instances;
+    bool with_density_sums;        // fill what only densification asks for: distance and absolute sums; else zeros
+    bool cleared;                  // `records` are zero where the radius is not 0
+    const float* color_gradients;  // [P, 3]
+    const float* alpha_gradients;  // [P] or null
+    const float* depth_gradients;  // [P] or null
+    const float* pixel_errors;     // [P] or null
+    float* records;                // [K, N, 16] out, ScreenRecord; off screen zero, or where `cleared`, left alone
+};
+
+// Every launcher returns the first CUDA error, and only enqueues work on `stream`.
+cudaError_t launch_projection(const ProjectionParams& params, cudaStream_t stream);
+cudaError_t launch_count_intersections(const CountIntersectionsParams& params, cudaStream_t stream);
+cudaError_t launch_scatter_intersections(const ScatterIntersectionsParams& params, cudaStream_t stream);
+cudaError_t launch_sort_intersections(const SortIntersectionsParams& params, cudaStream_t stream);
+cudaError_t launch_rasterize_forward(const ForwardParams& params, cudaStream_t stream);
+cudaError_t launch_rasterize_backward(const BackwardParams& params, cudaStream_t stream);
+
+}  // namespace turbogs

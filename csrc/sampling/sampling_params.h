@@ -1,0 +1,50 @@
+// Parameters of the samplers' kernels. No torch here. Index spaces as in turbogs_plugin/types.py: K views of the
+// batch, P sample slots, T tiles with samples, X flat pixels of all training views.
+#pragma once
+
+#include <cuda_runtime.h>
+
+#include <cstdint>
+
+#include "common/sample_view.h"
+#include "common/sizes.h"
+
+namespace turbogs {
+
+constexpr int kPhiloxRounds = 10;  // Philox4x32-10
+
+// turbogs_plugin/engine/reference/draws.py defines the draw, bit for bit.
+struct SamplePixelsParams {
+    SampleUnit unit;
+    int num_views;   // K
+    int num_tiles;   // of all views
+    int num_chosen;  // unit tile: chosen tiles of all views
+    SampleView views[kMaxViews];
+    int stages[kMaxViews][3];  // units of the hard, stable and mixed stage: of a tile, or for unit tile of the view
+    int slots_per_tile;        // units pixel and cell: slots of a tile that is not cut; also the cap of a cut one
+    bool mixed_uniform;
+    float importance;  // a of the weights p^-a, 0 for none
+    uint32_t seed_high;
+    uint32_t round_keys[kPhiloxRounds][2];  // from the low half of the seed and the iteration
+    int now;                                // a pixel's age is now - stamp, within 0 .. 32767
+
+    const void* errors;     // [X] half
+    const int16_t* stamps;  // [X]
+
+    int32_t* pixel_ids;     // [P] out
+    int32_t* tile_ids;      // [T] out
+    int32_t* tile_offsets;  // [T + 1] out
+    float* weights;         // [P] out, p^-a before normalisation; null where importance is 0
+
+    // Unit tile only, scratch over all tiles of the batch.
+    double* tile_errors;  // [tiles]
+    int32_t* tile_ages;   // [tiles]
+    int64_t* tile_keys;   // [tiles]
+    float* tile_missed;   // [tiles]
+};
+
+// Every launcher returns the first CUDA error, and only enqueues work on `stream`.
+cudaError_t launch_sample_pixels(const SamplePixelsParams& params, cudaStream_t stream);
+cudaError_t launch_sample_tiles(const SamplePixelsParams& params, cudaStream_t stream);  // unit tile
+
+}  // namespace turbogs

@@ -1,0 +1,97 @@
+// A warp's tile in the maps. A lane holds 8 of its pixels: pixel (j, lane) is number 32 j + lane of the order of
+// samples, `cell_order` in turbogs_plugin/types.py. That order goes through the tile in groups of 8x4 pixels, two
+// beside each other and four such rows, so lane and j say where a pixel lies.
+#pragma once
+
+#include <cuda_fp16.h>
+
+#include "common/tiles.cuh"
+#include "common/warp.cuh"
+#include "sampling/sampling_params.h"
+
+namespace turbogs {
+
+constexpr int kPerLane = kTilePixels / kWarpSize;    // pixels of a lane, one of each group
+constexpr int kGroupWidth = 8, kGroupHeight = 4;     // pixels
+constexpr int kRowGroups = kTileSize / kGroupWidth;  // groups beside each other
+static_assert(kGroupWidth * kGroupHeight == kWarpSize, "a lane has one pixel of each group");
+
+constexpr int kSampleThreads = 128;  // of a block; its warps share nothing. No record of other values
+constexpr int kAgeMax = INT16_MAX;   // AGE_MAX of turbogs_plugin/error_maps.py
+
+// The tile of this warp, and its 8 pixels a lane.
+struct TilePixels {
+    int view;                  // in the batch
+    int column, row;           // of the tile
+    int width, height;         // of the part inside the image
+    uint32_t inside;           // bit j: pixel (j, lane) exists
+    uint32_t first;            // id of pixel (0, lane), y * width + x
+    int image_width;
+
+    // From pixel (0, lane) to pixel (j, lane).
+    __device__ __forceinline__ int offset(int j) const {
+        return j / kRowGroups * kGroupHeight * image_width + j % kRowGroups * kGroupWidth;
+    }
+    __device__ __forceinline__ uint32_t id(int j) const { return first + static_cast<uint32_t>(offset(j)); }
+};
+
+__device__ __forceinline__ TilePixels locate_tile(const SamplePixelsParams& params, int tile) {
+    TilePixels pixels;
+    pixels.view = view_of_tile(params.views, params.num_views, tile);
+    const SampleView& view = params.views[pixels.view];
+    const int number = tile - view.tile_base;
+    pixels.row = number / view.tiles_x;
+    pixels.column = number - pixels.row * view.tiles_x;
+    pixels.width = min(kTileSize, view.width - kTileSize * pixels.column);
+    pixels.height = min(kTileSize, view.height - kTileSize * pixels.row);
+    pixels.inside = 0;
+    const int lane = this_lane(), x = lane % kGroupWidth, y = lane / kGroupWidth;
+    pixels.image_width = view.width;
+    pixels.first = static_cast<uint32_t>((kTileSize * pixels.row + y) * view.width + kTileSize * pixels.column + x);
+#pragma unroll
+    for (int j = 0; j < kPerLane; ++j) {
+        const bool exists = x + j % kRowGroups * kGroupWidth < pixels.width &&
+                            y + j / kRowGroups * kGroupHeight < pixels.height;
+        pixels.inside |= static_cast<uint32_t>(exists) << j;
+    }
+    return pixels;
+}
+
+// What the maps say of a lane's pixels: errors, halves, and above them the ages.
+struct PixelUnits {
+    const TilePixels& pixels;
+    uint32_t packed[kPerLane];
+
+    __device__ __forceinline__ float error(int j) const {
+        return __half2float(__ushort_as_half(static_cast<unsigned short>(packed[j])));
+    }
+    __device__ __forceinline__ int age(int j) const { return static_cast<int>(packed[j] >> 16); }
+    __device__ __forceinline__ uint32_t place(int j) const { return pixels.id(j); }
+};
+
+__device__ __forceinline__ PixelUnits load_maps(const SamplePixelsParams& params, const TilePixels& pixels) {
+    const SampleView& view = params.views[pixels.view];
+    const int64_t first = view.pixel_base + pixels.first;
+    const uint16_t* of_errors = static_cast<const uint16_t*>(params.errors) + first;
+    const int16_t* of_stamps = params.stamps + first;
+    uint16_t errors[kPerLane];
+    int16_t stamps[kPerLane];
+#pragma unroll
+    for (int j = 0; j < kPerLane; ++j) {
+        const bool exists = pixels.inside >> j & 1u;
+        errors[j] = exists ? of_errors[pixels.offset(j)] : uint16_t{0};
+        stamps[j] = exists ? of_stamps[pixels.offset(j)] : int16_t{0};
+    }
+    PixelUnits units{pixels, {}};
+#pragma unroll
+    for (int j = 0; j < kPerLane; ++j) {
+        const int age = min(max(params.now - static_cast<int>(stamps[j]), 0), kAgeMax);
+        units.packed[j] = errors[j] | (pixels.inside >> j & 1u ? static_cast<uint32_t>(age) << 16 : 0u);
+    }
+    return units;
+}
+
+// For the host: blocks of so many warps.
+inline int warp_blocks(int warps) { return blocks_for(warps, kSampleThreads / kWarpSize); }
+
+}  // namespace turbogs

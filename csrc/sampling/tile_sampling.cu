@@ -1,0 +1,195 @@
+// Error-guided sampling of whole tiles, in three launches: a warp per tile sums its errors and finds its greatest
+// age; a block per view draws tiles; a warp per drawn tile lists its pixels.
+//
+// A view's tiles are too many for registers, so their keys lie in memory, and each stage of the draw searches its
+// threshold bit by bit with counts over the block. It runs once for a few thousand keys, and its sets equal the torch
+// twin's.
+#include "sampling/tile_pixels.cuh"
+#include "sampling/warp_draw.cuh"
+
+namespace turbogs {
+namespace {
+
+constexpr int kChooseThreads = 1024;  // the most of a block: there is one block a view
+constexpr int kChooseWarps = kChooseThreads / kWarpSize;
+constexpr int kRankBits = 20;  // of a key, below the age or the race: RANK_BITS of draws.py
+constexpr int kAgeBits = 15;
+constexpr int kTopBit = kRankBits + kAgeTieBits + kAgeBits - 1;  // highest bit of a key; a race's are shorter
+
+__global__ void __launch_bounds__(kSampleThreads) tile_sums_kernel(const __grid_constant__ SamplePixelsParams params) {
+    const int tile = (blockIdx.x * kSampleThreads + threadIdx.x) / kWarpSize;
+    if (tile >= params.num_tiles) return;
+    const TilePixels pixels = locate_tile(params, tile);
+    const PixelUnits units = load_maps(params, pixels);
+    double error_sum = 0.0;
+    int oldest = 0;
+#pragma unroll
+    for (int j = 0; j < kPerLane; ++j) {
+        error_sum += static_cast<double>(units.error(j));
+        oldest = max(oldest, units.age(j));
+    }
+    error_sum = warp_sum(error_sum);
+    oldest = static_cast<int>(__reduce_max_sync(kFullWarp, static_cast<uint32_t>(oldest)));
+    if (this_lane() == 0) {
+        params.tile_errors[tile] = error_sum;
+        params.tile_ages[tile] = oldest;
+    }
+}
+
+// Sum over the block, the same in every thread. `scratch` holds one entry a warp.
+template <class T>
+__device__ __forceinline__ T block_sum(T value, T* scratch) {
+    value = warp_sum(value);
+    __syncthreads();  // the last use of `scratch` is over
+    if (this_lane() == 0) scratch[this_warp()] = value;
+    __syncthreads();
+    T total = 0;
+    for (int warp = 0; warp < kChooseWarps; ++warp) total += scratch[warp];
+    return total;
+}
+
+// A block draws the tiles of one view. Keys hold the rank in their low bits, so no two are equal; -1 marks a tile
+// that is drawn already.
+__global__ void __launch_bounds__(kChooseThreads) choose_tiles_kernel(
+    const __grid_constant__ SamplePixelsParams params) {
+    __shared__ double double_scratch[kChooseWarps];
+    __shared__ long long scratch[kChooseWarps];
+    const int batch_view = blockIdx.x;
+    const SampleView& view = params.views[batch_view];
+    const int count = view.tiles_x * view.tiles_y;
+    const double* errors = params.tile_errors + view.tile_base;
+    const int32_t* ages = params.tile_ages + view.tile_base;
+    int64_t* keys = params.tile_keys + view.tile_base;
+    float* missed = params.tile_missed + view.tile_base;
+    const bool weighted = params.weights != nullptr;
+
+    double error_part = 0.0;
+    long long age_part = 0;
+    for (int i = threadIdx.x; i < count; i += kChooseThreads) {
+        error_part += errors[i];
+        age_part += ages[i];
+        keys[i] = 0;
+        missed[i] = 1.0f;
+    }
+    const float error_sum = __double2float_rn(block_sum(error_part, double_scratch));
+    const float age_sum = __ll2float_rn(block_sum(age_part, scratch));
+
+    for (int stage = 0; stage < 3; ++stage) {
+        const int wanted = params.stages[batch_view][stage];
+        if (wanted == 0) continue;
+        const auto weight_of = [&](int i) {
+            const float error = __double2float_rn(errors[i]);
+            if (stage == 0) return error;
+            return params.mixed_uniform ? 1.0f : mixed_weight(error, ages[i], error_sum, age_sum);
+        };
+        long long open = 0;
+        for (int i = threadIdx.x; i < count; i += kChooseThreads) {
+            if (keys[i] < 0) continue;
+            ++open;
+            const Words words = random_words(params, static_cast<uint32_t>(i), static_cast<uint32_t>(view.view_number),
+                                             kPurposeTiles);
+            const uint64_t primary = stage == 1 ? age_key(ages[i], words.x1)
+                                                : race_key(weight_of(i), stage == 0 ? words.x0 : words.x2);
+            keys[i] = static_cast<int64_t>(primary << kRankBits | ((1u << kRankBits) - 1u - static_cast<uint32_t>(i)));
+        }
+        const bool exhausted = block_sum(open, scratch) <= wanted;
+        int64_t threshold = 0;
+        if (!exhausted) {
+            for (int bit = kTopBit; bit >= 0; --bit) {
+                const int64_t candidate = threshold | int64_t{1} << bit;
+                long long reached = 0;
+                for (int i = threadIdx.x; i < count; i += kChooseThreads) reached += keys[i] >= candidate;
+                const long long total = block_sum(reached, scratch);
+                if (total >= wanted) threshold = candidate;
+                if (total == wanted && !weighted) break;  // to the last bit, `threshold` is the smallest key taken
+            }
+        }
+        // The largest key left, found the same way: the largest number that some remaining key reaches.
+        int64_t largest_left = 0;
+        if (weighted && !exhausted) {
+            for (int bit = kTopBit; bit >= 0; --bit) {
+                const int64_t candidate = largest_left | int64_t{1} << bit;
+                long long reached = 0;
+                for (int i = threadIdx.x; i < count; i += kChooseThreads) {
+                    reached += keys[i] < threshold && keys[i] >= candidate;
+                }
+                if (block_sum(reached, scratch) > 0) largest_left = candidate;
+            }
+        }
+        for (int i = threadIdx.x; i < count; i += kChooseThreads) {
+            if (weighted) {
+                const int64_t tau = (keys[i] >= threshold ? largest_left : threshold) >> kRankBits;
+                const float chance = stage == 1 ? age_chance(ages[i], static_cast<uint64_t>(tau))
+                                                : race_chance(weight_of(i), static_cast<uint32_t>(tau));
+                missed[i] *= exhausted ? 0.0f : 1.0f - chance;
+            }
+            if (keys[i] >= threshold) keys[i] = -1;
+        }
+    }
+
+    // The drawn tiles in their order.
+    int next = view.slot_base;
+    for (int start = 0; start < count; start += kChooseThreads) {
+        const int i = start + threadIdx.x;
+        const bool mine = i < count && keys[i] < 0;
+        const uint32_t lanes = __ballot_sync(kFullWarp, mine);
+        __syncthreads();
+        if (this_lane() == 0) scratch[this_warp()] = __popc(lanes);
+        __syncthreads();
+        int before = 0, total = 0;
+        for (int warp = 0; warp < kChooseWarps; ++warp) {
+            const int size = static_cast<int>(scratch[warp]);
+            before += warp < this_warp() ? size : 0;
+            total += size;
+        }
+        if (mine) params.tile_ids[next + before + __popc(lanes & lanes_below(this_lane()))] = view.tile_base + i;
+        next += total;
+    }
+}
+
+__global__ void __launch_bounds__(kSampleThreads) fill_tiles_kernel(const __grid_constant__ SamplePixelsParams params) {
+    const int chosen = (blockIdx.x * kSampleThreads + threadIdx.x) / kWarpSize;
+    if (chosen >= params.num_chosen) return;
+    const int lane = this_lane();
+    const int tile = params.tile_ids[chosen];
+    const TilePixels pixels = locate_tile(params, tile);
+    const float weight =
+        params.weights != nullptr ? importance_weight(params.tile_missed[tile], params.importance) : 0.0f;
+    int next = chosen * kTilePixels;
+    const int end = next + kTilePixels;
+    const uint32_t lower_lanes = lanes_below(lane);
+#pragma unroll
+    for (int j = 0; j < kPerLane; ++j) {
+        const bool mine = pixels.inside >> j & 1u;
+        const uint32_t lanes = __ballot_sync(kFullWarp, mine);
+        if (mine) {
+            const int slot = next + __popc(lanes & lower_lanes);
+            params.pixel_ids[slot] = static_cast<int32_t>(pixels.id(j));
+            if (params.weights != nullptr) params.weights[slot] = weight;
+        }
+        next += __popc(lanes);
+    }
+    for (int slot = next + lane; slot < end; slot += kWarpSize) {
+        params.pixel_ids[slot] = -1;
+        if (params.weights != nullptr) params.weights[slot] = 0.0f;
+    }
+    if (lane == 0) {
+        params.tile_offsets[chosen] = chosen * kTilePixels;
+        if (chosen == params.num_chosen - 1) params.tile_offsets[chosen + 1] = end;
+    }
+}
+
+}  // namespace
+
+cudaError_t launch_sample_tiles(const SamplePixelsParams& params, cudaStream_t stream) {
+    tile_sums_kernel<<<warp_blocks(params.num_tiles), kSampleThreads, 0, stream>>>(params);
+    cudaError_t status = cudaGetLastError();
+    if (status != cudaSuccess) return status;
+    choose_tiles_kernel<<<params.num_views, kChooseThreads, 0, stream>>>(params);
+    status = cudaGetLastError();
+    if (status != cudaSuccess) return status;
+    fill_tiles_kernel<<<warp_blocks(params.num_chosen), kSampleThreads, 0, stream>>>(params);
+    return cudaGetLastError();
+}
+
+}  // namespace turbogs

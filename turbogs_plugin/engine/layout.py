@@ -1,0 +1,125 @@
+"""Sizes and layouts that Python and the kernels of csrc/ share. They are defined here and nowhere else.
+
+The build makes a C++ header of this file (csrc/generate_headers.py), so it must not import torch. In C++ a number
+``NAME`` is ``kName``, a class is a struct of such constants, and a column that is a slice is the number of its first.
+"""
+
+MAX_VIEWS = 128
+"""Views of one batch: their image sizes travel as an argument of the kernels."""
+
+MAX_SH_DEGREE = 3
+"""Highest degree of the spherical harmonics that the engines evaluate."""
+
+WARP_SIZE = 32
+"""Lanes of a warp. A chunk, the sample slots of a tile that a warp renders together, has as many."""
+
+BUCKET = 32
+"""Splats that a warp stages at once. Each has a bit of a 32-bit mask."""
+
+INTERSECTIONS_MAX = (1 << 31) - 1
+"""The count of a pass's intersections of tiles and splats stays here where it would be more."""
+
+SCAN_TILES = 1024
+"""Tiles of one block of the kernels that find each tile's first intersection."""
+
+SORT_RUN = 512
+"""Intersections of a tile that one warp sorts. A tile with more is sorted in runs of so many, which are then merged."""
+
+UNITS = ("pixel", "cell", "tile")
+"""What a draw chooses: single pixels, cells of 4x4 pixels, or whole tiles of 16x16. The kernels number them so."""
+
+STRUCTURES = ("none", "ncc", "contrast", "ssim")
+"""Similarities of a tile's samples that a loss may have beside its l1 term. The kernels number them so."""
+
+UPDATE_KINDS = ("adam", "balanced_lm", "paper_lm")
+"""What a step of the parameters is. The kernels number them so."""
+
+
+class ScreenRecord:
+    """Gradients and sums of one Gaussian in one view: a row of float32.
+
+    w is the weight of a sample (transmittance times alpha), e its error, D its distance from the mean in standard
+    deviations (Mahalanobis). Sums run over the samples. `ABSOLUTE` and `DISTANCE_SUM` are filled only where density
+    control asks for them, and are zero elsewhere.
+    """
+
+    MEAN = slice(0, 2)  # d loss / d projected mean, in pixels
+    CONIC = slice(2, 5)  # d loss / d (a, b, c) of the inverse covariance; b counts for both off-diagonal entries
+    COLOR = slice(5, 8)  # d loss / d color, after the clamp at 0
+    OPACITY = 8  # d loss / d opacity, after the sigmoid
+    ABSOLUTE = slice(9, 11)  # sums of the absolute values of each sample's d loss / d mean (AbsGS)
+    ERROR_SUM = 11  # sum of e * w
+    DISTANCE_SUM = 12  # sum of D * w
+    WEIGHT_SUM = 13  # sum of w
+    DEPTH = 14  # d loss / d depth
+    SIZE = 16  # the last one is unused: a record is four quads of 16 bytes
+
+
+class ParameterRow:
+    """Gradients or moments of the parameters of one Gaussian, without the higher bands: a row of float32.
+
+    Moment-damped LM solves two blocks of it: the geometry, up to the quaternions, and the appearance.
+    """
+
+    MEANS = slice(0, 3)
+    SCALES = slice(3, 6)
+    QUATS = slice(6, 10)
+    SH0 = slice(10, 13)
+    OPACITIES = slice(13, 14)
+    SIZE = 14
+
+
+class InstanceRow:
+    """A splat on the screen, one Gaussian in one view: a row of float32. `Instance` in csrc/raster/raster_params.h."""
+
+    MEAN = slice(0, 2)  # pixels
+    CONIC = slice(2, 5)
+    OPACITY = 5  # after the sigmoid
+    DEPTH = 6
+    LOG_REACH = 7  # log(opacity / alpha_min)
+    COLOR = slice(8, 11)  # after the clamp at 0
+    INVERSE_SIGMA_Y = 11  # 1 / standard deviation along y
+    SIZE = 12
+
+
+class CameraRow:
+    """A view as the raster kernels keep it: a row of 4-byte numbers that only they read."""
+
+    SIZE = 28
+
+
+class ImageRow:
+    """A view of a batch as the rasterizer is given it: a row of integers."""
+
+    WIDTH = 0
+    HEIGHT = 1
+    SIZE = 2
+
+
+class ViewRow:
+    """A view of a batch as the loss is given it: a row of integers."""
+
+    FIRST_PIXEL = 0  # of the view, among the flat pixels of all training views
+    WIDTH = 1
+    HEIGHT = 2
+    NUMBER = 3  # of the training view
+    SIZE = 4
+
+
+class DrawRow(ViewRow):
+    """A view of a batch as the sampler is given it: a row of integers, those of `ViewRow` first."""
+
+    FIRST_SLOT = 4  # for unit = tile the first chosen tile
+    WANTED = 5  # tiles to choose; only for unit = tile
+    STAGES = slice(6, 9)  # units of the hard, the stable and the mixed stage: of a tile, or for unit = tile of the view
+    SIZE = 9
+
+
+def columns(row: type) -> dict[str, slice]:
+    """Where each column of a row lies, by its name in lower case; those of a base class come first."""
+    found = {}
+    for base in reversed(row.__mro__):
+        for name, place in vars(base).items():
+            if name.isupper() and name != "SIZE":
+                found[name.lower()] = place if isinstance(place, slice) else slice(place, place + 1)
+    return found
