@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 from helpers.raster_cases import (
+    FLIP_SHARE,
     FORWARD_BOUND,
     GPU_ONLY,
     GRADIENT_BOUND,
@@ -92,20 +93,16 @@ def test_gradients(case, steady, of_all, bound):
     assert_all_gradients_close(case, got, wanted, values, bound)
 
 
-@pytest.mark.xfail(
-    strict=False,
-    reason="a few samples decided otherwise are more than 1e-3 of a gradient, and one pair of splats decides several "
-    "alike: of 24 models 10 fail here, and 9 of the reference in float32 (docs/results/h200)",
-)
-def test_all_samples_are_as_close_as_the_steady_ones(case):
-    """The bound that float32 keeps on some models only."""
+def test_gradients_differ_by_samples_of_another_color_alone(case, steady):
+    """Gradients of all samples may be farther apart than the bound of steady ones, as in float32 on some models
+    (docs/results/h200). A few samples explain it, whose colors are beyond their bound by a decision made otherwise."""
     got = rasterize(case.gpu_gaussians, case.gpu_cameras, case.gpu_samples)
     wanted = rasterize_reference(case.gaussians, case.cameras, case.samples)
-    differences = got.colors.double().cpu() - wanted.colors
-    beyond = differences[differences.abs() > FORWARD_BOUND]
-    if len(beyond) >= 20:  # symmetric: neither draws more than the other
-        assert 0.2 <= (beyond > 0).double().mean() <= 0.8
-    assert_all_gradients_close(case, got, wanted, upstream(case), GRADIENT_BOUND)
+    decided_otherwise = ((got.colors.double().cpu() - wanted.colors).abs() > FORWARD_BOUND).any(dim=-1)
+    assert not (decided_otherwise & steady).any() and decided_otherwise.double().mean() <= FLIP_SHARE
+    values = upstream(case)
+    values["color_gradients"][decided_otherwise] = 0.0
+    assert_all_gradients_close(case, got, wanted, values, GRADIENT_BOUND)
 
 
 def assert_all_gradients_close(case, got, wanted, values, bound):

@@ -1,6 +1,7 @@
 """The kernels on the worst inputs of tests/stability."""
 
 import dataclasses
+import itertools
 import math
 
 import pytest
@@ -13,9 +14,8 @@ from helpers.tolerances import TOLERANCES
 from turbogs_plugin.strategies.density.error_driven import ErrorDrivenDensity
 
 from turbogs_plugin.engine.rendering import dense_samples, rasterize
-from turbogs_plugin.errors import TrainingStopped
 from turbogs_plugin.scene import load_scene
-from turbogs_plugin.train.run import train
+from turbogs_plugin.train.run import load_model, train
 from turbogs_plugin.train.trainer import Trainer
 from turbogs_plugin.types import GaussianStats, Step
 
@@ -48,24 +48,26 @@ def test_equal_depths_render_the_same_bits_every_time():
 
 
 @pytest.mark.parametrize("size", [-200.0, -20.0, 9.0, 20.0, 88.0, 200.0])
-@pytest.mark.parametrize("place", [0.0, 1e-30, 4.0, 1e6, 1e18, 3e38])
-@pytest.mark.parametrize("norm", [0.0, 1e-38, 1.0, 1e37])
-def test_any_gaussian_among_ordinary_ones_stays_finite(size, place, norm):
-    gaussians = random_scene(8)
-    gaussians.scales[3] = torch.tensor([size, -2.0, -20.0])
-    gaussians.means[3] = torch.tensor([0.0, place, -place if place < 1e3 else 0.0])
-    gaussians.quats[3] *= norm
-    gaussians, cameras = gaussians.map(lambda value: value.cuda()), TWO_VIEWS.to("cuda")
-    samples, stats = dense_samples(cameras), GaussianStats.zeros(len(gaussians), "cuda")
-    rendered = rasterize(gaussians, cameras, samples)
-    ones = torch.ones_like(rendered.alphas)
-    gradients = rendered.backward(torch.ones_like(rendered.colors), ones, with_statistics=True).parameter_gradients(
-        True, stats
-    )
-    assert rendered.colors.isfinite().all() and rendered.alphas.isfinite().all()
-    assert all(value.isfinite().all() for value in (*vars(gradients).values(), *vars(stats).values()))
-    for name in NAMES[:-1]:
-        assert (getattr(gradients, name)[:, ~gradients.touched] == 0).all(), name
+def test_any_gaussian_among_ordinary_ones_stays_finite(size):
+    """Wherever it is, and whatever the length of its quaternion."""
+    cameras = TWO_VIEWS.to("cuda")
+    samples = dense_samples(cameras)
+    places, norms = [0.0, 1e-30, 4.0, 1e6, 1e18, 3e38], [0.0, 1e-38, 1.0, 1e37]
+    for place, norm in itertools.product(places, norms):
+        gaussians = random_scene(8)
+        gaussians.scales[3] = torch.tensor([size, -2.0, -20.0])
+        gaussians.means[3] = torch.tensor([0.0, place, -place if place < 1e3 else 0.0])
+        gaussians.quats[3] *= norm
+        gaussians, stats = gaussians.map(lambda value: value.cuda()), GaussianStats.zeros(len(gaussians), "cuda")
+        rendered = rasterize(gaussians, cameras, samples)
+        ones = torch.ones_like(rendered.alphas)
+        screen = rendered.backward(torch.ones_like(rendered.colors), ones, with_statistics=True)
+        gradients = screen.parameter_gradients(True, stats)
+        case = f"at {place}, quaternion of length {norm}"
+        assert rendered.colors.isfinite().all() and rendered.alphas.isfinite().all(), case
+        assert all(value.isfinite().all() for value in (*vars(gradients).values(), *vars(stats).values())), case
+        for name in NAMES[:-1]:
+            assert (getattr(gradients, name)[:, ~gradients.touched] == 0).all(), f"{name}, {case}"
 
 
 def test_what_is_too_large_to_split_goes():
@@ -82,15 +84,14 @@ def test_what_is_too_large_to_split_goes():
 
 @pytest.mark.parametrize("factor", [100, 1e4])
 def test_learning_rates_far_too_large(tmp_path, factor):
-    """A hundred times too large ends well; ten thousand times, a run may end early, but says so."""
+    """The model is useless, but finite to the end, as by the reference (tests/stability/test_training.py)."""
     rates = f"optimizer.learning_rates.batch_scale={2 * factor}"
     config = tiny_config(tiny_capture(tmp_path), rates, "train.device=cuda", "density.max_gaussians=3000")
-    try:
-        outcome = train(config, tmp_path / "run")
-    except TrainingStopped as stop:
-        assert factor > 100 and "iteration" in str(stop)
-    else:
-        assert all(math.isfinite(evaluation.psnr) for evaluation in outcome.history)
+    outcome = train(config, tmp_path / "run")
+    assert outcome.history[-1].iteration == config.train.iterations
+    assert all(math.isfinite(evaluation.psnr) for evaluation in outcome.history)
+    trained = load_model(tmp_path / "run", torch.device("cpu")).gaussians
+    assert len(trained) > 0 and all(value.isfinite().all() for _, value in trained.items())
 
 
 def test_the_guard_waits_for_nothing(tmp_path):

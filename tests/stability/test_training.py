@@ -16,7 +16,6 @@ from PIL import Image
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from turbogs_plugin.config.configuration import Config, load_config
-from turbogs_plugin.errors import TrainingStopped
 from turbogs_plugin.report.pages import write_report
 from turbogs_plugin.scene import load_scene
 from turbogs_plugin.train import run
@@ -83,7 +82,7 @@ def coordinates_run(capture: Path, out: Path) -> float:
     return train_to_the_end(capture, out, *STEADY).history[-1].psnr
 
 
-STEADY = ("train.iterations=30", "view_sampler.type=random", "pixel_sampler.type=random", "density.type=none")
+STEADY = ("train.iterations=15", "view_sampler.type=random", "pixel_sampler.type=random", "density.type=none")
 
 
 @pytest.mark.parametrize(
@@ -164,24 +163,19 @@ def test_points_that_no_camera_sees(variant, tmp_path):
 # ---- Settings ----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("factor", [100, 1e4, 1e8])
 @pytest.mark.parametrize(
-    "optimizer", [("moment_lm",), ("sparse_adam",), ("moment_lm", "optimizer.units=paper")], ids=lambda o: o[-1]
+    ("optimizer", "factor"),
+    [
+        *(((name,), factor) for name in ("moment_lm", "sparse_adam") for factor in (100, 1e4, 1e8)),
+        (("moment_lm", "optimizer.units=paper"), 1e8),
+    ],
+    ids=str,
 )
-def test_learning_rates_far_too_large(capture, tmp_path, factor, optimizer):
-    """A hundred times too large ends well; beyond, a run may end early, but what it saved is finite."""
+def test_learning_rates_far_too_large(capture, tmp_path, optimizer, factor):
+    """The model is useless, but finite to the end: nothing overflows, and no update is left out."""
     name, *others = optimizer
     overrides = [f"optimizer.type={name}", *others, f"optimizer.learning_rates.batch_scale={2 * factor}"]
-    try:
-        outcome = run.train(small_config(capture, *overrides), tmp_path / "run")
-        assert all(np.isfinite(evaluation.psnr) for evaluation in outcome.history)
-    except TrainingStopped as stop:
-        assert factor > 100
-        assert "iteration" in str(stop) and ("last good checkpoint" in str(stop) or "no checkpoint" in str(stop))
-    newest = latest_checkpoint(tmp_path / "run" / "checkpoints")
-    assert newest is not None or factor > 100
-    if newest is not None:
-        assert all(value.isfinite().all() for value in saved_model(tmp_path / "run").values())
+    train_to_the_end(capture, tmp_path / "run", *overrides)
 
 
 @pytest.mark.parametrize(

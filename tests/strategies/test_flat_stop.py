@@ -133,7 +133,7 @@ def test_a_run_that_stops_early_has_fewer_gaussians(tmp_path):
         config = tiny_config(capture, *overrides, f"density.stop_when_flat={stop}").without_plan()
         trainer = Trainer(config, scene, torch.device("cpu"))
         trainer.initialise_maps()
-        while trainer.iteration < 18:
+        while trainer.iteration < 15:
             trainer.step()
         counts.append(len(trainer.gaussians))
         assert bool(trainer.density.stopped_at) == (stop > 0)
