@@ -41,8 +41,7 @@ class StoredCell:
     """A cell as a file has it, together with what is common.
 
     Args:
-        scene, variant, seed, capture, resolved, warmup_iterations, lpips_reason, peak_bytes: as in
-            `CellResult`.
+        scene, variant, seed, capture, resolved, warmup_iterations, lpips_reason, peak_bytes: as in `CellResult`.
         provenance: place in the document's list.
         config: its difference from the document's.
         asked: the difference of what was asked for from the cell's own configuration.

@@ -121,7 +121,7 @@ def _row(name: str, results: Sequence[CellResult], base: Sequence[CellResult], t
         gaussians=_spread(results, "num_gaussians"),
         fps=Spread.of(cell.fps for cell in results),
         peak_bytes=Spread.of(math.nan if cell.peak_bytes is None else cell.peak_bytes for cell in results),
-        iterations=_fitted_lengths(results),
+        iterations=[cell.final.iteration for cell in results if cell.time_budget],
         psnr_difference=psnr.mean - base_psnr.mean,
         psnr_differs=differ(psnr, base_psnr),
         seconds_differ=differ(seconds, base_seconds),
@@ -143,7 +143,3 @@ def _reach(results: Sequence[CellResult], base: Sequence[CellResult], target: fl
     ratio = seconds.mean / against if against > 0 else math.nan
     reached = sum(map(math.isfinite, times))
     return Reach(target, seconds, reached, ratio if 0 < ratio < math.inf else math.nan)
-
-
-def _fitted_lengths(results: Sequence[CellResult]) -> list[int]:
-    return [cell.final.iteration for cell in results if cell.time_budget]
