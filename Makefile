@@ -27,8 +27,10 @@ demo/capture: | $(INSTALLED)
 pages: $(INSTALLED)
 	$(BIN)/turbogs report $(patsubst %/,%,$(dir $(wildcard docs/results/*/results.json)))
 
+# A process a core, each with one thread and with whole files, whose tests share captures and runs.
+test: export OMP_NUM_THREADS := 1
 test: $(INSTALLED)
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest --numprocesses auto --maxprocesses 8 --dist loadfile
 
 lint: $(INSTALLED)
 	$(BIN)/ruff check .
