@@ -8,12 +8,12 @@ import shutil
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 from helpers.framework_runs import TINY, tiny_capture
+from helpers.simulated_time import SimulatedTime
 
 from turbogs_plugin import cli
 from turbogs_plugin.config.configuration import load_config
@@ -29,7 +29,6 @@ from turbogs_plugin.study.folder import StudyFolder
 from turbogs_plugin.study.grid import load_ablation, variant_config
 from turbogs_plugin.study.results import CellResult
 from turbogs_plugin.study.results_file import DECIMALS
-from turbogs_plugin.train import calibration, clock
 from turbogs_plugin.train.folder import RunFolder
 from turbogs_plugin.train.history import Evaluation, append_evaluation, read_history
 from turbogs_plugin.train.loop import Listener, TrainingLoop
@@ -176,20 +175,8 @@ def test_a_cell_that_cannot_be_used_is_named_by_its_file(small, tmp_path, change
 
 @pytest.fixture
 def machine(monkeypatch) -> None:
-    """By the clock of training, an iteration takes 1/8 s, a view's first map 1/16 s, and all else nothing."""
-    now, step, initialise = [0.0], Trainer.step, Trainer.initialise_map
-
-    def taking(function, seconds):
-        def taken(*arguments):
-            function(*arguments)
-            now[0] += seconds
-
-        return taken
-
-    monkeypatch.setattr(Trainer, "step", taking(step, 0.125))
-    monkeypatch.setattr(Trainer, "initialise_map", taking(initialise, 0.0625))
-    for module in (clock, calibration):
-        monkeypatch.setattr(module, "time", SimpleNamespace(perf_counter=lambda: now[0]))
+    """On which an iteration takes 1/8 s, and all but training nothing."""
+    SimulatedTime(monkeypatch, tick=1e-9).in_iterations(monkeypatch, lambda trainer: 0.125)
 
 
 @pytest.mark.parametrize(

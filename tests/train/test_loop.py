@@ -7,6 +7,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from helpers.simulated_time import SimulatedTime
 
 import turbogs_plugin.train
 from turbogs_plugin.config.configuration import TrainConfig
@@ -118,22 +119,18 @@ def test_a_resumed_training_keeps_its_maps():
 
 def test_only_training_is_on_the_clock(monkeypatch):
     """An hour of evaluations takes no time; an iteration takes a second, and so do the maps."""
-    now = [0.0]
-    monkeypatch.setattr("turbogs_plugin.train.clock.time", SimpleNamespace(perf_counter=lambda: now[0]))
-
-    def pass_time(seconds: float) -> None:
-        now[0] += seconds
+    clock = SimulatedTime(monkeypatch)
 
     class Slow(Listener):
         def begun(self, loop: TrainingLoop) -> None:
-            pass_time(3600.0)
+            clock.passes(3600.0)
 
         evaluation_due = checkpoint_due = begun
 
     trainer = CountingTrainer(6, evaluate_at=(0.5,))
     step, initialise = trainer.step, trainer.initialise_maps
-    trainer.step = lambda: (step(), pass_time(1.0))
-    trainer.initialise_maps = lambda: (initialise(), pass_time(1.0))
+    trainer.step = lambda: (step(), clock.passes(1.0))
+    trainer.initialise_maps = lambda: (initialise(), clock.passes(1.0))
     loop = TrainingLoop(trainer, IterationPace(trainer.config.train), [Slow()], seconds=2.0)
     loop.run()
     assert loop.clock.seconds == 2.0 + 1.0 + 6.0
