@@ -10,7 +10,7 @@ import turbogs_plugin
 def test_few_modules_stand_beside_the_packages():
     root = Path(turbogs_plugin.__file__).parent
     modules = {path.stem for path in root.glob("*.py")} - {"__init__"}
-    assert modules <= {"types", "tiles", "errors", "error_maps", "files", "cli", "doctor"}
+    assert modules <= {"types", "tiles", "errors", "error_maps", "files", "device", "cli", "doctor"}
 
 
 def test_importing_the_trainer_loads_nothing_that_only_reports_need():

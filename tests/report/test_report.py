@@ -10,6 +10,7 @@ import torch
 from helpers.framework_runs import tiny_capture, tiny_config
 from PIL import Image
 
+from turbogs_plugin.device import peak_memory_bytes
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.report.pages import write_report
 from turbogs_plugin.report.plots import (
@@ -22,7 +23,7 @@ from turbogs_plugin.report.plots import (
 )
 from turbogs_plugin.report.tables import number, table
 from turbogs_plugin.train import run
-from turbogs_plugin.train.evaluate import Metrics, ViewMetrics, compare, load_lpips, peak_memory_bytes
+from turbogs_plugin.train.evaluate import Metrics, ViewMetrics, compare, load_lpips
 from turbogs_plugin.train.history import Evaluation, append_evaluation, read_history, rewind_history
 from turbogs_plugin.train.progress import TrainingProgress, describe_nonfinite
 

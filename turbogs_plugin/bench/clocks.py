@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import torch
 
-from turbogs_plugin.train.clock import synchronize
+from turbogs_plugin.device import synchronize
 
 BUSY_CYCLES = 20_000_000
 """Clock cycles for which the GPU is kept busy before what is timed, so that the host has enqueued all of it by then."""

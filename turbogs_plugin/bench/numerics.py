@@ -15,6 +15,7 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
+from turbogs_plugin.device import synchronize
 from turbogs_plugin.engine.reference.lm_solvers import (
     ROW_LIMIT,
     solve_float64,
@@ -26,7 +27,6 @@ from turbogs_plugin.files import write_atomically, write_text_atomically
 from turbogs_plugin.report.machine import hardware, software
 from turbogs_plugin.report.plots import STYLE
 from turbogs_plugin.report.tables import table
-from turbogs_plugin.train.clock import synchronize
 
 Problem = tuple[Tensor, Tensor, Tensor, Tensor]
 """rows [K, n, D], weights [K, n], damping [n, D], rhs [n, D], as the solvers take them."""

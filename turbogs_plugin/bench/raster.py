@@ -28,6 +28,7 @@ from turbogs_plugin.bench.models import (
     trained_model,
 )
 from turbogs_plugin.bench.precision import precision
+from turbogs_plugin.device import free_device_memory
 from turbogs_plugin.engine import engine_of
 from turbogs_plugin.engine.cuda.library import LIBRARY_VARIABLE
 from turbogs_plugin.engine.cuda.raster import CudaRendered
@@ -36,7 +37,6 @@ from turbogs_plugin.errors import InputError
 from turbogs_plugin.model.ply import load_ply, save_ply
 from turbogs_plugin.scene import Scene
 from turbogs_plugin.study.cell import scene_on
-from turbogs_plugin.train.evaluate import free_device_memory
 from turbogs_plugin.types import Cameras, Gaussians, GaussianStats
 
 STAGES = {

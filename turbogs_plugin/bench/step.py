@@ -17,11 +17,11 @@ from turbogs_plugin.bench.floors import raster_counts, step_floors
 from turbogs_plugin.bench.models import adopt, changed, resized, train, trained_model
 from turbogs_plugin.bench.recorder import StepRecorder, recorded
 from turbogs_plugin.config.configuration import Config, load_config
+from turbogs_plugin.device import synchronize
 from turbogs_plugin.engine.cuda.raster import CudaRendered
 from turbogs_plugin.model.ply import load_ply
 from turbogs_plugin.model.row_order import in_order_of_space
 from turbogs_plugin.scene import Scene
-from turbogs_plugin.train.clock import synchronize
 from turbogs_plugin.train.trainer import Trainer
 from turbogs_plugin.types import Gaussians, Step
 

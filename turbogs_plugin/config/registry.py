@@ -22,36 +22,36 @@ from turbogs_plugin.strategies import protocols
 
 BUILT_IN: dict[str, dict[str, str]] = {
     "schedule": {
-        "sinusoidal": "turbogs_plugin.strategies.schedule:SinusoidalSchedule",
-        "linear": "turbogs_plugin.strategies.schedule:LinearSchedule",
-        "exponential": "turbogs_plugin.strategies.schedule:ExponentialSchedule",
-        "fixed": "turbogs_plugin.strategies.schedule:FixedSchedule",
+        "sinusoidal": "turbogs_plugin.strategies:SinusoidalSchedule",
+        "linear": "turbogs_plugin.strategies:LinearSchedule",
+        "exponential": "turbogs_plugin.strategies:ExponentialSchedule",
+        "fixed": "turbogs_plugin.strategies:FixedSchedule",
     },
     "view_sampler": {
-        "geometry_aware": "turbogs_plugin.strategies.view_sampling:GeometryAwareViewSampler",
-        "random": "turbogs_plugin.strategies.view_sampling:RandomViewSampler",
+        "geometry_aware": "turbogs_plugin.strategies:GeometryAwareViewSampler",
+        "random": "turbogs_plugin.strategies:RandomViewSampler",
     },
     "pixel_sampler": {
-        "error_guided": "turbogs_plugin.strategies.pixel_sampling:ErrorGuidedPixelSampler",
-        "random": "turbogs_plugin.strategies.pixel_sampling:RandomPixelSampler",
-        "dense": "turbogs_plugin.strategies.pixel_sampling:DensePixelSampler",
+        "error_guided": "turbogs_plugin.strategies:ErrorGuidedPixelSampler",
+        "random": "turbogs_plugin.strategies:RandomPixelSampler",
+        "dense": "turbogs_plugin.strategies:DensePixelSampler",
     },
     "loss": {
-        "charbonnier_ncc": "turbogs_plugin.strategies.losses:CharbonnierNccLoss",
-        "charbonnier": "turbogs_plugin.strategies.losses:CharbonnierLoss",
-        "sparse_ssim": "turbogs_plugin.strategies.losses:SparseSsimLoss",
+        "charbonnier_ncc": "turbogs_plugin.strategies:CharbonnierNccLoss",
+        "charbonnier": "turbogs_plugin.strategies:CharbonnierLoss",
+        "sparse_ssim": "turbogs_plugin.strategies:SparseSsimLoss",
     },
     "density": {
-        "error_driven": "turbogs_plugin.strategies.density.error_driven:ErrorDrivenDensity",
-        "none": "turbogs_plugin.strategies.density.none:NoDensity",
-        "gsplat_default": "turbogs_plugin.strategies.density.gsplat_default:GsplatDefaultDensity",
-        "mcmc": "turbogs_plugin.strategies.density.mcmc:GsplatMcmcDensity",
-        "fastgs": "turbogs_plugin.strategies.density.fastgs:FastGsDensity",
+        "error_driven": "turbogs_plugin.strategies:ErrorDrivenDensity",
+        "none": "turbogs_plugin.strategies:NoDensity",
+        "gsplat_default": "turbogs_plugin.strategies:GsplatDefaultDensity",
+        "mcmc": "turbogs_plugin.strategies:GsplatMcmcDensity",
+        "fastgs": "turbogs_plugin.strategies:FastGsDensity",
     },
     "optimizer": {
-        "moment_lm": "turbogs_plugin.strategies.optimizers.moment_lm:MomentLMOptimizer",
-        "sparse_adam": "turbogs_plugin.strategies.optimizers.sparse_adam:SparseAdam",
-        "adam": "turbogs_plugin.strategies.optimizers.dense_adam:DenseAdam",
+        "moment_lm": "turbogs_plugin.strategies:MomentLMOptimizer",
+        "sparse_adam": "turbogs_plugin.strategies:SparseAdam",
+        "adam": "turbogs_plugin.strategies:DenseAdam",
     },
 }
 """Kind -> name -> "module:class". The first of a kind is the one that a config without that section gets."""

@@ -26,10 +26,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from turbogs_plugin.device import synchronize
 from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.scene import PosedImages
 from turbogs_plugin.scene.photos import Photos, pixel_offsets
-from turbogs_plugin.train.clock import synchronize
 
 SETS = 2
 """Sets of slots: one that the device works on, one that travels."""

@@ -12,12 +12,13 @@ import torch
 
 from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.config.scaling import with_iterations
+from turbogs_plugin.device import free_device_memory, peak_memory_bytes
 from turbogs_plugin.report.provenance import Provenance
 from turbogs_plugin.scene import PosedImages, Scene
 from turbogs_plugin.scene.offload import place_views
 from turbogs_plugin.study.results import CellResult
 from turbogs_plugin.study.timing import PeakMemory
-from turbogs_plugin.train.evaluate import evaluate, free_device_memory, load_lpips, peak_memory_bytes
+from turbogs_plugin.train.evaluate import evaluate, load_lpips
 from turbogs_plugin.train.evaluations import Evaluations
 from turbogs_plugin.train.loop import Listener, TrainingLoop
 from turbogs_plugin.train.run import new_loop, plan_scene

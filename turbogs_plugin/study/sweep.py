@@ -15,6 +15,7 @@ import torch
 
 from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.config.old_spellings import old_spelling
+from turbogs_plugin.device import synchronize
 from turbogs_plugin.errors import InputError, TrainingStopped
 from turbogs_plugin.report.provenance import COMMIT_VARIABLE, MODIFIED, Provenance
 from turbogs_plugin.scene import Scene, load_scene
@@ -23,7 +24,6 @@ from turbogs_plugin.study.folder import StudyFolder
 from turbogs_plugin.study.grid import Ablation, CellKey, variant_config
 from turbogs_plugin.study.progress import SweepProgress
 from turbogs_plugin.study.results import CellResult, Failure
-from turbogs_plugin.train.clock import synchronize
 from turbogs_plugin.train.run import resolve_device
 
 UNCOMPARED = (("scene", "path"), ("train", "device"))

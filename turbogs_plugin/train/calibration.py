@@ -12,6 +12,7 @@ import torch
 
 from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.config.scaling import with_iterations
+from turbogs_plugin.device import free_device_memory
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.plan.caps import (
     FEWEST_GAUSSIANS,
@@ -33,7 +34,6 @@ from turbogs_plugin.plan.pixels import (
 from turbogs_plugin.plan.time import IterationCost, fit_to_time
 from turbogs_plugin.scene import Scene
 from turbogs_plugin.train.clock import TrainingClock
-from turbogs_plugin.train.evaluate import free_device_memory
 from turbogs_plugin.train.loop import Listener, TrainingLoop
 from turbogs_plugin.train.trainer import Trainer
 

@@ -7,11 +7,7 @@ from types import TracebackType
 
 import torch
 
-
-def synchronize(device: torch.device) -> None:
-    """Wait for the GPU, so that a clock read next counts what was asked for; nothing on a CPU."""
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)
+from turbogs_plugin.device import synchronize
 
 
 class TrainingClock:

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import gc
 import importlib.util
 import math
-import sys
 import tempfile
 import time
 from collections.abc import Callable
@@ -16,10 +14,10 @@ import torch
 from torch import Tensor
 from torchmetrics.functional.image import structural_similarity_index_measure
 
+from turbogs_plugin.device import synchronize
 from turbogs_plugin.engine.rendering import DEFAULT_SETTINGS, RasterSettings, render_image
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene import PosedImages
-from turbogs_plugin.train.clock import synchronize
 from turbogs_plugin.types import Gaussians
 
 SSIM_SIDE = 11
@@ -175,20 +173,3 @@ def _load_lpips(file: Path, device: torch.device) -> Callable[[Tensor, Tensor], 
         finally:
             torch.hub.set_dir(cache)
     return lambda image, photo: network(image.permute(2, 0, 1)[None], photo.permute(2, 0, 1)[None]).item()
-
-
-def free_device_memory(device: torch.device) -> None:
-    """Give back to a GPU what nothing refers to any more, so that what comes next is measured by itself."""
-    if device.type == "cuda":
-        gc.collect()
-        torch.cuda.empty_cache()
-
-
-def peak_memory_bytes(device: torch.device) -> int:
-    """Peak of the tensors' memory on a GPU, or of this process on a CPU."""
-    if device.type == "cuda":
-        return torch.cuda.max_memory_allocated(device)
-    import resource  # not on Windows
-
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak if sys.platform == "darwin" else peak * 1024

@@ -6,8 +6,9 @@ from collections.abc import Callable
 
 from torch import Tensor
 
+from turbogs_plugin.device import peak_memory_bytes
 from turbogs_plugin.scene import PosedImages
-from turbogs_plugin.train.evaluate import Metrics, evaluate, peak_memory_bytes
+from turbogs_plugin.train.evaluate import Metrics, evaluate
 from turbogs_plugin.train.history import Evaluation
 from turbogs_plugin.train.loop import Listener, TrainingLoop
 

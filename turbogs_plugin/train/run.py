@@ -12,7 +12,7 @@ from typing import Any
 
 import torch
 
-from turbogs_plugin.config.configuration import Config
+from turbogs_plugin.config.configuration import DEFAULT_CONFIG, Config, load_config
 from turbogs_plugin.errors import InputError, TrainingStopped
 from turbogs_plugin.files import write_text_atomically
 from turbogs_plugin.model.ply import save_ply
@@ -138,6 +138,29 @@ def new_loop(config: Config, scene: Scene, device: torch.device) -> tuple[Traini
     trainer = Trainer(config, scene, device)
     pace = pace_of(config, calibration and calibration.cost)
     return TrainingLoop(trainer, pace, seconds=calibration.seconds if calibration else 0.0), calibration
+
+
+def fit(scene: Scene, *overrides: str, config: str = DEFAULT_CONFIG) -> Gaussians:
+    """Train on a loaded scene, in memory: nothing is written, nothing is printed.
+
+    Args:
+        scene: its photos in host memory.
+        overrides: changes of the configuration, ``section.key=value``.
+        config: name of a packaged configuration, or a YAML file.
+
+    Returns:
+        The model, on the device that it was trained on and about the scene's own centre.
+
+    Raises:
+        InputError: anything wrong with the input.
+        TrainingStopped: the model is lost.
+    """
+    settings = load_config(config, overrides)
+    device = resolve_device(settings.train.device)
+    loop, _ = new_loop(plan_scene(settings, scene, device).apply(settings), scene, device)
+    loop.run()
+    loop.trainer.require_finite()
+    return loop.trainer.gaussians
 
 
 def train(config: Config, out: Path, report: ReportWriter | None = None) -> Outcome:

@@ -1,0 +1,64 @@
+"""The page of the house and the faces of the packages: what they name is there."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+import torch
+
+import turbogs_plugin
+from turbogs_plugin import strategies
+from turbogs_plugin.config import registry
+from turbogs_plugin.scene import write_demo_capture
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGE = ROOT / "docs" / "architecture.md"
+FOLDERS = ("turbogs_plugin/", "strategies/", "csrc/", "configs/", "docs/")
+
+
+def named_places() -> list[str]:
+    return re.findall(r"`([\w./-]+)`", PAGE.read_text(encoding="utf-8"))
+
+
+def test_every_file_that_the_page_of_the_house_names_exists():
+    places = [place for place in named_places() if place.startswith(FOLDERS)]
+    assert len(places) > 40
+    assert [place for place in places if not (ROOT / place).exists()] == []
+    loose = [place for place in named_places() if place.endswith((".py", ".cu")) and not place.startswith(FOLDERS)]
+    assert loose == [], "a file is named with its folder"
+
+
+def test_the_page_of_the_house_names_every_room():
+    rooms = {path.parent.name for path in (ROOT / "turbogs_plugin").glob("*/__init__.py")}
+    text = PAGE.read_text(encoding="utf-8")
+    assert [room for room in sorted(rooms) if f"`turbogs_plugin/{room}/`" not in text] == []
+
+
+@pytest.mark.parametrize("package", [turbogs_plugin, strategies])
+def test_a_face_has_what_it_names(package):
+    for name in package.__all__:
+        assert getattr(package, name).__name__ == name if name != "__version__" else package.__version__
+    with pytest.raises(AttributeError, match="no attribute 'absent'"):
+        package.absent  # noqa: B018
+
+
+def test_every_built_in_strategy_is_on_the_face_of_its_package():
+    built_in = {place.partition(":")[2] for names in registry.BUILT_IN.values() for place in names.values()}
+    assert built_in <= set(strategies.__all__)
+    protocols = {protocol.__name__ for protocol in registry.PROTOCOLS.values()}
+    assert protocols <= set(strategies.__all__)
+
+
+def test_readmes_three_lines(tmp_path):
+    """As they stand there, on a smaller capture and for fewer iterations."""
+    (block,) = re.findall(r"```python\n(scene = .*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.S)
+    assert len(block.strip().splitlines()) == 3
+    capture = write_demo_capture(tmp_path / "capture", views=8, width=48, height=40)
+    short = 'fit(scene, "train.iterations=2", "train.refine_until=1", "train.device=cpu", '
+    block = block.replace('"demo/capture"', repr(str(capture))).replace("fit(scene, ", short)
+    names = {"turbogs_plugin": turbogs_plugin}
+    exec(block, names)
+    assert names["image"].shape == (40, 48, 3) and bool(torch.isfinite(names["image"]).all())
+    assert float(names["image"].std()) > 0.01

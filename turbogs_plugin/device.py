@@ -1,0 +1,31 @@
+"""What is asked of a device as a whole: to be waited for, how much of its memory was taken, and to free it."""
+
+from __future__ import annotations
+
+import gc
+import sys
+
+import torch
+
+
+def synchronize(device: torch.device) -> None:
+    """Wait for the GPU, so that a clock read next counts what was asked for; nothing on a CPU."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+
+
+def free_device_memory(device: torch.device) -> None:
+    """Give back to a GPU what nothing refers to any more, so that what comes next is measured by itself."""
+    if device.type == "cuda":
+        gc.collect()
+        torch.cuda.empty_cache()
+
+
+def peak_memory_bytes(device: torch.device) -> int:
+    """Peak of the tensors' memory on a GPU, or of this process on a CPU."""
+    if device.type == "cuda":
+        return torch.cuda.max_memory_allocated(device)
+    import resource  # not on Windows
+
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else peak * 1024
