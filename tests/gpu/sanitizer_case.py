@@ -15,8 +15,7 @@ import torch
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from helpers.framework_runs import tiny_config
 from helpers.raster_cases import samples_to
-from helpers.rendering_scenes import make_cameras, make_gaussians
-from test_raster_sorting import stacked_case, wide_case
+from helpers.rendering_scenes import make_cameras, make_gaussians, one_tile_of_a_wide_image, stacked_splats
 
 from turbogs_plugin.engine.autograd import rasterize_differentiable
 from turbogs_plugin.engine.rendering import dense_samples, rasterize
@@ -80,8 +79,8 @@ def main() -> None:
     image = rasterize_differentiable(gaussians, cameras, dense_samples(cameras), with_depth=True)
     (image.colors.sum() + image.alphas.sum() + image.depths.sum()).backward()
     assert gaussians.means.grad.isfinite().all()
-    draw(*wide_case())  # more large splats than their list has room for
-    draw(*stacked_case(torch.full((4097,), 3.0)))  # runs of equal depths to merge, and a last one of one pair
+    draw(*one_tile_of_a_wide_image())  # more large splats than their list has room for
+    draw(*stacked_splats(torch.full((4097,), 3.0)))  # runs of equal depths to merge, and a last one of one pair
     draw(*many_tiles())
     torch.cuda.synchronize()
     print(f"{len(gaussians)} Gaussians, {len(VARIANTS)} variants, done")

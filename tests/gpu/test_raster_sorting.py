@@ -1,12 +1,11 @@
 """Every tile's intersections: each splat that reaches it once, by depth and then by instance, whatever their number."""
 
-from dataclasses import replace
 from itertools import pairwise
 
 import pytest
 import torch
 from helpers.raster_cases import GPU_ONLY, make_case, samples_to
-from helpers.rendering_scenes import make_cameras, make_gaussians
+from helpers.rendering_scenes import one_tile_of_a_wide_image, stacked_splats
 
 from turbogs_plugin.engine.cuda import raster as cuda
 from turbogs_plugin.engine.rendering import dense_samples
@@ -46,31 +45,6 @@ def intersections_of_tiles(rendered):
     return [forward.intersection_ids[begin:end].cpu() for begin, end in pairwise(starts)]
 
 
-def stacked_case(z):
-    """One tile that every splat reaches; a pixel of one view, so that depths are the z of the means."""
-    count = len(z)
-    gaussians, cameras = make_gaussians(count, dtype=torch.float32), make_cameras([(2, 2)], torch.float32)
-    cameras.viewmats[0] = torch.eye(4)
-    cameras.Ks[0, :2, 2] = 1.0
-    gaussians.means = torch.stack([torch.zeros(count), torch.zeros(count), z], dim=1)
-    gaussians.scales[:], gaussians.opacities[:] = 0.1 * z.log()[:, None] - 1, 1.0
-    return gaussians, cameras, dense_samples(cameras)
-
-
-def wide_case():
-    """One active tile of a wide image, which every splat covers."""
-    gaussians, cameras = make_gaussians(60, dtype=torch.float32), make_cameras([(4096, 4096)], torch.float32)
-    gaussians.scales[:], gaussians.opacities[:] = 2.0, 1.0
-    samples = dense_samples(cameras)
-    samples = replace(
-        samples,
-        tile_ids=samples.tile_ids[5000:5001],
-        pixel_ids=samples.pixel_ids[5000 * 256 : 5001 * 256],
-        tile_offsets=samples.tile_offsets[:2],
-    )
-    return gaussians, cameras, samples
-
-
 def render(gaussians, cameras, samples):
     gaussians = gaussians.map(lambda value: value.cuda())
     return cuda.rasterize_cuda(gaussians, cameras.to("cuda"), samples_to(samples, "cuda"))
@@ -84,7 +58,7 @@ def render(gaussians, cameras, samples):
 )
 def test_a_tile_is_in_order(depths, count):
     z = depths(count, torch.Generator().manual_seed(count))
-    (got,) = intersections_of_tiles(render(*stacked_case(z)))
+    (got,) = intersections_of_tiles(render(*stacked_splats(z)))
     assert torch.equal(got.long(), z.sort(stable=True).indices)
 
 
@@ -106,7 +80,7 @@ def test_tiles_of_many_views_are_in_order():
 
 
 def test_more_large_splats_than_their_list_has_room_for():
-    rendered = render(*wide_case())
+    rendered = render(*one_tile_of_a_wide_image())
     (got,) = intersections_of_tiles(rendered)
     drawn = rendered.projected()
     assert torch.equal(got.long(), drawn.depths[0].cpu().sort(stable=True).indices)

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from torch import Tensor
 
-from turbogs_plugin.engine.rendering import DEFAULT_SETTINGS, RasterSettings
+from turbogs_plugin.engine.rendering import DEFAULT_SETTINGS, RasterSettings, dense_samples
 from turbogs_plugin.types import Cameras, Gaussians, PixelSamples
 
 
@@ -172,3 +173,28 @@ def loop_render(
         result.depths[slot] = depth_sum / max(result.alphas[slot], 1e-10)
     result.margin = margin
     return result
+
+
+def stacked_splats(z: Tensor) -> tuple[Gaussians, Cameras, PixelSamples]:
+    """One tile that every splat reaches, in one view, so that depths are the z of the means: [N]."""
+    count = len(z)
+    gaussians, cameras = make_gaussians(count, dtype=torch.float32), make_cameras([(2, 2)], torch.float32)
+    cameras.viewmats[0] = torch.eye(4)
+    cameras.Ks[0, :2, 2] = 1.0
+    gaussians.means = torch.stack([torch.zeros(count), torch.zeros(count), z], dim=1)
+    gaussians.scales[:], gaussians.opacities[:] = 0.1 * z.log()[:, None] - 1, 1.0
+    return gaussians, cameras, dense_samples(cameras)
+
+
+def one_tile_of_a_wide_image() -> tuple[Gaussians, Cameras, PixelSamples]:
+    """One active tile of a wide image, which every splat covers."""
+    gaussians, cameras = make_gaussians(60, dtype=torch.float32), make_cameras([(4096, 4096)], torch.float32)
+    gaussians.scales[:], gaussians.opacities[:] = 2.0, 1.0
+    samples = dense_samples(cameras)
+    samples = replace(
+        samples,
+        tile_ids=samples.tile_ids[5000:5001],
+        pixel_ids=samples.pixel_ids[5000 * 256 : 5001 * 256],
+        tile_offsets=samples.tile_offsets[:2],
+    )
+    return gaussians, cameras, samples

@@ -84,7 +84,7 @@ def test_mutated_models(capture, tmp_path, file, suffix):
         (tmp_path / path.name).write_bytes(content)
     choice = random.Random(f"{file}{suffix}")
     target = tmp_path / f"{file}{suffix}"
-    content, errors, cases = target.read_bytes(), 0, 200
+    content, errors, cases = target.read_bytes(), 0, 120
     for _ in range(cases):
         target.write_bytes(mutate(content, choice))
         result = in_bounded_memory(read_colmap, capture, tmp_path, suffix)
