@@ -178,6 +178,24 @@ def test_weights_have_mean_one_and_same_draw(unit, importance):
     assert weights[weighted.filled].std() > 0.01
 
 
+def test_what_was_likely_to_be_drawn_weighs_little_and_the_exponent_says_how_little():
+    """Two errors a thousandfold apart, drawn by error alone: the weights of the small one are the large ones, and those
+    of exponent 1 are the fourth power of those of 1/4, up to the factor that makes their mean 1."""
+    generator = torch.Generator().manual_seed(5)
+    large = torch.rand(32, 32, generator=generator) < 0.5
+    errors = torch.where(large, 1.0, 1e-3)
+    maps = ErrorMaps.from_images(errors[None])
+    quarter, whole = (
+        ErrorGuidedPixelSampler(hard_ratio=1.0, stable_ratio=0.0, importance=exponent).sample(maps, 0, 0.6, step(7))
+        for exponent in (0.25, 1.0)
+    )
+    is_large = large.reshape(-1)[whole.pixel_ids.long()]
+    assert 0 < int(is_large.sum()) < len(whole)
+    assert whole.weights[~is_large].min() > whole.weights[is_large].max()
+    factors = whole.weights / quarter.weights**4
+    torch.testing.assert_close(factors, factors[:1].expand_as(factors), rtol=1e-4, atol=0.0)
+
+
 def test_weights_are_one_where_everything_is_drawn():
     samples = ErrorGuidedPixelSampler(importance=1.0).sample(random_maps(), (0, 2), 1.0, step(3))
     assert (samples.weights == 1).all()
