@@ -4,18 +4,15 @@ from __future__ import annotations
 
 import sys
 import time
-from types import TracebackType
 
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn
+from rich.progress import BarColumn, TextColumn
 
 from turbogs_plugin.study.grid import CellKey
 from turbogs_plugin.study.results import CellResult, Failure
-from turbogs_plugin.train.loop import Listener, TrainingLoop
-from turbogs_plugin.train.progress import REFRESH_SECONDS
+from turbogs_plugin.train.progress import TerminalBar
 
 
-class SweepProgress(Listener):
+class SweepProgress(TerminalBar):
     """Shows cells as they finish, on stderr.
 
     Args:
@@ -26,37 +23,15 @@ class SweepProgress(Listener):
     def __init__(self, total: int, kept: int) -> None:
         self.total, self.done = total, 0
         self._started = time.perf_counter()
-        self._next_refresh = 0.0
-        self._bar: Progress | None = None
+        columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[left]}"))
+        super().__init__(*columns, transient=True, total=None, left="")
         if kept:
             self._say(f"{kept} finished cells are kept")
-        if sys.stderr.isatty():
-            columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[left]}"))
-            self._bar = Progress(*columns, console=Console(stderr=True), auto_refresh=False, transient=True)
-            self._task = self._bar.add_task("", total=None, left="")
-
-    def __enter__(self) -> SweepProgress:
-        if self._bar is not None:
-            self._bar.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        if self._bar is not None:
-            self._bar.stop()
 
     def begin(self, key: CellKey) -> None:
         """Called before a cell."""
         if self._bar is not None:
             self._bar.reset(self._task, total=None, description=str(key), left=self._left())
-
-    def advanced(self, loop: TrainingLoop) -> None:
-        if self._bar is None or time.perf_counter() < self._next_refresh:
-            return
-        self._next_refresh = time.perf_counter() + REFRESH_SECONDS
-        self._bar.update(self._task, completed=loop.trainer.iteration, total=loop.trainer.iterations)
-        self._bar.refresh()
 
     def finished(self, result: CellResult) -> None:
         """Called after a cell."""

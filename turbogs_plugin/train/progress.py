@@ -5,9 +5,18 @@ from __future__ import annotations
 import sys
 import time
 from types import TracebackType
+from typing import Any, TypeVar
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    ProgressColumn,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 
 from turbogs_plugin.train.history import Evaluation
 from turbogs_plugin.train.loop import Listener, TrainingLoop
@@ -16,33 +25,26 @@ REFRESH_SECONDS = 0.1
 """Between two updates of the bar, so that it costs a fast iteration nothing."""
 
 
-class TrainingProgress(Listener):
-    """Shows iteration, test PSNR, number of Gaussians and time left on stderr.
+BarType = TypeVar("BarType", bound="TerminalBar")
+
+
+class TerminalBar(Listener):
+    """A bar on stderr that follows the iterations, where stderr is a terminal; nothing elsewhere.
 
     Args:
-        total: T, as known at first.
-        iteration: where the run begins.
+        columns: of the bar.
+        transient: whether it goes when it is left.
+        task: what the bar begins with.
     """
 
-    def __init__(self, total: int, iteration: int = 0) -> None:
+    def __init__(self, *columns: ProgressColumn, transient: bool = False, **task: Any) -> None:
         self._next_refresh = 0.0
-        self._bar = None
+        self._bar: Progress | None = None
         if sys.stderr.isatty():
-            self._bar = Progress(
-                MofNCompleteColumn(),
-                BarColumn(),
-                TextColumn("test PSNR {task.fields[psnr]} dB · {task.fields[gaussians]} Gaussians"),
-                TimeElapsedColumn(),
-                TextColumn("·"),
-                TimeRemainingColumn(),
-                TextColumn("left"),
-                TextColumn("{task.fields[warning]}", style="bold red"),
-                console=Console(stderr=True),
-                auto_refresh=False,
-            )
-            self._task = self._bar.add_task("", total=total, completed=iteration, psnr="-", gaussians="-", warning="")
+            self._bar = Progress(*columns, console=Console(stderr=True), auto_refresh=False, transient=transient)
+            self._task = self._bar.add_task("", **task)
 
-    def __enter__(self) -> TrainingProgress:
+    def __enter__(self: BarType) -> BarType:
         if self._bar is not None:
             self._bar.start()
         return self
@@ -58,9 +60,39 @@ class TrainingProgress(Listener):
             return
         self._next_refresh = time.perf_counter() + REFRESH_SECONDS
         trainer = loop.trainer
-        gaussians = f"{len(trainer.gaussians):,}"
-        self._bar.update(self._task, completed=trainer.iteration, total=trainer.iterations, gaussians=gaussians)
+        self._bar.update(
+            self._task,
+            completed=trainer.iteration,
+            total=trainer.iterations,
+            gaussians=f"{len(trainer.gaussians):,}",
+        )
         self._bar.refresh()
+
+
+class TrainingProgress(TerminalBar):
+    """Shows iteration, test PSNR, number of Gaussians and time left on stderr.
+
+    Args:
+        total: T, as known at first.
+        iteration: where the run begins.
+    """
+
+    def __init__(self, total: int, iteration: int = 0) -> None:
+        super().__init__(
+            MofNCompleteColumn(),
+            BarColumn(),
+            TextColumn("test PSNR {task.fields[psnr]} dB · {task.fields[gaussians]} Gaussians"),
+            TimeElapsedColumn(),
+            TextColumn("·"),
+            TimeRemainingColumn(),
+            TextColumn("left"),
+            TextColumn("{task.fields[warning]}", style="bold red"),
+            total=total,
+            completed=iteration,
+            psnr="-",
+            gaussians="-",
+            warning="",
+        )
 
     def evaluated(self, loop: TrainingLoop, evaluation: Evaluation) -> None:
         warning, total = describe_nonfinite(evaluation), loop.trainer.iterations
