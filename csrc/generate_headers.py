@@ -77,9 +77,12 @@ def launches_header(layout: ModuleType, launches: ModuleType) -> str:
             if kind == "Tensors":
                 quoted = ", ".join(f'"{name}"' for name in names)
                 lines.append(f"    static constexpr const char* kTensorNames[] = {{{quoted}}};")
-        lines.append("};")
+        lines += [f"    static void run(const Arguments<{cls.__name__}>& in);  // in csrc/bindings", "};"]
+    lines += ["", "template <class...>", "struct List {};"]
+    lines.append(f"using All = List<{', '.join(cls.__name__ for cls in launches.LAUNCHES)}>;")
     lines += ["", f'constexpr const char* kInterface = R"interface({launches.interface(layout)})interface";']
-    return _header(LAUNCHES, ["namespace launches {", "", *lines, "", "}  // namespace launches"])
+    start = ["template <class>", "class Arguments;", "", "namespace launches {", ""]
+    return _header(LAUNCHES, [*start, *lines, "", "}  // namespace launches"])
 
 
 def _header(source: Path, lines: list[str]) -> str:

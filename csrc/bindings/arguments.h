@@ -2,7 +2,9 @@
 // current stream, and the errors of launches.
 //
 // Python sends the fields of a launch as four lists (turbogs_plugin/engine/cuda/launches.py). launches.h, which the
-// build makes of the same file, has the order of the fields, so they are read by name here.
+// build makes of the same file, has the order of the fields, so they are read by name here. It declares a function
+// `run` for each launch. The other files of this folder define them: each checks its tensors, then hands raw pointers
+// and torch's current stream to a launcher of the kernels. Buffers are made by Python.
 #pragma once
 
 #include <cuda_runtime.h>
@@ -12,11 +14,13 @@
 #include <torch/headeronly/core/ScalarType.h>
 #include <torch/headeronly/util/Exception.h>
 
+#include <algorithm>
 #include <cstdint>
 #include <initializer_list>
 #include <optional>
 #include <sstream>
 #include <string>
+#include <type_traits>
 #include <vector>
 
 #include "common/sizes.h"
@@ -33,9 +37,6 @@ using torch::stable::Tensor;
 using TensorList = std::vector<std::optional<Tensor>>;
 using IntegerList = std::vector<int64_t>;
 using RealList = std::vector<double>;
-
-// The schema of every operator. Any of the tensors may be written to.
-#define TURBOGS_LAUNCH_SCHEMA "(Tensor(a!)?[] tensors, int[] integers, float[] reals, int[] rows) -> ()"
 
 // Kernels count in 32 bits.
 inline int to_int(int64_t value, const char* what) {
@@ -61,7 +62,22 @@ Enumeration to_enumeration(int64_t value, int count, const char* allowed) {
     return static_cast<Enumeration>(value);
 }
 
-// The arguments of one call of an operator. Makes the device of its tensors current while it lives, and gives raw
+// What a tensor holds whose memory a kernel takes as `T*`: numbers of T, or what T is made of. A uint16_t has the
+// bits of a half; structs are made of floats.
+template <class T>
+constexpr ScalarType scalar_type() {
+    if (std::is_same_v<T, bool>) return ScalarType::Bool;
+    if (std::is_same_v<T, double>) return ScalarType::Double;
+    if (std::is_same_v<T, uint16_t>) return ScalarType::Half;
+    if (std::is_same_v<T, int2>) return ScalarType::Int;
+    if (!std::is_integral_v<T>) return ScalarType::Float;
+    return sizeof(T) == 1   ? ScalarType::Byte
+           : sizeof(T) == 2 ? ScalarType::Short
+           : sizeof(T) == 4 ? ScalarType::Int
+                            : ScalarType::Long;
+}
+
+// The arguments of one call of an operator. Makes the device of its first tensor current while it lives, and gives raw
 // pointers of tensors that are contiguous, on that device, of the wanted type and shape; says what was wanted where
 // one is not.
 //
@@ -73,16 +89,15 @@ public:
     using Integers = typename Launch::Integers;
     using Reals = typename Launch::Reals;
 
-    // `first` decides the device.
-    Arguments(const TensorList& tensors, const IntegerList& integers, const RealList& reals, const IntegerList& rows,
-              Tensors first)
+    Arguments(const TensorList& tensors, const IntegerList& integers, const RealList& reals, const IntegerList& rows)
         : tensors_(tensors), integers_(integers), reals_(reals), rows_(rows) {
         STD_TORCH_CHECK(tensors.size() == Launch::kNumTensors && integers.size() == Launch::kNumIntegers &&
                             reals.size() == Launch::kNumReals,
                         "turbogs: ", Launch::kName, " takes ", Launch::kNumTensors, " tensors, ", Launch::kNumIntegers,
                         " integers and ", Launch::kNumReals, " reals");
-        STD_TORCH_CHECK(tensor(first).is_cuda(), "turbogs: expected CUDA tensors");
-        device_ = tensor(first).get_device_index();
+        const Tensor& first = tensor(Tensors{});
+        STD_TORCH_CHECK(first.is_cuda(), "turbogs: expected CUDA tensors");
+        device_ = first.get_device_index();
         check_launched(cudaGetDevice(&previous_), "current device");
         if (previous_ != device_) check_launched(cudaSetDevice(device_), "setting the device");
     }
@@ -113,48 +128,40 @@ public:
     }
     const int64_t* row(int64_t view, int size) const { return rows_.data() + view * size; }
 
+    // Sets a pointer of a launcher's parameters to the memory of a tensor.
     template <class T>
-    T* pointer(Tensors field, ScalarType type, std::initializer_list<int64_t> shape) const {
+    void set(T*& pointer, Tensors field, std::initializer_list<int64_t> shape,
+             ScalarType type = scalar_type<std::remove_const_t<T>>(), size_t alignment = alignof(T)) const {
         const Tensor& value = tensor(field);
-        bool fits = value.is_cuda() && value.get_device_index() == device_ && value.scalar_type() == type &&
-                    value.is_contiguous() && value.dim() == static_cast<int64_t>(shape.size());
-        int64_t axis = 0;
-        for (const int64_t size : shape) {
-            fits = fits && value.size(axis) == size;
-            ++axis;
-        }
+        const bool fits = value.is_cuda() && value.get_device_index() == device_ && value.scalar_type() == type &&
+                          value.is_contiguous() && value.dim() == static_cast<int64_t>(shape.size()) &&
+                          std::equal(shape.begin(), shape.end(), value.sizes().begin());
         if (!fits) {
             STD_TORCH_CHECK(false, "turbogs: ", name(field), " must be a contiguous ",
                             torch::headeronly::toString(type), " ", text(shape),
                             " tensor on cuda:", static_cast<int>(device_), ", got ", describe(value));
         }
-        return static_cast<T*>(value.data_ptr());
+        pointer = static_cast<T*>(value.data_ptr());
+        STD_TORCH_CHECK(reinterpret_cast<uintptr_t>(pointer) % alignment == 0, "turbogs: ", name(field),
+                        " must start at a multiple of ", alignment, " bytes");
     }
 
     // The same, of memory that kernels read or write 16 bytes at a time.
     template <class T>
-    T* aligned_pointer(Tensors field, ScalarType type, std::initializer_list<int64_t> shape) const {
-        T* out = pointer<T>(field, type, shape);
-        STD_TORCH_CHECK(reinterpret_cast<uintptr_t>(out) % 16 == 0, "turbogs: ", name(field),
-                        " must start at a multiple of 16 bytes");
-        return out;
+    void set_quads(T*& pointer, Tensors field, std::initializer_list<int64_t> shape) const {
+        set(pointer, field, shape, scalar_type<std::remove_const_t<T>>(), sizeof(float4));
     }
 
-    // The same, null where there is no tensor.
+    // The same, left as it is where there is no tensor.
     template <class T>
-    T* optional(Tensors field, ScalarType type, std::initializer_list<int64_t> shape) const {
-        return has(field) ? pointer<T>(field, type, shape) : nullptr;
-    }
-
-    template <class T>
-    T* optional_aligned(Tensors field, ScalarType type, std::initializer_list<int64_t> shape) const {
-        return has(field) ? aligned_pointer<T>(field, type, shape) : nullptr;
+    void set_optional(T*& pointer, Tensors field, std::initializer_list<int64_t> shape) const {
+        if (has(field)) set(pointer, field, shape);
     }
 
     // Rows of one struct each.
     template <class T>
-    T* structs(Tensors field, int64_t rows) const {
-        return aligned_pointer<T>(field, ScalarType::Float, {rows, static_cast<int64_t>(sizeof(T) / sizeof(float))});
+    void set_structs(T*& pointer, Tensors field, int64_t rows) const {
+        set(pointer, field, {rows, static_cast<int64_t>(sizeof(T) / sizeof(float))});
     }
 
     cudaStream_t stream() const {

@@ -1,12 +1,10 @@
-// What the library says of itself, on any machine: operators that need no GPU.
-#include <torch/csrc/stable/library.h>
-
-#include <string>
-
-#include "launches.h"
+// The operators of the library, on torch's stable ABI: one build loads on torch 2.10 and later, with or without CUDA.
+#include "bindings/arguments.h"
 
 namespace turbogs {
 namespace {
+
+using torch::stable::detail::StableLibrary;
 
 // What the library was built for, such as "sm_80 sm_90".
 std::string architectures() { return TURBOGS_ARCHITECTURES; }
@@ -15,15 +13,35 @@ std::string architectures() { return TURBOGS_ARCHITECTURES; }
 // (turbogs_plugin/engine/cuda/library.py).
 std::string interface() { return launches::kInterface; }
 
+template <class Launch>
+void call(const TensorList& tensors, const IntegerList& integers, const RealList& reals, const IntegerList& rows) {
+    Launch::run({tensors, integers, reals, rows});
+}
+
+// Any of the tensors may be written to.
+template <class... Launches>
+void define(StableLibrary& m, launches::List<Launches...>) {
+    const std::string schema = "(Tensor(a!)?[] tensors, int[] integers, float[] reals, int[] rows) -> ()";
+    (m.def((Launches::kName + schema).c_str()), ...);
+}
+
+template <class... Launches>
+void implement(StableLibrary& m, launches::List<Launches...>) {
+    (m.impl(Launches::kName, TORCH_BOX(&call<Launches>)), ...);
+}
+
 }  // namespace
 }  // namespace turbogs
 
 STABLE_TORCH_LIBRARY_FRAGMENT(turbogs, m) {
     m.def("architectures() -> str");
     m.def("interface() -> str");
+    turbogs::define(m, turbogs::launches::All{});
 }
 
 STABLE_TORCH_LIBRARY_IMPL(turbogs, CompositeExplicitAutograd, m) {
     m.impl("architectures", TORCH_BOX(&turbogs::architectures));
     m.impl("interface", TORCH_BOX(&turbogs::interface));
 }
+
+STABLE_TORCH_LIBRARY_IMPL(turbogs, CUDA, m) { turbogs::implement(m, turbogs::launches::All{}); }

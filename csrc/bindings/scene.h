@@ -25,14 +25,14 @@ void read_scene(const Arguments<Launch>& in, SceneParams& scene) {
     scene.sh_degree = static_cast<int>(sh_degree);
     scene.bands = to_int(bands, "bands");
     scene.eps2d = in.number(Launch::Reals::eps2d);
-    scene.means = in.template pointer<float>(T::means, ScalarType::Float, {count, 3});
-    scene.quats = in.template aligned_pointer<float>(T::quats, ScalarType::Float, {count, 4});
-    scene.scales = in.template pointer<float>(T::scales, ScalarType::Float, {count, 3});
-    scene.opacities = in.template pointer<float>(T::opacities, ScalarType::Float, {count});
-    scene.sh0 = in.template pointer<float>(T::sh0, ScalarType::Float, {count, 1, 3});
-    scene.shN = in.template aligned_pointer<float>(T::shN, ScalarType::Float, {count, bands, 3});
-    scene.viewmats = in.template pointer<float>(T::viewmats, ScalarType::Float, {views, 4, 4});
-    scene.intrinsics = in.template pointer<float>(T::Ks, ScalarType::Float, {views, 3, 3});
+    in.set(scene.means, T::means, {count, 3});
+    in.set(scene.quats, T::quats, {count, 4});
+    in.set(scene.scales, T::scales, {count, 3});
+    in.set(scene.opacities, T::opacities, {count});
+    in.set(scene.sh0, T::sh0, {count, 1, 3});
+    in.set_quads(scene.shN, T::shN, {count, bands, 3});
+    in.set(scene.viewmats, T::viewmats, {views, 4, 4});
+    in.set(scene.intrinsics, T::Ks, {views, 3, 3});
     for (int64_t view = 0; view < views; ++view) {
         const int64_t* row = in.row(view, ImageRow::kSize);
         const int64_t width = row[ImageRow::kWidth], height = row[ImageRow::kHeight];

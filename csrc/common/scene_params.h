@@ -2,6 +2,8 @@
 // begin with it, and one function of the bindings fills it (bindings/scene.h).
 #pragma once
 
+#include <cuda_runtime.h>
+
 #include "common/sizes.h"
 
 namespace turbogs {
@@ -13,12 +15,13 @@ struct SceneParams {
     int bands;          // B, harmonics above band 0 that `shN` stores; B >= (sh_degree + 1)^2 - 1
     float eps2d;        // added to the diagonal of the screen covariance
 
-    const float* means;      // [N, 3]
-    const float* quats;      // [N, 4], not normalised
-    const float* scales;     // [N, 3], logarithms
-    const float* opacities;  // [N], logits
-    const float* sh0;        // [N, 3]
-    const float* shN;        // [N, B, 3]
+    // The fused step changes them in place.
+    float* means;      // [N, 3]
+    float4* quats;     // [N], not normalised
+    float* scales;     // [N, 3], logarithms
+    float* opacities;  // [N], logits
+    float* sh0;        // [N, 3]
+    float* shN;        // [N, B, 3]
 
     const float* viewmats;    // [K, 4, 4]
     const float* intrinsics;  // [K, 3, 3]

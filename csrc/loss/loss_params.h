@@ -42,7 +42,7 @@ struct SparseLossParams {
     unsigned long long* nonfinite_losses;  // [] 1 is added if the loss is not finite; or null
 
     // Maps of all views; all null where they are not to be updated.
-    void* errors;             // [X] half
+    uint16_t* errors;         // [X] halves
     int16_t* stamps;          // [X]
     double* view_sums;        // [V]
     const int32_t* overflow;  // [1] where not 0, the maps are left alone; or null

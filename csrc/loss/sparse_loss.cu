@@ -113,7 +113,7 @@ __device__ __forceinline__ TileTotals tile_loss(const SparseLossParams& params, 
 #pragma unroll
                 for (int j = 0; j < kSlots; ++j) {
                     flat[j] = view.pixel_base + samples.pixel[j];
-                    if (samples.pixel[j] >= 0) old[j] = static_cast<const __half*>(params.errors)[flat[j]];
+                    if (samples.pixel[j] >= 0) old[j] = __ushort_as_half(params.errors[flat[j]]);
                 }
             }
 #pragma unroll
@@ -140,7 +140,7 @@ __device__ __forceinline__ TileTotals tile_loss(const SparseLossParams& params, 
                     const float blended =
                         __fadd_rn(__fmul_rn(__half2float(old[j]), params.ema_old), __fmul_rn(error, params.ema_new));
                     const __half updated = __float2half_rn(fminf(blended, kErrorMax));
-                    static_cast<__half*>(params.errors)[flat[j]] = updated;
+                    params.errors[flat[j]] = __half_as_ushort(updated);
                     params.stamps[flat[j]] = params.stamp;
                     totals.view_delta +=
                         static_cast<double>(__half2float(updated)) - static_cast<double>(__half2float(old[j]));

@@ -82,7 +82,7 @@ __device__ __forceinline__ StoredGaussian load_gaussian(const ScreenBackwardPara
         stored.log_scale[i] = params.scales[triple + i];
         stored.sh0[i] = params.sh0[triple + i];
     }
-    const float4 quat = reinterpret_cast<const float4*>(params.quats)[gaussian];
+    const float4 quat = params.quats[gaussian];
     stored.quat[0] = quat.x, stored.quat[1] = quat.y, stored.quat[2] = quat.z, stored.quat[3] = quat.w;
     stored.logit = params.opacities[gaussian];
     return stored;

@@ -157,13 +157,11 @@ struct RowCollector {
 
 // Moments, solution and new values of one Gaussian's 14 parameters.
 template <Rows kRows>
-__device__ __forceinline__ void update_row(const OptimizerParams& optimizer, int gaussian, const RowCollector& rows,
+__device__ __forceinline__ void update_row(const ScreenBackwardParams& params, const OptimizerParams& optimizer, int gaussian, const RowCollector& rows,
                                            const StoredGaussian& old, float2 corrections) {
-    float2* exp_avg =
-        reinterpret_cast<float2*>(optimizer.exp_avg + static_cast<size_t>(gaussian) * ParameterRow::kSize);
-    float2* exp_avg_sq =
-        reinterpret_cast<float2*>(optimizer.exp_avg_sq + static_cast<size_t>(gaussian) * ParameterRow::kSize);
-    Terms terms = advance(optimizer, rows.sum, corrections, exp_avg, exp_avg_sq);
+    const size_t first_pair = static_cast<size_t>(gaussian) * (ParameterRow::kSize / 2);
+    Terms terms = advance(optimizer, rows.sum, corrections, optimizer.exp_avg + first_pair,
+                          optimizer.exp_avg_sq + first_pair);
     if (kRows == Rows::kPerView) {
         const auto geometry = [&](auto& system, const auto& weight_of) {
             rows.add_to<kGeometryFirst>(system, terms.scale, weight_of);
@@ -187,15 +185,15 @@ __device__ __forceinline__ void update_row(const OptimizerParams& optimizer, int
     using Place = ParameterRow;
 #pragma unroll
     for (int i = 0; i < 3; ++i) {
-        optimizer.means[triple + i] = __fadd_rn(old.mean[i], terms.adam[Place::kMeans + i]);
-        optimizer.scales[triple + i] = __fadd_rn(old.log_scale[i], terms.adam[Place::kScales + i]);
-        optimizer.sh0[triple + i] = __fadd_rn(old.sh0[i], terms.adam[Place::kSh0 + i]);
+        params.means[triple + i] = __fadd_rn(old.mean[i], terms.adam[Place::kMeans + i]);
+        params.scales[triple + i] = __fadd_rn(old.log_scale[i], terms.adam[Place::kScales + i]);
+        params.sh0[triple + i] = __fadd_rn(old.sh0[i], terms.adam[Place::kSh0 + i]);
     }
     const float* turn = terms.adam + Place::kQuats;
-    reinterpret_cast<float4*>(optimizer.quats)[gaussian] =
+    params.quats[gaussian] =
         make_float4(__fadd_rn(old.quat[0], turn[0]), __fadd_rn(old.quat[1], turn[1]), __fadd_rn(old.quat[2], turn[2]),
                     __fadd_rn(old.quat[3], turn[3]));
-    optimizer.opacities[gaussian] = __fadd_rn(old.logit, terms.adam[Place::kOpacities]);
+    params.opacities[gaussian] = __fadd_rn(old.logit, terms.adam[Place::kOpacities]);
 }
 
 // Adam on the harmonics of the block's updated Gaussians. Values and gradients come from shared memory.
@@ -244,13 +242,13 @@ __device__ __forceinline__ void update_harmonics(const ScreenBackwardParams& par
             if (block.updated[owners[0]] && block.updated[owners[1]]) {
                 *reinterpret_cast<float4*>(optimizer.exp_avg_shN + base + i) = mean;
                 *reinterpret_cast<float4*>(optimizer.exp_avg_sq_shN + base + i) = square;
-                *reinterpret_cast<float4*>(optimizer.shN + base + i) = value;
+                *reinterpret_cast<float4*>(params.shN + base + i) = value;
             } else {
                 const auto write = [&](int j, float of_value, float of_mean, float of_square) {
                     if (!block.updated[j >= boundary ? owners[1] : owners[0]]) return;
                     optimizer.exp_avg_shN[base + i + j] = of_mean;
                     optimizer.exp_avg_sq_shN[base + i + j] = of_square;
-                    optimizer.shN[base + i + j] = of_value;
+                    params.shN[base + i + j] = of_value;
                 };
                 write(0, value.x, mean.x, square.x);
                 write(1, value.y, mean.y, square.y);
@@ -266,7 +264,7 @@ __device__ __forceinline__ void update_harmonics(const ScreenBackwardParams& par
         float value = harmonics.coefficients[i + owner * (harmonics.stride - harmonics.row)];
         adam(optimizer, block.work[i], block.corrections[owner], value, optimizer.exp_avg_shN[base + i],
              optimizer.exp_avg_sq_shN[base + i]);
-        optimizer.shN[base + i] = value;
+        params.shN[base + i] = value;
     }
 }
 
@@ -311,7 +309,7 @@ __global__ void __launch_bounds__(kBackwardThreads, kStepBlocks) fused_step_kern
                                                    1.0f / bias_correction(optimizer.log_beta2, steps));
             optimizer.steps[gaussian] = steps;
             block.corrections[threadIdx.x] = corrections;
-            update_row<kRows>(optimizer, gaussian, rows, load_gaussian(params, gaussian), corrections);
+            update_row<kRows>(params, optimizer, gaussian, rows, load_gaussian(params, gaussian), corrections);
             if (params.sh_degree > 0) rows.harmonics(stored.mean, block.cameras, params.sh_degree, gradients);
         } else if (rows.count > 0) {
             atomicAdd(optimizer.skipped, 1ull);

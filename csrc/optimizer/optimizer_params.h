@@ -32,7 +32,7 @@ struct ScreenBackwardParams : SceneParams {
 // Outputs of the unfused backward pass. Every entry is written, zeros included.
 struct ProjectionBackwardOutputs {
     bool per_view;       // rows of each view, or their sum
-    float* rows;         // [K, N, 14] or [1, N, 14]
+    float2* rows;        // [K, N, 14] or [1, N, 14]
     float* shN;          // [N, B, 3]
     bool* touched;       // [N] sum w > 0 in some view
     float* view_losses;  // [K, N] or [1, N]
@@ -53,14 +53,9 @@ struct OptimizerParams {
     float curvature;  // balanced LM
     float max_step;   // balanced LM, 0 for no bound
 
-    float* means;  // [N, 3] updated in place, as are the rest; the same memory as ScreenBackwardParams'
-    float* quats;
-    float* scales;
-    float* opacities;
-    float* sh0;
-    float* shN;
-    float* exp_avg;               // [N, 14]
-    float* exp_avg_sq;            // [N, 14]
+    // Updated in place, as are the parameters.
+    float2* exp_avg;              // [N, 14]
+    float2* exp_avg_sq;           // [N, 14]
     float* exp_avg_shN;           // [N, 3 B]
     float* exp_avg_sq_shN;        // [N, 3 B]
     int32_t* steps;               // [N]

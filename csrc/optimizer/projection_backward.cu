@@ -41,7 +41,7 @@ struct HarmonicsSum {
 // Where the rows of one Gaussian go: to memory, view by view.
 struct RowWriter {
     HarmonicsSum harmonics;
-    float* rows;         // [K, N, 14]
+    float2* rows;        // [K, N, 14]
     float* view_losses;  // [K, N]
     int num_gaussians;
     int gaussian;
@@ -56,7 +56,7 @@ struct RowWriter {
         const size_t place = static_cast<size_t>(view) * num_gaussians + gaussian;
         float values[ParameterRow::kSize];
         row.pack(values);
-        float2* out = reinterpret_cast<float2*>(rows + place * ParameterRow::kSize);  // aligned, as rows are even
+        float2* out = rows + place * (ParameterRow::kSize / 2);
 #pragma unroll
         for (int i = 0; i < ParameterRow::kSize / 2; ++i) out[i] = make_float2(values[2 * i], values[2 * i + 1]);
         view_losses[place] = loss;

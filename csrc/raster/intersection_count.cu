@@ -115,7 +115,7 @@ __global__ void __launch_bounds__(kScanThreads)
 }  // namespace
 
 cudaError_t launch_count_intersections(const CountIntersectionsParams& params, cudaStream_t stream) {
-    const int blocks = params.num_active > 0 ? blocks_for(params.num_active, kScanTiles) : 1;
+    const int blocks = scan_blocks(params.num_active);
     sum_tiles_kernel<<<blocks, kScanThreads, 0, stream>>>(params);
     if (const cudaError_t error = cudaGetLastError()) return error;
     start_tiles_kernel<<<blocks, kScanThreads, 0, stream>>>(params);

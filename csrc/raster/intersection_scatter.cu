@@ -33,7 +33,7 @@ struct Emission {
     int2 rows;
 };
 
-__device__ __forceinline__ Emission make_emission(const ScatterIntersectionsParams& params, uint32_t instance,
+__device__ __forceinline__ Emission make_emission(const SortIntersectionsParams& params, uint32_t instance,
                                                   int& box_tiles) {
     Emission out;
     out.camera = params.cameras + instance / static_cast<uint32_t>(params.num_gaussians);
@@ -48,7 +48,7 @@ __device__ __forceinline__ Emission make_emission(const ScatterIntersectionsPara
     return out;
 }
 
-__device__ __forceinline__ int2 tiles_of_row(const ScatterIntersectionsParams& params, const Emission& emission,
+__device__ __forceinline__ int2 tiles_of_row(const SortIntersectionsParams& params, const Emission& emission,
                                              int row) {
     const RasterCamera& camera = *emission.camera;
     return active_tiles(camera, params.active_prefix, row, tile_columns(emission.reach, row, camera.tiles_x));
@@ -66,7 +66,7 @@ __device__ __forceinline__ int owner_of(int number, int sum) {
 
 // Each lane brings the tiles of a row and their key. Of the intersections of all lanes, begin .. end - 1 go to their
 // tiles, each by a lane of its own. Returns the number of intersections of all lanes.
-__device__ __forceinline__ int emit_rows(const ScatterIntersectionsParams& params, int2 tiles, uint64_t key, int begin,
+__device__ __forceinline__ int emit_rows(const SortIntersectionsParams& params, int2 tiles, uint64_t key, int begin,
                                          int end, int lane) {
     const int count = tiles.y - tiles.x;
     const int sum = sum_to_lane(count, lane);
@@ -100,7 +100,7 @@ __device__ __forceinline__ int emit_rows(const ScatterIntersectionsParams& param
 }
 
 // A warp puts intersections begin .. begin + kWindow - 1 of one splat into their tiles.
-__device__ __forceinline__ void emit_window(const ScatterIntersectionsParams& params, const Emission& emission,
+__device__ __forceinline__ void emit_window(const SortIntersectionsParams& params, const Emission& emission,
                                             int begin, int lane) {
     int first = 0;  // intersection of the rows at hand
     for (int base = emission.rows.x; base < emission.rows.y && first < begin + kWindow; base += kWarpSize) {
@@ -112,7 +112,7 @@ __device__ __forceinline__ void emit_window(const ScatterIntersectionsParams& pa
 
 // Lists the windows of a large splat for the next kernel. False where the list has no room: places of it that are
 // left then hold no instance.
-__device__ __forceinline__ bool list_windows(const ScatterIntersectionsParams& params, uint32_t instance,
+__device__ __forceinline__ bool list_windows(const SortIntersectionsParams& params, uint32_t instance,
                                              int box_tiles) {
     const uint32_t room = params.capacity / 2, windows = static_cast<uint32_t>((box_tiles + kWindow - 1) / kWindow);
     const uint32_t place = atomicAdd(&params.counters->num_windows, windows);
@@ -124,7 +124,7 @@ __device__ __forceinline__ bool list_windows(const ScatterIntersectionsParams& p
 }
 
 __global__ void __launch_bounds__(kScatterThreads)
-    scatter_kernel(const __grid_constant__ ScatterIntersectionsParams params) {
+    scatter_kernel(const __grid_constant__ SortIntersectionsParams params) {
     __shared__ uint32_t visible[kScatterInstances], large[kScatterInstances];
     __shared__ Emission emissions[kScatterThreads];
     __shared__ int num_visible, num_large;
@@ -184,7 +184,7 @@ __global__ void __launch_bounds__(kScatterThreads)
 
 // The windows of the list; and lists the runs of tiles with more than kSortRun intersections.
 __global__ void __launch_bounds__(kScatterThreads)
-    scatter_windows_kernel(const __grid_constant__ ScatterIntersectionsParams params) {
+    scatter_windows_kernel(const __grid_constant__ SortIntersectionsParams params) {
     if (params.status[1] != 0u) return;
     const int lane = this_lane(), thread = blockIdx.x * kScatterThreads + threadIdx.x;
     const uint32_t num_windows = min(params.counters->num_windows, params.capacity / 2);
@@ -206,7 +206,7 @@ __global__ void __launch_bounds__(kScatterThreads)
 
 }  // namespace
 
-cudaError_t launch_scatter_intersections(const ScatterIntersectionsParams& params, cudaStream_t stream) {
+cudaError_t launch_scatter_intersections(const SortIntersectionsParams& params, cudaStream_t stream) {
     if (params.num_instances == 0 || params.num_active == 0) return cudaSuccess;
     const int blocks = blocks_for(params.num_instances, kScatterInstances);
     scatter_kernel<<<blocks, kScatterThreads, 0, stream>>>(params);

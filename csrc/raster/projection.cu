@@ -221,7 +221,7 @@ __global__ void __launch_bounds__(kProjectionGaussians* kProjectionSlices, kProj
             usable = usable && fabsf(mean[i]) <= kDistanceMax && isfinite(log_scale) && isfinite(shared.sh0[local][i]);
             scale[i] = expf(log_scale);
         }
-        const float4 raw = reinterpret_cast<const float4*>(params.quats)[gaussian];
+        const float4 raw = params.quats[gaussian];
         usable = usable && all_finite(raw);
         const float quat[4] = {raw.x, raw.y, raw.z, raw.w};
         float unit[4];

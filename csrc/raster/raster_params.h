@@ -74,6 +74,9 @@ struct IntersectionCounters {
     uint32_t num_windows, num_runs;
 };
 
+// Blocks of stage 2.
+inline int scan_blocks(int tiles) { return tiles > 0 ? blocks_for(tiles, kScanTiles) : 1; }
+
 // Stage 2. First intersection of each tile.
 struct CountIntersectionsParams {
     int num_active;                  // T
@@ -83,11 +86,11 @@ struct CountIntersectionsParams {
     uint32_t* status;                // [2] out: intersections of this pass; a flag that is raised where they exceed the
                                      // capacity, and stays. No intersection is made while it is up.
     IntersectionCounters* counters;  // out: zeros
-    int64_t* block_sums;             // [ceil(T / kScanTiles), 2] scratch
+    int64_t* block_sums;             // [scan_blocks(T), 2] scratch
 };
 
-// Stage 3. Intersections to their tiles.
-struct ScatterIntersectionsParams {
+// Stages 3 and 4. Intersections to their tiles, and there in order of depth, then of the instance.
+struct SortIntersectionsParams {
     int num_instances;
     int num_gaussians;
     int num_active;             // T
@@ -98,22 +101,13 @@ struct ScatterIntersectionsParams {
     const uint32_t* tile_starts;   // [T + 1]
     const uint32_t* status;        // [2]
     int32_t* tile_cursors;         // [T + 1] in: first intersection of each tile; changed
-    uint64_t* intersection_keys;   // [M] out: depth and instance of each intersection
+    uint64_t* intersection_keys;   // [M] scratch: depth and instance of each intersection
     uint32_t capacity;             // M
     IntersectionCounters* counters;  // in: zeros
-    uint2* windows;                  // [M / 2] scratch: (instance, number) of every window of a large splat
-    int2* runs;                      // [M / kLeastOfRun] out: (tile, number) of every run of a tile that has several
-};
-
-// Stage 4. Every tile's intersections in order of depth, then of the instance.
-struct SortIntersectionsParams {
-    int num_active;               // T
-    uint32_t capacity;            // M
-    const uint32_t* tile_starts;  // [T + 1]
-    const IntersectionCounters* counters;
-    const int2* runs;             // [M / kLeastOfRun]
-    uint64_t* intersection_keys;  // [M] changed
-    uint32_t* intersection_ids;   // [M] out: instance of each intersection
+    uint2* windows;                  // [M / 2] scratch: (instance, number) of every window of a large splat; in the
+                                     // memory of `intersection_ids`, which stage 4 writes
+    int2* runs;                      // [M / kLeastOfRun] scratch: (tile, number) of every run of a tile with several
+    uint32_t* intersection_ids;      // [M] out: instance of each intersection
 };
 
 // Stage 5. One warp for each work item = (tile position, chunk): the 32 slots of the tile from chunk * 32 on. Further
@@ -157,7 +151,7 @@ struct BackwardParams {
 // Every launcher returns the first CUDA error, and only enqueues work on `stream`.
 cudaError_t launch_projection(const ProjectionParams& params, cudaStream_t stream);
 cudaError_t launch_count_intersections(const CountIntersectionsParams& params, cudaStream_t stream);
-cudaError_t launch_scatter_intersections(const ScatterIntersectionsParams& params, cudaStream_t stream);
+cudaError_t launch_scatter_intersections(const SortIntersectionsParams& params, cudaStream_t stream);
 cudaError_t launch_sort_intersections(const SortIntersectionsParams& params, cudaStream_t stream);
 cudaError_t launch_rasterize_forward(const ForwardParams& params, cudaStream_t stream);
 cudaError_t launch_rasterize_backward(const BackwardParams& params, cudaStream_t stream);

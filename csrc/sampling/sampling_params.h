@@ -28,8 +28,8 @@ struct SamplePixelsParams {
     uint32_t round_keys[kPhiloxRounds][2];  // from the low half of the seed and the iteration
     int now;                                // a pixel's age is now - stamp, within 0 .. 32767
 
-    const void* errors;     // [X] half
-    const int16_t* stamps;  // [X]
+    const uint16_t* errors;  // [X] halves
+    const int16_t* stamps;   // [X]
 
     int32_t* pixel_ids;     // [P] out
     int32_t* tile_ids;      // [T] out

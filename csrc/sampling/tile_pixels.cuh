@@ -72,7 +72,7 @@ struct PixelUnits {
 __device__ __forceinline__ PixelUnits load_maps(const SamplePixelsParams& params, const TilePixels& pixels) {
     const SampleView& view = params.views[pixels.view];
     const int64_t first = view.pixel_base + pixels.first;
-    const uint16_t* of_errors = static_cast<const uint16_t*>(params.errors) + first;
+    const uint16_t* of_errors = params.errors + first;
     const int16_t* of_stamps = params.stamps + first;
     uint16_t errors[kPerLane];
     int16_t stamps[kPerLane];
