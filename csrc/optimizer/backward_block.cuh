@@ -6,9 +6,10 @@
 // memory by asynchronous copies, all of a block's in quads, and cameras are kept there.
 #pragma once
 
+#include <cuda_pipeline.h>
+
 #include "common/approximate_math.cuh"
 #include "common/warp.cuh"
-#include "optimizer/async_copy.cuh"
 #include "optimizer/gaussian_backward.cuh"
 
 namespace turbogs {
@@ -44,7 +45,7 @@ struct SharedHarmonics {
         return params.bands > 0 ? (3 * params.bands) | 1 : 0;
     }
 
-    // Starts to copy those that are wanted; `wait_for_copies` and a barrier make them ready.
+    // Starts to copy those that are wanted. `wait` of every thread and a barrier make them ready.
     __device__ __forceinline__ void start(const ScreenBackwardParams& params) const {
         const int first = static_cast<int>(blockIdx.x) * kBackwardThreads;
         const int count = min(kBackwardThreads, params.num_gaussians - first) * row;
@@ -53,11 +54,18 @@ struct SharedHarmonics {
             const int last = min(i + 3, count - 1);
             if (!(wanted[owner(i)] | wanted[owner(last)])) continue;
             if (last == i + 3 && stride == row) {
-                copy_async<4>(coefficients + i, in + i);
+                __pipeline_memcpy_async(coefficients + i, in + i, sizeof(float4));
             } else {
-                for (int j = i; j <= last; ++j) copy_async<1>(coefficients + j + owner(j) * (stride - row), in + j);
+                for (int j = i; j <= last; ++j) {
+                    __pipeline_memcpy_async(coefficients + j + owner(j) * (stride - row), in + j, sizeof(float));
+                }
             }
         }
+    }
+
+    __device__ __forceinline__ static void wait() {
+        __pipeline_commit();
+        __pipeline_wait_prior(0);
     }
 };
 
@@ -178,11 +186,11 @@ __device__ __forceinline__ void backward_views(const ScreenBackwardParams& param
             float grad_color[3];
 #pragma unroll
             for (int c = 0; c < 3; ++c) grad_color[c] = record[Place::kColor + c];
-            RowGradient row;
+            float row[ParameterRow::kSize];
             geometry_backward(shape, camera, params.eps2d, grad_mean2d, record.values + Place::kConic,
                               record[Place::kDepth], row);
             color_backward(shape, camera, stored.sh0, params.sh_degree, coefficients, grad_color, row);
-            row.opacity = record[Place::kOpacity] * opacity * (1.0f - opacity);
+            row[ParameterRow::kOpacities] = record[Place::kOpacity] * opacity * (1.0f - opacity);
             sink.add(view, camera, row, grad_color, record[Place::kErrorSum] * inverse_filled);
 
             error_sum += record[Place::kErrorSum];
@@ -202,6 +210,18 @@ __device__ __forceinline__ void backward_views(const ScreenBackwardParams& param
         add_stat(params.grad_sums, gaussian, grad_sum);
         add_stat(params.absgrad_sums, gaussian, absgrad_sum);
     }
+}
+
+// Launches a kernel of blocks of kBackwardThreads Gaussians with so much dynamic shared memory.
+template <class Second>
+cudaError_t launch_blocks(void (*kernel)(ScreenBackwardParams, Second), size_t shared_bytes,
+                          const ScreenBackwardParams& params, const Second& second, cudaStream_t stream) {
+    const cudaError_t status =
+        cudaFuncSetAttribute(kernel, cudaFuncAttributeMaxDynamicSharedMemorySize, static_cast<int>(shared_bytes));
+    if (status != cudaSuccess) return status;
+    const int blocks = blocks_for(params.num_gaussians, kBackwardThreads);
+    kernel<<<blocks, kBackwardThreads, shared_bytes, stream>>>(params, second);
+    return cudaGetLastError();
 }
 
 }  // namespace turbogs

@@ -73,14 +73,14 @@ struct RowCollector {
     bool finite = true;
     bool large = false;
 
-    __device__ __forceinline__ void add(int view, const ViewCamera&, const RowGradient& row, const float*,
+    __device__ __forceinline__ void add(int view, const ViewCamera&, const float row[ParameterRow::kSize], const float*,
                                         float view_loss) {
         float values[kSlotFloats];
-        row.pack(values);
         values[kLossPlace] = view_loss;
         values[kViewPlace] = __int_as_float(view);
 #pragma unroll
         for (int i = 0; i < ParameterRow::kSize; ++i) {
+            values[i] = row[i];
             finite = finite && is_finite(values[i]);
             const bool of_color = i >= ParameterRow::kSh0 && i < ParameterRow::kSh0 + 3;
             large = large || (of_color && !(fabsf(values[i]) < kLargeGradient));
@@ -104,30 +104,30 @@ struct RowCollector {
     // kSize numbers of row `s` from kFirst on, and behind them its loss and its view.
     template <int kFirst, int kSize>
     __device__ __forceinline__ void get(int s, float (&values)[kSize + 2]) const {
-        if (s < num_slots) {
-            const float* slot = slots + kSlotFloats * s;
+        const auto read = [&](const float* slot) {
 #pragma unroll
             for (int i = 0; i < kSize; ++i) values[i] = slot[kFirst + i];
             values[kSize] = slot[kLossPlace];
             values[kSize + 1] = slot[kViewPlace];
-        } else {
-            const float* record = reinterpret_cast<const float*>(records + s * step);
-#pragma unroll
-            for (int i = 0; i < kSize; ++i) values[i] = record[kFirst + i];
-            values[kSize] = record[kLossPlace];
-            values[kSize + 1] = record[kViewPlace];
-        }
+        };
+        if (s < num_slots) read(slots + kSlotFloats * s);
+        else read(reinterpret_cast<const float*>(records + s * step));
     }
 
-    template <int kFirst, int kSize, class Weight>
+    // Adds to the system of a block of the parameters what the rows say of it.
+    template <Rows kRows, int kFirst, int kSize, class Weight>
     __device__ __forceinline__ void add_to(DampedSystem<kSize>& system, const float* scale,
                                            const Weight& weight_of) const {
-        for (int s = 0; s < count; ++s) {
-            float row[kSize + 2];
-            get<kFirst, kSize>(s, row);
+        if constexpr (kRows == Rows::kSummed) {
+            system.add(sum + kFirst, scale + kFirst, weight_of(loss));
+        } else {
+            for (int s = 0; s < count; ++s) {
+                float row[kSize + 2];
+                get<kFirst, kSize>(s, row);
 #pragma unroll
-            for (int i = 0; i < kSize; ++i) row[i] = clip_gradient(row[i]);
-            system.add(row, scale + kFirst, weight_of(row[kSize]));
+                for (int i = 0; i < kSize; ++i) row[i] = clip_gradient(row[i]);
+                system.add(row, scale + kFirst, weight_of(row[kSize]));
+            }
         }
     }
 
@@ -157,26 +157,18 @@ struct RowCollector {
 
 // Moments, solution and new values of one Gaussian's 14 parameters.
 template <Rows kRows>
-__device__ __forceinline__ void update_row(const ScreenBackwardParams& params, const OptimizerParams& optimizer, int gaussian, const RowCollector& rows,
-                                           const StoredGaussian& old, float2 corrections) {
+__device__ __forceinline__ void update_row(const ScreenBackwardParams& params, const OptimizerParams& optimizer,
+                                           int gaussian, const RowCollector& rows, const StoredGaussian& old,
+                                           float2 corrections) {
     const size_t first_pair = static_cast<size_t>(gaussian) * (ParameterRow::kSize / 2);
     Terms terms = advance(optimizer, rows.sum, corrections, optimizer.exp_avg + first_pair,
                           optimizer.exp_avg_sq + first_pair);
-    if (kRows == Rows::kPerView) {
+    if (kRows != Rows::kNone) {
         const auto geometry = [&](auto& system, const auto& weight_of) {
-            rows.add_to<kGeometryFirst>(system, terms.scale, weight_of);
+            rows.add_to<kRows, kGeometryFirst>(system, terms.scale, weight_of);
         };
         const auto appearance = [&](auto& system, const auto& weight_of) {
-            rows.add_to<kAppearanceFirst>(system, terms.scale, weight_of);
-        };
-        solve_block<kGeometryFirst, kGeometrySize>(optimizer, geometry, terms);
-        solve_block<kAppearanceFirst, kAppearanceSize>(optimizer, appearance, terms);
-    } else if (kRows == Rows::kSummed) {
-        const auto geometry = [&](auto& system, const auto& weight_of) {
-            system.add(rows.sum, terms.scale, weight_of(rows.loss));
-        };
-        const auto appearance = [&](auto& system, const auto& weight_of) {
-            system.add(rows.sum + kAppearanceFirst, terms.scale + kAppearanceFirst, weight_of(rows.loss));
+            rows.add_to<kRows, kAppearanceFirst>(system, terms.scale, weight_of);
         };
         solve_block<kGeometryFirst, kGeometrySize>(optimizer, geometry, terms);
         solve_block<kAppearanceFirst, kAppearanceSize>(optimizer, appearance, terms);
@@ -222,38 +214,32 @@ __device__ __forceinline__ void update_harmonics(const ScreenBackwardParams& par
             const int boundary = owners[1] * harmonics.row - i;  // elements from here on are the second owner's
             const float2 corrections[2] = {block.corrections[owners[0]], block.corrections[owners[1]]};
             const float4 gradient = *reinterpret_cast<const float4*>(block.work + i);
-            float4 value;
+            float4 &mean = means[q], &square = squares[q], value;
             if (harmonics.stride == harmonics.row) {
                 value = *reinterpret_cast<const float4*>(harmonics.coefficients + i);
             } else {
-                const auto coefficient = [&](int j) {
-                    return harmonics.coefficients[i + j + (j >= boundary ? owners[1] : owners[0])];
-                };
-                value = make_float4(coefficient(0), coefficient(1), coefficient(2), coefficient(3));
+#pragma unroll
+                for (int j = 0; j < 4; ++j) {
+                    (&value.x)[j] = harmonics.coefficients[i + j + (j >= boundary ? owners[1] : owners[0])];
+                }
             }
-            const auto step = [&](int j, float of_gradient, float& of_value, float& mean, float& square) {
-                adam(optimizer, of_gradient, j >= boundary ? corrections[1] : corrections[0], of_value, mean, square);
-            };
-            float4 &mean = means[q], &square = squares[q];
-            step(0, gradient.x, value.x, mean.x, square.x);
-            step(1, gradient.y, value.y, mean.y, square.y);
-            step(2, gradient.z, value.z, mean.z, square.z);
-            step(3, gradient.w, value.w, mean.w, square.w);
+#pragma unroll
+            for (int j = 0; j < 4; ++j) {
+                adam(optimizer, (&gradient.x)[j], j >= boundary ? corrections[1] : corrections[0], (&value.x)[j],
+                     (&mean.x)[j], (&square.x)[j]);
+            }
             if (block.updated[owners[0]] && block.updated[owners[1]]) {
                 *reinterpret_cast<float4*>(optimizer.exp_avg_shN + base + i) = mean;
                 *reinterpret_cast<float4*>(optimizer.exp_avg_sq_shN + base + i) = square;
                 *reinterpret_cast<float4*>(params.shN + base + i) = value;
             } else {
-                const auto write = [&](int j, float of_value, float of_mean, float of_square) {
-                    if (!block.updated[j >= boundary ? owners[1] : owners[0]]) return;
-                    optimizer.exp_avg_shN[base + i + j] = of_mean;
-                    optimizer.exp_avg_sq_shN[base + i + j] = of_square;
-                    params.shN[base + i + j] = of_value;
-                };
-                write(0, value.x, mean.x, square.x);
-                write(1, value.y, mean.y, square.y);
-                write(2, value.z, mean.z, square.z);
-                write(3, value.w, mean.w, square.w);
+#pragma unroll
+                for (int j = 0; j < 4; ++j) {
+                    if (!block.updated[j >= boundary ? owners[1] : owners[0]]) continue;
+                    optimizer.exp_avg_shN[base + i + j] = (&mean.x)[j];
+                    optimizer.exp_avg_sq_shN[base + i + j] = (&square.x)[j];
+                    params.shN[base + i + j] = (&value.x)[j];
+                }
             }
         }
     }
@@ -286,7 +272,7 @@ __global__ void __launch_bounds__(kBackwardThreads, kStepBlocks) fused_step_kern
     harmonics.start(params);
     const StoredGaussian stored = seen ? load_gaussian(params, gaussian) : StoredGaussian{};
     const int steps = seen ? optimizer.steps[gaussian] + 1 : 1;
-    wait_for_copies();
+    harmonics.wait();
     __syncthreads();
 
     float gradients[3 * kMaxBands] = {};
@@ -325,26 +311,15 @@ __global__ void __launch_bounds__(kBackwardThreads, kStepBlocks) fused_step_kern
     update_harmonics(params, optimizer, block);
 }
 
-template <Rows kRows>
-cudaError_t launch(const ScreenBackwardParams& params, const OptimizerParams& optimizer, cudaStream_t stream) {
-    const size_t bytes = StepShared::bytes(params);
-    auto kernel = fused_step_kernel<kRows>;
-    const cudaError_t status =
-        cudaFuncSetAttribute(kernel, cudaFuncAttributeMaxDynamicSharedMemorySize, static_cast<int>(bytes));
-    if (status != cudaSuccess) return status;
-    const int blocks = blocks_for(params.num_gaussians, kBackwardThreads);
-    kernel<<<blocks, kBackwardThreads, bytes, stream>>>(params, optimizer);
-    return cudaGetLastError();
-}
-
 }  // namespace
 
 cudaError_t launch_fused_step(const ScreenBackwardParams& params, const OptimizerParams& optimizer,
                               cudaStream_t stream) {
     if (params.num_gaussians == 0) return cudaSuccess;
-    if (optimizer.kind == UpdateKind::kAdam) return launch<Rows::kNone>(params, optimizer, stream);
-    return optimizer.rows_per_view ? launch<Rows::kPerView>(params, optimizer, stream)
-                                   : launch<Rows::kSummed>(params, optimizer, stream);
+    const auto kernel = optimizer.kind == UpdateKind::kAdam ? fused_step_kernel<Rows::kNone>
+                        : optimizer.rows_per_view           ? fused_step_kernel<Rows::kPerView>
+                                                            : fused_step_kernel<Rows::kSummed>;
+    return launch_blocks(kernel, StepShared::bytes(params), params, optimizer, stream);
 }
 
 }  // namespace turbogs

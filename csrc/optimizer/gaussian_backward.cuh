@@ -27,28 +27,6 @@ struct ViewCamera : Pinhole {
     float grad_scale_x, grad_scale_y;  // K * width / 2, K * height / 2
 };
 
-// Gradient of the 14 parameters that a view's row holds.
-struct RowGradient {
-    float mean[3];
-    float scale[3];
-    float quat[4];
-    float sh0[3];
-    float opacity;
-
-    // In the order of a packed row.
-    __device__ __forceinline__ void pack(float* row) const {
-#pragma unroll
-        for (int i = 0; i < 3; ++i) {
-            row[ParameterRow::kMeans + i] = mean[i];
-            row[ParameterRow::kScales + i] = scale[i];
-            row[ParameterRow::kSh0 + i] = sh0[i];
-        }
-#pragma unroll
-        for (int i = 0; i < 4; ++i) row[ParameterRow::kQuats + i] = quat[i];
-        row[ParameterRow::kOpacities] = opacity;
-    }
-};
-
 __device__ __forceinline__ ViewCamera load_camera(const float* __restrict__ viewmat,
                                                   const float* __restrict__ intrinsics, int width, int height,
                                                   int num_views) {
@@ -74,10 +52,10 @@ __device__ __forceinline__ GaussianShape make_shape(const float mean[3], const f
 }
 
 // Mean, scales and quaternion from the gradients of the screen mean, the conic (a, b, c; b's counts both off-diagonal
-// entries) and the depth. Sets those three of `row`; the direction's part of the mean is added by the caller.
+// entries) and the depth. Sets those three of `row`; `color_backward` adds the direction's part of the mean.
 __device__ __forceinline__ void geometry_backward(const GaussianShape& shape, const ViewCamera& camera, float eps2d,
                                                   const float grad_mean2d[2], const float grad_conic[3],
-                                                  float grad_depth, RowGradient& row) {
+                                                  float grad_depth, float row[ParameterRow::kSize]) {
     const float* W = camera.rotation;
     const float* M = shape.spread;
     float point[3];
@@ -102,7 +80,7 @@ __device__ __forceinline__ void geometry_backward(const GaussianShape& shape, co
         const float w0 = g00 * y0 + g01 * y1, w1 = g01 * y0 + g11 * y1;
         Q0[j] = -2.0f * (a * w0 + b * w1);
         Q1[j] = -2.0f * (b * w0 + c * w1);
-        row.scale[j] = -2.0f * (y0 * w0 + y1 * w1);
+        row[ParameterRow::kScales + j] = -2.0f * (y0 * w0 + y1 * w1);
     }
 
     // d/dT = Q M^T, and d/dJ = d/dT W^T at J's four entries.
@@ -134,7 +112,8 @@ __device__ __forceinline__ void geometry_backward(const GaussianShape& shape, co
                      rz2 * (camera.fx * grad_j00 + camera.fy * grad_j11);
 #pragma unroll
     for (int l = 0; l < 3; ++l) {
-        row.mean[l] = W[l] * grad_point[0] + W[3 + l] * grad_point[1] + W[6 + l] * grad_point[2];
+        row[ParameterRow::kMeans + l] =
+            W[l] * grad_point[0] + W[3 + l] * grad_point[1] + W[6 + l] * grad_point[2];
     }
 
     // d/dR_ij = T_0i Q_0j s_j + T_1i Q_1j s_j, then the quaternion's own derivative and its normalisation.
@@ -155,14 +134,16 @@ __device__ __forceinline__ void geometry_backward(const GaussianShape& shape, co
     direct[3] = 2.0f * (w * d10 + x * s20 + y * s21 - 2.0f * z * (G[0] + G[4]));
     const float along = direct[0] * w + direct[1] * x + direct[2] * y + direct[3] * z;
 #pragma unroll
-    for (int i = 0; i < 4; ++i) row.quat[i] = (direct[i] - along * shape.quat[i]) * shape.inverse_norm;
+    for (int i = 0; i < 4; ++i) {
+        row[ParameterRow::kQuats + i] = (direct[i] - along * shape.quat[i]) * shape.inverse_norm;
+    }
 }
 
 // Colour of one view back to band 0 and, through the direction, to the mean, which is added to. `coefficients`: [3 *
 // bands] of this Gaussian. `grad_color` comes in behind the clamp at 0 and leaves masked by it.
 __device__ __forceinline__ void color_backward(const GaussianShape& shape, const ViewCamera& camera, const float sh0[3],
                                                int degree, const float* coefficients, float grad_color[3],
-                                               RowGradient& row) {
+                                               float row[ParameterRow::kSize]) {
     float direction[3];
     const float inverse_length = view_direction(camera, shape.mean, direction);
     float color[3];
@@ -175,7 +156,7 @@ __device__ __forceinline__ void color_backward(const GaussianShape& shape, const
 #pragma unroll
     for (int c = 0; c < 3; ++c) {
         grad_color[c] = color[c] >= 0.0f ? grad_color[c] : 0.0f;
-        row.sh0[c] = kShBand0 * grad_color[c];
+        row[ParameterRow::kSh0 + c] = kShBand0 * grad_color[c];
     }
     float dots[kMaxBands];
 #pragma unroll
@@ -192,7 +173,9 @@ __device__ __forceinline__ void color_backward(const GaussianShape& shape, const
     const float along =
         grad_unit[0] * direction[0] + grad_unit[1] * direction[1] + grad_unit[2] * direction[2];
 #pragma unroll
-    for (int i = 0; i < 3; ++i) row.mean[i] += (grad_unit[i] - along * direction[i]) * inverse_length;
+    for (int i = 0; i < 3; ++i) {
+        row[ParameterRow::kMeans + i] += (grad_unit[i] - along * direction[i]) * inverse_length;
+    }
 }
 
 // Adds one view's gradient of the harmonics, [3 * bands]. `grad_color`: masked by the clamp.

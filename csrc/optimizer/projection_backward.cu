@@ -27,61 +27,34 @@ struct BackwardShared {
     }
 };
 
-// Gradients of the harmonics of one Gaussian, added up in its row of shared memory.
-struct HarmonicsSum {
-    const float* mean;
-    int degree;
-    float* gradients;
-
-    __device__ void add(const ViewCamera& camera, const float grad_color[3]) {
-        add_harmonics_gradient(mean, camera, degree, grad_color, gradients);
-    }
-};
-
-// Where the rows of one Gaussian go: to memory, view by view.
+// Writes the rows of one Gaussian, or adds them up, and adds up its gradients of the harmonics in shared memory.
+template <bool kPerView>
 struct RowWriter {
-    HarmonicsSum harmonics;
-    float2* rows;        // [K, N, 14]
-    float* view_losses;  // [K, N]
-    int num_gaussians;
-    int gaussian;
+    const ProjectionBackwardOutputs& outputs;
+    const float* mean;
+    int degree, num_gaussians, gaussian;
+    float* harmonics;
+    float sum[ParameterRow::kSize] = {};  // unless kPerView
+    float loss_sum = 0.0f;
 
-    __device__ void add(int view, const ViewCamera& camera, const RowGradient& row, const float grad_color[3],
-                        float loss) {
-        harmonics.add(camera, grad_color);
-        write(view, row, loss);
-    }
-
-    __device__ void write(int view, const RowGradient& row, float loss) {
-        const size_t place = static_cast<size_t>(view) * num_gaussians + gaussian;
-        float values[ParameterRow::kSize];
-        row.pack(values);
-        float2* out = rows + place * (ParameterRow::kSize / 2);
+    __device__ void add(int view, const ViewCamera& camera, const float row[ParameterRow::kSize],
+                        const float grad_color[3], float loss) {
+        add_harmonics_gradient(mean, camera, degree, grad_color, harmonics);
+        if (kPerView) {
+            write(view, row, loss);
+        } else {
 #pragma unroll
-        for (int i = 0; i < ParameterRow::kSize / 2; ++i) out[i] = make_float2(values[2 * i], values[2 * i + 1]);
-        view_losses[place] = loss;
-    }
-};
-
-// The sum of the rows, in registers.
-struct RowSum {
-    HarmonicsSum harmonics;
-    RowGradient sum = {};
-    float loss = 0.0f;
-
-    __device__ void add(int, const ViewCamera& camera, const RowGradient& row, const float grad_color[3],
-                        float view_loss) {
-        harmonics.add(camera, grad_color);
-#pragma unroll
-        for (int i = 0; i < 3; ++i) {
-            sum.mean[i] += row.mean[i];
-            sum.scale[i] += row.scale[i];
-            sum.sh0[i] += row.sh0[i];
+            for (int i = 0; i < ParameterRow::kSize; ++i) sum[i] += row[i];
+            loss_sum += loss;
         }
+    }
+
+    __device__ void write(int view, const float row[ParameterRow::kSize], float loss) const {
+        const size_t place = static_cast<size_t>(view) * num_gaussians + gaussian;
+        float2* out = outputs.rows + place * (ParameterRow::kSize / 2);
 #pragma unroll
-        for (int i = 0; i < 4; ++i) sum.quat[i] += row.quat[i];
-        sum.opacity += row.opacity;
-        loss += view_loss;
+        for (int i = 0; i < ParameterRow::kSize / 2; ++i) out[i] = make_float2(row[2 * i], row[2 * i + 1]);
+        outputs.view_losses[place] = loss;
     }
 };
 
@@ -123,7 +96,7 @@ __global__ void __launch_bounds__(kBackwardThreads) projection_backward_kernel(
     __syncthreads();
     harmonics.start(params);
     const StoredGaussian stored = any ? load_gaussian(params, gaussian) : StoredGaussian{};
-    wait_for_copies();
+    harmonics.wait();
     __syncthreads();
 
     const auto views_of = [&](int first) {
@@ -131,22 +104,20 @@ __global__ void __launch_bounds__(kBackwardThreads) projection_backward_kernel(
         return any ? views_with_gradient(params, gaussian, first, unused) : 0u;
     };
     const float* coefficients = harmonics.coefficients + threadIdx.x * harmonics.stride;
-    const HarmonicsSum sum{stored.mean, params.sh_degree, block.gradients + threadIdx.x * harmonics.stride};
     if (inside) {
-        RowWriter writer{sum, outputs.rows, outputs.view_losses, params.num_gaussians, gaussian};
+        RowWriter<kPerView> writer{outputs, stored.mean, params.sh_degree, params.num_gaussians, gaussian,
+                                   block.gradients + threadIdx.x * harmonics.stride};
+        if (any) backward_views<false>(params, block.cameras, coefficients, gaussian, stored, views_of, writer);
         if (kPerView) {
-            if (any) backward_views<false>(params, block.cameras, coefficients, gaussian, stored, views_of, writer);
-            const RowGradient zero = {};
+            const float zeros[ParameterRow::kSize] = {};
             for (int first = 0; first < params.num_views; first += kViewGroup) {
                 const uint32_t mask = views_of(first);
                 for (int view = first; view < min(params.num_views, first + kViewGroup); ++view) {
-                    if ((mask >> (view - first) & 1u) == 0u) writer.write(view, zero, 0.0f);
+                    if ((mask >> (view - first) & 1u) == 0u) writer.write(view, zeros, 0.0f);
                 }
             }
         } else {
-            RowSum total{sum};
-            if (any) backward_views<false>(params, block.cameras, coefficients, gaussian, stored, views_of, total);
-            writer.write(0, total.sum, total.loss);
+            writer.write(0, writer.sum, writer.loss_sum);
         }
         if (params.view_counts != nullptr) add_sight(params, gaussian, sight_of(params, gaussian));
         outputs.touched[gaussian] = touched;
@@ -161,24 +132,13 @@ __global__ void __launch_bounds__(kBackwardThreads) projection_backward_kernel(
     }
 }
 
-template <bool kPerView>
-cudaError_t launch(const ScreenBackwardParams& params, const ProjectionBackwardOutputs& outputs, cudaStream_t stream) {
-    const size_t bytes = BackwardShared::bytes(params);
-    auto kernel = projection_backward_kernel<kPerView>;
-    const cudaError_t status =
-        cudaFuncSetAttribute(kernel, cudaFuncAttributeMaxDynamicSharedMemorySize, static_cast<int>(bytes));
-    if (status != cudaSuccess) return status;
-    const int blocks = blocks_for(params.num_gaussians, kBackwardThreads);
-    kernel<<<blocks, kBackwardThreads, bytes, stream>>>(params, outputs);
-    return cudaGetLastError();
-}
-
 }  // namespace
 
 cudaError_t launch_projection_backward(const ScreenBackwardParams& params, const ProjectionBackwardOutputs& outputs,
                                        cudaStream_t stream) {
     if (params.num_gaussians == 0) return cudaSuccess;
-    return outputs.per_view ? launch<true>(params, outputs, stream) : launch<false>(params, outputs, stream);
+    const auto kernel = outputs.per_view ? projection_backward_kernel<true> : projection_backward_kernel<false>;
+    return launch_blocks(kernel, BackwardShared::bytes(params), params, outputs, stream);
 }
 
 }  // namespace turbogs
