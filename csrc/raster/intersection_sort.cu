@@ -5,6 +5,7 @@
 // swaps put them right. Of a tile with more intersections, every run of kSortRun is sorted so by a warp of its own,
 // and a second launch merges the runs, a thread for each key, which finds its place by bisection in the other runs.
 // Keys differ, so the order does not depend on the one they came in.
+#include "common/tiles.cuh"
 #include "common/warp.cuh"
 #include "raster/raster_params.h"
 
@@ -206,13 +207,8 @@ __global__ void __launch_bounds__(kMergeThreads)
             int smaller = place - run.y * kSortRun;
             for (int begin = 0; begin < count; begin += kSortRun) {
                 if (begin == run.y * kSortRun) continue;
-                int low = begin, high = min(begin + kSortRun, count);
-                while (low < high) {
-                    const int middle = (low + high) / 2;
-                    if (keys[middle] < key) low = middle + 1;
-                    else high = middle;
-                }
-                smaller += low - begin;
+                smaller += partition_point(begin, min(begin + kSortRun, count),
+                                           [&](int other) { return keys[other] < key; }) - begin;
             }
             params.intersection_ids[first + smaller] = static_cast<uint32_t>(key);
         }

@@ -10,6 +10,7 @@
 #include "common/quaternion.cuh"
 #include "common/spherical_harmonics.cuh"
 #include "common/splat_geometry.cuh"
+#include "common/tiles.cuh"
 #include "common/warp.cuh"
 #include "raster/tile_reach.cuh"
 
@@ -46,13 +47,7 @@ __global__ void prepare_kernel(const __grid_constant__ ProjectionParams params) 
     }
     if (i <= params.num_active) params.tile_differences[i] = 0;
     if (i > params.num_tiles || params.active_prefix == nullptr) return;
-    int low = 0, high = params.num_active;
-    while (low < high) {
-        const int middle = (low + high) / 2;
-        if (params.tile_ids[middle] < i) low = middle + 1;
-        else high = middle;
-    }
-    params.active_prefix[i] = low;
+    params.active_prefix[i] = partition_point(0, params.num_active, [&](int t) { return params.tile_ids[t] < i; });
 }
 
 // Colour in a unit direction, without offset and clamp. `coefficients`: [bands, 3].

@@ -236,11 +236,9 @@ __global__ void __launch_bounds__(kWarpSize) backward_kernel(const __grid_consta
     if (num_buckets == 0) return;
 
     const int tile = item / forward.chunks, chunk = item - tile * forward.chunks;
-    const TileFrame frame =
-        tile_frame(forward.cameras, forward.num_views, forward.tile_ids != nullptr ? forward.tile_ids[tile] : tile);
+    const TileFrame frame = tile_frame(forward, tile);
     const uint32_t first_intersection = forward.tile_starts[tile];
-    const uint32_t* masks =
-        forward.masks + static_cast<size_t>(first_intersection / kBucket + tile) * forward.chunks + chunk;
+    const uint32_t* masks = masks_of_item(forward, first_intersection, tile, chunk);
     const int slot_end = forward.tile_offsets[tile + 1];
     const float least_level = log2f(forward.alpha_min);
 
@@ -288,13 +286,6 @@ __global__ void __launch_bounds__(kWarpSize) backward_kernel(const __grid_consta
     }
 }
 
-template <bool kDepth, bool kDensity>
-cudaError_t launch(const BackwardParams& params, cudaStream_t stream) {
-    const int items = params.forward.num_active * params.forward.chunks;
-    backward_kernel<kDepth, kDensity><<<items, kWarpSize, 0, stream>>>(params);
-    return cudaGetLastError();
-}
-
 }  // namespace
 
 cudaError_t launch_rasterize_backward(const BackwardParams& params, cudaStream_t stream) {
@@ -303,12 +294,14 @@ cudaError_t launch_rasterize_backward(const BackwardParams& params, cudaStream_t
     if (!params.cleared) {
         if (const cudaError_t error = cudaMemsetAsync(params.records, 0, bytes, stream)) return error;
     }
-    if (params.forward.num_active * params.forward.chunks == 0) return cudaSuccess;
-    const bool depth = params.depth_gradients != nullptr;
-    if (params.with_density_sums) {
-        return depth ? launch<true, true>(params, stream) : launch<false, true>(params, stream);
-    }
-    return depth ? launch<true, false>(params, stream) : launch<false, false>(params, stream);
+    const int items = params.forward.num_active * params.forward.chunks;
+    if (items == 0) return cudaSuccess;
+    const bool density = params.with_density_sums;
+    const auto kernel = params.depth_gradients != nullptr
+                            ? (density ? backward_kernel<true, true> : backward_kernel<true, false>)
+                            : (density ? backward_kernel<false, true> : backward_kernel<false, false>);
+    kernel<<<items, kWarpSize, 0, stream>>>(params);
+    return cudaGetLastError();
 }
 
 }  // namespace turbogs

@@ -15,7 +15,7 @@ constexpr int kAhead = 2;         // splats whose arithmetic overlaps; no record
 
 // Blocks of an SM, so 72 registers for one work item a warp and 80 for two. Left to itself the compiler took 72 for
 // two as well, and the pass 292 us in place of 251 (docs/performance.md, step 9).
-constexpr int forward_blocks(int groups) { return groups == 1 ? 7 : 6; }
+constexpr int forward_blocks(int items) { return items == 1 ? 7 : 6; }
 
 constexpr float kLevelSlack = 0.01f;  // of a level (log2 of an alpha), for the rounding of the least one of a box
 
@@ -57,25 +57,23 @@ __device__ __forceinline__ bool reaches_box(const StagedSplat& splat, float mean
     return !(level < least_level - kLevelSlack);  // NaN stays
 }
 
-template <int kGroups, bool kDepth>
-__global__ void __launch_bounds__(kForwardWarps* kWarpSize, forward_blocks(kGroups))
+template <int kItems, bool kDepth>
+__global__ void __launch_bounds__(kForwardWarps* kWarpSize, forward_blocks(kItems))
     forward_kernel(const __grid_constant__ ForwardParams params) {
     __shared__ StagedSplat staged_splats[kForwardWarps][kBucket];
     const int lane = this_lane();
-    const int warps_per_tile = params.chunks / kGroups;
+    const int warps_per_tile = params.chunks / kItems;
     const int warp = blockIdx.x * kForwardWarps + this_warp();
     if (warp >= params.num_active * warps_per_tile) return;
     StagedSplat* staged = staged_splats[this_warp()];
 
-    const int tile = warp / warps_per_tile, first_chunk = (warp - tile * warps_per_tile) * kGroups;
-    const TileFrame frame =
-        tile_frame(params.cameras, params.num_views, params.tile_ids != nullptr ? params.tile_ids[tile] : tile);
+    const int tile = warp / warps_per_tile, first_chunk = (warp - tile * warps_per_tile) * kItems;
+    const TileFrame frame = tile_frame(params, tile);
     const uint32_t first_intersection = params.tile_starts[tile];
     const int num_intersections = static_cast<int>(params.tile_starts[tile + 1] - first_intersection);
     const int num_buckets = (num_intersections + kBucket - 1) / kBucket;
     const uint32_t* intersection_ids = params.intersection_ids + first_intersection;
-    uint32_t* masks =
-        params.masks + static_cast<size_t>(first_intersection / kBucket + tile) * params.chunks + first_chunk;
+    uint32_t* masks = masks_of_item(params, first_intersection, tile, first_chunk);
     const int slot_end = params.tile_offsets[tile + 1];
     const float least_level = log2f(params.alpha_min);
     const float never = infinity();
@@ -84,22 +82,22 @@ __global__ void __launch_bounds__(kForwardWarps* kWarpSize, forward_blocks(kGrou
     for (int slot_base = params.tile_offsets[tile] + first_chunk * kWarpSize; slot_base < slot_end;
          slot_base += params.chunks * kWarpSize) {
         // Level from which a splat is seen: never at a pixel that has ended, or at an empty slot.
-        float x[kGroups], y[kGroups], threshold[kGroups];
-        float transmittance[kGroups], red[kGroups], green[kGroups], blue[kGroups], depth[kGroups];
-        int last[kGroups];
+        float x[kItems], y[kItems], threshold[kItems];
+        float transmittance[kItems], red[kItems], green[kItems], blue[kItems], depth[kItems];
+        int last[kItems];
         SampleBox box = kNoBox;
 #pragma unroll
-        for (int g = 0; g < kGroups; ++g) {
-            const int slot = slot_base + g * kWarpSize + lane;
+        for (int item = 0; item < kItems; ++item) {
+            const int slot = slot_base + item * kWarpSize + lane;
             const int pixel = slot < slot_end ? params.pixel_ids[slot] : -1;
             const float2 at = pixel_in_tile(frame, max(pixel, 0));
-            x[g] = at.x;
-            y[g] = at.y;
-            threshold[g] = pixel >= 0 ? least_level : never;
+            x[item] = at.x;
+            y[item] = at.y;
+            threshold[item] = pixel >= 0 ? least_level : never;
             if (pixel >= 0) enlarge(box, at);
-            transmittance[g] = 1.0f;
-            red[g] = green[g] = blue[g] = depth[g] = 0.0f;
-            last[g] = -1;
+            transmittance[item] = 1.0f;
+            red[item] = green[item] = blue[item] = depth[item] = 0.0f;
+            last[item] = -1;
         }
         box = box_of_warp(box);
 
@@ -113,7 +111,7 @@ __global__ void __launch_bounds__(kForwardWarps* kWarpSize, forward_blocks(kGrou
         for (; bucket < num_buckets; ++bucket) {
             bool alive = false;
 #pragma unroll
-            for (int g = 0; g < kGroups; ++g) alive = alive || threshold[g] < never;
+            for (int item = 0; item < kItems; ++item) alive = alive || threshold[item] < never;
             if (!__any_sync(kFullWarp, alive)) break;
 
             const int own = bucket * kBucket + lane;
@@ -135,36 +133,36 @@ __global__ void __launch_bounds__(kForwardWarps* kWarpSize, forward_blocks(kGrou
             __syncwarp();
 
             // No branches: most splats left are seen by some lane, and several overlap this way.
-            uint32_t contributed[kGroups] = {};
+            uint32_t contributed[kItems] = {};
             for (int base = 0; base < count; base += kAhead) {
 #pragma unroll
                 for (int i = 0; i < kAhead; ++i) {
                     const float4 form = staged[base + i].form, rest = staged[base + i].rest;
                     const float4 color = staged[base + i].color;
 #pragma unroll
-                    for (int g = 0; g < kGroups; ++g) {
-                        const float level = splat_level(form, rest, x[g], y[g]);
-                        const bool seen = level >= threshold[g];
-                        const float full = fminf(params.alpha_max, approximate_exp2(level)) * transmittance[g];
-                        const bool ends = seen && transmittance[g] - full <= params.transmittance_min;
+                    for (int item = 0; item < kItems; ++item) {
+                        const float level = splat_level(form, rest, x[item], y[item]);
+                        const bool seen = level >= threshold[item];
+                        const float full = fminf(params.alpha_max, approximate_exp2(level)) * transmittance[item];
+                        const bool ends = seen && transmittance[item] - full <= params.transmittance_min;
                         const bool taken = seen && !ends;
                         const float weight = taken ? full : 0.0f;
-                        if (ends) threshold[g] = never;
-                        transmittance[g] -= weight;
-                        red[g] += weight * color.x;
-                        green[g] += weight * color.y;
-                        blue[g] += weight * color.z;
-                        if (kDepth) depth[g] += weight * rest.z;
-                        if (taken) last[g] = __float_as_int(rest.w);
-                        if (taken) contributed[g] |= __float_as_uint(color.w);
+                        if (ends) threshold[item] = never;
+                        transmittance[item] -= weight;
+                        red[item] += weight * color.x;
+                        green[item] += weight * color.y;
+                        blue[item] += weight * color.z;
+                        if (kDepth) depth[item] += weight * rest.z;
+                        if (taken) last[item] = __float_as_int(rest.w);
+                        if (taken) contributed[item] |= __float_as_uint(color.w);
                     }
                 }
             }
 #pragma unroll
-            for (int g = 0; g < kGroups; ++g) {
-                const uint32_t any = __reduce_or_sync(kFullWarp, contributed[g]);
-                if (lane == g) {
-                    uint32_t* mask = masks + static_cast<size_t>(bucket) * params.chunks + g;
+            for (int item = 0; item < kItems; ++item) {
+                const uint32_t any = __reduce_or_sync(kFullWarp, contributed[item]);
+                if (lane == item) {
+                    uint32_t* mask = masks + static_cast<size_t>(bucket) * params.chunks + item;
                     *mask = bucket < walked ? (*mask | any) : any;
                 }
             }
@@ -172,35 +170,32 @@ __global__ void __launch_bounds__(kForwardWarps* kWarpSize, forward_blocks(kGrou
         walked = max(walked, bucket);
 
 #pragma unroll
-        for (int g = 0; g < kGroups; ++g) {
-            const int slot = slot_base + g * kWarpSize + lane;
+        for (int item = 0; item < kItems; ++item) {
+            const int slot = slot_base + item * kWarpSize + lane;
             if (slot >= slot_end) continue;
-            const float alpha = 1.0f - transmittance[g];
-            params.colors[3 * static_cast<size_t>(slot)] = red[g];
-            params.colors[3 * static_cast<size_t>(slot) + 1] = green[g];
-            params.colors[3 * static_cast<size_t>(slot) + 2] = blue[g];
+            const float alpha = 1.0f - transmittance[item];
+            params.colors[3 * static_cast<size_t>(slot)] = red[item];
+            params.colors[3 * static_cast<size_t>(slot) + 1] = green[item];
+            params.colors[3 * static_cast<size_t>(slot) + 2] = blue[item];
             params.alphas[slot] = alpha;
-            params.transmittances[slot] = transmittance[g];
-            params.last_intersections[slot] = last[g];
-            if (kDepth) params.depths[slot] = depth[g] / fmaxf(alpha, kAlphaTiny);
+            params.transmittances[slot] = transmittance[item];
+            params.last_intersections[slot] = last[item];
+            if (kDepth) params.depths[slot] = depth[item] / fmaxf(alpha, kAlphaTiny);
         }
     }
-    if (lane < kGroups) params.bucket_counts[tile * params.chunks + first_chunk + lane] = walked;
-}
-
-template <int kGroups>
-cudaError_t launch(const ForwardParams& params, cudaStream_t stream) {
-    const int warps = params.num_active * (params.chunks / kGroups);
-    const auto kernel = params.depths != nullptr ? forward_kernel<kGroups, true> : forward_kernel<kGroups, false>;
-    kernel<<<blocks_for(warps, kForwardWarps), kForwardWarps * kWarpSize, 0, stream>>>(params);
-    return cudaGetLastError();
+    if (lane < kItems) params.bucket_counts[tile * params.chunks + first_chunk + lane] = walked;
 }
 
 }  // namespace
 
 cudaError_t launch_rasterize_forward(const ForwardParams& params, cudaStream_t stream) {
     if (params.num_active * params.chunks == 0) return cudaSuccess;
-    return params.chunks % 2 == 0 ? launch<2>(params, stream) : launch<1>(params, stream);
+    const bool even = params.chunks % 2 == 0;
+    const auto kernel = params.depths != nullptr ? (even ? forward_kernel<2, true> : forward_kernel<1, true>)
+                                                 : (even ? forward_kernel<2, false> : forward_kernel<1, false>);
+    const int warps = params.num_active * (even ? params.chunks / 2 : params.chunks);
+    kernel<<<blocks_for(warps, kForwardWarps), kForwardWarps * kWarpSize, 0, stream>>>(params);
+    return cudaGetLastError();
 }
 
 }  // namespace turbogs

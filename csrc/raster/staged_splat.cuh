@@ -70,11 +70,18 @@ struct TileFrame {
     float x, y;  // of the tile's centre
 };
 
-__device__ __forceinline__ TileFrame tile_frame(const RasterCamera* __restrict__ cameras, int num_views, int tile_id) {
-    const RasterCamera& camera = cameras[view_of_tile(cameras, num_views, tile_id)];
+__device__ __forceinline__ TileFrame tile_frame(const ForwardParams& params, int tile) {
+    const int tile_id = params.tile_ids != nullptr ? params.tile_ids[tile] : tile;
+    const RasterCamera& camera = params.cameras[view_of_tile(params.cameras, params.num_views, tile_id)];
     const int place = tile_id - camera.tile_base, row = place / camera.tiles_x, column = place - row * camera.tiles_x;
     const float half = 0.5f * kTileSize;
     return {camera.width, static_cast<float>(column * kTileSize) + half, static_cast<float>(row * kTileSize) + half};
+}
+
+// A work item's mask of the first bucket. That of the next one lies params.chunks further on.
+__device__ __forceinline__ uint32_t* masks_of_item(const ForwardParams& params, uint32_t first_intersection,
+                                                   int tile, int chunk) {
+    return params.masks + static_cast<size_t>(first_intersection / kBucket + tile) * params.chunks + chunk;
 }
 
 // Centre of a pixel in the tile's frame.

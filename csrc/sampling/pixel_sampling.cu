@@ -117,23 +117,8 @@ __global__ void __launch_bounds__(kSampleThreads, kSampleBlocks) sample_tiles_ke
 
     const int first = first_slot<kUnit>(params, pixels);
     const int end = first + tile_slots<kUnit>(params, pixels.width, pixels.height);
-    const uint32_t lower_lanes = lanes_below(lane);
-    int next = first;
-#pragma unroll
-    for (int j = 0; j < kPerLane; ++j) {
-        const bool mine = drawn >> j & 1u;
-        const uint32_t lanes = __ballot_sync(kFullWarp, mine);
-        if (mine) {
-            const int slot = next + __popc(lanes & lower_lanes);
-            params.pixel_ids[slot] = static_cast<int32_t>(pixels.id(j));
-            if (kWeighted) params.weights[slot] = importance_weight(missed[j], params.importance);
-        }
-        next += __popc(lanes);
-    }
-    for (int slot = next + lane; slot < end; slot += kWarpSize) {
-        params.pixel_ids[slot] = -1;
-        if (kWeighted) params.weights[slot] = 0.0f;
-    }
+    write_samples(params, pixels, drawn, first, end, kWeighted,
+                  [&](int j) { return importance_weight(missed[j], params.importance); });
     if (lane == 0) {
         params.tile_ids[tile] = tile;
         params.tile_offsets[tile] = first;
@@ -141,24 +126,19 @@ __global__ void __launch_bounds__(kSampleThreads, kSampleBlocks) sample_tiles_ke
     }
 }
 
-template <SampleUnit kUnit>
-cudaError_t launch_tiles(const SamplePixelsParams& params, int blocks, cudaStream_t stream) {
-    if (params.weights != nullptr) {
-        sample_tiles_kernel<kUnit, true><<<blocks, kSampleThreads, 0, stream>>>(params);
-    } else {
-        sample_tiles_kernel<kUnit, false><<<blocks, kSampleThreads, 0, stream>>>(params);
-    }
-    return cudaGetLastError();
-}
-
 }  // namespace
 
 cudaError_t launch_sample_pixels(const SamplePixelsParams& params, cudaStream_t stream) {
     if (params.num_tiles == 0) return cudaSuccess;
-    const int blocks = warp_blocks(params.num_tiles);
-    if (params.unit == SampleUnit::kPixel) return launch_tiles<SampleUnit::kPixel>(params, blocks, stream);
-    if (params.unit == SampleUnit::kCell) return launch_tiles<SampleUnit::kCell>(params, blocks, stream);
-    return launch_sample_tiles(params, stream);
+    if (params.unit == SampleUnit::kTile) return launch_sample_tiles(params, stream);
+    const bool weighted = params.weights != nullptr;
+    const auto kernel = params.unit == SampleUnit::kPixel
+                            ? (weighted ? sample_tiles_kernel<SampleUnit::kPixel, true>
+                                        : sample_tiles_kernel<SampleUnit::kPixel, false>)
+                            : (weighted ? sample_tiles_kernel<SampleUnit::kCell, true>
+                                        : sample_tiles_kernel<SampleUnit::kCell, false>);
+    kernel<<<warp_blocks(params.num_tiles), kSampleThreads, 0, stream>>>(params);
+    return cudaGetLastError();
 }
 
 }  // namespace turbogs

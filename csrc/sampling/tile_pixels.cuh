@@ -91,6 +91,32 @@ __device__ __forceinline__ PixelUnits load_maps(const SamplePixelsParams& params
     return units;
 }
 
+// Writes the drawn pixels, bit j of `drawn` being pixel (j, lane), in the order of samples to the slots first .. end - 1
+// of sample tile `number`. The slots that are left stay empty. `weight_of(j)` is asked for where `weighted`.
+template <class WeightOf>
+__device__ __forceinline__ void write_samples(const SamplePixelsParams& params, const TilePixels& pixels,
+                                              uint32_t drawn, int first, int end, bool weighted,
+                                              const WeightOf& weight_of) {
+    const int lane = this_lane();
+    const uint32_t lower_lanes = lanes_below(lane);
+    int next = first;
+#pragma unroll
+    for (int j = 0; j < kPerLane; ++j) {
+        const bool mine = drawn >> j & 1u;
+        const uint32_t lanes = __ballot_sync(kFullWarp, mine);
+        if (mine) {
+            const int slot = next + __popc(lanes & lower_lanes);
+            params.pixel_ids[slot] = static_cast<int32_t>(pixels.id(j));
+            if (weighted) params.weights[slot] = weight_of(j);
+        }
+        next += __popc(lanes);
+    }
+    for (int slot = next + lane; slot < end; slot += kWarpSize) {
+        params.pixel_ids[slot] = -1;
+        if (weighted) params.weights[slot] = 0.0f;
+    }
+}
+
 // For the host: blocks of so many warps.
 inline int warp_blocks(int warps) { return blocks_for(warps, kSampleThreads / kWarpSize); }
 

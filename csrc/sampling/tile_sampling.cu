@@ -150,31 +150,13 @@ __global__ void __launch_bounds__(kChooseThreads) choose_tiles_kernel(
 __global__ void __launch_bounds__(kSampleThreads) fill_tiles_kernel(const __grid_constant__ SamplePixelsParams params) {
     const int chosen = (blockIdx.x * kSampleThreads + threadIdx.x) / kWarpSize;
     if (chosen >= params.num_chosen) return;
-    const int lane = this_lane();
-    const int tile = params.tile_ids[chosen];
+    const int tile = params.tile_ids[chosen], first = chosen * kTilePixels, end = first + kTilePixels;
     const TilePixels pixels = locate_tile(params, tile);
     const float weight =
         params.weights != nullptr ? importance_weight(params.tile_missed[tile], params.importance) : 0.0f;
-    int next = chosen * kTilePixels;
-    const int end = next + kTilePixels;
-    const uint32_t lower_lanes = lanes_below(lane);
-#pragma unroll
-    for (int j = 0; j < kPerLane; ++j) {
-        const bool mine = pixels.inside >> j & 1u;
-        const uint32_t lanes = __ballot_sync(kFullWarp, mine);
-        if (mine) {
-            const int slot = next + __popc(lanes & lower_lanes);
-            params.pixel_ids[slot] = static_cast<int32_t>(pixels.id(j));
-            if (params.weights != nullptr) params.weights[slot] = weight;
-        }
-        next += __popc(lanes);
-    }
-    for (int slot = next + lane; slot < end; slot += kWarpSize) {
-        params.pixel_ids[slot] = -1;
-        if (params.weights != nullptr) params.weights[slot] = 0.0f;
-    }
-    if (lane == 0) {
-        params.tile_offsets[chosen] = chosen * kTilePixels;
+    write_samples(params, pixels, pixels.inside, first, end, params.weights != nullptr, [&](int) { return weight; });
+    if (this_lane() == 0) {
+        params.tile_offsets[chosen] = first;
         if (chosen == params.num_chosen - 1) params.tile_offsets[chosen + 1] = end;
     }
 }
@@ -183,11 +165,9 @@ __global__ void __launch_bounds__(kSampleThreads) fill_tiles_kernel(const __grid
 
 cudaError_t launch_sample_tiles(const SamplePixelsParams& params, cudaStream_t stream) {
     tile_sums_kernel<<<warp_blocks(params.num_tiles), kSampleThreads, 0, stream>>>(params);
-    cudaError_t status = cudaGetLastError();
-    if (status != cudaSuccess) return status;
+    if (const cudaError_t error = cudaGetLastError()) return error;
     choose_tiles_kernel<<<params.num_views, kChooseThreads, 0, stream>>>(params);
-    status = cudaGetLastError();
-    if (status != cudaSuccess) return status;
+    if (const cudaError_t error = cudaGetLastError()) return error;
     fill_tiles_kernel<<<warp_blocks(params.num_chosen), kSampleThreads, 0, stream>>>(params);
     return cudaGetLastError();
 }

@@ -90,6 +90,13 @@ __device__ __forceinline__ Split split_largest(const uint32_t (&keys)[kUnits], i
     return split;
 }
 
+// The keys of the `open` units; 0 is no unit.
+template <class Key, int kUnits, class KeyOf>
+__device__ __forceinline__ void make_keys(Key (&keys)[kUnits], uint32_t open, const KeyOf& key_of) {
+#pragma unroll
+    for (int j = 0; j < kUnits; ++j) keys[j] = open >> j & 1u ? key_of(j) : 0u;
+}
+
 // The first `room` of the tied units. Unit (j, lane) has rank 32 j + lane.
 template <int kUnits>
 __device__ __forceinline__ uint32_t take_by_rank(uint32_t tied, int room) {
@@ -131,8 +138,7 @@ __device__ __forceinline__ uint32_t take_race(uint32_t (&keys)[kUnits], uint32_t
 #pragma unroll
     for (int j = 0; j < kUnits; ++j) doubt = doubt || keys[j] - (split.threshold - kKeyGuard) <= 2u * kKeyGuard;
     if (!__any_sync(kFullWarp, doubt)) return split.taken;
-#pragma unroll
-    for (int j = 0; j < kUnits; ++j) keys[j] = open >> j & 1u ? exact_key(j) : 0u;
+    make_keys(keys, open, exact_key);
     return take_largest<Spread::kRace>(keys, count, split.threshold);
 }
 
@@ -178,44 +184,40 @@ __device__ __forceinline__ uint32_t draw(const SamplePixelsParams& params, const
             missed[j] *= thresholds.largest_left == 0 ? 0.0f : 1.0f - chance_of(j, tau);
         }
     };
+    // The winners of a race among the `open` units; `near_weight` is the weight but for rounding.
+    const auto race = [&](uint32_t open, int count, float total, const uint32_t (&words)[kUnits], const auto& weight_of,
+                          const auto& near_weight_of) {
+        const uint32_t guess = race_guess<kUnits>(total, count);
+        const auto exact_key = [&](int j) { return race_key(weight_of(j), words[j]); };
+        if constexpr (!kWeighted) {
+            make_keys(keys, open, [&](int j) { return approximate_race_key(near_weight_of(j), words[j]); });
+            return take_race(keys, open, count, guess, exact_key);
+        } else {
+            make_keys(keys, open, exact_key);
+            const uint32_t taken = take_largest<Spread::kRace>(keys, count, guess);
+            miss(taken, stage_thresholds(keys, taken),
+                 [&](int j, uint32_t tau) { return race_chance(weight_of(j), tau); });
+            return taken;
+        }
+    };
     uint32_t drawn = 0;
     if (hard > 0) {
-        const uint32_t guess = race_guess<kUnits>(__double2float_rn(error_sum), hard);
-        const auto exact_key = [&](int j) { return race_key(units.error(j), hard_words[j]); };
-        if (!kWeighted) {
-#pragma unroll
-            for (int j = 0; j < kUnits; ++j) {
-                keys[j] = exist >> j & 1u ? approximate_race_key(units.error(j), hard_words[j]) : 0u;
-            }
-            drawn = take_race(keys, exist, hard, guess, exact_key);
-        } else {
-#pragma unroll
-            for (int j = 0; j < kUnits; ++j) keys[j] = exist >> j & 1u ? exact_key(j) : 0u;
-            drawn = take_largest<Spread::kRace>(keys, hard, guess);
-            miss(drawn, stage_thresholds(keys, drawn),
-                 [&](int j, uint32_t tau) { return race_chance(units.error(j), tau); });
-        }
+        const auto weight_of = [&](int j) { return units.error(j); };
+        drawn = race(exist, hard, __double2float_rn(error_sum), hard_words, weight_of, weight_of);
     }
     if (stable > 0) {
         // By age first; of equal ages by the random words.
         const uint32_t open = exist & ~drawn;
-#pragma unroll
-        for (int j = 0; j < kUnits; ++j) keys[j] = open >> j & 1u ? static_cast<uint32_t>(units.age(j)) + 1u : 0u;
+        make_keys(keys, open, [&](int j) { return static_cast<uint32_t>(units.age(j)) + 1u; });
         const Split oldest = split_largest<Spread::kAges>(keys, stable);
         uint32_t taken = oldest.taken;
         if (oldest.room > 0) {
-#pragma unroll
-            for (int j = 0; j < kUnits; ++j) {
-                keys[j] = oldest.tied >> j & 1u ? (stable_words[j] >> (32 - kAgeTieBits)) + 1u : 0u;
-            }
+            make_keys(keys, oldest.tied, [&](int j) { return (stable_words[j] >> (32 - kAgeTieBits)) + 1u; });
             taken |= take_largest<Spread::kUniform>(keys, oldest.room);
         }
         if (kWeighted) {
             uint64_t age_keys[kUnits];  // plus 1, so that 0 is no unit
-#pragma unroll
-            for (int j = 0; j < kUnits; ++j) {
-                age_keys[j] = open >> j & 1u ? age_key(units.age(j), stable_words[j]) + 1u : 0u;
-            }
+            make_keys(age_keys, open, [&](int j) { return age_key(units.age(j), stable_words[j]) + 1u; });
             miss(taken, stage_thresholds(age_keys, taken),
                  [&](int j, uint64_t tau) { return age_chance(units.age(j), tau - 1u); });
         }
@@ -223,37 +225,17 @@ __device__ __forceinline__ uint32_t draw(const SamplePixelsParams& params, const
     }
     if (mixed > 0) {
         const float error_total = __double2float_rn(error_sum), age_total = __int2float_rn(age_sum);
-        const uint32_t open = exist & ~drawn;
-        const auto exact_weight = [&](int j) {
+        const float of_error = error_total > 0.0f ? approximate_reciprocal(error_total) : 0.0f;
+        const float of_age = age_total > 0.0f ? approximate_reciprocal(age_total) : 0.0f;
+        const auto weight_of = [&](int j) {
             return params.mixed_uniform ? 1.0f : mixed_weight(units.error(j), units.age(j), error_total, age_total);
         };
-        const auto exact_key = [&](int j) { return race_key(exact_weight(j), mixed_words[j]); };
+        const auto near_weight_of = [&](int j) {
+            return params.mixed_uniform ? 1.0f : units.error(j) * of_error + static_cast<float>(units.age(j)) * of_age;
+        };
         // The shares of all units add up to 2, of which the stages before took the larger.
-        const uint32_t guess =
-            race_guess<kUnits>(params.mixed_uniform ? static_cast<float>(kWarpSize * kUnits) : 1.0f, mixed);
-        uint32_t taken;
-        if (!kWeighted) {
-            const float of_error = error_total > 0.0f ? approximate_reciprocal(error_total) : 0.0f;
-            const float of_age = age_total > 0.0f ? approximate_reciprocal(age_total) : 0.0f;
-#pragma unroll
-            for (int j = 0; j < kUnits; ++j) {
-                const float weight =
-                    params.mixed_uniform ? 1.0f : units.error(j) * of_error + static_cast<float>(units.age(j)) * of_age;
-                keys[j] = open >> j & 1u ? approximate_race_key(weight, mixed_words[j]) : 0u;
-            }
-            taken = take_race(keys, open, mixed, guess, exact_key);
-        } else {
-            float weights[kUnits];
-#pragma unroll
-            for (int j = 0; j < kUnits; ++j) {
-                weights[j] = exact_weight(j);
-                keys[j] = open >> j & 1u ? exact_key(j) : 0u;
-            }
-            taken = take_largest<Spread::kRace>(keys, mixed, guess);
-            miss(taken, stage_thresholds(keys, taken),
-                 [&](int j, uint32_t tau) { return race_chance(weights[j], tau); });
-        }
-        drawn |= taken;
+        const float total = params.mixed_uniform ? static_cast<float>(kWarpSize * kUnits) : 1.0f;
+        drawn |= race(exist & ~drawn, mixed, total, mixed_words, weight_of, near_weight_of);
     }
     return drawn;
 }
