@@ -164,25 +164,29 @@ __device__ __forceinline__ TileTotals tile_loss(const SparseLossParams& params, 
     float factor[3] = {}, at_y[3] = {}, at_x[3] = {}, constant[3] = {};
     const auto offset_x = [&](int j, int c) { return (samples.x[j][c] - first_x[c]) - mean_x[c]; };
     const auto offset_y = [&](int j, int c) { return (samples.y[j][c] - first_y[c]) - mean_y[c]; };
-    const auto load_again = [&](int start) {
-        if (!resident) load_samples(params, view, start, end, samples);
+    // Of each sample again, the lane's j-th of a round.
+    const auto visit_samples = [&](const auto& visit) {
+        for (int start = first; start < end; start += kRound) {
+            if (!resident) load_samples(params, view, start, end, samples);
+#pragma unroll
+            for (int j = 0; j < kSlots; ++j) visit(j, start + kWarpSize * j + lane);
+        }
+    };
+    const auto structure_slope = [&](int j, int c) {
+        return offset_y(j, c) * at_y[c] - offset_x(j, c) * at_x[c] + constant[c];
     };
     if (structured) {
         // Pass 2: variances and covariances.
         float sums[8] = {}, last = 0.0f;  // xx 0-2, yy 3-5, xy 6, 7 and `last`
-        for (int start = first; start < end; start += kRound) {
-            load_again(start);
+        visit_samples([&](int j, int) {
 #pragma unroll
-            for (int j = 0; j < kSlots; ++j) {
-#pragma unroll
-                for (int c = 0; c < 3; ++c) {
-                    const float dx = offset_x(j, c), dy = offset_y(j, c);
-                    sums[c] += samples.weight[j] * (dx * dx);
-                    sums[3 + c] += samples.weight[j] * (dy * dy);
-                    (c < 2 ? sums[6 + c] : last) += samples.weight[j] * (dx * dy);
-                }
+            for (int c = 0; c < 3; ++c) {
+                const float dx = offset_x(j, c), dy = offset_y(j, c);
+                sums[c] += samples.weight[j] * (dx * dx);
+                sums[3 + c] += samples.weight[j] * (dy * dy);
+                (c < 2 ? sums[6 + c] : last) += samples.weight[j] * (dx * dy);
             }
-        }
+        });
         warp_sums(sums);
         last = warp_sum(last);
         float variance_y[3];
@@ -208,18 +212,12 @@ __device__ __forceinline__ TileTotals tile_loss(const SparseLossParams& params, 
         if (params.balance) {
             // Pass 3: norms of the structure term's gradients.
             float norm = 0.0f;
-            for (int start = first; start < end; start += kRound) {
-                load_again(start);
+            visit_samples([&](int j, int) {
+                float norm_of_sample = 0.0f;
 #pragma unroll
-                for (int j = 0; j < kSlots; ++j) {
-                    float norm_of_sample = 0.0f;
-#pragma unroll
-                    for (int c = 0; c < 3; ++c) {
-                        norm_of_sample += fabsf(offset_y(j, c) * at_y[c] - offset_x(j, c) * at_x[c] + constant[c]);
-                    }
-                    norm += samples.weight[j] * norm_of_sample;
-                }
-            }
+                for (int c = 0; c < 3; ++c) norm_of_sample += fabsf(structure_slope(j, c));
+                norm += samples.weight[j] * norm_of_sample;
+            });
             balance = fminf(norm_l1 / (warp_sum(norm) * inverse_total + kBalanceEpsilon), 1.0f);
         }
         float tile_sum = 0.0f;
@@ -235,22 +233,16 @@ __device__ __forceinline__ TileTotals tile_loss(const SparseLossParams& params, 
     }
 
     // Last pass: gradients.
-    for (int start = first; start < end; start += kRound) {
-        load_again(start);
+    visit_samples([&](int j, int slot) {
+        if (slot >= end) return;
 #pragma unroll
-        for (int j = 0; j < kSlots; ++j) {
-            const int slot = start + kWarpSize * j + lane;
-            if (slot >= end) continue;
-#pragma unroll
-            for (int c = 0; c < 3; ++c) {
-                const float d = samples.x[j][c] - samples.y[j][c];
-                const float l1 = d * approximate_rsqrt(fmaxf(d * d + epsilon2, FLT_MIN)) * l1_scale;
-                const float structure = offset_y(j, c) * at_y[c] - offset_x(j, c) * at_x[c] + constant[c];
-                params.color_gradients[3 * static_cast<size_t>(slot) + c] =
-                    samples.weight[j] * (l1 - factor[c] * structure);
-            }
+        for (int c = 0; c < 3; ++c) {
+            const float d = samples.x[j][c] - samples.y[j][c];
+            const float l1 = d * approximate_rsqrt(fmaxf(d * d + epsilon2, FLT_MIN)) * l1_scale;
+            params.color_gradients[3 * static_cast<size_t>(slot) + c] =
+                samples.weight[j] * (l1 - factor[c] * structure_slope(j, c));
         }
-    }
+    });
     return totals;
 }
 
