@@ -19,22 +19,32 @@ namespace turbogs {
 // Measured best: 64 were 3 to 6 % slower, 192 no better (docs/performance-training-kernels.md).
 constexpr int kBackwardThreads = 128;
 
-constexpr int kReciprocalBits = 20;  // of 1 / row in SharedHarmonics
+constexpr int kReciprocalBits = 20;  // enough that `BlockShared::owner` is exact for every element of a block
 
-// Harmonics of a block's Gaussians in shared memory.
-struct SharedHarmonics {
-    float* coefficients;  // [threads, stride]
-    bool* wanted;         // [threads] whether anybody needs this Gaussian's
+// Shared memory of a block.
+struct BlockShared {
+    float* coefficients;  // [threads, stride] the harmonics of its Gaussians
+    float* work;          // [threads, work_floats]
+    ViewCamera* cameras;  // [K]
+    bool* wanted;         // [threads] whether anybody needs the harmonics of this Gaussian
     int row;              // 3 B
-    int stride;           // of a row: 3 B made odd
-    uint32_t reciprocal;  // of `row` in 2^-kReciprocalBits, rounded up: exact for every element of a block
+    int stride;           // of a row of `coefficients`: 3 B made odd
+    uint32_t reciprocal;  // of `row` in 2^-kReciprocalBits, rounded up
 
-    __device__ SharedHarmonics(float* coefficients, bool* wanted, const ScreenBackwardParams& params)
-        : coefficients(coefficients),
-          wanted(wanted),
+    __device__ BlockShared(float4* shared, const ScreenBackwardParams& params, int work_floats)
+        : coefficients(reinterpret_cast<float*>(shared)),
           row(3 * params.bands),
           stride(row_stride(params)),
-          reciprocal(row > 0 ? ((1u << kReciprocalBits) + row - 1) / row : 0u) {}
+          reciprocal(row > 0 ? ((1u << kReciprocalBits) + row - 1) / row : 0u) {
+        work = coefficients + kBackwardThreads * stride;
+        wanted = reinterpret_cast<bool*>(work + kBackwardThreads * work_floats);
+        cameras = reinterpret_cast<ViewCamera*>(wanted + kBackwardThreads);
+    }
+
+    static size_t bytes(const ScreenBackwardParams& params, int work_floats) {
+        const int floats = row_stride(params) + work_floats;
+        return kBackwardThreads * (floats * sizeof(float) + sizeof(bool)) + params.num_views * sizeof(ViewCamera);
+    }
 
     // The Gaussian of the block that element `index` of its harmonics belongs to.
     __device__ __forceinline__ int owner(int index) const {
@@ -45,7 +55,14 @@ struct SharedHarmonics {
         return params.bands > 0 ? (3 * params.bands) | 1 : 0;
     }
 
-    // Starts to copy those that are wanted. `wait` of every thread and a barrier make them ready.
+    __device__ __forceinline__ void load_cameras(const ScreenBackwardParams& params) const {
+        for (int view = threadIdx.x; view < params.num_views; view += kBackwardThreads) {
+            cameras[view] = load_camera(params.viewmats + 16 * view, params.intrinsics + 9 * view, params.widths[view],
+                                        params.heights[view], params.num_views);
+        }
+    }
+
+    // Starts to copy the harmonics that are wanted. `wait` of every thread and a barrier make them ready.
     __device__ __forceinline__ void start(const ScreenBackwardParams& params) const {
         const int first = static_cast<int>(blockIdx.x) * kBackwardThreads;
         const int count = min(kBackwardThreads, params.num_gaussians - first) * row;
@@ -68,13 +85,6 @@ struct SharedHarmonics {
         __pipeline_wait_prior(0);
     }
 };
-
-__device__ __forceinline__ void load_cameras(const ScreenBackwardParams& params, ViewCamera* cameras) {
-    for (int view = threadIdx.x; view < params.num_views; view += kBackwardThreads) {
-        cameras[view] = load_camera(params.viewmats + 16 * view, params.intrinsics + 9 * view, params.widths[view],
-                                    params.heights[view], params.num_views);
-    }
-}
 
 // The parameters of one Gaussian but its harmonics, as they are stored.
 struct StoredGaussian {
@@ -212,15 +222,16 @@ __device__ __forceinline__ void backward_views(const ScreenBackwardParams& param
     }
 }
 
-// Launches a kernel of blocks of kBackwardThreads Gaussians with so much dynamic shared memory.
+// Launches a kernel whose threads have `work_floats` each in `BlockShared::work`.
 template <class Second>
-cudaError_t launch_blocks(void (*kernel)(ScreenBackwardParams, Second), size_t shared_bytes,
+cudaError_t launch_blocks(void (*kernel)(ScreenBackwardParams, Second), int work_floats,
                           const ScreenBackwardParams& params, const Second& second, cudaStream_t stream) {
+    const size_t bytes = BlockShared::bytes(params, work_floats);
     const cudaError_t status =
-        cudaFuncSetAttribute(kernel, cudaFuncAttributeMaxDynamicSharedMemorySize, static_cast<int>(shared_bytes));
+        cudaFuncSetAttribute(kernel, cudaFuncAttributeMaxDynamicSharedMemorySize, static_cast<int>(bytes));
     if (status != cudaSuccess) return status;
     const int blocks = blocks_for(params.num_gaussians, kBackwardThreads);
-    kernel<<<blocks, kBackwardThreads, shared_bytes, stream>>>(params, second);
+    kernel<<<blocks, kBackwardThreads, bytes, stream>>>(params, second);
     return cudaGetLastError();
 }
 

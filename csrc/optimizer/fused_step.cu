@@ -28,37 +28,19 @@ static_assert(kSlotFloats == ScreenRecord::kSize, "a row that is kept takes the 
 // The rows of J: none (Adam), the sum of the views' rows, or each.
 enum class Rows { kNone, kSummed, kPerView };
 
-struct StepShared {
-    SharedHarmonics harmonics;
-    float* work;          // [threads, work_stride] slots of each thread; later the harmonics' gradients, [threads, 3 B]
-    float2* corrections;  // [threads] inverses of the two bias corrections
-    ViewCamera* cameras;  // [K]
-    bool* updated;        // [threads]
-    int work_stride;      // odd
+// Rows of a Gaussian that shared memory holds.
+__host__ __device__ int shared_slots(const ScreenBackwardParams& params) {
+    return params.num_views < kSharedSlots ? params.num_views : kSharedSlots;
+}
 
-    __host__ __device__ static int slots(const ScreenBackwardParams& params) {
-        return params.num_views < kSharedSlots ? params.num_views : kSharedSlots;
-    }
+// Floats of a thread's slots, which later hold the gradients of its Gaussian's harmonics; odd.
+__host__ __device__ int slot_floats(const ScreenBackwardParams& params) {
+    const int rows = kSlotFloats * shared_slots(params), gradients = 3 * params.bands;
+    return (rows > gradients ? rows : gradients) | 1;
+}
 
-    __host__ __device__ static int work_row(const ScreenBackwardParams& params) {
-        const int rows = kSlotFloats * slots(params), gradients = 3 * params.bands;
-        return (rows > gradients ? rows : gradients) | 1;
-    }
-
-    __device__ StepShared(float* shared, const ScreenBackwardParams& params)
-        : harmonics(shared, nullptr, params), work_stride(work_row(params)) {
-        work = shared + kBackwardThreads * harmonics.stride;
-        corrections = reinterpret_cast<float2*>(work + kBackwardThreads * work_stride);
-        cameras = reinterpret_cast<ViewCamera*>(corrections + kBackwardThreads);
-        updated = reinterpret_cast<bool*>(cameras + params.num_views);
-        harmonics.wanted = updated;
-    }
-
-    static size_t bytes(const ScreenBackwardParams& params) {
-        const int floats = SharedHarmonics::row_stride(params) + work_row(params) + 2;
-        return kBackwardThreads * (floats * sizeof(float) + sizeof(bool)) + params.num_views * sizeof(ViewCamera);
-    }
-};
+// Behind the slots lie the inverses of the two bias corrections.
+__host__ __device__ int step_floats(const ScreenBackwardParams& params) { return slot_floats(params) + 2; }
 
 // Sums the rows of one Gaussian, and keeps them. Row s lies in slot s of shared memory, or where the record of view s
 // was.
@@ -190,18 +172,17 @@ __device__ __forceinline__ void update_row(const ScreenBackwardParams& params, c
 
 // Adam on the harmonics of the block's updated Gaussians. Values and gradients come from shared memory.
 __device__ __forceinline__ void update_harmonics(const ScreenBackwardParams& params, const OptimizerParams& optimizer,
-                                                 const StepShared& block) {
-    const SharedHarmonics& harmonics = block.harmonics;
+                                                 const BlockShared& block, const float2* block_corrections) {
     const int first = static_cast<int>(blockIdx.x) * kBackwardThreads;
-    const int count = min(kBackwardThreads, params.num_gaussians - first) * harmonics.row;
-    const size_t base = static_cast<size_t>(first) * harmonics.row;
+    const int count = min(kBackwardThreads, params.num_gaussians - first) * block.row;
+    const size_t base = static_cast<size_t>(first) * block.row;
     for (int start = 4 * threadIdx.x; start < count; start += kQuadBatch * 4 * kBackwardThreads) {
         float4 means[kQuadBatch], squares[kQuadBatch];
         bool wanted[kQuadBatch];
 #pragma unroll
         for (int q = 0; q < kQuadBatch; ++q) {
             const int i = start + q * 4 * kBackwardThreads;
-            wanted[q] = i + 3 < count && (block.updated[harmonics.owner(i)] | block.updated[harmonics.owner(i + 3)]);
+            wanted[q] = i + 3 < count && (block.wanted[block.owner(i)] | block.wanted[block.owner(i + 3)]);
             if (!wanted[q]) continue;
             means[q] = *reinterpret_cast<const float4*>(optimizer.exp_avg_shN + base + i);
             squares[q] = *reinterpret_cast<const float4*>(optimizer.exp_avg_sq_shN + base + i);
@@ -210,17 +191,17 @@ __device__ __forceinline__ void update_harmonics(const ScreenBackwardParams& par
         for (int q = 0; q < kQuadBatch; ++q) {
             if (!wanted[q]) continue;
             const int i = start + q * 4 * kBackwardThreads;
-            const int owners[2] = {harmonics.owner(i), harmonics.owner(i + 3)};
-            const int boundary = owners[1] * harmonics.row - i;  // elements from here on are the second owner's
-            const float2 corrections[2] = {block.corrections[owners[0]], block.corrections[owners[1]]};
+            const int owners[2] = {block.owner(i), block.owner(i + 3)};
+            const int boundary = owners[1] * block.row - i;  // elements from here on are the second owner's
+            const float2 corrections[2] = {block_corrections[owners[0]], block_corrections[owners[1]]};
             const float4 gradient = *reinterpret_cast<const float4*>(block.work + i);
             float4 &mean = means[q], &square = squares[q], value;
-            if (harmonics.stride == harmonics.row) {
-                value = *reinterpret_cast<const float4*>(harmonics.coefficients + i);
+            if (block.stride == block.row) {
+                value = *reinterpret_cast<const float4*>(block.coefficients + i);
             } else {
 #pragma unroll
                 for (int j = 0; j < 4; ++j) {
-                    (&value.x)[j] = harmonics.coefficients[i + j + (j >= boundary ? owners[1] : owners[0])];
+                    (&value.x)[j] = block.coefficients[i + j + (j >= boundary ? owners[1] : owners[0])];
                 }
             }
 #pragma unroll
@@ -228,14 +209,14 @@ __device__ __forceinline__ void update_harmonics(const ScreenBackwardParams& par
                 adam(optimizer, (&gradient.x)[j], j >= boundary ? corrections[1] : corrections[0], (&value.x)[j],
                      (&mean.x)[j], (&square.x)[j]);
             }
-            if (block.updated[owners[0]] && block.updated[owners[1]]) {
+            if (block.wanted[owners[0]] && block.wanted[owners[1]]) {
                 *reinterpret_cast<float4*>(optimizer.exp_avg_shN + base + i) = mean;
                 *reinterpret_cast<float4*>(optimizer.exp_avg_sq_shN + base + i) = square;
                 *reinterpret_cast<float4*>(params.shN + base + i) = value;
             } else {
 #pragma unroll
                 for (int j = 0; j < 4; ++j) {
-                    if (!block.updated[j >= boundary ? owners[1] : owners[0]]) continue;
+                    if (!block.wanted[j >= boundary ? owners[1] : owners[0]]) continue;
                     optimizer.exp_avg_shN[base + i + j] = (&mean.x)[j];
                     optimizer.exp_avg_sq_shN[base + i + j] = (&square.x)[j];
                     params.shN[base + i + j] = (&value.x)[j];
@@ -245,10 +226,10 @@ __device__ __forceinline__ void update_harmonics(const ScreenBackwardParams& par
     }
     // What is left of the last block's last quad.
     for (int i = (count & ~3) + threadIdx.x; i < count; i += kBackwardThreads) {
-        const int owner = harmonics.owner(i);
-        if (!block.updated[owner]) continue;
-        float value = harmonics.coefficients[i + owner * (harmonics.stride - harmonics.row)];
-        adam(optimizer, block.work[i], block.corrections[owner], value, optimizer.exp_avg_shN[base + i],
+        const int owner = block.owner(i);
+        if (!block.wanted[owner]) continue;
+        float value = block.coefficients[i + owner * (block.stride - block.row)];
+        adam(optimizer, block.work[i], block_corrections[owner], value, optimizer.exp_avg_shN[base + i],
              optimizer.exp_avg_sq_shN[base + i]);
         params.shN[base + i] = value;
     }
@@ -258,35 +239,36 @@ template <Rows kRows>
 __global__ void __launch_bounds__(kBackwardThreads, kStepBlocks) fused_step_kernel(
     const __grid_constant__ ScreenBackwardParams params, const __grid_constant__ OptimizerParams optimizer) {
     extern __shared__ float4 shared[];
-    const StepShared block(reinterpret_cast<float*>(shared), params);
-    const SharedHarmonics& harmonics = block.harmonics;
+    const BlockShared block(shared, params, step_floats(params));
+    const int work_stride = slot_floats(params);
+    float2* block_corrections = reinterpret_cast<float2*>(block.work + kBackwardThreads * work_stride);
     const int gaussian = blockIdx.x * kBackwardThreads + threadIdx.x;
 
     const int32_t overflow = params.overflow != nullptr ? *params.overflow : 0;
-    load_cameras(params, block.cameras);
+    block.load_cameras(params);
     const Sight sight = gaussian < params.num_gaussians ? sight_of(params, gaussian) : Sight{};
     if (overflow != 0) return;  // here, so that no load waits for another
     const bool seen = sight.count > 0;
-    block.updated[threadIdx.x] = seen;
+    block.wanted[threadIdx.x] = seen;
     __syncthreads();
-    harmonics.start(params);
+    block.start(params);
     const StoredGaussian stored = seen ? load_gaussian(params, gaussian) : StoredGaussian{};
     const int steps = seen ? optimizer.steps[gaussian] + 1 : 1;
-    harmonics.wait();
+    block.wait();
     __syncthreads();
 
     float gradients[3 * kMaxBands] = {};
     bool updated = false;
     if (seen) {
         RowCollector rows;
-        rows.slots = block.work + threadIdx.x * block.work_stride;
+        rows.slots = block.work + threadIdx.x * work_stride;
         rows.records = params.records + static_cast<size_t>(gaussian) * kRecordQuads;
         rows.step = static_cast<size_t>(params.num_gaussians) * kRecordQuads;
-        rows.num_slots = StepShared::slots(params);
+        rows.num_slots = shared_slots(params);
         const auto views_of = [&](int first) {
             return first == 0 ? sight.views : views_on_screen(params, gaussian, first);
         };
-        backward_views<true>(params, block.cameras, harmonics.coefficients + threadIdx.x * harmonics.stride, gaussian,
+        backward_views<true>(params, block.cameras, block.coefficients + threadIdx.x * block.stride, gaussian,
                              stored, views_of, rows);
         add_sight(params, gaussian, sight);
         updated = rows.count > 0 && rows.all_finite(stored.mean, block.cameras, params.sh_degree);
@@ -294,7 +276,7 @@ __global__ void __launch_bounds__(kBackwardThreads, kStepBlocks) fused_step_kern
             const float2 corrections = make_float2(1.0f / bias_correction(optimizer.log_beta1, steps),
                                                    1.0f / bias_correction(optimizer.log_beta2, steps));
             optimizer.steps[gaussian] = steps;
-            block.corrections[threadIdx.x] = corrections;
+            block_corrections[threadIdx.x] = corrections;
             update_row<kRows>(params, optimizer, gaussian, rows, load_gaussian(params, gaussian), corrections);
             if (params.sh_degree > 0) rows.harmonics(stored.mean, block.cameras, params.sh_degree, gradients);
         } else if (rows.count > 0) {
@@ -302,13 +284,13 @@ __global__ void __launch_bounds__(kBackwardThreads, kStepBlocks) fused_step_kern
         }
     }
     __syncthreads();  // all rows are done with
-    block.updated[threadIdx.x] = updated;
+    block.wanted[threadIdx.x] = updated;
 #pragma unroll
     for (int i = 0; i < 3 * kMaxBands; ++i) {
-        if (i < harmonics.row) block.work[threadIdx.x * harmonics.row + i] = gradients[i];
+        if (i < block.row) block.work[threadIdx.x * block.row + i] = gradients[i];
     }
     __syncthreads();
-    update_harmonics(params, optimizer, block);
+    update_harmonics(params, optimizer, block, block_corrections);
 }
 
 }  // namespace
@@ -319,7 +301,7 @@ cudaError_t launch_fused_step(const ScreenBackwardParams& params, const Optimize
     const auto kernel = optimizer.kind == UpdateKind::kAdam ? fused_step_kernel<Rows::kNone>
                         : optimizer.rows_per_view           ? fused_step_kernel<Rows::kPerView>
                                                             : fused_step_kernel<Rows::kSummed>;
-    return launch_blocks(kernel, StepShared::bytes(params), params, optimizer, stream);
+    return launch_blocks(kernel, step_floats(params), params, optimizer, stream);
 }
 
 }  // namespace turbogs

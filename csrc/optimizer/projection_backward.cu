@@ -9,24 +9,6 @@
 namespace turbogs {
 namespace {
 
-struct BackwardShared {
-    SharedHarmonics harmonics;
-    float* gradients;  // [threads, stride] of the harmonics
-    ViewCamera* cameras;
-
-    __device__ BackwardShared(float* shared, const ScreenBackwardParams& params)
-        : harmonics(shared, nullptr, params) {
-        gradients = shared + kBackwardThreads * harmonics.stride;
-        cameras = reinterpret_cast<ViewCamera*>(gradients + kBackwardThreads * harmonics.stride);
-        harmonics.wanted = reinterpret_cast<bool*>(cameras + params.num_views);
-    }
-
-    static size_t bytes(const ScreenBackwardParams& params) {
-        return 2 * kBackwardThreads * SharedHarmonics::row_stride(params) * sizeof(float) +
-               params.num_views * sizeof(ViewCamera) + kBackwardThreads;
-    }
-};
-
 // Writes the rows of one Gaussian, or adds them up, and adds up its gradients of the harmonics in shared memory.
 template <bool kPerView>
 struct RowWriter {
@@ -81,32 +63,31 @@ __global__ void __launch_bounds__(kBackwardThreads) projection_backward_kernel(
     const __grid_constant__ ScreenBackwardParams params, const ProjectionBackwardOutputs outputs) {
     if (params.overflow != nullptr && *params.overflow != 0) return;
     extern __shared__ float4 shared[];
-    const BackwardShared block(reinterpret_cast<float*>(shared), params);
-    const SharedHarmonics& harmonics = block.harmonics;
+    const BlockShared block(shared, params, BlockShared::row_stride(params));
     const int gaussian = blockIdx.x * kBackwardThreads + threadIdx.x;
     const bool inside = gaussian < params.num_gaussians;
 
-    load_cameras(params, block.cameras);
+    block.load_cameras(params);
     bool touched = false, any = false;
     for (int first = 0; inside && first < params.num_views; first += kViewGroup) {
         any = views_with_gradient(params, gaussian, first, touched) != 0u || any;
     }
-    harmonics.wanted[threadIdx.x] = any;
-    for (int i = threadIdx.x; i < kBackwardThreads * harmonics.stride; i += kBackwardThreads) block.gradients[i] = 0.0f;
+    block.wanted[threadIdx.x] = any;
+    for (int i = threadIdx.x; i < kBackwardThreads * block.stride; i += kBackwardThreads) block.work[i] = 0.0f;
     __syncthreads();
-    harmonics.start(params);
+    block.start(params);
     const StoredGaussian stored = any ? load_gaussian(params, gaussian) : StoredGaussian{};
-    harmonics.wait();
+    block.wait();
     __syncthreads();
 
     const auto views_of = [&](int first) {
         bool unused = false;
         return any ? views_with_gradient(params, gaussian, first, unused) : 0u;
     };
-    const float* coefficients = harmonics.coefficients + threadIdx.x * harmonics.stride;
+    const float* coefficients = block.coefficients + threadIdx.x * block.stride;
     if (inside) {
         RowWriter<kPerView> writer{outputs, stored.mean, params.sh_degree, params.num_gaussians, gaussian,
-                                   block.gradients + threadIdx.x * harmonics.stride};
+                                   block.work + threadIdx.x * block.stride};
         if (any) backward_views<false>(params, block.cameras, coefficients, gaussian, stored, views_of, writer);
         if (kPerView) {
             const float zeros[ParameterRow::kSize] = {};
@@ -123,12 +104,12 @@ __global__ void __launch_bounds__(kBackwardThreads) projection_backward_kernel(
         outputs.touched[gaussian] = touched;
     }
     __syncthreads();
-    const int row = harmonics.row;
+    const int row = block.row;
     const int count =
         min(kBackwardThreads, params.num_gaussians - static_cast<int>(blockIdx.x) * kBackwardThreads) * row;
     float* out = outputs.shN + static_cast<size_t>(blockIdx.x) * kBackwardThreads * row;
     for (int i = threadIdx.x; i < count; i += kBackwardThreads) {
-        out[i] = block.gradients[i + harmonics.owner(i) * (harmonics.stride - row)];
+        out[i] = block.work[i + block.owner(i) * (block.stride - row)];
     }
 }
 
@@ -138,7 +119,7 @@ cudaError_t launch_projection_backward(const ScreenBackwardParams& params, const
                                        cudaStream_t stream) {
     if (params.num_gaussians == 0) return cudaSuccess;
     const auto kernel = outputs.per_view ? projection_backward_kernel<true> : projection_backward_kernel<false>;
-    return launch_blocks(kernel, BackwardShared::bytes(params), params, outputs, stream);
+    return launch_blocks(kernel, BlockShared::row_stride(params), params, outputs, stream);
 }
 
 }  // namespace turbogs
