@@ -5,7 +5,6 @@
 // everything else follows from Q: d/dM = T^T Q, d/dlog s_j = sum_i U_ij Q_ij, d/dT = Q M^T.
 #pragma once
 
-#include "common/quaternion.cuh"
 #include "common/spherical_harmonics.cuh"
 #include "common/splat_geometry.cuh"
 #include "optimizer/optimizer_params.h"

@@ -12,7 +12,7 @@ namespace {
 
 constexpr int kSampleBlocks = 8;  // of an SM: 64 registers. 72 and 80, with less spilling, were no faster
 constexpr int kCellPixels = kCellSide * kCellSide;
-constexpr int kCellColumn = 2;  // bit of a lane that says in which of a group's two cells its pixels lie
+constexpr int kCellColumn = 2;  // bit of a lane that says in which of a patch's two cells its pixels lie
 
 // The cell of a lane.
 struct CellUnit {
@@ -72,9 +72,9 @@ __global__ void __launch_bounds__(kSampleThreads, kSampleBlocks) sample_tiles_ke
         age_sum = static_cast<int>(__reduce_add_sync(kFullWarp, static_cast<uint32_t>(age_sum)));
         drawn = draw<kWeighted>(params, units, pixels.inside, view_number, kPurposePixels, error_sum, age_sum, missed);
     } else {
-        // Group j holds two 4x4 cells, left (bit kCellColumn of a lane clear) and right. Lane n < 16 takes over cell
-        // n: it is in group `group`, and lane `source` has its sums.
-        const int source = lane % 2 << kCellColumn, group = lane / 4 % 4 * kRowGroups + lane / 2 % 2;
+        // Patch j holds two 4x4 cells, left (bit kCellColumn of a lane clear) and right. Lane n < 16 takes over cell
+        // n: it lies in patch `patch`, and lane `source` has its sums.
+        const int source = lane % 2 << kCellColumn, patch = lane / 4 % 4 * kRowPatches + lane / 2 % 2;
         double cell_error = 0.0;
         CellUnit cell = {};
         uint32_t cell_exists = 0;
@@ -92,7 +92,7 @@ __global__ void __launch_bounds__(kSampleThreads, kSampleBlocks) sample_tiles_ke
             const int source_age = __shfl_sync(kFullWarp, oldest, source);
             const uint32_t source_place = __shfl_sync(kFullWarp, pixels.id(j), source);
             const uint32_t source_exists = __shfl_sync(kFullWarp, pixels.inside >> j & 1u, source);
-            if (lane < kTileCells && group == j) {
+            if (lane < kTileCells && patch == j) {
                 cell_error = source_sum;
                 cell.oldest = source_age;
                 cell.first_pixel = source_place;
@@ -108,7 +108,7 @@ __global__ void __launch_bounds__(kSampleThreads, kSampleBlocks) sample_tiles_ke
         const uint32_t cells = __ballot_sync(kFullWarp, cell_drawn != 0u);
 #pragma unroll
         for (int j = 0; j < kPerLane; ++j) {
-            const int number = j / kRowGroups * 4 + j % kRowGroups * 2 + (lane >> kCellColumn) % 2;
+            const int number = j / kRowPatches * 4 + j % kRowPatches * 2 + (lane >> kCellColumn) % 2;
             drawn |= (cells >> number & 1u) << j;
             if (kWeighted) missed[j] = __shfl_sync(kFullWarp, cell_missed[0], number);
         }

@@ -1,6 +1,6 @@
-// A warp's tile in the maps. A lane holds 8 of its pixels: pixel (j, lane) is number 32 j + lane of the order of
-// samples, `cell_order` in turbogs_plugin/types.py. That order goes through the tile in groups of 8x4 pixels, two
-// beside each other and four such rows, so lane and j say where a pixel lies.
+// A warp's tile in the maps. A lane holds 8 of its pixels: pixel (j, lane) is number 32 j + lane in the order of
+// samples (turbogs_plugin/types.py). That order goes through the tile in patches of 8x4 pixels, two beside each other
+// and four such rows, so lane and j say where a pixel lies.
 #pragma once
 
 #include <cuda_fp16.h>
@@ -11,10 +11,10 @@
 
 namespace turbogs {
 
-constexpr int kPerLane = kTilePixels / kWarpSize;    // pixels of a lane, one of each group
-constexpr int kGroupWidth = 8, kGroupHeight = 4;     // pixels
-constexpr int kRowGroups = kTileSize / kGroupWidth;  // groups beside each other
-static_assert(kGroupWidth * kGroupHeight == kWarpSize, "a lane has one pixel of each group");
+constexpr int kPerLane = kTilePixels / kWarpSize;     // pixels of a lane, one of each patch
+constexpr int kPatchWidth = 8, kPatchHeight = 4;      // pixels
+constexpr int kRowPatches = kTileSize / kPatchWidth;  // patches beside each other
+static_assert(kPatchWidth * kPatchHeight == kWarpSize, "a lane has one pixel of each patch");
 
 constexpr int kSampleThreads = 128;  // of a block; its warps share nothing. No record of other values
 constexpr int kAgeMax = INT16_MAX;   // AGE_MAX of turbogs_plugin/error_maps.py
@@ -30,7 +30,7 @@ struct TilePixels {
 
     // From pixel (0, lane) to pixel (j, lane).
     __device__ __forceinline__ int offset(int j) const {
-        return j / kRowGroups * kGroupHeight * image_width + j % kRowGroups * kGroupWidth;
+        return j / kRowPatches * kPatchHeight * image_width + j % kRowPatches * kPatchWidth;
     }
     __device__ __forceinline__ uint32_t id(int j) const { return first + static_cast<uint32_t>(offset(j)); }
 };
@@ -45,13 +45,13 @@ __device__ __forceinline__ TilePixels locate_tile(const SamplePixelsParams& para
     pixels.width = min(kTileSize, view.width - kTileSize * pixels.column);
     pixels.height = min(kTileSize, view.height - kTileSize * pixels.row);
     pixels.inside = 0;
-    const int lane = this_lane(), x = lane % kGroupWidth, y = lane / kGroupWidth;
+    const int lane = this_lane(), x = lane % kPatchWidth, y = lane / kPatchWidth;
     pixels.image_width = view.width;
     pixels.first = static_cast<uint32_t>((kTileSize * pixels.row + y) * view.width + kTileSize * pixels.column + x);
 #pragma unroll
     for (int j = 0; j < kPerLane; ++j) {
-        const bool exists = x + j % kRowGroups * kGroupWidth < pixels.width &&
-                            y + j / kRowGroups * kGroupHeight < pixels.height;
+        const bool exists = x + j % kRowPatches * kPatchWidth < pixels.width &&
+                            y + j / kRowPatches * kPatchHeight < pixels.height;
         pixels.inside |= static_cast<uint32_t>(exists) << j;
     }
     return pixels;
