@@ -189,16 +189,9 @@ class BuildCuda(build_ext):
         print(f"turbogs: built {library.name} with {toolchain.nvcc} {' '.join(toolchain.code_flags)}", flush=True)
 
     def cuda_command(self) -> list[str]:
+        flags = ["-O3", "-std=c++17", "-lineinfo", "-Xcompiler", "-fPIC,-fvisibility=hidden"]
         exact = int(os.environ.get("TURBOGS_EXACT_MATH", "0"))
-        flags = [
-            "-O3",
-            "-std=c++17",
-            "-lineinfo",
-            "-Xcompiler",
-            "-fPIC,-fvisibility=hidden",
-            f"-DTURBOGS_EXACT_MATH={exact}",
-        ]
-        return [str(toolchain.nvcc), *toolchain.code_flags, *flags]
+        return [str(toolchain.nvcc), *toolchain.code_flags, *flags, f"-DTURBOGS_EXACT_MATH={exact}"]
 
     def cpp_command(self) -> list[str]:
         # nvcc hands .cpp files to the host compiler, and knows where the toolkit's headers are.

@@ -1,10 +1,10 @@
 // Loss on sampled pixels with its gradient, and the update of the error maps: one pass over the samples in memory, a
 // warp per tile.
 //
-// A lane keeps up to 4 of its tile's samples in registers: colour and truth are read once, the tile's moments are
-// warp sums in two passes about its first sample (a constant tile has variance 0 exactly), and the gradient is
-// written in the last. Larger tiles are read once a pass. Sums of the views are of half-precision numbers in double,
-// exact in any order.
+// A lane keeps up to 4 of its tile's samples in registers, so that colour and truth are read once; larger tiles are
+// read again in each pass. The first pass makes the means, relative to the tile's first sample, so that a constant tile
+// has variance 0 exactly. The second makes the variances, a third the norms that the balance needs, and the last writes
+// the gradient. The sums of the views add half-precision numbers in double, which is exact in any order.
 #include <cfloat>
 
 #include <cuda_fp16.h>

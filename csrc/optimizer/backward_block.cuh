@@ -1,9 +1,9 @@
 // From the screen gradients of K views to the parameters, a thread per Gaussian: what a block shares, and the loop
 // over the views of one Gaussian.
 //
-// Radii say which views those are, and only their records are read: there are none of what is off screen. Each lane
-// goes through its own views, so a warp makes as many turns as its busiest lane has views. Harmonics come to shared
-// memory by asynchronous copies, all of a block's in quads, and cameras are kept there.
+// The radii say in which views a Gaussian is on screen, and only the records of those are read. Each lane goes through
+// its own views, so a warp makes as many turns as its busiest lane has views. The harmonics of a block are copied to
+// shared memory asynchronously, in quads, and the cameras are kept there.
 #pragma once
 
 #include <cuda_pipeline.h>
@@ -106,7 +106,7 @@ __device__ __forceinline__ StoredGaussian load_gaussian(const ScreenBackwardPara
     return stored;
 }
 
-constexpr int kViewGroup = 32;  // views that one mask speaks of: a bit each
+constexpr int kViewGroup = 32;  // views of one mask, a bit each
 
 __device__ __forceinline__ const float4* record_of(const ScreenBackwardParams& params, int view, int gaussian) {
     return params.records + (static_cast<size_t>(view) * params.num_gaussians + gaussian) * kRecordQuads;

@@ -1,15 +1,12 @@
 // Projection backward and the optimizer's step in one kernel: gradients never reach memory.
 //
-// A thread per Gaussian. It goes through the views that have the Gaussian on screen, takes each record that a sample
-// contributed to to a row of 14 gradients, keeps the row and sums the rows; the sum advances the moments, which give
-// the damping. A second pass over the rows scales them by the damping, so that the systems are the identity plus
-// something positive semi-definite, and solves the two blocks (moment_lm.cuh) by Cholesky in registers; a third adds
-// up the harmonics' gradients, also in registers. Afterwards the block updates its Gaussians' harmonics together, in
-// 16-byte quads.
-//
-// Rows lie in shared memory, those beyond the first few in the place of records that are done with.
-//
-// There are few warps, so what is read is read early and in batches, and sums are added without waiting for them.
+// A thread takes one Gaussian and goes through the views that have it on screen. It turns each record that a sample
+// contributed to into a row of 14 gradients, keeps the row, and sums the rows. The sum advances the moments, which give
+// the damping. A second pass over the rows scales them by the damping, and solves the two blocks (moment_lm.cuh) by
+// Cholesky in registers. A third pass adds up the gradients of the harmonics, also in registers. At the end the block
+// updates the harmonics of all its Gaussians together, in 16-byte quads. The first few rows lie in shared memory, the
+// others overwrite records that have been read. There are few warps, so memory is read early and in batches, and sums
+// are added without waiting for them.
 #include "optimizer/backward_block.cuh"
 #include "optimizer/moment_lm.cuh"
 

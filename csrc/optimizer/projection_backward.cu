@@ -1,9 +1,9 @@
 // Backward pass of the projection alone: gradients of the parameters in memory, for optimizers without a kernel of
 // their own and for torch autograd.
 //
-// A thread per Gaussian. It looks for the views in which the Gaussian has gradients, takes each of those records to a
-// row of 14 numbers, and writes the rows or their sum; where there is nothing it writes zeros. Gradients of the
-// harmonics add up in shared memory and leave it at the end, all of a block's together.
+// A thread takes one Gaussian. It finds the views in which the Gaussian has gradients, turns each of those records into
+// a row of 14 numbers, and writes the rows or their sum; where there is nothing it writes zeros. The gradients of the
+// harmonics are summed in shared memory, and the block writes them together at the end.
 #include "optimizer/backward_block.cuh"
 
 namespace turbogs {

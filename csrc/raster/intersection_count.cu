@@ -1,12 +1,12 @@
 // Stage 2: the first intersection of each tile, and whether all intersections have room.
 //
-// The projection has counted every tile's splats as differences along the rows of tiles: the running sum of those are
-// the splats of each tile, and the running sum of these the first intersections. Two launches make both at once, a
-// block for each kScanTiles tiles and eight tiles a thread. The first leaves for each block the sum of its
-// differences, and its intersections as if no splat came in from the blocks before it. In the second every block sums
-// what the blocks before it left, adds for each splat that comes in the tiles that it goes through, and writes its
-// tiles' first intersections. Sums are 64 bits wide, so that a pass with more intersections than fit is noticed: it
-// leaves every tile empty and raises the flag.
+// The projection leaves, for each tile, how many more splats reach it than the tile before. The running sum of these
+// differences is the number of splats of each tile. The running sum of those numbers is each tile's first intersection.
+// Two launches make both sums, with a block for kScanTiles tiles and a thread for eight. The first launch writes two
+// sums for each block: its differences, and its intersections without the splats that continue from earlier blocks.
+// In the second, every block adds up the sums of all earlier blocks, and counts each splat that continues into it once
+// for each tile. Sums have 64 bits, so that too many intersections are noticed: then every tile is left empty and the
+// flag is raised.
 #include "common/warp.cuh"
 #include "raster/raster_params.h"
 
@@ -34,7 +34,7 @@ __device__ __forceinline__ int64_t sum_to_thread(int64_t value, int64_t& total) 
     return value;
 }
 
-// The running sum of a thread's differences, within the thread.
+// The running sum of a thread's differences, from its first tile on.
 __device__ __forceinline__ void load_differences(const CountIntersectionsParams& params, int first,
                                                  int64_t splats[kThreadTiles]) {
     int64_t sum = 0;
@@ -45,8 +45,6 @@ __device__ __forceinline__ void load_differences(const CountIntersectionsParams&
     }
 }
 
-// Of each block of tiles: the sum of its differences, and its intersections if no splat reached in from the tiles
-// before it.
 __global__ void __launch_bounds__(kScanThreads)
     sum_tiles_kernel(const __grid_constant__ CountIntersectionsParams params) {
     const int first = blockIdx.x * kScanTiles + threadIdx.x * kThreadTiles;
@@ -68,7 +66,7 @@ __global__ void __launch_bounds__(kScanThreads)
 __global__ void __launch_bounds__(kScanThreads)
     start_tiles_kernel(const __grid_constant__ CountIntersectionsParams params) {
     const int block = blockIdx.x, blocks = gridDim.x;
-    // A splat that enters in block i and is not left goes on through all tiles of the blocks between.
+    // Splats that begin in block i and do not end there count in every tile of the blocks between.
     int64_t splats_before = 0, intersections_before = 0, all_intersections = 0;
     for (int i = threadIdx.x; i < blocks; i += kScanThreads) {
         const int64_t splats = params.block_sums[2 * i], intersections = params.block_sums[2 * i + 1];
@@ -108,7 +106,7 @@ __global__ void __launch_bounds__(kScanThreads)
         const uint32_t count = static_cast<uint32_t>(min(all_intersections, static_cast<int64_t>(kIntersectionsMax)));
         params.tile_starts[params.num_active] = lost ? 0u : count;
         params.status[0] = count;
-        if (lost) params.status[1] = 1u;  // other blocks may read it before or after: they find the same
+        if (lost) params.status[1] = 1u;  // whether other blocks read it before or after: `lost` is the same in all
     }
 }
 

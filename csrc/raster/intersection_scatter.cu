@@ -1,13 +1,13 @@
 // Stage 3: intersections to their tiles, in any order.
 //
 // A block takes kScatterInstances instances and keeps those on screen, so that its warps are full. A warp works on 32
-// splats together: a lane for each row of tiles that they reach, then a lane for each intersection of those rows. The
-// lanes of one tile take their places from its cursor in one addition and write their keys there, four intersections
-// a lane under way. Splats of many tiles would hold such a warp up: they go into a list, in windows of kWindow
-// intersections, which a second launch shares out over all warps. Those that the list has no room for are done by
-// their block. The second launch also lists the runs of tiles with many intersections, as stage 4 wants them. In
-// which order intersections arrive does not matter, as that stage sorts keys of which no two are equal. The number of
-// intersections is not needed on the host, and a pass that overflows does nothing.
+// splats together, first with a lane for each row of tiles that they reach, then with a lane for each intersection of
+// those rows. Lanes of the same tile reserve their places with one addition to its cursor, and write their keys there.
+// A splat of many tiles would hold its warp up. It goes into a list, in windows of kWindow intersections, and a second
+// launch shares the windows among all warps. Splats that the list has no room for are done by their block. The second
+// launch also lists the runs of tiles with many intersections for stage 4. The order of arrival does not matter,
+// because stage 4 sorts keys of which no two are equal. The host does not need to know the number of intersections,
+// and a pass that overflows does nothing.
 #include "common/warp.cuh"
 #include "raster/tile_reach.cuh"
 
@@ -18,14 +18,14 @@ namespace {
 constexpr int kScatterThreads = 256;
 constexpr int kScatterWarps = kScatterThreads / kWarpSize;
 constexpr int kScatterInstances = 2 * kScatterThreads;  // of a block: somewhat less than half of them are on screen
-constexpr int kLargeBox = 3 * kWarpSize;  // tiles of a splat's box beyond which several warps share its intersections
-constexpr int kWindow = 256;              // intersections of such a splat that a warp takes on
+constexpr int kLargeBox = 3 * kWarpSize;  // a splat with more tiles in its box is cut into windows
+constexpr int kWindow = 256;              // intersections of such a splat that one warp takes
 constexpr int kWindowBlocks = 4 * 132;    // four for each SM of an H100 or H200; other GPUs share the work less evenly
 constexpr int kUnderWay = 4;              // places that a lane waits for at a time
 
 constexpr uint32_t kNoInstance = 0xFFFFFFFFu;
 
-// What it takes to enumerate the intersections of a splat.
+// A splat whose intersections are listed.
 struct Emission {
     uint64_t key;
     const RasterCamera* camera;
@@ -54,7 +54,7 @@ __device__ __forceinline__ int2 tiles_of_row(const SortIntersectionsParams& para
     return active_tiles(camera, params.active_prefix, row, tile_columns(emission.reach, row, camera.tiles_x));
 }
 
-// The lane whose share holds item `number`, `sum` being the sum of shares up to and including the lane's.
+// The lane that item `number` belongs to, if each lane has some items; `sum`: those of the lanes up to this one.
 __device__ __forceinline__ int owner_of(int number, int sum) {
     int owner = 0;
 #pragma unroll
@@ -64,8 +64,8 @@ __device__ __forceinline__ int owner_of(int number, int sum) {
     return owner;
 }
 
-// Each lane brings the tiles of a row and their key. Of the intersections of all lanes, begin .. end - 1 go to their
-// tiles, each by a lane of its own. Returns the number of intersections of all lanes.
+// Each lane brings a row of tiles and the key of its splat. Of all these intersections, numbers begin .. end - 1 are
+// written, a lane each. Returns how many there are in all.
 __device__ __forceinline__ int emit_rows(const SortIntersectionsParams& params, int2 tiles, uint64_t key, int begin,
                                          int end, int lane) {
     const int count = tiles.y - tiles.x;
@@ -102,7 +102,7 @@ __device__ __forceinline__ int emit_rows(const SortIntersectionsParams& params, 
 // A warp puts intersections begin .. begin + kWindow - 1 of one splat into their tiles.
 __device__ __forceinline__ void emit_window(const SortIntersectionsParams& params, const Emission& emission,
                                             int begin, int lane) {
-    int first = 0;  // intersection of the rows at hand
+    int first = 0;  // number of the first intersection of the rows at hand
     for (int base = emission.rows.x; base < emission.rows.y && first < begin + kWindow; base += kWarpSize) {
         const int row = base + lane;
         const int2 tiles = row < emission.rows.y ? tiles_of_row(params, emission, row) : make_int2(0, 0);
@@ -145,7 +145,6 @@ __global__ void __launch_bounds__(kScatterThreads)
     }
     __syncthreads();
 
-    // A warp takes splats together, a lane for each of their rows, then a lane for each intersection of those rows.
     Emission* splats = emissions + warp * kWarpSize;
     for (int base = warp * kWarpSize; base < num_visible; base += kScatterThreads) {
         int rows = 0;
@@ -172,7 +171,7 @@ __global__ void __launch_bounds__(kScatterThreads)
     }
     __syncthreads();
 
-    // What has found no room in the list.
+    // Large splats that the list has no room for.
     for (int i = 0; i < num_large; ++i) {
         int box_tiles;
         const Emission emission = make_emission(params, large[i], box_tiles);

@@ -1,10 +1,10 @@
 // Stage 4: every tile's intersections in order of depth, then of the instance.
 //
-// A tile of up to kSortRun intersections is sorted by one warp, in registers, by a bitonic network over 32-bit
-// numbers: the leading bits of a depth and a place among the intersections. Few depths agree in those bits, and few
-// swaps put them right. Of a tile with more intersections, every run of kSortRun is sorted so by a warp of its own,
-// and a second launch merges the runs, a thread for each key, which finds its place by bisection in the other runs.
-// Keys differ, so the order does not depend on the one they came in.
+// One warp sorts a tile of up to kSortRun intersections in registers, with a bitonic network over 32-bit numbers: the
+// leading bits of the depth, and behind them the place among the intersections. Few depths agree in those bits, and a
+// few swaps of neighbours put them right. A tile with more intersections is cut into runs of kSortRun, each sorted by a
+// warp of its own. A second launch merges the runs with a thread for each key, which finds its place in the other runs
+// by bisection. No two keys are equal, so the order does not depend on the order of arrival.
 #include "common/tiles.cuh"
 #include "common/warp.cuh"
 #include "raster/raster_params.h"
@@ -123,9 +123,9 @@ __device__ __forceinline__ void sort_places(SortShared& shared, int count, int l
     }
 }
 
-// One warp sorts the keys of up to 32 * kPer intersections. It sorts 32-bit numbers: as many bits of the depth, less
-// the nearest, as the place among the keys leaves room for, then that place. Depths that agree in all these bits may
-// be out of order; they are neighbours, and swapped.
+// One warp sorts the keys of up to 32 * kPer intersections, as 32-bit numbers: the depth less the nearest one, of which
+// the leading bits are kept, then the place among the keys. Depths that agree in all these bits may be out of order;
+// they are neighbours, and swapped.
 template <int kPer>
 __device__ __forceinline__ void sort_some(uint64_t* keys, int count, uint32_t* ids, SortShared& shared, int lane) {
     constexpr int kPlaceBits = kPer == 1 ? 5 : kPer == 2 ? 6 : kPer == 4 ? 7 : kPer == 8 ? 8 : 9;  // log2(32 * kPer)
@@ -167,8 +167,8 @@ __global__ void __launch_bounds__(kSortWarps* kWarpSize, kSortBlocks)
     __shared__ SortShared shareds[kSortWarps];
     const int lane = this_lane(), warp = blockIdx.x * kSortWarps + this_warp();
     SortShared& shared = shareds[this_warp()];
-    // The first warps take a run each, where there are so many, the others a tile. No warp takes two: what the
-    // compiler would keep in registers from one to the next is more than there are.
+    // The first `run_warps` warps take a run each, the others a tile each. A loop over several would need more
+    // registers than there are.
     const bool takes_run = warp < run_warps;
     if (takes_run && static_cast<uint32_t>(warp) >= params.counters->num_runs) return;
     if (!takes_run && warp - run_warps >= params.num_active) return;
@@ -186,13 +186,10 @@ __global__ void __launch_bounds__(kSortWarps* kWarpSize, kSortBlocks)
     else sort_some<16>(keys, count, ids, shared, lane);
 }
 
-// ---- Tiles of several runs -------------------------------------------------------------------------------------
-
 constexpr int kMergeBlocks = 4 * 132;  // four for each SM of an H100 or H200; other GPUs share the work less evenly
 constexpr int kMergeThreads = 256;     // two keys of a run each; no record of other values
 
-// Every key's place among all runs of its tile is the number of smaller keys: its place in its own run, and those
-// found by bisection in the others.
+// A key's place in its tile is the number of smaller keys: its place in its own run, and bisection in the others.
 __global__ void __launch_bounds__(kMergeThreads)
     merge_runs_kernel(const __grid_constant__ SortIntersectionsParams params) {
     const int num_runs = static_cast<int>(params.counters->num_runs);

@@ -1,11 +1,11 @@
 // Stage 6: from the gradients at the samples to a record for every splat on the screen, with the density sums.
 //
 // One warp takes one work item of the forward pass, 32 samples. It walks back to front the splats that contributed to
-// it, and no others: the forward pass left their bits. It takes `kSplats` at a time, in two phases that meet in
-// shared memory. In the first a lane is a sample and goes from splat to splat: it recovers the transmittance, and of
-// what lies behind needs one number. This leaves (w, d loss / d sigma) of kSplats x 32. In the second a lane is a
-// splat and a share of the samples: it goes from sample to sample, and all sums stay in its own registers. So next to
-// nothing is reduced across lanes, and each splat ends in four 16-byte atomic additions an item.
+// it, and no others: the forward pass left their bits. It takes `kSplats` at a time, in two phases that exchange their
+// results in shared memory. In the first phase a lane stands for a sample and goes from splat to splat. It recovers the
+// transmittance, and needs one number for all that lies behind. It writes (w, d loss / d sigma) of each splat. In the
+// second phase a lane stands for a splat and a share of the samples. It goes from sample to sample and keeps all sums
+// in its registers. So lanes exchange next to nothing, and a splat costs four 16-byte atomic additions for each item.
 #include "raster/staged_splat.cuh"
 
 namespace turbogs {

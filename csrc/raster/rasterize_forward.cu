@@ -1,10 +1,10 @@
 // Stage 5: colour, alpha and, when asked, depth at the sampled pixels.
 //
-// One warp renders one work item of an active tile, or two where a tile has an even number of them: 32 samples each,
-// with the state of a lane's pixels in registers, so work follows the samples and no warp waits for another. Splats
-// come 32 at a time, one to a lane, while the next 32 are fetched. Each lane drops its splat where it reaches none of
-// the warp's samples; the others are read from the warp's own shared memory by all lanes at once. For the backward
-// pass the warp leaves one bit for each splat that contributed to any of an item's samples.
+// One warp renders one work item of an active tile, or two where a tile has an even number of them. A work item is 32
+// samples, whose state lies in registers, one sample to a lane. So work grows with the samples, and no warp waits for
+// another. Splats come 32 at a time, one to a lane, while the next 32 are fetched. Each lane drops its splat if it
+// reaches none of the warp's samples. All lanes then read the others, one after another, from the warp's own shared
+// memory. For the backward pass the warp leaves one bit for each splat that contributed to any sample of the item.
 #include "raster/staged_splat.cuh"
 
 namespace turbogs {

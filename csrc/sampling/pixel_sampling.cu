@@ -1,9 +1,9 @@
 // Error-guided sampling of pixels and cells: every tile of K views in one launch, a warp per tile.
 //
-// A lane holds eight of the tile's 256 pixels, or one of its 16 cells, whose sums the warp makes of the pixels'. The
-// warp draws (warp_draw.cuh) and writes the drawn pixels in the order of samples. Slots of a tile follow from the
-// image's size alone, so nothing is counted on the host, and no warp waits for another. The sets equal those of the
-// torch reference (draws.py).
+// A lane holds eight of the tile's 256 pixels. To draw cells, the warp sums their pixels first, and a lane holds one of
+// the 16 cells. The warp draws (warp_draw.cuh) and writes the drawn pixels in the order of samples. The slots of a tile
+// follow from the image's size alone, so nothing is counted on the host, and no warp waits for another. The drawn sets
+// equal those of the torch reference (draws.py).
 #include "sampling/tile_pixels.cuh"
 #include "sampling/warp_draw.cuh"
 

@@ -99,8 +99,8 @@ __device__ __forceinline__ float mixed_weight(float error, int age, float error_
     return __fadd_rn(error_share, age_share);
 }
 
-// Probability that a race, or the draw by age, takes a unit given the others' keys; see "rank conditioning" in the
-// twin.
+// Probability that a race, or the draw by age, takes a unit given the others' keys; see "rank conditioning" in
+// draws.py.
 __device__ __forceinline__ float race_chance(float weight, uint32_t tau) {
     return -expm1f(-(fmaxf(weight, kWeightFloor) / __uint_as_float(tau)));
 }

@@ -91,8 +91,8 @@ __device__ __forceinline__ PixelUnits load_maps(const SamplePixelsParams& params
     return units;
 }
 
-// Writes the drawn pixels, bit j of `drawn` being pixel (j, lane), in the order of samples to the slots first .. end - 1
-// of sample tile `number`. The slots that are left stay empty. `weight_of(j)` is asked for where `weighted`.
+// Writes the drawn pixels (bit j of `drawn`: pixel (j, lane)) to the slots first .. end - 1, in the order of samples.
+// The slots that are left are made empty. `weight_of(j)` is the weight of pixel (j, lane), needed only if `weighted`.
 template <class WeightOf>
 __device__ __forceinline__ void write_samples(const SamplePixelsParams& params, const TilePixels& pixels,
                                               uint32_t drawn, int first, int end, bool weighted,

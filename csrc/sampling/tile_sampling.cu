@@ -1,9 +1,10 @@
-// Error-guided sampling of whole tiles, in three launches: a warp per tile sums its errors and finds its greatest
-// age; a block per view draws tiles; a warp per drawn tile lists its pixels.
+// Error-guided sampling of whole tiles, in three launches. In the first a warp sums the errors of one tile and finds
+// its greatest age. In the second a block draws the tiles of one view. In the third a warp lists the pixels of one
+// drawn tile.
 //
-// A view's tiles are too many for registers, so their keys lie in memory, and each stage of the draw searches its
-// threshold bit by bit with counts over the block. It runs once for a few thousand keys, and its sets equal the torch
-// twin's.
+// A view's tiles are too many for registers, so their keys lie in memory, and each stage of the draw finds its
+// threshold bit by bit, with counts over the block. There are only a few thousand keys. The drawn sets equal those of
+// the torch reference.
 #include "sampling/tile_pixels.cuh"
 #include "sampling/warp_draw.cuh"
 
