@@ -36,26 +36,6 @@ ScreenBackwardParams read_screen(const Arguments<Launch>& in) {
     return params;
 }
 
-// The rates in the order of a row.
-void set_rates(const Arguments<launches::FusedStep>& in, OptimizerParams& optimizer) {
-    using R = launches::FusedStep::Reals;
-    const struct {
-        int first, size;
-        R rate;
-    } columns[] = {
-        {ParameterRow::kMeans, 3, R::means},         {ParameterRow::kScales, 3, R::scales},
-        {ParameterRow::kQuats, 4, R::quats},         {ParameterRow::kSh0, 3, R::sh0},
-        {ParameterRow::kOpacities, 1, R::opacities},
-    };
-    for (const auto& column : columns) {
-        for (int i = column.first; i < column.first + column.size; ++i) {
-            optimizer.rates[i] = in.number(column.rate);
-            optimizer.inverse_rates[i] = 1.0f / std::max(optimizer.rates[i], kRateMin);
-        }
-    }
-    optimizer.rate_shN = in.number(R::shN);
-}
-
 }  // namespace
 
 void launches::ProjectionBackward::run(const Arguments<ProjectionBackward>& in) {
@@ -82,7 +62,18 @@ void launches::FusedStep::run(const Arguments<FusedStep>& in) {
     optimizer.kind = to_enumeration<UpdateKind>(in.integer(Integers::kind), kNumUpdateKinds,
                                                 "kind must be 0 (Adam), 1 (balanced LM) or 2 (paper's LM)");
     optimizer.rows_per_view = in.integer(Integers::rows_per_view) != 0;
-    set_rates(in, optimizer);
+    const auto set_rates = [&](int first, int size, Reals rate) {
+        std::fill_n(optimizer.rates + first, size, in.number(rate));
+    };
+    set_rates(ParameterRow::kMeans, 3, Reals::means);
+    set_rates(ParameterRow::kScales, 3, Reals::scales);
+    set_rates(ParameterRow::kQuats, 4, Reals::quats);
+    set_rates(ParameterRow::kSh0, 3, Reals::sh0);
+    set_rates(ParameterRow::kOpacities, 1, Reals::opacities);
+    for (int i = 0; i < ParameterRow::kSize; ++i) {
+        optimizer.inverse_rates[i] = 1.0f / std::max(optimizer.rates[i], kRateMin);
+    }
+    optimizer.rate_shN = in.number(Reals::shN);
     optimizer.beta1 = static_cast<float>(beta1);
     optimizer.beta2 = static_cast<float>(beta2);
     optimizer.one_minus_beta1 = static_cast<float>(1.0 - beta1);

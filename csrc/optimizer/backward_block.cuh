@@ -108,8 +108,14 @@ __device__ __forceinline__ StoredGaussian load_gaussian(const ScreenBackwardPara
 
 constexpr int kViewGroup = 32;  // views of one mask, a bit each
 
-__device__ __forceinline__ const float4* record_of(const ScreenBackwardParams& params, int view, int gaussian) {
-    return params.records + (static_cast<size_t>(view) * params.num_gaussians + gaussian) * kRecordQuads;
+__device__ __forceinline__ void load_record(const ScreenBackwardParams& params, int view, int gaussian,
+                                            float record[ScreenRecord::kSize]) {
+    const float4* in = params.records + (static_cast<size_t>(view) * params.num_gaussians + gaussian) * kRecordQuads;
+#pragma unroll
+    for (int i = 0; i < kRecordQuads; ++i) {
+        const float4 quad = in[i];
+        record[4 * i] = quad.x, record[4 * i + 1] = quad.y, record[4 * i + 2] = quad.z, record[4 * i + 3] = quad.w;
+    }
 }
 
 // Where a Gaussian is on screen.
@@ -157,20 +163,6 @@ __device__ __forceinline__ void add_sight(const ScreenBackwardParams& params, in
     atomicMax(reinterpret_cast<int*>(params.max_radii) + gaussian, __float_as_int(sight.largest));
 }
 
-// A record, from its four quads.
-struct LoadedRecord {
-    float values[ScreenRecord::kSize];
-
-    __device__ __forceinline__ explicit LoadedRecord(const float4* record) {
-#pragma unroll
-        for (int i = 0; i < kRecordQuads; ++i) {
-            const float4 quad = record[i];
-            values[4 * i] = quad.x, values[4 * i + 1] = quad.y, values[4 * i + 2] = quad.z, values[4 * i + 3] = quad.w;
-        }
-    }
-
-    __device__ __forceinline__ float operator[](int column) const { return values[column]; }
-};
 
 // One Gaussian in the views that its masks name: gives each view's row, colour gradient and loss to `sink.add(view,
 // camera, row, color, loss)`, and the sums to the statistics. `views_of(first)` is the mask of a group of views. With
@@ -188,16 +180,17 @@ __device__ __forceinline__ void backward_views(const ScreenBackwardParams& param
     for (int first = 0; first < params.num_views; first += kViewGroup) {
         for (uint32_t left = views_of(first); left != 0u; left &= left - 1u) {
             const int view = first + __ffs(static_cast<int>(left)) - 1;
-            const LoadedRecord record(record_of(params, view, gaussian));
+            float record[ScreenRecord::kSize];
+            load_record(params, view, gaussian, record);
             using Place = ScreenRecord;
             if (kSampledOnly && !(record[Place::kWeightSum] > 0.0f)) continue;
             const ViewCamera& camera = cameras[view];
-            const float* grad_mean2d = record.values + Place::kMean;
+            const float* grad_mean2d = record + Place::kMean;
             float grad_color[3];
 #pragma unroll
             for (int c = 0; c < 3; ++c) grad_color[c] = record[Place::kColor + c];
             float row[ParameterRow::kSize];
-            geometry_backward(shape, camera, params.eps2d, grad_mean2d, record.values + Place::kConic,
+            geometry_backward(shape, camera, params.eps2d, grad_mean2d, record + Place::kConic,
                               record[Place::kDepth], row);
             color_backward(shape, camera, stored.sh0, params.sh_degree, coefficients, grad_color, row);
             row[ParameterRow::kOpacities] = record[Place::kOpacity] * opacity * (1.0f - opacity);

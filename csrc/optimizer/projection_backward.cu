@@ -48,7 +48,8 @@ __device__ __forceinline__ uint32_t views_with_gradient(const ScreenBackwardPara
     uint32_t mask = 0u;
     for (uint32_t left = views_on_screen(params, gaussian, first); left != 0u; left &= left - 1u) {
         const int number = __ffs(static_cast<int>(left)) - 1;
-        const LoadedRecord record(record_of(params, first + number, gaussian));
+        float record[ScreenRecord::kSize];
+        load_record(params, first + number, gaussian, record);
         bool any = false;
 #pragma unroll
         for (int i = 0; i < ScreenRecord::kSize - 1; ++i) any = any || record[i] != 0.0f;  // the last is unused

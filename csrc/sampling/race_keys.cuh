@@ -17,15 +17,11 @@ constexpr float kWeightFloor = 7.888609052210118e-31f;  // 2^-100, the least wei
 constexpr uint32_t kPurposePixels = 0, kPurposeCells = 1, kPurposeTiles = 2;
 constexpr float kRandomUnit = 5.9604644775390625e-8f;  // 2^-24, the least chance
 
-struct Words {
-    uint32_t x0, x1, x2, x3;
-};
-
 // The multipliers of Philox4x32 (Salmon et al., SC 2011).
 constexpr uint32_t kPhiloxMultiplier0 = 0xD2511F53u, kPhiloxMultiplier1 = 0xCD9E8D57u;
 
-// Philox4x32-10 in the layout of philox.py.
-__device__ __forceinline__ Words random_words(const SamplePixelsParams& params, uint32_t place, uint32_t view,
+// The first three of the four words of Philox4x32-10, in the layout of philox.py.
+__device__ __forceinline__ uint3 random_words(const SamplePixelsParams& params, uint32_t place, uint32_t view,
                                               uint32_t purpose) {
     uint32_t c0 = place, c1 = view, c2 = purpose, c3 = params.seed_high;
 #pragma unroll
@@ -37,7 +33,7 @@ __device__ __forceinline__ Words random_words(const SamplePixelsParams& params, 
         c2 = high0 ^ c3 ^ params.round_keys[round][1];
         c3 = low0;
     }
-    return {c0, c1, c2, c3};
+    return make_uint3(c0, c1, c2);
 }
 
 // a / b, correctly rounded: the steps of __fdiv_rn without its test for extreme exponents. What is divided here lies

@@ -75,6 +75,12 @@ __global__ void __launch_bounds__(kChooseThreads) choose_tiles_kernel(
     const float error_sum = __double2float_rn(block_sum(error_part, double_scratch));
     const float age_sum = __ll2float_rn(block_sum(age_part, scratch));
 
+    // Tiles of the view for which a condition holds; the same in every thread.
+    const auto count_tiles = [&](const auto& holds) {
+        long long mine = 0;
+        for (int i = threadIdx.x; i < count; i += kChooseThreads) mine += holds(i);
+        return block_sum(mine, scratch);
+    };
     for (int stage = 0; stage < 3; ++stage) {
         const int wanted = params.stages[batch_view][stage];
         if (wanted == 0) continue;
@@ -87,10 +93,10 @@ __global__ void __launch_bounds__(kChooseThreads) choose_tiles_kernel(
         for (int i = threadIdx.x; i < count; i += kChooseThreads) {
             if (keys[i] < 0) continue;
             ++open;
-            const Words words = random_words(params, static_cast<uint32_t>(i), static_cast<uint32_t>(view.view_number),
+            const uint3 words = random_words(params, static_cast<uint32_t>(i), static_cast<uint32_t>(view.view_number),
                                              kPurposeTiles);
-            const uint64_t primary = stage == 1 ? age_key(ages[i], words.x1)
-                                                : race_key(weight_of(i), stage == 0 ? words.x0 : words.x2);
+            const uint64_t primary = stage == 1 ? age_key(ages[i], words.y)
+                                                : race_key(weight_of(i), stage == 0 ? words.x : words.z);
             keys[i] = static_cast<int64_t>(primary << kRankBits | ((1u << kRankBits) - 1u - static_cast<uint32_t>(i)));
         }
         const bool exhausted = block_sum(open, scratch) <= wanted;
@@ -98,9 +104,7 @@ __global__ void __launch_bounds__(kChooseThreads) choose_tiles_kernel(
         if (!exhausted) {
             for (int bit = kTopBit; bit >= 0; --bit) {
                 const int64_t candidate = threshold | int64_t{1} << bit;
-                long long reached = 0;
-                for (int i = threadIdx.x; i < count; i += kChooseThreads) reached += keys[i] >= candidate;
-                const long long total = block_sum(reached, scratch);
+                const long long total = count_tiles([&](int i) { return keys[i] >= candidate; });
                 if (total >= wanted) threshold = candidate;
                 if (total == wanted && !weighted) break;  // to the last bit, `threshold` is the smallest key taken
             }
@@ -110,11 +114,8 @@ __global__ void __launch_bounds__(kChooseThreads) choose_tiles_kernel(
         if (weighted && !exhausted) {
             for (int bit = kTopBit; bit >= 0; --bit) {
                 const int64_t candidate = largest_left | int64_t{1} << bit;
-                long long reached = 0;
-                for (int i = threadIdx.x; i < count; i += kChooseThreads) {
-                    reached += keys[i] < threshold && keys[i] >= candidate;
-                }
-                if (block_sum(reached, scratch) > 0) largest_left = candidate;
+                const auto left = [&](int i) { return keys[i] < threshold && keys[i] >= candidate; };
+                if (count_tiles(left) > 0) largest_left = candidate;
             }
         }
         for (int i = threadIdx.x; i < count; i += kChooseThreads) {

@@ -171,10 +171,10 @@ __device__ __forceinline__ uint32_t draw(const SamplePixelsParams& params, const
     uint32_t keys[kUnits], hard_words[kUnits], stable_words[kUnits], mixed_words[kUnits];
 #pragma unroll
     for (int j = 0; j < kUnits; ++j) {
-        const Words words = random_words(params, units.place(j), view, purpose);
-        hard_words[j] = words.x0;
-        stable_words[j] = words.x1;
-        mixed_words[j] = words.x2;
+        const uint3 words = random_words(params, units.place(j), view, purpose);
+        hard_words[j] = words.x;
+        stable_words[j] = words.y;
+        mixed_words[j] = words.z;
         if (kWeighted) missed[j] = 1.0f;
     }
     const auto miss = [&](uint32_t taken, const auto& thresholds, const auto& chance_of) {
