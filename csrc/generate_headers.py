@@ -2,7 +2,7 @@
 
 - ``layout.h``: the sizes and layouts of turbogs_plugin/engine/layout.py.
 - ``launches.h``: the fields of each launch, from turbogs_plugin/engine/cuda/launches.py, in the order in which Python
-  sends them.
+  sends them, and the declaration of its function ``run``, which csrc/bindings defines.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ def layout_header(layout: ModuleType) -> str:
 
 
 def launches_header(layout: ModuleType, launches: ModuleType) -> str:
-    """A struct of each launch, whose enumerations are the places of its fields in the lists that Python sends."""
+    """A struct for each launch, whose enumerations are the places of its fields in the lists that Python sends."""
     lines = []
     for cls in launches.LAUNCHES:
         lines += [f"struct {cls.__name__} {{", f'    static constexpr const char* kName = "{cls.operator}";']

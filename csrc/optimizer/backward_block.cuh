@@ -163,7 +163,6 @@ __device__ __forceinline__ void add_sight(const ScreenBackwardParams& params, in
     atomicMax(reinterpret_cast<int*>(params.max_radii) + gaussian, __float_as_int(sight.largest));
 }
 
-
 // One Gaussian in the views that its masks name: gives each view's row, colour gradient and loss to `sink.add(view,
 // camera, row, color, loss)`, and the sums to the statistics. `views_of(first)` is the mask of a group of views. With
 // kSampledOnly, views in which no sample met the Gaussian are left out. Lanes go through their own views.
