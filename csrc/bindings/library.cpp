@@ -4,8 +4,6 @@
 namespace turbogs {
 namespace {
 
-using torch::stable::detail::StableLibrary;
-
 // What the library was built for, such as "sm_80 sm_90".
 std::string architectures() { return TURBOGS_ARCHITECTURES; }
 
@@ -18,15 +16,15 @@ void call(const TensorList& tensors, const IntegerList& integers, const RealList
     Launch::run({tensors, integers, reals, rows});
 }
 
-// Any of the tensors may be written to.
-template <class... Launches>
-void define(StableLibrary& m, launches::List<Launches...>) {
+// Defines an operator for each launch. Any of its tensors may be written to.
+template <class Library, class... Launches>
+void define(Library& m, launches::List<Launches...>) {
     const std::string schema = "(Tensor(a!)?[] tensors, int[] integers, float[] reals, int[] rows) -> ()";
     (m.def((Launches::kName + schema).c_str()), ...);
 }
 
-template <class... Launches>
-void implement(StableLibrary& m, launches::List<Launches...>) {
+template <class Library, class... Launches>
+void implement(Library& m, launches::List<Launches...>) {
     (m.impl(Launches::kName, TORCH_BOX(&call<Launches>)), ...);
 }
 
