@@ -53,10 +53,10 @@ def _page(run: FinishedRun, metrics: Metrics, lpips_reason: str, shown: int) -> 
         (*ERRORS, "LPIPS (VGG)", "training in s", "Gaussians", "FPS", "peak memory in MiB"),
         [
             (
-                number(metrics.psnr, 2),
-                number(metrics.ssim, 4),
-                number(metrics.l1, 4),
-                number(metrics.lpips, 4),
+                number(metrics.mean("psnr"), 2),
+                number(metrics.mean("ssim"), 4),
+                number(metrics.mean("l1"), 4),
+                number(metrics.mean("lpips"), 4),
                 f"{last.train_seconds:.1f}",
                 last.num_gaussians,
                 f"{metrics.fps:.1f}",

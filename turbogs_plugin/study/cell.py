@@ -90,7 +90,7 @@ def train_cell(
         config=resolved,
         asked={name: section for name, section in asked.items() if section != resolved[name]},
         history=evaluations.history,
-        lpips=math.nan if lpips is None else evaluations.metrics.lpips,
+        lpips=math.nan if lpips is None else evaluations.metrics.mean("lpips"),
         lpips_reason=lpips_reason,
         fps=evaluations.metrics.fps,
         peak_bytes=memory.peak,

@@ -15,7 +15,7 @@ from torch import Tensor
 from torchmetrics.functional.image import structural_similarity_index_measure
 
 from turbogs_plugin.device import synchronize
-from turbogs_plugin.engine.rendering import DEFAULT_SETTINGS, RasterSettings, render_image
+from turbogs_plugin.engine.rendering import RasterSettings, render_image
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene import PosedImages
 from turbogs_plugin.types import Gaussians
@@ -58,34 +58,18 @@ class Metrics:
         return math.fsum(getattr(view, name) for view in self.views) / len(self.views)
 
     @property
-    def psnr(self) -> float:
-        return self.mean("psnr")
-
-    @property
     def worst_psnr(self) -> float:
         """Of the worst view: a mean hides that something covers one of them. NaN where a view has none."""
         values = [view.psnr for view in self.views]
         return math.nan if any(map(math.isnan, values)) else min(values)
-
-    @property
-    def ssim(self) -> float:
-        return self.mean("ssim")
-
-    @property
-    def l1(self) -> float:
-        return self.mean("l1")
-
-    @property
-    def lpips(self) -> float:
-        return self.mean("lpips")
 
 
 @torch.no_grad()
 def evaluate(
     gaussians: Gaussians,
     views: PosedImages,
-    sh_degree: int | None = None,
-    settings: RasterSettings | None = None,
+    sh_degree: int,
+    settings: RasterSettings,
     lpips: Callable[[Tensor, Tensor], float] | None = None,
 ) -> Metrics:
     """Render every view, one at a time, and compare it with its photo.
@@ -93,7 +77,7 @@ def evaluate(
     Args:
         gaussians: the model, on the views' device.
         views: cameras and photos.
-        sh_degree: bands in use; None: all.
+        sh_degree: of the bands in use.
         settings: of the rasterizer.
         lpips: from `load_lpips`, where wanted.
     """
@@ -113,14 +97,10 @@ def evaluate(
 
 @torch.no_grad()
 def render_view(
-    gaussians: Gaussians,
-    views: PosedImages,
-    view_id: int,
-    sh_degree: int | None = None,
-    settings: RasterSettings | None = None,
+    gaussians: Gaussians, views: PosedImages, view_id: int, sh_degree: int, settings: RasterSettings
 ) -> Tensor:
     """[H, W, 3] float32, 0 .. 1: the model seen by one of the cameras."""
-    image = render_image(gaussians, views.cameras, view_id, sh_degree=sh_degree, settings=settings or DEFAULT_SETTINGS)
+    image = render_image(gaussians, views.cameras, view_id, sh_degree=sh_degree, settings=settings)
     return image.colors.clamp(0.0, 1.0)
 
 

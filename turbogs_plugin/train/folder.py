@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 from turbogs_plugin.config.configuration import Config, resolve_complete, resolve_decided
@@ -12,44 +11,24 @@ from turbogs_plugin.files import require_writable
 from turbogs_plugin.plan import Plan
 
 
-@dataclass(frozen=True)
 class RunFolder:
-    """Where the parts of a run are."""
+    """Where the parts of a run are.
 
-    path: Path
+    Attributes:
+        asked: the configuration as it was asked for.
+        config: the resolved one: what plan and budgets made of it.
+    """
 
-    @property
-    def asked(self) -> Path:
-        """The configuration as it was asked for: `config` is what plan and budgets made of it."""
-        return self.path / "asked.yaml"
-
-    @property
-    def config(self) -> Path:
-        return self.path / "config.yaml"
-
-    @property
-    def plan(self) -> Path:
-        return self.path / "plan.json"
-
-    @property
-    def history(self) -> Path:
-        return self.path / "history.jsonl"
-
-    @property
-    def checkpoints(self) -> Path:
-        return self.path / "checkpoints"
-
-    @property
-    def report(self) -> Path:
-        return self.path / "report.md"
-
-    @property
-    def model(self) -> Path:
-        return self.path / "model.ply"
-
-    @property
-    def renders(self) -> Path:
-        return self.path / "renders"
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.asked = path / "asked.yaml"
+        self.config = path / "config.yaml"
+        self.plan = path / "plan.json"
+        self.history = path / "history.jsonl"
+        self.checkpoints = path / "checkpoints"
+        self.report = path / "report.md"
+        self.model = path / "model.ply"
+        self.renders = path / "renders"
 
     def require_new(self) -> None:
         """Raises `InputError` where the folder holds anything, or cannot be made."""
