@@ -124,7 +124,7 @@ def test_a_capture_larger_than_the_limit_trains_within_it():
     sizes = scene.train.cameras.sizes.prod(axis=1).sum()
     assert 7 * sizes > 1.5 * limit
     try:
-        plan = make_plan(asked, scene, GPU, memory_limit=limit)
+        plan = make_plan(asked, scene, GPU)
         config, _ = calibration.within_budget(plan.apply(asked), scene, GPU)
         assert (config.train.maps_place, config.train.photos_place) == ("host", "host")
         with pytest.raises(torch.cuda.OutOfMemoryError):

@@ -9,10 +9,10 @@ top of another. Some settings may be ``auto`` (`turbogs_plugin.config.auto`): th
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, is_dataclass
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 
 from omegaconf import OmegaConf
 
@@ -78,26 +78,15 @@ class Config:
 
     def to_mapping(self) -> dict[str, Any]:
         """Plain YAML values, every field written out, in sections that may be changed."""
-        return {
-            section.name: dict(getattr(self, section.name))
-            if section.name in registry.KINDS
-            else dataclass_mapping(getattr(self, section.name))
-            for section in fields(self)
-        }
+        return dataclass_mapping(self)
 
     def to_yaml(self) -> str:
         """Every setting; read back, it gives this very configuration."""
         return OmegaConf.to_yaml(OmegaConf.create(self.to_mapping()))
 
 
-SECTION_CLASSES = {
-    "scene": SceneConfig,
-    "train": TrainConfig,
-    "maps": MapsConfig,
-    "raster": RasterSettings,
-    "report": ReportConfig,
-    "budget": BudgetConfig,
-}
+SECTION_CLASSES = {name: hint for name, hint in get_type_hints(Config).items() if is_dataclass(hint)}
+"""The sections that are no strategy's."""
 
 
 def config_names() -> list[str]:
@@ -134,11 +123,15 @@ def resolve(mapping: Mapping[str, Any]) -> Config:
     return Config(**sections)
 
 
-def resolve_complete(mapping: Mapping[str, Any], where: str) -> Config:
+def resolve_complete(mapping: Mapping[str, Any], where: str, decided: bool = False) -> Config:
     """`resolve` of the mapping that a run has written.
 
+    Args:
+        where: the file, for messages.
+        decided: whether nothing may be left to a plan.
+
     Raises:
-        InputError: a part of it is missing, or an earlier version wrote it.
+        InputError: a part of it is missing or, where that is asked for, left to a plan; or an earlier version wrote it.
     """
     old = old_spelling(mapping)
     if old:
@@ -147,13 +140,7 @@ def resolve_complete(mapping: Mapping[str, Any], where: str) -> Config:
     missing = _first_missing(config.to_mapping(), mapping)
     if missing:
         raise InputError(f"'{where}' lacks '{missing}', which this version writes: bring the file back, or train anew")
-    return config
-
-
-def resolve_decided(mapping: Mapping[str, Any], where: str) -> Config:
-    """`resolve_complete` of a mapping in which all is decided. Raises `InputError` where a part is left to a plan."""
-    config = resolve_complete(mapping, where)
-    left = undecided(mapping)
+    left = undecided(mapping) if decided else []
     if left:
         raise InputError(f"'{where}' has {AUTO} for {', '.join(left)}, which a run decides: bring the file back")
     return config

@@ -4,8 +4,8 @@ The cost of an iteration is ``base + per_gaussian * N``. Where fewer iterations 
 much shorter; where these would be fewer than `FEWEST_SHARE` of the configured ones, Gaussians are given up for them.
 Where more fit than are configured, and than `train.epochs` take, an iteration gets more pixels
 (`turbogs_plugin.plan.pixels`) until these fill the time, and only then there are more iterations: those overfit the
-photos (docs/budgets.md). This is the length at the start; `turbogs_plugin.train.pace.TimePace` corrects it while the run
-trains.
+photos (docs/budgets.md). That is how a run begins; while it trains, `turbogs_plugin.train.pace.TimePace` measures the
+cost and corrects the number of iterations.
 """
 
 from __future__ import annotations

@@ -11,10 +11,10 @@ from turbogs_plugin.report.machine import hardware, software
 from turbogs_plugin.report.plots import ERROR_FULL_SCALE, plot_against_seconds, save_strip
 from turbogs_plugin.report.tables import ERRORS, number, table
 from turbogs_plugin.train.evaluate import Metrics, evaluate, load_lpips, render_view
-from turbogs_plugin.train.run import FinishedRun
+from turbogs_plugin.train.run import RunSession
 
 
-def write_report(run: FinishedRun) -> Path:
+def write_report(run: RunSession) -> Path:
     """Write ``report.md`` and its pictures (in ``report/``) into the run's folder.
 
     Returns:
@@ -35,7 +35,7 @@ def write_report(run: FinishedRun) -> Path:
     return run.folder.report
 
 
-def _page(run: FinishedRun, metrics: Metrics, lpips_reason: str, shown: int) -> str:
+def _page(run: RunSession, metrics: Metrics, lpips_reason: str, shown: int) -> str:
     """The page.
 
     Args:

@@ -69,11 +69,6 @@ class Calibration:
     configured_pixel_budget: float
     pixel_budget: float
 
-    @property
-    def before(self) -> float:
-        """Seconds of training that pass before the first iteration."""
-        return self.seconds + self.initialisation
-
 
 def within_budget(config: Config, scene: Scene, device: torch.device) -> tuple[Config, Calibration | None]:
     """The configuration that keeps its budgets, and what was measured for it where time is one of them.
@@ -95,7 +90,8 @@ def within_budget(config: Config, scene: Scene, device: torch.device) -> tuple[C
         config = with_pixel_budget(config, measured.pixel_budget)
         if limit is not None:
             config = lowered_cap(config, _memory_demand(config, scene).gaussians(limit))
-    iterations, cap = _fit(config, seconds - measured.before, measured.cost, measured.gaussians)
+    left = seconds - (measured.seconds + measured.initialisation)
+    iterations, cap = _fit(config, left, measured.cost, measured.gaussians)
     if cap != growth_cap(config, measured.gaussians):
         config = lowered_cap(config, cap)
     return with_iterations(config, iterations), measured
@@ -217,10 +213,7 @@ class _Trial:
         self._trainer = Trainer(self._config, scene, device)
         self._model = self._trainer.gaussians
         self._device = device
-
-    @property
-    def gaussians(self) -> int:
-        return len(self._model)
+        self.gaussians = len(self._model)
 
     def initialisation(self) -> float:
         """Seconds of `Trainer.initialise_maps`, from one view."""

@@ -11,6 +11,7 @@ import math
 import os
 import re
 import zipfile
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -45,7 +46,9 @@ def save_checkpoint(folder: Path, iteration: int, state: dict[str, Any]) -> Path
         TrainingStopped: the disk refused; the newest checkpoint is what it was before.
         TypeError: something in `state` is not plain.
     """
-    _require_plain(state, "state")
+    for place, value in _leaves(state, "state"):
+        if type(value) not in (Tensor, int, float, bool, str, type(None)):
+            raise TypeError(f"{place}: a checkpoint holds tensors and plain values, not {type(value).__name__}")
     path = folder / f"iteration-{iteration:06d}.pt"
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -98,7 +101,9 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
         state = torch.load(path, map_location="cpu", weights_only=True)
         if not isinstance(state, dict) or state.pop("format", None) != FORMAT:
             raise ValueError("not a checkpoint of this version of TurboGS")
-        _require_dense(state)
+        tensors = [value for _, value in _leaves(state, "state") if isinstance(value, Tensor)]
+        if any(tensor.numel() * tensor.element_size() > tensor.untyped_storage().nbytes() for tensor in tensors):
+            raise ValueError("it has a tensor that is not stored whole")
     except OSError as error:
         raise InputError(f"cannot read checkpoint '{path}': {error.strerror or error}") from None
     except Exception as error:  # torch and zipfile raise a dozen kinds for malformed files
@@ -146,19 +151,6 @@ def _iteration_of(file: Path) -> int:
     return int(_NAME.fullmatch(file.name).group(1))
 
 
-def _require_plain(value: Any, place: str) -> None:
-    if isinstance(value, dict):
-        for key, item in value.items():
-            if not isinstance(key, str | int):
-                raise TypeError(f"{place}: a checkpoint's keys are text or numbers, not {type(key).__name__}")
-            _require_plain(item, f"{place}.{key}")
-    elif isinstance(value, list | tuple):
-        for index, item in enumerate(value):
-            _require_plain(item, f"{place}[{index}]")
-    elif type(value) not in (Tensor, int, float, bool, str, type(None)):
-        raise TypeError(f"{place}: a checkpoint holds tensors and plain values, not {type(value).__name__}")
-
-
 def _require_bounded(path: Path) -> None:
     """Refuse archives that unpack to more than they are."""
     with zipfile.ZipFile(path) as archive:
@@ -169,12 +161,14 @@ def _require_bounded(path: Path) -> None:
         raise ValueError("its entries overlap")
 
 
-def _require_dense(value: Any) -> None:
-    """Refuse tensors that claim more elements than are stored."""
+def _leaves(value: Any, place: str) -> Iterator[tuple[str, Any]]:
+    """(place, value) of all that lies in nested dicts, lists and tuples, and of the dicts' keys."""
     if isinstance(value, dict):
-        value = list(value.values())
-    if isinstance(value, list | tuple):
-        for item in value:
-            _require_dense(item)
-    elif isinstance(value, Tensor) and value.numel() * value.element_size() > value.untyped_storage().nbytes():
-        raise ValueError("it has a tensor that is not stored whole")
+        for key, item in value.items():
+            yield f"{place}.{key}", key
+            yield from _leaves(item, f"{place}.{key}")
+    elif isinstance(value, list | tuple):
+        for index, item in enumerate(value):
+            yield from _leaves(item, f"{place}[{index}]")
+    else:
+        yield place, value

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from turbogs_plugin.config.configuration import Config, resolve_complete, resolve_decided
+from turbogs_plugin.config.configuration import Config, resolve_complete
 from turbogs_plugin.config.yaml_text import read_yaml
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.files import require_writable
@@ -44,7 +44,7 @@ class RunFolder:
         """The resolved configuration of the run. Raises `InputError` where this is no run, or part of it is missing."""
         if not self.config.is_file():
             raise InputError(f"'{self.path}' holds no run: there is no config.yaml")
-        return resolve_decided(read_yaml(self.config), str(self.config))
+        return resolve_complete(read_yaml(self.config), str(self.config), decided=True)
 
     def read_asked(self) -> Config:
         """The configuration that was asked for. Raises `InputError` where it is missing or incomplete."""
