@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,7 @@ import yaml
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from turbogs_plugin.config.schema import nearest
 from turbogs_plugin.errors import InputError
 
 SIZE_LIMIT = 64 * 1024
@@ -16,6 +18,31 @@ SIZE_LIMIT = 64 * 1024
 
 DEPTH_LIMIT = 16
 """Levels of nesting, well above what any configuration has."""
+
+
+def packaged_names(package: str) -> list[str]:
+    """Names of the YAML files that come with TurboGS in a package."""
+    entries = resources.files(package).iterdir()
+    return sorted(entry.name.removesuffix(".yaml") for entry in entries if entry.name.endswith(".yaml"))
+
+
+def read_named_yaml(name_or_file: str, package: str, kind: str) -> dict[str, Any]:
+    """The mapping in a packaged YAML file, or in one on the disk.
+
+    Args:
+        kind: what such files are, for messages.
+
+    Raises:
+        InputError: an unknown name, or an unreadable file.
+    """
+    known = packaged_names(package)
+    if name_or_file in known:
+        text = (resources.files(package) / f"{name_or_file}.yaml").read_text(encoding="utf-8")
+        return parse_yaml(text, name_or_file)
+    path = Path(name_or_file)
+    if path.suffix in (".yaml", ".yml") or path.is_file():
+        return read_yaml(path)
+    raise InputError(f"unknown {kind} '{name_or_file}': {nearest(name_or_file, known)}, or a .yaml file")
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
