@@ -18,6 +18,7 @@ from turbogs_plugin.errors import InputError, exit_code
 
 if TYPE_CHECKING:
     from turbogs_plugin.config.configuration import Config
+    from turbogs_plugin.train.run import RunSession
 
 app = tyro.extras.SubcommandApp()
 
@@ -406,15 +407,15 @@ def _require_positive(option: str, values: Sequence[float], most: float = math.i
         raise InputError(f"{option} {' '.join(map(str, values))}: it must be more than 0 and {limit}")
 
 
-def _tell(outcome) -> int:
+def _tell(session: RunSession) -> int:
     """Print how a training call ended; its exit code."""
     from turbogs_plugin.report.outputs import history_table
 
-    folder = outcome.folder
-    if outcome.signal is not None:
+    folder = session.folder
+    if session.signal is not None:
         print(f"stopped and saved: go on with  turbogs train --resume {folder.path}", file=sys.stderr)
-        return 128 + outcome.signal
-    print(history_table(outcome.history))
+        return 128 + session.signal
+    print(history_table(session.history))
     print(f"\nreport  {folder.report}\nmodel   {folder.model}\nrenders {folder.path / 'report'}")
     return 0
 

@@ -39,7 +39,7 @@ def capture(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def whole(capture, tmp_path_factory) -> run.Outcome:
+def whole(capture, tmp_path_factory) -> run.RunSession:
     """A run never stopped."""
     return run.train(tiny_config(capture), tmp_path_factory.mktemp("runs") / "whole", write_report)
 

@@ -35,15 +35,6 @@ from turbogs_plugin.types import Gaussians
 
 
 @dataclass
-class Outcome:
-    """How a call of `train` or `resume` ended. `signal`: the one that stopped it, or None at the end of the run."""
-
-    folder: RunFolder
-    history: list[Evaluation]
-    signal: int | None = None
-
-
-@dataclass
 class SavedModel:
     """What is needed of a run to look at its model."""
 
@@ -135,7 +126,7 @@ def fit(scene: Scene, *overrides: str, config: str = DEFAULT_CONFIG) -> Gaussian
     return loop.trainer.gaussians
 
 
-def train(config: Config, out: Path, report: Callable[[RunSession], object] | None = None) -> Outcome:
+def train(config: Config, out: Path, report: Callable[[RunSession], object] | None = None) -> RunSession:
     """Train from the start into a new folder, by a plan that is told first.
 
     Args:
@@ -164,7 +155,7 @@ def train(config: Config, out: Path, report: Callable[[RunSession], object] | No
     return session.run(report)
 
 
-def resume(path: Path, report: Callable[[RunSession], object] | None = None) -> Outcome:
+def resume(path: Path, report: Callable[[RunSession], object] | None = None) -> RunSession:
     """Go on with a stopped run from its newest checkpoint, by its own configuration, in which all is decided.
 
     On a CPU, the result is bit for bit that of a run never stopped.
@@ -241,6 +232,8 @@ class RunSession(Listener):
     Attributes:
         plan: that the run follows; None where its folder holds none.
         test: the test views, on the trainer's device.
+        resumed: the trainer's state was loaded.
+        signal: the one that stopped the training; None at the end of the run.
     """
 
     def __init__(self, folder: RunFolder, plan: Plan | None, scene: Scene, loop: TrainingLoop) -> None:
@@ -249,14 +242,15 @@ class RunSession(Listener):
         self.test = place_views(scene.test, self.trainer.device, self.trainer.config.train.photos_place)
         self.evaluations = Evaluations(self.test)
         self.resumed = False
-        self.saved_at = -1
+        self.signal: int | None = None
+        self._saved_at = -1
 
     @property
     def history(self) -> list[Evaluation]:
         """Every evaluation of the run."""
         return self.evaluations.history
 
-    def run(self, report: Callable[[RunSession], object] | None) -> Outcome:
+    def run(self, report: Callable[[RunSession], object] | None) -> RunSession:
         """Train to the end, or until a signal; both end with a checkpoint."""
         loop, trainer = self.loop, self.trainer
         try:
@@ -266,7 +260,7 @@ class RunSession(Listener):
             ):
                 loop.listeners = [self.evaluations, self, progress]
                 loop.run(self.resumed)
-                if loop.stopped and trainer.iteration != self.saved_at:
+                if loop.stopped and trainer.iteration != self._saved_at:
                     self._save()
             if loop.finished:
                 save_ply(trainer.gaussians, self.folder.model, self.scene.frame)
@@ -279,7 +273,8 @@ class RunSession(Listener):
                 f"iteration {trainer.iteration}: the device's memory was too small for {len(trainer.gaussians)} "
                 f"Gaussians; try --max-gaussians {round(0.7 * len(trainer.gaussians))}; {self._last_good()}"
             ) from error
-        return Outcome(self.folder, self.history, None if loop.finished else interrupts.signal)
+        self.signal = None if loop.finished else interrupts.signal
+        return self
 
     def evaluated(self, loop: TrainingLoop, evaluation: Evaluation) -> None:
         append_evaluation(self.folder.history, evaluation)
@@ -320,7 +315,7 @@ class RunSession(Listener):
     def _save(self) -> None:
         self.trainer.require_finite()
         save_checkpoint(self.folder.checkpoints, self.trainer.iteration, self.state_dict())
-        self.saved_at = self.trainer.iteration
+        self._saved_at = self.trainer.iteration
 
     def _last_good(self) -> str:
         checkpoint = latest_checkpoint(self.folder.checkpoints)
