@@ -86,24 +86,20 @@ def parse_yaml(text: str, where: str) -> dict[str, Any]:
 
 
 def _refuse_unsafe(text: str, where: str) -> None:
-    depth = documents = 0
+    depth, roots = 0, []
     for event in yaml.parse(text, Loader=yaml.SafeLoader):
         place = f"config '{where}' (line {event.start_mark.line + 1})"
         if isinstance(event, yaml.AliasEvent) or getattr(event, "anchor", None):
             raise InputError(f"{place}: anchors and aliases are not allowed")
         if getattr(event, "tag", None):
             raise InputError(f"{place}: tags are not allowed: {event.tag}")
-        if isinstance(event, yaml.CollectionStartEvent):
-            depth += 1
-            if depth > DEPTH_LIMIT:
-                raise InputError(f"config '{where}' is nested more than {DEPTH_LIMIT} levels deep")
-        elif isinstance(event, yaml.CollectionEndEvent):
-            depth -= 1
-        elif isinstance(event, yaml.DocumentStartEvent):
-            documents += 1
-        elif depth == 0 and isinstance(event, yaml.ScalarEvent):
-            raise InputError(f"config '{where}': expected a mapping of sections, got the text '{event.value[:40]}'")
-        if depth == 1 and isinstance(event, yaml.SequenceStartEvent):
-            raise InputError(f"config '{where}': expected a mapping of sections, got a list")
-    if documents != 1:
-        raise InputError(f"config '{where}': expected one YAML document, found {documents}")
+        if depth == 0 and isinstance(event, yaml.NodeEvent):
+            roots.append(event)
+        depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+        if depth > DEPTH_LIMIT:
+            raise InputError(f"config '{where}' is nested more than {DEPTH_LIMIT} levels deep")
+    if len(roots) != 1:
+        raise InputError(f"config '{where}': expected one YAML document, found {len(roots)}")
+    if not isinstance(roots[0], yaml.MappingStartEvent):
+        found = f"the text '{roots[0].value[:40]}'" if isinstance(roots[0], yaml.ScalarEvent) else "a list"
+        raise InputError(f"config '{where}': expected a mapping of sections, got {found}")

@@ -175,7 +175,7 @@ def _measure(config: Config, scene: Scene, device: torch.device, seconds: float,
         )
     configured, largest = pixel_budget_range(config, len(scene.train))
     largest = min(largest, configured + _room_for_images(config, scene, device, gaussians))
-    # What more iterations overfit is photos that are looked at often already.
+    # More epochs than configured overfit the photos.
     images = images_per_iteration(config, len(scene.train))
     wanted = max(config.train.iterations, math.ceil(config.train.epochs * len(scene.train) / images))
     # A measured iteration with more pixels takes at most about seconds / iterations.
@@ -246,14 +246,15 @@ class _Trial:
         return len(trainer.gaussians), loop.clock.seconds / enough.iterations
 
 
+@dataclass
 class _Enough(Listener):
     """Stops when so many iterations were made and so many seconds have passed."""
 
-    def __init__(self, fewest: int, seconds: float) -> None:
-        self.iterations = 0
-        self._fewest, self._seconds = fewest, seconds
+    fewest: int
+    seconds: float
+    iterations: int = 0
 
     def advanced(self, loop: TrainingLoop) -> None:
         self.iterations += 1
-        if self.iterations >= self._fewest and loop.clock.now() >= self._seconds:
+        if self.iterations >= self.fewest and loop.clock.now() >= self.seconds:
             loop.stop()
