@@ -73,8 +73,8 @@ def _plain(value: Any) -> Any:
 def convert(value: Any, hint: Any, where: str) -> Any:
     """`value` as the type that a hint asks for.
 
-    A whole number is a float where one is asked for, and ``5e3`` is an integer; nothing else changes its type. Hints
-    that are none of YAML's types are not checked: the dataclass that has them has to.
+    A whole number becomes a float where one is asked for, and ``5e3`` an integer; nothing else changes its type. A hint
+    that is no YAML type is not checked here: the dataclass checks such a field itself.
     """
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if is_dataclass(hint):

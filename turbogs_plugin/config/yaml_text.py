@@ -1,4 +1,4 @@
-"""Reading YAML that nobody vouches for: plain values only, in bounded memory."""
+"""Reading YAML from untrusted sources: plain values only, in bounded memory."""
 
 from __future__ import annotations
 

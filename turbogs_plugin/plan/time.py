@@ -37,9 +37,6 @@ class IterationCost:
     def at(self, gaussians: float) -> float:
         return self.base + self.per_gaussian * gaussians
 
-    def times(self, factor: float) -> IterationCost:
-        return IterationCost(factor * self.base, factor * self.per_gaussian)
-
 
 def fit_to_time(
     seconds: float,

@@ -1,5 +1,8 @@
-"""What budgets change before a run: memory, the cap on Gaussians; time, how long the run is and how many pixels an
-iteration has, by iterations timed on this machine."""
+"""What budgets change before a run.
+
+A memory budget lowers the cap on Gaussians. A time budget sets the number of iterations and the pixels of one, by
+iterations timed on this machine.
+"""
 
 from __future__ import annotations
 
@@ -186,7 +189,8 @@ def _measure(config: Config, scene: Scene, device: torch.device, seconds: float,
     def fitting(pixel_budget: float) -> int:
         if pixel_budget not in costs:
             # One size of model says it: of two measurements each, the noise of their slopes would decide.
-            costs[pixel_budget] = cost.times(trial.seconds_with(pixel_budget, share / RAISES) / cost.at(gaussians))
+            factor = trial.seconds_with(pixel_budget, share / RAISES) / cost.at(gaussians)
+            costs[pixel_budget] = IterationCost(factor * cost.base, factor * cost.per_gaussian)
         left = seconds - initialisation - (time.perf_counter() - started)
         return _fit(config, left, costs[pixel_budget], gaussians)[0]
 

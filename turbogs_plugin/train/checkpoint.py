@@ -113,11 +113,11 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
 
 
 def require_like(saved: Any, present: Any, place: str) -> None:
-    """Refuse a state that is not made as a present one: other keys, other types, other dtypes or dimensions of tensors,
-    or numbers that are not finite.
+    """Refuse a state whose structure differs from the present one: other keys or types, other dtypes or dimensions of
+    tensors. Numbers that are not finite are refused too.
 
-    How many rows a tensor has may differ, as that depends on how far the run had come, and so may whether a part has a
-    state at all: None stands for a mapping.
+    The number of rows of a tensor may differ, as it depends on how far the run had come. A part may have no state yet:
+    then None stands in the place of a mapping.
 
     Raises:
         ValueError: naming the place.
@@ -134,7 +134,7 @@ def require_like(saved: Any, present: Any, place: str) -> None:
             require_like(saved[key], value, f"{place}.{key}")
     elif isinstance(present, Tensor):
         if saved.dtype != present.dtype or saved.dim() != present.dim() or saved.shape[1:] != present.shape[1:]:
-            raise ValueError(f"{place} is {_plan(saved)}, which does not fit {_plan(present)}")
+            raise ValueError(f"{place} is {_layout(saved)}, which does not fit {_layout(present)}")
         if not saved.isfinite().all():
             raise ValueError(f"{place} is not finite")
     elif isinstance(present, float) and not math.isfinite(saved):
@@ -143,7 +143,7 @@ def require_like(saved: Any, present: Any, place: str) -> None:
         raise ValueError(f"{place} is {saved}, which is no count")
 
 
-def _plan(tensor: Tensor) -> str:
+def _layout(tensor: Tensor) -> str:
     return f"{str(tensor.dtype).removeprefix('torch.')} {tuple(tensor.shape)}"
 
 

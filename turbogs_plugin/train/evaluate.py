@@ -29,6 +29,9 @@ PSNR_LIMIT = 100.0
 VGG16_FILE = "vgg16-397923af.pth"
 """The name under which torchvision looks for the backbone of LPIPS."""
 
+Lpips = Callable[[Tensor, Tensor], float]
+"""LPIPS of two images [H, W, 3], 0 .. 1."""
+
 
 @dataclass
 class ViewMetrics:
@@ -66,11 +69,7 @@ class Metrics:
 
 @torch.no_grad()
 def evaluate(
-    gaussians: Gaussians,
-    views: PosedImages,
-    sh_degree: int,
-    settings: RasterSettings,
-    lpips: Callable[[Tensor, Tensor], float] | None = None,
+    gaussians: Gaussians, views: PosedImages, sh_degree: int, settings: RasterSettings, lpips: Lpips | None = None
 ) -> Metrics:
     """Render every view, one at a time, and compare it with its photo.
 
@@ -115,7 +114,7 @@ def compare(name: str, image: Tensor, photo: Tensor) -> ViewMetrics:
     return ViewMetrics(name, psnr, ssim, (image - photo).abs().mean().item())
 
 
-def load_lpips(weights: str | None, device: torch.device) -> tuple[Callable[[Tensor, Tensor], float] | None, str]:
+def load_lpips(weights: str | None, device: torch.device) -> tuple[Lpips | None, str]:
     """LPIPS (VGG16) where torchvision and the backbone's weights are on this machine. Nothing is downloaded.
 
     Args:
@@ -123,7 +122,7 @@ def load_lpips(weights: str | None, device: torch.device) -> tuple[Callable[[Ten
         device: where to compute.
 
     Returns:
-        A function of two [H, W, 3] images, or None; and the reason for None.
+        The function, or None; and the reason for None.
 
     Raises:
         InputError: `weights` names no readable file.
@@ -138,7 +137,7 @@ def load_lpips(weights: str | None, device: torch.device) -> tuple[Callable[[Ten
     return _load_lpips(file, device), ""
 
 
-def _load_lpips(file: Path, device: torch.device) -> Callable[[Tensor, Tensor], float]:
+def _load_lpips(file: Path, device: torch.device) -> Lpips:
     from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
 
     cache = torch.hub.get_dir()

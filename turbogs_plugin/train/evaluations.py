@@ -5,11 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from torch import Tensor
-
 from turbogs_plugin.device import peak_memory_bytes
 from turbogs_plugin.scene import PosedImages
-from turbogs_plugin.train.evaluate import Metrics, evaluate
+from turbogs_plugin.train.evaluate import Lpips, Metrics, evaluate
 from turbogs_plugin.train.history import Evaluation
 from turbogs_plugin.train.loop import Listener, TrainingLoop
 
@@ -29,7 +27,7 @@ class Evaluations(Listener):
     """
 
     test: PosedImages
-    lpips: Callable[[Tensor, Tensor], float] | None = None
+    lpips: Lpips | None = None
     peak_memory: Callable[[], int] | None = None
     history: list[Evaluation] = field(default_factory=list, init=False)
     metrics: Metrics | None = field(default=None, init=False)

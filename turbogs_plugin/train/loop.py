@@ -15,7 +15,7 @@ from turbogs_plugin.train.trainer import Trainer
 
 
 class Listener:
-    """Hears of a training what concerns it: a listener overrides the methods that it needs."""
+    """Is told what happens in a training. A listener overrides the methods that it needs."""
 
     def begun(self, loop: TrainingLoop) -> None:
         """The error maps are there, and this process has made no iteration yet."""

@@ -61,7 +61,7 @@ def open_scene(config: Config, folder: RunFolder | None = None) -> Scene:
     """The capture of a configuration.
 
     Args:
-        folder: of the run that names the capture, where the user does not.
+        folder: of the run whose configuration this is; None where the user names the capture.
 
     Raises:
         InputError: no usable capture there.
@@ -86,10 +86,10 @@ def plan_run(config: Config) -> Plan:
 
 
 def new_loop(config: Config, scene: Scene, device: torch.device) -> tuple[TrainingLoop, Calibration | None]:
-    """A training within its budgets, which has not begun: of a run as of a cell of a study.
+    """A training that has not begun, fitted to its budgets. Runs and the cells of studies both begin here.
 
     Args:
-        config: its plan is carried out. That of the trainer is the one fitted to the budgets.
+        config: with nothing left to decide (`Plan.apply`). The trainer's is the one fitted to the budgets.
 
     Returns:
         The loop, without listeners; and what was measured for a time budget, which is in the loop's seconds.
@@ -127,7 +127,7 @@ def fit(scene: Scene, *overrides: str, config: str = DEFAULT_CONFIG) -> Gaussian
 
 
 def train(config: Config, out: Path, report: Callable[[RunSession], object] | None = None) -> RunSession:
-    """Train from the start into a new folder, by a plan that is told first.
+    """Train from the start into a new folder. The plan is printed first.
 
     Args:
         report: is handed the run when it is finished; `turbogs_plugin.report.pages.write_report` writes its page.
@@ -189,7 +189,7 @@ def resume(path: Path, report: Callable[[RunSession], object] | None = None) -> 
 
 @contextmanager
 def _fitting(scene: Scene, remedy: str) -> Iterator[None]:
-    """Around what takes memory of the device before training; where there is too little, the user hears of a remedy."""
+    """Turns a lack of device memory before training into an `InputError` that names a remedy."""
     try:
         yield
     except torch.cuda.OutOfMemoryError:
@@ -197,7 +197,7 @@ def _fitting(scene: Scene, remedy: str) -> Iterator[None]:
 
 
 def _independent(config: Config, device: torch.device) -> Config:
-    """The configuration, with what else would depend on where the run is resumed from written into it."""
+    """The configuration with absolute paths and the device in use, so that a resume finds the same ones anywhere."""
     config.scene.path = str(Path(config.scene.path).resolve())
     if config.report.lpips_weights is not None:
         config.report.lpips_weights = str(Path(config.report.lpips_weights).resolve())
@@ -227,7 +227,7 @@ def load_model(path: Path, device: torch.device) -> SavedModel:
 
 
 class RunSession(Listener):
-    """One process's share of a run: keeps in the folder what the loop comes to.
+    """One process's part of a run: trains, and writes what comes of it into the run's folder.
 
     Attributes:
         plan: that the run follows; None where its folder holds none.
