@@ -109,14 +109,11 @@ def build(kind: str, mapping: Mapping[str, Any]) -> Any:
     strategy = build_dataclass(strategy_class(kind, name), options, kind)
     # An attribute is there, or will be as a field of run-time state. Nothing is read: that may need `setup`.
     present = {*dir(strategy), *(field.name for field in fields(strategy))}
-    missing = [member for member in _members(PROTOCOLS[kind]) if member not in present]
+    members = (name for name in vars(PROTOCOLS[kind]) if not name.startswith("_") or name == "__call__")
+    missing = [name for name in members if name not in present]
     if missing:
         raise InputError(
             f"{kind}.type '{name}' ({known_types(kind)[name]}) is no {PROTOCOLS[kind].__name__}: "
             f"it lacks {', '.join(missing)}"
         )
     return strategy
-
-
-def _members(protocol: type) -> list[str]:
-    return [name for name in vars(protocol) if not name.startswith("_") or name == "__call__"]

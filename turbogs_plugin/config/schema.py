@@ -80,7 +80,7 @@ def convert(value: Any, hint: Any, where: str) -> Any:
     if is_dataclass(hint):
         return build_dataclass(hint, value, where)
     if origin in (typing.Union, types.UnionType):
-        return _convert_union(value, arguments, hint, where)
+        return _convert_union(value, arguments, where)
     if origin is typing.Literal:
         if value not in arguments:
             raise InputError(f"{where}: {value!r} is not one of {', '.join(map(repr, arguments))}")
@@ -125,7 +125,7 @@ def _convert_sequence(value: Any, origin: type, arguments: tuple, where: str) ->
     return origin(convert(item, hint, f"{where}[{index}]") for index, (item, hint) in enumerate(items))
 
 
-def _convert_union(value: Any, arguments: tuple, hint: Any, where: str) -> Any:
+def _convert_union(value: Any, arguments: tuple, where: str) -> Any:
     messages = []
     for argument in arguments:
         try:

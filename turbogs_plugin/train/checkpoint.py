@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from turbogs_plugin.errors import InputError, TrainingStopped
-from turbogs_plugin.files import write_atomically, write_text_atomically
+from turbogs_plugin.files import read_text, write_atomically, write_text_atomically
 
 FORMAT = 2
 KEPT = 2
@@ -65,7 +65,8 @@ def save_checkpoint(folder: Path, iteration: int, state: dict[str, Any]) -> Path
     for leftover in folder.glob(".iteration-*.pt.part"):  # of a killed process
         leftover.unlink(missing_ok=True)
     others = [file for file in folder.iterdir() if _NAME.fullmatch(file.name) and file != path]
-    for old in sorted(others, key=_iteration_of)[: len(others) - (KEPT - 1)]:
+    others.sort(key=lambda file: int(_NAME.fullmatch(file.name)[1]))
+    for old in others[: len(others) - (KEPT - 1)]:
         old.unlink(missing_ok=True)
     return path
 
@@ -76,12 +77,10 @@ def latest_checkpoint(folder: Path) -> Path | None:
     Raises:
         InputError: `latest` names no checkpoint of this folder.
     """
-    try:
-        name = (folder / "latest").read_text(encoding="utf-8").strip()
-    except FileNotFoundError:
+    text = read_text(folder / "latest")
+    if text is None:
         return None
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"cannot read '{folder / 'latest'}': {error}") from None
+    name = text.strip()
     if not _NAME.fullmatch(name) or not (folder / name).is_file():
         raise InputError(f"'{folder / 'latest'}' names no checkpoint of its folder: '{name[:60]}'")
     return folder / name
@@ -145,10 +144,6 @@ def require_like(saved: Any, present: Any, place: str) -> None:
 
 def _layout(tensor: Tensor) -> str:
     return f"{str(tensor.dtype).removeprefix('torch.')} {tuple(tensor.shape)}"
-
-
-def _iteration_of(file: Path) -> int:
-    return int(_NAME.fullmatch(file.name).group(1))
 
 
 def _require_bounded(path: Path) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 from turbogs_plugin.config.configuration import Config, resolve_complete
 from turbogs_plugin.config.yaml_text import read_yaml
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.files import require_writable
+from turbogs_plugin.files import read_text, require_writable
 from turbogs_plugin.plan import Plan
 
 
@@ -54,9 +54,8 @@ class RunFolder:
 
     def read_plan(self) -> Plan | None:
         """What was planned when the run began, if it is there. Raises `InputError` where it cannot be read."""
+        text = read_text(self.plan)
         try:
-            return Plan.from_json(self.plan.read_text(encoding="utf-8"))
-        except FileNotFoundError:
-            return None
-        except (OSError, UnicodeDecodeError, InputError) as error:
+            return None if text is None else Plan.from_json(text)
+        except InputError as error:
             raise InputError(f"cannot read the plan '{self.plan}': {error}") from None
