@@ -74,8 +74,8 @@ class TrainingLoop:
         while not (self.finished or self.stopped):
             mark = pace.next_mark(trainer.iteration, clock.seconds)
             self.advance(mark)
-            if trainer.iteration < mark:
-                break  # stopped on the way
+            if trainer.iteration < mark:  # stopped on the way
+                break
             due = pace.reached(trainer.iteration, clock.seconds, len(trainer.gaussians))
             trainer.set_length(pace.iterations, pace.refine_until)
             if due.evaluate:

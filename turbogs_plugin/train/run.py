@@ -254,10 +254,8 @@ class RunSession(Listener):
         """Train to the end, or until a signal; both end with a checkpoint."""
         loop, trainer = self.loop, self.trainer
         try:
-            with (
-                Interrupts(loop.stop) as interrupts,
-                TrainingProgress(trainer.iterations, trainer.iteration) as progress,
-            ):
+            progress = TrainingProgress(trainer.iterations, trainer.iteration)
+            with Interrupts(loop.stop) as interrupts, progress:
                 loop.listeners = [self.evaluations, self, progress]
                 loop.run(self.resumed)
                 if loop.stopped and trainer.iteration != self._saved_at:
