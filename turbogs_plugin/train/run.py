@@ -183,7 +183,7 @@ def resume(path: Path, report: Callable[[RunSession], object] | None = None) -> 
         session = RunSession(folder, plan, scene, loop)
         if state is not None:
             session.load_state_dict(state, str(checkpoint))
-    session.evaluations.history = rewind_history(folder.history, loop.trainer.iteration if session.resumed else -1)
+    session.history += rewind_history(folder.history, loop.trainer.iteration if session.resumed else -1)
     return session.run(report)
 
 
@@ -232,6 +232,7 @@ class RunSession(Listener):
     Attributes:
         plan: that the run follows; None where its folder holds none.
         test: the test views, on the trainer's device.
+        history: every evaluation of the run.
         resumed: the trainer's state was loaded.
         signal: the one that stopped the training; None at the end of the run.
     """
@@ -241,14 +242,10 @@ class RunSession(Listener):
         self.trainer = loop.trainer
         self.test = place_views(scene.test, self.trainer.device, self.trainer.config.train.photos_place)
         self.evaluations = Evaluations(self.test)
+        self.history = self.evaluations.history
         self.resumed = False
         self.signal: int | None = None
         self._saved_at = -1
-
-    @property
-    def history(self) -> list[Evaluation]:
-        """Every evaluation of the run."""
-        return self.evaluations.history
 
     def run(self, report: Callable[[RunSession], object] | None) -> RunSession:
         """Train to the end, or until a signal; both end with a checkpoint."""
