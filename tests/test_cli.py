@@ -3,7 +3,6 @@
 import os
 import re
 import shutil
-import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -13,7 +12,7 @@ import numpy as np
 import pycolmap
 import pytest
 import torch
-from helpers.framework_runs import TINY, tiny_capture
+from helpers.framework_runs import TINY, stop_after, tiny_capture
 from PIL import Image
 
 from turbogs_plugin import scene
@@ -372,14 +371,7 @@ def test_doctor(turbogs):
 
 
 def test_ctrl_c_saves_and_says_how_to_go_on(turbogs, capture, tmp_path, monkeypatch):
-    step = Trainer.step
-
-    def interrupted(trainer):
-        step(trainer)
-        if trainer.iteration == 3:
-            signal.raise_signal(signal.SIGINT)
-
-    monkeypatch.setattr(Trainer, "step", interrupted)
+    stop_after(monkeypatch, 3)
     code, out, err = turbogs("train", capture, "--out", tmp_path / "run", "--device", "cpu", *TINY)
     assert code == 130 and out == ""
     assert f"turbogs train --resume {tmp_path / 'run'}" in err

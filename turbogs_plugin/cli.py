@@ -7,13 +7,18 @@ import math
 import re
 import sys
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 from tyro.conf import Positional, UseAppendAction, arg
 
 from turbogs_plugin.errors import InputError, exit_code
+
+if TYPE_CHECKING:
+    from turbogs_plugin.config.configuration import Config
+    from turbogs_plugin.train.run import RunSession
 
 app = tyro.extras.SubcommandApp()
 
@@ -23,11 +28,56 @@ Device = Literal["auto", "cpu", "cuda"]
 
 # Options that several verbs have.
 Overrides = Annotated[Positional[tuple[str, ...]], arg(metavar="[section.key=value ...]")]
-ConfigName = Annotated[str | None, arg(metavar="NAME_OR_FILE")]
 Count = Annotated[int | None, arg(metavar="N")]
-Place = Annotated[Device | None, arg(metavar="auto|cpu|cuda")]
-Memory = Annotated[str | None, arg(metavar="2GiB")]
 Time = Annotated[str | None, arg(metavar="20s")]
+Decibels = Annotated[tuple[float, ...], arg(metavar="DB ...")]
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """What train and plan change in a configuration.
+
+    Args:
+        config: name of a packaged configuration or a .yaml file; turbogs where absent.
+        factor: scale photos down by this.
+        device: where to train; auto takes a GPU where there is one.
+        max_gaussians: never more than this (density.max_gaussians).
+        max_memory: of the GPU, never more than this for tensors: 2GiB, 1500MB (budget.max_memory). Photos and error
+            maps move to the host if need be, then the number of Gaussians is limited.
+        time_budget: seconds of training to end after: 20s, 2m (budget.time). The schedule is fitted to it, and
+            the pixels of an iteration or the number of Gaussians.
+    """
+
+    config: Annotated[str | None, arg(metavar="NAME_OR_FILE")] = None
+    factor: Count = None
+    device: Annotated[Device | None, arg(metavar="auto|cpu|cuda")] = None
+    max_gaussians: Count = None
+    max_memory: Annotated[str | None, arg(metavar="2GiB")] = None
+    time_budget: Time = None
+
+    def settings(self, scene: Path, overrides: tuple[str, ...]) -> Config:
+        """The configuration that a command line asks for."""
+        from turbogs_plugin.config.configuration import DEFAULT_CONFIG, load_config
+        from turbogs_plugin.plan.caps import with_cap
+
+        budget = _budget(self.max_memory, self.time_budget)
+        if self.max_gaussians is not None and self.max_gaussians < 1:
+            raise InputError(f"--max-gaussians {self.max_gaussians}: it must be at least 1; leave it out for no limit")
+        if any(override.partition("=")[0].strip() == "scene.path" for override in overrides):
+            raise InputError(f"scene.path is '{scene}', as SCENE says: leave the override out")
+        settings = load_config(DEFAULT_CONFIG if self.config is None else self.config, (*overrides, *budget))
+        if self.max_gaussians is not None:
+            settings = with_cap(settings, self.max_gaussians)
+        settings.scene.path = str(scene)
+        if self.factor is not None:
+            settings.scene.factor = self.factor
+        if self.device is not None:
+            settings.train.device = self.device
+        return settings
+
+
+NO_OPTIONS = RunOptions()
+Flat = Annotated[RunOptions, arg(name="")]
 
 
 @app.command
@@ -38,12 +88,7 @@ def train(
     *,
     out: Annotated[Path | None, arg(metavar="RUN")] = None,
     resume: Annotated[Path | None, arg(metavar="RUN")] = None,
-    config: ConfigName = None,
-    factor: Count = None,
-    device: Place = None,
-    max_gaussians: Count = None,
-    max_memory: Memory = None,
-    time_budget: Time = None,
+    options: Flat = NO_OPTIONS,
 ) -> int:
     """Train on a capture, or go on with a stopped run.
 
@@ -52,28 +97,17 @@ def train(
         overrides: changes of the configuration, e.g. train.iterations=8000 density.type=none.
         out: new folder for the run.
         resume: folder of a stopped run to go on with, by its own configuration.
-        config: name of a packaged configuration or a .yaml file; turbogs where absent.
-        factor: scale photos down by this.
-        device: where to train; auto takes a GPU where there is one.
-        max_gaussians: never more than this (density.max_gaussians).
-        max_memory: of the GPU, never more than this for tensors: 2GiB, 1500MB (budget.max_memory). Photos and error
-            maps move to the host if need be, then the number of Gaussians is limited.
-        time_budget: seconds of training to end after: 20s, 2m (budget.time). The schedule is fitted to it, and
-            the pixels of an iteration or the number of Gaussians.
     """
     from turbogs_plugin.report.pages import write_report
     from turbogs_plugin.train import run
 
-    budget = _budget(max_memory, time_budget)
     if resume is not None:
-        others = (out, config, factor, device, max_gaussians)
-        if scene or overrides or budget or any(option is not None for option in others):
+        if scene or overrides or out or options != NO_OPTIONS:
             raise InputError("--resume goes on by the run's own configuration: give it nothing else")
         return _tell(run.resume(resume, write_report))
     if scene is None or out is None:
         raise InputError("train needs a SCENE and --out RUN, or --resume RUN")
-    settings = _settings(scene, (*overrides, *budget), config, factor, device, max_gaussians)
-    return _tell(run.train(settings, out, write_report))
+    return _tell(run.train(options.settings(scene, overrides), out, write_report))
 
 
 @app.command
@@ -82,29 +116,17 @@ def plan(
     overrides: Overrides = (),
     /,
     *,
-    config: ConfigName = None,
-    factor: Count = None,
-    device: Place = None,
-    max_gaussians: Count = None,
-    max_memory: Memory = None,
-    time_budget: Time = None,
+    options: Flat = NO_OPTIONS,
 ) -> int:
     """Print what a run on a capture would decide of the settings that are `auto`, and why, without training.
 
     Args:
-        scene: as in train, and so are all others.
+        scene: as in train.
         overrides: as in train; train.sh_degree=auto leaves a setting to the plan, any other value forces it.
-        config: as in train.
-        factor: as in train.
-        device: as in train.
-        max_gaussians: as in train.
-        max_memory: as in train.
-        time_budget: as in train.
     """
     from turbogs_plugin.train.run import plan_run
 
-    budget = _budget(max_memory, time_budget)
-    print(plan_run(_settings(scene, (*overrides, *budget), config, factor, device, max_gaussians)).text())
+    print(plan_run(options.settings(scene, overrides)).text())
     return 0
 
 
@@ -182,7 +204,7 @@ def ablate(
     steps: Count = None,
     time_budget: Time = None,
     only: Annotated[tuple[str, ...], arg(metavar="VARIANT ...")] = (),
-    psnr: Annotated[tuple[float, ...], arg(metavar="DB ...")] = (),
+    psnr: Decibels = (),
     reuse: Annotated[tuple[Path, ...], arg(metavar="STUDY ...")] = (),
     merge: Annotated[tuple[Path, ...], arg(metavar="STUDY ...")] = (),
     device: Device = "auto",
@@ -228,7 +250,7 @@ def compare(
     /,
     *,
     out: Path,
-    psnr: Annotated[tuple[float, ...], arg(metavar="DB ...")] = (),
+    psnr: Decibels = (),
 ) -> int:
     """Report any runs side by side; runs that were asked the same, but for the seed, count as one variant.
 
@@ -250,7 +272,7 @@ def report(
     studies: Annotated[Positional[tuple[Path, ...]], arg(metavar="STUDY ...")],
     /,
     *,
-    psnr: Annotated[tuple[float, ...], arg(metavar="DB ...")] = (),
+    psnr: Decibels = (),
 ) -> int:
     """Write the report of studies again, from their results.json. A plot whose data did not change is left as it is.
 
@@ -385,42 +407,15 @@ def _require_positive(option: str, values: Sequence[float], most: float = math.i
         raise InputError(f"{option} {' '.join(map(str, values))}: it must be more than 0 and {limit}")
 
 
-def _settings(
-    scene: Path,
-    overrides: tuple[str, ...],
-    config: str | None,
-    factor: int | None,
-    device: Device | None,
-    max_gaussians: int | None,
-):
-    """The configuration that a command line asks for."""
-    from turbogs_plugin.config.configuration import DEFAULT_CONFIG, load_config
-    from turbogs_plugin.plan.caps import with_cap
-
-    if max_gaussians is not None and max_gaussians < 1:
-        raise InputError(f"--max-gaussians {max_gaussians}: it must be at least 1; leave it out for no limit")
-    if any(override.partition("=")[0].strip() == "scene.path" for override in overrides):
-        raise InputError(f"scene.path is '{scene}', as SCENE says: leave the override out")
-    settings = load_config(DEFAULT_CONFIG if config is None else config, overrides)
-    if max_gaussians is not None:
-        settings = with_cap(settings, max_gaussians)
-    settings.scene.path = str(scene)
-    if factor is not None:
-        settings.scene.factor = factor
-    if device is not None:
-        settings.train.device = device
-    return settings
-
-
-def _tell(outcome) -> int:
+def _tell(session: RunSession) -> int:
     """Print how a training call ended; its exit code."""
     from turbogs_plugin.report.outputs import history_table
 
-    folder = outcome.folder
-    if outcome.signal is not None:
+    folder = session.folder
+    if session.signal is not None:
         print(f"stopped and saved: go on with  turbogs train --resume {folder.path}", file=sys.stderr)
-        return 128 + outcome.signal
-    print(history_table(outcome.history))
+        return 128 + session.signal
+    print(history_table(session.history))
     print(f"\nreport  {folder.report}\nmodel   {folder.model}\nrenders {folder.path / 'report'}")
     return 0
 

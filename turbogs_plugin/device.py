@@ -1,4 +1,4 @@
-"""What is asked of a device as a whole: to be waited for, how much of its memory was taken, and to free it."""
+"""Operations on a device as a whole: wait for it, measure its peak memory, free what is unused."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def synchronize(device: torch.device) -> None:
 
 
 def free_device_memory(device: torch.device) -> None:
-    """Give back to a GPU what nothing refers to any more, so that what comes next is measured by itself."""
+    """Free a GPU's memory that nothing refers to any more, so that it does not count in the next measurement."""
     if device.type == "cuda":
         gc.collect()
         torch.cuda.empty_cache()

@@ -1,4 +1,4 @@
-"""Writing files so that a reader sees the old one or the new one, and never a part."""
+"""Reading text, and writing files so that a reader sees the old one or the new one, and never a part."""
 
 from __future__ import annotations
 
@@ -29,6 +29,16 @@ def require_writable(folder: Path, given: str) -> None:
     except OSError as error:
         reason = error.strerror if place.is_dir() else "not a folder"
         raise InputError(f"{given} cannot be made in '{place}' ({reason}): choose a folder to write to") from None
+
+
+def read_text(path: Path) -> str | None:
+    """The UTF-8 text of a file, or None where there is none. Raises `InputError` where it cannot be read."""
+    try:
+        return path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        return None
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"cannot read '{path}': {error}") from None
 
 
 def write_atomically(path: Path, write: Callable[[BinaryIO], None]) -> None:

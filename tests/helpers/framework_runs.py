@@ -1,7 +1,10 @@
 """A tiny capture and a tiny configuration for tests of whole runs."""
 
+import signal
+from collections.abc import Callable
 from pathlib import Path
 
+import pytest
 import torch
 
 from turbogs_plugin.config.configuration import Config, load_config
@@ -46,6 +49,25 @@ def tiny_config(capture: Path, *overrides: str) -> Config:
     config = load_config("turbogs", [*TINY, "train.device=cpu", *overrides])
     config.scene.path = str(capture)
     return config
+
+
+def interrupt(trainer: Trainer) -> None:
+    """Ctrl-C."""
+    signal.raise_signal(signal.SIGINT)
+
+
+def stop_after(
+    monkeypatch: pytest.MonkeyPatch, iteration: int, action: Callable[[Trainer], object] = interrupt
+) -> None:
+    """Run `action` within the step that finishes this many iterations."""
+    step = Trainer.step
+
+    def stepping(trainer: Trainer) -> None:
+        step(trainer)
+        if trainer.iteration == iteration:
+            action(trainer)
+
+    monkeypatch.setattr(Trainer, "step", stepping)
 
 
 def assert_identical(a, b, place: str = "state") -> None:

@@ -3,11 +3,10 @@
 import dataclasses
 import json
 import re
-import signal
 
 import pytest
 import torch
-from helpers.framework_runs import TINY, tiny_capture, tiny_config
+from helpers.framework_runs import TINY, stop_after, tiny_capture, tiny_config
 
 from turbogs_plugin.config.auto import AUTO_SETTINGS
 from turbogs_plugin.config.configuration import apply_overrides, config_names, load_config, resolve
@@ -281,14 +280,7 @@ def test_a_planned_run_tells_its_plan_and_resumes_bit_for_bit(turbogs, capture, 
     assert (config.schedule["type"], config.train.sh_degree, config.optimizer["type"]) == ("fixed", 1, "sparse_adam")
     assert json.loads((whole / "plan.json").read_text())["decisions"][0]["setting"] == "train.backdrop"
 
-    step = Trainer.step
-
-    def interrupted(trainer):
-        step(trainer)
-        if trainer.iteration == 7:
-            signal.raise_signal(signal.SIGINT)
-
-    monkeypatch.setattr(Trainer, "step", interrupted)
+    stop_after(monkeypatch, 7)
     assert turbogs("train", capture, *short, *decided, "--out", stopped, "--device", "cpu")[0] == 130
     monkeypatch.undo()
     monkeypatch.setattr(run, "make_plan", None)  # a resumed run must not plan again

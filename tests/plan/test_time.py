@@ -5,8 +5,10 @@ import random
 
 import pytest
 
+from turbogs_plugin.config.sections import TrainConfig
 from turbogs_plugin.plan.caps import EXPECTED_GROWTH
-from turbogs_plugin.plan.time import FEWEST_SHARE, IterationCost, TimePlan, fit_to_time
+from turbogs_plugin.plan.time import FEWEST_SHARE, IterationCost, fit_to_time
+from turbogs_plugin.train.pace import TimePace
 
 COST = IterationCost(base=2e-3, per_gaussian=2e-8)
 
@@ -38,23 +40,29 @@ def test_a_short_time_gives_up_gaussians_before_iterations():
     assert fit_to_time(1e-9, COST, 50_000, 0, 5000, 0.7)[0] == 1
 
 
-def simulate(plan: TimePlan, cost, count, seconds: float = 0.0) -> list[tuple[int, float, int, int]]:
-    """Train by a plan on a machine where iteration i takes cost(i) with count(i / iterations) Gaussians."""
+def new_pace(
+    seconds: float, iterations: int, refine_until: int, cost: IterationCost | None = None, cap: int = 0
+) -> TimePace:
+    return TimePace(TrainConfig(iterations=iterations, refine_until=refine_until), seconds, cost, cap)
+
+
+def simulate(pace: TimePace, cost, count, seconds: float = 0.0) -> list[tuple[int, float, int, int]]:
+    """Train by a pace on a machine where iteration i takes cost(i) with count(i / iterations) Gaussians."""
     iteration, marks = 0, []
-    plan.start(iteration, seconds, count(0, plan))
-    while iteration < plan.iterations:
-        mark = plan.next_mark(iteration, seconds)
+    pace.start(iteration, seconds, count(0, pace))
+    while iteration < pace.iterations:
+        mark = pace.next_mark(iteration, seconds)
         assert mark > iteration
         while iteration < mark:
-            seconds += cost(iteration, count(iteration, plan))
+            seconds += cost(iteration, count(iteration, pace))
             iteration += 1
-        plan.replan(iteration, seconds, count(iteration, plan))
-        marks.append((iteration, seconds, plan.iterations, plan.refine_until))
+        pace.reached(iteration, seconds, count(iteration, pace))
+        marks.append((iteration, seconds, pace.iterations, pace.refine_until))
     return marks
 
 
-def growing(iteration: int, plan: TimePlan) -> int:
-    return int(50_000 + 150_000 * min(1.0, iteration / max(1, plan.refine_until)))
+def growing(iteration: int, pace: TimePace) -> int:
+    return int(50_000 + 150_000 * min(1.0, iteration / max(1, pace.refine_until)))
 
 
 MACHINES = {
@@ -72,35 +80,35 @@ MACHINES = {
 @pytest.mark.parametrize("seconds", [5.0, 20.0])
 def test_a_run_ends_with_its_time(machine, seconds):
     iterations, cap = fit_to_time(seconds, COST, 50_000, 0, 5000, 0.7)
-    plan = TimePlan(seconds, iterations, round(0.7 * iterations), COST, cap)
-    marks = simulate(plan, MACHINES[machine], growing)
+    pace = new_pace(seconds, iterations, round(0.7 * iterations), COST, cap)
+    marks = simulate(pace, MACHINES[machine], growing)
     assert marks[-1][1] == pytest.approx(seconds, rel=0.02)
-    assert marks[-1][0] == plan.iterations
+    assert marks[-1][0] == pace.iterations
     assert len(marks) >= 30
     # Density control ended on the way, about where it was to, and did not begin again.
-    assert 0.5 < plan.refine_until / plan.iterations < 0.9
+    assert 0.5 < pace.refine_until / pace.iterations < 0.9
     over = [until for iteration, _, _, until in marks if iteration >= until]
     assert len(set(over)) == 1
 
 
 def test_few_slow_iterations_end_within_half_of_one():
-    plan = TimePlan(10.0, 40, 28)
-    marks = simulate(plan, lambda i, n: 0.4, lambda i, plan: 100)
+    pace = new_pace(10.0, 40, 28)
+    marks = simulate(pace, lambda i, n: 0.4, lambda i, pace: 100)
     assert 9.8 <= marks[-1][1] <= 10.2
 
 
 def test_a_plan_foresees_growth():
     """With what it knows after a tenth of the run, the length is within a fifth of what it will be."""
     iterations, _ = fit_to_time(20.0, COST, 50_000, 0, 5000, 0.7)
-    plan = TimePlan(20.0, iterations, round(0.7 * iterations), COST)
-    marks = simulate(plan, lambda i, n: 1.5 * COST.at(n), growing)
+    pace = new_pace(20.0, iterations, round(0.7 * iterations), COST)
+    marks = simulate(pace, lambda i, n: 1.5 * COST.at(n), growing)
     early = next(planned for iteration, seconds, planned, _ in marks if seconds > 2.0)
-    assert math.isclose(early, plan.iterations, rel_tol=0.2)
+    assert math.isclose(early, pace.iterations, rel_tol=0.2)
 
 
 def test_a_plan_goes_on_after_a_stop():
-    plan = TimePlan(20.0, 4000, 2800)
-    plan.start(1000, 5.0, 60_000)
-    assert plan.next_mark(1000, 5.0) == 1000 + int(0.03 * 20.0 / (15.0 / 3000))
-    plan.replan(1120, 6.2, 60_000)
-    assert abs(plan.iterations - (1120 + 13.8 / (0.5 * (15.0 / 3000 + 1.2 / 120)))) <= 1
+    pace = new_pace(20.0, 4000, 2800)
+    pace.start(1000, 5.0, 60_000)
+    assert pace.next_mark(1000, 5.0) == 1000 + int(0.03 * 20.0 / (15.0 / 3000))
+    pace.reached(1120, 6.2, 60_000)
+    assert abs(pace.iterations - (1120 + 13.8 / (0.5 * (15.0 / 3000 + 1.2 / 120)))) <= 1

@@ -58,7 +58,7 @@ def small_config(capture: Path, *overrides: str) -> Config:
     return config
 
 
-def train_to_the_end(capture: Path, out: Path, *overrides: str) -> run.Outcome:
+def train_to_the_end(capture: Path, out: Path, *overrides: str) -> run.RunSession:
     """A run that ends with a finite model and without an event."""
     outcome = run.train(small_config(capture, *overrides), out, write_report)
     assert all(value.isfinite().all() for value in saved_model(out).values())

@@ -127,7 +127,8 @@ def test_the_engine_gets_rule_moments_and_statistics(capture, monkeypatch):
 def test_statistics_need_a_pass_that_sums_them_up(capture):
     trainer = make_trainer(capture)
     samples = trainer.pixel_sampler.sample(trainer.maps, (0, 1), 0.2, trainer.now)
-    rendered = trainer.render((0, 1), samples)
+    cameras, options = trainer.views.cameras.select((0, 1)), {"sh_degree": 0, "settings": trainer.config.raster}
+    rendered = trainer.engine.render(trainer.gaussians, cameras, samples, **options)
     screen = rendered.backward(torch.ones_like(rendered.colors))
     with pytest.raises(ValueError, match="with_statistics"):
         screen.parameter_gradients(rows=True, stats=trainer.density.stats)

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from helpers.framework_runs import tiny_capture, tiny_config
+from helpers.framework_runs import stop_after, tiny_capture, tiny_config
 from helpers.simulated_time import SimulatedTime
 
 from turbogs_plugin.config.configuration import TrainConfig, resolve
@@ -148,14 +148,7 @@ def test_a_scene_that_does_not_fit_is_refused(capture, tmp_path, monkeypatch):
 def stopped(capture, tmp_path, monkeypatch) -> Path:
     """The folder of a run with a checkpoint of its fifth iteration."""
     with monkeypatch.context() as context:
-        step = Trainer.step
-
-        def stopping(trainer):
-            step(trainer)
-            if trainer.iteration == 5:
-                os.kill(os.getpid(), signal.SIGINT)
-
-        context.setattr(Trainer, "step", stopping)
+        stop_after(context, 5)
         run.train(tiny_config(capture), tmp_path / "run")
     return tmp_path / "run"
 

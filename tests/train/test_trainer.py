@@ -14,7 +14,7 @@ import numpy as np
 import pycolmap
 import pytest
 import torch
-from helpers.framework_runs import TINY, assert_identical, tiny_capture, tiny_config
+from helpers.framework_runs import TINY, assert_identical, stop_after, tiny_capture, tiny_config
 from PIL import Image
 
 from turbogs_plugin.config.configuration import load_config, resolve
@@ -39,25 +39,13 @@ def capture(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def whole(capture, tmp_path_factory) -> run.Outcome:
+def whole(capture, tmp_path_factory) -> run.RunSession:
     """A run never stopped."""
     return run.train(tiny_config(capture), tmp_path_factory.mktemp("runs") / "whole", write_report)
 
 
 def saved(folder: Path) -> dict:
     return load_checkpoint(latest_checkpoint(folder / "checkpoints"))["trainer"]
-
-
-def stop_after(monkeypatch, iteration: int, action) -> None:
-    """Run `action` within the step that finishes this many iterations."""
-    step = Trainer.step
-
-    def stepping(trainer):
-        step(trainer)
-        if trainer.iteration == iteration:
-            action(trainer)
-
-    monkeypatch.setattr(Trainer, "step", stepping)
 
 
 def test_a_run_leaves_everything_that_it_promises(whole, capture):
@@ -291,11 +279,11 @@ def test_weights_of_lpips_are_found_from_another_folder(capture, tmp_path, monke
     monkeypatch.setattr("turbogs_plugin.train.evaluate._load_lpips", lambda file, device: None)
     with monkeypatch.context() as context:
         context.chdir(tmp_path / "here")
-        stop_after(context, 5, lambda trainer: os.kill(os.getpid(), signal.SIGINT))
+        stop_after(context, 5)
         run.train(tiny_config(capture, "report.lpips_weights=w.pth"), tmp_path / "run")
     monkeypatch.chdir(tmp_path)
     with monkeypatch.context() as context:
-        stop_after(context, 6, lambda trainer: os.kill(os.getpid(), signal.SIGINT))
+        stop_after(context, 6)
         assert run.resume(tmp_path / "run").signal == signal.SIGINT
     (tmp_path / "here" / "w.pth").unlink()
     with pytest.raises(InputError, match=r"lpips_weights: no such file '.*here/w\.pth'"):
@@ -392,7 +380,7 @@ def test_the_trainer_names_no_strategy():
     from turbogs_plugin.train import trainer
 
     source = Path(trainer.__file__).read_text()
-    classes = [path.rpartition(":")[2] for kind in registry.BUILT_IN.values() for path in kind.values()]
+    classes = [name for kind in registry.BUILT_IN.values() for name in kind.values()]
     assert not [name for name in classes if name in source]
 
 

@@ -41,17 +41,17 @@ def value_of(mapping: Mapping[str, Mapping[str, Any]], setting: str) -> Any:
 
 
 def concrete(kind: str, section: Any) -> Any:
-    """A strategy's section, with its kind's default type in the place of ``auto``; what is no mapping as it is."""
+    """A strategy's section with its kind's default type instead of ``auto``; anything else is returned unchanged."""
     if isinstance(section, Mapping) and section.get("type") == AUTO and f"{kind}.type" in AUTO_SETTINGS:
         return {**section, "type": registry.default_type(kind)}
     return section
 
 
 def of_type(kind: str, section: Mapping[str, Any], name: str, options: Mapping[str, Any]) -> dict[str, Any]:
-    """A section of ``type: auto`` once its type is known to be `name`.
+    """A section of ``type: auto`` whose type is now decided: `name`, with the values of `options`.
 
-    Of another type than the default one it has the section's values that were changed from their defaults, as far as it
-    has fields of these names, and then `options`.
+    If that is not the kind's default type, it takes over the values that were changed from the default type's defaults,
+    where it has fields of the same names.
     """
     default = registry.default_type(kind)
     if name == default:

@@ -9,10 +9,8 @@ top of another. Some settings may be ``auto`` (`turbogs_plugin.config.auto`): th
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
-from importlib import resources
-from pathlib import Path
-from typing import Any
+from dataclasses import dataclass, field, is_dataclass
+from typing import Any, get_type_hints
 
 from omegaconf import OmegaConf
 
@@ -21,14 +19,17 @@ from turbogs_plugin.config.auto import AUTO, AUTO_SETTINGS, concrete, undecided
 from turbogs_plugin.config.old_spellings import old_spelling
 from turbogs_plugin.config.schema import build_dataclass, dataclass_mapping, nearest
 from turbogs_plugin.config.sections import BudgetConfig, MapsConfig, ReportConfig, SceneConfig, TrainConfig
-from turbogs_plugin.config.yaml_text import parse_yaml, read_yaml
+from turbogs_plugin.config.yaml_text import packaged_names, parse_yaml, read_named_yaml
 from turbogs_plugin.engine.rendered import RasterSettings
 from turbogs_plugin.errors import InputError
 
 DEFAULT_CONFIG = "turbogs"
 """The packaged configuration that a run without ``--config`` takes."""
 
+PACKAGE = "turbogs_plugin.configs"
+
 BASE_DEPTH_LIMIT = 8
+"""Configurations under one another by ``base``."""
 
 
 @dataclass
@@ -78,32 +79,20 @@ class Config:
 
     def to_mapping(self) -> dict[str, Any]:
         """Plain YAML values, every field written out, in sections that may be changed."""
-        return {
-            section.name: dict(getattr(self, section.name))
-            if section.name in registry.KINDS
-            else dataclass_mapping(getattr(self, section.name))
-            for section in fields(self)
-        }
+        return dataclass_mapping(self)
 
     def to_yaml(self) -> str:
         """Every setting; read back, it gives this very configuration."""
         return OmegaConf.to_yaml(OmegaConf.create(self.to_mapping()))
 
 
-SECTION_CLASSES = {
-    "scene": SceneConfig,
-    "train": TrainConfig,
-    "maps": MapsConfig,
-    "raster": RasterSettings,
-    "report": ReportConfig,
-    "budget": BudgetConfig,
-}
+SECTION_CLASSES = {name: hint for name, hint in get_type_hints(Config).items() if is_dataclass(hint)}
+"""The sections that are no strategy's."""
 
 
 def config_names() -> list[str]:
     """Names of the configurations that come with TurboGS."""
-    folder = resources.files("turbogs_plugin.configs")
-    return sorted(entry.name[: -len(".yaml")] for entry in folder.iterdir() if entry.name.endswith(".yaml"))
+    return packaged_names(PACKAGE)
 
 
 def load_config(name_or_file: str = DEFAULT_CONFIG, overrides: Sequence[str] = ()) -> Config:
@@ -134,11 +123,15 @@ def resolve(mapping: Mapping[str, Any]) -> Config:
     return Config(**sections)
 
 
-def resolve_complete(mapping: Mapping[str, Any], where: str) -> Config:
+def resolve_complete(mapping: Mapping[str, Any], where: str, decided: bool = False) -> Config:
     """`resolve` of the mapping that a run has written.
 
+    Args:
+        where: the file, for messages.
+        decided: whether nothing may be left to a plan.
+
     Raises:
-        InputError: a part of it is missing, or an earlier version wrote it.
+        InputError: a part of it is missing or, where that is asked for, left to a plan; or an earlier version wrote it.
     """
     old = old_spelling(mapping)
     if old:
@@ -147,13 +140,7 @@ def resolve_complete(mapping: Mapping[str, Any], where: str) -> Config:
     missing = _first_missing(config.to_mapping(), mapping)
     if missing:
         raise InputError(f"'{where}' lacks '{missing}', which this version writes: bring the file back, or train anew")
-    return config
-
-
-def resolve_decided(mapping: Mapping[str, Any], where: str) -> Config:
-    """`resolve_complete` of a mapping in which all is decided. Raises `InputError` where a part is left to a plan."""
-    config = resolve_complete(mapping, where)
-    left = undecided(mapping)
+    left = undecided(mapping) if decided else []
     if left:
         raise InputError(f"'{where}' has {AUTO} for {', '.join(left)}, which a run decides: bring the file back")
     return config
@@ -191,17 +178,9 @@ def apply_overrides(mapping: Mapping[str, Any], overrides: Sequence[str]) -> dic
 def _load_mapping(name_or_file: str, depth: int = 0) -> dict[str, Any]:
     if depth > BASE_DEPTH_LIMIT:
         raise InputError(f"config '{name_or_file}': its bases form a circle")
-    if name_or_file in config_names():
-        text = (resources.files("turbogs_plugin.configs") / f"{name_or_file}.yaml").read_text(encoding="utf-8")
-        mapping = parse_yaml(text, name_or_file)
-    elif Path(name_or_file).suffix in (".yaml", ".yml") or Path(name_or_file).is_file():
-        mapping = read_yaml(Path(name_or_file))
-    else:
-        raise InputError(f"unknown config '{name_or_file}': {nearest(name_or_file, config_names())}, or a .yaml file")
+    mapping = read_named_yaml(name_or_file, PACKAGE, "config")
     base = mapping.pop("base", None)
-    if base is None:
-        return mapping
-    return _merge(_load_mapping(str(base), depth + 1), mapping)
+    return mapping if base is None else _merge(_load_mapping(str(base), depth + 1), mapping)
 
 
 def _merge(under: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:

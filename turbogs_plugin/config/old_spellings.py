@@ -31,13 +31,9 @@ def old_spelling(mapping: Mapping[str, Any]) -> str:
     for setting, now in NOW.items():
         section, key = setting.split(".")
         values = mapping.get(section)
-        if isinstance(values, Mapping) and key in values and _is_ours(section, values):
-            return f"{setting} {now}"
+        if isinstance(values, Mapping) and key in values:
+            # A strategy of somebody else's may have such a key.
+            kind = registry.BUILT_IN.get(section)
+            if kind is None or values.get("type", registry.default_type(section)) in kind:
+                return f"{setting} {now}"
     return ""
-
-
-def _is_ours(section: str, values: Mapping[str, Any]) -> bool:
-    """Whether the section's keys are ours to name: not those of a strategy of somebody else's."""
-    if section not in registry.KINDS:
-        return True
-    return values.get("type", registry.default_type(section)) in registry.BUILT_IN[section]

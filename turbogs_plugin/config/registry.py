@@ -10,7 +10,6 @@ and a YAML names it by ``pixel_sampler: {type: my_sampler, ...}``. Nothing is im
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from importlib.metadata import EntryPoint, entry_points
@@ -22,39 +21,33 @@ from turbogs_plugin.strategies import protocols
 
 BUILT_IN: dict[str, dict[str, str]] = {
     "schedule": {
-        "sinusoidal": "turbogs_plugin.strategies:SinusoidalSchedule",
-        "linear": "turbogs_plugin.strategies:LinearSchedule",
-        "exponential": "turbogs_plugin.strategies:ExponentialSchedule",
-        "fixed": "turbogs_plugin.strategies:FixedSchedule",
+        "sinusoidal": "SinusoidalSchedule",
+        "linear": "LinearSchedule",
+        "exponential": "ExponentialSchedule",
+        "fixed": "FixedSchedule",
     },
-    "view_sampler": {
-        "geometry_aware": "turbogs_plugin.strategies:GeometryAwareViewSampler",
-        "random": "turbogs_plugin.strategies:RandomViewSampler",
-    },
+    "view_sampler": {"geometry_aware": "GeometryAwareViewSampler", "random": "RandomViewSampler"},
     "pixel_sampler": {
-        "error_guided": "turbogs_plugin.strategies:ErrorGuidedPixelSampler",
-        "random": "turbogs_plugin.strategies:RandomPixelSampler",
-        "dense": "turbogs_plugin.strategies:DensePixelSampler",
+        "error_guided": "ErrorGuidedPixelSampler",
+        "random": "RandomPixelSampler",
+        "dense": "DensePixelSampler",
     },
     "loss": {
-        "charbonnier_ncc": "turbogs_plugin.strategies:CharbonnierNccLoss",
-        "charbonnier": "turbogs_plugin.strategies:CharbonnierLoss",
-        "sparse_ssim": "turbogs_plugin.strategies:SparseSsimLoss",
+        "charbonnier_ncc": "CharbonnierNccLoss",
+        "charbonnier": "CharbonnierLoss",
+        "sparse_ssim": "SparseSsimLoss",
     },
     "density": {
-        "error_driven": "turbogs_plugin.strategies:ErrorDrivenDensity",
-        "none": "turbogs_plugin.strategies:NoDensity",
-        "gsplat_default": "turbogs_plugin.strategies:GsplatDefaultDensity",
-        "mcmc": "turbogs_plugin.strategies:GsplatMcmcDensity",
-        "fastgs": "turbogs_plugin.strategies:FastGsDensity",
+        "error_driven": "ErrorDrivenDensity",
+        "none": "NoDensity",
+        "gsplat_default": "GsplatDefaultDensity",
+        "mcmc": "GsplatMcmcDensity",
+        "fastgs": "FastGsDensity",
     },
-    "optimizer": {
-        "moment_lm": "turbogs_plugin.strategies:MomentLMOptimizer",
-        "sparse_adam": "turbogs_plugin.strategies:SparseAdam",
-        "adam": "turbogs_plugin.strategies:DenseAdam",
-    },
+    "optimizer": {"moment_lm": "MomentLMOptimizer", "sparse_adam": "SparseAdam", "adam": "DenseAdam"},
 }
-"""Kind -> name -> "module:class". The first of a kind is the one that a config without that section gets."""
+"""Kind -> name -> class of `turbogs_plugin.strategies`. The first of a kind is the one that a config without that
+section gets."""
 
 KINDS = tuple(BUILT_IN)
 
@@ -71,7 +64,7 @@ PROTOCOLS: dict[str, type] = {
 def known_types(kind: str) -> dict[str, str]:
     """Every name of a kind -> "module:class". A name of ours cannot be taken over by an entry point."""
     plugged_in = {point.name: point.value for point in entry_points(group=f"turbogs.{kind}")}
-    return {**plugged_in, **BUILT_IN[kind]}
+    return plugged_in | {name: f"turbogs_plugin.strategies:{found}" for name, found in BUILT_IN[kind].items()}
 
 
 def default_type(kind: str) -> str:
@@ -114,21 +107,13 @@ def build(kind: str, mapping: Mapping[str, Any]) -> Any:
     options = dict(mapping)
     name = options.pop("type", default_type(kind))
     strategy = build_dataclass(strategy_class(kind, name), options, kind)
-    missing = [member for member in _members(PROTOCOLS[kind]) if not _has(strategy, member)]
+    # An attribute is there, or will be as a field of run-time state. Nothing is read: that may need `setup`.
+    present = {*dir(strategy), *(field.name for field in fields(strategy))}
+    members = (name for name in vars(PROTOCOLS[kind]) if not name.startswith("_") or name == "__call__")
+    missing = [name for name in members if name not in present]
     if missing:
         raise InputError(
             f"{kind}.type '{name}' ({known_types(kind)[name]}) is no {PROTOCOLS[kind].__name__}: "
             f"it lacks {', '.join(missing)}"
         )
     return strategy
-
-
-def _members(protocol: type) -> list[str]:
-    return [name for name in vars(protocol) if not name.startswith("_") or name == "__call__"]
-
-
-def _has(strategy: Any, member: str) -> bool:
-    """Whether the attribute is there, or a field of run-time state. Nothing is read: that may need `setup`."""
-    absent = object()
-    known = {field.name for field in fields(strategy)}
-    return member in known or inspect.getattr_static(strategy, member, absent) is not absent

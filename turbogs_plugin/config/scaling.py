@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from turbogs_plugin.config.configuration import Config, resolve
 from turbogs_plugin.errors import InputError
 
@@ -25,26 +23,16 @@ REGROWTH = 50
 
 
 def with_iterations(config: Config, iterations: int) -> Config:
-    """The configuration for a run of exactly this length, with everything scaled that counts iterations."""
-    mapping = config.to_mapping()
-    scale_iterations(mapping, config.train.written_iterations, iterations)
-    return resolve(mapping)
-
-
-def scale_iterations(mapping: dict[str, dict[str, Any]], written: int, iterations: int) -> None:
-    """Change the sections of a complete configuration from one length to another.
+    """The configuration for a run of exactly this length, with everything scaled that counts iterations.
 
     Intervals of density control stay at `SHORTEST_INTERVAL` or above; 0 stays 0.
-
-    Args:
-        written: the length that the sections are written for (`TrainConfig.written_iterations`).
 
     Raises:
         InputError: no iterations.
     """
     if iterations < 1:
         raise InputError(f"a run has at least one iteration, not {iterations}")
-    factor = iterations / written
+    mapping, factor = config.to_mapping(), iterations / config.train.written_iterations
     density = mapping["density"]
     interval = density.get("refine_every", REGROWTH)
     for section, names in ITERATION_FIELDS.items():
@@ -56,6 +44,7 @@ def scale_iterations(mapping: dict[str, dict[str, Any]], written: int, iteration
     mapping["train"]["iterations"] = mapping["train"]["base_iterations"] = iterations
     if density.get("opacity_decay", 0.0):
         density["opacity_decay"] = decay_at(density["opacity_decay"], interval, density["refine_every"])
+    return resolve(mapping)
 
 
 def decay_at(decay: float, interval: int, other: int) -> float:

@@ -73,14 +73,14 @@ def _plain(value: Any) -> Any:
 def convert(value: Any, hint: Any, where: str) -> Any:
     """`value` as the type that a hint asks for.
 
-    A whole number is a float where one is asked for, and ``5e3`` is an integer; nothing else changes its type. Hints
-    that are none of YAML's types are not checked: the dataclass that has them has to.
+    A whole number becomes a float where one is asked for, and ``5e3`` an integer; nothing else changes its type. A hint
+    that is no YAML type is not checked here: the dataclass checks such a field itself.
     """
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if is_dataclass(hint):
         return build_dataclass(hint, value, where)
     if origin in (typing.Union, types.UnionType):
-        return _convert_union(value, arguments, hint, where)
+        return _convert_union(value, arguments, where)
     if origin is typing.Literal:
         if value not in arguments:
             raise InputError(f"{where}: {value!r} is not one of {', '.join(map(repr, arguments))}")
@@ -125,7 +125,7 @@ def _convert_sequence(value: Any, origin: type, arguments: tuple, where: str) ->
     return origin(convert(item, hint, f"{where}[{index}]") for index, (item, hint) in enumerate(items))
 
 
-def _convert_union(value: Any, arguments: tuple, hint: Any, where: str) -> Any:
+def _convert_union(value: Any, arguments: tuple, where: str) -> Any:
     messages = []
     for argument in arguments:
         try:

@@ -43,10 +43,10 @@ class TrainConfig:
     """The run itself.
 
     Args:
-        iterations: T. A number scales nothing. ``auto``: as many as `epochs` take, and all settings that count
-            iterations (`turbogs_plugin.config.scaling`) are scaled from `base_iterations` to that length.
-        epochs: how often each training pixel is looked at in the mean: iterations times images an iteration over
-            training views. Used where `iterations` is ``auto``, and by a time budget that is longer than that.
+        iterations: T. A number leaves all other settings as they are. ``auto``: as many as `epochs` take, and all
+            settings that count iterations (`turbogs_plugin.config.scaling`) are scaled from `base_iterations`.
+        epochs: passes over the training photos: iterations times images per iteration, divided by training views. Used
+            where `iterations` is ``auto``, and where a time budget allows for more.
         base_iterations: the length for which the settings that count iterations are written. Used where `iterations`
             is ``auto``.
         refine_until: tau_until, the last iteration of density control, which also ends the annealing of the sampling.

@@ -14,23 +14,17 @@ SECOND_UNITS = {"": 1.0, "s": 1.0, "m": 60.0, "min": 60.0, "h": 3600.0}
 
 def parse_bytes(text: str) -> int:
     """``2GiB``, ``1500 MB``, ``300000000``. Raises `InputError`."""
-    number = _parse(text, BYTE_UNITS)
-    if number is None or number < 1:
-        raise InputError(f"'{text[:40]}' is no amount of memory: write 2GiB, 1500MB or a number of bytes")
-    return int(number)
+    return int(_parse(text, BYTE_UNITS, 1.0, "memory: write 2GiB, 1500MB or a number of bytes"))
 
 
 def parse_seconds(text: str) -> float:
     """``20s``, ``2m``, ``1.5h``, ``20``. Raises `InputError`."""
-    number = _parse(text, SECOND_UNITS)
-    if number is None or number <= 0:
-        raise InputError(f"'{text[:40]}' is no amount of time: write 20s, 2m or 1.5h")
-    return number
+    return _parse(text, SECOND_UNITS, 1e-9, "time: write 20s, 2m or 1.5h")
 
 
-def _parse(text: str, units: Mapping[str, float]) -> float | None:
-    match = re.fullmatch(r"\s*(\d+(?:\.\d*)?|\.\d+)\s*([a-z]*)\s*", str(text).lower())
-    if match is None or match[2] not in units:
-        return None
-    amount = float(match[1]) * units[match[2]]
-    return amount if math.isfinite(amount) else None
+def _parse(text: str, units: Mapping[str, float], least: float, expected: str) -> float:
+    match = re.fullmatch(r"\s*(\d+(?:\.\d*)?|\.\d+)\s*([a-z]*)\s*", text.lower())
+    amount = float(match[1]) * units.get(match[2], math.nan) if match else math.nan
+    if not least <= amount < math.inf:
+        raise InputError(f"'{text[:40]}' is no amount of {expected}")
+    return amount

@@ -1,7 +1,8 @@
-"""Reading YAML that nobody vouches for: plain values only, in bounded memory."""
+"""Reading YAML from untrusted sources: plain values only, in bounded memory."""
 
 from __future__ import annotations
 
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,7 @@ import yaml
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from turbogs_plugin.config.schema import nearest
 from turbogs_plugin.errors import InputError
 
 SIZE_LIMIT = 64 * 1024
@@ -16,6 +18,31 @@ SIZE_LIMIT = 64 * 1024
 
 DEPTH_LIMIT = 16
 """Levels of nesting, well above what any configuration has."""
+
+
+def packaged_names(package: str) -> list[str]:
+    """Names of the YAML files that come with TurboGS in a package."""
+    entries = resources.files(package).iterdir()
+    return sorted(entry.name.removesuffix(".yaml") for entry in entries if entry.name.endswith(".yaml"))
+
+
+def read_named_yaml(name_or_file: str, package: str, kind: str) -> dict[str, Any]:
+    """The mapping in a packaged YAML file, or in one on the disk.
+
+    Args:
+        kind: what such files are, for messages.
+
+    Raises:
+        InputError: an unknown name, or an unreadable file.
+    """
+    known = packaged_names(package)
+    if name_or_file in known:
+        text = (resources.files(package) / f"{name_or_file}.yaml").read_text(encoding="utf-8")
+        return parse_yaml(text, name_or_file)
+    path = Path(name_or_file)
+    if path.suffix in (".yaml", ".yml") or path.is_file():
+        return read_yaml(path)
+    raise InputError(f"unknown {kind} '{name_or_file}': {nearest(name_or_file, known)}, or a .yaml file")
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
@@ -59,24 +86,20 @@ def parse_yaml(text: str, where: str) -> dict[str, Any]:
 
 
 def _refuse_unsafe(text: str, where: str) -> None:
-    depth = documents = 0
+    depth, roots = 0, []
     for event in yaml.parse(text, Loader=yaml.SafeLoader):
         place = f"config '{where}' (line {event.start_mark.line + 1})"
         if isinstance(event, yaml.AliasEvent) or getattr(event, "anchor", None):
             raise InputError(f"{place}: anchors and aliases are not allowed")
         if getattr(event, "tag", None):
             raise InputError(f"{place}: tags are not allowed: {event.tag}")
-        if isinstance(event, yaml.CollectionStartEvent):
-            depth += 1
-            if depth > DEPTH_LIMIT:
-                raise InputError(f"config '{where}' is nested more than {DEPTH_LIMIT} levels deep")
-        elif isinstance(event, yaml.CollectionEndEvent):
-            depth -= 1
-        elif isinstance(event, yaml.DocumentStartEvent):
-            documents += 1
-        elif depth == 0 and isinstance(event, yaml.ScalarEvent):
-            raise InputError(f"config '{where}': expected a mapping of sections, got the text '{event.value[:40]}'")
-        if depth == 1 and isinstance(event, yaml.SequenceStartEvent):
-            raise InputError(f"config '{where}': expected a mapping of sections, got a list")
-    if documents != 1:
-        raise InputError(f"config '{where}': expected one YAML document, found {documents}")
+        if depth == 0 and isinstance(event, yaml.NodeEvent):
+            roots.append(event)
+        depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+        if depth > DEPTH_LIMIT:
+            raise InputError(f"config '{where}' is nested more than {DEPTH_LIMIT} levels deep")
+    if len(roots) != 1:
+        raise InputError(f"config '{where}': expected one YAML document, found {len(roots)}")
+    if not isinstance(roots[0], yaml.MappingStartEvent):
+        found = f"the text '{roots[0].value[:40]}'" if isinstance(roots[0], yaml.ScalarEvent) else "a list"
+        raise InputError(f"config '{where}': expected a mapping of sections, got {found}")

@@ -17,10 +17,10 @@ from turbogs_plugin.types import TILE_SIZE
 FLAT_DEVIATION = 0.01
 """Standard deviation of luminance (0 .. 1) below which a tile has no texture: 2.5 of 255 steps, a camera's noise."""
 TILES_AT_MOST = 6400
-"""Tiles looked at, over all photos."""
+"""Tiles examined, over all photos."""
 TILES_PER_PHOTO = 64
 POINTS_AT_MOST = 2000
-"""3D points looked at."""
+"""3D points examined."""
 COMMON_POINTS = 32
 """Points that two photos must share for their exposures to be compared."""
 LUMINANCE = (0.299, 0.587, 0.114)
@@ -95,8 +95,8 @@ def gather_facts(
         scene=scene.name,
         train_views=len(views),
         test_views=len(scene.test),
-        smallest_photo=_pair(sizes[order[0]]),
-        largest_photo=_pair(sizes[order[-1]]),
+        smallest_photo=tuple(sizes[order[0]].tolist()),
+        largest_photo=tuple(sizes[order[-1]].tolist()),
         points=len(scene.points),
         extent=scene.extent * scene.frame.scale,
         baseline=_baseline(views, sight, scene.extent),
@@ -207,7 +207,3 @@ def _free_host_bytes() -> int:
     except OSError:
         pass  # not Linux
     return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-
-
-def _pair(size: np.ndarray) -> tuple[int, int]:
-    return int(size[0]), int(size[1])

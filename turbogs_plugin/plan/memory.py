@@ -24,10 +24,10 @@ from turbogs_plugin.scene.offload import SETS
 from turbogs_plugin.scene.photos import PHOTO_BYTES
 
 VIEW_BYTES = 230
-"""Of a Gaussian in a view: the rasterizer's instance, radius and gradient record, and its share of the pairs. Measured
-on an H200: 213 between 150 and 600 thousand Gaussians (docs/results/h200/bench-step.json)."""
+"""Of a Gaussian in a view: the rasterizer's instance, radius and gradient record, and its share of the
+intersections. Measured on an H200: 213 between 150 and 600 thousand Gaussians (docs/results/h200/bench-step.json)."""
 SAMPLE_BYTES = 400
-"""Of a sample: draw, colours, gradients, errors, masks of pairs, scratch. Measured there: 320 to 400."""
+"""Of a sample: draw, colours, gradients, errors, masks of intersections, scratch. Measured there: 320 to 400."""
 IMAGE_BYTES = 120
 """Of a pixel of a whole render."""
 

@@ -51,8 +51,8 @@ def pixels_for_time(
 ) -> float:
     """The lambda with which about the configured number of iterations fills the time.
 
-    The cost of an iteration grows more slowly than lambda, so that raising lambda by the ratio of the iterations that
-    fit to those wanted never raises it too far, but again and again not far enough.
+    Lambda is raised by the ratio of the iterations that fit to those wanted. The cost of an iteration grows more slowly
+    than lambda, so that this is never too far, but often not far enough: it is repeated.
 
     Args:
         configured, largest: the range of lambda.
@@ -61,8 +61,8 @@ def pixels_for_time(
         fitting: how many iterations fit with a lambda; it is asked for the configured one first.
 
     Returns:
-        The configured lambda unless more iterations fit with it than wanted; of those tried and costing none of the
-        iterations wanted, beyond `TOLERANCE`, the one with which their number is nearest.
+        The configured lambda if no more iterations fit with it than wanted. Else, of those tried with which enough
+        iterations fit (within `TOLERANCE`), the one that comes nearest to the number wanted.
     """
     enough, most = (1.0 - TOLERANCE) * iterations, (1.0 + TOLERANCE) * iterations
     pixel_budget, fits = configured, fitting(configured)

@@ -10,7 +10,7 @@ import torch
 
 from turbogs_plugin.config.auto import of_type
 from turbogs_plugin.config.configuration import Config, resolve
-from turbogs_plugin.config.scaling import scale_iterations
+from turbogs_plugin.config.scaling import with_iterations
 from turbogs_plugin.config.schema import build_dataclass
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.plan.decisions import RULES, Decision, decide, mebibytes
@@ -36,7 +36,7 @@ class Plan:
             if key == "type":
                 mapping[section] = of_type(section, mapping[section], decision.value, decision.options)
             elif decision.setting == "train.iterations":
-                scale_iterations(mapping, config.train.base_iterations, decision.value)
+                mapping = with_iterations(resolve(mapping), decision.value).to_mapping()
             else:
                 mapping[section][key] = decision.value
         return resolve(mapping)
@@ -84,25 +84,16 @@ class Plan:
         return build_dataclass(cls, mapping, "plan")
 
 
-def make_plan(
-    config: Config,
-    scene: Scene,
-    device: torch.device,
-    *,
-    memory_limit: int | None = None,
-    time_budget: float | None = None,
-) -> Plan:
-    """Look at scene and machine, and decide what the configuration leaves to decide.
+def make_plan(config: Config, scene: Scene, device: torch.device) -> Plan:
+    """Look at scene and machine, and decide what the configuration leaves to decide, within its budgets.
 
     Args:
         config: what is ``auto`` in it is decided.
         scene: loaded.
         device: where training is to be.
-        memory_limit: bytes of the device that must not be exceeded.
-        time_budget: seconds.
     """
-    facts = gather_facts(scene, device, memory_limit=memory_limit, time_budget=time_budget)
-    return plan_from_facts(facts, config)
+    limit, seconds = config.budget.memory_bytes(), config.budget.seconds()
+    return plan_from_facts(gather_facts(scene, device, memory_limit=limit, time_budget=seconds), config)
 
 
 def plan_from_facts(facts: SceneFacts, config: Config) -> Plan:

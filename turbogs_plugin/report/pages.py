@@ -11,10 +11,10 @@ from turbogs_plugin.report.machine import hardware, software
 from turbogs_plugin.report.plots import ERROR_FULL_SCALE, plot_against_seconds, save_strip
 from turbogs_plugin.report.tables import ERRORS, number, table
 from turbogs_plugin.train.evaluate import Metrics, evaluate, load_lpips, render_view
-from turbogs_plugin.train.run import FinishedRun
+from turbogs_plugin.train.run import RunSession
 
 
-def write_report(run: FinishedRun) -> Path:
+def write_report(run: RunSession) -> Path:
     """Write ``report.md`` and its pictures (in ``report/``) into the run's folder.
 
     Returns:
@@ -35,7 +35,7 @@ def write_report(run: FinishedRun) -> Path:
     return run.folder.report
 
 
-def _page(run: FinishedRun, metrics: Metrics, lpips_reason: str, shown: int) -> str:
+def _page(run: RunSession, metrics: Metrics, lpips_reason: str, shown: int) -> str:
     """The page.
 
     Args:
@@ -53,10 +53,10 @@ def _page(run: FinishedRun, metrics: Metrics, lpips_reason: str, shown: int) -> 
         (*ERRORS, "LPIPS (VGG)", "training in s", "Gaussians", "FPS", "peak memory in MiB"),
         [
             (
-                number(metrics.psnr, 2),
-                number(metrics.ssim, 4),
-                number(metrics.l1, 4),
-                number(metrics.lpips, 4),
+                number(metrics.mean("psnr"), 2),
+                number(metrics.mean("ssim"), 4),
+                number(metrics.mean("l1"), 4),
+                number(metrics.mean("lpips"), 4),
                 f"{last.train_seconds:.1f}",
                 last.num_gaussians,
                 f"{metrics.fps:.1f}",

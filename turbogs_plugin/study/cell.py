@@ -13,6 +13,7 @@ import torch
 from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.config.scaling import with_iterations
 from turbogs_plugin.device import free_device_memory, peak_memory_bytes
+from turbogs_plugin.plan import make_plan
 from turbogs_plugin.report.provenance import Provenance
 from turbogs_plugin.scene import PosedImages, Scene
 from turbogs_plugin.scene.offload import place_views
@@ -21,7 +22,7 @@ from turbogs_plugin.study.timing import PeakMemory
 from turbogs_plugin.train.evaluate import evaluate, load_lpips
 from turbogs_plugin.train.evaluations import Evaluations
 from turbogs_plugin.train.loop import Listener, TrainingLoop
-from turbogs_plugin.train.run import new_loop, plan_scene
+from turbogs_plugin.train.run import new_loop
 from turbogs_plugin.train.trainer import Trainer
 
 WARMUP_ITERATIONS = {"cuda": 20, "cpu": 2}
@@ -72,7 +73,7 @@ def train_cell(
         InputError: a budget is too small.
         TrainingStopped: the model is lost.
     """
-    planned = plan_scene(config, scene, device).apply(config)
+    planned = make_plan(config, scene, device).apply(config)
     test = place_views(scene.test, device, planned.train.photos_place)
     warmup = min(WARMUP_ITERATIONS[device.type], planned.train.iterations)
     warm_up(planned, scene, test, device, warmup)
@@ -90,7 +91,7 @@ def train_cell(
         config=resolved,
         asked={name: section for name, section in asked.items() if section != resolved[name]},
         history=evaluations.history,
-        lpips=math.nan if lpips is None else evaluations.metrics.lpips,
+        lpips=math.nan if lpips is None else evaluations.metrics.mean("lpips"),
         lpips_reason=lpips_reason,
         fps=evaluations.metrics.fps,
         peak_bytes=memory.peak,

@@ -1,5 +1,8 @@
-"""What budgets change before a run: memory, the cap on Gaussians; time, how long the run is and how many pixels an
-iteration has, by iterations timed on this machine."""
+"""What budgets change before a run.
+
+A memory budget lowers the cap on Gaussians. A time budget sets the number of iterations and the pixels of one, by
+iterations timed on this machine.
+"""
 
 from __future__ import annotations
 
@@ -69,11 +72,6 @@ class Calibration:
     configured_pixel_budget: float
     pixel_budget: float
 
-    @property
-    def before(self) -> float:
-        """Seconds of training that pass before the first iteration."""
-        return self.seconds + self.initialisation
-
 
 def within_budget(config: Config, scene: Scene, device: torch.device) -> tuple[Config, Calibration | None]:
     """The configuration that keeps its budgets, and what was measured for it where time is one of them.
@@ -95,7 +93,8 @@ def within_budget(config: Config, scene: Scene, device: torch.device) -> tuple[C
         config = with_pixel_budget(config, measured.pixel_budget)
         if limit is not None:
             config = lowered_cap(config, _memory_demand(config, scene).gaussians(limit))
-    iterations, cap = _fit(config, seconds - measured.before, measured.cost, measured.gaussians)
+    left = seconds - (measured.seconds + measured.initialisation)
+    iterations, cap = _fit(config, left, measured.cost, measured.gaussians)
     if cap != growth_cap(config, measured.gaussians):
         config = lowered_cap(config, cap)
     return with_iterations(config, iterations), measured
@@ -179,7 +178,7 @@ def _measure(config: Config, scene: Scene, device: torch.device, seconds: float,
         )
     configured, largest = pixel_budget_range(config, len(scene.train))
     largest = min(largest, configured + _room_for_images(config, scene, device, gaussians))
-    # What more iterations overfit is photos that are looked at often already.
+    # More epochs than configured overfit the photos.
     images = images_per_iteration(config, len(scene.train))
     wanted = max(config.train.iterations, math.ceil(config.train.epochs * len(scene.train) / images))
     # A measured iteration with more pixels takes at most about seconds / iterations.
@@ -190,7 +189,8 @@ def _measure(config: Config, scene: Scene, device: torch.device, seconds: float,
     def fitting(pixel_budget: float) -> int:
         if pixel_budget not in costs:
             # One size of model says it: of two measurements each, the noise of their slopes would decide.
-            costs[pixel_budget] = cost.times(trial.seconds_with(pixel_budget, share / RAISES) / cost.at(gaussians))
+            factor = trial.seconds_with(pixel_budget, share / RAISES) / cost.at(gaussians)
+            costs[pixel_budget] = IterationCost(factor * cost.base, factor * cost.per_gaussian)
         left = seconds - initialisation - (time.perf_counter() - started)
         return _fit(config, left, costs[pixel_budget], gaussians)[0]
 
@@ -217,10 +217,7 @@ class _Trial:
         self._trainer = Trainer(self._config, scene, device)
         self._model = self._trainer.gaussians
         self._device = device
-
-    @property
-    def gaussians(self) -> int:
-        return len(self._model)
+        self.gaussians = len(self._model)
 
     def initialisation(self) -> float:
         """Seconds of `Trainer.initialise_maps`, from one view."""
@@ -253,14 +250,15 @@ class _Trial:
         return len(trainer.gaussians), loop.clock.seconds / enough.iterations
 
 
+@dataclass
 class _Enough(Listener):
     """Stops when so many iterations were made and so many seconds have passed."""
 
-    def __init__(self, fewest: int, seconds: float) -> None:
-        self.iterations = 0
-        self._fewest, self._seconds = fewest, seconds
+    fewest: int
+    seconds: float
+    iterations: int = 0
 
     def advanced(self, loop: TrainingLoop) -> None:
         self.iterations += 1
-        if self.iterations >= self._fewest and loop.clock.now() >= self._seconds:
+        if self.iterations >= self.fewest and loop.clock.now() >= self.seconds:
             loop.stop()

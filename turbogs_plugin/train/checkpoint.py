@@ -11,6 +11,7 @@ import math
 import os
 import re
 import zipfile
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ import torch
 from torch import Tensor
 
 from turbogs_plugin.errors import InputError, TrainingStopped
-from turbogs_plugin.files import write_atomically, write_text_atomically
+from turbogs_plugin.files import read_text, write_atomically, write_text_atomically
 
 FORMAT = 2
 KEPT = 2
@@ -45,7 +46,9 @@ def save_checkpoint(folder: Path, iteration: int, state: dict[str, Any]) -> Path
         TrainingStopped: the disk refused; the newest checkpoint is what it was before.
         TypeError: something in `state` is not plain.
     """
-    _require_plain(state, "state")
+    for place, value in _leaves(state, "state"):
+        if type(value) not in (Tensor, int, float, bool, str, type(None)):
+            raise TypeError(f"{place}: a checkpoint holds tensors and plain values, not {type(value).__name__}")
     path = folder / f"iteration-{iteration:06d}.pt"
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -62,7 +65,8 @@ def save_checkpoint(folder: Path, iteration: int, state: dict[str, Any]) -> Path
     for leftover in folder.glob(".iteration-*.pt.part"):  # of a killed process
         leftover.unlink(missing_ok=True)
     others = [file for file in folder.iterdir() if _NAME.fullmatch(file.name) and file != path]
-    for old in sorted(others, key=_iteration_of)[: len(others) - (KEPT - 1)]:
+    others.sort(key=lambda file: int(_NAME.fullmatch(file.name)[1]))
+    for old in others[: len(others) - (KEPT - 1)]:
         old.unlink(missing_ok=True)
     return path
 
@@ -73,12 +77,10 @@ def latest_checkpoint(folder: Path) -> Path | None:
     Raises:
         InputError: `latest` names no checkpoint of this folder.
     """
-    try:
-        name = (folder / "latest").read_text(encoding="utf-8").strip()
-    except FileNotFoundError:
+    text = read_text(folder / "latest")
+    if text is None:
         return None
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"cannot read '{folder / 'latest'}': {error}") from None
+    name = text.strip()
     if not _NAME.fullmatch(name) or not (folder / name).is_file():
         raise InputError(f"'{folder / 'latest'}' names no checkpoint of its folder: '{name[:60]}'")
     return folder / name
@@ -98,7 +100,9 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
         state = torch.load(path, map_location="cpu", weights_only=True)
         if not isinstance(state, dict) or state.pop("format", None) != FORMAT:
             raise ValueError("not a checkpoint of this version of TurboGS")
-        _require_dense(state)
+        tensors = [value for _, value in _leaves(state, "state") if isinstance(value, Tensor)]
+        if any(tensor.numel() * tensor.element_size() > tensor.untyped_storage().nbytes() for tensor in tensors):
+            raise ValueError("it has a tensor that is not stored whole")
     except OSError as error:
         raise InputError(f"cannot read checkpoint '{path}': {error.strerror or error}") from None
     except Exception as error:  # torch and zipfile raise a dozen kinds for malformed files
@@ -108,11 +112,11 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
 
 
 def require_like(saved: Any, present: Any, place: str) -> None:
-    """Refuse a state that is not made as a present one: other keys, other types, other dtypes or dimensions of tensors,
-    or numbers that are not finite.
+    """Refuse a state whose structure differs from the present one: other keys or types, other dtypes or dimensions of
+    tensors. Numbers that are not finite are refused too.
 
-    How many rows a tensor has may differ, as that depends on how far the run had come, and so may whether a part has a
-    state at all: None stands for a mapping.
+    The number of rows of a tensor may differ, as it depends on how far the run had come. A part may have no state yet:
+    then None stands in the place of a mapping.
 
     Raises:
         ValueError: naming the place.
@@ -129,7 +133,7 @@ def require_like(saved: Any, present: Any, place: str) -> None:
             require_like(saved[key], value, f"{place}.{key}")
     elif isinstance(present, Tensor):
         if saved.dtype != present.dtype or saved.dim() != present.dim() or saved.shape[1:] != present.shape[1:]:
-            raise ValueError(f"{place} is {_plan(saved)}, which does not fit {_plan(present)}")
+            raise ValueError(f"{place} is {_layout(saved)}, which does not fit {_layout(present)}")
         if not saved.isfinite().all():
             raise ValueError(f"{place} is not finite")
     elif isinstance(present, float) and not math.isfinite(saved):
@@ -138,25 +142,8 @@ def require_like(saved: Any, present: Any, place: str) -> None:
         raise ValueError(f"{place} is {saved}, which is no count")
 
 
-def _plan(tensor: Tensor) -> str:
+def _layout(tensor: Tensor) -> str:
     return f"{str(tensor.dtype).removeprefix('torch.')} {tuple(tensor.shape)}"
-
-
-def _iteration_of(file: Path) -> int:
-    return int(_NAME.fullmatch(file.name).group(1))
-
-
-def _require_plain(value: Any, place: str) -> None:
-    if isinstance(value, dict):
-        for key, item in value.items():
-            if not isinstance(key, str | int):
-                raise TypeError(f"{place}: a checkpoint's keys are text or numbers, not {type(key).__name__}")
-            _require_plain(item, f"{place}.{key}")
-    elif isinstance(value, list | tuple):
-        for index, item in enumerate(value):
-            _require_plain(item, f"{place}[{index}]")
-    elif type(value) not in (Tensor, int, float, bool, str, type(None)):
-        raise TypeError(f"{place}: a checkpoint holds tensors and plain values, not {type(value).__name__}")
 
 
 def _require_bounded(path: Path) -> None:
@@ -169,12 +156,14 @@ def _require_bounded(path: Path) -> None:
         raise ValueError("its entries overlap")
 
 
-def _require_dense(value: Any) -> None:
-    """Refuse tensors that claim more elements than are stored."""
+def _leaves(value: Any, place: str) -> Iterator[tuple[str, Any]]:
+    """(place, value) of all that lies in nested dicts, lists and tuples, and of the dicts' keys."""
     if isinstance(value, dict):
-        value = list(value.values())
-    if isinstance(value, list | tuple):
-        for item in value:
-            _require_dense(item)
-    elif isinstance(value, Tensor) and value.numel() * value.element_size() > value.untyped_storage().nbytes():
-        raise ValueError("it has a tensor that is not stored whole")
+        for key, item in value.items():
+            yield f"{place}.{key}", key
+            yield from _leaves(item, f"{place}.{key}")
+    elif isinstance(value, list | tuple):
+        for index, item in enumerate(value):
+            yield from _leaves(item, f"{place}[{index}]")
+    else:
+        yield place, value

@@ -15,7 +15,7 @@ from torch import Tensor
 from torchmetrics.functional.image import structural_similarity_index_measure
 
 from turbogs_plugin.device import synchronize
-from turbogs_plugin.engine.rendering import DEFAULT_SETTINGS, RasterSettings, render_image
+from turbogs_plugin.engine.rendering import RasterSettings, render_image
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene import PosedImages
 from turbogs_plugin.types import Gaussians
@@ -28,6 +28,9 @@ PSNR_LIMIT = 100.0
 
 VGG16_FILE = "vgg16-397923af.pth"
 """The name under which torchvision looks for the backbone of LPIPS."""
+
+Lpips = Callable[[Tensor, Tensor], float]
+"""LPIPS of two images [H, W, 3], 0 .. 1."""
 
 
 @dataclass
@@ -58,42 +61,22 @@ class Metrics:
         return math.fsum(getattr(view, name) for view in self.views) / len(self.views)
 
     @property
-    def psnr(self) -> float:
-        return self.mean("psnr")
-
-    @property
     def worst_psnr(self) -> float:
         """Of the worst view: a mean hides that something covers one of them. NaN where a view has none."""
         values = [view.psnr for view in self.views]
         return math.nan if any(map(math.isnan, values)) else min(values)
 
-    @property
-    def ssim(self) -> float:
-        return self.mean("ssim")
-
-    @property
-    def l1(self) -> float:
-        return self.mean("l1")
-
-    @property
-    def lpips(self) -> float:
-        return self.mean("lpips")
-
 
 @torch.no_grad()
 def evaluate(
-    gaussians: Gaussians,
-    views: PosedImages,
-    sh_degree: int | None = None,
-    settings: RasterSettings | None = None,
-    lpips: Callable[[Tensor, Tensor], float] | None = None,
+    gaussians: Gaussians, views: PosedImages, sh_degree: int, settings: RasterSettings, lpips: Lpips | None = None
 ) -> Metrics:
     """Render every view, one at a time, and compare it with its photo.
 
     Args:
         gaussians: the model, on the views' device.
         views: cameras and photos.
-        sh_degree: bands in use; None: all.
+        sh_degree: of the bands in use.
         settings: of the rasterizer.
         lpips: from `load_lpips`, where wanted.
     """
@@ -113,14 +96,10 @@ def evaluate(
 
 @torch.no_grad()
 def render_view(
-    gaussians: Gaussians,
-    views: PosedImages,
-    view_id: int,
-    sh_degree: int | None = None,
-    settings: RasterSettings | None = None,
+    gaussians: Gaussians, views: PosedImages, view_id: int, sh_degree: int, settings: RasterSettings
 ) -> Tensor:
     """[H, W, 3] float32, 0 .. 1: the model seen by one of the cameras."""
-    image = render_image(gaussians, views.cameras, view_id, sh_degree=sh_degree, settings=settings or DEFAULT_SETTINGS)
+    image = render_image(gaussians, views.cameras, view_id, sh_degree=sh_degree, settings=settings)
     return image.colors.clamp(0.0, 1.0)
 
 
@@ -135,7 +114,7 @@ def compare(name: str, image: Tensor, photo: Tensor) -> ViewMetrics:
     return ViewMetrics(name, psnr, ssim, (image - photo).abs().mean().item())
 
 
-def load_lpips(weights: str | None, device: torch.device) -> tuple[Callable[[Tensor, Tensor], float] | None, str]:
+def load_lpips(weights: str | None, device: torch.device) -> tuple[Lpips | None, str]:
     """LPIPS (VGG16) where torchvision and the backbone's weights are on this machine. Nothing is downloaded.
 
     Args:
@@ -143,7 +122,7 @@ def load_lpips(weights: str | None, device: torch.device) -> tuple[Callable[[Ten
         device: where to compute.
 
     Returns:
-        A function of two [H, W, 3] images, or None; and the reason for None.
+        The function, or None; and the reason for None.
 
     Raises:
         InputError: `weights` names no readable file.
@@ -158,7 +137,7 @@ def load_lpips(weights: str | None, device: torch.device) -> tuple[Callable[[Ten
     return _load_lpips(file, device), ""
 
 
-def _load_lpips(file: Path, device: torch.device) -> Callable[[Tensor, Tensor], float]:
+def _load_lpips(file: Path, device: torch.device) -> Lpips:
     from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
 
     cache = torch.hub.get_dir()

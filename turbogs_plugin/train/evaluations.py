@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-
-from torch import Tensor
+from dataclasses import dataclass, field
 
 from turbogs_plugin.device import peak_memory_bytes
 from turbogs_plugin.scene import PosedImages
-from turbogs_plugin.train.evaluate import Metrics, evaluate
+from turbogs_plugin.train.evaluate import Lpips, Metrics, evaluate
 from turbogs_plugin.train.history import Evaluation
 from turbogs_plugin.train.loop import Listener, TrainingLoop
 
 
+@dataclass
 class Evaluations(Listener):
     """Measures the model and tells all listeners of it.
 
@@ -26,40 +26,31 @@ class Evaluations(Listener):
         metrics: of the newest one.
     """
 
-    def __init__(
-        self,
-        test: PosedImages,
-        lpips: Callable[[Tensor, Tensor], float] | None = None,
-        peak_memory: Callable[[], int] | None = None,
-    ) -> None:
-        self.test = test
-        self.history: list[Evaluation] = []
-        self.metrics: Metrics | None = None
-        self._lpips = lpips
-        self._peak_memory = peak_memory
+    test: PosedImages
+    lpips: Lpips | None = None
+    peak_memory: Callable[[], int] | None = None
+    history: list[Evaluation] = field(default_factory=list, init=False)
+    metrics: Metrics | None = field(default=None, init=False)
 
     def begun(self, loop: TrainingLoop) -> None:
         if not self.history:
-            self._evaluate(loop)
+            self.evaluation_due(loop)
 
     def evaluation_due(self, loop: TrainingLoop) -> None:
-        self._evaluate(loop)
-
-    def _evaluate(self, loop: TrainingLoop) -> None:
         for listener in loop.listeners:
             listener.evaluating(loop)
         trainer = loop.trainer
         trainer.require_finite()
-        lpips = self._lpips if loop.finished else None
+        lpips = self.lpips if loop.finished else None
         metrics = evaluate(trainer.gaussians, self.test, trainer.sh_degree, trainer.config.raster, lpips)
         evaluation = Evaluation(
             iteration=trainer.iteration,
             train_seconds=loop.clock.seconds,
-            psnr=metrics.psnr,
-            ssim=metrics.ssim,
-            l1=metrics.l1,
+            psnr=metrics.mean("psnr"),
+            ssim=metrics.mean("ssim"),
+            l1=metrics.mean("l1"),
             num_gaussians=len(trainer.gaussians),
-            memory_bytes=self._peak_memory() if self._peak_memory else peak_memory_bytes(trainer.device),
+            memory_bytes=self.peak_memory() if self.peak_memory else peak_memory_bytes(trainer.device),
             nonfinite_losses=int(trainer.nonfinite_losses),
             skipped_updates=int(trainer.optimizer.skipped),
             worst_psnr=metrics.worst_psnr,

@@ -2,54 +2,33 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
-from turbogs_plugin.config.configuration import Config, resolve_complete, resolve_decided
+from turbogs_plugin.config.configuration import Config, resolve_complete
 from turbogs_plugin.config.yaml_text import read_yaml
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.files import require_writable
+from turbogs_plugin.files import read_text, require_writable
 from turbogs_plugin.plan import Plan
 
 
-@dataclass(frozen=True)
 class RunFolder:
-    """Where the parts of a run are."""
+    """Where the parts of a run are.
 
-    path: Path
+    Attributes:
+        asked: the configuration as it was asked for.
+        config: the resolved one: what plan and budgets made of it.
+    """
 
-    @property
-    def asked(self) -> Path:
-        """The configuration as it was asked for: `config` is what plan and budgets made of it."""
-        return self.path / "asked.yaml"
-
-    @property
-    def config(self) -> Path:
-        return self.path / "config.yaml"
-
-    @property
-    def plan(self) -> Path:
-        return self.path / "plan.json"
-
-    @property
-    def history(self) -> Path:
-        return self.path / "history.jsonl"
-
-    @property
-    def checkpoints(self) -> Path:
-        return self.path / "checkpoints"
-
-    @property
-    def report(self) -> Path:
-        return self.path / "report.md"
-
-    @property
-    def model(self) -> Path:
-        return self.path / "model.ply"
-
-    @property
-    def renders(self) -> Path:
-        return self.path / "renders"
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.asked = path / "asked.yaml"
+        self.config = path / "config.yaml"
+        self.plan = path / "plan.json"
+        self.history = path / "history.jsonl"
+        self.checkpoints = path / "checkpoints"
+        self.report = path / "report.md"
+        self.model = path / "model.ply"
+        self.renders = path / "renders"
 
     def require_new(self) -> None:
         """Raises `InputError` where the folder holds anything, or cannot be made."""
@@ -65,7 +44,7 @@ class RunFolder:
         """The resolved configuration of the run. Raises `InputError` where this is no run, or part of it is missing."""
         if not self.config.is_file():
             raise InputError(f"'{self.path}' holds no run: there is no config.yaml")
-        return resolve_decided(read_yaml(self.config), str(self.config))
+        return resolve_complete(read_yaml(self.config), str(self.config), decided=True)
 
     def read_asked(self) -> Config:
         """The configuration that was asked for. Raises `InputError` where it is missing or incomplete."""
@@ -75,9 +54,8 @@ class RunFolder:
 
     def read_plan(self) -> Plan | None:
         """What was planned when the run began, if it is there. Raises `InputError` where it cannot be read."""
+        text = read_text(self.plan)
         try:
-            return Plan.from_json(self.plan.read_text(encoding="utf-8"))
-        except FileNotFoundError:
-            return None
-        except (OSError, UnicodeDecodeError, InputError) as error:
+            return None if text is None else Plan.from_json(text)
+        except InputError as error:
             raise InputError(f"cannot read the plan '{self.plan}': {error}") from None

@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.files import write_text_atomically
+from turbogs_plugin.files import read_text, write_text_atomically
 
 
 @dataclass
@@ -54,17 +54,10 @@ def read_history(path: Path) -> list[Evaluation]:
     Raises:
         InputError: unreadable, or a line that is not an evaluation.
     """
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
-    except FileNotFoundError:
-        return []
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"cannot read '{path}': {error}") from None
+    text = read_text(path) or ""
     names = {field.name for field in fields(Evaluation)}
     evaluations = []
-    for number, line in enumerate(lines, start=1):
-        if number == len(lines) and not line.endswith("\n"):
-            break
+    for number, line in enumerate(text[: text.rfind("\n") + 1].splitlines(), start=1):
         try:
             values = {name: value for name, value in json.loads(line).items() if name in names}
             evaluations.append(Evaluation(**{name: math.nan if v is None else v for name, v in values.items()}))

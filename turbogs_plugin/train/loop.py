@@ -15,7 +15,7 @@ from turbogs_plugin.train.trainer import Trainer
 
 
 class Listener:
-    """Hears of a training what concerns it: a listener overrides the methods that it needs."""
+    """Is told what happens in a training. A listener overrides the methods that it needs."""
 
     def begun(self, loop: TrainingLoop) -> None:
         """The error maps are there, and this process has made no iteration yet."""
@@ -74,8 +74,16 @@ class TrainingLoop:
         while not (self.finished or self.stopped):
             mark = pace.next_mark(trainer.iteration, clock.seconds)
             self.advance(mark)
-            if trainer.iteration == mark:
-                self._arrive()
+            if trainer.iteration < mark:  # stopped on the way
+                break
+            due = pace.reached(trainer.iteration, clock.seconds, len(trainer.gaussians))
+            trainer.set_length(pace.iterations, pace.refine_until)
+            if due.evaluate:
+                for listener in self.listeners:
+                    listener.evaluation_due(self)
+            if due.save:
+                for listener in self.listeners:
+                    listener.checkpoint_due(self)
 
     def advance(self, mark: int) -> None:
         """Train until so many iterations are finished, or until `stop`."""
@@ -100,15 +108,3 @@ class TrainingLoop:
         if self.trainer.iteration >= mark or self.stopped:
             self.trainer.repeat_lost(wait=True)
         return self.trainer.iteration < mark and not self.stopped
-
-    def _arrive(self) -> None:
-        """At a mark: the pace says how long the run is now, and what is due."""
-        trainer, pace = self.trainer, self.pace
-        due = pace.reached(trainer.iteration, self.clock.seconds, len(trainer.gaussians))
-        trainer.set_length(pace.iterations, pace.refine_until)
-        if due.evaluate:
-            for listener in self.listeners:
-                listener.evaluation_due(self)
-        if due.save:
-            for listener in self.listeners:
-                listener.checkpoint_due(self)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 import time
-from types import TracebackType
 from typing import Any, TypeVar
 
 from rich.console import Console
@@ -20,6 +19,7 @@ from rich.progress import (
 
 from turbogs_plugin.train.history import Evaluation
 from turbogs_plugin.train.loop import Listener, TrainingLoop
+from turbogs_plugin.train.trainer import Trainer
 
 REFRESH_SECONDS = 0.1
 """Between two updates of the bar, so that it costs a fast iteration nothing."""
@@ -49,9 +49,7 @@ class TerminalBar(Listener):
             self._bar.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         if self._bar is not None:
             self._bar.stop()
 
@@ -59,12 +57,12 @@ class TerminalBar(Listener):
         if self._bar is None or time.perf_counter() < self._next_refresh:
             return
         self._next_refresh = time.perf_counter() + REFRESH_SECONDS
-        trainer = loop.trainer
+        self._show(loop.trainer)
+
+    def _show(self, trainer: Trainer, **columns: str) -> None:
+        gaussians = f"{len(trainer.gaussians):,}"
         self._bar.update(
-            self._task,
-            completed=trainer.iteration,
-            total=trainer.iterations,
-            gaussians=f"{len(trainer.gaussians):,}",
+            self._task, completed=trainer.iteration, total=trainer.iterations, gaussians=gaussians, **columns
         )
         self._bar.refresh()
 
@@ -97,15 +95,7 @@ class TrainingProgress(TerminalBar):
     def evaluated(self, loop: TrainingLoop, evaluation: Evaluation) -> None:
         warning, total = describe_nonfinite(evaluation), loop.trainer.iterations
         if self._bar is not None:
-            self._bar.update(
-                self._task,
-                completed=evaluation.iteration,
-                total=total,
-                psnr=f"{evaluation.psnr:.2f}",
-                gaussians=f"{evaluation.num_gaussians:,}",
-                warning=warning,
-            )
-            self._bar.refresh()
+            self._show(loop.trainer, psnr=f"{evaluation.psnr:.2f}", warning=warning)
             return
         print(
             f"iteration {evaluation.iteration:>{len(str(total))}}/{total}  "

@@ -17,7 +17,7 @@ from turbogs_plugin.errors import InputError, TrainingStopped
 from turbogs_plugin.files import write_text_atomically
 from turbogs_plugin.model.ply import save_ply
 from turbogs_plugin.plan import Plan, make_plan
-from turbogs_plugin.scene import Frame, PosedImages, Scene, load_scene
+from turbogs_plugin.scene import Frame, Scene, load_scene
 from turbogs_plugin.scene.fingerprint import capture_difference, capture_state, frame_of_state
 from turbogs_plugin.scene.offload import place_views
 from turbogs_plugin.train.calibration import Calibration, budget_text, hold_to, within_budget
@@ -32,37 +32,6 @@ from turbogs_plugin.train.pace import pace_of
 from turbogs_plugin.train.progress import TrainingProgress
 from turbogs_plugin.train.trainer import Trainer, gaussians_of_state
 from turbogs_plugin.types import Gaussians
-
-
-@dataclass
-class Outcome:
-    """How a call of `train` or `resume` ended. `signal`: the one that stopped it, or None at the end of the run."""
-
-    folder: RunFolder
-    history: list[Evaluation]
-    signal: int | None = None
-
-
-@dataclass
-class FinishedRun:
-    """A run at its end, for who reports on it.
-
-    Args:
-        plan: that the run followed; None where its folder holds none.
-        trainer: with the final model.
-        test: the test views, on the trainer's device.
-        history: every evaluation.
-    """
-
-    folder: RunFolder
-    plan: Plan | None
-    scene: Scene
-    trainer: Trainer
-    test: PosedImages
-    history: list[Evaluation]
-
-
-ReportWriter = Callable[[FinishedRun], object]
 
 
 @dataclass
@@ -92,7 +61,7 @@ def open_scene(config: Config, folder: RunFolder | None = None) -> Scene:
     """The capture of a configuration.
 
     Args:
-        folder: of the run that names the capture, where the user does not.
+        folder: of the run whose configuration this is; None where the user names the capture.
 
     Raises:
         InputError: no usable capture there.
@@ -113,20 +82,14 @@ def plan_run(config: Config) -> Plan:
         InputError: anything wrong with the input.
     """
     device = resolve_device(config.train.device)
-    return plan_scene(config, open_scene(config), device)
-
-
-def plan_scene(config: Config, scene: Scene, device: torch.device) -> Plan:
-    """The plan of a loaded scene, within the budgets of the configuration."""
-    limit, seconds = config.budget.memory_bytes(), config.budget.seconds()
-    return make_plan(config, scene, device, memory_limit=limit, time_budget=seconds)
+    return make_plan(config, open_scene(config), device)
 
 
 def new_loop(config: Config, scene: Scene, device: torch.device) -> tuple[TrainingLoop, Calibration | None]:
-    """A training within its budgets, which has not begun: of a run as of a cell of a study.
+    """A training that has not begun, fitted to its budgets. Runs and the cells of studies both begin here.
 
     Args:
-        config: its plan is carried out. That of the trainer is the one fitted to the budgets.
+        config: with nothing left to decide (`Plan.apply`). The trainer's is the one fitted to the budgets.
 
     Returns:
         The loop, without listeners; and what was measured for a time budget, which is in the loop's seconds.
@@ -157,14 +120,14 @@ def fit(scene: Scene, *overrides: str, config: str = DEFAULT_CONFIG) -> Gaussian
     """
     settings = load_config(config, overrides)
     device = resolve_device(settings.train.device)
-    loop, _ = new_loop(plan_scene(settings, scene, device).apply(settings), scene, device)
+    loop, _ = new_loop(make_plan(settings, scene, device).apply(settings), scene, device)
     loop.run()
     loop.trainer.require_finite()
     return loop.trainer.gaussians
 
 
-def train(config: Config, out: Path, report: ReportWriter | None = None) -> Outcome:
-    """Train from the start into a new folder, by a plan that is told first.
+def train(config: Config, out: Path, report: Callable[[RunSession], object] | None = None) -> RunSession:
+    """Train from the start into a new folder. The plan is printed first.
 
     Args:
         report: is handed the run when it is finished; `turbogs_plugin.report.pages.write_report` writes its page.
@@ -178,11 +141,11 @@ def train(config: Config, out: Path, report: ReportWriter | None = None) -> Outc
     device = resolve_device(config.train.device)
     scene = open_scene(config)
     load_lpips(config.report.lpips_weights, device)
-    plan = plan_scene(config, scene, device)
+    plan = make_plan(config, scene, device)
     remedy = "use train.photos_place=host and train.maps_place=host, --max-gaussians or a larger --factor"
     with _fitting(scene, remedy):
         loop, calibration = new_loop(_independent(plan.apply(config), device), scene, device)
-        session = _Session(folder, plan, scene, loop)
+        session = RunSession(folder, plan, scene, loop)
     resolved = loop.trainer.config
     print("\n".join(filter(None, [plan.text(), budget_text(resolved, calibration)])), file=sys.stderr)
     folder.path.mkdir(parents=True, exist_ok=True)
@@ -192,7 +155,7 @@ def train(config: Config, out: Path, report: ReportWriter | None = None) -> Outc
     return session.run(report)
 
 
-def resume(path: Path, report: ReportWriter | None = None) -> Outcome:
+def resume(path: Path, report: Callable[[RunSession], object] | None = None) -> RunSession:
     """Go on with a stopped run from its newest checkpoint, by its own configuration, in which all is decided.
 
     On a CPU, the result is bit for bit that of a run never stopped.
@@ -217,16 +180,16 @@ def resume(path: Path, report: ReportWriter | None = None) -> Outcome:
         hold_to(limit, device)
     with _fitting(scene, "end what else is in that memory, or go on with this run where there is more"):
         loop = TrainingLoop(Trainer(config, scene, device), pace_of(config))
-        session = _Session(folder, plan, scene, loop)
+        session = RunSession(folder, plan, scene, loop)
         if state is not None:
             session.load_state_dict(state, str(checkpoint))
-    session.evaluations.history = rewind_history(folder.history, loop.trainer.iteration if session.resumed else -1)
+    session.history += rewind_history(folder.history, loop.trainer.iteration if session.resumed else -1)
     return session.run(report)
 
 
 @contextmanager
 def _fitting(scene: Scene, remedy: str) -> Iterator[None]:
-    """Around what takes memory of the device before training; where there is too little, the user hears of a remedy."""
+    """Turns a lack of device memory before training into an `InputError` that names a remedy."""
     try:
         yield
     except torch.cuda.OutOfMemoryError:
@@ -234,7 +197,7 @@ def _fitting(scene: Scene, remedy: str) -> Iterator[None]:
 
 
 def _independent(config: Config, device: torch.device) -> Config:
-    """The configuration, with what else would depend on where the run is resumed from written into it."""
+    """The configuration with absolute paths and the device in use, so that a resume finds the same ones anywhere."""
     config.scene.path = str(Path(config.scene.path).resolve())
     if config.report.lpips_weights is not None:
         config.report.lpips_weights = str(Path(config.report.lpips_weights).resolve())
@@ -263,31 +226,41 @@ def load_model(path: Path, device: torch.device) -> SavedModel:
         raise InputError(f"checkpoint '{checkpoint}' is not one of a run: {error}") from None
 
 
-class _Session(Listener):
-    """One process's share of a run: keeps in the folder what the loop comes to."""
+class RunSession(Listener):
+    """One process's part of a run: trains, and writes what comes of it into the run's folder.
+
+    Attributes:
+        plan: that the run follows; None where its folder holds none.
+        test: the test views, on the trainer's device.
+        history: every evaluation of the run.
+        resumed: the trainer's state was loaded.
+        signal: the one that stopped the training; None at the end of the run.
+    """
 
     def __init__(self, folder: RunFolder, plan: Plan | None, scene: Scene, loop: TrainingLoop) -> None:
         self.folder, self.plan, self.scene, self.loop = folder, plan, scene, loop
         self.trainer = loop.trainer
-        test = place_views(scene.test, self.trainer.device, self.trainer.config.train.photos_place)
-        self.evaluations = Evaluations(test)
+        self.test = place_views(scene.test, self.trainer.device, self.trainer.config.train.photos_place)
+        self.evaluations = Evaluations(self.test)
+        self.history = self.evaluations.history
         self.resumed = False
-        self.saved_at = -1
+        self.signal: int | None = None
+        self._saved_at = -1
 
-    def run(self, report: ReportWriter | None) -> Outcome:
+    def run(self, report: Callable[[RunSession], object] | None) -> RunSession:
         """Train to the end, or until a signal; both end with a checkpoint."""
         loop, trainer = self.loop, self.trainer
         try:
-            with (
-                Interrupts(loop.stop) as interrupts,
-                TrainingProgress(trainer.iterations, trainer.iteration) as progress,
-            ):
+            progress = TrainingProgress(trainer.iterations, trainer.iteration)
+            with Interrupts(loop.stop) as interrupts, progress:
                 loop.listeners = [self.evaluations, self, progress]
                 loop.run(self.resumed)
-                if loop.stopped and trainer.iteration != self.saved_at:
+                if loop.stopped and trainer.iteration != self._saved_at:
                     self._save()
             if loop.finished:
-                self._finish(report)
+                save_ply(trainer.gaussians, self.folder.model, self.scene.frame)
+                if report is not None:
+                    report(self)
         except TrainingStopped as stop:
             raise TrainingStopped(f"{stop}; {self._last_good()}") from stop
         except torch.cuda.OutOfMemoryError as error:
@@ -295,7 +268,8 @@ class _Session(Listener):
                 f"iteration {trainer.iteration}: the device's memory was too small for {len(trainer.gaussians)} "
                 f"Gaussians; try --max-gaussians {round(0.7 * len(trainer.gaussians))}; {self._last_good()}"
             ) from error
-        return Outcome(self.folder, self.evaluations.history, None if loop.finished else interrupts.signal)
+        self.signal = None if loop.finished else interrupts.signal
+        return self
 
     def evaluated(self, loop: TrainingLoop, evaluation: Evaluation) -> None:
         append_evaluation(self.folder.history, evaluation)
@@ -336,14 +310,7 @@ class _Session(Listener):
     def _save(self) -> None:
         self.trainer.require_finite()
         save_checkpoint(self.folder.checkpoints, self.trainer.iteration, self.state_dict())
-        self.saved_at = self.trainer.iteration
-
-    def _finish(self, report: ReportWriter | None) -> None:
-        """The model as a .ply, and the report."""
-        save_ply(self.trainer.gaussians, self.folder.model, self.scene.frame)
-        if report is not None:
-            evaluations = self.evaluations
-            report(FinishedRun(self.folder, self.plan, self.scene, self.trainer, evaluations.test, evaluations.history))
+        self._saved_at = self.trainer.iteration
 
     def _last_good(self) -> str:
         checkpoint = latest_checkpoint(self.folder.checkpoints)

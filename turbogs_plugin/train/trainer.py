@@ -13,7 +13,7 @@ from torch import Tensor
 from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.engine import engine_of
 from turbogs_plugin.engine.layout import MAX_SH_DEGREE
-from turbogs_plugin.engine.rendered import Rendered, ScreenGradients
+from turbogs_plugin.engine.rendered import ScreenGradients
 from turbogs_plugin.engine.rendering import render_image
 from turbogs_plugin.errors import TrainingStopped
 from turbogs_plugin.model.distant import RESTRAIN_EVERY, restrain_distant
@@ -23,18 +23,13 @@ from turbogs_plugin.plan.caps import cap_of, chosen_points
 from turbogs_plugin.scene import Scene
 from turbogs_plugin.scene.offload import place_maps, place_views
 from turbogs_plugin.scene.photos import PhotoSamples
-from turbogs_plugin.types import (
-    PARAMETER_NAMES,
-    Gaussians,
-    GaussianStats,
-    LossOutput,
-    PixelSamples,
-    RowUpdate,
-    Step,
-)
+from turbogs_plugin.types import PARAMETER_NAMES, Gaussians, GaussianStats, LossOutput, RowUpdate, Step
 
 COLOR_STRIDE = 97
 """Every so many pixels count for the mean colour of the photos; coprime to usual widths."""
+
+STATEFUL = ("maps", "view_sampler", "optimizer", "density")
+"""Attributes of a trainer that keep a state of their own."""
 
 
 class Trainer:
@@ -102,7 +97,10 @@ class Trainer:
         truth = self.views.photos.at(samples)
 
         # 5) Sparse forward rendering
-        rendered = self.render(view_ids, samples)
+        cameras = self.views.cameras.select(view_ids)
+        rendered = self.engine.render(
+            self.gaussians, cameras, samples, sh_degree=self.sh_degree, settings=self.config.raster
+        )
 
         # 6) Sparse loss and its gradients, and 7) EMA update of the error maps
         loss = self.supervise(rendered.colors, truth, step)
@@ -118,16 +116,6 @@ class Trainer:
         self.follow(self.density.update(self.gaussians, step))
 
         self.iteration += 1
-
-    def render(self, view_ids: tuple[int, ...], samples: PixelSamples) -> Rendered:
-        """The present model at the samples of some training views."""
-        return self.engine.render(
-            self.gaussians,
-            self.views.cameras.select(view_ids),
-            samples,
-            sh_degree=self.sh_degree,
-            settings=self.config.raster,
-        )
 
     def supervise(self, colors: Tensor, truth: PhotoSamples, step: Step) -> LossOutput:
         """Loss and error maps: at once where the loss is a rule, else by the loss's own code."""
@@ -218,10 +206,7 @@ class Trainer:
             "initial_error": self.initial_error,
             "nonfinite_losses": int(self.nonfinite_losses),
             "gaussians": dict(self.gaussians.items()),
-            "maps": self.maps.state_dict(),
-            "view_sampler": self.view_sampler.state_dict(),
-            "optimizer": self.optimizer.state_dict(),
-            "density": self.density.state_dict(),
+            **{name: getattr(self, name).state_dict() for name in STATEFUL},
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -239,12 +224,10 @@ class Trainer:
         self.initial_error = state["initial_error"]
         self.nonfinite_losses.fill_(state["nonfinite_losses"])
         self.gaussians = gaussians_of_state(state, self.device)
-        self.maps.load_state_dict(state["maps"])
-        self.view_sampler.load_state_dict(state["view_sampler"])
         self.optimizer.setup(self.gaussians)
-        self.optimizer.load_state_dict(state["optimizer"])
         self.density.setup(self.gaussians)
-        self.density.load_state_dict(state["density"])
+        for name in STATEFUL:
+            getattr(self, name).load_state_dict(state[name])
 
 
 def initial_gaussians(scene: Scene, config: Config) -> Gaussians:
