@@ -38,7 +38,7 @@ void sparse_loss(const TensorList& tensors, const IntegerList& integers, const R
     params.num_tiles = to_int(tiles, "tiles");
     params.num_slots = to_int(slots, "samples");
     params.structure = to_enumeration<Structure>(in.integer(I::structure), kNumStructures,
-                                                 "structure must be 0 (none), 1 (ncc), 2 (contrast) or 3 (ssim)");
+                                                 "structure must be 0 (none), 1 (ncc), 2 (contrast), 3 (ssim) or 4 (printed_ncc)");
     params.epsilon = in.number(R::epsilon);
     params.l1_weight = in.number(R::l1_weight);
     params.structure_weight = in.number(R::structure_weight);
