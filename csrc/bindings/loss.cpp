@@ -27,7 +27,7 @@ void launches::SparseLoss::run(const Arguments<SparseLoss>& in) {
     params.num_tiles = to_int(tiles, "tiles");
     params.num_slots = to_int(slots, "samples");
     params.structure = to_enumeration<Structure>(in.integer(Integers::structure), kNumStructures,
-                                                 "structure must be 0 (none), 1 (ncc), 2 (contrast) or 3 (ssim)");
+                                                 "structure must be 0 .. 4: none, ncc, contrast, ssim or printed_ncc");
     params.epsilon = in.number(Reals::epsilon);
     params.l1_weight = in.number(Reals::l1_weight);
     params.structure_weight = in.number(Reals::structure_weight);

@@ -199,6 +199,8 @@ __device__ __forceinline__ TileTotals tile_loss(const SparseLossParams& params, 
                 similarity = correlation(xx, yy, xy, params.variance_constant);
             } else if (params.structure == Structure::kContrast) {
                 similarity = contrast(xx, yy, xy, params.variance_constant);
+            } else if (params.structure == Structure::kPrintedNcc) {
+                similarity = printed_correlation(xx, yy, xy, params.variance_constant);
             } else {
                 similarity = ssim(mean_x[c] + first_x[c], mean_y[c] + first_y[c], xx, yy, xy);
             }

@@ -23,6 +23,13 @@ __device__ __forceinline__ Similarity correlation(float variance_x, float varian
     return {value, 1.0f / scale_x / scale_y, value / scale_x / scale_x, 0.0f};
 }
 
+__device__ __forceinline__ Similarity printed_correlation(float variance_x, float variance_y, float covariance,
+                                                          float epsilon) {
+    const float scale = sqrtf(variance_x * variance_y + epsilon);
+    const float value = covariance / scale;
+    return {value, 1.0f / scale, value / (variance_x + epsilon), 0.0f};
+}
+
 __device__ __forceinline__ Similarity contrast(float variance_x, float variance_y, float covariance, float c) {
     const float denominator = variance_x + variance_y + c;
     const float value = (2.0f * covariance + c) / denominator;

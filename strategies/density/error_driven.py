@@ -48,7 +48,7 @@ class ErrorDrivenDensity:
         grad_threshold, absgrad_threshold: of the mean over views of the screen gradient and of its absolute variant
             (tau_grad, tau_grad_abs), in gsplat's units. Either suffices.
         top_fraction: share of the seen, the most difficult, that may be densified (eta_topk).
-        percent_dense: clone where 3 * largest standard deviation <= this * scene extent, else split (rho_dense).
+        percent_dense: clone where the largest standard deviation <= this * scene extent, else split (rho_dense).
         split: two draws from the Gaussian, all axes divided by 1.6 as in 3DGS (`sample`); or two halves along its
             longest axis, which is divided by 1.6, so placed that the pair has the parent's mean and covariance
             (`long_axis`).
@@ -224,7 +224,7 @@ class ErrorDrivenDensity:
         candidates = passes & difficult & ~hopeless
 
         largest = gaussians.scales.amax(dim=-1).exp()  # [N]
-        small = 3 * largest <= self.percent_dense * extent
+        small = largest <= self.percent_dense * extent
         big = torch.zeros_like(seen)
         if step.progress >= self.prune_size_from:
             if self.prune_world_size > 0:

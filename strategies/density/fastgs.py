@@ -73,7 +73,7 @@ class FastGsDensity:
     refine_every: int = 500
     grad_threshold: float = ErrorDrivenDensity.grad_threshold
     absgrad_threshold: float = 1.2e-3
-    percent_dense: float = ErrorDrivenDensity.percent_dense
+    percent_dense: float = 0.001
     prune_opacity: float = ErrorDrivenDensity.prune_opacity
     prune_world_size: float = ErrorDrivenDensity.prune_world_size
     error_threshold: float = 1.0

@@ -28,6 +28,7 @@ CASES = {
     "ncc": CharbonnierNccLoss(),
     "contrast": CharbonnierNccLoss(structure="contrast", gate=True, ncc_weight=1.0),
     "ssim": SparseSsimLoss(),
+    "printed": CharbonnierNccLoss(structure="printed_ncc", ncc_weight=1.0, variance_constant=1e-6),
 }
 
 

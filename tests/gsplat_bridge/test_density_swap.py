@@ -105,7 +105,7 @@ BASE_OF_CONTROLLER = {
     "refine_every": 3,
     "grad_threshold": 0.02,
     "absgrad_threshold": 0.02,
-    "percent_dense": 0.51,  # of three standard deviations
+    "percent_dense": 0.17,
     "top_fraction": 0.5,
     "lambda_base": 0.8,
     "score": "balanced",
@@ -125,7 +125,7 @@ FIELDS = {
     "grow_grad2d": ({"grow_grad2d": 0.001}, {"grad_threshold": 0.001}),
     "absgrad": ({"absgrad": False}, {}),
     "grow_absgrad2d": ({"grow_absgrad2d": 0.05}, {"absgrad_threshold": 0.05}),
-    "grow_scale3d": ({"grow_scale3d": 0.2}, {"percent_dense": 0.6}),
+    "grow_scale3d": ({"grow_scale3d": 0.2}, {"percent_dense": 0.2}),
     "scene_scale": ({}, {}),
     "seed": ({"seed": 7}, {}),
     "top_fraction": ({"top_fraction": 0.2}, {"top_fraction": 0.2}),

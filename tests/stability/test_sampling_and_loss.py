@@ -64,7 +64,7 @@ def test_training_on_any_errors_keeps_maps_and_samples_valid(
     contrast=LEVELS,
     truth_level=st.sampled_from([0.0, 0.3, 1.0]),
     truth_contrast=st.sampled_from([0.0, 1e-8, 1e-3, 1.0]),
-    structure=st.sampled_from(["ncc", "contrast"]),
+    structure=st.sampled_from(["ncc", "printed_ncc", "contrast"]),
     variance_constant=st.sampled_from([1e-8, 0.03**2]),
     gate=st.booleans(),
     dtype=st.sampled_from([torch.float16, torch.float32, torch.float64]),

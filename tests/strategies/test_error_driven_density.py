@@ -87,7 +87,7 @@ def test_event_equals_plain_loops(seed, config):
     """Who is cloned, split and pruned, one Gaussian at a time."""
     count = 200
     gaussians, stats = make_gaussians(count, seed), random_stats(count, seed)
-    density = controlled(gaussians, stats, percent_dense=0.04, **config)
+    density = controlled(gaussians, stats, percent_dense=0.013, **config)
     score, seen = (value.tolist() for value in density.scores(FULL))
     update = density.update(gaussians, FULL)
 
@@ -98,7 +98,7 @@ def test_event_equals_plain_loops(seed, config):
     for i in range(count):
         views = max(1.0, float(stats.view_counts[i]))
         largest = math.exp(float(gaussians.scales[i].max()))
-        small = 3 * largest <= 0.04 * 2.0
+        small = largest <= 0.013 * 2.0
         passes = float(stats.grad_sums[i]) / views > 2e-4 or float(stats.absgrad_sums[i]) / views > 4e-4
         transparent = 1 / (1 + math.exp(-float(gaussians.opacities[i]))) < density.prune_opacity
         easy = density.prune_score_fraction > 0 and seen[i] and score[i] < easy_limit

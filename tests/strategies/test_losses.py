@@ -188,6 +188,46 @@ def test_textured_tiles_have_the_papers_ncc():
         assert structure.item() == pytest.approx(factor * expected, rel=1e-5)
 
 
+def test_printed_ncc_is_the_appendix():
+    """S and its gradient, written out; far above epsilon they are numpy's correlation and its derivative."""
+    colors, targets, samples = random_case(counts=(9, 16), empty=(1, 0))
+    x, y = 0.05 * colors.numpy(), 0.05 * targets.numpy()  # variances of 1e-4, where epsilon counts
+    for epsilon, far_above in ((1e-6, False), (1e-14, True)):
+        loss = CharbonnierNccLoss(ncc_weight=1.0, structure="printed_ncc", variance_constant=epsilon)
+        result = loss(torch.as_tensor(x), torch.as_tensor(y), samples)
+        plain = CharbonnierLoss()(torch.as_tensor(x), torch.as_tensor(y), samples)
+        value, gradient = 0.0, np.zeros_like(x)
+        for slots in tiles_of(samples):
+            scores, slopes = np.zeros(3), np.zeros((len(slots), 3))
+            for c in range(3):
+                a, b = x[slots, c], y[slots, c]
+                da, db = a - a.mean(), b - b.mean()
+                root = np.sqrt(a.var() * b.var() + epsilon)
+                scores[c] = (da * db).mean() / root
+                slopes[:, c] = db / root - scores[c] * da / (a.var() + epsilon)
+                if far_above:
+                    assert scores[c] == pytest.approx(np.corrcoef(a, b)[0, 1], rel=1e-5)
+            d = x[slots] - y[slots]
+            norm_l1 = np.abs(d / np.sqrt(d**2 + loss.epsilon**2)).sum(axis=1).mean()
+            factor = min(1.0, norm_l1 / (np.abs(slopes).sum(axis=1).mean() + 1e-8))
+            value += factor * (1 - scores).mean() / 2
+            gradient[slots] = -factor * slopes / len(slots) / 3 / 2
+        assert (result.loss - plain.loss).item() == pytest.approx(value, rel=1e-6)
+        assert np.allclose((result.color_gradients - plain.color_gradients).numpy(), gradient, rtol=1e-6, atol=1e-12)
+
+
+def test_a_flat_tile_scores_zero_as_printed_and_one_with_the_floor():
+    colors, targets = extreme_tiles()["truth constant"]
+    plain = CharbonnierLoss()(colors, targets, make_samples([30]))
+    printed = CharbonnierNccLoss(ncc_weight=1.0, structure="printed_ncc")(colors, targets, make_samples([30]))
+    assert torch.equal(printed.color_gradients, plain.color_gradients)  # no information, no gradient
+    flat = torch.full((30, 3), 0.3)
+    for structure, score in (("printed_ncc", 0.0), ("ncc", 1.0)):
+        loss = CharbonnierNccLoss(ncc_weight=1.0, structure=structure)(flat + 0.2, flat, make_samples([30])).loss
+        l1 = CharbonnierLoss()(flat + 0.2, flat, make_samples([30])).loss
+        assert (loss - l1).item() == pytest.approx(1.0 - score, abs=1e-6)
+
+
 # --- extremes -------------------------------------------------------------------------------------------------------
 
 

@@ -28,7 +28,7 @@ SORT_RUN = 512
 UNITS = ("pixel", "cell", "tile")
 """What a draw chooses: single pixels, cells of 4x4 pixels, or whole tiles of 16x16. The kernels number them so."""
 
-STRUCTURES = ("none", "ncc", "contrast", "ssim")
+STRUCTURES = ("none", "ncc", "contrast", "ssim", "printed_ncc")
 """Similarities of a tile's samples that a loss may have beside its l1 term. The kernels number them so."""
 
 UPDATE_KINDS = ("adam", "balanced_lm", "paper_lm")

@@ -56,7 +56,7 @@ class LossTerms:
         l1_weight: factor of that term.
         structure: one of `layout.STRUCTURES`.
         structure_weight: factor of the mean over tiles and channels of 1 - S, S the similarity.
-        variance_constant: c of `ncc` and `contrast`.
+        variance_constant: c of `ncc` and `contrast`, epsilon of `printed_ncc`.
         balance: scale the structure term by the paper's lambda.
         gate: scale it by the truth's variance.
     """

@@ -191,7 +191,7 @@ class TurboDensityStrategy(DefaultStrategy):
             grad_threshold=self.grow_grad2d,
             absgrad_threshold=self.grow_absgrad2d,
             top_fraction=self.top_fraction,
-            percent_dense=3 * self.grow_scale3d,  # gsplat compares the standard deviation, the controller three of them
+            percent_dense=self.grow_scale3d,
             split=self.split,
             max_gaussians=self.max_gaussians,
             prune_opacity=self.prune_opa,

@@ -145,6 +145,21 @@ def correlation(moments: TileMoments, groups: TileGroups, constant: float) -> Si
     return similarity, moments.offset_y * groups.spread(slope_y) - moments.offset_x * groups.spread(slope_x)
 
 
+def printed_correlation(moments: TileMoments, groups: TileGroups, constant: float) -> Similarity:
+    """NCC and its gradient as the appendix prints them, with epsilon = constant::
+
+        S = s_xy / sqrt(s_x^2 s_y^2 + epsilon)
+        g = (y - mean_y) / sqrt(s_x^2 s_y^2 + epsilon) - S (x - mean_x) / (s_x^2 + epsilon)
+
+    A flat tile scores 0, and so does a faint texture: epsilon is compared with the product of two variances. There g is
+    not quite the derivative of S, which has s_y^2 / (s_x^2 s_y^2 + epsilon) in the place of 1 / (s_x^2 + epsilon).
+    """
+    scale = (moments.variance_x * moments.variance_y + constant).sqrt()
+    similarity = moments.covariance / scale
+    slope_x = similarity / (moments.variance_x + constant)
+    return similarity, moments.offset_y * groups.spread(1.0 / scale) - moments.offset_x * groups.spread(slope_x)
+
+
 def contrast(moments: TileMoments, groups: TileGroups, constant: float) -> Similarity:
     """The contrast-structure term of SSIM, with c = constant::
 
@@ -175,6 +190,7 @@ SIMILARITIES: dict[str, Callable[[TileMoments, TileGroups, float], Similarity]] 
     "ncc": correlation,
     "contrast": contrast,
     "ssim": ssim,
+    "printed_ncc": printed_correlation,
 }
 """Name of a structure term -> its definition. Those of `strategies.losses` are named alike."""
 
