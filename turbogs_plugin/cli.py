@@ -338,7 +338,7 @@ def bench(
         step = StepBench(
             gaussians, views, pixel_budget, iterations, repeats, overrides, ply[0] if ply else None, offload
         )
-        return commands.run_step(step, scene, commands.Synthetic(photos, size), factor, where, out)
+        return commands.run_step(step, scene, photos, size, factor, where, out)
     if overrides:
         raise InputError("bench raster times the rasterizer alone: it has no section.key=value")
     if training is not None and scene is None:

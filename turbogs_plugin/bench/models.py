@@ -54,17 +54,10 @@ def trained_model(
     trainer = Trainer(config, scene, device)
     if iterations:
         train(trainer, growing)
-    settled = settled_trainer(config, scene, resized(trainer.gaussians, count), device)
-    del trainer
-    train(settled, iterations - growing)
-    return settled.gaussians
-
-
-def settled_trainer(config: Config, scene: Scene, gaussians: Gaussians, device: torch.device) -> Trainer:
-    """A trainer of these Gaussians that uses every band and leaves their number as it is."""
-    trainer = Trainer(changed(config, train={"sh_interval": 1}, density={"type": "none"}), scene, device)
-    adopt(trainer, gaussians)
-    return trainer
+    settling = changed(config, train={"sh_interval": 1}, density={"type": "none"})
+    trainer = trainer_of(settling, scene, resized(trainer.gaussians, count), device)
+    train(trainer, iterations - growing)
+    return trainer.gaussians
 
 
 def changed(config: Config, **sections: dict[str, Any]) -> Config:
@@ -75,12 +68,14 @@ def changed(config: Config, **sections: dict[str, Any]) -> Config:
     return resolve(mapping)
 
 
-def adopt(trainer: Trainer, gaussians: Gaussians) -> None:
-    """Let a trainer go on with other Gaussians, as if it started from them."""
+def trainer_of(config: Config, scene: Scene, gaussians: Gaussians, device: torch.device) -> Trainer:
+    """A trainer that starts from a copy of these Gaussians, and not from the points of the scene."""
+    trainer = Trainer(config, scene, device)
     trainer.gaussians = gaussians.map(lambda value: value.clone())
     trainer.optimizer.setup(trainer.gaussians)
     trainer.density.setup(trainer.gaussians)
     trainer.initialise_maps()
+    return trainer
 
 
 def train(trainer: Trainer, iterations: int) -> None:

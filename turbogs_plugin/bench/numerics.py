@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import json
-import statistics
-import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 
 import matplotlib
@@ -15,7 +14,7 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from turbogs_plugin.device import synchronize
+from turbogs_plugin.bench.clocks import measure
 from turbogs_plugin.engine.reference.lm_solvers import (
     ROW_LIMIT,
     solve_float64,
@@ -187,18 +186,10 @@ def bench_solvers(out: Path, device: torch.device) -> list[SolverResult]:
 def _nanoseconds(views: int, device: torch.device) -> dict[str, float]:
     """Time a system, by solver. Branch-free solvers take the same time on every family."""
     problem = tuple(value.to(device) for value in make_problem(FAMILIES[0], views, BATCH, seed=0))
-    times = {}
-    for name, solve in SOLVERS.items():
-        solve(*problem)
-        spans = []
-        for _ in range(REPEATS):
-            synchronize(device)
-            started = time.perf_counter()
-            solve(*problem)
-            synchronize(device)
-            spans.append(time.perf_counter() - started)
-        times[name] = 1e9 * statistics.median(spans) / BATCH
-    return times
+    return {
+        name: 1e6 * measure(partial(solve, *problem), REPEATS, device)["median_ms"] / BATCH
+        for name, solve in SOLVERS.items()
+    }
 
 
 def solvers_table(results: list[SolverResult]) -> str:

@@ -12,9 +12,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from turbogs_plugin.bench.clocks import BLOCKS, Mark, back_to_back, copy_bandwidth, keep_busy, summary
+from turbogs_plugin.bench.clocks import BLOCKS, Mark, back_to_back, copy_bandwidth, device_times, keep_busy, summary
 from turbogs_plugin.bench.floors import raster_counts, step_floors
-from turbogs_plugin.bench.models import adopt, changed, resized, train, trained_model
+from turbogs_plugin.bench.models import changed, resized, train, trained_model, trainer_of
 from turbogs_plugin.bench.recorder import StepRecorder, recorded
 from turbogs_plugin.config.configuration import Config, load_config
 from turbogs_plugin.device import synchronize
@@ -40,8 +40,8 @@ BYTES_OUT = {"maps": 4, "photos": 0}
 RATE_FACTOR = 1e-3
 """Of the learning rates: their size costs nothing, and the model stays the one that is to be timed."""
 
-WARMUP_ITERATIONS = 40
-"""More than the workspace's early passes, so that its buffers have their steady size."""
+WARMUP_ITERATIONS = {"cuda": 40, "cpu": 2}
+"""On a GPU more than the workspace's early passes, so that its buffers have their steady size."""
 
 
 @dataclass
@@ -95,10 +95,7 @@ class StepBench:
     ) -> dict[str, Any]:
         config, on_gpu = self._config(views), device.type == "cuda"
         held = torch.cuda.memory_allocated(device) if on_gpu else 0
-        trainer = Trainer(config, scene, device)
-        adopt(trainer, model)
-        trainer.iteration = config.train.sh_degree  # every band is in use
-        train(trainer, WARMUP_ITERATIONS if on_gpu else 2)
+        trainer = warm_trainer(config, scene, model, device)
         if on_gpu:
             torch.cuda.empty_cache()
             torch.cuda.reset_peak_memory_stats(device)
@@ -151,22 +148,17 @@ class StepBench:
     ) -> dict[str, dict[str, Any]]:
         """What is in host memory -> time of an iteration back to back, bytes of the windows, bytes that travel."""
         results = {}
+        view_pixels = int(scene.train.cameras.sizes.prod(axis=1).mean())
+        pixels = min(config.schedule["views"], len(scene.train)) * view_pixels
         for name, hosted in OFFLOADED.items():
             places = {f"{what}_place": "host" if what in hosted else "device" for what in ("maps", "photos")}
-            trainer = Trainer(changed(config, train=places), scene, device)
-            adopt(trainer, model)
-            trainer.iteration = config.train.sh_degree
-            train(trainer, WARMUP_ITERATIONS if device.type == "cuda" else 2)
+            trainer = warm_trainer(changed(config, train=places), scene, model, device)
             wall = back_to_back(trainer.step, self.repeats, device)
             trainer.repeat_lost(wait=True)
-            pixels = min(config.schedule["views"], len(scene.train)) * int(
-                scene.train.cameras.sizes.prod(axis=1).mean()
-            )
+            owners = (trainer.maps, trainer.views.photos)
             results[name] = {
                 "wall": wall,
-                "window_bytes": sum(
-                    getattr(owner, "window_bytes", 0) for owner in (trainer.maps, trainer.views.photos)
-                ),
+                "window_bytes": sum(getattr(owner, "window_bytes", 0) for owner in owners),
                 "bytes_in": pixels * sum(BYTES_IN[what] for what in hosted),
                 "bytes_out": pixels * sum(BYTES_OUT[what] for what in hosted),
             }
@@ -193,7 +185,15 @@ class StepBench:
             trainer.step()
             marks.append(Mark(device))
         synchronize(device)
-        return summary([first.until(last) for first, last in itertools.pairwise(marks)])
+        return device_times(itertools.pairwise(marks))
+
+
+def warm_trainer(config: Config, scene: Scene, model: Gaussians, device: torch.device) -> Trainer:
+    """A trainer of this model with every band in use, after the iterations that are unlike all later ones."""
+    trainer = trainer_of(config, scene, model, device)
+    trainer.iteration = config.train.sh_degree
+    train(trainer, WARMUP_ITERATIONS[device.type])
+    return trainer
 
 
 def density_event(
@@ -259,7 +259,7 @@ def memory(trainer: Trainer, scene: Scene, held: int, device: torch.device) -> d
 def tensor_bytes(value: Any) -> int:
     """Bytes of the tensors in nested dicts and lists."""
     if isinstance(value, dict):
-        return sum(map(tensor_bytes, value.values()))
+        value = list(value.values())
     if isinstance(value, list | tuple):
         return sum(map(tensor_bytes, value))
-    return value.numel() * value.element_size() if isinstance(value, Tensor) else 0
+    return value.nbytes if isinstance(value, Tensor) else 0
