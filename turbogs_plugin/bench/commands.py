@@ -42,10 +42,7 @@ def run_step(
     if scene is None and photos < FEWEST_VIEWS:
         raise InputError(f"--photos {photos}: at least {FEWEST_VIEWS} are needed, as of any capture")
     _require_new(out)
-    if scene is None:
-        capture = synthetic_scene(photos, *size, device)
-    else:
-        capture = scene_on(load_scene(scene, factor), device)
+    capture = synthetic_scene(photos, *size, device) if scene is None else scene_on(load_scene(scene, factor), device)
     measured = bench.run(capture, device)
     report = _report("step", measured, device)
     _keep(report, step_lines(measured), out)

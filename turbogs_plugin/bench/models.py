@@ -14,6 +14,7 @@ from torch.nn.functional import normalize
 from turbogs_plugin.config.configuration import Config, load_config, resolve
 from turbogs_plugin.model.row_order import spatial_order
 from turbogs_plugin.scene import Scene
+from turbogs_plugin.scene.poses import look_at
 from turbogs_plugin.tiles import TILE_PIXELS, pixel_table
 from turbogs_plugin.train.loop import TrainingLoop
 from turbogs_plugin.train.trainer import Trainer
@@ -110,20 +111,15 @@ def resized(gaussians: Gaussians, count: int, seed: int = 0) -> Gaussians:
 
 def ring_cameras(count: int, width: int, height: int, device: torch.device) -> Cameras:
     """Cameras on a ring that look at the origin."""
+    origin, up = np.zeros(3), np.array([0.0, -1.0, 0.0])
     viewmats = []
     for angle in np.linspace(0, 2 * math.pi, count, endpoint=False):
-        x, z = RING_RADIUS * math.sin(angle), -RING_RADIUS * math.cos(angle)
-        position = torch.tensor([x, -0.6, z], dtype=torch.float64)
-        forward = normalize(-position, dim=0)
-        right = normalize(torch.linalg.cross(torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64), forward), dim=0)
-        rotation = torch.stack([right, torch.linalg.cross(forward, right), forward])
-        viewmat = torch.eye(4, dtype=torch.float64)
-        viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ position
-        viewmats.append(viewmat)
+        position = np.array([RING_RADIUS * math.sin(angle), -0.6, -RING_RADIUS * math.cos(angle)])
+        viewmats.append(look_at(position, origin, up))
     focal = 0.9 * max(width, height)
     intrinsics = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
     sizes = np.array([[width, height]] * count, dtype=np.int64)
-    return Cameras(torch.stack(viewmats).float(), intrinsics.repeat(count, 1, 1), sizes).to(device)
+    return Cameras(torch.from_numpy(np.stack(viewmats)).float(), intrinsics.repeat(count, 1, 1), sizes).to(device)
 
 
 def surface_gaussians(count: int, device: torch.device, seed: int = 0) -> Gaussians:

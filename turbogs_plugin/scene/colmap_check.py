@@ -8,6 +8,7 @@ file does not hold, and every identifier is looked up.
 from __future__ import annotations
 
 import struct
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -52,6 +53,12 @@ class _Reader:
         self.position += size
         return start
 
+    def records(self, smallest: int) -> Iterator[int]:
+        """The numbers of the records that it announces, of at least `smallest` bytes each. Nothing may follow them."""
+        yield from range(self.count(smallest))
+        if self.position != len(self.data):
+            raise self.fail(f"{len(self.data) - self.position} bytes follow its last record")
+
     def unpack(self, format: str) -> tuple:
         layout = struct.Struct("<" + format)
         return layout.unpack_from(self.data, self.skip(layout.size))
@@ -63,7 +70,9 @@ class _Reader:
             raise self.fail(f"it announces {count} records, more than its {len(self.data)} bytes can hold")
         return count
 
-    def array(self, dtype: np.dtype, count: int) -> np.ndarray:
+    def array(self, dtype: np.dtype) -> np.ndarray:
+        """As many elements as it announces."""
+        count = self.count(dtype.itemsize)
         return np.frombuffer(self.data, dtype, count, self.skip(count * dtype.itemsize))
 
     def name(self) -> None:
@@ -75,10 +84,6 @@ class _Reader:
         except UnicodeDecodeError:
             raise self.fail(f"the image name at byte {self.position} is not UTF-8") from None
         self.position = end + 1
-
-    def end(self) -> None:
-        if self.position != len(self.data):
-            raise self.fail(f"{len(self.data) - self.position} bytes follow its last record")
 
     def new(self, kind: str, number: int, known: dict | set) -> None:
         if number in known:
@@ -116,23 +121,22 @@ def check_binary_model(folder: Path) -> None:
 def _check_cameras(reader: _Reader) -> set[int]:
     parameter_counts = _parameter_counts()
     cameras: set[int] = set()
-    for _ in range(reader.count(24)):
+    for _ in reader.records(24):
         camera, model, width, height = reader.unpack("IiQQ")
         reader.new("camera", camera, cameras)
         if model not in parameter_counts:
             raise reader.fail(f"camera {camera} has the unknown model {model}")
         if not (0 < width < 2**31 and 0 < height < 2**31):
             raise reader.fail(f"camera {camera} is {width}x{height} pixels")
-        reader.array(np.dtype("<f8"), parameter_counts[model])
+        reader.skip(8 * parameter_counts[model])
         cameras.add(camera)
-    reader.end()
     return cameras
 
 
 def _check_images(reader: _Reader, cameras: set[int]) -> dict[int, tuple[int, np.ndarray]]:
     """Image -> (its camera, the 3D point of each of its 2D points)."""
     images: dict[int, tuple[int, np.ndarray]] = {}
-    for _ in range(reader.count(73)):
+    for _ in reader.records(73):
         (image,) = reader.unpack("I")
         reader.new("image", image, images)
         reader.pose(f"image {image}")
@@ -140,29 +144,27 @@ def _check_images(reader: _Reader, cameras: set[int]) -> dict[int, tuple[int, np
         if camera not in cameras:
             raise reader.fail(f"image {image} has camera {camera}, which cameras.bin does not have")
         reader.name()
-        images[image] = camera, reader.array(POINT2D, reader.count(POINT2D.itemsize))["point3D_id"]
-    reader.end()
+        images[image] = camera, reader.array(POINT2D)["point3D_id"]
     return images
 
 
 def _check_points(reader: _Reader, images: dict[int, tuple[int, np.ndarray]]) -> np.ndarray:
     """Identifiers of the points, [M] uint64."""
     points: set[int] = set()
-    for _ in range(reader.count(51)):
+    for _ in reader.records(51):
         (point, *_) = reader.unpack("Q3d3Bd")
         reader.new("point", point, points)
         points.add(point)
-        for image, point2D in reader.array(TRACK_ELEMENT, reader.count(TRACK_ELEMENT.itemsize)).tolist():
+        for image, point2D in reader.array(TRACK_ELEMENT).tolist():
             if image not in images or point2D >= len(images[image][1]) or images[image][1][point2D] != point:
                 raise reader.fail(f"point {point} is said to be 2D point {point2D} of image {image}, which it is not")
-    reader.end()
     return np.fromiter(points, dtype=np.uint64, count=len(points))
 
 
 def _check_rigs(reader: _Reader, cameras: set[int]) -> dict[int, set[int]]:
     """Rig -> its cameras."""
     rigs: dict[int, set[int]] = {}
-    for _ in range(reader.count(8)):
+    for _ in reader.records(8):
         rig, sensors = reader.unpack("II")
         reader.new("rig", rig, rigs)
         members: set[int] = set()
@@ -175,13 +177,12 @@ def _check_rigs(reader: _Reader, cameras: set[int]) -> dict[int, set[int]]:
                 reader.pose(f"rig {rig}")
             members.add(camera)
         rigs[rig] = members
-    reader.end()
     return rigs
 
 
 def _check_frames(reader: _Reader, rigs: dict[int, set[int]], images: dict[int, tuple[int, np.ndarray]]) -> None:
     frames: set[int] = set()
-    for _ in range(reader.count(68)):
+    for _ in reader.records(68):
         frame, rig = reader.unpack("II")
         reader.new("frame", frame, frames)
         frames.add(frame)
@@ -194,4 +195,3 @@ def _check_frames(reader: _Reader, rigs: dict[int, set[int]], images: dict[int, 
                 continue
             if sensor not in rigs[rig] or image not in images or images[image][0] != sensor:
                 raise reader.fail(f"frame {frame} has image {image} of camera {sensor}, which the others do not have")
-    reader.end()

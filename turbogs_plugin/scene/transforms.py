@@ -13,6 +13,7 @@ from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene.capture import LARGEST_SIDE, Capture, check_photo_name
 from turbogs_plugin.scene.photos import photo_size
 from turbogs_plugin.scene.ply import read_vertices
+from turbogs_plugin.scene.poses import camera_centers
 
 FILE = "transforms.json"
 DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
@@ -80,7 +81,7 @@ def random_points(viewmats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     Args:
         viewmats: [V, 4, 4] float64 world to camera.
     """
-    centers = -np.einsum("vji,vj->vi", viewmats[:, :3, :3], viewmats[:, :3, 3])
+    centers = camera_centers(viewmats)
     axes = viewmats[:, 2, :3]
     # A slight pull towards the cameras' mean settles the case of parallel axes.
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]  # [V, 3, 3]
