@@ -19,7 +19,7 @@ BUSY_CYCLES = 20_000_000
 WARMUP_CALLS = 3
 
 BLOCKS = 5
-"""Blocks of calls that follow each other without a pause; their spread is that of wall times."""
+"""Wall times are measured over so many blocks of calls; their spread is that of the blocks."""
 
 Summary = dict[str, float]
 

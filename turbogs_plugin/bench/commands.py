@@ -24,7 +24,8 @@ from turbogs_plugin.scene.load import FEWEST_VIEWS
 from turbogs_plugin.study.cell import scene_on
 
 AGAIN = "this build, in a process of its own"
-"""What other builds compare with: where the models were trained the same kernels take up to 10 % less or more."""
+"""The name of this build among the others, which compare with it and not with the first measurement: in the process
+that trained the models, the same kernels take up to 10 % less or more."""
 
 
 def run_step(

@@ -94,11 +94,6 @@ def step_floors(counts: Counts, bandwidth: float) -> dict[str, float]:
         # records and radii in; parameters and two moments of the touched in and out
         "solve+update": 64 * counts["visible"] + 8 * counts["instances"] + 3 * 2 * 4 * PARAMETER_FLOATS * touched,
     }
-    front = sum(raster[stage] for stage in ("projection", "intersection count", "intersection sort", "forward"))
-    return {
-        "EPS": 1e3 * traffic["EPS"] / bandwidth,
-        "FWD": front,
-        "gather+L+E": 1e3 * traffic["gather+L+E"] / bandwidth,
-        "BWD": raster["backward"],
-        "solve+update": 1e3 * traffic["solve+update"] / bandwidth,
-    }
+    forward = sum(raster[stage] for stage in ("projection", "intersection count", "intersection sort", "forward"))
+    floors = {name: 1e3 * size / bandwidth for name, size in traffic.items()}
+    return {**floors, "FWD": forward, "BWD": raster["backward"]}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -37,6 +38,9 @@ SOLVERS: dict[str, Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]] = {
     "scaled Cholesky, float64": solve_float64,
 }
 COLORS = ("#b3261e", "#1f5fa8", "#2e7d32", "#6d6d6d")
+
+VIEWS = (3, 10)
+"""Values of K."""
 
 SIZE = 10
 """D of the geometry block, the larger of the two."""
@@ -161,18 +165,16 @@ def bench_solvers(out: Path, device: torch.device) -> list[SolverResult]:
     """
     out.mkdir(parents=True, exist_ok=True)
     results = []
-    for views in (3, 10):
+    for views in VIEWS:
         times = _nanoseconds(views, device)
         for seed, family in enumerate(FAMILIES):
             problem = make_problem(family, views, SYSTEMS, seed)
             exact = solve_exactly(problem)
             for name, solve in SOLVERS.items():
                 errors = scaled_errors(solve(*(value.to(device) for value in problem)), exact, problem)
-                good = errors <= FAILED_ERROR
-                median, largest = (
-                    (float(np.median(errors[good])), float(errors[good].max())) if good.any() else (float("nan"),) * 2
-                )
-                failed = float(1 - good.mean())
+                good = errors[errors <= FAILED_ERROR]
+                median, largest = (float(np.median(good)), float(good.max())) if len(good) else (math.nan, math.nan)
+                failed = 1 - len(good) / len(errors)
                 results.append(SolverResult(name, family.name, views, median, largest, failed, times[name]))
     machine = {"hardware": hardware(device.type), "software": dict(software()), "threads": torch.get_num_threads()}
     settings = {"systems": SYSTEMS, "batch": BATCH, "repeats": REPEATS, "size": SIZE}
@@ -200,24 +202,21 @@ def solvers_table(results: list[SolverResult]) -> str:
             return "all fail"
         return f"{result.max_error:.0e}" + (f" ({100 * result.failed:.1f} % fail)" if result.failed else "")
 
-    keys = list(dict.fromkeys((result.views, result.family) for result in results))
-    by_key = {(result.views, result.family, result.solver): result for result in results}
-    rows = [(views, family, *(cell(by_key[views, family, name]) for name in SOLVERS)) for views, family in keys]
-    for views in dict.fromkeys(result.views for result in results):
-        family = next(family for k, family in keys if k == views)
-        rows.append(
-            (views, "time a system", *(f"{by_key[views, family, name].nanoseconds:.0f} ns" for name in SOLVERS))
-        )
+    def of(views: int, family: Stiffness) -> list[SolverResult]:
+        return [result for result in results if (result.views, result.family) == (views, family.name)]
+
+    rows = [(k, family.name, *(cell(result) for result in of(k, family))) for k in VIEWS for family in FAMILIES]
+    for k in VIEWS:
+        rows.append((k, "time a system", *(f"{result.nanoseconds:.0f} ns" for result in of(k, FAMILIES[0]))))
     return table(("rows K", "systems of 10 x 10", *SOLVERS), rows)
 
 
 def _plot(results: list[SolverResult]) -> Figure:
     """Largest error of every family against time, a panel for each K. Hollow: rows beyond `ROW_LIMIT`."""
-    views = list(dict.fromkeys(result.views for result in results))
     lengths = {family.name: family.length for family in FAMILIES}
     with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(5.4 * len(views), 4.6), layout="constrained")
-        for axes, k in zip(figure.subplots(1, len(views), sharey=True, squeeze=False)[0], views, strict=True):
+        figure = Figure(figsize=(5.4 * len(VIEWS), 4.6), layout="constrained")
+        for axes, k in zip(figure.subplots(1, len(VIEWS), sharey=True), VIEWS, strict=True):
             for name, color in zip(SOLVERS, COLORS, strict=True):
                 own = [result for result in results if result.views == k and result.solver == name]
                 time_ns = own[0].nanoseconds

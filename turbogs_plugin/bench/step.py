@@ -26,19 +26,18 @@ from turbogs_plugin.train.trainer import Trainer
 from turbogs_plugin.types import Gaussians, Step
 
 NO_EVENTS = 1 << 20
-"""Iteration of the first density event: none, while statistics are kept as in any iteration."""
+"""Iteration of the first density event, which is never reached. Statistics are kept as in any training."""
 
 FIRST_EVENT = {"refine_from", "refine_start_iter"}
-"""What the kinds of density control call it."""
+"""The setting of the first density event, by its name in each kind of density control."""
 
 OFFLOADED = {"photos": ("photos",), "maps": ("maps",), "both": ("maps", "photos")}
-"""Rows of the offload table: what is in host memory."""
-BYTES_IN = {"maps": 4, "photos": 3}
-BYTES_OUT = {"maps": 4, "photos": 0}
-"""Of a pixel of a view that comes into the window, at most: views of the iteration before are there already."""
+"""What is in host memory, by the name in the results."""
+BYTES_IN, BYTES_OUT = {"maps": 4, "photos": 3}, {"maps": 4, "photos": 0}
+"""Copied to and from the device for a pixel, at most: a view of the iteration before is there already."""
 
 RATE_FACTOR = 1e-3
-"""Of the learning rates: their size costs nothing, and the model stays the one that is to be timed."""
+"""Factor of the learning rates. Small steps take as long as large ones, and the timed model hardly changes."""
 
 WARMUP_ITERATIONS = {"cuda": 40, "cpu": 2}
 """On a GPU more than the workspace's early passes, so that its buffers have their steady size."""
@@ -77,7 +76,7 @@ class StepBench:
             if loaded is None:
                 model = trained_model(scene, count, self.training, device, self.overrides)
             else:
-                model = resized(loaded.map(lambda value: value.float().to(device).contiguous()), count)
+                model = resized(loaded.map(lambda value: value.to(device)), count)
             for views in self.views:
                 passes.append(self._measure(scene, model, views, device, bandwidth))
         return {

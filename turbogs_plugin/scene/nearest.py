@@ -71,7 +71,4 @@ def _buckets(points: Tensor, size: int) -> tuple[Tensor, list[int]]:
             sorted_part = part[members[:, axis].argsort(stable=True)]
             halves += [sorted_part[: len(part) // 2], sorted_part[len(part) // 2 :]]
         parts = halves
-    starts = [0]
-    for part in parts:
-        starts.append(starts[-1] + len(part))
-    return torch.cat(parts), starts
+    return torch.cat(parts), [0, *itertools.accumulate(map(len, parts))]

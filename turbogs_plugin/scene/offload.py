@@ -4,7 +4,7 @@ Of every array over flat pixels the device has a *window*: slots, each as large 
 the present iteration and of the one before. The kernels see a flat array with the first pixel of each view, as ever;
 only where views begin changes from iteration to iteration.
 
-Nobody waits for a copy but the device. With two sets of slots, the views of an iteration travel in while the device is
+Only the device waits for copies. With two sets of slots, the views of an iteration travel in while the device is
 still at the iteration before, and the changed maps of that one travel out while the device is at this one:
 
 - in: after the last work that used the slot, and after what was in it has travelled out;

@@ -55,13 +55,8 @@ class Photos:
         Whoever reads these arrays calls it first. Here all views are always there; see `offload`.
         """
 
-    def gather(self, samples: PixelSamples) -> Tensor:
-        """[P, 3] float32, 0 .. 1: the colours at the samples, 0 in empty slots."""
-        self.fetch(samples.view_ids)
-        return self.colors[samples.flat_pixels(self.offsets)].float().div_(255.0).mul_(samples.filled[:, None])
-
     def at(self, samples: PixelSamples) -> PhotoSamples:
-        """The photos at the samples, to be gathered where they are compared."""
+        """The photos at the samples. To be used before the photos of other views are fetched."""
         self.fetch(samples.view_ids)
         return PhotoSamples(self, samples)
 
@@ -78,7 +73,7 @@ class Photos:
 
 @dataclass(frozen=True)
 class PhotoSamples:
-    """Ground truth of an iteration. Not gathered yet: the loss's kernel does that itself."""
+    """Ground truth of an iteration, not gathered yet: the kernel of the loss reads the photos itself."""
 
     photos: Photos
     samples: PixelSamples
@@ -89,8 +84,9 @@ class PhotoSamples:
         return self.photos.offsets[list(self.samples.view_ids)]
 
     def colors(self) -> Tensor:
-        """[P, 3] float32, 0 .. 1, as `Photos.gather` gives them."""
-        return self.photos.gather(self.samples)
+        """[P, 3] float32, 0 .. 1: the colours at the samples, 0 in empty slots."""
+        pixels = self.samples.flat_pixels(self.photos.offsets)
+        return self.photos.colors[pixels].float().div_(255.0).mul_(self.samples.filled[:, None])
 
 
 def pixel_offsets(sizes: np.ndarray) -> np.ndarray:
