@@ -15,10 +15,10 @@ from turbogs_plugin.config.configuration import Config, load_config, resolve
 from turbogs_plugin.model.row_order import spatial_order
 from turbogs_plugin.scene import Scene
 from turbogs_plugin.scene.poses import look_at
-from turbogs_plugin.tiles import TILE_PIXELS, pixel_table
+from turbogs_plugin.tiles import TILE_PIXELS, compact, pixel_table
 from turbogs_plugin.train.loop import TrainingLoop
 from turbogs_plugin.train.trainer import Trainer
-from turbogs_plugin.types import Cameras, Gaussians, PixelSamples, TileGrid
+from turbogs_plugin.types import Cameras, Gaussians, PixelSamples
 
 TRAINING_ITERATIONS = 1500
 """Of a model that is trained to be timed, where nothing else is asked for."""
@@ -153,17 +153,9 @@ def tile_samples(sizes: np.ndarray, rate: float, device: torch.device, seed: int
     table = pixel_table(sizes, device)  # [T, 256]
     generator = torch.Generator(device).manual_seed(seed)
     keys = torch.rand(table.shape, device=device, generator=generator).masked_fill_(table < 0, -1.0)
-    places = keys.topk(count, dim=1).indices
-    places = torch.where(table.gather(1, places) >= 0, places, TILE_PIXELS).sort(dim=1).values
-    padded = torch.cat([table, table.new_full((len(table), 1), -1)], dim=1)
-    tiles = torch.arange(len(TileGrid(sizes)), dtype=torch.int32, device=device)
-    return PixelSamples(
-        view_ids=tuple(range(len(sizes))),
-        sizes=sizes,
-        pixel_ids=padded.gather(1, places).reshape(-1),
-        tile_ids=tiles,
-        tile_offsets=torch.arange(len(tiles) + 1, dtype=torch.int32, device=device) * count,
-    )
+    chosen = torch.zeros_like(table, dtype=torch.bool).scatter_(1, keys.topk(count, dim=1).indices, True)
+    tiles = torch.arange(len(table), dtype=torch.int32, device=device)
+    return compact(range(len(sizes)), sizes, table, chosen & (table >= 0), tiles, np.full(len(table), count))
 
 
 def spread_views(count: int, of: int) -> list[int]:

@@ -15,6 +15,7 @@ from typing import Any
 from unittest.mock import patch
 
 import torch
+from torch import Tensor
 
 from turbogs_plugin.bench.clocks import Recorder, back_to_back, copy_bandwidth, device_times, measure
 from turbogs_plugin.bench.floors import raster_counts, raster_floors
@@ -126,10 +127,7 @@ class RasterBench:
         if scene is None:
             return [surface_gaussians(count, torch.device("cpu")) for count in self.gaussians]
         placed = scene_on(scene, device)
-        trained = [
-            trained_model(placed, count, self.training, device, ()).map(lambda value: value.detach().cpu())
-            for count in self.gaussians
-        ]
+        trained = [trained_model(placed, count, self.training, device, ()).map(Tensor.cpu) for count in self.gaussians]
         del placed
         free_device_memory(device)
         return trained

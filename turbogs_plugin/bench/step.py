@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,7 @@ from turbogs_plugin.model.ply import load_ply
 from turbogs_plugin.model.row_order import in_order_of_space
 from turbogs_plugin.scene import Scene
 from turbogs_plugin.train.trainer import Trainer
-from turbogs_plugin.types import Gaussians, Step
+from turbogs_plugin.types import Gaussians
 
 NO_EVENTS = 1 << 20
 """Iteration of the first density event, which is never reached. Statistics are kept as in any training."""
@@ -124,7 +124,7 @@ class StepBench:
         free_running = self._free_running(trainer, device)
         wall = back_to_back(trainer.step, self.repeats, device)
         trainer.repeat_lost(wait=True)
-        event = density_event(trainer, config, self.overrides, device)
+        event = density_event(trainer, self.overrides, device)
         lost = start + 1 + self.repeats * (2 + BLOCKS) - trainer.iteration
         del trainer
         return {
@@ -196,7 +196,7 @@ def warm_trainer(config: Config, scene: Scene, model: Gaussians, device: torch.d
 
 
 def density_event(
-    trainer: Trainer, config: Config, overrides: Sequence[str], device: torch.device, repeats: int = 5
+    trainer: Trainer, overrides: Sequence[str], device: torch.device, repeats: int = 5
 ) -> dict[str, Any] | None:
     """One event of density control with its change of model and optimizer state, by the statistics of this trainer.
 
@@ -206,13 +206,8 @@ def density_event(
     if "refine_from" not in usual.density:
         return None
     interval = usual.density["refine_every"]
-    due = Step(
-        iteration=-(-usual.density["refine_from"] // interval) * interval,
-        total=usual.train.iterations,
-        refine_until=usual.train.refine_until,
-        seed=config.train.seed,
-        scene_extent=trainer.extent,
-    )
+    iteration = -(-usual.density["refine_from"] // interval) * interval
+    due = replace(trainer.now, iteration=iteration, total=usual.train.iterations, refine_until=usual.train.refine_until)
     spans, after = [], len(trainer.gaussians)
     for _ in range(repeats):
         density, optimizer = usual.build("density"), copy.deepcopy(trainer.optimizer)
