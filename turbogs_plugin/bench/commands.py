@@ -28,22 +28,16 @@ AGAIN = "this build, in a process of its own"
 that trained the models, the same kernels take up to 10 % less or more."""
 
 
-def run_step(
-    bench: StepBench,
-    scene: Path | None,
-    photos: int,
-    size: tuple[int, int],
-    factor: int,
-    device: torch.device,
-    out: Path | None,
-) -> int:
-    """`photos`, `size`: of a synthetic capture, where there is no scene."""
-    if (scene is None) == (photos == 0):
+def run_step(bench: StepBench, scene: Path | None, factor: int, device: torch.device, out: Path | None) -> int:
+    if (scene is None) == (bench.photos == 0):
         raise InputError("bench step needs cameras and photos: --scene SCENE, or --photos N for synthetic ones")
-    if scene is None and photos < FEWEST_VIEWS:
-        raise InputError(f"--photos {photos}: at least {FEWEST_VIEWS} are needed, as of any capture")
+    if scene is None and bench.photos < FEWEST_VIEWS:
+        raise InputError(f"--photos {bench.photos}: at least {FEWEST_VIEWS} are needed, as of any capture")
     _require_new(out)
-    capture = synthetic_scene(photos, *size, device) if scene is None else scene_on(load_scene(scene, factor), device)
+    if scene is None:
+        capture = synthetic_scene(bench.photos, *bench.size, device)
+    else:
+        capture = scene_on(load_scene(scene, factor), device)
     measured = bench.run(capture, device)
     report = _report("step", measured, device)
     _keep(report, step_lines(measured), out)

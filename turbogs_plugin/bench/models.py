@@ -35,7 +35,7 @@ def trained_model(
 ) -> Gaussians:
     """A model of `count` Gaussians, trained briefly.
 
-    It grows by density control, to at most so many, is brought to the exact size by `resized`, and settles without
+    It grows by density control, to at most `count`, is brought to the exact size by `resized`, and settles without
     density control.
 
     Args:

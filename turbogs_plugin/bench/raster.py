@@ -48,7 +48,7 @@ STAGES = {
     "raster_backward": "backward",
     "projection_backward": "projection backward",
 }
-"""Operators of the library and the names their times go by."""
+"""Operators of the library, and the stage that each of them is."""
 
 
 @contextmanager

@@ -56,6 +56,7 @@ class StepBench:
         overrides: of the configuration, whose strategies are timed.
         ply: a model in place of a trained one.
         offload: time the iteration with photos and error maps in host memory, too.
+        photos, size: how many synthetic photos of which (width, height) take the place of a scene; 0: none.
     """
 
     gaussians: Sequence[int]
@@ -66,6 +67,8 @@ class StepBench:
     overrides: Sequence[str]
     ply: Path | None = None
     offload: bool = False
+    photos: int = 0
+    size: tuple[int, int] = (0, 0)
 
     def run(self, scene: Scene, device: torch.device) -> dict[str, Any]:
         """The measurements, ready for JSON. `scene`: its photos on the device, or where every trainer gets its own."""

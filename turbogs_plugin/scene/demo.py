@@ -40,6 +40,7 @@ FOCAL = 1.15
 POINT_NOISE = 0.004
 """Standard deviation of the noise on the reconstruction's points; solids are about 1 across."""
 POINTS_PER_VIEW = 150
+PHOTO_NAME = "view_{:03d}.png"
 
 
 @dataclass
@@ -262,7 +263,7 @@ def _write(folder: Path, random: np.random.Generator, views: int, width: int, he
         directions /= lengths
         colors, distances = cast(solids, origin, directions)
         pixels = colors.reshape(height, side, width, side, 3).mean(axis=(1, 3))
-        Image.fromarray(np.round(pixels * 255).astype(np.uint8)).save(folder / "images" / photo_name(view))
+        Image.fromarray(np.round(pixels * 255).astype(np.uint8)).save(folder / "images" / PHOTO_NAME.format(view))
         centers = np.s_[side // 2 :: side, side // 2 :: side]
         depths[view] = (distances[:, None] / lengths).reshape(height * side, width * side)[centers]
         hits = np.flatnonzero(np.isfinite(distances))
@@ -271,10 +272,6 @@ def _write(folder: Path, random: np.random.Generator, views: int, width: int, he
         point_colors.append(colors[chosen])
     reconstruction = _reconstruct(poses, np.concatenate(points), np.concatenate(point_colors), depths, focal, random)
     reconstruction.write_binary(folder / "sparse" / "0")
-
-
-def photo_name(view: int) -> str:
-    return f"view_{view:03d}.png"
 
 
 def _reconstruct(
@@ -310,7 +307,8 @@ def _reconstruct(
     reconstruction.add_camera_with_trivial_rig(camera)
     positions = np.cumsum(visible, axis=1) - 1  # [V, M] number of a point among those of its view
     for view in range(views):
-        image = pycolmap.Image(photo_name(view), keypoints=pixels[view, visible[view]], camera_id=1, image_id=view + 1)
+        name = PHOTO_NAME.format(view)
+        image = pycolmap.Image(name, keypoints=pixels[view, visible[view]], camera_id=1, image_id=view + 1)
         reconstruction.add_image_with_trivial_frame(image, pycolmap.Rigid3d(poses[view]))
     displaced = points + random.normal(scale=POINT_NOISE, size=points.shape)
     for point in np.flatnonzero(visible.any(axis=0)):

@@ -153,12 +153,7 @@ def load_photos(paths: Sequence[Path], sizes: np.ndarray, targets: np.ndarray) -
         pixels[offsets[view] : offsets[view + 1]] = np.asarray(photo).reshape(-1, 3)
 
     with ThreadPoolExecutor(min(8, os.cpu_count() or 1)) as pool:
-        for job in [pool.submit(load, view) for view in range(len(paths))]:
-            try:
-                job.result()
-            except BaseException:
-                pool.shutdown(wait=True, cancel_futures=True)
-                raise
+        list(pool.map(load, range(len(paths))))  # raises the first error in order, and cancels what has not begun
     return Photos(colors, targets)
 
 
