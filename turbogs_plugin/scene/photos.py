@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -113,11 +114,8 @@ def reduced_sizes(sizes: np.ndarray, factor: int) -> np.ndarray:
 
 def photo_size(path: Path) -> tuple[int, int]:
     """(width, height) from the file's header alone; `InputError` where it cannot be read."""
-    try:
-        with Image.open(path) as image:
-            return image.size
-    except Exception as error:  # a broken file can raise anything in its decoder
-        raise InputError(f"cannot read the photo {path}: {_reason(error)}") from error
+    with _opened(path) as image:
+        return image.size
 
 
 def load_photos(paths: Sequence[Path], sizes: np.ndarray, targets: np.ndarray) -> Photos:
@@ -159,24 +157,28 @@ def load_photos(paths: Sequence[Path], sizes: np.ndarray, targets: np.ndarray) -
 
 def _decode(path: Path, size: tuple[int, int]) -> Image.Image:
     """An RGB image of exactly this size, or `InputError`. The size is checked before any pixel is decoded."""
+    with _opened(path) as image:
+        if image.size != size:
+            raise InputError(
+                f"photo {path} is {image.size[0]}x{image.size[1]} but its camera is {size[0]}x{size[1]}: "
+                "use the photos that the cameras were reconstructed from"
+            )
+        if image.mode.startswith(("I", "F")):
+            raise InputError(f"photo {path} has more than 8 bits a channel: convert it to 8-bit RGB")
+        if "A" in image.getbands() or "transparency" in image.info:
+            image = image.convert("RGBA")
+            return Image.alpha_composite(Image.new("RGBA", size, (0, 0, 0, 255)), image).convert("RGB")
+        return image.convert("RGB")
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Image.Image]:
+    """The photo with its header read; `InputError` for whatever goes wrong with it while entered."""
     try:
         with Image.open(path) as image:
-            if image.size != size:
-                raise InputError(
-                    f"photo {path} is {image.size[0]}x{image.size[1]} but its camera is {size[0]}x{size[1]}: "
-                    "use the photos that the cameras were reconstructed from"
-                )
-            if image.mode.startswith(("I", "F")):
-                raise InputError(f"photo {path} has more than 8 bits a channel: convert it to 8-bit RGB")
-            if "A" in image.getbands() or "transparency" in image.info:
-                image = image.convert("RGBA")
-                return Image.alpha_composite(Image.new("RGBA", size, (0, 0, 0, 255)), image).convert("RGB")
-            return image.convert("RGB")
+            yield image
     except InputError:
         raise
     except Exception as error:  # a broken file can raise anything in its decoder
-        raise InputError(f"cannot read the photo {path}: {_reason(error)}") from error
-
-
-def _reason(error: Exception) -> str:
-    return " ".join((str(error) or type(error).__name__).split())
+        reason = " ".join((str(error) or type(error).__name__).split())
+        raise InputError(f"cannot read the photo {path}: {reason}") from error
