@@ -31,7 +31,7 @@ def summary(milliseconds: Sequence[float]) -> Summary:
 
 
 class Mark:
-    """A moment on the device's clock. `host`: seconds on the host's, when the mark was enqueued."""
+    """A moment on the device's clock. `host`: when the host enqueued it, in seconds."""
 
     def __init__(self, device: torch.device) -> None:
         self.event: torch.cuda.Event | None = None
@@ -41,7 +41,7 @@ class Mark:
         self.host = time.perf_counter()
 
     def until(self, later: Mark) -> float:
-        """Milliseconds on the device; on a GPU only after it has been waited for."""
+        """Milliseconds on the device. A GPU must have been waited for."""
         return self.host_until(later) if self.event is None else self.event.elapsed_time(later.event)
 
     def host_until(self, later: Mark) -> float:
@@ -53,7 +53,7 @@ Span = tuple[Mark, Mark]
 
 
 def device_times(spans: Iterable[Span]) -> Summary:
-    """Of spans on the device; on a GPU only after it has been waited for."""
+    """The summary of spans on the device. A GPU must have been waited for."""
     return summary([first.until(last) for first, last in spans])
 
 

@@ -73,7 +73,7 @@ def run_numerics(device: torch.device, out: Path) -> int:
 
 
 def _require_new(out: Path | None) -> None:
-    """A place to write to, known before anything is measured. An older result of the same name is replaced."""
+    """Check the place of the result before anything is measured. An older result of the same name is replaced."""
     if out is None:
         return
     if out.is_dir() or not out.absolute().parent.is_dir():
@@ -98,7 +98,7 @@ def _finish(report: dict[str, Any], out: Path | None) -> int:
 
 
 def step_lines(measured: dict[str, Any]) -> list[str]:
-    """A line a pass: the whole iteration, then its steps with their floors in brackets."""
+    """One line for each pass: the whole iteration, then its steps with their floors in brackets."""
     lines = []
     for entry in measured["passes"]:
         steps, floors = entry["steps"], entry["floors_ms"] or {}
@@ -118,7 +118,7 @@ def step_lines(measured: dict[str, Any]) -> list[str]:
 
 
 def raster_lines(measured: dict[str, Any]) -> list[str]:
-    """A line a pass, and a line for gsplat's dense one."""
+    """One line for each pass, and one for gsplat's dense pass."""
     lines = []
     for entry in measured["passes"]:
         parts = [f"{name} {value['median_ms']:.3f}" for name, value in entry.get("stages", {}).items()]

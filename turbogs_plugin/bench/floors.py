@@ -15,10 +15,10 @@ from turbogs_plugin.engine.layout import BUCKET, WARP_SIZE
 from turbogs_plugin.types import PixelSamples
 
 FORWARD_INSTRUCTIONS, BACKWARD_INSTRUCTIONS = 23, 75
-"""Per (splat, 32 samples): what the inner loops issue, as profiled."""
+"""Instructions of the inner loops for one splat and 32 samples, as profiled."""
 
 PARAMETER_FLOATS = 59
-"""Of a Gaussian with three bands."""
+"""Parameters of a Gaussian with three bands."""
 
 Counts = dict[str, int]
 
@@ -41,7 +41,7 @@ def raster_counts(rendered: CudaRendered, samples: PixelSamples) -> Counts:
 
 
 def count_contributions(rendered: CudaRendered) -> Counts:
-    """Splats of work items of a pass: those walked, and those that contributed."""
+    """How many splats the work items of a pass walked, and how many of these contributed."""
     forward = rendered._forward
     tile_starts, buckets, chunks = forward.tile_starts, forward.bucket_counts.long(), forward.chunks
     items = torch.arange(len(buckets), device=buckets.device)

@@ -1,4 +1,4 @@
-"""A capture of any size that no disk has to hold: synthetic Gaussians, photographed by the renderer."""
+"""A capture of any size that needs no disk: synthetic Gaussians, photographed by the renderer."""
 
 from __future__ import annotations
 

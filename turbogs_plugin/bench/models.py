@@ -21,10 +21,10 @@ from turbogs_plugin.train.trainer import Trainer
 from turbogs_plugin.types import Cameras, Gaussians, PixelSamples
 
 TRAINING_ITERATIONS = 1500
-"""Of a model that is trained to be timed, where nothing else is asked for."""
+"""How long a model is trained before it is timed, unless something else is asked for."""
 
 RING_RADIUS = 3.0
-"""Of the synthetic cameras about the origin."""
+"""Distance of the synthetic cameras from the vertical axis."""
 
 GROWING_SHARE = 0.8
 """Share of a model's training in which it grows; in the rest it settles at its final size."""
@@ -80,12 +80,12 @@ def trainer_of(config: Config, scene: Scene, gaussians: Gaussians, device: torch
 
 
 def train(trainer: Trainer, iterations: int) -> None:
-    """So many more iterations, those repeated that were lost to an overflow."""
+    """Train for so many more iterations. Iterations that were lost to an overflow are repeated."""
     TrainingLoop(trainer).advance(trainer.iteration + iterations)
 
 
 def resized(gaussians: Gaussians, count: int, seed: int = 0) -> Gaussians:
-    """A model of the same look with `count` Gaussians: a random subset, or all and jittered copies of random ones.
+    """A model that looks the same, with `count` Gaussians: a random subset, or all and jittered copies of random ones.
 
     Standard deviations change with the inverse root of the number, so that surfaces stay covered as they were. Copies
     follow their original in memory.
@@ -159,5 +159,5 @@ def tile_samples(sizes: np.ndarray, rate: float, device: torch.device, seed: int
 
 
 def spread_views(count: int, of: int) -> list[int]:
-    """`count` views spread evenly over so many."""
+    """`count` of so many views, spread evenly."""
     return np.linspace(0, of - 1, min(count, of)).round().astype(int).tolist()

@@ -40,19 +40,19 @@ SOLVERS: dict[str, Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]] = {
 COLORS = ("#b3261e", "#1f5fa8", "#2e7d32", "#6d6d6d")
 
 VIEWS = (3, 10)
-"""Values of K."""
+"""The values of K that are measured."""
 
 SIZE = 10
-"""D of the geometry block, the larger of the two."""
+"""D, the size of the systems: that of the geometry block, the larger of the two."""
 
 SYSTEMS = 2000
-"""Systems of a family whose error is measured."""
+"""How many systems of each family are solved to measure the error."""
 
 BATCH = 100_000
-"""Systems that are solved at once when the time is measured."""
+"""How many systems are solved at once to measure the time."""
 
 REPEATS = 5
-"""Of the time measurement; the median counts."""
+"""How often the time is measured; the median counts."""
 
 FAILED_ERROR = 1.0
 """A solution that is not finite, or further off than this, is worth less than no step at all."""

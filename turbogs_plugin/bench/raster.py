@@ -97,7 +97,7 @@ class RasterBench:
                 raise InputError(f"no such library: '{library}'")
 
     def arguments(self) -> list[str]:
-        """Of the command line that measures the same models, synthetic ones or files, the libraries left out."""
+        """Options of a command line that measures the same models, synthetic ones or files, without the libraries."""
         values = {
             "--gaussians": self.gaussians,
             "--views": self.views,

@@ -71,7 +71,7 @@ class StepBench:
     size: tuple[int, int] = (0, 0)
 
     def run(self, scene: Scene, device: torch.device) -> dict[str, Any]:
-        """The measurements, ready for JSON. `scene`: its photos on the device, or where every trainer gets its own."""
+        """The measurements, ready for JSON. `scene`: on the device, or every trainer copies the photos."""
         bandwidth = copy_bandwidth(device)
         loaded = None if self.ply is None else load_ply(self.ply, scene.frame)
         passes = []

@@ -1,4 +1,4 @@
-"""A bound on the size of Gaussians far away, which no training view need show."""
+"""A bound on the size of far Gaussians, which grow where no training view shows it."""
 
 from __future__ import annotations
 

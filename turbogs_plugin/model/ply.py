@@ -20,7 +20,7 @@ from turbogs_plugin.scene.ply import TYPES, read_vertices
 from turbogs_plugin.types import Gaussians
 
 POSITION_ERROR = 1e-6
-"""Largest rounding of exported positions that the place of the capture may cause, in units of the frame's scale."""
+"""Largest rounding error of exported positions that is accepted, in units of the frame's scale."""
 
 
 def save_ply(gaussians: Gaussians, path: str | Path, frame: Frame | None = None) -> None:

@@ -80,7 +80,7 @@ class _Reader:
         self.position = end + 1
 
     def pose(self, owner: str) -> None:
-        """A unit-free quaternion and a translation."""
+        """Step over a quaternion of any length and a translation, both finite."""
         values = np.array(self.unpack("7d"))
         if not np.isfinite(values).all() or not 1e-6 < np.abs(values[:4]).max() < 1e6:
             raise InputError(f"{self.path}: {owner} has a pose that is not finite, or a zero rotation")
@@ -103,7 +103,7 @@ def check_binary_model(folder: Path) -> None:
 
 
 def _check_cameras(reader: _Reader) -> set[int]:
-    """The identifiers."""
+    """Gives the identifiers."""
     parameter_counts = _parameter_counts()
     cameras: set[int] = set()
     for _ in reader.records(24):

@@ -9,7 +9,7 @@ from torch import Tensor
 
 BUCKET_SIZE = 64
 BUCKETS_AT_ONCE = 32
-"""Buckets compared at a time with one, so that memory is bounded and near ones tighten the bound for the others."""
+"""How many buckets are compared with one at a time: it bounds memory, and near ones tighten the bound for far ones."""
 
 
 def mean_neighbor_distances(points: Tensor, neighbors: int) -> Tensor:

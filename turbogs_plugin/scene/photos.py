@@ -18,9 +18,9 @@ from turbogs_plugin.errors import InputError
 from turbogs_plugin.types import PixelSamples
 
 PHOTO_BYTES = 3
-"""Of a pixel."""
+"""Bytes of a pixel."""
 SMALLEST_SIDE = 4
-"""Pixels that a reduction leaves of a photo's shorter side: a cell's."""
+"""The shorter side of a reduced photo has at least so many pixels: those of a cell."""
 MEMORY_SHARE = 0.8
 """Photos may take this share of the machine's memory."""
 
