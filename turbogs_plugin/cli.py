@@ -357,10 +357,9 @@ def bench(
     if what == "step":
         if len(ply) > 1:
             raise InputError("bench step takes one --ply, at the sizes of --gaussians")
-        step = StepBench(
-            gaussians, views, pixel_budget, iterations, repeats, overrides, ply[0] if ply else None, offload
-        )
-        return commands.run_step(step, scene, commands.Synthetic(photos, size), factor, where, out)
+        model = ply[0] if ply else None
+        step = StepBench(gaussians, views, pixel_budget, iterations, repeats, overrides, model, offload, photos, size)
+        return commands.run_step(step, scene, factor, where, out)
     if overrides:
         raise InputError("bench raster times the rasterizer alone: it has no section.key=value")
     if training is not None and scene is None:

@@ -156,7 +156,7 @@ def test_gather_takes_the_pixels_of_the_samples(tmp_path):
         tile_offsets=torch.tensor([0, 2, 4], dtype=torch.int32),
     )
     expected = [[6, 6, 120], [0, 0, 0], [6, 6, 20], [0, 0, 0]]  # (1, 1) of photo 6; (1, 1) of photo 1
-    np.testing.assert_allclose(photos.gather(samples) * 255, expected, atol=1e-4)
+    np.testing.assert_allclose(photos.at(samples).colors() * 255, expected, atol=1e-4)
 
 
 def test_factor_scales_intrinsics_by_the_actual_sizes(tmp_path):

@@ -2,13 +2,13 @@
 
 import random
 import struct
-import tracemalloc
 from pathlib import Path
 
 import numpy as np
 import pycolmap
 import pytest
 import torch
+from helpers.bounded_memory import outcome_within
 from helpers.framework_runs import thin_out_points
 
 from turbogs_plugin.errors import InputError
@@ -61,20 +61,6 @@ def mutate(content: bytes, choice: random.Random) -> bytes:
     return bytes(data)
 
 
-def in_bounded_memory(function, *arguments):
-    """The result of a call, or the InputError it ended in; anything else fails."""
-    tracemalloc.start()
-    try:
-        return function(*arguments)
-    except InputError as error:
-        assert "\n" not in str(error)
-        return error
-    finally:
-        peak = tracemalloc.get_traced_memory()[1]
-        tracemalloc.stop()
-        assert peak < MEMORY
-
-
 @pytest.mark.parametrize("suffix", [".bin", ".txt"])
 @pytest.mark.parametrize("file", FILES)
 def test_mutated_models(capture, tmp_path, file, suffix):
@@ -87,7 +73,7 @@ def test_mutated_models(capture, tmp_path, file, suffix):
     content, errors, cases = target.read_bytes(), 0, 120
     for _ in range(cases):
         target.write_bytes(mutate(content, choice))
-        result = in_bounded_memory(read_colmap, capture, tmp_path, suffix)
+        result = outcome_within(MEMORY, read_colmap, capture, tmp_path, suffix)
         if isinstance(result, InputError):
             errors += 1
         else:
@@ -114,7 +100,7 @@ def test_counts_beyond_the_file(capture, tmp_path, file, count):
         (tmp_path / path.name).write_bytes(path.read_bytes())
     target = tmp_path / f"{file}.bin"
     target.write_bytes(struct.pack("<Q", count) + target.read_bytes()[8:])
-    error = in_bounded_memory(read_colmap, capture, tmp_path, ".bin")
+    error = outcome_within(MEMORY, read_colmap, capture, tmp_path, ".bin")
     assert isinstance(error, InputError) and f"announces {count} records" in str(error)
 
 
@@ -163,7 +149,7 @@ def test_mutated_ply(model_ply, tmp_path):
         # Every second case goes for the header, which is the smaller part.
         mutated = mutate(content[:header], choice) + content[header:] if case % 2 else mutate(content, choice)
         target.write_bytes(mutated)
-        result = in_bounded_memory(load_ply, target)
+        result = outcome_within(MEMORY, load_ply, target)
         if isinstance(result, InputError):
             errors += 1
         else:
@@ -193,7 +179,7 @@ def test_bad_ply_headers(model_ply, tmp_path, old, new, words):
     content = model_ply.read_bytes()
     assert old in content
     target.write_bytes(content.replace(old, new, 1))
-    error = in_bounded_memory(load_ply, target)
+    error = outcome_within(MEMORY, load_ply, target)
     assert isinstance(error, InputError)
     with pytest.raises(InputError, match=words):
         raise error

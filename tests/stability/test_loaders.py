@@ -1,5 +1,5 @@
 """Checkpoints, configurations, photos and transforms.json that were damaged or made to harm: a clear error or a correct
-result, in bounded memory. The loaders of COLMAP models and of .ply files are in test_scene_hostile.py."""
+result, in bounded memory. The loaders of COLMAP models and of .ply files are in scene/test_hostile.py."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ import copy
 import json
 import random
 import shutil
-import tracemalloc
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from helpers.bounded_memory import outcome_within
 from helpers.framework_runs import tiny_capture, tiny_config
 
 from turbogs_plugin.config.configuration import load_config
@@ -36,20 +36,6 @@ def capture(tmp_path_factory) -> Path:
 def finished(capture, tmp_path_factory) -> Path:
     """The folder of a finished run, which is not to be changed."""
     return run.train(tiny_config(capture, "train.iterations=3"), tmp_path_factory.mktemp("runs") / "run").folder.path
-
-
-def outcome_of(function, *arguments):
-    """The result of a call, or the InputError it ended in; anything else fails."""
-    tracemalloc.start()
-    try:
-        return function(*arguments)
-    except InputError as error:
-        assert len(str(error)) < 2000
-        return error
-    finally:
-        peak = tracemalloc.get_traced_memory()[1]
-        tracemalloc.stop()
-        assert peak < MEMORY
 
 
 def damaged(content: bytes, choice: random.Random) -> bytes:
@@ -129,7 +115,7 @@ def test_damaged_checkpoints(finished, tmp_path):
     choice, target, refused = random.Random(4), tmp_path / "iteration-000003.pt", 0
     for _ in range(200):
         target.write_bytes(damaged(content, choice))
-        refused += isinstance(outcome_of(load_checkpoint, target), InputError)
+        refused += isinstance(outcome_within(MEMORY, load_checkpoint, target), InputError)
     assert refused > 100
 
 
@@ -147,7 +133,7 @@ def test_damaged_configurations():
     choice, refused = random.Random(5), 0
     for _ in range(60):
         changed = damaged(text, choice).decode("utf-8", "replace")
-        result = outcome_of(parse_yaml, changed, "config")
+        result = outcome_within(MEMORY, parse_yaml, changed, "config")
         refused += isinstance(result, InputError)
     assert 6 < refused < 60
 
@@ -170,7 +156,7 @@ BOMBS = {
 @pytest.mark.parametrize("name", BOMBS)
 def test_yaml_bombs(tmp_path, name):
     (tmp_path / "bomb.yaml").write_text(BOMBS[name])
-    assert isinstance(outcome_of(load_config, str(tmp_path / "bomb.yaml")), InputError)
+    assert isinstance(outcome_within(MEMORY, load_config, str(tmp_path / "bomb.yaml")), InputError)
 
 
 # ---- Captures ----------------------------------------------------------------------------------------------------
@@ -195,7 +181,7 @@ def test_damaged_transforms(transforms):
     content, choice, refused = (transforms / "transforms.json").read_bytes(), random.Random(6), 0
     for _ in range(200):
         (transforms / "transforms.json").write_bytes(damaged(content, choice))
-        result = outcome_of(load_scene, transforms)
+        result = outcome_within(MEMORY, load_scene, transforms)
         refused += isinstance(result, InputError)
         if not isinstance(result, InputError):
             assert result.train.cameras.viewmats.isfinite().all() and result.points.isfinite().all()
@@ -218,7 +204,7 @@ def test_damaged_photos(capture, tmp_path, kind):
     refused = 0
     for changed in contents:
         photo.write_bytes(changed)
-        result = outcome_of(load_scene, folder)
+        result = outcome_within(MEMORY, load_scene, folder)
         refused += isinstance(result, InputError)
         if isinstance(result, InputError):
             assert photo.name in str(result)

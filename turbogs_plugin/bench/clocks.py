@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import statistics
 import time
-from collections.abc import Callable, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,7 +19,7 @@ BUSY_CYCLES = 20_000_000
 WARMUP_CALLS = 3
 
 BLOCKS = 5
-"""Blocks of calls that follow each other without a pause; their spread is that of wall times."""
+"""Wall times are measured over so many blocks of calls; their spread is that of the blocks."""
 
 Summary = dict[str, float]
 
@@ -29,7 +31,7 @@ def summary(milliseconds: Sequence[float]) -> Summary:
 
 
 class Mark:
-    """A moment on the device's clock. `host`: seconds on the host's, when the mark was enqueued."""
+    """A moment on the device's clock. `host`: when the host enqueued it, in seconds."""
 
     def __init__(self, device: torch.device) -> None:
         self.event: torch.cuda.Event | None = None
@@ -39,12 +41,43 @@ class Mark:
         self.host = time.perf_counter()
 
     def until(self, later: Mark) -> float:
-        """Milliseconds on the device; on a GPU only after it has been waited for."""
+        """Milliseconds on the device. A GPU must have been waited for."""
         return self.host_until(later) if self.event is None else self.event.elapsed_time(later.event)
 
     def host_until(self, later: Mark) -> float:
         """Milliseconds on the host."""
         return 1e3 * (later.host - self.host)
+
+
+Span = tuple[Mark, Mark]
+
+
+def device_times(spans: Iterable[Span]) -> Summary:
+    """The summary of spans on the device. A GPU must have been waited for."""
+    return summary([first.until(last) for first, last in spans])
+
+
+class Recorder:
+    """Spans of function calls.
+
+    Attributes:
+        spans: of each name, in the order of the calls.
+    """
+
+    def __init__(self, device: torch.device) -> None:
+        self.device = device
+        self.spans: dict[str, list[Span]] = defaultdict(list)
+
+    def timed(self, name: str, function: Callable) -> Callable:
+        """The function, with the spans of its calls recorded under a name."""
+
+        def call(*arguments: Any, **keywords: Any) -> Any:
+            first = Mark(self.device)
+            result = function(*arguments, **keywords)
+            self.spans[name].append((first, Mark(self.device)))
+            return result
+
+        return call
 
 
 def keep_busy(device: torch.device) -> None:
@@ -58,14 +91,13 @@ def measure(function: Callable[[], object], repeats: int, device: torch.device) 
     """Time of the device for `function`: on a GPU without the gaps in which it waits for the host."""
     for _ in range(WARMUP_CALLS if device.type == "cuda" else 1):
         function()
-    spans = []
+    recorder = Recorder(device)
+    timed = recorder.timed("", function)
     for _ in range(repeats):
         keep_busy(device)
-        first = Mark(device)
-        function()
-        spans.append((first, Mark(device)))
+        timed()
     synchronize(device)
-    return summary([first.until(last) for first, last in spans])
+    return device_times(recorder.spans[""])
 
 
 def back_to_back(function: Callable[[], object], repeats: int, device: torch.device) -> Summary:

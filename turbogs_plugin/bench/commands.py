@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import tempfile
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -24,33 +24,23 @@ from turbogs_plugin.scene.load import FEWEST_VIEWS
 from turbogs_plugin.study.cell import scene_on
 
 AGAIN = "this build, in a process of its own"
-"""What other builds compare with: where the models were trained the same kernels take up to 10 % less or more."""
+"""The name of this build among the others, which compare with it and not with the first measurement: in the process
+that trained the models, the same kernels take up to 10 % less or more."""
 
 
-@dataclass(frozen=True)
-class Synthetic:
-    """A capture to time on where none is given: so many photos of (width, height)."""
-
-    photos: int
-    size: tuple[int, int]
-
-
-def run_step(
-    bench: StepBench, scene: Path | None, synthetic: Synthetic, factor: int, device: torch.device, out: Path | None
-) -> int:
-    if (scene is None) == (synthetic.photos == 0):
+def run_step(bench: StepBench, scene: Path | None, factor: int, device: torch.device, out: Path | None) -> int:
+    if (scene is None) == (bench.photos == 0):
         raise InputError("bench step needs cameras and photos: --scene SCENE, or --photos N for synthetic ones")
-    if scene is None and synthetic.photos < FEWEST_VIEWS:
-        raise InputError(f"--photos {synthetic.photos}: at least {FEWEST_VIEWS} are needed, as of any capture")
+    if scene is None and bench.photos < FEWEST_VIEWS:
+        raise InputError(f"--photos {bench.photos}: at least {FEWEST_VIEWS} are needed, as of any capture")
     _require_new(out)
     if scene is None:
-        capture = synthetic_scene(synthetic.photos, *synthetic.size, device)
+        capture = synthetic_scene(bench.photos, *bench.size, device)
     else:
         capture = scene_on(load_scene(scene, factor), device)
     measured = bench.run(capture, device)
     report = _report("step", measured, device)
-    _save(report, out)
-    _tell(step_lines(measured), out)
+    _keep(report, step_lines(measured), out)
     return _finish(report, out)
 
 
@@ -64,16 +54,14 @@ def run_raster(bench: RasterBench, scene: Path | None, factor: int, device: torc
         command = [*shared.arguments(), *place]
         measured = shared.run(capture, device)
         report = _report("raster", {**measured, **model, "other_builds": {}}, device)
-        _save(report, out)  # a build that fails takes nothing away
-        _tell(raster_lines(measured), out)
+        _keep(report, raster_lines(measured), out)  # a build that fails takes nothing away
         builds = {library.name: library for library in bench.libraries}
         if builds and not compiled_kernels().unavailable:
             builds = {AGAIN: compiled_kernels().path, **builds}
         for name, library in builds.items():
             measured = other_build(library, command)
             report["other_builds"][name] = {**measured, **model}
-            _save(report, out)
-            _tell([f"{name}:", *raster_lines(measured)], out)
+            _keep(report, [f"{name}:", *raster_lines(measured)], out)
     return _finish(report, out)
 
 
@@ -85,7 +73,7 @@ def run_numerics(device: torch.device, out: Path) -> int:
 
 
 def _require_new(out: Path | None) -> None:
-    """A place to write to, known before anything is measured. An older result of the same name is replaced."""
+    """Check the place of the result before anything is measured. An older result of the same name is replaced."""
     if out is None:
         return
     if out.is_dir() or not out.absolute().parent.is_dir():
@@ -97,15 +85,11 @@ def _report(what: str, measured: dict[str, Any], device: torch.device) -> dict[s
     return {"bench": what, "device": device.type, "provenance": asdict(provenance(device.type)), **measured}
 
 
-def _save(report: dict[str, Any], out: Path | None) -> None:
+def _keep(report: dict[str, Any], gist: Sequence[str], out: Path | None) -> None:
+    """Write what is known so far, and print its gist. Without a file, standard output is for the JSON alone."""
     if out is not None:
         write_text_atomically(out, json.dumps(report, indent=2) + "\n")
-
-
-def _tell(lines: Sequence[str], out: Path | None) -> None:
-    """The gist as it is known; without a file standard output is for the JSON alone."""
-    if out is not None:
-        print("\n".join(lines), flush=True)
+        print("\n".join(gist), flush=True)
 
 
 def _finish(report: dict[str, Any], out: Path | None) -> int:
@@ -114,7 +98,7 @@ def _finish(report: dict[str, Any], out: Path | None) -> int:
 
 
 def step_lines(measured: dict[str, Any]) -> list[str]:
-    """A line a pass: the whole iteration, then its steps with their floors in brackets."""
+    """One line for each pass: the whole iteration, then its steps with their floors in brackets."""
     lines = []
     for entry in measured["passes"]:
         steps, floors = entry["steps"], entry["floors_ms"] or {}
@@ -134,7 +118,7 @@ def step_lines(measured: dict[str, Any]) -> list[str]:
 
 
 def raster_lines(measured: dict[str, Any]) -> list[str]:
-    """A line a pass, and a line for gsplat's dense one."""
+    """One line for each pass, and one for gsplat's dense pass."""
     lines = []
     for entry in measured["passes"]:
         parts = [f"{name} {value['median_ms']:.3f}" for name, value in entry.get("stages", {}).items()]

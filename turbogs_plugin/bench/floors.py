@@ -15,10 +15,10 @@ from turbogs_plugin.engine.layout import BUCKET, WARP_SIZE
 from turbogs_plugin.types import PixelSamples
 
 FORWARD_INSTRUCTIONS, BACKWARD_INSTRUCTIONS = 23, 75
-"""Per (splat, 32 samples): what the inner loops issue, as profiled."""
+"""Instructions of the inner loops for one splat and 32 samples, as profiled."""
 
 PARAMETER_FLOATS = 59
-"""Of a Gaussian with three bands."""
+"""Parameters of a Gaussian with three bands."""
 
 Counts = dict[str, int]
 
@@ -41,7 +41,7 @@ def raster_counts(rendered: CudaRendered, samples: PixelSamples) -> Counts:
 
 
 def count_contributions(rendered: CudaRendered) -> Counts:
-    """Splats of work items of a pass: those walked, and those that contributed."""
+    """How many splats the work items of a pass walked, and how many of these contributed."""
     forward = rendered._forward
     tile_starts, buckets, chunks = forward.tile_starts, forward.bucket_counts.long(), forward.chunks
     items = torch.arange(len(buckets), device=buckets.device)
@@ -94,11 +94,6 @@ def step_floors(counts: Counts, bandwidth: float) -> dict[str, float]:
         # records and radii in; parameters and two moments of the touched in and out
         "solve+update": 64 * counts["visible"] + 8 * counts["instances"] + 3 * 2 * 4 * PARAMETER_FLOATS * touched,
     }
-    front = sum(raster[stage] for stage in ("projection", "intersection count", "intersection sort", "forward"))
-    return {
-        "EPS": 1e3 * traffic["EPS"] / bandwidth,
-        "FWD": front,
-        "gather+L+E": 1e3 * traffic["gather+L+E"] / bandwidth,
-        "BWD": raster["backward"],
-        "solve+update": 1e3 * traffic["solve+update"] / bandwidth,
-    }
+    forward = sum(raster[stage] for stage in ("projection", "intersection count", "intersection sort", "forward"))
+    floors = {name: 1e3 * size / bandwidth for name, size in traffic.items()}
+    return {**floors, "FWD": forward, "BWD": raster["backward"]}

@@ -1,4 +1,4 @@
-"""A capture of any size that no disk has to hold: synthetic Gaussians, photographed by the renderer."""
+"""A capture of any size that needs no disk: synthetic Gaussians, photographed by the renderer."""
 
 from __future__ import annotations
 
@@ -14,18 +14,16 @@ from turbogs_plugin.types import SH_C0, Cameras
 POINT_NOISE = 0.01
 """Standard deviation of the points' noise; the cameras are 3 from the centre."""
 PIXELS_PER_GAUSSIAN, FEWEST_GAUSSIANS = 40, 100
-EXTENT_MARGIN = 1.1
+EXTENT_MARGIN, TEST_EVERY = 1.1, 8
 """As in 3DGS."""
 
 
 @torch.no_grad()
-def synthetic_scene(
-    views: int, width: int, height: int, device: torch.device, gaussians: int | None = None, test_every: int = 8
-) -> Scene:
+def synthetic_scene(views: int, width: int, height: int, device: torch.device, gaussians: int | None = None) -> Scene:
     """A scene whose photos are renders of `surface_gaussians`, in host memory.
 
     Args:
-        views: photos in all, from a ring of cameras; every `test_every`-th one tests.
+        views: photos in all, from a ring of cameras; every eighth one tests.
         width, height: of each.
         device: where to render them.
         gaussians: of the model that is photographed; one for `PIXELS_PER_GAUSSIAN` of a photo where None. A quarter of
@@ -33,7 +31,7 @@ def synthetic_scene(
     """
     model = surface_gaussians(gaussians or max(FEWEST_GAUSSIANS, width * height // PIXELS_PER_GAUSSIAN), device)
     cameras = ring_cameras(views, width, height, device)
-    test = np.arange(views) % test_every == 0
+    test = np.arange(views) % TEST_EVERY == 0
 
     def photograph(chosen: np.ndarray) -> PosedImages:
         pixels = torch.empty(len(chosen), height, width, 3, dtype=torch.uint8)

@@ -14,16 +14,17 @@ from torch.nn.functional import normalize
 from turbogs_plugin.config.configuration import Config, load_config, resolve
 from turbogs_plugin.model.row_order import spatial_order
 from turbogs_plugin.scene import Scene
-from turbogs_plugin.tiles import TILE_PIXELS, pixel_table
+from turbogs_plugin.scene.poses import look_at
+from turbogs_plugin.tiles import TILE_PIXELS, compact, pixel_table
 from turbogs_plugin.train.loop import TrainingLoop
 from turbogs_plugin.train.trainer import Trainer
-from turbogs_plugin.types import Cameras, Gaussians, PixelSamples, TileGrid
+from turbogs_plugin.types import Cameras, Gaussians, PixelSamples
 
 TRAINING_ITERATIONS = 1500
-"""Of a model that is trained to be timed, where nothing else is asked for."""
+"""How long a model is trained before it is timed, unless something else is asked for."""
 
 RING_RADIUS = 3.0
-"""Of the synthetic cameras about the origin."""
+"""Distance of the synthetic cameras from the vertical axis."""
 
 GROWING_SHARE = 0.8
 """Share of a model's training in which it grows; in the rest it settles at its final size."""
@@ -34,7 +35,7 @@ def trained_model(
 ) -> Gaussians:
     """A model of `count` Gaussians, trained briefly.
 
-    It grows by density control, to at most so many, is brought to the exact size by `resized`, and settles without
+    It grows by density control, to at most `count`, is brought to the exact size by `resized`, and settles without
     density control.
 
     Args:
@@ -54,17 +55,10 @@ def trained_model(
     trainer = Trainer(config, scene, device)
     if iterations:
         train(trainer, growing)
-    settled = settled_trainer(config, scene, resized(trainer.gaussians, count), device)
-    del trainer
-    train(settled, iterations - growing)
-    return settled.gaussians
-
-
-def settled_trainer(config: Config, scene: Scene, gaussians: Gaussians, device: torch.device) -> Trainer:
-    """A trainer of these Gaussians that uses every band and leaves their number as it is."""
-    trainer = Trainer(changed(config, train={"sh_interval": 1}, density={"type": "none"}), scene, device)
-    adopt(trainer, gaussians)
-    return trainer
+    settling = changed(config, train={"sh_interval": 1}, density={"type": "none"})
+    trainer = trainer_of(settling, scene, resized(trainer.gaussians, count), device)
+    train(trainer, iterations - growing)
+    return trainer.gaussians
 
 
 def changed(config: Config, **sections: dict[str, Any]) -> Config:
@@ -75,21 +69,23 @@ def changed(config: Config, **sections: dict[str, Any]) -> Config:
     return resolve(mapping)
 
 
-def adopt(trainer: Trainer, gaussians: Gaussians) -> None:
-    """Let a trainer go on with other Gaussians, as if it started from them."""
+def trainer_of(config: Config, scene: Scene, gaussians: Gaussians, device: torch.device) -> Trainer:
+    """A trainer that starts from a copy of these Gaussians, and not from the points of the scene."""
+    trainer = Trainer(config, scene, device)
     trainer.gaussians = gaussians.map(lambda value: value.clone())
     trainer.optimizer.setup(trainer.gaussians)
     trainer.density.setup(trainer.gaussians)
     trainer.initialise_maps()
+    return trainer
 
 
 def train(trainer: Trainer, iterations: int) -> None:
-    """So many more iterations, those repeated that were lost to an overflow."""
+    """Train for so many more iterations. Iterations that were lost to an overflow are repeated."""
     TrainingLoop(trainer).advance(trainer.iteration + iterations)
 
 
 def resized(gaussians: Gaussians, count: int, seed: int = 0) -> Gaussians:
-    """A model of the same look with `count` Gaussians: a random subset, or all and jittered copies of random ones.
+    """A model that looks the same, with `count` Gaussians: a random subset, or all and jittered copies of random ones.
 
     Standard deviations change with the inverse root of the number, so that surfaces stay covered as they were. Copies
     follow their original in memory.
@@ -115,20 +111,15 @@ def resized(gaussians: Gaussians, count: int, seed: int = 0) -> Gaussians:
 
 def ring_cameras(count: int, width: int, height: int, device: torch.device) -> Cameras:
     """Cameras on a ring that look at the origin."""
+    origin, up = np.zeros(3), np.array([0.0, -1.0, 0.0])
     viewmats = []
     for angle in np.linspace(0, 2 * math.pi, count, endpoint=False):
-        x, z = RING_RADIUS * math.sin(angle), -RING_RADIUS * math.cos(angle)
-        position = torch.tensor([x, -0.6, z], dtype=torch.float64)
-        forward = normalize(-position, dim=0)
-        right = normalize(torch.linalg.cross(torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64), forward), dim=0)
-        rotation = torch.stack([right, torch.linalg.cross(forward, right), forward])
-        viewmat = torch.eye(4, dtype=torch.float64)
-        viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ position
-        viewmats.append(viewmat)
+        position = np.array([RING_RADIUS * math.sin(angle), -0.6, -RING_RADIUS * math.cos(angle)])
+        viewmats.append(look_at(position, origin, up))
     focal = 0.9 * max(width, height)
     intrinsics = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
     sizes = np.array([[width, height]] * count, dtype=np.int64)
-    return Cameras(torch.stack(viewmats).float(), intrinsics.repeat(count, 1, 1), sizes).to(device)
+    return Cameras(torch.from_numpy(np.stack(viewmats)).float(), intrinsics.repeat(count, 1, 1), sizes).to(device)
 
 
 def surface_gaussians(count: int, device: torch.device, seed: int = 0) -> Gaussians:
@@ -162,19 +153,11 @@ def tile_samples(sizes: np.ndarray, rate: float, device: torch.device, seed: int
     table = pixel_table(sizes, device)  # [T, 256]
     generator = torch.Generator(device).manual_seed(seed)
     keys = torch.rand(table.shape, device=device, generator=generator).masked_fill_(table < 0, -1.0)
-    places = keys.topk(count, dim=1).indices
-    places = torch.where(table.gather(1, places) >= 0, places, TILE_PIXELS).sort(dim=1).values
-    padded = torch.cat([table, table.new_full((len(table), 1), -1)], dim=1)
-    tiles = torch.arange(len(TileGrid(sizes)), dtype=torch.int32, device=device)
-    return PixelSamples(
-        view_ids=tuple(range(len(sizes))),
-        sizes=sizes,
-        pixel_ids=padded.gather(1, places).reshape(-1),
-        tile_ids=tiles,
-        tile_offsets=torch.arange(len(tiles) + 1, dtype=torch.int32, device=device) * count,
-    )
+    chosen = torch.zeros_like(table, dtype=torch.bool).scatter_(1, keys.topk(count, dim=1).indices, True)
+    tiles = torch.arange(len(table), dtype=torch.int32, device=device)
+    return compact(range(len(sizes)), sizes, table, chosen & (table >= 0), tiles, np.full(len(table), count))
 
 
 def spread_views(count: int, of: int) -> list[int]:
-    """`count` views spread evenly over so many."""
+    """`count` of so many views, spread evenly."""
     return np.linspace(0, of - 1, min(count, of)).round().astype(int).tolist()

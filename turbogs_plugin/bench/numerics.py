@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import json
-import statistics
-import time
+import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 
 import matplotlib
@@ -15,7 +15,7 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from turbogs_plugin.device import synchronize
+from turbogs_plugin.bench.clocks import measure
 from turbogs_plugin.engine.reference.lm_solvers import (
     ROW_LIMIT,
     solve_float64,
@@ -39,17 +39,20 @@ SOLVERS: dict[str, Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]] = {
 }
 COLORS = ("#b3261e", "#1f5fa8", "#2e7d32", "#6d6d6d")
 
+VIEWS = (3, 10)
+"""The values of K that are measured."""
+
 SIZE = 10
-"""D of the geometry block, the larger of the two."""
+"""D, the size of the systems: that of the geometry block, the larger of the two."""
 
 SYSTEMS = 2000
-"""Systems of a family whose error is measured."""
+"""How many systems of each family are solved to measure the error."""
 
 BATCH = 100_000
-"""Systems that are solved at once when the time is measured."""
+"""How many systems are solved at once to measure the time."""
 
 REPEATS = 5
-"""Of the time measurement; the median counts."""
+"""How often the time is measured; the median counts."""
 
 FAILED_ERROR = 1.0
 """A solution that is not finite, or further off than this, is worth less than no step at all."""
@@ -162,18 +165,16 @@ def bench_solvers(out: Path, device: torch.device) -> list[SolverResult]:
     """
     out.mkdir(parents=True, exist_ok=True)
     results = []
-    for views in (3, 10):
+    for views in VIEWS:
         times = _nanoseconds(views, device)
         for seed, family in enumerate(FAMILIES):
             problem = make_problem(family, views, SYSTEMS, seed)
             exact = solve_exactly(problem)
             for name, solve in SOLVERS.items():
                 errors = scaled_errors(solve(*(value.to(device) for value in problem)), exact, problem)
-                good = errors <= FAILED_ERROR
-                median, largest = (
-                    (float(np.median(errors[good])), float(errors[good].max())) if good.any() else (float("nan"),) * 2
-                )
-                failed = float(1 - good.mean())
+                good = errors[errors <= FAILED_ERROR]
+                median, largest = (float(np.median(good)), float(good.max())) if len(good) else (math.nan, math.nan)
+                failed = 1 - len(good) / len(errors)
                 results.append(SolverResult(name, family.name, views, median, largest, failed, times[name]))
     machine = {"hardware": hardware(device.type), "software": dict(software()), "threads": torch.get_num_threads()}
     settings = {"systems": SYSTEMS, "batch": BATCH, "repeats": REPEATS, "size": SIZE}
@@ -187,18 +188,10 @@ def bench_solvers(out: Path, device: torch.device) -> list[SolverResult]:
 def _nanoseconds(views: int, device: torch.device) -> dict[str, float]:
     """Time a system, by solver. Branch-free solvers take the same time on every family."""
     problem = tuple(value.to(device) for value in make_problem(FAMILIES[0], views, BATCH, seed=0))
-    times = {}
-    for name, solve in SOLVERS.items():
-        solve(*problem)
-        spans = []
-        for _ in range(REPEATS):
-            synchronize(device)
-            started = time.perf_counter()
-            solve(*problem)
-            synchronize(device)
-            spans.append(time.perf_counter() - started)
-        times[name] = 1e9 * statistics.median(spans) / BATCH
-    return times
+    return {
+        name: 1e6 * measure(partial(solve, *problem), REPEATS, device)["median_ms"] / BATCH
+        for name, solve in SOLVERS.items()
+    }
 
 
 def solvers_table(results: list[SolverResult]) -> str:
@@ -209,24 +202,21 @@ def solvers_table(results: list[SolverResult]) -> str:
             return "all fail"
         return f"{result.max_error:.0e}" + (f" ({100 * result.failed:.1f} % fail)" if result.failed else "")
 
-    keys = list(dict.fromkeys((result.views, result.family) for result in results))
-    by_key = {(result.views, result.family, result.solver): result for result in results}
-    rows = [(views, family, *(cell(by_key[views, family, name]) for name in SOLVERS)) for views, family in keys]
-    for views in dict.fromkeys(result.views for result in results):
-        family = next(family for k, family in keys if k == views)
-        rows.append(
-            (views, "time a system", *(f"{by_key[views, family, name].nanoseconds:.0f} ns" for name in SOLVERS))
-        )
+    def of(views: int, family: Stiffness) -> list[SolverResult]:
+        return [result for result in results if (result.views, result.family) == (views, family.name)]
+
+    rows = [(k, family.name, *(cell(result) for result in of(k, family))) for k in VIEWS for family in FAMILIES]
+    for k in VIEWS:
+        rows.append((k, "time a system", *(f"{result.nanoseconds:.0f} ns" for result in of(k, FAMILIES[0]))))
     return table(("rows K", "systems of 10 x 10", *SOLVERS), rows)
 
 
 def _plot(results: list[SolverResult]) -> Figure:
     """Largest error of every family against time, a panel for each K. Hollow: rows beyond `ROW_LIMIT`."""
-    views = list(dict.fromkeys(result.views for result in results))
     lengths = {family.name: family.length for family in FAMILIES}
     with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(5.4 * len(views), 4.6), layout="constrained")
-        for axes, k in zip(figure.subplots(1, len(views), sharey=True, squeeze=False)[0], views, strict=True):
+        figure = Figure(figsize=(5.4 * len(VIEWS), 4.6), layout="constrained")
+        for axes, k in zip(figure.subplots(1, len(VIEWS), sharey=True), VIEWS, strict=True):
             for name, color in zip(SOLVERS, COLORS, strict=True):
                 own = [result for result in results if result.views == k and result.solver == name]
                 time_ns = own[0].nanoseconds

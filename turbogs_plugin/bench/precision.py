@@ -10,7 +10,7 @@ from turbogs_plugin.engine.layout import ScreenRecord, columns
 from turbogs_plugin.engine.rendering import rasterize, rasterize_reference
 
 COLUMNS = ("mean", "conic", "color", "opacity")
-"""Of the records of the screen gradients, those that every pass has."""
+"""The columns that the records of screen gradients have in every pass."""
 
 THRESHOLD = 1e-4
 """Differences beyond it are counted: a splat at a threshold is drawn by one and not by the other."""

@@ -7,16 +7,17 @@ import os
 import subprocess
 import sys
 import tempfile
-from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import torch
+from torch import Tensor
 
-from turbogs_plugin.bench.clocks import Mark, Summary, back_to_back, copy_bandwidth, measure, summary
+from turbogs_plugin.bench.clocks import Recorder, back_to_back, copy_bandwidth, device_times, measure
 from turbogs_plugin.bench.floors import raster_counts, raster_floors
 from turbogs_plugin.bench.gsplat_dense import bench_gsplat
 from turbogs_plugin.bench.models import (
@@ -47,30 +48,18 @@ STAGES = {
     "raster_backward": "backward",
     "projection_backward": "projection backward",
 }
-"""Operators of the library and the names their times go by."""
+"""Operators of the library, and the stage that each of them is."""
 
 
 @contextmanager
-def timed_operators(times: dict[str, list[tuple[Mark, Mark]]], device: torch.device) -> Iterator[None]:
-    """Records a pair of marks around every call of the operators in `STAGES`."""
-    originals = {name: getattr(torch.ops.turbogs, name) for name in STAGES}
-
-    def wrap(name: str, operator: Callable) -> Callable:
-        def call(*arguments):
-            first = Mark(device)
-            result = operator(*arguments)
-            times[STAGES[name]].append((first, Mark(device)))
-            return result
-
-        return call
-
-    for name, operator in originals.items():
-        setattr(torch.ops.turbogs, name, wrap(name, operator))
-    try:
-        yield
-    finally:
-        for name, operator in originals.items():
-            setattr(torch.ops.turbogs, name, operator)
+def recorded_operators(device: torch.device) -> Iterator[Recorder]:
+    """While entered, every call of the operators in `STAGES` is recorded under its stage."""
+    recorder = Recorder(device)
+    with ExitStack() as stack:
+        for name, stage in STAGES.items():
+            timed = recorder.timed(stage, getattr(torch.ops.turbogs, name))
+            stack.enter_context(patch.object(torch.ops.turbogs, name, timed))
+        yield recorder
 
 
 @dataclass
@@ -108,7 +97,7 @@ class RasterBench:
                 raise InputError(f"no such library: '{library}'")
 
     def arguments(self) -> list[str]:
-        """Of the command line that measures the same models, synthetic ones or files, the libraries left out."""
+        """Options of a command line that measures the same models, synthetic ones or files, without the libraries."""
         values = {
             "--gaussians": self.gaussians,
             "--views": self.views,
@@ -138,10 +127,7 @@ class RasterBench:
         if scene is None:
             return [surface_gaussians(count, torch.device("cpu")) for count in self.gaussians]
         placed = scene_on(scene, device)
-        trained = [
-            trained_model(placed, count, self.training, device, ()).map(lambda value: value.detach().cpu())
-            for count in self.gaussians
-        ]
+        trained = [trained_model(placed, count, self.training, device, ()).map(Tensor.cpu) for count in self.gaussians]
         del placed
         free_device_memory(device)
         return trained
@@ -213,39 +199,29 @@ class RasterBench:
             "density_sums": density,
             "samples": len(samples),
         }
-        if not isinstance(render(), CudaRendered):
+        on_kernels = isinstance(render(), CudaRendered)
+        if on_kernels:
+            torch.cuda.reset_peak_memory_stats(device)
+            whole()
+            with recorded_operators(device) as recorder:
+                measure(whole, self.repeats, device)
+            spans = recorder.spans.items()
+            measured["stages"] = {stage: device_times(calls[-self.repeats :]) for stage, calls in spans}
+        else:
+            measured["forward"] = measure(render, self.repeats, device)
+        measured["forward_backward"] = measure(whole, self.repeats, device)
+        measured["wall"] = back_to_back(whole, self.repeats, device)
+        if not on_kernels:
             visible = (render().projected().radii > 0).any(dim=-1).any(dim=0)  # [N]
-            return {
-                **measured,
-                "forward": measure(render, self.repeats, device),
-                **self._totals(whole, device),
-                "counts": {"visible_gaussians": int(visible.sum())},
-            }
-        torch.cuda.reset_peak_memory_stats(device)
-        whole()
-        times: dict[str, list[tuple[Mark, Mark]]] = defaultdict(list)
-        with timed_operators(times, device):
-            measure(whole, self.repeats, device)
-        stages = {
-            name: summary([first.until(last) for first, last in spans[-self.repeats :]])
-            for name, spans in times.items()
-        }
+            return {**measured, "counts": {"visible_gaussians": int(visible.sum())}}
         counts = raster_counts(render(), samples)
         return {
             **measured,
-            "stages": stages,
-            **self._totals(whole, device),
             "counts": counts,
             "floors_ms": raster_floors(counts, bandwidth),
             "lost_passes": engine.settle(wait=True),
             "workspace_bytes": engine.bytes_held,
             "peak_bytes": torch.cuda.max_memory_allocated(device),
-        }
-
-    def _totals(self, whole: Callable[[], None], device: torch.device) -> dict[str, Summary]:
-        return {
-            "forward_backward": measure(whole, self.repeats, device),
-            "wall": back_to_back(whole, self.repeats, device),
         }
 
 

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from typing import Any
+from unittest.mock import patch
 
 import torch
 
-from turbogs_plugin.bench.clocks import Mark, Summary, summary
+from turbogs_plugin.bench.clocks import Recorder, Summary, device_times, summary
 from turbogs_plugin.engine import Engine
 from turbogs_plugin.engine.rendered import Rendered
 from turbogs_plugin.train.trainer import Trainer
@@ -20,7 +20,7 @@ STEPS = ("budget", "GVS", "EPS", "FWD", "gather+L+E", "BWD", "solve+update", "ED
 with loss and error maps, backward to the screen, backward to the parameters with the optimizer, density control."""
 
 
-class StepRecorder:
+class StepRecorder(Recorder):
     """Spans of the steps of iterations.
 
     Attributes:
@@ -28,27 +28,15 @@ class StepRecorder:
     """
 
     def __init__(self, device: torch.device) -> None:
-        self.device = device
-        self.spans: dict[str, list[tuple[Mark, Mark]]] = defaultdict(list)
+        super().__init__(device)
         self.rendered: Rendered | None = None
         self.samples: PixelSamples | None = None
-
-    def timed(self, name: str, function: Callable) -> Callable:
-        """The function, with its spans recorded under a name."""
-
-        def call(*arguments: Any, **keywords: Any) -> Any:
-            first = Mark(self.device)
-            result = function(*arguments, **keywords)
-            self.spans[name].append((first, Mark(self.device)))
-            return result
-
-        return call
 
     def summaries(self) -> dict[str, dict[str, Summary]]:
         """Step -> times on the device and on the host, after the device has been waited for."""
         return {
             name: {
-                "device": summary([first.until(last) for first, last in self.spans[name]]),
+                "device": device_times(self.spans[name]),
                 "host": summary([first.host_until(last) for first, last in self.spans[name]]),
             }
             for name in ("iteration", *STEPS)
@@ -56,19 +44,15 @@ class StepRecorder:
         }
 
 
-class TimedEngine:
-    """Another engine whose every call is recorded; what it renders records its backward pass too.
-
-    Args:
-        engine: of the trainer.
-    """
+class RecordedEngine:
+    """Another engine whose forward passes are recorded, and the backward passes of what it renders."""
 
     def __init__(self, engine: Engine, recorder: StepRecorder) -> None:
         self._engine, self._recorder = engine, recorder
-        self.draw, self.evaluate, self.learn, self.settle = engine.draw, engine.evaluate, engine.learn, engine.settle
-        self.supervise = recorder.timed("gather+L+E", engine.supervise)
-        self.update = recorder.timed("solve+update", engine.update)
         self._render = recorder.timed("FWD", engine.render)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._engine, name)
 
     def render(self, gaussians: Gaussians, cameras: Cameras, samples: PixelSamples, **options: Any) -> Rendered:
         rendered = self._render(gaussians, cameras, samples, **options)
@@ -76,42 +60,21 @@ class TimedEngine:
         rendered.backward = self._recorder.timed("BWD", rendered.backward)
         return rendered
 
-    @property
-    def bytes_held(self) -> int:
-        return self._engine.bytes_held
-
 
 @contextmanager
 def recorded(trainer: Trainer, recorder: StepRecorder) -> Iterator[Callable[[], None]]:
     """While entered, the steps of this trainer's iterations are recorded; gives its iteration."""
     timed = recorder.timed
-    replacements = [
-        (trainer, "engine", TimedEngine(trainer.engine, recorder)),
+    replacements = (
         (trainer.schedule, "query", timed("budget", trainer.schedule.query)),
         (trainer.view_sampler, "select", timed("GVS", trainer.view_sampler.select)),
         (trainer.pixel_sampler, "sample", timed("EPS", trainer.pixel_sampler.sample)),
+        (trainer, "engine", RecordedEngine(trainer.engine, recorder)),
+        (trainer, "supervise", timed("gather+L+E", trainer.supervise)),
+        (trainer, "update", timed("solve+update", trainer.update)),
         (trainer.density, "update", timed("EDC", trainer.density.update)),
-    ]
-    if trainer.loss.terms is None:  # its own code is not the engine's
-        replacements.append((trainer, "supervise", timed("gather+L+E", trainer.supervise)))
-    if trainer.optimizer.rule(trainer.now) is None:
-        replacements.append((trainer, "update", timed("solve+update", trainer.update)))
+    )
     with ExitStack() as stack:
         for owner, name, replacement in replacements:
-            stack.enter_context(_replaced(owner, name, replacement))
+            stack.enter_context(patch.object(owner, name, replacement))
         yield timed("iteration", trainer.step)
-
-
-@contextmanager
-def _replaced(owner: Any, name: str, value: Any) -> Iterator[None]:
-    """Another attribute for a while."""
-    own = name in vars(owner)
-    before = getattr(owner, name)
-    setattr(owner, name, value)
-    try:
-        yield
-    finally:
-        if own:
-            setattr(owner, name, before)
-        else:
-            delattr(owner, name)

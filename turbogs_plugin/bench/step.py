@@ -5,16 +5,16 @@ from __future__ import annotations
 import copy
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from turbogs_plugin.bench.clocks import BLOCKS, Mark, back_to_back, copy_bandwidth, keep_busy, summary
+from turbogs_plugin.bench.clocks import BLOCKS, Mark, back_to_back, copy_bandwidth, device_times, keep_busy, summary
 from turbogs_plugin.bench.floors import raster_counts, step_floors
-from turbogs_plugin.bench.models import adopt, changed, resized, train, trained_model
+from turbogs_plugin.bench.models import changed, resized, train, trained_model, trainer_of
 from turbogs_plugin.bench.recorder import StepRecorder, recorded
 from turbogs_plugin.config.configuration import Config, load_config
 from turbogs_plugin.device import synchronize
@@ -23,25 +23,24 @@ from turbogs_plugin.model.ply import load_ply
 from turbogs_plugin.model.row_order import in_order_of_space
 from turbogs_plugin.scene import Scene
 from turbogs_plugin.train.trainer import Trainer
-from turbogs_plugin.types import Gaussians, Step
+from turbogs_plugin.types import Gaussians
 
 NO_EVENTS = 1 << 20
-"""Iteration of the first density event: none, while statistics are kept as in any iteration."""
+"""Iteration of the first density event, which is never reached. Statistics are kept as in any training."""
 
 FIRST_EVENT = {"refine_from", "refine_start_iter"}
-"""What the kinds of density control call it."""
+"""The setting of the first density event, by its name in each kind of density control."""
 
 OFFLOADED = {"photos": ("photos",), "maps": ("maps",), "both": ("maps", "photos")}
-"""Rows of the offload table: what is in host memory."""
-BYTES_IN = {"maps": 4, "photos": 3}
-BYTES_OUT = {"maps": 4, "photos": 0}
-"""Of a pixel of a view that comes into the window, at most: views of the iteration before are there already."""
+"""What is in host memory, by the name in the results."""
+BYTES_IN, BYTES_OUT = {"maps": 4, "photos": 3}, {"maps": 4, "photos": 0}
+"""Copied to and from the device for a pixel, at most: a view of the iteration before is there already."""
 
 RATE_FACTOR = 1e-3
-"""Of the learning rates: their size costs nothing, and the model stays the one that is to be timed."""
+"""Factor of the learning rates. Small steps take as long as large ones, and the timed model hardly changes."""
 
-WARMUP_ITERATIONS = 40
-"""More than the workspace's early passes, so that its buffers have their steady size."""
+WARMUP_ITERATIONS = {"cuda": 40, "cpu": 2}
+"""On a GPU more than the workspace's early passes, so that its buffers have their steady size."""
 
 
 @dataclass
@@ -57,6 +56,7 @@ class StepBench:
         overrides: of the configuration, whose strategies are timed.
         ply: a model in place of a trained one.
         offload: time the iteration with photos and error maps in host memory, too.
+        photos, size: how many synthetic photos of which (width, height) take the place of a scene; 0: none.
     """
 
     gaussians: Sequence[int]
@@ -67,9 +67,11 @@ class StepBench:
     overrides: Sequence[str]
     ply: Path | None = None
     offload: bool = False
+    photos: int = 0
+    size: tuple[int, int] = (0, 0)
 
     def run(self, scene: Scene, device: torch.device) -> dict[str, Any]:
-        """The measurements, ready for JSON. `scene`: its photos on the device, or where every trainer gets its own."""
+        """The measurements, ready for JSON. `scene`: on the device, or every trainer copies the photos."""
         bandwidth = copy_bandwidth(device)
         loaded = None if self.ply is None else load_ply(self.ply, scene.frame)
         passes = []
@@ -77,7 +79,7 @@ class StepBench:
             if loaded is None:
                 model = trained_model(scene, count, self.training, device, self.overrides)
             else:
-                model = resized(loaded.map(lambda value: value.float().to(device).contiguous()), count)
+                model = resized(loaded.map(lambda value: value.to(device)), count)
             for views in self.views:
                 passes.append(self._measure(scene, model, views, device, bandwidth))
         return {
@@ -95,10 +97,7 @@ class StepBench:
     ) -> dict[str, Any]:
         config, on_gpu = self._config(views), device.type == "cuda"
         held = torch.cuda.memory_allocated(device) if on_gpu else 0
-        trainer = Trainer(config, scene, device)
-        adopt(trainer, model)
-        trainer.iteration = config.train.sh_degree  # every band is in use
-        train(trainer, WARMUP_ITERATIONS if on_gpu else 2)
+        trainer = warm_trainer(config, scene, model, device)
         if on_gpu:
             torch.cuda.empty_cache()
             torch.cuda.reset_peak_memory_stats(device)
@@ -128,7 +127,7 @@ class StepBench:
         free_running = self._free_running(trainer, device)
         wall = back_to_back(trainer.step, self.repeats, device)
         trainer.repeat_lost(wait=True)
-        event = density_event(trainer, config, self.overrides, device)
+        event = density_event(trainer, self.overrides, device)
         lost = start + 1 + self.repeats * (2 + BLOCKS) - trainer.iteration
         del trainer
         return {
@@ -151,22 +150,17 @@ class StepBench:
     ) -> dict[str, dict[str, Any]]:
         """What is in host memory -> time of an iteration back to back, bytes of the windows, bytes that travel."""
         results = {}
+        view_pixels = int(scene.train.cameras.sizes.prod(axis=1).mean())
+        pixels = min(config.schedule["views"], len(scene.train)) * view_pixels
         for name, hosted in OFFLOADED.items():
             places = {f"{what}_place": "host" if what in hosted else "device" for what in ("maps", "photos")}
-            trainer = Trainer(changed(config, train=places), scene, device)
-            adopt(trainer, model)
-            trainer.iteration = config.train.sh_degree
-            train(trainer, WARMUP_ITERATIONS if device.type == "cuda" else 2)
+            trainer = warm_trainer(changed(config, train=places), scene, model, device)
             wall = back_to_back(trainer.step, self.repeats, device)
             trainer.repeat_lost(wait=True)
-            pixels = min(config.schedule["views"], len(scene.train)) * int(
-                scene.train.cameras.sizes.prod(axis=1).mean()
-            )
+            owners = (trainer.maps, trainer.views.photos)
             results[name] = {
                 "wall": wall,
-                "window_bytes": sum(
-                    getattr(owner, "window_bytes", 0) for owner in (trainer.maps, trainer.views.photos)
-                ),
+                "window_bytes": sum(getattr(owner, "window_bytes", 0) for owner in owners),
                 "bytes_in": pixels * sum(BYTES_IN[what] for what in hosted),
                 "bytes_out": pixels * sum(BYTES_OUT[what] for what in hosted),
             }
@@ -193,11 +187,19 @@ class StepBench:
             trainer.step()
             marks.append(Mark(device))
         synchronize(device)
-        return summary([first.until(last) for first, last in itertools.pairwise(marks)])
+        return device_times(itertools.pairwise(marks))
+
+
+def warm_trainer(config: Config, scene: Scene, model: Gaussians, device: torch.device) -> Trainer:
+    """A trainer of this model with every band in use, after the iterations that are unlike all later ones."""
+    trainer = trainer_of(config, scene, model, device)
+    trainer.iteration = config.train.sh_degree
+    train(trainer, WARMUP_ITERATIONS[device.type])
+    return trainer
 
 
 def density_event(
-    trainer: Trainer, config: Config, overrides: Sequence[str], device: torch.device, repeats: int = 5
+    trainer: Trainer, overrides: Sequence[str], device: torch.device, repeats: int = 5
 ) -> dict[str, Any] | None:
     """One event of density control with its change of model and optimizer state, by the statistics of this trainer.
 
@@ -207,13 +209,8 @@ def density_event(
     if "refine_from" not in usual.density:
         return None
     interval = usual.density["refine_every"]
-    due = Step(
-        iteration=-(-usual.density["refine_from"] // interval) * interval,
-        total=usual.train.iterations,
-        refine_until=usual.train.refine_until,
-        seed=config.train.seed,
-        scene_extent=trainer.extent,
-    )
+    iteration = -(-usual.density["refine_from"] // interval) * interval
+    due = replace(trainer.now, iteration=iteration, total=usual.train.iterations, refine_until=usual.train.refine_until)
     spans, after = [], len(trainer.gaussians)
     for _ in range(repeats):
         density, optimizer = usual.build("density"), copy.deepcopy(trainer.optimizer)
@@ -259,7 +256,7 @@ def memory(trainer: Trainer, scene: Scene, held: int, device: torch.device) -> d
 def tensor_bytes(value: Any) -> int:
     """Bytes of the tensors in nested dicts and lists."""
     if isinstance(value, dict):
-        return sum(map(tensor_bytes, value.values()))
+        value = list(value.values())
     if isinstance(value, list | tuple):
         return sum(map(tensor_bytes, value))
-    return value.numel() * value.element_size() if isinstance(value, Tensor) else 0
+    return value.nbytes if isinstance(value, Tensor) else 0

@@ -1,4 +1,4 @@
-"""A bound on the size of Gaussians far away, which no training view need show."""
+"""A bound on the size of far Gaussians, which grow where no training view shows it."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ import torch
 from turbogs_plugin.types import Gaussians
 
 DISTANT = 2.0
-"""In extents: what lies beyond is bounded. All cameras are within one extent, so that is at least one from any of them:
-nearer, the bound would reach the scene itself."""
+"""Gaussians farther than this from the cameras' centre, in extents, are bounded. All cameras lie within one extent of
+it. So these Gaussians are at least one extent away from every camera; a nearer limit would bound the scene itself."""
 RESTRAIN_EVERY = 10
-"""Iterations from one bounding to the next: in so few, a deviation grows by a quarter at most."""
+"""Iterations from one bounding to the next. In so few, a standard deviation grows by a quarter at most."""
 
 
 @torch.no_grad()

@@ -25,7 +25,7 @@ def band_energy(gaussians: Gaussians) -> list[float]:
 
 
 def drop_faint_bands(gaussians: Gaussians, threshold: float) -> Gaussians:
-    """The model without its highest degrees, as many as together have at most this share of its colours' energy.
+    """The model without its highest degrees: as many as together have at most this share of its colours' energy.
 
     Args:
         gaussians: the model; its means and shapes are shared with the result.

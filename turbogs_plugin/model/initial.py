@@ -16,17 +16,17 @@ from turbogs_plugin.types import SH_C0, Gaussians
 INITIAL_OPACITY = 0.1
 """As in 3DGS."""
 DARKEST = 0.5
-"""Least channel of a new Gaussian's colour, of 255: at exactly 0 the clamp of colours may zero its gradient."""
+"""Smallest channel of a new Gaussian's colour, of 255: at exactly 0 the clamp of colours may zero its gradient."""
 SMALLEST_SCALE = 1e-4
-"""Of a new Gaussian, in extents: coincident points would otherwise give a scale of zero."""
+"""Smallest scale of a new Gaussian, in extents: coincident points would otherwise give a scale of zero."""
 LONELY_SCALE = 0.01
 """Scale of a Gaussian without neighbours, in extents."""
 BACKDROP_COUNT = 3000
-"""They lie 3.7 degrees apart: enough for one colour, and few beside what a capture has. Detail is for densification."""
+"""Gaussians of the backdrop, 3.7 degrees apart: enough for one colour, and few beside those of a capture."""
 BACKDROP_RADIUS = 20.0
-"""In extents: beyond what a capture shows, near enough that floats tell its Gaussians apart."""
+"""Distance of the backdrop, in extents: beyond what a capture shows, near enough for the precision of float32."""
 BACKDROP_OPACITY = 0.88
-"""Several of its Gaussians cover a direction, so that nothing shines through."""
+"""Opacity of the backdrop's Gaussians. Several cover each direction, so that nothing shines through."""
 
 
 def gaussians_from_points(

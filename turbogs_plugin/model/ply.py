@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import warnings
 from pathlib import Path
@@ -15,11 +16,11 @@ from turbogs_plugin.engine.layout import MAX_SH_DEGREE
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.files import write_atomically
 from turbogs_plugin.scene.frame import Frame
-from turbogs_plugin.scene.ply import read_vertices
+from turbogs_plugin.scene.ply import TYPES, read_vertices
 from turbogs_plugin.types import Gaussians
 
 POSITION_ERROR = 1e-6
-"""Largest rounding of exported positions that the place of the capture may cause, in units of the frame's scale."""
+"""Largest rounding error of exported positions that is accepted, in units of the frame's scale."""
 
 
 def save_ply(gaussians: Gaussians, path: str | Path, frame: Frame | None = None) -> None:
@@ -51,14 +52,16 @@ def save_ply(gaussians: Gaussians, path: str | Path, frame: Frame | None = None)
     values["means"] = frame.restore_points(values["means"])
     values["scales"] = values["scales"] + math.log(frame.scale)
 
-    names = ply_properties(rows.shN.shape[1])
-    table = np.zeros(len(rows), dtype=[(name, "<f8" if far and name in ("x", "y", "z") else "<f4") for name in names])
-    for parameter, columns in _property_groups(rows.shN.shape[1]).items():
-        for column, name in enumerate(columns):
-            table[name] = values[parameter][:, column]
-    types = {"<f4": "float", "<f8": "double"}
+    groups = _property_groups(rows.shN.shape[1])
+    types = dict.fromkeys(itertools.chain.from_iterable(groups.values()), "float")
+    if far:
+        types.update(dict.fromkeys(groups["means"], "double"))
+    table = np.zeros(len(rows), dtype=[(name, TYPES[kind]) for name, kind in types.items()])
+    for parameter, value in values.items():
+        for column, name in enumerate(groups[parameter]):
+            table[name] = value[:, column]
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(table)}"]
-    header += [f"property {types[table.dtype[name].str]} {name}" for name in names]
+    header += [f"property {kind} {name}" for name, kind in types.items()]
 
     def write(file: BinaryIO) -> None:
         file.write("\n".join([*header, "end_header\n"]).encode())
@@ -86,7 +89,7 @@ def load_ply(path: str | Path, frame: Frame | None = None) -> Gaussians:
     """
     vertices = read_vertices(path)
     frame = frame or Frame(np.zeros(3), 1.0)
-    names = set(vertices.dtype.names)
+    names = vertices.dtype.names
     rest = sum(name.startswith("f_rest_") for name in names)
     bands = {3 * ((degree + 1) ** 2 - 1): (degree + 1) ** 2 - 1 for degree in range(MAX_SH_DEGREE + 1)}
     if rest not in bands:
@@ -95,21 +98,20 @@ def load_ply(path: str | Path, frame: Frame | None = None) -> Gaussians:
             f"largest here, have one of {sorted(bands)}"
         )
     groups = _property_groups(bands[rest])
+    del groups["normals"]  # which a model does not have
     missing = [name for group in groups.values() for name in group if name not in names]
     if missing:
         raise InputError(f"{path} is not a 3DGS model: it lacks the properties {', '.join(missing[:4])}")
     if not len(vertices):
         raise InputError(f"{path} holds no Gaussians")
     values = {
-        parameter: np.stack([vertices[name].astype(np.float64) for name in group], axis=1)
-        if group
-        else np.zeros((len(vertices), 0))
+        parameter: np.array([vertices[name] for name in group], dtype=np.float64).reshape(len(group), len(vertices)).T
         for parameter, group in groups.items()
     }
     values["means"] = frame.normalise_points(values["means"])
     values["scales"] = values["scales"] - math.log(frame.scale)
     with np.errstate(over="ignore"):
-        tensors = {parameter: torch.from_numpy(value.astype(np.float32)) for parameter, value in values.items()}
+        tensors = {name: torch.from_numpy(value.astype(np.float32, order="C")) for name, value in values.items()}
     bad = ~torch.cat(list(tensors.values()), dim=1).isfinite().all(dim=1)
     if bad.any():
         raise InputError(f"{path}: {int(bad.sum())} of {len(bad)} Gaussians are not finite")
@@ -123,18 +125,14 @@ def load_ply(path: str | Path, frame: Frame | None = None) -> Gaussians:
     )
 
 
-def ply_properties(bands: int) -> list[str]:
-    """Names and order of the properties in the original 3DGS's files; `bands`: rows of `Gaussians.shN`."""
-    groups = _property_groups(bands)
-    order = ("means", "normals", "sh0", "shN", "opacities", "scales", "quats")
-    groups["normals"] = ["nx", "ny", "nz"]
-    return [name for group in order for name in groups[group]]
-
-
 def _property_groups(bands: int) -> dict[str, list[str]]:
-    """Parameter -> the properties that hold it; those of shN run over the bands of red, then green, then blue."""
+    """Parameter -> the properties that hold it, in the order of the original 3DGS's files.
+
+    Those of shN run over the bands of red, then green, then blue. `bands`: rows of `Gaussians.shN`.
+    """
     return {
         "means": ["x", "y", "z"],
+        "normals": ["nx", "ny", "nz"],
         "sh0": [f"f_dc_{i}" for i in range(3)],
         "shN": [f"f_rest_{i}" for i in range(3 * bands)],
         "opacities": ["opacity"],

@@ -8,7 +8,7 @@ from torch import Tensor
 from turbogs_plugin.types import Gaussians, RowUpdate, Step
 
 BITS = 21
-"""Of a coordinate: three of them fill 63 bits."""
+"""Bits of a coordinate: three coordinates fill 63 bits."""
 SPREADS = (
     (32, 0x001F00000000FFFF),
     (16, 0x001F0000FF0000FF),

@@ -62,7 +62,8 @@ def read_colmap(scene: Path, model: Path, suffix: str) -> Capture:
     try:
         (reconstruction.read_binary if suffix == ".bin" else reconstruction.read_text)(model)
     except Exception as error:  # pycolmap raises whatever C++ threw
-        raise InputError(f"{model} is not a COLMAP reconstruction: {' '.join(str(error).split())[:200]}") from error
+        reason = " ".join(str(error).split())[:200]
+        raise InputError(f"{model} is not a COLMAP reconstruction: {reason}; copy or reconstruct it again") from error
 
     images = sorted((image for image in reconstruction.images.values() if image.has_pose), key=lambda image: image.name)
     names = tuple(check_photo_name(image.name, model) for image in images)

@@ -1,23 +1,23 @@
 """Checks COLMAP's binary files before pycolmap sees them.
 
-pycolmap trusts the counts in these files: a count of 2^60 becomes an allocation of that size, and a reference to
-something that is not there may end the process. So every record is walked here first; nothing is allocated that the
-file does not hold, and every identifier is looked up.
+pycolmap trusts the counts in these files: a count of 2^60 becomes an allocation of that size. So every record is walked
+here first, and nothing is allocated that the file does not hold. What one record says of another one, pycolmap checks.
 """
 
 from __future__ import annotations
 
 import struct
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
 from turbogs_plugin.errors import InputError
 
-NO_POINT = np.uint64(2**64 - 1)
-POINT2D = np.dtype([("xy", "<f8", 2), ("point3D_id", "<u8")])
-TRACK_ELEMENT = np.dtype([("image_id", "<u4"), ("point2D_id", "<u4")])
-CAMERA_SENSOR = 0
+POINT2D_BYTES, TRACK_ELEMENT_BYTES = 24, 8
+POINT3D_BYTES = 43
+"""Identifier, position, colour and error, without the track."""
+SENSOR_BYTES, FRAME_MEMBER_BYTES = 8, 16
 LONGEST_NAME = 4096
 
 
@@ -52,6 +52,12 @@ class _Reader:
         self.position += size
         return start
 
+    def records(self, smallest: int) -> Iterator[int]:
+        """The numbers of the records that it announces, of at least `smallest` bytes each. Nothing may follow them."""
+        yield from range(self.count(smallest))
+        if self.position != len(self.data):
+            raise self.fail(f"{len(self.data) - self.position} bytes follow its last record")
+
     def unpack(self, format: str) -> tuple:
         layout = struct.Struct("<" + format)
         return layout.unpack_from(self.data, self.skip(layout.size))
@@ -63,9 +69,6 @@ class _Reader:
             raise self.fail(f"it announces {count} records, more than its {len(self.data)} bytes can hold")
         return count
 
-    def array(self, dtype: np.dtype, count: int) -> np.ndarray:
-        return np.frombuffer(self.data, dtype, count, self.skip(count * dtype.itemsize))
-
     def name(self) -> None:
         end = self.data.find(b"\0", self.position, self.position + LONGEST_NAME)
         if end < 0:
@@ -76,122 +79,73 @@ class _Reader:
             raise self.fail(f"the image name at byte {self.position} is not UTF-8") from None
         self.position = end + 1
 
-    def end(self) -> None:
-        if self.position != len(self.data):
-            raise self.fail(f"{len(self.data) - self.position} bytes follow its last record")
-
-    def new(self, kind: str, number: int, known: dict | set) -> None:
-        if number in known:
-            raise self.fail(f"{kind} {number} is there twice")
-
     def pose(self, owner: str) -> None:
-        """A unit-free quaternion and a translation."""
+        """Step over a quaternion of any length and a translation, both finite."""
         values = np.array(self.unpack("7d"))
         if not np.isfinite(values).all() or not 1e-6 < np.abs(values[:4]).max() < 1e6:
             raise InputError(f"{self.path}: {owner} has a pose that is not finite, or a zero rotation")
 
 
 def check_binary_model(folder: Path) -> None:
-    """Raise `InputError` unless the reconstruction in `folder` is whole and consistent.
+    """Raise `InputError` unless the files of the reconstruction in `folder` are whole, with finite poses.
 
     Reads ``cameras.bin``, ``images.bin``, ``points3D.bin`` and, where they are, ``rigs.bin`` and ``frames.bin``.
     """
     cameras = _check_cameras(_Reader(folder / "cameras.bin"))
-    images = _check_images(_Reader(folder / "images.bin"), cameras)
-    points = _check_points(_Reader(folder / "points3D.bin"), images)
-    for image_id, (_, observed) in images.items():
-        unknown = ~np.isin(observed, np.append(points, NO_POINT))
-        if unknown.any():
-            raise InputError(
-                f"{folder / 'images.bin'} is damaged: image {image_id} sees point {observed[unknown][0]}, which "
-                "points3D.bin does not have; copy or reconstruct it again"
-            )
+    _check_images(_Reader(folder / "images.bin"), cameras)
+    _check_points(_Reader(folder / "points3D.bin"))
     rigs, frames = folder / "rigs.bin", folder / "frames.bin"
     if rigs.exists() != frames.exists():
         raise InputError(f"{folder} has one of rigs.bin and frames.bin: it must have both or neither")
     if rigs.exists():
-        _check_frames(_Reader(frames), _check_rigs(_Reader(rigs), cameras), images)
+        _check_rigs(_Reader(rigs))
+        _check_frames(_Reader(frames))
 
 
 def _check_cameras(reader: _Reader) -> set[int]:
+    """Gives the identifiers."""
     parameter_counts = _parameter_counts()
     cameras: set[int] = set()
-    for _ in range(reader.count(24)):
+    for _ in reader.records(24):
         camera, model, width, height = reader.unpack("IiQQ")
-        reader.new("camera", camera, cameras)
         if model not in parameter_counts:
             raise reader.fail(f"camera {camera} has the unknown model {model}")
         if not (0 < width < 2**31 and 0 < height < 2**31):
             raise reader.fail(f"camera {camera} is {width}x{height} pixels")
-        reader.array(np.dtype("<f8"), parameter_counts[model])
+        reader.skip(8 * parameter_counts[model])
         cameras.add(camera)
-    reader.end()
     return cameras
 
 
-def _check_images(reader: _Reader, cameras: set[int]) -> dict[int, tuple[int, np.ndarray]]:
-    """Image -> (its camera, the 3D point of each of its 2D points)."""
-    images: dict[int, tuple[int, np.ndarray]] = {}
-    for _ in range(reader.count(73)):
+def _check_images(reader: _Reader, cameras: set[int]) -> None:
+    for _ in reader.records(73):
         (image,) = reader.unpack("I")
-        reader.new("image", image, images)
         reader.pose(f"image {image}")
         (camera,) = reader.unpack("I")
         if camera not in cameras:
             raise reader.fail(f"image {image} has camera {camera}, which cameras.bin does not have")
         reader.name()
-        images[image] = camera, reader.array(POINT2D, reader.count(POINT2D.itemsize))["point3D_id"]
-    reader.end()
-    return images
+        reader.skip(POINT2D_BYTES * reader.count(POINT2D_BYTES))
 
 
-def _check_points(reader: _Reader, images: dict[int, tuple[int, np.ndarray]]) -> np.ndarray:
-    """Identifiers of the points, [M] uint64."""
-    points: set[int] = set()
-    for _ in range(reader.count(51)):
-        (point, *_) = reader.unpack("Q3d3Bd")
-        reader.new("point", point, points)
-        points.add(point)
-        for image, point2D in reader.array(TRACK_ELEMENT, reader.count(TRACK_ELEMENT.itemsize)).tolist():
-            if image not in images or point2D >= len(images[image][1]) or images[image][1][point2D] != point:
-                raise reader.fail(f"point {point} is said to be 2D point {point2D} of image {image}, which it is not")
-    reader.end()
-    return np.fromiter(points, dtype=np.uint64, count=len(points))
+def _check_points(reader: _Reader) -> None:
+    for _ in reader.records(51):
+        reader.skip(POINT3D_BYTES)
+        reader.skip(TRACK_ELEMENT_BYTES * reader.count(TRACK_ELEMENT_BYTES))
 
 
-def _check_rigs(reader: _Reader, cameras: set[int]) -> dict[int, set[int]]:
-    """Rig -> its cameras."""
-    rigs: dict[int, set[int]] = {}
-    for _ in range(reader.count(8)):
+def _check_rigs(reader: _Reader) -> None:
+    for _ in reader.records(8):
         rig, sensors = reader.unpack("II")
-        reader.new("rig", rig, rigs)
-        members: set[int] = set()
         for position in range(sensors):
-            kind, camera = reader.unpack("iI")
-            if kind == CAMERA_SENSOR and camera not in cameras:
-                raise reader.fail(f"rig {rig} has camera {camera}, which cameras.bin does not have")
-            reader.new(f"sensor of rig {rig}", camera, members)
+            reader.skip(SENSOR_BYTES)
             if position and reader.unpack("B")[0]:
                 reader.pose(f"rig {rig}")
-            members.add(camera)
-        rigs[rig] = members
-    reader.end()
-    return rigs
 
 
-def _check_frames(reader: _Reader, rigs: dict[int, set[int]], images: dict[int, tuple[int, np.ndarray]]) -> None:
-    frames: set[int] = set()
-    for _ in range(reader.count(68)):
-        frame, rig = reader.unpack("II")
-        reader.new("frame", frame, frames)
-        frames.add(frame)
-        if rig not in rigs:
-            raise reader.fail(f"frame {frame} has rig {rig}, which rigs.bin does not have")
+def _check_frames(reader: _Reader) -> None:
+    for _ in reader.records(68):
+        frame, _ = reader.unpack("II")
         reader.pose(f"frame {frame}")
-        for _ in range(reader.unpack("I")[0]):
-            kind, sensor, image = reader.unpack("iIQ")
-            if kind != CAMERA_SENSOR:
-                continue
-            if sensor not in rigs[rig] or image not in images or images[image][0] != sensor:
-                raise reader.fail(f"frame {frame} has image {image} of camera {sensor}, which the others do not have")
-    reader.end()
+        (members,) = reader.unpack("I")
+        reader.skip(FRAME_MEMBER_BYTES * members)

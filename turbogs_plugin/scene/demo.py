@@ -18,6 +18,7 @@ from PIL import Image
 
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene.colmap import load_pycolmap
+from turbogs_plugin.scene.poses import look_at
 
 if TYPE_CHECKING:
     import pycolmap
@@ -39,22 +40,21 @@ FOCAL = 1.15
 POINT_NOISE = 0.004
 """Standard deviation of the noise on the reconstruction's points; solids are about 1 across."""
 POINTS_PER_VIEW = 150
+PHOTO_NAME = "view_{:03d}.png"
 
 
 @dataclass
 class Solid:
-    """A sphere, box or disc, placed by a turn about the vertical and a translation.
+    """A solid on the vertical axis of its own coordinates, placed by a turn about it and a translation.
 
     Args:
-        intersect: (origins [3], directions [R, 3]) in own coordinates -> [R] distances, inf where missed.
-        normal: [R, 3] surface points -> [R, 3] outward unit normals, in own coordinates.
+        size: radius, or of a box half of each side [3].
         texture: colours of surface points.
         position: [3].
         turn: radians.
     """
 
-    intersect: Callable[[np.ndarray, np.ndarray], np.ndarray]
-    normal: Callable[[np.ndarray], np.ndarray]
+    size: float | np.ndarray
     texture: Texture
     position: np.ndarray
     turn: float = 0.0
@@ -65,41 +65,58 @@ class Solid:
         cos, sin = np.cos(self.turn), np.sin(self.turn)
         return np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]], dtype=np.float32)
 
+    def intersect(self, origin: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        """[R] distances along rays from `origin` [3] in `directions` [R, 3], in own coordinates; inf where missed."""
+        raise NotImplementedError
 
-def sphere(radius: float, **placed) -> Solid:
-    def intersect(origin: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    def normal(self, points: np.ndarray) -> np.ndarray:
+        """[R, 3] outward unit normals at surface points, in own coordinates."""
+        raise NotImplementedError
+
+
+class Sphere(Solid):
+    def intersect(self, origin: np.ndarray, directions: np.ndarray) -> np.ndarray:
         along = directions @ origin
-        under_root = along**2 - (origin @ origin - radius**2)
+        under_root = along**2 - (origin @ origin - self.size**2)
         with np.errstate(invalid="ignore"):
             return np.where(under_root > 0, -along - np.sqrt(under_root), np.inf)
 
-    return Solid(intersect, lambda points: points / radius, **placed)
+    def normal(self, points: np.ndarray) -> np.ndarray:
+        return points / self.size
 
 
-def box(half: tuple[float, float, float], **placed) -> Solid:
-    half_sides = np.array(half, dtype=np.float32)
-
-    def intersect(origin: np.ndarray, directions: np.ndarray) -> np.ndarray:
+class Box(Solid):
+    def intersect(self, origin: np.ndarray, directions: np.ndarray) -> np.ndarray:
         with np.errstate(divide="ignore"):
             inverse = 1.0 / directions
-        first, second = (-half_sides - origin) * inverse, (half_sides - origin) * inverse
+        first, second = (-self.size - origin) * inverse, (self.size - origin) * inverse
         enter, leave = np.minimum(first, second).max(axis=1), np.maximum(first, second).min(axis=1)
         return np.where((enter < leave) & (enter > 0), enter, np.inf)
 
-    def normal(points: np.ndarray) -> np.ndarray:
-        relative = points / half_sides
+    def normal(self, points: np.ndarray) -> np.ndarray:
+        relative = points / self.size
         return np.sign(relative) * (np.abs(relative) == np.abs(relative).max(axis=1, keepdims=True))
 
-    return Solid(intersect, normal, **placed)
 
-
-def disc(radius: float, **placed) -> Solid:
-    def intersect(origin: np.ndarray, directions: np.ndarray) -> np.ndarray:
+class Disc(Solid):
+    def intersect(self, origin: np.ndarray, directions: np.ndarray) -> np.ndarray:
         distances = -origin[2] / directions[:, 2]
         hits = origin + distances[:, None] * directions
-        return np.where((distances > 0) & (hits[:, 0] ** 2 + hits[:, 1] ** 2 < radius**2), distances, np.inf)
+        return np.where((distances > 0) & (hits[:, 0] ** 2 + hits[:, 1] ** 2 < self.size**2), distances, np.inf)
 
-    return Solid(intersect, lambda points: np.broadcast_to(np.float32([0, 0, 1]), points.shape), **placed)
+    def normal(self, points: np.ndarray) -> np.ndarray:
+        return np.broadcast_to(np.float32([0, 0, 1]), points.shape)
+
+
+class Sky(Solid):
+    """A sphere seen from inside, as bright everywhere."""
+
+    def intersect(self, origin: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        along = directions @ origin
+        return np.sqrt(along**2 - (origin @ origin - self.size**2)) - along
+
+    def normal(self, points: np.ndarray) -> np.ndarray:
+        return np.broadcast_to(LIGHT, points.shape)
 
 
 def checker(size: float, first: np.ndarray, second: np.ndarray) -> Texture:
@@ -131,29 +148,18 @@ def demo_solids(random: np.random.Generator) -> list[Solid]:
     def turn() -> float:
         return float(random.uniform(0, np.pi))
 
-    def at(x: float, y: float, z: float) -> np.ndarray:
-        return np.array([x, y, z], dtype=np.float32)
+    def mixed(size: float) -> Texture:
+        return noise(size, color(), color(), random)
 
+    vector = np.float32
     return [
-        disc(1.7, texture=noise(0.8, color(), color(), random), position=at(0, 0, 0), turn=turn()),
-        box((0.35, 0.35, 0.45), texture=checker(0.23, color(), color()), position=at(0.1, 0.0, 0.45), turn=turn()),
-        sphere(0.36, texture=noise(0.5, color(), color(), random), position=at(-0.85, 0.35, 0.36), turn=turn()),
-        sphere(0.28, texture=checker(0.2, color(), color()), position=at(0.55, -0.85, 0.28), turn=turn()),
-        box(
-            (0.4, 0.18, 0.15), texture=noise(0.4, color(), color(), random), position=at(-0.5, -0.75, 0.15), turn=turn()
-        ),
-        box((0.15, 0.15, 0.3), texture=noise(0.3, color(), color(), random), position=at(0.8, 0.65, 0.3), turn=turn()),
+        Disc(1.7, mixed(0.8), vector((0, 0, 0)), turn()),
+        Box(vector((0.35, 0.35, 0.45)), checker(0.23, color(), color()), vector((0.1, 0.0, 0.45)), turn()),
+        Sphere(0.36, mixed(0.5), vector((-0.85, 0.35, 0.36)), turn()),
+        Sphere(0.28, checker(0.2, color(), color()), vector((0.55, -0.85, 0.28)), turn()),
+        Box(vector((0.4, 0.18, 0.15)), mixed(0.4), vector((-0.5, -0.75, 0.15)), turn()),
+        Box(vector((0.15, 0.15, 0.3)), mixed(0.3), vector((0.8, 0.65, 0.3)), turn()),
     ]
-
-
-def sky(radius: float, **placed) -> Solid:
-    """A sphere seen from inside, as bright everywhere."""
-
-    def intersect(origin: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        along = directions @ origin
-        return np.sqrt(along**2 - (origin @ origin - radius**2)) - along
-
-    return Solid(intersect, lambda points: np.broadcast_to(LIGHT, points.shape), **placed)
 
 
 def horizon_solids(random: np.random.Generator) -> list[Solid]:
@@ -164,20 +170,19 @@ def horizon_solids(random: np.random.Generator) -> list[Solid]:
         for size, first, second in ((1.0, (0.2, 0.35, 0.1), (0.45, 0.55, 0.25)), (8.0, (-0.1,) * 3, (0.1,) * 3))
     )
     clouds = noise(30.0, np.float32((0.55, 0.7, 0.95)), np.float32((0.9, 0.92, 0.95)), random)
-    origin = np.zeros(3, dtype=np.float32)
-    below = np.array([0, 0, -0.02], dtype=np.float32)
-    solids = [
-        disc(HORIZON, texture=lambda points: np.clip(grass(points) + shades(points), 0, 1), position=below),
-        sky(SKY, texture=clouds, position=origin),
+    solids: list[Solid] = [
+        Disc(HORIZON, lambda points: np.clip(grass(points) + shades(points), 0, 1), np.float32((0, 0, -0.02))),
+        Sky(SKY, clouds, np.float32((0, 0, 0))),
     ]
     for number in range(HOUSES):
         distance, angle = random.uniform(1.7, 12.5) * ORBIT_RADIUS, random.uniform(0, 2 * np.pi)
         height = random.uniform(0.06, 0.16) * distance
         first, second = random.uniform(0.1, 0.95, (2, 3)).astype(np.float32)
         texture = checker(0.25 * height, first, second) if number % 3 else noise(0.8 * height, first, second, random)
-        position = np.array([distance * np.cos(angle), distance * np.sin(angle), height], dtype=np.float32)
-        placed = {"texture": texture, "position": position, "turn": float(random.uniform(0, np.pi))}
-        solids.append(box((0.6 * height, 0.5 * height, height), **placed) if number % 2 else sphere(height, **placed))
+        position = np.float32((distance * np.cos(angle), distance * np.sin(angle), height))
+        placed = (texture, position, float(random.uniform(0, np.pi)))
+        half_sides = np.float32((0.6 * height, 0.5 * height, height))
+        solids.append(Box(half_sides, *placed) if number % 2 else Sphere(height, *placed))
     return solids
 
 
@@ -198,17 +203,16 @@ def cast(solids: list[Solid], origin: np.ndarray, directions: np.ndarray) -> tup
     return colors, nearest
 
 
-def orbit_pose(angle: float, look_at: float = LOOK_AT) -> np.ndarray:
-    """[3, 4] float64 world to camera, on a ring about the table that swings in height, looking at the middle."""
+def orbit_pose(angle: float, height: float) -> np.ndarray:
+    """[3, 4] float64 world to camera, on a ring about the table that swings in height.
+
+    Args:
+        height: of what the camera looks at, above the middle of the table.
+    """
     center = np.array(
         [ORBIT_RADIUS * np.cos(angle), ORBIT_RADIUS * np.sin(angle), ORBIT_HEIGHT + ORBIT_SWING * np.sin(3 * angle)]
     )
-    forward = np.array([0.0, 0.0, look_at]) - center
-    forward /= np.linalg.norm(forward)
-    right = np.cross(forward, [0.0, 0.0, 1.0])
-    right /= np.linalg.norm(right)
-    rotation = np.stack([right, np.cross(forward, right), forward])
-    return np.concatenate([rotation, -rotation @ center[:, None]], axis=1)
+    return look_at(center, target=np.array([0.0, 0.0, height]), up=np.array([0.0, 0.0, 1.0]))[:3]
 
 
 def write_demo_capture(
@@ -239,14 +243,13 @@ def write_demo_capture(
 
 
 def _write(folder: Path, random: np.random.Generator, views: int, width: int, height: int, horizon: bool) -> None:
-    solids = demo_solids(random)
+    solids, seen_height = demo_solids(random), LOOK_AT
     if horizon:
-        solids += horizon_solids(random)
-    look_at = LOOK_AT_WITH_HORIZON if horizon else LOOK_AT
+        solids, seen_height = solids + horizon_solids(random), LOOK_AT_WITH_HORIZON
     (folder / "images").mkdir(parents=True)
     (folder / "sparse" / "0").mkdir(parents=True)
     focal = FOCAL * width
-    poses = np.stack([orbit_pose(2 * np.pi * view / views, look_at) for view in range(views)])  # [V, 3, 4]
+    poses = np.stack([orbit_pose(2 * np.pi * view / views, seen_height) for view in range(views)])  # [V, 3, 4]
     side = RAYS_PER_SIDE
     x, y = np.meshgrid((np.arange(width * side) + 0.5) / side, (np.arange(height * side) + 0.5) / side)
     rays = np.stack([(x - width / 2) / focal, (y - height / 2) / focal, np.ones_like(x)], axis=-1)
@@ -260,7 +263,7 @@ def _write(folder: Path, random: np.random.Generator, views: int, width: int, he
         directions /= lengths
         colors, distances = cast(solids, origin, directions)
         pixels = colors.reshape(height, side, width, side, 3).mean(axis=(1, 3))
-        Image.fromarray(np.round(pixels * 255).astype(np.uint8)).save(folder / "images" / photo_name(view))
+        Image.fromarray(np.round(pixels * 255).astype(np.uint8)).save(folder / "images" / PHOTO_NAME.format(view))
         centers = np.s_[side // 2 :: side, side // 2 :: side]
         depths[view] = (distances[:, None] / lengths).reshape(height * side, width * side)[centers]
         hits = np.flatnonzero(np.isfinite(distances))
@@ -269,10 +272,6 @@ def _write(folder: Path, random: np.random.Generator, views: int, width: int, he
         point_colors.append(colors[chosen])
     reconstruction = _reconstruct(poses, np.concatenate(points), np.concatenate(point_colors), depths, focal, random)
     reconstruction.write_binary(folder / "sparse" / "0")
-
-
-def photo_name(view: int) -> str:
-    return f"view_{view:03d}.png"
 
 
 def _reconstruct(
@@ -308,7 +307,8 @@ def _reconstruct(
     reconstruction.add_camera_with_trivial_rig(camera)
     positions = np.cumsum(visible, axis=1) - 1  # [V, M] number of a point among those of its view
     for view in range(views):
-        image = pycolmap.Image(photo_name(view), keypoints=pixels[view, visible[view]], camera_id=1, image_id=view + 1)
+        name = PHOTO_NAME.format(view)
+        image = pycolmap.Image(name, keypoints=pixels[view, visible[view]], camera_id=1, image_id=view + 1)
         reconstruction.add_image_with_trivial_frame(image, pycolmap.Rigid3d(poses[view]))
     displaced = points + random.normal(scale=POINT_NOISE, size=points.shape)
     for point in np.flatnonzero(visible.any(axis=0)):

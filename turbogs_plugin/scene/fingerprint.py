@@ -1,4 +1,4 @@
-"""What a checkpoint says of the capture that it was trained on, so that a run goes on with no other."""
+"""What a checkpoint says of its capture, so that no run is resumed with another one."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import torch
 from turbogs_plugin.scene import Frame, PosedImages, Scene
 
 ROUNDING = 1e-5
-"""Two readings of one reconstruction differ by less, in extents and in parts of an intrinsic."""
+"""Two readings of one reconstruction differ by less: in extents, and relative to each intrinsic."""
 
 
 def capture_state(scene: Scene) -> dict[str, Any]:
@@ -32,7 +32,7 @@ def frame_of_state(state: dict[str, Any]) -> Frame:
 
 
 def capture_difference(saved: dict[str, Any], present: dict[str, Any]) -> str:
-    """What a capture has other than a saved one, in words; empty where it is the same.
+    """How a capture differs from a saved one, in words; empty where it does not.
 
     Args:
         saved, present: what `capture_state` gave, of one structure (`checkpoint.require_like`), among other things.

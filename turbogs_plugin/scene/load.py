@@ -14,6 +14,7 @@ from turbogs_plugin.scene.capture import Capture
 from turbogs_plugin.scene.colmap import find_model, read_colmap
 from turbogs_plugin.scene.frame import Frame
 from turbogs_plugin.scene.photos import Photos, load_photos, photo_size, reduced_sizes
+from turbogs_plugin.scene.poses import camera_centers
 from turbogs_plugin.scene.transforms import FILE, read_transforms
 from turbogs_plugin.types import Cameras
 
@@ -90,8 +91,7 @@ def load_scene(path: str | Path, factor: int = 1, test_every: int = 8) -> Scene:
     if test.all():
         raise InputError(f"test_every is {test_every}: every image of {scene} would be a test image; use 2 or more")
 
-    centers = -np.einsum("vji,vj->vi", capture.viewmats[:, :3, :3], capture.viewmats[:, :3, 3])
-    frame = Frame.around(centers[~test], capture.points)
+    frame = Frame.around(camera_centers(capture.viewmats[~test]), capture.points)
     viewmats = torch.from_numpy(frame.normalise_poses(capture.viewmats)).float()
     points = torch.from_numpy(frame.normalise_points(capture.points)).float()
     far = ~points.isfinite().all(dim=1)

@@ -9,7 +9,7 @@ from torch import Tensor
 
 BUCKET_SIZE = 64
 BUCKETS_AT_ONCE = 32
-"""Buckets compared at a time with one, so that memory is bounded and near ones tighten the bound for the others."""
+"""How many buckets are compared with one at a time: it bounds memory, and near ones tighten the bound for far ones."""
 
 
 def mean_neighbor_distances(points: Tensor, neighbors: int) -> Tensor:
@@ -71,7 +71,4 @@ def _buckets(points: Tensor, size: int) -> tuple[Tensor, list[int]]:
             sorted_part = part[members[:, axis].argsort(stable=True)]
             halves += [sorted_part[: len(part) // 2], sorted_part[len(part) // 2 :]]
         parts = halves
-    starts = [0]
-    for part in parts:
-        starts.append(starts[-1] + len(part))
-    return torch.cat(parts), starts
+    return torch.cat(parts), [0, *itertools.accumulate(map(len, parts))]

@@ -4,7 +4,7 @@ Of every array over flat pixels the device has a *window*: slots, each as large 
 the present iteration and of the one before. The kernels see a flat array with the first pixel of each view, as ever;
 only where views begin changes from iteration to iteration.
 
-Nobody waits for a copy but the device. With two sets of slots, the views of an iteration travel in while the device is
+Only the device waits for copies. With two sets of slots, the views of an iteration travel in while the device is
 still at the iteration before, and the changed maps of that one travel out while the device is at this one:
 
 - in: after the last work that used the slot, and after what was in it has travelled out;
@@ -73,10 +73,6 @@ class ViewWindow:
         _wait(self.device, self._arriving)
         self._arriving.clear()
         return self._arrays
-
-    def bytes_held(self) -> int:
-        """Memory of the window."""
-        return sum(array.numel() * array.element_size() for array in self._arrays)
 
     def fetch(self, view_ids: Sequence[int]) -> None:
         """Bring these views into the window, where they stay until the call after next that brings others."""
@@ -174,11 +170,30 @@ class ViewWindow:
         """(window, store) of one view, of each array."""
         start, end = self._starts[view : view + 2].tolist()
         first = int(self.offsets[view])
-        pairs = zip(self._arrays, self._stores, strict=True)
-        return [(array[first : first + end - start], store[start:end]) for array, store in pairs]
+        both = zip(self._arrays, self._stores, strict=True)
+        return [(array[first : first + end - start], store[start:end]) for array, store in both]
 
 
-class OffloadedPhotos(Photos):
+class _Windowed:
+    """Arrays in host memory that are used through a window on a device."""
+
+    _window: ViewWindow
+
+    @property
+    def offsets(self) -> np.ndarray:
+        """See `ViewWindow`."""
+        return self._window.offsets
+
+    @property
+    def window_bytes(self) -> int:
+        """Memory of the window."""
+        return sum(array.nbytes for array in self._window._arrays)
+
+    def fetch(self, view_ids: Sequence[int]) -> None:
+        self._window.fetch(view_ids)
+
+
+class OffloadedPhotos(_Windowed, Photos):
     """Photos in host memory, with a window on a device; `colors` and `offsets` are the window's.
 
     Args:
@@ -199,24 +214,12 @@ class OffloadedPhotos(Photos):
     def colors(self) -> Tensor:
         return self._window.arrays[0][:-1]
 
-    @property
-    def offsets(self) -> np.ndarray:
-        return self._window.offsets
-
-    @property
-    def window_bytes(self) -> int:
-        """Memory of the window."""
-        return self._window.bytes_held()
-
-    def fetch(self, view_ids: Sequence[int]) -> None:
-        self._window.fetch(view_ids)
-
     def to(self, device: torch.device | str) -> OffloadedPhotos:
         """The same photos, with a window on that device."""
         return self if torch.device(device) == self._window.device else OffloadedPhotos(self, device)
 
 
-class OffloadedErrorMaps(ErrorMaps):
+class OffloadedErrorMaps(_Windowed, ErrorMaps):
     """Error maps in host memory, with a window on a device; `errors`, `stamps` and `offsets` are the window's."""
 
     @property
@@ -228,24 +231,12 @@ class OffloadedErrorMaps(ErrorMaps):
         return self._stamps[:-1]
 
     @property
-    def offsets(self) -> np.ndarray:
-        return self._window.offsets
-
-    @property
     def _errors(self) -> Tensor:
         return self._window.arrays[0]
 
     @property
     def _stamps(self) -> Tensor:
         return self._window.arrays[1]
-
-    @property
-    def window_bytes(self) -> int:
-        """Memory of the window."""
-        return self._window.bytes_held()
-
-    def fetch(self, view_ids: Sequence[int]) -> None:
-        self._window.fetch(view_ids)
 
     def _allocate(self) -> None:
         pixels = int(self.sizes.prod(axis=1).sum())
@@ -326,7 +317,7 @@ def _page_lock(window: ViewWindow) -> None:
     for store in window._stores:
         if store.is_pinned():
             continue
-        if int(runtime.cudaHostRegister(store.data_ptr(), store.numel() * store.element_size(), 0)) == 0:
+        if int(runtime.cudaHostRegister(store.data_ptr(), store.nbytes, 0)) == 0:
             locked.append(store)
         else:  # a limit of the system: copies are slower; the runtime tells the error once more, to the next caller
             with contextlib.suppress(RuntimeError):

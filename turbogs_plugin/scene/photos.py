@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,9 +18,9 @@ from turbogs_plugin.errors import InputError
 from turbogs_plugin.types import PixelSamples
 
 PHOTO_BYTES = 3
-"""Of a pixel."""
+"""Bytes of a pixel."""
 SMALLEST_SIDE = 4
-"""Pixels that a reduction leaves of a photo's shorter side: a cell's."""
+"""The shorter side of a reduced photo has at least so many pixels: those of a cell."""
 MEMORY_SHARE = 0.8
 """Photos may take this share of the machine's memory."""
 
@@ -55,13 +56,8 @@ class Photos:
         Whoever reads these arrays calls it first. Here all views are always there; see `offload`.
         """
 
-    def gather(self, samples: PixelSamples) -> Tensor:
-        """[P, 3] float32, 0 .. 1: the colours at the samples, 0 in empty slots."""
-        self.fetch(samples.view_ids)
-        return self.colors[samples.flat_pixels(self.offsets)].float().div_(255.0).mul_(samples.filled[:, None])
-
     def at(self, samples: PixelSamples) -> PhotoSamples:
-        """The photos at the samples, to be gathered where they are compared."""
+        """The photos at the samples. To be used before the photos of other views are fetched."""
         self.fetch(samples.view_ids)
         return PhotoSamples(self, samples)
 
@@ -78,7 +74,7 @@ class Photos:
 
 @dataclass(frozen=True)
 class PhotoSamples:
-    """Ground truth of an iteration. Not gathered yet: the loss's kernel does that itself."""
+    """Ground truth of an iteration, not gathered yet: the kernel of the loss reads the photos itself."""
 
     photos: Photos
     samples: PixelSamples
@@ -89,8 +85,9 @@ class PhotoSamples:
         return self.photos.offsets[list(self.samples.view_ids)]
 
     def colors(self) -> Tensor:
-        """[P, 3] float32, 0 .. 1, as `Photos.gather` gives them."""
-        return self.photos.gather(self.samples)
+        """[P, 3] float32, 0 .. 1: the colours at the samples, 0 in empty slots."""
+        pixels = self.samples.flat_pixels(self.photos.offsets)
+        return self.photos.colors[pixels].float().div_(255.0).mul_(self.samples.filled[:, None])
 
 
 def pixel_offsets(sizes: np.ndarray) -> np.ndarray:
@@ -117,11 +114,8 @@ def reduced_sizes(sizes: np.ndarray, factor: int) -> np.ndarray:
 
 def photo_size(path: Path) -> tuple[int, int]:
     """(width, height) from the file's header alone; `InputError` where it cannot be read."""
-    try:
-        with Image.open(path) as image:
-            return image.size
-    except Exception as error:  # a broken file can raise anything in its decoder
-        raise InputError(f"cannot read the photo {path}: {_reason(error)}") from error
+    with _opened(path) as image:
+        return image.size
 
 
 def load_photos(paths: Sequence[Path], sizes: np.ndarray, targets: np.ndarray) -> Photos:
@@ -157,35 +151,34 @@ def load_photos(paths: Sequence[Path], sizes: np.ndarray, targets: np.ndarray) -
         pixels[offsets[view] : offsets[view + 1]] = np.asarray(photo).reshape(-1, 3)
 
     with ThreadPoolExecutor(min(8, os.cpu_count() or 1)) as pool:
-        for job in [pool.submit(load, view) for view in range(len(paths))]:
-            try:
-                job.result()
-            except BaseException:
-                pool.shutdown(wait=True, cancel_futures=True)
-                raise
+        list(pool.map(load, range(len(paths))))  # raises the first error in order, and cancels what has not begun
     return Photos(colors, targets)
 
 
 def _decode(path: Path, size: tuple[int, int]) -> Image.Image:
     """An RGB image of exactly this size, or `InputError`. The size is checked before any pixel is decoded."""
+    with _opened(path) as image:
+        if image.size != size:
+            raise InputError(
+                f"photo {path} is {image.size[0]}x{image.size[1]} but its camera is {size[0]}x{size[1]}: "
+                "use the photos that the cameras were reconstructed from"
+            )
+        if image.mode.startswith(("I", "F")):
+            raise InputError(f"photo {path} has more than 8 bits a channel: convert it to 8-bit RGB")
+        if "A" in image.getbands() or "transparency" in image.info:
+            image = image.convert("RGBA")
+            return Image.alpha_composite(Image.new("RGBA", size, (0, 0, 0, 255)), image).convert("RGB")
+        return image.convert("RGB")
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Image.Image]:
+    """The photo with its header read; `InputError` for whatever goes wrong with it while entered."""
     try:
         with Image.open(path) as image:
-            if image.size != size:
-                raise InputError(
-                    f"photo {path} is {image.size[0]}x{image.size[1]} but its camera is {size[0]}x{size[1]}: "
-                    "use the photos that the cameras were reconstructed from"
-                )
-            if image.mode.startswith(("I", "F")):
-                raise InputError(f"photo {path} has more than 8 bits a channel: convert it to 8-bit RGB")
-            if "A" in image.getbands() or "transparency" in image.info:
-                image = image.convert("RGBA")
-                return Image.alpha_composite(Image.new("RGBA", size, (0, 0, 0, 255)), image).convert("RGB")
-            return image.convert("RGB")
+            yield image
     except InputError:
         raise
     except Exception as error:  # a broken file can raise anything in its decoder
-        raise InputError(f"cannot read the photo {path}: {_reason(error)}") from error
-
-
-def _reason(error: Exception) -> str:
-    return " ".join((str(error) or type(error).__name__).split())
+        reason = " ".join((str(error) or type(error).__name__).split())
+        raise InputError(f"cannot read the photo {path}: {reason}") from error

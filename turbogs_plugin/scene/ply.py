@@ -9,24 +9,10 @@ import numpy as np
 from turbogs_plugin.errors import InputError
 
 LONGEST_HEADER = 1 << 16
-TYPES = {
-    "char": "<i1",
-    "int8": "<i1",
-    "uchar": "<u1",
-    "uint8": "<u1",
-    "short": "<i2",
-    "int16": "<i2",
-    "ushort": "<u2",
-    "uint16": "<u2",
-    "int": "<i4",
-    "int32": "<i4",
-    "uint": "<u4",
-    "uint32": "<u4",
-    "float": "<f4",
-    "float32": "<f4",
-    "double": "<f8",
-    "float64": "<f8",
-}
+C_TYPES = ("char", "uchar", "short", "ushort", "int", "uint", "float", "double")
+NUMPY_TYPES = ("int8", "uint8", "int16", "uint16", "int32", "uint32", "float32", "float64")
+TYPES = dict(zip(C_TYPES + NUMPY_TYPES, 2 * NUMPY_TYPES, strict=True))
+"""The numpy types of the names that a header may have for them."""
 
 
 def read_vertices(path: str | Path) -> np.ndarray:
@@ -97,7 +83,7 @@ def _parse_header(path: Path, lines: list[str]) -> tuple[bool, int, np.dtype, bo
             raise fail(line, "is not understood")
     if binary is None or not properties:
         raise InputError(f"{path}: its header has no {'format' if binary is None else 'vertex properties'}")
-    return binary, count, np.dtype(list(properties.items())), len(elements) == 1
+    return binary, count, np.dtype(list(properties.items())).newbyteorder("<"), len(elements) == 1
 
 
 def _read_ascii(path: Path, offset: int, count: int, layout: np.dtype) -> np.ndarray:

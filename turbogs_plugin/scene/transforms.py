@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -13,6 +14,7 @@ from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene.capture import LARGEST_SIDE, Capture, check_photo_name
 from turbogs_plugin.scene.photos import photo_size
 from turbogs_plugin.scene.ply import read_vertices
+from turbogs_plugin.scene.poses import camera_centers
 
 FILE = "transforms.json"
 DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
@@ -48,8 +50,8 @@ def read_transforms(scene: Path) -> Capture:
         if name in views:
             raise InputError(f"{source} has two frames for '{name}'")
         views[name] = (_viewmat(frame, name, source), *_intrinsics({**content, **frame}, scene / name, source))
-    names = tuple(sorted(views))
-    viewmats = np.stack([views[name][0] for name in names])
+    names, cameras = zip(*sorted(views.items()), strict=True)
+    viewmats, intrinsics, sizes = (np.array(values) for values in zip(*cameras, strict=True))
     if "ply_file_path" in content:
         points, colors = _read_points(scene, content["ply_file_path"], source)
     else:
@@ -63,8 +65,8 @@ def read_transforms(scene: Path) -> Capture:
         names=tuple(str((scene / name).relative_to(photo_folder)) for name in names),
         photo_folder=photo_folder,
         viewmats=viewmats,
-        Ks=np.stack([views[name][1] for name in names]),
-        sizes=np.array([views[name][2] for name in names], dtype=np.int64),
+        Ks=intrinsics,
+        sizes=sizes,
         points=points,
         point_colors=colors,
     )
@@ -80,7 +82,7 @@ def random_points(viewmats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     Args:
         viewmats: [V, 4, 4] float64 world to camera.
     """
-    centers = -np.einsum("vji,vj->vi", viewmats[:, :3, :3], viewmats[:, :3, 3])
+    centers = camera_centers(viewmats)
     axes = viewmats[:, 2, :3]
     # A slight pull towards the cameras' mean settles the case of parallel axes.
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]  # [V, 3, 3]
@@ -106,10 +108,10 @@ def _photo_name(scene: Path, name: Any, source: Path) -> str:
     return name
 
 
-def _number(values: dict, key: str, source: Path) -> float | None:
-    """A finite number, or None where the key is absent."""
+def _number(values: dict, source: Path, key: str, default: float | None = None) -> float | None:
+    """A finite number, or the default where the key is absent."""
     if key not in values:
-        return None
+        return default
     value = values[key]
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < 1e300:
         raise InputError(f"{source}: {key} is {str(value)[:40]!r}: it must be a finite number")
@@ -118,8 +120,8 @@ def _number(values: dict, key: str, source: Path) -> float | None:
 
 def _intrinsics(values: dict, photo: Path, source: Path) -> tuple[np.ndarray, tuple[int, int]]:
     """[3, 3] float64 and (width, height) of one frame, whose `values` go before those for all frames."""
-    bent = {key: _number(values, key, source) for key in DISTORTION}
-    bent = {key: value for key, value in bent.items() if value}
+    number = partial(_number, values, source)
+    bent = {key: value for key in DISTORTION if (value := number(key))}
     model = values.get("camera_model", "PINHOLE")
     if bent or model not in CAMERA_MODELS:
         raise InputError(
@@ -127,27 +129,29 @@ def _intrinsics(values: dict, photo: Path, source: Path) -> tuple[np.ndarray, tu
             "undistort with 'colmap image_undistorter --image_path IMAGES --input_path MODEL --output_path NEW' and "
             "train on NEW"
         )
-    width, height = _number(values, "w", source), _number(values, "h", source)
+    width, height = number("w"), number("h")
     if width is None or height is None:
         if not photo.is_file():
             raise InputError(f"{source} gives no w and h for {photo}, and the photo is missing")
         width, height = photo_size(photo)
     if not (1 <= width <= LARGEST_SIDE and 1 <= height <= LARGEST_SIDE):
         raise InputError(f"{source}: the size of {photo.name} is {width:g}x{height:g} pixels")
-    focal_x, focal_y = _number(values, "fl_x", source), _number(values, "fl_y", source)
+
+    def focal_length(axis: str, side: float, default: float | None) -> float | None:
+        """As given, or by the angle of view."""
+        focal = number(f"fl_{axis}")
+        if focal is not None:
+            return focal
+        angle = number(f"camera_angle_{axis}")
+        return default if angle is None or not 0 < angle < math.pi else 0.5 * side / math.tan(0.5 * angle)
+
+    focal_x = focal_length("x", width, None)
     if focal_x is None:
-        angle = _number(values, "camera_angle_x", source)
-        if angle is None or not 0 < angle < math.pi:
-            raise InputError(f"{source}: the camera of {photo.name} has neither fl_x nor a camera_angle_x in 0 .. pi")
-        focal_x = 0.5 * width / math.tan(0.5 * angle)
-    if focal_y is None:
-        angle = _number(values, "camera_angle_y", source)
-        focal_y = 0.5 * height / math.tan(0.5 * angle) if angle and 0 < angle < math.pi else focal_x
-    center_x, center_y = _number(values, "cx", source), _number(values, "cy", source)
-    intrinsics = np.eye(3)
-    intrinsics[0, 0], intrinsics[1, 1] = focal_x, focal_y
-    intrinsics[0, 2] = 0.5 * width if center_x is None else center_x
-    intrinsics[1, 2] = 0.5 * height if center_y is None else center_y
+        raise InputError(f"{source}: the camera of {photo.name} has neither fl_x nor a camera_angle_x in 0 .. pi")
+    focal_y = focal_length("y", height, focal_x)
+    intrinsics = np.array(
+        [[focal_x, 0.0, number("cx", 0.5 * width)], [0.0, focal_y, number("cy", 0.5 * height)], [0.0, 0.0, 1.0]]
+    )
     return intrinsics, (round(width), round(height))
 
 

@@ -1,0 +1,16 @@
+"""Poses: where a camera stands and what it looks at."""
+
+import numpy as np
+
+from turbogs_plugin.scene.poses import camera_centers, look_at
+
+
+def test_a_camera_looks_at_its_target_with_up_upwards():
+    center, target, up = np.array([3.0, -2.0, 1.5]), np.array([0.5, 0.25, -1.0]), np.array([0.0, 0.0, 1.0])
+    viewmat = look_at(center, target, up)
+    np.testing.assert_allclose(camera_centers(viewmat[None]), [center], atol=1e-12)
+    np.testing.assert_allclose(viewmat[:3, :3] @ viewmat[:3, :3].T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(viewmat[:3, :3]) > 0
+    ahead, above = (viewmat[:3, :3] @ point + viewmat[:3, 3] for point in (target, target + 0.1 * up))
+    np.testing.assert_allclose(ahead, [0.0, 0.0, np.linalg.norm(target - center)], atol=1e-12)
+    assert abs(above[0]) < 1e-12 and above[1] < 0  # y points down
