@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, fields
 
 from turbogs_plugin.engine.rules import ParameterRates
-from turbogs_plugin.errors import InputError, require
+from turbogs_plugin.errors import InputError, require_not_negative
 from turbogs_plugin.types import Step
 
 
@@ -43,9 +42,7 @@ class LearningRates:
     batch_scale: float = 2.0
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            value = getattr(self, field.name)
-            require(math.isfinite(value) and value >= 0, field.name, value, "a finite learning rate >= 0")
+        require_not_negative(self, *(field.name for field in fields(self)))
         if (self.means > 0) != (self.means_final > 0):
             raise InputError(
                 f"learning rates means={self.means} and means_final={self.means_final}: "

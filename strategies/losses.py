@@ -6,39 +6,28 @@ gradients are as large as those of a dense mean loss. Formulas: `turbogs_plugin.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 from torch import Tensor
+from turbogs_plugin.strategies.checks import require_positive
 
 from turbogs_plugin.engine import engine_of
 from turbogs_plugin.engine.rules import STRUCTURE_CONSTANT, LossTerms
-from turbogs_plugin.errors import require
+from turbogs_plugin.errors import require, require_not_negative
 from turbogs_plugin.types import LossOutput, PixelSamples
 
 STRUCTURES = ("ncc", "contrast")
 """Structure terms of `CharbonnierNccLoss`."""
 
 
-class RuleLoss:
-    """A loss that its terms describe: called alone, it is evaluated by the engine of the colours' device."""
-
-    terms: LossTerms
-
-    def __call__(self, colors: Tensor, targets: Tensor, samples: PixelSamples) -> LossOutput:
-        return engine_of(colors.device).evaluate(self.terms, colors, targets, samples)
-
-
-def _check_epsilon(epsilon: float) -> None:
-    require(math.isfinite(epsilon) and epsilon > 0, "epsilon", epsilon, "a finite number above 0")
-
-
 @dataclass
-class CharbonnierLoss(RuleLoss):
+class CharbonnierLoss:
     """The Charbonnier l1 term alone: mean over filled samples and channels of ``w (sqrt(d^2 + eps^2) - eps)``.
 
     l1(p) is the mean over the three channels, not their sum: so it has the size of a dense L1 loss in gsplat.
     Each entry of the gradient is at most ``w / (3 n)``, n the number of filled samples.
+
+    A loss with other `terms` inherits from it.
 
     Args:
         epsilon: residuals below it are treated quadratically.
@@ -47,16 +36,20 @@ class CharbonnierLoss(RuleLoss):
     epsilon: float = 1e-3
 
     def __post_init__(self) -> None:
-        _check_epsilon(self.epsilon)
+        require_positive(self, "epsilon")
 
     @property
     def terms(self) -> LossTerms:
         """This loss as engines take it."""
         return LossTerms(self.epsilon)
 
+    def __call__(self, colors: Tensor, targets: Tensor, samples: PixelSamples) -> LossOutput:
+        """The loss by the engine of the colours' device."""
+        return engine_of(colors.device).evaluate(self.terms, colors, targets, samples)
+
 
 @dataclass
-class CharbonnierNccLoss(RuleLoss):
+class CharbonnierNccLoss(CharbonnierLoss):
     """Charbonnier l1 plus a gradient-balanced structure term of each tile (equations of section 3.7)::
 
         L = l1 + ncc_weight * mean over tiles of lambda * mean over channels of gate * (1 - S)
@@ -81,23 +74,19 @@ class CharbonnierNccLoss(RuleLoss):
         gate: scale the term by the gate.
     """
 
-    epsilon: float = 1e-3
     ncc_weight: float = 0.4
     structure: str = "ncc"
     variance_constant: float = STRUCTURE_CONSTANT
     gate: bool = False
 
     def __post_init__(self) -> None:
-        _check_epsilon(self.epsilon)
-        valid = math.isfinite(self.ncc_weight) and self.ncc_weight >= 0
-        require(valid, "ncc_weight", self.ncc_weight, "finite and 0 or more")
+        super().__post_init__()
+        require_not_negative(self, "ncc_weight")
         require(self.structure in STRUCTURES, "structure", self.structure, f"one of {', '.join(STRUCTURES)}")
-        valid = math.isfinite(self.variance_constant) and self.variance_constant > 0
-        require(valid, "variance_constant", self.variance_constant, "a finite number above 0")
+        require_positive(self, "variance_constant")
 
     @property
     def terms(self) -> LossTerms:
-        """This loss as engines take it."""
         return LossTerms(
             self.epsilon,
             structure=self.structure,
@@ -109,7 +98,7 @@ class CharbonnierNccLoss(RuleLoss):
 
 
 @dataclass
-class SparseSsimLoss(RuleLoss):
+class SparseSsimLoss(CharbonnierLoss):
     """``(1 - ssim_weight) * l1 + ssim_weight * mean over tiles and channels of (1 - SSIM)``, 3DGS' mixture.
 
     SSIM's statistics are those of a tile's samples, taken as one window.
@@ -119,16 +108,14 @@ class SparseSsimLoss(RuleLoss):
         ssim_weight: 0 .. 1.
     """
 
-    epsilon: float = 1e-3
     ssim_weight: float = 0.2
 
     def __post_init__(self) -> None:
-        _check_epsilon(self.epsilon)
+        super().__post_init__()
         require(0 <= self.ssim_weight <= 1, "ssim_weight", self.ssim_weight, "between 0 and 1")
 
     @property
     def terms(self) -> LossTerms:
-        """This loss as engines take it."""
         return LossTerms(
             self.epsilon, l1_weight=1.0 - self.ssim_weight, structure="ssim", structure_weight=self.ssim_weight
         )

@@ -79,16 +79,18 @@ class SparseLoss(Protocol):
 
 @runtime_checkable
 class DensityController(Protocol):
-    """Where Gaussians are added and removed (section 3.8)."""
+    """Where Gaussians are added and removed (section 3.8).
+
+    A class that inherits from this one and keeps nothing by Gaussian needs no method but `update`.
+    """
 
     @property
     def stats(self) -> GaussianStats | None:
         """The window that backward passes add to, or None where nothing is needed now."""
-        ...
+        return None
 
     def setup(self, gaussians: Gaussians) -> None:
         """Called once before training, and after a resume, before `load_state_dict`."""
-        ...
 
     def update(self, gaussians: Gaussians, step: Step) -> RowUpdate | None:
         """Called after every optimizer step: proposes a change of the set of Gaussians, or None for none."""
@@ -97,11 +99,12 @@ class DensityController(Protocol):
     def apply(self, update: RowUpdate) -> None:
         """Follow the change with its own state by Gaussian, row by row. Called after model and optimizer followed; the
         rows may be in another order than in what `update` proposed."""
-        ...
 
-    def state_dict(self) -> dict[str, Any]: ...
+    def state_dict(self) -> dict[str, Any]:
+        return {}
 
-    def load_state_dict(self, state: dict[str, Any]) -> None: ...
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Take over what `state_dict` gave."""
 
 
 @runtime_checkable

@@ -18,7 +18,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from turbogs_plugin.errors import require
+from turbogs_plugin.strategies.checks import require_positive
+
+from turbogs_plugin.errors import require, require_not_negative
 from turbogs_plugin.types import SamplingBudget, Step
 
 EPSILON = 1e-12
@@ -31,8 +33,8 @@ def error_ratio(mean_error: float, initial_error: float) -> float:
 
 
 def _check_budget(pixel_budget: float) -> None:
-    valid = math.isfinite(pixel_budget) and pixel_budget > 0
-    require(valid, "pixel_budget", pixel_budget, "a finite number above 0 (images per iteration)")
+    allowed = "a finite number above 0 (images per iteration)"
+    require(0 < pixel_budget < math.inf, "pixel_budget", pixel_budget, allowed)
 
 
 @dataclass
@@ -55,7 +57,7 @@ class _AdaptiveSchedule:
         allowed = f"min_views ({self.min_views}) or more"
         require(self.max_views >= self.min_views, "max_views", self.max_views, allowed)
         _check_budget(self.pixel_budget)
-        require(math.isfinite(self.alpha) and self.alpha >= 0, "alpha", self.alpha, "finite and 0 or more")
+        require_not_negative(self, "alpha")
 
     def phi(self, ratio: float) -> float:
         """The modulation of the error ratio, from [0, 1] onto [0, 1]."""
@@ -103,8 +105,7 @@ class ExponentialSchedule(_AdaptiveSchedule):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        valid = math.isfinite(self.steepness) and self.steepness > 0
-        require(valid, "steepness", self.steepness, "a finite number above 0")
+        require_positive(self, "steepness")
 
     def phi(self, ratio: float) -> float:
         return math.expm1(-self.steepness * ratio) / math.expm1(-self.steepness)

@@ -2,15 +2,24 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 import torch
 from torch import Tensor
+from turbogs_plugin.strategies.checks import require_at_least_one, require_share, shared_settings
 from turbogs_plugin.strategies.density.error_driven import ErrorDrivenDensity
-from turbogs_plugin.strategies.density.rows import finite_rows, leave_one, loaded_rows, removal
+from turbogs_plugin.strategies.density.rows import (
+    add_stats,
+    finite_rows,
+    leave_one,
+    loaded_rows,
+    removal,
+    saved_rows,
+)
+from turbogs_plugin.strategies.protocols import DensityController
 
-from turbogs_plugin.errors import require, require_not_negative
+from turbogs_plugin.errors import require_not_negative
 from turbogs_plugin.types import Gaussians, GaussianStats, RowUpdate, Step
 
 
@@ -44,7 +53,7 @@ class ViewVotes:
 
 
 @dataclass
-class FastGsDensity:
+class FastGsDensity(DensityController):
     """Densify what many views agree is rendered badly; prune what many views blame.
 
     FastGS renders some training views in full at each event, marks the pixels of large (normalised) error, and scores
@@ -86,20 +95,12 @@ class FastGsDensity:
     _votes: ViewVotes | None = field(init=False, repr=False, default=None)
 
     def __post_init__(self) -> None:
-        require(self.prune_every >= 1, "prune_every", self.prune_every, "at least 1")
+        require_at_least_one(self, "prune_every")
         require_not_negative(self, "error_threshold")
-        for name in ("consistency", "blame_threshold"):
-            require(0 < getattr(self, name) <= 1, name, getattr(self, name), "more than 0 and at most 1")
-        # Carries the events out; which Gaussians may be densified is said by the gradients it is shown.
-        shared = ("refine_from", "refine_every", "grad_threshold", "absgrad_threshold", "percent_dense")
-        shared += ("prune_opacity", "prune_world_size")
-        self._events = ErrorDrivenDensity(
-            **{name: getattr(self, name) for name in shared},
-            score="raw",
-            lambda_base=0.0,
-            top_fraction=1.0,
-            final_keep=1.0,
-        )
+        require_share(self, "consistency", "blame_threshold")
+        # Carries the events out. The gradients that it is shown say which Gaussians may be densified.
+        settings = shared_settings(self, ErrorDrivenDensity)
+        self._events = ErrorDrivenDensity(**settings, score="raw", lambda_base=0.0, top_fraction=1.0, final_keep=1.0)
 
     @property
     def stats(self) -> GaussianStats | None:
@@ -112,14 +113,18 @@ class FastGsDensity:
     def update(self, gaussians: Gaussians, step: Step) -> RowUpdate | None:
         if self._look is None:
             return None
-        self._take_look()
+        self._votes.add(self._look, self.error_threshold)
+        add_stats(self._window, self._look)
+        self._look.zero_()
         after = step.iteration - step.refine_until
+        densify, _ = self._events.due(step)
+        prune = after > 0 and after % self.prune_every == 0
         update = None
-        if after <= 0 and step.iteration >= self.refine_from and step.iteration % self.refine_every == 0:
+        if densify:
             update = self._densify(gaussians, step)
-            self._restart(len(gaussians), gaussians.device)
-        elif after > 0 and after % self.prune_every == 0:
+        elif prune:
             update = self._prune(gaussians)
+        if densify or prune:
             self._restart(len(gaussians), gaussians.device)
         if after > 0 and step.iteration + self.prune_every - after % self.prune_every >= step.total:
             self._look = self._window = self._votes = None  # no event is left in this run
@@ -130,39 +135,26 @@ class FastGsDensity:
             self._restart(len(update.source), update.source.device)
 
     def state_dict(self) -> dict[str, Any]:
-        parts = {"look": self._look, "window": self._window, "votes": self._votes}
-        return {
-            name: None if part is None else {item.name: getattr(part, item.name) for item in fields(part)}
-            for name, part in parts.items()
-        }
+        return {name: saved_rows(part) for name, part in self._parts().items()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        parts = {"look": self._look, "window": self._window, "votes": self._votes}
-        loaded = {name: loaded_rows(name, state[name], present) for name, present in parts.items()}
+        loaded = {name: loaded_rows(name, state[name], present) for name, present in self._parts().items()}
         self._look, self._window, self._votes = loaded.values()
+
+    def _parts(self) -> dict[str, Any]:
+        return {"look": self._look, "window": self._window, "votes": self._votes}
 
     def _restart(self, count: int, device: torch.device) -> None:
         self._look, self._window = GaussianStats.zeros(count, device), GaussianStats.zeros(count, device)
         self._votes = ViewVotes.zeros(count, device)
 
-    def _take_look(self) -> None:
-        """Add this iteration's statistics to the window's, and count its votes."""
-        self._votes.add(self._look, self.error_threshold)
-        for item in fields(GaussianStats):
-            window, look = getattr(self._window, item.name), getattr(self._look, item.name)
-            if item.name == "max_radii":
-                torch.maximum(window, look, out=window)
-            else:
-                window += look
-        self._look.zero_()
-
     def _densify(self, gaussians: Gaussians, step: Step) -> RowUpdate | None:
         votes, window = self._votes, self._window
         agreed = (votes.marked >= self.consistency * votes.seen) & (votes.seen > 0)
-        shown = replace(window, grad_sums=window.grad_sums * agreed, absgrad_sums=window.absgrad_sums * agreed)
+        window.grad_sums *= agreed
+        window.absgrad_sums *= agreed
         self._events.setup(gaussians)
-        stats = {item.name: getattr(shown, item.name) for item in fields(GaussianStats)}
-        self._events.load_state_dict({"stats": stats})
+        self._events.load_state_dict({"stats": vars(window)})
         return self._events.update(gaussians, step)
 
     def _prune(self, gaussians: Gaussians) -> RowUpdate | None:
