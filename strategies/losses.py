@@ -21,17 +21,8 @@ STRUCTURES = ("ncc", "contrast")
 
 
 @dataclass
-class CharbonnierLoss:
-    """The Charbonnier l1 term alone: mean over filled samples and channels of ``w (sqrt(d^2 + eps^2) - eps)``.
-
-    l1(p) is the mean over the three channels, not their sum: so it has the size of a dense L1 loss in gsplat.
-    Each entry of the gradient is at most ``w / (3 n)``, n the number of filled samples.
-
-    A loss with other `terms` inherits from it.
-
-    Args:
-        epsilon: residuals below it are treated quadratically.
-    """
+class RuleLoss:
+    """A loss that its terms describe; called alone, it is evaluated by the engine of the colours' device."""
 
     epsilon: float = 1e-3
 
@@ -44,12 +35,23 @@ class CharbonnierLoss:
         return LossTerms(self.epsilon)
 
     def __call__(self, colors: Tensor, targets: Tensor, samples: PixelSamples) -> LossOutput:
-        """The loss by the engine of the colours' device."""
         return engine_of(colors.device).evaluate(self.terms, colors, targets, samples)
 
 
 @dataclass
-class CharbonnierNccLoss(CharbonnierLoss):
+class CharbonnierLoss(RuleLoss):
+    """The Charbonnier l1 term alone: mean over filled samples and channels of ``w (sqrt(d^2 + eps^2) - eps)``.
+
+    l1(p) is the mean over the three channels, not their sum: so it has the size of a dense L1 loss in gsplat.
+    Each entry of the gradient is at most ``w / (3 n)``, n the number of filled samples.
+
+    Args:
+        epsilon: residuals below it are treated quadratically.
+    """
+
+
+@dataclass
+class CharbonnierNccLoss(RuleLoss):
     """Charbonnier l1 plus a gradient-balanced structure term of each tile (equations of section 3.7)::
 
         L = l1 + ncc_weight * mean over tiles of lambda * mean over channels of gate * (1 - S)
@@ -98,7 +100,7 @@ class CharbonnierNccLoss(CharbonnierLoss):
 
 
 @dataclass
-class SparseSsimLoss(CharbonnierLoss):
+class SparseSsimLoss(RuleLoss):
     """``(1 - ssim_weight) * l1 + ssim_weight * mean over tiles and channels of (1 - SSIM)``, 3DGS' mixture.
 
     SSIM's statistics are those of a tile's samples, taken as one window.

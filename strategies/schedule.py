@@ -27,11 +27,6 @@ EPSILON = 1e-12
 """Added to the initial error, which is zero where the initial model is already exact."""
 
 
-def error_ratio(mean_error: float, initial_error: float) -> float:
-    """clip(E_mean / (E_init + eps), 0, 1); 0 where the quotient is not a number."""
-    return min(1.0, max(0.0, mean_error / (initial_error + EPSILON)))
-
-
 def _check_budget(pixel_budget: float) -> None:
     allowed = "a finite number above 0 (images per iteration)"
     require(0 < pixel_budget < math.inf, "pixel_budget", pixel_budget, allowed)
@@ -72,7 +67,8 @@ class _AdaptiveSchedule:
             num_views: V, an upper bound of K.
         """
         low, high = min(self.min_views, num_views), min(self.max_views, num_views)
-        x = 1.0 - step.anneal * self.phi(error_ratio(mean_error, initial_error))
+        ratio = min(1.0, max(0.0, mean_error / (initial_error + EPSILON)))  # 0 where the quotient is not a number
+        x = 1.0 - step.anneal * self.phi(ratio)
         views = math.floor(low + (high - low) * math.exp(-self.alpha * x) + 0.5)
         rate_low, rate_high = self.pixel_budget / high, self.pixel_budget / low
         return SamplingBudget(views, min(1.0, rate_low + (rate_high - rate_low) * x))

@@ -9,14 +9,7 @@ import torch
 from torch import Tensor
 from turbogs_plugin.strategies.checks import require_at_least_one, require_share, shared_settings
 from turbogs_plugin.strategies.density.error_driven import ErrorDrivenDensity
-from turbogs_plugin.strategies.density.rows import (
-    add_stats,
-    finite_rows,
-    leave_one,
-    loaded_rows,
-    removal,
-    saved_rows,
-)
+from turbogs_plugin.strategies.density.rows import add_stats, finite_rows, leave_one, loaded_rows, removal, saved_rows
 from turbogs_plugin.strategies.protocols import DensityController
 
 from turbogs_plugin.errors import require_not_negative

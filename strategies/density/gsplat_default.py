@@ -11,7 +11,7 @@ from gsplat.strategy import DefaultStrategy, Strategy
 from gsplat.strategy.ops import reset_opa
 from torch import Tensor
 from turbogs_plugin.strategies.checks import require_at_least_one, require_choices, shared_settings
-from turbogs_plugin.strategies.density.rows import WindowedDensity, finite_rows
+from turbogs_plugin.strategies.density.rows import WindowedDensity, finite_rows, leave_one, removal
 
 from turbogs_plugin.errors import require, require_not_negative
 from turbogs_plugin.types import Gaussians, RowUpdate, Step
@@ -77,7 +77,7 @@ class GsplatDefaultDensity(WindowedDensity):
             return None
         usable = torch.nonzero(finite_rows(gaussians)).squeeze(-1)
         if len(usable) == 0:
-            return self._keep_one(gaussians, usable)
+            return self._keep_one(gaussians)
         strategy = _FilledStrategy(**shared_settings(self, DefaultStrategy), refine_stop_iter=step.refine_until)
         values = {name: value[usable] for name, value in gaussians.items()}
         state = self._gsplat_state(usable, step)
@@ -85,7 +85,7 @@ class GsplatDefaultDensity(WindowedDensity):
         if reset_due and self.opacity_reset == "repaired":
             reset_opa(params, optimizers, state, self.prune_opa * 2.0)
         if len(state["source_row"]) == 0:
-            return self._keep_one(gaussians, usable)
+            return self._keep_one(gaussians)
         return self._change(gaussians, params, optimizers, state)
 
     def _gsplat_state(self, rows: Tensor, step: Step) -> dict[str, Any]:
@@ -99,13 +99,10 @@ class GsplatDefaultDensity(WindowedDensity):
             "scene_scale": step.scene_extent,
         }
 
-    def _keep_one(self, gaussians: Gaussians, usable: Tensor) -> RowUpdate | None:
-        """What there is instead of a model of nothing: the most opaque Gaussian of those that are `usable` [M]."""
+    def _keep_one(self, gaussians: Gaussians) -> RowUpdate | None:
+        """What there is instead of a model of nothing: the most opaque Gaussian that is finite."""
         self._stats.zero_()
-        if len(gaussians) == 1:
-            return None
-        source = usable[gaussians.opacities[usable].argmax()] if len(usable) else usable.new_zeros(())
-        return RowUpdate(source.reshape(1), usable.new_zeros(1, dtype=torch.bool), {}, num_pruned=len(gaussians) - 1)
+        return removal(leave_one(torch.ones(len(gaussians), dtype=torch.bool, device=gaussians.device), gaussians))
 
     def _change(self, gaussians: Gaussians, params: dict, optimizers: dict, state: dict) -> RowUpdate | None:
         """What gsplat has done, as one change."""
