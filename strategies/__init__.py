@@ -10,8 +10,10 @@ from __future__ import annotations
 from turbogs_plugin import lazy_face
 
 _MODULES: dict[str, tuple[str, ...]] = {
-    "protocols": ("SamplingSchedule", "ViewSampler", "PixelSampler", "SparseLoss")
-    + ("DensityController", "GaussianOptimizer"),
+    "protocols": (
+        *("SamplingSchedule", "ViewSampler", "PixelSampler", "SparseLoss"),
+        *("DensityController", "GaussianOptimizer"),
+    ),
     "schedule": ("SinusoidalSchedule", "LinearSchedule", "ExponentialSchedule", "FixedSchedule"),
     "view_sampling": ("GeometryAwareViewSampler", "RandomViewSampler"),
     "pixel_sampling": ("ErrorGuidedPixelSampler", "RandomPixelSampler", "DensePixelSampler"),

@@ -6,10 +6,15 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.types import PARAMETER_NAMES, Gaussians
+
+Parameters = dict[str, torch.nn.Parameter] | torch.nn.ParameterDict
+Optimizers = Mapping[str, torch.optim.Optimizer]
+"""A host's, by the names of the parameters."""
 
 PREDICTION, GROUND_TRUTH = "prediction", "ground_truth"
 """Keys under which a host puts what it rendered and what it should have been into `info`."""

@@ -14,8 +14,9 @@ of the member's own parameter group.
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterable
-from typing import Any, Protocol
+from collections.abc import Callable, Iterable, Iterator
+from types import SimpleNamespace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -25,6 +26,7 @@ from turbogs_plugin.engine.rules import ParameterRates
 from turbogs_plugin.errors import InputError, require
 from turbogs_plugin.gsplat_bridge.gaussian_errors import loss_shares
 from turbogs_plugin.gsplat_bridge.host import host_gaussians
+from turbogs_plugin.strategies.optimizers.sparse_adam import SparseAdam
 from turbogs_plugin.types import PARAMETER_NAMES, GaussianGradients, Gaussians, Step
 
 COUNT = "step"
@@ -32,18 +34,6 @@ COUNT = "step"
 operations take every other value for one with rows."""
 
 MOMENTS = ("exp_avg", "exp_avg_sq")
-
-
-class BlockOptimizer(Protocol):
-    """What `SharedOptimizer` needs of an optimizer: `SparseAdam` and `MomentLMOptimizer` are such."""
-
-    learning_rates: Any
-    beta1: float
-    beta2: float
-    eps: float
-    moments: GaussianMoments
-
-    def step(self, gaussians: Gaussians, gradients: GaussianGradients, step: Step) -> None: ...
 
 
 class SharedOptimizer:
@@ -58,12 +48,13 @@ class SharedOptimizer:
         }
 
     Args:
-        optimizer: the rule. Its learning rates, betas and eps are replaced by the members' parameter groups'. Autograd
-            gives the sum of the gradients over views, so J has one row, whatever `MomentLMOptimizer.rows` says.
+        optimizer: a `SparseAdam`, as a `MomentLMOptimizer` is, too. Its learning rates, betas and eps are replaced by
+            those of the members' parameter groups. Autograd gives the sum of the gradients over views, so J has one
+            row, whatever `MomentLMOptimizer.rows` says.
     """
 
-    def __init__(self, optimizer: BlockOptimizer) -> None:
-        if isinstance(optimizer, type) or "moments" not in getattr(optimizer, "__dataclass_fields__", ()):
+    def __init__(self, optimizer: SparseAdam) -> None:
+        if not isinstance(optimizer, SparseAdam):
             name = optimizer.__name__ if isinstance(optimizer, type) else type(optimizer).__name__
             raise InputError(f"SharedOptimizer takes SparseAdam() or MomentLMOptimizer(), an instance: got {name}")
         self.optimizer = copy.copy(optimizer)
@@ -138,7 +129,7 @@ class SharedOptimizer:
         rates = ParameterRates(**{name: float(group["lr"]) for name, group in groups.items()})
         (beta1, beta2), eps = groups["means"]["betas"], groups["means"]["eps"]
         check_moments_config(beta1, beta2, eps)
-        self.optimizer.learning_rates = _FixedRates(rates)
+        self.optimizer.learning_rates = SimpleNamespace(at=lambda step: rates)  # hosts' schedulers have set them
         self.optimizer.beta1, self.optimizer.beta2, self.optimizer.eps = beta1, beta2, eps
 
     def _pack(self, gaussians: Gaussians) -> GaussianMoments:
@@ -147,25 +138,25 @@ class SharedOptimizer:
         if self.skipped is None:
             self.skipped = packed.skipped
         packed.skipped = self.skipped
-        for name, member in self.members.items():
-            state = member.checked_state()
-            for moment in MOMENTS:
-                if name == "shN":
-                    getattr(packed, f"{moment}_shN").copy_(state[moment].flatten(1))
-                else:
-                    getattr(packed, moment)[:, COLUMNS[name]] = state[moment].reshape(len(packed), -1)
+        for place, moment in self._moments(packed):
+            place.copy_(moment.reshape(place.shape))
         packed.steps.fill_(int(self.members["means"].checked_state()[COUNT]))
         return packed
 
     def _unpack(self, packed: GaussianMoments) -> None:
+        for place, moment in self._moments(packed):
+            moment.copy_(place.reshape(moment.shape))
+        self.members["means"].checked_state()[COUNT] += 1
+
+    def _moments(self, packed: GaussianMoments) -> Iterator[tuple[Tensor, Tensor]]:
+        """Each moment of each parameter: its place in the packed form, and the member's own tensor."""
         for name, member in self.members.items():
             state = member.checked_state()
             for moment in MOMENTS:
-                source = (
-                    getattr(packed, f"{moment}_shN") if name == "shN" else getattr(packed, moment)[:, COLUMNS[name]]
-                )
-                state[moment].copy_(source.reshape(state[moment].shape))
-        self.members["means"].checked_state()[COUNT] += 1
+                if name == "shN":
+                    yield getattr(packed, f"{moment}_shN"), state[moment]
+                else:
+                    yield getattr(packed, moment)[:, COLUMNS[name]], state[moment]
 
     def _shares(self, gaussians: Gaussians, info: dict[str, Any] | None) -> Tensor:
         """[1, N] the Gaussians' share of the loss, zero where nothing is known of it."""
@@ -259,16 +250,6 @@ class MemberOptimizer(torch.optim.Optimizer):
                     f"expected {tuple(parameter.shape)}: rows were added or removed without the optimizer"
                 )
         return state
-
-
-class _FixedRates:
-    """Learning rates that hosts' schedulers have set for this step."""
-
-    def __init__(self, rates: ParameterRates) -> None:
-        self.rates = rates
-
-    def at(self, step: Step) -> ParameterRates:
-        return self.rates
 
 
 def _one_row(gradients: dict[str, Tensor], shares: Tensor) -> GaussianGradients:

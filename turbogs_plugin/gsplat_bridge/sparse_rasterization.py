@@ -111,12 +111,6 @@ def sparse_rasterization(
     given |= {"viewmats": viewmats, "Ks": Ks} | ({} if backgrounds is None else {"backgrounds": backgrounds})
     _check_tensors(given)
     _check_shapes(given, sh_degree)
-    for name in ("viewmats", "Ks"):
-        if given[name].requires_grad and torch.is_grad_enabled():
-            raise InputError(
-                f"{name} requires a gradient, and cameras get none from sparse_rasterization: pass {name}.detach(), or "
-                "optimise the cameras with gsplat's rasterization"
-            )
     _check_samples(samples)
     sizes = {(int(w), int(h)) for w, h in samples.sizes}
     if sizes != {(width, height)} or len(samples.view_ids) != len(viewmats):
@@ -195,34 +189,23 @@ def sparse_loss(
         if not isinstance(value, Tensor) or not value.is_floating_point() or value.shape != (len(samples), 3):
             found = f"{value.dtype} {tuple(value.shape)}" if isinstance(value, Tensor) else type(value).__name__
             raise InputError(f"{name} is {found}: expected floating point {(len(samples), 3)}, as there are samples")
-    if isinstance(loss, type):
-        raise _not_a_loss(loss)
-    try:
-        output = loss(colors.detach(), targets.detach(), samples)
-    except TypeError:
-        if _takes_three(loss):
-            raise
-        raise _not_a_loss(loss) from None
+    output = loss(colors.detach(), targets.detach(), samples) if _takes_three(loss) else None
     if not isinstance(output, LossOutput):
-        raise _not_a_loss(loss)
+        name = getattr(loss, "__name__", type(loss).__name__)
+        raise InputError(
+            f"loss is {'the class ' if isinstance(loss, type) else ''}{name}: expected an instance of a loss on samples, "
+            "as CharbonnierNccLoss() is, which is called with (colors, targets, samples) and gives a LossOutput"
+        )
     return _Loss.apply(colors, output)
 
 
 def _takes_three(loss: Any) -> bool:
-    """Whether it can be called with colours, targets and samples."""
+    """Whether it is no class, and can be called with colours, targets and samples."""
     try:
         inspect.signature(loss.forward if isinstance(loss, torch.nn.Module) else loss).bind(None, None, None)
-    except (TypeError, ValueError):  # of other arguments, or none that can be told; not callable
+    except (TypeError, ValueError):  # not callable, of other arguments, or one that does not tell
         return False
-    return True
-
-
-def _not_a_loss(loss: Any) -> InputError:
-    name = f"the class {loss.__name__}" if isinstance(loss, type) else getattr(loss, "__name__", type(loss).__name__)
-    return InputError(
-        f"loss is {name}: expected an instance of a loss on samples, as CharbonnierNccLoss() is, which is called with "
-        "(colors, targets, samples) and gives a LossOutput"
-    )
+    return not isinstance(loss, type)
 
 
 class _Loss(torch.autograd.Function):
@@ -312,16 +295,21 @@ def _check_options(options: dict[str, Any]) -> None:
 
 
 def _check_tensors(given: dict[str, Any]) -> None:
-    """All are tensors of the means' floating point type, on the means' device."""
+    """All are tensors of the means' floating point type, on the means' device; cameras want no gradient."""
+    means = given["means"]
     for name, value in given.items():
         if not isinstance(value, Tensor):
             raise InputError(f"{name} is a {type(value).__name__}: expected a tensor")
         if not value.is_floating_point():
             raise InputError(f"{name} is of {value.dtype}: expected floating point")
-        means = given["means"]
         if (value.dtype, value.device) != (means.dtype, means.device):
             raise InputError(
                 f"{name} is of {value.dtype} on {value.device}: expected {means.dtype} on {means.device} as means"
+            )
+        if name in ("viewmats", "Ks") and value.requires_grad and torch.is_grad_enabled():
+            raise InputError(
+                f"{name} requires a gradient, and cameras get none from sparse_rasterization: pass {name}.detach(), or "
+                "optimise the cameras with gsplat's rasterization"
             )
 
 
