@@ -16,15 +16,7 @@ from turbogs_plugin.engine.rendered import RasterSettings
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.gsplat_bridge.gaussian_errors import residuals
 from turbogs_plugin.gsplat_bridge.host import GROUND_TRUTH, LOSS_SHARES, PREDICTION, STATISTICS
-from turbogs_plugin.types import (
-    SH_C0,
-    TILE_SIZE,
-    Cameras,
-    Gaussians,
-    GaussianStats,
-    LossOutput,
-    PixelSamples,
-)
+from turbogs_plugin.types import SH_C0, TILE_SIZE, Cameras, Gaussians, GaussianStats, LossOutput, PixelSamples
 
 LOGIT_MARGIN = 2.0**-23
 """Opacities are kept this far from 0 and 1, where the logit is infinite. An alpha is cut at 0.999 in any case."""
@@ -192,9 +184,10 @@ def sparse_loss(
     output = loss(colors.detach(), targets.detach(), samples) if _takes_three(loss) else None
     if not isinstance(output, LossOutput):
         name = getattr(loss, "__name__", type(loss).__name__)
+        found = f"the class {name}" if isinstance(loss, type) else name
         raise InputError(
-            f"loss is {'the class ' if isinstance(loss, type) else ''}{name}: expected an instance of a loss on samples, "
-            "as CharbonnierNccLoss() is, which is called with (colors, targets, samples) and gives a LossOutput"
+            f"loss is {found}: expected an instance of a loss on samples, as CharbonnierNccLoss() is, which is called "
+            "with (colors, targets, samples) and gives a LossOutput"
         )
     return _Loss.apply(colors, output)
 
@@ -235,8 +228,17 @@ class _InfoObserver:
 
     def pixel_errors(self) -> Tensor | None:
         info = self.info()
-        errors = None if info is None else _sample_errors(info, self.samples)
+        errors = None if info is None else residuals(info)
         self.has_errors = errors is not None
+        if errors is None:
+            return None
+        if errors.dim() == 3:
+            errors = gather_pixels(errors[..., None], self.samples)[:, 0]
+        if errors.shape != (len(self.samples),):
+            raise InputError(
+                f"info['{PREDICTION}'] and info['{GROUND_TRUTH}'] are of shape {(*errors.shape, 3)}: expected "
+                f"{(len(self.samples), 3)}, as there are samples, or [C, H, W, 3]"
+            )
         return errors
 
     def passed(self, stats: GaussianStats, view_losses: Tensor) -> None:
@@ -245,39 +247,13 @@ class _InfoObserver:
             info[STATISTICS], info[LOSS_SHARES] = stats, view_losses
 
 
-def _sample_errors(info: dict[str, Any], samples: PixelSamples) -> Tensor | None:
-    """[P] L1 norms of the residuals at the samples, or None where `info` has no prediction and ground truth."""
-    errors = residuals(info)
-    if errors is not None and errors.dim() == 3:
-        errors = gather_pixels(errors[..., None], samples)[:, 0]
-    if errors is not None and errors.shape != (len(samples),):
-        raise InputError(
-            f"info['{PREDICTION}'] and info['{GROUND_TRUTH}'] are of shape {(*errors.shape, 3)}: expected "
-            f"{(len(samples), 3)}, as there are samples, or [C, H, W, 3]"
-        )
-    return errors
-
-
 def _info(render: DifferentiableRender, cameras: int, width: int, height: int) -> _Info:
-    projected = render.projected
     absent = ("batch_ids", "camera_ids", "gaussian_ids", "tiles_per_gauss", "isect_ids", "flatten_ids", "isect_offsets")
-    return _Info(
-        {
-            **dict.fromkeys(absent),
-            "means2d": render.means2d,  # a leaf: `retain_grad` of it is allowed and needless
-            "radii": projected.radii,
-            "depths": projected.depths,
-            "conics": projected.conics,
-            "opacities": projected.opacities,
-            "width": width,
-            "height": height,
-            "tile_size": TILE_SIZE,
-            "tile_width": -(-width // TILE_SIZE),
-            "tile_height": -(-height // TILE_SIZE),
-            "n_batches": 1,
-            "n_cameras": cameras,
-        }
-    )
+    shown = {name: getattr(render.projected, name) for name in ("radii", "depths", "conics", "opacities")}
+    sizes = {"width": width, "height": height, "n_batches": 1, "n_cameras": cameras}
+    tiles = {"tile_size": TILE_SIZE, "tile_width": -(-width // TILE_SIZE), "tile_height": -(-height // TILE_SIZE)}
+    # means2d is a leaf: `retain_grad` of it is allowed and needless.
+    return _Info(means2d=render.means2d, **shown, **sizes, **tiles, **dict.fromkeys(absent))
 
 
 def _check_samples(samples: Any) -> None:
@@ -314,22 +290,13 @@ def _check_tensors(given: dict[str, Any]) -> None:
 
 
 def _check_shapes(given: dict[str, Tensor], sh_degree: int | None) -> None:
-    means, viewmats, colors = given["means"], given["viewmats"], given["colors"]
-    count, cameras = len(means), len(viewmats)
-    expected = {
-        "means": (count, 3),
-        "quats": (count, 4),
-        "scales": (count, 3),
-        "opacities": (count,),
-        "viewmats": (cameras, 4, 4),
-        "Ks": (cameras, 3, 3),
-        "colors": (count, 3) if sh_degree is None else (count, *colors.shape[1:2], 3),
-        "backgrounds": (cameras, 3),
-    }
+    colors, count, cameras = given["colors"], len(given["means"]), len(given["viewmats"])
+    expected = {"means": (count, 3), "quats": (count, 4), "scales": (count, 3), "opacities": (count,)}
+    expected["colors"] = (count, 3) if sh_degree is None else (count, *colors.shape[1:2], 3)
+    expected |= {"viewmats": (cameras, 4, 4), "Ks": (cameras, 3, 3), "backgrounds": (cameras, 3)}
     for name, value in given.items():
-        shape = expected[name]
-        if tuple(value.shape) != shape:
-            form = "[N, 3] without sh_degree" if name == "colors" and sh_degree is None else str(list(shape))
+        if tuple(value.shape) != expected[name]:
+            form = "[N, 3] without sh_degree" if name == "colors" and sh_degree is None else list(expected[name])
             raise InputError(f"{name} has shape {tuple(value.shape)}: expected {form} (N = {count}, C = {cameras})")
     if sh_degree is None:
         return
