@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import torch
+import tyro
 from gsplat import DefaultStrategy, rasterization
 from torch import Tensor
 
@@ -53,10 +54,34 @@ class Result:
     last_psnr: float
 
 
-def demo_scene(views: int = 16, width: int = 96, height: int = 72) -> Scene:
-    """A small capture, made on the spot."""
-    with tempfile.TemporaryDirectory() as folder:
-        return load_scene(write_demo_capture(Path(folder) / "demo", views=views, width=width, height=height))
+@dataclass
+class Options:
+    """What the scripts take on the command line.
+
+    Args:
+        scene: a capture's folder; a demo capture where empty.
+        refine_start_iter, refine_every: of the strategy.
+    """
+
+    scene: str = ""
+    iterations: int = 300
+    refine_start_iter: int = 50
+    refine_every: int = 50
+
+    def capture(self) -> Scene:
+        """The capture; a small one is made on the spot where none is named."""
+        if self.scene:
+            return load_scene(self.scene)
+        with tempfile.TemporaryDirectory() as folder:
+            return load_scene(write_demo_capture(Path(folder) / "demo", views=16, width=96, height=72))
+
+    def strategy(self, cls: type[DefaultStrategy]) -> DefaultStrategy:
+        return cls(refine_start_iter=self.refine_start_iter, refine_every=self.refine_every)
+
+
+def command_line(main: Callable[..., None]) -> None:
+    """Run a script, whose first argument is its `Options`."""
+    tyro.cli(main, config=(tyro.conf.OmitArgPrefixes,))
 
 
 def create_splats(scene: Scene, device: str) -> torch.nn.ParameterDict:
