@@ -7,15 +7,22 @@ from collections.abc import Callable
 from dataclasses import fields
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
-from turbogs_plugin.errors import require
+from turbogs_plugin.errors import require, require_not_negative
 
 
-def require_choices(instance: Any) -> None:
-    """Raise `InputError` unless every field of a `Literal` type has one of its values."""
-    for name, hint in get_type_hints(type(instance)).items():
-        if get_origin(hint) is Literal:
-            value, allowed = getattr(instance, name), get_args(hint)
+def require_settings(instance: Any) -> None:
+    """Raise `InputError` unless a dataclass's settings are what all settings of strategies have to be.
+
+    A field of a `Literal` type has one of its values; a number is finite and >= 0. Call it after stricter checks.
+    """
+    hints = get_type_hints(type(instance))
+    for name in [field.name for field in fields(instance) if field.init]:
+        value = getattr(instance, name)
+        if get_origin(hints[name]) is Literal:
+            allowed = get_args(hints[name])
             require(value in allowed, name, value, f"one of {', '.join(allowed)}")
+        elif isinstance(value, int | float):
+            require_not_negative(instance, name)
 
 
 def require_each(instance: Any, valid: Callable[[Any], bool], allowed: str, *names: str) -> None:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
+
+from turbogs_plugin.strategies.checks import require_settings
 
 from turbogs_plugin.engine.rules import ParameterRates
-from turbogs_plugin.errors import InputError, require_not_negative
+from turbogs_plugin.errors import InputError
 from turbogs_plugin.types import Step
 
 
@@ -42,7 +44,7 @@ class LearningRates:
     batch_scale: float = 2.0
 
     def __post_init__(self) -> None:
-        require_not_negative(self, *(field.name for field in fields(self)))
+        require_settings(self)
         if (self.means > 0) != (self.means_final > 0):
             raise InputError(
                 f"learning rates means={self.means} and means_final={self.means_final}: "

@@ -9,11 +9,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from torch import Tensor
-from turbogs_plugin.strategies.checks import require_positive
+from turbogs_plugin.strategies.checks import require_positive, require_settings
 
 from turbogs_plugin.engine import engine_of
 from turbogs_plugin.engine.rules import STRUCTURE_CONSTANT, LossTerms
-from turbogs_plugin.errors import require, require_not_negative
+from turbogs_plugin.errors import require
 from turbogs_plugin.types import LossOutput, PixelSamples
 
 STRUCTURES = ("ncc", "contrast")
@@ -83,9 +83,9 @@ class CharbonnierNccLoss(RuleLoss):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require_not_negative(self, "ncc_weight")
         require(self.structure in STRUCTURES, "structure", self.structure, f"one of {', '.join(STRUCTURES)}")
         require_positive(self, "variance_constant")
+        require_settings(self)
 
     @property
     def terms(self) -> LossTerms:

@@ -18,9 +18,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from turbogs_plugin.strategies.checks import require_positive
+from turbogs_plugin.strategies.checks import require_positive, require_settings
 
-from turbogs_plugin.errors import require, require_not_negative
+from turbogs_plugin.errors import require
 from turbogs_plugin.types import SamplingBudget, Step
 
 EPSILON = 1e-12
@@ -52,7 +52,7 @@ class _AdaptiveSchedule:
         allowed = f"min_views ({self.min_views}) or more"
         require(self.max_views >= self.min_views, "max_views", self.max_views, allowed)
         _check_budget(self.pixel_budget)
-        require_not_negative(self, "alpha")
+        require_settings(self)
 
     def phi(self, ratio: float) -> float:
         """The modulation of the error ratio, from [0, 1] onto [0, 1]."""

@@ -9,9 +9,10 @@ from typing import Any
 
 import numpy as np
 import torch
+from turbogs_plugin.strategies.checks import require_settings
 
 from turbogs_plugin.engine.reference.philox import MASK, PURPOSE_STACK, PURPOSE_VIEWS, philox4x32
-from turbogs_plugin.errors import require, require_not_negative
+from turbogs_plugin.errors import require
 from turbogs_plugin.types import Cameras, Step
 
 _BLOCK = 64
@@ -97,7 +98,7 @@ class GeometryAwareViewSampler(RandomViewSampler):
     directions: np.ndarray = field(init=False, repr=False)  # [V, 3] float64
 
     def __post_init__(self) -> None:
-        require_not_negative(self, "distance_weight", "direction_weight")
+        require_settings(self)
 
     def setup(self, cameras: Cameras, scene_extent: float) -> None:
         """Take the training cameras; an extent of 0 (all cameras in one place) leaves only the directions to count."""

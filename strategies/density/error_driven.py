@@ -9,11 +9,11 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 from torch.nn.functional import logsigmoid
-from turbogs_plugin.strategies.checks import require_at_least_one, require_choices, require_each, require_share
+from turbogs_plugin.strategies.checks import require_at_least_one, require_each, require_settings, require_share
 from turbogs_plugin.strategies.density.rows import WindowedDensity, finite_rows, leave_one, removal
 from turbogs_plugin.strategies.density.splitting import split_in_two
 
-from turbogs_plugin.errors import InputError, require_not_negative
+from turbogs_plugin.errors import InputError
 from turbogs_plugin.types import Gaussians, RowUpdate, Step
 
 FLAT_EVENTS = 5
@@ -102,16 +102,11 @@ class ErrorDrivenDensity(WindowedDensity):
     stopped_at: int = field(init=False, repr=False, default=0)
 
     def __post_init__(self) -> None:
-        require_choices(self)
         require_at_least_one(self, "refine_every", "final_every")
         require_share(self, "top_fraction", "final_keep")
         shares = ("prune_opacity", "prune_score_fraction", "opacity_decay", "stop_when_flat")
         require_each(self, lambda value: 0 <= value < 1, "at least 0 and less than 1", *shares)
-        require_not_negative(
-            self,
-            *("lambda_base", "refine_from", "grad_threshold", "absgrad_threshold", "percent_dense"),
-            *("max_gaussians", "prune_world_size", "prune_screen_size", "prune_size_from", "spare_beyond"),
-        )
+        require_settings(self)
 
     @torch.no_grad()
     def update(self, gaussians: Gaussians, step: Step) -> RowUpdate | None:

@@ -7,12 +7,11 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from turbogs_plugin.strategies.checks import require_at_least_one, require_share, shared_settings
+from turbogs_plugin.strategies.checks import require_at_least_one, require_settings, require_share, shared_settings
 from turbogs_plugin.strategies.density.error_driven import ErrorDrivenDensity
 from turbogs_plugin.strategies.density.rows import add_stats, finite_rows, leave_one, loaded_rows, removal, saved_rows
 from turbogs_plugin.strategies.protocols import DensityController
 
-from turbogs_plugin.errors import require_not_negative
 from turbogs_plugin.types import Gaussians, GaussianStats, RowUpdate, Step
 
 
@@ -89,8 +88,8 @@ class FastGsDensity(DensityController):
 
     def __post_init__(self) -> None:
         require_at_least_one(self, "prune_every")
-        require_not_negative(self, "error_threshold")
         require_share(self, "consistency", "blame_threshold")
+        require_settings(self)
         # Carries the events out. The gradients that it is shown say which Gaussians may be densified.
         settings = shared_settings(self, ErrorDrivenDensity)
         self._events = ErrorDrivenDensity(**settings, score="raw", lambda_base=0.0, top_fraction=1.0, final_keep=1.0)

@@ -10,10 +10,10 @@ import torch
 from gsplat.strategy import DefaultStrategy, Strategy
 from gsplat.strategy.ops import reset_opa
 from torch import Tensor
-from turbogs_plugin.strategies.checks import require_at_least_one, require_choices, shared_settings
+from turbogs_plugin.strategies.checks import require_at_least_one, require_settings, shared_settings
 from turbogs_plugin.strategies.density.rows import WindowedDensity, finite_rows, leave_one, removal
 
-from turbogs_plugin.errors import require, require_not_negative
+from turbogs_plugin.errors import require
 from turbogs_plugin.types import Gaussians, RowUpdate, Step
 
 
@@ -59,14 +59,9 @@ class GsplatDefaultDensity(WindowedDensity):
     opacity_reset: Literal["repaired", "as_shipped"] = "repaired"
 
     def __post_init__(self) -> None:
-        require_choices(self)
         require_at_least_one(self, "refine_every", "reset_every")
         require(0 <= self.prune_opa < 0.5, "prune_opa", self.prune_opa, "at least 0 and less than 0.5")
-        require_not_negative(
-            self,
-            *("grow_grad2d", "grow_scale3d", "grow_scale2d", "prune_scale3d", "prune_scale2d"),
-            *("refine_scale2d_stop_iter", "refine_start_iter", "pause_refine_after_reset"),
-        )
+        require_settings(self)
 
     @torch.no_grad()
     def update(self, gaussians: Gaussians, step: Step) -> RowUpdate | None:

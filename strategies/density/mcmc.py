@@ -7,13 +7,13 @@ from dataclasses import dataclass, field, replace
 import torch
 from gsplat.strategy import MCMCStrategy
 from torch import Tensor
-from turbogs_plugin.strategies.checks import require_at_least_one, shared_settings
+from turbogs_plugin.strategies.checks import require_at_least_one, require_settings, shared_settings
 from turbogs_plugin.strategies.density.gsplat_default import new_rows, run_gsplat
 from turbogs_plugin.strategies.density.rows import finite_rows
 from turbogs_plugin.strategies.learning_rates import LearningRates
 from turbogs_plugin.strategies.protocols import DensityController
 
-from turbogs_plugin.errors import InputError, require, require_not_negative
+from turbogs_plugin.errors import InputError, require
 from turbogs_plugin.types import Gaussians, RowUpdate, Step
 
 DEAD_LOGIT = -50.0
@@ -51,8 +51,8 @@ class GsplatMcmcDensity(DensityController):
 
     def __post_init__(self) -> None:
         require_at_least_one(self, "max_gaussians", "refine_every")
-        require_not_negative(self, "noise_lr", "refine_start_iter")
         require(0 < self.min_opacity < 1, "min_opacity", self.min_opacity, "more than 0 and less than 1")
+        require_settings(self)
 
     def setup(self, gaussians: Gaussians) -> None:
         if gaussians.device.type != "cuda":

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from turbogs_plugin.strategies.checks import require_settings
 from turbogs_plugin.strategies.protocols import DensityController
 
-from turbogs_plugin.errors import require_not_negative
 from turbogs_plugin.types import Gaussians, RowUpdate, Step
 
 
@@ -21,7 +21,7 @@ class NoDensity(DensityController):
     max_gaussians: int = 0
 
     def __post_init__(self) -> None:
-        require_not_negative(self, "max_gaussians")
+        require_settings(self)
 
     def update(self, gaussians: Gaussians, step: Step) -> RowUpdate | None:
         return None

@@ -8,11 +8,11 @@ from typing import Any
 import torch
 from torch import Tensor
 from torch.optim.adam import adam
+from turbogs_plugin.strategies.checks import require_settings
 from turbogs_plugin.strategies.learning_rates import LearningRates
 
 from turbogs_plugin.engine.moments import check_moments_config, check_state
 from turbogs_plugin.engine.reference.update import clipped, finite_gradients
-from turbogs_plugin.errors import require_not_negative
 from turbogs_plugin.types import PARAMETER_NAMES, GaussianGradients, Gaussians, RowUpdate, Step
 
 
@@ -58,7 +58,7 @@ class DenseAdam:
 
     def __post_init__(self) -> None:
         check_moments_config(self.beta1, self.beta2, self.eps)
-        require_not_negative(self, "opacity_reg", "scale_reg")
+        require_settings(self)
 
     def setup(self, gaussians: Gaussians) -> None:
         self.exp_avg, self.exp_avg_sq = (gaussians.map(torch.zeros_like) for _ in range(2))

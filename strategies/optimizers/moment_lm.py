@@ -5,11 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Literal
 
-from turbogs_plugin.strategies.checks import require_choices
+from turbogs_plugin.strategies.checks import require_settings
 from turbogs_plugin.strategies.optimizers.sparse_adam import SparseAdam
 
 from turbogs_plugin.engine.rules import MomentLMParams, UpdateRule
-from turbogs_plugin.errors import require_not_negative
 from turbogs_plugin.types import Step
 
 
@@ -58,8 +57,7 @@ class MomentLMOptimizer(SparseAdam):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require_choices(self)
-        require_not_negative(self, "curvature", "max_step")
+        require_settings(self)
 
     @property
     def per_view(self) -> bool:

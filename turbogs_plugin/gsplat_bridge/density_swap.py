@@ -130,11 +130,12 @@ class TurboDensityStrategy(DefaultStrategy):
         # The end of the run is not known here; the controller needs it only to stop taking statistics.
         now = Step(step, sys.maxsize, self.refine_stop_iter - 1, self.seed, state["scene_scale"])
         update = controller.update(gaussians, now)
-        if update is not None:
-            apply_row_update(in_order_of_space(update, gaussians, now), params, optimizers, state)
         for name in _STATS:
             state[name].zero_()
-        if self.verbose and update is not None:
+        if update is None:
+            return
+        apply_row_update(in_order_of_space(update, gaussians, now), params, optimizers, state)
+        if self.verbose:
             print(
                 f"Step {step}: {update.num_cloned} GSs duplicated, {update.num_split} split, "
                 f"{update.num_pruned} pruned. Now having {len(params['means'])} GSs."

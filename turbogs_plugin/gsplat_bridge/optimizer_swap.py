@@ -60,6 +60,7 @@ class SharedOptimizer:
         self.optimizer = copy.copy(optimizer)
         self.members: dict[str, MemberOptimizer] = {}
         self.skipped: Tensor | None = None
+        self._gradients: dict[str, Tensor | None] = {}
         self._info: dict[str, Any] | None = None
         self._told = False
 
@@ -91,16 +92,25 @@ class SharedOptimizer:
         Gaussians' shares of the loss, which the damped system needs; without them the step is Adam's."""
         self._info = info
 
-    def waiting(self) -> list[str]:
-        """Names of the parameters whose member has not been stepped in this iteration."""
-        return [name for name in PARAMETER_NAMES if name not in self.members or not self.members[name].is_stepped]
+    def hand_over(self, name: str, gradient: Tensor | None) -> None:
+        """Take a member's gradient; the last one to come carries out the update of all parameters.
 
-    @torch.no_grad()
-    def update(self) -> None:
-        """Carry out the update of all parameters from the gradients handed over."""
-        members = self.members
-        gradients = {name: members[name].take_gradient() for name in PARAMETER_NAMES}
-        info, self._info = self._info, None
+        Raises:
+            InputError: there is one of this member already.
+        """
+        if name in self._gradients:
+            waiting = [other for other in PARAMETER_NAMES if other not in self._gradients]
+            raise InputError(
+                f"the optimizer of '{name}' was stepped twice: expected, as one update is shared by all, "
+                f"a step of {', '.join(waiting)} in between"
+            )
+        self._gradients[name] = gradient
+        if len(self._gradients) == len(PARAMETER_NAMES):
+            self._update()
+
+    def _update(self) -> None:
+        members, gradients, info = self.members, self._gradients, self._info
+        self._gradients, self._info = {}, None
         if all(gradient is None for gradient in gradients.values()):
             return
         gaussians = host_gaussians({name: members[name].parameter for name in PARAMETER_NAMES})
@@ -187,8 +197,6 @@ class MemberOptimizer(torch.optim.Optimizer):
         require(len(self.param_groups[0]["params"]) == 1, "params", self.param_groups[0]["params"], "one tensor")
         self.shared = shared
         self.name: str = groups[0]["name"]
-        self.is_stepped = False
-        self._gradient: Tensor | None = None
 
     @property
     def parameter(self) -> torch.nn.Parameter:
@@ -214,23 +222,11 @@ class MemberOptimizer(torch.optim.Optimizer):
         if closure is not None:
             with torch.enable_grad():
                 loss = closure()
-        if self.is_stepped:
-            raise InputError(
-                f"the optimizer of '{self.name}' was stepped twice: expected, as one update is shared by all, "
-                f"a step of {', '.join(self.shared.waiting())} in between"
-            )
         gradient, self.parameter.grad = self.parameter.grad, None
         if gradient is not None and gradient.is_sparse:
             raise InputError(f"the gradient of '{self.name}' is sparse: expected a dense one (sparse_grad=False)")
-        self._gradient, self.is_stepped = gradient, True
-        if not self.shared.waiting():
-            self.shared.update()
+        self.shared.hand_over(self.name, gradient)
         return loss
-
-    def take_gradient(self) -> Tensor | None:
-        """The gradient handed over; a new iteration begins."""
-        gradient, self._gradient, self.is_stepped = self._gradient, None, False
-        return gradient
 
     def checked_state(self) -> dict[str, Tensor]:
         """The state of the parameter, zeros at first.

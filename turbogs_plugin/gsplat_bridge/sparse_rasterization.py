@@ -24,24 +24,10 @@ LOGIT_MARGIN = 2.0**-23
 RENDER_MODES = ("RGB", "ED", "RGB+ED")
 """Those of gsplat's that there are here: colours, expected depth, or both."""
 
-_ONLY = {
-    "packed": False,
-    "sparse_grad": False,
-    "radius_clip": 0.0,
-    "tile_size": TILE_SIZE,
-    "rasterize_mode": "classic",
-    "camera_model": "pinhole",
-    "distributed": False,
-    "segmented": False,
-    "with_ut": False,
-    "with_eval3d": False,
-    "covars": None,
-    "ftheta_coeffs": None,
-    "radial_coeffs": None,
-    "tangential_coeffs": None,
-    "thin_prism_coeffs": None,
-    "viewmats_rs": None,
-}
+_ONLY = {"radius_clip": 0.0, "tile_size": TILE_SIZE, "rasterize_mode": "classic", "camera_model": "pinhole"}
+_ONLY |= dict.fromkeys(("packed", "sparse_grad", "distributed", "segmented", "with_ut", "with_eval3d"), False)
+_ONLY |= dict.fromkeys(("covars", "ftheta_coeffs", "radial_coeffs", "tangential_coeffs", "thin_prism_coeffs"))
+_ONLY |= {"viewmats_rs": None}
 """Options of gsplat's `rasterization` that hosts pass, and the one value of each that there is here."""
 
 
@@ -112,17 +98,11 @@ def sparse_rasterization(
         )
     if sh_degree is None:
         colors, sh_degree = ((colors - 0.5) / SH_C0)[:, None], 0
-    parameters = {
-        "means": means,
-        "quats": quats,
-        "scales": scales.clamp(min=torch.finfo(scales.dtype).tiny).log(),
-        "opacities": opacities.clamp(LOGIT_MARGIN, 1.0 - LOGIT_MARGIN).logit(),
-        "sh0": colors[:, :1],
-        "shN": colors[:, 1:],
-    }
+    scales = scales.clamp(min=torch.finfo(scales.dtype).tiny).log()
+    opacities = opacities.clamp(LOGIT_MARGIN, 1.0 - LOGIT_MARGIN).logit()
     observer = _InfoObserver(samples)
     render = rasterize_differentiable(
-        Gaussians(**parameters),
+        Gaussians(means, quats, scales, opacities, sh0=colors[:, :1], shN=colors[:, 1:]),
         Cameras(viewmats, Ks, samples.sizes),
         samples,
         sh_degree=sh_degree,
