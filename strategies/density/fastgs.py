@@ -154,7 +154,6 @@ class FastGsDensity(DensityController):
             return None
         blame = self._votes.blame
         blamed = blame > self.blame_threshold * blame.max()
-        if bool(blamed.all()):  # all alike: this tells none from another
-            blamed = torch.zeros_like(blamed)
+        blamed &= ~blamed.all()  # all alike: this tells none from another
         transparent = torch.sigmoid(gaussians.opacities) < self.prune_opacity
         return removal(leave_one(blamed | transparent | ~finite_rows(gaussians), gaussians))
