@@ -103,4 +103,6 @@ class GsplatMcmcDensity(DensityController):
         settings = shared_settings(self, MCMCStrategy)
         strategy = MCMCStrategy(**settings, cap_max=self.max_gaussians, refine_stop_iter=refine_until)
         rate = self.learning_rates.at(replace(step, iteration=step.iteration + 1)).means
-        return run_gsplat(strategy, values, strategy.initialize_state(), step, lr=rate)
+        # gsplat's state is a table for relocation, which takes longer to make than an iteration.
+        state = strategy.initialize_state() if refine_until > 0 else {"binoms": torch.empty(0)}
+        return run_gsplat(strategy, values, state, step, lr=rate)
