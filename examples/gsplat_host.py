@@ -113,30 +113,27 @@ def dense_rasterization(*args: Any, **kwargs: Any) -> tuple[Tensor, Tensor, dict
     return colors, alphas, info
 
 
-def splat_arguments(splats: torch.nn.ParameterDict) -> dict[str, Tensor]:
-    """The parameters as gsplat's `rasterization` takes them: activated."""
+def render_arguments(splats: torch.nn.ParameterDict, batch: Batch) -> dict[str, Any]:
+    """What a trainer passes to gsplat's `rasterization`: the parameters, activated, and the cameras."""
+    height, width = batch.pixels.shape[1:3]
     return {
         "means": splats["means"],
         "quats": splats["quats"],
         "scales": torch.exp(splats["scales"]),
         "opacities": torch.sigmoid(splats["opacities"]),
         "colors": torch.cat([splats["sh0"], splats["shN"]], 1),
+        "viewmats": batch.viewmats,
+        "Ks": batch.Ks,
+        "width": width,
+        "height": height,
+        "packed": False,
     }
 
 
 def render_images(splats: torch.nn.ParameterDict, batch: Batch, **render: Any) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """gsplat's render call."""
     rasterize = rasterization if batch.pixels.is_cuda else dense_rasterization
-    height, width = batch.pixels.shape[1:3]
-    return rasterize(
-        **splat_arguments(splats),
-        viewmats=batch.viewmats,
-        Ks=batch.Ks,
-        width=width,
-        height=height,
-        packed=False,
-        **render,
-    )
+    return rasterize(**render_arguments(splats, batch), **render)
 
 
 def l1_of_images(splats: torch.nn.ParameterDict, batch: Batch, step: int, **render: Any) -> tuple[Tensor, dict]:

@@ -6,7 +6,7 @@ from typing import Any
 
 import torch
 from gsplat import DefaultStrategy
-from gsplat_host import Batch, Options, command_line, report, splat_arguments, train
+from gsplat_host import Batch, Options, command_line, render_arguments, report, train
 from torch import Tensor
 from turbogs_plugin.strategies.losses import CharbonnierNccLoss
 from turbogs_plugin.strategies.pixel_sampling import ErrorGuidedPixelSampler
@@ -37,17 +37,8 @@ class SparseForward:
     def __call__(self, splats: torch.nn.ParameterDict, batch: Batch, step: int, **render: Any) -> tuple[Tensor, dict]:
         now = Step(step, self.iterations, self.iterations)
         samples = self.sampler.sample(self.maps, tuple(batch.image_ids), self.rate, now)
-        height, width = batch.pixels.shape[1:3]
-        colors, _, info = sparse_rasterization(  # 1. the render call, at samples
-            **splat_arguments(splats),
-            viewmats=batch.viewmats,
-            Ks=batch.Ks,
-            width=width,
-            height=height,
-            samples=samples,
-            packed=False,
-            **render,
-        )
+        # 1. the render call, at samples
+        colors, _, info = sparse_rasterization(**render_arguments(splats, batch), samples=samples, **render)
         pixels = gather_pixels(batch.pixels, samples)  # 2. the ground truth there
         loss = sparse_loss(self.loss, colors, pixels, samples)  # 3. the loss
         info.update(prediction=colors, ground_truth=pixels)  # for error-driven strategies; others do not mind

@@ -75,24 +75,17 @@ class GsplatDefaultDensity(WindowedDensity):
             return self._keep_one(gaussians)
         strategy = _FilledStrategy(**shared_settings(self, DefaultStrategy), refine_stop_iter=step.refine_until)
         values = {name: value[usable] for name, value in gaussians.items()}
-        state = self._gsplat_state(usable, step)
+        grads = self._stats.absgrad_sums if self.absgrad else self._stats.grad_sums
+        state = {"grad2d": grads, "count": self._stats.view_counts, "radii": self._stats.max_radii}
+        state = {name: rows[usable] for name, rows in state.items()}
+        # gsplat treats the row numbers as one more running statistic.
+        state |= {"source_row": usable, "scene_scale": step.scene_extent}
         params, optimizers = run_gsplat(strategy, values, state, step)
         if reset_due and self.opacity_reset == "repaired":
             reset_opa(params, optimizers, state, self.prune_opa * 2.0)
         if len(state["source_row"]) == 0:
             return self._keep_one(gaussians)
         return self._change(gaussians, params, optimizers, state)
-
-    def _gsplat_state(self, rows: Tensor, step: Step) -> dict[str, Any]:
-        """gsplat's running state out of our statistics, and the row numbers, which it will treat alike. `rows`: [M]."""
-        stats = self._stats
-        return {
-            "grad2d": (stats.absgrad_sums if self.absgrad else stats.grad_sums)[rows],
-            "count": stats.view_counts[rows],
-            "radii": stats.max_radii[rows],
-            "source_row": rows,
-            "scene_scale": step.scene_extent,
-        }
 
     def _keep_one(self, gaussians: Gaussians) -> RowUpdate | None:
         """What there is instead of a model of nothing: the most opaque Gaussian that is finite."""
