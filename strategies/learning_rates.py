@@ -8,7 +8,7 @@ from turbogs_plugin.strategies.checks import require_settings
 
 from turbogs_plugin.engine.rules import ParameterRates
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.types import Step
+from turbogs_plugin.types import PARAMETER_NAMES, Step
 
 
 @dataclass
@@ -56,11 +56,5 @@ class LearningRates:
         fraction = min(1.0, step.iteration / max(1, step.total))
         means = self.means and self.means * (self.means_final / self.means) ** fraction
         factor = self.batch_scale * self.final_factor**fraction
-        return ParameterRates(
-            means=self.batch_scale * means * step.scene_extent,
-            quats=factor * self.quats,
-            scales=factor * self.scales,
-            opacities=factor * self.opacities,
-            sh0=factor * self.sh0,
-            shN=factor * self.shN,
-        )
+        rest = {name: factor * getattr(self, name) for name in PARAMETER_NAMES if name != "means"}
+        return ParameterRates(means=self.batch_scale * means * step.scene_extent, **rest)
