@@ -121,17 +121,16 @@ class TurboDensityStrategy(DefaultStrategy):
         if step >= self.refine_stop_iter and self.final_keep == 1:
             return
         gaussians = host_gaussians(params, GEOMETRY)
-        self._accumulate(state, info, len(gaussians))
+        window = self._accumulate(state, info, len(gaussians))
         if not self._due(step):
             return
         controller = self._controller(step)
         controller.setup(gaussians)
-        controller.load_state_dict({"stats": {name: state[name] for name in _STATS}})
+        controller.load_state_dict({"stats": vars(window)})
         # The end of the run is not known here; the controller needs it only to stop taking statistics.
         now = Step(step, sys.maxsize, self.refine_stop_iter - 1, self.seed, state["scene_scale"])
         update = controller.update(gaussians, now)
-        for name in _STATS:
-            state[name].zero_()
+        window.zero_()
         if update is None:
             return
         apply_row_update(in_order_of_space(update, gaussians, now), params, optimizers, state)
@@ -141,7 +140,8 @@ class TurboDensityStrategy(DefaultStrategy):
                 f"{update.num_pruned} pruned. Now having {len(params['means'])} GSs."
             )
 
-    def _accumulate(self, state: dict[str, Any], info: dict[str, Any], count: int) -> None:
+    def _accumulate(self, state: dict[str, Any], info: dict[str, Any], count: int) -> GaussianStats:
+        """Add this iteration's statistics to those in `state`; returns the latter."""
         if state is None:
             raise InputError("the strategy was called without its state: expected that of strategy.initialize_state()")
         require_keys(state, _STATE_KEYS, "the state", "expected that of TurboDensityStrategy.initialize_state()")
@@ -171,7 +171,9 @@ class TurboDensityStrategy(DefaultStrategy):
                     f"state['{name}'] has {len(state[name])} rows, the parameters {count}: rows were added or removed "
                     "without passing this state along"
                 )
-        add_stats(GaussianStats(**{name: state[name] for name in _STATS}), stats)
+        window = GaussianStats(**{name: state[name] for name in _STATS})
+        add_stats(window, stats)
+        return window
 
     def _due(self, step: int) -> bool:
         """Whether a densification or a final pruning happens at this step, at gsplat's places in the schedule."""
