@@ -17,7 +17,7 @@ from turbogs_plugin.errors import InputError
 from turbogs_plugin.types import Gaussians, RowUpdate, Step
 
 FLAT_EVENTS = 5
-"""Events of density control over which `stop_when_flat` looks at the error's fall."""
+"""Events of density control over which `stop_when_flat` measures the error's fall."""
 
 EPS = 1e-12
 """Keeps divisions defined; the least weight a drawn splat can have in a pixel is 1e-4 / 255."""
@@ -37,8 +37,8 @@ class ErrorDrivenDensity(WindowedDensity):
     (then the lower row goes first).
 
     Until `Step.refine_until`, every `refine_every` iterations from `refine_from` on, one event clones, splits and
-    prunes. A Gaussian that is due for pruning is not densified; one that is too big but chosen to be split is not
-    pruned, while one that the cap denies its split is. Afterwards, every `final_every` iterations, one only
+    prunes. A Gaussian that is due for pruning is not densified. One that is too large is pruned unless it is split; it
+    is also pruned where the cap leaves no room to split it. Afterwards, every `final_every` iterations, an event only
     prunes. At least one Gaussian is always left.
 
     Args:
