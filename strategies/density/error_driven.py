@@ -186,18 +186,14 @@ class ErrorDrivenDensity(WindowedDensity):
         return len(self.window_errors) > FLAT_EVENTS and before - now < self.stop_when_flat * before
 
     def _refine(self, gaussians: Gaussians, step: Step) -> RowUpdate | None:
-        stats, extent = self._stats, step.scene_extent
+        extent = step.scene_extent
         score, seen = self.scores(step)
-        views = stats.view_counts.clamp(min=1)
-        passes = (stats.grad_sums / views > self.grad_threshold) | (stats.absgrad_sums / views > self.absgrad_threshold)
         finite = finite_rows(gaussians)
         spared = self._spared(gaussians, finite, extent)
         hopeless = ~finite | (torch.sigmoid(gaussians.opacities) < self.prune_opacity)
         if self.prune_score_fraction > 0:
             hopeless |= seen & (score < _quantile(score, seen, self.prune_score_fraction))
-        difficult = seen & (score >= _quantile(score, seen, 1 - self.top_fraction))
-        candidates = passes & difficult & ~hopeless
-
+        candidates = self._growing(score, seen) & ~hopeless
         largest = gaussians.scales.amax(dim=-1).exp()  # [N]
         small = 3 * largest <= self.percent_dense * extent
         big = torch.zeros_like(seen)
@@ -207,7 +203,7 @@ class ErrorDrivenDensity(WindowedDensity):
                 reference = extent if self.prune_world_reference == "extent" else distance
                 big |= largest > self.prune_world_size * reference
             if self.prune_screen_size > 0:
-                big |= stats.max_radii > self.prune_screen_size
+                big |= self._stats.max_radii > self.prune_screen_size
         pruned = leave_one((hopeless | (big & ~(candidates & ~small))) & ~spared, gaussians)
         candidates &= ~pruned
         if self.max_gaussians > 0:
@@ -219,6 +215,13 @@ class ErrorDrivenDensity(WindowedDensity):
             if excess > 0:  # then nothing was chosen
                 pruned = pruned | self._easiest(score, seen, ~pruned, spared, excess)
         return self._compose(gaussians, candidates & small, candidates & ~small, pruned, spared, step)
+
+    def _growing(self, score: Tensor, seen: Tensor) -> Tensor:
+        """[N] bool, the rule of growth: among the most difficult, and of a high screen gradient."""
+        stats = self._stats
+        views = stats.view_counts.clamp(min=1)
+        passes = (stats.grad_sums / views > self.grad_threshold) | (stats.absgrad_sums / views > self.absgrad_threshold)
+        return passes & seen & (score >= _quantile(score, seen, 1 - self.top_fraction))
 
     def _spared(self, gaussians: Gaussians, finite: Tensor, extent: float) -> Tensor:
         """[N] bool: the finite ones that lie beyond `spare_beyond`."""
