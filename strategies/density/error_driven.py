@@ -199,8 +199,9 @@ class ErrorDrivenDensity(WindowedDensity):
         big = torch.zeros_like(seen)
         if step.progress >= self.prune_size_from:
             if self.prune_world_size > 0:
-                distance = gaussians.means.norm(dim=-1).clamp(min=extent)
-                reference = extent if self.prune_world_reference == "extent" else distance
+                reference = extent
+                if self.prune_world_reference == "distance":
+                    reference = gaussians.means.norm(dim=-1).clamp(min=extent)
                 big |= largest > self.prune_world_size * reference
             if self.prune_screen_size > 0:
                 big |= self._stats.max_radii > self.prune_screen_size
