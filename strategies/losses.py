@@ -7,6 +7,7 @@ gradients are as large as those of a dense mean loss. Formulas: `turbogs_plugin.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 from torch import Tensor
 from turbogs_plugin.strategies.checks import require_positive, require_settings
@@ -15,9 +16,6 @@ from turbogs_plugin.engine import engine_of
 from turbogs_plugin.engine.rules import STRUCTURE_CONSTANT, LossTerms
 from turbogs_plugin.errors import require
 from turbogs_plugin.types import LossOutput, PixelSamples
-
-STRUCTURES = ("ncc", "contrast")
-"""Structure terms of `CharbonnierNccLoss`."""
 
 
 @dataclass
@@ -77,13 +75,12 @@ class CharbonnierNccLoss(RuleLoss):
     """
 
     ncc_weight: float = 0.4
-    structure: str = "ncc"
+    structure: Literal["ncc", "contrast"] = "ncc"
     variance_constant: float = STRUCTURE_CONSTANT
     gate: bool = False
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require(self.structure in STRUCTURES, "structure", self.structure, f"one of {', '.join(STRUCTURES)}")
         require_positive(self, "variance_constant")
         require_settings(self)
 
