@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import torch
+import tyro
 from gsplat import DefaultStrategy, rasterization
 from torch import Tensor
 
@@ -53,10 +54,34 @@ class Result:
     last_psnr: float
 
 
-def demo_scene(views: int = 16, width: int = 96, height: int = 72) -> Scene:
-    """A small capture, made on the spot."""
-    with tempfile.TemporaryDirectory() as folder:
-        return load_scene(write_demo_capture(Path(folder) / "demo", views=views, width=width, height=height))
+@dataclass
+class Options:
+    """What the scripts take on the command line.
+
+    Args:
+        scene: a capture's folder; a demo capture where empty.
+        refine_start_iter, refine_every: of the strategy.
+    """
+
+    scene: str = ""
+    iterations: int = 300
+    refine_start_iter: int = 50
+    refine_every: int = 50
+
+    def capture(self) -> Scene:
+        """The capture; a small one is made on the spot where none is named."""
+        if self.scene:
+            return load_scene(self.scene)
+        with tempfile.TemporaryDirectory() as folder:
+            return load_scene(write_demo_capture(Path(folder) / "demo", views=16, width=96, height=72))
+
+    def strategy(self, cls: type[DefaultStrategy]) -> DefaultStrategy:
+        return cls(refine_start_iter=self.refine_start_iter, refine_every=self.refine_every)
+
+
+def command_line(main: Callable[..., None]) -> None:
+    """Run a script, whose first argument is its `Options`."""
+    tyro.cli(main, config=(tyro.conf.OmitArgPrefixes,))
 
 
 def create_splats(scene: Scene, device: str) -> torch.nn.ParameterDict:
@@ -88,30 +113,27 @@ def dense_rasterization(*args: Any, **kwargs: Any) -> tuple[Tensor, Tensor, dict
     return colors, alphas, info
 
 
-def splat_arguments(splats: torch.nn.ParameterDict) -> dict[str, Tensor]:
-    """The parameters as gsplat's `rasterization` takes them: activated."""
+def render_arguments(splats: torch.nn.ParameterDict, batch: Batch) -> dict[str, Any]:
+    """What a trainer passes to gsplat's `rasterization`: the parameters, activated, and the cameras."""
+    height, width = batch.pixels.shape[1:3]
     return {
         "means": splats["means"],
         "quats": splats["quats"],
         "scales": torch.exp(splats["scales"]),
         "opacities": torch.sigmoid(splats["opacities"]),
         "colors": torch.cat([splats["sh0"], splats["shN"]], 1),
+        "viewmats": batch.viewmats,
+        "Ks": batch.Ks,
+        "width": width,
+        "height": height,
+        "packed": False,
     }
 
 
 def render_images(splats: torch.nn.ParameterDict, batch: Batch, **render: Any) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """gsplat's render call."""
     rasterize = rasterization if batch.pixels.is_cuda else dense_rasterization
-    height, width = batch.pixels.shape[1:3]
-    return rasterize(
-        **splat_arguments(splats),
-        viewmats=batch.viewmats,
-        Ks=batch.Ks,
-        width=width,
-        height=height,
-        packed=False,
-        **render,
-    )
+    return rasterize(**render_arguments(splats, batch), **render)
 
 
 def l1_of_images(splats: torch.nn.ParameterDict, batch: Batch, step: int, **render: Any) -> tuple[Tensor, dict]:

@@ -3,31 +3,24 @@
 from __future__ import annotations
 
 import torch
-import tyro
 from gsplat import DefaultStrategy
-from gsplat_host import demo_scene, l1_of_images_with_errors, report, train
+from gsplat_host import Options, command_line, l1_of_images_with_errors, report, train
 from turbogs_plugin.strategies.optimizers.moment_lm import MomentLMOptimizer
 from turbogs_plugin.strategies.optimizers.sparse_adam import SparseAdam
 
 from turbogs_plugin.gsplat_bridge import SharedOptimizer, TurboDensityStrategy
-from turbogs_plugin.scene import load_scene
 
 
-def main(scene: str = "", iterations: int = 300, refine_start_iter: int = 50, refine_every: int = 50) -> None:
-    """Train with torch's Adam, with sparse Adam, and with LM, which takes the errors that `info` has.
-
-    Args:
-        scene: a capture's folder; a demo capture where empty.
-    """
-    capture = load_scene(scene) if scene else demo_scene()
-    when = {"refine_start_iter": refine_start_iter, "refine_every": refine_every}
-    report("Adam", train(capture, iterations, DefaultStrategy(**when), torch.optim.Adam))
-    report("SparseAdam", train(capture, iterations, DefaultStrategy(**when), SharedOptimizer(SparseAdam())))
+def main(options: Options) -> None:
+    """Train with torch's Adam, with sparse Adam, and with LM, which takes the errors that `info` has."""
+    capture = options.capture()
+    for name, optimizer in (("Adam", torch.optim.Adam), ("SparseAdam", SharedOptimizer(SparseAdam()))):
+        report(name, train(capture, options.iterations, options.strategy(DefaultStrategy), optimizer))
     # TurboDensityStrategy shows `info` to the optimizers; in front of another strategy, call
     # optimizers["means"].observe(info) before the optimizers' steps.
-    lm = SharedOptimizer(MomentLMOptimizer())
-    report("LM", train(capture, iterations, TurboDensityStrategy(**when), lm, l1_of_images_with_errors))
+    strategy, lm = options.strategy(TurboDensityStrategy), SharedOptimizer(MomentLMOptimizer())
+    report("LM", train(capture, options.iterations, strategy, lm, l1_of_images_with_errors))
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    command_line(main)

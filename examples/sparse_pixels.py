@@ -5,16 +5,15 @@ from __future__ import annotations
 from typing import Any
 
 import torch
-import tyro
 from gsplat import DefaultStrategy
-from gsplat_host import Batch, demo_scene, report, splat_arguments, train
+from gsplat_host import Batch, Options, command_line, render_arguments, report, train
 from torch import Tensor
 from turbogs_plugin.strategies.losses import CharbonnierNccLoss
 from turbogs_plugin.strategies.pixel_sampling import ErrorGuidedPixelSampler
 
 from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.gsplat_bridge import gather_pixels, sparse_loss, sparse_rasterization
-from turbogs_plugin.scene import Scene, load_scene
+from turbogs_plugin.scene import Scene
 from turbogs_plugin.types import Step
 
 
@@ -38,17 +37,8 @@ class SparseForward:
     def __call__(self, splats: torch.nn.ParameterDict, batch: Batch, step: int, **render: Any) -> tuple[Tensor, dict]:
         now = Step(step, self.iterations, self.iterations)
         samples = self.sampler.sample(self.maps, tuple(batch.image_ids), self.rate, now)
-        height, width = batch.pixels.shape[1:3]
-        colors, _, info = sparse_rasterization(  # 1. the render call, at samples
-            **splat_arguments(splats),
-            viewmats=batch.viewmats,
-            Ks=batch.Ks,
-            width=width,
-            height=height,
-            samples=samples,
-            packed=False,
-            **render,
-        )
+        # 1. the render call, at samples
+        colors, _, info = sparse_rasterization(**render_arguments(splats, batch), samples=samples, **render)
         pixels = gather_pixels(batch.pixels, samples)  # 2. the ground truth there
         loss = sparse_loss(self.loss, colors, pixels, samples)  # 3. the loss
         info.update(prediction=colors, ground_truth=pixels)  # for error-driven strategies; others do not mind
@@ -56,20 +46,17 @@ class SparseForward:
         return loss, info
 
 
-def main(
-    scene: str = "", iterations: int = 300, rate: float = 0.25, refine_start_iter: int = 50, refine_every: int = 50
-) -> None:
+def main(options: Options, rate: float = 0.25) -> None:
     """Train on a share of the pixels of two views an iteration.
 
     Args:
-        scene: a capture's folder; a demo capture where empty.
         rate: share of the pixels.
     """
-    capture = load_scene(scene) if scene else demo_scene()
-    strategy = DefaultStrategy(refine_start_iter=refine_start_iter, refine_every=refine_every)
-    forward = SparseForward(capture, rate, iterations)
-    report(f"{rate:.0%} of the pixels", train(capture, iterations, strategy, forward=forward, batch_size=2))
+    capture, strategy = options.capture(), options.strategy(DefaultStrategy)
+    forward = SparseForward(capture, rate, options.iterations)
+    result = train(capture, options.iterations, strategy, forward=forward, batch_size=2)
+    report(f"{rate:.0%} of the pixels", result)
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    command_line(main)

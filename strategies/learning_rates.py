@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
+
+from turbogs_plugin.strategies.checks import require_settings
 
 from turbogs_plugin.engine.rules import ParameterRates
-from turbogs_plugin.errors import InputError, require
-from turbogs_plugin.types import Step
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.types import PARAMETER_NAMES, Step
 
 
 @dataclass
@@ -43,9 +44,7 @@ class LearningRates:
     batch_scale: float = 2.0
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            value = getattr(self, field.name)
-            require(math.isfinite(value) and value >= 0, field.name, value, "a finite learning rate >= 0")
+        require_settings(self)
         if (self.means > 0) != (self.means_final > 0):
             raise InputError(
                 f"learning rates means={self.means} and means_final={self.means_final}: "
@@ -57,11 +56,5 @@ class LearningRates:
         fraction = min(1.0, step.iteration / max(1, step.total))
         means = self.means and self.means * (self.means_final / self.means) ** fraction
         factor = self.batch_scale * self.final_factor**fraction
-        return ParameterRates(
-            means=self.batch_scale * means * step.scene_extent,
-            quats=factor * self.quats,
-            scales=factor * self.scales,
-            opacities=factor * self.opacities,
-            sh0=factor * self.sh0,
-            shN=factor * self.shN,
-        )
+        rest = {name: factor * getattr(self, name) for name in PARAMETER_NAMES if name != "means"}
+        return ParameterRates(means=self.batch_scale * means * step.scene_extent, **rest)

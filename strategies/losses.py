@@ -6,31 +6,34 @@ gradients are as large as those of a dense mean loss. Formulas: `turbogs_plugin.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
+from typing import Literal
 
 from torch import Tensor
+from turbogs_plugin.strategies.checks import require_positive, require_settings
 
 from turbogs_plugin.engine import engine_of
 from turbogs_plugin.engine.rules import STRUCTURE_CONSTANT, LossTerms
 from turbogs_plugin.errors import require
 from turbogs_plugin.types import LossOutput, PixelSamples
 
-STRUCTURES = ("ncc", "printed_ncc", "contrast")
-"""Structure terms of `CharbonnierNccLoss`."""
 
-
+@dataclass
 class RuleLoss:
-    """A loss that its terms describe: called alone, it is evaluated by the engine of the colours' device."""
+    """A loss that its terms describe; called alone, it is evaluated by the engine of the colours' device."""
 
-    terms: LossTerms
+    epsilon: float = 1e-3
+
+    def __post_init__(self) -> None:
+        require_positive(self, "epsilon")
+
+    @property
+    def terms(self) -> LossTerms:
+        """This loss as engines take it."""
+        return LossTerms(self.epsilon)
 
     def __call__(self, colors: Tensor, targets: Tensor, samples: PixelSamples) -> LossOutput:
         return engine_of(colors.device).evaluate(self.terms, colors, targets, samples)
-
-
-def _check_epsilon(epsilon: float) -> None:
-    require(math.isfinite(epsilon) and epsilon > 0, "epsilon", epsilon, "a finite number above 0")
 
 
 @dataclass
@@ -43,16 +46,6 @@ class CharbonnierLoss(RuleLoss):
     Args:
         epsilon: residuals below it are treated quadratically.
     """
-
-    epsilon: float = 1e-3
-
-    def __post_init__(self) -> None:
-        _check_epsilon(self.epsilon)
-
-    @property
-    def terms(self) -> LossTerms:
-        """This loss as engines take it."""
-        return LossTerms(self.epsilon)
 
 
 @dataclass
@@ -83,23 +76,18 @@ class CharbonnierNccLoss(RuleLoss):
         gate: scale the term by the gate.
     """
 
-    epsilon: float = 1e-3
     ncc_weight: float = 0.4
-    structure: str = "ncc"
+    structure: Literal["ncc", "printed_ncc", "contrast"] = "ncc"
     variance_constant: float = STRUCTURE_CONSTANT
     gate: bool = False
 
     def __post_init__(self) -> None:
-        _check_epsilon(self.epsilon)
-        valid = math.isfinite(self.ncc_weight) and self.ncc_weight >= 0
-        require(valid, "ncc_weight", self.ncc_weight, "finite and 0 or more")
-        require(self.structure in STRUCTURES, "structure", self.structure, f"one of {', '.join(STRUCTURES)}")
-        valid = math.isfinite(self.variance_constant) and self.variance_constant > 0
-        require(valid, "variance_constant", self.variance_constant, "a finite number above 0")
+        super().__post_init__()
+        require_positive(self, "variance_constant")
+        require_settings(self)
 
     @property
     def terms(self) -> LossTerms:
-        """This loss as engines take it."""
         return LossTerms(
             self.epsilon,
             structure=self.structure,
@@ -121,16 +109,14 @@ class SparseSsimLoss(RuleLoss):
         ssim_weight: 0 .. 1.
     """
 
-    epsilon: float = 1e-3
     ssim_weight: float = 0.2
 
     def __post_init__(self) -> None:
-        _check_epsilon(self.epsilon)
+        super().__post_init__()
         require(0 <= self.ssim_weight <= 1, "ssim_weight", self.ssim_weight, "between 0 and 1")
 
     @property
     def terms(self) -> LossTerms:
-        """This loss as engines take it."""
         return LossTerms(
             self.epsilon, l1_weight=1.0 - self.ssim_weight, structure="ssim", structure_weight=self.ssim_weight
         )

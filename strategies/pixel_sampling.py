@@ -46,14 +46,20 @@ def view_numbers(view_ids: ViewIds, maps: ErrorMaps) -> tuple[int, ...]:
     return numbers
 
 
-def _sample(rule: DrawRule, maps: ErrorMaps, view_ids: ViewIds, rate: float, step: Step) -> PixelSamples:
-    require(0 < rate < math.inf, "rate", rate, "finite and above 0")
-    require(isinstance(step, Step), "step", step, "a Step, as Step(iteration=0, total=1000, refine_until=500) is")
-    return engine_of(maps.errors.device).draw(rule, maps, view_numbers(view_ids, maps), rate, step)
+class RulePixelSampler:
+    """A sampler that its rule describes: the engine of the maps' device draws."""
+
+    rule: DrawRule
+
+    def sample(self, maps: ErrorMaps, view_ids: ViewIds, rate: float, step: Step) -> PixelSamples:
+        """Draw the fraction `rate` (r) of the units of each tile, or of the tiles of each view (of `view_numbers`)."""
+        require(0 < rate < math.inf, "rate", rate, "finite and above 0")
+        require(isinstance(step, Step), "step", step, "a Step, as Step(iteration=0, total=1000, refine_until=500) is")
+        return engine_of(maps.errors.device).draw(self.rule, maps, view_numbers(view_ids, maps), rate, step)
 
 
 @dataclass
-class ErrorGuidedPixelSampler:
+class ErrorGuidedPixelSampler(RulePixelSampler):
     """The paper's sampler: hard units by error, stable ones by age, the rest by both (`engine.reference.draws`).
 
     Args:
@@ -78,15 +84,13 @@ class ErrorGuidedPixelSampler:
         require(self.unit in UNITS, "unit", self.unit, f"one of {', '.join(UNITS)}")
         require(0 <= self.importance <= 1, "importance", self.importance, "between 0 and 1")
 
-    def sample(self, maps: ErrorMaps, view_ids: ViewIds, rate: float, step: Step) -> PixelSamples:
-        """Draw the fraction `rate` (r) of the units of each tile, or of the tiles of each view (of `view_numbers`)."""
-        uniform = self.mixed == "uniform"
-        rule = DrawRule(self.unit, self.hard_ratio, self.stable_ratio, uniform, self.importance)
-        return _sample(rule, maps, view_ids, rate, step)
+    @property
+    def rule(self) -> DrawRule:
+        return DrawRule(self.unit, self.hard_ratio, self.stable_ratio, self.mixed == "uniform", self.importance)
 
 
 @dataclass
-class RandomPixelSampler:
+class RandomPixelSampler(RulePixelSampler):
     """Uniformly random units of each tile (or tiles of each view), without replacement.
 
     Args:
@@ -98,9 +102,10 @@ class RandomPixelSampler:
     def __post_init__(self) -> None:
         require(self.unit in UNITS, "unit", self.unit, f"one of {', '.join(UNITS)}")
 
-    def sample(self, maps: ErrorMaps, view_ids: ViewIds, rate: float, step: Step) -> PixelSamples:
-        """Draw the fraction `rate` of the units; of the maps, only the sizes matter."""
-        return _sample(DrawRule(self.unit, 0.0, 0.0, True, 0.0), maps, view_ids, rate, step)
+    @property
+    def rule(self) -> DrawRule:
+        """One stage, which ignores the maps."""
+        return DrawRule(self.unit, hard=0.0, stable=0.0, mixed_uniform=True, importance=0.0)
 
 
 @dataclass

@@ -34,7 +34,6 @@ class SamplingSchedule(Protocol):
 
     def query(self, step: Step, mean_error: float, initial_error: float, num_views: int) -> SamplingBudget:
         """The budget of this iteration; `views` never exceeds `num_views`."""
-        ...
 
 
 @runtime_checkable
@@ -43,11 +42,9 @@ class ViewSampler(Protocol):
 
     def setup(self, cameras: Cameras, scene_extent: float) -> None:
         """Take the geometry of the V training cameras; called once before training."""
-        ...
 
     def select(self, count: int, view_errors: np.ndarray, step: Step) -> tuple[int, ...]:
         """`count` distinct view numbers. `view_errors`: [V] float64, mean error of each view."""
-        ...
 
     def state_dict(self) -> dict[str, Any]: ...
 
@@ -60,7 +57,6 @@ class PixelSampler(Protocol):
 
     def sample(self, maps: ErrorMaps, view_ids: tuple[int, ...], rate: float, step: Step) -> PixelSamples:
         """Draw the samples of an iteration from the maps of these views, on the maps' device."""
-        ...
 
 
 @runtime_checkable
@@ -70,38 +66,38 @@ class SparseLoss(Protocol):
     @property
     def terms(self) -> LossTerms | None:
         """The loss as a rule, which an engine evaluates together with the error maps; None: it is called."""
-        ...
 
     def __call__(self, colors: Tensor, targets: Tensor, samples: PixelSamples) -> LossOutput:
         """`colors`, `targets`: [P, 3], both 0 .. 1 in range for photos; `colors` may exceed it."""
-        ...
 
 
 @runtime_checkable
 class DensityController(Protocol):
-    """Where Gaussians are added and removed (section 3.8)."""
+    """Where Gaussians are added and removed (section 3.8).
+
+    A class that inherits from this one and keeps nothing by Gaussian needs no method but `update`.
+    """
 
     @property
     def stats(self) -> GaussianStats | None:
         """The window that backward passes add to, or None where nothing is needed now."""
-        ...
+        return None
 
     def setup(self, gaussians: Gaussians) -> None:
         """Called once before training, and after a resume, before `load_state_dict`."""
-        ...
 
     def update(self, gaussians: Gaussians, step: Step) -> RowUpdate | None:
         """Called after every optimizer step: proposes a change of the set of Gaussians, or None for none."""
-        ...
 
     def apply(self, update: RowUpdate) -> None:
         """Follow the change with its own state by Gaussian, row by row. Called after model and optimizer followed; the
         rows may be in another order than in what `update` proposed."""
-        ...
 
-    def state_dict(self) -> dict[str, Any]: ...
+    def state_dict(self) -> dict[str, Any]:
+        return {}
 
-    def load_state_dict(self, state: dict[str, Any]) -> None: ...
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Take over what `state_dict` gave."""
 
 
 @runtime_checkable
@@ -115,33 +111,26 @@ class GaussianOptimizer(Protocol):
     @property
     def moments(self) -> GaussianMoments | None:
         """The state that a rule's step changes."""
-        ...
 
     @property
     def per_view(self) -> bool:
         """Whether `step` wants the gradients of each view, not only their sum."""
-        ...
 
     @property
     def skipped(self) -> Tensor:
         """[] int64 on the device: updates left out so far because a gradient was not finite. Read at evaluations."""
-        ...
 
     def setup(self, gaussians: Gaussians) -> None:
         """Allocate state for these Gaussians; called once before training, and after a resume."""
-        ...
 
     def rule(self, step: Step) -> UpdateRule | None:
         """The step of this iteration as a rule, or None."""
-        ...
 
     def step(self, gaussians: Gaussians, gradients: GaussianGradients, step: Step) -> None:
         """Update `gaussians` in place by gradients of each view or their sum."""
-        ...
 
     def apply(self, update: RowUpdate) -> None:
         """Follow a change of the set of Gaussians row by row."""
-        ...
 
     def state_dict(self) -> dict[str, Any]: ...
 

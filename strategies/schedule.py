@@ -18,6 +18,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from turbogs_plugin.strategies.checks import require_positive, require_settings
+
 from turbogs_plugin.errors import require
 from turbogs_plugin.types import SamplingBudget, Step
 
@@ -25,14 +27,9 @@ EPSILON = 1e-12
 """Added to the initial error, which is zero where the initial model is already exact."""
 
 
-def error_ratio(mean_error: float, initial_error: float) -> float:
-    """clip(E_mean / (E_init + eps), 0, 1); 0 where the quotient is not a number."""
-    return min(1.0, max(0.0, mean_error / (initial_error + EPSILON)))
-
-
 def _check_budget(pixel_budget: float) -> None:
-    valid = math.isfinite(pixel_budget) and pixel_budget > 0
-    require(valid, "pixel_budget", pixel_budget, "a finite number above 0 (images per iteration)")
+    allowed = "a finite number above 0 (images per iteration)"
+    require(0 < pixel_budget < math.inf, "pixel_budget", pixel_budget, allowed)
 
 
 @dataclass
@@ -55,7 +52,7 @@ class _AdaptiveSchedule:
         allowed = f"min_views ({self.min_views}) or more"
         require(self.max_views >= self.min_views, "max_views", self.max_views, allowed)
         _check_budget(self.pixel_budget)
-        require(math.isfinite(self.alpha) and self.alpha >= 0, "alpha", self.alpha, "finite and 0 or more")
+        require_settings(self)
 
     def phi(self, ratio: float) -> float:
         """The modulation of the error ratio, from [0, 1] onto [0, 1]."""
@@ -70,7 +67,8 @@ class _AdaptiveSchedule:
             num_views: V, an upper bound of K.
         """
         low, high = min(self.min_views, num_views), min(self.max_views, num_views)
-        x = 1.0 - step.anneal * self.phi(error_ratio(mean_error, initial_error))
+        ratio = min(1.0, max(0.0, mean_error / (initial_error + EPSILON)))  # 0 where the quotient is not a number
+        x = 1.0 - step.anneal * self.phi(ratio)
         views = math.floor(low + (high - low) * math.exp(-self.alpha * x) + 0.5)
         rate_low, rate_high = self.pixel_budget / high, self.pixel_budget / low
         return SamplingBudget(views, min(1.0, rate_low + (rate_high - rate_low) * x))
@@ -103,8 +101,7 @@ class ExponentialSchedule(_AdaptiveSchedule):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        valid = math.isfinite(self.steepness) and self.steepness > 0
-        require(valid, "steepness", self.steepness, "a finite number above 0")
+        require_positive(self, "steepness")
 
     def phi(self, ratio: float) -> float:
         return math.expm1(-self.steepness * ratio) / math.expm1(-self.steepness)

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from turbogs_plugin.strategies.checks import require_settings
 
 from turbogs_plugin.engine.reference.philox import MASK, PURPOSE_STACK, PURPOSE_VIEWS, philox4x32
 from turbogs_plugin.errors import require
@@ -33,61 +34,51 @@ def _uniform_block(purpose: int, num_views: int, seed: int, block: int) -> np.nd
     return (high * 2.0**20 + (low >> 12) + 0.5) / 2.0**52
 
 
-class ViewStack:
-    """A shuffled stack of views; what is drawn leaves it, and it is filled again when fewer than K are left.
-
-    Args:
-        num_views: V.
-    """
-
-    def __init__(self, num_views: int) -> None:
-        self.num_views = num_views
-        self.views = np.zeros(0, dtype=np.int64)
-
-    def prepare(self, count: int, step: Step) -> np.ndarray:
-        """The views on the stack, in its order: at least `count` of them, for `count` <= V."""
-        if len(self.views) < count:
-            self.views = np.argsort(_uniforms(PURPOSE_STACK, self.num_views, step), kind="stable")
-        return self.views
-
-    def take(self, positions: np.ndarray) -> tuple[int, ...]:
-        """Remove and return the views at these positions, in the positions' order."""
-        taken = tuple(int(view) for view in self.views[positions])
-        self.views = np.delete(self.views, positions)
-        return taken
-
-    def restore(self, views: np.ndarray) -> None:
-        """Take over a saved stack. ValueError where it does not hold distinct views of this scene."""
-        if len(np.unique(views)) != len(views) or not np.isin(views, np.arange(self.num_views)).all():
-            raise ValueError(f"the saved stack does not hold distinct ones of {self.num_views} views")
-        self.views = views
-
-
 @dataclass
 class RandomViewSampler:
-    """Uniformly random views, none twice until nearly all have been seen (the shuffled stack of 3DGS)."""
+    """Uniformly random views, none twice until nearly all have been seen, as in 3DGS.
 
-    stack: ViewStack | None = field(init=False, repr=False, default=None)
+    They come from a shuffled stack. What is drawn leaves it, and it is filled again when fewer than K are left.
+    """
+
+    stack: np.ndarray | None = field(init=False, repr=False, default=None)  # the views left, int64
+    num_views: int = field(init=False, repr=False, default=0)  # V
 
     def setup(self, cameras: Cameras, scene_extent: float) -> None:
-        self.stack = ViewStack(len(cameras))
+        self.stack, self.num_views = np.zeros(0, dtype=np.int64), len(cameras)
 
     def select(self, count: int, view_errors: np.ndarray, step: Step) -> tuple[int, ...]:
         """`count` distinct views, or all V where `count` is more."""
-        stack = _ready(self.stack)
-        count = min(count, stack.num_views)
-        stack.prepare(count, step)
-        return stack.take(np.arange(count))
+        return self._take(np.arange(self._fill(count, step)))
+
+    def _fill(self, count: int, step: Step) -> int:
+        """Fill the stack again where it holds fewer than `count` views. Returns `count`, at most V."""
+        if self.stack is None:
+            raise RuntimeError("a view sampler needs setup(cameras, scene_extent) before it is used")
+        count = min(count, self.num_views)
+        if len(self.stack) < count:
+            self.stack = np.argsort(_uniforms(PURPOSE_STACK, self.num_views, step), kind="stable")
+        return count
+
+    def _take(self, positions: np.ndarray) -> tuple[int, ...]:
+        """Remove and return the views at these positions of the stack, in the positions' order."""
+        taken = tuple(self.stack[positions].tolist())
+        self.stack = np.delete(self.stack, positions)
+        return taken
 
     def state_dict(self) -> dict[str, Any]:
-        return {"stack": torch.from_numpy(_ready(self.stack).views.copy())}
+        return {"stack": torch.from_numpy(self.stack.copy())}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        _ready(self.stack).restore(state["stack"].cpu().numpy().copy())
+        """Take over a saved stack. ValueError where it does not hold distinct views of this scene."""
+        views = state["stack"].cpu().numpy().copy()
+        if len(np.unique(views)) != len(views) or not np.isin(views, np.arange(self.num_views)).all():
+            raise ValueError(f"the saved stack does not hold distinct ones of {self.num_views} views")
+        self.stack = views
 
 
 @dataclass
-class GeometryAwareViewSampler:
+class GeometryAwareViewSampler(RandomViewSampler):
     """The view with the largest mean error, and views near to it that look the same way (equation of section 3.4).
 
     The anchor is the one with the largest mean error among the views on the stack (among all views it would be
@@ -103,19 +94,16 @@ class GeometryAwareViewSampler:
 
     distance_weight: float = 2.0
     direction_weight: float = 2.0
-    stack: ViewStack | None = field(init=False, repr=False, default=None)
     centers: np.ndarray = field(init=False, repr=False)  # [V, 3] float64, scene extents
     directions: np.ndarray = field(init=False, repr=False)  # [V, 3] float64
 
     def __post_init__(self) -> None:
-        for name in ("distance_weight", "direction_weight"):
-            value = getattr(self, name)
-            require(math.isfinite(value) and value >= 0, name, value, "finite and 0 or more")
+        require_settings(self)
 
     def setup(self, cameras: Cameras, scene_extent: float) -> None:
         """Take the training cameras; an extent of 0 (all cameras in one place) leaves only the directions to count."""
         require(math.isfinite(scene_extent) and scene_extent >= 0, "scene_extent", scene_extent, "finite and 0 or more")
-        self.stack = ViewStack(len(cameras))
+        super().setup(cameras, scene_extent)
         self.centers = cameras.centers.double().cpu().numpy() / (scene_extent or 1.0)
         self.directions = cameras.directions.double().cpu().numpy()
 
@@ -131,23 +119,9 @@ class GeometryAwareViewSampler:
         Args:
             view_errors: [V] float64; equal ones leave the anchor to the stack's random order.
         """
-        stack = _ready(self.stack)
-        count = min(count, stack.num_views)
-        candidates = stack.prepare(count, step)
-        anchor = int(np.argmax(view_errors[candidates]))
-        gumbel = -np.log(-np.log(_uniforms(PURPOSE_VIEWS, stack.num_views, step)))
-        scores = (self.log_weights(int(candidates[anchor])) + gumbel)[candidates]
+        count = self._fill(count, step)
+        anchor = int(np.argmax(view_errors[self.stack]))
+        gumbel = -np.log(-np.log(_uniforms(PURPOSE_VIEWS, self.num_views, step)))
+        scores = (self.log_weights(int(self.stack[anchor])) + gumbel)[self.stack]
         scores[anchor] = np.inf
-        return stack.take(np.argsort(-scores, kind="stable")[:count])
-
-    def state_dict(self) -> dict[str, Any]:
-        return {"stack": torch.from_numpy(_ready(self.stack).views.copy())}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        _ready(self.stack).restore(state["stack"].cpu().numpy().copy())
-
-
-def _ready(stack: ViewStack | None) -> ViewStack:
-    if stack is None:
-        raise RuntimeError("a view sampler needs setup(cameras, scene_extent) before it is used")
-    return stack
+        return self._take(np.argsort(-scores, kind="stable")[:count])

@@ -3,27 +3,28 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import torch
 from torch import Tensor
 from torch.nn.functional import logsigmoid
-from turbogs_plugin.strategies.density.rows import finite_rows, leave_one, loaded_rows, removal
+from turbogs_plugin.strategies.checks import require_at_least_one, require_each, require_settings, require_share
+from turbogs_plugin.strategies.density.rows import WindowedDensity, finite_rows, leave_one, removal
 from turbogs_plugin.strategies.density.splitting import split_in_two
 
-from turbogs_plugin.errors import InputError, require, require_not_negative
-from turbogs_plugin.types import Gaussians, GaussianStats, RowUpdate, Step
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.types import Gaussians, RowUpdate, Step
 
 FLAT_EVENTS = 5
-"""Events of density control over which `stop_when_flat` looks at the error's fall."""
+"""Events of density control over which `stop_when_flat` measures the error's fall."""
 
 EPS = 1e-12
 """Keeps divisions defined; the least weight a drawn splat can have in a pixel is 1e-4 / 255."""
 
 
 @dataclass
-class ErrorDrivenDensity:
+class ErrorDrivenDensity(WindowedDensity):
     """Densify where the screen gradient is high and the sampled pixels say the Gaussian is difficult; prune where a
     Gaussian is transparent, huge or easy. There is no reset of opacities.
 
@@ -36,8 +37,8 @@ class ErrorDrivenDensity:
     (then the lower row goes first).
 
     Until `Step.refine_until`, every `refine_every` iterations from `refine_from` on, one event clones, splits and
-    prunes. A Gaussian that is due for pruning is not densified; one that is too big but chosen to be split is not
-    pruned, while one that the cap denies its split is. Afterwards, every `final_every` iterations, one only
+    prunes. A Gaussian that is due for pruning is not densified. One that is too large is pruned unless it is split; it
+    is also pruned where the cap leaves no room to split it. Afterwards, every `final_every` iterations, an event only
     prunes. At least one Gaussian is always left.
 
     Args:
@@ -99,58 +100,34 @@ class ErrorDrivenDensity:
     stop_when_flat: float = 0.0
     window_errors: list[float] = field(init=False, repr=False, default_factory=list)
     stopped_at: int = field(init=False, repr=False, default=0)
-    _stats: GaussianStats | None = field(init=False, repr=False, default=None)
 
     def __post_init__(self) -> None:
-        choices = {
-            "score": ("balanced", "raw"),
-            "split": ("sample", "long_axis"),
-            "prune_world_reference": ("extent", "distance"),
-        }
-        for name, allowed in choices.items():
-            require(getattr(self, name) in allowed, name, getattr(self, name), f"one of {', '.join(allowed)}")
-        for name in ("refine_every", "final_every"):
-            require(getattr(self, name) >= 1, name, getattr(self, name), "at least 1")
-        for name in ("top_fraction", "final_keep"):
-            require(0 < getattr(self, name) <= 1, name, getattr(self, name), "more than 0 and at most 1")
-        for name in ("prune_opacity", "prune_score_fraction", "opacity_decay", "stop_when_flat"):
-            require(0 <= getattr(self, name) < 1, name, getattr(self, name), "at least 0 and less than 1")
-        require_not_negative(
-            self,
-            *("lambda_base", "refine_from", "grad_threshold", "absgrad_threshold", "percent_dense"),
-            *("max_gaussians", "prune_world_size", "prune_screen_size", "prune_size_from", "spare_beyond"),
-        )
-
-    @property
-    def stats(self) -> GaussianStats | None:
-        return self._stats
-
-    def setup(self, gaussians: Gaussians) -> None:
-        self._stats = GaussianStats.zeros(len(gaussians), gaussians.device)
+        require_at_least_one(self, "refine_every", "final_every")
+        require_share(self, "top_fraction", "final_keep")
+        shares = ("prune_opacity", "prune_score_fraction", "opacity_decay", "stop_when_flat")
+        require_each(self, lambda value: 0 <= value < 1, "at least 0 and less than 1", *shares)
+        require_settings(self)
 
     @torch.no_grad()
     def update(self, gaussians: Gaussians, step: Step) -> RowUpdate | None:
-        densify, final = self._due(step)
+        if self._stats is None or len(gaussians) == 0:
+            return None
+        densify, final = self.due(step)
         update = None
-        if densify and self._stats is not None and self.stop_when_flat > 0 and self._error_is_flat():
-            self.stopped_at, densify = step.iteration, False
-            self._stats.zero_()
-        if self._stats is not None and (densify or final) and len(gaussians) > 0:
-            score, seen = self.scores(step)
-            event = self._refine if densify else self._final_prune
-            update = event(gaussians, score, seen, step)
+        if densify and self.stop_when_flat > 0 and self._error_is_flat():
+            self.stopped_at = step.iteration
+        elif densify:
+            update = self._refine(gaussians, step)
+        elif final:
+            update = self._final_prune(gaussians, step)
+        if densify or final:
             self._stats.zero_()
         if step.iteration >= self._last_event(step):
             self._stats = None
         return update
 
-    def apply(self, update: RowUpdate) -> None:
-        if self._stats is not None:
-            self._stats = self._stats.map(update.apply_state)
-
     def state_dict(self) -> dict[str, Any]:
-        stats = None if self._stats is None else {f.name: getattr(self._stats, f.name) for f in fields(self._stats)}
-        state = {"stats": stats}
+        state = super().state_dict()
         if self.stop_when_flat > 0:
             window_errors = torch.tensor(self.window_errors, dtype=torch.float64)
             state |= {"window_errors": window_errors, "stopped_at": self.stopped_at}
@@ -162,7 +139,7 @@ class ErrorDrivenDensity:
                 f"stop_when_flat = {self.stop_when_flat:g}, but the saved run had it at 0 and kept no record of its "
                 "error: continue it with stop_when_flat = 0, or start a new run"
             )
-        self._stats = loaded_rows("stats", state["stats"], self._stats)
+        super().load_state_dict(state)
         if self.stop_when_flat > 0:
             self.window_errors = state["window_errors"].tolist()
             self.stopped_at = state["stopped_at"]
@@ -180,12 +157,11 @@ class ErrorDrivenDensity:
             errors, distances = (value / (value.sum() / count + EPS) for value in (errors, distances))
         return errors + self.lambda_base * step.anneal * distances, seen
 
-    def _due(self, step: Step) -> tuple[bool, bool]:
+    def due(self, step: Step) -> tuple[bool, bool]:
         """Whether this iteration densifies, and whether it prunes finally."""
         iteration, after = step.iteration, step.iteration - step.refine_until
         densify = after <= 0 and iteration >= self.refine_from and iteration % self.refine_every == 0
-        densify = densify and not self.stopped_at
-        return densify, self.final_keep < 1 and after > 0 and after % self.final_every == 0
+        return densify and not self.stopped_at, self.final_keep < 1 and after > 0 and after % self.final_every == 0
 
     def _last_event(self, step: Step) -> int:
         """Iteration after which no statistics are needed: that of the last event, or where densification ends.
@@ -195,9 +171,7 @@ class ErrorDrivenDensity:
         rest = max(0, step.total - 1 - step.refine_until)
         if self.final_keep < 1 and rest >= self.final_every:
             return step.refine_until + rest // self.final_every * self.final_every
-        if self.stopped_at:
-            return self.stopped_at
-        return step.refine_until
+        return self.stopped_at or step.refine_until
 
     def _error_is_flat(self) -> bool:
         """Take the present window's error into the record; whether it has stopped falling."""
@@ -211,26 +185,26 @@ class ErrorDrivenDensity:
         before, now = self.window_errors[0], self.window_errors[-1]
         return len(self.window_errors) > FLAT_EVENTS and before - now < self.stop_when_flat * before
 
-    def _refine(self, gaussians: Gaussians, score: Tensor, seen: Tensor, step: Step) -> RowUpdate | None:
-        stats, extent = self._stats, step.scene_extent
-        views = stats.view_counts.clamp(min=1)
-        passes = (stats.grad_sums / views > self.grad_threshold) | (stats.absgrad_sums / views > self.absgrad_threshold)
+    def _refine(self, gaussians: Gaussians, step: Step) -> RowUpdate | None:
+        extent = step.scene_extent
+        score, seen = self.scores(step)
         finite = finite_rows(gaussians)
         spared = self._spared(gaussians, finite, extent)
         hopeless = ~finite | (torch.sigmoid(gaussians.opacities) < self.prune_opacity)
         if self.prune_score_fraction > 0:
             hopeless |= seen & (score < _quantile(score, seen, self.prune_score_fraction))
-        difficult = seen & (score >= _quantile(score, seen, 1 - self.top_fraction))
-        candidates = passes & difficult & ~hopeless
-
+        candidates = self._growing(score, seen) & ~hopeless
         largest = gaussians.scales.amax(dim=-1).exp()  # [N]
         small = largest <= self.percent_dense * extent
         big = torch.zeros_like(seen)
         if step.progress >= self.prune_size_from:
             if self.prune_world_size > 0:
-                big |= largest > self.prune_world_size * self._world_reference(gaussians, extent)
+                reference = extent
+                if self.prune_world_reference == "distance":
+                    reference = gaussians.means.norm(dim=-1).clamp(min=extent)
+                big |= largest > self.prune_world_size * reference
             if self.prune_screen_size > 0:
-                big |= stats.max_radii > self.prune_screen_size
+                big |= self._stats.max_radii > self.prune_screen_size
         pruned = leave_one((hopeless | (big & ~(candidates & ~small))) & ~spared, gaussians)
         candidates &= ~pruned
         if self.max_gaussians > 0:
@@ -243,17 +217,17 @@ class ErrorDrivenDensity:
                 pruned = pruned | self._easiest(score, seen, ~pruned, spared, excess)
         return self._compose(gaussians, candidates & small, candidates & ~small, pruned, spared, step)
 
-    def _world_reference(self, gaussians: Gaussians, extent: float) -> Tensor | float:
-        """[N], or the same for all: what `prune_world_size` is a share of."""
-        if self.prune_world_reference == "extent":
-            return extent
-        return gaussians.means.norm(dim=-1).clamp(min=extent)
+    def _growing(self, score: Tensor, seen: Tensor) -> Tensor:
+        """[N] bool, the rule of growth: among the most difficult, and of a high screen gradient."""
+        stats = self._stats
+        views = stats.view_counts.clamp(min=1)
+        passes = (stats.grad_sums / views > self.grad_threshold) | (stats.absgrad_sums / views > self.absgrad_threshold)
+        return passes & seen & (score >= _quantile(score, seen, 1 - self.top_fraction))
 
     def _spared(self, gaussians: Gaussians, finite: Tensor, extent: float) -> Tensor:
         """[N] bool: the finite ones that lie beyond `spare_beyond`."""
-        if self.spare_beyond == 0:
-            return torch.zeros_like(finite)
-        return finite & (gaussians.means.norm(dim=-1) > self.spare_beyond * extent)
+        beyond = self.spare_beyond * extent if self.spare_beyond > 0 else math.inf
+        return finite & (gaussians.means.norm(dim=-1) > beyond)
 
     def _easiest(self, score: Tensor, seen: Tensor, present: Tensor, spared: Tensor, count: int) -> Tensor:
         """[N] bool: the easiest `count` of those `present`, the spared ones only for what the others leave to take."""
@@ -263,8 +237,9 @@ class ErrorDrivenDensity:
         taken = _first(ease, present & ~spared, count)
         return taken | _first(ease, present & spared, count - int(taken.sum()))
 
-    def _final_prune(self, gaussians: Gaussians, score: Tensor, seen: Tensor, step: Step) -> RowUpdate | None:
+    def _final_prune(self, gaussians: Gaussians, step: Step) -> RowUpdate | None:
         finite = finite_rows(gaussians)
+        score, seen = self.scores(step)
         easy = seen & (score < _quantile(score, seen, 1 - self.final_keep))
         return removal(leave_one(~finite | easy & ~self._spared(gaussians, finite, step.scene_extent), gaussians))
 

@@ -2,26 +2,27 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 import torch
 from torch import Tensor
+from turbogs_plugin.strategies.checks import require_at_least_one, require_settings, require_share, shared_settings
 from turbogs_plugin.strategies.density.error_driven import ErrorDrivenDensity
-from turbogs_plugin.strategies.density.rows import finite_rows, leave_one, loaded_rows, removal
+from turbogs_plugin.strategies.density.rows import add_stats, finite_rows, leave_one, loaded_rows, removal, saved_rows
+from turbogs_plugin.strategies.protocols import DensityController
 
-from turbogs_plugin.errors import require, require_not_negative
 from turbogs_plugin.types import Gaussians, GaussianStats, RowUpdate, Step
 
 
 @dataclass
 class ViewVotes:
-    """What the looks of a window say of each Gaussian, [N] float32 each.
+    """What the batches of a window say of each Gaussian, [N] float32 each. A batch is the views of one iteration.
 
     Args:
-        seen: looks in which it had weight.
+        seen: batches in which it had weight.
         marked: those in which it stood out by its error.
-        blame: sum of the mean errors of the looks that marked it.
+        blame: sum of the mean errors of the batches that marked it.
     """
 
     seen: Tensor
@@ -32,10 +33,10 @@ class ViewVotes:
     def zeros(cls, count: int, device: torch.device | str) -> ViewVotes:
         return cls(*(torch.zeros(count, device=device) for _ in fields(cls)))
 
-    def add(self, look: GaussianStats, error_threshold: float) -> None:
-        """Count one look: the statistics of one iteration. What is not finite was not seen."""
-        seen = (look.weight_sums > 0) & torch.isfinite(look.weight_sums + look.error_sums)
-        errors, weights = (torch.where(seen, sums, 0.0) for sums in (look.error_sums, look.weight_sums))
+    def add(self, batch: GaussianStats, error_threshold: float) -> None:
+        """Count one batch by the statistics of its iteration. What is not finite was not seen."""
+        seen = (batch.weight_sums > 0) & torch.isfinite(batch.weight_sums + batch.error_sums)
+        errors, weights = (torch.where(seen, sums, 0.0) for sums in (batch.error_sums, batch.weight_sums))
         mean_error = errors.sum() / weights.sum().clamp(min=1e-12)
         marked = seen & (errors > error_threshold * mean_error * weights)
         self.seen += seen
@@ -44,27 +45,28 @@ class ViewVotes:
 
 
 @dataclass
-class FastGsDensity:
+class FastGsDensity(DensityController):
     """Densify what many views agree is rendered badly; prune what many views blame.
 
     FastGS renders some training views in full at each event, marks the pixels of large (normalised) error, and scores
-    each Gaussian by the marked pixels in its footprint: by their mean number over the views for densification, by
-    their number times each view's photometric error, normalised, for pruning. Its two ideas are kept here, its renders
-    are not: the looks of an event are the iterations since the last one. In a look, a Gaussian is *marked* if its mean
-    error, sum of e * w over sum of w, exceeds `error_threshold` times the look's mean error. A look is a view where an
-    iteration has one view, as in ``configs/fastgs.yaml``; otherwise it is the batch.
+    each Gaussian by the marked pixels in its footprint. For densification the score is their mean number over the
+    views; for pruning it is their number times each view's photometric error, normalised. Its two ideas are kept here,
+    its renders are not: an event asks the batches of the iterations since the last event. In a batch, a Gaussian is
+    *marked* if its mean error, sum of e * w over sum of w, exceeds `error_threshold` times the batch's mean error.
+    In ``configs/fastgs.yaml`` a batch is one view.
 
     Until `Step.refine_until`, every `refine_every` iterations from `refine_from` on, a Gaussian is cloned or split
-    where its screen gradient, or its absolute one, passes the threshold *and* at least `consistency` of the looks that
-    saw it marked it. Transparent and huge ones are pruned. Afterwards, every `prune_every` iterations, transparent ones
-    are pruned and those whose blame (the marking looks' mean errors, summed) exceeds `blame_threshold` of the largest,
-    unless all have as much. A Gaussian that is not finite is pruned at either; one is always left.
+    where its screen gradient, or its absolute one, passes the threshold *and* at least `consistency` of the batches
+    that saw it marked it. Transparent and huge ones are pruned. Afterwards, every `prune_every` iterations, transparent
+    ones are pruned. So are those whose blame (the sum of the mean errors of the batches that marked them) exceeds
+    `blame_threshold` of the largest, unless all have as much. A Gaussian that is not finite is pruned at either; one is
+    always left.
 
     Args:
         refine_from, refine_every, grad_threshold, absgrad_threshold, percent_dense, prune_opacity, prune_world_size:
             as in `ErrorDrivenDensity`.
-        error_threshold: of a Gaussian's mean error in a look, in units of the look's mean error.
-        consistency: share of the looks that must agree.
+        error_threshold: of a Gaussian's mean error in a batch, in units of the batch's mean error.
+        consistency: share of the batches that must agree.
         prune_every: interval of the pruning after densification.
         blame_threshold: above this share of the largest blame a Gaussian is pruned. 1 prunes none.
     """
@@ -81,88 +83,71 @@ class FastGsDensity:
     prune_every: int = 3000
     blame_threshold: float = 0.9
     _events: ErrorDrivenDensity = field(init=False, repr=False)
-    _look: GaussianStats | None = field(init=False, repr=False, default=None)
+    _batch: GaussianStats | None = field(init=False, repr=False, default=None)
     _window: GaussianStats | None = field(init=False, repr=False, default=None)
     _votes: ViewVotes | None = field(init=False, repr=False, default=None)
 
     def __post_init__(self) -> None:
-        require(self.prune_every >= 1, "prune_every", self.prune_every, "at least 1")
-        require_not_negative(self, "error_threshold")
-        for name in ("consistency", "blame_threshold"):
-            require(0 < getattr(self, name) <= 1, name, getattr(self, name), "more than 0 and at most 1")
-        # Carries the events out; which Gaussians may be densified is said by the gradients it is shown.
-        shared = ("refine_from", "refine_every", "grad_threshold", "absgrad_threshold", "percent_dense")
-        shared += ("prune_opacity", "prune_world_size")
-        self._events = ErrorDrivenDensity(
-            **{name: getattr(self, name) for name in shared},
-            score="raw",
-            lambda_base=0.0,
-            top_fraction=1.0,
-            final_keep=1.0,
-        )
+        require_at_least_one(self, "prune_every")
+        require_share(self, "consistency", "blame_threshold")
+        require_settings(self)
+        # Carries the events out. The gradients that it is shown say which Gaussians may be densified.
+        settings = shared_settings(self, ErrorDrivenDensity)
+        self._events = ErrorDrivenDensity(**settings, score="raw", lambda_base=0.0, top_fraction=1.0, final_keep=1.0)
 
     @property
     def stats(self) -> GaussianStats | None:
-        return self._look
+        return self._batch
 
     def setup(self, gaussians: Gaussians) -> None:
         self._restart(len(gaussians), gaussians.device)
 
     @torch.no_grad()
     def update(self, gaussians: Gaussians, step: Step) -> RowUpdate | None:
-        if self._look is None:
+        if self._batch is None:
             return None
-        self._take_look()
+        self._votes.add(self._batch, self.error_threshold)
+        add_stats(self._window, self._batch)
+        self._batch.zero_()
         after = step.iteration - step.refine_until
+        densify, _ = self._events.due(step)
+        prune = after > 0 and after % self.prune_every == 0
         update = None
-        if after <= 0 and step.iteration >= self.refine_from and step.iteration % self.refine_every == 0:
+        if densify:
             update = self._densify(gaussians, step)
-            self._restart(len(gaussians), gaussians.device)
-        elif after > 0 and after % self.prune_every == 0:
+        elif prune:
             update = self._prune(gaussians)
+        if densify or prune:
             self._restart(len(gaussians), gaussians.device)
         if after > 0 and step.iteration + self.prune_every - after % self.prune_every >= step.total:
-            self._look = self._window = self._votes = None  # no event is left in this run
+            self._batch = self._window = self._votes = None  # no event is left in this run
         return update
 
     def apply(self, update: RowUpdate) -> None:
-        if self._look is not None:  # a window starts anew at each event
+        if self._batch is not None:  # a window starts anew at each event
             self._restart(len(update.source), update.source.device)
 
     def state_dict(self) -> dict[str, Any]:
-        parts = {"look": self._look, "window": self._window, "votes": self._votes}
-        return {
-            name: None if part is None else {item.name: getattr(part, item.name) for item in fields(part)}
-            for name, part in parts.items()
-        }
+        return {name: saved_rows(part) for name, part in self._parts().items()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        parts = {"look": self._look, "window": self._window, "votes": self._votes}
-        loaded = {name: loaded_rows(name, state[name], present) for name, present in parts.items()}
-        self._look, self._window, self._votes = loaded.values()
+        loaded = {name: loaded_rows(name, state[name], present) for name, present in self._parts().items()}
+        self._batch, self._window, self._votes = loaded.values()
+
+    def _parts(self) -> dict[str, Any]:
+        return {"look": self._batch, "window": self._window, "votes": self._votes}
 
     def _restart(self, count: int, device: torch.device) -> None:
-        self._look, self._window = GaussianStats.zeros(count, device), GaussianStats.zeros(count, device)
+        self._batch, self._window = GaussianStats.zeros(count, device), GaussianStats.zeros(count, device)
         self._votes = ViewVotes.zeros(count, device)
-
-    def _take_look(self) -> None:
-        """Add this iteration's statistics to the window's, and count its votes."""
-        self._votes.add(self._look, self.error_threshold)
-        for item in fields(GaussianStats):
-            window, look = getattr(self._window, item.name), getattr(self._look, item.name)
-            if item.name == "max_radii":
-                torch.maximum(window, look, out=window)
-            else:
-                window += look
-        self._look.zero_()
 
     def _densify(self, gaussians: Gaussians, step: Step) -> RowUpdate | None:
         votes, window = self._votes, self._window
         agreed = (votes.marked >= self.consistency * votes.seen) & (votes.seen > 0)
-        shown = replace(window, grad_sums=window.grad_sums * agreed, absgrad_sums=window.absgrad_sums * agreed)
+        window.grad_sums *= agreed
+        window.absgrad_sums *= agreed
         self._events.setup(gaussians)
-        stats = {item.name: getattr(shown, item.name) for item in fields(GaussianStats)}
-        self._events.load_state_dict({"stats": stats})
+        self._events.load_state_dict({"stats": vars(window)})
         return self._events.update(gaussians, step)
 
     def _prune(self, gaussians: Gaussians) -> RowUpdate | None:
@@ -170,7 +155,6 @@ class FastGsDensity:
             return None
         blame = self._votes.blame
         blamed = blame > self.blame_threshold * blame.max()
-        if bool(blamed.all()):  # all alike: this tells none from another
-            blamed = torch.zeros_like(blamed)
+        blamed &= ~blamed.all()  # all alike: this tells none from another
         transparent = torch.sigmoid(gaussians.opacities) < self.prune_opacity
         return removal(leave_one(blamed | transparent | ~finite_rows(gaussians), gaussians))

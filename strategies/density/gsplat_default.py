@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
 import torch
-from gsplat.strategy import DefaultStrategy
+from gsplat.strategy import DefaultStrategy, Strategy
 from gsplat.strategy.ops import reset_opa
 from torch import Tensor
-from turbogs_plugin.strategies.density.rows import finite_rows, loaded_rows
+from turbogs_plugin.strategies.checks import require_at_least_one, require_settings, shared_settings
+from turbogs_plugin.strategies.density.rows import WindowedDensity, finite_rows, leave_one, removal
 
-from turbogs_plugin.errors import require, require_not_negative
-from turbogs_plugin.types import Gaussians, GaussianStats, RowUpdate, Step
+from turbogs_plugin.errors import require
+from turbogs_plugin.types import Gaussians, RowUpdate, Step
 
 
 class _FilledStrategy(DefaultStrategy):
@@ -24,12 +25,12 @@ class _FilledStrategy(DefaultStrategy):
 
 
 @dataclass
-class GsplatDefaultDensity:
+class GsplatDefaultDensity(WindowedDensity):
     """gsplat's own clone, split, prune and reset, run on our parameters and statistics.
 
-    gsplat changes parameters and optimizer state together. Here it is handed the parameters, two optimizers whose only
-    state marks rows that it has touched, and the row numbers as a running statistic of its own; what comes back
-    is a `RowUpdate`. It stops at `Step.refine_until` (its `refine_stop_iter`).
+    gsplat changes parameters and optimizer state together. Here it is handed the parameters, optimizers whose only
+    state marks the rows that it has made or reset, and the row numbers as a running statistic of its own. What comes
+    back is a `RowUpdate`. It stops at `Step.refine_until` (its `refine_stop_iter`).
 
     Unlike gsplat, which would train on with NaN or fail, an event first removes Gaussians that are not finite or too
     large to be split, and one Gaussian, the most opaque, is always left.
@@ -56,26 +57,11 @@ class GsplatDefaultDensity:
     absgrad: bool = False
     revised_opacity: bool = False
     opacity_reset: Literal["repaired", "as_shipped"] = "repaired"
-    _stats: GaussianStats | None = field(init=False, repr=False, default=None)
 
     def __post_init__(self) -> None:
-        allowed = ("repaired", "as_shipped")
-        require(self.opacity_reset in allowed, "opacity_reset", self.opacity_reset, f"one of {', '.join(allowed)}")
-        for name in ("refine_every", "reset_every"):
-            require(getattr(self, name) >= 1, name, getattr(self, name), "at least 1")
+        require_at_least_one(self, "refine_every", "reset_every")
         require(0 <= self.prune_opa < 0.5, "prune_opa", self.prune_opa, "at least 0 and less than 0.5")
-        require_not_negative(
-            self,
-            *("grow_grad2d", "grow_scale3d", "grow_scale2d", "prune_scale3d", "prune_scale2d"),
-            *("refine_scale2d_stop_iter", "refine_start_iter", "pause_refine_after_reset"),
-        )
-
-    @property
-    def stats(self) -> GaussianStats | None:
-        return self._stats
-
-    def setup(self, gaussians: Gaussians) -> None:
-        self._stats = GaussianStats.zeros(len(gaussians), gaussians.device)
+        require_settings(self)
 
     @torch.no_grad()
     def update(self, gaussians: Gaussians, step: Step) -> RowUpdate | None:
@@ -86,64 +72,34 @@ class GsplatDefaultDensity:
             return None
         usable = torch.nonzero(finite_rows(gaussians)).squeeze(-1)
         if len(usable) == 0:
-            return self._keep_one(gaussians, usable)
-        params = {name: torch.nn.Parameter(value[usable], requires_grad=False) for name, value in gaussians.items()}
-        optimizers = {name: marking_optimizer(params[name]) for name in ("means", "opacities")}
-        state = self._gsplat_state(usable, step)
-        strategy = _FilledStrategy(**self._gsplat_config(), refine_stop_iter=step.refine_until)
-        with torch.random.fork_rng(devices=[gaussians.device] if gaussians.device.type == "cuda" else []):
-            torch.manual_seed(int(np.random.SeedSequence([step.seed, step.iteration]).generate_state(1)[0]))
-            strategy.step_post_backward(params, optimizers, state, step.iteration, {})
+            return self._keep_one(gaussians)
+        strategy = _FilledStrategy(**shared_settings(self, DefaultStrategy), refine_stop_iter=step.refine_until)
+        values = {name: value[usable] for name, value in gaussians.items()}
+        grads = self._stats.absgrad_sums if self.absgrad else self._stats.grad_sums
+        state = {"grad2d": grads, "count": self._stats.view_counts, "radii": self._stats.max_radii}
+        state = {name: rows[usable] for name, rows in state.items()}
+        # gsplat treats the row numbers as one more running statistic.
+        state |= {"source_row": usable, "scene_scale": step.scene_extent}
+        params, optimizers = run_gsplat(strategy, values, state, step)
         if reset_due and self.opacity_reset == "repaired":
             reset_opa(params, optimizers, state, self.prune_opa * 2.0)
         if len(state["source_row"]) == 0:
-            return self._keep_one(gaussians, usable)
+            return self._keep_one(gaussians)
         return self._change(gaussians, params, optimizers, state)
 
-    def apply(self, update: RowUpdate) -> None:
-        if self._stats is not None:
-            self._stats = self._stats.map(update.apply_state)
-
-    def state_dict(self) -> dict[str, Any]:
-        if self._stats is None:
-            return {"stats": None}
-        return {"stats": {item.name: getattr(self._stats, item.name) for item in fields(self._stats)}}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        self._stats = loaded_rows("stats", state["stats"], self._stats)
-
-    def _gsplat_config(self) -> dict[str, Any]:
-        ours = ("opacity_reset", "_stats")
-        return {item.name: getattr(self, item.name) for item in fields(self) if item.name not in ours}
-
-    def _gsplat_state(self, rows: Tensor, step: Step) -> dict[str, Any]:
-        """gsplat's running state out of our statistics, and the row numbers, which it will treat alike. `rows`: [M]."""
-        stats = self._stats
-        return {
-            "grad2d": (stats.absgrad_sums if self.absgrad else stats.grad_sums)[rows],
-            "count": stats.view_counts[rows],
-            "radii": stats.max_radii[rows],
-            "source_row": rows,
-            "scene_scale": step.scene_extent,
-        }
-
-    def _keep_one(self, gaussians: Gaussians, usable: Tensor) -> RowUpdate | None:
-        """What there is instead of a model of nothing: the most opaque Gaussian of those that are `usable` [M]."""
+    def _keep_one(self, gaussians: Gaussians) -> RowUpdate | None:
+        """What there is instead of a model of nothing: the most opaque Gaussian that is finite."""
         self._stats.zero_()
-        if len(gaussians) == 1:
-            return None
-        source = usable[gaussians.opacities[usable].argmax()] if len(usable) else usable.new_zeros(())
-        return RowUpdate(source.reshape(1), usable.new_zeros(1, dtype=torch.bool), {}, num_pruned=len(gaussians) - 1)
+        return removal(leave_one(torch.ones(len(gaussians), dtype=torch.bool, device=gaussians.device), gaussians))
 
     def _change(self, gaussians: Gaussians, params: dict, optimizers: dict, state: dict) -> RowUpdate | None:
         """What gsplat has done, as one change."""
         source = state["source_row"]
-        fresh, opacity_fresh = (touched_rows(optimizers[name], params[name]) for name in ("means", "opacities"))
+        fresh, opacity_fresh = (new_rows(params, optimizers, name) for name in ("means", "opacities"))
         was_reset = bool(opacity_fresh.all()) and not bool(fresh.all())
         if not bool(state["count"].any()):  # gsplat starts a new window after a refinement
             self._stats.zero_()
-        unchanged = len(source) == len(gaussians) and not was_reset and not bool(fresh.any())
-        if unchanged:
+        if len(source) == len(gaussians) and not was_reset and not bool(fresh.any()):
             return None
         present = torch.bincount(source, minlength=len(gaussians))
         copies = torch.bincount(source[fresh], minlength=len(gaussians))
@@ -158,13 +114,30 @@ class GsplatDefaultDensity:
         )
 
 
-def marking_optimizer(param: torch.nn.Parameter) -> torch.optim.Optimizer:
-    """An optimizer whose one state tensor is 1 for rows it knows; gsplat puts 0 where it makes or resets rows."""
-    optimizer = torch.optim.SGD([param], lr=0.0)
-    optimizer.state[param]["known"] = torch.ones(len(param), device=param.device)
-    return optimizer
+def run_gsplat(
+    strategy: Strategy, values: dict[str, Tensor], state: dict[str, Any], step: Step, **options: Any
+) -> tuple[dict[str, torch.nn.Parameter], dict[str, torch.optim.Optimizer]]:
+    """A strategy of gsplat after an optimizer's step. Its random numbers are a function of seed and iteration.
+
+    Args:
+        values: name -> parameter [N, ...]; some operations of gsplat write into it.
+        state: the strategy's running state, changed in place.
+        options: further arguments of its `step_post_backward`.
+
+    Returns:
+        The parameters after it, and optimizers that `new_rows` reads.
+    """
+    params = {name: torch.nn.Parameter(value, requires_grad=False) for name, value in values.items()}
+    optimizers = {name: torch.optim.SGD([param], lr=0.0) for name, param in params.items()}
+    for name, param in params.items():  # gsplat puts 0 where it makes or resets rows
+        optimizers[name].state[param]["known"] = torch.ones(len(param), device=param.device)
+    device = params["means"].device
+    with torch.random.fork_rng(devices=[device] if device.type == "cuda" else []):
+        torch.manual_seed(int(np.random.SeedSequence([step.seed, step.iteration]).generate_state(1)[0]))
+        strategy.step_post_backward(params, optimizers, state, step.iteration, {}, **options)
+    return params, optimizers
 
 
-def touched_rows(optimizer: torch.optim.Optimizer, param: torch.nn.Parameter) -> Tensor:
-    """[M] bool: the rows that gsplat has made or reset."""
-    return optimizer.state[param]["known"] == 0
+def new_rows(params: dict[str, torch.nn.Parameter], optimizers: dict[str, torch.optim.Optimizer], name: str) -> Tensor:
+    """[M] bool: the rows of a parameter that gsplat has made or reset since `run_gsplat` began."""
+    return optimizers[name].state[params[name]]["known"] == 0

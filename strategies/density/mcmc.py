@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Any
 
-import numpy as np
 import torch
 from gsplat.strategy import MCMCStrategy
 from torch import Tensor
-from turbogs_plugin.strategies.density.gsplat_default import marking_optimizer, touched_rows
+from turbogs_plugin.strategies.checks import require_at_least_one, require_settings, shared_settings
+from turbogs_plugin.strategies.density.gsplat_default import new_rows, run_gsplat
 from turbogs_plugin.strategies.density.rows import finite_rows
 from turbogs_plugin.strategies.learning_rates import LearningRates
+from turbogs_plugin.strategies.protocols import DensityController
 
-from turbogs_plugin.errors import InputError, require, require_not_negative
-from turbogs_plugin.types import Gaussians, GaussianStats, RowUpdate, Step
+from turbogs_plugin.errors import InputError, require
+from turbogs_plugin.types import Gaussians, RowUpdate, Step
 
 DEAD_LOGIT = -50.0
 """Opacity of Gaussians that are to be relocated whatever they are."""
@@ -24,7 +24,7 @@ LARGEST_LOG_SCALE = 40.0
 
 
 @dataclass
-class GsplatMcmcDensity:
+class GsplatMcmcDensity(DensityController):
     """gsplat's relocation, growth and noise (Kheradmand et al. 2024), run on our parameters.
 
     The noise on the means, which is part of every iteration, is added in place. What makes the method's dead Gaussians
@@ -50,14 +50,9 @@ class GsplatMcmcDensity:
     learning_rates: LearningRates = field(default_factory=LearningRates)
 
     def __post_init__(self) -> None:
-        for name in ("max_gaussians", "refine_every"):
-            require(getattr(self, name) >= 1, name, getattr(self, name), "at least 1")
-        require_not_negative(self, "noise_lr", "refine_start_iter")
+        require_at_least_one(self, "max_gaussians", "refine_every")
         require(0 < self.min_opacity < 1, "min_opacity", self.min_opacity, "more than 0 and less than 1")
-
-    @property
-    def stats(self) -> GaussianStats | None:
-        return None
+        require_settings(self)
 
     def setup(self, gaussians: Gaussians) -> None:
         if gaussians.device.type != "cuda":
@@ -78,9 +73,6 @@ class GsplatMcmcDensity:
         self._add_noise(gaussians, step)
         return None
 
-    def apply(self, update: RowUpdate) -> None:
-        pass
-
     def _refine(self, gaussians: Gaussians, usable: Tensor, step: Step) -> RowUpdate:
         """Relocation, growth and noise, on copies: relocation writes into the tensors that it is given.
 
@@ -94,7 +86,7 @@ class GsplatMcmcDensity:
         added = params.pop("source_row").data[len(rows) :]
         return RowUpdate(
             torch.cat([rows, added]),
-            touched_rows(optimizers["means"], params["means"]),
+            new_rows(params, optimizers, "means"),
             {name: value.data for name, value in params.items()},
             num_cloned=len(added),
         )
@@ -107,26 +99,10 @@ class GsplatMcmcDensity:
         gaussians.means.copy_(torch.where(finite, gaussians.means, before))
 
     def _run_gsplat(self, values: dict[str, Tensor], refine_until: int, step: Step) -> tuple[dict, dict]:
-        """gsplat's strategy on these parameters: what became of them, and the optimizers that mark rows it has made."""
-        strategy = MCMCStrategy(
-            cap_max=self.max_gaussians,
-            noise_lr=self.noise_lr,
-            refine_start_iter=self.refine_start_iter,
-            refine_stop_iter=refine_until,
-            refine_every=self.refine_every,
-            min_opacity=self.min_opacity,
-        )
-        params = {name: torch.nn.Parameter(value, requires_grad=False) for name, value in values.items()}
-        optimizers = {name: marking_optimizer(params[name]) for name in params}
+        """`run_gsplat` with gsplat's strategy of these settings."""
+        settings = shared_settings(self, MCMCStrategy)
+        strategy = MCMCStrategy(**settings, cap_max=self.max_gaussians, refine_stop_iter=refine_until)
         rate = self.learning_rates.at(replace(step, iteration=step.iteration + 1)).means
-        device = params["means"].device
-        with torch.random.fork_rng(devices=[device] if device.type == "cuda" else []):
-            torch.manual_seed(int(np.random.SeedSequence([step.seed, step.iteration]).generate_state(1)[0]))
-            strategy.step_post_backward(params, optimizers, strategy.initialize_state(), step.iteration, {}, lr=rate)
-        return params, optimizers
-
-    def state_dict(self) -> dict[str, Any]:
-        return {}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        pass
+        # gsplat's state is a table for relocation, which takes longer to make than an iteration.
+        state = strategy.initialize_state() if refine_until > 0 else {"binoms": torch.empty(0)}
+        return run_gsplat(strategy, values, state, step, lr=rate)

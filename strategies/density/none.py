@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
-from turbogs_plugin.errors import require_not_negative
-from turbogs_plugin.types import Gaussians, GaussianStats, RowUpdate, Step
+from turbogs_plugin.strategies.checks import require_settings
+from turbogs_plugin.strategies.protocols import DensityController
+
+from turbogs_plugin.types import Gaussians, RowUpdate, Step
 
 
 @dataclass
-class NoDensity:
+class NoDensity(DensityController):
     """The set of Gaussians stays as it is.
 
     Args:
@@ -20,23 +21,7 @@ class NoDensity:
     max_gaussians: int = 0
 
     def __post_init__(self) -> None:
-        require_not_negative(self, "max_gaussians")
-
-    @property
-    def stats(self) -> GaussianStats | None:
-        return None
-
-    def setup(self, gaussians: Gaussians) -> None:
-        pass
+        require_settings(self)
 
     def update(self, gaussians: Gaussians, step: Step) -> RowUpdate | None:
         return None
-
-    def apply(self, update: RowUpdate) -> None:
-        pass
-
-    def state_dict(self) -> dict[str, Any]:
-        return {}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        pass

@@ -1,17 +1,55 @@
-"""What density controllers share: usable Gaussians, one that always stays, a removal, statistics of a state."""
+"""What density controllers share: statistics of a window, usable Gaussians, one that always stays, a removal."""
 
 from __future__ import annotations
 
-from dataclasses import fields
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
+from turbogs_plugin.strategies.protocols import DensityController
 
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.types import Gaussians, RowUpdate
+from turbogs_plugin.types import Gaussians, GaussianStats, RowUpdate
 
 RowsType = TypeVar("RowsType")  # a dataclass of [N] tensors
+
+
+class WindowedDensity(DensityController):
+    """A density control that keeps the statistics of a window of iterations; None once it needs no more of them."""
+
+    _stats: GaussianStats | None = None
+
+    @property
+    def stats(self) -> GaussianStats | None:
+        return self._stats
+
+    def setup(self, gaussians: Gaussians) -> None:
+        self._stats = GaussianStats.zeros(len(gaussians), gaussians.device)
+
+    def apply(self, update: RowUpdate) -> None:
+        if self._stats is not None:
+            self._stats = self._stats.map(update.apply_state)
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"stats": saved_rows(self._stats)}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self._stats = loaded_rows("stats", state["stats"], self._stats)
+
+
+def add_stats(window: GaussianStats, new: GaussianStats) -> None:
+    """Add statistics to those of a window, in place."""
+    for name, value in vars(new).items():
+        total = getattr(window, name)
+        if name == "max_radii":
+            torch.maximum(total, value, out=total)
+        else:
+            total += value
+
+
+def saved_rows(rows: RowsType | None) -> dict[str, Tensor] | None:
+    """What `loaded_rows` takes: name of a field -> [N], or None."""
+    return None if rows is None else dict(vars(rows))
 
 
 def loaded_rows(name: str, saved: dict[str, Tensor] | None, present: RowsType | None) -> RowsType | None:
@@ -19,14 +57,14 @@ def loaded_rows(name: str, saved: dict[str, Tensor] | None, present: RowsType | 
 
     Args:
         name: of the entry, for the error.
-        saved: name of a field -> [N], or None where the saved run needed them no more.
+        saved: of `saved_rows`; None where the saved run needed them no more.
         present: what `setup` made.
     """
     if saved is None:
         return None
     if present is None:
         raise InputError(f"density {name}: nothing to load into, call setup with the model of the saved run first")
-    like = getattr(present, fields(present)[0].name)
+    like = next(iter(vars(present).values()))
     for key, value in saved.items():
         if value.shape != like.shape:
             raise InputError(

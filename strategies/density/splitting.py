@@ -24,8 +24,7 @@ def split_in_two(
     Args:
         gaussians: the model.
         rows: [n] int64, which of them.
-        how: two draws from the Gaussian, all axes divided by 1.6 as in 3DGS (`sample`); or two halves along its longest
-            axis, which is divided by 1.6, so placed that the pair has the parent's mean and covariance (`long_axis`).
+        how: `split` of `ErrorDrivenDensity`.
         step: the draws are a function of its seed and iteration.
 
     Returns:

@@ -8,11 +8,11 @@ from typing import Any
 import torch
 from torch import Tensor
 from torch.optim.adam import adam
+from turbogs_plugin.strategies.checks import require_settings
 from turbogs_plugin.strategies.learning_rates import LearningRates
 
 from turbogs_plugin.engine.moments import check_moments_config, check_state
 from turbogs_plugin.engine.reference.update import clipped, finite_gradients
-from turbogs_plugin.errors import require_not_negative
 from turbogs_plugin.types import PARAMETER_NAMES, GaussianGradients, Gaussians, RowUpdate, Step
 
 
@@ -58,7 +58,7 @@ class DenseAdam:
 
     def __post_init__(self) -> None:
         check_moments_config(self.beta1, self.beta2, self.eps)
-        require_not_negative(self, "opacity_reg", "scale_reg")
+        require_settings(self)
 
     def setup(self, gaussians: Gaussians) -> None:
         self.exp_avg, self.exp_avg_sq = (gaussians.map(torch.zeros_like) for _ in range(2))
@@ -76,6 +76,8 @@ class DenseAdam:
         rates = self.learning_rates.at(step)
         # Torch's way of leaving an iteration out without asking the device.
         nothing = (~touched.any()).to(torch.float32)
+        options = {"beta1": self.beta1, "beta2": self.beta2, "eps": self.eps}
+        options |= {"weight_decay": 0.0, "amsgrad": False, "maximize": False}
         for count, (name, parameter) in zip(self.counts.unbind(), gaussians.items(), strict=True):
             gradient = _of_finite(gradients, name, finite)
             if name == "opacities" and self.opacity_reg > 0:
@@ -83,23 +85,9 @@ class DenseAdam:
                 gradient += self.opacity_reg / max(1, parameter.numel()) * opacity * (1 - opacity)
             if name == "scales" and self.scale_reg > 0:
                 gradient += clipped(self.scale_reg / max(1, parameter.numel()) * parameter.exp())
-            adam(
-                [parameter],
-                [gradient],
-                [getattr(self.exp_avg, name)],
-                [getattr(self.exp_avg_sq, name)],
-                [],
-                [count],
-                fused=True,
-                found_inf=nothing,
-                amsgrad=False,
-                beta1=self.beta1,
-                beta2=self.beta2,
-                lr=getattr(rates, name),
-                weight_decay=0.0,
-                eps=self.eps,
-                maximize=False,
-            )
+            exp_avg, exp_avg_sq = (getattr(moments, name) for moments in (self.exp_avg, self.exp_avg_sq))
+            lists = ([value] for value in (parameter, gradient, exp_avg, exp_avg_sq))
+            adam(*lists, [], [count], fused=True, found_inf=nothing, lr=getattr(rates, name), **options)
 
     def apply(self, update: RowUpdate) -> None:
         for moments in (self.exp_avg, self.exp_avg_sq):
@@ -109,10 +97,9 @@ class DenseAdam:
                 getattr(moments, name).zero_()
 
     def state_dict(self) -> dict[str, Any]:
-        moments = {"exp_avg": self.exp_avg, "exp_avg_sq": self.exp_avg_sq}
-        state = {
-            f"{name}.{parameter}": value for name, of_all in moments.items() for parameter, value in of_all.items()
-        }
+        state = {}
+        for moment in ("exp_avg", "exp_avg_sq"):
+            state |= {f"{moment}.{name}": value for name, value in getattr(self, moment).items()}
         return {**state, "counts": self.counts, "skipped": self.skipped}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:

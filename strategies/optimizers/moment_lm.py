@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Any, Literal
+from dataclasses import dataclass, replace
+from typing import Literal
 
-from torch import Tensor
-from turbogs_plugin.strategies.learning_rates import LearningRates
+from turbogs_plugin.strategies.checks import require_settings
+from turbogs_plugin.strategies.optimizers.sparse_adam import SparseAdam
 
-from turbogs_plugin.engine.moments import GaussianMoments, check_moments_config
-from turbogs_plugin.engine.reference.update import apply_update
 from turbogs_plugin.engine.rules import MomentLMParams, UpdateRule
-from turbogs_plugin.errors import require, require_not_negative
-from turbogs_plugin.types import GaussianGradients, Gaussians, RowUpdate, Step
+from turbogs_plugin.types import Step
 
 
 @dataclass
-class MomentLMOptimizer:
+class MomentLMOptimizer(SparseAdam):
     """Moment-damped LM on a geometry block (mean 3, scale 3, quaternion 4) and an appearance block (band 0, opacity);
     Adam on the higher bands.
 
@@ -37,8 +34,7 @@ class MomentLMOptimizer:
     the g_k as rows of J: it has no learning rate and changes with the unit of the loss. It is there to compare.
 
     Args:
-        learning_rates: of each parameter over the run.
-        beta1, beta2: decay of the moments.
+        learning_rates, beta1, beta2: as in `SparseAdam`.
         eps: added to sqrt(v). The default is small enough that a loss scaled by 1e-6 gives the same steps down to
             gradients of 1e-12, and not below what v can hold: where g^2 underflows in float32 (|g| < 1.2e-21), m / eps
             is still less than one.
@@ -53,48 +49,19 @@ class MomentLMOptimizer:
             off. `balanced` only, as the printed equation has no learning rates.
     """
 
-    learning_rates: LearningRates = field(default_factory=LearningRates)
-    beta1: float = 0.9
-    beta2: float = 0.999
     eps: float = 1e-20
     units: Literal["balanced", "paper"] = "balanced"
     rows: Literal["views", "summed"] = "views"
     curvature: float = 0.5
     max_step: float = 1.0
-    moments: GaussianMoments = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        check_moments_config(self.beta1, self.beta2, self.eps)
-        choices = {"units": ("balanced", "paper"), "rows": ("views", "summed")}
-        for name, allowed in choices.items():
-            require(getattr(self, name) in allowed, name, getattr(self, name), f"one of {', '.join(allowed)}")
-        require_not_negative(self, "curvature", "max_step")
+        super().__post_init__()
+        require_settings(self)
 
     @property
     def per_view(self) -> bool:
         return self.rows == "views"
 
-    @property
-    def skipped(self) -> Tensor:
-        """[] int64 on the device: updates left out because of a non-finite gradient."""
-        return self.moments.skipped
-
-    def setup(self, gaussians: Gaussians) -> None:
-        self.moments = GaussianMoments.zeros(gaussians)
-
     def rule(self, step: Step) -> UpdateRule:
-        """The rule of this iteration's step."""
-        lm = MomentLMParams(self.units, self.rows, self.curvature, self.max_step)
-        return UpdateRule(self.learning_rates.at(step), self.beta1, self.beta2, self.eps, lm)
-
-    def step(self, gaussians: Gaussians, gradients: GaussianGradients, step: Step) -> None:
-        apply_update(self.rule(step), gaussians, gradients, self.moments)
-
-    def apply(self, update: RowUpdate) -> None:
-        self.moments.apply(update)
-
-    def state_dict(self) -> dict[str, Any]:
-        return self.moments.state_dict()
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        self.moments.load_state_dict(state)
+        return replace(super().rule(step), lm=MomentLMParams(self.units, self.rows, self.curvature, self.max_step))

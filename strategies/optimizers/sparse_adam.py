@@ -21,6 +21,8 @@ class SparseAdam:
     A Gaussian that no sample touched keeps its parameters, moments and step count, so momentum does not move what
     this iteration knows nothing of. One with a non-finite gradient is left alone too, and counted.
 
+    An optimizer with another `rule` on the same moments inherits from it, as `MomentLMOptimizer` does.
+
     Args:
         learning_rates: of each parameter over the run.
         beta1, beta2: decay of the moments.
@@ -33,13 +35,10 @@ class SparseAdam:
     beta2: float = 0.999
     eps: float = 1e-15
     moments: GaussianMoments = field(init=False, repr=False)
+    per_view = False
 
     def __post_init__(self) -> None:
         check_moments_config(self.beta1, self.beta2, self.eps)
-
-    @property
-    def per_view(self) -> bool:
-        return False
 
     @property
     def skipped(self) -> Tensor:

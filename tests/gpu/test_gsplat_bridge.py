@@ -217,9 +217,7 @@ def trainings(monkeypatch):
     scene = load_scene(folder)
 
     def with_our_rasterizer(splats, batch, step, **render):
-        height, width = batch.pixels.shape[1:3]
-        views = {"viewmats": batch.viewmats, "Ks": batch.Ks, "width": width, "height": height}
-        colors, _, info = host.dense_rasterization(**host.splat_arguments(splats), **views, packed=False, **render)
+        colors, _, info = host.dense_rasterization(**host.render_arguments(splats, batch), **render)
         return torch.nn.functional.l1_loss(colors, batch.pixels), info
 
     def train(name, forward, options, seed=0):

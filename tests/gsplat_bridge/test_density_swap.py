@@ -7,7 +7,7 @@ import pytest
 import torch
 import tyro
 from gsplat import DefaultStrategy, MCMCStrategy
-from helpers.bridge_host import SURGERY, Host, make_splats, surgery
+from helpers.bridge_host import SURGERY, Host, assert_rows_match_after, make_splats, surgery
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from turbogs_plugin.strategies.density.error_driven import ErrorDrivenDensity
@@ -255,17 +255,8 @@ def test_a_host_in_double_precision_trains(tells_errors):
     st.integers(0, 99),
 )
 def test_rows_match_after_any_sequence(operations, seed):
-    generator = torch.Generator().manual_seed(seed)
     host = Host(TurboDensityStrategy(**{**SOON, "refine_stop_iter": 100}))
-    host.step(0)
-    for number, operation in enumerate(operations, start=1):
-        if operation == "step":
-            host.step(number)
-        else:
-            surgery(operation, host, generator)
-        host.assert_rows_match()
-    host.step(9)
-    host.assert_rows_match()
+    assert_rows_match_after(host, operations, seed)
 
 
 def tag_rows(host: Host) -> None:

@@ -6,7 +6,7 @@ import itertools
 import pytest
 import torch
 from gsplat import DefaultStrategy
-from helpers.bridge_host import RATES, SURGERY, Host, make_splats, surgery
+from helpers.bridge_host import RATES, SURGERY, Host, assert_rows_match_after, make_splats, surgery
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from turbogs_plugin.strategies.optimizers.dense_adam import DenseAdam
@@ -197,17 +197,7 @@ def test_state_dicts_resume_exactly(rule):
     st.integers(0, 99),
 )
 def test_rows_match_after_any_sequence(rule, operations, seed):
-    generator = torch.Generator().manual_seed(seed)
-    host = Host(DefaultStrategy(**LATE), SharedOptimizer(RULES[rule]()))
-    host.step(0)
-    for number, operation in enumerate(operations, start=1):
-        if operation == "step":
-            host.step(number)
-        else:
-            surgery(operation, host, generator)
-        host.assert_rows_match()
-    host.step(9)
-    host.assert_rows_match()
+    assert_rows_match_after(Host(DefaultStrategy(**LATE), SharedOptimizer(RULES[rule]())), operations, seed)
 
 
 def test_surgery_moves_the_state_of_each_row_with_it():

@@ -17,7 +17,7 @@ def gaussians() -> Gaussians:
     return Gaussians(**{name: value.detach() for name, value in make_splats(COUNT).items()})
 
 
-def look(
+def add_batch(
     density: FastGsDensity, errors: list[float], weights: list[float] | None = None, gradient: float = 1.0
 ) -> None:
     """Fill in what the backward pass of one iteration would."""
@@ -29,11 +29,11 @@ def look(
     stats.view_counts += weights > 0
 
 
-def run_looks(density: FastGsDensity, gaussians: Gaussians, looks: list[list[float]], first: int = 1):
+def run_batches(density: FastGsDensity, gaussians: Gaussians, batches: list[list[float]], first: int = 1):
     """The updates of iterations `first`, `first` + 1, ... with these errors."""
     updates = []
-    for iteration, errors in enumerate(looks, start=first):
-        look(density, errors)
+    for iteration, errors in enumerate(batches, start=first):
+        add_batch(density, errors)
         updates.append(density.update(gaussians, Step(iteration, 1000, 500)))
         if updates[-1] is not None:
             density.apply(updates[-1])
@@ -45,11 +45,11 @@ OFTEN = [HIGH, LOW, LOW, LOW, LOW, LOW, LOW, LOW]
 ONCE = [HIGH, HIGH, LOW, LOW, LOW, LOW, LOW, LOW]
 
 
-def test_only_what_most_looks_mark_is_densified(gaussians):
-    """Gaussian 0 stands out in all four looks, Gaussian 1 in one: only 0 is split, though all gradients are high."""
+def test_only_what_most_batches_mark_is_densified(gaussians):
+    """Gaussian 0 stands out in all four batches, Gaussian 1 in one: only 0 is split, though all gradients are high."""
     density = FastGsDensity(refine_from=4, refine_every=4, consistency=0.5, prune_opacity=0.0, prune_world_size=0.0)
     density.setup(gaussians)
-    *before, update = run_looks(density, gaussians, [OFTEN, ONCE, OFTEN, OFTEN])
+    *before, update = run_batches(density, gaussians, [OFTEN, ONCE, OFTEN, OFTEN])
     assert before == [None, None, None]
     assert update.num_split == 1 and update.num_cloned == update.num_pruned == 0
     assert sorted(update.source.tolist()) == [0, 0, 1, 2, 3, 4, 5, 6, 7]
@@ -57,7 +57,7 @@ def test_only_what_most_looks_mark_is_densified(gaussians):
     assert len(density.stats.weight_sums) == 9 and not density.stats.weight_sums.any()
     lenient = FastGsDensity(refine_from=4, refine_every=4, consistency=0.25, prune_opacity=0.0, prune_world_size=0.0)
     lenient.setup(gaussians)
-    assert run_looks(lenient, gaussians, [OFTEN, ONCE, OFTEN, OFTEN])[-1].num_split == 2
+    assert run_batches(lenient, gaussians, [OFTEN, ONCE, OFTEN, OFTEN])[-1].num_split == 2
 
 
 @pytest.mark.parametrize(("error_threshold", "splits"), [(2.9, 2), (3.1, 0)])
@@ -66,16 +66,16 @@ def test_a_mark_is_an_error_of_so_many_means(gaussians, error_threshold, splits)
     always = {"prune_opacity": 0.0, "prune_world_size": 0.0, "error_threshold": error_threshold}
     density = FastGsDensity(refine_from=2, refine_every=2, **always)
     density.setup(gaussians)
-    update = run_looks(density, gaussians, [ONCE, ONCE])[-1]
+    update = run_batches(density, gaussians, [ONCE, ONCE])[-1]
     assert (0 if update is None else update.num_split) == splits
 
 
-def test_looks_that_did_not_see_it_do_not_count(gaussians):
+def test_batches_that_did_not_see_it_do_not_count(gaussians):
     density = FastGsDensity(refine_from=4, refine_every=4, prune_opacity=0.0, prune_world_size=0.0)
     density.setup(gaussians)
     unseen = [0.0] + [1.0] * (COUNT - 1)
     for iteration in range(1, 5):
-        look(density, OFTEN, None if iteration == 1 else unseen)
+        add_batch(density, OFTEN, None if iteration == 1 else unseen)
         update = density.update(gaussians, Step(iteration, 1000, 500))
     assert update.num_split == 1
 
@@ -83,14 +83,14 @@ def test_looks_that_did_not_see_it_do_not_count(gaussians):
 def test_a_low_gradient_is_not_densified(gaussians):
     density = FastGsDensity(refine_from=1, refine_every=1, prune_opacity=0.0, prune_world_size=0.0)
     density.setup(gaussians)
-    look(density, OFTEN, gradient=1e-6)
+    add_batch(density, OFTEN, gradient=1e-6)
     assert density.update(gaussians, Step(1, 1000, 500)) is None
 
 
 def test_after_densification_the_most_blamed_go(gaussians):
     density = FastGsDensity(prune_every=3, prune_opacity=0.0, blame_threshold=0.9)
     density.setup(gaussians)
-    updates = run_looks(density, gaussians, [OFTEN, ONCE, OFTEN], first=501)
+    updates = run_batches(density, gaussians, [OFTEN, ONCE, OFTEN], first=501)
     assert updates[:2] == [None, None]
     assert updates[2].source.tolist() == list(range(1, COUNT))
     assert updates[2].num_pruned == 1 and not updates[2].fresh.any()
@@ -100,10 +100,10 @@ def test_a_resumed_window_goes_on_exactly(gaussians):
     straight, first, second = (FastGsDensity(refine_from=4, refine_every=4, prune_world_size=0.0) for _ in range(3))
     for density in (straight, first, second):
         density.setup(gaussians)
-    expected = run_looks(straight, gaussians, [OFTEN, ONCE, OFTEN, OFTEN])[-1]
-    run_looks(first, gaussians, [OFTEN, ONCE])
+    expected = run_batches(straight, gaussians, [OFTEN, ONCE, OFTEN, OFTEN])[-1]
+    run_batches(first, gaussians, [OFTEN, ONCE])
     second.load_state_dict(first.state_dict())
-    actual = run_looks(second, gaussians, [OFTEN, OFTEN], first=3)[-1]
+    actual = run_batches(second, gaussians, [OFTEN, OFTEN], first=3)[-1]
     assert torch.equal(actual.source, expected.source)
     assert torch.equal(actual.values["means"], expected.values["means"])
     other = FastGsDensity()

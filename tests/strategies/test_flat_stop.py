@@ -92,7 +92,7 @@ def test_final_pruning_goes_on_after_an_early_end():
     assert density.stopped_at and density.stats is None  # taken until the last pruning, which is before the run's end
     stopped = ErrorDrivenDensity(stop_when_flat=0.1, final_keep=0.9, final_every=20, refine_every=EVERY)
     stopped.stopped_at = 100
-    assert stopped._due(Step(UNTIL + 20, TOTAL, UNTIL)) == (False, True)
+    assert stopped.due(Step(UNTIL + 20, TOTAL, UNTIL)) == (False, True)
     assert stopped._last_event(Step(0, TOTAL, UNTIL)) == 480
 
 

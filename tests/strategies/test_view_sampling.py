@@ -92,7 +92,7 @@ def test_stack_is_refilled_when_too_few_are_left(sampler):
     assert len(set(first + second)) == 6
     third = sampler.select(3, errors, step(2))  # two are left: all eight come back
     assert len(set(third)) == 3
-    assert len(sampler.stack.views) == 5
+    assert len(sampler.stack) == 5
 
 
 @pytest.mark.parametrize("sampler", SAMPLERS)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -14,9 +13,19 @@ from torch import Tensor
 
 from turbogs_plugin.errors import InputError, require
 from turbogs_plugin.gsplat_bridge.gaussian_errors import iteration_stats
-from turbogs_plugin.gsplat_bridge.host import GEOMETRY, GROUND_TRUTH, PREDICTION, host_gaussians, require_keys
+from turbogs_plugin.gsplat_bridge.host import (
+    GEOMETRY,
+    GROUND_TRUTH,
+    PREDICTION,
+    Optimizers,
+    Parameters,
+    host_gaussians,
+    require_keys,
+)
 from turbogs_plugin.model.row_order import in_order_of_space
+from turbogs_plugin.strategies.checks import shared_settings
 from turbogs_plugin.strategies.density.error_driven import ErrorDrivenDensity
+from turbogs_plugin.strategies.density.rows import add_stats
 from turbogs_plugin.types import GaussianStats, RowUpdate, Step
 
 _STATS = tuple(field.name for field in fields(GaussianStats))
@@ -67,10 +76,9 @@ class TurboDensityStrategy(DefaultStrategy):
 
     def __post_init__(self) -> None:
         require(not self.revised_opacity, "revised_opacity", self.revised_opacity, "False: splits copy the opacity")
-        allowed = "0: opacities are never reset"
-        require(self.pause_refine_after_reset == 0, "pause_refine_after_reset", self.pause_refine_after_reset, allowed)
-        allowed = "'means2d': the error sums are those of 3D Gaussians"
-        require(self.key_for_gradient == "means2d", "key_for_gradient", self.key_for_gradient, allowed)
+        pause, key = self.pause_refine_after_reset, self.key_for_gradient
+        require(pause == 0, "pause_refine_after_reset", pause, "0: opacities are never reset")
+        require(key == "means2d", "key_for_gradient", key, "'means2d': the error sums are those of 3D Gaussians")
         self._controller(0)  # checks the rest
 
     def initialize_state(self, scene_scale: float = 1.0) -> dict[str, Any]:
@@ -79,26 +87,20 @@ class TurboDensityStrategy(DefaultStrategy):
         return {"scene_scale": scene_scale, _DRIVEN_BY: None, **dict.fromkeys(_STATS)}
 
     def step_pre_backward(
-        self,
-        params: Mapping[str, torch.nn.Parameter],
-        optimizers: Mapping[str, torch.optim.Optimizer],
-        state: dict[str, Any],
-        step: int,
-        info: dict[str, Any],
+        self, params: Parameters, optimizers: Optimizers, state: dict[str, Any], step: int, info: dict[str, Any]
     ) -> None:
         """To be called before ``loss.backward()``. Shows `info` to optimizers that want the errors, too."""
         require_keys(info, ("means2d",), "info", "pass what the rasterization returned")
         super().step_pre_backward(params, optimizers, state, step, info)
         for optimizer in optimizers.values():
-            observe = getattr(optimizer, "observe", None)
-            if observe is not None:
-                observe(info)
+            if hasattr(optimizer, "observe"):
+                optimizer.observe(info)
 
     @torch.no_grad()
     def step_post_backward(
         self,
-        params: dict[str, torch.nn.Parameter] | torch.nn.ParameterDict,
-        optimizers: Mapping[str, torch.optim.Optimizer],
+        params: Parameters,
+        optimizers: Optimizers,
         state: dict[str, Any],
         step: int,
         info: dict[str, Any],
@@ -119,26 +121,27 @@ class TurboDensityStrategy(DefaultStrategy):
         if step >= self.refine_stop_iter and self.final_keep == 1:
             return
         gaussians = host_gaussians(params, GEOMETRY)
-        self._accumulate(state, info, len(gaussians))
+        window = self._accumulate(state, info, len(gaussians))
         if not self._due(step):
             return
         controller = self._controller(step)
         controller.setup(gaussians)
-        controller.load_state_dict({"stats": {name: state[name] for name in _STATS}})
+        controller.load_state_dict({"stats": vars(window)})
         # The end of the run is not known here; the controller needs it only to stop taking statistics.
         now = Step(step, sys.maxsize, self.refine_stop_iter - 1, self.seed, state["scene_scale"])
         update = controller.update(gaussians, now)
-        if update is not None:
-            apply_row_update(in_order_of_space(update, gaussians, now), params, optimizers, state)
-        for name in _STATS:
-            state[name].zero_()
-        if self.verbose and update is not None:
+        window.zero_()
+        if update is None:
+            return
+        apply_row_update(in_order_of_space(update, gaussians, now), params, optimizers, state)
+        if self.verbose:
             print(
                 f"Step {step}: {update.num_cloned} GSs duplicated, {update.num_split} split, "
                 f"{update.num_pruned} pruned. Now having {len(params['means'])} GSs."
             )
 
-    def _accumulate(self, state: dict[str, Any], info: dict[str, Any], count: int) -> None:
+    def _accumulate(self, state: dict[str, Any], info: dict[str, Any], count: int) -> GaussianStats:
+        """Add this iteration's statistics to those in `state`; returns the latter."""
         if state is None:
             raise InputError("the strategy was called without its state: expected that of strategy.initialize_state()")
         require_keys(state, _STATE_KEYS, "the state", "expected that of TurboDensityStrategy.initialize_state()")
@@ -160,19 +163,17 @@ class TurboDensityStrategy(DefaultStrategy):
             stats.absgrad_sums = torch.zeros_like(stats.absgrad_sums)
         elif getattr(info["means2d"], "absgrad", None) is None:
             raise InputError("info['means2d'] has no absgrad: render with absgrad=True, or use absgrad=False here")
+        if state[_STATS[0]] is None:
+            state.update(vars(GaussianStats.zeros(count, stats.view_counts.device)))
         for name in _STATS:
-            new = getattr(stats, name)
-            if state[name] is None:
-                state[name] = new.clone()
-            elif state[name].shape != new.shape:
+            if len(state[name]) != count:
                 raise InputError(
                     f"state['{name}'] has {len(state[name])} rows, the parameters {count}: rows were added or removed "
                     "without passing this state along"
                 )
-            elif name == "max_radii":
-                torch.maximum(state[name], new, out=state[name])
-            else:
-                state[name] += new
+        window = GaussianStats(**{name: state[name] for name in _STATS})
+        add_stats(window, stats)
+        return window
 
     def _due(self, step: int) -> bool:
         """Whether a densification or a final pruning happens at this step, at gsplat's places in the schedule."""
@@ -182,36 +183,21 @@ class TurboDensityStrategy(DefaultStrategy):
 
     def _controller(self, step: int) -> ErrorDrivenDensity:
         """The controller with the present values of all fields."""
-        by_screen_size = step < self.refine_scale2d_stop_iter
         return ErrorDrivenDensity(
-            lambda_base=self.lambda_base,
-            score=self.score,
+            **shared_settings(self, ErrorDrivenDensity),
             refine_from=self.refine_start_iter + 1,
-            refine_every=self.refine_every,
             grad_threshold=self.grow_grad2d,
             absgrad_threshold=self.grow_absgrad2d,
-            top_fraction=self.top_fraction,
             percent_dense=self.grow_scale3d,
-            split=self.split,
-            max_gaussians=self.max_gaussians,
             prune_opacity=self.prune_opa,
             prune_world_size=self.prune_scale3d,
-            prune_screen_size=self.prune_scale2d if by_screen_size else 0.0,
+            prune_screen_size=self.prune_scale2d if step < self.refine_scale2d_stop_iter else 0.0,
             prune_size_from=self.reset_every / max(1, self.refine_stop_iter),
-            prune_score_fraction=self.prune_score_fraction,
-            opacity_decay=self.opacity_decay,
-            final_every=self.final_every,
-            final_keep=self.final_keep,
         )
 
 
 @torch.no_grad()
-def apply_row_update(
-    update: RowUpdate,
-    params: dict[str, torch.nn.Parameter] | torch.nn.ParameterDict,
-    optimizers: Mapping[str, torch.optim.Optimizer],
-    state: dict[str, Any],
-) -> None:
+def apply_row_update(update: RowUpdate, params: Parameters, optimizers: Optimizers, state: dict[str, Any]) -> None:
     """Carry a `RowUpdate` out on a gsplat host: its parameters, its optimizers' state and a strategy's running state.
 
     Args:
@@ -225,12 +211,9 @@ def apply_row_update(
 
     _update_param_with_optimizer(new_parameter, lambda key, value: update.apply_state(value), params, optimizers)
     if update.reset:
+        names = list(update.reset)
         _update_param_with_optimizer(
-            lambda name, parameter: parameter,
-            lambda key, value: torch.zeros_like(value),
-            params,
-            optimizers,
-            names=list(update.reset),
+            lambda _, value: value, lambda _, value: torch.zeros_like(value), params, optimizers, names
         )
     for key, value in state.items():
         if isinstance(value, Tensor):

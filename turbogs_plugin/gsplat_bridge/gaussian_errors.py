@@ -169,16 +169,8 @@ def zero_channel_sums(info: dict[str, Any], upstream: Tensor) -> Tensor:
     means2d = info["means2d"].detach()
     with torch.enable_grad():
         channels = means2d.new_zeros(*means2d.shape[:-1], upstream.shape[-1]).requires_grad_()
-        image, _ = rasterize_to_pixels(
-            means2d,
-            info["conics"].detach(),
-            channels,
-            info["opacities"].detach(),
-            info["width"],
-            info["height"],
-            info["tile_size"],
-            info["isect_offsets"],
-            info["flatten_ids"],
-            packed=info["gaussian_ids"] is not None,
-        )
+        conics, opacities = info["conics"].detach(), info["opacities"].detach()
+        tiles = (info[key] for key in ("width", "height", "tile_size", "isect_offsets", "flatten_ids"))
+        packed = info["gaussian_ids"] is not None
+        image, _ = rasterize_to_pixels(means2d, conics, channels, opacities, *tiles, packed=packed)
     return torch.autograd.grad(image, channels, upstream.to(image.dtype))[0]

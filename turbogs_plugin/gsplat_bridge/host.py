@@ -6,10 +6,15 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.types import PARAMETER_NAMES, Gaussians
+
+Parameters = dict[str, torch.nn.Parameter] | torch.nn.ParameterDict
+Optimizers = Mapping[str, torch.optim.Optimizer]
+"""A host's, by the names of the parameters."""
 
 PREDICTION, GROUND_TRUTH = "prediction", "ground_truth"
 """Keys under which a host puts what it rendered and what it should have been into `info`."""
@@ -58,18 +63,12 @@ def host_gaussians(params: Mapping[str, Tensor], names: Iterable[str] = PARAMETE
     """
     require_keys(params, names, "params", f"expected {', '.join(names)}")
     count = params["means"].shape[0]
-    for name in PARAMETER_NAMES:
-        if name in params and not _fits(tuple(params[name].shape), SHAPES[name], count):
+    for name in [name for name in PARAMETER_NAMES if name in params]:
+        shape = tuple(params[name].shape)
+        form = SHAPES[name].replace("N", str(count)).replace("B", str(shape[1]) if len(shape) > 1 else "B")
+        if str(list(shape)) != form:
             raise InputError(
-                f"parameter '{name}' has shape {tuple(params[name].shape)}: "
-                f"expected {SHAPES[name]} with N = {count} as in 'means'"
+                f"parameter '{name}' has shape {shape}: expected {SHAPES[name]} with N = {count} as in 'means'"
             )
     absent = params["means"].new_zeros(count, 1, 3)
     return Gaussians(**{name: params[name].detach() if name in params else absent for name in PARAMETER_NAMES})
-
-
-def _fits(shape: tuple[int, ...], form: str, count: int) -> bool:
-    """Whether a shape is of a form as in `SHAPES`, with N = `count` and any B."""
-    sizes = form.strip("[]").split(", ")
-    expected = {"N": count, "B": shape[1] if len(shape) > 1 else None}
-    return shape == tuple(expected[size] if size in expected else int(size) for size in sizes)

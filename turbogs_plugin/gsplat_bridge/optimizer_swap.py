@@ -14,8 +14,9 @@ of the member's own parameter group.
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterable
-from typing import Any, Protocol
+from collections.abc import Callable, Iterable, Iterator
+from types import SimpleNamespace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -25,6 +26,7 @@ from turbogs_plugin.engine.rules import ParameterRates
 from turbogs_plugin.errors import InputError, require
 from turbogs_plugin.gsplat_bridge.gaussian_errors import loss_shares
 from turbogs_plugin.gsplat_bridge.host import host_gaussians
+from turbogs_plugin.strategies.optimizers.sparse_adam import SparseAdam
 from turbogs_plugin.types import PARAMETER_NAMES, GaussianGradients, Gaussians, Step
 
 COUNT = "step"
@@ -32,18 +34,6 @@ COUNT = "step"
 operations take every other value for one with rows."""
 
 MOMENTS = ("exp_avg", "exp_avg_sq")
-
-
-class BlockOptimizer(Protocol):
-    """What `SharedOptimizer` needs of an optimizer: `SparseAdam` and `MomentLMOptimizer` are such."""
-
-    learning_rates: Any
-    beta1: float
-    beta2: float
-    eps: float
-    moments: GaussianMoments
-
-    def step(self, gaussians: Gaussians, gradients: GaussianGradients, step: Step) -> None: ...
 
 
 class SharedOptimizer:
@@ -58,17 +48,19 @@ class SharedOptimizer:
         }
 
     Args:
-        optimizer: the rule. Its learning rates, betas and eps are replaced by the members' parameter groups'. Autograd
-            gives the sum of the gradients over views, so J has one row, whatever `MomentLMOptimizer.rows` says.
+        optimizer: a `SparseAdam`, as a `MomentLMOptimizer` is, too. Its learning rates, betas and eps are replaced by
+            those of the members' parameter groups. Autograd gives the sum of the gradients over views, so J has one
+            row, whatever `MomentLMOptimizer.rows` says.
     """
 
-    def __init__(self, optimizer: BlockOptimizer) -> None:
-        if isinstance(optimizer, type) or "moments" not in getattr(optimizer, "__dataclass_fields__", ()):
+    def __init__(self, optimizer: SparseAdam) -> None:
+        if not isinstance(optimizer, SparseAdam):
             name = optimizer.__name__ if isinstance(optimizer, type) else type(optimizer).__name__
             raise InputError(f"SharedOptimizer takes SparseAdam() or MomentLMOptimizer(), an instance: got {name}")
         self.optimizer = copy.copy(optimizer)
         self.members: dict[str, MemberOptimizer] = {}
         self.skipped: Tensor | None = None
+        self._gradients: dict[str, Tensor | None] = {}
         self._info: dict[str, Any] | None = None
         self._told = False
 
@@ -100,16 +92,25 @@ class SharedOptimizer:
         Gaussians' shares of the loss, which the damped system needs; without them the step is Adam's."""
         self._info = info
 
-    def waiting(self) -> list[str]:
-        """Names of the parameters whose member has not been stepped in this iteration."""
-        return [name for name in PARAMETER_NAMES if name not in self.members or not self.members[name].is_stepped]
+    def hand_over(self, name: str, gradient: Tensor | None) -> None:
+        """Take a member's gradient; the last one to come carries out the update of all parameters.
 
-    @torch.no_grad()
-    def update(self) -> None:
-        """Carry out the update of all parameters from the gradients handed over."""
-        members = self.members
-        gradients = {name: members[name].take_gradient() for name in PARAMETER_NAMES}
-        info, self._info = self._info, None
+        Raises:
+            InputError: there is one of this member already.
+        """
+        if name in self._gradients:
+            waiting = [other for other in PARAMETER_NAMES if other not in self._gradients]
+            raise InputError(
+                f"the optimizer of '{name}' was stepped twice: expected, as one update is shared by all, "
+                f"a step of {', '.join(waiting)} in between"
+            )
+        self._gradients[name] = gradient
+        if len(self._gradients) == len(PARAMETER_NAMES):
+            self._update()
+
+    def _update(self) -> None:
+        members, gradients, info = self.members, self._gradients, self._info
+        self._gradients, self._info = {}, None
         if all(gradient is None for gradient in gradients.values()):
             return
         gaussians = host_gaussians({name: members[name].parameter for name in PARAMETER_NAMES})
@@ -138,7 +139,7 @@ class SharedOptimizer:
         rates = ParameterRates(**{name: float(group["lr"]) for name, group in groups.items()})
         (beta1, beta2), eps = groups["means"]["betas"], groups["means"]["eps"]
         check_moments_config(beta1, beta2, eps)
-        self.optimizer.learning_rates = _FixedRates(rates)
+        self.optimizer.learning_rates = SimpleNamespace(at=lambda step: rates)  # hosts' schedulers have set them
         self.optimizer.beta1, self.optimizer.beta2, self.optimizer.eps = beta1, beta2, eps
 
     def _pack(self, gaussians: Gaussians) -> GaussianMoments:
@@ -147,25 +148,25 @@ class SharedOptimizer:
         if self.skipped is None:
             self.skipped = packed.skipped
         packed.skipped = self.skipped
-        for name, member in self.members.items():
-            state = member.checked_state()
-            for moment in MOMENTS:
-                if name == "shN":
-                    getattr(packed, f"{moment}_shN").copy_(state[moment].flatten(1))
-                else:
-                    getattr(packed, moment)[:, COLUMNS[name]] = state[moment].reshape(len(packed), -1)
+        for place, moment in self._moments(packed):
+            place.copy_(moment.reshape(place.shape))
         packed.steps.fill_(int(self.members["means"].checked_state()[COUNT]))
         return packed
 
     def _unpack(self, packed: GaussianMoments) -> None:
+        for place, moment in self._moments(packed):
+            moment.copy_(place.reshape(moment.shape))
+        self.members["means"].checked_state()[COUNT] += 1
+
+    def _moments(self, packed: GaussianMoments) -> Iterator[tuple[Tensor, Tensor]]:
+        """Each moment of each parameter: its place in the packed form, and the member's own tensor."""
         for name, member in self.members.items():
             state = member.checked_state()
             for moment in MOMENTS:
-                source = (
-                    getattr(packed, f"{moment}_shN") if name == "shN" else getattr(packed, moment)[:, COLUMNS[name]]
-                )
-                state[moment].copy_(source.reshape(state[moment].shape))
-        self.members["means"].checked_state()[COUNT] += 1
+                if name == "shN":
+                    yield getattr(packed, f"{moment}_shN"), state[moment]
+                else:
+                    yield getattr(packed, moment)[:, COLUMNS[name]], state[moment]
 
     def _shares(self, gaussians: Gaussians, info: dict[str, Any] | None) -> Tensor:
         """[1, N] the Gaussians' share of the loss, zero where nothing is known of it."""
@@ -196,8 +197,6 @@ class MemberOptimizer(torch.optim.Optimizer):
         require(len(self.param_groups[0]["params"]) == 1, "params", self.param_groups[0]["params"], "one tensor")
         self.shared = shared
         self.name: str = groups[0]["name"]
-        self.is_stepped = False
-        self._gradient: Tensor | None = None
 
     @property
     def parameter(self) -> torch.nn.Parameter:
@@ -223,23 +222,11 @@ class MemberOptimizer(torch.optim.Optimizer):
         if closure is not None:
             with torch.enable_grad():
                 loss = closure()
-        if self.is_stepped:
-            raise InputError(
-                f"the optimizer of '{self.name}' was stepped twice: expected, as one update is shared by all, "
-                f"a step of {', '.join(self.shared.waiting())} in between"
-            )
         gradient, self.parameter.grad = self.parameter.grad, None
         if gradient is not None and gradient.is_sparse:
             raise InputError(f"the gradient of '{self.name}' is sparse: expected a dense one (sparse_grad=False)")
-        self._gradient, self.is_stepped = gradient, True
-        if not self.shared.waiting():
-            self.shared.update()
+        self.shared.hand_over(self.name, gradient)
         return loss
-
-    def take_gradient(self) -> Tensor | None:
-        """The gradient handed over; a new iteration begins."""
-        gradient, self._gradient, self.is_stepped = self._gradient, None, False
-        return gradient
 
     def checked_state(self) -> dict[str, Tensor]:
         """The state of the parameter, zeros at first.
@@ -259,16 +246,6 @@ class MemberOptimizer(torch.optim.Optimizer):
                     f"expected {tuple(parameter.shape)}: rows were added or removed without the optimizer"
                 )
         return state
-
-
-class _FixedRates:
-    """Learning rates that hosts' schedulers have set for this step."""
-
-    def __init__(self, rates: ParameterRates) -> None:
-        self.rates = rates
-
-    def at(self, step: Step) -> ParameterRates:
-        return self.rates
 
 
 def _one_row(gradients: dict[str, Tensor], shares: Tensor) -> GaussianGradients:

@@ -16,15 +16,7 @@ from turbogs_plugin.engine.rendered import RasterSettings
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.gsplat_bridge.gaussian_errors import residuals
 from turbogs_plugin.gsplat_bridge.host import GROUND_TRUTH, LOSS_SHARES, PREDICTION, STATISTICS
-from turbogs_plugin.types import (
-    SH_C0,
-    TILE_SIZE,
-    Cameras,
-    Gaussians,
-    GaussianStats,
-    LossOutput,
-    PixelSamples,
-)
+from turbogs_plugin.types import SH_C0, TILE_SIZE, Cameras, Gaussians, GaussianStats, LossOutput, PixelSamples
 
 LOGIT_MARGIN = 2.0**-23
 """Opacities are kept this far from 0 and 1, where the logit is infinite. An alpha is cut at 0.999 in any case."""
@@ -32,24 +24,10 @@ LOGIT_MARGIN = 2.0**-23
 RENDER_MODES = ("RGB", "ED", "RGB+ED")
 """Those of gsplat's that there are here: colours, expected depth, or both."""
 
-_ONLY = {
-    "packed": False,
-    "sparse_grad": False,
-    "radius_clip": 0.0,
-    "tile_size": TILE_SIZE,
-    "rasterize_mode": "classic",
-    "camera_model": "pinhole",
-    "distributed": False,
-    "segmented": False,
-    "with_ut": False,
-    "with_eval3d": False,
-    "covars": None,
-    "ftheta_coeffs": None,
-    "radial_coeffs": None,
-    "tangential_coeffs": None,
-    "thin_prism_coeffs": None,
-    "viewmats_rs": None,
-}
+_ONLY = {"radius_clip": 0.0, "tile_size": TILE_SIZE, "rasterize_mode": "classic", "camera_model": "pinhole"}
+_ONLY |= dict.fromkeys(("packed", "sparse_grad", "distributed", "segmented", "with_ut", "with_eval3d"), False)
+_ONLY |= dict.fromkeys(("covars", "ftheta_coeffs", "radial_coeffs", "tangential_coeffs", "thin_prism_coeffs"))
+_ONLY |= {"viewmats_rs": None}
 """Options of gsplat's `rasterization` that hosts pass, and the one value of each that there is here."""
 
 
@@ -111,12 +89,6 @@ def sparse_rasterization(
     given |= {"viewmats": viewmats, "Ks": Ks} | ({} if backgrounds is None else {"backgrounds": backgrounds})
     _check_tensors(given)
     _check_shapes(given, sh_degree)
-    for name in ("viewmats", "Ks"):
-        if given[name].requires_grad and torch.is_grad_enabled():
-            raise InputError(
-                f"{name} requires a gradient, and cameras get none from sparse_rasterization: pass {name}.detach(), or "
-                "optimise the cameras with gsplat's rasterization"
-            )
     _check_samples(samples)
     sizes = {(int(w), int(h)) for w, h in samples.sizes}
     if sizes != {(width, height)} or len(samples.view_ids) != len(viewmats):
@@ -126,17 +98,11 @@ def sparse_rasterization(
         )
     if sh_degree is None:
         colors, sh_degree = ((colors - 0.5) / SH_C0)[:, None], 0
-    parameters = {
-        "means": means,
-        "quats": quats,
-        "scales": scales.clamp(min=torch.finfo(scales.dtype).tiny).log(),
-        "opacities": opacities.clamp(LOGIT_MARGIN, 1.0 - LOGIT_MARGIN).logit(),
-        "sh0": colors[:, :1],
-        "shN": colors[:, 1:],
-    }
+    scales = scales.clamp(min=torch.finfo(scales.dtype).tiny).log()
+    opacities = opacities.clamp(LOGIT_MARGIN, 1.0 - LOGIT_MARGIN).logit()
     observer = _InfoObserver(samples)
     render = rasterize_differentiable(
-        Gaussians(**parameters),
+        Gaussians(means, quats, scales, opacities, sh0=colors[:, :1], shN=colors[:, 1:]),
         Cameras(viewmats, Ks, samples.sizes),
         samples,
         sh_degree=sh_degree,
@@ -195,34 +161,24 @@ def sparse_loss(
         if not isinstance(value, Tensor) or not value.is_floating_point() or value.shape != (len(samples), 3):
             found = f"{value.dtype} {tuple(value.shape)}" if isinstance(value, Tensor) else type(value).__name__
             raise InputError(f"{name} is {found}: expected floating point {(len(samples), 3)}, as there are samples")
-    if isinstance(loss, type):
-        raise _not_a_loss(loss)
-    try:
-        output = loss(colors.detach(), targets.detach(), samples)
-    except TypeError:
-        if _takes_three(loss):
-            raise
-        raise _not_a_loss(loss) from None
+    output = loss(colors.detach(), targets.detach(), samples) if _takes_three(loss) else None
     if not isinstance(output, LossOutput):
-        raise _not_a_loss(loss)
+        name = getattr(loss, "__name__", type(loss).__name__)
+        found = f"the class {name}" if isinstance(loss, type) else name
+        raise InputError(
+            f"loss is {found}: expected an instance of a loss on samples, as CharbonnierNccLoss() is, which is called "
+            "with (colors, targets, samples) and gives a LossOutput"
+        )
     return _Loss.apply(colors, output)
 
 
 def _takes_three(loss: Any) -> bool:
-    """Whether it can be called with colours, targets and samples."""
+    """Whether it is no class, and can be called with colours, targets and samples."""
     try:
         inspect.signature(loss.forward if isinstance(loss, torch.nn.Module) else loss).bind(None, None, None)
-    except (TypeError, ValueError):  # of other arguments, or none that can be told; not callable
+    except (TypeError, ValueError):  # not callable, of other arguments, or one that does not tell
         return False
-    return True
-
-
-def _not_a_loss(loss: Any) -> InputError:
-    name = f"the class {loss.__name__}" if isinstance(loss, type) else getattr(loss, "__name__", type(loss).__name__)
-    return InputError(
-        f"loss is {name}: expected an instance of a loss on samples, as CharbonnierNccLoss() is, which is called with "
-        "(colors, targets, samples) and gives a LossOutput"
-    )
+    return not isinstance(loss, type)
 
 
 class _Loss(torch.autograd.Function):
@@ -252,8 +208,17 @@ class _InfoObserver:
 
     def pixel_errors(self) -> Tensor | None:
         info = self.info()
-        errors = None if info is None else _sample_errors(info, self.samples)
+        errors = None if info is None else residuals(info)
         self.has_errors = errors is not None
+        if errors is None:
+            return None
+        if errors.dim() == 3:
+            errors = gather_pixels(errors[..., None], self.samples)[:, 0]
+        if errors.shape != (len(self.samples),):
+            raise InputError(
+                f"info['{PREDICTION}'] and info['{GROUND_TRUTH}'] are of shape {(*errors.shape, 3)}: expected "
+                f"{(len(self.samples), 3)}, as there are samples, or [C, H, W, 3]"
+            )
         return errors
 
     def passed(self, stats: GaussianStats, view_losses: Tensor) -> None:
@@ -262,39 +227,13 @@ class _InfoObserver:
             info[STATISTICS], info[LOSS_SHARES] = stats, view_losses
 
 
-def _sample_errors(info: dict[str, Any], samples: PixelSamples) -> Tensor | None:
-    """[P] L1 norms of the residuals at the samples, or None where `info` has no prediction and ground truth."""
-    errors = residuals(info)
-    if errors is not None and errors.dim() == 3:
-        errors = gather_pixels(errors[..., None], samples)[:, 0]
-    if errors is not None and errors.shape != (len(samples),):
-        raise InputError(
-            f"info['{PREDICTION}'] and info['{GROUND_TRUTH}'] are of shape {(*errors.shape, 3)}: expected "
-            f"{(len(samples), 3)}, as there are samples, or [C, H, W, 3]"
-        )
-    return errors
-
-
 def _info(render: DifferentiableRender, cameras: int, width: int, height: int) -> _Info:
-    projected = render.projected
     absent = ("batch_ids", "camera_ids", "gaussian_ids", "tiles_per_gauss", "isect_ids", "flatten_ids", "isect_offsets")
-    return _Info(
-        {
-            **dict.fromkeys(absent),
-            "means2d": render.means2d,  # a leaf: `retain_grad` of it is allowed and needless
-            "radii": projected.radii,
-            "depths": projected.depths,
-            "conics": projected.conics,
-            "opacities": projected.opacities,
-            "width": width,
-            "height": height,
-            "tile_size": TILE_SIZE,
-            "tile_width": -(-width // TILE_SIZE),
-            "tile_height": -(-height // TILE_SIZE),
-            "n_batches": 1,
-            "n_cameras": cameras,
-        }
-    )
+    shown = {name: getattr(render.projected, name) for name in ("radii", "depths", "conics", "opacities")}
+    sizes = {"width": width, "height": height, "n_batches": 1, "n_cameras": cameras}
+    tiles = {"tile_size": TILE_SIZE, "tile_width": -(-width // TILE_SIZE), "tile_height": -(-height // TILE_SIZE)}
+    # means2d is a leaf: `retain_grad` of it is allowed and needless.
+    return _Info(means2d=render.means2d, **shown, **sizes, **tiles, **dict.fromkeys(absent))
 
 
 def _check_samples(samples: Any) -> None:
@@ -312,36 +251,32 @@ def _check_options(options: dict[str, Any]) -> None:
 
 
 def _check_tensors(given: dict[str, Any]) -> None:
-    """All are tensors of the means' floating point type, on the means' device."""
+    """All are tensors of the means' floating point type, on the means' device; cameras want no gradient."""
+    means = given["means"]
     for name, value in given.items():
         if not isinstance(value, Tensor):
             raise InputError(f"{name} is a {type(value).__name__}: expected a tensor")
         if not value.is_floating_point():
             raise InputError(f"{name} is of {value.dtype}: expected floating point")
-        means = given["means"]
         if (value.dtype, value.device) != (means.dtype, means.device):
             raise InputError(
                 f"{name} is of {value.dtype} on {value.device}: expected {means.dtype} on {means.device} as means"
             )
+        if name in ("viewmats", "Ks") and value.requires_grad and torch.is_grad_enabled():
+            raise InputError(
+                f"{name} requires a gradient, and cameras get none from sparse_rasterization: pass {name}.detach(), or "
+                "optimise the cameras with gsplat's rasterization"
+            )
 
 
 def _check_shapes(given: dict[str, Tensor], sh_degree: int | None) -> None:
-    means, viewmats, colors = given["means"], given["viewmats"], given["colors"]
-    count, cameras = len(means), len(viewmats)
-    expected = {
-        "means": (count, 3),
-        "quats": (count, 4),
-        "scales": (count, 3),
-        "opacities": (count,),
-        "viewmats": (cameras, 4, 4),
-        "Ks": (cameras, 3, 3),
-        "colors": (count, 3) if sh_degree is None else (count, *colors.shape[1:2], 3),
-        "backgrounds": (cameras, 3),
-    }
+    colors, count, cameras = given["colors"], len(given["means"]), len(given["viewmats"])
+    expected = {"means": (count, 3), "quats": (count, 4), "scales": (count, 3), "opacities": (count,)}
+    expected["colors"] = (count, 3) if sh_degree is None else (count, *colors.shape[1:2], 3)
+    expected |= {"viewmats": (cameras, 4, 4), "Ks": (cameras, 3, 3), "backgrounds": (cameras, 3)}
     for name, value in given.items():
-        shape = expected[name]
-        if tuple(value.shape) != shape:
-            form = "[N, 3] without sh_degree" if name == "colors" and sh_degree is None else str(list(shape))
+        if tuple(value.shape) != expected[name]:
+            form = "[N, 3] without sh_degree" if name == "colors" and sh_degree is None else list(expected[name])
             raise InputError(f"{name} has shape {tuple(value.shape)}: expected {form} (N = {count}, C = {cameras})")
     if sh_degree is None:
         return

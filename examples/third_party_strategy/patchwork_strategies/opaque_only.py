@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import torch
+from turbogs_plugin.strategies.protocols import DensityController
 
 from turbogs_plugin.errors import require
-from turbogs_plugin.types import Gaussians, GaussianStats, RowUpdate, Step
+from turbogs_plugin.types import Gaussians, RowUpdate, Step
 
 
 @dataclass
-class OpaqueOnlyDensity:
+class OpaqueOnlyDensity(DensityController):
     """Nothing is added; every `every` iterations, Gaussians of less opacity than `least_opacity` are removed.
+
+    It keeps nothing by Gaussian, so `update` is all that it needs.
 
     Args:
         every: iterations between two prunings.
@@ -27,13 +29,6 @@ class OpaqueOnlyDensity:
         require(self.every >= 1, "every", self.every, "at least 1")
         require(0 <= self.least_opacity < 1, "least_opacity", self.least_opacity, "at least 0 and less than 1")
 
-    @property
-    def stats(self) -> GaussianStats | None:
-        return None
-
-    def setup(self, gaussians: Gaussians) -> None:
-        pass
-
     def update(self, gaussians: Gaussians, step: Step) -> RowUpdate | None:
         if step.iteration == 0 or step.iteration % self.every != 0:
             return None
@@ -42,12 +37,3 @@ class OpaqueOnlyDensity:
             return None
         fresh = torch.zeros_like(kept, dtype=torch.bool)
         return RowUpdate(kept, fresh, {}, num_pruned=len(gaussians) - len(kept))
-
-    def apply(self, update: RowUpdate) -> None:
-        pass  # it keeps nothing by Gaussian
-
-    def state_dict(self) -> dict[str, Any]:
-        return {}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        pass

@@ -1,0 +1,53 @@
+"""Checks of strategies' settings, and settings that one strategy has in common with another."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import fields
+from typing import Any, Literal, get_args, get_origin, get_type_hints
+
+from turbogs_plugin.errors import require, require_not_negative
+
+
+def require_settings(instance: Any) -> None:
+    """Raise `InputError` unless a dataclass's settings are what all settings of strategies have to be.
+
+    A field of a `Literal` type has one of its values; a number is finite and >= 0. Call it after stricter checks.
+    """
+    hints = get_type_hints(type(instance))
+    for name in [field.name for field in fields(instance) if field.init]:
+        value = getattr(instance, name)
+        if get_origin(hints[name]) is Literal:
+            allowed = get_args(hints[name])
+            require(value in allowed, name, value, f"one of {', '.join(allowed)}")
+        elif isinstance(value, int | float):
+            require_not_negative(instance, name)
+
+
+def require_each(instance: Any, valid: Callable[[Any], bool], allowed: str, *names: str) -> None:
+    """Raise `InputError` unless each of these attributes is `valid`; `allowed` says in words what is."""
+    for name in names:
+        value = getattr(instance, name)
+        require(valid(value), name, value, allowed)
+
+
+def require_at_least_one(instance: Any, *names: str) -> None:
+    """Raise `InputError` unless each of these attributes is 1 or more."""
+    require_each(instance, lambda value: value >= 1, "at least 1", *names)
+
+
+def require_positive(instance: Any, *names: str) -> None:
+    """Raise `InputError` unless each of these attributes is a finite number above 0."""
+    require_each(instance, lambda value: 0 < value < math.inf, "a finite number above 0", *names)
+
+
+def require_share(instance: Any, *names: str) -> None:
+    """Raise `InputError` unless each of these attributes is above 0 and at most 1."""
+    require_each(instance, lambda value: 0 < value <= 1, "more than 0 and at most 1", *names)
+
+
+def shared_settings(instance: Any, other: type) -> dict[str, Any]:
+    """Values of the init fields of a dataclass that the dataclass `other` has by the same names."""
+    theirs = {field.name for field in fields(other) if field.init}
+    return {field.name: getattr(instance, field.name) for field in fields(instance) if field.name in theirs}
