@@ -164,7 +164,8 @@ def test_a_cell_of_other_settings_is_not_mixed_in(turbogs, small, capture, study
 def test_a_cell_that_cannot_be_used_is_named_by_its_file(small, tmp_path, changes, words):
     folder = StudyFolder(tmp_path / "study")
     folder.write_ablation(load_ablation(str(small)))
-    folder.write(CellResult("fox", "full", 0, {}, [Evaluation(4, 1.0, 30.0, 0.8, 0.1, 100, 2**20)]))
+    history = [Evaluation(4, 1.0, 30.0, 0.8, 0.1, 100, 2**20)]
+    folder.write(CellResult(scene="fox", variant="full", seed=0, config={}, history=history))
     path = folder.cells / "fox" / "full--seed0.json"
     document = json.loads(path.read_text())
     document["cells"][0] |= changes

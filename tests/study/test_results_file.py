@@ -30,9 +30,9 @@ def result(variant: str, seed: int, scene: str = "fox", **changes) -> CellResult
         Evaluation(0, 0.1, 9.5, math.nan, 0.2, 50, 2**20),
         Evaluation(26, 2.5, 30.125 + seed, 0.9, 0.02, 90, 2**21),
     ]
-    made = CellResult(scene, variant, seed, config.to_mapping(), history, asked={"maps": {"beta": 0.25}})
     known = {"fps": 100.5, "peak_bytes": 2**21, "warmup_iterations": 20, "provenance": HERE, "capture": "c0ffee"}
-    return replace(made, **(known | changes))
+    known |= {"config": config.to_mapping(), "asked": {"maps": {"beta": 0.25}}, "history": history}
+    return CellResult(scene=scene, variant=variant, seed=seed, **(known | changes))
 
 
 def study() -> Study:

@@ -17,15 +17,41 @@ from turbogs_plugin.report.provenance import Provenance
 from turbogs_plugin.scene import PosedImages, Scene
 from turbogs_plugin.scene.offload import place_views
 from turbogs_plugin.study.results import CellResult
-from turbogs_plugin.study.timing import PeakMemory
 from turbogs_plugin.train.evaluate import evaluate, load_lpips
 from turbogs_plugin.train.evaluations import Evaluations
+from turbogs_plugin.train.history import Evaluation
 from turbogs_plugin.train.loop import Listener, TrainingLoop
 from turbogs_plugin.train.run import new_loop, plan_scene
 from turbogs_plugin.train.trainer import Trainer
 
 WARMUP_ITERATIONS = {"cuda": 20, "cpu": 2}
 """Of the same configuration scaled to this length: every kind of step loads its code before the clock starts."""
+
+
+class PeakMemory(Listener):
+    """Peak of the GPU's tensors while training, without what evaluations need; nothing on a CPU.
+
+    One process trains all cells, so a CPU's peak, which is the process's, would be that of the largest cell so far.
+
+    Attributes:
+        peak: bytes; None on a CPU.
+    """
+
+    def __init__(self, device: torch.device) -> None:
+        self.device = device
+        self.peak: int | None = None
+        self._begin()
+
+    def evaluating(self, loop: TrainingLoop) -> None:
+        if self.device.type == "cuda":
+            self.peak = max(self.peak or 0, torch.cuda.max_memory_allocated(self.device))
+
+    def evaluated(self, loop: TrainingLoop, evaluation: Evaluation) -> None:
+        self._begin()
+
+    def _begin(self) -> None:
+        if self.device.type == "cuda":
+            torch.cuda.reset_peak_memory_stats(self.device)
 
 
 def capture_digest(scene: Scene) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import re
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +26,7 @@ def study_of_runs(paths: Sequence[Path]) -> Study:
     Raises:
         InputError: no run there, one without an evaluation, or the same run twice.
     """
-    variants: list[tuple[dict[str, Any], str]] = []  # what was asked for without the seed and the place, and its name
+    variants: dict[str, dict[str, Any]] = {}  # name -> what was asked for without the seed and the place
     results: list[CellResult] = []
     folders = [RunFolder(path) for path in paths]
     configs = [folder.read_config() for folder in folders]
@@ -35,23 +35,28 @@ def study_of_runs(paths: Sequence[Path]) -> Study:
         history = read_history(folder.history)
         if not history:
             raise InputError(f"'{path}' has no evaluation yet")
-        resolved, asked = config.to_mapping(), folder.read_asked().to_mapping()
+        asked = folder.read_asked().to_mapping()
         shared = _shared(asked, config.train.device)
-        name = next((name for known, name in variants if known == shared), None)
-        if name is None:
-            name = _new_name(path, {taken for _, taken in variants})
-            variants.append((shared, name))
-        result = CellResult(scene, name, config.train.seed, resolved, history, asked)
+        name = next((name for name, known in variants.items() if known == shared), None) or _new_name(path, variants)
+        variants[name] = shared
+        result = CellResult(
+            scene=scene,
+            variant=name,
+            seed=config.train.seed,
+            lpips_reason="a run's history does not record it; see the runs' own reports",
+            config=config.to_mapping(),
+            asked=asked,
+            peak_bytes=history[-1].memory_bytes,  # a CPU run records the peak of its process, which is its own
+            history=history,
+        )
         if any(other.key == result.key for other in results):
             raise InputError(f"'{path}' is the same run as another one: {result.key}")
-        # A CPU run records the peak of its process, which is its own.
-        result.peak_bytes = history[-1].memory_bytes
-        result.lpips_reason = "a run's history does not record it; see the runs' own reports"
         results.append(result)
+    base = next(iter(variants))
     ablation = Ablation(
         title=f"Comparison of {len(paths)} runs",
-        variants={name: _overrides(variants[0][0], shared) for shared, name in variants},
-        base=str(variants[0][1]),
+        variants={name: _overrides(variants[base], shared) for name, shared in variants.items()},
+        base=base,
     )
     return Study(ablation, results)
 
@@ -85,12 +90,11 @@ def _shared(asked: dict[str, Any], device: str) -> dict[str, Any]:
     return sections
 
 
-def _new_name(path: Path, taken: set[str]) -> str:
+def _new_name(path: Path, taken: Container[str]) -> str:
     """The folder's name, made fit for a variant and unique."""
     name = re.sub(r"[^A-Za-z0-9_+.-]", "-", path.resolve().name)[:40].lstrip("._-") or "run"
-    if name not in taken:
-        return name
-    return next(f"{name}-{number}" for number in range(2, len(taken) + 3) if f"{name}-{number}" not in taken)
+    names = (name if number == 1 else f"{name}-{number}" for number in itertools.count(1))
+    return next(name for name in names if name not in taken)
 
 
 def _overrides(base: dict[str, Any], other: dict[str, Any]) -> list[str]:
