@@ -168,7 +168,7 @@ def test_a_cell_that_is_not_in_the_results_yet_is_not_lost(folder):
 
 
 def test_a_failure_is_known_until_its_cell_is_there(folder):
-    folder.write_failure(Failure(CellKey("h", "base", 1), "no luck"))
+    folder.write(Failure(CellKey("h", "base", 1), "no luck"))
     assert [failure.reason for failure in folder.read_study().failures] == ["it broke", "no luck"]
     folder.write(result("base", 1, "h"))
     assert [failure.reason for failure in folder.read_study().failures] == ["it broke"]

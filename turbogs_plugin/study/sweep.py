@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import gc
 import itertools
 import json
 import traceback
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,7 @@ import torch
 
 from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.config.old_spellings import old_spelling
-from turbogs_plugin.device import synchronize
+from turbogs_plugin.device import free_device_memory, synchronize
 from turbogs_plugin.errors import InputError, TrainingStopped
 from turbogs_plugin.report.provenance import COMMIT_VARIABLE, MODIFIED, Provenance
 from turbogs_plugin.scene import Scene, load_scene
@@ -23,7 +22,7 @@ from turbogs_plugin.study.cell import capture_digest, train_cell
 from turbogs_plugin.study.folder import StudyFolder
 from turbogs_plugin.study.grid import Ablation, CellKey, variant_config
 from turbogs_plugin.study.progress import SweepProgress
-from turbogs_plugin.study.results import CellResult, Failure
+from turbogs_plugin.study.results import CellResult, Failure, Study
 from turbogs_plugin.train.run import resolve_device
 
 UNCOMPARED = (("scene", "path"), ("train", "device"))
@@ -84,7 +83,8 @@ def run_sweep(
         TrainingStopped: the GPU can no longer be used by this process.
     """
     folder.require_usable()
-    finished = folder.read_results()
+    study = folder.read_study() if folder.file.is_file() else Study(ablation, [])
+    finished = {result.key: result for result in study.results}
     for result in finished.values():
         if result.variant not in ablation.variants:
             raise InputError(f"'{folder.path}' has a cell of another ablation ({result.key}): choose a new --out")
@@ -111,17 +111,27 @@ def run_sweep(
                 taken.append(replace(known, variant=key.variant))
             else:
                 grid[name].append((key, config))
-        _require_capture(finished.values(), name, capture)
+        for key, result in finished.items():
+            if key.scene == name and result.capture not in ("", capture):
+                raise InputError(
+                    f"the cell '{key}' has other photos or cameras than '{name}' has now: choose a new --out"
+                )
         if grid[name]:
             loaded[name] = scene
         del scene  # photos take room
-    folder.write_ablation(ablation)
+    folder.write_study(replace(study, ablation=ablation))
     for result in taken:
         folder.write(result)
     with SweepProgress(sum(map(len, grid.values())), kept + len(taken)) as progress:
         for name, cells in grid.items():
-            if cells:
-                _train_scene(cells, loaded.pop(name), device, here, folder, progress)
+            scene = loaded.pop(name, None)
+            for key, config in cells:
+                progress.begin(key)
+                outcome = _train(key, config, scene, device, here, progress)
+                folder.write(outcome)
+                progress.ended(outcome)
+                if isinstance(outcome, Failure):
+                    _require_working(device)
 
 
 def _scene_configs(
@@ -139,36 +149,14 @@ def _scene_configs(
     return configs
 
 
-def _train_scene(
-    cells: list[tuple[CellKey, Config]],
-    scene: Scene,
-    device: torch.device,
-    here: Provenance,
-    folder: StudyFolder,
-    progress: SweepProgress,
-) -> None:
-    for key, config in cells:
-        progress.begin(key)
-        try:
-            result = train_cell(key.variant, config, scene, device, here, [progress])
-        except Exception as error:  # whatever a variant breaks by, the other cells go on
-            failure = Failure(key, _reason(error))
-            folder.write_failure(failure)
-            progress.failed(failure)
-            # Its traceback holds the broken model.
-            del error
-            _require_working(device)
-        else:
-            folder.write(result)
-            progress.finished(result)
-
-
-def _require_capture(results: Iterable[CellResult], scene: str, capture: str) -> None:
-    for result in results:
-        if result.scene == scene and result.capture not in ("", capture):
-            raise InputError(
-                f"the cell '{result.key}' has other photos or cameras than '{scene}' has now: choose a new --out"
-            )
+def _train(
+    key: CellKey, config: Config, scene: Scene, device: torch.device, here: Provenance, progress: SweepProgress
+) -> CellResult | Failure:
+    """Whatever a variant breaks by, the other cells go on."""
+    try:
+        return train_cell(key.variant, config, scene, device, here, [progress])
+    except Exception as error:
+        return Failure(key, _reason(error))
 
 
 def _require_same(present: CellResult, config: Config) -> None:
@@ -220,12 +208,10 @@ def _reason(error: Exception) -> str:
 
 
 def _require_working(device: torch.device) -> None:
-    """After a failure: free its memory, and see whether the GPU still answers this process."""
-    gc.collect()
+    """After a failure: see whether the GPU still answers this process, and free the broken model's memory."""
     try:
         synchronize(device)
     except RuntimeError as error:
         reason = str(error).splitlines()[0]
         raise TrainingStopped(f"the GPU no longer answers this process ({reason}): the same command goes on") from None
-    if device.type == "cuda":
-        torch.cuda.empty_cache()
+    free_device_memory(device)
