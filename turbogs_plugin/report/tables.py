@@ -16,6 +16,6 @@ def table(header: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
     return "\n".join(f"| {' | '.join(str(cell) for cell in line)} |" for line in lines)
 
 
-def number(value: float, digits: int) -> str:
-    """A number for a table; "not computed" for NaN."""
-    return "not computed" if math.isnan(value) else f"{value:.{digits}f}"
+def number(value: float, digits: int, absent: str = "not computed") -> str:
+    """A number for a table, with so many digits behind the point; `absent` for NaN."""
+    return absent if math.isnan(value) else f"{value:.{digits}f}"

@@ -26,10 +26,10 @@ class Spread:
     count: int
 
     @classmethod
-    def of(cls, values: Iterable[float]) -> Spread:
-        """NaN in any value makes all NaN: a mean over some of the seeds would be compared with means over all."""
+    def of(cls, values: Iterable[float | None]) -> Spread:
+        """NaN or None in any makes all NaN: a mean over some seeds would be compared with means over all."""
         values = list(values)
-        if not values or any(math.isnan(value) for value in values):
+        if not values or any(value is None or math.isnan(value) for value in values):
             return cls(math.nan, math.nan, math.nan, len(values))
         return cls(math.fsum(values) / len(values), min(values), max(values), len(values))
 
