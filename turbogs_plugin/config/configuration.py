@@ -10,8 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
-from importlib import resources
-from pathlib import Path
 from typing import Any
 
 from omegaconf import OmegaConf
@@ -21,9 +19,12 @@ from turbogs_plugin.config.auto import AUTO, AUTO_SETTINGS, concrete, undecided
 from turbogs_plugin.config.old_spellings import old_spelling
 from turbogs_plugin.config.schema import build_dataclass, dataclass_mapping, nearest
 from turbogs_plugin.config.sections import BudgetConfig, MapsConfig, ReportConfig, SceneConfig, TrainConfig
-from turbogs_plugin.config.yaml_text import parse_yaml, read_yaml
+from turbogs_plugin.config.yaml_text import packaged_names, parse_yaml, read_named_yaml
 from turbogs_plugin.engine.rendered import RasterSettings
 from turbogs_plugin.errors import InputError
+
+PACKAGE = "turbogs_plugin.configs"
+"""Where the packaged configurations are."""
 
 DEFAULT_CONFIG = "turbogs"
 """The packaged configuration that a run without ``--config`` takes."""
@@ -102,8 +103,7 @@ SECTION_CLASSES = {
 
 def config_names() -> list[str]:
     """Names of the configurations that come with TurboGS."""
-    folder = resources.files("turbogs_plugin.configs")
-    return sorted(entry.name[: -len(".yaml")] for entry in folder.iterdir() if entry.name.endswith(".yaml"))
+    return packaged_names(PACKAGE)
 
 
 def load_config(name_or_file: str = DEFAULT_CONFIG, overrides: Sequence[str] = ()) -> Config:
@@ -191,13 +191,7 @@ def apply_overrides(mapping: Mapping[str, Any], overrides: Sequence[str]) -> dic
 def _load_mapping(name_or_file: str, depth: int = 0) -> dict[str, Any]:
     if depth > BASE_DEPTH_LIMIT:
         raise InputError(f"config '{name_or_file}': its bases form a circle")
-    if name_or_file in config_names():
-        text = (resources.files("turbogs_plugin.configs") / f"{name_or_file}.yaml").read_text(encoding="utf-8")
-        mapping = parse_yaml(text, name_or_file)
-    elif Path(name_or_file).suffix in (".yaml", ".yml") or Path(name_or_file).is_file():
-        mapping = read_yaml(Path(name_or_file))
-    else:
-        raise InputError(f"unknown config '{name_or_file}': {nearest(name_or_file, config_names())}, or a .yaml file")
+    mapping = read_named_yaml(name_or_file, PACKAGE, "config")
     base = mapping.pop("base", None)
     if base is None:
         return mapping

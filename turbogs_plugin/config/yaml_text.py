@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,7 @@ import yaml
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from turbogs_plugin.config.schema import nearest
 from turbogs_plugin.errors import InputError
 
 SIZE_LIMIT = 64 * 1024
@@ -35,6 +37,30 @@ def read_yaml(path: Path) -> dict[str, Any]:
         return parse_yaml(data.decode("utf-8"), str(path))
     except UnicodeDecodeError:
         raise InputError(f"config '{path}' is not UTF-8 text") from None
+
+
+def packaged_names(package: str) -> list[str]:
+    """Names of the YAML files that come with TurboGS in a package."""
+    files = [Path(entry.name) for entry in resources.files(package).iterdir()]
+    return sorted(file.stem for file in files if file.suffix == ".yaml")
+
+
+def read_named_yaml(name_or_file: str, package: str, what: str) -> dict[str, Any]:
+    """The mapping of a name in `packaged_names`, or else of a YAML file.
+
+    Args:
+        package: where the names are.
+        what: the file holds, for the message.
+
+    Raises:
+        InputError: neither such a name nor a file, or refused by `read_yaml`.
+    """
+    names = packaged_names(package)
+    if name_or_file in names:
+        return parse_yaml((resources.files(package) / f"{name_or_file}.yaml").read_text(encoding="utf-8"), name_or_file)
+    if Path(name_or_file).suffix in (".yaml", ".yml") or Path(name_or_file).is_file():
+        return read_yaml(Path(name_or_file))
+    raise InputError(f"unknown {what} '{name_or_file}': {nearest(name_or_file, names)}, or a .yaml file")
 
 
 def parse_yaml(text: str, where: str) -> dict[str, Any]:

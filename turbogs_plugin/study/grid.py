@@ -16,16 +16,17 @@ import json
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from importlib import resources
 from pathlib import Path
-from typing import Any
 
 from turbogs_plugin.config.auto import AUTO
 from turbogs_plugin.config.configuration import Config, load_config
 from turbogs_plugin.config.scaling import with_iterations
 from turbogs_plugin.config.schema import build_dataclass, nearest
-from turbogs_plugin.config.yaml_text import parse_yaml, read_yaml
+from turbogs_plugin.config.yaml_text import packaged_names, read_named_yaml
 from turbogs_plugin.errors import InputError
+
+PACKAGE = "turbogs_plugin.configs.ablations"
+"""Where the packaged ablations are."""
 
 _NAME = re.compile(r"[A-Za-z0-9+][A-Za-z0-9_+.-]{0,47}")
 
@@ -89,8 +90,7 @@ class CellKey:
 
 def ablation_names() -> list[str]:
     """Names of the ablations that come with TurboGS."""
-    folder = resources.files("turbogs_plugin.configs.ablations")
-    return sorted(entry.name[: -len(".yaml")] for entry in folder.iterdir() if entry.name.endswith(".yaml"))
+    return packaged_names(PACKAGE)
 
 
 def load_ablation(name_or_file: str) -> Ablation:
@@ -99,16 +99,7 @@ def load_ablation(name_or_file: str) -> Ablation:
     Raises:
         InputError: an unknown name, an unreadable file, or one that is not an ablation.
     """
-    if name_or_file in ablation_names():
-        folder = resources.files("turbogs_plugin.configs.ablations")
-        text = (folder / f"{name_or_file}.yaml").read_text(encoding="utf-8")
-        mapping: dict[str, Any] = parse_yaml(text, name_or_file)
-    elif Path(name_or_file).suffix in (".yaml", ".yml") or Path(name_or_file).is_file():
-        mapping = read_yaml(Path(name_or_file))
-    else:
-        raise InputError(
-            f"unknown ablation '{name_or_file}': {nearest(name_or_file, ablation_names())}, or a .yaml file"
-        )
+    mapping = read_named_yaml(name_or_file, PACKAGE, "ablation")
     return build_dataclass(Ablation, mapping, f"ablation '{name_or_file}'")
 
 
