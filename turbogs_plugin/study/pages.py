@@ -8,6 +8,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from turbogs_plugin.config.units import parse_seconds
 from turbogs_plugin.files import write_text_atomically
@@ -77,16 +78,13 @@ def _header(study: Study) -> list[Block]:
     if budgets:
         length.append(f"as many iterations as fit into {', '.join(budgets)} of training, calibration included")
     said = ", or ".join(length)
-    warmup = (
-        f"Before the clock starts, {_listing(warmups)} iterations of the same configuration, scaled to that length, "
-        "train a model that is thrown away."
-        if any(warmups)
-        else "Without warm-up."
-    )
-    blocks: list[Block] = [
-        Paragraph(f"{said[:1].upper()}{said[1:]}. {TIMING_RULES} {warmup}"),
-        Paragraph(HOW_TO_READ),
-    ]
+    warmup = "Without warm-up."
+    if any(warmups):
+        warmup = (
+            f"Before the clock starts, {_listing(warmups)} iterations of the same configuration, scaled to that "
+            "length, train a model that is thrown away."
+        )
+    blocks: list[Block] = [Paragraph(f"{said[:1].upper()}{said[1:]}. {TIMING_RULES} {warmup}"), Paragraph(HOW_TO_READ)]
     missing = sorted({result.lpips_reason for result in results if result.lpips_reason})
     blocks += [Paragraph(f"LPIPS was not computed: {reason}.") for reason in missing]
     return [*blocks, *_machines(study.provenances)]
@@ -95,12 +93,7 @@ def _header(study: Study) -> list[Block]:
 def _machines(provenances: Sequence[Provenance | None]) -> list[Block]:
     recorded = [entry for entry in provenances if entry is not None]
     rows = [
-        (
-            entry.machine,
-            entry.kernels,
-            entry.commit or "unknown",
-            ", ".join(f"{name} {version}" for name, version in entry.software.items()),
-        )
+        (entry.machine, entry.kernels, entry.commit or "unknown", ", ".join(map(" ".join, entry.software.items())))
         for entry in recorded
     ]
     blocks: list[Block] = [Table(("machine", "kernels", "commit", "software"), rows, numeric=False)] if rows else []
@@ -201,21 +194,24 @@ def _settings(study: Study) -> list[Block]:
 
 def table_csv(summaries: Sequence[SceneSummary]) -> str:
     """All numbers of the tables, unrounded; empty where not computed or not measured, ``inf`` where never reached."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    header = ["scene", "variant", "seeds", "pareto", "psnr_differs_from_baseline", "seconds_differ_from_baseline"]
-    header += [f"{measure}_{part}" for measure in MEASURES for part in ("mean", "low", "high")]
-    for place in range(max((len(summary.targets) for summary in summaries), default=0)):
-        header += [f"target_{place}_{part}" for part in ("psnr", "seconds", "ratio")]
-    writer.writerow(header)
+    lines: list[dict[str, Any]] = []
     for summary in summaries:
         for row in summary.rows:
-            line = [summary.scene, row.name, len(row.cells), row.on_front, row.differs("psnr"), row.differs("seconds")]
-            for spread in map(row.spread, MEASURES):
-                line += [spread.mean, spread.low, spread.high]
-            for target in summary.targets:
-                line += [target, Spread.of(row.seconds_to(target)).mean, row.ratio_to(target)]
-            writer.writerow(["" if value is None or value != value else value for value in line])
+            line = {"scene": summary.scene, "variant": row.name, "seeds": len(row.cells), "pareto": row.on_front}
+            line["psnr_differs_from_baseline"] = row.differs("psnr")
+            line["seconds_differ_from_baseline"] = row.differs("seconds")
+            for measure in MEASURES:
+                spread = row.spread(measure)
+                line |= {f"{measure}_mean": spread.mean, f"{measure}_low": spread.low, f"{measure}_high": spread.high}
+            for place, target in enumerate(summary.targets):
+                line[f"target_{place}_psnr"] = target
+                line[f"target_{place}_seconds"] = Spread.of(row.seconds_to(target)).mean
+                line[f"target_{place}_ratio"] = row.ratio_to(target)
+            lines.append({name: "" if value is None or value != value else value for name, value in line.items()})
+    text = io.StringIO()
+    writer = csv.DictWriter(text, lines[0], lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(lines)
     return text.getvalue()
 
 

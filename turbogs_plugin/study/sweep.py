@@ -90,48 +90,45 @@ def run_sweep(
             raise InputError(f"'{folder.path}' has a cell of another ablation ({result.key}): choose a new --out")
     device = resolve_device(options.device)
     reusable = _reusable_cells(options, here, siblings)
-    grid: dict[str, list[tuple[CellKey, Config]]] = {}
     taken: list[CellResult] = []
-    kept = 0
+    left: list[tuple[Scene, CellKey, Config]] = []
     # All scenes are read before anything is trained, so that a wrong one is known at once.
-    loaded: dict[str, Scene] = {}
     for path in options.scenes:
         name = path.resolve().name
         configs = _scene_configs(ablation, variants, options, path.resolve(), device)
         settings = next(iter(configs.values())).scene
         scene = load_scene(path, settings.factor, settings.test_every)
         capture = capture_digest(scene)
-        grid[name] = []
         for key, config in configs.items():
             known = reusable.get((name, capture, _comparable(config.to_mapping())))
             if key in finished:
                 _require_same(finished[key], config)
-                kept += 1
             elif known is not None:
                 taken.append(replace(known, variant=key.variant))
             else:
-                grid[name].append((key, config))
+                left.append((scene, key, config))
         for key, result in finished.items():
             if key.scene == name and result.capture not in ("", capture):
                 raise InputError(
                     f"the cell '{key}' has other photos or cameras than '{name}' has now: choose a new --out"
                 )
-        if grid[name]:
-            loaded[name] = scene
-        del scene  # photos take room
+        del scene  # where no cell needs it: photos take room
     folder.write_study(replace(study, ablation=ablation))
     for result in taken:
         folder.write(result)
-    with SweepProgress(sum(map(len, grid.values())), kept + len(taken)) as progress:
-        for name, cells in grid.items():
-            scene = loaded.pop(name, None)
-            for key, config in cells:
-                progress.begin(key)
-                outcome = _train(key, config, scene, device, here, progress)
-                folder.write(outcome)
-                progress.ended(outcome)
-                if isinstance(outcome, Failure):
-                    _require_working(device)
+    wanted = len(options.scenes) * len(options.seeds) * len(variants)
+    with SweepProgress(len(left), wanted - len(left)) as progress:
+        while left:
+            scene, key, config = left.pop(0)  # the photos go with the last cell that needs them
+            progress.begin(key)
+            try:
+                outcome = train_cell(key.variant, config, scene, device, here, [progress])
+            except Exception as error:  # whatever a variant breaks by, the other cells go on
+                outcome = Failure(key, _reason(error))
+            folder.write(outcome)
+            progress.ended(outcome)
+            if isinstance(outcome, Failure):
+                _require_working(device)
 
 
 def _scene_configs(
@@ -147,16 +144,6 @@ def _scene_configs(
             if config.scene != next(iter(configs.values())).scene:
                 raise InputError(f"variant '{variant}' changes the scene's photos, which all variants share")
     return configs
-
-
-def _train(
-    key: CellKey, config: Config, scene: Scene, device: torch.device, here: Provenance, progress: SweepProgress
-) -> CellResult | Failure:
-    """Whatever a variant breaks by, the other cells go on."""
-    try:
-        return train_cell(key.variant, config, scene, device, here, [progress])
-    except Exception as error:
-        return Failure(key, _reason(error))
 
 
 def _require_same(present: CellResult, config: Config) -> None:
