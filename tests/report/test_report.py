@@ -178,7 +178,7 @@ def test_tables():
 
 
 def training(iteration: int, gaussians: int) -> SimpleNamespace:
-    """What progress looks at of a loop: so far of 100 iterations, with so many Gaussians."""
+    """What progress reads of a loop: the iteration, of 100, and the number of Gaussians."""
     return SimpleNamespace(trainer=SimpleNamespace(iteration=iteration, iterations=100, gaussians=range(gaussians)))
 
 

@@ -1,4 +1,4 @@
-"""What one can get out of a finished or stopped run: its error, its views, its model."""
+"""What `turbogs eval`, `render` and `export` take from a run: its errors, its views, its model."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def distinct_stems(names: Sequence[str]) -> list[str]:
 
 
 def export_run(path: Path, file_format: str, out: Path | None, drop_bands: float | None = None) -> str:
-    """Write a run's newest model; what was written, in words.
+    """Write a run's newest model; returns in words what was written.
 
     Args:
         path: folder of the run.

@@ -26,10 +26,10 @@ STYLE = {
 SECONDS_LABEL = "training time in seconds (evaluation excluded)"
 
 ERROR_FULL_SCALE = 0.25
-"""Mean absolute error over RGB that has the brightest colour of an error map."""
+"""Mean absolute error over RGB at which an error map has its brightest colour."""
 
 FAINTEST = 0.1
-"""Place of the farthest on the scale of colours of a depth: visibly not black."""
+"""Place of the farthest depth on the scale of colours, 0 .. 1: it can be told from black."""
 
 GAP = 6
 """White pixels between the pictures of a strip."""
@@ -85,8 +85,8 @@ def error_picture(photo: Tensor, image: Tensor) -> np.ndarray:
 def depth_picture(depths: np.ndarray) -> np.ndarray:
     """[H, W, 3] uint8 of depths [H, W]: near is bright, far is dark, and what has no depth (0) is black.
 
-    The colours are even in 1 / depth, so that what is far takes no more of them than it shows, and go from its 1st to
-    its 99th percentile in this image.
+    The scale of colours is even in 1 / depth, so that near depths have most of it, and goes from the 1st to the 99th
+    percentile of 1 / depth in this image.
     """
     seen = depths > 0
     if not seen.any():

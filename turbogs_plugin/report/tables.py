@@ -25,13 +25,13 @@ def number(value: float, digits: int, absent: str = "not computed") -> str:
 
 
 def errors(measured: ViewMetrics | Metrics | Evaluation, psnr_digits: int = 2) -> list[str]:
-    """The cells below `ERRORS`, and where it has been measured below "LPIPS (VGG)"."""
+    """The numbers for the columns `ERRORS`, and for "LPIPS (VGG)" where the measurement has one."""
     names = ("psnr", "ssim", "l1") if isinstance(measured, Evaluation) else ("psnr", "ssim", "l1", "lpips")
     return [number(getattr(measured, name), psnr_digits if name == "psnr" else 4) for name in names]
 
 
 def views_table(metrics: Metrics, with_means: bool = False) -> str:
-    """The errors of each test view, and where asked for their means."""
+    """A table with the errors of each test view, and with their means as its last line if asked for."""
     rows = [[view.name, *errors(view)] for view in metrics.views]
     if with_means:
         rows.append([f"mean of {len(rows)}", *errors(metrics, psnr_digits=4)])

@@ -1,4 +1,4 @@
-"""One training of a grid: the trainer of any run, without what a run keeps (checkpoints, model, pictures)."""
+"""Training of one cell: as a run is trained, but no checkpoint, model or picture is kept."""
 
 from __future__ import annotations
 
@@ -25,7 +25,8 @@ from turbogs_plugin.train.run import new_loop, plan_scene
 from turbogs_plugin.train.trainer import Trainer
 
 WARMUP_ITERATIONS = {"cuda": 20, "cpu": 2}
-"""Of the same configuration scaled to this length: every kind of step loads its code before the clock starts."""
+"""Iterations of warm-up: the configuration is scaled to this length and trained once before the clock starts, so that
+the code of every kind of step is loaded."""
 
 
 class PeakMemory(Listener):
@@ -55,10 +56,11 @@ class PeakMemory(Listener):
 
 
 def capture_digest(scene: Scene) -> str:
-    """What tells a capture from another one of its name: names, sizes and cameras of its photos, and how many points.
+    """A digest that tells captures of the same name apart: of the photos' names, sizes and cameras, and the number of
+    points.
 
-    Not the photos' pixels, in which decoders differ from version to version. Of the cameras four digits of a sum, as
-    the last bits of their coordinates differ from machine to machine.
+    Pixels are not in it, for decoders of different versions give different ones. Of the cameras' coordinates it takes
+    four digits of a sum, for the last bits differ from machine to machine.
     """
     digest = hashlib.sha256(str(len(scene.points)).encode())
     for part in (scene.train, scene.test):

@@ -18,10 +18,10 @@ from turbogs_plugin.train.history import read_history
 
 
 def study_of_runs(paths: Sequence[Path]) -> Study:
-    """The runs' histories as cells. The first run's variant is the baseline; variants have the first run's name.
+    """The runs' histories as cells. A variant is called as its first run; the first run's variant is the baseline.
 
-    What was asked for makes a variant: what plan and budgets make of it differs from machine to machine and from seed
-    to seed.
+    Runs are of one variant where the same was asked for. What plan and budgets make of it does not count, for that
+    differs from machine to machine and from seed to seed.
 
     Raises:
         InputError: no run there, one without an evaluation, or the same run twice.
@@ -81,7 +81,7 @@ def _shared(asked: dict[str, Any], device: str) -> dict[str, Any]:
     """What makes two runs seeds of one variant: all but the seed, the photos, and what is only reported or kept.
 
     Args:
-        device: that was taken.
+        device: the one that the run was trained on.
     """
     sections = {name: dict(section) for name, section in asked.items() if name not in ("report", "scene")}
     for key in ("seed", "checkpoint_every", "evaluate_at"):

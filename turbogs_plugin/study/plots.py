@@ -28,19 +28,20 @@ BASELINE_COLOR = "black"
 OTHER_COLOR = "0.75"
 LABEL_SIZE = 8
 TOLD_APART_UP_TO = 10
-"""So many variants have a colour and a shaded spread each; of more, only the baseline and the Pareto front have."""
+"""Where there are more variants, only the baseline and the Pareto front have a colour and a shaded spread."""
 
 SHOWN_BELOW = 4.0
-"""dB below the worst final result at which the PSNR plot ends: what comes before is over in a moment."""
+"""The PSNR plot ends this many dB below the worst final result: trainings pass what is below in a moment."""
 SHOWN_ABOVE = 1.6
-"""Times the worst final error, at which that plot ends: 4 dB as well."""
+"""The plot of errors ends at the worst final error times this, which is 4 dB as well."""
 FAILED_BELOW = 8.0
-"""dB below the best final result at which a variant has failed: it is named below a plot to the scale of the others."""
+"""A variant has failed that ends this many dB below the best one: it is not drawn, but named below the plot."""
 
 DRAWING = 1
-"""Raised by whoever changes how a plot looks: a plot of the same data is not drawn again."""
+"""Version of the way in which plots are drawn. Raise it with every change of that: a plot is only drawn again where its
+data or this number differ."""
 DATA_KEY = "data"
-"""Text in a plot's PNG: the digest of what it shows."""
+"""Name of the text in a plot's PNG that holds the digest of what it shows."""
 PALETTE = 128
 """Colours of a plot's PNG: a third of the bytes, and no difference that can be seen."""
 

@@ -1,4 +1,4 @@
-"""What a sweep shows: a line a cell with the time left, and on a terminal a bar of the present one."""
+"""What a sweep shows: for each cell a line with the time left, and on a terminal a bar of the present cell."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class SweepProgress(TerminalBar):
         self._say(f"[{self.done}/{self.total}] {outcome.key}: {text}" + (f"; {left}" if left else ""))
 
     def _left(self) -> str:
-        """From the mean time of the cells so far, all they needed included."""
+        """The time left in words, by the mean time that a cell has taken so far with all its parts; "" where unknown."""
         if not self.done or self.done == self.total:
             return ""
         seconds = round((time.perf_counter() - self._started) / self.done * (self.total - self.done))

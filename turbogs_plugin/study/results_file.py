@@ -24,7 +24,7 @@ from turbogs_plugin.study.results import CellResult, Failure, Study
 from turbogs_plugin.train.history import Evaluation
 
 FORMAT = 2
-"""Raised where an older reader would take a file for something else."""
+"""Raised by one whenever an older version of TurboGS would misread a new file."""
 
 DECIMALS = {"train_seconds": 6, "psnr": 5, "worst_psnr": 5, "ssim": 7, "l1": 7, "lpips": 7, "fps": 3}
 """Digits behind the point that are kept of a measure: for errors those that float32 has."""
