@@ -45,7 +45,7 @@ class SweepProgress(TerminalBar):
         self._say(f"[{self.done}/{self.total}] {outcome.key}: {text}" + (f"; {left}" if left else ""))
 
     def _left(self) -> str:
-        """The time left in words, by the mean time that a cell has taken so far with all its parts; "" where unknown."""
+        """The time left in words, by the mean time that a cell has taken so far; "" where it is not known."""
         if not self.done or self.done == self.total:
             return ""
         seconds = round((time.perf_counter() - self._started) / self.done * (self.total - self.done))

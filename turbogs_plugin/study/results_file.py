@@ -35,7 +35,7 @@ SHARED = ("provenance", "resolved", "warmup_iterations", "lpips_reason")
 Columns = make_dataclass(
     "Columns",
     [
-        (entry.name, list[float | None] if entry.type == "float" else list[int], field(default=entry.default))
+        (entry.name, list[int] if entry.type == "int" else list[float | None], field(default=entry.default))
         for entry in fields(Evaluation)
     ],
 )

@@ -26,7 +26,7 @@ from turbogs_plugin.study.results import CellResult, Failure, Study
 from turbogs_plugin.train.run import resolve_device
 
 UNCOMPARED = (("scene", "path"), ("train", "device"))
-"""Settings that may differ between a kept cell and the present call: they say where things are, not what is computed."""
+"""Settings that may differ between a kept cell and the present call: where things are changes no result."""
 
 
 @dataclass
