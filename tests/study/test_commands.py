@@ -165,7 +165,7 @@ def test_a_cell_that_cannot_be_used_is_named_by_its_file(small, tmp_path, change
     folder = StudyFolder(tmp_path / "study")
     folder.write_study(Study(load_ablation(str(small)), []))
     history = [Evaluation(4, 1.0, 30.0, 0.8, 0.1, 100, 2**20)]
-    folder.write(CellResult(scene="fox", variant="full", seed=0, config={}, history=history))
+    folder.write(CellResult(scene="fox", variant="full", seed=0, config={}, asked={}, history=history))
     path = folder.cells / "fox" / "full--seed0.json"
     document = json.loads(path.read_text())
     document["cells"][0] |= changes

@@ -27,8 +27,9 @@ def entry(iteration: int, seconds: float, psnr: float, count: int = 100) -> Eval
 
 def cell(variant: str, seed: int, *entries: Evaluation, scene: str = "fox") -> CellResult:
     config = load_config("turbogs", [f"train.seed={seed}", f"train.iterations={entries[-1].iteration}"])
+    mapping = config.to_mapping()
     return CellResult(
-        scene=scene, variant=variant, seed=seed, config=config.to_mapping(), history=list(entries), fps=100.0
+        scene=scene, variant=variant, seed=seed, config=mapping, asked=mapping, history=list(entries), fps=100.0
     )
 
 

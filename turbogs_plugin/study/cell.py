@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -110,15 +109,14 @@ def train_cell(
     evaluations = Evaluations(test, lpips, lambda: memory.peak or peak_memory_bytes(device))
     loop.listeners = [evaluations, memory, *listeners]
     loop.run()
-    resolved, asked = loop.trainer.config.to_mapping(), config.to_mapping()
     return CellResult(
         scene=scene.name,
         variant=variant,
         seed=config.train.seed,
-        config=resolved,
-        asked={name: section for name, section in asked.items() if section != resolved[name]},
+        config=loop.trainer.config.to_mapping(),
+        asked=config.to_mapping(),
         history=evaluations.history,
-        lpips=math.nan if lpips is None else evaluations.metrics.lpips,
+        lpips=evaluations.metrics.lpips,
         lpips_reason=lpips_reason,
         fps=evaluations.metrics.fps,
         peak_bytes=memory.peak,

@@ -23,7 +23,7 @@ class CellResult:
         warmup_iterations: iterations of the same configuration before the clock started, on a model thrown away.
         lpips_reason: why LPIPS was not computed; empty where it was.
         config: its configuration, as plan and budgets resolved it.
-        asked: the sections of `config` that were asked for otherwise, as they were asked for.
+        asked: the configuration that was asked for: by it a finished cell is recognised.
         lpips: NaN where it was not computed.
         fps: test views rendered a second, one after the other; NaN where it was not recorded.
         peak_bytes: peak of the GPU's tensors while training, or None where it was not measured.
@@ -39,7 +39,7 @@ class CellResult:
     warmup_iterations: int = 0
     lpips_reason: str = ""
     config: dict[str, Any]
-    asked: dict[str, dict[str, Any]] = field(default_factory=dict)
+    asked: dict[str, Any]
     lpips: float = math.nan
     fps: float = math.nan
     peak_bytes: int | None = None
@@ -53,11 +53,6 @@ class CellResult:
     def final(self) -> Evaluation:
         """The evaluation of the final model."""
         return self.history[-1]
-
-    @property
-    def asked_config(self) -> dict[str, Any]:
-        """The configuration that was asked for: by it a finished cell is recognised."""
-        return {**self.config, **self.asked}
 
     @property
     def time_budget(self) -> str:

@@ -53,8 +53,8 @@ class Document:
         common: field in `SHARED` -> its value in cells that name no other.
         config: the common configuration, ``section.key`` -> value.
         cells: of each, what is not common: fields of `CellResult`, but for ``provenance``, which is a place in
-            `provenances`; ``config``, the difference from `config`; ``asked``, the difference of the configuration that
-            was asked for from the cell's own; and ``history``, `Columns`. What is absent has the default.
+            `provenances`; ``config``, the difference from `config`; ``asked``, the difference from the cell's own
+            configuration; and ``history``, `Columns`. What is absent has the default.
     """
 
     format: int
@@ -112,7 +112,7 @@ def _complete(result: CellResult, provenances: Sequence[Provenance | None]) -> d
     return {name: _rounded(name, value) for name, value in vars(result).items()} | {
         "provenance": provenances.index(result.provenance),
         "config": config,
-        "asked": difference(config, _placeless(result.asked_config)),
+        "asked": difference(config, _placeless(result.asked)),
         "history": _columns(result.history),
     }
 
@@ -139,14 +139,12 @@ def _result(document: Document, cell: dict[str, Any], where: str) -> CellResult:
     )
     flat = restored(document.config, changes)
     try:
-        config, asked = nested(flat), nested(restored(flat, asked_changes))
+        cell["config"], cell["asked"] = nested(flat), nested(restored(flat, asked_changes))
     except (AttributeError, TypeError):
         raise InputError(f"{where}: its configuration cannot be restored") from None
     place = convert(cell.get("provenance"), int, f"{where}.provenance")
     if not 0 <= place < len(document.provenances):
         raise InputError(f"{where}.provenance: there is no provenance {place}")
-    cell["config"] = config
-    cell["asked"] = {name: section for name, section in asked.items() if section != config.get(name)}
     history = _evaluations(cell.get("history", {}), f"{where}.history")
     result = build_dataclass(CellResult, cell | {"provenance": None, "history": []}, where)
     return replace(result, provenance=document.provenances[place], history=history)

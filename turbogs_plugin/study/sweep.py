@@ -147,10 +147,10 @@ def _scene_configs(
 
 
 def _require_same(present: CellResult, config: Config) -> None:
-    old = old_spelling(present.asked_config)
+    old = old_spelling(present.asked)
     if old:
         raise InputError(f"the cell '{present.key}' is of an earlier version ({old}): choose a new --out")
-    made, wanted = (_sections(mapping) for mapping in (present.asked_config, config.to_mapping()))
+    made, wanted = (_sections(mapping) for mapping in (present.asked, config.to_mapping()))
     if made != wanted:
         sections = [name for name in wanted if made.get(name) != wanted[name]]
         raise InputError(
@@ -167,7 +167,7 @@ def _reusable_cells(
     folders = [*map(StudyFolder, options.reuse), *siblings]
     results = [result for folder in folders for result in folder.read_study().results]
     return {
-        (result.scene, result.capture, _comparable(result.asked_config)): result
+        (result.scene, result.capture, _comparable(result.asked)): result
         for result in results
         if result.capture and result.provenance == here
     }
