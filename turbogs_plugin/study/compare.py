@@ -16,6 +16,9 @@ from turbogs_plugin.study.results import CellResult, Study
 from turbogs_plugin.train.folder import RunFolder
 from turbogs_plugin.train.history import read_history
 
+UNSHARED = ("scene.", "report.", "train.seed", "train.checkpoint_every", "train.evaluate_at")
+"""Sections and settings in which the runs of a variant may differ: seed, photos, and what is only reported or kept."""
+
 
 def study_of_runs(paths: Sequence[Path]) -> Study:
     """The runs' histories as cells. A variant is called as its first run; the first run's variant is the baseline.
@@ -53,12 +56,11 @@ def study_of_runs(paths: Sequence[Path]) -> Study:
             raise InputError(f"'{path}' is the same run as another one: {result.key}")
         results.append(result)
     base = next(iter(variants))
-    ablation = Ablation(
-        title=f"Comparison of {len(paths)} runs",
-        variants={name: _overrides(variants[base], shared) for name, shared in variants.items()},
-        base=base,
-    )
-    return Study(ablation, results)
+    overrides = {
+        name: [f"{path}={value}" for path, value in difference(variants[base], shared).items() if path != ABSENT]
+        for name, shared in variants.items()
+    }
+    return Study(Ablation(title=f"Comparison of {len(paths)} runs", variants=overrides, base=base), results)
 
 
 def _scene_names(scenes: Sequence[SceneConfig]) -> list[str]:
@@ -78,16 +80,13 @@ def _scene_names(scenes: Sequence[SceneConfig]) -> list[str]:
 
 
 def _shared(asked: dict[str, Any], device: str) -> dict[str, Any]:
-    """What makes two runs seeds of one variant: all but the seed, the photos, and what is only reported or kept.
+    """What makes two runs seeds of one variant, ``section.key`` -> value: all that is in none of `UNSHARED`.
 
     Args:
         device: the one that the run was trained on.
     """
-    sections = {name: dict(section) for name, section in asked.items() if name not in ("report", "scene")}
-    for key in ("seed", "checkpoint_every", "evaluate_at"):
-        sections["train"].pop(key)
-    sections["train"]["device"] = device
-    return sections
+    flat = flattened(asked) | {"train.device": device}
+    return {path: value for path, value in flat.items() if not path.startswith(UNSHARED)}
 
 
 def _new_name(path: Path, taken: Container[str]) -> str:
@@ -95,9 +94,3 @@ def _new_name(path: Path, taken: Container[str]) -> str:
     name = re.sub(r"[^A-Za-z0-9_+.-]", "-", path.resolve().name)[:40].lstrip("._-") or "run"
     names = (name if number == 1 else f"{name}-{number}" for number in itertools.count(1))
     return next(name for name in names if name not in taken)
-
-
-def _overrides(base: dict[str, Any], other: dict[str, Any]) -> list[str]:
-    """Overrides that lead from one configuration to another."""
-    changes = difference(flattened(base), flattened(other))
-    return [f"{path}={value}" for path, value in changes.items() if path != ABSENT]

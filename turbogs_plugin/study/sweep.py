@@ -19,13 +19,14 @@ from turbogs_plugin.errors import InputError, TrainingStopped
 from turbogs_plugin.report.provenance import COMMIT_VARIABLE, MODIFIED, Provenance
 from turbogs_plugin.scene import Scene, load_scene
 from turbogs_plugin.study.cell import capture_digest, train_cell
+from turbogs_plugin.study.difference import ABSENT, difference, flattened
 from turbogs_plugin.study.folder import StudyFolder
 from turbogs_plugin.study.grid import Ablation, CellKey, variant_config
 from turbogs_plugin.study.progress import SweepProgress
 from turbogs_plugin.study.results import CellResult, Failure, Study
 from turbogs_plugin.train.run import resolve_device
 
-UNCOMPARED = (("scene", "path"), ("train", "device"))
+UNCOMPARED = ("scene.path", "train.device")
 """Settings that may differ between a kept cell and the present call: where things are changes no result."""
 
 
@@ -150,9 +151,9 @@ def _require_same(present: CellResult, config: Config) -> None:
     old = old_spelling(present.asked)
     if old:
         raise InputError(f"the cell '{present.key}' is of an earlier version ({old}): choose a new --out")
-    made, wanted = (_sections(mapping) for mapping in (present.asked, config.to_mapping()))
-    if made != wanted:
-        sections = [name for name in wanted if made.get(name) != wanted[name]]
+    changes = difference(_settings(present.asked), _settings(config.to_mapping()))
+    if changes:
+        sections = dict.fromkeys(path.partition(".")[0] for path in [*changes.pop(ABSENT, ()), *changes])
         raise InputError(
             f"the cell '{present.key}' was made with other settings ({', '.join(sections)}): choose a new --out"
         )
@@ -174,15 +175,13 @@ def _reusable_cells(
 
 
 def _comparable(mapping: dict[str, Any]) -> str:
-    """What decides a result, as text to compare."""
-    return json.dumps(_sections(mapping), sort_keys=True)
+    """`_settings` as a text to compare."""
+    return json.dumps(_settings(mapping), sort_keys=True)
 
 
-def _sections(mapping: dict[str, Any]) -> dict[str, dict[str, Any]]:
-    sections = {name: dict(section) for name, section in mapping.items()}
-    for section, name in UNCOMPARED:
-        sections[section].pop(name, None)
-    return sections
+def _settings(mapping: dict[str, Any]) -> dict[str, Any]:
+    """``section.key`` -> value, of what decides a result."""
+    return {path: value for path, value in flattened(mapping).items() if path not in UNCOMPARED}
 
 
 def _reason(error: Exception) -> str:
