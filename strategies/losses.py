@@ -55,10 +55,10 @@ class CharbonnierNccLoss(RuleLoss):
         L = l1 + ncc_weight * mean over tiles of lambda * mean over channels of gate * (1 - S)
         lambda = clip(mean |grad l1| / (mean |grad S| + 1e-8), 0, 1)
 
-    with S = `correlation`, `printed_correlation` or `contrast`. The two means of the balance are over the tile's samples (by their shares), of
-    the L1 norms over channels of ``d / sqrt(d^2 + eps^2)`` and of g: the appendix's printed gradients, which without
-    1 / n compare the two terms as they enter L. lambda is constant in the backward pass. The structure term's
-    gradient is *added*: the appendix's minus would lower the correlation.
+    with S = `correlation`, `printed_correlation` or `contrast`. The two means of the balance are over the tile's samples
+    (by their shares), of the L1 norms over channels of ``d / sqrt(d^2 + eps^2)`` and of g: the appendix's printed
+    gradients, which without 1 / n compare the two terms as they enter L. lambda is constant in the backward pass. The
+    structure term's gradient is *added*: the appendix's minus would lower the correlation.
 
     The gate ``s_y^2 / (s_y^2 + c)`` of the truth's own variance comes after the balance, which would undo it.
 
@@ -69,8 +69,8 @@ class CharbonnierNccLoss(RuleLoss):
     Args:
         epsilon: of the Charbonnier term.
         ncc_weight: factor of the structure term; 1 in the paper.
-        structure: `ncc`, with a variance floor in numerator and denominator, so that a flat tile scores 1; `printed_ncc`,
-            as the appendix has it: a flat tile scores 0; or `contrast`.
+        structure: `ncc`, with a variance floor in numerator and denominator, so that a flat tile scores 1;
+            `printed_ncc`, as the appendix has it: a flat tile scores 0; or `contrast`.
         variance_constant: c, variance below which a tile counts as flat; SSIM's by default. NCC's floor is c / 2. The
             printed NCC takes it as its epsilon, beside the product of two variances: 1e-6 there is two of 1e-3.
         gate: scale the term by the gate.

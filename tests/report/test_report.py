@@ -2,6 +2,7 @@
 
 import json
 import math
+import subprocess
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,6 +13,7 @@ from PIL import Image
 
 from turbogs_plugin.device import peak_memory_bytes
 from turbogs_plugin.errors import InputError
+from turbogs_plugin.report import provenance
 from turbogs_plugin.report.pages import write_report
 from turbogs_plugin.report.plots import (
     ERROR_FULL_SCALE,
@@ -148,13 +150,35 @@ def test_plots_of_any_length(tmp_path, count):
     assert width > 600 and height > 400
 
 
+def test_the_commit_of_the_sources(tmp_path, monkeypatch):
+    monkeypatch.delenv(provenance.COMMIT_VARIABLE, raising=False)
+    monkeypatch.setattr(provenance, "__file__", str(tmp_path / "turbogs_plugin" / "report" / "provenance.py"))
+    assert provenance.source_commit() == "", "sources without a history"
+
+    def git(*arguments: str) -> str:
+        who = ["-c", "user.name=a", "-c", "user.email=a@b"]
+        return subprocess.run(["git", "-C", tmp_path, *who, *arguments], capture_output=True, text=True).stdout.strip()
+
+    source = tmp_path / "source.py"
+    source.write_text("1")
+    for arguments in (["init"], ["add", "."], ["commit", "-m", "first"], ["tag", "-a", "v1", "-m", "a tag"]):
+        git(*arguments)
+    commit = git("rev-parse", "--short=12", "HEAD")
+    (tmp_path / "results.json").write_text("no source")
+    assert len(commit) == 12 and provenance.source_commit() == commit
+    source.write_text("2")
+    assert provenance.source_commit() == commit + provenance.MODIFIED
+    monkeypatch.setenv(provenance.COMMIT_VARIABLE, "named")
+    assert provenance.source_commit() == "named"
+
+
 def test_tables():
     assert table(("a", "b"), [(1, 2)]).splitlines() == ["| a | b |", "| --- | --- |", "| 1 | 2 |"]
     assert number(1.23456, 2) == "1.23" and number(math.nan, 2) == "not computed"
 
 
 def training(iteration: int, gaussians: int) -> SimpleNamespace:
-    """What progress looks at of a loop: so far of 100 iterations, with so many Gaussians."""
+    """What progress reads of a loop: the iteration, of 100, and the number of Gaussians."""
     return SimpleNamespace(trainer=SimpleNamespace(iteration=iteration, iterations=100, gaussians=range(gaussians)))
 
 

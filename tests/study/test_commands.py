@@ -27,7 +27,7 @@ from turbogs_plugin.study.cell import capture_digest, train_cell
 from turbogs_plugin.study.compare import study_of_runs
 from turbogs_plugin.study.folder import StudyFolder
 from turbogs_plugin.study.grid import load_ablation, variant_config
-from turbogs_plugin.study.results import CellResult
+from turbogs_plugin.study.results import CellResult, Study
 from turbogs_plugin.study.results_file import DECIMALS
 from turbogs_plugin.train.folder import RunFolder
 from turbogs_plugin.train.history import Evaluation, append_evaluation, read_history
@@ -163,8 +163,9 @@ def test_a_cell_of_other_settings_is_not_mixed_in(turbogs, small, capture, study
 )
 def test_a_cell_that_cannot_be_used_is_named_by_its_file(small, tmp_path, changes, words):
     folder = StudyFolder(tmp_path / "study")
-    folder.write_ablation(load_ablation(str(small)))
-    folder.write(CellResult("fox", "full", 0, {}, [Evaluation(4, 1.0, 30.0, 0.8, 0.1, 100, 2**20)]))
+    folder.write_study(Study(load_ablation(str(small)), []))
+    history = [Evaluation(4, 1.0, 30.0, 0.8, 0.1, 100, 2**20)]
+    folder.write(CellResult(scene="fox", variant="full", seed=0, config={}, asked={}, history=history))
     path = folder.cells / "fox" / "full--seed0.json"
     document = json.loads(path.read_text())
     document["cells"][0] |= changes

@@ -30,16 +30,18 @@ def result(variant: str, seed: int, scene: str = "fox", **changes) -> CellResult
         Evaluation(0, 0.1, 9.5, math.nan, 0.2, 50, 2**20),
         Evaluation(26, 2.5, 30.125 + seed, 0.9, 0.02, 90, 2**21),
     ]
-    made = CellResult(scene, variant, seed, config.to_mapping(), history, asked={"maps": {"beta": 0.25}})
     known = {"fps": 100.5, "peak_bytes": 2**21, "warmup_iterations": 20, "provenance": HERE, "capture": "c0ffee"}
-    return replace(made, **(known | changes))
+    mapping = config.to_mapping()
+    known |= {"config": mapping, "asked": mapping | {"maps": {"beta": 0.25}}, "history": history}
+    return CellResult(scene=scene, variant=variant, seed=seed, **(known | changes))
 
 
 def study() -> Study:
     results = [result(variant, seed) for variant in ABLATION.variants for seed in (0, 1)]
     elsewhere = replace(HERE, machine="another machine")
     results[3] = replace(results[3], provenance=elsewhere, warmup_iterations=7, lpips=0.25, capture="")
-    results.append(result("base", 0, "h", provenance=None, asked={}, resolved=False, capture="beef"))
+    results.append(result("base", 0, "h", provenance=None, resolved=False, capture="beef"))
+    results[4].asked = results[4].config
     results[4].history[1].worst_psnr = 25.5
     return Study(ABLATION, results, [Failure(CellKey("h", "other", 1), "it broke")], [29.5])
 
@@ -54,11 +56,11 @@ def folder(tmp_path) -> StudyFolder:
 def test_a_study_is_read_as_it_was_written(folder):
     again = folder.read_study()
     assert (again.ablation, again.failures, again.targets) == (ABLATION, study().failures, [29.5])
-    configs = [(entry.config, entry.asked_config) for entry in again.results]
-    wanted = [(entry.config, entry.asked_config) for entry in study().results]
+    configs = [(entry.config, entry.asked) for entry in again.results]
+    wanted = [(entry.config, entry.asked) for entry in study().results]
     assert json.dumps(configs, sort_keys=True) == json.dumps(wanted, sort_keys=True).replace("/somewhere/", "")
     for entry, original in zip(again.results, study().results, strict=True):
-        assert repr(replace(entry, config={})) == repr(replace(original, config={}))
+        assert repr(replace(entry, config={}, asked={})) == repr(replace(original, config={}, asked={}))
 
 
 def test_what_is_written_again_is_the_same_to_the_letter(folder):
@@ -168,7 +170,7 @@ def test_a_cell_that_is_not_in_the_results_yet_is_not_lost(folder):
 
 
 def test_a_failure_is_known_until_its_cell_is_there(folder):
-    folder.write_failure(Failure(CellKey("h", "base", 1), "no luck"))
+    folder.write(Failure(CellKey("h", "base", 1), "no luck"))
     assert [failure.reason for failure in folder.read_study().failures] == ["it broke", "no luck"]
     folder.write(result("base", 1, "h"))
     assert [failure.reason for failure in folder.read_study().failures] == ["it broke"]

@@ -27,7 +27,10 @@ def entry(iteration: int, seconds: float, psnr: float, count: int = 100) -> Eval
 
 def cell(variant: str, seed: int, *entries: Evaluation, scene: str = "fox") -> CellResult:
     config = load_config("turbogs", [f"train.seed={seed}", f"train.iterations={entries[-1].iteration}"])
-    return CellResult(scene, variant, seed, config.to_mapping(), list(entries), fps=100.0)
+    mapping = config.to_mapping()
+    return CellResult(
+        scene=scene, variant=variant, seed=seed, config=mapping, asked=mapping, history=list(entries), fps=100.0
+    )
 
 
 # The grid
@@ -218,17 +221,20 @@ def test_a_summary_of_known_numbers():
     )
     (summary,) = summarise(replace(study, targets=[20.0, 30.5]))
     base, fast, slow = summary.rows
-    assert (base.seconds.mean, base.gaussians.mean) == (11.0, 1100.0)
-    assert fast.psnr_difference == pytest.approx(0.9) and fast.psnr_differs is True and fast.seconds_differ is True
-    assert slow.psnr_differs is False
+    assert (base.seconds.mean, base.spread("gaussians").mean) == (11.0, 1100.0)
+    assert fast.difference("psnr") == pytest.approx(0.9) and fast.ratio("seconds") == pytest.approx(5.0 / 11.0)
+    assert fast.differs("psnr") is True and fast.differs("seconds") is True
+    assert slow.differs("psnr") is False
     assert [row.on_front for row in summary.rows] == [False, True, False]
     of_base = (10.0 * 10 / 20.0 + 12.0 * 10 / 20.2) / 2
-    assert base.reaches[0].seconds.mean == pytest.approx(of_base) and base.reaches[0].ratio == pytest.approx(1.0)
-    assert fast.reaches[0].ratio == pytest.approx(5.0 * 10 / 21.0 / of_base)
-    assert (slow.reaches[0].reached, slow.reaches[1].reached) == (2, 0)
-    assert math.isnan(fast.reaches[1].ratio)  # the baseline never got there
+    assert np.mean(base.seconds_to(20.0)) == pytest.approx(of_base) and base.ratio_to(20.0) == pytest.approx(1.0)
+    assert fast.ratio_to(20.0) == pytest.approx(5.0 * 10 / 21.0 / of_base)
+    assert [np.isfinite(slow.seconds_to(target)).sum() for target in (20.0, 30.5)] == [2, 0]
+    assert math.isnan(fast.ratio_to(30.5))  # the baseline never got there
     (begun,) = summarise(replace(study, targets=[9.0]))
-    assert [(row.reaches[0].reached, math.isnan(row.reaches[0].ratio)) for row in begun.rows] == [(2, True)] * 3
+    assert [(np.isfinite(row.seconds_to(9.0)).sum(), math.isnan(row.ratio_to(9.0))) for row in begun.rows] == [
+        (2, True)
+    ] * 3
     (default,) = summarise(study)
     assert default.targets == [29.0, 29.5, 30.0]
 

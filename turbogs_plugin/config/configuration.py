@@ -23,6 +23,9 @@ from turbogs_plugin.config.yaml_text import packaged_names, parse_yaml, read_nam
 from turbogs_plugin.engine.rendered import RasterSettings
 from turbogs_plugin.errors import InputError
 
+PACKAGE = "turbogs_plugin.configs"
+"""Where the packaged configurations are."""
+
 DEFAULT_CONFIG = "turbogs"
 """The packaged configuration that a run without ``--config`` takes."""
 

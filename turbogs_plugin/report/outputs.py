@@ -1,4 +1,4 @@
-"""What one can get out of a finished or stopped run: its error, its views, its model."""
+"""What `turbogs eval`, `render` and `export` take from a run: its errors, its views, its model."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from turbogs_plugin.errors import InputError
 from turbogs_plugin.model.harmonics import band_energy, drop_faint_bands
 from turbogs_plugin.model.ply import save_ply
 from turbogs_plugin.report.plots import depth_picture, to_uint8
-from turbogs_plugin.report.tables import ERRORS, number, table
+from turbogs_plugin.report.tables import views_table
 from turbogs_plugin.scene import PosedImages
 from turbogs_plugin.scene.offload import place_views
 from turbogs_plugin.train.evaluate import evaluate, load_lpips
@@ -38,14 +38,9 @@ def evaluate_run(path: Path, device_name: str) -> str:
     views = place_views(views, model.gaussians.device, model.config.train.photos_place)
     lpips, reason = load_lpips(model.config.report.lpips_weights, model.gaussians.device)
     metrics = evaluate(model.gaussians, views, model.sh_degree, model.config.raster, lpips)
-    rows = [
-        (view.name, number(view.psnr, 2), number(view.ssim, 4), number(view.l1, 4), number(view.lpips, 4))
-        for view in [*metrics.views]
-    ]
-    means = (f"mean of {len(rows)}", *(number(metrics.mean(name), 4) for name in ("psnr", "ssim", "l1", "lpips")))
     note = f"\nLPIPS was not computed: {reason}" if reason else ""
     return (
-        table(("view", *ERRORS, "LPIPS (VGG)"), [*rows, means])
+        views_table(metrics, with_means=True)
         + f"\n\niteration {model.iteration}, {len(model.gaussians)} Gaussians, {metrics.fps:.1f} views a second{note}"
     )
 
@@ -69,14 +64,8 @@ def render_run(path: Path, split: str, device_name: str, with_depth: bool = Fals
     for folder in folders:
         folder.mkdir(parents=True, exist_ok=True)
     for view_id, name in enumerate(distinct_stems(views.names)):
-        image = render_image(
-            model.gaussians,
-            cameras,
-            view_id,
-            sh_degree=model.sh_degree,
-            settings=model.config.raster,
-            with_depth=with_depth,
-        )
+        options = {"sh_degree": model.sh_degree, "settings": model.config.raster, "with_depth": with_depth}
+        image = render_image(model.gaussians, cameras, view_id, **options)
         Image.fromarray(to_uint8(image.colors)).save(folders[0] / f"{name}.png")
         if with_depth:
             depths = (image.depths.cpu().double() * model.frame.scale).float().numpy()
@@ -99,7 +88,7 @@ def distinct_stems(names: Sequence[str]) -> list[str]:
 
 
 def export_run(path: Path, file_format: str, out: Path | None, drop_bands: float | None = None) -> str:
-    """Write a run's newest model; what was written, in words.
+    """Write a run's newest model; returns in words what was written.
 
     Args:
         path: folder of the run.

@@ -9,8 +9,9 @@ from turbogs_plugin.files import write_text_atomically
 from turbogs_plugin.plan import Plan
 from turbogs_plugin.report.machine import hardware, software
 from turbogs_plugin.report.plots import ERROR_FULL_SCALE, plot_against_seconds, save_strip
-from turbogs_plugin.report.tables import ERRORS, number, table
+from turbogs_plugin.report.tables import ERRORS, errors, table, views_table
 from turbogs_plugin.train.evaluate import Metrics, evaluate, load_lpips, render_view
+from turbogs_plugin.train.history import Evaluation
 from turbogs_plugin.train.run import RunSession
 
 
@@ -45,40 +46,17 @@ def _page(run: RunSession, metrics: Metrics, lpips_reason: str, shown: int) -> s
     """
     last = run.history[-1]
     config = run.trainer.config
-    views = [
-        (view.name, number(view.psnr, 2), number(view.ssim, 4), number(view.l1, 4), number(view.lpips, 4))
-        for view in metrics.views
-    ]
     result = table(
         (*ERRORS, "LPIPS (VGG)", "training in s", "Gaussians", "FPS", "peak memory in MiB"),
-        [
-            (
-                number(metrics.mean("psnr"), 2),
-                number(metrics.mean("ssim"), 4),
-                number(metrics.mean("l1"), 4),
-                number(metrics.mean("lpips"), 4),
-                f"{last.train_seconds:.1f}",
-                last.num_gaussians,
-                f"{metrics.fps:.1f}",
-                f"{last.memory_bytes / 2**20:.0f}",
-            )
-        ],
+        [(*errors(metrics.mean), f"{last.train_seconds:.1f}", last.num_gaussians, f"{metrics.fps:.1f}", _mebibytes(last))],
     )
     lpips = f"\nLPIPS was not computed: {lpips_reason}.\n" if lpips_reason else ""
     history = table(
         ("iteration", "training in s", *ERRORS, "Gaussians", "peak memory in MiB"),
-        (
-            (
-                evaluation.iteration,
-                f"{evaluation.train_seconds:.1f}",
-                number(evaluation.psnr, 2),
-                number(evaluation.ssim, 4),
-                number(evaluation.l1, 4),
-                evaluation.num_gaussians,
-                f"{evaluation.memory_bytes / 2**20:.0f}",
-            )
-            for evaluation in run.history
-        ),
+        [
+            (entry.iteration, f"{entry.train_seconds:.1f}", *errors(entry), entry.num_gaussians, _mebibytes(entry))
+            for entry in run.history
+        ],
     )
     strips = "\n\n".join(
         f"{view.name}: {view.psnr:.2f} dB\n\n![{view.name}](report/test-{view_id:03d}.png)"
@@ -108,7 +86,7 @@ From left to right: photo, render, error (mean absolute difference over RGB: bla
 
 {strips}
 
-{table(("view", *ERRORS, "LPIPS (VGG)"), views)}
+{views_table(metrics)}
 
 ## Plan
 
@@ -131,6 +109,10 @@ finite: {last.skipped_updates}.
 {config.to_yaml().rstrip()}
 ```
 """
+
+
+def _mebibytes(evaluation: Evaluation) -> str:
+    return f"{evaluation.memory_bytes / 2**20:.0f}"
 
 
 def _plan(plan: Plan | None) -> str:

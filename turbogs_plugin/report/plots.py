@@ -23,11 +23,13 @@ STYLE = {
     "lines.markersize": 5,
 }
 
+SECONDS_LABEL = "training time in seconds (evaluation excluded)"
+
 ERROR_FULL_SCALE = 0.25
-"""Mean absolute error over RGB that has the brightest colour of an error map."""
+"""Mean absolute error over RGB at which an error map has its brightest colour."""
 
 FAINTEST = 0.1
-"""Place of the farthest on the scale of colours of a depth: visibly not black."""
+"""Place of the farthest depth on the scale of colours, 0 .. 1: it can be told from black."""
 
 GAP = 6
 """White pixels between the pictures of a strip."""
@@ -56,7 +58,7 @@ def plot_against_seconds(path: Path, history: list[Evaluation], name: str, label
             textcoords="offset points",
             ha="right",
         )
-        axes.set(xlabel="training time in seconds (evaluation excluded)", ylabel=label, title=title)
+        axes.set(xlabel=SECONDS_LABEL, ylabel=label, title=title)
         axes.set_xlim(left=0)
         axes.margins(y=0.12)
         figure.savefig(path)
@@ -77,15 +79,14 @@ def save_strip(path: Path, photo: Tensor, image: Tensor) -> None:
 def error_picture(photo: Tensor, image: Tensor) -> np.ndarray:
     """[H, W, 3] uint8: mean absolute error over RGB, black (none) to bright yellow (`ERROR_FULL_SCALE` and more)."""
     errors = (photo - image).abs().mean(dim=-1).cpu().numpy() / ERROR_FULL_SCALE  # [H, W]
-    colors = matplotlib.colormaps["inferno"](errors.clip(0.0, 1.0))[..., :3]
-    return (colors * 255.0).round().astype(np.uint8)
+    return _colored(errors.clip(0.0, 1.0))
 
 
 def depth_picture(depths: np.ndarray) -> np.ndarray:
     """[H, W, 3] uint8 of depths [H, W]: near is bright, far is dark, and what has no depth (0) is black.
 
-    The colours are even in 1 / depth, so that what is far takes no more of them than it shows, and go from its 1st to
-    its 99th percentile in this image.
+    The scale of colours is even in 1 / depth, so that near depths have most of it, and goes from the 1st to the 99th
+    percentile of 1 / depth in this image.
     """
     seen = depths > 0
     if not seen.any():
@@ -93,7 +94,12 @@ def depth_picture(depths: np.ndarray) -> np.ndarray:
     nearness = 1.0 / np.where(seen, depths, 1.0)
     far, near = np.percentile(nearness[seen], [1, 99])
     share = ((nearness - far) / max(near - far, np.finfo(np.float32).tiny)).clip(0.0, 1.0)
-    colors = matplotlib.colormaps["inferno"](FAINTEST + (1.0 - FAINTEST) * share)[..., :3] * seen[..., None]
+    return _colored(FAINTEST + (1.0 - FAINTEST) * share) * seen[..., None]
+
+
+def _colored(share: np.ndarray) -> np.ndarray:
+    """[H, W, 3] uint8: black (0) to bright yellow (1)."""
+    colors = matplotlib.colormaps["inferno"](share)[..., :3]
     return (colors * 255.0).round().astype(np.uint8)
 
 

@@ -51,12 +51,9 @@ def source_commit() -> str:
     root = Path(__file__).resolve().parents[2]
     if not (root / ".git").exists():
         return ""
-    commands = (["rev-parse", "--short=12", "HEAD"], ["status", "--porcelain", "--untracked-files=no"])
+    describe = ["describe", "--always", "--exclude=*", "--abbrev=12", f"--dirty={MODIFIED}"]
     try:
-        commit, changes = (
-            subprocess.run(["git", "-C", root, *command], capture_output=True, text=True, timeout=20, check=True).stdout
-            for command in commands
-        )
+        result = subprocess.run(["git", "-C", root, *describe], capture_output=True, text=True, timeout=20, check=True)
     except (OSError, subprocess.SubprocessError):
         return ""
-    return commit.strip() + (MODIFIED if changes.strip() else "")
+    return result.stdout.strip()

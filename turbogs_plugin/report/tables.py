@@ -5,6 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 
+from turbogs_plugin.train.evaluate import Metrics, ViewMetrics
+from turbogs_plugin.train.history import Evaluation
+
 ERRORS = ("PSNR in dB", "SSIM", "mean absolute error")
 """Heads of the columns that every table of errors has."""
 
@@ -16,6 +19,20 @@ def table(header: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
     return "\n".join(f"| {' | '.join(str(cell) for cell in line)} |" for line in lines)
 
 
-def number(value: float, digits: int) -> str:
-    """A number for a table; "not computed" for NaN."""
-    return "not computed" if math.isnan(value) else f"{value:.{digits}f}"
+def number(value: float, digits: int, absent: str = "not computed") -> str:
+    """A number for a table, with so many digits behind the point; `absent` for NaN."""
+    return absent if math.isnan(value) else f"{value:.{digits}f}"
+
+
+def errors(measured: ViewMetrics | Evaluation, psnr_digits: int = 2) -> list[str]:
+    """The numbers for the columns `ERRORS`, and for "LPIPS (VGG)" where the measurement has one."""
+    names = ("psnr", "ssim", "l1") if isinstance(measured, Evaluation) else ("psnr", "ssim", "l1", "lpips")
+    return [number(getattr(measured, name), psnr_digits if name == "psnr" else 4) for name in names]
+
+
+def views_table(metrics: Metrics, with_means: bool = False) -> str:
+    """A table with the errors of each test view, and with their means as its last line if asked for."""
+    rows = [[view.name, *errors(view)] for view in metrics.views]
+    if with_means:
+        rows.append([metrics.mean.name, *errors(metrics.mean, psnr_digits=4)])
+    return table(("view", *ERRORS, "LPIPS (VGG)"), rows)

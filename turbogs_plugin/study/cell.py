@@ -1,9 +1,8 @@
-"""One training of a grid: the trainer of any run, without what a run keeps (checkpoints, model, pictures)."""
+"""Training of one cell: as a run is trained, but no checkpoint, model or picture is kept."""
 
 from __future__ import annotations
 
 import hashlib
-import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -18,22 +17,50 @@ from turbogs_plugin.report.provenance import Provenance
 from turbogs_plugin.scene import PosedImages, Scene
 from turbogs_plugin.scene.offload import place_views
 from turbogs_plugin.study.results import CellResult
-from turbogs_plugin.study.timing import PeakMemory
 from turbogs_plugin.train.evaluate import evaluate, load_lpips
 from turbogs_plugin.train.evaluations import Evaluations
+from turbogs_plugin.train.history import Evaluation
 from turbogs_plugin.train.loop import Listener, TrainingLoop
 from turbogs_plugin.train.run import new_loop
 from turbogs_plugin.train.trainer import Trainer
 
 WARMUP_ITERATIONS = {"cuda": 20, "cpu": 2}
-"""Of the same configuration scaled to this length: every kind of step loads its code before the clock starts."""
+"""Iterations of warm-up: the configuration is scaled to this length and trained once before the clock starts, so that
+the code of every kind of step is loaded."""
+
+
+class PeakMemory(Listener):
+    """Peak of the GPU's tensors while training, without what evaluations need; nothing on a CPU.
+
+    One process trains all cells, so a CPU's peak, which is the process's, would be that of the largest cell so far.
+
+    Attributes:
+        peak: bytes; None on a CPU.
+    """
+
+    def __init__(self, device: torch.device) -> None:
+        self.device = device
+        self.peak: int | None = None
+        self._begin()
+
+    def evaluating(self, loop: TrainingLoop) -> None:
+        if self.device.type == "cuda":
+            self.peak = max(self.peak or 0, torch.cuda.max_memory_allocated(self.device))
+
+    def evaluated(self, loop: TrainingLoop, evaluation: Evaluation) -> None:
+        self._begin()
+
+    def _begin(self) -> None:
+        if self.device.type == "cuda":
+            torch.cuda.reset_peak_memory_stats(self.device)
 
 
 def capture_digest(scene: Scene) -> str:
-    """What tells a capture from another one of its name: names, sizes and cameras of its photos, and how many points.
+    """A digest that tells captures of the same name apart: of the photos' names, sizes and cameras, and the number of
+    points.
 
-    Not the photos' pixels, in which decoders differ from version to version. Of the cameras four digits of a sum, as
-    the last bits of their coordinates differ from machine to machine.
+    Pixels are not in it, for decoders of different versions give different ones. Of the cameras' coordinates it takes
+    four digits of a sum, for the last bits differ from machine to machine.
     """
     digest = hashlib.sha256(str(len(scene.points)).encode())
     for part in (scene.train, scene.test):
@@ -83,15 +110,14 @@ def train_cell(
     evaluations = Evaluations(test, lpips, lambda: memory.peak or peak_memory_bytes(device))
     loop.listeners = [evaluations, memory, *listeners]
     loop.run()
-    resolved, asked = loop.trainer.config.to_mapping(), config.to_mapping()
     return CellResult(
         scene=scene.name,
         variant=variant,
         seed=config.train.seed,
-        config=resolved,
-        asked={name: section for name, section in asked.items() if section != resolved[name]},
+        config=loop.trainer.config.to_mapping(),
+        asked=config.to_mapping(),
         history=evaluations.history,
-        lpips=math.nan if lpips is None else evaluations.metrics.mean("lpips"),
+        lpips=evaluations.metrics.mean.lpips,
         lpips_reason=lpips_reason,
         fps=evaluations.metrics.fps,
         peak_bytes=memory.peak,

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.report.provenance import Provenance, provenance
+from turbogs_plugin.report.provenance import provenance
 from turbogs_plugin.study.compare import study_of_runs
 from turbogs_plugin.study.folder import StudyFolder, merged
 from turbogs_plugin.study.grid import Ablation, alike_at, load_ablation
@@ -34,7 +34,14 @@ def ablate(
     chosen = [_variants(ablation, only, options) for ablation in ablations.values()]
     code = 0
     for number, (ablation, variants, folder) in enumerate(zip(ablations.values(), chosen, folders, strict=True)):
-        code = max(code, _study(ablation, variants, options, here, folder, folders[:number], targets))
+        try:
+            run_sweep(ablation, variants, options, here, folder, folders[:number])
+        finally:
+            if folder.file.is_file() and folder.read_study().results:  # after a refusal there may be none
+                _report(folder, targets)
+        for failure in folder.read_study().failures:
+            print(f"failed  {failure.key}: {failure.reason}")
+            code = 1
     return code
 
 
@@ -50,26 +57,6 @@ def _variants(ablation: Ablation, only: Sequence[str], options: SweepOptions) ->
     return [variant for variant in variants if variant not in alike]
 
 
-def _study(
-    ablation: Ablation,
-    variants: Sequence[str],
-    options: SweepOptions,
-    here: Provenance,
-    folder: StudyFolder,
-    siblings: Sequence[StudyFolder],
-    targets: Sequence[float],
-) -> int:
-    try:
-        run_sweep(ablation, variants, options, here, folder, siblings)
-    finally:
-        if folder.read_results():  # after a refusal there may be none
-            print(f"report  {write_report(folder, targets)}")
-    failures = folder.read_study().failures
-    for failure in failures:
-        print(f"failed  {failure.key}: {failure.reason}")
-    return 1 if failures else 0
-
-
 def merge(sources: Sequence[Path], out: Path, targets: Sequence[float]) -> int:
     """Put studies together and write the report, without training. What `out` holds of a study stays in it."""
     folder = StudyFolder(out)
@@ -79,7 +66,7 @@ def merge(sources: Sequence[Path], out: Path, targets: Sequence[float]) -> int:
     if not study.results:
         raise InputError("there are no finished cells to report on")
     folder.write_study(study)
-    print(f"report  {write_report(folder, targets)}")
+    _report(folder, targets)
     return 0
 
 
@@ -89,7 +76,7 @@ def compare(runs: Sequence[Path], out: Path, targets: Sequence[float]) -> int:
         raise InputError(f"--out '{out}' is there and not empty: choose a new folder")
     folder = StudyFolder(out)
     folder.write_study(study_of_runs(runs))
-    print(f"report  {write_report(folder, targets)}")
+    _report(folder, targets)
     return 0
 
 
@@ -99,5 +86,9 @@ def report(studies: Sequence[Path], targets: Sequence[float]) -> int:
         folder = StudyFolder(path)
         if not folder.read_study().results:
             raise InputError(f"'{path}' has no finished cells to report on")
-        print(f"report  {write_report(folder, targets or None)}")
+        _report(folder, targets or None)
     return 0
+
+
+def _report(folder: StudyFolder, targets: Sequence[float] | None) -> None:
+    print(f"report  {write_report(folder, targets)}")

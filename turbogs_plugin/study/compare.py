@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import re
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,17 +16,20 @@ from turbogs_plugin.study.results import CellResult, Study
 from turbogs_plugin.train.folder import RunFolder
 from turbogs_plugin.train.history import read_history
 
+UNSHARED = ("scene.", "report.", "train.seed", "train.checkpoint_every", "train.evaluate_at")
+"""Sections and settings in which the runs of a variant may differ: seed, photos, and what is only reported or kept."""
+
 
 def study_of_runs(paths: Sequence[Path]) -> Study:
-    """The runs' histories as cells. The first run's variant is the baseline; variants have the first run's name.
+    """The runs' histories as cells. A variant is called as its first run; the first run's variant is the baseline.
 
-    What was asked for makes a variant: what plan and budgets make of it differs from machine to machine and from seed
-    to seed.
+    Runs are of one variant where the same was asked for. What plan and budgets make of it does not count, for that
+    differs from machine to machine and from seed to seed.
 
     Raises:
         InputError: no run there, one without an evaluation, or the same run twice.
     """
-    variants: list[tuple[dict[str, Any], str]] = []  # what was asked for without the seed and the place, and its name
+    variants: dict[str, dict[str, Any]] = {}  # name -> what was asked for without the seed and the place
     results: list[CellResult] = []
     folders = [RunFolder(path) for path in paths]
     configs = [folder.read_config() for folder in folders]
@@ -35,25 +38,29 @@ def study_of_runs(paths: Sequence[Path]) -> Study:
         history = read_history(folder.history)
         if not history:
             raise InputError(f"'{path}' has no evaluation yet")
-        resolved, asked = config.to_mapping(), folder.read_asked().to_mapping()
+        asked = folder.read_asked().to_mapping()
         shared = _shared(asked, config.train.device)
-        name = next((name for known, name in variants if known == shared), None)
-        if name is None:
-            name = _new_name(path, {taken for _, taken in variants})
-            variants.append((shared, name))
-        result = CellResult(scene, name, config.train.seed, resolved, history, asked)
+        name = next((name for name, known in variants.items() if known == shared), None) or _new_name(path, variants)
+        variants[name] = shared
+        result = CellResult(
+            scene=scene,
+            variant=name,
+            seed=config.train.seed,
+            lpips_reason="a run's history does not record it; see the runs' own reports",
+            config=config.to_mapping(),
+            asked=asked,
+            peak_bytes=history[-1].memory_bytes,  # a CPU run records the peak of its process, which is its own
+            history=history,
+        )
         if any(other.key == result.key for other in results):
             raise InputError(f"'{path}' is the same run as another one: {result.key}")
-        # A CPU run records the peak of its process, which is its own.
-        result.peak_bytes = history[-1].memory_bytes
-        result.lpips_reason = "a run's history does not record it; see the runs' own reports"
         results.append(result)
-    ablation = Ablation(
-        title=f"Comparison of {len(paths)} runs",
-        variants={name: _overrides(variants[0][0], shared) for shared, name in variants},
-        base=str(variants[0][1]),
-    )
-    return Study(ablation, results)
+    base = next(iter(variants))
+    overrides = {
+        name: [f"{path}={value}" for path, value in difference(variants[base], shared).items() if path != ABSENT]
+        for name, shared in variants.items()
+    }
+    return Study(Ablation(title=f"Comparison of {len(paths)} runs", variants=overrides, base=base), results)
 
 
 def _scene_names(scenes: Sequence[SceneConfig]) -> list[str]:
@@ -73,27 +80,17 @@ def _scene_names(scenes: Sequence[SceneConfig]) -> list[str]:
 
 
 def _shared(asked: dict[str, Any], device: str) -> dict[str, Any]:
-    """What makes two runs seeds of one variant: all but the seed, the photos, and what is only reported or kept.
+    """What makes two runs seeds of one variant, ``section.key`` -> value: all that is in none of `UNSHARED`.
 
     Args:
-        device: that was taken.
+        device: the one that the run was trained on.
     """
-    sections = {name: dict(section) for name, section in asked.items() if name not in ("report", "scene")}
-    for key in ("seed", "checkpoint_every", "evaluate_at"):
-        sections["train"].pop(key)
-    sections["train"]["device"] = device
-    return sections
+    flat = flattened(asked) | {"train.device": device}
+    return {path: value for path, value in flat.items() if not path.startswith(UNSHARED)}
 
 
-def _new_name(path: Path, taken: set[str]) -> str:
+def _new_name(path: Path, taken: Container[str]) -> str:
     """The folder's name, made fit for a variant and unique."""
     name = re.sub(r"[^A-Za-z0-9_+.-]", "-", path.resolve().name)[:40].lstrip("._-") or "run"
-    if name not in taken:
-        return name
-    return next(f"{name}-{number}" for number in range(2, len(taken) + 3) if f"{name}-{number}" not in taken)
-
-
-def _overrides(base: dict[str, Any], other: dict[str, Any]) -> list[str]:
-    """Overrides that lead from one configuration to another."""
-    changes = difference(flattened(base), flattened(other))
-    return [f"{path}={value}" for path, value in changes.items() if path != ABSENT]
+    names = (name if number == 1 else f"{name}-{number}" for number in itertools.count(1))
+    return next(name for name in names if name not in taken)

@@ -11,13 +11,14 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 ABSENT = "absent"
-"""Key of a difference: the paths of the common configuration that the other one has not. Every path has a dot."""
+"""Key in a difference: its value lists the paths that only the common configuration has. No path is called so, for
+every path has a dot."""
 
 
 def flattened(mapping: Mapping[str, Any], place: str = "") -> dict[str, Any]:
     """``section.key`` -> value of a nested configuration.
 
-    A mapping that could not be found again by a path (it is empty, or a name in it has a dot) stays a value.
+    A mapping that is empty, or has a name with a dot, stays a value: no path could lead into it.
     """
     flat: dict[str, Any] = {}
     for key, value in mapping.items():
@@ -42,7 +43,7 @@ def nested(flat: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def common_configuration(flats: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """What most of these configurations have, path by path; of values that are as frequent, the first."""
+    """For each path the most frequent value; the first one where several are. A path that most lack is left out."""
     common: dict[str, Any] = {}
     for path in dict.fromkeys(path for flat in flats for path in flat):
         texts = Counter(_text(flat[path]) if path in flat else None for flat in flats)
@@ -67,5 +68,5 @@ def restored(common: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str,
 
 
 def _text(value: Any) -> str:
-    """For comparisons: 1, 1.0 and true are equal in Python, and not the same in a configuration."""
+    """A text to compare values by: in Python 1, 1.0 and True are equal, in a configuration they are different."""
     return json.dumps(value, sort_keys=True)

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import base64
-import html
 from collections.abc import Sequence
 from dataclasses import dataclass
+from html import escape
 from pathlib import Path
 
 from turbogs_plugin.report.tables import table
@@ -16,10 +16,37 @@ class Heading:
     text: str
     level: int = 2
 
+    def markdown(self) -> str:
+        return f"{'#' * self.level} {self.text}"
+
+    def html(self, folder: Path) -> str:
+        return f"<h{self.level}>{escape(self.text)}</h{self.level}>"
+
 
 @dataclass(frozen=True)
 class Paragraph:
     text: str
+
+    def markdown(self) -> str:
+        return self.text
+
+    def html(self, folder: Path) -> str:
+        return f"<p>{escape(self.text)}</p>"
+
+
+@dataclass(frozen=True)
+class Picture:
+    """`file`: its name, beside the page."""
+
+    file: str
+    text: str
+
+    def markdown(self) -> str:
+        return f"![{self.text}]({self.file})"
+
+    def html(self, folder: Path) -> str:
+        data = base64.b64encode((folder / self.file).read_bytes()).decode("ascii")
+        return f'<p><img alt="{escape(self.text)}" src="data:image/png;base64,{data}"></p>'
 
 
 @dataclass(frozen=True)
@@ -30,16 +57,22 @@ class Table:
     rows: Sequence[Sequence[str]]
     numeric: bool = True
 
+    def markdown(self) -> str:
+        return table(
+            self.header, [[cell.replace("|", "\\|") for cell in row] for row in self.rows]
+        )  # a bar ends a cell
 
-@dataclass(frozen=True)
-class Picture:
-    """`file`: its name, beside the page."""
+    def html(self, folder: Path) -> str:
+        kind = ' class="numeric"' if self.numeric else ""
+        head, *rows = (
+            "<tr>" + "".join(f"<{tag}>{escape(cell)}</{tag}>" for cell in row) + "</tr>"
+            for tag, row in [("th", self.header), *(("td", row) for row in self.rows)]
+        )
+        body = "\n".join(rows)
+        return f'<div class="scroll"><table{kind}>\n<thead>{head}</thead>\n<tbody>\n{body}\n</tbody></table></div>'
 
-    file: str
-    text: str
 
-
-Block = Heading | Paragraph | Table | Picture
+Block = Heading | Paragraph | Picture | Table
 
 CSS = """
 :root { color-scheme: light; }
@@ -57,48 +90,13 @@ img { max-width: 100%; } p { max-width: 60rem; }
 
 def to_markdown(title: str, blocks: Sequence[Block]) -> str:
     """Markdown, for a file beside the pictures."""
-    parts = [f"# {title}"]
-    for block in blocks:
-        if isinstance(block, Heading):
-            parts.append(f"{'#' * block.level} {block.text}")
-        elif isinstance(block, Paragraph):
-            parts.append(block.text)
-        elif isinstance(block, Table):
-            parts.append(table(block.header, [[_cell(value) for value in row] for row in block.rows]))
-        else:
-            parts.append(f"![{block.text}]({block.file})")
-    return "\n\n".join(parts) + "\n"
+    return "\n\n".join(block.markdown() for block in (Heading(title, 1), *blocks)) + "\n"
 
 
 def to_html(title: str, blocks: Sequence[Block], folder: Path) -> str:
     """One HTML file with the pictures of `folder` in it, which opens from the disk and asks for nothing else."""
-    body = [f"<h1>{html.escape(title)}</h1>"]
-    for block in blocks:
-        if isinstance(block, Heading):
-            body.append(f"<h{block.level}>{html.escape(block.text)}</h{block.level}>")
-        elif isinstance(block, Paragraph):
-            body.append(f"<p>{html.escape(block.text)}</p>")
-        elif isinstance(block, Table):
-            body.append(_html_table(block))
-        else:
-            data = base64.b64encode((folder / block.file).read_bytes()).decode("ascii")
-            body.append(f'<p><img alt="{html.escape(block.text)}" src="data:image/png;base64,{data}"></p>')
+    body = "\n".join(block.html(folder) for block in (Heading(title, 1), *blocks))
     return (
-        f'<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n<title>{html.escape(title)}</title>\n'
-        f"<style>{CSS}</style>\n</head>\n<body>\n" + "\n".join(body) + "\n</body>\n</html>\n"
+        f'<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n<title>{escape(title)}</title>\n'
+        f"<style>{CSS}</style>\n</head>\n<body>\n{body}\n</body>\n</html>\n"
     )
-
-
-def _html_table(block: Table) -> str:
-    def line(cells: Sequence[str], tag: str) -> str:
-        return "<tr>" + "".join(f"<{tag}>{html.escape(str(cell))}</{tag}>" for cell in cells) + "</tr>"
-
-    kind = ' class="numeric"' if block.numeric else ""
-    rows = "\n".join(line(row, "td") for row in block.rows)
-    head = line(block.header, "th")
-    return f'<div class="scroll"><table{kind}>\n<thead>{head}</thead>\n<tbody>\n{rows}\n</tbody></table></div>'
-
-
-def _cell(value: str) -> str:
-    """A bar would end a Markdown cell."""
-    return str(value).replace("|", "\\|")

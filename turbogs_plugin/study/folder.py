@@ -34,27 +34,16 @@ class StudyFolder:
         if self.path.is_dir() and any(self.path.iterdir()) and not self.file.is_file():
             raise InputError(f"--out '{self.path}' is not empty and holds no study: choose a new folder")
 
-    def write_ablation(self, ablation: Ablation) -> None:
-        """Begin a study, or go on with one whose variants may have become more."""
-        study = self.read_study() if self.file.is_file() else Study(ablation, [])
-        self.write_study(replace(study, ablation=ablation))
-
-    def write(self, result: CellResult) -> None:
-        """Keep a result; a failure of the same cell is forgotten."""
-        self._write_cell(result.key, Study(_ablation_of(result.key), [result]))
-
-    def write_failure(self, failure: Failure) -> None:
-        """Keep the reason why a cell has no result."""
-        self._write_cell(failure.key, Study(_ablation_of(failure.key), [], [failure]))
+    def write(self, outcome: CellResult | Failure) -> None:
+        """Keep a result, or the reason why there is none; a failure of a cell is forgotten when it has a result."""
+        path = self.cells / outcome.key.file
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_text_atomically(path, _cell_text(outcome))
 
     def write_study(self, study: Study) -> None:
         """Write ``results.json``."""
         self.path.mkdir(parents=True, exist_ok=True)
         write_text_atomically(self.file, study_to_json(study))
-
-    def read_results(self) -> dict[CellKey, CellResult]:
-        """The finished cells; none where there is no study."""
-        return {result.key: result for result in self.read_study().results} if self.file.is_file() else {}
 
     def read_study(self) -> Study:
         """Everything that is there, variants in the order of the ablation, scenes and seeds sorted.
@@ -82,15 +71,12 @@ class StudyFolder:
             failures=[failure for key, failure in failures.items() if key not in results],
         )
 
-    def _write_cell(self, key: CellKey, study: Study) -> None:
-        path = self.cells / key.file
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_text_atomically(path, study_to_json(study))
 
-
-def _ablation_of(key: CellKey) -> Ablation:
+def _cell_text(outcome: CellResult | Failure) -> str:
     """A cell's file is a study of that cell alone."""
-    return Ablation(title=str(key), variants={key.variant: []})
+    ablation = Ablation(title=str(outcome.key), variants={outcome.key.variant: []})
+    failed = isinstance(outcome, Failure)
+    return study_to_json(Study(ablation, [], [outcome]) if failed else Study(ablation, [outcome]))
 
 
 def merged(folders: Sequence[StudyFolder]) -> Study:
@@ -113,12 +99,6 @@ def merged(folders: Sequence[StudyFolder]) -> Study:
     for result in (result for study in studies for result in study.results):
         if result.capture and captures.setdefault(result.scene, result.capture) != result.capture:
             raise InputError(f"two different captures are called '{result.scene}' in what is to be merged")
-        if not _equal(results.setdefault(result.key, result), result):
+        if _cell_text(results.setdefault(result.key, result)) != _cell_text(result):
             raise InputError(f"two different results of the cell {result.key}")
     return Study(ablation, list(results.values()))
-
-
-def _equal(first: CellResult, second: CellResult) -> bool:
-    """Whether a file would say the same of both."""
-    ablation = _ablation_of(first.key)
-    return study_to_json(Study(ablation, [first])) == study_to_json(Study(ablation, [second]))

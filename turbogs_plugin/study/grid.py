@@ -26,6 +26,7 @@ from turbogs_plugin.config.yaml_text import packaged_names, read_named_yaml
 from turbogs_plugin.errors import InputError
 
 PACKAGE = "turbogs_plugin.configs.ablations"
+"""Where the packaged ablations are."""
 
 _NAME = re.compile(r"[A-Za-z0-9+][A-Za-z0-9_+.-]{0,47}")
 
@@ -103,10 +104,10 @@ def load_ablation(name_or_file: str) -> Ablation:
 
 
 def alike_at(ablation: Ablation, variants: Sequence[str], overrides: Sequence[str], steps: int) -> dict[str, str]:
-    """Of these variants, those that a common length leaves without a difference -> the one that they would repeat.
+    """Variants that become the same as another one when all have this length -> that other variant.
 
-    A length that is asked for is not the plan's to change, so that a variant about `train.epochs` would be another
-    one under its own name. Which variants are the same at their own lengths as well is the ablation's affair.
+    A variant may differ from another one by nothing but `train.epochs`, which a given number of iterations replaces.
+    Variants that are the same at their own lengths, too, are not listed: the ablation wants them so.
 
     Raises:
         InputError: naming the variant, whatever is wrong with its configuration.

@@ -6,20 +6,27 @@ import csv
 import io
 import math
 from collections.abc import Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from turbogs_plugin.config.units import parse_seconds
 from turbogs_plugin.files import write_text_atomically
+from turbogs_plugin.report.provenance import Provenance
+from turbogs_plugin.report.tables import number
 from turbogs_plugin.study.document import Block, Heading, Paragraph, Picture, Table, to_html, to_markdown
 from turbogs_plugin.study.folder import StudyFolder
 from turbogs_plugin.study.plots import PLOTS, write_plots
-from turbogs_plugin.study.results import CellResult, Study
+from turbogs_plugin.study.results import Study
 from turbogs_plugin.study.statistics import Spread
-from turbogs_plugin.study.summary import Reach, SceneSummary, VariantRow, summarise
-from turbogs_plugin.study.timing import TIMING_RULES
+from turbogs_plugin.study.summary import MEASURES, SceneSummary, VariantRow, summarise
 
 MIB = 2**20
+
+TIMING_RULES = (
+    "Seconds are those of training alone: the initial error maps and the iterations, by one clock for all cells, with "
+    "the GPU waited for wherever it is read. Loading, evaluation, and reports are not in them."
+)
 
 HOW_TO_READ = (
     "A number is the mean over seeds, the smallest and the largest in brackets where they matter. Two variants are "
@@ -56,12 +63,8 @@ def report_blocks(study: Study, summaries: Sequence[SceneSummary]) -> list[Block
     for summary in summaries:
         blocks += _scene(summary)
     if study.failures:
-        blocks += [
-            Heading("Cells without a result"),
-            Table(
-                ("cell", "reason"), [(str(failure.key), failure.reason) for failure in study.failures], numeric=False
-            ),
-        ]
+        failures = [(str(failure.key), failure.reason) for failure in study.failures]
+        blocks += [Heading("Cells without a result"), Table(("cell", "reason"), failures, numeric=False)]
     return blocks + _settings(study)
 
 
@@ -75,38 +78,26 @@ def _header(study: Study) -> list[Block]:
     if budgets:
         length.append(f"as many iterations as fit into {', '.join(budgets)} of training, calibration included")
     said = ", or ".join(length)
-    warmup = (
-        f"Before the clock starts, {_listing(warmups)} iterations of the same configuration, scaled to that length, "
-        "train a model that is thrown away."
-        if any(warmups)
-        else "Without warm-up."
-    )
-    blocks: list[Block] = [
-        Paragraph(f"{said[:1].upper()}{said[1:]}. {TIMING_RULES} {warmup}"),
-        Paragraph(HOW_TO_READ),
-    ]
+    warmup = "Without warm-up."
+    if any(warmups):
+        warmup = (
+            f"Before the clock starts, {_listing(warmups)} iterations of the same configuration, scaled to that "
+            "length, train a model that is thrown away."
+        )
+    blocks: list[Block] = [Paragraph(f"{said[:1].upper()}{said[1:]}. {TIMING_RULES} {warmup}"), Paragraph(HOW_TO_READ)]
     missing = sorted({result.lpips_reason for result in results if result.lpips_reason})
     blocks += [Paragraph(f"LPIPS was not computed: {reason}.") for reason in missing]
-    return [*blocks, *_machines(results)]
+    return [*blocks, *_machines(study.provenances)]
 
 
-def _machines(results: Sequence[CellResult]) -> list[Block]:
-    made = []
-    for result in results:
-        if result.provenance not in made:
-            made.append(result.provenance)
-    recorded = [entry for entry in made if entry is not None]
+def _machines(provenances: Sequence[Provenance | None]) -> list[Block]:
+    recorded = [entry for entry in provenances if entry is not None]
     rows = [
-        (
-            entry.machine,
-            entry.kernels,
-            entry.commit or "unknown",
-            ", ".join(f"{name} {version}" for name, version in entry.software.items()),
-        )
+        (entry.machine, entry.kernels, entry.commit or "unknown", ", ".join(map(" ".join, entry.software.items())))
         for entry in recorded
     ]
     blocks: list[Block] = [Table(("machine", "kernels", "commit", "software"), rows, numeric=False)] if rows else []
-    if None in made:
+    if None in provenances:
         blocks.append(Paragraph("The machine is not recorded for every run; seconds compare only within one machine."))
     if len({entry.machine for entry in recorded}) > 1:
         blocks.append(Paragraph("Cells are from different machines: their seconds do not compare."))
@@ -119,41 +110,46 @@ def _scene(summary: SceneSummary) -> list[Block]:
         *("variant", "front", "seeds", "time in s", f"time{against}", "PSNR in dB", f"PSNR{against}"),
         *("worst view in dB", "SSIM", "LPIPS (VGG)", "Gaussians", "FPS", "peak MiB"),
     )
-    reach_header = ["variant"]
+    reach_header, reach_lines = ["variant"], [[row.name] for row in summary.rows]
     for target in summary.targets:
         reach_header += [f"s to {target:.1f} dB", f"ratio{against}"]
+        for row, line in zip(summary.rows, reach_lines, strict=True):
+            line += [_reach_text(row.seconds_to(target)), _ratio_text(row.ratio_to(target))]
     blocks: list[Block] = [
         Heading(summary.scene),
         Table(header, [_result_line(row, summary) for row in summary.rows]),
         *(Picture(f"{summary.scene}-{plot.name}.png", f"{summary.scene}: {plot.text}") for plot in PLOTS),
         Heading(f"Time to reach a PSNR on {summary.scene}", 3),
-        Table(reach_header, [_reach_line(row) for row in summary.rows]),
+        Table(reach_header, reach_lines),
     ]
-    fitted = [f"{row.name} ({_listing(sorted(row.iterations))})" for row in summary.rows if row.iterations]
+    budgeted = {
+        row.name: sorted(cell.final.iteration for cell in row.cells if cell.time_budget) for row in summary.rows
+    }
+    fitted = [f"{name} ({_listing(iterations)})" for name, iterations in budgeted.items() if iterations]
     if fitted:
         blocks.append(Paragraph(f"Iterations that fit into the time budget, of each seed: {', '.join(fitted)}."))
     return blocks
 
 
 def _result_line(row: VariantRow, summary: SceneSummary) -> tuple[str, ...]:
-    base = summary.row(summary.baseline)
-    is_base = base is None or row.name == base.name
-    ratio = "" if is_base else f"x {row.seconds.mean / base.seconds.mean:.2f}{_verdict(row.seconds_differ)}"
-    difference = "" if is_base else f"{row.psnr_difference:+.2f}{_verdict(row.psnr_differs)}"
+    ratio = difference = ""
+    if summary.baseline not in ("", row.name):
+        ratio = f"x {row.ratio('seconds'):.2f}{_verdict(row.differs('seconds'))}"
+        difference = f"{row.difference('psnr'):+.2f}{_verdict(row.differs('psnr'))}"
     return (
         row.name,
         "★" if row.on_front else "",
-        str(len(row.seeds)),
+        str(len(row.cells)),
         spread_text(row.seconds, 1),
         ratio,
         spread_text(row.psnr, 2),
         difference,
-        spread_text(row.worst_psnr, 2, "not recorded"),
-        spread_text(row.ssim, 4),
-        spread_text(row.lpips, 4),
-        f"{row.gaussians.mean:.0f}",
-        "not recorded" if math.isnan(row.fps.mean) else f"{row.fps.mean:.0f}",
-        "not measured" if math.isnan(row.peak_bytes.mean) else f"{row.peak_bytes.mean / MIB:.0f}",
+        spread_text(row.spread("worst_psnr"), 2, "not recorded"),
+        spread_text(row.spread("ssim"), 4),
+        spread_text(row.spread("lpips"), 4),
+        number(row.spread("gaussians").mean, 0),
+        number(row.spread("fps").mean, 0, "not recorded"),
+        number(row.spread("peak_bytes").mean / MIB, 0, "not measured"),
     )
 
 
@@ -161,28 +157,21 @@ def _verdict(different: bool | None) -> str:
     return {None: " (open)", True: " (different)", False: " (overlap)"}[different]
 
 
-def _reach_line(row: VariantRow) -> list[str]:
-    line = [row.name]
-    for reach in row.reaches:
-        line += [_reach_text(reach), "" if math.isnan(reach.ratio) else f"x {reach.ratio:.2f}"]
-    return line
-
-
-def _reach_text(reach: Reach) -> str:
-    if reach.reached == 0:
+def _reach_text(seconds: Sequence[float]) -> str:
+    reached = sum(map(math.isfinite, seconds))
+    if not reached:
         return "not reached"
-    if reach.reached < reach.seconds.count:
-        return f"{reach.reached} of {reach.seconds.count} seeds"
-    return spread_text(reach.seconds, 2)
+    return f"{reached} of {len(seconds)} seeds" if reached < len(seconds) else spread_text(Spread.of(seconds), 2)
+
+
+def _ratio_text(ratio: float) -> str:
+    return "" if math.isnan(ratio) else f"x {ratio:.2f}"
 
 
 def spread_text(spread: Spread, digits: int, absent: str = "not computed") -> str:
     """``mean [low, high]``; the mean alone for one seed."""
-    if math.isnan(spread.mean):
-        return absent
-    if spread.count == 1:
-        return f"{spread.mean:.{digits}f}"
-    return f"{spread.mean:.{digits}f} [{spread.low:.{digits}f}, {spread.high:.{digits}f}]"
+    mean, low, high = (number(value, digits, absent) for value in (spread.mean, spread.low, spread.high))
+    return mean if spread.count == 1 or math.isnan(spread.mean) else f"{mean} [{low}, {high}]"
 
 
 def _settings(study: Study) -> list[Block]:
@@ -205,24 +194,24 @@ def _settings(study: Study) -> list[Block]:
 
 def table_csv(summaries: Sequence[SceneSummary]) -> str:
     """All numbers of the tables, unrounded; empty where not computed or not measured, ``inf`` where never reached."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    spreads = [field.name for field in fields(VariantRow) if field.type == "Spread"]
-    header = ["scene", "variant", "seeds", "pareto", "psnr_differs_from_baseline", "seconds_differ_from_baseline"]
-    header += [f"{name}_{part}" for name in spreads for part in ("mean", "low", "high")]
-    most = max((len(summary.targets) for summary in summaries), default=0)
-    for number in range(most):
-        header += [f"target_{number}_psnr", f"target_{number}_seconds", f"target_{number}_ratio"]
-    writer.writerow(header)
+    lines: list[dict[str, Any]] = []
     for summary in summaries:
         for row in summary.rows:
-            line = [summary.scene, row.name, len(row.seeds), row.on_front, row.psnr_differs, row.seconds_differ]
-            for name in spreads:
-                spread = getattr(row, name)
-                line += [spread.mean, spread.low, spread.high]
-            for reach in row.reaches:
-                line += [reach.psnr, reach.seconds.mean, reach.ratio]
-            writer.writerow(["" if value is None or value != value else value for value in line])
+            line = {"scene": summary.scene, "variant": row.name, "seeds": len(row.cells), "pareto": row.on_front}
+            line["psnr_differs_from_baseline"] = row.differs("psnr")
+            line["seconds_differ_from_baseline"] = row.differs("seconds")
+            for measure in MEASURES:
+                spread = row.spread(measure)
+                line |= {f"{measure}_mean": spread.mean, f"{measure}_low": spread.low, f"{measure}_high": spread.high}
+            for place, target in enumerate(summary.targets):
+                line[f"target_{place}_psnr"] = target
+                line[f"target_{place}_seconds"] = Spread.of(row.seconds_to(target)).mean
+                line[f"target_{place}_ratio"] = row.ratio_to(target)
+            lines.append({name: "" if value is None or value != value else value for name, value in line.items()})
+    text = io.StringIO()
+    writer = csv.DictWriter(text, lines[0], lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(lines)
     return text.getvalue()
 
 

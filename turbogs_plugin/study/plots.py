@@ -19,7 +19,7 @@ from matplotlib.transforms import Bbox
 from PIL import Image, PngImagePlugin
 
 from turbogs_plugin.files import write_atomically
-from turbogs_plugin.report.plots import STYLE
+from turbogs_plugin.report.plots import SECONDS_LABEL, STYLE
 from turbogs_plugin.study.summary import SceneSummary, VariantRow
 
 COLORS = ("#1f5fa8", "#d1495b", "#2e8b57", "#e08e0b", "#7a4fa3", "#17919e", "#8c5a3c", "#5c6670")
@@ -28,19 +28,20 @@ BASELINE_COLOR = "black"
 OTHER_COLOR = "0.75"
 LABEL_SIZE = 8
 TOLD_APART_UP_TO = 10
-"""So many variants have a colour and a shaded spread each; of more, only the baseline and the Pareto front have."""
+"""Where there are more variants, only the baseline and the Pareto front have a colour and a shaded spread."""
 
 SHOWN_BELOW = 4.0
-"""dB below the worst final result at which the PSNR plot ends: what comes before is over in a moment."""
+"""The PSNR plot ends this many dB below the worst final result: trainings pass what is below in a moment."""
 SHOWN_ABOVE = 1.6
-"""Times the worst final error, at which that plot ends: 4 dB as well."""
+"""The plot of errors ends at the worst final error times this, which is 4 dB as well."""
 FAILED_BELOW = 8.0
-"""dB below the best final result at which a variant has failed: it is named below a plot to the scale of the others."""
+"""A variant has failed that ends this many dB below the best one: it is not drawn, but named below the plot."""
 
 DRAWING = 1
-"""Raised by whoever changes how a plot looks: a plot of the same data is not drawn again."""
+"""Version of the way in which plots are drawn. Raise it with every change of that: a plot is only drawn again where its
+data or this number differ."""
 DATA_KEY = "data"
-"""Text in a plot's PNG: the digest of what it shows."""
+"""Name of the text in a plot's PNG that holds the digest of what it shows."""
 PALETTE = 128
 """Colours of a plot's PNG: a third of the bytes, and no difference that can be seen."""
 
@@ -81,7 +82,7 @@ def write_plots(folder: Path, summary: SceneSummary) -> None:
 def plot_digest(summary: SceneSummary) -> str:
     """Of all that the plots show, and of the way in which they show it."""
     rows = [
-        (row.name, row.on_front, *map(asdict, (row.seconds, row.psnr, row.psnr_curve, row.l1_curve)))
+        (row.name, row.on_front, *map(asdict, (row.seconds, row.psnr, row.curve("psnr"), row.curve("l1"))))
         for row in summary.rows
     ]
     text = json.dumps([DRAWING, summary.scene, summary.baseline, rows], default=np.ndarray.tolist)
@@ -99,20 +100,17 @@ def shown_digest(path: Path) -> str:
 
 def _styles(summary: SceneSummary) -> dict[str, tuple[str, str]]:
     """Variant -> (colour, dash): black for the baseline, else one of each combination."""
-    combinations = ((color, dash) for dash, color in itertools.product(DASHES, COLORS))
-    return {
-        row.name: (BASELINE_COLOR, "-") if row.name == summary.baseline else style
-        for row, style in zip(summary.rows, itertools.cycle(combinations), strict=False)
-    }
+    combinations = itertools.cycle((color, dash) for dash in DASHES for color in COLORS)
+    styles = {row.name: style for row, style in zip(summary.rows, combinations, strict=False)}
+    return styles | {summary.baseline: (BASELINE_COLOR, "-")}
 
 
 def told_apart(summary: SceneSummary) -> tuple[list[VariantRow], str]:
     """The variants that set a plot's scale, and a line that names those that failed ("" for none)."""
     floor = max(row.psnr.mean for row in summary.rows) - FAILED_BELOW
-    failed = [row for row in summary.rows if row.psnr.mean < floor]
-    shown = [row for row in summary.rows if not row.psnr.mean < floor]  # NaN is shown
-    words = (f"{row.name} ({row.psnr.mean:.1f} dB in {row.seconds.mean:.1f} s)" for row in failed)
-    return shown, "Not in the plot: " + ", ".join(words) if failed else ""
+    failed = [row for row in summary.rows if row.psnr.mean < floor]  # NaN is shown
+    words = ", ".join(f"{row.name} ({row.psnr.mean:.1f} dB in {row.seconds.mean:.1f} s)" for row in failed)
+    return [row for row in summary.rows if row not in failed], f"Not in the plot: {words}" if failed else ""
 
 
 def draw_curves(summary: SceneSummary) -> Figure:
@@ -122,32 +120,30 @@ def draw_curves(summary: SceneSummary) -> Figure:
     grey behind these; the front's plot has their names.
     """
     styles, (rows, failed) = _styles(summary), told_apart(summary)
-    few = len(rows) <= TOLD_APART_UP_TO
-    named, others = [], []
-    for row in rows:
-        (named if few or row.on_front or row.name == summary.baseline else others).append(row)
+    named, others = rows, []
+    if len(rows) > TOLD_APART_UP_TO:
+        named = [row for row in rows if row.on_front or row.name == summary.baseline]
+        others = [row for row in rows if row not in named]
     figure = Figure(figsize=(12.0, 5.2), layout="constrained")
     for axes, name in zip(figure.subplots(1, 2), ("psnr", "l1"), strict=True):
         for row in others:
-            curve = getattr(row, f"{name}_curve")
-            label = f"{len(others)} others" if row is others[0] else None
+            curve, label = row.curve(name), f"{len(others)} others" if row is others[0] else None
             axes.plot(curve.seconds, curve.mean, color=OTHER_COLOR, linewidth=0.8, label=label)
         for row in named:
-            curve = getattr(row, f"{name}_curve")
-            color, dash = styles[row.name]
+            curve, (color, dash) = row.curve(name), styles[row.name]
             axes.plot(curve.seconds, curve.mean, dash, marker="o", markersize=3.5, color=color, label=row.name)
             if row.psnr.count > 1:
                 axes.fill_between(curve.seconds, curve.low, curve.high, color=color, alpha=0.15, linewidth=0)
-        axes.set_xlabel("training time in seconds (evaluation excluded)")
+        axes.set_xlabel(SECONDS_LABEL)
         axes.set_xlim(left=0)
     psnr_axes, l1_axes = figure.axes
     floor = min(row.psnr.mean for row in rows) - SHOWN_BELOW
     psnr_axes.set(ylabel="test PSNR in dB", title=f"{summary.scene}: PSNR")
     psnr_axes.set_ylim(bottom=max(floor, psnr_axes.get_ylim()[0]))
     l1_axes.set(ylabel="mean absolute error on test views (0 .. 1)", title="mean absolute error")
-    ceiling = SHOWN_ABOVE * max(row.l1_curve.mean[-1] for row in rows)
-    floor = 0.9 * min(min(row.l1_curve.mean) for row in rows)
-    l1_axes.set_ylim(bottom=floor, top=min(ceiling, l1_axes.get_ylim()[1]))
+    errors = [row.curve("l1").mean for row in rows]
+    ceiling = SHOWN_ABOVE * max(error[-1] for error in errors)
+    l1_axes.set_ylim(bottom=0.9 * min(map(min, errors)), top=min(ceiling, l1_axes.get_ylim()[1]))
     handles, labels = psnr_axes.get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside right center", frameon=False, fontsize=9)
     figure.supxlabel(failed, fontsize=9)
@@ -171,21 +167,10 @@ def draw_front(summary: SceneSummary) -> Figure:
             elinewidth=1.0,
             alpha=0.9,
         )
-    front = sorted((row for row in rows if row.on_front), key=lambda row: row.seconds.mean)
-    axes.step(
-        [row.seconds.mean for row in front],
-        [row.psnr.mean for row in front],
-        where="post",
-        color="grey",
-        linewidth=1.2,
-        zorder=0,
-        label="Pareto front (stars)",
-    )
-    axes.set(
-        xlabel="training time in seconds (evaluation excluded)",
-        ylabel="final test PSNR in dB",
-        title=f"{summary.scene}: error against time",
-    )
+    front = sorted((row.seconds.mean, row.psnr.mean) for row in rows if row.on_front)
+    steps = np.reshape(front, (-1, 2)).T  # [2, variants], also of none
+    axes.step(*steps, where="post", color="grey", linewidth=1.2, zorder=0, label="Pareto front (stars)")
+    axes.set(xlabel=SECONDS_LABEL, ylabel="final test PSNR in dB", title=f"{summary.scene}: error against time")
     axes.margins(x=0.18, y=0.12)
     axes.legend(loc="lower right", frameon=False, fontsize=9)
     figure.supxlabel(failed, fontsize=9)

@@ -1,4 +1,4 @@
-"""What a sweep shows: a line a cell with the time left, and on a terminal a bar of the present one."""
+"""What a sweep shows: for each cell a line with the time left, and on a terminal a bar of the present cell."""
 
 from __future__ import annotations
 
@@ -33,24 +33,19 @@ class SweepProgress(TerminalBar):
         if self._bar is not None:
             self._bar.reset(self._task, total=None, description=str(key), left=self._left())
 
-    def finished(self, result: CellResult) -> None:
-        """Called after a cell."""
-        final = result.final
-        self._count(
-            f"{result.key}: {final.psnr:.2f} dB in {final.train_seconds:.1f} s, {final.num_gaussians} Gaussians"
-        )
-
-    def failed(self, failure: Failure) -> None:
-        """Called after a cell that broke."""
-        self._count(f"{failure.key}: FAILED: {failure.reason}")
-
-    def _count(self, text: str) -> None:
+    def ended(self, outcome: CellResult | Failure) -> None:
+        """Called after a cell, finished or broken."""
+        if isinstance(outcome, Failure):
+            text = f"FAILED: {outcome.reason}"
+        else:
+            final = outcome.final
+            text = f"{final.psnr:.2f} dB in {final.train_seconds:.1f} s, {final.num_gaussians} Gaussians"
         self.done += 1
         left = self._left()
-        self._say(f"[{self.done}/{self.total}] {text}" + (f"; {left}" if left else ""))
+        self._say(f"[{self.done}/{self.total}] {outcome.key}: {text}" + (f"; {left}" if left else ""))
 
     def _left(self) -> str:
-        """From the mean time of the cells so far, all they needed included."""
+        """The time left in words, by the mean time that a cell has taken so far; "" where it is not known."""
         if not self.done or self.done == self.total:
             return ""
         seconds = round((time.perf_counter() - self._started) / self.done * (self.total - self.done))

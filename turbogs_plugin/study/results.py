@@ -11,39 +11,39 @@ from turbogs_plugin.study.grid import Ablation, CellKey
 from turbogs_plugin.train.history import Evaluation
 
 
-@dataclass
+@dataclass(kw_only=True)
 class CellResult:
-    """What one training gave.
+    """What one training gave. `turbogs_plugin.study.results_file` keeps all of it, in this order.
 
     Args:
         scene, variant, seed: which.
-        config: its configuration, as plan and budgets resolved it.
-        history: every evaluation, the last one of the final model.
-        asked: the sections of `config` that were asked for otherwise, as they were asked for.
+        capture: `capture_digest` of the scene, or "" where it was not recorded.
+        provenance: machine, versions and commit, or None where they were not recorded.
         resolved: False in a record that has only the configuration asked for, which is then `config`.
+        warmup_iterations: iterations of the same configuration before the clock started, on a model thrown away.
+        lpips_reason: why LPIPS was not computed; empty where it was.
+        config: its configuration, as plan and budgets resolved it.
+        asked: the configuration that was asked for: by it a finished cell is recognised.
         lpips: NaN where it was not computed.
-        lpips_reason: why not; empty where it was.
         fps: test views rendered a second, one after the other; NaN where it was not recorded.
         peak_bytes: peak of the GPU's tensors while training, or None where it was not measured.
-        warmup_iterations: iterations of the same configuration before the clock started, on a model thrown away.
-        provenance: machine, versions and commit, or None where they were not recorded.
-        capture: `capture_digest` of the scene, or "" where it was not recorded.
+        history: every evaluation, the last one of the final model.
     """
 
     scene: str
     variant: str
     seed: int
-    config: dict[str, Any]
-    history: list[Evaluation]
-    asked: dict[str, dict[str, Any]] = field(default_factory=dict)
+    capture: str = ""
+    provenance: Provenance | None = None
     resolved: bool = True
-    lpips: float = math.nan
+    warmup_iterations: int = 0
     lpips_reason: str = ""
+    config: dict[str, Any]
+    asked: dict[str, Any]
+    lpips: float = math.nan
     fps: float = math.nan
     peak_bytes: int | None = None
-    warmup_iterations: int = 0
-    provenance: Provenance | None = None
-    capture: str = ""
+    history: list[Evaluation]
 
     @property
     def key(self) -> CellKey:
@@ -53,11 +53,6 @@ class CellResult:
     def final(self) -> Evaluation:
         """The evaluation of the final model."""
         return self.history[-1]
-
-    @property
-    def asked_config(self) -> dict[str, Any]:
-        """The configuration that was asked for: by it a finished cell is recognised."""
-        return {**self.config, **self.asked}
 
     @property
     def time_budget(self) -> str:
@@ -92,6 +87,12 @@ class Study:
     @property
     def scenes(self) -> list[str]:
         return list(dict.fromkeys(result.scene for result in self.results))
+
+    @property
+    def provenances(self) -> list[Provenance | None]:
+        """The different ones of the results, in their order."""
+        made = [result.provenance for result in self.results]
+        return [entry for number, entry in enumerate(made) if entry not in made[:number]]
 
     def of(self, scene: str, variant: str) -> list[CellResult]:
         """The results of all seeds."""

@@ -10,12 +10,12 @@ from __future__ import annotations
 import json
 import math
 from collections import Counter
-from collections.abc import Mapping
-from dataclasses import MISSING, dataclass, field, fields, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import MISSING, dataclass, field, fields, make_dataclass, replace
 from pathlib import Path
-from typing import Any, get_type_hints
+from typing import Any
 
-from turbogs_plugin.config.schema import build_dataclass, convert, dataclass_mapping, nearest
+from turbogs_plugin.config.schema import build_dataclass, convert, dataclass_mapping
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.report.provenance import Provenance
 from turbogs_plugin.study.difference import common_configuration, difference, flattened, nested, restored
@@ -24,7 +24,7 @@ from turbogs_plugin.study.results import CellResult, Failure, Study
 from turbogs_plugin.train.history import Evaluation
 
 FORMAT = 2
-"""Raised where an older reader would take a file for something else."""
+"""Raised by one whenever an older version of TurboGS would misread a new file."""
 
 DECIMALS = {"train_seconds": 6, "psnr": 5, "worst_psnr": 5, "ssim": 7, "l1": 7, "lpips": 7, "fps": 3}
 """Digits behind the point that are kept of a measure: for errors those that float32 has."""
@@ -32,37 +32,14 @@ DECIMALS = {"train_seconds": 6, "psnr": 5, "worst_psnr": 5, "ssim": 7, "l1": 7, 
 SHARED = ("provenance", "resolved", "warmup_iterations", "lpips_reason")
 """Fields of a cell that are written once, as ``common``, and in a cell only where its value is another one."""
 
-_EVALUATION_TYPES = get_type_hints(Evaluation)
-_EVALUATION_DEFAULTS = {entry.name: entry.default for entry in fields(Evaluation)}
-
-
-@dataclass
-class StoredCell:
-    """A cell as a file has it, together with what is common.
-
-    Args:
-        scene, variant, seed, capture, resolved, warmup_iterations, lpips_reason, peak_bytes: as in `CellResult`.
-        provenance: place in the document's list.
-        config: its difference from the document's.
-        asked: the difference of what was asked for from the cell's own configuration.
-        lpips, fps: null where not computed or not recorded.
-        history: field of `Evaluation` -> its values. A field that has its default all along is left out.
-    """
-
-    scene: str
-    variant: str
-    seed: int
-    capture: str
-    provenance: int
-    resolved: bool
-    warmup_iterations: int
-    lpips_reason: str
-    config: dict[str, Any] = field(default_factory=dict)
-    asked: dict[str, Any] = field(default_factory=dict)
-    lpips: float | None = None
-    fps: float | None = None
-    peak_bytes: int | None = None
-    history: dict[str, list[Any]] = field(default_factory=dict)
+Columns = make_dataclass(
+    "Columns",
+    [
+        (entry.name, list[int] if entry.type == "int" else list[float | None], field(default=entry.default))
+        for entry in fields(Evaluation)
+    ],
+)
+"""A history as the file has it: field of `Evaluation` -> its values. One that has its default all along is absent."""
 
 
 @dataclass
@@ -75,7 +52,9 @@ class Document:
         captures: scene -> digest of its capture, for cells that name no other.
         common: field in `SHARED` -> its value in cells that name no other.
         config: the common configuration, ``section.key`` -> value.
-        cells: fields of `StoredCell`, without what is common, nulls and empty differences.
+        cells: of each, what is not common: fields of `CellResult`, but for ``provenance``, which is a place in
+            `provenances`; ``config``, the difference from `config`; ``asked``, the difference from the cell's own
+            configuration; and ``history``, `Columns`. What is absent has the default.
     """
 
     format: int
@@ -91,16 +70,13 @@ class Document:
 
 def study_to_json(study: Study) -> str:
     """The text of the file."""
-    provenances: list[Provenance | None] = []
     captures: dict[str, str] = {}
-    cells = []
     for result in study.results:
-        if result.provenance not in provenances:
-            provenances.append(result.provenance)
         captures[result.scene] = captures.get(result.scene) or result.capture
-        cells.append(_stored(result, provenances.index(result.provenance)))
-    common = {name: Counter(getattr(cell, name) for cell in cells).most_common(1)[0][0] for name in SHARED if cells}
-    config = common_configuration([cell.config for cell in cells])
+    provenances = study.provenances
+    cells = [_complete(result, provenances) for result in study.results]
+    common = {name: Counter(cell[name] for cell in cells).most_common(1)[0][0] for name in SHARED if cells}
+    config = common_configuration([cell["config"] for cell in cells])
     document = Document(
         format=FORMAT,
         ablation=study.ablation,
@@ -110,9 +86,9 @@ def study_to_json(study: Study) -> str:
         common=common,
         config=config,
         failures=study.failures,
-        cells=[_reduced(cell, common | {"capture": captures[cell.scene]}, config) for cell in cells],
+        cells=[_reduced(cell, common | {"capture": captures[cell["scene"]]}, config) for cell in cells],
     )
-    return _two_levels(dataclass_mapping(document))
+    return _text(dataclass_mapping(document), 2) + "\n"
 
 
 def study_from_json(path: Path) -> Study:
@@ -126,29 +102,19 @@ def study_from_json(path: Path) -> Study:
     if mapping["format"] != FORMAT:
         raise InputError(f"'{path}' is of format {mapping['format']}: this version of TurboGS reads format {FORMAT}")
     document = build_dataclass(Document, mapping, str(path))
-    results = [_result(document, number, f"{path}.cells[{number}]") for number in range(len(document.cells))]
+    results = [_result(document, cell, f"{path}.cells[{number}]") for number, cell in enumerate(document.cells)]
     return Study(document.ablation, results, document.failures, document.targets)
 
 
-def _stored(result: CellResult, provenance: int) -> StoredCell:
-    """All of a result, its configuration complete and flat."""
+def _complete(result: CellResult, provenances: Sequence[Provenance | None]) -> dict[str, Any]:
+    """All of a result as the file has it, its configuration complete and flat."""
     config = _placeless(result.config)
-    return StoredCell(
-        scene=result.scene,
-        variant=result.variant,
-        seed=result.seed,
-        capture=result.capture,
-        provenance=provenance,
-        resolved=result.resolved,
-        warmup_iterations=result.warmup_iterations,
-        lpips_reason=result.lpips_reason,
-        config=config,
-        asked=difference(config, _placeless(result.asked_config)),
-        lpips=_rounded("lpips", result.lpips),
-        fps=_rounded("fps", result.fps),
-        peak_bytes=result.peak_bytes,
-        history=_columns(result.history),
-    )
+    return {name: _rounded(name, value) for name, value in vars(result).items()} | {
+        "provenance": provenances.index(result.provenance),
+        "config": config,
+        "asked": difference(config, _placeless(result.asked)),
+        "history": _columns(result.history),
+    }
 
 
 def _placeless(config: Mapping[str, Any]) -> dict[str, Any]:
@@ -159,99 +125,67 @@ def _placeless(config: Mapping[str, Any]) -> dict[str, Any]:
     return flat
 
 
-def _reduced(cell: StoredCell, common: Mapping[str, Any], config: Mapping[str, Any]) -> dict[str, Any]:
+def _reduced(cell: dict[str, Any], common: Mapping[str, Any], config: Mapping[str, Any]) -> dict[str, Any]:
     """What a cell's line says."""
-    changed = replace(cell, config=difference(config, cell.config))
-    return {
-        name: value
-        for name, value in dataclass_mapping(changed).items()
-        if value is not None and value != {} and not (name in common and value == common[name])
-    }
+    cell = cell | {"config": difference(config, cell["config"])}
+    own = {name: value for name, value in cell.items() if name not in common or value != common[name]}
+    return {name: value for name, value in own.items() if value not in (None, {})}
 
 
-def _result(document: Document, number: int, where: str) -> CellResult:
-    own = document.cells[number]
-    captured = {"capture": document.captures.get(str(own.get("scene")), "")}
-    cell = build_dataclass(StoredCell, document.common | captured | own, where)
-    if not 0 <= cell.provenance < len(document.provenances):
-        raise InputError(f"{where}.provenance: there is no provenance {cell.provenance}")
-    flat = restored(document.config, cell.config)
+def _result(document: Document, cell: dict[str, Any], where: str) -> CellResult:
+    cell = document.common | {"capture": document.captures.get(str(cell.get("scene")), "")} | cell
+    changes, asked_changes = (
+        convert(cell.get(name, {}), dict[str, Any], f"{where}.{name}") for name in ("config", "asked")
+    )
+    flat = restored(document.config, changes)
     try:
-        config, asked = nested(flat), nested(restored(flat, cell.asked))
+        cell["config"], cell["asked"] = nested(flat), nested(restored(flat, asked_changes))
     except (AttributeError, TypeError):
         raise InputError(f"{where}: its configuration cannot be restored") from None
-    return CellResult(
-        scene=cell.scene,
-        variant=cell.variant,
-        seed=cell.seed,
-        config=config,
-        history=_evaluations(cell.history, f"{where}.history"),
-        asked={name: section for name, section in asked.items() if section != config.get(name)},
-        resolved=cell.resolved,
-        lpips=math.nan if cell.lpips is None else cell.lpips,
-        lpips_reason=cell.lpips_reason,
-        fps=math.nan if cell.fps is None else cell.fps,
-        peak_bytes=cell.peak_bytes,
-        warmup_iterations=cell.warmup_iterations,
-        provenance=document.provenances[cell.provenance],
-        capture=cell.capture,
-    )
+    place = convert(cell.get("provenance"), int, f"{where}.provenance")
+    if not 0 <= place < len(document.provenances):
+        raise InputError(f"{where}.provenance: there is no provenance {place}")
+    history = _evaluations(cell.get("history", {}), f"{where}.history")
+    result = build_dataclass(CellResult, cell | {"provenance": None, "history": []}, where)
+    return replace(result, provenance=document.provenances[place], history=history)
 
 
-def _columns(history: list[Evaluation]) -> dict[str, list[Any]]:
-    columns = {
-        name: [_rounded(name, getattr(evaluation, name)) for evaluation in history] for name in _EVALUATION_DEFAULTS
-    }
-    return {
-        name: values
-        for name, values in columns.items()
-        if (default := _EVALUATION_DEFAULTS[name]) is MISSING
-        or any(value != _rounded(name, default) for value in values)
-    }
+def _columns(history: Sequence[Evaluation]) -> dict[str, list[Any]]:
+    columns = {}
+    for entry in fields(Evaluation):
+        values = [_rounded(entry.name, getattr(evaluation, entry.name)) for evaluation in history]
+        if entry.default is MISSING or any(value != _rounded(entry.name, entry.default) for value in values):
+            columns[entry.name] = values
+    return columns
 
 
-def _evaluations(columns: Mapping[str, list[Any]], where: str) -> list[Evaluation]:
-    for name in columns:
-        if name not in _EVALUATION_TYPES:
-            raise InputError(f"unknown key '{where}.{name}': {nearest(name, _EVALUATION_TYPES)}")
-    for name, default in _EVALUATION_DEFAULTS.items():
-        if default is MISSING and name not in columns:
-            raise InputError(f"{where}: key '{name}' is missing")
-    lengths = {len(values) for values in columns.values()}
-    if len(lengths) > 1 or 0 in lengths:
+def _evaluations(history: Mapping[str, Any], where: str) -> list[Evaluation]:
+    columns = vars(build_dataclass(Columns, history, where))
+    given = {name: columns[name] for name in history}
+    lengths = {len(values) for values in given.values()}
+    if len(lengths) != 1 or 0 in lengths:
         raise InputError(f"{where}: columns of one length are needed, with one evaluation at least")
     return [
-        Evaluation(**{name: _number(values[row], name, f"{where}.{name}[{row}]") for name, values in columns.items()})
-        for row in range(lengths.pop())
+        Evaluation(**{name: math.nan if value is None else value for name, value in zip(given, row, strict=True)})
+        for row in zip(*given.values(), strict=True)
     ]
 
 
-def _number(value: Any, name: str, where: str) -> float:
-    kind = _EVALUATION_TYPES[name]
-    return math.nan if value is None and kind is float else convert(value, kind, where)
-
-
-def _rounded(name: str, value: float) -> float | None:
-    """With the digits that are kept; null where it is not finite, which JSON has no word for."""
-    if isinstance(value, int):
+def _rounded(name: str, value: Any) -> Any:
+    """A float with the digits that are kept; null where it is not finite, which JSON has no word for."""
+    if not isinstance(value, float):
         return value
     return round(value, DECIMALS[name]) if math.isfinite(value) else None
 
 
-def _two_levels(mapping: Mapping[str, Any]) -> str:
-    """JSON with a line for each entry of what stands at the top."""
-    parts = []
-    for name, value in mapping.items():
-        if isinstance(value, dict) and value:
-            inner = ",\n".join(f"  {_compact(key)}: {_compact(item)}" for key, item in value.items())
-            parts.append(f" {_compact(name)}: {{\n{inner}\n }}")
-        elif isinstance(value, list) and value:
-            inner = ",\n".join(f"  {_compact(item)}" for item in value)
-            parts.append(f" {_compact(name)}: [\n{inner}\n ]")
-        else:
-            parts.append(f" {_compact(name)}: {_compact(value)}")
-    return "{\n" + ",\n".join(parts) + "\n}\n"
-
-
-def _compact(value: Any) -> str:
-    return json.dumps(value, ensure_ascii=False, separators=(",", ":"))
+def _text(value: Any, levels: int, indent: str = "") -> str:
+    """JSON with a line for each entry of so many levels."""
+    if not levels or not value or not isinstance(value, dict | list):
+        return json.dumps(value, ensure_ascii=False, separators=(",", ":"))
+    below = levels - 1, indent + " "
+    if isinstance(value, dict):
+        entries = [f"{_text(key, 0)}: {_text(item, *below)}" for key, item in value.items()]
+    else:
+        entries = [_text(item, *below) for item in value]
+    start, end = "{}" if isinstance(value, dict) else "[]"
+    return f"{start}\n" + ",\n".join(f"{indent} {entry}" for entry in entries) + f"\n{indent}{end}"

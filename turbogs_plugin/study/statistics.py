@@ -26,10 +26,10 @@ class Spread:
     count: int
 
     @classmethod
-    def of(cls, values: Iterable[float]) -> Spread:
-        """NaN in any value makes all NaN: a mean over some of the seeds would be compared with means over all."""
+    def of(cls, values: Iterable[float | None]) -> Spread:
+        """NaN or None in any makes all NaN: a mean over some seeds would be compared with means over all."""
         values = list(values)
-        if not values or any(math.isnan(value) for value in values):
+        if not values or any(value is None or math.isnan(value) for value in values):
             return cls(math.nan, math.nan, math.nan, len(values))
         return cls(math.fsum(values) / len(values), min(values), max(values), len(values))
 
@@ -84,14 +84,10 @@ class Curve:
 def pareto_front(points: Sequence[tuple[float, float]]) -> list[bool]:
     """For each (seconds, quality) whether no other is at least as fast and as good, and better in one of the two.
 
-    A point with NaN is not on the front and keeps nobody from it.
+    A point with NaN is not on the front and keeps nobody from it, for no comparison with NaN is true.
     """
 
-    def beats(first: tuple[float, float], second: tuple[float, float]) -> bool:
-        return first[0] <= second[0] and first[1] >= second[1] and first != second
+    def beaten(point: tuple[float, float]) -> bool:
+        return any(other[0] <= point[0] and other[1] >= point[1] and other != point for other in points)
 
-    valid = [not math.isnan(seconds + quality) for seconds, quality in points]
-    return [
-        valid[number] and not any(beats(other, point) for other, good in zip(points, valid, strict=True) if good)
-        for number, point in enumerate(points)
-    ]
+    return [not math.isnan(sum(point)) and not beaten(point) for point in points]

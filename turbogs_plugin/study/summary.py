@@ -5,67 +5,81 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from operator import attrgetter
 
 from turbogs_plugin.study.results import CellResult, Study
 from turbogs_plugin.study.statistics import Curve, Spread, differ, pareto_front, seconds_to_reach
 
 TARGET_STEP = 0.5
-"""Default targets of the time to a PSNR are this many dB apart, from what every seed of the baseline reached down."""
+"""dB between the default targets of the time to a PSNR. The highest one is what every seed of the baseline reached."""
+
+MEASURES = {
+    "seconds": attrgetter("final.train_seconds"),
+    "psnr": attrgetter("final.psnr"),
+    "worst_psnr": attrgetter("final.worst_psnr"),
+    "ssim": attrgetter("final.ssim"),
+    "l1": attrgetter("final.l1"),
+    "lpips": attrgetter("lpips"),
+    "gaussians": attrgetter("final.num_gaussians"),
+    "fps": attrgetter("fps"),
+    "peak_bytes": attrgetter("peak_bytes"),
+}
+"""What is compared: name -> its value in a `CellResult`, at the final model."""
 
 
-@dataclass
-class Reach:
-    """Time to reach a PSNR.
-
-    Args:
-        psnr: in dB.
-        seconds: over seeds; inf where a seed never reached it.
-        reached: seeds that did.
-        ratio: mean seconds over the baseline's; NaN where one of the two did not reach it with every seed, or began
-            there.
-    """
-
-    psnr: float
-    seconds: Spread
-    reached: int
-    ratio: float
-
-
-@dataclass
+@dataclass(eq=False)
 class VariantRow:
-    """One variant on one scene.
+    """One variant on one scene, measured over its seeds and compared with the baseline.
 
     Args:
         name: of the variant.
-        seconds, psnr, worst_psnr, ssim, l1, lpips, gaussians, fps, peak_bytes: over seeds; NaN where not computed or
-            not measured.
-        iterations: of the seeds, where a time budget decided them, else empty.
-        psnr_difference: mean PSNR minus the baseline's.
-        psnr_differs, seconds_differ: whether the seeds' spreads are apart from the baseline's; None where that is open.
-        reaches: time to each target.
-        on_front: no other variant is at least as fast and as good.
-        psnr_curve, l1_curve: against seconds.
+        cells: its seeds' results.
+        base: the baseline's results; none where it has none here.
+        on_front: whether no other variant is at least as fast and as good.
     """
 
     name: str
-    seeds: list[int]
-    seconds: Spread
-    psnr: Spread
-    worst_psnr: Spread
-    ssim: Spread
-    l1: Spread
-    lpips: Spread
-    gaussians: Spread
-    fps: Spread
-    peak_bytes: Spread
-    iterations: list[int]
-    psnr_difference: float
-    psnr_differs: bool | None
-    seconds_differ: bool | None
-    reaches: list[Reach]
-    on_front: bool
-    psnr_curve: Curve
-    l1_curve: Curve
+    cells: Sequence[CellResult]
+    base: Sequence[CellResult]
+    on_front: bool = False
+
+    @property
+    def seconds(self) -> Spread:
+        return self.spread("seconds")
+
+    @property
+    def psnr(self) -> Spread:
+        return self.spread("psnr")
+
+    def spread(self, measure: str) -> Spread:
+        """Of one of `MEASURES` over the seeds; NaN where a seed lacks it."""
+        return _spread(self.cells, measure)
+
+    def difference(self, measure: str) -> float:
+        """The mean minus the baseline's mean; NaN where there is no baseline."""
+        return self.spread(measure).mean - _spread(self.base, measure).mean
+
+    def ratio(self, measure: str) -> float:
+        """The mean over the baseline's mean; NaN where there is no baseline."""
+        return self.spread(measure).mean / _spread(self.base, measure).mean
+
+    def differs(self, measure: str) -> bool | None:
+        """Whether the seeds' spread and the baseline's do not overlap; None where that is open."""
+        return differ(self.spread(measure), _spread(self.base, measure))
+
+    def curve(self, name: str) -> Curve:
+        """Of a field of `Evaluation` against seconds."""
+        return Curve.of([cell.history for cell in self.cells], name)
+
+    def seconds_to(self, psnr: float) -> list[float]:
+        """For each seed, the seconds in which it reached this PSNR in dB; inf where it never did."""
+        return [seconds_to_reach(cell.history, psnr) for cell in self.cells]
+
+    def ratio_to(self, psnr: float) -> float:
+        """Mean `seconds_to` over the baseline's; NaN where a seed of either never reached it, or began there."""
+        base = Spread.of(seconds_to_reach(cell.history, psnr) for cell in self.base).mean
+        ratio = Spread.of(self.seconds_to(psnr)).mean / base if base > 0 else math.nan
+        return ratio if 0 < ratio < math.inf else math.nan
 
 
 @dataclass
@@ -74,15 +88,13 @@ class SceneSummary:
 
     Args:
         baseline: name of the variant that the others are compared with, or "" where it has no result here.
+        targets: PSNRs in dB whose time is asked for.
     """
 
     scene: str
     baseline: str
     targets: list[float]
     rows: list[VariantRow]
-
-    def row(self, name: str) -> VariantRow | None:
-        return next((row for row in self.rows if row.name == name), None)
 
 
 def summarise(study: Study) -> list[SceneSummary]:
@@ -94,8 +106,9 @@ def _summarise_scene(study: Study, scene: str) -> SceneSummary:
     cells = {name: results for name in study.ablation.variants if (results := study.of(scene, name))}
     baseline = study.ablation.baseline if study.ablation.baseline in cells else ""
     targets = study.targets or _default_targets(cells[baseline] if baseline else next(iter(cells.values())))
-    rows = [_row(name, results, cells.get(baseline, []), targets) for name, results in cells.items()]
-    for row, on_front in zip(rows, pareto_front([(row.seconds.mean, row.psnr.mean) for row in rows]), strict=True):
+    rows = [VariantRow(name, results, cells.get(baseline, [])) for name, results in cells.items()]
+    points = [(row.seconds.mean, row.psnr.mean) for row in rows]
+    for row, on_front in zip(rows, pareto_front(points), strict=True):
         row.on_front = on_front
     return SceneSummary(scene, baseline, targets, rows)
 
@@ -106,40 +119,5 @@ def _default_targets(reference: Sequence[CellResult]) -> list[float]:
     return [math.floor(10 * reached) / 10 - step * TARGET_STEP for step in (2, 1, 0)]
 
 
-def _row(name: str, results: Sequence[CellResult], base: Sequence[CellResult], targets: Sequence[float]) -> VariantRow:
-    psnr, seconds = _spread(results, "psnr"), _spread(results, "train_seconds")
-    base_psnr, base_seconds = _spread(base, "psnr"), _spread(base, "train_seconds")
-    return VariantRow(
-        name=name,
-        seeds=[cell.seed for cell in results],
-        seconds=seconds,
-        psnr=psnr,
-        worst_psnr=_spread(results, "worst_psnr"),
-        ssim=_spread(results, "ssim"),
-        l1=_spread(results, "l1"),
-        lpips=Spread.of(cell.lpips for cell in results),
-        gaussians=_spread(results, "num_gaussians"),
-        fps=Spread.of(cell.fps for cell in results),
-        peak_bytes=Spread.of(math.nan if cell.peak_bytes is None else cell.peak_bytes for cell in results),
-        iterations=[cell.final.iteration for cell in results if cell.time_budget],
-        psnr_difference=psnr.mean - base_psnr.mean,
-        psnr_differs=differ(psnr, base_psnr),
-        seconds_differ=differ(seconds, base_seconds),
-        reaches=[_reach(results, base, target) for target in targets],
-        on_front=False,
-        psnr_curve=Curve.of([cell.history for cell in results], "psnr"),
-        l1_curve=Curve.of([cell.history for cell in results], "l1"),
-    )
-
-
-def _spread(results: Sequence[CellResult], measure: str) -> Spread:
-    """Of a field of `Evaluation`, at the final models."""
-    return Spread.of(getattr(cell.final, measure) for cell in results)
-
-
-def _reach(results: Sequence[CellResult], base: Sequence[CellResult], target: float) -> Reach:
-    times, base_times = ([seconds_to_reach(cell.history, target) for cell in cells] for cells in (results, base))
-    seconds, against = Spread.of(times), Spread.of(base_times).mean
-    ratio = seconds.mean / against if against > 0 else math.nan
-    reached = sum(map(math.isfinite, times))
-    return Reach(target, seconds, reached, ratio if 0 < ratio < math.inf else math.nan)
+def _spread(cells: Sequence[CellResult], measure: str) -> Spread:
+    return Spread.of(map(MEASURES[measure], cells))

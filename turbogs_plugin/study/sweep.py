@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import gc
 import itertools
 import json
 import traceback
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -15,19 +14,20 @@ import torch
 
 from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.config.old_spellings import old_spelling
-from turbogs_plugin.device import synchronize
+from turbogs_plugin.device import free_device_memory, synchronize
 from turbogs_plugin.errors import InputError, TrainingStopped
 from turbogs_plugin.report.provenance import COMMIT_VARIABLE, MODIFIED, Provenance
 from turbogs_plugin.scene import Scene, load_scene
 from turbogs_plugin.study.cell import capture_digest, train_cell
+from turbogs_plugin.study.difference import ABSENT, difference, flattened
 from turbogs_plugin.study.folder import StudyFolder
 from turbogs_plugin.study.grid import Ablation, CellKey, variant_config
 from turbogs_plugin.study.progress import SweepProgress
-from turbogs_plugin.study.results import CellResult, Failure
+from turbogs_plugin.study.results import CellResult, Failure, Study
 from turbogs_plugin.train.run import resolve_device
 
-UNCOMPARED = (("scene", "path"), ("train", "device"))
-"""Settings that may differ between a kept cell and the present call: where things are, not what is computed."""
+UNCOMPARED = ("scene.path", "train.device")
+"""Settings that may differ between a kept cell and the present call: where things are changes no result."""
 
 
 @dataclass
@@ -84,44 +84,52 @@ def run_sweep(
         TrainingStopped: the GPU can no longer be used by this process.
     """
     folder.require_usable()
-    finished = folder.read_results()
+    study = folder.read_study() if folder.file.is_file() else Study(ablation, [])
+    finished = {result.key: result for result in study.results}
     for result in finished.values():
         if result.variant not in ablation.variants:
             raise InputError(f"'{folder.path}' has a cell of another ablation ({result.key}): choose a new --out")
     device = resolve_device(options.device)
     reusable = _reusable_cells(options, here, siblings)
-    grid: dict[str, list[tuple[CellKey, Config]]] = {}
     taken: list[CellResult] = []
-    kept = 0
+    left: list[tuple[Scene, CellKey, Config]] = []
     # All scenes are read before anything is trained, so that a wrong one is known at once.
-    loaded: dict[str, Scene] = {}
     for path in options.scenes:
         name = path.resolve().name
         configs = _scene_configs(ablation, variants, options, path.resolve(), device)
         settings = next(iter(configs.values())).scene
         scene = load_scene(path, settings.factor, settings.test_every)
         capture = capture_digest(scene)
-        grid[name] = []
         for key, config in configs.items():
             known = reusable.get((name, capture, _comparable(config.to_mapping())))
             if key in finished:
                 _require_same(finished[key], config)
-                kept += 1
             elif known is not None:
                 taken.append(replace(known, variant=key.variant))
             else:
-                grid[name].append((key, config))
-        _require_capture(finished.values(), name, capture)
-        if grid[name]:
-            loaded[name] = scene
-        del scene  # photos take room
-    folder.write_ablation(ablation)
+                left.append((scene, key, config))
+        for key, result in finished.items():
+            if key.scene == name and result.capture not in ("", capture):
+                raise InputError(
+                    f"the cell '{key}' has other photos or cameras than '{name}' has now: choose a new --out"
+                )
+        del scene  # where no cell needs it: photos take room
+    folder.write_study(replace(study, ablation=ablation))
     for result in taken:
         folder.write(result)
-    with SweepProgress(sum(map(len, grid.values())), kept + len(taken)) as progress:
-        for name, cells in grid.items():
-            if cells:
-                _train_scene(cells, loaded.pop(name), device, here, folder, progress)
+    wanted = len(options.scenes) * len(options.seeds) * len(variants)
+    with SweepProgress(len(left), wanted - len(left)) as progress:
+        while left:
+            scene, key, config = left.pop(0)  # the photos go with the last cell that needs them
+            progress.begin(key)
+            try:
+                outcome = train_cell(key.variant, config, scene, device, here, [progress])
+            except Exception as error:  # whatever a variant breaks by, the other cells go on
+                outcome = Failure(key, _reason(error))
+            folder.write(outcome)
+            progress.ended(outcome)
+            if isinstance(outcome, Failure):
+                _require_working(device)
 
 
 def _scene_configs(
@@ -139,45 +147,13 @@ def _scene_configs(
     return configs
 
 
-def _train_scene(
-    cells: list[tuple[CellKey, Config]],
-    scene: Scene,
-    device: torch.device,
-    here: Provenance,
-    folder: StudyFolder,
-    progress: SweepProgress,
-) -> None:
-    for key, config in cells:
-        progress.begin(key)
-        try:
-            result = train_cell(key.variant, config, scene, device, here, [progress])
-        except Exception as error:  # whatever a variant breaks by, the other cells go on
-            failure = Failure(key, _reason(error))
-            folder.write_failure(failure)
-            progress.failed(failure)
-            # Its traceback holds the broken model.
-            del error
-            _require_working(device)
-        else:
-            folder.write(result)
-            progress.finished(result)
-
-
-def _require_capture(results: Iterable[CellResult], scene: str, capture: str) -> None:
-    for result in results:
-        if result.scene == scene and result.capture not in ("", capture):
-            raise InputError(
-                f"the cell '{result.key}' has other photos or cameras than '{scene}' has now: choose a new --out"
-            )
-
-
 def _require_same(present: CellResult, config: Config) -> None:
-    old = old_spelling(present.asked_config)
+    old = old_spelling(present.asked)
     if old:
         raise InputError(f"the cell '{present.key}' is of an earlier version ({old}): choose a new --out")
-    made, wanted = (_sections(mapping) for mapping in (present.asked_config, config.to_mapping()))
-    if made != wanted:
-        sections = [name for name in wanted if made.get(name) != wanted[name]]
+    changes = difference(_settings(present.asked), _settings(config.to_mapping()))
+    if changes:
+        sections = dict.fromkeys(path.partition(".")[0] for path in [*changes.pop(ABSENT, ()), *changes])
         raise InputError(
             f"the cell '{present.key}' was made with other settings ({', '.join(sections)}): choose a new --out"
         )
@@ -192,22 +168,20 @@ def _reusable_cells(
     folders = [*map(StudyFolder, options.reuse), *siblings]
     results = [result for folder in folders for result in folder.read_study().results]
     return {
-        (result.scene, result.capture, _comparable(result.asked_config)): result
+        (result.scene, result.capture, _comparable(result.asked)): result
         for result in results
         if result.capture and result.provenance == here
     }
 
 
 def _comparable(mapping: dict[str, Any]) -> str:
-    """What decides a result, as text to compare."""
-    return json.dumps(_sections(mapping), sort_keys=True)
+    """`_settings` as a text to compare."""
+    return json.dumps(_settings(mapping), sort_keys=True)
 
 
-def _sections(mapping: dict[str, Any]) -> dict[str, dict[str, Any]]:
-    sections = {name: dict(section) for name, section in mapping.items()}
-    for section, name in UNCOMPARED:
-        sections[section].pop(name, None)
-    return sections
+def _settings(mapping: dict[str, Any]) -> dict[str, Any]:
+    """``section.key`` -> value, of what decides a result."""
+    return {path: value for path, value in flattened(mapping).items() if path not in UNCOMPARED}
 
 
 def _reason(error: Exception) -> str:
@@ -220,12 +194,10 @@ def _reason(error: Exception) -> str:
 
 
 def _require_working(device: torch.device) -> None:
-    """After a failure: free its memory, and see whether the GPU still answers this process."""
-    gc.collect()
+    """After a failure: see whether the GPU still answers this process, and free the broken model's memory."""
     try:
         synchronize(device)
     except RuntimeError as error:
         reason = str(error).splitlines()[0]
         raise TrainingStopped(f"the GPU no longer answers this process ({reason}): the same command goes on") from None
-    if device.type == "cuda":
-        torch.cuda.empty_cache()
+    free_device_memory(device)

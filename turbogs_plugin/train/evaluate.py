@@ -56,9 +56,11 @@ class Metrics:
     views: list[ViewMetrics]
     fps: float
 
-    def mean(self, name: str) -> float:
-        """The mean over views of `psnr`, `ssim`, `l1` or `lpips`; NaN where a view has none."""
-        return math.fsum(getattr(view, name) for view in self.views) / len(self.views)
+    @property
+    def mean(self) -> ViewMetrics:
+        """The means over views; NaN where a view has none."""
+        columns = zip(*((view.psnr, view.ssim, view.l1, view.lpips) for view in self.views), strict=True)
+        return ViewMetrics(f"mean of {len(self.views)}", *(math.fsum(column) / len(self.views) for column in columns))
 
     @property
     def worst_psnr(self) -> float:

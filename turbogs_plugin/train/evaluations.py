@@ -46,9 +46,9 @@ class Evaluations(Listener):
         evaluation = Evaluation(
             iteration=trainer.iteration,
             train_seconds=loop.clock.seconds,
-            psnr=metrics.mean("psnr"),
-            ssim=metrics.mean("ssim"),
-            l1=metrics.mean("l1"),
+            psnr=metrics.mean.psnr,
+            ssim=metrics.mean.ssim,
+            l1=metrics.mean.l1,
             num_gaussians=len(trainer.gaussians),
             memory_bytes=self.peak_memory() if self.peak_memory else peak_memory_bytes(trainer.device),
             nonfinite_losses=int(trainer.nonfinite_losses),
