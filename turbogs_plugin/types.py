@@ -22,12 +22,12 @@ from torch import Tensor
 TILE_SIZE = 16
 """Side of a square tile in pixels (S in the paper). The kernels are built for this value."""
 
-CELL_WIDTH, CELL_HEIGHT = 8, 4
-"""Samples of a tile are ordered by cells of this size, so that 32 neighbours of a dense tile are one warp's."""
+GROUP_WIDTH, GROUP_HEIGHT = 8, 4
+"""Samples of a tile are ordered by groups of this size, so that 32 neighbours of a dense tile are one warp's."""
 
 
-def cell_order(x: Tensor, y: Tensor) -> Tensor:
-    """Rank of a pixel within its tile: row-major over cells of 8x4, then row-major within the cell.
+def sample_order(x: Tensor, y: Tensor) -> Tensor:
+    """Rank of a pixel within its tile: row-major over groups of 8x4, then row-major within the group.
 
     Args:
         x, y: integer tensors of one shape, coordinates within the tile, 0 .. TILE_SIZE - 1.
@@ -35,8 +35,8 @@ def cell_order(x: Tensor, y: Tensor) -> Tensor:
     Returns:
         Integers 0 .. TILE_SIZE^2 - 1 of the same shape.
     """
-    cell = (y // CELL_HEIGHT) * (TILE_SIZE // CELL_WIDTH) + x // CELL_WIDTH
-    return cell * (CELL_WIDTH * CELL_HEIGHT) + (y % CELL_HEIGHT) * CELL_WIDTH + x % CELL_WIDTH
+    group = (y // GROUP_HEIGHT) * (TILE_SIZE // GROUP_WIDTH) + x // GROUP_WIDTH
+    return group * (GROUP_WIDTH * GROUP_HEIGHT) + (y % GROUP_HEIGHT) * GROUP_WIDTH + x % GROUP_WIDTH
 
 
 PARAMETER_NAMES = ("means", "quats", "scales", "opacities", "sh0", "shN")
@@ -159,7 +159,7 @@ class PixelSamples:
         view_ids: K numbers of training views, on the host.
         sizes: [K, 2] int64 numpy array (width, height) of those views.
         pixel_ids: [P] int32, ``y * width + x`` in its own view, or -1 for an empty slot. Within a tile, ascending
-            in `cell_order`, empty slots last.
+            in `sample_order`, empty slots last.
         tile_ids: [T] int32, ascending, in the numbering of ``TileGrid(sizes)``.
         tile_offsets: [T + 1] int32, the first slot of each tile; the last entry is P.
         weights: [P] float32 importance weights with mean 1 over the filled slots, or None where all are 1.

@@ -18,8 +18,7 @@ SETTINGS = RasterSettings()
 
 def project(gaussians: Gaussians, cameras, degree: int = 3, settings: RasterSettings = SETTINGS):
     rows = drawable_rows(gaussians, cameras, settings)
-    parameters = [value[rows.gaussians] for name, value in gaussians.items() if name != "shN"]
-    return rows, project_rows(rows, *parameters, gaussians.shN, cameras, degree, settings)
+    return rows, project_rows(rows, rows.take(gaussians), cameras, degree, settings)
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])

@@ -39,9 +39,7 @@ def make_maps(device, seed=0):
 
 def make_samples(rate, unit="cell", importance=0.0, views=(2, 0)):
     maps = make_maps("cpu")
-    index = np.asarray(views)
-    rule = DrawRule(unit, 0.4, 0.3, False, importance)
-    return draw_pixels(maps.errors, maps.stamps, 0, maps.offsets[index], SIZES[index], views, rate, rule, 0, 0)
+    return draw_pixels(DrawRule(unit, 0.4, 0.3, False, importance), maps, views, rate, Step(0, 1, 1))
 
 
 def to_device(samples):
@@ -75,9 +73,9 @@ def test_equals_the_twin(name, rate, unit, importance):
     terms = CASES[name].terms
     samples = make_samples(rate, unit, importance)
     colors, targets, photos, starts = make_colors(samples)
-    expected = sparse_loss(colors.double(), targets.double(), samples, terms)
+    expected = sparse_loss(terms, colors.double(), targets.double(), samples)
     for truth, extra in ((targets, {}), (photos, {"starts": starts})):
-        found = training_kernels.sparse_loss(colors.to(DEVICE), truth.to(DEVICE), to_device(samples), terms, **extra)
+        found = training_kernels.sparse_loss(terms, colors.to(DEVICE), truth.to(DEVICE), to_device(samples), **extra)
         assert float(found.loss) == pytest.approx(float(expected.loss), rel=1e-5)
         assert relative(found.color_gradients, expected.color_gradients) < 1e-5
         assert not found.color_gradients.cpu()[~samples.filled].any()
@@ -91,7 +89,7 @@ def test_maps_follow(rate):
     colors, targets, _, _ = make_colors(samples)
     maps, twin = make_maps(DEVICE), make_maps("cpu")
     found = training_kernels.sparse_loss(
-        colors.to(DEVICE), targets.to(DEVICE), to_device(samples), CASES["ncc"].terms, update=MapUpdate(maps, STEP)
+        CASES["ncc"].terms, colors.to(DEVICE), targets.to(DEVICE), to_device(samples), update=MapUpdate(maps, STEP)
     )
     twin.update(samples, found.pixel_errors.cpu(), STEP)
     assert torch.equal(maps.errors.cpu(), twin.errors)
@@ -108,10 +106,10 @@ def test_bad_colors_stay_out(bad):
     colors[slots, 1] = bad
     maps = make_maps(DEVICE)
     found = training_kernels.sparse_loss(
+        CASES["ncc"].terms,
         colors.to(DEVICE),
         targets.to(DEVICE),
         to_device(samples),
-        CASES["ncc"].terms,
         update=MapUpdate(maps, STEP),
     )
     assert torch.isfinite(found.loss)
@@ -130,12 +128,12 @@ def test_side_stream_and_half_colors():
     samples = make_samples(0.3, "cell")
     colors, targets, _, _ = make_colors(samples)
     colors, targets, samples = colors.half().to(DEVICE), targets.to(DEVICE), to_device(samples)
-    expected = training_kernels.sparse_loss(colors, targets, samples, CASES["ncc"].terms)
+    expected = training_kernels.sparse_loss(CASES["ncc"].terms, colors, targets, samples)
     stream = torch.cuda.Stream()
     stream.wait_stream(torch.cuda.current_stream())
     with torch.cuda.stream(stream):
         torch.cuda._sleep(50_000_000)  # work on the default stream would overtake this
-        found = training_kernels.sparse_loss(colors + 0, targets + 0, samples, CASES["ncc"].terms)
+        found = training_kernels.sparse_loss(CASES["ncc"].terms, colors + 0, targets + 0, samples)
     stream.synchronize()
     assert torch.equal(found.color_gradients, expected.color_gradients)
     assert torch.equal(found.pixel_errors, expected.pixel_errors)
@@ -150,6 +148,6 @@ def test_lost_losses_are_counted_once():
     for value, expected in ((0.5, 0), (1e38, 1), (0.5, 1), (1e38, 2)):
         colors[::7] = value
         found = training_kernels.sparse_loss(
-            colors.to(DEVICE), targets.to(DEVICE), to_device(samples), CASES["l1"].terms, nonfinite_losses=counter
+            CASES["l1"].terms, colors.to(DEVICE), targets.to(DEVICE), to_device(samples), nonfinite_losses=counter
         )
         assert int(counter) == expected and bool(torch.isfinite(found.loss)) == (value == 0.5)

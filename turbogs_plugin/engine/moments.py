@@ -9,17 +9,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from turbogs_plugin.engine.layout import ParameterRow
+from turbogs_plugin.engine.layout import ParameterRow, columns
 from turbogs_plugin.errors import InputError, require
 from turbogs_plugin.types import Gaussians, RowUpdate
 
-COLUMNS = {
-    "means": ParameterRow.MEANS,
-    "scales": ParameterRow.SCALES,
-    "quats": ParameterRow.QUATS,
-    "sh0": ParameterRow.SH0,
-    "opacities": ParameterRow.OPACITIES,
-}
+COLUMNS = columns(ParameterRow)
 """Where each parameter lies in a packed row: all parameters but the higher bands."""
 
 

@@ -2,25 +2,33 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from abc import ABC, abstractmethod
 
+import torch
 from torch import Tensor
 
 from turbogs_plugin.engine.moments import GaussianMoments
-from turbogs_plugin.engine.rendered import DEFAULT_SETTINGS, RasterSettings, Rendered, ScreenGradients
+from turbogs_plugin.engine.rendered import DEFAULT_OPTIONS, Rendered, RenderOptions, ScreenGradients
 from turbogs_plugin.engine.rules import DrawRule, LossTerms, UpdateRule
 from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.scene.photos import PhotoSamples
 from turbogs_plugin.types import Cameras, Gaussians, GaussianStats, LossOutput, PixelSamples, Step
 
 
-class Engine(Protocol):
+class Engine(ABC):
     """What computes, on the device of the tensors that it is given.
 
     It knows rules, never strategies. `ReferenceEngine` defines every result; any other engine gives the same, to
     rounding. An engine made for training may run ahead of the host: see `settle`.
     """
 
+    @property
+    def overflow(self) -> Tensor | None:
+        """[1] int32 on the device, never read on the host: not 0 while iterations do nothing, for lack of room. None
+        where that cannot be."""
+        return None
+
+    @abstractmethod
     def draw(self, rule: DrawRule, maps: ErrorMaps, view_ids: tuple[int, ...], rate: float, step: Step) -> PixelSamples:
         """Draw the samples of an iteration.
 
@@ -30,31 +38,20 @@ class Engine(Protocol):
             rate: r, the fraction of units to draw, above 0.
             step: gives seed and iteration, on which alone the random numbers depend, and ages.
         """
-        ...
 
+    @abstractmethod
     def render(
-        self,
-        gaussians: Gaussians,
-        cameras: Cameras,
-        samples: PixelSamples,
-        *,
-        sh_degree: int | None = None,
-        settings: RasterSettings = DEFAULT_SETTINGS,
-        with_depth: bool = False,
+        self, gaussians: Gaussians, cameras: Cameras, samples: PixelSamples, options: RenderOptions = DEFAULT_OPTIONS
     ) -> Rendered:
         """Render samples of K views with gsplat's conventions, on a black background.
 
         Args:
             cameras: the K views of the batch, in the order of `samples.view_ids`.
-            sh_degree: highest degree of spherical harmonics used; all there are where None.
-            settings: thresholds and planes.
-            with_depth: also give expected depths.
         """
-        ...
 
+    @abstractmethod
     def evaluate(self, terms: LossTerms, colors: Tensor, targets: Tensor, samples: PixelSamples) -> LossOutput:
         """The loss of rendered samples and its gradient. `colors`, `targets`: [P, 3]."""
-        ...
 
     def supervise(
         self,
@@ -65,14 +62,10 @@ class Engine(Protocol):
         step: Step,
         nonfinite_losses: Tensor | None = None,
     ) -> LossOutput:
-        """`evaluate` against the photos, and `learn` from it, at once.
-
-        Args:
-            colors: [P, 3] rendered.
-            truth: the photos at the samples, on the device of `colors`.
-            maps, step, nonfinite_losses: see `learn`.
-        """
-        ...
+        """`evaluate` against the photos at the samples, on the device of `colors` [P, 3], and `learn` from it."""
+        output = self.evaluate(terms, colors, truth.colors(), truth.samples)
+        self.learn(maps, truth.samples, colors, output, step, nonfinite_losses)
+        return output
 
     def learn(
         self,
@@ -85,7 +78,8 @@ class Engine(Protocol):
     ) -> None:
         """Let the error maps learn the errors of an iteration, whatever loss gave them.
 
-        A sample whose colour or error is not finite changes nothing: neither the error of its pixel nor its age.
+        A sample whose colour or error is not finite changes nothing: neither the error of its pixel nor its age. An
+        iteration that did nothing changes nothing here either.
 
         Args:
             maps: updated in place.
@@ -93,8 +87,14 @@ class Engine(Protocol):
             step: gives the stamp.
             nonfinite_losses: [] int64 on the device; 1 is added if the loss is not finite.
         """
-        ...
+        drawn, nonfinite = torch.isfinite(colors).all(dim=1), ~output.loss.isfinite()
+        if self.overflow is not None:
+            drawn, nonfinite = drawn & (self.overflow == 0), nonfinite & (self.overflow[0] == 0)
+        maps.update(samples, torch.where(drawn, output.pixel_errors, torch.nan), step)
+        if nonfinite_losses is not None:
+            nonfinite_losses += nonfinite
 
+    @abstractmethod
     def update(
         self,
         rule: UpdateRule,
@@ -111,7 +111,6 @@ class Engine(Protocol):
             gaussians: the model that was rendered; changed in place, as is `moments`.
             stats: the window of density control; this pass is added to it. None where none is needed.
         """
-        ...
 
     def settle(self, wait: bool = False) -> int:
         """How many of the latest iterations did nothing and must be done again, for lack of room on the device.
@@ -125,9 +124,9 @@ class Engine(Protocol):
         Raises:
             InputError: an iteration has more intersections of a tile and a splat than a pass can have.
         """
-        ...
+        return 0
 
     @property
     def bytes_held(self) -> int:
         """Memory that is kept from one iteration to the next."""
-        ...
+        return 0

@@ -13,7 +13,7 @@ from torch import Tensor
 from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.engine import engine_of
 from turbogs_plugin.engine.layout import MAX_SH_DEGREE
-from turbogs_plugin.engine.rendered import Rendered, ScreenGradients
+from turbogs_plugin.engine.rendered import Rendered, RenderOptions, ScreenGradients
 from turbogs_plugin.engine.rendering import render_image
 from turbogs_plugin.errors import TrainingStopped
 from turbogs_plugin.model.distant import RESTRAIN_EVERY, restrain_distant
@@ -121,13 +121,8 @@ class Trainer:
 
     def render(self, view_ids: tuple[int, ...], samples: PixelSamples) -> Rendered:
         """The present model at the samples of some training views."""
-        return self.engine.render(
-            self.gaussians,
-            self.views.cameras.select(view_ids),
-            samples,
-            sh_degree=self.sh_degree,
-            settings=self.config.raster,
-        )
+        options = RenderOptions(self.sh_degree, self.config.raster)
+        return self.engine.render(self.gaussians, self.views.cameras.select(view_ids), samples, options)
 
     def supervise(self, colors: Tensor, truth: PhotoSamples, step: Step) -> LossOutput:
         """Loss and error maps: at once where the loss is a rule, else by the loss's own code."""
