@@ -46,7 +46,19 @@ SH_C0 = 0.28209479177387814
 
 
 @dataclass
-class Gaussians:
+class ParameterTensors:
+    """A tensor for each parameter of the model."""
+
+    means: Tensor
+    quats: Tensor
+    scales: Tensor
+    opacities: Tensor
+    sh0: Tensor
+    shN: Tensor
+
+
+@dataclass
+class Gaussians(ParameterTensors):
     """The model, in gsplat's parameter layout. All tensors share one device and one dtype.
 
     Args:
@@ -57,13 +69,6 @@ class Gaussians:
         sh0: [N, 1, 3], spherical harmonics of band 0.
         shN: [N, B, 3], the higher bands, B = (degree + 1)^2 - 1.
     """
-
-    means: Tensor
-    quats: Tensor
-    scales: Tensor
-    opacities: Tensor
-    sh0: Tensor
-    shN: Tensor
 
     def __len__(self) -> int:
         return self.means.shape[0]
@@ -228,7 +233,7 @@ class LossOutput:
 
 
 @dataclass
-class GaussianGradients:
+class GaussianGradients(ParameterTensors):
     """Gradients of the parameters, in `Gaussians`' layout, with a leading view dimension where rows are asked for.
 
     Args:
@@ -239,12 +244,6 @@ class GaussianGradients:
             e * w / P``; zero where the Gaussian has no part.
     """
 
-    means: Tensor
-    quats: Tensor
-    scales: Tensor
-    opacities: Tensor
-    sh0: Tensor
-    shN: Tensor
     touched: Tensor
     view_losses: Tensor
 
@@ -289,12 +288,12 @@ class GaussianStats:
         return cls(*(torch.zeros(count, device=device) for _ in fields(cls)))
 
     def zero_(self) -> None:
-        for field in fields(self):
-            getattr(self, field.name).zero_()
+        for value in vars(self).values():
+            value.zero_()
 
     def map(self, function) -> GaussianStats:
         """Statistics whose every tensor is `function` of the present one."""
-        return GaussianStats(*(function(getattr(self, field.name)) for field in fields(self)))
+        return GaussianStats(*map(function, vars(self).values()))
 
 
 @dataclass
@@ -322,12 +321,8 @@ class RowUpdate:
 
     def apply(self, gaussians: Gaussians) -> Gaussians:
         """The model after the change."""
-        return Gaussians(
-            **{
-                name: self.values[name] if name in self.values else value[self.source]
-                for name, value in gaussians.items()
-            }
-        )
+        copies = {name: value[self.source] for name, value in gaussians.items() if name not in self.values}
+        return Gaussians(**copies, **self.values)
 
     def reordered(self, order: Tensor) -> RowUpdate:
         """The same change with its new rows in another order [M], a permutation."""

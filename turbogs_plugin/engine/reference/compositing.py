@@ -81,17 +81,30 @@ class Compositor:
             yield Block(slots, starts[begin:end], device_counts[begin:end], depth)
             begin = end
 
-    def slices(self, block: Block) -> Iterator[tuple[Tensor, Tensor]]:
-        """Intersection numbers [B, G] of the block's splats, front to back, and where they are real."""
-        for first in range(0, block.depth, SLICE_SPLATS):
-            number = torch.arange(first, min(first + SLICE_SPLATS, block.depth), device=self.device)
-            real = number < block.count[:, None]
-            yield torch.where(real, block.start[:, None] + number, 0), real
+    def slices(self, table: Tensor) -> Iterator[tuple[Block, Tensor, Tensor, Slice]]:
+        """Every slice of every block, those of a block front to back until all its pixels are opaque.
 
-    def pixel_centers(self, dtype: torch.dtype) -> Tensor:
-        """[P + 1, 2], the last of them padding."""
-        centers = self.samples.coordinates().to(dtype) + 0.5
-        return torch.cat([centers, centers.new_zeros(1, 2)])
+        Args:
+            table: see `splat_table`.
+
+        Yields:
+            The block; numbers [B, G] of the intersections of the slice, and where they are real; the slice.
+        """
+        centers = self.samples.coordinates().to(table.dtype) + 0.5
+        centers = torch.cat([centers, centers.new_zeros(1, 2)])  # [P + 1, 2], the last of them padding
+        for block in self.blocks():
+            block_centers = centers[block.samples]  # [B, S, 2]
+            transmittance = torch.ones_like(block_centers[:, :, :1])
+            for first in range(0, block.depth, SLICE_SPLATS):
+                number = torch.arange(first, min(first + SLICE_SPLATS, block.depth), device=self.device)
+                real = number < block.count[:, None]
+                numbers = torch.where(real, block.start[:, None] + number, 0)
+                rows = self.intersections.rows[numbers]
+                piece = composite_slice(table, rows, real, block_centers, transmittance, self.settings)
+                yield block, numbers, real, piece
+                transmittance = piece.transmittance
+                if not transmittance.any():
+                    break
 
 
 @dataclass
@@ -164,20 +177,10 @@ def composite(compositor: Compositor, table: Tensor) -> Tensor:
     Returns:
         [P, 5]: sums of weight times red, green, blue, 1 and depth. Zero in empty slots.
     """
-    samples, settings, listed = compositor.samples, compositor.settings, compositor.intersections.rows
-    centers = compositor.pixel_centers(table.dtype)
+    samples = compositor.samples
     sums = table.new_zeros(len(samples) + 1, 5)
-    for block in compositor.blocks():
-        block_centers = centers[block.samples]  # [B, S, 2]
-        transmittance = torch.ones_like(block_centers[:, :, :1])
-        total = table.new_zeros(*block.samples.shape, 5)
-        for numbers, real in compositor.slices(block):
-            piece = composite_slice(table, listed[numbers], real, block_centers, transmittance, settings)
-            total.baddbmm_(piece.weights, piece.features.transpose(1, 2))
-            transmittance = piece.transmittance
-            if not transmittance.any():
-                break
-        sums[block.samples] = total
+    for block, _, _, piece in compositor.slices(table):
+        sums[block.samples] = sums[block.samples].baddbmm_(piece.weights, piece.features.transpose(1, 2))
     return sums[:-1] * samples.filled[:, None]
 
 
@@ -197,26 +200,17 @@ def composite_backward(
     Returns:
         [R, 16], see `layout.ScreenRecord`.
     """
-    samples, settings, intersections = compositor.samples, compositor.settings, compositor.intersections
-    filled = samples.filled[:, None]
+    intersections, filled = compositor.intersections, compositor.samples.filled[:, None]
     # Red, green, blue, alpha, depth, error, 1. Zero in the padding slot and in empty ones.
     upstream = torch.cat([gradients, pixel_errors[:, None].to(sums.dtype), torch.ones_like(sums[:, :1])], dim=1)
     upstream = torch.where(filled, upstream, 0.0)
     upstream = torch.cat([upstream, upstream.new_zeros(1, 7)])
     totals = torch.cat([(upstream[:-1, :5] * sums).sum(dim=1, keepdim=True), sums.new_zeros(1, 1)])
-    centers = compositor.pixel_centers(table.dtype)
     records = table.new_zeros(len(intersections.rows), ScreenRecord.SIZE)
-    for block in compositor.blocks():
-        block_centers, block_upstream = centers[block.samples], upstream[block.samples]  # [B, S, 2], [B, S, 7]
-        behind = totals[block.samples]  # [B, S, 1] what the splats to come will contribute
-        transmittance = torch.ones_like(behind)
-        for numbers, real in compositor.slices(block):
-            piece = composite_slice(table, intersections.rows[numbers], real, block_centers, transmittance, settings)
-            record, behind = _slice_backward(piece, block_upstream, behind)
-            records[intersections.slots[numbers[real]]] = record[real]
-            transmittance = piece.transmittance
-            if not transmittance.any():
-                break
+    for block, numbers, real, piece in compositor.slices(table):
+        # `totals` [P + 1, 1]: what the splats to come will contribute
+        record, totals[block.samples] = _slice_backward(piece, upstream[block.samples], totals[block.samples])
+        records[intersections.slots[numbers[real]]] = record[real]
     return intersections.sum_by_row(records)
 
 

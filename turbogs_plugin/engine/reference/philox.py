@@ -116,11 +116,6 @@ def exponentials(words: Tensor) -> Tensor:
     s = (f - 1.0) / (f + 1.0)
     q = s * s
     c3, c5, c7, c9 = LOG_COEFFICIENTS
-    p = q * c9
-    p = p + c7
-    p = p * q
-    p = p + c5
-    p = p * q
-    p = p + c3
+    p = ((q * c9 + c7) * q + c5) * q + c3  # torch rounds each operation
     tail = s * (q * p)
     return (24 - exponents).to(torch.float32) * LOG_2 - (s + s + tail)
