@@ -54,13 +54,13 @@ def make_colors(samples, seed=0):
     photos = torch.randint(0, 256, (int(SIZES.prod(axis=1).sum()), 3), generator=generator, dtype=torch.uint8)
     photos[: 40 * 16] = 200
     offsets = np.concatenate([[0], np.cumsum(SIZES.prod(axis=1))])
-    starts = offsets[list(samples.view_ids)]
-    flat = torch.as_tensor(starts)[samples.view_of_slot()] + samples.pixel_ids.long().clamp(min=0)
+    starts = torch.as_tensor(offsets[list(samples.view_ids)])
+    flat = starts[samples.view_of_slot()] + samples.pixel_ids.long().clamp(min=0)
     targets = photos[flat].float().div(255.0) * samples.filled[:, None]
     colors = targets + 0.1 * torch.randn(targets.shape, generator=generator)
     colors[:40] = targets[:40]
     colors = colors * samples.filled[:, None]
-    return colors, targets, photos, starts
+    return colors, targets, photos
 
 
 def relative(found, expected):
@@ -72,9 +72,9 @@ def relative(found, expected):
 def test_equals_the_twin(name, rate, unit, importance):
     terms = CASES[name].terms
     samples = make_samples(rate, unit, importance)
-    colors, targets, photos, starts = make_colors(samples)
+    colors, targets, photos = make_colors(samples)
     expected = sparse_loss(terms, colors.double(), targets.double(), samples)
-    for truth, extra in ((targets, {}), (photos, {"starts": starts})):
+    for truth, extra in ((targets, {}), (photos, {"update": MapUpdate(make_maps(DEVICE), STEP)})):
         found = training_kernels.sparse_loss(terms, colors.to(DEVICE), truth.to(DEVICE), to_device(samples), **extra)
         assert float(found.loss) == pytest.approx(float(expected.loss), rel=1e-5)
         assert relative(found.color_gradients, expected.color_gradients) < 1e-5
@@ -86,7 +86,7 @@ def test_equals_the_twin(name, rate, unit, importance):
 def test_maps_follow(rate):
     """Bit for bit: sums of three absolute values in one order, then single-precision products rounded one by one."""
     samples = make_samples(rate, "cell")
-    colors, targets, _, _ = make_colors(samples)
+    colors, targets, _ = make_colors(samples)
     maps, twin = make_maps(DEVICE), make_maps("cpu")
     found = training_kernels.sparse_loss(
         CASES["ncc"].terms, colors.to(DEVICE), targets.to(DEVICE), to_device(samples), update=MapUpdate(maps, STEP)
@@ -101,7 +101,7 @@ def test_maps_follow(rate):
 @pytest.mark.parametrize("bad", [float("nan"), float("inf")])
 def test_bad_colors_stay_out(bad):
     samples = make_samples(0.3, "pixel")
-    colors, targets, _, _ = make_colors(samples)
+    colors, targets, _ = make_colors(samples)
     slots = torch.tensor([0, 5, 300])
     colors[slots, 1] = bad
     maps = make_maps(DEVICE)
@@ -126,7 +126,7 @@ def test_bad_colors_stay_out(bad):
 
 def test_side_stream_and_half_colors():
     samples = make_samples(0.3, "cell")
-    colors, targets, _, _ = make_colors(samples)
+    colors, targets, _ = make_colors(samples)
     colors, targets, samples = colors.half().to(DEVICE), targets.to(DEVICE), to_device(samples)
     expected = training_kernels.sparse_loss(CASES["ncc"].terms, colors, targets, samples)
     stream = torch.cuda.Stream()
@@ -143,7 +143,7 @@ def test_side_stream_and_half_colors():
 def test_lost_losses_are_counted_once():
     """A finite colour whose square is not: the loss overflows in many tiles, and counts as one lost."""
     samples = make_samples(0.3, "pixel")
-    colors, targets, _, _ = make_colors(samples)
+    colors, targets, _ = make_colors(samples)
     counter = torch.zeros((), dtype=torch.int64, device=DEVICE)
     for value, expected in ((0.5, 0), (1e38, 1), (0.5, 1), (1e38, 2)):
         colors[::7] = value

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 import torch
@@ -83,23 +84,16 @@ class CudaScreenGradients:
         gaussians = self.scene.gaussians
         shape = (len(self.records) if rows else 1, len(gaussians))
         # The kernel writes every entry, unless an overflow keeps it from running.
-        new = torch.empty if self.overflow is None else torch.zeros
-        device = self.records.device
-        backward = launches.ProjectionBackward(
-            screen=self.backward_arguments(stats),
-            rows=new(*shape, ParameterRow.SIZE, device=device),
-            shN_gradients=new(gaussians.shN.shape, device=device),
-            touched=new(len(gaussians), dtype=torch.bool, device=device),
-            view_losses=new(*shape, device=device),
-        )
-        library.launch(backward)
+        new = partial(torch.empty if self.overflow is None else torch.zeros, device=self.records.device)
+        packed, shN, view_losses = new(*shape, ParameterRow.SIZE), new(gaussians.shN.shape), new(*shape)
+        touched = new(len(gaussians), dtype=torch.bool)
+        screen = self.backward_arguments(stats)
+        library.launch(launches.ProjectionBackward(screen, packed, shN, touched, view_losses))
         columns = {
-            name: backward.rows[..., place].view(*shape, *getattr(gaussians, name).shape[1:])
+            name: packed[..., place].view(*shape, *getattr(gaussians, name).shape[1:])
             for name, place in COLUMNS.items()
         }
-        return GaussianGradients(
-            **columns, shN=backward.shN_gradients, touched=backward.touched, view_losses=backward.view_losses
-        )
+        return GaussianGradients(**columns, shN=shN, touched=touched, view_losses=view_losses)
 
     def backward_arguments(self, stats: GaussianStats | None) -> launches.ScreenBackward:
         """What the launches that take these gradients to the parameters have in common."""
@@ -159,26 +153,22 @@ class CudaRendered(Rendered):
     def _backward(self, upstream: dict[str, Tensor | None], with_statistics: bool) -> CudaScreenGradients:
         if upstream["depth_gradients"] is not None and self.depths is None:
             raise InputError("depth_gradients need a pass with depths: rasterize(..., with_depth=True)")
-        ready = dict.fromkeys(upstream)
         for name, value in upstream.items():
-            if value is None:
-                continue
-            shape, device = (self.colors if name == "color_gradients" else self.alphas).shape, self.colors.device
-            if value.shape != shape or value.dtype != torch.float32 or value.device != device:
-                wanted = f"float32 {list(shape)} on {device}"
+            like = self.colors if name == "color_gradients" else self.alphas
+            if value is not None and (value.shape, value.dtype, value.device) != (like.shape, like.dtype, like.device):
+                wanted = f"float32 {list(like.shape)} on {like.device}"
                 raise InputError(f"{name} must be {wanted}, got {value.dtype} {list(value.shape)} on {value.device}")
-            ready[name] = value.contiguous()
+        ready = {name: None if value is None else value.contiguous() for name, value in upstream.items()}
         shape = (*self._radii.shape[:2], ScreenRecord.SIZE)
         records = _Buffers(self._workspace, self.colors.device).floats("records", *shape)
-        library.launch(
-            launches.RasterBackward(
-                forward=self._forward,
-                **ready,
-                records=records.flatten(0, 1),
-                with_density_sums=with_statistics,
-                cleared=self._cleared,
-            )
+        backward = launches.RasterBackward(
+            self._forward,
+            **ready,
+            records=records.flatten(0, 1),
+            with_density_sums=with_statistics,
+            cleared=self._cleared,
         )
+        library.launch(backward)
         self._cleared = False
         overflow = None if self._workspace is None else self._workspace.overflow
         return CudaScreenGradients(self._scene, self._samples, records, self._radii, with_statistics, overflow)
@@ -223,7 +213,7 @@ def rasterize_cuda(
     device = gaussians.device
     buffers = _Buffers(workspace, device)
     views, count, slots = len(cameras), len(gaussians), len(samples)
-    total, num_tiles, num_active = views * count, len(samples.grid), len(samples.tile_ids)
+    num_tiles, num_active = len(samples.grid), len(samples.tile_ids)
 
     # A pass over every tile needs no table of the active ones.
     everywhere = num_active == num_tiles
@@ -238,7 +228,7 @@ def rasterize_cuda(
     )
     splats = launches.Splats(
         cameras=buffers.floats("cameras", views, layout.CameraRow.SIZE),
-        instances=buffers.floats("instances", total, InstanceRow.SIZE),
+        instances=buffers.floats("instances", views * count, InstanceRow.SIZE),
         radii=buffers.integers("radii", views, count, 2),
         active_prefix=None if everywhere else buffers.integers("active_prefix", num_tiles + 1),
     )
@@ -249,18 +239,14 @@ def rasterize_cuda(
         counters=buffers.integers("counters", 2),
     )
     # With a workspace a backward pass is likely to follow.
-    records = None if workspace is None else buffers.floats("records", total, ScreenRecord.SIZE)
+    records = None if workspace is None else buffers.floats("records", views * count, ScreenRecord.SIZE)
     library.launch(launches.RasterProject(scene, settings, splats, tile_ids, tiles.tile_cursors, records))
 
     capacity = None if workspace is None else workspace.capacity(count, num_active)
     blocks = max(1, math.ceil(num_active / layout.SCAN_TILES))
-    library.launch(
-        launches.RasterCountIntersections(
-            tiles=tiles,
-            block_sums=buffers.integers("block_sums", blocks, 2, dtype=torch.int64),
-            capacity=layout.INTERSECTIONS_MAX if capacity is None else capacity,
-        )
-    )
+    block_sums = buffers.integers("block_sums", blocks, 2, dtype=torch.int64)
+    most = layout.INTERSECTIONS_MAX if capacity is None else capacity
+    library.launch(launches.RasterCountIntersections(tiles, block_sums, most))
     if capacity is None:
         intersections = int(tiles.status[0])
         require_possible(intersections)
@@ -269,15 +255,9 @@ def rasterize_cuda(
             workspace.learn(intersections, num_active)
 
     intersection_ids = buffers.integers("intersection_ids", capacity)
-    library.launch(
-        launches.RasterSortIntersections(
-            splats=splats,
-            tiles=tiles,
-            intersection_keys=buffers.integers("intersection_keys", capacity, dtype=torch.int64),
-            intersection_ids=intersection_ids,
-            runs=buffers.integers("runs", capacity // (layout.SORT_RUN // 2), 2),
-        )
-    )
+    intersection_keys = buffers.integers("intersection_keys", capacity, dtype=torch.int64)
+    runs = buffers.integers("runs", capacity // (layout.SORT_RUN // 2), 2)
+    library.launch(launches.RasterSortIntersections(splats, tiles, intersection_keys, intersection_ids, runs))
     if workspace is not None:
         workspace.send_count(num_active)
 
@@ -302,9 +282,9 @@ def rasterize_cuda(
     )
     library.launch(forward)
     return CudaRendered(
-        colors=forward.colors,
-        alphas=forward.alphas,
-        depths=forward.depths,
+        forward.colors,
+        forward.alphas,
+        forward.depths,
         num_intersections=tiles.status[:1],
         _scene=scene,
         _samples=samples,

@@ -60,7 +60,7 @@ def sample_pixels(rule: DrawRule, maps: ErrorMaps, view_ids: tuple[int, ...], ra
         importance=rule.importance,
         seed=step.seed,
         iteration=step.iteration,
-        now=step.iteration - maps.stamp_base,
+        now=maps.now(step),
         pixel_ids=torch.empty(slots, dtype=torch.int32, device=device),
         tile_ids=torch.empty(chosen, dtype=torch.int32, device=device),
         tile_offsets=torch.empty(chosen + 1, dtype=torch.int32, device=device),
@@ -111,8 +111,6 @@ def sparse_loss(
     colors: Tensor,
     targets: Tensor,
     samples: PixelSamples,
-    *,
-    starts: np.ndarray | None = None,
     update: MapUpdate | None = None,
     nonfinite_losses: Tensor | None = None,
 ) -> LossOutput:
@@ -124,10 +122,9 @@ def sparse_loss(
     Args:
         colors: [P, 3] float32 or float16.
         targets: [P, 3] float32, the truth at the samples; or [X, 3] uint8, the photos of all views, gathered by the
-            kernel; then `starts` is needed.
+            kernel: they lie as the maps of `update` do, which are then needed.
         samples: of at most `MAX_VIEWS` views.
-        starts: [K] int64, first flat pixel of each view.
-        update: the maps to update; their offsets give `starts`.
+        update: the maps to update.
         nonfinite_losses: [] int64, 1 is added if the loss is not finite.
 
     Returns:
@@ -137,15 +134,13 @@ def sparse_loss(
     colors = colors.detach().float().contiguous()
     photos = targets if targets.dtype == torch.uint8 else None
     maps, beta, stamp, overflow = launches.NO_MAPS, 0.0, 0, None
+    starts = np.zeros(len(samples.view_ids), dtype=np.int64)
     if update is not None:
         maps, overflow = update.maps, update.overflow
-        maps._rebase(update.step.iteration)
-        beta, stamp = maps.beta, update.step.iteration - maps.stamp_base
+        beta, stamp = maps.beta, maps.stamp(update.step)
         starts = maps.offsets[list(samples.view_ids)]
-    if starts is None:
-        if photos is not None:
-            raise ValueError("photos are gathered from the first flat pixel of each view: give `starts`")
-        starts = np.zeros(len(samples.view_ids), dtype=np.int64)
+    elif photos is not None:
+        raise ValueError("photos are gathered from where the maps of each view begin: give `update`")
     loss = launches.SparseLoss(
         colors=colors,
         targets=None if photos is not None else targets.detach().float().contiguous(),

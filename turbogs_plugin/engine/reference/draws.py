@@ -155,13 +155,13 @@ def draw_pixels(rule: DrawRule, maps: ErrorMaps, view_ids: tuple[int, ...], rate
     """
     maps.fetch(view_ids)
     device, views = maps.errors.device, np.asarray(view_ids, dtype=np.int64)
-    sizes, now = maps.sizes[views], step.iteration - maps.stamp_base
+    sizes = maps.sizes[views]
     table = pixel_table(sizes, device)  # [T, 256]
     inside = table >= 0
     tile_views = np.repeat(views, TileGrid(sizes).shapes.prod(axis=1))  # [T]
     flat = torch.as_tensor(maps.offsets[tile_views], device=device)[:, None] + table.clamp(min=0)
     errors = torch.where(inside, maps.errors[flat].double(), 0.0)  # [T, 256]
-    ages = torch.where(inside, (now - maps.stamps[flat].int()).clamp(0, AGE_MAX), 0)
+    ages = torch.where(inside, (maps.now(step) - maps.stamps[flat].int()).clamp(0, AGE_MAX), 0)
     view_numbers = torch.as_tensor(tile_views, device=device)[:, None]  # [T, 1]
 
     def words(place: Tensor, purpose: int) -> Words:
