@@ -34,6 +34,7 @@ Together, ``p = 1 - (1 - p_hard) (1 - p_stable) (1 - p_mixed)``, and 1 where all
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -75,16 +76,16 @@ class Units:
     Args:
         errors: [R, U] float64, exact sums; 0 where there is no unit.
         ages: [R, U] integers; 0 where there is no unit.
-        exist: [R, U] bool: rows of cut tiles, and of views with fewer tiles than others, have gaps.
+        exist: [R, U] bool: rows of cut tiles have gaps.
         words: four [R, U] int64 random words.
-        counts: [R] or [1] int64 on the host, units to draw from each row.
+        wanted: units to draw from each row.
     """
 
     errors: Tensor
     ages: Tensor
     exist: Tensor
     words: Words
-    counts: np.ndarray
+    wanted: int
 
 
 def draw_units(units: Units, rule: DrawRule) -> tuple[Tensor, Tensor | None]:
@@ -94,9 +95,7 @@ def draw_units(units: Units, rule: DrawRule) -> tuple[Tensor, Tensor | None]:
         [R, U] bool, the units drawn; and their inclusion probabilities p, [R, U] float32 (meaningless where not
         drawn), or None where the rule has no importance weights.
     """
-    device = units.errors.device
-    stages = np.array([rule.stages(int(count)) for count in units.counts], dtype=np.int64)  # [R, 3]
-    ranks = (1 << RANK_BITS) - 1 - torch.arange(units.exist.shape[1], device=device)  # [U]
+    ranks = (1 << RANK_BITS) - 1 - torch.arange(units.exist.shape[1], device=units.errors.device)  # [U]
     errors, ages = units.errors.float(), units.ages.long()
     if rule.mixed_uniform:
         mixed = torch.ones_like(errors)
@@ -106,9 +105,8 @@ def draw_units(units: Units, rule: DrawRule) -> tuple[Tensor, Tensor | None]:
 
     drawn = torch.zeros_like(units.exist)
     missed = torch.ones_like(errors)  # probability of not being drawn
-    for stage, weights, words in ((0, errors, units.words[0]), (1, None, units.words[1]), (2, mixed, units.words[2])):
-        counts = stages[:, stage]
-        if not counts.any():
+    for count, weights, words in zip(rule.stages(units.wanted), (errors, None, mixed), units.words[:3], strict=True):
+        if count == 0:
             continue
         if weights is None:
             primary = (ages << AGE_TIE_BITS) | (words >> (32 - AGE_TIE_BITS))
@@ -116,21 +114,19 @@ def draw_units(units: Units, rule: DrawRule) -> tuple[Tensor, Tensor | None]:
             weights = weights.clamp(min=WEIGHT_FLOOR)
             primary = (weights / exponentials(words)).view(torch.int32).long()
         keys = torch.where(units.exist & ~drawn, (primary << RANK_BITS) | ranks, -1)
-        takes = torch.as_tensor(counts, device=device)[:, None].expand(len(keys), 1)
-        largest = keys.topk(min(int(counts.max()) + 1, keys.shape[1]), dim=1).values
+        largest = keys.topk(min(count + 1, keys.shape[1]), dim=1).values
         largest = torch.nn.functional.pad(largest, (0, 1), value=-1)  # a stage may take all there are
-        largest_left = largest.gather(1, takes)
+        smallest_taken, largest_left = largest[:, count - 1, None], largest[:, count, None]
         taken = keys > largest_left
         drawn |= taken
         if rule.importance:
-            smallest_taken = largest.gather(1, (takes - 1).clamp(min=0))
             tau = torch.where(taken, largest_left, smallest_taken) >> RANK_BITS  # -1 for none
             if weights is None:
                 chance = (((ages + 1) << AGE_TIE_BITS) - tau).clamp(0, 1 << AGE_TIE_BITS) * 2.0**-AGE_TIE_BITS
             else:
                 threshold = tau.to(torch.int32).view(torch.float32)
                 chance = torch.where(tau < 0, 1.0, -torch.expm1(-weights / threshold))
-            missed = missed * (1.0 - chance * (takes > 0))
+            missed = missed * (1.0 - chance)
     if not rule.importance:
         return drawn, None
     complete = (drawn | ~units.exist).all(dim=1, keepdim=True)
@@ -190,15 +186,11 @@ def _draw_within_tiles(batch: _Batch, rate: float, rule: DrawRule) -> PixelSampl
     cells = cell_of_place(batch.table.device)  # [256]
     if by_cell:
         places = torch.argsort(cells, stable=True).view(TILE_CELLS, -1)  # [16, 16] of each cell
-        first_pixels, errors, ages = (
-            first_pixels[:, places[:, 0]],
-            errors[:, places].sum(dim=2),
-            ages[:, places].amax(2),
-        )
-        purpose = PURPOSE_CELLS
+        first_pixels, purpose = first_pixels[:, places[:, 0]], PURPOSE_CELLS
+        errors, ages = errors[:, places].sum(dim=2), ages[:, places].amax(dim=2)
     wanted = rule.wanted(rate, errors.shape[1])
     words = batch.words(first_pixels, purpose)
-    drawn, probabilities = draw_units(Units(errors, ages, first_pixels >= 0, words, np.array([wanted])), rule)
+    drawn, probabilities = draw_units(Units(errors, ages, first_pixels >= 0, words, wanted), rule)
     weights = _importance_weights(probabilities, rule)
     if by_cell:
         drawn, weights = drawn[:, cells] & (batch.table >= 0), None if weights is None else weights[:, cells]
@@ -209,31 +201,25 @@ def _draw_within_tiles(batch: _Batch, rate: float, rule: DrawRule) -> PixelSampl
 
 def _draw_tiles(batch: _Batch, rate: float, rule: DrawRule) -> PixelSamples:
     """Whole tiles as units, drawn from each view."""
-    device = batch.table.device
-    tiles = TileGrid(batch.sizes).shapes.prod(axis=1)  # [K]
-    # Views are rows of a draw, as long as the longest; `places` are their tiles in the padded array.
-    places = torch.as_tensor(np.flatnonzero(np.arange(tiles.max()) < tiles[:, None]), device=device)  # [T]
-    counts = np.array([rule.wanted(rate, int(count)) for count in tiles])
-
-    def padded(values: Tensor) -> Tensor:  # [T] -> [K, longest]
-        rows = values.new_zeros(len(tiles) * int(tiles.max()))
-        rows[places] = values
-        return rows.view(len(tiles), -1)
-
-    numbers = (places % int(tiles.max()))[:, None]  # [T, 1] within the view
-    units = Units(
-        padded(batch.errors.sum(dim=1)),
-        padded(batch.ages.amax(dim=1)),
-        padded(torch.ones_like(places, dtype=torch.bool)),
-        tuple(padded(word[:, 0]) for word in batch.words(numbers, PURPOSE_TILES)),
-        counts,
-    )
-    drawn, probabilities = draw_units(units, rule)
-    # Their number is known here; a boolean index would ask the device for it.
-    order = torch.argsort(drawn.reshape(-1)[places].to(torch.int8), stable=True, descending=True)
-    tile_ids = order[: counts.sum()]
+    device, ends = batch.table.device, TileGrid(batch.sizes).offsets
+    errors, ages = batch.errors.sum(dim=1), batch.ages.amax(dim=1)  # [T]
+    tiles = torch.arange(len(batch.table), device=device)
+    firsts = torch.as_tensor(np.repeat(ends[:-1], np.diff(ends)), device=device)
+    words = batch.words((tiles - firsts)[:, None], PURPOSE_TILES)  # of the numbers within the view
+    chosen, weights = [], []
+    for first, end in itertools.pairwise(ends.tolist()):
+        row = slice(first, end)
+        wanted = rule.wanted(rate, end - first)
+        exist = torch.ones(1, end - first, dtype=torch.bool, device=device)
+        of_row = tuple(word[row].T for word in words)
+        drawn, probabilities = draw_units(Units(errors[None, row], ages[None, row], exist, of_row, wanted), rule)
+        # Their number is known here; a boolean index would ask the device for it.
+        tile_ids = torch.argsort(drawn[0].to(torch.int8), stable=True, descending=True)[:wanted]
+        chosen.append(first + tile_ids)
+        if rule.importance:
+            weights.append(_importance_weights(probabilities, rule)[0, tile_ids])
+    tile_ids = torch.cat(chosen)
     table = batch.table[tile_ids]
-    weights = _importance_weights(probabilities, rule)
-    weights = None if weights is None else weights.reshape(-1)[places][tile_ids, None].expand(table.shape)
+    tile_weights = torch.cat(weights)[:, None].expand(table.shape) if rule.importance else None
     slots = np.full(len(tile_ids), TILE_PIXELS)
-    return compact(batch.view_ids, batch.sizes, table, table >= 0, tile_ids.int(), slots, weights)
+    return compact(batch.view_ids, batch.sizes, table, table >= 0, tile_ids.int(), slots, tile_weights)

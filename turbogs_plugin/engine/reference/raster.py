@@ -16,11 +16,6 @@ from turbogs_plugin.engine.rendered import DEFAULT_OPTIONS, Projected, Rendered,
 from turbogs_plugin.types import PARAMETER_NAMES, Cameras, GaussianGradients, Gaussians, GaussianStats, PixelSamples
 
 
-def expected_depths(sums: Tensor) -> Tensor:
-    """[P, 5] sums -> [P] expected depth, 0 where nothing was hit. Differentiable."""
-    return sums[:, 4] / sums[:, 3].clamp(min=ALPHA_TINY)
-
-
 @dataclass
 class ReferenceScreenGradients:
     """Gradients on the screen (see `ScreenGradients`).
@@ -140,5 +135,5 @@ def rasterize_reference(
         compositor = Compositor(intersect_tiles(rows, splats, samples, settings), samples, settings)
         table = compositing.splat_table(splats.means2d, splats.conics, splats.colors, splats.opacities, splats.depths)
         sums = compositing.composite(compositor, table)
-        depths = expected_depths(sums) if options.with_depth else None
+        depths = sums[:, 4] / sums[:, 3].clamp(min=ALPHA_TINY) if options.with_depth else None
     return ReferenceRendered(sums[:, :3], sums[:, 3], depths, sums, table, compositor, rows, splats, leaves)
