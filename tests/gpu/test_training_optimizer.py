@@ -87,7 +87,7 @@ class Scene:
     def reference(self):
         """The screen gradients of the reference in float64."""
         leaves, splats = self.project(self.gaussians.map(lambda value: value.double()), torch.float64)
-        records = self.rows.gather(self.records.double())
+        records = self.records.double().flatten(0, 1)[self.rows.flat]
         return ReferenceScreenGradients(self.rows, splats, leaves, records, self.samples, True)
 
     def screen(self, gaussians=None, overflow=None):

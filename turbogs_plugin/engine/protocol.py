@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from turbogs_plugin.engine.moments import GaussianMoments
+from turbogs_plugin.engine.reference.update import apply_update
 from turbogs_plugin.engine.rendered import DEFAULT_OPTIONS, Rendered, RenderOptions, ScreenGradients
 from turbogs_plugin.engine.rules import DrawRule, LossTerms, UpdateRule
 from turbogs_plugin.error_maps import ErrorMaps
@@ -19,7 +20,8 @@ class Engine(ABC):
     """What computes, on the device of the tensors that it is given.
 
     It knows rules, never strategies. `ReferenceEngine` defines every result; any other engine gives the same, to
-    rounding. An engine made for training may run ahead of the host: see `settle`.
+    rounding. `supervise` and `update` are two steps each, which an engine may do at once. An engine made for training
+    may run ahead of the host: see `settle`.
     """
 
     @property
@@ -94,7 +96,6 @@ class Engine(ABC):
         if nonfinite_losses is not None:
             nonfinite_losses += nonfinite
 
-    @abstractmethod
     def update(
         self,
         rule: UpdateRule,
@@ -111,6 +112,7 @@ class Engine(ABC):
             gaussians: the model that was rendered; changed in place, as is `moments`.
             stats: the window of density control; this pass is added to it. None where none is needed.
         """
+        apply_update(rule, gaussians, screen.parameter_gradients(rule.per_view, stats), moments)
 
     def settle(self, wait: bool = False) -> int:
         """How many of the latest iterations did nothing and must be done again, for lack of room on the device.

@@ -58,10 +58,6 @@ class Rows:
         full = values.new_zeros(count, *values.shape[1:]).index_copy(0, self.flat, values)
         return full.reshape(*self.shape, *values.shape[1:])
 
-    def gather(self, values: Tensor) -> Tensor:
-        """[K, N, ...] -> [R, ...]. Differentiable."""
-        return values.flatten(0, 1).index_select(0, self.flat)
-
 
 @dataclass
 class Splats:
