@@ -7,7 +7,7 @@ from turbogs_plugin.strategies.losses import CharbonnierLoss, CharbonnierNccLoss
 
 from turbogs_plugin.engine.cuda import library as kernels
 from turbogs_plugin.engine.cuda import training as training_kernels
-from turbogs_plugin.engine.cuda.training import MapUpdate
+from turbogs_plugin.engine.protocol import MapUpdate
 from turbogs_plugin.engine.reference.draws import draw_pixels
 from turbogs_plugin.engine.reference.losses import sparse_loss
 from turbogs_plugin.engine.rules import DrawRule
@@ -145,9 +145,10 @@ def test_lost_losses_are_counted_once():
     samples = make_samples(0.3, "pixel")
     colors, targets, _ = make_colors(samples)
     counter = torch.zeros((), dtype=torch.int64, device=DEVICE)
+    update = MapUpdate(make_maps(DEVICE), STEP, counter)
     for value, expected in ((0.5, 0), (1e38, 1), (0.5, 1), (1e38, 2)):
         colors[::7] = value
         found = training_kernels.sparse_loss(
-            CASES["l1"].terms, colors.to(DEVICE), targets.to(DEVICE), to_device(samples), nonfinite_losses=counter
+            CASES["l1"].terms, colors.to(DEVICE), targets.to(DEVICE), to_device(samples), update
         )
         assert int(counter) == expected and bool(torch.isfinite(found.loss)) == (value == 0.5)

@@ -11,7 +11,7 @@ import torch
 
 from turbogs_plugin.bench.clocks import Mark, Summary, summary
 from turbogs_plugin.engine import Engine
-from turbogs_plugin.engine.rendered import Rendered
+from turbogs_plugin.engine.rendered import Rendered, RenderOptions
 from turbogs_plugin.train.trainer import Trainer
 from turbogs_plugin.types import Cameras, Gaussians, PixelSamples
 
@@ -70,8 +70,8 @@ class TimedEngine:
         self.update = recorder.timed("solve+update", engine.update)
         self._render = recorder.timed("FWD", engine.render)
 
-    def render(self, gaussians: Gaussians, cameras: Cameras, samples: PixelSamples, **options: Any) -> Rendered:
-        rendered = self._render(gaussians, cameras, samples, **options)
+    def render(self, gaussians: Gaussians, cameras: Cameras, samples: PixelSamples, options: RenderOptions) -> Rendered:
+        rendered = self._render(gaussians, cameras, samples, options)
         self._recorder.rendered, self._recorder.samples = rendered, samples
         rendered.backward = self._recorder.timed("BWD", rendered.backward)
         return rendered

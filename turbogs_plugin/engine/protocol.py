@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -14,6 +15,21 @@ from turbogs_plugin.engine.rules import DrawRule, LossTerms, UpdateRule
 from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.scene.photos import PhotoSamples
 from turbogs_plugin.types import Cameras, Gaussians, GaussianStats, LossOutput, PixelSamples, Step
+
+
+@dataclass(frozen=True)
+class MapUpdate:
+    """What learns of the errors of an iteration.
+
+    Args:
+        maps: of all views; updated in place.
+        step: gives the stamp.
+        nonfinite_losses: [] int64 on the device; 1 is added if the loss is not finite.
+    """
+
+    maps: ErrorMaps
+    step: Step
+    nonfinite_losses: Tensor | None = None
 
 
 class Engine(ABC):
@@ -55,46 +71,24 @@ class Engine(ABC):
     def evaluate(self, terms: LossTerms, colors: Tensor, targets: Tensor, samples: PixelSamples) -> LossOutput:
         """The loss of rendered samples and its gradient. `colors`, `targets`: [P, 3]."""
 
-    def supervise(
-        self,
-        terms: LossTerms,
-        colors: Tensor,
-        truth: PhotoSamples,
-        maps: ErrorMaps,
-        step: Step,
-        nonfinite_losses: Tensor | None = None,
-    ) -> LossOutput:
+    def supervise(self, terms: LossTerms, colors: Tensor, truth: PhotoSamples, update: MapUpdate) -> LossOutput:
         """`evaluate` against the photos at the samples, on the device of `colors` [P, 3], and `learn` from it."""
         output = self.evaluate(terms, colors, truth.colors(), truth.samples)
-        self.learn(maps, truth.samples, colors, output, step, nonfinite_losses)
+        self.learn(truth.samples, colors, output, update)
         return output
 
-    def learn(
-        self,
-        maps: ErrorMaps,
-        samples: PixelSamples,
-        colors: Tensor,
-        output: LossOutput,
-        step: Step,
-        nonfinite_losses: Tensor | None = None,
-    ) -> None:
+    def learn(self, samples: PixelSamples, colors: Tensor, output: LossOutput, update: MapUpdate) -> None:
         """Let the error maps learn the errors of an iteration, whatever loss gave them.
 
-        A sample whose colour or error is not finite changes nothing: neither the error of its pixel nor its age. An
-        iteration that did nothing changes nothing here either.
-
-        Args:
-            maps: updated in place.
-            colors: [P, 3] rendered.
-            step: gives the stamp.
-            nonfinite_losses: [] int64 on the device; 1 is added if the loss is not finite.
+        A sample whose rendered colour, of `colors` [P, 3], or whose error is not finite changes nothing: neither the
+        error of its pixel nor its age. An iteration that did nothing changes nothing here either.
         """
         drawn, nonfinite = torch.isfinite(colors).all(dim=1), ~output.loss.isfinite()
         if self.overflow is not None:
             drawn, nonfinite = drawn & (self.overflow == 0), nonfinite & (self.overflow[0] == 0)
-        maps.update(samples, torch.where(drawn, output.pixel_errors, torch.nan), step)
-        if nonfinite_losses is not None:
-            nonfinite_losses += nonfinite
+        update.maps.update(samples, torch.where(drawn, output.pixel_errors, torch.nan), update.step)
+        if update.nonfinite_losses is not None:
+            update.nonfinite_losses.add_(nonfinite)
 
     def update(
         self,

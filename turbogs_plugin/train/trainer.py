@@ -13,6 +13,7 @@ from torch import Tensor
 from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.engine import engine_of
 from turbogs_plugin.engine.layout import MAX_SH_DEGREE
+from turbogs_plugin.engine.protocol import MapUpdate
 from turbogs_plugin.engine.rendered import Rendered, RenderOptions, ScreenGradients
 from turbogs_plugin.engine.rendering import render_image
 from turbogs_plugin.errors import TrainingStopped
@@ -126,11 +127,11 @@ class Trainer:
 
     def supervise(self, colors: Tensor, truth: PhotoSamples, step: Step) -> LossOutput:
         """Loss and error maps: at once where the loss is a rule, else by the loss's own code."""
-        terms, samples = self.loss.terms, truth.samples
-        if terms is not None:
-            return self.engine.supervise(terms, colors, truth, self.maps, step, self.nonfinite_losses)
-        loss = self.loss(colors, truth.colors(), samples)
-        self.engine.learn(self.maps, samples, colors, loss, step, self.nonfinite_losses)
+        update = MapUpdate(self.maps, step, self.nonfinite_losses)
+        if self.loss.terms is not None:
+            return self.engine.supervise(self.loss.terms, colors, truth, update)
+        loss = self.loss(colors, truth.colors(), truth.samples)
+        self.engine.learn(truth.samples, colors, loss, update)
         return loss
 
     def update(self, screen: ScreenGradients, stats: GaussianStats | None, step: Step) -> None:

@@ -9,12 +9,11 @@ from torch import Tensor
 from turbogs_plugin.engine.cuda import training
 from turbogs_plugin.engine.cuda.raster import CudaRendered, rasterize_cuda
 from turbogs_plugin.engine.cuda.workspace import Workspace
-from turbogs_plugin.engine.protocol import Engine
+from turbogs_plugin.engine.protocol import Engine, MapUpdate
 from turbogs_plugin.engine.rendered import DEFAULT_OPTIONS, RenderOptions
 from turbogs_plugin.engine.rules import LossTerms
-from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.scene.photos import PhotoSamples
-from turbogs_plugin.types import Cameras, Gaussians, LossOutput, PixelSamples, Step
+from turbogs_plugin.types import Cameras, Gaussians, LossOutput, PixelSamples
 
 
 class CudaEngine(Engine):
@@ -41,25 +40,13 @@ class CudaEngine(Engine):
     ) -> CudaRendered:
         return rasterize_cuda(gaussians, cameras, samples, options, self.workspace)
 
-    def supervise(
-        self,
-        terms: LossTerms,
-        colors: Tensor,
-        truth: PhotoSamples,
-        maps: ErrorMaps,
-        step: Step,
-        nonfinite_losses: Tensor | None = None,
-    ) -> LossOutput:
+    def supervise(self, terms: LossTerms, colors: Tensor, truth: PhotoSamples, update: MapUpdate) -> LossOutput:
         # The kernel gathers the truth itself where photos and maps of each view begin at the same pixel. With only one
         # of the two in host memory they do not.
-        photos = truth.photos.colors
-        aligned = len(photos) == len(maps.errors) and np.array_equal(
-            truth.starts, maps.offsets[list(truth.samples.view_ids)]
-        )
-        targets, update = photos if aligned else truth.colors(), training.MapUpdate(maps, step, self.overflow)
-        return training.sparse_loss(
-            terms, colors, targets, truth.samples, update=update, nonfinite_losses=nonfinite_losses
-        )
+        photos, starts = truth.photos.colors, update.maps.offsets[list(truth.samples.view_ids)]
+        aligned = len(photos) == len(update.maps.errors) and np.array_equal(truth.starts, starts)
+        targets = photos if aligned else truth.colors()
+        return training.sparse_loss(terms, colors, targets, truth.samples, update, self.overflow)
 
     def settle(self, wait: bool = False) -> int:
         return 0 if self.workspace is None else self.workspace.take_lost(wait)

@@ -9,7 +9,6 @@ torch's current stream and not waited for. Tensors must be contiguous; one of an
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -20,6 +19,7 @@ from turbogs_plugin.engine.cuda import launches, library
 from turbogs_plugin.engine.cuda.raster import CudaScreenGradients, count_filled, require_views
 from turbogs_plugin.engine.layout import STRUCTURES, UNITS, UPDATE_KINDS
 from turbogs_plugin.engine.moments import GaussianMoments
+from turbogs_plugin.engine.protocol import MapUpdate
 from turbogs_plugin.engine.rules import DrawRule, LossTerms, UpdateRule
 from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.tiles import CELL_SIDE, TILE_PIXELS, slots_of_tiles, tile_extents
@@ -91,28 +91,13 @@ def view_rows(
     return [number for start, size, view_id, draw in columns for number in (start, *size, view_id, *draw)]
 
 
-@dataclass
-class MapUpdate:
-    """The maps to update along with a loss.
-
-    Args:
-        maps: of all views, on the device of the colours.
-        step: gives the stamp.
-        overflow: [1] int32 on the device, or None; where it is not 0, the maps stay as they are.
-    """
-
-    maps: ErrorMaps
-    step: Step
-    overflow: Tensor | None = None
-
-
 def sparse_loss(
     terms: LossTerms,
     colors: Tensor,
     targets: Tensor,
     samples: PixelSamples,
     update: MapUpdate | None = None,
-    nonfinite_losses: Tensor | None = None,
+    overflow: Tensor | None = None,
 ) -> LossOutput:
     """Loss, gradient and pixel errors, and with `update` what `ErrorMaps.update` does, in one launch.
 
@@ -124,8 +109,7 @@ def sparse_loss(
         targets: [P, 3] float32, the truth at the samples; or [X, 3] uint8, the photos of all views, gathered by the
             kernel: they lie as the maps of `update` do, which are then needed.
         samples: of at most `MAX_VIEWS` views.
-        update: the maps to update.
-        nonfinite_losses: [] int64, 1 is added if the loss is not finite.
+        overflow: [1] int32 on the device, or None; where it is not 0, maps and count of `update` stay as they are.
 
     Returns:
         The loss (a float64 scalar on the device), gradients [P, 3] float32 and errors [P] float32.
@@ -133,10 +117,10 @@ def sparse_loss(
     library.require()
     colors = colors.detach().float().contiguous()
     photos = targets if targets.dtype == torch.uint8 else None
-    maps, beta, stamp, overflow = launches.NO_MAPS, 0.0, 0, None
+    maps, beta, stamp, nonfinite_losses = launches.NO_MAPS, 0.0, 0, None
     starts = np.zeros(len(samples.view_ids), dtype=np.int64)
     if update is not None:
-        maps, overflow = update.maps, update.overflow
+        maps, nonfinite_losses = update.maps, update.nonfinite_losses
         beta, stamp = maps.beta, maps.stamp(update.step)
         starts = maps.offsets[list(samples.view_ids)]
     elif photos is not None:
