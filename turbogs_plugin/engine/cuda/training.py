@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import lru_cache
+from itertools import accumulate
 
 import numpy as np
 import torch
@@ -23,7 +24,7 @@ from turbogs_plugin.engine.protocol import MapUpdate
 from turbogs_plugin.engine.rules import DrawRule, LossTerms, UpdateRule
 from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.tiles import CELL_SIDE, TILE_PIXELS, slots_of_tiles, tile_extents
-from turbogs_plugin.types import Gaussians, GaussianStats, LossOutput, PixelSamples, Step, TileGrid
+from turbogs_plugin.types import TILE_SIZE, Gaussians, GaussianStats, LossOutput, PixelSamples, Step
 
 
 def sample_pixels(rule: DrawRule, maps: ErrorMaps, view_ids: tuple[int, ...], rate: float, step: Step) -> PixelSamples:
@@ -32,11 +33,12 @@ def sample_pixels(rule: DrawRule, maps: ErrorMaps, view_ids: tuple[int, ...], ra
     maps.fetch(view_ids)
     views = np.asarray(view_ids, dtype=np.int64)
     device, sizes = maps.errors.device, maps.sizes[views]
-    tiles = TileGrid(sizes).shapes.prod(axis=1).tolist()  # [K]
+    shapes = sizes.tolist()
+    tiles = [-(-width // TILE_SIZE) * -(-height // TILE_SIZE) for width, height in shapes]  # [K]
     scratch, by_tile = launches.NO_SCRATCH, rule.unit == "tile"
     if by_tile:
         wanted, slots_per_tile = [rule.wanted(rate, count) for count in tiles], 0
-        ends = np.cumsum(wanted).tolist()  # of each view's chosen tiles
+        ends = list(accumulate(wanted))  # of each view's chosen tiles
         chosen, slots = ends[-1], ends[-1] * TILE_PIXELS
         dtypes = (torch.float64, torch.int32, torch.int64, torch.float32)
         scratch = launches.TileScratch(*(torch.empty(sum(tiles), dtype=dtype, device=device) for dtype in dtypes))
@@ -44,12 +46,11 @@ def sample_pixels(rule: DrawRule, maps: ErrorMaps, view_ids: tuple[int, ...], ra
         unit_pixels = CELL_SIDE**2 if rule.unit == "cell" else 1
         wanted = [rule.wanted(rate, TILE_PIXELS // unit_pixels)] * len(tiles)  # of each tile
         slots_per_tile = wanted[0] * unit_pixels
-        ends = np.cumsum([_view_slots(*size, rule.unit, wanted[0]) for size in sizes.tolist()]).tolist()
+        ends = list(accumulate(_view_slots(*size, rule.unit, wanted[0]) for size in shapes))
         chosen, slots = sum(tiles), ends[-1]
-    draws = [
-        (first, count if by_tile else 0, *rule.stages(count))
-        for first, count in zip([0, *ends[:-1]], wanted, strict=True)
-    ]
+    stages = {count: rule.stages(count) for count in set(wanted)}
+    firsts = zip([0, *ends[:-1]], wanted, strict=True)
+    draws = [(first, count if by_tile else 0, *stages[count]) for first, count in firsts]
     draw = launches.SamplePixels(
         errors=maps.errors,
         stamps=maps.stamps,
