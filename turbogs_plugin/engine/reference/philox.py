@@ -6,7 +6,7 @@ words under a key of two to four random words. The layout that every sampler of 
 =========  ==================================================================================
 word       value
 =========  ==================================================================================
-counter 0  the place: pixel id, cell id, tile id (see `pixel_sampling`), or view number
+counter 0  the place: pixel id, cell id, tile id (see `draws`), or view number
 counter 1  the training view's number; 0 where the place is a view
 counter 2  the purpose, one of `PURPOSE_*`
 counter 3  the high 32 bits of the seed
