@@ -55,8 +55,8 @@ class CharbonnierNccLoss(RuleLoss):
         L = l1 + ncc_weight * mean over tiles of lambda * mean over channels of gate * (1 - S)
         lambda = clip(mean |grad l1| / (mean |grad S| + 1e-8), 0, 1)
 
-    with S = `correlation`, `printed_correlation` or `contrast`. The two means of the balance are over the tile's samples
-    (by their shares), of the L1 norms over channels of ``d / sqrt(d^2 + eps^2)`` and of g: the appendix's printed
+    with S = `correlation`, `printed_correlation` or `contrast`. The two means of the balance are over the tile's
+    samples (by their shares), of the L1 norms over channels of ``d / sqrt(d^2 + eps^2)`` and of g: the appendix's printed
     gradients, which without 1 / n compare the two terms as they enter L. lambda is constant in the backward pass. The
     structure term's gradient is *added*: the appendix's minus would lower the correlation.
 

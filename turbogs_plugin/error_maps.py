@@ -125,10 +125,10 @@ class ErrorMaps:
         if errors.shape != (width * height,):
             raise InputError(f"errors of view {view_id} have shape {tuple(errors.shape)}, expected ({width * height},)")
         self.fetch([view_id])
-        start, end = self._extent(view_id)
+        place = self._extent(view_id)
         errors = torch.nan_to_num(errors.detach().float(), nan=0.0, posinf=0.0, neginf=0.0).clamp(0.0, ERROR_MAX)
-        self.errors[start:end] = errors.to(torch.float16)
-        self.view_sums[view_id] = self.errors[start:end].sum(dtype=torch.float64)
+        self.errors[place] = errors.to(torch.float16)
+        self.view_sums[view_id] = self.errors[place].sum(dtype=torch.float64)
         self._means.restart()
 
     def update(self, samples: PixelSamples, pixel_errors: Tensor, step: Step) -> None:
@@ -151,7 +151,7 @@ class ErrorMaps:
                 f"pixel errors have shape {tuple(pixel_errors.shape)}, expected ({len(samples)},): one for each sample"
             )
         self.fetch(samples.view_ids)
-        self._rebase(step.iteration)
+        stamp = self.stamp(step)
         views = samples.view_of_slot()
         errors = pixel_errors.detach().float()
         starts = torch.as_tensor(self.offsets[list(samples.view_ids)], device=errors.device)
@@ -160,7 +160,7 @@ class ErrorMaps:
         old = self._errors[flat]
         new = (old.float() * (1.0 - self.beta) + errors * self.beta).clamp(max=ERROR_MAX).to(torch.float16)
         self._errors[flat] = new
-        self._stamps[flat] = step.iteration - self.stamp_base
+        self._stamps[flat] = stamp
         deltas = torch.where(changed, new.double() - old.double(), 0.0)
         batch_sums = deltas.new_zeros(len(samples.view_ids)).index_add_(0, views, deltas)
         view_ids = torch.as_tensor(samples.view_ids, device=errors.device)
@@ -169,9 +169,19 @@ class ErrorMaps:
     def ages(self, view_id: int, step: Step) -> Tensor:
         """[H * W] int32: iterations since each pixel of a view was last sampled, saturated at `AGE_MAX`."""
         self.fetch([view_id])
-        start, end = self._extent(view_id)
-        now = step.iteration - self.stamp_base
-        return (now - self.stamps[start:end].int()).clamp(0, AGE_MAX)
+        return (self.now(step) - self.stamps[self._extent(view_id)].int()).clamp(0, AGE_MAX)
+
+    def now(self, step: Step) -> int:
+        """The age of a pixel is this less its stamp."""
+        return step.iteration - self.stamp_base
+
+    def stamp(self, step: Step) -> int:
+        """The stamp of the pixels visited now. Keeps it within its range: stamps too old to matter saturate."""
+        shift = self.now(step)
+        if shift > AGE_MAX:
+            self._change_stamps(lambda stamps: (stamps.int() - shift).clamp(min=-AGE_MAX))
+            self.stamp_base = step.iteration
+        return self.now(step)
 
     def view_means(self) -> np.ndarray:
         """[V] float64 on the host: mean error of each view.
@@ -209,10 +219,10 @@ class ErrorMaps:
         self.view_sums.copy_(state["view_sums"])
         self._means.load_state_dict(state)
 
-    def _extent(self, view_id: int) -> tuple[int, int]:
-        """First flat pixel of a view, and the one after its last."""
+    def _extent(self, view_id: int) -> slice:
+        """The flat pixels of a view."""
         start = int(self.offsets[view_id])
-        return start, start + int(self.sizes[view_id].prod())
+        return slice(start, start + int(self.sizes[view_id].prod()))
 
     def _stored(self) -> tuple[Tensor, Tensor]:
         """([X] errors, [X] stamps) of all views, end to end."""
@@ -226,13 +236,6 @@ class ErrorMaps:
     def _change_stamps(self, function: Callable[[Tensor], Tensor]) -> None:
         """Replace the stamps of all views by a function of each."""
         self._stamps.copy_(function(self._stamps))
-
-    def _rebase(self, iteration: int) -> None:
-        """Keep ``iteration - stamp_base`` within the stamps' range; stamps too old to matter saturate."""
-        shift = iteration - self.stamp_base
-        if shift > AGE_MAX:
-            self._change_stamps(lambda stamps: (stamps.int() - shift).clamp(min=-AGE_MAX))
-            self.stamp_base = iteration
 
 
 class _LaggedCopy:

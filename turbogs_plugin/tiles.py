@@ -9,19 +9,38 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from turbogs_plugin.types import TILE_SIZE, PixelSamples, TileGrid, cell_order
+from turbogs_plugin.types import TILE_SIZE, PixelSamples, TileGrid, sample_order
 
 TILE_PIXELS = TILE_SIZE * TILE_SIZE
 CELL_SIDE = 4
 TILE_CELLS = (TILE_SIZE // CELL_SIDE) ** 2
 
 
+def _places(device: torch.device | str) -> tuple[Tensor, Tensor]:
+    """x and y within the tile, [256] int32 each, of the places of a tile in `sample_order`."""
+    pixels = torch.arange(TILE_PIXELS, dtype=torch.int32, device=device)
+    x, y = pixels % TILE_SIZE, pixels // TILE_SIZE
+    order = torch.argsort(sample_order(x, y))
+    return x[order], y[order]
+
+
+def cell_of_place(device: torch.device | str) -> Tensor:
+    """[256] int32: which 4x4 cell of the tile, counted row by row, each place lies in."""
+    x, y = _places(device)
+    return y // CELL_SIDE * (TILE_SIZE // CELL_SIDE) + x // CELL_SIDE
+
+
+def slots_of_tiles(unit: str, wanted: int, widths: np.ndarray, heights: np.ndarray) -> np.ndarray:
+    """[T] int64: slots of each tile of which so many units are drawn, `pixel` or `cell`. The rest as `tile_extents`."""
+    if unit == "cell":
+        cells = -(-widths // CELL_SIDE) * -(-heights // CELL_SIDE)
+        wanted = np.minimum(wanted, cells) * CELL_SIDE**2
+    return np.minimum(wanted, widths * heights)
+
+
 def pixel_table(sizes: np.ndarray, device: torch.device | str) -> Tensor:
-    """[T, 256] int32: the pixel id of each place of each tile of ``TileGrid(sizes)``, in `cell_order`; -1 outside."""
-    side = torch.arange(TILE_SIZE, dtype=torch.int32, device=device)
-    y, x = (axis.reshape(-1) for axis in torch.meshgrid(side, side, indexing="ij"))
-    order = torch.argsort(cell_order(x, y))
-    x, y = x[order], y[order]
+    """[T, 256] int32: the pixel id of each place of each tile of ``TileGrid(sizes)``, in `sample_order`; -1 outside."""
+    x, y = _places(device)
     tables = []
     for width, height in sizes.tolist():
         xs = torch.arange(0, width, TILE_SIZE, dtype=torch.int32, device=device)[:, None] + x  # [tiles in x, 256]

@@ -22,12 +22,12 @@ from torch import Tensor
 TILE_SIZE = 16
 """Side of a square tile in pixels (S in the paper). The kernels are built for this value."""
 
-CELL_WIDTH, CELL_HEIGHT = 8, 4
-"""Samples of a tile are ordered by cells of this size, so that 32 neighbours of a dense tile are one warp's."""
+PATCH_WIDTH, PATCH_HEIGHT = 8, 4
+"""Samples of a tile are ordered by patches of this size, so that 32 neighbours of a dense tile are one warp's."""
 
 
-def cell_order(x: Tensor, y: Tensor) -> Tensor:
-    """Rank of a pixel within its tile: row-major over cells of 8x4, then row-major within the cell.
+def sample_order(x: Tensor, y: Tensor) -> Tensor:
+    """Rank of a pixel within its tile: row-major over patches of 8x4, then row-major within the patch.
 
     Args:
         x, y: integer tensors of one shape, coordinates within the tile, 0 .. TILE_SIZE - 1.
@@ -35,8 +35,8 @@ def cell_order(x: Tensor, y: Tensor) -> Tensor:
     Returns:
         Integers 0 .. TILE_SIZE^2 - 1 of the same shape.
     """
-    cell = (y // CELL_HEIGHT) * (TILE_SIZE // CELL_WIDTH) + x // CELL_WIDTH
-    return cell * (CELL_WIDTH * CELL_HEIGHT) + (y % CELL_HEIGHT) * CELL_WIDTH + x % CELL_WIDTH
+    patch = (y // PATCH_HEIGHT) * (TILE_SIZE // PATCH_WIDTH) + x // PATCH_WIDTH
+    return patch * (PATCH_WIDTH * PATCH_HEIGHT) + (y % PATCH_HEIGHT) * PATCH_WIDTH + x % PATCH_WIDTH
 
 
 PARAMETER_NAMES = ("means", "quats", "scales", "opacities", "sh0", "shN")
@@ -46,7 +46,19 @@ SH_C0 = 0.28209479177387814
 
 
 @dataclass
-class Gaussians:
+class ParameterTensors:
+    """A tensor for each parameter of the model."""
+
+    means: Tensor
+    quats: Tensor
+    scales: Tensor
+    opacities: Tensor
+    sh0: Tensor
+    shN: Tensor
+
+
+@dataclass
+class Gaussians(ParameterTensors):
     """The model, in gsplat's parameter layout. All tensors share one device and one dtype.
 
     Args:
@@ -57,13 +69,6 @@ class Gaussians:
         sh0: [N, 1, 3], spherical harmonics of band 0.
         shN: [N, B, 3], the higher bands, B = (degree + 1)^2 - 1.
     """
-
-    means: Tensor
-    quats: Tensor
-    scales: Tensor
-    opacities: Tensor
-    sh0: Tensor
-    shN: Tensor
 
     def __len__(self) -> int:
         return self.means.shape[0]
@@ -159,7 +164,7 @@ class PixelSamples:
         view_ids: K numbers of training views, on the host.
         sizes: [K, 2] int64 numpy array (width, height) of those views.
         pixel_ids: [P] int32, ``y * width + x`` in its own view, or -1 for an empty slot. Within a tile, ascending
-            in `cell_order`, empty slots last.
+            in `sample_order`, empty slots last.
         tile_ids: [T] int32, ascending, in the numbering of ``TileGrid(sizes)``.
         tile_offsets: [T + 1] int32, the first slot of each tile; the last entry is P.
         weights: [P] float32 importance weights with mean 1 over the filled slots, or None where all are 1.
@@ -228,7 +233,7 @@ class LossOutput:
 
 
 @dataclass
-class GaussianGradients:
+class GaussianGradients(ParameterTensors):
     """Gradients of the parameters, in `Gaussians`' layout, with a leading view dimension where rows are asked for.
 
     Args:
@@ -239,12 +244,6 @@ class GaussianGradients:
             e * w / P``; zero where the Gaussian has no part.
     """
 
-    means: Tensor
-    quats: Tensor
-    scales: Tensor
-    opacities: Tensor
-    sh0: Tensor
-    shN: Tensor
     touched: Tensor
     view_losses: Tensor
 
@@ -289,12 +288,12 @@ class GaussianStats:
         return cls(*(torch.zeros(count, device=device) for _ in fields(cls)))
 
     def zero_(self) -> None:
-        for field in fields(self):
-            getattr(self, field.name).zero_()
+        for value in vars(self).values():
+            value.zero_()
 
     def map(self, function) -> GaussianStats:
         """Statistics whose every tensor is `function` of the present one."""
-        return GaussianStats(*(function(getattr(self, field.name)) for field in fields(self)))
+        return GaussianStats(*map(function, vars(self).values()))
 
 
 @dataclass
@@ -322,12 +321,8 @@ class RowUpdate:
 
     def apply(self, gaussians: Gaussians) -> Gaussians:
         """The model after the change."""
-        return Gaussians(
-            **{
-                name: self.values[name] if name in self.values else value[self.source]
-                for name, value in gaussians.items()
-            }
-        )
+        copies = {name: value[self.source] for name, value in gaussians.items() if name not in self.values}
+        return Gaussians(**copies, **self.values)
 
     def reordered(self, order: Tensor) -> RowUpdate:
         """The same change with its new rows in another order [M], a permutation."""

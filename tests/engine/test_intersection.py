@@ -12,10 +12,9 @@ from turbogs_plugin.engine.rendering import RasterSettings, dense_samples
 SETTINGS = RasterSettings()
 
 
-def pairs_of(gaussians, cameras, samples):
+def intersections_of(gaussians, cameras, samples):
     rows = drawable_rows(gaussians, cameras, SETTINGS)
-    parameters = [value[rows.gaussians] for name, value in gaussians.items() if name != "shN"]
-    splats = project_rows(rows, *parameters, gaussians.shN, cameras, 0, SETTINGS)
+    splats = project_rows(rows, rows.take(gaussians), cameras, 0, SETTINGS)
     return rows, splats, intersect_tiles(rows, splats, samples, SETTINGS)
 
 
@@ -47,10 +46,10 @@ def test_no_contribution_is_lost_and_order_is_by_depth(dtype, shape):
         gaussians.scales[:, 1:] -= 5
     cameras = make_cameras([(70, 45), (33, 64)], dtype)
     samples = thin_out(dense_samples(cameras), 0.2)
-    rows, splats, pairs = pairs_of(gaussians, cameras, samples)
+    rows, splats, intersections = intersections_of(gaussians, cameras, samples)
     assert len(samples.tile_ids) < len(samples.grid)
     found, needed = 0, 0
-    for tile, listed in enumerate(pairs.rows.split(pairs.tile_counts.tolist())):
+    for tile, listed in enumerate(intersections.rows.split(intersections.tile_counts.tolist())):
         expected = contributing(rows, splats, samples, tile).nonzero()[:, 0]
         assert set(expected.tolist()) <= set(listed.tolist())
         keys = list(zip(splats.depths[listed].tolist(), rows.gaussians[listed].tolist(), strict=True))
@@ -80,22 +79,22 @@ def test_smallest_exponents_are_the_minimum_over_the_rectangle():
     assert (found >= brute - 0.02 * (1 + brute)).all()  # the brute search has a step
 
 
-def test_pairs_cover_every_row_once_when_summed():
+def test_intersections_cover_every_row_once_when_summed():
     gaussians, cameras = make_gaussians(50, degree=0), make_cameras([(70, 45)])
-    _, splats, pairs = pairs_of(gaussians, cameras, dense_samples(cameras))
-    values = torch.empty(len(pairs.rows), 1, dtype=torch.float64)
-    values[pairs.slots, 0] = (pairs.rows + 1).double()
-    counts = torch.bincount(pairs.rows, minlength=len(splats.depths))
+    _, splats, intersections = intersections_of(gaussians, cameras, dense_samples(cameras))
+    values = torch.empty(len(intersections.rows), 1, dtype=torch.float64)
+    values[intersections.slots, 0] = (intersections.rows + 1).double()
+    counts = torch.bincount(intersections.rows, minlength=len(splats.depths))
     expected = counts * torch.arange(1, len(counts) + 1)
-    assert torch.equal(pairs.sum_by_row(values)[:, 0], expected.double())
+    assert torch.equal(intersections.sum_by_row(values)[:, 0], expected.double())
 
 
 def test_equal_depths_keep_the_order_of_the_gaussians():
     gaussians, cameras = make_gaussians(40, degree=0), make_cameras([(32, 32)])
     gaussians.means[:] = gaussians.means[0]
-    rows, splats, pairs = pairs_of(gaussians, cameras, dense_samples(cameras))
+    rows, splats, intersections = intersections_of(gaussians, cameras, dense_samples(cameras))
     assert len(set(splats.depths.tolist())) == 1
-    for listed in pairs.rows.split(pairs.tile_counts.tolist()):
+    for listed in intersections.rows.split(intersections.tile_counts.tolist()):
         assert (rows.gaussians[listed].diff() > 0).all()
 
 

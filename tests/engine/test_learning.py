@@ -7,7 +7,8 @@ import pytest
 import torch
 from turbogs_plugin.strategies.losses import CharbonnierLoss, CharbonnierNccLoss, SparseSsimLoss
 
-from turbogs_plugin.engine import engine_of, shared
+from turbogs_plugin.engine import engine_of
+from turbogs_plugin.engine.protocol import MapUpdate
 from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.scene.photos import Photos
 from turbogs_plugin.tiles import dense_pixels
@@ -29,7 +30,7 @@ def case():
 
 @pytest.mark.parametrize("overflow", [None, 0, 1])
 @pytest.mark.parametrize("factor", [1.0, torch.inf])
-def test_a_pass_that_drew_nothing_teaches_nothing(case, factor, overflow):
+def test_a_pass_that_drew_nothing_teaches_nothing(case, monkeypatch, factor, overflow):
     """Neither does its loss count as lost, finite or not."""
     maps, truth = case
     before, count = maps.state_dict(), torch.zeros((), dtype=torch.int64)
@@ -37,7 +38,9 @@ def test_a_pass_that_drew_nothing_teaches_nothing(case, factor, overflow):
     colors = torch.zeros(256, 3)
     output = CharbonnierLoss()(colors, truth.colors(), truth.samples)
     output = LossOutput(output.loss * factor, output.color_gradients, output.pixel_errors)
-    shared.learn(maps, truth.samples, colors, output, STEP, count, flag)
+    engine = engine_of(colors.device)
+    monkeypatch.setattr(type(engine), "overflow", flag)
+    engine.learn(truth.samples, colors, output, MapUpdate(maps, STEP, count))
     after = maps.state_dict()
     same = {name: torch.equal(before[name], after[name]) for name in MAPS}
     assert set(same.values()) == {overflow == 1}
@@ -53,7 +56,7 @@ def test_a_colour_that_is_not_finite_leaves_its_pixel_alone(case, loss, bad):
     slots = torch.tensor([0, 5, 100])
     colors = torch.full((256, 3), 0.5)
     colors[slots, 1] = bad
-    output = engine_of(colors.device).supervise(loss.terms, colors, truth, maps, STEP)
+    output = engine_of(colors.device).supervise(loss.terms, colors, truth, MapUpdate(maps, STEP))
     assert not output.pixel_errors[slots].any() and not output.color_gradients[slots].any()
     flat = maps.flat_pixels(truth.samples)
     kept = torch.zeros(len(maps.errors), dtype=torch.bool)
@@ -70,8 +73,8 @@ def test_supervising_is_evaluating_and_learning(case):
     other = ErrorMaps(SIZES)
     other.load_state_dict(maps.state_dict())
     engine = engine_of(colors.device)
-    whole = engine.supervise(loss.terms, colors, truth, maps, STEP)
+    whole = engine.supervise(loss.terms, colors, truth, MapUpdate(maps, STEP))
     parts = loss(colors, truth.colors(), truth.samples)
-    engine.learn(other, truth.samples, colors, parts, STEP)
+    engine.learn(truth.samples, colors, parts, MapUpdate(other, STEP))
     assert all(torch.equal(getattr(whole, name), getattr(parts, name)) for name in vars(parts))
     assert all(torch.equal(maps.state_dict()[name], other.state_dict()[name]) for name in MAPS)

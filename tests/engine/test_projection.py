@@ -18,8 +18,7 @@ SETTINGS = RasterSettings()
 
 def project(gaussians: Gaussians, cameras, degree: int = 3, settings: RasterSettings = SETTINGS):
     rows = drawable_rows(gaussians, cameras, settings)
-    parameters = [value[rows.gaussians] for name, value in gaussians.items() if name != "shN"]
-    return rows, project_rows(rows, *parameters, gaussians.shN, cameras, degree, settings)
+    return rows, project_rows(rows, rows.take(gaussians), cameras, degree, settings)
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
@@ -63,19 +62,16 @@ def test_projection_and_its_gradients_are_gsplats(spread):
     rows, splats = project(gaussians, cameras)
 
     covariances, _ = _quat_scale_to_covar_preci(gaussians.quats, gaussians.scales.exp(), compute_preci=False)
-    _, means2d, depths, conics, _ = _fully_fused_projection(
-        gaussians.means, covariances, cameras.viewmats, cameras.Ks, 48, 32
-    )
+    theirs = _fully_fused_projection(gaussians.means, covariances, cameras.viewmats, cameras.Ks, 48, 32)
+    means2d, depths, conics = (value.flatten(0, 1)[rows.flat] for value in theirs[1:4])
     for ours, theirs in ((splats.means2d, means2d), (splats.depths, depths), (splats.conics, conics)):
-        torch.testing.assert_close(ours, rows.gather(theirs), rtol=1e-9, atol=1e-11)
+        torch.testing.assert_close(ours, theirs, rtol=1e-9, atol=1e-11)
 
     generator = torch.Generator().manual_seed(5)
     upstream = [torch.randn(value.shape, generator=generator, dtype=torch.float64) for value in (means2d, conics)]
     leaves = (gaussians.means, gaussians.quats, gaussians.scales)
-    ours = torch.autograd.grad((splats.means2d, splats.conics), leaves, [rows.gather(value) for value in upstream])
-    theirs = torch.autograd.grad(
-        (rows.gather(means2d), rows.gather(conics)), leaves, [rows.gather(value) for value in upstream]
-    )
+    ours = torch.autograd.grad((splats.means2d, splats.conics), leaves, upstream)
+    theirs = torch.autograd.grad((means2d, conics), leaves, upstream)
     for our, their in zip(ours, theirs, strict=True):
         torch.testing.assert_close(our, their, rtol=1e-8, atol=1e-8 * float(their.abs().max()))
 

@@ -19,7 +19,7 @@ from turbogs_plugin.engine.rendering import (
     render_image,
 )
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.types import PARAMETER_NAMES, Gaussians, GaussianStats, PixelSamples, cell_order
+from turbogs_plugin.types import PARAMETER_NAMES, Gaussians, GaussianStats, PixelSamples, sample_order
 
 SIZES = [(37, 29), (20, 50)]
 ACTIVATED = {"opaque": 5.0, "as made": 0.0}
@@ -86,8 +86,7 @@ def test_projected_is_what_was_drawn():
     samples = dense_samples(cameras)
     projected = rasterize(gaussians, cameras, samples).projected()
     rows = projection.drawable_rows(gaussians, cameras, RasterSettings())
-    drawn = [getattr(gaussians, name)[rows.gaussians] for name in PARAMETER_NAMES[:-1]]
-    splats = projection.project_rows(rows, *drawn, gaussians.shN, cameras, 3, RasterSettings())
+    splats = projection.project_rows(rows, rows.take(gaussians), cameras, 3, RasterSettings())
     shown = (projected.radii > 0).any(dim=-1)
     assert 0 < int(shown.sum()) < shown.numel()
     for name in ("means2d", "conics", "depths", "opacities"):
@@ -375,14 +374,14 @@ def test_settings_of_gsplat_are_taken():
     assert pytest.approx(projection.EXTENT_MAX) == (-2 * np.log(ALPHA_MIN_LOWEST)) ** 0.5
 
 
-def test_dense_samples_are_every_pixel_in_cell_order():
+def test_dense_samples_are_every_pixel_in_sample_order():
     cameras = make_cameras([(37, 29), (5, 16), (16, 32)])
     samples = dense_samples(cameras, [2, 0])
     assert samples.view_ids == (2, 0) and samples.sizes.tolist() == [[16, 32], [37, 29]]
     assert sorted(samples.pixel_ids[: 16 * 32].tolist()) == list(range(16 * 32))
     assert sorted(samples.pixel_ids[16 * 32 :].tolist()) == list(range(37 * 29))
     x, y = samples.coordinates().unbind(dim=-1)
-    ranks = cell_order(x % 16, y % 16)
+    ranks = sample_order(x % 16, y % 16)
     assert (x[samples.view_of_slot() == 0] < 16).all()
     for first, last in zip(samples.tile_offsets[:-1].tolist(), samples.tile_offsets[1:].tolist(), strict=True):
         assert (ranks[first:last].diff() > 0).all()

@@ -12,7 +12,7 @@ from turbogs_plugin.engine.cuda import raster as cuda
 from turbogs_plugin.engine.cuda.workspace import Workspace
 from turbogs_plugin.engine.layout import ScreenRecord
 from turbogs_plugin.engine.reference.projection import SPAN_MAX
-from turbogs_plugin.engine.rendering import rasterize_reference
+from turbogs_plugin.engine.rendering import RenderOptions, rasterize_reference
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.types import PARAMETER_NAMES
 
@@ -24,8 +24,9 @@ def case():
     return make_case([(70, 50), (33, 47)], count=200, rate=0.4, seed=11)
 
 
-def render(case, **options):
-    return cuda.rasterize_cuda(case.gpu_gaussians, case.gpu_cameras, case.gpu_samples, **options)
+def render(case, workspace=None, **options):
+    options = RenderOptions(**options)
+    return cuda.rasterize_cuda(case.gpu_gaussians, case.gpu_cameras, case.gpu_samples, options, workspace)
 
 
 def test_no_gaussians(case):
@@ -93,7 +94,9 @@ def test_draws_what_the_reference_draws(case, limit, degree):
         getattr(gaussians, name).view(len(gaussians), -1)[::3, -1] = value
     got = render(case, sh_degree=degree).projected().radii.cpu().any(dim=-1)
     wanted = (
-        rasterize_reference(case.gaussians, case.cameras, case.samples, sh_degree=degree).projected().radii.any(dim=-1)
+        rasterize_reference(case.gaussians, case.cameras, case.samples, RenderOptions(degree))
+        .projected()
+        .radii.any(dim=-1)
     )
     assert torch.equal(got, wanted)
     assert (got[:, ::3] == drawn).all() and got[:, 1::3].all()

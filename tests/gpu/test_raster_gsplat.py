@@ -8,7 +8,7 @@ from helpers.rendering_scenes import thin_out
 
 from turbogs_plugin.engine.autograd import rasterize_differentiable
 from turbogs_plugin.engine.cuda import raster as cuda
-from turbogs_plugin.engine.rendering import dense_samples
+from turbogs_plugin.engine.rendering import RenderOptions, dense_samples
 
 pytestmark = GPU_ONLY
 SIZE = (250, 170)
@@ -49,7 +49,7 @@ def test_forward(case, rate):
     device_samples = type(samples)(
         samples.view_ids, samples.sizes, samples.pixel_ids.cuda(), samples.tile_ids.cuda(), samples.tile_offsets.cuda()
     )
-    got = cuda.rasterize_cuda(case.gpu_gaussians, case.gpu_cameras, device_samples, with_depth=True)
+    got = cuda.rasterize_cuda(case.gpu_gaussians, case.gpu_cameras, device_samples, RenderOptions(with_depth=True))
     rows = pixel_rows(samples)
     ours = torch.cat([got.colors, got.depths[:, None], got.alphas[:, None]], dim=1)
     theirs = torch.cat([images.reshape(-1, 4)[rows], alphas.reshape(-1, 1)[rows]], dim=1)

@@ -15,7 +15,7 @@ from helpers.raster_cases import (
 from turbogs_plugin.engine.autograd import rasterize_differentiable
 from turbogs_plugin.engine.cuda import raster as cuda
 from turbogs_plugin.engine.layout import ScreenRecord
-from turbogs_plugin.engine.rendering import rasterize_reference
+from turbogs_plugin.engine.rendering import RenderOptions, rasterize_reference
 from turbogs_plugin.types import GaussianStats
 
 pytestmark = GPU_ONLY
@@ -45,8 +45,9 @@ def with_depth(request):
 
 
 def render_both(case, with_depth=False):
-    got = cuda.rasterize_cuda(case.gpu_gaussians, case.gpu_cameras, case.gpu_samples, with_depth=with_depth)
-    return got, rasterize_reference(case.gaussians, case.cameras, case.samples, with_depth=with_depth)
+    options = RenderOptions(with_depth=with_depth)
+    got = cuda.rasterize_cuda(case.gpu_gaussians, case.gpu_cameras, case.gpu_samples, options)
+    return got, rasterize_reference(case.gaussians, case.cameras, case.samples, options)
 
 
 def test_forward(case, with_depth):

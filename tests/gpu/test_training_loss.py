@@ -7,7 +7,7 @@ from turbogs_plugin.strategies.losses import CharbonnierLoss, CharbonnierNccLoss
 
 from turbogs_plugin.engine.cuda import library as kernels
 from turbogs_plugin.engine.cuda import training as training_kernels
-from turbogs_plugin.engine.cuda.training import MapUpdate
+from turbogs_plugin.engine.protocol import MapUpdate
 from turbogs_plugin.engine.reference.draws import draw_pixels
 from turbogs_plugin.engine.reference.losses import sparse_loss
 from turbogs_plugin.engine.rules import DrawRule
@@ -40,9 +40,7 @@ def make_maps(device, seed=0):
 
 def make_samples(rate, unit="cell", importance=0.0, views=(2, 0)):
     maps = make_maps("cpu")
-    index = np.asarray(views)
-    rule = DrawRule(unit, 0.4, 0.3, False, importance)
-    return draw_pixels(maps.errors, maps.stamps, 0, maps.offsets[index], SIZES[index], views, rate, rule, 0, 0)
+    return draw_pixels(DrawRule(unit, 0.4, 0.3, False, importance), maps, views, rate, Step(0, 1, 1))
 
 
 def to_device(samples):
@@ -57,13 +55,13 @@ def make_colors(samples, seed=0):
     photos = torch.randint(0, 256, (int(SIZES.prod(axis=1).sum()), 3), generator=generator, dtype=torch.uint8)
     photos[: 40 * 16] = 200
     offsets = np.concatenate([[0], np.cumsum(SIZES.prod(axis=1))])
-    starts = offsets[list(samples.view_ids)]
-    flat = torch.as_tensor(starts)[samples.view_of_slot()] + samples.pixel_ids.long().clamp(min=0)
+    starts = torch.as_tensor(offsets[list(samples.view_ids)])
+    flat = starts[samples.view_of_slot()] + samples.pixel_ids.long().clamp(min=0)
     targets = photos[flat].float().div(255.0) * samples.filled[:, None]
     colors = targets + 0.1 * torch.randn(targets.shape, generator=generator)
     colors[:40] = targets[:40]
     colors = colors * samples.filled[:, None]
-    return colors, targets, photos, starts
+    return colors, targets, photos
 
 
 def relative(found, expected):
@@ -75,10 +73,10 @@ def relative(found, expected):
 def test_equals_the_twin(name, rate, unit, importance):
     terms = CASES[name].terms
     samples = make_samples(rate, unit, importance)
-    colors, targets, photos, starts = make_colors(samples)
-    expected = sparse_loss(colors.double(), targets.double(), samples, terms)
-    for truth, extra in ((targets, {}), (photos, {"starts": starts})):
-        found = training_kernels.sparse_loss(colors.to(DEVICE), truth.to(DEVICE), to_device(samples), terms, **extra)
+    colors, targets, photos = make_colors(samples)
+    expected = sparse_loss(terms, colors.double(), targets.double(), samples)
+    for truth, extra in ((targets, {}), (photos, {"update": MapUpdate(make_maps(DEVICE), STEP)})):
+        found = training_kernels.sparse_loss(terms, colors.to(DEVICE), truth.to(DEVICE), to_device(samples), **extra)
         assert float(found.loss) == pytest.approx(float(expected.loss), rel=1e-5)
         assert relative(found.color_gradients, expected.color_gradients) < 1e-5
         assert not found.color_gradients.cpu()[~samples.filled].any()
@@ -89,10 +87,10 @@ def test_equals_the_twin(name, rate, unit, importance):
 def test_maps_follow(rate):
     """Bit for bit: sums of three absolute values in one order, then single-precision products rounded one by one."""
     samples = make_samples(rate, "cell")
-    colors, targets, _, _ = make_colors(samples)
+    colors, targets, _ = make_colors(samples)
     maps, twin = make_maps(DEVICE), make_maps("cpu")
     found = training_kernels.sparse_loss(
-        colors.to(DEVICE), targets.to(DEVICE), to_device(samples), CASES["ncc"].terms, update=MapUpdate(maps, STEP)
+        CASES["ncc"].terms, colors.to(DEVICE), targets.to(DEVICE), to_device(samples), update=MapUpdate(maps, STEP)
     )
     twin.update(samples, found.pixel_errors.cpu(), STEP)
     assert torch.equal(maps.errors.cpu(), twin.errors)
@@ -104,15 +102,15 @@ def test_maps_follow(rate):
 @pytest.mark.parametrize("bad", [float("nan"), float("inf")])
 def test_bad_colors_stay_out(bad):
     samples = make_samples(0.3, "pixel")
-    colors, targets, _, _ = make_colors(samples)
+    colors, targets, _ = make_colors(samples)
     slots = torch.tensor([0, 5, 300])
     colors[slots, 1] = bad
     maps = make_maps(DEVICE)
     found = training_kernels.sparse_loss(
+        CASES["ncc"].terms,
         colors.to(DEVICE),
         targets.to(DEVICE),
         to_device(samples),
-        CASES["ncc"].terms,
         update=MapUpdate(maps, STEP),
     )
     assert torch.isfinite(found.loss)
@@ -129,14 +127,14 @@ def test_bad_colors_stay_out(bad):
 
 def test_side_stream_and_half_colors():
     samples = make_samples(0.3, "cell")
-    colors, targets, _, _ = make_colors(samples)
+    colors, targets, _ = make_colors(samples)
     colors, targets, samples = colors.half().to(DEVICE), targets.to(DEVICE), to_device(samples)
-    expected = training_kernels.sparse_loss(colors, targets, samples, CASES["ncc"].terms)
+    expected = training_kernels.sparse_loss(CASES["ncc"].terms, colors, targets, samples)
     stream = torch.cuda.Stream()
     stream.wait_stream(torch.cuda.current_stream())
     with torch.cuda.stream(stream):
         torch.cuda._sleep(50_000_000)  # work on the default stream would overtake this
-        found = training_kernels.sparse_loss(colors + 0, targets + 0, samples, CASES["ncc"].terms)
+        found = training_kernels.sparse_loss(CASES["ncc"].terms, colors + 0, targets + 0, samples)
     stream.synchronize()
     assert torch.equal(found.color_gradients, expected.color_gradients)
     assert torch.equal(found.pixel_errors, expected.pixel_errors)
@@ -146,11 +144,12 @@ def test_side_stream_and_half_colors():
 def test_lost_losses_are_counted_once():
     """A finite colour whose square is not: the loss overflows in many tiles, and counts as one lost."""
     samples = make_samples(0.3, "pixel")
-    colors, targets, _, _ = make_colors(samples)
+    colors, targets, _ = make_colors(samples)
     counter = torch.zeros((), dtype=torch.int64, device=DEVICE)
+    update = MapUpdate(make_maps(DEVICE), STEP, counter)
     for value, expected in ((0.5, 0), (1e38, 1), (0.5, 1), (1e38, 2)):
         colors[::7] = value
         found = training_kernels.sparse_loss(
-            colors.to(DEVICE), targets.to(DEVICE), to_device(samples), CASES["l1"].terms, nonfinite_losses=counter
+            CASES["l1"].terms, colors.to(DEVICE), targets.to(DEVICE), to_device(samples), update
         )
         assert int(counter) == expected and bool(torch.isfinite(found.loss)) == (value == 0.5)

@@ -10,16 +10,23 @@ from turbogs_plugin.strategies.learning_rates import LearningRates
 from turbogs_plugin.strategies.optimizers.moment_lm import MomentLMOptimizer
 from turbogs_plugin.strategies.optimizers.sparse_adam import SparseAdam
 
+from turbogs_plugin.engine.cuda import launches
 from turbogs_plugin.engine.cuda import library as kernels
-from turbogs_plugin.engine.cuda import raster as cuda
 from turbogs_plugin.engine.cuda import training as training_kernels
 from turbogs_plugin.engine.cuda.raster import CudaScreenGradients
-from turbogs_plugin.engine.layout import ScreenRecord
+from turbogs_plugin.engine.layout import MAX_VIEWS, ScreenRecord
 from turbogs_plugin.engine.reference.projection import drawable_rows, project_rows
-from turbogs_plugin.engine.reference.raster import ROW_PARAMETERS, ReferenceScreenGradients
+from turbogs_plugin.engine.reference.raster import ReferenceScreenGradients
 from turbogs_plugin.engine.rendered import DEFAULT_SETTINGS
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.types import Cameras, GaussianGradients, Gaussians, GaussianStats, PixelSamples, Step
+from turbogs_plugin.types import (
+    PARAMETER_NAMES,
+    GaussianGradients,
+    Gaussians,
+    GaussianStats,
+    PixelSamples,
+    Step,
+)
 
 pytestmark = [
     pytest.mark.gpu,
@@ -72,16 +79,15 @@ class Scene:
         self.records = (records * (self.radii > 0).any(dim=-1, keepdim=True)).float()
 
     def project(self, gaussians, dtype):
-        leaves = [getattr(gaussians, name)[self.rows.gaussians].detach().requires_grad_() for name in ROW_PARAMETERS]
-        leaves.append(gaussians.shN.detach().requires_grad_())
+        leaves = self.rows.take(gaussians).map(lambda value: value.detach().requires_grad_())
         cameras = self.cameras.to(dtype=dtype)
         with torch.enable_grad():
-            return leaves, project_rows(self.rows, *leaves, cameras, self.degree, DEFAULT_SETTINGS)
+            return leaves, project_rows(self.rows, leaves, cameras, self.degree, DEFAULT_SETTINGS)
 
     def reference(self):
         """The screen gradients of the reference in float64."""
         leaves, splats = self.project(self.gaussians.map(lambda value: value.double()), torch.float64)
-        records = self.rows.gather(self.records.double())
+        records = self.records.double().flatten(0, 1)[self.rows.flat]
         return ReferenceScreenGradients(self.rows, splats, leaves, records, self.samples, True)
 
     def screen(self, gaussians=None, overflow=None):
@@ -93,12 +99,11 @@ class Scene:
             self.samples.sizes,
             *(getattr(self.samples, name).to(DEVICE) for name in ("pixel_ids", "tile_ids", "tile_offsets")),
         )
+        viewmats, Ks = self.cameras.viewmats.to(DEVICE), self.cameras.Ks.to(DEVICE)
+        sizes = self.cameras.sizes.reshape(-1).tolist()
         return CudaScreenGradients(
-            gaussians=gaussians,
-            cameras=Cameras(self.cameras.viewmats.to(DEVICE), self.cameras.Ks.to(DEVICE), self.cameras.sizes),
+            scene=launches.Scene(gaussians, viewmats, Ks, sizes, self.degree, DEFAULT_SETTINGS.eps2d),
             samples=samples,
-            sh_degree=self.degree,
-            settings=DEFAULT_SETTINGS,
             records=torch.where(on_screen, self.records, torch.nan).to(DEVICE, copy=True),
             radii=self.radii.to(DEVICE),
             with_statistics=True,
@@ -129,12 +134,12 @@ def test_gradients_are_the_reference_s(degree, used_degree, rows):
     expected_stats, stats = GaussianStats.zeros(count, "cpu"), GaussianStats.zeros(count, DEVICE)
     expected = scene.reference().parameter_gradients(rows, expected_stats)
     found = scene.screen().parameter_gradients(rows, stats)
-    for name in (*ROW_PARAMETERS, "shN", "view_losses"):
+    for name in (*PARAMETER_NAMES, "view_losses"):
         value, wanted = getattr(found, name), getattr(expected, name)
         assert value.shape == wanted.shape, name
         if wanted.numel():
             assert_close_gradients(value, wanted, name)
-    for name in ROW_PARAMETERS:
+    for name in PARAMETER_NAMES[:-1]:
         lengths, wanted = (getattr(g, name).double().cpu().reshape(-1, count).norm(dim=0) for g in (found, expected))
         assert float((lengths - wanted).norm()) <= 1e-4 * float(wanted.norm()), name
     assert torch.equal(found.touched.cpu(), expected.touched)
@@ -193,7 +198,7 @@ def check_fused_step(name, **case):
         scene.gaussians = gaussians.map(lambda value: value.cpu())  # gradients at the kernels' own parameters
         twin.moments = expected_moments
         twin_step(twin, expected, scene)
-        training_kernels.fused_step(scene.screen(gaussians), gaussians, moments, optimizer.rule(STEP))
+        training_kernels.fused_step(optimizer.rule(STEP), scene.screen(gaussians), gaussians, moments)
         for field in fields(moments):
             found, wanted = doubled(getattr(moments, field.name)), doubled(getattr(expected_moments, field.name))
             # The rows of the views may cancel in their sum: entries far below the largest carry its rounding.
@@ -222,7 +227,7 @@ def test_balanced_step_without_shares_is_adam():
     for optimizer in (MomentLMOptimizer(RATES), SparseAdam(RATES, eps=1e-20)):
         gaussians = scene.on_device()
         optimizer.setup(gaussians)
-        training_kernels.fused_step(scene.screen(gaussians), gaussians, optimizer.moments, optimizer.rule(STEP))
+        training_kernels.fused_step(optimizer.rule(STEP), scene.screen(gaussians), gaussians, optimizer.moments)
         stepped.append(gaussians)
     for parameter, value in stepped[0].items():
         assert torch.equal(value, getattr(stepped[1], parameter)), parameter
@@ -236,7 +241,7 @@ def test_rows_of_vanishing_loss_are_cut():
     optimizer.setup(expected)
     twin_step(optimizer, expected, scene)
     optimizer.setup(gaussians)
-    training_kernels.fused_step(scene.screen(gaussians), gaussians, optimizer.moments, optimizer.rule(STEP))
+    training_kernels.fused_step(optimizer.rule(STEP), scene.screen(gaussians), gaussians, optimizer.moments)
     for parameter in ("means", "scales", "quats", "sh0", "opacities"):
         start, end = getattr(scene.gaussians, parameter).double(), getattr(gaussians, parameter).double().cpu()
         wanted = getattr(expected, parameter)
@@ -256,7 +261,7 @@ def test_bad_gradient_is_skipped_and_neighbours_step(name, entry):
         scene.records[1, bad, entry] = value
         gaussians = scene.on_device()
         optimizer.setup(gaussians)
-        training_kernels.fused_step(scene.screen(gaussians), gaussians, optimizer.moments, optimizer.rule(STEP))
+        training_kernels.fused_step(optimizer.rule(STEP), scene.screen(gaussians), gaussians, optimizer.moments)
         results.append((gaussians, optimizer.moments))
     (clean, clean_moments), (found, moments) = results
     assert int(clean_moments.skipped) == 0 and int(moments.skipped) == 1
@@ -277,7 +282,7 @@ def test_overflow_changes_nothing():
     stats = GaussianStats.zeros(50, DEVICE)
     overflow = torch.ones(1, dtype=torch.int32, device=DEVICE)
     screen = scene.screen(gaussians, overflow=overflow)
-    training_kernels.fused_step(screen, gaussians, optimizer.moments, optimizer.rule(STEP), stats)
+    training_kernels.fused_step(optimizer.rule(STEP), screen, gaussians, optimizer.moments, stats)
     for parameter, value in gaussians.items():
         assert torch.equal(value.cpu(), getattr(scene.gaussians, parameter)), parameter
     assert not optimizer.moments.steps.any() and not stats.view_counts.any()
@@ -294,7 +299,7 @@ def test_any_number_of_gaussians(count):
     scene.radii = scene.radii[:, keep].contiguous()
     gaussians, optimizer = scene.on_device(), OPTIMIZERS["lm"]
     optimizer.setup(gaussians)
-    training_kernels.fused_step(scene.screen(gaussians), gaussians, optimizer.moments, optimizer.rule(STEP))
+    training_kernels.fused_step(optimizer.rule(STEP), scene.screen(gaussians), gaussians, optimizer.moments)
     touched = (scene.records[..., ScreenRecord.WEIGHT_SUM] > 0).any(dim=0)
     assert torch.equal(optimizer.moments.steps.cpu().bool(), touched)
     assert len(scene.screen().parameter_gradients(True).touched) == count
@@ -307,17 +312,17 @@ def test_wrong_tensors_are_named():
     optimizer.setup(gaussians)
     optimizer.moments.exp_avg = optimizer.moments.exp_avg[:, :13]
     with pytest.raises(RuntimeError, match="exp_avg must be a contiguous"):
-        training_kernels.fused_step(scene.screen(gaussians), gaussians, optimizer.moments, optimizer.rule(STEP))
+        training_kernels.fused_step(optimizer.rule(STEP), scene.screen(gaussians), gaussians, optimizer.moments)
     with pytest.raises(ValueError, match="not the Gaussians"):
-        training_kernels.fused_step(scene.screen(), gaussians, optimizer.moments, optimizer.rule(STEP))
+        training_kernels.fused_step(optimizer.rule(STEP), scene.screen(), gaussians, optimizer.moments)
 
 
 def test_more_views_than_the_kernels_take_are_refused():
-    scene = Scene(count=20, views=cuda.MAX_VIEWS + 1)
+    scene = Scene(count=20, views=MAX_VIEWS + 1)
     gaussians, optimizer = scene.on_device(), OPTIMIZERS["lm"]
     optimizer.setup(gaussians)
     with pytest.raises(InputError, match="views, got 129"):
-        training_kernels.fused_step(scene.screen(gaussians), gaussians, optimizer.moments, optimizer.rule(STEP))
+        training_kernels.fused_step(optimizer.rule(STEP), scene.screen(gaussians), gaussians, optimizer.moments)
     with pytest.raises(InputError, match="views, got 129"):
         scene.screen().parameter_gradients(False)
 
@@ -326,7 +331,7 @@ def test_side_stream():
     scene, optimizer = Scene(), OPTIMIZERS["lm"]
     wanted = scene.on_device()
     optimizer.setup(wanted)
-    training_kernels.fused_step(scene.screen(wanted), wanted, optimizer.moments, optimizer.rule(STEP))
+    training_kernels.fused_step(optimizer.rule(STEP), scene.screen(wanted), wanted, optimizer.moments)
     start = scene.screen()
     stream = torch.cuda.Stream()
     stream.wait_stream(torch.cuda.current_stream())
@@ -335,7 +340,7 @@ def test_side_stream():
         gaussians = start.gaussians.map(lambda value: value + 0)
         screen = replace(start, gaussians=gaussians, records=start.records + 0)
         optimizer.setup(gaussians)
-        training_kernels.fused_step(screen, gaussians, optimizer.moments, optimizer.rule(STEP))
+        training_kernels.fused_step(optimizer.rule(STEP), screen, gaussians, optimizer.moments)
     stream.synchronize()
     for parameter, value in wanted.items():
         assert torch.equal(value, getattr(gaussians, parameter)), parameter

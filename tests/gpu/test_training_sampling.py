@@ -8,6 +8,8 @@ from turbogs_plugin.engine.cuda import library as kernels
 from turbogs_plugin.engine.cuda import training as training_kernels
 from turbogs_plugin.engine.reference.draws import WEIGHT_FLOOR, DrawRule, draw_pixels
 from turbogs_plugin.engine.reference.philox import PURPOSE_PIXELS, exponentials, random_words
+from turbogs_plugin.error_maps import ErrorMaps
+from turbogs_plugin.types import Step
 
 pytestmark = [
     pytest.mark.gpu,
@@ -16,6 +18,7 @@ pytestmark = [
 
 DEVICE = "cuda"
 SIZES = [(40, 33), (16, 16), (7, 50), (128, 64)]  # whole tiles, edge tiles, one tile, a narrow image
+NOW = 7
 
 
 def random_maps(seed=0, zero_share=0.3):
@@ -30,11 +33,27 @@ def random_maps(seed=0, zero_share=0.3):
     return errors.half(), stamps.to(torch.int16)
 
 
-def arguments(errors, stamps, views, rate, rule, seed, iteration):
-    offsets = np.concatenate([[0], np.cumsum([width * height for width, height in SIZES])])
-    sizes = np.array([SIZES[view] for view in views], dtype=np.int64)
-    numbers = tuple(3 * view + 1 for view in views)  # of training views: only the random words see them
-    return errors, stamps, 7, offsets[list(views)], sizes, numbers, rate, rule, seed, iteration
+def make_maps(device, errors, stamps, sizes=SIZES):
+    """Maps of training views 1, 4, 7, ...; those between are of one pixel. So a view's number is not its place."""
+    padded = np.ones((3 * len(sizes), 2), dtype=np.int64)
+    padded[1::3] = sizes
+    maps = ErrorMaps(padded, device)
+    counts = np.stack([np.ones_like(padded[1::3, 0]), padded[1::3].prod(axis=1), np.ones_like(padded[1::3, 0])], axis=1)
+    used = torch.as_tensor(np.repeat(np.tile([False, True, False], len(sizes)), counts.reshape(-1)), device=device)
+    maps.errors[used], maps.stamps[used] = errors.to(device), stamps.to(device)
+    return maps
+
+
+def draw_both(errors, stamps, views, rate, rule, seed, iteration, sizes=SIZES):
+    """The draw of the kernels, and that of the reference."""
+    step, numbers = Step(iteration, iteration + 1, iteration + 1, seed), tuple(3 * view + 1 for view in views)
+    draws = {DEVICE: training_kernels.sample_pixels, "cpu": draw_pixels}
+    samples = []
+    for device, draw in draws.items():
+        maps = make_maps(device, errors, stamps, sizes)
+        maps.stamp_base = iteration - NOW
+        samples.append(draw(rule, maps, numbers, rate, step))
+    return samples
 
 
 def assert_equal_samples(found, expected):
@@ -58,22 +77,18 @@ def test_equal_sets(unit, rate, hard, stable, uniform):
     errors, stamps = random_maps()
     rule = DrawRule(unit, hard, stable, uniform, 0.0)
     for iteration, views in enumerate([(0,), (3, 1, 0, 2)]):
-        given = arguments(errors, stamps, views, rate, rule, 2**40 + 5, iteration)
-        on_device = (errors.to(DEVICE), stamps.to(DEVICE), *given[2:])
-        assert_equal_samples(training_kernels.sample_pixels(*on_device), draw_pixels(*given))
+        assert_equal_samples(*draw_both(errors, stamps, views, rate, rule, 2**40 + 5, iteration))
 
 
 @pytest.mark.parametrize("iteration", range(4))
 def test_equal_sets_of_many_tiles(iteration):
     """So many that in about a hundred of them the approximate keys leave the set in doubt."""
-    sizes = np.array([[800, 640]])  # 2000 tiles, each with two races of 76 and 58 winners
+    sizes = [(800, 640)]  # 2000 tiles, each with two races of 76 and 58 winners
     generator = torch.Generator().manual_seed(iteration)
     errors = torch.rand(800 * 640, generator=generator).square().half()
     stamps = torch.randint(-40, 5, (800 * 640,), generator=generator).to(torch.int16)
     rule = DrawRule("pixel", 0.4, 0.3, False, 0.0)
-    given = (7, np.zeros(1, dtype=np.int64), sizes, (3,), 0.75, rule, 5, iteration)
-    found = training_kernels.sample_pixels(errors.to(DEVICE), stamps.to(DEVICE), *given)
-    assert_equal_samples(found, draw_pixels(errors, stamps, *given))
+    assert_equal_samples(*draw_both(errors, stamps, (0,), 0.75, rule, 5, iteration, sizes))
 
 
 @pytest.mark.parametrize("unit", ["pixel", "cell", "tile"])
@@ -81,9 +96,7 @@ def test_equal_sets_of_many_tiles(iteration):
 def test_importance_weights(unit, importance):
     errors, stamps = random_maps(seed=1)
     rule = DrawRule(unit, 0.4, 0.3, False, importance)
-    given = arguments(errors, stamps, (2, 3), 0.2, rule, 11, 400)
-    on_device = (errors.to(DEVICE), stamps.to(DEVICE), *given[2:])
-    assert_equal_samples(training_kernels.sample_pixels(*on_device), draw_pixels(*given))
+    assert_equal_samples(*draw_both(errors, stamps, (2, 3), 0.2, rule, 11, 400))
 
 
 @pytest.mark.parametrize("value", [0.0, 0.25])
@@ -91,9 +104,8 @@ def test_tied_errors_and_ages(value):
     """All errors and ages equal: only the random words and the ranks decide."""
     errors, stamps = random_maps()
     errors[:], stamps[:] = value, 3
-    given = arguments(errors, stamps, (0, 3), 0.1, DrawRule("pixel", 0.4, 0.3, False, 0.0), 0, 9)
-    on_device = (errors.to(DEVICE), stamps.to(DEVICE), *given[2:])
-    assert_equal_samples(training_kernels.sample_pixels(*on_device), draw_pixels(*given))
+    rule = DrawRule("pixel", 0.4, 0.3, False, 0.0)
+    assert_equal_samples(*draw_both(errors, stamps, (0, 3), 0.1, rule, 0, 9))
 
 
 @pytest.mark.parametrize("iteration", [144101, 222332, 285526])
@@ -101,18 +113,17 @@ def test_equal_keys_at_the_threshold(iteration):
     """Found by search: without errors, the 25th and 26th largest keys of this tile are one number; rank decides."""
     errors, stamps = random_maps()
     errors[:] = 0
-    given = arguments(errors, stamps, (1,), 0.1, DrawRule("pixel", 1.0, 0.0, False, 0.0), 0, iteration)
     words = random_words(torch.arange(256), 4, PURPOSE_PIXELS, 0, iteration)
     keys = (torch.tensor(WEIGHT_FLOOR) / exponentials(words[0])).sort(descending=True).values
     assert keys[24] == keys[25]
-    on_device = (errors.to(DEVICE), stamps.to(DEVICE), *given[2:])
-    assert_equal_samples(training_kernels.sample_pixels(*on_device), draw_pixels(*given))
+    rule = DrawRule("pixel", 1.0, 0.0, False, 0.0)
+    assert_equal_samples(*draw_both(errors, stamps, (1,), 0.1, rule, 0, iteration))
 
 
-def test_wrong_tensors_are_named():
-    errors, stamps = random_maps()
-    given = arguments(errors, stamps, (0,), 0.1, DrawRule("pixel", 0.4, 0.3, False, 0.0), 0, 0)
-    with pytest.raises(RuntimeError, match="errors must be a contiguous"):
-        training_kernels.sample_pixels(errors.float().to(DEVICE), stamps.to(DEVICE), *given[2:])
-    with pytest.raises(RuntimeError, match="stamps must be a contiguous"):
-        training_kernels.sample_pixels(errors.to(DEVICE), stamps.to(DEVICE).repeat_interleave(2)[::2], *given[2:])
+@pytest.mark.parametrize("name", ["errors", "stamps"])
+def test_wrong_tensors_are_named(name):
+    maps = make_maps(DEVICE, *random_maps())
+    value = getattr(maps, name)
+    setattr(maps, name, value.float() if name == "errors" else value.repeat_interleave(2)[::2])
+    with pytest.raises(RuntimeError, match=f"{name} must be a contiguous"):
+        training_kernels.sample_pixels(DrawRule("pixel", 0.4, 0.3, False, 0.0), maps, (1,), 0.1, Step(0, 1, 1))

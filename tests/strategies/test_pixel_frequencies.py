@@ -152,7 +152,7 @@ def test_weights_make_sums_unbiased(stages, columns, wanted, tolerance):
     ages = torch.randint(1, 2 if stages[1] == 1.0 else 4, (rows, columns), generator=generator)
     exist = torch.ones_like(ages, dtype=torch.bool)
     words = random_words(place, 0, PURPOSE_PIXELS, 0, 0)
-    units = Units(errors.expand(rows, columns), ages, exist, words, np.array([wanted]))
+    units = Units(errors.expand(rows, columns), ages, exist, words, wanted)
     drawn, probabilities = draw_units(units, DrawRule("pixel", *stages, False, 1.0))
     assert (drawn.sum(dim=1) == wanted).all()
     assert (probabilities[drawn] > 0).all()

@@ -12,7 +12,7 @@ from turbogs_plugin.engine.reference.draws import DrawRule
 from turbogs_plugin.engine.reference.philox import PURPOSE_PIXELS, exponentials, random_words
 from turbogs_plugin.error_maps import AGE_MAX, ErrorMaps
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.types import TILE_SIZE, Cameras, cell_order
+from turbogs_plugin.types import TILE_SIZE, Cameras, sample_order
 
 # --- layout ---------------------------------------------------------------------------------------------------------
 
@@ -42,7 +42,7 @@ def test_layout(sampler, unit, rate):
     columns = torch.as_tensor(grid.shapes[:, 0])[view_of_slot]
     tiles = torch.as_tensor(grid.offsets[:-1])[view_of_slot] + (y // TILE_SIZE) * columns + x // TILE_SIZE
     assert (tiles == samples.tile_ids[tile_of_slot])[filled].all()
-    ranks = torch.where(filled, cell_order(x % TILE_SIZE, y % TILE_SIZE), TILE_SIZE**2)  # empty slots come last
+    ranks = torch.where(filled, sample_order(x % TILE_SIZE, y % TILE_SIZE), TILE_SIZE**2)  # empty slots come last
     same_tile = tile_of_slot[1:] == tile_of_slot[:-1]
     rising = (ranks[1:] > ranks[:-1]) | ~filled[1:]
     assert (rising & (filled[:-1] | ~filled[1:]) | ~same_tile).all()
@@ -152,7 +152,7 @@ def test_draws_depend_on_seed_and_iteration_alone(unit):
 
 
 def documented_draw(errors, ages, place, view, rule, wanted, seed, iteration):
-    """The module's text for one tile in plain Python: the set of ranks drawn. Arrays are in `cell_order`."""
+    """The module's text for one tile in plain Python: the set of ranks drawn. Arrays are in `sample_order`."""
     f32, floor = np.float32, np.float32(2.0**-100)
     x = [w.numpy() for w in random_words(torch.as_tensor(place), view, PURPOSE_PIXELS, seed, iteration)]
     races = [exponentials(torch.as_tensor(word)).numpy() for word in x]
@@ -187,7 +187,7 @@ def test_draw_is_the_documented_one(view, mixed):
         for tile, pixels in pixels_by_tile(samples).items():
             columns = -(-width // TILE_SIZE)
             ys, xs = np.mgrid[0:16, 0:16].reshape(2, -1)
-            order = np.argsort(cell_order(torch.as_tensor(xs), torch.as_tensor(ys)).numpy())
+            order = np.argsort(sample_order(torch.as_tensor(xs), torch.as_tensor(ys)).numpy())
             ys, xs = ys[order] + tile // columns * 16, xs[order] + tile % columns * 16
             inside = (xs < width) & (ys < height)
             ids = (ys * width + xs)[inside]

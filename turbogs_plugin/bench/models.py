@@ -148,7 +148,7 @@ def surface_gaussians(count: int, device: torch.device, seed: int = 0) -> Gaussi
 
 
 def tile_samples(sizes: np.ndarray, rate: float, device: torch.device, seed: int) -> PixelSamples:
-    """floor(rate * 256) random pixels of every tile, in cell order."""
+    """floor(rate * 256) random pixels of every tile, in the order of samples."""
     count = max(1, int(rate * TILE_PIXELS))
     table = pixel_table(sizes, device)  # [T, 256]
     generator = torch.Generator(device).manual_seed(seed)

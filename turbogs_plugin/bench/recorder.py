@@ -11,7 +11,7 @@ import torch
 
 from turbogs_plugin.bench.clocks import Recorder, Summary, device_times, summary
 from turbogs_plugin.engine import Engine
-from turbogs_plugin.engine.rendered import Rendered
+from turbogs_plugin.engine.rendered import Rendered, RenderOptions
 from turbogs_plugin.train.trainer import Trainer
 from turbogs_plugin.types import Cameras, Gaussians, PixelSamples
 
@@ -54,8 +54,8 @@ class RecordedEngine:
     def __getattr__(self, name: str) -> Any:
         return getattr(self._engine, name)
 
-    def render(self, gaussians: Gaussians, cameras: Cameras, samples: PixelSamples, **options: Any) -> Rendered:
-        rendered = self._render(gaussians, cameras, samples, **options)
+    def render(self, gaussians: Gaussians, cameras: Cameras, samples: PixelSamples, options: RenderOptions) -> Rendered:
+        rendered = self._render(gaussians, cameras, samples, options)
         self._recorder.rendered, self._recorder.samples = rendered, samples
         rendered.backward = self._recorder.timed("BWD", rendered.backward)
         return rendered

@@ -1,4 +1,4 @@
-"""What computes: a protocol, the torch reference, its CUDA twin, and the one place that picks one.
+"""What computes: a base class, the torch reference, its CUDA twin, and the one place that picks one.
 
 `Engine` is the seam: strategies say what is to be done (`rules`), an engine does it on one device. Nobody outside this
 package asks which device it is.

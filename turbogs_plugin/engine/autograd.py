@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from turbogs_plugin.engine.layout import ScreenRecord
-from turbogs_plugin.engine.rendered import DEFAULT_SETTINGS, Projected, RasterSettings, Rendered
+from turbogs_plugin.engine.rendered import Projected, Rendered
 from turbogs_plugin.engine.rendering import rasterize
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.types import PARAMETER_NAMES, Cameras, Gaussians, GaussianStats, PixelSamples
@@ -49,21 +49,14 @@ class DifferentiableRender:
 
 
 def rasterize_differentiable(
-    gaussians: Gaussians,
-    cameras: Cameras,
-    samples: PixelSamples,
-    *,
-    sh_degree: int | None = None,
-    settings: RasterSettings = DEFAULT_SETTINGS,
-    with_depth: bool = False,
-    observer: PassObserver | None = None,
+    gaussians: Gaussians, cameras: Cameras, samples: PixelSamples, observer: PassObserver | None = None, **options: Any
 ) -> DifferentiableRender:
     """`rasterize` under torch autograd, with gradients to the Gaussians and none to the cameras.
 
     Args:
         gaussians: the model, of any tensors that autograd knows.
-        cameras, samples, sh_degree, settings, with_depth: as in `Engine.render`.
         observer: of the backward pass.
+        options: the fields of `RenderOptions`.
 
     Raises:
         InputError: as `Engine.render`; and from a second backward of one pass.
@@ -72,9 +65,7 @@ def rasterize_differentiable(
         gaussians.map(lambda value: value.detach().contiguous()),
         Cameras(cameras.viewmats.detach(), cameras.Ks.detach(), cameras.sizes),
         samples,
-        sh_degree=sh_degree,
-        settings=settings,
-        with_depth=with_depth,
+        **options,
     )
     projected = rendered.projected()
     means2d = projected.means2d.detach().requires_grad_(torch.is_grad_enabled())
@@ -95,21 +86,18 @@ class _Pass(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(
-        ctx, color_gradients: Tensor | None, alpha_gradients: Tensor | None, depth_gradients: Tensor | None
-    ) -> tuple:
+    def backward(ctx, *upstream: Tensor | None) -> tuple:
         if ctx.spent:
             raise InputError("backward of one rendering a second time: sum the losses first, or render again")
         ctx.spent = True
         errors = None if ctx.observer is None else ctx.observer.pixel_errors()
-        if color_gradients is None:
-            color_gradients = torch.zeros_like(ctx.rendered.colors)
-        given = {"alpha_gradients": alpha_gradients, "depth_gradients": depth_gradients}
+        colors, alphas, depths = (None if value is None else value.contiguous() for value in upstream)
         screen = ctx.rendered.backward(
-            color_gradients.contiguous(),
+            torch.zeros_like(ctx.rendered.colors) if colors is None else colors,
             errors,
             with_statistics=True,  # among them the absolute gradients
-            **{name: None if value is None else value.contiguous() for name, value in given.items()},
+            alpha_gradients=alphas,
+            depth_gradients=depths,
         )
         records = screen.full_records()
         stats = GaussianStats.zeros(records.shape[1], records.device)
@@ -117,9 +105,5 @@ class _Pass(torch.autograd.Function):
         ctx.means2d.absgrad = records[..., ScreenRecord.ABSOLUTE].clone()
         if ctx.observer is not None:
             ctx.observer.passed(stats, gradients.view_losses[0])
-        return (
-            None,
-            None,
-            records[..., ScreenRecord.MEAN].clone(),
-            *(gradients.summed(name) for name in PARAMETER_NAMES),
-        )
+        means2d = records[..., ScreenRecord.MEAN].clone()
+        return None, None, means2d, *(gradients.summed(name) for name in PARAMETER_NAMES)

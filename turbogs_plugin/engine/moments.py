@@ -9,17 +9,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from turbogs_plugin.engine.layout import ParameterRow
+from turbogs_plugin.engine.layout import ParameterRow, columns
 from turbogs_plugin.errors import InputError, require
 from turbogs_plugin.types import Gaussians, RowUpdate
 
-COLUMNS = {
-    "means": ParameterRow.MEANS,
-    "scales": ParameterRow.SCALES,
-    "quats": ParameterRow.QUATS,
-    "sh0": ParameterRow.SH0,
-    "opacities": ParameterRow.OPACITIES,
-}
+COLUMNS = columns(ParameterRow)
 """Where each parameter lies in a packed row: all parameters but the higher bands."""
 
 
@@ -61,18 +55,16 @@ class GaussianMoments:
 
     def apply(self, update: RowUpdate) -> None:
         """Follow a change of the set of Gaussians."""
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if field.name == "steps":
-                self.steps = value[update.source]
-            elif field.name != "skipped":
-                setattr(self, field.name, update.apply_state(value))
+        for name in ("exp_avg", "exp_avg_sq", "exp_avg_shN", "exp_avg_sq_shN"):
+            setattr(self, name, update.apply_state(getattr(self, name)))
+        self.steps = self.steps[update.source]
         for name in update.reset:
             for moment in ("exp_avg", "exp_avg_sq"):
-                if name == "shN":
-                    getattr(self, f"{moment}_shN").zero_()
-                else:
-                    getattr(self, moment)[:, COLUMNS[name]] = 0
+                self.part(moment, name).zero_()
+
+    def part(self, moment: str, name: str) -> Tensor:
+        """[N, D] the moment (`exp_avg` or `exp_avg_sq`) of one parameter: a view, not a copy."""
+        return getattr(self, f"{moment}_shN") if name == "shN" else getattr(self, moment)[:, COLUMNS[name]]
 
     def state_dict(self) -> dict[str, Any]:
         return {field.name: getattr(self, field.name) for field in fields(self)}

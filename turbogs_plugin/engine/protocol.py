@@ -2,25 +2,51 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
 
+import torch
 from torch import Tensor
 
 from turbogs_plugin.engine.moments import GaussianMoments
-from turbogs_plugin.engine.rendered import DEFAULT_SETTINGS, RasterSettings, Rendered, ScreenGradients
+from turbogs_plugin.engine.reference.update import apply_update
+from turbogs_plugin.engine.rendered import DEFAULT_OPTIONS, Rendered, RenderOptions, ScreenGradients
 from turbogs_plugin.engine.rules import DrawRule, LossTerms, UpdateRule
 from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.scene.photos import PhotoSamples
 from turbogs_plugin.types import Cameras, Gaussians, GaussianStats, LossOutput, PixelSamples, Step
 
 
-class Engine(Protocol):
+@dataclass(frozen=True)
+class MapUpdate:
+    """What learns of the errors of an iteration.
+
+    Args:
+        maps: of all views; updated in place.
+        step: gives the stamp.
+        nonfinite_losses: [] int64 on the device; 1 is added if the loss is not finite.
+    """
+
+    maps: ErrorMaps
+    step: Step
+    nonfinite_losses: Tensor | None = None
+
+
+class Engine(ABC):
     """What computes, on the device of the tensors that it is given.
 
     It knows rules, never strategies. `ReferenceEngine` defines every result; any other engine gives the same, to
-    rounding. An engine made for training may run ahead of the host: see `settle`.
+    rounding. `supervise` and `update` are two steps each, which an engine may do at once. An engine made for training
+    may run ahead of the host: see `settle`.
     """
 
+    @property
+    def overflow(self) -> Tensor | None:
+        """[1] int32 on the device, never read on the host: not 0 while iterations do nothing, for lack of room. None
+        where that cannot be."""
+        return None
+
+    @abstractmethod
     def draw(self, rule: DrawRule, maps: ErrorMaps, view_ids: tuple[int, ...], rate: float, step: Step) -> PixelSamples:
         """Draw the samples of an iteration.
 
@@ -30,70 +56,39 @@ class Engine(Protocol):
             rate: r, the fraction of units to draw, above 0.
             step: gives seed and iteration, on which alone the random numbers depend, and ages.
         """
-        ...
 
+    @abstractmethod
     def render(
-        self,
-        gaussians: Gaussians,
-        cameras: Cameras,
-        samples: PixelSamples,
-        *,
-        sh_degree: int | None = None,
-        settings: RasterSettings = DEFAULT_SETTINGS,
-        with_depth: bool = False,
+        self, gaussians: Gaussians, cameras: Cameras, samples: PixelSamples, options: RenderOptions = DEFAULT_OPTIONS
     ) -> Rendered:
         """Render samples of K views with gsplat's conventions, on a black background.
 
         Args:
             cameras: the K views of the batch, in the order of `samples.view_ids`.
-            sh_degree: highest degree of spherical harmonics used; all there are where None.
-            settings: thresholds and planes.
-            with_depth: also give expected depths.
         """
-        ...
 
+    @abstractmethod
     def evaluate(self, terms: LossTerms, colors: Tensor, targets: Tensor, samples: PixelSamples) -> LossOutput:
         """The loss of rendered samples and its gradient. `colors`, `targets`: [P, 3]."""
-        ...
 
-    def supervise(
-        self,
-        terms: LossTerms,
-        colors: Tensor,
-        truth: PhotoSamples,
-        maps: ErrorMaps,
-        step: Step,
-        nonfinite_losses: Tensor | None = None,
-    ) -> LossOutput:
-        """`evaluate` against the photos, and `learn` from it, at once.
+    def supervise(self, terms: LossTerms, colors: Tensor, truth: PhotoSamples, update: MapUpdate) -> LossOutput:
+        """`evaluate` against the photos at the samples, on the device of `colors` [P, 3], and `learn` from it."""
+        output = self.evaluate(terms, colors, truth.colors(), truth.samples)
+        self.learn(truth.samples, colors, output, update)
+        return output
 
-        Args:
-            colors: [P, 3] rendered.
-            truth: the photos at the samples, on the device of `colors`.
-            maps, step, nonfinite_losses: see `learn`.
-        """
-        ...
-
-    def learn(
-        self,
-        maps: ErrorMaps,
-        samples: PixelSamples,
-        colors: Tensor,
-        output: LossOutput,
-        step: Step,
-        nonfinite_losses: Tensor | None = None,
-    ) -> None:
+    def learn(self, samples: PixelSamples, colors: Tensor, output: LossOutput, update: MapUpdate) -> None:
         """Let the error maps learn the errors of an iteration, whatever loss gave them.
 
-        A sample whose colour or error is not finite changes nothing: neither the error of its pixel nor its age.
-
-        Args:
-            maps: updated in place.
-            colors: [P, 3] rendered.
-            step: gives the stamp.
-            nonfinite_losses: [] int64 on the device; 1 is added if the loss is not finite.
+        A sample whose rendered colour, of `colors` [P, 3], or whose error is not finite changes nothing: neither the
+        error of its pixel nor its age. An iteration that did nothing changes nothing here either.
         """
-        ...
+        drawn, nonfinite = torch.isfinite(colors).all(dim=1), ~output.loss.isfinite()
+        if self.overflow is not None:
+            drawn, nonfinite = drawn & (self.overflow == 0), nonfinite & (self.overflow[0] == 0)
+        update.maps.update(samples, torch.where(drawn, output.pixel_errors, torch.nan), update.step)
+        if update.nonfinite_losses is not None:
+            update.nonfinite_losses.add_(nonfinite)
 
     def update(
         self,
@@ -111,7 +106,7 @@ class Engine(Protocol):
             gaussians: the model that was rendered; changed in place, as is `moments`.
             stats: the window of density control; this pass is added to it. None where none is needed.
         """
-        ...
+        apply_update(rule, gaussians, screen.parameter_gradients(rule.per_view, stats), moments)
 
     def settle(self, wait: bool = False) -> int:
         """How many of the latest iterations did nothing and must be done again, for lack of room on the device.
@@ -125,9 +120,9 @@ class Engine(Protocol):
         Raises:
             InputError: an iteration has more intersections of a tile and a splat than a pass can have.
         """
-        ...
+        return 0
 
     @property
     def bytes_held(self) -> int:
         """Memory that is kept from one iteration to the next."""
-        ...
+        return 0

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Protocol
 
+import torch
 from torch import Tensor
 
-from turbogs_plugin.errors import require
-from turbogs_plugin.types import GaussianGradients, GaussianStats
+from turbogs_plugin.engine.layout import MAX_SH_DEGREE
+from turbogs_plugin.errors import InputError, require
+from turbogs_plugin.types import GaussianGradients, Gaussians, GaussianStats
 
 
 @dataclass(frozen=True)
@@ -58,10 +61,11 @@ def require_statistics(with_statistics: bool, stats: GaussianStats | None) -> No
         raise ValueError("statistics of a pass without them: call Rendered.backward(..., with_statistics=True)")
 
 
-class Rendered(Protocol):
+@dataclass
+class Rendered(ABC):
     """One forward pass.
 
-    Attributes:
+    Args:
         colors: [P, 3]; zero in empty slots.
         alphas: [P]; zero in empty slots.
         depths: [P] expected depth (sum of w * z over alpha), or None where not asked for.
@@ -71,10 +75,11 @@ class Rendered(Protocol):
     alphas: Tensor
     depths: Tensor | None
 
+    @abstractmethod
     def projected(self) -> Projected:
         """The projection that this pass drew."""
-        ...
 
+    @torch.no_grad()
     def backward(
         self,
         color_gradients: Tensor,
@@ -91,8 +96,21 @@ class Rendered(Protocol):
             pixel_errors: [P] the errors that are carried to the Gaussians; zeros where None.
             with_statistics: also sum up what `GaussianStats` has (absolute gradients, distances).
             alpha_gradients, depth_gradients: [P], where the loss has such terms.
+
+        Raises:
+            InputError: on CUDA: depth gradients of a pass without depths; a tensor of wrong shape, dtype or device.
         """
-        ...
+        upstream = {
+            "color_gradients": color_gradients,
+            "alpha_gradients": alpha_gradients,
+            "depth_gradients": depth_gradients,
+            "pixel_errors": pixel_errors,
+        }
+        return self._backward(upstream, with_statistics)
+
+    @abstractmethod
+    def _backward(self, upstream: dict[str, Tensor | None], with_statistics: bool) -> ScreenGradients:
+        """`backward`, its tensors by name."""
 
 
 EXTENT_MAX = 3.33
@@ -141,3 +159,37 @@ class RasterSettings:
 
 
 DEFAULT_SETTINGS = RasterSettings()
+
+
+@dataclass(frozen=True)
+class RenderOptions:
+    """What is rendered of a model, and how.
+
+    Args:
+        sh_degree: highest degree of spherical harmonics used; all there are where None.
+        settings: thresholds and planes.
+        with_depth: also give expected depths.
+    """
+
+    sh_degree: int | None = None
+    settings: RasterSettings = DEFAULT_SETTINGS
+    with_depth: bool = False
+
+    def used_degree(self, gaussians: Gaussians) -> int:
+        """The degree of spherical harmonics to evaluate.
+
+        Raises:
+            InputError: the model holds more than any engine evaluates, or not what is asked for.
+        """
+        held = gaussians.sh_degree
+        if held > MAX_SH_DEGREE:
+            raise InputError(
+                f"these Gaussians hold spherical harmonics of degree {held}: the largest that is rendered is "
+                f"{MAX_SH_DEGREE}, so leave the coefficients above it out"
+            )
+        if self.sh_degree is not None and not 0 <= self.sh_degree <= held:
+            raise InputError(f"sh_degree is {self.sh_degree}, but these Gaussians hold degrees 0 to {held}")
+        return held if self.sh_degree is None else self.sh_degree
+
+
+DEFAULT_OPTIONS = RenderOptions()

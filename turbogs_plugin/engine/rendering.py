@@ -4,19 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from turbogs_plugin.engine import engine_of
 from turbogs_plugin.engine.reference.raster import rasterize_reference
-from turbogs_plugin.engine.rendered import DEFAULT_SETTINGS, RasterSettings, Rendered, ScreenGradients
+from turbogs_plugin.engine.rendered import DEFAULT_SETTINGS, RasterSettings, Rendered, RenderOptions, ScreenGradients
 from turbogs_plugin.tiles import dense_pixels
 from turbogs_plugin.types import Cameras, Gaussians, PixelSamples
 
 __all__ = [
     "DEFAULT_SETTINGS",
     "RasterSettings",
+    "RenderOptions",
     "Rendered",
     "RenderedImage",
     "ScreenGradients",
@@ -27,23 +29,13 @@ __all__ = [
 ]
 
 
-def rasterize(
-    gaussians: Gaussians,
-    cameras: Cameras,
-    samples: PixelSamples,
-    *,
-    sh_degree: int | None = None,
-    settings: RasterSettings = DEFAULT_SETTINGS,
-    with_depth: bool = False,
-) -> Rendered:
-    """Render samples of K views by the engine of the Gaussians' device; see `Engine.render`."""
-    return engine_of(gaussians.device).render(
-        gaussians, cameras, samples, sh_degree=sh_degree, settings=settings, with_depth=with_depth
-    )
+def rasterize(gaussians: Gaussians, cameras: Cameras, samples: PixelSamples, **options: Any) -> Rendered:
+    """`Engine.render` by the engine of the Gaussians' device; `options` are the fields of `RenderOptions`."""
+    return engine_of(gaussians.device).render(gaussians, cameras, samples, RenderOptions(**options))
 
 
 def dense_samples(cameras: Cameras, view_ids: Sequence[int] | None = None) -> PixelSamples:
-    """Every pixel of every tile of some views, in cell order, without empty slots.
+    """Every pixel of every tile of some views, in the order of samples, without empty slots.
 
     Args:
         cameras: all V cameras.
@@ -70,20 +62,10 @@ class RenderedImage:
 
 
 @torch.no_grad()
-def render_image(
-    gaussians: Gaussians,
-    cameras: Cameras,
-    view_id: int = 0,
-    *,
-    sh_degree: int | None = None,
-    settings: RasterSettings = DEFAULT_SETTINGS,
-    with_depth: bool = False,
-) -> RenderedImage:
-    """Every pixel of one of the cameras; the other arguments are those of `Engine.render`."""
+def render_image(gaussians: Gaussians, cameras: Cameras, view_id: int = 0, **options: Any) -> RenderedImage:
+    """Every pixel of one of the cameras; `options` are the fields of `RenderOptions`."""
     samples = dense_samples(cameras, [view_id])
-    rendered = rasterize(
-        gaussians, cameras.select([view_id]), samples, sh_degree=sh_degree, settings=settings, with_depth=with_depth
-    )
+    rendered = rasterize(gaussians, cameras.select([view_id]), samples, **options)
     width, height = cameras.sizes[view_id].tolist()
     places = samples.pixel_ids.long()
 

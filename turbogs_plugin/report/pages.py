@@ -48,7 +48,15 @@ def _page(run: RunSession, metrics: Metrics, lpips_reason: str, shown: int) -> s
     config = run.trainer.config
     result = table(
         (*ERRORS, "LPIPS (VGG)", "training in s", "Gaussians", "FPS", "peak memory in MiB"),
-        [(*errors(metrics.mean), f"{last.train_seconds:.1f}", last.num_gaussians, f"{metrics.fps:.1f}", _mebibytes(last))],
+        [
+            (
+                *errors(metrics.mean),
+                f"{last.train_seconds:.1f}",
+                last.num_gaussians,
+                f"{metrics.fps:.1f}",
+                _mebibytes(last),
+            )
+        ],
     )
     lpips = f"\nLPIPS was not computed: {lpips_reason}.\n" if lpips_reason else ""
     history = table(

@@ -13,7 +13,8 @@ from torch import Tensor
 from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.engine import engine_of
 from turbogs_plugin.engine.layout import MAX_SH_DEGREE
-from turbogs_plugin.engine.rendered import ScreenGradients
+from turbogs_plugin.engine.protocol import MapUpdate
+from turbogs_plugin.engine.rendered import RenderOptions, ScreenGradients
 from turbogs_plugin.engine.rendering import render_image
 from turbogs_plugin.errors import TrainingStopped
 from turbogs_plugin.model.distant import RESTRAIN_EVERY, restrain_distant
@@ -98,9 +99,7 @@ class Trainer:
 
         # 5) Sparse forward rendering
         cameras = self.views.cameras.select(view_ids)
-        rendered = self.engine.render(
-            self.gaussians, cameras, samples, sh_degree=self.sh_degree, settings=self.config.raster
-        )
+        rendered = self.engine.render(self.gaussians, cameras, samples, RenderOptions(self.sh_degree, self.config.raster))
 
         # 6) Sparse loss and its gradients, and 7) EMA update of the error maps
         loss = self.supervise(rendered.colors, truth, step)
@@ -119,11 +118,11 @@ class Trainer:
 
     def supervise(self, colors: Tensor, truth: PhotoSamples, step: Step) -> LossOutput:
         """Loss and error maps: at once where the loss is a rule, else by the loss's own code."""
-        terms, samples = self.loss.terms, truth.samples
-        if terms is not None:
-            return self.engine.supervise(terms, colors, truth, self.maps, step, self.nonfinite_losses)
-        loss = self.loss(colors, truth.colors(), samples)
-        self.engine.learn(self.maps, samples, colors, loss, step, self.nonfinite_losses)
+        update = MapUpdate(self.maps, step, self.nonfinite_losses)
+        if self.loss.terms is not None:
+            return self.engine.supervise(self.loss.terms, colors, truth, update)
+        loss = self.loss(colors, truth.colors(), truth.samples)
+        self.engine.learn(truth.samples, colors, loss, update)
         return loss
 
     def update(self, screen: ScreenGradients, stats: GaussianStats | None, step: Step) -> None:

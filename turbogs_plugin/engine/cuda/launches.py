@@ -24,39 +24,39 @@ LAUNCHES: list[type[Launch]] = []
 """All launches, in the order of this file."""
 
 
-class Launch(Protocol):
-    """What `launch` gives a class.
+class Launch:
+    """A call of an operator.
 
     Attributes:
-        operator: name of the operator.
+        operator: its name: that of the class, in small letters.
         paths: dotted paths of the fields that each of the four lists holds, in their order.
     """
 
     operator: ClassVar[str]
     paths: ClassVar[tuple[list[str], ...]]
 
+    def __init_subclass__(cls) -> None:
+        cls.operator = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", cls.__name__).lower()
+        cls.paths = _paths(cls)
+        cls.lists = _reader(*cls.paths)
+        LAUNCHES.append(cls)
+
     def lists(self) -> tuple[tuple, ...]:
         """The four lists."""
-        ...
 
 
-def launch(cls: type) -> type[Launch]:
-    """Make a launch of a dataclass."""
-    cls.operator = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", cls.__name__).lower()
-    cls.paths = _paths(cls)
-    cls.lists = _reader(*cls.paths)
-    LAUNCHES.append(cls)
-    return cls
+def fields_of(kind: str, names: str) -> type:
+    """What a launch reads of an object of another module: fields that are all of one kind."""
+    return type("Fields", (), {"__annotations__": dict.fromkeys(names.split(), kind)})
 
 
 def _paths(cls: type, prefix: str = "") -> tuple[list[str], list[str], list[str], list[str]]:
     """Dotted paths of the tensors, integers, reals and rows of a class, in the order of its fields."""
-    tensors, integers, reals, rows = paths = [], [], [], []
-    kinds = {"Tensor": tensors, "Tensor | None": tensors, "int": integers, "bool": integers, "float": reals}
-    kinds["list[int]"] = rows
+    paths = [], [], [], []
+    kinds = {"Tensor": 0, "Tensor | None": 0, "int": 1, "bool": 1, "float": 2, "list[int]": 3}
     for name, annotation in cls.__annotations__.items():
         if annotation in kinds:
-            kinds[annotation].append(prefix + name)
+            paths[kinds[annotation]].append(prefix + name)
         else:
             for mine, nested in zip(paths, _paths(globals()[annotation], f"{prefix}{name}."), strict=True):
                 mine.extend(nested)
@@ -86,18 +86,11 @@ def interface(layout: ModuleType) -> str:
 # ---- What several launches have in common ---------------------------------------------------------------------------
 
 
-class GaussianArrays(Protocol):
-    """`types.Gaussians`."""
-
-    means: Tensor  # [N, 3] float32
-    quats: Tensor  # [N, 4] float32, 16-byte aligned
-    scales: Tensor  # [N, 3] float32
-    opacities: Tensor  # [N] float32
-    sh0: Tensor  # [N, 1, 3] float32
-    shN: Tensor  # [N, B, 3] float32, 16-byte aligned
+GaussianArrays = fields_of("Tensor", "means quats scales opacities sh0 shN")
+"""`types.Gaussians`, float32; `quats` and `shN` are 16-byte aligned."""
 
 
-@dataclass(slots=True)
+@dataclass
 class Scene:
     """The Gaussians and the views of a batch."""
 
@@ -109,7 +102,7 @@ class Scene:
     eps2d: float
 
 
-@dataclass(slots=True)
+@dataclass
 class Splats:
     """What the projection leaves for the stages behind it."""
 
@@ -119,7 +112,7 @@ class Splats:
     active_prefix: Tensor | None  # [tiles + 1] int32, tiles with samples of a smaller id; None where all have some
 
 
-@dataclass(slots=True)
+@dataclass
 class TileLists:
     """Where the intersections of each tile lie, and how many there are."""
 
@@ -129,23 +122,17 @@ class TileLists:
     counters: Tensor  # [2] int32
 
 
-class StatSums(Protocol):
-    """`types.GaussianStats`, or `NO_STATS`."""
-
-    error_sums: Tensor | None  # [N] float32, as are the others
-    distance_sums: Tensor | None
-    weight_sums: Tensor | None
-    grad_sums: Tensor | None
-    absgrad_sums: Tensor | None
-    view_counts: Tensor | None
-    max_radii: Tensor | None
+StatSums = fields_of(
+    "Tensor | None", "error_sums distance_sums weight_sums grad_sums absgrad_sums view_counts max_radii"
+)
+"""`types.GaussianStats`, or `NO_STATS`: each [N] float32."""
 
 
 NO_STATS = SimpleNamespace(**dict.fromkeys(StatSums.__annotations__))
 """In place of statistics that are not wanted."""
 
 
-@dataclass(slots=True)
+@dataclass
 class ScreenBackward:
     """Gradients on the screen, and what takes them to the parameters."""
 
@@ -170,17 +157,12 @@ class SampleArrays(Protocol):
 # ---- The rasterizer -------------------------------------------------------------------------------------------------
 
 
-class ProjectionSettings(Protocol):
-    """Of `RasterSettings`."""
-
-    near_plane: float
-    far_plane: float
-    alpha_min: float
+ProjectionSettings = fields_of("float", "near_plane far_plane alpha_min")
+"""Of `RasterSettings`."""
 
 
-@launch
-@dataclass(slots=True)
-class RasterProject:
+@dataclass
+class RasterProject(Launch):
     """Stage 1: `scene` onto the screen. Writes `splats` and `tile_cursors`, and clears records on screen."""
 
     scene: Scene
@@ -191,9 +173,8 @@ class RasterProject:
     records: Tensor | None  # [K * N, 16] float32
 
 
-@launch
-@dataclass(slots=True)
-class RasterCountIntersections:
+@dataclass
+class RasterCountIntersections(Launch):
     """Stage 2: where the intersections of each tile begin. Raises `status[1]` where there are too many."""
 
     tiles: TileLists
@@ -201,9 +182,8 @@ class RasterCountIntersections:
     capacity: int  # M
 
 
-@launch
-@dataclass(slots=True)
-class RasterSortIntersections:
+@dataclass
+class RasterSortIntersections(Launch):
     """Stages 3 and 4: the intersections of each tile, in order of depth."""
 
     splats: Splats
@@ -213,17 +193,12 @@ class RasterSortIntersections:
     runs: Tensor  # [M / (SORT_RUN / 2), 2] int32 scratch
 
 
-class BlendSettings(Protocol):
-    """Of `RasterSettings`."""
-
-    alpha_min: float
-    alpha_max: float
-    transmittance_min: float
+BlendSettings = fields_of("float", "alpha_min alpha_max transmittance_min")
+"""Of `RasterSettings`."""
 
 
-@launch
-@dataclass(slots=True)
-class RasterForward:
+@dataclass
+class RasterForward(Launch):
     """Stage 5: colours, alphas and, where asked for, depths at the samples."""
 
     cameras: Tensor  # of `Splats`
@@ -244,9 +219,8 @@ class RasterForward:
     settings: BlendSettings
 
 
-@launch
-@dataclass(slots=True)
-class RasterBackward:
+@dataclass
+class RasterBackward(Launch):
     """Stage 6: records of the gradients on the screen."""
 
     forward: RasterForward  # of the pass
@@ -262,7 +236,7 @@ class RasterBackward:
 # ---- Sampling and loss ----------------------------------------------------------------------------------------------
 
 
-@dataclass(slots=True)
+@dataclass
 class TileScratch:
     """For unit = tile: an entry for each tile of the batch."""
 
@@ -276,9 +250,8 @@ NO_SCRATCH = TileScratch(None, None, None, None)
 """For the other units."""
 
 
-@launch
-@dataclass(slots=True)
-class SamplePixels:
+@dataclass
+class SamplePixels(Launch):
     """Draws samples: writes `pixel_ids`, `tile_ids`, `tile_offsets` and `weights`."""
 
     errors: Tensor  # [X] float16
@@ -298,9 +271,8 @@ class SamplePixels:
     scratch: TileScratch
 
 
-@launch
-@dataclass(slots=True)
-class CountFilled:
+@dataclass
+class CountFilled(Launch):
     """Adds the number of filled slots."""
 
     pixel_ids: Tensor  # [P] int32
@@ -318,21 +290,16 @@ class LossSettings(Protocol):
     gate: bool
 
 
-class MapArrays(Protocol):
-    """`ErrorMaps`, or `NO_MAPS`."""
-
-    errors: Tensor | None  # [X] float16
-    stamps: Tensor | None  # [X] int16
-    view_sums: Tensor | None  # [V] float64
+MapArrays = fields_of("Tensor | None", "errors stamps view_sums")
+"""`ErrorMaps`, or `NO_MAPS`: [X] float16, [X] int16, [V] float64."""
 
 
 NO_MAPS = SimpleNamespace(**dict.fromkeys(MapArrays.__annotations__))
 """In place of maps that are not to be updated."""
 
 
-@launch
-@dataclass(slots=True)
-class SparseLoss:
+@dataclass
+class SparseLoss(Launch):
     """Loss with its gradient and errors; updates the maps."""
 
     colors: Tensor  # [P, 3] float32
@@ -356,9 +323,8 @@ class SparseLoss:
 # ---- From the screen to the parameters ------------------------------------------------------------------------------
 
 
-@launch
-@dataclass(slots=True)
-class ProjectionBackward:
+@dataclass
+class ProjectionBackward(Launch):
     """Gradients of the parameters: rows of each view or their sum. Every entry is written."""
 
     screen: ScreenBackward
@@ -368,31 +334,16 @@ class ProjectionBackward:
     view_losses: Tensor  # [K or 1, N] float32
 
 
-class Moments(Protocol):
-    """`GaussianMoments`."""
-
-    exp_avg: Tensor  # [N, 14] float32, layout.ParameterRow
-    exp_avg_sq: Tensor  # [N, 14] float32
-    exp_avg_shN: Tensor  # [N, 3 * B] float32
-    exp_avg_sq_shN: Tensor  # [N, 3 * B] float32
-    steps: Tensor  # [N] int32
-    skipped: Tensor  # [] int64
+Moments = fields_of("Tensor", "exp_avg exp_avg_sq exp_avg_shN exp_avg_sq_shN steps skipped")
+"""`GaussianMoments`, float32 but for `steps`, int32, and `skipped`, int64."""
 
 
-class Rates(Protocol):
-    """`ParameterRates`."""
-
-    means: float
-    quats: float
-    scales: float
-    opacities: float
-    sh0: float
-    shN: float
+Rates = fields_of("float", "means quats scales opacities sh0 shN")
+"""`ParameterRates`."""
 
 
-@launch
-@dataclass(slots=True)
-class FusedStep:
+@dataclass
+class FusedStep(Launch):
     """Projection backward and one step of the optimizer. Changes the Gaussians and the moments in place."""
 
     screen: ScreenBackward

@@ -161,6 +161,12 @@ class Workspace:
                 self._first_lost = arrived.number
             self.learn(intersections, arrived.tiles)
 
+    def _wait(self) -> None:
+        """Take in every count under way. They arrive in the order of the passes."""
+        if self._pending:
+            self._pending[-1].event.synchronize()
+            self.poll()
+
     def take_lost(self, wait: bool = False) -> int:
         """Number of passes at the end that did nothing and must be done again; makes room for them and lowers the flag.
 
@@ -170,17 +176,14 @@ class Workspace:
         Raises:
             InputError: a pass had more intersections than one can have: repeating it is no use.
         """
-        if wait and self._pending:
-            self._pending[-1].event.synchronize()
+        if wait:
+            self._wait()
         self.poll()
         if self._first_lost is None:
             return 0
         lost = self.passes - self._first_lost
         # The counts still under way belong to lost passes; they are true, so the repetition will fit.
-        while self._pending:
-            arrived = self._pending.popleft()
-            arrived.event.synchronize()
-            self.learn(int(arrived.values[0]), arrived.tiles)
+        self._wait()
         self._first_lost = None
         self.status.zero_()
         return lost

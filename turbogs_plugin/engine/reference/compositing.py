@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.nn.functional import threshold_
 
 from turbogs_plugin.engine.layout import ScreenRecord
-from turbogs_plugin.engine.reference.intersection import TilePairs
+from turbogs_plugin.engine.reference.intersection import Intersections
 from turbogs_plugin.engine.rendered import RasterSettings
 from turbogs_plugin.types import PixelSamples
 
@@ -31,7 +31,7 @@ ALPHA_TINY = 1e-10
 
 @dataclass
 class Block:
-    """B tiles. `samples`: [B, S] slots, P where padded. `start`, `count`: [B] the tiles' range of pairs."""
+    """B tiles. `samples`: [B, S] slots, P where padded. `start`, `count`: [B] the tiles' range of intersections."""
 
     samples: Tensor
     start: Tensor
@@ -41,32 +41,30 @@ class Block:
 
 @dataclass
 class Compositor:
-    """What compositing needs beside the splats: which pairs, which pixels.
+    """What compositing needs beside the splats: which intersections, which pixels.
 
     Args:
-        pairs: the M pairs of the T tiles.
+        intersections: the M intersections of the T tiles.
         samples: the P samples.
         settings: thresholds.
     """
 
-    pairs: TilePairs
+    intersections: Intersections
     samples: PixelSamples
     settings: RasterSettings
 
     def __post_init__(self) -> None:
-        self.device = self.pairs.rows.device
-        self.tile_counts = self.pairs.tile_counts.cpu()
+        self.device = self.intersections.rows.device
 
     def blocks(self) -> Iterator[Block]:
-        """All tiles that have both samples and pairs, those with the most pairs first."""
-        counts, order = self.tile_counts.sort(descending=True, stable=True)
-        counts = counts.tolist()
+        """All tiles that have both samples and intersections, those with the most intersections first."""
+        tile_counts = self.intersections.tile_counts
+        device_counts, order = tile_counts.sort(descending=True, stable=True)
+        counts = device_counts.tolist()
         offsets = self.samples.tile_offsets.long()
-        sample_counts = offsets.diff()[order.to(self.device)]
+        sample_counts, sample_starts = offsets.diff()[order], offsets[:-1][order]
         host_sample_counts = sample_counts.tolist()
-        sample_starts = offsets[:-1][order.to(self.device)]
-        pair_counts = self.tile_counts[order].to(self.device)
-        pair_starts = (self.pairs.tile_counts.cumsum(0) - self.pairs.tile_counts)[order.to(self.device)]
+        starts = (tile_counts.cumsum(0) - tile_counts)[order]
         limit = BLOCK_ELEMENTS[self.device.type]
 
         begin = 0
@@ -80,28 +78,39 @@ class Compositor:
             number = torch.arange(most_samples, device=self.device)
             slots = sample_starts[begin:end, None] + number
             slots = slots.masked_fill_(number >= sample_counts[begin:end, None], len(self.samples))
-            yield Block(slots, pair_starts[begin:end], pair_counts[begin:end], depth)
+            yield Block(slots, starts[begin:end], device_counts[begin:end], depth)
             begin = end
 
-    def slices(self, block: Block) -> Iterator[tuple[Tensor, Tensor]]:
-        """Pair numbers [B, G] of the block's splats, front to back, and where they are real."""
-        for first in range(0, block.depth, SLICE_SPLATS):
-            number = torch.arange(first, min(first + SLICE_SPLATS, block.depth), device=self.device)
-            real = number < block.count[:, None]
-            yield torch.where(real, block.start[:, None] + number, 0), real
+    def slices(self, table: Tensor) -> Iterator[tuple[Block, Tensor, Tensor, Slice]]:
+        """Every slice of every block, those of a block front to back until all its pixels are opaque.
 
-    def pixel_centers(self, dtype: torch.dtype) -> Tensor:
-        """[P + 1, 2], the last of them padding."""
-        centers = self.samples.coordinates().to(dtype) + 0.5
-        return torch.cat([centers, centers.new_zeros(1, 2)])
+        Args:
+            table: see `splat_table`.
+
+        Yields:
+            The block; numbers [B, G] of the intersections of the slice, and where they are real; the slice.
+        """
+        centers = self.samples.coordinates().to(table.dtype) + 0.5
+        centers = torch.cat([centers, centers.new_zeros(1, 2)])  # [P + 1, 2], the last of them padding
+        for block in self.blocks():
+            block_centers = centers[block.samples]  # [B, S, 2]
+            transmittance = torch.ones_like(block_centers[:, :, :1])
+            for first in range(0, block.depth, SLICE_SPLATS):
+                number = torch.arange(first, min(first + SLICE_SPLATS, block.depth), device=self.device)
+                real = number < block.count[:, None]
+                numbers = torch.where(real, block.start[:, None] + number, 0)
+                rows = self.intersections.rows[numbers]
+                piece = composite_slice(table, rows, real, block_centers, transmittance, self.settings)
+                yield block, numbers, real, piece
+                transmittance = piece.transmittance
+                if not transmittance.any():
+                    break
 
 
 @dataclass
 class Slice:
     """One slice of a block, [B, S, G] unless told: what the forward pass knows of it and the backward pass needs."""
 
-    rows: Tensor  # [B, G]
-    real: Tensor  # [B, G]
     features: Tensor  # [B, 5, G] red, green, blue, 1, depth
     conics: Tensor  # [3, B, 1, G]
     opacities: Tensor  # [B, 1, G]
@@ -115,12 +124,7 @@ class Slice:
 
 
 def composite_slice(
-    table: Tensor,
-    rows: Tensor,
-    real: Tensor,
-    centers: Tensor,
-    transmittance: Tensor,
-    settings: RasterSettings,
+    table: Tensor, rows: Tensor, real: Tensor, centers: Tensor, transmittance: Tensor, settings: RasterSettings
 ) -> Slice:
     """Weights of a slice's splats.
 
@@ -158,7 +162,7 @@ def composite_slice(
         weights.masked_fill_(ended, 0)
         alpha.masked_fill_(ended, 0)
         threshold_(behind, settings.transmittance_min, 0.0)
-    return Slice(rows, real, features, conics, opacities, dx, dy, sigma, alpha, clamped, weights, behind)
+    return Slice(features, conics, opacities, dx, dy, sigma, alpha, clamped, weights, behind)
 
 
 def splat_table(means2d: Tensor, conics: Tensor, colors: Tensor, opacities: Tensor, depths: Tensor) -> Tensor:
@@ -173,25 +177,15 @@ def composite(compositor: Compositor, table: Tensor) -> Tensor:
     Returns:
         [P, 5]: sums of weight times red, green, blue, 1 and depth. Zero in empty slots.
     """
-    samples, settings = compositor.samples, compositor.settings
-    centers = compositor.pixel_centers(table.dtype)
+    samples = compositor.samples
     sums = table.new_zeros(len(samples) + 1, 5)
-    for block in compositor.blocks():
-        block_centers = centers[block.samples]  # [B, S, 2]
-        transmittance = torch.ones_like(block_centers[:, :, :1])
-        total = table.new_zeros(*block.samples.shape, 5)
-        for rows, real in compositor.slices(block):
-            piece = composite_slice(table, compositor.pairs.rows[rows], real, block_centers, transmittance, settings)
-            total.baddbmm_(piece.weights, piece.features.transpose(1, 2))
-            transmittance = piece.transmittance
-            if not transmittance.any():
-                break
-        sums[block.samples] = total
+    for block, _, _, piece in compositor.slices(table):
+        sums[block.samples] = sums[block.samples].baddbmm_(piece.weights, piece.features.transpose(1, 2))
     return sums[:-1] * samples.filled[:, None]
 
 
 def composite_backward(
-    compositor: Compositor, table: Tensor, sums: Tensor, gradients: Tensor, pixel_errors: Tensor | None
+    compositor: Compositor, table: Tensor, sums: Tensor, gradients: Tensor, pixel_errors: Tensor
 ) -> Tensor:
     """Take the gradients of `composite` to the splats.
 
@@ -201,34 +195,23 @@ def composite_backward(
     Args:
         table, sums: what `composite` took and gave.
         gradients: [P, 5], d loss / d sums.
-        pixel_errors: [P] or None for zeros.
+        pixel_errors: [P].
 
     Returns:
         [R, 16], see `layout.ScreenRecord`.
     """
-    samples, settings, pairs = compositor.samples, compositor.settings, compositor.pairs
-    filled = samples.filled[:, None]
-    errors = torch.zeros_like(sums[:, :1]) if pixel_errors is None else pixel_errors[:, None].to(sums.dtype)
+    intersections, filled = compositor.intersections, compositor.samples.filled[:, None]
     # Red, green, blue, alpha, depth, error, 1. Zero in the padding slot and in empty ones.
-    upstream = torch.cat(
-        [torch.where(filled, torch.cat([gradients, errors], dim=1), 0.0), filled.to(sums.dtype)], dim=1
-    )
+    upstream = torch.cat([gradients, pixel_errors[:, None].to(sums.dtype), torch.ones_like(sums[:, :1])], dim=1)
+    upstream = torch.where(filled, upstream, 0.0)
     upstream = torch.cat([upstream, upstream.new_zeros(1, 7)])
     totals = torch.cat([(upstream[:-1, :5] * sums).sum(dim=1, keepdim=True), sums.new_zeros(1, 1)])
-    centers = compositor.pixel_centers(table.dtype)
-    records = table.new_zeros(len(pairs.rows), ScreenRecord.SIZE)
-    for block in compositor.blocks():
-        block_centers, block_upstream = centers[block.samples], upstream[block.samples]  # [B, S, 2], [B, S, 7]
-        behind = totals[block.samples]  # [B, S, 1] what the splats to come will contribute
-        transmittance = torch.ones_like(behind)
-        for numbers, real in compositor.slices(block):
-            piece = composite_slice(table, pairs.rows[numbers], real, block_centers, transmittance, settings)
-            record, behind = _slice_backward(piece, block_upstream, behind)
-            records[pairs.slots[numbers[real]]] = record[real]
-            transmittance = piece.transmittance
-            if not transmittance.any():
-                break
-    return pairs.sum_by_row(records)
+    records = table.new_zeros(len(intersections.rows), ScreenRecord.SIZE)
+    for block, numbers, real, piece in compositor.slices(table):
+        # `totals` [P + 1, 1]: what the splats to come will contribute
+        record, totals[block.samples] = _slice_backward(piece, upstream[block.samples], totals[block.samples])
+        records[intersections.slots[numbers[real]]] = record[real]
+    return intersections.sum_by_row(records)
 
 
 def _slice_backward(piece: Slice, upstream: Tensor, behind: Tensor) -> tuple[Tensor, Tensor]:

@@ -12,8 +12,8 @@ The draw is defined down to the bit, so that `draw_pixels` here and its CUDA twi
 2. Four random words ``x0 .. x3`` of each unit (layout in `philox`): the place is the pixel id ``y * width + x``, the id
    of the cell's first pixel, or the tile's number within its view; the purpose says which of the three.
 3. Each stage ranks the units not yet drawn by a 64-bit key, and takes the largest; keys are distinct, for their low
-   20 bits are ``2^20 - 1 - rank``, so among equals the lower rank goes first. The rank is the pixel's `cell_order`, the
-   cell's number in its tile, row by row, or the tile's number in its view. The high bits are:
+   20 bits are ``2^20 - 1 - rank``, so among equals the lower rank goes first. The rank is the pixel's `sample_order`,
+   the cell's number in its tile, row by row, or the tile's number in its view. The high bits are:
 
    - hard: the bits, as an integer, of the float32 ``max(E, 2^-100) / exponential(x0)``, an exponential race: taking the
      largest is the multinomial draw without replacement, with the probabilities E / sum(E). Zero errors come
@@ -34,6 +34,7 @@ Together, ``p = 1 - (1 - p_hard) (1 - p_stable) (1 - p_mixed)``, and 1 where all
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -50,9 +51,17 @@ from turbogs_plugin.engine.reference.philox import (
     random_words,
 )
 from turbogs_plugin.engine.rules import DrawRule
-from turbogs_plugin.error_maps import AGE_MAX
-from turbogs_plugin.tiles import CELL_SIDE, TILE_CELLS, TILE_PIXELS, compact, pixel_table, tile_extents
-from turbogs_plugin.types import CELL_HEIGHT, CELL_WIDTH, TILE_SIZE, PixelSamples, TileGrid
+from turbogs_plugin.error_maps import AGE_MAX, ErrorMaps
+from turbogs_plugin.tiles import (
+    TILE_CELLS,
+    TILE_PIXELS,
+    cell_of_place,
+    compact,
+    pixel_table,
+    slots_of_tiles,
+    tile_extents,
+)
+from turbogs_plugin.types import PixelSamples, Step, TileGrid
 
 RANK_BITS = 20
 AGE_TIE_BITS = 24
@@ -67,16 +76,16 @@ class Units:
     Args:
         errors: [R, U] float64, exact sums; 0 where there is no unit.
         ages: [R, U] integers; 0 where there is no unit.
-        exist: [R, U] bool: rows of cut tiles, and of views with fewer tiles than others, have gaps.
+        exist: [R, U] bool: rows of cut tiles have gaps.
         words: four [R, U] int64 random words.
-        counts: [R] or [1] int64 on the host, units to draw from each row.
+        wanted: units to draw from each row.
     """
 
     errors: Tensor
     ages: Tensor
     exist: Tensor
     words: Words
-    counts: np.ndarray
+    wanted: int
 
 
 def draw_units(units: Units, rule: DrawRule) -> tuple[Tensor, Tensor | None]:
@@ -86,9 +95,7 @@ def draw_units(units: Units, rule: DrawRule) -> tuple[Tensor, Tensor | None]:
         [R, U] bool, the units drawn; and their inclusion probabilities p, [R, U] float32 (meaningless where not
         drawn), or None where the rule has no importance weights.
     """
-    device = units.errors.device
-    stages = np.array([rule.stages(int(count)) for count in units.counts], dtype=np.int64)  # [R, 3]
-    ranks = (1 << RANK_BITS) - 1 - torch.arange(units.exist.shape[1], device=device)  # [U]
+    ranks = (1 << RANK_BITS) - 1 - torch.arange(units.exist.shape[1], device=units.errors.device)  # [U]
     errors, ages = units.errors.float(), units.ages.long()
     if rule.mixed_uniform:
         mixed = torch.ones_like(errors)
@@ -98,9 +105,8 @@ def draw_units(units: Units, rule: DrawRule) -> tuple[Tensor, Tensor | None]:
 
     drawn = torch.zeros_like(units.exist)
     missed = torch.ones_like(errors)  # probability of not being drawn
-    for stage, weights, words in ((0, errors, units.words[0]), (1, None, units.words[1]), (2, mixed, units.words[2])):
-        counts = stages[:, stage]
-        if not counts.any():
+    for count, weights, words in zip(rule.stages(units.wanted), (errors, None, mixed), units.words[:3], strict=True):
+        if count == 0:
             continue
         if weights is None:
             primary = (ages << AGE_TIE_BITS) | (words >> (32 - AGE_TIE_BITS))
@@ -108,25 +114,27 @@ def draw_units(units: Units, rule: DrawRule) -> tuple[Tensor, Tensor | None]:
             weights = weights.clamp(min=WEIGHT_FLOOR)
             primary = (weights / exponentials(words)).view(torch.int32).long()
         keys = torch.where(units.exist & ~drawn, (primary << RANK_BITS) | ranks, -1)
-        takes = torch.as_tensor(counts, device=device)[:, None].expand(len(keys), 1)
-        largest = keys.topk(min(int(counts.max()) + 1, keys.shape[1]), dim=1).values
+        largest = keys.topk(min(count + 1, keys.shape[1]), dim=1).values
         largest = torch.nn.functional.pad(largest, (0, 1), value=-1)  # a stage may take all there are
-        largest_left = largest.gather(1, takes)
+        smallest_taken, largest_left = largest[:, count - 1, None], largest[:, count, None]
         taken = keys > largest_left
         drawn |= taken
         if rule.importance:
-            smallest_taken = largest.gather(1, (takes - 1).clamp(min=0))
             tau = torch.where(taken, largest_left, smallest_taken) >> RANK_BITS  # -1 for none
             if weights is None:
                 chance = (((ages + 1) << AGE_TIE_BITS) - tau).clamp(0, 1 << AGE_TIE_BITS) * 2.0**-AGE_TIE_BITS
             else:
                 threshold = tau.to(torch.int32).view(torch.float32)
                 chance = torch.where(tau < 0, 1.0, -torch.expm1(-weights / threshold))
-            missed = missed * (1.0 - chance * (takes > 0))
+            missed = missed * (1.0 - chance)
     if not rule.importance:
         return drawn, None
     complete = (drawn | ~units.exist).all(dim=1, keepdim=True)
     return drawn, torch.where(complete, 1.0, 1.0 - missed)
+
+
+def _importance_weights(probabilities: Tensor | None, rule: DrawRule) -> Tensor | None:
+    return None if probabilities is None else probabilities.clamp(min=2.0**-24) ** -rule.importance
 
 
 def _share(values: Tensor, sums: Tensor) -> Tensor:
@@ -134,46 +142,29 @@ def _share(values: Tensor, sums: Tensor) -> Tensor:
     return torch.where(sums > 0, values / sums, 0.0)
 
 
-def draw_pixels(
-    errors: Tensor,
-    stamps: Tensor,
-    now: int,
-    starts: np.ndarray,
-    sizes: np.ndarray,
-    view_ids: tuple[int, ...],
-    rate: float,
-    rule: DrawRule,
-    seed: int,
-    iteration: int,
-) -> PixelSamples:
-    """Draw the samples of K views; the definition of the CUDA twin (see the module's text).
-
-    Args:
-        errors: [X] float16, finite, 0 or more.
-        stamps: [X] int16; ``min(now - stamp, AGE_MAX)`` is a pixel's age.
-        starts: [K] int64, the first flat pixel of each view.
-        sizes: [K, 2] int64 (width, height).
-        view_ids: K training views.
-        rate: r, the fraction of units to draw, above 0.
+def draw_pixels(rule: DrawRule, maps: ErrorMaps, view_ids: tuple[int, ...], rate: float, step: Step) -> PixelSamples:
+    """`Engine.draw`, the definition of the CUDA twin (see the module's text).
 
     Returns:
         Samples whose every count is known without reading anything back from the device. Slots of a tile: min(N, its
         pixels) for unit = pixel; 16 for each drawn cell, at most its pixels, for cell; 256 for tile.
     """
-    device = errors.device
+    maps.fetch(view_ids)
+    device, views = maps.errors.device, np.asarray(view_ids, dtype=np.int64)
+    sizes = maps.sizes[views]
     table = pixel_table(sizes, device)  # [T, 256]
     inside = table >= 0
-    tile_views = np.repeat(np.arange(len(view_ids)), TileGrid(sizes).shapes.prod(axis=1))  # [T]
-    flat = torch.as_tensor(starts[tile_views], device=device)[:, None] + table.clamp(min=0)
-    pixel_errors = torch.where(inside, errors[flat].double(), 0.0)  # [T, 256]
-    pixel_ages = torch.where(inside, (now - stamps[flat].int()).clamp(0, AGE_MAX), 0)
-    view_numbers = torch.as_tensor(np.asarray(view_ids, dtype=np.int64)[tile_views], device=device)[:, None]  # [T, 1]
+    tile_views = np.repeat(views, TileGrid(sizes).shapes.prod(axis=1))  # [T]
+    flat = torch.as_tensor(maps.offsets[tile_views], device=device)[:, None] + table.clamp(min=0)
+    errors = torch.where(inside, maps.errors[flat].double(), 0.0)  # [T, 256]
+    ages = torch.where(inside, (maps.now(step) - maps.stamps[flat].int()).clamp(0, AGE_MAX), 0)
+    view_numbers = torch.as_tensor(tile_views, device=device)[:, None]  # [T, 1]
 
     def words(place: Tensor, purpose: int) -> Words:
-        return random_words(place.clamp(min=0).long(), view_numbers, purpose, seed, iteration)
+        return random_words(place.clamp(min=0).long(), view_numbers, purpose, step.seed, step.iteration)
 
-    draw = {"pixel": _draw_by_pixel, "cell": _draw_by_cell, "tile": _draw_by_tile}[rule.unit]
-    return draw(_Batch(view_ids, sizes, table, pixel_errors, pixel_ages, words), rate, rule)
+    draw = _draw_tiles if rule.unit == "tile" else _draw_within_tiles
+    return draw(_Batch(view_ids, sizes, table, errors, ages, words), rate, rule)
 
 
 @dataclass(frozen=True)
@@ -187,85 +178,48 @@ class _Batch:
     ages: Tensor  # [T, 256] int32
     words: Callable[[Tensor, int], Words]
 
-    def all_tiles(self) -> Tensor:
-        return torch.arange(len(self.table), dtype=torch.int32, device=self.table.device)
 
-
-def _draw_by_pixel(batch: _Batch, rate: float, rule: DrawRule) -> PixelSamples:
-    wanted = rule.wanted(rate, TILE_PIXELS)
-    words = batch.words(batch.table, PURPOSE_PIXELS)
-    units = Units(batch.errors, batch.ages, batch.table >= 0, words, np.array([wanted]))
-    drawn, probabilities = draw_units(units, rule)
-    widths, heights = tile_extents(batch.sizes)
-    slots = np.minimum(wanted, widths * heights)
+def _draw_within_tiles(batch: _Batch, rate: float, rule: DrawRule) -> PixelSamples:
+    """Pixels or cells as units, drawn from each tile."""
+    first_pixels, errors, ages, purpose = batch.table, batch.errors, batch.ages, PURPOSE_PIXELS
+    by_cell = rule.unit == "cell"
+    cells = cell_of_place(batch.table.device)  # [256]
+    if by_cell:
+        places = torch.argsort(cells, stable=True).view(TILE_CELLS, -1)  # [16, 16] of each cell
+        first_pixels, purpose = first_pixels[:, places[:, 0]], PURPOSE_CELLS
+        errors, ages = errors[:, places].sum(dim=2), ages[:, places].amax(dim=2)
+    wanted = rule.wanted(rate, errors.shape[1])
+    words = batch.words(first_pixels, purpose)
+    drawn, probabilities = draw_units(Units(errors, ages, first_pixels >= 0, words, wanted), rule)
     weights = _importance_weights(probabilities, rule)
-    return compact(batch.view_ids, batch.sizes, batch.table, drawn, batch.all_tiles(), slots, weights, full=True)
+    if by_cell:
+        drawn, weights = drawn[:, cells] & (batch.table >= 0), None if weights is None else weights[:, cells]
+    slots = slots_of_tiles(rule.unit, wanted, *tile_extents(batch.sizes))
+    tile_ids = torch.arange(len(batch.table), dtype=torch.int32, device=batch.table.device)
+    return compact(batch.view_ids, batch.sizes, batch.table, drawn, tile_ids, slots, weights, full=not by_cell)
 
 
-def _draw_by_cell(batch: _Batch, rate: float, rule: DrawRule) -> PixelSamples:
-    wanted = rule.wanted(rate, TILE_CELLS)
-    first_pixels = _cells_of(batch.table)[:, :, 0]  # [T, 16]
-    units = Units(
-        _cells_of(batch.errors).sum(dim=2),
-        _cells_of(batch.ages).amax(dim=2),
-        first_pixels >= 0,
-        batch.words(first_pixels, PURPOSE_CELLS),
-        np.array([wanted]),
-    )
-    drawn, probabilities = draw_units(units, rule)
-    widths, heights = tile_extents(batch.sizes)
-    cells = np.minimum(wanted, -(-widths // CELL_SIDE) * -(-heights // CELL_SIDE))
-    slots = np.minimum(cells * CELL_SIDE**2, widths * heights)
-    mask = _pixels_of(drawn) & (batch.table >= 0)
-    weights = _importance_weights(probabilities, rule)
-    weights = None if weights is None else _pixels_of(weights)
-    return compact(batch.view_ids, batch.sizes, batch.table, mask, batch.all_tiles(), slots, weights)
-
-
-def _draw_by_tile(batch: _Batch, rate: float, rule: DrawRule) -> PixelSamples:
-    device = batch.table.device
-    tiles = TileGrid(batch.sizes).shapes.prod(axis=1)  # [K]
-    # Views are rows of a draw, as long as the longest; `places` are their tiles in the padded array.
-    places = torch.as_tensor(np.flatnonzero(np.arange(tiles.max()) < tiles[:, None]), device=device)  # [T]
-    counts = np.array([rule.wanted(rate, int(count)) for count in tiles])
-
-    def padded(values: Tensor) -> Tensor:  # [T] -> [K, longest]
-        rows = values.new_zeros(len(tiles) * int(tiles.max()))
-        rows[places] = values
-        return rows.view(len(tiles), -1)
-
-    numbers = (places % int(tiles.max()))[:, None]  # [T, 1] within the view
-    units = Units(
-        padded(batch.errors.sum(dim=1)),
-        padded(batch.ages.amax(dim=1)),
-        padded(torch.ones_like(places, dtype=torch.bool)),
-        tuple(padded(word[:, 0]) for word in batch.words(numbers, PURPOSE_TILES)),
-        counts,
-    )
-    drawn, probabilities = draw_units(units, rule)
-    # Their number is known here; a boolean index would ask the device for it.
-    order = torch.argsort(drawn.reshape(-1)[places].to(torch.int8), stable=True, descending=True)
-    tile_ids = order[: counts.sum()]
+def _draw_tiles(batch: _Batch, rate: float, rule: DrawRule) -> PixelSamples:
+    """Whole tiles as units, drawn from each view."""
+    device, ends = batch.table.device, TileGrid(batch.sizes).offsets
+    errors, ages = batch.errors.sum(dim=1), batch.ages.amax(dim=1)  # [T]
+    tiles = torch.arange(len(batch.table), device=device)
+    firsts = torch.as_tensor(np.repeat(ends[:-1], np.diff(ends)), device=device)
+    words = batch.words((tiles - firsts)[:, None], PURPOSE_TILES)  # of the numbers within the view
+    chosen, weights = [], []
+    for first, end in itertools.pairwise(ends.tolist()):
+        row = slice(first, end)
+        wanted = rule.wanted(rate, end - first)
+        exist = torch.ones(1, end - first, dtype=torch.bool, device=device)
+        of_row = tuple(word[row].T for word in words)
+        drawn, probabilities = draw_units(Units(errors[None, row], ages[None, row], exist, of_row, wanted), rule)
+        # Their number is known here; a boolean index would ask the device for it.
+        tile_ids = torch.argsort(drawn[0].to(torch.int8), stable=True, descending=True)[:wanted]
+        chosen.append(first + tile_ids)
+        if rule.importance:
+            weights.append(_importance_weights(probabilities, rule)[0, tile_ids])
+    tile_ids = torch.cat(chosen)
     table = batch.table[tile_ids]
-    weights = _importance_weights(probabilities, rule)
-    weights = None if weights is None else weights.reshape(-1)[places][tile_ids, None].expand(table.shape)
+    tile_weights = torch.cat(weights)[:, None].expand(table.shape) if rule.importance else None
     slots = np.full(len(tile_ids), TILE_PIXELS)
-    return compact(batch.view_ids, batch.sizes, table, table >= 0, tile_ids.int(), slots, weights)
-
-
-def _importance_weights(probabilities: Tensor | None, rule: DrawRule) -> Tensor | None:
-    return None if probabilities is None else probabilities.clamp(min=2.0**-24) ** -rule.importance
-
-
-def _cells_of(values: Tensor) -> Tensor:
-    """[T, 256] in `cell_order` -> [T, 16, 16]: the 4x4 cells of a tile row by row, their pixels row by row."""
-    blocks = TILE_SIZE // CELL_HEIGHT * (TILE_SIZE // CELL_WIDTH)
-    split = values.view(-1, blocks, CELL_HEIGHT, CELL_WIDTH // CELL_SIDE, CELL_SIDE)
-    return split.transpose(2, 3).reshape(-1, TILE_CELLS, CELL_SIDE**2)
-
-
-def _pixels_of(cells: Tensor) -> Tensor:
-    """[T, 16] of cells -> [T, 256] of their pixels in `cell_order`."""
-    blocks = TILE_SIZE // CELL_HEIGHT * (TILE_SIZE // CELL_WIDTH)
-    wide = cells.view(-1, blocks, 1, CELL_WIDTH // CELL_SIDE, 1)
-    return wide.expand(-1, -1, CELL_HEIGHT, -1, CELL_SIDE).reshape(-1, TILE_PIXELS)
+    return compact(batch.view_ids, batch.sizes, table, table >= 0, tile_ids.int(), slots, tile_weights)

@@ -16,14 +16,14 @@ ROUNDING = 16
 
 
 @dataclass
-class TilePairs:
-    """The M (tile, row) pairs that can contribute, front to back within each tile.
+class Intersections:
+    """The M intersections of a tile and a row that can contribute, front to back within each tile.
 
     Args:
         rows: [M] int64, ordered by (tile, depth, Gaussian).
-        tile_counts: [T] int64, pairs of each tile of `PixelSamples.tile_ids`.
-        slots: [M] int64, where each pair stands in an order in which all pairs of a row are neighbours.
-        row_counts: [R] int64, pairs of each row in that order, of the rows as listed in `row_order`.
+        tile_counts: [T] int64, intersections of each tile of `PixelSamples.tile_ids`.
+        slots: [M] int64, where each stands in an order in which all intersections of a row are neighbours.
+        row_counts: [R] int64, intersections of each row in that order, of the rows as listed in `row_order`.
         row_order: [R] int64.
     """
 
@@ -34,10 +34,10 @@ class TilePairs:
     row_order: Tensor
 
     def sum_by_row(self, values: Tensor) -> Tensor:
-        """Sum pair values into rows, in a fixed order.
+        """Sum values of intersections into rows, in a fixed order.
 
         Args:
-            values: [M, C] in the order of `slots` (that is, `values[slots[i]]` belongs to pair ``i``).
+            values: [M, C] in the order of `slots` (that is, `values[slots[i]]` belongs to intersection ``i``).
 
         Returns:
             [R, C].
@@ -88,10 +88,10 @@ def smallest_exponents(conics: Tensor, low: Tensor, high: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def intersect_tiles(rows: Rows, splats: Splats, samples: PixelSamples, settings: RasterSettings) -> TilePairs:
-    """Find the pairs of all tiles that hold samples.
+def intersect_tiles(rows: Rows, splats: Splats, samples: PixelSamples, settings: RasterSettings) -> Intersections:
+    """Find the intersections of all tiles that hold samples.
 
-    Every pair with ``alpha >= alpha_min`` at some pixel of the tile is found; one that has it at no point of the
+    Every one with ``alpha >= alpha_min`` at some pixel of the tile is found; one that has it at no point of the
     rectangle of the tile's pixel centres is not, apart from rounding.
     """
     device = splats.means2d.device
@@ -130,7 +130,7 @@ def intersect_tiles(rows: Rows, splats: Splats, samples: PixelSamples, settings:
 
     owners, tiles = owners[kept], tiles[kept]
     slots = tiles.sort(stable=True).indices  # [M] front to back within each tile
-    return TilePairs(
+    return Intersections(
         rows=order[owners[slots]],
         tile_counts=torch.bincount(tiles, minlength=num_tiles),
         slots=slots,

@@ -25,7 +25,7 @@ BALANCE_EPSILON = 1e-8
 """Keeps the balance of a structure term without gradient defined (the paper's equation of lambda)."""
 
 
-def sparse_loss(colors: Tensor, targets: Tensor, samples: PixelSamples, terms: LossTerms) -> LossOutput:
+def sparse_loss(terms: LossTerms, colors: Tensor, targets: Tensor, samples: PixelSamples) -> LossOutput:
     """The loss of some samples and its gradient::
 
         L = l1_weight * l1 + structure_weight * mean over tiles of f * mean over channels of (1 - S)
@@ -39,9 +39,9 @@ def sparse_loss(colors: Tensor, targets: Tensor, samples: PixelSamples, terms: L
     undo it.
 
     Args:
+        terms: which loss.
         colors, targets: [P, 3].
         samples: the P slots.
-        terms: which loss.
     """
     problem = _Problem(colors, targets, samples, terms.epsilon)
     loss, gradients = terms.l1_weight * problem.loss, terms.l1_weight * problem.gradients

@@ -6,7 +6,7 @@ words under a key of two to four random words. The layout that every sampler of 
 =========  ==================================================================================
 word       value
 =========  ==================================================================================
-counter 0  the place: pixel id, cell id, tile id (see `pixel_sampling`), or view number
+counter 0  the place: pixel id, cell id, tile id (see `draws`), or view number
 counter 1  the training view's number; 0 where the place is a view
 counter 2  the purpose, one of `PURPOSE_*`
 counter 3  the high 32 bits of the seed
@@ -116,11 +116,6 @@ def exponentials(words: Tensor) -> Tensor:
     s = (f - 1.0) / (f + 1.0)
     q = s * s
     c3, c5, c7, c9 = LOG_COEFFICIENTS
-    p = q * c9
-    p = p + c7
-    p = p * q
-    p = p + c5
-    p = p * q
-    p = p + c3
+    p = ((q * c9 + c7) * q + c5) * q + c3  # torch rounds each operation
     tail = s * (q * p)
     return (24 - exponents).to(torch.float32) * LOG_2 - (s + s + tail)

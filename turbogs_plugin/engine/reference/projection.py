@@ -1,8 +1,8 @@
 """Perspective projection of Gaussians onto the images of K views (EWA splatting, as gsplat 1.5.3 does it).
 
-Only the (view, Gaussian) pairs that can be drawn at all are projected. They are called *rows*, R in number and ordered
-by (view, Gaussian): pairs behind the camera, too transparent, or not finite never enter the graph, so nothing of theirs
-can overflow in it.
+A *row* is one Gaussian in one view. Only the R rows that can be drawn at all are projected, ordered by view, then
+Gaussian. What is behind the camera, too transparent, or not finite never enters the graph, so nothing of it can
+overflow there.
 """
 
 from __future__ import annotations
@@ -47,15 +47,16 @@ class Rows:
         """[R] int64 position in a flattened [K, N]."""
         return self.views * self.shape[1] + self.gaussians
 
+    def take(self, gaussians: Gaussians) -> Gaussians:
+        """The parameters [R, ...] of each row, and the model's own `shN`, whose gradient is summed over views."""
+        rows = {name: value if name == "shN" else value[self.gaussians] for name, value in gaussians.items()}
+        return Gaussians(**rows)
+
     def scatter(self, values: Tensor) -> Tensor:
         """[R, ...] -> [K, N, ...], zero where there is no row. Differentiable."""
         count = self.shape[0] * self.shape[1]
         full = values.new_zeros(count, *values.shape[1:]).index_copy(0, self.flat, values)
         return full.reshape(*self.shape, *values.shape[1:])
-
-    def gather(self, values: Tensor) -> Tensor:
-        """[K, N, ...] -> [R, ...]. Differentiable."""
-        return values.flatten(0, 1).index_select(0, self.flat)
 
 
 @dataclass
@@ -119,32 +120,21 @@ def rotation_matrices(quats: Tensor) -> Tensor:
 
 
 def project_rows(
-    rows: Rows,
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    sh0: Tensor,
-    shN: Tensor,
-    cameras: Cameras,
-    sh_degree: int,
-    settings: RasterSettings,
+    rows: Rows, parameters: Gaussians, cameras: Cameras, sh_degree: int, settings: RasterSettings
 ) -> Splats:
     """Project rows; differentiable in the parameters.
 
     Args:
-        rows: which rows the parameters belong to.
-        means, quats, scales, opacities, sh0: [R, ...], one for each row, as in `Gaussians`.
-        shN: [N, B, 3], the model's own: its gradient is summed over views.
+        parameters: of the rows, see `Rows.take`.
         cameras: the K views.
         sh_degree: 0 .. 3.
     """
-    views = rows.views
+    views, means = rows.views, parameters.means
     rotations = cameras.viewmats[views, :3, :3]  # [R, 3, 3]
     points = torch.bmm(rotations, means[:, :, None])[:, :, 0] + cameras.viewmats[views, :3, 3]  # [R, 3]
     fx, fy, cx, cy = cameras.Ks[:, [0, 1, 0, 1], [0, 1, 2, 2]][views].unbind(dim=-1)  # [R] each
-    sizes = torch.as_tensor(cameras.sizes, device=means.device)
-    width, height = sizes.to(means.dtype)[views].unbind(dim=-1)
+    image = torch.as_tensor(cameras.sizes, device=means.device).to(means.dtype)[views]  # [R, 2]
+    width, height = image.unbind(dim=-1)
 
     x, y, depths = points.unbind(dim=-1)
     x, y, inverse = x / depths, y / depths, 1 / depths
@@ -162,7 +152,7 @@ def project_rows(
         ],
         dim=1,
     )  # [R, 2, 3], Jacobian times rotation
-    axes = torch.bmm(to_screen, rotation_matrices(quats)) * scales.exp()[:, None, :]  # [R, 2, 3]
+    axes = torch.bmm(to_screen, rotation_matrices(parameters.quats)) * parameters.scales.exp()[:, None, :]  # [R, 2, 3]
     u, v = axes.unbind(dim=1)
     variance_x, variance_y, covariance = (u * u).sum(dim=-1), (v * v).sum(dim=-1), (u * v).sum(dim=-1)
     # Lagrange's identity gives the determinant as a sum of squares: no cancellation, however thin the splat.
@@ -171,16 +161,15 @@ def project_rows(
     variance_x, variance_y = variance_x + settings.eps2d, variance_y + settings.eps2d
     conics = torch.stack([variance_y, -covariance, variance_x], dim=-1) / determinant[:, None]
 
-    opacities = torch.sigmoid(opacities)
+    opacities = torch.sigmoid(parameters.opacities)
     directions = unit_directions(means - cameras.centers[views])
-    bands = shN[:, : num_bands(sh_degree)].index_select(0, rows.gaussians)
-    colors = (evaluate(sh0, bands, directions, sh_degree) + 0.5).clamp(min=0)
+    bands = parameters.shN[:, : num_bands(sh_degree)].index_select(0, rows.gaussians)
+    colors = (evaluate(parameters.sh0, bands, directions, sh_degree) + 0.5).clamp(min=0)
 
     with torch.no_grad():
         variances = torch.stack([variance_x, variance_y], dim=-1)  # [R, 2]
         extents = (2 * torch.log(opacities / settings.alpha_min)).clamp(min=0).sqrt().clamp(max=EXTENT_MAX)
         radii = torch.ceil(extents[:, None] * variances.sqrt())
-        image = torch.stack([width, height], dim=-1)
         drawn = ((means2d + radii > 0) & (means2d - radii < image)).all(dim=-1) & (radii > 0).any(dim=-1)
         radii = torch.where(drawn[:, None], radii, 0).to(torch.int32)
     return Splats(means2d, conics, depths, opacities, colors, radii)

@@ -60,8 +60,5 @@ def evaluate(sh0: Tensor, shN: Tensor, directions: Tensor, degree: int) -> Tenso
     Returns:
         [R, 3].
     """
-    colors = SH_C0 * sh0[:, 0]
-    if degree == 0:
-        return colors
     values = basis(directions, degree)  # [R, B]
-    return colors + (values[:, :, None] * shN[:, : values.shape[1]]).sum(dim=1)
+    return SH_C0 * sh0[:, 0] + (values[:, :, None] * shN[:, : values.shape[1]]).sum(dim=1)

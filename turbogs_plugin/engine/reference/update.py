@@ -18,9 +18,11 @@ from turbogs_plugin.engine.reference.lm_solvers import solve_low_rank
 from turbogs_plugin.engine.rules import ParameterRates, UpdateRule
 from turbogs_plugin.types import GaussianGradients, Gaussians
 
-GEOMETRY = slice(ParameterRow.MEANS.start, ParameterRow.QUATS.stop)
-APPEARANCE = slice(ParameterRow.SH0.start, ParameterRow.OPACITIES.stop)
-"""The two blocks of a packed row that moment-damped LM solves."""
+BLOCKS = (
+    slice(ParameterRow.MEANS.start, ParameterRow.QUATS.stop),
+    slice(ParameterRow.SH0.start, ParameterRow.OPACITIES.stop),
+)
+"""The two blocks of a packed row that moment-damped LM solves: geometry and appearance."""
 
 GRADIENT_LIMIT = 1e17
 """Gradients are cut here, so that the square of a sum over up to 100 views stays finite in float32 (largest 3.4e38)."""
@@ -32,10 +34,14 @@ def apply_update(
 ) -> None:
     """Make one step of `rule`: changes `gaussians` and `moments` in place.
 
+    The higher bands make Adam's step whatever the rule (appendix, second half of the LM equation): no block has them.
+
     Args:
         gradients: of each view, or their sum; what the rule needs summed is summed here.
     """
-    index = updatable(gradients, moments)
+    finite = finite_gradients(gradients)
+    moments.skipped += (gradients.touched & ~finite).sum()
+    index = torch.nonzero(gradients.touched & finite).squeeze(-1)  # [n] whom to update
     moments.steps[index] += 1
     steps = moments.steps[index]
     rows = packed_rows(gradients, index)  # [K, n, 14]
@@ -51,8 +57,12 @@ def apply_update(
             delta = balanced_delta(rows, losses, terms, rule)
         else:
             delta = paper_delta(rows, moments.exp_avg[index], moments.exp_avg_sq[index], rule)
-    add_packed(gaussians, index, delta)
-    step_shN(gaussians, gradients.shN, moments, index, steps, rule)
+    gradient = clipped(gradients.shN[index].flatten(1))
+    terms = advance(moments.exp_avg_shN, moments.exp_avg_sq_shN, gradient, index, steps, rule)
+    changes = {name: delta[:, columns] for name, columns in COLUMNS.items()}
+    for name, change in {**changes, "shN": terms.delta(rule.rates.shN)}.items():
+        value = getattr(gaussians, name)
+        value.index_add_(0, index, change.reshape(len(index), *value.shape[1:]))
 
 
 def packed_rates(rates: ParameterRates, like: Tensor) -> Tensor:
@@ -63,8 +73,7 @@ def packed_rates(rates: ParameterRates, like: Tensor) -> Tensor:
 
 def packed_rows(gradients: GaussianGradients, index: Tensor) -> Tensor:
     """[K, n, 14] gradients of the Gaussians `index` [n] in the order of `COLUMNS`, cut at `GRADIENT_LIMIT`."""
-    columns = [getattr(gradients, name)[:, index].flatten(2) for name in ("means", "scales", "quats", "sh0")]
-    columns.append(gradients.opacities[:, index].unsqueeze(-1))
+    columns = [getattr(gradients, name)[:, index].unsqueeze(-1).flatten(2) for name in COLUMNS]
     return clipped(torch.cat(columns, dim=-1))
 
 
@@ -80,13 +89,6 @@ def finite_gradients(gradients: GaussianGradients) -> Tensor:
         value = getattr(gradients, name)
         finite &= torch.isfinite(value).unsqueeze(-1).flatten(2).all(dim=-1).all(dim=0)
     return finite
-
-
-def updatable(gradients: GaussianGradients, moments: GaussianMoments) -> Tensor:
-    """[n] int64: the touched Gaussians whose every gradient is finite; the others are added to `moments.skipped`."""
-    finite = finite_gradients(gradients)
-    moments.skipped += (gradients.touched & ~finite).sum()
-    return torch.nonzero(gradients.touched & finite).squeeze(-1)
 
 
 @dataclass
@@ -134,15 +136,16 @@ def balanced_delta(rows: Tensor, losses: Tensor, terms: AdamTerms, rule: UpdateR
     weights = torch.where(has_share, (rule.lm.curvature / losses).clamp(max=largest), 0.0).to(rows.dtype)
     # A rate of zero holds its parameter: no coupling may move it, so it gets the damping of the largest float's root.
     damping = terms.denominator / rates.clamp(min=torch.finfo(rows.dtype).tiny ** 0.5)
-    delta = torch.cat([_solve(rows, weights, damping, terms.mean, block) for block in (GEOMETRY, APPEARANCE)], -1)
+    delta = _solve(rows, weights, damping, terms.mean)
     if rule.lm.max_step > 0:
         bound = torch.maximum(rule.lm.max_step * rates, adam.abs())
         delta = torch.maximum(torch.minimum(delta, bound), -bound)
     # Without rows the solution is Adam's step; taking that one as it is makes them equal to the last bit.
-    has_rows = torch.stack([_any_row(rows, weights, block) for block in (GEOMETRY, APPEARANCE)], dim=-1)  # [n, 2]
-    sizes = torch.tensor([10, 4], device=rows.device)
-    takes_solution = torch.repeat_interleave(has_rows, sizes, dim=-1, output_size=14) & (rates > 0)
-    return torch.where(takes_solution, delta, adam)
+    takes_solution = torch.zeros_like(delta, dtype=torch.bool)
+    for block in BLOCKS:
+        has_row = (rows[..., block] != 0).any(dim=-1) & (weights > 0)  # [K, n]
+        takes_solution[:, block] = has_row.any(dim=0)[:, None]
+    return torch.where(takes_solution & (rates > 0), delta, adam)
 
 
 def paper_delta(rows: Tensor, mean: Tensor, square: Tensor, rule: UpdateRule) -> Tensor:
@@ -152,46 +155,9 @@ def paper_delta(rows: Tensor, mean: Tensor, square: Tensor, rule: UpdateRule) ->
         rows: [K, n, 14] gradients of each view, the rows of J.
         mean, square: [n, 14] the moments m and v, without bias correction, as the equation has them.
     """
-    weights = torch.ones_like(rows[..., 0])
-    damping = torch.sqrt(square) + rule.eps
-    return torch.cat([_solve(rows, weights, damping, mean, block) for block in (GEOMETRY, APPEARANCE)], -1)
+    return _solve(rows, torch.ones_like(rows[..., 0]), torch.sqrt(square) + rule.eps, mean)
 
 
-def _solve(rows: Tensor, weights: Tensor, damping: Tensor, mean: Tensor, block: slice) -> Tensor:
-    return -solve_low_rank(rows[..., block], weights, damping[:, block], mean[:, block])
-
-
-def _any_row(rows: Tensor, weights: Tensor, block: slice) -> Tensor:
-    """[n] bool: some view has a row for this block."""
-    return ((rows[..., block] != 0).any(dim=-1) & (weights > 0)).any(dim=0)
-
-
-def add_packed(gaussians: Gaussians, index: Tensor, delta: Tensor) -> None:
-    """Add [n, 14] changes to the Gaussians `index`, in place."""
-    for name, columns in COLUMNS.items():
-        value = getattr(gaussians, name)
-        value.index_add_(0, index, delta[:, columns].reshape(-1, *value.shape[1:]))
-
-
-def step_shN(
-    gaussians: Gaussians,
-    gradient: Tensor,
-    moments: GaussianMoments,
-    index: Tensor,
-    steps: Tensor,
-    rule: UpdateRule,
-) -> None:
-    """Adam's step of the higher bands (appendix, second half of the LM equation), which no block takes in.
-
-    Args:
-        gradient: [N, B, 3].
-        index: [n] the Gaussians to update; steps: [n] their step counts, this one included.
-    """
-    gradient = clipped(gradient[index].flatten(1))
-    terms = advance(moments.exp_avg_shN, moments.exp_avg_sq_shN, gradient, index, steps, rule)
-    add_shN(gaussians, index, terms.delta(rule.rates.shN))
-
-
-def add_shN(gaussians: Gaussians, index: Tensor, delta: Tensor) -> None:
-    """Add [n, B * 3] changes to the higher bands of the Gaussians `index`, in place."""
-    gaussians.shN.index_add_(0, index, delta.reshape(len(index), *gaussians.shN.shape[1:]))
+def _solve(rows: Tensor, weights: Tensor, damping: Tensor, mean: Tensor) -> Tensor:
+    """[n, 14] minus the solution of the damped system of each block."""
+    return -torch.cat([solve_low_rank(rows[..., b], weights, damping[:, b], mean[:, b]) for b in BLOCKS], dim=-1)
