@@ -56,9 +56,9 @@ class CharbonnierNccLoss(RuleLoss):
         lambda = clip(mean |grad l1| / (mean |grad S| + 1e-8), 0, 1)
 
     with S = `correlation`, `printed_correlation` or `contrast`. The two means of the balance are over the tile's
-    samples (by their shares), of the L1 norms over channels of ``d / sqrt(d^2 + eps^2)`` and of g: the appendix's printed
-    gradients, which without 1 / n compare the two terms as they enter L. lambda is constant in the backward pass. The
-    structure term's gradient is *added*: the appendix's minus would lower the correlation.
+    samples (by their shares), of the L1 norms over channels of ``d / sqrt(d^2 + eps^2)`` and of g: the appendix's
+    printed gradients, which without 1 / n compare the two terms as they enter L. lambda is constant in the backward
+    pass. The structure term's gradient is *added*: the appendix's minus would lower the correlation.
 
     The gate ``s_y^2 / (s_y^2 + c)`` of the truth's own variance comes after the balance, which would undo it.
 

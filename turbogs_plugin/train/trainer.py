@@ -98,8 +98,8 @@ class Trainer:
         truth = self.views.photos.at(samples)
 
         # 5) Sparse forward rendering
-        cameras = self.views.cameras.select(view_ids)
-        rendered = self.engine.render(self.gaussians, cameras, samples, RenderOptions(self.sh_degree, self.config.raster))
+        cameras, options = self.views.cameras.select(view_ids), RenderOptions(self.sh_degree, self.config.raster)
+        rendered = self.engine.render(self.gaussians, cameras, samples, options)
 
         # 6) Sparse loss and its gradients, and 7) EMA update of the error maps
         loss = self.supervise(rendered.colors, truth, step)
