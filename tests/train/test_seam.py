@@ -12,6 +12,7 @@ from turbogs_plugin.strategies.optimizers.moment_lm import MomentLMOptimizer
 from turbogs_plugin.strategies.optimizers.sparse_adam import SparseAdam
 
 from turbogs_plugin.engine.reference.update import apply_update
+from turbogs_plugin.engine.rendered import RenderOptions
 from turbogs_plugin.scene import load_scene
 from turbogs_plugin.train.trainer import Trainer
 
@@ -127,8 +128,8 @@ def test_the_engine_gets_rule_moments_and_statistics(capture, monkeypatch):
 def test_statistics_need_a_pass_that_sums_them_up(capture):
     trainer = make_trainer(capture)
     samples = trainer.pixel_sampler.sample(trainer.maps, (0, 1), 0.2, trainer.now)
-    cameras, options = trainer.views.cameras.select((0, 1)), {"sh_degree": 0, "settings": trainer.config.raster}
-    rendered = trainer.engine.render(trainer.gaussians, cameras, samples, **options)
+    cameras, options = trainer.views.cameras.select((0, 1)), RenderOptions(0, trainer.config.raster)
+    rendered = trainer.engine.render(trainer.gaussians, cameras, samples, options)
     screen = rendered.backward(torch.ones_like(rendered.colors))
     with pytest.raises(ValueError, match="with_statistics"):
         screen.parameter_gradients(rows=True, stats=trainer.density.stats)
