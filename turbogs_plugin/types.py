@@ -150,7 +150,7 @@ class TileGrid:
         return np.concatenate([[0], np.cumsum(self.shapes.prod(axis=1))])
 
     def __len__(self) -> int:
-        return int(self.offsets[-1])
+        return sum(-(-width // TILE_SIZE) * -(-height // TILE_SIZE) for width, height in self.sizes.tolist())
 
 
 @dataclass

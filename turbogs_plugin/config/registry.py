@@ -64,7 +64,11 @@ PROTOCOLS: dict[str, type] = {
 def known_types(kind: str) -> dict[str, str]:
     """Every name of a kind -> "module:class". A name of ours cannot be taken over by an entry point."""
     plugged_in = {point.name: point.value for point in entry_points(group=f"turbogs.{kind}")}
-    return plugged_in | {name: f"turbogs_plugin.strategies:{found}" for name, found in BUILT_IN[kind].items()}
+    return plugged_in | _own_types(kind)
+
+
+def _own_types(kind: str) -> dict[str, str]:
+    return {name: f"turbogs_plugin.strategies:{found}" for name, found in BUILT_IN[kind].items()}
 
 
 def default_type(kind: str) -> str:
@@ -79,7 +83,9 @@ def strategy_class(kind: str, name: str) -> type:
         InputError: an unknown name (naming the nearest and all that are known), one whose module cannot be imported,
             or one of something else than a dataclass.
     """
-    known = known_types(kind)
+    known = _own_types(kind)
+    if isinstance(name, str) and name not in known:
+        known = known_types(kind)  # which reads the files of every installed package
     if not isinstance(name, str) or name not in known:
         raise InputError(f"unknown {kind}.type '{name}': {nearest(name, known)}")
     place = f"{kind}.type '{name}' ({known[name]})"

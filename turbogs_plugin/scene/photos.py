@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -40,7 +41,7 @@ class Photos:
     def __len__(self) -> int:
         return len(self.sizes)
 
-    @property
+    @cached_property
     def offsets(self) -> np.ndarray:
         """[V + 1] int64: the first flat pixel of each view, and the count of all at the end."""
         return pixel_offsets(self.sizes)
