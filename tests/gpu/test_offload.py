@@ -144,7 +144,7 @@ def test_a_capture_larger_than_the_limit_trains_within_it():
         print(
             f"\nallocated at most {torch.cuda.max_memory_allocated() / 2**30:.2f} GiB, reserved "
             f"{torch.cuda.max_memory_reserved() / 2**30:.2f} GiB of {LIMIT}; cap {config.density['max_gaussians']}, "
-            f"{len(trainer.gaussians)} Gaussians; PSNR {metrics.mean('psnr'):.2f}"
+            f"{len(trainer.gaussians)} Gaussians; PSNR {metrics.mean.psnr:.2f}"
         )
     finally:
         torch.cuda.set_per_process_memory_fraction(1.0)

@@ -337,8 +337,8 @@ def test_side_stream():
     stream.wait_stream(torch.cuda.current_stream())
     with torch.cuda.stream(stream):
         torch.cuda._sleep(50_000_000)  # work on the default stream would overtake this
-        gaussians = start.gaussians.map(lambda value: value + 0)
-        screen = replace(start, gaussians=gaussians, records=start.records + 0)
+        gaussians = start.scene.gaussians.map(lambda value: value + 0)
+        screen = replace(start, scene=replace(start.scene, gaussians=gaussians), records=start.records + 0)
         optimizer.setup(gaussians)
         training_kernels.fused_step(optimizer.rule(STEP), screen, gaussians, optimizer.moments)
     stream.synchronize()
