@@ -23,9 +23,11 @@ ablation: demo/capture
 demo/capture: | $(INSTALLED)
 	$(BIN)/turbogs demo $@
 
-# The page and the plots of every study in docs/, from its results.json; a second run changes nothing.
+# The page and the plots of every study in docs/, and the tables of README, from results.json; a second run changes
+# nothing.
 pages: $(INSTALLED)
 	$(BIN)/turbogs report $(patsubst %/,%,$(dir $(wildcard docs/results/*/results.json)))
+	$(BIN)/python docs/make_pages.py
 
 # A process a core, each with one thread and with whole files, whose tests share captures and runs.
 test: export OMP_NUM_THREADS := 1

@@ -171,7 +171,7 @@ def test_bench_step_says_what_it_measured_on(turbogs, capture, tmp_path):
     assert code == 0 and str(out) in printed and "M=500 K=3" in printed
     report = json.loads(out.read_text())
     assert report["device"] == "cpu" and "reference" in report["provenance"]["kernels"]
-    assert report["provenance"]["software"]["torch"] == torch.__version__
+    assert torch.__version__.startswith(report["provenance"]["software"]["torch"])
     assert [entry["views"] for entry in report["passes"]] == [3, 2]
     for entry in report["passes"]:
         assert set(entry["steps"]) == {"iteration", *STEPS}

@@ -492,8 +492,8 @@ def test_bad_calls_are_refused(turbogs, capture, tmp_path, arguments, words):
 
 
 def test_a_limit_of_memory_which_is_of_a_process_is_refused():
-    with pytest.raises(InputError, match=r"variant 'moment-lm'.*max_memory.*max_gaussians"):
-        variant_config(load_ablation("optimizer"), "moment-lm", 0, ("budget.max_memory=2GiB",), None)
+    with pytest.raises(InputError, match=r"variant 'sparse-adam'.*max_memory.*max_gaussians"):
+        variant_config(load_ablation("parts"), "sparse-adam", 0, ("budget.max_memory=2GiB",), None)
 
 
 def test_a_cell_keeps_a_cap_on_gaussians(tmp_path):

@@ -1,5 +1,7 @@
 """The studies in docs/results: their pages and plots are those that `make pages` makes of their results."""
 
+import importlib.util
+import re
 from pathlib import Path
 
 import pytest
@@ -13,13 +15,14 @@ from turbogs_plugin.study.summary import summarise
 
 DOCS = Path(__file__).parents[2] / "docs"
 FOLDERS = sorted(path.parent for path in DOCS.glob("results/*/results.json"))
+SPEC = importlib.util.spec_from_file_location("make_pages", DOCS / "make_pages.py")
+make_pages = importlib.util.module_from_spec(SPEC)
+SPEC.loader.exec_module(make_pages)
 NOT_IN_THE_REPOSITORY = {"report.html", "table.csv"}  # .gitignore has them: `make pages` leaves them here
 
 
 def test_the_studies_are_there():
-    assert {"components", "replacements", "optimizer", "views", "hard_ratio", "schedule"} <= {
-        folder.name for folder in FOLDERS
-    }
+    assert {"baselines", "components", "parts", "views", "hard_ratio", "schedule"} <= {path.name for path in FOLDERS}
 
 
 @pytest.mark.parametrize("folder", FOLDERS, ids=lambda folder: folder.name)
@@ -34,6 +37,19 @@ def test_a_study_in_the_documentation_is_what_its_results_say(folder):
         assert shown_digest(folder / name) == digest, f"{name} does not show these results: make pages"
     files = {path.name for path in folder.iterdir()} - NOT_IN_THE_REPOSITORY
     assert files == {"results.json", "report.md", *shown}
+
+
+def test_the_tables_in_the_pages_are_those_of_the_results():
+    """`make pages` would change nothing; and every table that it can make stands somewhere."""
+    texts = [page.read_text() for page in make_pages.PAGES]
+    assert [make_pages.filled(text) for text in texts] == texts, "make pages"
+    assert {name for text in texts for _, name, _ in make_pages.BLOCK.findall(text)} == set(make_pages.TABLES)
+
+
+def test_a_number_changed_by_hand_is_found():
+    text = make_pages.PAGES[0].read_text()
+    (psnr,) = re.findall(r"\*\*turbogs\*\* \| [\d.]+ s, ([\d.]+) dB", text)
+    assert make_pages.filled(text.replace(psnr, "33.99")) == text
 
 
 def test_the_documentation_keeps_summaries_and_no_runs():

@@ -185,7 +185,7 @@ def test_a_second_report_changes_nothing(turbogs, folder, monkeypatch):
     assert code == 0 and "report.html" in printed
     before = contents(folder)
     assert set(before) == {"results.json", "report.md", "report.html", "table.csv"} | {
-        f"{scene}-{plot}.png" for scene in ("fox", "h") for plot in ("curves", "pareto")
+        f"{scene}-{plot}.png" for scene in ("fox", "h") for plot in ("curves", "pareto", "gaussians")
     }
     assert b"s to 29.5 dB" in before["report.md"], "the targets of the last report"
     monkeypatch.setattr(Figure, "savefig", lambda *_, **__: pytest.fail("a plot of the same data was drawn again"))
@@ -207,6 +207,7 @@ def test_a_plot_of_other_data_or_a_broken_one_is_drawn_again(turbogs, folder):
     assert {name for name in after if after[name] != before[name] and name.endswith("png")} == {
         "fox-curves.png",
         "fox-pareto.png",
+        "fox-gaussians.png",
     }
 
 

@@ -16,7 +16,7 @@ from turbogs_plugin.errors import InputError
 from turbogs_plugin.study.grid import Ablation, ablation_names, alike_at, load_ablation, variant_config
 from turbogs_plugin.study.plots import OTHER_COLOR, draw_curves, draw_front, told_apart
 from turbogs_plugin.study.results import CellResult, Study
-from turbogs_plugin.study.statistics import Curve, Spread, differ, pareto_front, seconds_to_reach
+from turbogs_plugin.study.statistics import Curve, Difference, Spread, pareto_front, seconds_to_reach
 from turbogs_plugin.study.summary import summarise
 from turbogs_plugin.train.history import Evaluation
 
@@ -51,7 +51,7 @@ def test_every_packaged_ablation_resolves_and_its_variants_differ(name):
 
 
 def test_the_tables_of_the_paper_are_there():
-    assert set(ablation_names()) >= {"components", "replacements", "optimizer", "views", "hard_ratio", "schedule"}
+    assert set(ablation_names()) >= {"baselines", "components", "paper_parts", "parts", "views", "hard_ratio", "schedule"}
     components = load_ablation("components")
     assert list(components.variants)[:5] == ["3dgs", "+err-sps", "+geo-vs", "+sparse-ncc", "+err-dp"]
     assert variant_config(components, "turbogs", 0, (), None).to_yaml() == load_config("turbogs").to_yaml()
@@ -160,14 +160,22 @@ def test_a_common_length_leaves_out_what_it_makes_a_copy():
 # Statistics
 
 
-def test_spreads_and_when_two_are_different():
-    first, second = Spread.of([30.0, 30.2]), Spread.of([30.3, 30.5])
+def test_spreads_and_differences():
+    first = Spread.of([30.0, 30.2])
     assert (first.mean, first.low, first.high, first.count) == (pytest.approx(30.1), 30.0, 30.2, 2)
-    assert differ(first, second) is True and differ(second, first) is True
-    assert differ(first, Spread.of([30.2, 31.0])) is False
-    assert differ(first, Spread.of([35.0])) is None
-    assert differ(first, Spread.of([math.nan, 35.0])) is None
     assert math.isnan(Spread.of([1.0, math.nan]).mean)
+    five = Difference.of([0.1, 0.2, 0.3, 0.2, 0.2])
+    assert (five.mean, five.standard_error) == (pytest.approx(0.2), pytest.approx(0.1 / math.sqrt(10)))
+    assert five.clear is True and Difference.of([-0.1, 0.2, 0.3, 0.2, -0.2]).clear is False
+    assert Difference.of([0.3]).clear is None and math.isnan(Difference.of([]).mean)
+
+
+def test_a_difference_is_taken_seed_by_seed_of_the_seeds_that_both_have():
+    """The baseline's third seed is an accident that the variant never had: it counts for neither."""
+    values = {"base": {0: 30.0, 1: 34.0, 2: 10.0}, "other": {1: 34.5, 0: 30.5, 7: 99.0}}
+    cells = [cell(name, seed, entry(1, 1.0, psnr)) for name, of in values.items() for seed, psnr in of.items()]
+    (summary,) = summarise(Study(Ablation("x", {"base": [], "other": []}), cells))
+    assert summary.rows[1].difference("psnr") == Difference(0.5, 0.0, 2)
 
 
 def test_time_to_a_psnr_is_linear_between_evaluations():
@@ -222,9 +230,10 @@ def test_a_summary_of_known_numbers():
     (summary,) = summarise(replace(study, targets=[20.0, 30.5]))
     base, fast, slow = summary.rows
     assert (base.seconds.mean, base.spread("gaussians").mean) == (11.0, 1100.0)
-    assert fast.difference("psnr") == pytest.approx(0.9) and fast.ratio("seconds") == pytest.approx(5.0 / 11.0)
-    assert fast.differs("psnr") is True and fast.differs("seconds") is True
-    assert slow.differs("psnr") is False
+    assert fast.difference("psnr").mean == pytest.approx(0.9) and fast.ratio("seconds") == pytest.approx(5.0 / 11.0)
+    assert fast.difference("psnr").standard_error == pytest.approx(0.1)  # 1.0 and 0.8
+    assert fast.difference("psnr").clear is False  # two seeds say little: 12.7 standard errors are needed
+    assert slow.difference("seconds") == Difference(9.0, 1.0, 2)
     assert [row.on_front for row in summary.rows] == [False, True, False]
     of_base = (10.0 * 10 / 20.0 + 12.0 * 10 / 20.2) / 2
     assert np.mean(base.seconds_to(20.0)) == pytest.approx(of_base) and base.ratio_to(20.0) == pytest.approx(1.0)

@@ -10,18 +10,25 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from turbogs_plugin.config.configuration import config_names
 from turbogs_plugin.config.units import parse_seconds
+from turbogs_plugin.errors import InputError
 from turbogs_plugin.files import write_text_atomically
 from turbogs_plugin.report.provenance import Provenance
 from turbogs_plugin.report.tables import number
+from turbogs_plugin.study.difference import ABSENT, difference, flattened
 from turbogs_plugin.study.document import Block, Heading, Paragraph, Picture, Table, to_html, to_markdown
 from turbogs_plugin.study.folder import StudyFolder
+from turbogs_plugin.study.grid import variant_config
 from turbogs_plugin.study.plots import PLOTS, write_plots
 from turbogs_plugin.study.results import Study
-from turbogs_plugin.study.statistics import Spread
+from turbogs_plugin.study.statistics import Difference, Spread
 from turbogs_plugin.study.summary import MEASURES, SceneSummary, VariantRow, summarise
 
 MIB = 2**20
+
+OF_THE_CALL = ("scene.", "report.", "budget.", "train.seed", "train.device", "train.evaluate_at")
+"""Settings that belong to a call, or change no result: a page does not go stale by them."""
 
 TIMING_RULES = (
     "Seconds are those of training alone: the initial error maps and the iterations, by one clock for all cells, with "
@@ -29,9 +36,9 @@ TIMING_RULES = (
 )
 
 HOW_TO_READ = (
-    "A number is the mean over seeds, the smallest and the largest in brackets where they matter. Two variants are "
-    "called different only where these ranges do not overlap; with one seed that stays open. A star marks the Pareto "
-    "front: no other variant is at least as fast and as good."
+    "A number is the mean over seeds, the smallest and the largest in brackets where they matter. A difference is the "
+    "mean over the seeds that both have, with its standard error; it is clear where noise alone would make so much in "
+    "fewer than one case of twenty. A star marks the Pareto front: no other variant is at least as fast and as good."
 )
 
 
@@ -87,7 +94,26 @@ def _header(study: Study) -> list[Block]:
     blocks: list[Block] = [Paragraph(f"{said[:1].upper()}{said[1:]}. {TIMING_RULES} {warmup}"), Paragraph(HOW_TO_READ)]
     missing = sorted({result.lpips_reason for result in results if result.lpips_reason})
     blocks += [Paragraph(f"LPIPS was not computed: {reason}.") for reason in missing]
-    return [*blocks, *_machines(study.provenances)]
+    return [*blocks, *_machines(study.provenances), *_changed_since(study)]
+
+
+def _changed_since(study: Study) -> list[Block]:
+    """A line that marks a page whose baseline a packaged configuration no longer gives."""
+    ablation = study.ablation
+    measured = [result for result in study.results if result.variant == ablation.baseline]
+    if ablation.base not in config_names() or not measured:
+        return []
+    try:
+        present = flattened(variant_config(ablation, ablation.baseline, 0, (), None).to_mapping())
+    except InputError as error:  # a setting of then, in the ablation's own words
+        return [Paragraph(f"Stale: {error}.")]
+    asked = flattened(measured[0].asked)
+    changes = difference(present, {path: value for path, value in asked.items() if not path.startswith(OF_THE_CALL)})
+    changed = sorted(path for path in changes if path != ABSENT and path in present)
+    if not changed:
+        return []
+    listed = ", ".join(f"{path} {asked[path]} (now {present[path]})" for path in changed)
+    return [Paragraph(f"Stale: '{ablation.base}' is no longer what was measured here. Then: {listed}.")]
 
 
 def _machines(provenances: Sequence[Provenance | None]) -> list[Block]:
@@ -108,7 +134,7 @@ def _scene(summary: SceneSummary) -> list[Block]:
     against = f" against {summary.baseline}" if summary.baseline else ""
     header = (
         *("variant", "front", "seeds", "time in s", f"time{against}", "PSNR in dB", f"PSNR{against}"),
-        *("worst view in dB", "SSIM", "LPIPS (VGG)", "Gaussians", "FPS", "peak MiB"),
+        *("worst view in dB", "SSIM", f"SSIM{against}", "LPIPS (VGG)", "Gaussians", "FPS", "peak MiB"),
     )
     reach_header, reach_lines = ["variant"], [[row.name] for row in summary.rows]
     for target in summary.targets:
@@ -132,10 +158,10 @@ def _scene(summary: SceneSummary) -> list[Block]:
 
 
 def _result_line(row: VariantRow, summary: SceneSummary) -> tuple[str, ...]:
-    ratio = difference = ""
+    ratio = psnr = ssim = ""
     if summary.baseline not in ("", row.name):
-        ratio = f"x {row.ratio('seconds'):.2f}{_verdict(row.differs('seconds'))}"
-        difference = f"{row.difference('psnr'):+.2f}{_verdict(row.differs('psnr'))}"
+        ratio = f"x {row.ratio('seconds'):.2f}"
+        psnr, ssim = difference_text(row.difference("psnr"), 2), difference_text(row.difference("ssim"), 4)
     return (
         row.name,
         "★" if row.on_front else "",
@@ -143,9 +169,10 @@ def _result_line(row: VariantRow, summary: SceneSummary) -> tuple[str, ...]:
         spread_text(row.seconds, 1),
         ratio,
         spread_text(row.psnr, 2),
-        difference,
+        psnr,
         spread_text(row.spread("worst_psnr"), 2, "not recorded"),
         spread_text(row.spread("ssim"), 4),
+        ssim,
         spread_text(row.spread("lpips"), 4),
         number(row.spread("gaussians").mean, 0),
         number(row.spread("fps").mean, 0, "not recorded"),
@@ -153,8 +180,14 @@ def _result_line(row: VariantRow, summary: SceneSummary) -> tuple[str, ...]:
     )
 
 
-def _verdict(different: bool | None) -> str:
-    return {None: " (open)", True: " (different)", False: " (overlap)"}[different]
+def difference_text(difference: Difference, digits: int) -> str:
+    """``+0.14 ± 0.05 (clear)``; without an error for one seed; empty where there is no common seed."""
+    if not difference.count or math.isnan(difference.mean):
+        return ""
+    text = f"{difference.mean:+.{digits}f}"
+    if difference.clear is not None:
+        text += f" ± {difference.standard_error:.{digits}f}"
+    return f"{text} (clear)" if difference.clear else text
 
 
 def _reach_text(seconds: Sequence[float]) -> str:
@@ -198,11 +231,12 @@ def table_csv(summaries: Sequence[SceneSummary]) -> str:
     for summary in summaries:
         for row in summary.rows:
             line = {"scene": summary.scene, "variant": row.name, "seeds": len(row.cells), "pareto": row.on_front}
-            line["psnr_differs_from_baseline"] = row.differs("psnr")
-            line["seconds_differ_from_baseline"] = row.differs("seconds")
             for measure in MEASURES:
                 spread = row.spread(measure)
                 line |= {f"{measure}_mean": spread.mean, f"{measure}_low": spread.low, f"{measure}_high": spread.high}
+            for measure in ("psnr", "ssim", "seconds"):
+                difference = row.difference(measure)
+                line |= {f"{measure}_difference": difference.mean, f"{measure}_error": difference.standard_error}
             for place, target in enumerate(summary.targets):
                 line[f"target_{place}_psnr"] = target
                 line[f"target_{place}_seconds"] = Spread.of(row.seconds_to(target)).mean

@@ -8,6 +8,7 @@ import itertools
 import json
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 
 import matplotlib
@@ -20,6 +21,7 @@ from PIL import Image, PngImagePlugin
 
 from turbogs_plugin.files import write_atomically
 from turbogs_plugin.report.plots import SECONDS_LABEL, STYLE
+from turbogs_plugin.study.statistics import pareto_front
 from turbogs_plugin.study.summary import SceneSummary, VariantRow
 
 COLORS = ("#1f5fa8", "#d1495b", "#2e8b57", "#e08e0b", "#7a4fa3", "#17919e", "#8c5a3c", "#5c6670")
@@ -37,7 +39,13 @@ SHOWN_ABOVE = 1.6
 FAILED_BELOW = 8.0
 """A variant has failed that ends this many dB below the best one: it is not drawn, but named below the plot."""
 
-DRAWING = 1
+COSTS = {
+    "seconds": (SECONDS_LABEL, "error against time"),
+    "gaussians": ("Gaussians of the final model", "error against size"),
+}
+"""What a Pareto plot may have below it -> its label, and the plot's title."""
+
+DRAWING = 2
 """Version of the way in which plots are drawn. Raise it with every change of that: a plot is only drawn again where its
 data or this number differ."""
 DATA_KEY = "data"
@@ -82,7 +90,10 @@ def write_plots(folder: Path, summary: SceneSummary) -> None:
 def plot_digest(summary: SceneSummary) -> str:
     """Of all that the plots show, and of the way in which they show it."""
     rows = [
-        (row.name, row.on_front, *map(asdict, (row.seconds, row.psnr, row.curve("psnr"), row.curve("l1"))))
+        (
+            *(row.name, row.on_front),
+            *map(asdict, (row.seconds, row.psnr, row.spread("gaussians"), row.curve("psnr"), row.curve("l1"))),
+        )
         for row in summary.rows
     ]
     text = json.dumps([DRAWING, summary.scene, summary.baseline, rows], default=np.ndarray.tolist)
@@ -150,44 +161,51 @@ def draw_curves(summary: SceneSummary) -> Figure:
     return figure
 
 
-def draw_front(summary: SceneSummary) -> Figure:
-    """Final PSNR against training time: a point a variant with the seeds' spreads, the Pareto front marked."""
+def draw_front(summary: SceneSummary, cost: str = "seconds") -> Figure:
+    """Final PSNR against what it cost: a point a variant with the seeds' spreads, the Pareto front marked.
+
+    Args:
+        cost: a key of `COSTS`.
+    """
+    label, title = COSTS[cost]
     styles, (rows, failed) = _styles(summary), told_apart(summary)
+    points = [(row.spread(cost).mean, row.psnr.mean) for row in rows]
+    front = [point for point, on_front in zip(points, pareto_front(points), strict=True) if on_front]
     figure = Figure(figsize=(8.6, 5.2), layout="constrained")
     axes = figure.add_subplot()
-    for row in rows:
+    for row, point in zip(rows, points, strict=True):
+        spread = row.spread(cost)
         axes.errorbar(
-            row.seconds.mean,
-            row.psnr.mean,
-            xerr=[[row.seconds.mean - row.seconds.low], [row.seconds.high - row.seconds.mean]],
+            *point,
+            xerr=[[spread.mean - spread.low], [spread.high - spread.mean]],
             yerr=[[row.psnr.mean - row.psnr.low], [row.psnr.high - row.psnr.mean]],
-            fmt="*" if row.on_front else "o",
-            markersize=13 if row.on_front else 6,
+            fmt="*" if point in front else "o",
+            markersize=13 if point in front else 6,
             color=styles[row.name][0],
             elinewidth=1.0,
             alpha=0.9,
         )
-    front = sorted((row.seconds.mean, row.psnr.mean) for row in rows if row.on_front)
-    steps = np.reshape(front, (-1, 2)).T  # [2, variants], also of none
+    steps = np.reshape(sorted(front), (-1, 2)).T  # [2, variants], also of none
     axes.step(*steps, where="post", color="grey", linewidth=1.2, zorder=0, label="Pareto front (stars)")
-    axes.set(xlabel=SECONDS_LABEL, ylabel="final test PSNR in dB", title=f"{summary.scene}: error against time")
+    axes.set(xlabel=label, ylabel="final test PSNR in dB", title=f"{summary.scene}: {title}")
     axes.margins(x=0.18, y=0.12)
     axes.legend(loc="lower right", frameon=False, fontsize=9)
     figure.supxlabel(failed, fontsize=9)
-    _label_points(axes, rows)
+    _label_points(axes, rows, points)
     return figure
 
 
 PLOTS = (
     Plot("curves", "error against seconds of training", draw_curves),
     Plot("pareto", "final PSNR against training time", draw_front),
+    Plot("gaussians", "final PSNR against the number of Gaussians", partial(draw_front, cost="gaussians")),
 )
 
 
-def _label_points(axes: Axes, rows: list[VariantRow]) -> None:
+def _label_points(axes: Axes, rows: list[VariantRow], values: list[tuple[float, float]]) -> None:
     """Names beside their points, each where it meets no other name and no other point, if there is such a place."""
     axes.figure.draw_without_rendering()  # so that places in pixels are those of the picture
-    points = axes.transData.transform([(row.seconds.mean, row.psnr.mean) for row in rows])
+    points = axes.transData.transform(values)
     pixels = axes.figure.dpi / 72.0
     height = 1.3 * LABEL_SIZE * pixels
     taken = [Bbox.from_bounds(x - 7, y - 7, 14, 14) for x, y in points]

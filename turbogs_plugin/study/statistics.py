@@ -1,4 +1,4 @@
-"""Numbers over seeds: means and spreads, when two are different, time to reach an error, and the Pareto front."""
+"""Numbers over seeds: means and spreads, differences, time to reach an error, and the Pareto front."""
 
 from __future__ import annotations
 
@@ -34,11 +34,38 @@ class Spread:
         return cls(math.fsum(values) / len(values), min(values), max(values), len(values))
 
 
-def differ(first: Spread, second: Spread) -> bool | None:
-    """Whether the seeds' spreads [low, high] do not overlap; None where fewer than two seeds leave that open."""
-    if min(first.count, second.count) < 2 or math.isnan(first.mean + second.mean):
-        return None
-    return first.high < second.low or second.high < first.low
+T95 = (12.71, 4.30, 3.18, 2.78, 2.57, 2.45, 2.36, 2.31, 2.26, 2.23)
+"""Student's t of 1 .. 10 degrees of freedom: standard errors within which 95 % of means of pure noise lie."""
+
+
+@dataclass(frozen=True)
+class Difference:
+    """A quantity minus the baseline's, seed by seed: both ran with the same seed, so that what it decides cancels.
+
+    Args:
+        mean: over the seeds that both have; NaN where there is none.
+        standard_error: of the mean; NaN for fewer than two seeds.
+        count: seeds.
+    """
+
+    mean: float
+    standard_error: float
+    count: int
+
+    @classmethod
+    def of(cls, values: Sequence[float]) -> Difference:
+        """Of the differences of each seed."""
+        count = len(values)
+        mean = math.fsum(values) / count if count else math.nan
+        squares = math.fsum((value - mean) ** 2 for value in values)
+        return cls(mean, math.sqrt(squares / (count - 1) / count) if count > 1 else math.nan, count)
+
+    @property
+    def clear(self) -> bool | None:
+        """Whether noise alone would make so much in less than one case of twenty; None where one seed leaves it open."""
+        if math.isnan(self.standard_error):
+            return None
+        return abs(self.mean) > T95[min(self.count - 1, len(T95)) - 1] * self.standard_error
 
 
 def seconds_to_reach(history: Sequence[Evaluation], psnr: float) -> float:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from operator import attrgetter
 
 from turbogs_plugin.study.results import CellResult, Study
-from turbogs_plugin.study.statistics import Curve, Spread, differ, pareto_front, seconds_to_reach
+from turbogs_plugin.study.statistics import Curve, Difference, Spread, pareto_front, seconds_to_reach
 
 TARGET_STEP = 0.5
 """dB between the default targets of the time to a PSNR. The highest one is what every seed of the baseline reached."""
@@ -55,17 +55,14 @@ class VariantRow:
         """Of one of `MEASURES` over the seeds; NaN where a seed lacks it."""
         return _spread(self.cells, measure)
 
-    def difference(self, measure: str) -> float:
-        """The mean minus the baseline's mean; NaN where there is no baseline."""
-        return self.spread(measure).mean - _spread(self.base, measure).mean
+    def difference(self, measure: str) -> Difference:
+        """From the baseline, over the seeds that both have."""
+        own, base = ({cell.seed: MEASURES[measure](cell) for cell in cells} for cells in (self.cells, self.base))
+        return Difference.of([value - base[seed] for seed, value in own.items() if seed in base])
 
     def ratio(self, measure: str) -> float:
         """The mean over the baseline's mean; NaN where there is no baseline."""
         return self.spread(measure).mean / _spread(self.base, measure).mean
-
-    def differs(self, measure: str) -> bool | None:
-        """Whether the seeds' spread and the baseline's do not overlap; None where that is open."""
-        return differ(self.spread(measure), _spread(self.base, measure))
 
     def curve(self, name: str) -> Curve:
         """Of a field of `Evaluation` against seconds."""

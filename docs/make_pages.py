@@ -1,0 +1,100 @@
+"""Fills the tables of README.md and docs/results/README.md from the studies' results; `make pages` runs it.
+
+A table stands between ``<!-- made: NAME -->`` and ``<!-- end -->``, where NAME is a key of `TABLES`. What is between the
+two is replaced. A second run changes nothing.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+from turbogs_plugin.report.tables import table
+from turbogs_plugin.study.folder import StudyFolder
+from turbogs_plugin.study.pages import difference_text
+from turbogs_plugin.study.summary import VariantRow, summarise
+
+ROOT = Path(__file__).resolve().parent.parent
+PAGES = (ROOT / "README.md", ROOT / "docs/results/README.md")
+CAPTURES = ("fox", "caliterra", "snowmiku")
+BLOCK = re.compile(r"(<!-- made: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
+
+OURS = (
+    ("baselines", "3dgs", "3DGS by gsplat's strategy in our renderer, 30,000 iterations"),
+    ("parts", "turbogs", "**turbogs**"),
+)
+"""Rows of the headline table that are ours: study, variant, what to call it."""
+
+
+def rows_of(study: str) -> dict[str, dict[str, VariantRow]]:
+    """Capture -> variant -> its row."""
+    summaries = summarise(StudyFolder(ROOT / "docs/results" / study).read_study())
+    return {summary.scene: {row.name: row for row in summary.rows} for summary in summaries}
+
+
+def result(seconds: float, psnr: float, ssim: float | None, gaussians: float | None) -> str:
+    """``4.1 s, 32.20 dB, .893, 209k``; what was not recorded is left out."""
+    size = (
+        gaussians if gaussians is None else f"{gaussians / 1e6:.2f}M" if gaussians >= 1e6 else f"{gaussians / 1e3:.0f}k"
+    )
+    parts = [f"{seconds:.1f} s" if seconds < 10 else f"{seconds:.0f} s", f"{psnr:.2f} dB"]
+    parts += [] if ssim is None else [f"{ssim:.3f}".lstrip("0")]
+    return ", ".join(parts if size is None else [*parts, size])
+
+
+def headline() -> str:
+    """Ours beside the others, on each capture."""
+    peers = json.loads((ROOT / "docs/results/peers.json").read_text())
+    lines: dict[str, dict[str, str]] = {}
+    for entry in peers["rows"]:
+        cell = result(entry["seconds"], entry["psnr"], entry["ssim"], entry["gaussians"])
+        lines.setdefault(entry["method"], {})[entry["capture"]] = cell
+    for study, variant, name in OURS:
+        for capture, rows in rows_of(study).items():
+            if row := rows.get(variant):
+                means = [row.spread(measure).mean for measure in ("seconds", "psnr", "ssim", "gaussians")]
+                lines.setdefault(name, {})[capture] = result(*means)
+    return table(
+        ("", *CAPTURES), [[name, *(cells.get(capture, "") for capture in CAPTURES)] for name, cells in lines.items()]
+    )
+
+
+def changes(study: str) -> str:
+    """Every variant of a study against its own baseline, over the same seeds."""
+    found = rows_of(study)
+    lines = []
+    for variant in StudyFolder(ROOT / "docs/results" / study).read_study().ablation.variants:
+        cells = []
+        for capture in CAPTURES:
+            row = found.get(capture, {}).get(variant)
+            cells.append("" if row is None or row.cells == row.base else change(row))
+        if any(cells):
+            lines.append((variant, *cells))
+    return table(("", *CAPTURES), lines)
+
+
+def change(row: VariantRow) -> str:
+    """Differences in PSNR and SSIM, ratios of time and Gaussians, and how many seeds."""
+    sizes = row.ratio("gaussians")
+    parts = [f"{difference_text(row.difference('psnr'), 2)} dB", difference_text(row.difference("ssim"), 4)]
+    parts += [f"x {row.ratio('seconds'):.2f} s", "" if math.isnan(sizes) else f"x {sizes:.2f} N"]
+    return f"{', '.join(filter(None, parts))} ({row.difference('psnr').count})"
+
+
+TABLES: dict[str, Callable[[], str]] = {
+    "headline": headline,
+    "parts": lambda: changes("parts"),
+}
+
+
+def filled(text: str) -> str:
+    """A page with its tables made anew."""
+    return BLOCK.sub(lambda block: f"{block[1]}\n{TABLES[block[2]]()}\n\n{block[3]}", text)
+
+
+if __name__ == "__main__":
+    for page in PAGES:
+        page.write_text(filled(page.read_text()))
