@@ -81,11 +81,11 @@ class RandomViewSampler:
 class GeometryAwareViewSampler(RandomViewSampler):
     """The view with the largest mean error, and views near to it that look the same way (equation of section 3.4).
 
-    The anchor is the one with the largest mean error among the views on the stack (among all views it would be
-    the same one until its error falls). The K - 1 others are drawn from the stack without replacement, with
-    log-weights ``-distance_weight * |c_u - c_a| / extent - direction_weight * (1 - <d_u, d_a>)``, by adding Gumbel
-    noise and taking the largest: exactly the sequential draw, and no weight underflows. The drawn views leave the
-    stack.
+    The anchor a is the view with the largest mean error on the stack. (Among all views it would be the same one until
+    its error falls.) The K - 1 others are drawn from the stack without replacement, view u with a probability
+    proportional to ``exp(-lambda_d |c_u - c_a| / extent - lambda_theta (1 - <d_u, d_a>))``. The draw adds Gumbel noise
+    to the logarithms and takes the largest sums: this equals the sequential draw, and no weight underflows. The drawn
+    views leave the stack.
 
     Args:
         distance_weight: lambda_d, per scene extent.

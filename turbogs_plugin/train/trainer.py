@@ -199,7 +199,11 @@ class Trainer:
                 )
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything that iterations change, as plain tensors and numbers."""
+        """Everything that iterations change, as plain tensors and numbers.
+
+        A resume from it is bit for bit the same on a CPU: there is no generator to save, as all randomness is a
+        function of (seed, iteration, place) (`turbogs_plugin.engine.reference.philox`).
+        """
         return {
             "iteration": self.iteration,
             "initial_error": self.initial_error,

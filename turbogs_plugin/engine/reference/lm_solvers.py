@@ -4,12 +4,12 @@ All functions have one signature, ``solve(rows, weights, damping, rhs) -> x``:
 
 - rows: [K, n, D] the g_k; weights: [K, n] the c_k >= 0; damping: [n, D] the d > 0; rhs: [n, D] the b; x: [n, D].
 
-The optimizer uses `solve_scaled_cholesky` and `solve_low_rank`. They first scale the system by d^(-1/2) on both sides:
-it becomes I + (something positive semi-definite), whose eigenvalues are >= 1, and the length of the scaled rows, on
-which alone its condition depends, can be bounded. Cholesky itself does not mind how many orders of magnitude lie
-between the entries of d; what it minds is damping lost in rounding beside long rows, and squares that overflow. The
-scaled form has neither. `solve_raw_cholesky` is what happens without it; `solve_float64` is the yardstick. Both are
-there for the table of docs/numerics.md.
+For the blocks of Moment-LM (D = 10 and 4) `reference/update.py` uses `solve_low_rank`, and the CUDA kernel
+(`csrc/optimizer/moment_lm.cuh`) does what `solve_scaled_cholesky` does. Both first scale the system by d^(-1/2) on both
+sides. It becomes I + (something positive semi-definite), whose eigenvalues are >= 1. Its condition depends only on the
+length of the scaled rows, which can be bounded. Entries of d of very different sizes do not harm Cholesky. Damping lost
+in rounding beside long rows does, and so do squares that overflow; the scaled form has neither. `solve_raw_cholesky`
+shows what happens without scaling, `solve_float64` is the yardstick. Both are there for the table of docs/numerics.md.
 """
 
 from __future__ import annotations
