@@ -24,7 +24,7 @@ GROWTH = 1.25
 """A buffer that must grow gets this factor of the size asked for."""
 
 MARGIN, EARLY_MARGIN, EARLY_PASSES = 1.15, 1.5, 32
-"""Memory for intersections over the largest number expected: in general, in the first passes, and how many these are."""
+"""Memory for intersections over the largest number expected: in general; in the first passes; how many these are."""
 
 FORGETTING = 0.998
 """Each pass multiplies the largest count per tile by this, so that a rare peak does not cost sorting for ever."""
