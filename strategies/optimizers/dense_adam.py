@@ -62,7 +62,8 @@ class DenseAdam:
 
     def setup(self, gaussians: Gaussians) -> None:
         self.exp_avg, self.exp_avg_sq = (gaussians.map(torch.zeros_like) for _ in range(2))
-        self.counts = torch.zeros(len(PARAMETER_NAMES), device=gaussians.device)  # each parameter's, for torch
+        # Torch's kernel needs a count for each parameter.
+        self.counts = torch.zeros(len(PARAMETER_NAMES), device=gaussians.device)
         self.skipped = torch.zeros((), dtype=torch.int64, device=gaussians.device)
 
     def rule(self, step: Step) -> None:
