@@ -32,8 +32,8 @@ class GsplatDefaultDensity(WindowedDensity):
     marks the rows that gsplat makes or resets, and the row numbers as one more running statistic. The result is a
     `RowUpdate`. It stops at `Step.refine_until` (gsplat's `refine_stop_iter`).
 
-    gsplat would fail or go on training with NaN where this does not: an event first removes Gaussians that are not
-    finite or too large to be split, and one Gaussian, the most opaque, is always left.
+    An event first removes Gaussians that are not finite or too large to be split, on which gsplat would fail or go on
+    training with NaN. One Gaussian, the most opaque, is always left.
 
     Args:
         prune_opa, grow_grad2d, grow_scale3d, grow_scale2d, prune_scale3d, prune_scale2d, refine_scale2d_stop_iter,

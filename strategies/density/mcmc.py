@@ -32,8 +32,9 @@ class GsplatMcmcDensity(DensityController):
     `opacity_reg` and `scale_reg`, which ``configs/mcmc.yaml`` sets. Relocation and growth stop at `Step.refine_until`
     (gsplat's `refine_stop_iter`).
 
-    gsplat would fail or go on training with NaN where this does not: a Gaussian that is not finite, or too large,
-    counts as dead; noise that is not finite is left out; an event without living Gaussians relocates and adds none.
+    Three rules avoid cases in which gsplat would fail or go on training with NaN. A Gaussian that is not finite, or too
+    large, counts as dead. Noise that is not finite is left out. An event without living Gaussians relocates and adds
+    none.
 
     Args:
         max_gaussians: `cap_max` of `gsplat.MCMCStrategy`.
