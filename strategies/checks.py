@@ -1,4 +1,4 @@
-"""Checks of strategies' settings, and settings that one strategy has in common with another."""
+"""Checks of the settings of strategies, and the settings that two strategies share."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from turbogs_plugin.errors import require, require_not_negative
 
 
 def require_settings(instance: Any) -> None:
-    """Raise `InputError` unless a dataclass's settings are what all settings of strategies have to be.
+    """Raise `InputError` where a setting of a strategy breaks the rules that hold for all of them.
 
     A field of a `Literal` type has one of its values; a number is finite and >= 0. Call it after stricter checks.
     """
@@ -26,7 +26,7 @@ def require_settings(instance: Any) -> None:
 
 
 def require_each(instance: Any, valid: Callable[[Any], bool], allowed: str, *names: str) -> None:
-    """Raise `InputError` unless each of these attributes is `valid`; `allowed` says in words what is."""
+    """Raise `InputError` unless each of these attributes is `valid`; `allowed` describes the valid values."""
     for name in names:
         value = getattr(instance, name)
         require(valid(value), name, value, allowed)
@@ -48,6 +48,6 @@ def require_share(instance: Any, *names: str) -> None:
 
 
 def shared_settings(instance: Any, other: type) -> dict[str, Any]:
-    """Values of the init fields of a dataclass that the dataclass `other` has by the same names."""
+    """The init fields of a dataclass that the dataclass `other` has too, as name -> value."""
     theirs = {field.name for field in fields(other) if field.init}
     return {field.name: getattr(instance, field.name) for field in fields(instance) if field.name in theirs}

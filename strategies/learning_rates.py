@@ -15,9 +15,9 @@ from turbogs_plugin.types import PARAMETER_NAMES, Step
 class LearningRates:
     """The rates of 3DGS, with the decay of the means over the run and one factor for batches of views.
 
-    A rate r of Adam moves a parameter by about r in an iteration whose gradients agree with the past ones, whatever
-    their size: the mean over K views has less noise than one view's gradient but no longer step, so a run of few
-    iterations of many views wants higher rates than 3DGS's one-view ones.
+    With rate r, Adam moves a parameter by about r in an iteration whose gradients agree with the past ones, whatever
+    their size. The mean over K views has less noise than one view's gradient but no longer step. So a run of few
+    iterations of many views needs higher rates than 3DGS, which has one view.
 
     Args:
         means: rate of the means at the first iteration, in units of the scene extent.
@@ -27,8 +27,7 @@ class LearningRates:
         opacities: of the opacity logits.
         sh0: of band 0.
         shN: of the higher bands.
-        final_factor: the rates of all but the means fall exponentially to this share of themselves at the end of the
-            run.
+        final_factor: the rates of all but the means fall exponentially, over the run, to this share of themselves.
         batch_scale: multiplies every rate at every iteration, whatever K is at that iteration. 2 gained 0.5 dB over 1
             (fox, 4000 iterations, K from 10 down to 3); one-view baselines (3DGS) set 1.
     """

@@ -20,7 +20,7 @@ from turbogs_plugin.types import LossOutput, PixelSamples
 
 @dataclass
 class RuleLoss:
-    """A loss that its terms describe; called alone, it is evaluated by the engine of the colours' device."""
+    """A loss described by its terms. When called, the engine of the colours' device evaluates it."""
 
     epsilon: float = 1e-3
 
@@ -29,7 +29,7 @@ class RuleLoss:
 
     @property
     def terms(self) -> LossTerms:
-        """This loss as engines take it."""
+        """This loss as a rule for engines."""
         return LossTerms(self.epsilon)
 
     def __call__(self, colors: Tensor, targets: Tensor, samples: PixelSamples) -> LossOutput:
@@ -40,7 +40,7 @@ class RuleLoss:
 class CharbonnierLoss(RuleLoss):
     """The Charbonnier l1 term alone: mean over filled samples and channels of ``w (sqrt(d^2 + eps^2) - eps)``.
 
-    l1(p) is the mean over the three channels, not their sum: so it has the size of a dense L1 loss in gsplat.
+    l1(p) is the mean over the three channels, not their sum, so it has the size of a dense L1 loss in gsplat.
     Each entry of the gradient is at most ``w / (3 n)``, n the number of filled samples.
 
     Args:
@@ -55,16 +55,16 @@ class CharbonnierNccLoss(RuleLoss):
         L = l1 + ncc_weight * mean over tiles of lambda * mean over channels of gate * (1 - S)
         lambda = clip(mean |grad l1| / (mean |grad S| + 1e-8), 0, 1)
 
-    with S = `correlation`, `printed_correlation` or `contrast`. The two means of the balance are over the tile's
-    samples (by their shares), of the L1 norms over channels of ``d / sqrt(d^2 + eps^2)`` and of g: the appendix's
-    printed gradients, which without 1 / n compare the two terms as they enter L. lambda is constant in the backward
-    pass. The structure term's gradient is *added*: the appendix's minus would lower the correlation.
+    S is `correlation`, `printed_correlation` or `contrast`. ``grad l1`` is ``d / sqrt(d^2 + eps^2)`` and ``grad S`` is
+    g, the gradients that the appendix prints. lambda takes their L1 norms over channels, and means over the tile's
+    samples (by their shares). Both gradients lack 1 / n, so the two terms compare as they enter L. lambda is constant
+    in the backward pass. The structure term's gradient is *added*: the appendix's minus would lower the correlation.
 
-    The gate ``s_y^2 / (s_y^2 + c)`` of the truth's own variance comes after the balance, which would undo it.
+    The gate ``s_y^2 / (s_y^2 + c)`` of the truth's own variance is applied after lambda, which would undo it.
 
-    However the tile looks, each entry of the gradient is at most ``w / (3 n) + ncc_weight / T`` (n filled samples, T
-    tiles): the balance keeps the structure term's gradients in a tile, in sum, below those of l1. Where x = y, and for
-    the structure term in tiles of one sample or constant in both, it is exactly 0.
+    In every tile, each entry of the gradient is at most ``w / (3 n) + ncc_weight / T`` (n filled samples, T tiles):
+    lambda keeps the sum of the structure term's gradients in a tile below that of l1. The gradient is exactly 0 where
+    x = y; that of the structure term also in tiles of one sample, or constant in both x and y.
 
     Args:
         epsilon: of the Charbonnier term.
@@ -72,8 +72,8 @@ class CharbonnierNccLoss(RuleLoss):
         structure: `ncc`, with a variance floor in numerator and denominator, so that a flat tile scores 1;
             `printed_ncc`, as the appendix has it: a flat tile scores 0; or `contrast`.
         variance_constant: c, variance below which a tile counts as flat; SSIM's by default. NCC's floor is c / 2. The
-            printed NCC takes it as its epsilon, beside the product of two variances: 1e-6 there is two of 1e-3.
-        gate: scale the term by the gate.
+            printed NCC adds it as its epsilon to a product of two variances: 1e-6 there means two variances of 1e-3.
+        gate: multiply the structure term by the gate.
     """
 
     ncc_weight: float = 0.4

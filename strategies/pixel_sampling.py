@@ -1,4 +1,4 @@
-"""Which pixels of the chosen views are rendered (paper section 3.5): samplers, as rules that every engine draws by."""
+"""Which pixels of the chosen views are rendered (paper section 3.5): samplers as rules that every engine can draw."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ def view_numbers(view_ids: ViewIds, maps: ErrorMaps) -> tuple[int, ...]:
     """The views of a batch as plain numbers on the host.
 
     Args:
-        view_ids: K training views; a single one may be given as its number. For those of a tensor on another device
-            the host waits, once; whoever has them on the host gives them from there.
+        view_ids: K training views; a single one may be given as its number. For a tensor on another device the host
+            waits once, so give host numbers where there are some.
 
     Raises:
-        InputError: not whole numbers, none, one that the maps do not have, or one of them twice.
+        InputError: no view, not whole numbers, a view that the maps do not have, or one view twice.
     """
     plain = view_ids.tolist() if isinstance(view_ids, (Tensor, np.ndarray)) else view_ids
     try:
@@ -47,12 +47,16 @@ def view_numbers(view_ids: ViewIds, maps: ErrorMaps) -> tuple[int, ...]:
 
 
 class RulePixelSampler:
-    """A sampler that its rule describes: the engine of the maps' device draws."""
+    """A sampler described by its rule alone: the engine of the maps' device draws."""
 
     rule: DrawRule
 
     def sample(self, maps: ErrorMaps, view_ids: ViewIds, rate: float, step: Step) -> PixelSamples:
-        """Draw the fraction `rate` (r) of the units of each tile, or of the tiles of each view (of `view_numbers`)."""
+        """Draw the fraction `rate` (r) of the units of each tile, or of the tiles of each view.
+
+        Args:
+            view_ids: see `view_numbers`.
+        """
         require(0 < rate < math.inf, "rate", rate, "finite and above 0")
         require(isinstance(step, Step), "step", step, "a Step, as Step(iteration=0, total=1000, refine_until=500) is")
         return engine_of(maps.errors.device).draw(self.rule, maps, view_numbers(view_ids, maps), rate, step)
@@ -64,7 +68,7 @@ class ErrorGuidedPixelSampler(RulePixelSampler):
 
     Args:
         hard_ratio, stable_ratio: r_hard and r_stable, shares of the units drawn in each tile.
-        mixed: what draws the remaining share, which the paper names but does not define: `error_age`, the mean of
+        mixed: how the remaining share is drawn, which the paper names but does not define: by `error_age`, the mean of
             the two normalised distributions, or `uniform`.
         unit: `pixel` (the paper), `cell` (4x4 pixels of a tile), or `tile` (whole tiles of a view).
         importance: a of the importance weights ``p^-a``, 0 (none, as in the paper's runs) to 1 (unbiased).

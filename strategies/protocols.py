@@ -1,8 +1,8 @@
 """The protocols that strategies implement. A strategy gets tensors and small dataclasses, never a trainer.
 
-Every strategy is a dataclass whose init fields are its configuration, so that ``Strategy(**mapping)`` builds it from
-YAML and the fields' defaults are the only place where defaults live. Run-time state is kept in fields with
-``init=False``. Strategies with state give it by ``state_dict`` as plain tensors and numbers.
+Every strategy is a dataclass whose init fields are its configuration: ``Strategy(**mapping)`` builds it from YAML, and
+the fields' defaults are the only defaults. Run-time state is kept in fields with ``init=False``. ``state_dict`` gives
+it as plain tensors and numbers.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from turbogs_plugin.types import (
 
 @runtime_checkable
 class SamplingSchedule(Protocol):
-    """How many views and which share of their pixels an iteration looks at (appendix, adaptive scheduling)."""
+    """How many views an iteration samples, and which share of their pixels (appendix, adaptive scheduling)."""
 
     def query(self, step: Step, mean_error: float, initial_error: float, num_views: int) -> SamplingBudget:
         """The budget of this iteration; `views` never exceeds `num_views`."""
@@ -38,7 +38,7 @@ class SamplingSchedule(Protocol):
 
 @runtime_checkable
 class ViewSampler(Protocol):
-    """Which training views an iteration looks at (section 3.4)."""
+    """Which training views an iteration samples (section 3.4)."""
 
     def setup(self, cameras: Cameras, scene_extent: float) -> None:
         """Take the geometry of the V training cameras; called once before training."""
@@ -65,47 +65,47 @@ class SparseLoss(Protocol):
 
     @property
     def terms(self) -> LossTerms | None:
-        """The loss as a rule, which an engine evaluates together with the error maps; None: it is called."""
+        """The loss as a rule that an engine evaluates, updating the error maps too. None: `__call__` is used."""
 
     def __call__(self, colors: Tensor, targets: Tensor, samples: PixelSamples) -> LossOutput:
-        """`colors`, `targets`: [P, 3], both 0 .. 1 in range for photos; `colors` may exceed it."""
+        """`colors`, `targets`: [P, 3]. Photos are within 0 .. 1; `colors` may exceed 1."""
 
 
 @runtime_checkable
 class DensityController(Protocol):
     """Where Gaussians are added and removed (section 3.8).
 
-    A class that inherits from this one and keeps nothing by Gaussian needs no method but `update`.
+    A class that inherits from this one and keeps no state per Gaussian needs only `update`.
     """
 
     @property
     def stats(self) -> GaussianStats | None:
-        """The window that backward passes add to, or None where nothing is needed now."""
+        """The statistics that backward passes add to, or None while none are needed."""
         return None
 
     def setup(self, gaussians: Gaussians) -> None:
         """Called once before training, and after a resume, before `load_state_dict`."""
 
     def update(self, gaussians: Gaussians, step: Step) -> RowUpdate | None:
-        """Called after every optimizer step: proposes a change of the set of Gaussians, or None for none."""
+        """Propose a change of the set of Gaussians, or None. Called after every optimizer step."""
 
     def apply(self, update: RowUpdate) -> None:
-        """Follow the change with its own state by Gaussian, row by row. Called after model and optimizer followed; the
-        rows may be in another order than in what `update` proposed."""
+        """Apply the change to the controller's own state, row by row. Called after model and optimizer have followed;
+        the rows may be in another order than `update` proposed."""
 
     def state_dict(self) -> dict[str, Any]:
         return {}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Take over what `state_dict` gave."""
+        """Load what `state_dict` gave."""
 
 
 @runtime_checkable
 class GaussianOptimizer(Protocol):
     """Turns gradients into a step of the parameters, in place (section 3.9).
 
-    An optimizer whose `rule` is None is stepped by its own code, and its `moments` are None. Any other has both, and an
-    engine makes the step, together with the backward pass that the gradients come from.
+    An optimizer whose `rule` is None makes the step in its own code, and its `moments` are None. Any other has both,
+    and an engine makes the step together with the backward pass that gives the gradients.
     """
 
     @property
@@ -118,7 +118,7 @@ class GaussianOptimizer(Protocol):
 
     @property
     def skipped(self) -> Tensor:
-        """[] int64 on the device: updates left out so far because a gradient was not finite. Read at evaluations."""
+        """[] int64 on the device: updates skipped so far because a gradient was not finite. Read at evaluations."""
 
     def setup(self, gaussians: Gaussians) -> None:
         """Allocate state for these Gaussians; called once before training, and after a resume."""
@@ -130,7 +130,7 @@ class GaussianOptimizer(Protocol):
         """Update `gaussians` in place by gradients of each view or their sum."""
 
     def apply(self, update: RowUpdate) -> None:
-        """Follow a change of the set of Gaussians row by row."""
+        """Apply a change of the set of Gaussians to the state, row by row."""
 
     def state_dict(self) -> dict[str, Any]: ...
 

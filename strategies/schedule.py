@@ -1,4 +1,4 @@
-"""How many views and which share of their pixels an iteration looks at (paper, appendix, adaptive scheduling).
+"""How many views an iteration samples, and which share of their pixels (paper, appendix, adaptive scheduling).
 
 All schedules but the fixed one share the appendix's two equations and differ in the modulation phi of the error
 ratio::
@@ -8,8 +8,8 @@ ratio::
     K     = round(K_min + (K_max - K_min) * exp(-alpha * x))
     r     = r_min + (r_max - r_min) * x,    r_min = lambda / K_max,  r_max = lambda / K_min
 
-so that K * r stays at about lambda (`pixel_budget`): many views with few pixels each at first, then fewer views with
-more pixels. A scene with fewer views than K_min or K_max lowers those two, which keeps K * r at lambda there too;
+K * r stays at about lambda (`pixel_budget`): at first many views with few pixels each, then fewer views with more
+pixels. In a scene with fewer views than K_min or K_max these two are lowered, so K * r stays at lambda there too.
 r never exceeds 1.
 """
 
@@ -94,7 +94,7 @@ class LinearSchedule(_AdaptiveSchedule):
 class ExponentialSchedule(_AdaptiveSchedule):
     """phi(ratio) = (1 - exp(-steepness * ratio)) / (1 - exp(-steepness)).
 
-    The paper names an exponential variant without an equation; this is the saturating one through (0, 0) and (1, 1).
+    The paper names an exponential variant but gives no equation. This one saturates and passes (0, 0) and (1, 1).
     """
 
     steepness: float = 3.0

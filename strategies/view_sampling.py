@@ -1,4 +1,4 @@
-"""Which training views an iteration looks at (paper section 3.4)."""
+"""Which training views an iteration samples (paper section 3.4)."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from turbogs_plugin.errors import require
 from turbogs_plugin.types import Cameras, Step
 
 _BLOCK = 64
-"""Iterations whose numbers are made at once: numpy costs the same for one as for many of this size."""
+"""Random numbers are made for this many iterations at once, which costs numpy the same as for one."""
 
 
 def _uniforms(purpose: int, num_views: int, step: Step) -> np.ndarray:
@@ -26,7 +26,7 @@ def _uniforms(purpose: int, num_views: int, step: Step) -> np.ndarray:
 
 @lru_cache(maxsize=8)
 def _uniform_block(purpose: int, num_views: int, seed: int, block: int) -> np.ndarray:
-    """[_BLOCK, V] float64, not to be written to: `_uniforms` of the iterations from ``block * _BLOCK`` on."""
+    """[_BLOCK, V] float64: `_uniforms` of the iterations from ``block * _BLOCK`` on. Shared: do not write to it."""
     views = np.tile(np.arange(num_views), (_BLOCK, 1))
     iterations = np.arange(block * _BLOCK, (block + 1) * _BLOCK)[:, None] & MASK
     constants = (np.array([value]) for value in (0, purpose, seed >> 32 & MASK))
@@ -38,7 +38,7 @@ def _uniform_block(purpose: int, num_views: int, seed: int, block: int) -> np.nd
 class RandomViewSampler:
     """Uniformly random views, none twice until nearly all have been seen, as in 3DGS.
 
-    They come from a shuffled stack. What is drawn leaves it, and it is filled again when fewer than K are left.
+    They come from a shuffled stack. Drawn views leave it, and it is filled again when fewer than K are left.
     """
 
     stack: np.ndarray | None = field(init=False, repr=False, default=None)  # the views left, int64
@@ -52,7 +52,7 @@ class RandomViewSampler:
         return self._take(np.arange(self._fill(count, step)))
 
     def _fill(self, count: int, step: Step) -> int:
-        """Fill the stack again where it holds fewer than `count` views. Returns `count`, at most V."""
+        """Fill the stack again if it holds fewer than `count` views. Returns `count`, at most V."""
         if self.stack is None:
             raise RuntimeError("a view sampler needs setup(cameras, scene_extent) before it is used")
         count = min(count, self.num_views)
@@ -70,7 +70,7 @@ class RandomViewSampler:
         return {"stack": torch.from_numpy(self.stack.copy())}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Take over a saved stack. ValueError where it does not hold distinct views of this scene."""
+        """Load a saved stack. ValueError if it does not hold distinct views of this scene."""
         views = state["stack"].cpu().numpy().copy()
         if len(np.unique(views)) != len(views) or not np.isin(views, np.arange(self.num_views)).all():
             raise ValueError(f"the saved stack does not hold distinct ones of {self.num_views} views")
@@ -79,13 +79,13 @@ class RandomViewSampler:
 
 @dataclass
 class GeometryAwareViewSampler(RandomViewSampler):
-    """The view with the largest mean error, and views near to it that look the same way (equation of section 3.4).
+    """The view with the largest mean error, and views near it with a similar direction (equation of section 3.4).
 
-    The anchor is the one with the largest mean error among the views on the stack (among all views it would be
-    the same one until its error falls). The K - 1 others are drawn from the stack without replacement, with
-    log-weights ``-distance_weight * |c_u - c_a| / extent - direction_weight * (1 - <d_u, d_a>)``, by adding Gumbel
-    noise and taking the largest: exactly the sequential draw, and no weight underflows. The drawn views leave the
-    stack.
+    The anchor a is the view with the largest mean error on the stack. (Among all views it would be the same one until
+    its error falls.) The K - 1 others are drawn from the stack without replacement, view u with a probability
+    proportional to ``exp(-lambda_d |c_u - c_a| / extent - lambda_theta (1 - <d_u, d_a>))``. The draw adds Gumbel noise
+    to the logarithms and takes the largest sums: this equals the sequential draw, and no weight underflows. The drawn
+    views leave the stack.
 
     Args:
         distance_weight: lambda_d, per scene extent.
@@ -101,7 +101,7 @@ class GeometryAwareViewSampler(RandomViewSampler):
         require_settings(self)
 
     def setup(self, cameras: Cameras, scene_extent: float) -> None:
-        """Take the training cameras; an extent of 0 (all cameras in one place) leaves only the directions to count."""
+        """Take the training cameras. With an extent of 0 (all cameras in one place) only the directions count."""
         require(math.isfinite(scene_extent) and scene_extent >= 0, "scene_extent", scene_extent, "finite and 0 or more")
         super().setup(cameras, scene_extent)
         self.centers = cameras.centers.double().cpu().numpy() / (scene_extent or 1.0)
@@ -117,7 +117,7 @@ class GeometryAwareViewSampler(RandomViewSampler):
         """`count` distinct views (all V where `count` is more), the anchor first.
 
         Args:
-            view_errors: [V] float64; equal ones leave the anchor to the stack's random order.
+            view_errors: [V] float64; among equal ones the stack's random order decides the anchor.
         """
         count = self._fill(count, step)
         anchor = int(np.argmax(view_errors[self.stack]))

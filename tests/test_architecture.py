@@ -1,4 +1,4 @@
-"""The page of the house and the faces of the packages: what they name is there."""
+"""docs/architecture.md and the names that the packages export: what they name exists."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def named_places() -> list[str]:
     return re.findall(r"`([\w./-]+)`", PAGE.read_text(encoding="utf-8"))
 
 
-def test_every_file_that_the_page_of_the_house_names_exists():
+def test_every_file_that_the_architecture_names_exists():
     places = [place for place in named_places() if place.startswith(FOLDERS)]
     assert len(places) > 40
     assert [place for place in places if not (ROOT / place).exists()] == []
@@ -30,21 +30,21 @@ def test_every_file_that_the_page_of_the_house_names_exists():
     assert loose == [], "a file is named with its folder"
 
 
-def test_the_page_of_the_house_names_every_room():
-    rooms = {path.parent.name for path in (ROOT / "turbogs_plugin").glob("*/__init__.py")}
+def test_the_architecture_names_every_folder():
+    folders = {path.parent.name for path in (ROOT / "turbogs_plugin").glob("*/__init__.py")}
     text = PAGE.read_text(encoding="utf-8")
-    assert [room for room in sorted(rooms) if f"`turbogs_plugin/{room}/`" not in text] == []
+    assert [folder for folder in sorted(folders) if f"`turbogs_plugin/{folder}/`" not in text] == []
 
 
 @pytest.mark.parametrize("package", [turbogs_plugin, strategies])
-def test_a_face_has_what_it_names(package):
+def test_a_package_has_what_it_exports(package):
     for name in package.__all__:
         assert getattr(package, name).__name__ == name if name != "__version__" else package.__version__
     with pytest.raises(AttributeError, match="no attribute 'absent'"):
         package.absent  # noqa: B018
 
 
-def test_every_built_in_strategy_is_on_the_face_of_its_package():
+def test_every_built_in_strategy_is_exported():
     built_in = {name for names in registry.BUILT_IN.values() for name in names.values()}
     assert built_in <= set(strategies.__all__)
     protocols = {protocol.__name__ for protocol in registry.PROTOCOLS.values()}

@@ -1,9 +1,9 @@
 """Persistent error and age of every pixel of every training view (paper section 3.3).
 
-The maps of all views lie end to end in one array ("flat pixels"), so views may differ in size. Ages are kept as
-the iteration of the last visit ("stamps"): the same ages as the paper's counters, plus one, at the cost of the sampled
-pixels alone. The mean error of a view is kept incrementally; as errors are stored in half precision and their sums in
-double, those sums are exact (below 2^29 a view) and do not drift.
+The maps of all views lie end to end in one array ("flat pixels"), so views may differ in size. For each pixel the
+iteration of its last visit is stored, its "stamp". This gives the same ages as the paper's counters, plus one, and only
+the sampled pixels have to be written. The sum of a view's errors is updated incrementally. Errors are stored in half
+precision and their sums in double, so the sums are exact (below 2^29 a view) and do not drift.
 
 Without Gaussians, from plain error images::
 
@@ -30,7 +30,7 @@ AGE_MAX = 32767
 """Ages saturate here, in iterations."""
 
 MAP_BYTES = 4
-"""Of a pixel: an error in half precision and a stamp of 16 bits."""
+"""Bytes per pixel: an error in half precision and a stamp of 16 bits."""
 
 ERROR_MAX = 65504.0
 """Errors saturate here: the largest finite number in half precision."""
@@ -47,7 +47,7 @@ class ErrorMaps:
         sizes: [V, 2] int64 numpy array (width, height).
         device: where the maps live.
         beta: EMA weight of a new error.
-        refresh: on a device other than the CPU, `view_means` is brought up to date every so many calls.
+        refresh: on a device other than the CPU, every `refresh`-th call of `view_means` updates the means.
     """
 
     sizes: np.ndarray
@@ -70,7 +70,7 @@ class ErrorMaps:
     def _allocate(self) -> None:
         self.offsets = np.concatenate([[0], np.cumsum(self.sizes.prod(axis=1))])  # [V + 1]
         pixels = int(self.offsets[-1])
-        # One pixel more than the maps: empty slots write there, so that no device has to count them first.
+        # One pixel more than the maps: empty slots write there, so they need not be filtered out first.
         self._errors = torch.zeros(pixels + 1, dtype=torch.float16, device=self.device)
         self._stamps = torch.full((pixels + 1,), -1, dtype=torch.int16, device=self.device)
         self.errors, self.stamps = self._errors[:-1], self._stamps[:-1]
@@ -103,9 +103,9 @@ class ErrorMaps:
         return maps
 
     def fetch(self, view_ids: Sequence[int]) -> None:
-        """Have the maps of these views where they are drawn from and updated: `errors`, `stamps`, from `offsets` on.
+        """Make the maps of these views available in `errors` and `stamps`, from `offsets` on.
 
-        Whoever reads or writes these arrays calls it first. Here all views are always there; see `offload`.
+        Call it before reading or writing these arrays. Here all views are always there; see `scene/offload.py`.
         """
 
     def flat_pixels(self, samples: PixelSamples) -> Tensor:
@@ -134,13 +134,13 @@ class ErrorMaps:
     def update(self, samples: PixelSamples, pixel_errors: Tensor, step: Step) -> None:
         """EMA of the errors, stamps and view sums at the samples.
 
-        A non-finite error changes nothing of its pixel: not its error, its stamp, nor its view's sum. Finite errors
-        saturate at `ERROR_MAX`. The new error is ``half(min((1 - beta) * old + beta * new, ERROR_MAX))`` with
+        A non-finite error changes nothing: not its pixel's error or stamp, nor its view's sum. Finite errors saturate
+        at `ERROR_MAX`. The new error is ``half(min((1 - beta) * old + beta * new, ERROR_MAX))`` with
         both factors and every operation rounded to single precision.
 
         Args:
-            pixel_errors: [P] float, 0 or more, detached here; what stands in empty slots is ignored. Nobody checks the
-                sign, for that would wait for the device: negative errors are stored, and falsify means and draws.
+            pixel_errors: [P] float, 0 or more, detached here; empty slots are ignored. The sign is not checked, as that
+                would wait for the device: negative errors are stored, and make means and draws wrong.
             step: gives the stamp.
 
         Raises:
@@ -172,11 +172,11 @@ class ErrorMaps:
         return (self.now(step) - self.stamps[self._extent(view_id)].int()).clamp(0, AGE_MAX)
 
     def now(self, step: Step) -> int:
-        """The age of a pixel is this less its stamp."""
+        """The number from which a pixel's stamp is subtracted to get its age."""
         return step.iteration - self.stamp_base
 
     def stamp(self, step: Step) -> int:
-        """The stamp of the pixels visited now. Keeps it within its range: stamps too old to matter saturate."""
+        """The stamp of the pixels visited now. Beyond its range, all stamps are shifted, and old ones saturate."""
         shift = self.now(step)
         if shift > AGE_MAX:
             self._change_stamps(lambda stamps: (stamps.int() - shift).clamp(min=-AGE_MAX))
@@ -187,18 +187,18 @@ class ErrorMaps:
         """[V] float64 on the host: mean error of each view.
 
         On the CPU they are exact. Elsewhere reading them at every call would stall the device, so a copy is started
-        at every `refresh`-th call and read at the next such call: the means are between `refresh` and
+        at every `refresh`-th call and read at the next such call. So the means are between `refresh` and
         ``2 * refresh - 1`` calls old (between 0 and ``2 * refresh - 1`` after the first call or `initialise`, which
-        wait for the device), and depend on the number of calls alone, never on timing.
+        wait for the device). They depend on the number of calls alone, never on timing.
         """
         return np.maximum(self._means.read(), 0.0) / self.sizes.prod(axis=1)
 
     def mean(self) -> float:
-        """Mean over the views of their mean error, the schedule's E_mean: counts as a call of `view_means`."""
+        """Mean over the views of their mean error, the schedule's E_mean. Counts as a call of `view_means`."""
         return float(self.view_means().mean())
 
     def state_dict(self) -> dict[str, Any]:
-        """Plain tensors and numbers; resuming from them is bit-identical."""
+        """Plain tensors and numbers; a resume from them gives the same bits."""
         errors, stamps = self._stored()
         return {
             "errors": errors.clone(),
@@ -229,12 +229,12 @@ class ErrorMaps:
         return self.errors, self.stamps
 
     def _load(self, errors: Tensor, stamps: Tensor) -> None:
-        """Take over [X] errors and [X] stamps of all views."""
+        """Load [X] errors and [X] stamps of all views."""
         self.errors.copy_(errors)
         self.stamps.copy_(stamps)
 
     def _change_stamps(self, function: Callable[[Tensor], Tensor]) -> None:
-        """Replace the stamps of all views by a function of each."""
+        """Apply a function to the stamps of all views."""
         self._stamps.copy_(function(self._stamps))
 
 
@@ -267,7 +267,7 @@ class _LaggedCopy:
         return self.values.copy()
 
     def _collect(self) -> None:
-        """Take the copy that is under way; by now it has long arrived."""
+        """Take in the copy that was started; by now it has long arrived."""
         if self.copy is not None:
             buffer, event = self.copy
             event.synchronize()

@@ -1,13 +1,13 @@
-"""What flows between the parts of TurboGS: small dataclasses of tensors, in the order in which they flow.
+"""The data that the parts of TurboGS pass on: small dataclasses of tensors, in the order in which they are used.
 
-Index spaces, which every shape below is written in:
+Every shape below is written with these letters:
 
 - ``V`` training views, ``K`` views of one iteration (a batch; ``k`` is the position in the batch);
 - ``N`` Gaussians;
 - ``P`` sample slots, ordered by (view of the batch, tile), ``T`` tiles that hold samples;
 - ``X`` pixels of all training views laid end to end ("flat pixels").
 
-Nothing here imports anything of the project, so strategies and framework can both rest on it.
+This file imports nothing else of the project, so strategies and framework can both import it.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ TILE_SIZE = 16
 """Side of a square tile in pixels (S in the paper). The kernels are built for this value."""
 
 PATCH_WIDTH, PATCH_HEIGHT = 8, 4
-"""Samples of a tile are ordered by patches of this size, so that 32 neighbours of a dense tile are one warp's."""
+"""Samples of a tile are ordered by patches of this size, so that in a dense tile a warp gets 32 neighbours."""
 
 
 def sample_order(x: Tensor, y: Tensor) -> Tensor:
@@ -78,7 +78,7 @@ class Gaussians(ParameterTensors):
         return ((name, getattr(self, name)) for name in PARAMETER_NAMES)
 
     def map(self, function) -> Gaussians:
-        """A model whose every tensor is `function` of the present one."""
+        """A model with `function` applied to every tensor."""
         return Gaussians(**{name: function(value) for name, value in self.items()})
 
     @property
@@ -110,7 +110,7 @@ class Cameras:
 
     def select(self, view_ids: Sequence[int]) -> Cameras:
         """The cameras of these views, in this order."""
-        # Stacked rather than indexed: no index has to travel to the device.
+        # Stacked, not indexed: so no index has to be copied to the device.
         viewmats, Ks = (torch.stack([of_all[view] for view in view_ids]) for of_all in (self.viewmats, self.Ks))
         return Cameras(viewmats, Ks, self.sizes[np.asarray(view_ids, dtype=np.int64)])
 
@@ -131,7 +131,7 @@ class Cameras:
 
 @dataclass
 class TileGrid:
-    """The tiles of a batch of K images, numbered through: view after view, row after row.
+    """The tiles of a batch of K images, numbered without gaps: view after view, row after row.
 
     Args:
         sizes: [K, 2] int64 numpy array (width, height).
@@ -146,7 +146,7 @@ class TileGrid:
 
     @property
     def offsets(self) -> np.ndarray:
-        """[K + 1] int64: number of the first tile of each image, and the count of all at the end."""
+        """[K + 1] int64: number of the first tile of each image; the last entry is the count of all tiles."""
         return np.concatenate([[0], np.cumsum(self.shapes.prod(axis=1))])
 
     def __len__(self) -> int:
@@ -157,8 +157,8 @@ class TileGrid:
 class PixelSamples:
     """The pixels of one iteration, grouped by tile.
 
-    A slot whose pixel id is -1 is empty: it renders to nothing, costs nothing in a loss and touches no map. Empty
-    slots keep the number of slots known to the host where edge tiles are cut.
+    A slot whose pixel id is -1 is empty: it renders nothing, adds nothing to a loss and changes no map. Tiles cut by
+    the image's edge get empty slots, so that the host knows the number of slots.
 
     Args:
         view_ids: K numbers of training views, on the host.
@@ -168,7 +168,7 @@ class PixelSamples:
         tile_ids: [T] int32, ascending, in the numbering of ``TileGrid(sizes)``.
         tile_offsets: [T + 1] int32, the first slot of each tile; the last entry is P.
         weights: [P] float32 importance weights with mean 1 over the filled slots, or None where all are 1.
-        has_empty_slots: False promises that every slot is filled, so that nobody needs to count them.
+        has_empty_slots: False promises that every slot is filled, so that none has to be counted.
     """
 
     view_ids: tuple[int, ...]
@@ -219,7 +219,7 @@ class PixelSamples:
 
 @dataclass
 class LossOutput:
-    """What a loss says of the samples.
+    """The result of a loss on the samples.
 
     Args:
         loss: scalar.
@@ -234,14 +234,14 @@ class LossOutput:
 
 @dataclass
 class GaussianGradients(ParameterTensors):
-    """Gradients of the parameters, in `Gaussians`' layout, with a leading view dimension where rows are asked for.
+    """Gradients of the parameters, in the layout of `Gaussians` with a leading dimension of views or of 1.
 
     Args:
-        means, quats, scales, opacities, sh0: [K, N, ...] one row per view, or [1, N, ...] their sum.
+        means, quats, scales, opacities, sh0: [K, N, ...] one row per view, or [1, N, ...] the sum of these.
         shN: [N, B, 3], always summed.
-        touched: [N] bool, some sampled pixel had a contribution of this Gaussian.
+        touched: [N] bool, the Gaussian contributed to some sampled pixel.
         view_losses: [K, N] (or [1, N]), the Gaussian's share of the loss in each view, ``sum over pixels of
-            e * w / P``; zero where the Gaussian has no part.
+            e * w / P``; zero where the Gaussian contributed nothing.
     """
 
     touched: Tensor
@@ -253,7 +253,7 @@ class GaussianGradients(ParameterTensors):
         return value if name == "shN" else value.sum(dim=0)
 
     def over_views(self) -> GaussianGradients:
-        """The same with one row, the sum of all; itself where it has one."""
+        """The gradients with one row, the sum over views; itself if it has one row already."""
         if len(self.view_losses) == 1:
             return self
         sums = {name: value.sum(dim=0, keepdim=True) for name, value in vars(self).items()}
@@ -262,7 +262,7 @@ class GaussianGradients(ParameterTensors):
 
 @dataclass
 class GaussianStats:
-    """Per-Gaussian statistics of a window of iterations, added to by each backward pass (paper section 3.8).
+    """Per-Gaussian sums over a window of iterations, to which each backward pass adds (paper section 3.8).
 
     Args:
         error_sums: [N] float32, sum over views and samples of e * w, with w = T * alpha.
@@ -270,7 +270,7 @@ class GaussianStats:
         weight_sums: [N] float32, sum of w.
         grad_sums: [N] float32, sum over views of the norm of the screen gradient of the mean, in gsplat's units
             (x scaled by K * width / 2, y by K * height / 2).
-        absgrad_sums: [N] float32, the same of the absolute gradients (AbsGS).
+        absgrad_sums: [N] float32, the same for the absolute gradients (AbsGS).
         view_counts: [N] float32, views in which the Gaussian was on screen.
         max_radii: [N] float32, largest screen radius over the larger side of the image.
     """
@@ -292,23 +292,23 @@ class GaussianStats:
             value.zero_()
 
     def map(self, function) -> GaussianStats:
-        """Statistics whose every tensor is `function` of the present one."""
+        """Statistics with `function` applied to every tensor."""
         return GaussianStats(*map(function, vars(self).values()))
 
 
 @dataclass
 class RowUpdate:
-    """A change of the set of Gaussians: clone, split, prune, relocate and reorder are all of this one form.
+    """A change of the set of Gaussians: clone, split, prune, relocate and reorder all have this form.
 
-    Row ``i`` of every array over Gaussians becomes a copy of old row ``source[i]``; where ``fresh[i]``, optimizer
-    state and statistics of the row start from zero instead; then ``values`` replace whole parameters.
+    Row ``i`` of every array over Gaussians becomes a copy of old row ``source[i]``. Where ``fresh[i]``, the row's
+    optimizer state and statistics start from zero instead. Then ``values`` replace whole parameters.
 
     Args:
         source: [M] int64, the old row of each new row.
         fresh: [M] bool.
         values: name of a parameter -> its new tensor [M, ...]; parameters not named are copies.
         reset: names of parameters whose optimizer state starts from zero in every row (a reset of opacities).
-        num_cloned, num_split, num_pruned: for the report.
+        num_cloned, num_split, num_pruned: counts for the report.
     """
 
     source: Tensor
@@ -367,7 +367,7 @@ class Step:
 
 @dataclass(frozen=True)
 class SamplingBudget:
-    """How much one iteration looks at: `views` (K) views, and the fraction `rate` (r) of each tile's pixels."""
+    """How much one iteration samples: `views` (K) views, and the fraction `rate` (r) of each tile's pixels."""
 
     views: int
     rate: float

@@ -1,5 +1,5 @@
 // The rule of a step for one Gaussian (turbogs_plugin/engine/reference/update.py and lm_solvers.py): Adam's
-// terms, and the damped systems of the 10 parameters of the geometry and the 4 of the appearance.
+// terms, and the damped systems: the 10x10 block of the geometry and the 4x4 block of the appearance.
 //
 // With S the damping's inverse root, (J^T J + damping) x = m becomes (I + S J^T J S) y = S m with x = S y: its pivots
 // are 1 or more, whatever the scales of the parameters, so Cholesky in single precision holds. Everything of a

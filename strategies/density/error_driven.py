@@ -17,7 +17,7 @@ from turbogs_plugin.errors import InputError
 from turbogs_plugin.types import Gaussians, RowUpdate, Step
 
 FLAT_EVENTS = 5
-"""Events of density control over which `stop_when_flat` measures the error's fall."""
+"""`stop_when_flat` measures the fall of the error over this many events of density control."""
 
 EPS = 1e-12
 """Keeps divisions defined; the least weight a drawn splat can have in a pixel is 1e-4 / 255."""
@@ -28,53 +28,53 @@ class ErrorDrivenDensity(WindowedDensity):
     """Densify where the screen gradient is high and the sampled pixels say the Gaussian is difficult; prune where a
     Gaussian is transparent, huge or easy. There is no reset of opacities.
 
-    Of the statistics of the window since the last event, with W the sum of weights of a Gaussian,
+    The difficulty score s of a Gaussian comes from its `GaussianStats` since the last event, the sums of error E,
+    distance D and weight W::
 
         e = E / (W + eps),  d = D / (W + eps),  s = e + lambda_base * anneal * d
 
-    is its difficulty. A Gaussian with W = 0, or with non-finite statistics, was not seen: it has no score, and is
-    neither densified nor pruned by score. Equal scores stand or fall together, except where a cap must choose
-    (then the lower row goes first).
+    A Gaussian with W = 0, or with non-finite sums, was not seen: it has no score, and is neither densified nor pruned
+    by score. Equal scores are treated alike, except where a cap must choose (then the lower row goes first).
 
     Until `Step.refine_until`, every `refine_every` iterations from `refine_from` on, one event clones, splits and
-    prunes. A Gaussian that is due for pruning is not densified. One that is too large is pruned unless it is split; it
-    is also pruned where the cap leaves no room to split it. Afterwards, every `final_every` iterations, an event only
-    prunes. At least one Gaussian is always left.
+    prunes. A Gaussian that is due for pruning is not densified. One that is too large is pruned unless it is split,
+    so also where the cap leaves no room to split it. Afterwards, every `final_every` iterations, an event only prunes.
+    At least one Gaussian is always left.
 
     Args:
         lambda_base: weight of the distance term.
-        score: as in the equation (`raw`), or with e and d each divided by its mean over the seen (`balanced`), so
-            that both count: d is of order 1 and e of order 0.1.
+        score: as in the equation (`raw`), or with e and d each divided by its mean over the seen Gaussians
+            (`balanced`), so that both count: d is of order 1 and e of order 0.1.
         refine_from, refine_every: first iteration and interval of densification (tau_from, Delta_dens).
-        grad_threshold, absgrad_threshold: of the mean over views of the screen gradient and of its absolute variant
-            (tau_grad, tau_grad_abs), in gsplat's units. Either suffices.
-        top_fraction: share of the seen, the most difficult, that may be densified (eta_topk).
+        grad_threshold, absgrad_threshold: thresholds of the screen gradient and of its absolute variant, means over
+            views (tau_grad, tau_grad_abs), in gsplat's units. Passing one of them suffices.
+        top_fraction: the most difficult share of the seen Gaussians, which may be densified (eta_topk).
         percent_dense: clone where the largest standard deviation <= this * scene extent, else split (rho_dense).
         split: two draws from the Gaussian, all axes divided by 1.6 as in 3DGS (`sample`); or two halves along its
-            longest axis, which is divided by 1.6, so placed that the pair has the parent's mean and covariance
+            longest axis, which is divided by 1.6, placed so that the pair has the parent's mean and covariance
             (`long_axis`).
-        max_gaussians: never more than this; an initial model that has more is cut to it at the first event, easiest
+        max_gaussians: never more than this. An initial model that has more is cut to it at the first event, easiest
             first, those of `spare_beyond` last. 0: no cap.
-        prune_opacity: less opaque ones are pruned.
+        prune_opacity: less opaque Gaussians are pruned.
         prune_world_size: pruned where the largest standard deviation exceeds this * `prune_world_reference`. 0: off.
-        prune_world_reference: the scene extent, as in 3DGS (`extent`); or, for what is farther than that from the
-            cameras' centre, its distance from there (`distance`): nothing is then too large for being far.
+        prune_world_reference: the scene extent, as in 3DGS (`extent`). With `distance`, a Gaussian farther than that
+            from the cameras' centre is compared with its distance from there, so it may be larger.
         prune_screen_size: pruned where the screen radius exceeds this * the larger side of the image. 0: off, as in
             3DGS in effect.
         prune_size_from: both size rules begin at this progress; 3DGS has 3000 / 15000.
-        prune_score_fraction: share of the seen, the easiest, that each densification event prunes. Off by default: the
-            paper gives no value, and what has little error may be what is rendered well.
-        opacity_decay: share of its opacity that every Gaussian loses at each densification event. What the photos need
-            grows back, what they do not falls below `prune_opacity`; a gentle substitute for 3DGS's reset.
+        prune_score_fraction: the easiest share of the seen Gaussians, which each densification event prunes. Off by
+            default: the paper gives no value, and a Gaussian with little error may be one that is rendered well.
+        opacity_decay: share of its opacity that every Gaussian loses at each densification event. If the photos need
+            it, it grows back; if not, it falls below `prune_opacity`. A gentle substitute for 3DGS's reset.
         spare_beyond: Gaussians farther from the cameras' centre than this * scene extent are neither decayed nor pruned
-            (unless they are not finite, or `max_gaussians` leaves no other choice): a backdrop behind the scene, which
-            few photos see. 0: none.
-        final_every, final_keep: interval of the final pruning, and the share of the seen that each one keeps, the
-            most difficult (Delta_prune, eta_final). 1 keeps all.
+            (unless they are not finite, or `max_gaussians` leaves no other choice). It protects a backdrop behind the
+            scene, which few photos see. 0: none.
+        final_every, final_keep: interval of the final pruning, and the most difficult share of the seen Gaussians,
+            which it keeps (Delta_prune, eta_final). 1 keeps all.
         stop_when_flat: densification ends early, at the first event where the error has fallen by less than this share
-            of itself over the last `FLAT_EVENTS` events. The error of a window is the mean over what its samples saw of
-            e, weighted by w; as the sampling's rate rises, it falls a little by itself, so the rule waits rather than
-            hurries. 0: never.
+            of itself over the last `FLAT_EVENTS` events. The error of a window is the mean of its samples' e, weighted
+            by w. It falls a little by itself as the sampling rate rises, so densification ends later rather than
+            sooner. 0: never.
     """
 
     lambda_base: float = 0.8
@@ -145,7 +145,7 @@ class ErrorDrivenDensity(WindowedDensity):
             self.stopped_at = state["stopped_at"]
 
     def scores(self, step: Step) -> tuple[Tensor, Tensor]:
-        """([N] score, [N] bool seen) of the present window; the score of what was not seen is 0 and means nothing."""
+        """([N] difficulty score, [N] bool seen) of the present window. The score 0 of an unseen one has no meaning."""
         stats = self._stats
         weights = stats.weight_sums
         seen = (weights > 0) & torch.isfinite(weights + stats.error_sums + stats.distance_sums)
@@ -158,7 +158,7 @@ class ErrorDrivenDensity(WindowedDensity):
         return errors + self.lambda_base * step.anneal * distances, seen
 
     def due(self, step: Step) -> tuple[bool, bool]:
-        """Whether this iteration densifies, and whether it prunes finally."""
+        """Whether this iteration densifies, and whether it makes a final pruning."""
         iteration, after = step.iteration, step.iteration - step.refine_until
         densify = after <= 0 and iteration >= self.refine_from and iteration % self.refine_every == 0
         return densify and not self.stopped_at, self.final_keep < 1 and after > 0 and after % self.final_every == 0
@@ -166,7 +166,7 @@ class ErrorDrivenDensity(WindowedDensity):
     def _last_event(self, step: Step) -> int:
         """Iteration after which no statistics are needed: that of the last event, or where densification ends.
 
-        Not that of the last densification: a time budget may move the end, and room for another one, until it is there.
+        It is not that of the last densification: until the end a time budget may still move it and allow another one.
         """
         rest = max(0, step.total - 1 - step.refine_until)
         if self.final_keep < 1 and rest >= self.final_every:
@@ -174,13 +174,13 @@ class ErrorDrivenDensity(WindowedDensity):
         return self.stopped_at or step.refine_until
 
     def _error_is_flat(self) -> bool:
-        """Take the present window's error into the record; whether it has stopped falling."""
+        """Record the present window's error, and say whether it has stopped falling."""
         stats = self._stats
         valid = torch.isfinite(stats.error_sums + stats.weight_sums)
         sums = torch.stack([stats.error_sums, stats.weight_sums]).where(valid, 0.0).double().sum(dim=1)
         error, weight = sums.tolist()  # events wait for the device anyway
         if weight == 0:
-            return False  # nothing was seen, which says nothing
+            return False  # nothing was seen, so nothing is known
         self.window_errors = [*self.window_errors[-FLAT_EVENTS:], error / weight]
         before, now = self.window_errors[0], self.window_errors[-1]
         return len(self.window_errors) > FLAT_EVENTS and before - now < self.stop_when_flat * before
@@ -218,7 +218,7 @@ class ErrorDrivenDensity(WindowedDensity):
         return self._compose(gaussians, candidates & small, candidates & ~small, pruned, spared, step)
 
     def _growing(self, score: Tensor, seen: Tensor) -> Tensor:
-        """[N] bool, the rule of growth: among the most difficult, and of a high screen gradient."""
+        """[N] bool, which may be densified: among the most difficult, and with a high screen gradient."""
         stats = self._stats
         views = stats.view_counts.clamp(min=1)
         passes = (stats.grad_sums / views > self.grad_threshold) | (stats.absgrad_sums / views > self.absgrad_threshold)
@@ -230,7 +230,7 @@ class ErrorDrivenDensity(WindowedDensity):
         return finite & (gaussians.means.norm(dim=-1) > beyond)
 
     def _easiest(self, score: Tensor, seen: Tensor, present: Tensor, spared: Tensor, count: int) -> Tensor:
-        """[N] bool: the easiest `count` of those `present`, the spared ones only for what the others leave to take."""
+        """[N] bool: the easiest `count` of those `present`; spared ones only if the others do not suffice."""
         # The unseen count as average: nothing says that they are easy.
         average = torch.where(seen, score, 0.0).sum() / seen.sum().clamp(min=1)
         ease = -torch.where(seen, score, average)
@@ -246,7 +246,7 @@ class ErrorDrivenDensity(WindowedDensity):
     def _compose(
         self, gaussians: Gaussians, cloned: Tensor, split: Tensor, pruned: Tensor, spared: Tensor, step: Step
     ) -> RowUpdate | None:
-        """One change out of masks [N]: the rest, the clones, and both halves of the split, in this order."""
+        """One change from masks [N]. New rows: the Gaussians that stay, the clones, then both halves of the split."""
         rest, copies, halves = (torch.nonzero(mask).squeeze(-1) for mask in (~(pruned | split), cloned, split))
         if len(rest) == len(gaussians) and len(copies) == 0 and self.opacity_decay == 0:
             return None
@@ -267,7 +267,7 @@ class ErrorDrivenDensity(WindowedDensity):
 def _quantile(values: Tensor, mask: Tensor, fraction: float) -> Tensor:
     """The value at rank ``floor(fraction * n)`` of the n masked values [N] in ascending order; 0 if there are none.
 
-    `value < it` then holds for that many, fewer where they tie with it.
+    So many values, or fewer in case of ties, are less than it.
     """
     chosen = values[mask]
     if len(chosen) == 0:
@@ -277,7 +277,7 @@ def _quantile(values: Tensor, mask: Tensor, fraction: float) -> Tensor:
 
 
 def _first(keys: Tensor, mask: Tensor, count: int) -> Tensor:
-    """[N] bool: those `count` of the mask (or all, if fewer) with the largest keys; of equal ones the lower rows."""
+    """[N] bool: the `count` rows of the mask (or all, if fewer) with the largest keys; of equal keys the lower rows."""
     order = torch.argsort(torch.where(mask, keys, -torch.inf), descending=True, stable=True)
     chosen = torch.zeros_like(mask)
     chosen[order[:count]] = True
@@ -285,6 +285,6 @@ def _first(keys: Tensor, mask: Tensor, count: int) -> Tensor:
 
 
 def _decayed(logits: Tensor, decay: float) -> Tensor:
-    """Logits of opacities times (1 - decay), by logarithms, so that no opacity rounds to 0 or 1 on the way."""
+    """Logits of the opacities times (1 - decay). Computed by logarithms, so that no opacity rounds to 0 or 1."""
     log_opacity = logsigmoid(logits) + math.log1p(-decay)
     return log_opacity - torch.log(-torch.expm1(log_opacity))

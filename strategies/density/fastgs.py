@@ -17,11 +17,11 @@ from turbogs_plugin.types import Gaussians, GaussianStats, RowUpdate, Step
 
 @dataclass
 class ViewVotes:
-    """What the batches of a window say of each Gaussian, [N] float32 each. A batch is the views of one iteration.
+    """What the batches of a window say about each Gaussian, [N] float32 each. A batch is the views of one iteration.
 
     Args:
-        seen: batches in which it had weight.
-        marked: those in which it stood out by its error.
+        seen: number of batches in which the Gaussian had weight.
+        marked: number of batches in which its error stood out.
         blame: sum of the mean errors of the batches that marked it.
     """
 
@@ -34,7 +34,7 @@ class ViewVotes:
         return cls(*(torch.zeros(count, device=device) for _ in fields(cls)))
 
     def add(self, batch: GaussianStats, error_threshold: float) -> None:
-        """Count one batch by the statistics of its iteration. What is not finite was not seen."""
+        """Count one batch, given the statistics of its iteration. A Gaussian with non-finite sums was not seen."""
         seen = (batch.weight_sums > 0) & torch.isfinite(batch.weight_sums + batch.error_sums)
         errors, weights = (torch.where(seen, sums, 0.0) for sums in (batch.error_sums, batch.weight_sums))
         mean_error = errors.sum() / weights.sum().clamp(min=1e-12)
@@ -46,26 +46,26 @@ class ViewVotes:
 
 @dataclass
 class FastGsDensity(DensityController):
-    """Densify what many views agree is rendered badly; prune what many views blame.
+    """Densify Gaussians that many views find badly rendered; prune those that many views blame.
 
     FastGS renders some training views in full at each event, marks the pixels of large (normalised) error, and scores
     each Gaussian by the marked pixels in its footprint. For densification the score is their mean number over the
-    views; for pruning it is their number times each view's photometric error, normalised. Its two ideas are kept here,
-    its renders are not: an event asks the batches of the iterations since the last event. In a batch, a Gaussian is
-    *marked* if its mean error, sum of e * w over sum of w, exceeds `error_threshold` times the batch's mean error.
-    In ``configs/fastgs.yaml`` a batch is one view.
+    views; for pruning it is their number times each view's photometric error, normalised. This class keeps these two
+    ideas without the extra renders: an event uses the batches of the iterations since the last event. In a batch, a
+    Gaussian is *marked* if its mean error, sum of e * w over sum of w, exceeds `error_threshold` times the batch's mean
+    error. In ``configs/fastgs.yaml`` a batch is one view.
 
     Until `Step.refine_until`, every `refine_every` iterations from `refine_from` on, a Gaussian is cloned or split
     where its screen gradient, or its absolute one, passes the threshold *and* at least `consistency` of the batches
     that saw it marked it. Transparent and huge ones are pruned. Afterwards, every `prune_every` iterations, transparent
     ones are pruned. So are those whose blame (the sum of the mean errors of the batches that marked them) exceeds
-    `blame_threshold` of the largest, unless all have as much. A Gaussian that is not finite is pruned at either; one is
-    always left.
+    `blame_threshold` of the largest, unless all have that much. Both kinds of event prune Gaussians that are not
+    finite. One Gaussian is always left.
 
     Args:
         refine_from, refine_every, grad_threshold, absgrad_threshold, percent_dense, prune_opacity, prune_world_size:
             as in `ErrorDrivenDensity`.
-        error_threshold: of a Gaussian's mean error in a batch, in units of the batch's mean error.
+        error_threshold: threshold of a Gaussian's mean error in a batch, in units of the batch's mean error.
         consistency: share of the batches that must agree.
         prune_every: interval of the pruning after densification.
         blame_threshold: above this share of the largest blame a Gaussian is pruned. 1 prunes none.
@@ -91,7 +91,7 @@ class FastGsDensity(DensityController):
         require_at_least_one(self, "prune_every")
         require_share(self, "consistency", "blame_threshold")
         require_settings(self)
-        # Carries the events out. The gradients that it is shown say which Gaussians may be densified.
+        # It carries the events out. The gradients it is given decide which Gaussians may be densified.
         settings = shared_settings(self, ErrorDrivenDensity)
         self._events = ErrorDrivenDensity(**settings, score="raw", lambda_base=0.0, top_fraction=1.0, final_keep=1.0)
 
@@ -155,6 +155,6 @@ class FastGsDensity(DensityController):
             return None
         blame = self._votes.blame
         blamed = blame > self.blame_threshold * blame.max()
-        blamed &= ~blamed.all()  # all alike: this tells none from another
+        blamed &= ~blamed.all()  # all alike: nothing distinguishes them
         transparent = torch.sigmoid(gaussians.opacities) < self.prune_opacity
         return removal(leave_one(blamed | transparent | ~finite_rows(gaussians), gaussians))

@@ -18,7 +18,7 @@ from turbogs_plugin.types import Gaussians, RowUpdate, Step
 
 
 class _FilledStrategy(DefaultStrategy):
-    """A DefaultStrategy whose running statistics somebody else has filled in."""
+    """A DefaultStrategy whose running statistics are already filled in."""
 
     def _update_state(self, *args, **kwargs) -> None:
         pass
@@ -28,19 +28,19 @@ class _FilledStrategy(DefaultStrategy):
 class GsplatDefaultDensity(WindowedDensity):
     """gsplat's own clone, split, prune and reset, run on our parameters and statistics.
 
-    gsplat changes parameters and optimizer state together. Here it is handed the parameters, optimizers whose only
-    state marks the rows that it has made or reset, and the row numbers as a running statistic of its own. What comes
-    back is a `RowUpdate`. It stops at `Step.refine_until` (its `refine_stop_iter`).
+    gsplat changes parameters and optimizer state together. Here it gets the parameters, optimizers whose only state
+    marks the rows that gsplat makes or resets, and the row numbers as one more running statistic. The result is a
+    `RowUpdate`. It stops at `Step.refine_until` (gsplat's `refine_stop_iter`).
 
-    Unlike gsplat, which would train on with NaN or fail, an event first removes Gaussians that are not finite or too
-    large to be split, and one Gaussian, the most opaque, is always left.
+    An event first removes Gaussians that are not finite or too large to be split, on which gsplat would fail or go on
+    training with NaN. One Gaussian, the most opaque, is always left.
 
     Args:
         prune_opa, grow_grad2d, grow_scale3d, grow_scale2d, prune_scale3d, prune_scale2d, refine_scale2d_stop_iter,
             refine_start_iter, reset_every, refine_every, pause_refine_after_reset, absgrad, revised_opacity: as in
             `gsplat.DefaultStrategy`.
-        opacity_reset: gsplat 1.5.3 never resets opacities (`step % reset_every == 0 & step > 0` is always false):
-            `as_shipped` leaves it so, `repaired` resets every `reset_every` iterations, as its text says.
+        opacity_reset: gsplat 1.5.3 never resets opacities (`step % reset_every == 0 & step > 0` is always false).
+            `as_shipped` keeps that; `repaired` resets every `reset_every` iterations, as gsplat's docs say.
     """
 
     prune_opa: float = 0.005
@@ -88,12 +88,12 @@ class GsplatDefaultDensity(WindowedDensity):
         return self._change(gaussians, params, optimizers, state)
 
     def _keep_one(self, gaussians: Gaussians) -> RowUpdate | None:
-        """What there is instead of a model of nothing: the most opaque Gaussian that is finite."""
+        """Keep only the most opaque finite Gaussian, so that the model is never empty."""
         self._stats.zero_()
         return removal(leave_one(torch.ones(len(gaussians), dtype=torch.bool, device=gaussians.device), gaussians))
 
     def _change(self, gaussians: Gaussians, params: dict, optimizers: dict, state: dict) -> RowUpdate | None:
-        """What gsplat has done, as one change."""
+        """What gsplat has changed, as a `RowUpdate`."""
         source = state["source_row"]
         fresh, opacity_fresh = (new_rows(params, optimizers, name) for name in ("means", "opacities"))
         was_reset = bool(opacity_fresh.all()) and not bool(fresh.all())
@@ -117,15 +117,15 @@ class GsplatDefaultDensity(WindowedDensity):
 def run_gsplat(
     strategy: Strategy, values: dict[str, Tensor], state: dict[str, Any], step: Step, **options: Any
 ) -> tuple[dict[str, torch.nn.Parameter], dict[str, torch.optim.Optimizer]]:
-    """A strategy of gsplat after an optimizer's step. Its random numbers are a function of seed and iteration.
+    """Run a strategy of gsplat after an optimizer's step. Seed and iteration decide its random numbers.
 
     Args:
-        values: name -> parameter [N, ...]; some operations of gsplat write into it.
+        values: name -> parameter [N, ...]; some operations of gsplat change it in place.
         state: the strategy's running state, changed in place.
-        options: further arguments of its `step_post_backward`.
+        options: further arguments of the strategy's `step_post_backward`.
 
     Returns:
-        The parameters after it, and optimizers that `new_rows` reads.
+        The parameters afterwards, and optimizers for `new_rows`.
     """
     params = {name: torch.nn.Parameter(value, requires_grad=False) for name, value in values.items()}
     optimizers = {name: torch.optim.SGD([param], lr=0.0) for name, param in params.items()}

@@ -17,7 +17,7 @@ from turbogs_plugin.errors import InputError, require
 from turbogs_plugin.types import Gaussians, RowUpdate, Step
 
 DEAD_LOGIT = -50.0
-"""Opacity of Gaussians that are to be relocated whatever they are."""
+"""Opacity logit given to Gaussians that must be relocated."""
 
 LARGEST_LOG_SCALE = 40.0
 """Larger Gaussians are relocated: noise in proportion to their covariance could overflow in float32."""
@@ -27,19 +27,20 @@ LARGEST_LOG_SCALE = 40.0
 class GsplatMcmcDensity(DensityController):
     """gsplat's relocation, growth and noise (Kheradmand et al. 2024), run on our parameters.
 
-    The noise on the means, which is part of every iteration, is added in place. What makes the method's dead Gaussians
-    in the first place are terms of opacity and scale in the objective (0.01 each in gsplat's trainer): those are
-    `DenseAdam`'s `opacity_reg` and `scale_reg`, as ``configs/mcmc.yaml`` sets them. It stops relocating and growing at
-    `Step.refine_until` (its `refine_stop_iter`).
+    The noise on the means, which is part of every iteration, is added in place. The method's dead Gaussians come from
+    terms of opacity and scale in the objective (0.01 each in gsplat's trainer). Here these are `DenseAdam`'s
+    `opacity_reg` and `scale_reg`, which ``configs/mcmc.yaml`` sets. Relocation and growth stop at `Step.refine_until`
+    (gsplat's `refine_stop_iter`).
 
-    Unlike gsplat, which would fail or train on with NaN: a Gaussian that is not finite, or endlessly large, counts as
-    dead; noise that is not finite is left out; and an event that finds nothing alive relocates and adds none.
+    Three rules avoid cases in which gsplat would fail or go on training with NaN. A Gaussian that is not finite, or too
+    large, counts as dead. Noise that is not finite is left out. An event without living Gaussians relocates and adds
+    none.
 
     Args:
         max_gaussians: `cap_max` of `gsplat.MCMCStrategy`.
         noise_lr, refine_start_iter, refine_every, min_opacity: as in `gsplat.MCMCStrategy`.
-        learning_rates: those of the optimizer; the noise follows the means' rate of the next iteration, as in gsplat's
-            trainer, whose schedulers step first.
+        learning_rates: those of the optimizer. The noise uses the means' rate of the next iteration, as in gsplat's
+            trainer, where the schedulers step first.
     """
 
     max_gaussians: int = 1_000_000
@@ -76,8 +77,8 @@ class GsplatMcmcDensity(DensityController):
     def _refine(self, gaussians: Gaussians, usable: Tensor, step: Step) -> RowUpdate:
         """Relocation, growth and noise, on copies: relocation writes into the tensors that it is given.
 
-        What is relocated takes over its new place's parameters but keeps its own row's state, as in gsplat; what is
-        added comes from the row that it was copied from, which gsplat finds as it copies row numbers along.
+        As in gsplat, a relocated Gaussian takes the parameters of its new place but keeps the state of its own row. The
+        source of an added one is the row it was copied from, known because gsplat copies the row numbers too.
         """
         rows = torch.arange(len(gaussians), device=gaussians.device)
         opacities = torch.where(usable, gaussians.opacities, DEAD_LOGIT)
@@ -99,7 +100,7 @@ class GsplatMcmcDensity(DensityController):
         gaussians.means.copy_(torch.where(finite, gaussians.means, before))
 
     def _run_gsplat(self, values: dict[str, Tensor], refine_until: int, step: Step) -> tuple[dict, dict]:
-        """`run_gsplat` with gsplat's strategy of these settings."""
+        """`run_gsplat` with gsplat's strategy and these settings."""
         settings = shared_settings(self, MCMCStrategy)
         strategy = MCMCStrategy(**settings, cap_max=self.max_gaussians, refine_stop_iter=refine_until)
         rate = self.learning_rates.at(replace(step, iteration=step.iteration + 1)).means

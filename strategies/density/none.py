@@ -15,7 +15,7 @@ class NoDensity(DensityController):
     """The set of Gaussians stays as it is.
 
     Args:
-        max_gaussians: cap on the points that a model begins with. 0: no cap.
+        max_gaussians: cap on the initial number of Gaussians. 0: no cap.
     """
 
     max_gaussians: int = 0

@@ -1,4 +1,4 @@
-"""What density controllers share: statistics of a window, usable Gaussians, one that always stays, a removal."""
+"""Functions for density controllers: statistics of a window, finite Gaussians, one that always stays, a removal."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ RowsType = TypeVar("RowsType")  # a dataclass of [N] tensors
 
 
 class WindowedDensity(DensityController):
-    """A density control that keeps the statistics of a window of iterations; None once it needs no more of them."""
+    """A density control that keeps the statistics of a window of iterations, until it needs no more of them."""
 
     _stats: GaussianStats | None = None
 
@@ -53,12 +53,12 @@ def saved_rows(rows: RowsType | None) -> dict[str, Tensor] | None:
 
 
 def loaded_rows(name: str, saved: dict[str, Tensor] | None, present: RowsType | None) -> RowsType | None:
-    """What a state holds of Gaussians, as copies on the device of what is there, which must be of as many.
+    """Saved rows as copies on the device of the present ones, which must have the same number of Gaussians.
 
     Args:
-        name: of the entry, for the error.
-        saved: of `saved_rows`; None where the saved run needed them no more.
-        present: what `setup` made.
+        name: of the entry, for the error message.
+        saved: from `saved_rows`; None if the saved run no longer needed them.
+        present: from `setup`.
     """
     if saved is None:
         return None
@@ -75,13 +75,13 @@ def loaded_rows(name: str, saved: dict[str, Tensor] | None, present: RowsType | 
 
 
 def finite_rows(gaussians: Gaussians) -> Tensor:
-    """[N] bool: every parameter of the Gaussian is finite, and so are its variances, that its halves may be, too."""
+    """[N] bool: every parameter of the Gaussian is finite, and so are its variances, which a split needs."""
     values = [value for _, value in gaussians.items()] + [(2 * gaussians.scales).exp()]
     return torch.stack([torch.isfinite(value.reshape(len(value), -1)).all(dim=-1) for value in values]).all(dim=0)
 
 
 def leave_one(pruned: Tensor, gaussians: Gaussians) -> Tensor:
-    """The mask [N], without the most opaque (finite) Gaussian where it would leave none."""
+    """The mask [N]. If it would prune every Gaussian, the most opaque (finite) one is taken out of it."""
     if not bool(pruned.all()):
         return pruned
     pruned = pruned.clone()
@@ -90,7 +90,7 @@ def leave_one(pruned: Tensor, gaussians: Gaussians) -> Tensor:
 
 
 def removal(pruned: Tensor) -> RowUpdate | None:
-    """The change that leaves out the Gaussians of the mask [N]; None where there are none."""
+    """The change that removes the Gaussians of the mask [N]; None if there are none."""
     source = torch.nonzero(~pruned).squeeze(-1)
     if len(source) == len(pruned):
         return None

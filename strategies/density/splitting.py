@@ -1,4 +1,4 @@
-"""Two Gaussians in the place of one."""
+"""Splitting: two Gaussians in the place of one."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def split_in_two(
         gaussians: the model.
         rows: [n] int64, which of them.
         how: `split` of `ErrorDrivenDensity`.
-        step: the draws are a function of its seed and iteration.
+        step: its seed and iteration decide the draws.
 
     Returns:
         [2 n, 3] means and [2 n, 3] log scales: the first halves of all, then the second ones.

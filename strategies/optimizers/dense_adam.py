@@ -22,16 +22,16 @@ class DenseAdam:
 
     What differs from `SparseAdam`:
 
-    - a Gaussian that no sample touched has a gradient of zero: its moments decay and it goes on along its momentum;
+    - a Gaussian that no sample touched has a gradient of zero: its moments decay, and its momentum still moves it;
     - the bias correction counts iterations of the run, not updates of the Gaussian and those it was made of.
 
-    In both, a new Gaussian has moments of zero and hardly any correction, so that it moves by more than the rate: with
-    the usual betas and a constant gradient by 3.2 rates at once, 6.5 rates after ten iterations, and 1.6 rates after
-    five hundred.
+    In both, a new Gaussian has moments of zero and hardly any correction, so it moves by more than the rate: with the
+    usual betas and a constant gradient by 3.2 rates at once, 6.5 rates after ten iterations, and 1.6 rates after five
+    hundred.
 
-    Two things differ from `torch.optim.Adam`: an iteration whose samples touched nothing changes nothing (on the GPU,
-    such are also iterations that are going to be done again), and a Gaussian with a non-finite gradient is treated
-    as if untouched, and counted.
+    Two things differ from `torch.optim.Adam`. An iteration whose samples touched nothing changes nothing; on the GPU,
+    iterations that will be repeated are of this kind too. And a Gaussian with a non-finite gradient is treated as
+    untouched, and counted.
 
     Args:
         learning_rates: of each parameter over the run.
@@ -39,8 +39,8 @@ class DenseAdam:
         eps: added to sqrt(v); gsplat's value.
         opacity_reg: weight of the mean opacity, after the sigmoid, in the objective.
         scale_reg: weight of the mean standard deviation, world units, in the objective. Both are terms of the loss of
-            3DGS-MCMC (Kheradmand et al. 2024; 0.01 each in gsplat's trainer). A `SparseLoss` sees colours alone;
-            gradients of parameters are first known here, so here theirs are added, before the moments.
+            3DGS-MCMC (Kheradmand et al. 2024; 0.01 each in gsplat's trainer). A `SparseLoss` sees only colours, so the
+            gradients of these two terms are added here, before the moments.
     """
 
     learning_rates: LearningRates = field(default_factory=LearningRates)
@@ -49,7 +49,7 @@ class DenseAdam:
     eps: float = 1e-15
     opacity_reg: float = 0.0
     scale_reg: float = 0.0
-    moments = None  # those of an `UpdateRule`; its own are torch's
+    moments = None  # only an `UpdateRule` has them; here torch keeps its own
     per_view = False
     exp_avg: Gaussians = field(init=False, repr=False)
     exp_avg_sq: Gaussians = field(init=False, repr=False)
@@ -62,11 +62,12 @@ class DenseAdam:
 
     def setup(self, gaussians: Gaussians) -> None:
         self.exp_avg, self.exp_avg_sq = (gaussians.map(torch.zeros_like) for _ in range(2))
-        self.counts = torch.zeros(len(PARAMETER_NAMES), device=gaussians.device)  # one each, as torch's kernel wants
+        # Torch's kernel needs a count for each parameter.
+        self.counts = torch.zeros(len(PARAMETER_NAMES), device=gaussians.device)
         self.skipped = torch.zeros((), dtype=torch.int64, device=gaussians.device)
 
     def rule(self, step: Step) -> None:
-        """None: no engine has a pass for it."""
+        """None: no engine makes this step."""
 
     @torch.no_grad()
     def step(self, gaussians: Gaussians, gradients: GaussianGradients, step: Step) -> None:
@@ -74,7 +75,7 @@ class DenseAdam:
         finite, touched = finite_gradients(gradients), gradients.touched
         self.skipped += (touched & ~finite).sum()
         rates = self.learning_rates.at(step)
-        # Torch's way of leaving an iteration out without asking the device.
+        # Torch's way of skipping an iteration without waiting for the device.
         nothing = (~touched.any()).to(torch.float32)
         options = {"beta1": self.beta1, "beta2": self.beta2, "eps": self.eps}
         options |= {"weight_decay": 0.0, "amsgrad": False, "maximize": False}
@@ -103,7 +104,7 @@ class DenseAdam:
         return {**state, "counts": self.counts, "skipped": self.skipped}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Take a saved state. Raises `InputError` where it is not one of as many Gaussians and bands as this."""
+        """Load a saved state. Raises `InputError` if its number of Gaussians or bands is another."""
         present = self.state_dict()
         check_state(state, present)
         for name, value in present.items():

@@ -22,31 +22,32 @@ class MomentLMOptimizer(SparseAdam):
 
         (sum_k curvature * g_k g_k^T / L_k + diag((sqrt(v) + eps) / eta)) delta = -m.
 
-    A loss of c times the size (c L_k, c g_k) gives the same delta, and without rows delta is Adam's step exactly.
-    Where the gradients of the views agree that an Adam step would overshoot the loss there is, delta stops short.
-    That needs shares and gradients of one loss. What the renderers give as L_k is the share of the L1 error summed over
-    the three channels and averaged over the samples, `GaussianGradients.view_losses`, whatever loss the gradients are
-    of. Two things follow. For a loss that is a mean over channels too, as ours are, L_k is 3 times its share, and
-    `curvature` acts as a third of itself. And a loss multiplied by c on the way (a sum instead of a mean, loss scaling)
-    multiplies the rows' term by c against Adam's, which shortens the steps where c > 1, unless its shares are
-    multiplied alike.
-    `units: paper` is the printed equation, (J^T J + diag(sqrt(v) + eps)) delta = -m with m and v as they are and
-    the g_k as rows of J: it has no learning rate and changes with the unit of the loss. It is there to compare.
+    A loss c times as large (c L_k, c g_k) gives the same delta. Without rows delta is exactly Adam's step. Where the
+    views' gradients agree that Adam's step would take off more loss than there is, delta is shorter.
+
+    This needs shares and gradients of the same loss. The renderers give as L_k (`GaussianGradients.view_losses`) the
+    share of the L1 error, summed over the three channels and averaged over the samples, whatever the loss. Two things
+    follow. Our losses are means over channels too, so L_k is 3 times their share, and `curvature` acts as a third of
+    itself. And if only the loss is multiplied by c (a sum instead of a mean, loss scaling), the rows' term grows by c
+    relative to Adam's, which shortens the steps where c > 1.
+
+    `units: paper` is the printed equation, (J^T J + diag(sqrt(v) + eps)) delta = -m, with m and v uncorrected and the
+    g_k as rows of J. It has no learning rate and depends on the unit of the loss. It is there for comparison.
 
     Args:
         learning_rates, beta1, beta2: as in `SparseAdam`.
-        eps: added to sqrt(v). The default is small enough that a loss scaled by 1e-6 gives the same steps down to
-            gradients of 1e-12, and not below what v can hold: where g^2 underflows in float32 (|g| < 1.2e-21), m / eps
-            is still less than one.
+        eps: added to sqrt(v). The default is so small that a loss scaled by 1e-6 gives the same steps down to gradients
+            of 1e-12. It is not below what v can hold: where g^2 underflows in float32 (|g| < 1.2e-21), m / eps is still
+            less than one.
         units: see above.
-        rows: one row of J per view, or one of their sum (rank 1).
-        curvature: for L_k that are true shares, 1/2 is Gauss-Newton for a loss r^2 / 2, and 1 is that for |r|
-            (iteratively reweighted); with the L_k above and a mean over channels, the default of 0.5 acts as 1/6.
+        rows: J has one row per view, or one row, their sum (rank 1).
+        curvature: if L_k were true shares, 1/2 would be Gauss-Newton for a loss r^2 / 2, and 1 Gauss-Newton for |r|
+            (iteratively reweighted). With the L_k above and a mean over channels, the default of 0.5 acts as 1/6.
             `balanced` only.
-        max_step: no entry of delta exceeds this many learning rates, or Adam's own entry where that is longer: coupling
-            may pass motion on to a parameter whose own gradient is near zero, and the linear model that wants it
-            does not hold that far. 1 is the length of Adam's step for gradients that always agree; 0 turns the bound
-            off. `balanced` only, as the printed equation has no learning rates.
+        max_step: no entry of delta exceeds this many learning rates, or Adam's own entry where that is longer. Coupling
+            can move a parameter whose own gradient is near zero so far that the linear model no longer holds. 1 is
+            the length of Adam's step for gradients that always agree; 0 turns the bound off. `balanced` only, as the
+            printed equation has no learning rates.
     """
 
     eps: float = 1e-20

@@ -25,8 +25,8 @@ AUTO_SETTINGS: dict[str, Any] = {
     "train.maps_place": "device",
     "train.photos_place": "device",
 }
-"""Setting -> what it is where no plan is made; None: `train.base_iterations`. `train.device` is no plan's: a plan
-is made for a device."""
+"""Setting -> its value if no plan is made; None: `train.base_iterations`. What a plan makes of `auto` is decided in
+`turbogs_plugin.plan.decisions`. `train.device` is not among them, as a plan is made for a given device."""
 
 
 def undecided(mapping: Mapping[str, Mapping[str, Any]]) -> list[str]:

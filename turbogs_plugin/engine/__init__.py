@@ -1,7 +1,7 @@
-"""What computes: a base class, the torch reference, its CUDA twin, and the one place that picks one.
+"""The engines, which do all computation: a base class, the torch reference, its CUDA twin, and the choice of one.
 
-`Engine` is the seam: strategies say what is to be done (`rules`), an engine does it on one device. Nobody outside this
-package asks which device it is.
+`Engine` is the interface: strategies say what is to be done (`rules`), an engine does it on one device. No code outside
+this package asks which device it is.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ __all__ = ["CompiledKernels", "Engine", "compiled_kernels", "engine_of"]
 
 @dataclass(frozen=True)
 class CompiledKernels:
-    """The compiled library of kernels, for whoever reports on it.
+    """The compiled library of kernels, for reports.
 
     Args:
-        path: where it is looked for.
-        architectures: what it holds code for: ``sm_90``, ..., or PTX, ``compute_90``.
-        unavailable: why it cannot run here, in one line; "" where it does.
+        path: where it is expected.
+        architectures: those it holds code for: ``sm_90``, ..., or PTX, ``compute_90``.
+        unavailable: why it cannot run here, in one line; "" if it can.
     """
 
     path: Path
@@ -35,7 +35,7 @@ class CompiledKernels:
 
 
 def compiled_kernels() -> CompiledKernels:
-    """The library that `engine_of` takes for CUDA tensors, or why it takes the reference."""
+    """The library that `engine_of` uses for CUDA tensors, or why it uses the reference instead."""
     return CompiledKernels(library.library_path(), library.architectures(), library.unavailable_reason())
 
 
@@ -43,8 +43,8 @@ def engine_of(device: torch.device, for_training: bool = False) -> Engine:
     """The engine for tensors on a device: the kernels where they are compiled and run, else the torch reference.
 
     Args:
-        for_training: one that keeps its memory from pass to pass and never waits for the GPU. What it renders is valid
-            until its next pass, and its caller must ask `Engine.settle` before each iteration.
+        for_training: the engine keeps its memory from pass to pass and never waits for the GPU. What it renders is
+            valid until its next pass, and the caller must call `Engine.settle` before each iteration.
     """
     if device.type == "cuda" and library.available():
         return CudaEngine(device if for_training else None)

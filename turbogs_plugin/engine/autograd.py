@@ -17,15 +17,15 @@ from turbogs_plugin.types import PARAMETER_NAMES, Cameras, Gaussians, GaussianSt
 
 
 class PassObserver(Protocol):
-    """Who has a say in the backward pass beside the loss. It must not hold what the pass gave: the graph, which holds
-    the observer, would keep itself alive."""
+    """Takes part in the backward pass beside the loss. It must keep no reference to the pass's results: the graph holds
+    the observer, and would keep itself alive."""
 
     def pixel_errors(self) -> Tensor | None:
-        """[P] errors that are to be carried to the Gaussians, asked for as the backward pass begins; None for none."""
+        """[P] errors to carry to the Gaussians, or None. Called when the backward pass begins."""
         ...
 
     def passed(self, stats: GaussianStats, view_losses: Tensor) -> None:
-        """The pass's statistics, and [N] each Gaussian's share of the loss; both of no errors where there were none."""
+        """Receive the pass's statistics and [N] each Gaussian's share of the loss, both for the errors given before."""
         ...
 
 
@@ -34,10 +34,10 @@ class DifferentiableRender:
     """A forward pass connected to autograd.
 
     Args:
-        colors: [P, 3]. alphas: [P]. depths: [P] expected depth along the camera's axis, or None where not asked for.
-            All zero in empty slots.
-        means2d: [K, N, 2] pixels, zero where a Gaussian is not drawn. A leaf: after backward it has ``grad``, and, as
-            in gsplat with ``absgrad=True``, ``absgrad``. No gradient of it reaches the model.
+        colors: [P, 3]. alphas: [P]. depths: [P] expected depth along the camera's axis, or None if not asked for. All
+            are zero in empty slots.
+        means2d: [K, N, 2] pixels, zero where a Gaussian is not drawn. A leaf: after backward it has ``grad`` and, as
+            in gsplat with ``absgrad=True``, ``absgrad``. No gradient flows from it to the model.
         projected: the projection that was drawn, without gradients.
     """
 
@@ -54,12 +54,12 @@ def rasterize_differentiable(
     """`rasterize` under torch autograd, with gradients to the Gaussians and none to the cameras.
 
     Args:
-        gaussians: the model, of any tensors that autograd knows.
+        gaussians: the model; any of its tensors may require gradients.
         observer: of the backward pass.
         options: the fields of `RenderOptions`.
 
     Raises:
-        InputError: as `Engine.render`; and from a second backward of one pass.
+        InputError: as `Engine.render`; and at a second backward of one pass.
     """
     rendered = rasterize(
         gaussians.map(lambda value: value.detach().contiguous()),
@@ -75,7 +75,7 @@ def rasterize_differentiable(
 
 
 class _Pass(torch.autograd.Function):
-    """A `Rendered` pass in autograd. It was made before; here its outputs are tied to what they depend on."""
+    """Connects a finished `Rendered` pass to autograd: its outputs to the parameters they depend on."""
 
     @staticmethod
     def forward(ctx, rendered: Rendered, observer: PassObserver | None, means2d: Tensor, *parameters: Tensor) -> tuple:

@@ -1,7 +1,7 @@
 """Sizes and layouts that Python and the kernels of csrc/ share. They are defined here and nowhere else.
 
-The build makes a C++ header of this file (csrc/generate_headers.py), so it must not import torch. In C++ a number
-``NAME`` is ``kName``, a class is a struct of such constants, and a column that is a slice is the number of its first.
+The build makes a C++ header from this file (csrc/generate_headers.py), so it must not import torch. In C++ a number
+``NAME`` is ``kName``, a class is a struct of such constants, and a slice of columns is the number of its first column.
 """
 
 MAX_VIEWS = 128
@@ -11,36 +11,36 @@ MAX_SH_DEGREE = 3
 """Highest degree of the spherical harmonics that the engines evaluate."""
 
 WARP_SIZE = 32
-"""Lanes of a warp. A chunk, the sample slots of a tile that a warp renders together, has as many."""
+"""Lanes of a warp. A chunk, the sample slots of a tile that a warp renders together, has the same size."""
 
 BUCKET = 32
 """Splats that a warp stages at once. Each has a bit of a 32-bit mask."""
 
 INTERSECTIONS_MAX = (1 << 31) - 1
-"""The count of a pass's intersections of tiles and splats stays here where it would be more."""
+"""The count of a pass's intersections of tiles and splats saturates here."""
 
 SCAN_TILES = 1024
 """Tiles of one block of the kernels that find each tile's first intersection."""
 
 SORT_RUN = 512
-"""Intersections of a tile that one warp sorts. A tile with more is sorted in runs of so many, which are then merged."""
+"""Intersections of a tile that one warp sorts. A tile with more is sorted in runs of this length, which are merged."""
 
 UNITS = ("pixel", "cell", "tile")
-"""What a draw chooses: single pixels, cells of 4x4 pixels, or whole tiles of 16x16. The kernels number them so."""
+"""Units of a draw: pixels, cells of 4x4 pixels, or whole tiles of 16x16. The kernels number them in this order."""
 
 STRUCTURES = ("none", "ncc", "contrast", "ssim", "printed_ncc")
-"""Similarities of a tile's samples that a loss may have beside its l1 term. The kernels number them so."""
+"""Similarities of a tile's samples that a loss may use beside its l1 term. The kernels number them in this order."""
 
 UPDATE_KINDS = ("adam", "balanced_lm", "paper_lm")
-"""What a step of the parameters is. The kernels number them so."""
+"""Kinds of a step of the parameters. The kernels number them in this order."""
 
 
 class ScreenRecord:
     """Gradients and sums of one Gaussian in one view: a row of float32.
 
     w is the weight of a sample (transmittance times alpha), e its error, D its distance from the mean in standard
-    deviations (Mahalanobis). Sums run over the samples. `ABSOLUTE` and `DISTANCE_SUM` are filled only where density
-    control asks for them, and are zero elsewhere.
+    deviations (Mahalanobis). Sums run over the samples. `ABSOLUTE` and `DISTANCE_SUM` are filled only if density
+    control asks for them, and are zero otherwise.
     """
 
     MEAN = slice(0, 2)  # d loss / d projected mean, in pixels
@@ -83,13 +83,13 @@ class InstanceRow:
 
 
 class CameraRow:
-    """A view as the raster kernels keep it: a row of 4-byte numbers that only they read."""
+    """A view inside the raster kernels: a row of 4-byte numbers that only they read."""
 
     SIZE = 28
 
 
 class ImageRow:
-    """A view of a batch as the rasterizer is given it: a row of integers."""
+    """A view of a batch, as input of the rasterizer: a row of integers."""
 
     WIDTH = 0
     HEIGHT = 1
@@ -97,7 +97,7 @@ class ImageRow:
 
 
 class ViewRow:
-    """A view of a batch as the loss is given it: a row of integers."""
+    """A view of a batch, as input of the loss: a row of integers."""
 
     FIRST_PIXEL = 0  # of the view, among the flat pixels of all training views
     WIDTH = 1
@@ -107,7 +107,7 @@ class ViewRow:
 
 
 class DrawRow(ViewRow):
-    """A view of a batch as the sampler is given it: a row of integers, those of `ViewRow` first."""
+    """A view of a batch, as input of the sampler: a row of integers, those of `ViewRow` first."""
 
     FIRST_SLOT = 4  # for unit = tile the first chosen tile
     WANTED = 5  # tiles to choose; only for unit = tile
@@ -116,7 +116,7 @@ class DrawRow(ViewRow):
 
 
 def columns(row: type) -> dict[str, slice]:
-    """Where each column of a row lies, by its name in lower case; those of a base class come first."""
+    """Name of each column in lower case -> where it lies; the columns of a base class come first."""
     found = {}
     for base in reversed(row.__mro__):
         for name, place in vars(base).items():

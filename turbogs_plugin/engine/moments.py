@@ -24,12 +24,12 @@ class GaussianMoments:
     Args:
         exp_avg, exp_avg_sq: [N, 14], the order of `COLUMNS`.
         exp_avg_shN, exp_avg_sq_shN: [N, B * 3].
-        steps: [N] int32, updates that each Gaussian and the ones it was made of have had. Its bias correction counts
-            these. A new Gaussian has moments of zero and its source's count, as with torch's Adam and gsplat's surgery.
-            So its moments are hardly corrected, and its first steps are 3 to 6 times the rate. That is intended: it
-            finds its place by them.
-        skipped: [] int64, updates left out because of a non-finite gradient, since the start of the run. Stays on the
-            device: reading it is a synchronisation.
+        steps: [N] int32, number of updates of each Gaussian and of those it was made of. The bias correction uses it. A
+            new Gaussian has moments of zero and its source's count, as with torch's Adam and gsplat's operations. So
+            its moments are hardly corrected, and its first steps are 3 to 6 times the rate. That is intended: they
+            bring it to its place.
+        skipped: [] int64, updates skipped since the start of the run because of a non-finite gradient. Stays on the
+            device, as reading it would wait for the device.
     """
 
     exp_avg: Tensor
@@ -41,7 +41,7 @@ class GaussianMoments:
 
     @classmethod
     def zeros(cls, gaussians: Gaussians) -> GaussianMoments:
-        """State of Gaussians that were never updated, in their dtype and on their device."""
+        """The state of Gaussians that were never updated, with their dtype and device."""
         count, coefficients = len(gaussians), gaussians.shN.shape[1] * 3
         return cls(
             *(gaussians.means.new_zeros(count, ParameterRow.SIZE) for _ in range(2)),
@@ -70,7 +70,7 @@ class GaussianMoments:
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Take a saved state. Raises `InputError` where it is not one of as many Gaussians and bands as this."""
+        """Load a saved state. Raises `InputError` if its number of Gaussians or bands is another."""
         check_state(state, self.state_dict())
         for field in fields(self):
             present = getattr(self, field.name)
@@ -78,7 +78,7 @@ class GaussianMoments:
 
 
 def check_state(saved: dict[str, Any], present: dict[str, Tensor]) -> None:
-    """Raise `InputError` where a saved state lacks a tensor of the present one, or has it of another shape."""
+    """Raise `InputError` if a saved state lacks a tensor of the present one, or has one of another shape."""
     for name, value in present.items():
         if name not in saved or saved[name].shape != value.shape:
             found = f"shape {tuple(saved[name].shape)}" if name in saved else "nothing"

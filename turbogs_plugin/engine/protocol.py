@@ -1,4 +1,4 @@
-"""The seam between what is to be done and how a device does it."""
+"""The interface of an engine: what is to be done, whatever device does it."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from turbogs_plugin.types import Cameras, Gaussians, GaussianStats, LossOutput, 
 
 @dataclass(frozen=True)
 class MapUpdate:
-    """What learns of the errors of an iteration.
+    """The error maps, and what else takes in the errors of an iteration.
 
     Args:
         maps: of all views; updated in place.
@@ -33,17 +33,17 @@ class MapUpdate:
 
 
 class Engine(ABC):
-    """What computes, on the device of the tensors that it is given.
+    """Does all computation, on the device of the given tensors.
 
-    It knows rules, never strategies. `ReferenceEngine` defines every result; any other engine gives the same, to
-    rounding. `supervise` and `update` are two steps each, which an engine may do at once. An engine made for training
-    may run ahead of the host: see `settle`.
+    It knows rules, never strategies. `ReferenceEngine` defines every result; any other engine gives the same up to
+    rounding. `supervise` and `update` are two steps each, which an engine may do at once. The host does not wait for an
+    engine made for training: see `settle`.
     """
 
     @property
     def overflow(self) -> Tensor | None:
-        """[1] int32 on the device, never read on the host: not 0 while iterations do nothing, for lack of room. None
-        where that cannot be."""
+        """[1] int32 on the device, never read on the host: not 0 while iterations do nothing for lack of memory. None
+        if that cannot happen."""
         return None
 
     @abstractmethod
@@ -54,7 +54,7 @@ class Engine(ABC):
             maps: of all views.
             view_ids: K training views.
             rate: r, the fraction of units to draw, above 0.
-            step: gives seed and iteration, on which alone the random numbers depend, and ages.
+            step: gives seed and iteration, which decide the random numbers, and the ages.
         """
 
     @abstractmethod
@@ -72,16 +72,16 @@ class Engine(ABC):
         """The loss of rendered samples and its gradient. `colors`, `targets`: [P, 3]."""
 
     def supervise(self, terms: LossTerms, colors: Tensor, truth: PhotoSamples, update: MapUpdate) -> LossOutput:
-        """`evaluate` against the photos at the samples, on the device of `colors` [P, 3], and `learn` from it."""
+        """`evaluate` against the photos at the samples, then `learn`. `colors`: [P, 3], on the engine's device."""
         output = self.evaluate(terms, colors, truth.colors(), truth.samples)
         self.learn(truth.samples, colors, output, update)
         return output
 
     def learn(self, samples: PixelSamples, colors: Tensor, output: LossOutput, update: MapUpdate) -> None:
-        """Let the error maps learn the errors of an iteration, whatever loss gave them.
+        """Update the error maps with the errors of an iteration, from any loss.
 
-        A sample whose rendered colour, of `colors` [P, 3], or whose error is not finite changes nothing: neither the
-        error of its pixel nor its age. An iteration that did nothing changes nothing here either.
+        A sample with a non-finite rendered colour (of `colors` [P, 3]) or error changes neither the error of its pixel
+        nor its age. An iteration that did nothing changes nothing here either.
         """
         drawn, nonfinite = torch.isfinite(colors).all(dim=1), ~output.loss.isfinite()
         if self.overflow is not None:
@@ -98,24 +98,24 @@ class Engine(ABC):
         moments: GaussianMoments,
         stats: GaussianStats | None,
     ) -> None:
-        """Take gradients from the screen to the parameters, and make one step of them.
+        """Take gradients from the screen to the parameters, and make one step with them.
 
         Args:
             rule: which step.
-            screen: of a backward pass of this engine, which is used up.
+            screen: from a backward pass of this engine; it cannot be used again.
             gaussians: the model that was rendered; changed in place, as is `moments`.
-            stats: the window of density control; this pass is added to it. None where none is needed.
+            stats: the statistics of density control, to which this pass is added; None if not needed.
         """
         apply_update(rule, gaussians, screen.parameter_gradients(rule.per_view, stats), moments)
 
     def settle(self, wait: bool = False) -> int:
-        """How many of the latest iterations did nothing and must be done again, for lack of room on the device.
+        """How many of the latest iterations did nothing for lack of device memory, and must be done again.
 
-        Until the host asks, all that follows such an iteration does nothing either: no map, parameter, moment or
-        statistic changes. Whoever trains asks before each iteration.
+        Until this is called, iterations after such a one do nothing either: no map, parameter, moment or statistic
+        changes. A trainer calls it before each iteration.
 
         Args:
-            wait: for the device, so as to know of all; else only what is known already counts.
+            wait: wait for the device, to know of all; else only what is known already counts.
 
         Raises:
             InputError: an iteration has more intersections of a tile and a splat than a pass can have.
@@ -124,5 +124,5 @@ class Engine(ABC):
 
     @property
     def bytes_held(self) -> int:
-        """Memory that is kept from one iteration to the next."""
+        """Bytes of memory kept from one iteration to the next."""
         return 0

@@ -1,4 +1,4 @@
-"""What a rasterizer gives back: colours at the samples, and a way from their gradients to the parameters'."""
+"""The result of a rasterizer: colours at the samples, and the backward pass from their gradients to the parameters."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from turbogs_plugin.types import GaussianGradients, Gaussians, GaussianStats
 
 @dataclass(frozen=True)
 class Projected:
-    """Where K views see the N Gaussians, as gsplat's `info` has it; zero where a Gaussian is not drawn.
+    """The projection of the N Gaussians onto K views, as in gsplat's `info`; zero where a Gaussian is not drawn.
 
     Args:
         means2d: [K, N, 2] pixels.
@@ -37,15 +37,15 @@ class Projected:
 class ScreenGradients(Protocol):
     """Gradients on the screen, not yet taken back to the parameters.
 
-    They are taken there when asked for, so that an engine can fuse that step with the optimizer's update: then the
-    gradients of the higher bands never reach memory.
+    That happens later, so that an engine can fuse it with the optimizer's update: then the gradients of the higher
+    bands never reach memory.
     """
 
     def parameter_gradients(self, rows: bool, stats: GaussianStats | None = None) -> GaussianGradients:
         """The gradients of the parameters: one row per view (`rows`), or their sum. May be called once.
 
         Args:
-            stats: the window of density control, which this pass is added to; only of a backward pass
+            stats: the statistics of density control, to which this pass is added; only after a backward pass
                 ``with_statistics``.
         """
         ...
@@ -56,7 +56,7 @@ class ScreenGradients(Protocol):
 
 
 def require_statistics(with_statistics: bool, stats: GaussianStats | None) -> None:
-    """Raise `ValueError` where statistics are wanted of a backward pass that did not sum them up."""
+    """Raise `ValueError` if statistics are wanted from a backward pass that did not sum them up."""
     if stats is not None and not with_statistics:
         raise ValueError("statistics of a pass without them: call Rendered.backward(..., with_statistics=True)")
 
@@ -68,7 +68,7 @@ class Rendered(ABC):
     Args:
         colors: [P, 3]; zero in empty slots.
         alphas: [P]; zero in empty slots.
-        depths: [P] expected depth (sum of w * z over alpha), or None where not asked for.
+        depths: [P] expected depth (sum of w * z over alpha), or None if not asked for.
     """
 
     colors: Tensor
@@ -77,7 +77,7 @@ class Rendered(ABC):
 
     @abstractmethod
     def projected(self) -> Projected:
-        """The projection that this pass drew."""
+        """The projection drawn by this pass."""
 
     @torch.no_grad()
     def backward(
@@ -93,12 +93,12 @@ class Rendered(ABC):
 
         Args:
             color_gradients: [P, 3] d loss / d colors.
-            pixel_errors: [P] the errors that are carried to the Gaussians; zeros where None.
-            with_statistics: also sum up what `GaussianStats` has (absolute gradients, distances).
+            pixel_errors: [P] the errors to carry to the Gaussians; None for zeros.
+            with_statistics: also sum up what `GaussianStats` needs (absolute gradients, distances).
             alpha_gradients, depth_gradients: [P], where the loss has such terms.
 
         Raises:
-            InputError: on CUDA: depth gradients of a pass without depths; a tensor of wrong shape, dtype or device.
+            InputError: on CUDA, depth gradients for a pass without depths, or a tensor of wrong shape, dtype or device.
         """
         upstream = {
             "color_gradients": color_gradients,
@@ -110,15 +110,15 @@ class Rendered(ABC):
 
     @abstractmethod
     def _backward(self, upstream: dict[str, Tensor | None], with_statistics: bool) -> ScreenGradients:
-        """`backward`, its tensors by name."""
+        """`backward`, with its tensors by name."""
 
 
 EXTENT_MAX = 3.33
-"""gsplat's cut of a splat's half-width, in standard deviations. At the default `alpha_min` it cuts nothing visible:
+"""gsplat's limit of a splat's half-width, in standard deviations. At the default `alpha_min` it cuts nothing visible:
 an opaque splat fades to 1/255 at 3.329."""
 
 ALPHA_MIN_LOWEST = math.exp(-(EXTENT_MAX**2) / 2)
-"""The most opacity that a splat has there."""
+"""The largest opacity that a splat can have at `EXTENT_MAX`."""
 
 
 @dataclass(frozen=True)
@@ -128,10 +128,10 @@ class RasterSettings:
     Args:
         eps2d: added to the diagonal of the projected covariance, pixels squared; 0 or more.
         near_plane, far_plane: depths outside are not drawn, world units; 0 < near_plane < far_plane.
-        alpha_min: a splat with less opacity at a pixel is skipped there. At least exp(-3.33^2 / 2), about 0.00391:
-            below that the reference, which cuts splats at 3.33 standard deviations, and the CUDA kernels, which reach
-            as far as alpha_min asks, would differ.
-        alpha_max: opacity at a pixel is cut here (and has no gradient beyond); between alpha_min and 1.
+        alpha_min: a splat with less opacity at a pixel is skipped there. At least exp(-3.33^2 / 2), about 0.00391.
+            Below that the engines would differ: the reference cuts splats at 3.33 standard deviations, the CUDA kernels
+            where they reach alpha_min.
+        alpha_max: opacity at a pixel is limited to this (without a gradient beyond); between alpha_min and 1.
         transmittance_min: a pixel ends before the splat that would bring its transmittance to this or below; between 0
             and 1.
 
@@ -163,12 +163,12 @@ DEFAULT_SETTINGS = RasterSettings()
 
 @dataclass(frozen=True)
 class RenderOptions:
-    """What is rendered of a model, and how.
+    """What to render of a model, and how.
 
     Args:
-        sh_degree: highest degree of spherical harmonics used; all there are where None.
+        sh_degree: highest degree of spherical harmonics to use; None for all that the model holds.
         settings: thresholds and planes.
-        with_depth: also give expected depths.
+        with_depth: also render expected depths.
     """
 
     sh_degree: int | None = None
@@ -179,7 +179,7 @@ class RenderOptions:
         """The degree of spherical harmonics to evaluate.
 
         Raises:
-            InputError: the model holds more than any engine evaluates, or not what is asked for.
+            InputError: the model holds a higher degree than any engine evaluates, or a lower one than asked for.
         """
         held = gaussians.sh_degree
         if held > MAX_SH_DEGREE:

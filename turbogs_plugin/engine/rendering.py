@@ -1,4 +1,4 @@
-"""Rendering at sampled pixels and of whole images, by the engine of the Gaussians' device."""
+"""Rendering of sampled pixels and of whole images, by the engine of the Gaussians' device."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ def rasterize(gaussians: Gaussians, cameras: Cameras, samples: PixelSamples, **o
 
 
 def dense_samples(cameras: Cameras, view_ids: Sequence[int] | None = None) -> PixelSamples:
-    """Every pixel of every tile of some views, in the order of samples, without empty slots.
+    """Every pixel of some views, as samples without empty slots.
 
     Args:
         cameras: all V cameras.
-        view_ids: which of them; all where None.
+        view_ids: which of them; None for all.
     """
     view_ids = tuple(range(len(cameras)) if view_ids is None else view_ids)
     return dense_pixels(view_ids, cameras.sizes[list(view_ids)], cameras.viewmats.device)
@@ -53,7 +53,7 @@ class RenderedImage:
         colors: [H, W, 3], not clamped above.
         alphas: [H, W].
         depths: [H, W] expected depth along the camera's axis, in the unit of the means; 0 where nothing was hit. None
-            where not asked for.
+            if not asked for.
     """
 
     colors: Tensor
@@ -63,7 +63,7 @@ class RenderedImage:
 
 @torch.no_grad()
 def render_image(gaussians: Gaussians, cameras: Cameras, view_id: int = 0, **options: Any) -> RenderedImage:
-    """Every pixel of one of the cameras; `options` are the fields of `RenderOptions`."""
+    """Render every pixel of one of the cameras; `options` are the fields of `RenderOptions`."""
     samples = dense_samples(cameras, [view_id])
     rendered = rasterize(gaussians, cameras.select([view_id]), samples, **options)
     width, height = cameras.sizes[view_id].tolist()

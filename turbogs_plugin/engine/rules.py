@@ -1,6 +1,6 @@
-"""Rules: what a strategy wants done, as plain values that every engine can carry out.
+"""Rules: what a strategy asks for, as plain values that every engine can carry out.
 
-A strategy that is described by a rule needs no code for a device: the engine of the device has it. The torch reference
+A strategy with a rule needs no code of its own for a device: the engine has it. The torch reference
 (`turbogs_plugin.engine.reference`) defines what each rule means; its CUDA twin does the same in fewer passes.
 """
 
@@ -33,15 +33,15 @@ class DrawRule:
     importance: float
 
     def wanted(self, rate: float, units: int) -> int:
-        """Units to draw of so many: ``max(1, floor(rate * units))``, the paper's N_pix where they are the 256 pixels.
+        """How many of `units` to draw: ``max(1, floor(rate * units))``, the paper's N_pix for the 256 pixels of a tile.
 
-        Of the 16 cells of a tile it is the nearest number: rounding down would lose up to half of a small budget.
+        For the 16 cells of a tile it is the nearest number: rounding down would lose up to half of a small budget.
         """
         slack = 0.5 if self.unit == "cell" else 0.0
         return min(units, max(1, math.floor(rate * units + slack)))
 
     def stages(self, wanted: int) -> tuple[int, int, int]:
-        """Units of the hard, stable and mixed stage; halves round up."""
+        """Number of units of the hard, stable and mixed stage; halves round up."""
         hard = min(wanted, math.floor(self.hard * wanted + 0.5))
         stable = min(wanted - hard, math.floor(self.stable * wanted + 0.5))
         return hard, stable, wanted - hard - stable
@@ -57,7 +57,7 @@ class LossTerms:
         structure: one of `layout.STRUCTURES`.
         structure_weight: factor of the mean over tiles and channels of 1 - S, S the similarity.
         variance_constant: c of `ncc` and `contrast`, epsilon of `printed_ncc`.
-        balance: scale the structure term by the paper's lambda.
+        balance: scale the structure term by the paper's lambda, the gradient-balanced weight.
         gate: scale it by the truth's variance.
     """
 
@@ -96,7 +96,7 @@ class MomentLMParams:
 class UpdateRule:
     """One step of the parameters (paper section 3.9); `engine.reference.update` defines it.
 
-    It is Adam, or with `lm` moment-damped LM on two blocks of each Gaussian and Adam on the higher bands.
+    It is Adam; or, with `lm`, moment-damped LM on two blocks of each Gaussian and Adam on the higher bands.
 
     Args:
         rates: learning rate of each parameter at this iteration.
@@ -113,5 +113,5 @@ class UpdateRule:
 
     @property
     def per_view(self) -> bool:
-        """Whether the rule asks for the gradients of each view, or for their sum alone."""
+        """Whether the rule needs the gradients of each view; else their sum suffices."""
         return self.lm is not None and self.lm.rows == "views"

@@ -1,1 +1,1 @@
-"""The model: Gaussians made from points, and to and from files."""
+"""The model: the initial Gaussians, their order and limits, and their files."""

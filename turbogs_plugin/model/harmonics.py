@@ -1,4 +1,4 @@
-"""Which bands of spherical harmonics a model needs, by the energy of its colours."""
+"""Which degrees of spherical harmonics a model needs, by the energy of its colours."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from turbogs_plugin.types import SH_C0, Gaussians
 def band_energy(gaussians: Gaussians) -> list[float]:
     """Share of each degree, 0 first, in the energy of a model's colours.
 
-    The harmonics are orthonormal, so a Gaussian's colour squared, over all directions and channels, is the sum of its
-    squared coefficients, that of degree 0 with the offset of 0.5 that colours have. Gaussians count by their opacity;
-    those that are not finite do not.
+    The harmonics are orthonormal, so the energy of a Gaussian's colour, over all directions and channels, is the sum of
+    its squared coefficients. That of degree 0 includes the offset of 0.5. Gaussians are weighted by their opacity;
+    those that are not finite are left out.
     """
     constant = gaussians.sh0.double() + 0.5 / SH_C0  # [N, 1, 3]
     squares = torch.cat([constant, gaussians.shN.double()], dim=1).square().sum(dim=2)  # [N, (degree + 1)^2]
@@ -28,12 +28,11 @@ def drop_faint_bands(gaussians: Gaussians, threshold: float) -> Gaussians:
     """The model without its highest degrees: as many as together have at most this share of its colours' energy.
 
     Args:
-        gaussians: the model; its means and shapes are shared with the result.
-        threshold: 0 .. 1; 0 drops what is zero. Colours change by about the root of it, relative to themselves: 1e-4 is
-            1 %.
+        gaussians: the model; the result shares its means and shapes.
+        threshold: 0 .. 1; 0 drops only zeros. The relative change of colours is about its root: 1e-4 means 1 %.
 
     Raises:
-        InputError: a threshold out of range.
+        InputError: the threshold is out of range.
     """
     require(0 <= threshold < 1, "threshold", threshold, "at least 0 and less than 1")
     shares = band_energy(gaussians)

@@ -1,4 +1,4 @@
-"""The Gaussians that training starts from: one a point of the capture, and a backdrop behind them."""
+"""The Gaussians that training starts from: one for each point of the capture, and a backdrop behind them."""
 
 from __future__ import annotations
 
@@ -16,37 +16,37 @@ from turbogs_plugin.types import SH_C0, Gaussians
 INITIAL_OPACITY = 0.1
 """As in 3DGS."""
 DARKEST = 0.5
-"""Smallest channel of a new Gaussian's colour, of 255: at exactly 0 the clamp of colours may zero its gradient."""
+"""Smallest channel of a new Gaussian's colour, out of 255: at exactly 0 the clamp of colours may zero its gradient."""
 SMALLEST_SCALE = 1e-4
 """Smallest scale of a new Gaussian, in extents: coincident points would otherwise give a scale of zero."""
 LONELY_SCALE = 0.01
 """Scale of a Gaussian without neighbours, in extents."""
 BACKDROP_COUNT = 3000
-"""Gaussians of the backdrop, 3.7 degrees apart: enough for one colour, and few beside those of a capture."""
+"""Number of Gaussians in the backdrop, 3.7 degrees apart: enough for one colour, and few compared with a capture."""
 BACKDROP_RADIUS = 20.0
-"""Distance of the backdrop, in extents: beyond what a capture shows, near enough for the precision of float32."""
+"""Distance of the backdrop, in extents: behind everything in a capture, near enough for the precision of float32."""
 BACKDROP_OPACITY = 0.88
-"""Opacity of the backdrop's Gaussians. Several cover each direction, so that nothing shines through."""
+"""Opacity of the backdrop's Gaussians. Several of them cover each direction, so nothing shines through."""
 
 
 def gaussians_from_points(
     points: Tensor, colors: Tensor, sh_degree: int, extent: float, opacity: float = INITIAL_OPACITY, size: float = 1.0
 ) -> Gaussians:
-    """One isotropic Gaussian a point, as 3DGS starts (Kerbl et al. 2023, section 5.1).
+    """One isotropic Gaussian for each point, as 3DGS starts (Kerbl et al. 2023, section 5.1).
 
-    Its scale is `size` times the mean distance to the three nearest points, its colour the point's, black as half a
-    step above it; the higher bands are zero.
+    Its scale is `size` times the mean distance to the three nearest points. Its colour is the point's; channels of 0
+    become `DARKEST`. The higher bands are zero.
 
     Args:
         points: [M, 3] float. Points that are not finite are left out, with a warning that counts them.
         colors: [M, 3] uint8.
-        sh_degree: the degree to make room for, 0 .. 3.
-        extent: the scene's, in the points' unit; bounds the scales from below where points coincide.
-        opacity: of every Gaussian, within (0, 1).
+        sh_degree: highest degree to allocate, 0 .. 3.
+        extent: the scene's, in the points' unit; gives the smallest scale where points coincide.
+        opacity: opacity of every Gaussian, within (0, 1).
         size: factor of the scales.
 
     Raises:
-        InputError: no finite points, a degree out of range, an extent that is not positive.
+        InputError: no finite points, a degree out of range, or an extent that is not positive.
     """
     if not 0 <= sh_degree <= MAX_SH_DEGREE:
         raise InputError(f"sh_degree is {sh_degree}: it must be 0 .. {MAX_SH_DEGREE}")
@@ -76,13 +76,13 @@ def gaussians_from_points(
 
 
 def backdrop_gaussians(color: Tensor, sh_degree: int, extent: float) -> Gaussians:
-    """A sphere around the scene and all cameras, of one colour: what is seen where the model has nothing.
+    """A sphere of one colour around the scene and all cameras, seen where the model has nothing else.
 
-    Without it, that is black. Its Gaussians lie on a Fibonacci lattice and train like all others.
+    Without it, such pixels are black. Its Gaussians lie on a Fibonacci lattice and train like all others.
 
     Args:
         color: [3] float, 0 .. 1, for instance the mean of the photos.
-        sh_degree: the degree to make room for, 0 .. 3.
+        sh_degree: highest degree to allocate, 0 .. 3.
         extent: the scene's.
     """
     index = torch.arange(BACKDROP_COUNT, dtype=torch.float64) + 0.5

@@ -1,4 +1,4 @@
-"""A model to and from a .ply file, with the properties of the original 3DGS."""
+"""Writing and reading a model as a .ply file, with the properties of the original 3DGS."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ POSITION_ERROR = 1e-6
 def save_ply(gaussians: Gaussians, path: str | Path, frame: Frame | None = None) -> None:
     """Write a model as a .ply with the properties of the original 3DGS, normals (zero) included.
 
-    All properties are float, as viewers expect. Only where the capture lies so far from the origin that float would
-    round positions by more than 1e-6 of its extent (UTM metres) are x, y and z double. The file appears whole or not
-    at all.
+    All properties are float, as viewers expect. Only x, y and z are double, if the capture lies so far from the origin
+    that float would round positions by more than 1e-6 of its extent (UTM metres). The file is written whole or not at
+    all.
 
     Args:
         gaussians: the model. Gaussians that are not finite are left out, with a warning that counts them.
         path: the file to write; its folder must exist.
-        frame: where given, the model is taken back to the capture's own coordinates.
+        frame: if given, the model is written in the capture's own coordinates.
 
     Raises:
-        InputError: nothing to write, or the file cannot be written.
+        InputError: there is nothing to write, or the file cannot be written.
     """
     path = Path(path)
     frame = frame or Frame(np.zeros(3), 1.0)
@@ -79,13 +79,13 @@ def load_ply(path: str | Path, frame: Frame | None = None) -> Gaussians:
 
     Args:
         path: the file.
-        frame: where given, the model is brought from the capture's own coordinates into this frame.
+        frame: if given, the model is converted from the capture's own coordinates into this frame.
 
     Returns:
         float32, on the CPU.
 
     Raises:
-        InputError: a file that is not such a .ply, lacks a property, or has values that are not finite.
+        InputError: the file is not such a .ply, lacks a property, or has values that are not finite.
     """
     vertices = read_vertices(path)
     frame = frame or Frame(np.zeros(3), 1.0)
@@ -98,7 +98,7 @@ def load_ply(path: str | Path, frame: Frame | None = None) -> Gaussians:
             f"largest here, have one of {sorted(bands)}"
         )
     groups = _property_groups(bands[rest])
-    del groups["normals"]  # which a model does not have
+    del groups["normals"]  # not part of a model
     missing = [name for group in groups.values() for name in group if name not in names]
     if missing:
         raise InputError(f"{path} is not a 3DGS model: it lacks the properties {', '.join(missing[:4])}")
@@ -126,9 +126,9 @@ def load_ply(path: str | Path, frame: Frame | None = None) -> Gaussians:
 
 
 def _property_groups(bands: int) -> dict[str, list[str]]:
-    """Parameter -> the properties that hold it, in the order of the original 3DGS's files.
+    """Parameter -> its properties in the file, in the order of the original 3DGS.
 
-    Those of shN run over the bands of red, then green, then blue. `bands`: rows of `Gaussians.shN`.
+    For shN: all bands of red, then of green, then of blue. `bands`: rows of `Gaussians.shN`.
     """
     return {
         "means": ["x", "y", "z"],
@@ -142,7 +142,7 @@ def _property_groups(bands: int) -> dict[str, list[str]]:
 
 
 def _columns(gaussians: Gaussians) -> list[tuple[str, Tensor]]:
-    """(parameter, [N, ...]) whose last dimensions, flattened, are in the order of `_property_groups`."""
+    """(parameter, [N, ...]); the flattened last dimensions are in the order of `_property_groups`."""
     return [
         ("means", gaussians.means),
         ("sh0", gaussians.sh0),

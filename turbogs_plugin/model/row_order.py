@@ -1,4 +1,4 @@
-"""The order of the rows: along a curve through space, so that what lies close together is close in memory."""
+"""The order of the rows: along a curve through space, so that near Gaussians are near in memory."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ SPREADS = (
     (4, 0x10C30C30C30C30C3),
     (2, 0x1249249249249249),
 )
-"""Shifts and masks that put two empty bits behind each of 21."""
+"""Shifts and masks that put two empty bits behind each of the 21 bits."""
 
 
 def in_order_of_space(update: RowUpdate, gaussians: Gaussians, step: Step) -> RowUpdate:
-    """The same change with its new rows in the order of space; for whoever applies an update, before it does.
+    """The same change with its new rows sorted in space. To be called before the change is applied.
 
-    Splats of a tile are gathered, and added to, by row: what is seen together should be read together. After
+    Kernels read the splats of a tile, and add to them, by row; so splats seen together should be near in memory. After
     `Step.refine_until` the change stays as it is: Gaussians are then only removed, which leaves the others in order.
 
     Args:
         update: a change of `gaussians`.
-        gaussians: the model before it, about the cameras' centre.
-        step: when.
+        gaussians: the model before the change, with the cameras' centre as origin.
+        step: the time of the change.
     """
     if step.iteration > step.refine_until:
         return update
@@ -39,12 +39,12 @@ def in_order_of_space(update: RowUpdate, gaussians: Gaussians, step: Step) -> Ro
 def spatial_order(means: Tensor, extent: float) -> Tensor:
     """Rows in Morton order (Morton 1966, "A computer oriented geodetic data base").
 
-    Coordinates go through x / (extent + |x|) first, so that everything has a place, however far away. Ties keep their
-    order, and what is not finite is among the last. Does not wait for the GPU.
+    Coordinates are first mapped by x / (extent + |x|), so that every point has a place, however far away. Ties keep
+    their order, and points that are not finite are among the last. Does not wait for the GPU.
 
     Args:
         means: [N, 3] float.
-        extent: of the scene, in their unit; this far from the origin, cells are four times as large as at it.
+        extent: the scene's, in the unit of `means`; at this distance cells are four times as large as at the origin.
 
     Returns:
         [N] int64, a permutation.

@@ -27,15 +27,15 @@ memory."""
 DEVICE_SHARE = 0.5
 """Share of the device's memory that photos and maps may take: the rest is for the model, its optimizer, workspaces."""
 SHORTEST_SHARE = 0.4
-"""Of `train.base_iterations`: fewer leave the events of density control too little time between them, however few the
-photos. fox has 44 % of them with 50 epochs, and loses nothing."""
+"""Least share of `train.base_iterations`: with fewer iterations, however few the photos, the events of density control
+would be too close together. fox has 44 % of them with 50 epochs, and loses nothing."""
 
 Value = bool | int | str
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What the facts say of a setting.
+    """What the facts say about a setting.
 
     Args:
         value: what it should be.
@@ -129,7 +129,7 @@ def wanted_optimizer(facts: SceneFacts, config: Config) -> Verdict:
 
 
 def wanted_iterations(facts: SceneFacts, config: Config) -> Verdict:
-    """As many as look at each training pixel so often: error stops falling after epochs, not after iterations."""
+    """As many iterations as `train.epochs` take: error stops falling after epochs, not after iterations."""
     train, views = config.train, facts.train_views
     wanted = train.epochs * views / images_per_iteration(config, views)
     fewest = SHORTEST_SHARE * train.base_iterations

@@ -24,12 +24,12 @@ from turbogs_plugin.scene.offload import SETS
 from turbogs_plugin.scene.photos import PHOTO_BYTES
 
 VIEW_BYTES = 230
-"""Of a Gaussian in a view: the rasterizer's instance, radius and gradient record, and its share of the
+"""Bytes of a Gaussian in a view: the rasterizer's instance, radius and gradient record, and its share of the
 intersections. Measured on an H200: 213 between 150 and 600 thousand Gaussians (docs/results/h200/bench-step.json)."""
 SAMPLE_BYTES = 400
-"""Of a sample: draw, colours, gradients, errors, masks of intersections, scratch. Measured there: 320 to 400."""
+"""Bytes of a sample: draw, colours, gradients, errors, masks of intersections, scratch. Measured there: 320 to 400."""
 IMAGE_BYTES = 120
-"""Of a pixel of a whole render."""
+"""Bytes of a pixel of a whole render."""
 
 
 @dataclass(frozen=True)

@@ -1,11 +1,11 @@
 """How many iterations fit into a time.
 
-The cost of an iteration is ``base + per_gaussian * N``. Where fewer iterations fit than are configured, the run is that
-much shorter; where these would be fewer than `FEWEST_SHARE` of the configured ones, Gaussians are given up for them.
-Where more fit than are configured, and than `train.epochs` take, an iteration gets more pixels
-(`turbogs_plugin.plan.pixels`) until these fill the time, and only then there are more iterations: those overfit the
-photos (docs/budgets.md). That is how a run begins; while it trains, `turbogs_plugin.train.pace.TimePace` measures the
-cost and corrects the number of iterations.
+The cost of an iteration is ``base + per_gaussian * N``. If fewer iterations fit than are configured, the run is that
+much shorter; if they would be fewer than `FEWEST_SHARE` of the configured ones, the number of Gaussians is lowered. If
+more fit than are configured, and than `train.epochs` take, an iteration gets more pixels
+(`turbogs_plugin.plan.pixels`) until these fill the time. Only then are there more iterations, as those overfit the
+photos (docs/budgets.md). This is the plan before a run; while it trains, `turbogs_plugin.train.pace.TimePace` measures
+the cost and corrects the number of iterations.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from turbogs_plugin.plan.caps import expected_gaussians
 
 FEWEST_SHARE = 0.3
-"""Of the configured iterations; a shorter schedule gets fewer Gaussians instead."""
+"""Least share of the configured iterations; instead of fewer, the run gets fewer Gaussians."""
 
 
 @dataclass(frozen=True)

@@ -35,7 +35,7 @@ class Provenance:
 
 
 def provenance(device_type: str) -> Provenance:
-    """Of this process, computing on `cpu` or `cuda`."""
+    """The provenance of results of this process, computed on `cpu` or `cuda`."""
     kernels = compiled_kernels()
     reason = kernels.unavailable if device_type == "cuda" else "the device is the CPU"
     engine = f"{kernels.path.name} for {', '.join(kernels.architectures)}"

@@ -1,17 +1,17 @@
 """Error maps and photos that live in host memory while a GPU trains (for captures that do not fit beside the model).
 
-Of every array over flat pixels the device has a *window*: slots, each as large as the largest view, for the views of
-the present iteration and of the one before. The kernels see a flat array with the first pixel of each view, as ever;
-only where views begin changes from iteration to iteration.
+For every array over flat pixels the device has a *window*: slots, each as large as the largest view, for the views of
+the present iteration and of the one before. The kernels see a flat array and the first pixel of each view, as always;
+only these first pixels change from iteration to iteration.
 
-Only the device waits for copies. With two sets of slots, the views of an iteration travel in while the device is
-still at the iteration before, and the changed maps of that one travel out while the device is at this one:
+Only the device waits for copies. There are two sets of slots: the views of an iteration are copied in while the device
+still works on the iteration before, whose changed maps are copied out while the device works on this one. The order is:
 
-- in: after the last work that used the slot, and after what was in it has travelled out;
-- out: after the work that changed it, as soon as the next views are asked for;
-- work on a slot: after its view has travelled in.
+- copy in: after the last work that used the slot, and after its old content has been copied out;
+- copy out: after the work that changed the slot, as soon as the next views are asked for;
+- work on a slot: after its view has been copied in.
 
-What is computed is bit for bit what resident maps and photos give.
+The results are bit for bit those of maps and photos on the device.
 """
 
 from __future__ import annotations

@@ -52,9 +52,9 @@ class Photos:
         return self.colors
 
     def fetch(self, view_ids: Sequence[int]) -> None:
-        """Have the photos of these views in `colors`, from `offsets` on.
+        """Make the photos of these views available in `colors`, from `offsets` on.
 
-        Whoever reads these arrays calls it first. Here all views are always there; see `offload`.
+        Call it before reading these arrays. Here all views are always there; see `scene/offload.py`.
         """
 
     def at(self, samples: PixelSamples) -> PhotoSamples:

@@ -88,7 +88,7 @@ def write_plots(folder: Path, summary: SceneSummary) -> None:
 
 
 def plot_digest(summary: SceneSummary) -> str:
-    """Of all that the plots show, and of the way in which they show it."""
+    """A digest of everything that the plots show, and of how they are drawn."""
     rows = [
         (
             *(row.name, row.on_front),
@@ -127,8 +127,8 @@ def told_apart(summary: SceneSummary) -> tuple[list[VariantRow], str]:
 def draw_curves(summary: SceneSummary) -> Figure:
     """PSNR and mean absolute error against seconds: mean over seeds, their spread shaded.
 
-    Of more variants than can be told apart, those that are neither the baseline nor on the Pareto front are thin and
-    grey behind these; the front's plot has their names.
+    If there are more variants than can be told apart, those that are neither the baseline nor on the Pareto front are
+    drawn thin and grey behind the others; the front's plot has their names.
     """
     styles, (rows, failed) = _styles(summary), told_apart(summary)
     named, others = rows, []

@@ -95,8 +95,8 @@ class Curve:
 
     @classmethod
     def of(cls, histories: Sequence[Sequence[Evaluation]], name: str) -> Curve:
-        """Of a field of `Evaluation`. Where a time budget ended seeds at different iterations, equally many evaluations
-        are paired in their order, which are at the same fractions of the time; of others, the ends are paired."""
+        """The curve of a field of `Evaluation`. If a time budget ended seeds at different iterations, evaluations are
+        paired in order when all seeds have as many, as they are at the same fractions of it; else their ends are."""
         common = set.intersection(*({entry.iteration for entry in history} for history in histories))
         rows = [[entry for entry in history if entry.iteration in common] for history in histories]
         if any(history[-1].iteration not in common for history in histories):
@@ -111,7 +111,7 @@ class Curve:
 def pareto_front(points: Sequence[tuple[float, float]]) -> list[bool]:
     """For each (seconds, quality) whether no other is at least as fast and as good, and better in one of the two.
 
-    A point with NaN is not on the front and keeps nobody from it, for no comparison with NaN is true.
+    A point with NaN is not on the front and keeps no other point from it, as no comparison with NaN is true.
     """
 
     def beaten(point: tuple[float, float]) -> bool:

@@ -52,7 +52,7 @@ class VariantRow:
         return self.spread("psnr")
 
     def spread(self, measure: str) -> Spread:
-        """Of one of `MEASURES` over the seeds; NaN where a seed lacks it."""
+        """The spread of one of `MEASURES` over the seeds; NaN if a seed lacks it."""
         return _spread(self.cells, measure)
 
     def difference(self, measure: str) -> Difference:
@@ -65,7 +65,7 @@ class VariantRow:
         return self.spread(measure).mean / _spread(self.base, measure).mean
 
     def curve(self, name: str) -> Curve:
-        """Of a field of `Evaluation` against seconds."""
+        """The curve of a field of `Evaluation` against seconds."""
         return Curve.of([cell.history for cell in self.cells], name)
 
     def seconds_to(self, psnr: float) -> list[float]:

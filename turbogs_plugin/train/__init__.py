@@ -1,1 +1,1 @@
-"""Training: Algorithm 1, the one loop around it, and what a run keeps."""
+"""Training: Algorithm 1, the loop around it, and the files of a run."""

@@ -1,7 +1,7 @@
-"""What budgets change before a run.
+"""How budgets change the configuration before a run.
 
-A memory budget lowers the cap on Gaussians. A time budget sets the number of iterations and the pixels of one, by
-iterations timed on this machine.
+A memory budget lowers the cap on Gaussians. A time budget sets the number of iterations and of pixels per iteration,
+from iterations timed on this machine.
 """
 
 from __future__ import annotations
@@ -41,16 +41,16 @@ from turbogs_plugin.train.loop import Listener, TrainingLoop
 from turbogs_plugin.train.trainer import Trainer
 
 CALIBRATION_SHARE = 0.04
-"""Of the time budget, for the measurements that the first plan rests on: half for lambda as configured."""
+"""Share of the time budget for the measurements behind the first plan; half of it for lambda as configured."""
 CALIBRATION_SECONDS = 5.0
-"""Never more than that, as further measurements would say no more."""
+"""The measurements never take longer, as more of them would add nothing."""
 WARMUP_ITERATIONS = {"cuda": 20, "cpu": 1}
-"""Not measured: they load code and find the sizes of buffers."""
+"""Iterations that are not measured: they load code and find the sizes of buffers."""
 FEWEST_MEASURED = {"cuda": 20, "cpu": 2}
 LARGEST_OVERHEAD = 0.7
-"""Share of a time budget that may go before the first iteration."""
+"""Share of a time budget that may pass before the first iteration."""
 MEMORY_SHARE = 0.5
-"""Of a GPU's free memory, what a run without a limit may come to with more pixels than configured."""
+"""Share of a GPU's free memory that a run without a limit may take if it has more pixels than configured."""
 
 
 @dataclass(frozen=True)
@@ -58,11 +58,11 @@ class Calibration:
     """What was measured of a scene on this machine before its training.
 
     Args:
-        seconds: that the measurement took.
+        seconds: duration of the measurement.
         initialisation: seconds of `Trainer.initialise_maps`, extrapolated from one view.
-        cost: of an iteration with `pixel_budget`.
-        gaussians: at the start.
-        configured_pixel_budget, pixel_budget: lambda as it was, and as chosen to fill the time.
+        cost: cost of an iteration with `pixel_budget`.
+        gaussians: number at the start.
+        configured_pixel_budget, pixel_budget: lambda as configured, and as chosen to fill the time.
     """
 
     seconds: float
@@ -74,13 +74,13 @@ class Calibration:
 
 
 def within_budget(config: Config, scene: Scene, device: torch.device) -> tuple[Config, Calibration | None]:
-    """The configuration that keeps its budgets, and what was measured for it where time is one of them.
+    """The configuration that keeps its budgets, and what was measured for a time budget, if there is one.
 
     Args:
-        config: its places of maps and photos are decided.
+        config: the places of maps and photos are decided in it.
 
     Raises:
-        InputError: nothing fits, naming what would.
+        InputError: nothing fits; the message names what would.
     """
     limit, seconds = config.budget.memory_bytes(), config.budget.seconds()
     if limit is not None:
@@ -101,10 +101,10 @@ def within_budget(config: Config, scene: Scene, device: torch.device) -> tuple[C
 
 
 def budget_text(config: Config, measured: Calibration | None) -> str:
-    """What the budgets came to, for a terminal; empty where there are none.
+    """The results of the budgets, for a terminal; empty if there are none.
 
     Args:
-        config: as `within_budget` gave it.
+        config: from `within_budget`.
     """
     parts = []
     if cap_of(config):
@@ -149,11 +149,11 @@ def _fit(config: Config, seconds: float, cost: IterationCost, gaussians: int) ->
 
 
 def calibrate(config: Config, scene: Scene, device: torch.device, seconds: float) -> Calibration:
-    """Measure what an iteration costs; where more than the configured ones would fit, with more pixels too.
+    """Measure the cost of an iteration. If more than the configured iterations fit, measure it with more pixels too.
 
     Args:
-        seconds: of the time budget. `CALIBRATION_SHARE` of them are for this, at most `CALIBRATION_SECONDS`; more where
-            the fewest iterations that are measured take longer.
+        seconds: the time budget. `CALIBRATION_SHARE` of it is used here, at most `CALIBRATION_SECONDS`; more if the
+            fewest iterations to measure take longer.
 
     Raises:
         InputError: too much of the time would pass before the first iteration.
@@ -166,7 +166,7 @@ def calibrate(config: Config, scene: Scene, device: torch.device, seconds: float
 
 @torch.no_grad()
 def _measure(config: Config, scene: Scene, device: torch.device, seconds: float, started: float) -> Calibration:
-    """`calibrate`, but for what cleaning up takes."""
+    """`calibrate` without the clean-up."""
     trial = _Trial(config, scene, device)
     gaussians, share = trial.gaussians, 0.5 * min(CALIBRATION_SHARE * seconds, CALIBRATION_SECONDS)
     initialisation, cost = trial.initialisation(), trial.cost(share)
@@ -178,7 +178,7 @@ def _measure(config: Config, scene: Scene, device: torch.device, seconds: float,
         )
     configured, largest = pixel_budget_range(config, len(scene.train))
     largest = min(largest, configured + _room_for_images(config, scene, device, gaussians))
-    # More epochs than configured overfit the photos.
+    # More epochs than configured would overfit the photos.
     images = images_per_iteration(config, len(scene.train))
     wanted = max(config.train.iterations, math.ceil(config.train.epochs * len(scene.train) / images))
     # A measured iteration with more pixels takes at most about seconds / iterations.
@@ -188,7 +188,7 @@ def _measure(config: Config, scene: Scene, device: torch.device, seconds: float,
 
     def fitting(pixel_budget: float) -> int:
         if pixel_budget not in costs:
-            # One size of model says it: of two measurements each, the noise of their slopes would decide.
+            # Measured with one size of model: with two, the noise of their slope would decide.
             factor = trial.seconds_with(pixel_budget, share / RAISES) / cost.at(gaussians)
             costs[pixel_budget] = IterationCost(factor * cost.base, factor * cost.per_gaussian)
         left = seconds - initialisation - (time.perf_counter() - started)
@@ -210,7 +210,7 @@ def _room_for_images(config: Config, scene: Scene, device: torch.device, gaussia
 
 
 class _Trial:
-    """Iterations before training, to time them: with a model that does not grow, all bands in use."""
+    """Iterations made before training to time them, with a model that does not grow and all bands in use."""
 
     def __init__(self, config: Config, scene: Scene, device: torch.device) -> None:
         self._config = without_growth(config)
@@ -227,12 +227,12 @@ class _Trial:
         return clock.seconds * len(self._trainer.views)
 
     def cost(self, seconds: float) -> IterationCost:
-        """Of an iteration as configured: the line through what half the model and all of it take."""
+        """Cost of an iteration as configured: the line through the times of half the model and of all of it."""
         half, whole = (self._timed(stride, 0.5 * seconds) for stride in (2, 1))
         return IterationCost.through(half, whole)
 
     def seconds_with(self, pixel_budget: float, seconds: float) -> float:
-        """Of an iteration with this lambda and the whole model."""
+        """Seconds of an iteration with this lambda and the whole model."""
         self._trainer.schedule = with_pixel_budget(self._config, pixel_budget).build("schedule")
         return self._timed(1, seconds)[1]
 
@@ -241,7 +241,7 @@ class _Trial:
         trainer, train = self._trainer, self._config.train
         trainer.gaussians = self._model.map(lambda value: value[::stride].clone())
         trainer.optimizer.setup(trainer.gaussians)
-        # About half way, views and rates of a schedule are what they are in the mean.
+        # About half way, a schedule's views and rates are near their means.
         trainer.iteration = max(train.sh_degree * train.sh_interval, train.iterations // 2)
         TrainingLoop(trainer).advance(trainer.iteration + WARMUP_ITERATIONS[self._device.type])
         enough = _Enough(FEWEST_MEASURED[self._device.type], seconds)
@@ -252,7 +252,7 @@ class _Trial:
 
 @dataclass
 class _Enough(Listener):
-    """Stops when so many iterations were made and so many seconds have passed."""
+    """Stops after at least `fewest` iterations and `seconds` seconds."""
 
     fewest: int
     seconds: float

@@ -1,8 +1,9 @@
 """Checkpoints: plain tensors and numbers in one file, never half-written, never executed.
 
 A run's folder ``checkpoints/`` holds ``iteration-NNNNNN.pt`` files and ``latest``, a text file with the name of the
-newest complete one. Each is put in place by one rename, the checkpoint before the pointer, and older checkpoints are
-removed only after that: at every moment `latest` names a complete file.
+newest complete one. Both are put in place by one rename each, first the checkpoint, then `latest`. Older checkpoints
+are removed after that. So at every moment `latest` names a complete file. What a checkpoint holds:
+`RunSession.state_dict` and `Trainer.state_dict`.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ def save_checkpoint(folder: Path, iteration: int, state: dict[str, Any]) -> Path
     """Write the state of a run and make it the newest one.
 
     Args:
-        folder: ``checkpoints/`` of the run; made where absent.
+        folder: ``checkpoints/`` of the run; made if absent.
         iteration: finished iterations.
         state: nested dicts, lists and tuples of tensors, numbers, text, booleans and None.
 
@@ -43,7 +44,7 @@ def save_checkpoint(folder: Path, iteration: int, state: dict[str, Any]) -> Path
         The file.
 
     Raises:
-        TrainingStopped: the disk refused; the newest checkpoint is what it was before.
+        TrainingStopped: the disk refused; the newest checkpoint is the one before.
         TypeError: something in `state` is not plain.
     """
     for place, value in _leaves(state, "state"):
@@ -62,7 +63,7 @@ def save_checkpoint(folder: Path, iteration: int, state: dict[str, Any]) -> Path
             f"iteration {iteration}: the checkpoint could not be written to '{folder}' ({reason}): "
             "once it can be, go on with --resume"
         ) from error
-    for leftover in folder.glob(".iteration-*.pt.part"):  # of a killed process
+    for leftover in folder.glob(".iteration-*.pt.part"):  # from a killed process
         leftover.unlink(missing_ok=True)
     others = [file for file in folder.iterdir() if _NAME.fullmatch(file.name) and file != path]
     others.sort(key=lambda file: int(_NAME.fullmatch(file.name)[1]))
@@ -72,7 +73,7 @@ def save_checkpoint(folder: Path, iteration: int, state: dict[str, Any]) -> Path
 
 
 def latest_checkpoint(folder: Path) -> Path | None:
-    """The newest complete checkpoint of a ``checkpoints/`` folder, or None where there is none.
+    """The newest complete checkpoint of a ``checkpoints/`` folder, or None if there is none.
 
     Raises:
         InputError: `latest` names no checkpoint of this folder.
@@ -89,11 +90,11 @@ def latest_checkpoint(folder: Path) -> Path | None:
 def load_checkpoint(path: Path) -> dict[str, Any]:
     """The state in a checkpoint, on the CPU.
 
-    Only plain tensors and values are read (``weights_only``), stored uncompressed and no larger than the file, so a
-    file from an untrusted source can neither run code nor fill the memory.
+    Only plain tensors and values are read (``weights_only``). They must be uncompressed and no larger than the file. So
+    a file from an untrusted source can neither run code nor fill the memory.
 
     Raises:
-        InputError: not a checkpoint of ours, truncated, or with anything else in it.
+        InputError: not a checkpoint of TurboGS, truncated, or with anything else in it.
     """
     try:
         _require_bounded(path)
@@ -115,11 +116,11 @@ def require_like(saved: Any, present: Any, place: str) -> None:
     """Refuse a state whose structure differs from the present one: other keys or types, other dtypes or dimensions of
     tensors. Numbers that are not finite are refused too.
 
-    The number of rows of a tensor may differ, as it depends on how far the run had come. A part may have no state yet:
-    then None stands in the place of a mapping.
+    The number of rows of a tensor may differ, as it depends on how far the run had come. None instead of a mapping is
+    allowed too: a part without state.
 
     Raises:
-        ValueError: naming the place.
+        ValueError: the message names the place.
     """
     if present is None or (saved is None and isinstance(present, dict)):
         return
@@ -147,7 +148,7 @@ def _layout(tensor: Tensor) -> str:
 
 
 def _require_bounded(path: Path) -> None:
-    """Refuse archives that unpack to more than they are."""
+    """Refuse archives that unpack to more than their size."""
     with zipfile.ZipFile(path) as archive:
         entries = archive.infolist()
     if any(entry.compress_type != zipfile.ZIP_STORED for entry in entries):
@@ -157,7 +158,7 @@ def _require_bounded(path: Path) -> None:
 
 
 def _leaves(value: Any, place: str) -> Iterator[tuple[str, Any]]:
-    """(place, value) of all that lies in nested dicts, lists and tuples, and of the dicts' keys."""
+    """(place, value) of every value in nested dicts, lists and tuples, and of the dicts' keys."""
     if isinstance(value, dict):
         for key, item in value.items():
             yield f"{place}.{key}", key

@@ -1,4 +1,4 @@
-"""The clock of training: what counts as time, in a run as in an ablation."""
+"""The clock of training, which decides what counts as time in runs and ablations."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from turbogs_plugin.device import synchronize
 
 
 class TrainingClock:
-    """Seconds of training. Entered for training alone; waits for the GPU at both ends.
+    """Seconds of training. Use it as a context around training alone; it waits for the GPU at both ends.
 
     Args:
-        seconds: of training that passed before.
+        seconds: training time that passed before.
     """
 
     def __init__(self, device: torch.device, seconds: float = 0.0) -> None:
@@ -30,5 +30,5 @@ class TrainingClock:
         self.seconds += time.perf_counter() - self._started
 
     def now(self) -> float:
-        """Seconds so far, while entered. Does not wait for the GPU, which the trainer never leaves far behind."""
+        """Seconds so far, within the context. Does not wait for the GPU, which is never far behind the trainer."""
         return self.seconds + time.perf_counter() - self._started

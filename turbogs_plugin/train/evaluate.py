@@ -1,4 +1,4 @@
-"""Test error of a model: PSNR, SSIM, mean absolute error, LPIPS where its weights are at hand, and rendering speed."""
+"""Test error of a model: PSNR, SSIM, mean absolute error, LPIPS if its weights are there; and rendering speed."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from turbogs_plugin.scene import PosedImages
 from turbogs_plugin.types import Gaussians
 
 SSIM_SIDE = 11
-"""Side of SSIM's Gaussian window; a smaller image has none."""
+"""Side of SSIM's Gaussian window; a smaller image has no SSIM."""
 
 PSNR_LIMIT = 100.0
 """PSNR of an exact match, in dB."""
 
 VGG16_FILE = "vgg16-397923af.pth"
-"""The name under which torchvision looks for the backbone of LPIPS."""
+"""The file name under which torchvision looks for the backbone of LPIPS."""
 
 Lpips = Callable[[Tensor, Tensor], float]
 """LPIPS of two images [H, W, 3], 0 .. 1."""
@@ -46,11 +46,11 @@ class ViewMetrics:
 
 @dataclass
 class Metrics:
-    """Errors of a model over its test views: means of the views' values.
+    """Errors of a model on its test views.
 
     Args:
-        views: each test view.
-        fps: test views rendered a second, one after the other.
+        views: the errors of each test view.
+        fps: test views rendered per second, one after the other.
     """
 
     views: list[ViewMetrics]
@@ -58,13 +58,13 @@ class Metrics:
 
     @property
     def mean(self) -> ViewMetrics:
-        """The means over views; NaN where a view has none."""
+        """The means over views; NaN if a view has no value."""
         columns = zip(*((view.psnr, view.ssim, view.l1, view.lpips) for view in self.views), strict=True)
         return ViewMetrics(f"mean of {len(self.views)}", *(math.fsum(column) / len(self.views) for column in columns))
 
     @property
     def worst_psnr(self) -> float:
-        """Of the worst view: a mean hides that something covers one of them. NaN where a view has none."""
+        """PSNR of the worst view, as a mean hides one view that something covers. NaN if a view has no value."""
         values = [view.psnr for view in self.views]
         return math.nan if any(map(math.isnan, values)) else min(values)
 
@@ -78,9 +78,9 @@ def evaluate(
     Args:
         gaussians: the model, on the views' device.
         views: cameras and photos.
-        sh_degree: of the bands in use.
-        settings: of the rasterizer.
-        lpips: from `load_lpips`, where wanted.
+        sh_degree: highest degree in use.
+        settings: those of the rasterizer.
+        lpips: from `load_lpips`, if wanted.
     """
     metrics, seconds = [], 0.0
     for view_id, name in enumerate(views.names):
@@ -117,10 +117,10 @@ def compare(name: str, image: Tensor, photo: Tensor) -> ViewMetrics:
 
 
 def load_lpips(weights: str | None, device: torch.device) -> tuple[Lpips | None, str]:
-    """LPIPS (VGG16) where torchvision and the backbone's weights are on this machine. Nothing is downloaded.
+    """LPIPS (VGG16), if torchvision and the backbone's weights are on this machine. Nothing is downloaded.
 
     Args:
-        weights: local file with torchvision's VGG16 weights; None: torch's own cache is looked at.
+        weights: local file with torchvision's VGG16 weights; None: torch's own cache is searched.
         device: where to compute.
 
     Returns:
@@ -143,7 +143,7 @@ def _load_lpips(file: Path, device: torch.device) -> Lpips:
     from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
 
     cache = torch.hub.get_dir()
-    with tempfile.TemporaryDirectory() as folder:  # torchvision takes the file from a cache in which it is found
+    with tempfile.TemporaryDirectory() as folder:  # torchvision loads the file only from a cache
         (Path(folder) / "checkpoints").mkdir()
         (Path(folder) / "checkpoints" / VGG16_FILE).symlink_to(file.resolve())
         torch.hub.set_dir(folder)

@@ -1,4 +1,4 @@
-"""Where evaluations of a training are made: at its beginning, and wherever its pace wants one."""
+"""Evaluations during training: at its beginning, and where its pace asks for one."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from turbogs_plugin.train.loop import Listener, TrainingLoop
 
 @dataclass
 class Evaluations(Listener):
-    """Measures the model and tells all listeners of it.
+    """Evaluates the model and passes the result to all listeners.
 
     Args:
         test: the test views, on the trainer's device.
-        lpips: from `load_lpips`, for the evaluation at the end; None: without.
-        peak_memory: bytes to record; None: the peak of the process so far.
+        lpips: from `load_lpips`, for the evaluation at the end; None: no LPIPS.
+        peak_memory: gives the bytes to record; None: the peak of the process so far.
 
     Attributes:
         history: every evaluation.
-        metrics: of the newest one.
+        metrics: those of the newest one.
     """
 
     test: PosedImages

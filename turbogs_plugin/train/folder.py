@@ -1,4 +1,4 @@
-"""Where the parts of a run are on the disk."""
+"""The files of a run on the disk."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from turbogs_plugin.plan import Plan
 
 
 class RunFolder:
-    """Where the parts of a run are.
+    """The paths of a run's files.
 
     Attributes:
-        asked: the configuration as it was asked for.
-        config: the resolved one: what plan and budgets made of it.
+        asked: the configuration as the user asked for it.
+        config: the resolved one, after plan and budgets.
     """
 
     def __init__(self, path: Path) -> None:
@@ -31,7 +31,7 @@ class RunFolder:
         self.renders = path / "renders"
 
     def require_new(self) -> None:
-        """Raises `InputError` where the folder holds anything, or cannot be made."""
+        """Raise `InputError` if the folder holds anything, or cannot be made."""
         if self.config.exists():
             raise InputError(f"'{self.path}' holds another run: choose a new --out, or go on with --resume {self.path}")
         if self.path.exists() and not self.path.is_dir():
@@ -41,19 +41,19 @@ class RunFolder:
         require_writable(self.path, f"--out '{self.path}'")
 
     def read_config(self) -> Config:
-        """The resolved configuration of the run. Raises `InputError` where this is no run, or part of it is missing."""
+        """The resolved configuration of the run. Raises `InputError` if this is no run, or part of it is missing."""
         if not self.config.is_file():
             raise InputError(f"'{self.path}' holds no run: there is no config.yaml")
         return resolve_complete(read_yaml(self.config), str(self.config), decided=True)
 
     def read_asked(self) -> Config:
-        """The configuration that was asked for. Raises `InputError` where it is missing or incomplete."""
+        """The configuration that was asked for. Raises `InputError` if it is missing or incomplete."""
         if not self.asked.is_file():
             raise InputError(f"'{self.path}' has no {self.asked.name}, which says what was asked for: train anew")
         return resolve_complete(read_yaml(self.asked), str(self.asked))
 
     def read_plan(self) -> Plan | None:
-        """What was planned when the run began, if it is there. Raises `InputError` where it cannot be read."""
+        """The plan made when the run began, or None. Raises `InputError` if it cannot be read."""
         text = read_text(self.plan)
         try:
             return None if text is None else Plan.from_json(text)

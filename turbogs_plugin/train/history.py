@@ -1,4 +1,4 @@
-"""``history.jsonl``: one line an evaluation, the record of error against run time."""
+"""``history.jsonl``, the record of error against run time: one line per evaluation."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ class Evaluation:
 
     Args:
         iteration: finished iterations.
-        train_seconds: of training until then, without loading, evaluation, checkpoints and report.
-        psnr, ssim, l1: means over the test views; `ssim` is NaN where the images are too small for it.
+        train_seconds: training time until then, without loading, evaluation, checkpoints and report.
+        psnr, ssim, l1: means over the test views; `ssim` is NaN if the images are too small for it.
         num_gaussians: N.
         memory_bytes: peak of the GPU's tensors, or of the process on a CPU.
         nonfinite_losses: iterations so far whose loss was not finite.
-        skipped_updates: Gaussians' updates left out so far because their gradient was not finite.
-        worst_psnr: of the worst test view; NaN in what was written before it was recorded.
+        skipped_updates: updates of Gaussians skipped so far because their gradient was not finite.
+        worst_psnr: PSNR of the worst test view; NaN in old files, which lack it.
     """
 
     iteration: int
@@ -49,7 +49,7 @@ def append_evaluation(path: Path, evaluation: Evaluation) -> None:
 
 
 def read_history(path: Path) -> list[Evaluation]:
-    """All complete lines of a history; a last line cut short by a kill is left out.
+    """All complete lines of a history; a last line cut short by a killed process is left out.
 
     Raises:
         InputError: unreadable, or a line that is not an evaluation.
@@ -67,7 +67,7 @@ def read_history(path: Path) -> list[Evaluation]:
 
 
 def rewind_history(path: Path, iteration: int) -> list[Evaluation]:
-    """Drop what a history says of iterations after this one, as a resumed run will say it again."""
+    """Drop the evaluations after this iteration, as a resumed run will make them again."""
     kept = [evaluation for evaluation in read_history(path) if evaluation.iteration <= iteration]
     write_text_atomically(path, "".join(evaluation.to_json() + "\n" for evaluation in kept))
     return kept

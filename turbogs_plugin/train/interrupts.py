@@ -9,12 +9,12 @@ from types import FrameType
 
 
 class Interrupts:
-    """Turns SIGINT and SIGTERM into a wish to stop after this iteration; a second one stops at once.
+    """At the first SIGINT or SIGTERM, asks training to stop after this iteration; at a second one, stops at once.
 
-    Only in the main thread: in others, Python lets nobody handle signals, and they are left as they are.
+    It works only in the main thread: in others Python does not allow handlers, so signals keep their usual effect.
 
     Args:
-        stop: is called at the first signal.
+        stop: called at the first signal.
     """
 
     SIGNALS = (signal.SIGINT, signal.SIGTERM)

@@ -1,7 +1,7 @@
-"""The one loop of all training: of runs, of the cells of a study, of calibration, and of models that are timed.
+"""The loop of all training: for runs, the cells of a study, calibration, and models that are timed.
 
-The loop takes a trainer from mark to mark of a pace, on a clock. All else that happens in a training listens to it:
-evaluations, checkpoints, progress, records, stops.
+A pace sets marks, iterations at which the loop stops to do something else; a clock measures the training between them.
+Everything else in a training is a listener of the loop: evaluations, checkpoints, progress, records, stops.
 """
 
 from __future__ import annotations
@@ -15,16 +15,16 @@ from turbogs_plugin.train.trainer import Trainer
 
 
 class Listener:
-    """Is told what happens in a training. A listener overrides the methods that it needs."""
+    """Its methods are called when something happens in a training. A listener overrides those it needs."""
 
     def begun(self, loop: TrainingLoop) -> None:
-        """The error maps are there, and this process has made no iteration yet."""
+        """The error maps are there; this process has not yet made an iteration."""
 
     def advanced(self, loop: TrainingLoop) -> None:
         """An iteration was made. The clock runs, so this has to be cheap."""
 
     def evaluation_due(self, loop: TrainingLoop) -> None:
-        """The pace wants an evaluation here."""
+        """The pace asks for an evaluation here."""
 
     def evaluating(self, loop: TrainingLoop) -> None:
         """An evaluation begins."""
@@ -33,17 +33,17 @@ class Listener:
         """An evaluation was made."""
 
     def checkpoint_due(self, loop: TrainingLoop) -> None:
-        """The pace wants a checkpoint here; an evaluation that was due at the same place has been made."""
+        """The pace asks for a checkpoint here. An evaluation due at the same place has been made."""
 
 
 class TrainingLoop:
-    """Trains by a pace, on a clock.
+    """Trains from mark to mark of a pace, and measures the time.
 
     Args:
         trainer: new, or with a state loaded.
-        pace: where to stop on the way, and where it ends; None: after the configured iterations.
-        listeners: are told in this order.
-        seconds: of training that passed before.
+        pace: where to stop on the way, and where to end; None: after the configured iterations.
+        listeners: called in this order.
+        seconds: training time that passed before.
     """
 
     def __init__(
@@ -59,7 +59,7 @@ class TrainingLoop:
         """Train to the end, or until `stop`.
 
         Args:
-            resumed: the trainer's state was loaded: its error maps are there.
+            resumed: the trainer's state was loaded, so its error maps are there.
 
         Raises:
             TrainingStopped: the model is lost.
@@ -86,7 +86,7 @@ class TrainingLoop:
                     listener.checkpoint_due(self)
 
     def advance(self, mark: int) -> None:
-        """Train until so many iterations are finished, or until `stop`."""
+        """Train until `mark` iterations are finished, or until `stop`."""
         with self.clock:
             while self._is_short_of(mark):
                 self.trainer.step()
@@ -103,8 +103,8 @@ class TrainingLoop:
         return self.trainer.iteration >= self.pace.iterations
 
     def _is_short_of(self, mark: int) -> bool:
-        """Whether to go on towards a mark. Where not, the GPU is waited for and lost iterations are taken back, so that
-        none is missing at a mark or a stop."""
+        """Whether to go on towards a mark. At a mark or a stop it waits for the GPU and subtracts lost iterations, so
+        that none is missing there."""
         if self.trainer.iteration >= mark or self.stopped:
             self.trainer.repeat_lost(wait=True)
         return self.trainer.iteration < mark and not self.stopped

@@ -1,4 +1,4 @@
-"""How far a run goes, and where it stops on the way: by iterations, or by time."""
+"""The pace of a run: how far it goes, and where it stops on the way, by iterations or by time."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from turbogs_plugin.plan.caps import cap_of
 from turbogs_plugin.plan.time import IterationCost
 
 MARK_SHARE = 0.03
-"""Of the time, between two looks at the clock; towards the end, half of what is left."""
+"""Share of the time between two checks of the clock; but at most half of the time left."""
 
 
 class Due(NamedTuple):
@@ -36,7 +36,7 @@ class IterationPace:
         self._save_every = train.checkpoint_every or self.iterations
 
     def start(self, iteration: int, seconds: float, gaussians: int) -> None:
-        """Training begins or goes on, with so many finished iterations and seconds of training."""
+        """Training begins or goes on, after this many finished iterations and seconds of training."""
 
     def next_mark(self, iteration: int, seconds: float) -> int:
         """The finished iteration to stop at next."""
@@ -56,17 +56,17 @@ class IterationPace:
 
 
 class TimePace:
-    """As many iterations as fit into a time: their number is fitted to what they cost, again and again.
+    """As many iterations as fit into a time. Their number is fitted again and again to what they cost.
 
-    So all that goes by progress (learning rates, sampling, density control) ends with the time. Evaluations are at the
-    configured fractions of the time. Methods and attributes are those of `IterationPace`.
+    So everything that depends on progress (learning rates, sampling, density control) ends with the time. Evaluations
+    are at the configured fractions of the time. Methods and attributes are those of `IterationPace`.
 
     Args:
-        train: of the run; its iterations and its end of density control are what is planned first.
-        seconds: when to end, on the clock of training; what came before the first iteration counts.
-        cost: how the cost of an iteration depends on the number of Gaussians, from the calibration; only ratios of it
+        train: settings of the run. Its iterations and its end of density control are the first plan.
+        seconds: when to end, on the clock of training; the time before the first iteration counts.
+        cost: how the cost of an iteration depends on the number of Gaussians, from the calibration. Only its ratios
             count. None: growth is not foreseen.
-        cap: never more Gaussians than that; 0: none.
+        cap: most Gaussians; 0: no cap.
     """
 
     def __init__(self, train: TrainConfig, seconds: float, cost: IterationCost | None = None, cap: int = 0) -> None:
@@ -77,7 +77,7 @@ class TimePace:
         self._cap = cap
         self._refine_share = min(1.0, self.refine_until / self.iterations)
         self._last: tuple[int, float, int] | None = None
-        self._now = 0.0  # seconds of an iteration, of late
+        self._now = 0.0  # seconds of a recent iteration
         self._fractions = sorted({*train.evaluate_at, 1.0})
         self._save_every = train.checkpoint_every
         self._evaluated = 0
@@ -119,7 +119,7 @@ class TimePace:
         self._evaluated, self._saved = state["evaluated"], state["saved"]
 
     def _replan(self, iteration: int, seconds: float, gaussians: int) -> None:
-        """Fit `iterations` and `refine_until` to where training stands. Density control that is over stays over."""
+        """Fit `iterations` and `refine_until` to the present state. Density control that has ended does not restart."""
         before, started, fewer = self._last
         if iteration > before:
             latest = (seconds - started) / (iteration - before)
@@ -128,12 +128,12 @@ class TimePace:
             self._last = (iteration, seconds, gaussians)
             left = max(0.0, self._seconds - seconds)
             cost = max(1e-9, self._now * self._rise(iteration, gaussians, growth))
-            self.iterations = iteration + int(left / cost + 0.5)  # to the nearest, so half of one late or early
+            self.iterations = iteration + int(left / cost + 0.5)  # the nearest: at most half an iteration early or late
             if iteration < self.refine_until:
                 self.refine_until = max(iteration, round(self._refine_share * self.iterations))
 
     def _rise(self, iteration: int, gaussians: int, growth: float) -> float:
-        """Mean cost of the iterations left, in units of the present cost, if the number goes on to grow as of late."""
+        """Mean cost of the iterations left over the present cost, if the number of Gaussians grows on as recently."""
         left, growing = self.iterations - iteration, self.refine_until - iteration
         if growing <= 0 or left <= 0:
             return 1.0
@@ -144,7 +144,7 @@ class TimePace:
 
 
 Pace = IterationPace | TimePace
-"""Where a run stops to be evaluated and saved, and where it ends."""
+"""Either kind of pace."""
 
 
 def pace_of(config: Config, cost: IterationCost | None = None) -> Pace:

@@ -1,4 +1,4 @@
-"""What a run shows while it trains: a bar on a terminal, a line an evaluation elsewhere."""
+"""What a run shows while it trains: a bar on a terminal, a line per evaluation elsewhere."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ from turbogs_plugin.train.loop import Listener, TrainingLoop
 from turbogs_plugin.train.trainer import Trainer
 
 REFRESH_SECONDS = 0.1
-"""Between two updates of the bar, so that it costs a fast iteration nothing."""
+"""Time between two updates of the bar, so that fast iterations are not slowed down."""
 
 
 BarType = TypeVar("BarType", bound="TerminalBar")
 
 
 class TerminalBar(Listener):
-    """A bar on stderr that follows the iterations, where stderr is a terminal; nothing elsewhere.
+    """A bar on stderr that follows the iterations, if stderr is a terminal; otherwise nothing.
 
     Args:
-        columns: of the bar.
-        transient: whether it goes when it is left.
-        task: what the bar begins with.
+        columns: columns of the bar.
+        transient: whether the bar disappears at the end.
+        task: first values of the bar.
     """
 
     def __init__(self, *columns: ProgressColumn, transient: bool = False, **task: Any) -> None:
@@ -71,7 +71,7 @@ class TrainingProgress(TerminalBar):
     """Shows iteration, test PSNR, number of Gaussians and time left on stderr.
 
     Args:
-        total: T, as known at first.
+        total: T, as first known.
         iteration: where the run begins.
     """
 
@@ -107,7 +107,7 @@ class TrainingProgress(TerminalBar):
 
 
 def describe_nonfinite(evaluation: Evaluation) -> str:
-    """The counts of non-finite events in words; empty where there were none."""
+    """The counts of non-finite events in words; empty if there were none."""
     parts = []
     if evaluation.nonfinite_losses:
         parts.append(f"{evaluation.nonfinite_losses} non-finite losses")

@@ -1,4 +1,4 @@
-"""A run and its folder: training with evaluations and checkpoints, from the start or from a stop, to a saved model."""
+"""A run and its folder: training with evaluations and checkpoints, new or resumed, up to a saved model."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from turbogs_plugin.types import Gaussians
 
 @dataclass
 class SavedModel:
-    """What is needed of a run to look at its model."""
+    """The parts of a run needed to render or export its model."""
 
     folder: RunFolder
     config: Config
@@ -50,7 +50,7 @@ class SavedModel:
 
 
 def resolve_device(name: str, remedy: str = "use --device cpu, or see 'turbogs doctor'") -> torch.device:
-    """The device of ``auto``, ``cpu`` or ``cuda``. Raises `InputError` where CUDA is asked for and absent."""
+    """The device of ``auto``, ``cpu`` or ``cuda``. Raises `InputError` if CUDA is asked for and absent."""
     if name == "cuda" and not torch.cuda.is_available():
         build = "this PyTorch is built without CUDA" if torch.version.cuda is None else "no GPU answers"
         raise InputError(f"CUDA was asked for and is absent ({build}): {remedy}")
@@ -61,10 +61,10 @@ def open_scene(config: Config, folder: RunFolder | None = None) -> Scene:
     """The capture of a configuration.
 
     Args:
-        folder: of the run whose configuration this is; None where the user names the capture.
+        folder: that of the run with this configuration; None if the user names the capture.
 
     Raises:
-        InputError: no usable capture there.
+        InputError: there is no usable capture.
     """
     settings = config.scene
     if folder is not None and not Path(settings.path).exists():
@@ -76,7 +76,7 @@ def open_scene(config: Config, folder: RunFolder | None = None) -> Scene:
 
 
 def plan_run(config: Config) -> Plan:
-    """What `train` would decide here and now.
+    """The plan that `train` would make now.
 
     Raises:
         InputError: anything wrong with the input.
@@ -89,13 +89,13 @@ def new_loop(config: Config, scene: Scene, device: torch.device) -> tuple[Traini
     """A training that has not begun, fitted to its budgets. Runs and the cells of studies both begin here.
 
     Args:
-        config: with nothing left to decide (`Plan.apply`). The trainer's is the one fitted to the budgets.
+        config: nothing in it is `auto` any more (`Plan.apply`). The trainer gets it fitted to the budgets.
 
     Returns:
-        The loop, without listeners; and what was measured for a time budget, which is in the loop's seconds.
+        The loop, without listeners; and the measurements for a time budget, whose seconds the loop's clock includes.
 
     Raises:
-        InputError: a budget is too small, naming what would do.
+        InputError: a budget is too small; the message names one that would do.
     """
     config, calibration = within_budget(config, scene, device)
     trainer = Trainer(config, scene, device)
@@ -112,7 +112,7 @@ def fit(scene: Scene, *overrides: str, config: str = DEFAULT_CONFIG) -> Gaussian
         config: name of a packaged configuration, or a YAML file.
 
     Returns:
-        The model, on the device that it was trained on and about the scene's own centre.
+        The model, on the device of the training and in the scene's coordinates.
 
     Raises:
         InputError: anything wrong with the input.
@@ -130,11 +130,11 @@ def train(config: Config, out: Path, report: Callable[[RunSession], object] | No
     """Train from the start into a new folder. The plan is printed first.
 
     Args:
-        report: is handed the run when it is finished; `turbogs_plugin.report.pages.write_report` writes its page.
+        report: called with the finished run; `turbogs_plugin.report.pages.write_report` writes its page.
 
     Raises:
         InputError: anything wrong with the input; then nothing was written.
-        TrainingStopped: the run cannot go on; what it saved stays.
+        TrainingStopped: the run cannot go on; the files that it saved stay.
     """
     folder = RunFolder(out)
     folder.require_new()
@@ -156,16 +156,16 @@ def train(config: Config, out: Path, report: Callable[[RunSession], object] | No
 
 
 def resume(path: Path, report: Callable[[RunSession], object] | None = None) -> RunSession:
-    """Go on with a stopped run from its newest checkpoint, by its own configuration, in which all is decided.
+    """Go on with a stopped run from its newest checkpoint, with its own configuration, in which nothing is `auto`.
 
-    On a CPU, the result is bit for bit that of a run never stopped.
+    On a CPU, the result is bit for bit that of a run never stopped; `Trainer.state_dict` says why.
 
     Args:
         report: as in `train`.
 
     Raises:
-        InputError: no run there, an unusable checkpoint, a capture that is no longer what it was, or a machine that
-            does not have what the run needs; then nothing was changed.
+        InputError: no run there, an unusable checkpoint, a changed capture, or a machine without what the run needs;
+            then nothing was changed.
         TrainingStopped: the run cannot go on.
     """
     folder = RunFolder(path)
@@ -189,7 +189,7 @@ def resume(path: Path, report: Callable[[RunSession], object] | None = None) -> 
 
 @contextmanager
 def _fitting(scene: Scene, remedy: str) -> Iterator[None]:
-    """Turns a lack of device memory before training into an `InputError` that names a remedy."""
+    """Turn a lack of device memory before training into an `InputError` that names a remedy."""
     try:
         yield
     except torch.cuda.OutOfMemoryError:
@@ -197,7 +197,7 @@ def _fitting(scene: Scene, remedy: str) -> Iterator[None]:
 
 
 def _independent(config: Config, device: torch.device) -> Config:
-    """The configuration with absolute paths and the device in use, so that a resume finds the same ones anywhere."""
+    """The configuration with absolute paths and the device in use, so that a resume finds the same from any folder."""
     config.scene.path = str(Path(config.scene.path).resolve())
     if config.report.lpips_weights is not None:
         config.report.lpips_weights = str(Path(config.report.lpips_weights).resolve())
@@ -227,14 +227,14 @@ def load_model(path: Path, device: torch.device) -> SavedModel:
 
 
 class RunSession(Listener):
-    """One process's part of a run: trains, and writes what comes of it into the run's folder.
+    """The part of a run in one process: trains, and writes the results into the run's folder.
 
     Attributes:
-        plan: that the run follows; None where its folder holds none.
+        plan: the plan of the run; None if its folder holds none.
         test: the test views, on the trainer's device.
         history: every evaluation of the run.
-        resumed: the trainer's state was loaded.
-        signal: the one that stopped the training; None at the end of the run.
+        resumed: whether the trainer's state was loaded.
+        signal: the signal that stopped the training; None at the end of the run.
     """
 
     def __init__(self, folder: RunFolder, plan: Plan | None, scene: Scene, loop: TrainingLoop) -> None:
@@ -296,7 +296,7 @@ class RunSession(Listener):
                 self.trainer.load_state_dict(state["trainer"])
                 loop.clock.seconds = state["train_seconds"]
                 self.resumed = True
-        except torch.cuda.OutOfMemoryError:  # a RuntimeError, which says nothing of the checkpoint
+        except torch.cuda.OutOfMemoryError:  # a RuntimeError too, but not the checkpoint's fault
             raise
         except (KeyError, TypeError, AttributeError, IndexError, ArithmeticError, RuntimeError, ValueError) as error:
             raise InputError(f"checkpoint '{source}' does not fit this run and its capture: {error}") from None

@@ -1,6 +1,6 @@
-"""Algorithm 1 of the paper: what one iteration of training is, and the state that iterations change.
+"""Algorithm 1 of the paper: one iteration of training, and the state that iterations change.
 
-What makes iteration after iteration is in `turbogs_plugin.train.loop`.
+The loop over iterations is in `turbogs_plugin.train.loop`.
 """
 
 from __future__ import annotations
@@ -27,17 +27,17 @@ from turbogs_plugin.scene.photos import PhotoSamples
 from turbogs_plugin.types import PARAMETER_NAMES, Gaussians, GaussianStats, LossOutput, RowUpdate, Step
 
 COLOR_STRIDE = 97
-"""Every so many pixels count for the mean colour of the photos; coprime to usual widths."""
+"""The mean colour of the photos is taken over every 97th pixel; coprime to usual widths."""
 
 STATEFUL = ("maps", "view_sampler", "optimizer", "density")
-"""Attributes of a trainer that keep a state of their own."""
+"""Attributes of a trainer that have a state of their own."""
 
 
 class Trainer:
     """The Gaussians, the error maps and the strategies of one run.
 
     Args:
-        config: of the run, in which a plan has decided what was ``auto``.
+        config: that of the run, in which nothing is ``auto`` any more.
         scene: on any device.
         device: where everything is computed and kept.
     """
@@ -66,13 +66,13 @@ class Trainer:
         self.nonfinite_losses = torch.zeros((), dtype=torch.int64, device=device)
 
     def initialise_maps(self) -> None:
-        """The errors of a dense render of the initial Gaussians, Algorithm 1's initialization."""
+        """Set the maps to the errors of a dense render of the initial Gaussians, Algorithm 1's initialization."""
         for view_id in range(len(self.views)):
             self.initialise_map(view_id)
         self.initial_error = self.maps.mean()
 
     def initialise_map(self, view_id: int) -> None:
-        """The errors of one view."""
+        """Set the map of one view to the errors of its dense render."""
         image = render_image(
             self.gaussians, self.views.cameras, view_id, sh_degree=self.sh_degree, settings=self.config.raster
         )
@@ -104,11 +104,11 @@ class Trainer:
         # 6) Sparse loss and its gradients, and 7) EMA update of the error maps
         loss = self.supervise(rendered.colors, truth, step)
 
-        # 8) Backward to the screen, with the errors that step 11 wants at the Gaussians
+        # 8) Backward to the screen, carrying along the errors that step 11 needs per Gaussian
         stats = self.density.stats
         screen = rendered.backward(loss.color_gradients, loss.pixel_errors, with_statistics=stats is not None)
 
-        # 9) and 10) Backward to the parameters, solve for their updates and apply them; `stats` get this iteration's
+        # 9) and 10) Backward to the parameters, solve for their updates and apply them; adds to `stats`
         self.update(screen, stats, step)
 
         # 11) Error-driven density control
@@ -117,7 +117,7 @@ class Trainer:
         self.iteration += 1
 
     def supervise(self, colors: Tensor, truth: PhotoSamples, step: Step) -> LossOutput:
-        """Loss and error maps: at once where the loss is a rule, else by the loss's own code."""
+        """Loss and error maps: in one step if the loss is a rule, else by the loss's own code."""
         update = MapUpdate(self.maps, step, self.nonfinite_losses)
         if self.loss.terms is not None:
             return self.engine.supervise(self.loss.terms, colors, truth, update)
@@ -126,7 +126,7 @@ class Trainer:
         return loss
 
     def update(self, screen: ScreenGradients, stats: GaussianStats | None, step: Step) -> None:
-        """Gradients, statistics and step: at once where the optimizer has a rule, else by the optimizer's own code."""
+        """Gradients, statistics and update: in one step if the optimizer has a rule, else by its own code."""
         rule = self.optimizer.rule(step)
         if rule is not None:
             self.engine.update(rule, screen, self.gaussians, self.optimizer.moments, stats)
@@ -135,10 +135,10 @@ class Trainer:
             self.optimizer.step(self.gaussians, gradients, step)
 
     def follow(self, update: RowUpdate | None) -> None:
-        """What is done after density control has proposed a change of the set of Gaussians, or none.
+        """Apply the change of the set of Gaussians that density control proposed, if any.
 
-        Model, optimizer and controller follow the change, in the order of space. Then what is far away is kept from
-        growing, which no part of the paper does.
+        Model, optimizer and controller follow the change, with its rows sorted in space. Then the size of distant
+        Gaussians is limited, which is not in the paper.
         """
         if update is not None:
             if len(update.source) == 0:
@@ -152,17 +152,17 @@ class Trainer:
             restrain_distant(self.gaussians, self.extent, self.config.train.distant_size)
 
     def set_length(self, iterations: int, refine_until: int) -> None:
-        """T and the last iteration of density control: as configured, until a run that goes by time says otherwise."""
+        """Set T and the last iteration of density control. A run with a time budget changes them as it goes."""
         self.iterations, self.refine_until = iterations, refine_until
 
     def repeat_lost(self, wait: bool = False) -> None:
-        """Go back by the iterations that did nothing because the engine had too little room for them.
+        """Set the iteration back by those that did nothing because the engine had too little memory for them.
 
-        It never rewinds past a change of the set of Gaussians, which would then be made twice: iterations that were
-        lost just before one are not repeated.
+        It never goes back past a change of the set of Gaussians, which would then be made twice: iterations lost just
+        before one are not repeated.
 
         Args:
-            wait: for the GPU, to know of all of them.
+            wait: wait for the GPU, to know of all of them.
 
         Raises:
             InputError: an iteration has more intersections of a tile and a splat than a pass can have.
@@ -172,7 +172,7 @@ class Trainer:
 
     @property
     def now(self) -> Step:
-        """Where training stands."""
+        """The present state of training, as strategies see it."""
         return Step(self.iteration, self.iterations, self.refine_until, self.config.train.seed, self.extent)
 
     @property
@@ -182,14 +182,14 @@ class Trainer:
 
     @property
     def sh_degree(self) -> int:
-        """Degree of the bands in use."""
+        """Highest degree of spherical harmonics in use."""
         return self.config.train.sh_degree_at(self.iteration)
 
     def require_finite(self) -> None:
         """Stop a run whose model is lost.
 
         Raises:
-            TrainingStopped: a parameter is not finite, which no further iteration would repair.
+            TrainingStopped: a parameter is not finite, which later iterations would not repair.
         """
         for name, tensor in self.gaussians.items():
             bad = int((~tensor.isfinite()).reshape(len(tensor), -1).any(dim=1).sum()) if tensor.numel() else 0
@@ -199,7 +199,11 @@ class Trainer:
                 )
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything that iterations change, as plain tensors and numbers."""
+        """Everything that iterations change, as plain tensors and numbers.
+
+        A resume from it is bit for bit the same on a CPU: there is no generator to save, as all randomness is a
+        function of (seed, iteration, place) (`turbogs_plugin.engine.reference.philox`).
+        """
         return {
             "iteration": self.iteration,
             "initial_error": self.initial_error,
@@ -209,13 +213,13 @@ class Trainer:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Take over what `state_dict` gave, in a trainer of the same configuration and scene.
+        """Load what `state_dict` gave, into a trainer of the same configuration and scene.
 
-        A state that nobody vouches for is first compared with the present one (`checkpoint.require_like`). Of a run
-        that goes by time, `set_length` comes first.
+        An untrusted state must first be compared with the present one (`checkpoint.require_like`). In a run with a time
+        budget, call `set_length` before.
 
         Raises:
-            ValueError: the parts of the state do not fit each other or this trainer.
+            ValueError: the parts of the state do not fit each other, or not this trainer.
         """
         if not 0 <= state["iteration"] <= self.iterations or state["nonfinite_losses"] < 0:
             raise ValueError(f"iteration {state['iteration']} with {state['nonfinite_losses']} non-finite losses")
@@ -230,9 +234,9 @@ class Trainer:
 
 
 def initial_gaussians(scene: Scene, config: Config) -> Gaussians:
-    """The model that training starts from: the capture's points, and a backdrop where one is wanted.
+    """The model that training starts from: the capture's points, and a backdrop if one is wanted.
 
-    Of more points than `density.max_gaussians` has room for, that many are taken, evenly in their order.
+    If there are more points than `density.max_gaussians` allows, as many as it allows are taken, evenly in their order.
     """
     train = config.train
     rows = chosen_points(len(scene.points), cap_of(config), BACKDROP_COUNT if train.backdrop else 0)
@@ -251,7 +255,7 @@ def gaussians_of_state(state: dict[str, Any], device: torch.device) -> Gaussians
     """The model in a checkpoint's state.
 
     Raises:
-        ValueError: not the parameters of one model, or not finite.
+        ValueError: the tensors are not the parameters of one model, or not finite.
     """
     gaussians = Gaussians(**{name: state["gaussians"][name].to(device) for name in PARAMETER_NAMES})
     count, bands = len(gaussians), gaussians.shN.shape[1]

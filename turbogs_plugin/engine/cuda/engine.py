@@ -1,4 +1,4 @@
-"""The CUDA engine: the reference's twin on the kernels of csrc/."""
+"""The CUDA engine, the twin of the reference on the kernels of csrc/."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ class CudaEngine(Engine):
     """`Engine` on one CUDA device, on torch's current stream, float32.
 
     Args:
-        device: of the training whose passes share memory and never wait for the GPU (`Workspace`). None: each pass has
-            memory of its own and waits once, to learn how many intersections it has.
+        device: that of a training, whose passes share memory and never wait for the GPU (`Workspace`). None: each pass
+            has memory of its own and waits once, to learn how many intersections it has.
     """
 
     def __init__(self, device: torch.device | None = None) -> None:
@@ -41,8 +41,8 @@ class CudaEngine(Engine):
         return rasterize_cuda(gaussians, cameras, samples, options, self.workspace)
 
     def supervise(self, terms: LossTerms, colors: Tensor, truth: PhotoSamples, update: MapUpdate) -> LossOutput:
-        # The kernel gathers the truth itself where photos and maps of each view begin at the same pixel. With only one
-        # of the two in host memory they do not.
+        # The kernel gathers the photos' colours itself if the photos and the maps of each view begin at the same pixel.
+        # If only one of the two is in host memory, they do not.
         photos, starts = truth.photos.colors, update.maps.offsets[list(truth.samples.view_ids)]
         aligned = len(photos) == len(update.maps.errors) and np.array_equal(truth.starts, starts)
         targets = photos if aligned else truth.colors()

@@ -1,12 +1,12 @@
-"""What each operator of csrc/ takes: one class an operator, one field an argument. `library.launch` calls it.
+"""The arguments of the operators of csrc/: a class for each operator, a field for each argument.
 
-The fields of a launch travel as four lists: its tensors, integers, reals and the rows of its views, each in the order
-of the fields, with those of a nested class in its place. The build makes the same order known to C++
-(csrc/generate_headers.py), so this file must not import torch, and no order is written down a second time.
+`library.launch` calls an operator with four lists: the tensors, integers, reals and rows of views of the launch. Each
+list is in the order of the fields; those of a nested class stand in its place. The build writes the same order into a
+C++ header (csrc/generate_headers.py). So this file must not import torch, and no order is written down twice.
 
-Index spaces: K views, N Gaussians, T tiles with samples, P sample slots, M the most intersections of tiles and splats,
-B harmonics above band 0, X flat pixels and V training views. An instance is a Gaussian in a view, row k * N + n. All
-tensors are contiguous and on one CUDA device. A tensor that may be None is left out where the comment says.
+Letters in shapes: K views, N Gaussians, T tiles with samples, P sample slots, M the most intersections of tiles and
+splats, B harmonics above band 0, X flat pixels and V training views. An instance is a Gaussian in a view, its row
+k * N + n. All tensors are contiguous and on one CUDA device. Where a tensor may be None, a comment says when.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ class Launch:
     """A call of an operator.
 
     Attributes:
-        operator: its name: that of the class, in small letters.
-        paths: dotted paths of the fields that each of the four lists holds, in their order.
+        operator: its name, that of the class in snake case.
+        paths: dotted paths of the fields in each of the four lists, in order.
     """
 
     operator: ClassVar[str]
@@ -46,7 +46,7 @@ class Launch:
 
 
 def fields_of(kind: str, names: str) -> type:
-    """What a launch reads of an object of another module: fields that are all of one kind."""
+    """A type for an object of another module, of which a launch reads these fields, all of one kind."""
     return type("Fields", (), {"__annotations__": dict.fromkeys(names.split(), kind)})
 
 
@@ -64,13 +64,13 @@ def _paths(cls: type, prefix: str = "") -> tuple[list[str], list[str], list[str]
 
 
 def _reader(tensors: list[str], integers: list[str], reals: list[str], rows: list[str]) -> Callable[[Launch], tuple]:
-    """A function that reads the lists from a launch; written out and compiled, as it runs for every launch."""
+    """A function that reads the lists from a launch. It is generated as code, because it runs for every launch."""
     lists = ["(" + "".join(f"launch.{path}, " for path in paths) + ")" for paths in (tensors, integers, reals)]
     return eval(f"lambda launch: ({', '.join(lists)}, {f'launch.{rows[0]}' if rows else '()'})")
 
 
 def interface(layout: ModuleType) -> str:
-    """The orders of all fields and the numbers of `layout`, as text. A library built of other sources tells another."""
+    """The order of all fields and the numbers of `layout`, as text. A library from other sources has another text."""
     lines = []
     for cls in LAUNCHES:
         lines.append(f"{cls.operator}: " + "; ".join(" ".join(names) for names in cls.paths))
@@ -104,12 +104,12 @@ class Scene:
 
 @dataclass
 class Splats:
-    """What the projection leaves for the stages behind it."""
+    """The results of the projection, for the later stages."""
 
     cameras: Tensor  # [K, 28] float32, layout.CameraRow
     instances: Tensor  # [K * N, 12] float32, layout.InstanceRow; nothing where off screen
     radii: Tensor  # [K, N, 2] int32, zero where off screen
-    active_prefix: Tensor | None  # [tiles + 1] int32, tiles with samples of a smaller id; None where all have some
+    active_prefix: Tensor | None  # [tiles + 1] int32, number of tiles with samples of a smaller id; None: all have some
 
 
 @dataclass
@@ -129,20 +129,20 @@ StatSums = fields_of(
 
 
 NO_STATS = SimpleNamespace(**dict.fromkeys(StatSums.__annotations__))
-"""In place of statistics that are not wanted."""
+"""Where no statistics are wanted."""
 
 
 @dataclass
 class ScreenBackward:
-    """Gradients on the screen, and what takes them to the parameters."""
+    """Gradients on the screen, and what is needed to take them to the parameters."""
 
     scene: Scene
     records: Tensor  # [K, N, 16] float32, layout.ScreenRecord; anything where off screen
     radii: Tensor  # [K, N, 2] int32
-    stats: StatSums  # added to
+    stats: StatSums  # the launch adds to them
     num_filled: Tensor | None  # [1] int32; None where all slots are filled
     num_slots: int  # P
-    overflow: Tensor | None  # [1] int32; where not 0 the launch does nothing
+    overflow: Tensor | None  # [1] int32; if not 0, the launch does nothing
 
 
 class SampleArrays(Protocol):
@@ -158,12 +158,12 @@ class SampleArrays(Protocol):
 
 
 ProjectionSettings = fields_of("float", "near_plane far_plane alpha_min")
-"""Of `RasterSettings`."""
+"""Fields of `RasterSettings`."""
 
 
 @dataclass
 class RasterProject(Launch):
-    """Stage 1: `scene` onto the screen. Writes `splats` and `tile_cursors`, and clears records on screen."""
+    """Stage 1: project `scene`. Writes `splats` and `tile_cursors`, and clears the records of splats on screen."""
 
     scene: Scene
     settings: ProjectionSettings
@@ -175,7 +175,7 @@ class RasterProject(Launch):
 
 @dataclass
 class RasterCountIntersections(Launch):
-    """Stage 2: where the intersections of each tile begin. Raises `status[1]` where there are too many."""
+    """Stage 2: where the intersections of each tile begin. Sets the flag `status[1]` if there are too many."""
 
     tiles: TileLists
     block_sums: Tensor  # [ceil(T / SCAN_TILES), 2] int64 scratch
@@ -184,7 +184,7 @@ class RasterCountIntersections(Launch):
 
 @dataclass
 class RasterSortIntersections(Launch):
-    """Stages 3 and 4: the intersections of each tile, in order of depth."""
+    """Stages 3 and 4: the intersections of each tile, sorted by depth."""
 
     splats: Splats
     tiles: TileLists
@@ -194,12 +194,12 @@ class RasterSortIntersections(Launch):
 
 
 BlendSettings = fields_of("float", "alpha_min alpha_max transmittance_min")
-"""Of `RasterSettings`."""
+"""Fields of `RasterSettings`."""
 
 
 @dataclass
 class RasterForward(Launch):
-    """Stage 5: colours, alphas and, where asked for, depths at the samples."""
+    """Stage 5: colours, alphas and, if asked for, depths at the samples."""
 
     cameras: Tensor  # of `Splats`
     tile_ids: Tensor | None  # [T] int32; None where all tiles have samples
@@ -221,9 +221,9 @@ class RasterForward(Launch):
 
 @dataclass
 class RasterBackward(Launch):
-    """Stage 6: records of the gradients on the screen."""
+    """Stage 6: the gradients on the screen, as records, with the sums for density control."""
 
-    forward: RasterForward  # of the pass
+    forward: RasterForward  # that of the pass
     color_gradients: Tensor  # [P, 3] float32
     alpha_gradients: Tensor | None  # [P] float32
     depth_gradients: Tensor | None  # [P] float32; only of a pass with depths
@@ -238,7 +238,7 @@ class RasterBackward(Launch):
 
 @dataclass
 class TileScratch:
-    """For unit = tile: an entry for each tile of the batch."""
+    """Scratch for unit = tile: an entry for each tile of the batch."""
 
     tile_errors: Tensor | None  # float64
     tile_ages: Tensor | None  # int32
@@ -252,13 +252,13 @@ NO_SCRATCH = TileScratch(None, None, None, None)
 
 @dataclass
 class SamplePixels(Launch):
-    """Draws samples: writes `pixel_ids`, `tile_ids`, `tile_offsets` and `weights`."""
+    """Draw samples: writes `pixel_ids`, `tile_ids`, `tile_offsets` and `weights`."""
 
     errors: Tensor  # [X] float16
     stamps: Tensor  # [X] int16
     views: list[int]  # [K] layout.DrawRow
     unit: int  # of layout.UNITS
-    slots_per_tile: int  # of a tile that is not cut; 0 for unit = tile
+    slots_per_tile: int  # slots of a tile that the image's edge does not cut; 0 for unit = tile
     mixed_uniform: bool
     importance: float
     seed: int
@@ -273,14 +273,14 @@ class SamplePixels(Launch):
 
 @dataclass
 class CountFilled(Launch):
-    """Adds the number of filled slots."""
+    """Add the number of filled slots to `num_filled`."""
 
     pixel_ids: Tensor  # [P] int32
     num_filled: Tensor  # [1] int32
 
 
 class LossSettings(Protocol):
-    """Of the terms of a loss."""
+    """Fields of `LossTerms`."""
 
     epsilon: float
     l1_weight: float
@@ -295,29 +295,29 @@ MapArrays = fields_of("Tensor | None", "errors stamps view_sums")
 
 
 NO_MAPS = SimpleNamespace(**dict.fromkeys(MapArrays.__annotations__))
-"""In place of maps that are not to be updated."""
+"""Where no maps are to be updated."""
 
 
 @dataclass
 class SparseLoss(Launch):
-    """Loss with its gradient and errors; updates the maps."""
+    """Compute the loss with its gradient and errors, and update the maps."""
 
     colors: Tensor  # [P, 3] float32
     targets: Tensor | None  # [P, 3] float32
-    photos: Tensor | None  # [X, 3] uint8: in place of `targets`, to gather them from
+    photos: Tensor | None  # [X, 3] uint8, from which to gather the colours; instead of `targets`
     samples: SampleArrays
     views: list[int]  # [K] layout.ViewRow
     structure: int  # of layout.STRUCTURES
     terms: LossSettings
     maps: MapArrays
-    beta: float  # of the maps' average
+    beta: float  # EMA weight of a new error
     stamp: int  # for the pixels visited
     num_filled: Tensor | None  # [1] int32; None where all slots are filled
     loss: Tensor  # [] float64, zero
     color_gradients: Tensor  # [P, 3] float32
     pixel_errors: Tensor  # [P] float32
-    nonfinite_losses: Tensor | None  # [] int64, added to
-    overflow: Tensor | None  # [1] int32; where not 0 the maps stay as they are
+    nonfinite_losses: Tensor | None  # [] int64, 1 is added if the loss is not finite
+    overflow: Tensor | None  # [1] int32; if not 0, the maps stay as they are
 
 
 # ---- From the screen to the parameters ------------------------------------------------------------------------------
@@ -325,7 +325,7 @@ class SparseLoss(Launch):
 
 @dataclass
 class ProjectionBackward(Launch):
-    """Gradients of the parameters: rows of each view or their sum. Every entry is written."""
+    """Gradients of the parameters: a row for each view, or their sum. Every entry is written."""
 
     screen: ScreenBackward
     rows: Tensor  # [K or 1, N, 14] float32, layout.ParameterRow
@@ -344,7 +344,7 @@ Rates = fields_of("float", "means quats scales opacities sh0 shN")
 
 @dataclass
 class FusedStep(Launch):
-    """Projection backward and one step of the optimizer. Changes the Gaussians and the moments in place."""
+    """Projection backward and one step of the optimizer, in place on Gaussians and moments."""
 
     screen: ScreenBackward
     moments: Moments

@@ -1,4 +1,4 @@
-"""The compiled CUDA library: where it is, whether it can be used here, and why not. Importing this never fails."""
+"""The compiled CUDA library: where it is, and whether it can be used here. Importing this file never fails."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from turbogs_plugin.engine.cuda import launches
 from turbogs_plugin.errors import InputError
 
 LIBRARY_VARIABLE = "TURBOGS_LIBRARY"
-"""Environment variable that names another build of the library, to compare builds."""
+"""Environment variable with the path of another build of the library, to compare builds."""
 
 FIRST_TORCH = (2, 10)
-"""The library is built on torch's stable interface of this version."""
+"""The library uses the stable interface of this version of torch."""
 
 
 OLDEST_CAPABILITY = (8, 0)
@@ -25,14 +25,14 @@ OLDEST_CAPABILITY = (8, 0)
 
 
 def library_path() -> Path:
-    """Where the library is looked for, whether or not it is there."""
+    """Where the library should be, whether or not it is there."""
     named = os.environ.get(LIBRARY_VARIABLE)
     return Path(named) if named else Path(__file__).parents[2] / "_C.abi3.so"
 
 
 @lru_cache(maxsize=1)
 def _load_failure() -> str:
-    """Load the library once; "" where that went well, else why not, in one line."""
+    """Load the library once. Returns "" on success, else the reason in one line."""
     path = library_path()
     if not path.is_file():
         return f"{path.name} is not built (TURBOGS_CUDA=require pip install --no-build-isolation . says why)"
@@ -49,16 +49,16 @@ def _load_failure() -> str:
 
 
 def _interface() -> str:
-    """The orders of fields and the sizes that the loaded library was built with."""
-    tell = getattr(torch.ops.turbogs, "interface", None)  # libraries of before had none
+    """The order of fields and the sizes that the loaded library was built with, as text."""
+    tell = getattr(torch.ops.turbogs, "interface", None)  # older libraries have none
     return "" if tell is None else tell()
 
 
 def _runs_on(architecture: str, capability: tuple[int, int]) -> bool:
-    """Whether code of this name (``sm_90``, ``sm_90a``, PTX: ``compute_90``) runs on such a GPU."""
+    """Whether code of this name (``sm_90``, ``sm_90a``, PTX: ``compute_90``) runs on a GPU of this capability."""
     kind, major, minor, kin = re.fullmatch(r"(sm|compute)_(\d+)(\d)([af]?)", architecture).groups()
     built = int(major), int(minor)
-    if kin == "a":  # of that GPU only
+    if kin == "a":  # only for that GPU
         return built == capability
     if kind == "compute" and not kin:
         return built <= capability
@@ -66,7 +66,7 @@ def _runs_on(architecture: str, capability: tuple[int, int]) -> bool:
 
 
 def _mismatch(architectures: tuple[str, ...], capability: tuple[int, int]) -> str:
-    """Why a library of these architectures has no code for such a GPU, in one line; "" where it has."""
+    """Why a library of these architectures has no code for such a GPU, in one line; "" if it has."""
     if any(_runs_on(architecture, capability) for architecture in architectures):
         return ""
     present = "{}{}".format(*capability)
@@ -77,7 +77,7 @@ def _mismatch(architectures: tuple[str, ...], capability: tuple[int, int]) -> st
 
 @lru_cache(maxsize=1)
 def unavailable_reason() -> str:
-    """Why the kernels cannot run here, in one line; "" where they can. The GPU is torch's current one."""
+    """Why the kernels cannot run here, in one line; "" if they can. The GPU is torch's current one."""
     if failure := _load_failure():
         return failure
     if not torch.cuda.is_available():
@@ -101,14 +101,14 @@ def require() -> None:
 
 
 def launch(arguments: launches.Launch) -> None:
-    """Call the operator that a launch is for. Enqueued on torch's current stream of its tensors' device.
+    """Call the operator of a launch. It is enqueued on torch's current stream of its tensors' device.
 
     Raises:
-        RuntimeError: a tensor is not what the operator takes; the message names it.
+        RuntimeError: the operator does not accept a tensor; the message names it.
     """
     getattr(torch.ops.turbogs, arguments.operator)(*arguments.lists())
 
 
 def architectures() -> tuple[str, ...]:
-    """What the library holds code for: ``sm_90``, ..., or PTX, ``compute_90``; nothing where it is not loaded."""
+    """What the library holds code for: ``sm_90``, ..., or PTX, ``compute_90``. Empty if it is not loaded."""
     return () if _load_failure() else tuple(torch.ops.turbogs.architectures().split())

@@ -1,4 +1,4 @@
-"""The rasterizer in CUDA (csrc/raster), twin of `engine.reference.raster`: projection, sort by tile, forward and
+"""The rasterizer in CUDA (csrc/raster), twin of `engine.reference.raster`: projection, sorting by tile, forward and
 backward pass.
 
 Everything is float32. Without a `Workspace` a pass waits once for the GPU, to learn the number of intersections of
@@ -26,7 +26,7 @@ from turbogs_plugin.types import Cameras, GaussianGradients, Gaussians, Gaussian
 
 
 def _prepared(tensor: Tensor) -> Tensor:
-    """Detached, contiguous and aligned for 16-byte loads; itself where it already is."""
+    """The tensor detached, contiguous and aligned for 16-byte loads; a copy only if needed."""
     tensor = tensor.detach().contiguous()
     return tensor if tensor.data_ptr() % 16 == 0 else tensor.clone()
 
@@ -47,21 +47,21 @@ def _check(gaussians: Gaussians, cameras: Cameras, samples: PixelSamples) -> Non
 
 
 def warps_per_tile(slots: int, tiles: int) -> int:
-    """Work items of a tile, 32 slots each, for tiles of this many slots on average; fuller ones take several rounds."""
+    """Work items of a tile, 32 slots each, by the average slots of a tile; fuller tiles take several rounds."""
     return max(1, -(-slots // (max(1, tiles) * layout.WARP_SIZE)))
 
 
 @dataclass
 class CudaScreenGradients:
-    """Gradients on the screen (see `ScreenGradients`), and what takes them to the parameters.
+    """Gradients on the screen (see `ScreenGradients`), and what is needed to take them to the parameters.
 
     Args:
-        scene: what was drawn. Its Gaussians are raw parameters, the caller's own tensors where those were contiguous.
-        samples: of the pass.
+        scene: what was drawn. Its Gaussians are raw parameters, the caller's own tensors if those were contiguous.
+        samples: those of the pass.
         records: [K, N, 16] float32, `layout.ScreenRecord`. Where a Gaussian is off screen, a record may hold anything.
         radii: [K, N, 2] int32, zero where off screen.
         with_statistics: whether the columns that only density control asks for were filled.
-        overflow: [1] int32 on the device, or None; where not 0 the pass drew nothing and nothing may change.
+        overflow: [1] int32 on the device, or None; if not 0, the pass drew nothing and nothing may change.
     """
 
     scene: launches.Scene
@@ -96,7 +96,7 @@ class CudaScreenGradients:
         return GaussianGradients(**columns, shN=shN, touched=touched, view_losses=view_losses)
 
     def backward_arguments(self, stats: GaussianStats | None) -> launches.ScreenBackward:
-        """What the launches that take these gradients to the parameters have in common."""
+        """The arguments shared by the launches that take these gradients to the parameters."""
         require_views(len(self.records))
         require_statistics(self.with_statistics, stats)
         return launches.ScreenBackward(
@@ -111,7 +111,7 @@ class CudaScreenGradients:
 
 
 def count_filled(samples: PixelSamples) -> Tensor | None:
-    """[1] int32 on the device: the filled slots; None where all are."""
+    """[1] int32 on the device: the number of filled slots; None if all are."""
     if not samples.has_empty_slots:
         return None
     count = torch.zeros(1, dtype=torch.int32, device=samples.pixel_ids.device)
@@ -120,7 +120,7 @@ def count_filled(samples: PixelSamples) -> Tensor | None:
 
 
 def require_views(count: int) -> None:
-    """Raise `InputError` where a batch has no view, or more than the kernels take."""
+    """Raise `InputError` if a batch has no view, or more than the kernels accept."""
     if not 1 <= count <= layout.MAX_VIEWS:
         raise InputError(f"a batch takes 1 .. {layout.MAX_VIEWS} views, got {count}")
 
@@ -176,7 +176,7 @@ class CudaRendered(Rendered):
 
 @dataclass(frozen=True)
 class _Buffers:
-    """Uninitialised memory of a pass: the workspace's, or memory of its own where there is none."""
+    """Uninitialised memory for a pass: from the workspace, or newly allocated without one."""
 
     workspace: Workspace | None
     device: torch.device
@@ -201,7 +201,7 @@ def rasterize_cuda(
     """`Engine.render`, on torch's current stream of the Gaussians' device.
 
     Args:
-        workspace: memory to use again, and no waiting for the GPU; see `Workspace` for what the caller then owes.
+        workspace: memory to reuse, so that nothing waits for the GPU; `Workspace` says what the caller must then do.
 
     Raises:
         InputError: no kernels here, a tensor of wrong dtype or device, or more intersections than a pass can have.

@@ -1,9 +1,9 @@
-"""The training kernels, typed: sampling, loss, and projection backward with the optimizer's step on CUDA tensors.
+"""Python functions for the training kernels: sampling, loss, and projection backward with the optimizer's step.
 
 Each function does what its torch twin in `engine.reference` defines: `draws.draw_pixels`, `losses.sparse_loss` with
 `ErrorMaps.update`, `raster.ReferenceScreenGradients.parameter_gradients` with `update.apply_update`. It is enqueued on
-torch's current stream and not waited for. Tensors must be contiguous; one of another device, dtype or shape raises
-`RuntimeError`, naming it and what was expected; more views than the kernels take raise `InputError`.
+torch's current stream and does not wait. Tensors must be contiguous. A wrong device, dtype or shape raises
+`RuntimeError`, which names the tensor and what was expected; more views than the kernels accept raise `InputError`.
 """
 
 from __future__ import annotations
@@ -79,14 +79,14 @@ def sample_pixels(rule: DrawRule, maps: ErrorMaps, view_ids: tuple[int, ...], ra
 
 @lru_cache(maxsize=4096)
 def _view_slots(width: int, height: int, unit: str, wanted: int) -> int:
-    """Slots of a view of which so many pixels or cells of each tile are drawn."""
+    """Slots of a view when `wanted` pixels or cells are drawn from each tile."""
     return int(slots_of_tiles(unit, wanted, *tile_extents(np.array([[width, height]]))).sum())
 
 
 def view_rows(
     starts: np.ndarray, sizes: np.ndarray, view_ids: Sequence[int], draws: Sequence[tuple[int, ...]] | None = None
 ) -> list[int]:
-    """A `layout.ViewRow` of each view, or with `draws` a `layout.DrawRow`, end to end."""
+    """A `layout.ViewRow` for each view (with `draws` a `layout.DrawRow`), end to end."""
     require_views(len(view_ids))
     columns = zip(starts.tolist(), sizes.tolist(), view_ids, draws or [()] * len(view_ids), strict=True)
     return [number for start, size, view_id, draw in columns for number in (start, *size, view_id, *draw)]
@@ -100,17 +100,17 @@ def sparse_loss(
     update: MapUpdate | None = None,
     overflow: Tensor | None = None,
 ) -> LossOutput:
-    """Loss, gradient and pixel errors, and with `update` what `ErrorMaps.update` does, in one launch.
+    """Loss, gradient and pixel errors, in one launch. With `update` it also does what `ErrorMaps.update` does.
 
-    A sample whose colour is not finite counts as an empty slot: its gradient and error are zero, and the maps keep what
-    they have.
+    A sample whose colour is not finite counts as an empty slot: its gradient and error are zero, and its pixel in the
+    maps stays as it is.
 
     Args:
         colors: [P, 3] float32 or float16.
-        targets: [P, 3] float32, the truth at the samples; or [X, 3] uint8, the photos of all views, gathered by the
-            kernel: they lie as the maps of `update` do, which are then needed.
+        targets: [P, 3] float32, the truth at the samples. Or [X, 3] uint8, the photos of all views, from which the
+            kernel gathers; they are laid out like the maps, so `update` is then needed.
         samples: of at most `MAX_VIEWS` views.
-        overflow: [1] int32 on the device, or None; where it is not 0, maps and count of `update` stay as they are.
+        overflow: [1] int32 on the device, or None; if it is not 0, maps and count of `update` stay as they are.
 
     Returns:
         The loss (a float64 scalar on the device), gradients [P, 3] float32 and errors [P] float32.
@@ -160,7 +160,7 @@ def fused_step(
 
     Args:
         screen: of at most `MAX_VIEWS` views.
-        gaussians: the model that `screen` was made of: float32, contiguous.
+        gaussians: the model that `screen` was made from: float32, contiguous.
         moments: its optimizer state, float32.
     """
     library.require()

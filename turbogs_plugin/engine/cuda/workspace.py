@@ -1,11 +1,11 @@
-"""Memory of the CUDA rasterizer from one pass to the next, and how it does without waiting for the GPU.
+"""Memory of the CUDA rasterizer, kept from one pass to the next, so that no pass waits for the GPU.
 
-The number of intersections of tiles and splats of a pass is known on the GPU only. A `Workspace` gives every pass room
-for as many as earlier passes lead to expect. Each pass sends its true count to the host without waiting, and later
-passes look whether it has come. Where a count exceeds its room, the kernels raise a flag on the device: that pass and
-all that follow it draw nothing and change nothing, until the host learns of it, makes room and lowers the flag
-(`Workspace.take_lost`). So a splat is never dropped silently. Whoever lost passes does them again; in training that is
-`Trainer.repeat_lost`, which leaves out those before a change of the set of Gaussians.
+Only the GPU knows how many intersections of tiles and splats a pass has. A `Workspace` gives every pass memory for as
+many as earlier passes suggest. Each pass sends its true count to the host without waiting, and later passes check
+whether it has arrived. If a count exceeds the memory, the kernels set an overflow flag on the device. That pass and all
+later ones draw nothing and change nothing, until the host learns of it, enlarges the memory and clears the flag
+(`Workspace.take_lost`). So a splat is never dropped silently. The caller repeats the lost passes; in training
+`Trainer.repeat_lost` does so, except for those before a change of the set of Gaussians.
 """
 
 from __future__ import annotations
@@ -21,22 +21,22 @@ from turbogs_plugin.engine.layout import INTERSECTIONS_MAX
 from turbogs_plugin.errors import InputError
 
 GROWTH = 1.25
-"""A buffer that must grow gets this much more than was asked for."""
+"""A buffer that must grow gets this factor of the size asked for."""
 
 MARGIN, EARLY_MARGIN, EARLY_PASSES = 1.15, 1.5, 32
-"""Room for intersections over the largest number expected; the margin of the first passes, which know few views."""
+"""Memory for intersections over the largest number expected: in general; in the first passes; how many these are."""
 
 FORGETTING = 0.998
-"""What a pass leaves of the largest count per tile, so that a rare peak does not cost sorting for ever."""
+"""Each pass multiplies the largest count per tile by this, so that a rare peak does not cost sorting for ever."""
 
 CAPACITY_STEP = 1 << 14
 """Capacities are multiples of this, so that sizes of scratch memory can be remembered."""
 
 MAX_CAPACITY = INTERSECTIONS_MAX // CAPACITY_STEP * CAPACITY_STEP
-"""The largest capacity. A count of `INTERSECTIONS_MAX` is beyond it and therefore raises the flag."""
+"""The largest capacity. A count of `INTERSECTIONS_MAX` exceeds it, so it sets the flag."""
 
 PENDING_MAX = 8
-"""Counts under way; one more waits for the oldest."""
+"""Most counts on their way to the host; one more waits for the oldest."""
 
 
 def round_capacity(intersections: float) -> int:
@@ -48,7 +48,7 @@ def require_possible(intersections: int) -> None:
     """Refuse a pass of more intersections than one can have.
 
     Raises:
-        InputError: no memory would be room enough.
+        InputError: no memory would suffice.
     """
     if intersections > MAX_CAPACITY:
         raise InputError(
@@ -58,7 +58,7 @@ def require_possible(intersections: int) -> None:
 
 @dataclass
 class _Pending:
-    """A count under way: of which pass, with how many active tiles; where it arrives, and when."""
+    """A count on its way to the host: of pass `number`, with `tiles` active tiles. `event` says when it has arrived."""
 
     number: int
     tiles: int
@@ -67,14 +67,14 @@ class _Pending:
 
 
 class Workspace:
-    """Buffers of one training run on one device and one stream. What a pass left in them is valid until the next pass.
+    """Buffers of one training run on one device and one stream. Their content is valid until the next pass.
 
     Args:
         device: a CUDA device.
 
     Attributes:
         status: [2] int32 on the device: intersections of the latest pass; the overflow flag.
-        passes: passes begun.
+        passes: number of passes begun.
     """
 
     def __init__(self, device: torch.device | str) -> None:
@@ -91,16 +91,16 @@ class Workspace:
 
     @property
     def overflow(self) -> Tensor:
-        """[1] int32 on the device, not 0 while passes do nothing. Kernels that change state must look at it."""
+        """[1] int32 on the device, not 0 while passes do nothing. Kernels that change state must check it."""
         return self.status[1:]
 
     @property
     def overflowed(self) -> bool:
-        """The host knows of a pass that did not fit."""
+        """Whether the host knows of a pass that did not fit."""
         return self._first_lost is not None
 
     def buffer(self, name: str, shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
-        """Memory of this name, uninitialised; grown where needed."""
+        """The buffer of this name, uninitialised; it grows if needed."""
         view = self._views.get(name)
         if view is not None and view.shape == shape and view.dtype == dtype:  # nearly always; slicing takes 9 us
             return view
@@ -114,11 +114,11 @@ class Workspace:
         return view
 
     def bytes_held(self) -> int:
-        """Memory of all buffers."""
+        """Bytes of all buffers."""
         return sum(held.numel() * held.element_size() for held in self._buffers.values())
 
     def capacity(self, gaussians: int, tiles: int) -> int | None:
-        """Room for the intersections of a pass, or None where nothing is known yet.
+        """How many intersections a pass gets memory for, or None if nothing is known yet.
 
         Raises:
             RuntimeError: an overflow is known and `take_lost` has not been called.
@@ -137,7 +137,7 @@ class Workspace:
         """Take in the true count of a pass.
 
         Raises:
-            InputError: a pass cannot have that many.
+            InputError: more than a pass can have.
         """
         require_possible(intersections)
         self._intersections_per_tile = max(self._intersections_per_tile * FORGETTING, intersections / max(1, tiles))
@@ -158,7 +158,7 @@ class Workspace:
         """Take in the counts that have arrived.
 
         Raises:
-            InputError: a pass had more intersections than one can have; it drew nothing.
+            InputError: a pass had more intersections than a pass can have; it drew nothing.
         """
         while self._pending and self._pending[0].event.query():
             arrived = self._pending.popleft()
@@ -168,19 +168,19 @@ class Workspace:
             self.learn(intersections, arrived.tiles)
 
     def _wait(self) -> None:
-        """Take in every count under way. They arrive in the order of the passes."""
+        """Wait for every count under way and take it in. They arrive in the order of the passes."""
         if self._pending:
             self._pending[-1].event.synchronize()
             self.poll()
 
     def take_lost(self, wait: bool = False) -> int:
-        """Number of passes at the end that did nothing and must be done again; makes room for them and lowers the flag.
+        """How many of the latest passes did nothing and must be repeated. Clears the flag; the repetition will fit.
 
         Args:
-            wait: for every count under way, as at the end of training; else only what has arrived is looked at.
+            wait: wait for every count under way, as at the end of training; else only arrived ones are looked at.
 
         Raises:
-            InputError: a pass had more intersections than one can have: repeating it is no use.
+            InputError: a pass had more intersections than a pass can have: repeating it is no use.
         """
         if wait:
             self._wait()

@@ -1,8 +1,8 @@
 """Front-to-back compositing of splats at sampled pixels, and its gradient.
 
-Tiles with like numbers of splats go together into a block ``[B tiles, S samples, G splats]`` of bounded size, padded to
-a rectangle, so that a block's intermediate arrays stay in cache; the splats of deep tiles are taken in slices. Slices
-end early where every pixel of the block is opaque.
+Tiles with similar numbers of splats form a block ``[B tiles, S samples, G splats]``, padded to a rectangle. Its size is
+bounded, so that its intermediate arrays stay in cache. The splats of deep tiles are taken in slices. Once every pixel
+of a block is opaque, its further slices are skipped.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class Block:
 
 @dataclass
 class Compositor:
-    """What compositing needs beside the splats: which intersections, which pixels.
+    """What compositing needs beside the splats: intersections, pixels and settings.
 
     Args:
         intersections: the M intersections of the T tiles.
@@ -88,7 +88,7 @@ class Compositor:
             table: see `splat_table`.
 
         Yields:
-            The block; numbers [B, G] of the intersections of the slice, and where they are real; the slice.
+            The block; numbers [B, G] of the slice's intersections; which of them are real, not padding; the slice.
         """
         centers = self.samples.coordinates().to(table.dtype) + 0.5
         centers = torch.cat([centers, centers.new_zeros(1, 2)])  # [P + 1, 2], the last of them padding
@@ -109,7 +109,7 @@ class Compositor:
 
 @dataclass
 class Slice:
-    """One slice of a block, [B, S, G] unless told: what the forward pass knows of it and the backward pass needs."""
+    """One slice of a block, [B, S, G] unless noted: what the forward pass computes and the backward pass needs."""
 
     features: Tensor  # [B, 5, G] red, green, blue, 1, depth
     conics: Tensor  # [3, B, 1, G]
@@ -166,7 +166,7 @@ def composite_slice(
 
 
 def splat_table(means2d: Tensor, conics: Tensor, colors: Tensor, opacities: Tensor, depths: Tensor) -> Tensor:
-    """[10, R], channel by channel."""
+    """[10, R], the channels that `composite_slice` lists."""
     columns = [means2d, conics, opacities[:, None], colors, depths[:, None]]
     return torch.cat(columns, dim=1).T.contiguous()
 
@@ -175,7 +175,7 @@ def composite(compositor: Compositor, table: Tensor) -> Tensor:
     """Composite all samples.
 
     Returns:
-        [P, 5]: sums of weight times red, green, blue, 1 and depth. Zero in empty slots.
+        [P, 5]: sums of weight times (red, green, blue, 1, depth). Zero in empty slots.
     """
     samples = compositor.samples
     sums = table.new_zeros(len(samples) + 1, 5)
@@ -189,11 +189,11 @@ def composite_backward(
 ) -> Tensor:
     """Take the gradients of `composite` to the splats.
 
-    The weights are composited a second time, front to back; what lies behind a splat is the pixel's total less what has
-    been seen of it, so nothing is divided by a small transmittance.
+    The weights are composited a second time, front to back. The contribution behind a splat is the pixel's total minus
+    what has been seen of it, so nothing is divided by a small transmittance.
 
     Args:
-        table, sums: what `composite` took and gave.
+        table, sums: the argument and the result of `composite`.
         gradients: [P, 5], d loss / d sums.
         pixel_errors: [P].
 
@@ -208,7 +208,7 @@ def composite_backward(
     totals = torch.cat([(upstream[:-1, :5] * sums).sum(dim=1, keepdim=True), sums.new_zeros(1, 1)])
     records = table.new_zeros(len(intersections.rows), ScreenRecord.SIZE)
     for block, numbers, real, piece in compositor.slices(table):
-        # `totals` [P + 1, 1]: what the splats to come will contribute
+        # `totals` [P + 1, 1]: the contribution of the splats still to come
         record, totals[block.samples] = _slice_backward(piece, upstream[block.samples], totals[block.samples])
         records[intersections.slots[numbers[real]]] = record[real]
     return intersections.sum_by_row(records)

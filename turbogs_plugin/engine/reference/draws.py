@@ -1,35 +1,36 @@
 """The draw of pixels, cells or tiles by which the samplers choose what is rendered (paper section 3.5).
 
-Within every 16x16 tile of the K views, N units are drawn without replacement in three stages, each from what the
-stages before it left: the *hard* share by error, the *stable* share by age, the *mixed* rest by both. A unit is a pixel
-(the paper's), a 4x4 cell, or, drawn among the tiles of a view instead of within a tile, a whole tile.
+Within every 16x16 tile of the K views, N units are drawn without replacement in three stages, each from the units that
+the stages before it left: the *hard* share by error, the *stable* share by age, the *mixed* rest by both. A unit is a
+pixel (the paper's), a 4x4 cell, or a whole tile; whole tiles are drawn among the tiles of a view.
 
 The draw is defined down to the bit, so that `draw_pixels` here and its CUDA twin return equal sets:
 
-1. Of each unit: its error E, float32 (the error of a pixel; of a cell or tile the exact sum of its pixels' errors,
-   rounded once; sums of halves are exact in float64), and its age A, an integer (the largest age of its pixels; they
-   are drawn together, so their ages differ only in maps that were once drawn by another unit).
-2. Four random words ``x0 .. x3`` of each unit (layout in `philox`): the place is the pixel id ``y * width + x``, the id
-   of the cell's first pixel, or the tile's number within its view; the purpose says which of the three.
-3. Each stage ranks the units not yet drawn by a 64-bit key, and takes the largest; keys are distinct, for their low
-   20 bits are ``2^20 - 1 - rank``, so among equals the lower rank goes first. The rank is the pixel's `sample_order`,
-   the cell's number in its tile, row by row, or the tile's number in its view. The high bits are:
+1. Each unit has an error E, float32. For a pixel it is the pixel's error. For a cell or tile it is the exact sum of its
+   pixels' errors, rounded once; sums of halves are exact in float64. It also has an age A, an integer, the largest age
+   of its pixels. (They are drawn together, so their ages differ only in maps once drawn by another unit.)
+2. Each unit has four random words ``x0 .. x3`` (layout in `philox`). Their place is the pixel id ``y * width + x``, the
+   id of the cell's first pixel, or the tile's number within its view; the purpose says which of the three.
+3. Each stage ranks the units not yet drawn by a 64-bit key, and takes the largest. Keys are distinct, as their low 20
+   bits are ``2^20 - 1 - rank``, so among equals the lower rank goes first. The rank is the pixel's `sample_order`, the
+   cell's number in its tile, row by row, or the tile's number in its view. The high bits are:
 
    - hard: the bits, as an integer, of the float32 ``max(E, 2^-100) / exponential(x0)``, an exponential race: taking the
-     largest is the multinomial draw without replacement, with the probabilities E / sum(E). Zero errors come
-     after all others, and among themselves at random: a tile without error is drawn uniformly;
+     largest is the multinomial draw without replacement, with the probabilities E / sum(E). Zero errors come after
+     all others, in random order, so a tile without error is drawn uniformly;
    - stable: ``A << 24 | x1 >> 8``, the largest age, ties at random;
    - mixed: the bits of ``max(M, 2^-100) / exponential(x2)`` with ``M = E / S + A / B``, the two divisions and the sum
-     each rounded to float32; S and B are the exact sums of E and A over the tile (over the view for unit = tile),
-     whether drawn or not, rounded to float32; a quotient by zero counts as 0. For `mixed` = uniform, M = 1.
+     each rounded to float32. S and B are the exact sums of E and A over all units of the tile (of the view for unit =
+     tile), drawn or not, rounded to float32. A quotient by zero counts as 0. For `mixed` = uniform, M = 1.
 
-Importance weights are ``w = p^-a`` over their mean, with p the probability that a unit is drawn given the keys of the
+Importance weights are ``w = p^-a`` over their mean. p is the probability that a unit is drawn, given the keys of the
 others ("rank conditioning", Cohen and Kaplan 2007: dividing by it makes a single stage exactly unbiased). In a stage,
-tau is the least key with which the unit would have been taken: for a unit that the stage takes, the largest key it
-leaves (none where it takes all there are); for any other, drawn before or not at all, the smallest key it takes. With
-the high bits of tau as what they stand for, the chance of a race is ``1 - exp(-max(E or M, 2^-100) / tau)``, of the
-stable stage ``clamp(((A + 1) << 24) - tau, 0, 2^24) / 2^24``, and 1 without a tau; a stage that takes nothing has none.
-Together, ``p = 1 - (1 - p_hard) (1 - p_stable) (1 - p_mixed)``, and 1 where all units of a row are drawn.
+tau is the least key with which the unit would have been taken. For a unit that the stage takes, it is the largest key
+left (none if the stage takes all). For any other unit, drawn before or not at all, it is the smallest key taken. If
+tau stands below for the number in its high bits, the probability of a stage is ``1 - exp(-max(E or M, 2^-100) / tau)``
+in a race, ``clamp(((A + 1) << 24) - tau, 0, 2^24) / 2^24`` in the stable stage, and 1 without a tau. It is 0 for a
+stage that takes nothing. Together, ``p = 1 - (1 - p_hard) (1 - p_stable) (1 - p_mixed)``, and 1 where all units of a
+row are drawn.
 """
 
 from __future__ import annotations
@@ -66,17 +67,17 @@ from turbogs_plugin.types import PixelSamples, Step, TileGrid
 RANK_BITS = 20
 AGE_TIE_BITS = 24
 WEIGHT_FLOOR = 2.0**-100
-"""Below every positive weight by so much that a unit of no weight never wins against one that has some."""
+"""So far below every positive weight that a unit of zero weight never wins against one with a positive weight."""
 
 
 @dataclass(frozen=True)
 class Units:
-    """The units of a draw: R rows of U units, each row drawn by itself.
+    """The units of a draw: R rows of U units; each row is a draw of its own.
 
     Args:
         errors: [R, U] float64, exact sums; 0 where there is no unit.
         ages: [R, U] integers; 0 where there is no unit.
-        exist: [R, U] bool: rows of cut tiles have gaps.
+        exist: [R, U] bool, there is a unit: rows of tiles cut by the image's edge have gaps.
         words: four [R, U] int64 random words.
         wanted: units to draw from each row.
     """
@@ -89,11 +90,11 @@ class Units:
 
 
 def draw_units(units: Units, rule: DrawRule) -> tuple[Tensor, Tensor | None]:
-    """Draw from each row, in the three stages of the module's text.
+    """Draw from each row, in the three stages of the module docstring.
 
     Returns:
-        [R, U] bool, the units drawn; and their inclusion probabilities p, [R, U] float32 (meaningless where not
-        drawn), or None where the rule has no importance weights.
+        [R, U] bool, the units drawn; and their inclusion probabilities p, [R, U] float32 (meaningless for units not
+        drawn), or None if the rule has no importance weights.
     """
     ranks = (1 << RANK_BITS) - 1 - torch.arange(units.exist.shape[1], device=units.errors.device)  # [U]
     errors, ages = units.errors.float(), units.ages.long()
@@ -143,11 +144,11 @@ def _share(values: Tensor, sums: Tensor) -> Tensor:
 
 
 def draw_pixels(rule: DrawRule, maps: ErrorMaps, view_ids: tuple[int, ...], rate: float, step: Step) -> PixelSamples:
-    """`Engine.draw`, the definition of the CUDA twin (see the module's text).
+    """`Engine.draw`, as the module docstring defines it.
 
     Returns:
-        Samples whose every count is known without reading anything back from the device. Slots of a tile: min(N, its
-        pixels) for unit = pixel; 16 for each drawn cell, at most its pixels, for cell; 256 for tile.
+        Samples whose counts are all known without reading from the device. A tile has min(N, its pixels) slots for
+        unit = pixel; 16 for each drawn cell, at most its pixels, for cell; 256 for tile.
     """
     maps.fetch(view_ids)
     device, views = maps.errors.device, np.asarray(view_ids, dtype=np.int64)
@@ -213,7 +214,7 @@ def _draw_tiles(batch: _Batch, rate: float, rule: DrawRule) -> PixelSamples:
         exist = torch.ones(1, end - first, dtype=torch.bool, device=device)
         of_row = tuple(word[row].T for word in words)
         drawn, probabilities = draw_units(Units(errors[None, row], ages[None, row], exist, of_row, wanted), rule)
-        # Their number is known here; a boolean index would ask the device for it.
+        # Their number is known here; a boolean index would wait for the device.
         tile_ids = torch.argsort(drawn[0].to(torch.int8), stable=True, descending=True)[:wanted]
         chosen.append(first + tile_ids)
         if rule.importance:

@@ -1,4 +1,4 @@
-"""The torch engine: every result is defined here, on any device and in float32 or float64."""
+"""The torch engine, the definition of every result, on any device and in float32 or float64."""
 
 from __future__ import annotations
 

@@ -12,7 +12,7 @@ from turbogs_plugin.engine.rendered import RasterSettings
 from turbogs_plugin.types import TILE_SIZE, PixelSamples
 
 ROUNDING = 16
-"""Units in the last place by which a computed exponent may be off, relative to the largest of its terms."""
+"""Rounding error allowed for a computed exponent: units in the last place of the largest of its terms."""
 
 
 @dataclass
@@ -22,9 +22,9 @@ class Intersections:
     Args:
         rows: [M] int64, ordered by (tile, depth, Gaussian).
         tile_counts: [T] int64, intersections of each tile of `PixelSamples.tile_ids`.
-        slots: [M] int64, where each stands in an order in which all intersections of a row are neighbours.
-        row_counts: [R] int64, intersections of each row in that order, of the rows as listed in `row_order`.
-        row_order: [R] int64.
+        slots: [M] int64, place of each in a second order, in which the intersections of a row are neighbours.
+        row_counts: [R] int64, intersections of each row of `row_order`.
+        row_order: [R] int64, the rows in that second order.
     """
 
     rows: Tensor
@@ -34,10 +34,10 @@ class Intersections:
     row_order: Tensor
 
     def sum_by_row(self, values: Tensor) -> Tensor:
-        """Sum values of intersections into rows, in a fixed order.
+        """Sum the values of the intersections of each row, in a fixed order.
 
         Args:
-            values: [M, C] in the order of `slots` (that is, `values[slots[i]]` belongs to intersection ``i``).
+            values: [M, C]; `values[slots[i]]` belongs to intersection ``i``.
 
         Returns:
             [R, C].
@@ -47,7 +47,7 @@ class Intersections:
 
 
 def spread(counts: Tensor) -> tuple[Tensor, Tensor]:
-    """Lay out `counts[i]` items for every ``i``, end to end.
+    """Lay `counts[i]` items for every ``i`` end to end.
 
     Args:
         counts: [R] int64.
@@ -63,8 +63,8 @@ def spread(counts: Tensor) -> tuple[Tensor, Tensor]:
 def smallest_exponents(conics: Tensor, low: Tensor, high: Tensor) -> Tensor:
     """A lower bound, tight to rounding, of ``sigma = (a dx^2 + c dy^2) / 2 + b dx dy`` over rectangles.
 
-    A convex form that has its minimum outside a rectangle takes its smallest value on one of the two edges that face
-    the minimum; along an edge it is a parabola. Inside, both candidates below are zero.
+    If a convex form has its minimum outside a rectangle, its smallest value there is on one of the two edges that face
+    the minimum. Along an edge it is a parabola. If the minimum is inside, both candidates below are zero.
 
     Args:
         conics: [C, 3].
@@ -91,8 +91,8 @@ def smallest_exponents(conics: Tensor, low: Tensor, high: Tensor) -> Tensor:
 def intersect_tiles(rows: Rows, splats: Splats, samples: PixelSamples, settings: RasterSettings) -> Intersections:
     """Find the intersections of all tiles that hold samples.
 
-    Every one with ``alpha >= alpha_min`` at some pixel of the tile is found; one that has it at no point of the
-    rectangle of the tile's pixel centres is not, apart from rounding.
+    A splat with ``alpha >= alpha_min`` at some pixel of the tile is always found. A splat with less at every point of
+    the rectangle of the tile's pixel centres is not, apart from rounding.
     """
     device = splats.means2d.device
     sizes = torch.as_tensor(samples.sizes, device=device)  # [K, 2]

@@ -4,12 +4,12 @@ All functions have one signature, ``solve(rows, weights, damping, rhs) -> x``:
 
 - rows: [K, n, D] the g_k; weights: [K, n] the c_k >= 0; damping: [n, D] the d > 0; rhs: [n, D] the b; x: [n, D].
 
-The optimizer uses `solve_scaled_cholesky` and `solve_low_rank`. They first scale the system by d^(-1/2) on both sides:
-it becomes I + (something positive semi-definite), whose eigenvalues are >= 1, and the length of the scaled rows, on
-which alone its condition depends, can be bounded. Cholesky itself does not mind how many orders of magnitude lie
-between the entries of d; what it minds is damping lost in rounding beside long rows, and squares that overflow. The
-scaled form has neither. `solve_raw_cholesky` is what happens without it; `solve_float64` is the yardstick. Both are
-there for the table of docs/numerics.md.
+For the blocks of Moment-LM (D = 10 and 4) `reference/update.py` uses `solve_low_rank`, and the CUDA kernel
+(`csrc/optimizer/moment_lm.cuh`) does what `solve_scaled_cholesky` does. Both first scale the system by d^(-1/2) on both
+sides. It becomes I + (something positive semi-definite), whose eigenvalues are >= 1. Its condition depends only on the
+length of the scaled rows, which can be bounded. Entries of d of very different sizes do not harm Cholesky. Damping lost
+in rounding beside long rows does, and so do squares that overflow; the scaled form has neither. `solve_raw_cholesky`
+shows what happens without scaling, `solve_float64` is the yardstick. Both are there for the table of docs/numerics.md.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ import torch
 from torch import Tensor
 
 ROW_LIMIT = 100.0
-"""Longest scaled row. One row of length l shrinks the step along itself by 1 / (1 + l^2): at this limit to a ten
-thousandth, as good as none, while the condition number stays below 1 + K * 1e4, which float32 can carry. Where rows
-that long span many directions and all but depend on each other, cutting them changes the answer (it damps less)."""
+"""Longest scaled row. A row of length l multiplies the step along itself by 1 / (1 + l^2). At this limit that is a ten
+thousandth, nearly nothing, while the condition number stays below 1 + K * 1e4, which float32 can handle. If rows of
+that length span many directions and are almost linearly dependent, cutting them changes the answer (it damps less)."""
 
 
 def scaled_rows(rows: Tensor, weights: Tensor, damping: Tensor) -> Tensor:
-    """[K, n, D]: sqrt(c_k) g_k / sqrt(d), cut to length `ROW_LIMIT`. Neither overflows nor gives NaN for finite input:
-    the direction is divided by its largest entry before anything is squared."""
+    """[K, n, D]: sqrt(c_k) g_k / sqrt(d), cut to length `ROW_LIMIT`. Finite input gives no overflow and no NaN: the
+    direction is divided by its largest entry before anything is squared."""
     direction = rows * torch.rsqrt(damping)
     largest = direction.abs().amax(dim=-1, keepdim=True)  # [K, n, 1]
     unit = direction / largest.clamp(min=torch.finfo(rows.dtype).tiny)  # entries within -1 .. 1
@@ -35,7 +35,7 @@ def scaled_rows(rows: Tensor, weights: Tensor, damping: Tensor) -> Tensor:
 
 
 def solve_scaled_cholesky(rows: Tensor, weights: Tensor, damping: Tensor, rhs: Tensor) -> Tensor:
-    """Cholesky of the scaled system, D x D."""
+    """Cholesky of the scaled system, D x D, as in the CUDA kernel."""
     scale = torch.rsqrt(damping)
     scaled = scaled_rows(rows, weights, damping)
     matrix = torch.einsum("kni,knj->ijn", scaled, scaled)
@@ -54,8 +54,8 @@ def solve_low_rank(rows: Tensor, weights: Tensor, damping: Tensor, rhs: Tensor) 
 
 
 def solve_raw_cholesky(rows: Tensor, weights: Tensor, damping: Tensor, rhs: Tensor) -> Tensor:
-    """Cholesky of the system as printed in the paper, unscaled. For comparison only: where a pivot fails, or the
-    products overflow, the result is NaN."""
+    """Cholesky of the system as printed in the paper, unscaled. For comparison only: if a pivot fails, or products
+    overflow, the result is NaN."""
     matrix = torch.einsum("kn,kni,knj->nij", weights, rows, rows) + torch.diag_embed(damping)
     factor, failed = torch.linalg.cholesky_ex(matrix)
     solution = torch.cholesky_solve(rhs.unsqueeze(-1), factor).squeeze(-1)
@@ -63,7 +63,7 @@ def solve_raw_cholesky(rows: Tensor, weights: Tensor, damping: Tensor, rhs: Tens
 
 
 def solve_float64(rows: Tensor, weights: Tensor, damping: Tensor, rhs: Tensor) -> Tensor:
-    """`solve_scaled_cholesky` in float64 throughout. For comparison; the answer is float64."""
+    """`solve_scaled_cholesky` in float64 throughout. For comparison; the result is float64."""
     return solve_scaled_cholesky(rows.double(), weights.double(), damping.double(), rhs.double())
 
 

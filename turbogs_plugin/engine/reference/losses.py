@@ -1,10 +1,10 @@
-"""Losses on sampled pixels in torch, each with its own gradient: the definition of what `LossTerms` mean (paper section
-3.7 and appendix).
+"""Losses on sampled pixels in torch, each with its own gradient: the definition of `LossTerms` (paper section 3.7 and
+appendix).
 
 Every loss is a mean over all filled samples of the K views together, or over the tiles that hold them, so its gradients
-are as large as those of a dense mean loss. Half-precision colours are computed with in single precision, and get
-single-precision gradients. A sample whose colour is not finite contributes no loss and no gradient, and its error is 0;
-it still counts in the mean. With autograd upstream: ``colors.backward(out.color_gradients)``.
+are as large as those of a dense mean loss. Half-precision colours are converted to single precision, and so are their
+gradients. A sample whose colour is not finite adds no loss and no gradient, and its error is 0; it still counts in the
+mean. With autograd upstream: ``colors.backward(out.color_gradients)``.
 
 Notation, per tile and channel: n samples x (prediction) and y (truth) with importance weights w; their shares
 ``omega = w / sum(w)`` (1 / n without weights) define means, variances s_x^2, s_y^2 and covariance s_xy, all biased.
@@ -22,7 +22,7 @@ from turbogs_plugin.engine.rules import LUMINANCE_CONSTANT, STRUCTURE_CONSTANT, 
 from turbogs_plugin.types import LossOutput, PixelSamples
 
 BALANCE_EPSILON = 1e-8
-"""Keeps the balance of a structure term without gradient defined (the paper's equation of lambda)."""
+"""Keeps the paper's lambda, the gradient-balanced weight, defined where the structure term has no gradient."""
 
 
 def sparse_loss(terms: LossTerms, colors: Tensor, targets: Tensor, samples: PixelSamples) -> LossOutput:
@@ -32,11 +32,11 @@ def sparse_loss(terms: LossTerms, colors: Tensor, targets: Tensor, samples: Pixe
         f = lambda (with `balance`) * gate (with `gate`)
         lambda = clip(mean |grad l1| / (mean |grad S| + 1e-8), 0, 1)
 
-    l1 is the Charbonnier term of `_Problem`, S the similarity named by `structure`. The two means of the balance are
-    over the tile's samples (by their shares), of the L1 norms over channels of ``d / sqrt(d^2 + eps^2)`` and of g: the
-    appendix's printed gradients, which without 1 / n compare the two terms as they enter L. lambda is constant in the
-    backward pass. The gate ``s_y^2 / (s_y^2 + c)`` of the truth's own variance comes after the balance, which would
-    undo it.
+    l1 is the Charbonnier term of `_Problem`, S the similarity named by `structure`. ``grad l1`` is
+    ``d / sqrt(d^2 + eps^2)`` and ``grad S`` is g, the gradients that the appendix prints. lambda takes their L1 norms
+    over channels, and means over the tile's samples (by their shares). Both gradients lack 1 / n, so the two terms
+    compare as they enter L. lambda is constant in the backward pass. The gate ``s_y^2 / (s_y^2 + c)`` of the truth's
+    own variance is applied after lambda, which would undo it.
 
     Args:
         terms: which loss.
@@ -67,14 +67,14 @@ class TileGroups:
     """The samples of each tile, with their weights.
 
     Attributes:
-        weights: [P, 1], 0 in slots without a part.
+        weights: [P, 1], 0 in unused slots.
         shares: [P, 1], omega: the weights over their sum in the tile.
         tiles: T.
         filled: scalar tensor, the number of filled slots, at least 1.
     """
 
     def __init__(self, samples: PixelSamples, used: Tensor) -> None:
-        """`used`: [P], 1 for the slots that have a part, 0 for the others, in the dtype of the computation."""
+        """`used`: [P], 1 for the slots that count, 0 for the others, in the dtype of the computation."""
         self.tile_of_slot = samples.tile_of_slot()
         self.tiles = len(samples.tile_ids)
         self.first_slots = samples.tile_offsets[:-1].long().clamp(max=max(0, len(samples) - 1))  # [T]
@@ -88,7 +88,7 @@ class TileGroups:
         return values.new_zeros(self.tiles, values.shape[1]).index_add_(0, self.tile_of_slot, values)
 
     def mean(self, values: Tensor) -> Tensor:
-        """[P, C] -> [T, C]: means under the shares."""
+        """[P, C] -> [T, C]: means weighted by the shares."""
         return self.sum(self.shares * values)
 
     def spread(self, values: Tensor) -> Tensor:
@@ -115,7 +115,7 @@ class TileMoments:
 
     @classmethod
     def of(cls, groups: TileGroups, colors: Tensor, targets: Tensor) -> TileMoments:
-        """Two passes, about the tile's first sample: a constant tile has variance 0 exactly, at any brightness."""
+        """Two passes, relative to the tile's first sample, so a constant tile has variance 0 exactly."""
         first_x, first_y = colors[groups.first_slots], targets[groups.first_slots]
         relative_x, relative_y = colors - groups.spread(first_x), targets - groups.spread(first_y)
         mean_x, mean_y = groups.mean(torch.cat([relative_x, relative_y], dim=1)).chunk(2, dim=1)
@@ -135,8 +135,8 @@ def correlation(moments: TileMoments, groups: TileGroups, constant: float) -> Si
         S = (s_xy + f) / sqrt((s_x^2 + f) (s_y^2 + f))
         g = (y - mean_y) / sqrt((s_x^2 + f) (s_y^2 + f)) - S (x - mean_x) / (s_x^2 + f)
 
-    Where variances exceed f this is the paper's NCC. With the floor in numerator and denominator, S = 1 and g = 0
-    where x = y and where a tile has one sample or is constant in both, and ``|omega g| <= 1.5 sqrt(omega / f)``.
+    Where variances exceed f this is the paper's NCC. As the floor is in numerator and denominator, S = 1 and g = 0
+    where x = y, in tiles of one sample, and in tiles constant in both x and y. ``|omega g| <= 1.5 sqrt(omega / f)``.
     """
     floor = 0.5 * constant
     scale_x, scale_y = (moments.variance_x + floor).sqrt(), (moments.variance_y + floor).sqrt()
@@ -151,8 +151,8 @@ def printed_correlation(moments: TileMoments, groups: TileGroups, constant: floa
         S = s_xy / sqrt(s_x^2 s_y^2 + epsilon)
         g = (y - mean_y) / sqrt(s_x^2 s_y^2 + epsilon) - S (x - mean_x) / (s_x^2 + epsilon)
 
-    A flat tile scores 0, and so does a faint texture: epsilon is compared with the product of two variances. There g is
-    not quite the derivative of S, which has s_y^2 / (s_x^2 s_y^2 + epsilon) in the place of 1 / (s_x^2 + epsilon).
+    A flat tile scores 0, and a faint texture scores near 0, as epsilon is added to a product of two variances. There g
+    is not quite the derivative of S, which has s_y^2 / (s_x^2 s_y^2 + epsilon) in the place of 1 / (s_x^2 + epsilon).
     """
     scale = (moments.variance_x * moments.variance_y + constant).sqrt()
     similarity = moments.covariance / scale
@@ -175,8 +175,8 @@ def contrast(moments: TileMoments, groups: TileGroups, constant: float) -> Simil
 
 
 def ssim(moments: TileMoments, groups: TileGroups, constant: float) -> Similarity:
-    """SSIM of each tile's samples taken as one window: the luminance term times `contrast`, both with SSIM's own
-    constants whatever `constant` is."""
+    """SSIM with a tile's samples as one window: the luminance term times `contrast`, both with SSIM's own constants,
+    whatever `constant` is."""
     structure, structure_gradients = contrast(moments, groups, STRUCTURE_CONSTANT)
     mean_x, mean_y = moments.mean_x, moments.mean_y
     denominator = mean_x * mean_x + mean_y * mean_y + LUMINANCE_CONSTANT
@@ -192,14 +192,14 @@ SIMILARITIES: dict[str, Callable[[TileMoments, TileGroups, float], Similarity]] 
     "ssim": ssim,
     "printed_ncc": printed_correlation,
 }
-"""Name of a structure term -> its definition. Those of `strategies.losses` are named alike."""
+"""Name of a structure term -> its definition. `strategies.losses` uses the same names."""
 
 
 class _Problem:
-    """What all losses start from: inputs in the precision of the computation, and the Charbonnier term.
+    """The start of every loss: inputs in the precision of the computation, and the Charbonnier term.
 
-    The term is ``mean over filled samples of w * mean over channels of (sqrt(d^2 + eps^2) - eps)``, d = x - y: the
-    paper's up to a constant, so that it is 0 at d = 0. `slopes` [P, 3] is ``d / sqrt(d^2 + eps^2)``.
+    The term is ``mean over filled samples of w * mean over channels of (sqrt(d^2 + eps^2) - eps)``, d = x - y. It is
+    the paper's minus a constant, so that it is 0 at d = 0. `slopes` [P, 3] is ``d / sqrt(d^2 + eps^2)``.
     """
 
     def __init__(self, colors: Tensor, targets: Tensor, samples: PixelSamples, epsilon: float) -> None:

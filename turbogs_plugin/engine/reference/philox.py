@@ -1,4 +1,4 @@
-"""Counter-based random numbers, and exponential variates that are the same to the last bit on every device.
+"""Counter-based random numbers, and exponential variates with the same bits on every device.
 
 Philox4x32-10 (Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", SC 2011) maps a counter of four 32-bit
 words under a key of two to four random words. The layout that every sampler of this project uses:
@@ -14,10 +14,10 @@ key 0      the low 32 bits of the seed
 key 1      the iteration, modulo 2^32
 =========  ==================================================================================
 
-One call gives the four words ``x0 .. x3`` of a place; who uses them says which is for what.
+One call gives the four words ``x0 .. x3`` of a place; each caller says which word it uses for what.
 
 A uniform number in (0, 1) is ``u = (2 * (x >> 9) + 1) * 2^-24``: an odd multiple of 2^-24, exact in single precision
-and never 0 or 1. (24 random bits and a half would need 25 bits, and round to 1.)
+and never 0 or 1. (With 24 random bits it would need 25 bits, and could round to 1.)
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def philox4x32(
     Args:
         counter: four int64 tensors (or numpy arrays), each holding values 0 .. 2^32 - 1; the first has the shape of the
             result, the others broadcast to it.
-        key: two such numbers, or arrays of them that broadcast to the first.
+        key: two such numbers, or arrays of them that broadcast to the first counter.
 
     Returns:
         Four int64 tensors (or arrays), each holding values 0 .. 2^32 - 1.

@@ -1,8 +1,8 @@
 """Perspective projection of Gaussians onto the images of K views (EWA splatting, as gsplat 1.5.3 does it).
 
 A *row* is one Gaussian in one view. Only the R rows that can be drawn at all are projected, ordered by view, then
-Gaussian. What is behind the camera, too transparent, or not finite never enters the graph, so nothing of it can
-overflow there.
+Gaussian. Gaussians behind the camera, too transparent, or not finite never enter the graph, so they cannot overflow
+there.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ SPAN_MAX = 1e7
 covariance would overflow in float32."""
 
 DISTANCE_MAX = 1e18
-"""Gaussians with a coordinate beyond this are not drawn: squared distances would overflow in float32. No image reaches
-that far to the side of what is nearer than the far plane."""
+"""Gaussians with a coordinate beyond this are not drawn: squared distances would overflow in float32. No image shows
+anything so far to the side and nearer than the far plane."""
 
 QUATERNION_MIN = 1e-30
 """Quaternions whose largest component is below this have no direction; they count as the identity."""
@@ -30,7 +30,7 @@ QUATERNION_MIN = 1e-30
 
 @dataclass
 class Rows:
-    """Which Gaussian and view each of the R rows is, in the order (view, Gaussian).
+    """The view and the Gaussian of each of the R rows, in the order (view, Gaussian).
 
     Args:
         views: [R] int64, position in the batch.
@@ -44,11 +44,11 @@ class Rows:
 
     @property
     def flat(self) -> Tensor:
-        """[R] int64 position in a flattened [K, N]."""
+        """[R] int64 position in the flattened [K, N]."""
         return self.views * self.shape[1] + self.gaussians
 
     def take(self, gaussians: Gaussians) -> Gaussians:
-        """The parameters [R, ...] of each row, and the model's own `shN`, whose gradient is summed over views."""
+        """The parameters [R, ...] of each row; but the model's own `shN`, whose gradient is summed over views."""
         rows = {name: value if name == "shN" else value[self.gaussians] for name, value in gaussians.items()}
         return Gaussians(**rows)
 
@@ -82,7 +82,7 @@ class Splats:
 
 @torch.no_grad()
 def drawable_rows(gaussians: Gaussians, cameras: Cameras, settings: RasterSettings) -> Rows:
-    """The rows within the depth planes, with enough opacity, of Gaussians that are finite and of sane size."""
+    """The rows between the depth planes and opaque enough, of Gaussians that are finite and of bounded size."""
     usable = torch.sigmoid(gaussians.opacities) >= settings.alpha_min  # [N]; False for NaN
     usable &= gaussians.means.abs().amax(dim=1) <= DISTANCE_MAX
     for name, value in gaussians.items():
@@ -107,7 +107,7 @@ def rotation_matrices(quats: Tensor) -> Tensor:
     """
     size = quats.detach().abs().amax(dim=-1, keepdim=True)
     identity = quats.new_tensor([1.0, 0.0, 0.0, 0.0])
-    # The division by the largest component keeps the squares of tiny and huge quaternions in range.
+    # Dividing by the largest component keeps the squares of tiny and huge quaternions in range.
     scaled = torch.where(size > QUATERNION_MIN, quats / size.clamp(min=QUATERNION_MIN), identity)
     w, x, y, z = (scaled * (scaled * scaled).sum(dim=-1, keepdim=True).rsqrt()).unbind(dim=-1)
     xx, yy, zz, xy, xz, yz, wx, wy, wz = x * x, y * y, z * z, x * y, x * z, y * z, w * x, w * y, w * z
@@ -125,7 +125,7 @@ def project_rows(
     """Project rows; differentiable in the parameters.
 
     Args:
-        parameters: of the rows, see `Rows.take`.
+        parameters: those of the rows, see `Rows.take`.
         cameras: the K views.
         sh_degree: 0 .. 3.
     """
@@ -140,8 +140,8 @@ def project_rows(
     x, y, inverse = x / depths, y / depths, 1 / depths
     means2d = torch.stack([fx * x + cx, fy * y + cy], dim=-1)
 
-    # The Jacobian is taken at a point moved to within 15 % of the image's edge, as in gsplat: far outside, the linear
-    # approximation would blow the splat up.
+    # As in gsplat, the Jacobian is taken at a point within 15 % of the image's edge: farther outside, the linear
+    # approximation would make the splat far too large.
     margin_x, margin_y = 0.15 * width / fx, 0.15 * height / fy
     x = x.clamp(min=-(cx / fx + margin_x), max=(width - cx) / fx + margin_x)
     y = y.clamp(min=-(cy / fy + margin_y), max=(height - cy) / fy + margin_y)

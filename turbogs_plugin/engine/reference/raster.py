@@ -1,4 +1,4 @@
-"""The rasterizer in torch: the definition of what every other one computes, and what runs without a GPU."""
+"""The rasterizer in torch: the definition of every other one, and the one that runs without a GPU."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ class ReferenceScreenGradients:
     """Gradients on the screen (see `ScreenGradients`).
 
     Args:
-        rows: which (view, Gaussian) each row is.
+        rows: the (view, Gaussian) of each row.
         splats: their projection, connected to `leaves` by autograd.
         leaves: the parameters of the rows, see `Rows.take`.
         records: [R, 16], see `layout.ScreenRecord`.
-        samples: of the pass.
-        with_statistics: whether the pass was asked for them.
+        samples: those of the pass.
+        with_statistics: whether the pass summed up statistics.
     """
 
     rows: Rows

@@ -1,7 +1,7 @@
-"""One step of the parameters in torch: the definition of what an `UpdateRule` means (paper section 3.9 and appendix).
+"""One step of the parameters in torch: the definition of `UpdateRule` (paper section 3.9 and appendix).
 
 A step is a function of (parameters, gradients, `GaussianMoments`, `UpdateRule`). A Gaussian that no sample touched
-keeps its parameters, moments and step count; so does one with a gradient that is not finite, which is counted.
+keeps its parameters, moments and step count. So does one with a gradient that is not finite; these are counted.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ BLOCKS = (
 """The two blocks of a packed row that moment-damped LM solves: geometry and appearance."""
 
 GRADIENT_LIMIT = 1e17
-"""Gradients are cut here, so that the square of a sum over up to 100 views stays finite in float32 (largest 3.4e38)."""
+"""Gradients are cut here, so that the square of a sum over up to 100 views stays finite in float32 (up to 3.4e38)."""
 
 
 @torch.no_grad()
@@ -34,14 +34,14 @@ def apply_update(
 ) -> None:
     """Make one step of `rule`: changes `gaussians` and `moments` in place.
 
-    The higher bands make Adam's step whatever the rule (appendix, second half of the LM equation): no block has them.
+    The higher bands make Adam's step under every rule: they are in no block (appendix, second half of the LM equation).
 
     Args:
-        gradients: of each view, or their sum; what the rule needs summed is summed here.
+        gradients: of each view, or their sum; this function sums them where the rule needs that.
     """
     finite = finite_gradients(gradients)
     moments.skipped += (gradients.touched & ~finite).sum()
-    index = torch.nonzero(gradients.touched & finite).squeeze(-1)  # [n] whom to update
+    index = torch.nonzero(gradients.touched & finite).squeeze(-1)  # [n] Gaussians to update
     moments.steps[index] += 1
     steps = moments.steps[index]
     rows = packed_rows(gradients, index)  # [K, n, 14]
@@ -93,23 +93,23 @@ def finite_gradients(gradients: GaussianGradients) -> Tensor:
 
 @dataclass
 class AdamTerms:
-    """What an update of n Gaussians is made of: bias-corrected m, and sqrt(v) + eps of bias-corrected v; [n, D]."""
+    """The terms of an update of n Gaussians, [n, D] each: bias-corrected m; sqrt(v) + eps, v bias-corrected."""
 
     mean: Tensor
     denominator: Tensor
 
     def delta(self, rates: Tensor | float) -> Tensor:
-        """[n, D] Adam's change of the parameters."""
+        """[n, D] the change of the parameters by Adam."""
         return -(rates * (self.mean / self.denominator))
 
 
 def advance(
     exp_avg: Tensor, exp_avg_sq: Tensor, gradient: Tensor, index: Tensor, steps: Tensor, rule: UpdateRule
 ) -> AdamTerms:
-    """Move the moments of the Gaussians `index` [n] on by their gradients [n, D]. `steps`: [n], this one included.
+    """Advance the moments of the Gaussians `index` [n] by their gradients [n, D]. `steps`: [n], this one included.
 
-    1 - beta is formed in double, and the bias correction 1 - beta^t as -expm1(t log beta): either difference taken in
-    float32 would be off by 5e-5 of itself for beta = 0.999.
+    1 - beta is computed in double, and the bias correction 1 - beta^t as -expm1(t log beta): in float32 either
+    difference would have a relative error of 5e-5 for beta = 0.999.
     """
     mean = torch.lerp(exp_avg[index], gradient, 1 - rule.beta1)
     square = torch.lerp(exp_avg_sq[index], gradient * gradient, 1 - rule.beta2)
@@ -125,22 +125,22 @@ def balanced_delta(rows: Tensor, losses: Tensor, terms: AdamTerms, rule: UpdateR
 
     Args:
         rows: [K, n, 14] gradients of each view.
-        losses: [K, n] the Gaussian's share of the loss in each view. A row whose share is zero or not finite says
-            nothing of curvature and is left out.
-        terms: of the bias-corrected moments, [n, 14].
+        losses: [K, n] the Gaussian's share of the loss in each view. A row whose share is zero or not finite is left
+            out, as it says nothing about curvature.
+        terms: from the bias-corrected moments, [n, 14].
     """
     rates = packed_rates(rule.rates, rows)
     adam = terms.delta(rates)
     has_share = (losses > 0) & torch.isfinite(losses)
     largest = torch.finfo(rows.dtype).max
     weights = torch.where(has_share, (rule.lm.curvature / losses).clamp(max=largest), 0.0).to(rows.dtype)
-    # A rate of zero holds its parameter: no coupling may move it, so it gets the damping of the largest float's root.
+    # A rate of zero fixes its parameter, even against coupling: its damping divides by the root of the smallest float.
     damping = terms.denominator / rates.clamp(min=torch.finfo(rows.dtype).tiny ** 0.5)
     delta = _solve(rows, weights, damping, terms.mean)
     if rule.lm.max_step > 0:
         bound = torch.maximum(rule.lm.max_step * rates, adam.abs())
         delta = torch.maximum(torch.minimum(delta, bound), -bound)
-    # Without rows the solution is Adam's step; taking that one as it is makes them equal to the last bit.
+    # Without rows the solution is Adam's step; taking Adam's makes them equal to the last bit.
     takes_solution = torch.zeros_like(delta, dtype=torch.bool)
     for block in BLOCKS:
         has_row = (rows[..., block] != 0).any(dim=-1) & (weights > 0)  # [K, n]
@@ -159,5 +159,5 @@ def paper_delta(rows: Tensor, mean: Tensor, square: Tensor, rule: UpdateRule) ->
 
 
 def _solve(rows: Tensor, weights: Tensor, damping: Tensor, mean: Tensor) -> Tensor:
-    """[n, 14] minus the solution of the damped system of each block."""
+    """[n, 14] minus the solution of the damped systems, the 10x10 block of geometry and the 4x4 one of appearance."""
     return -torch.cat([solve_low_rank(rows[..., b], weights, damping[:, b], mean[:, b]) for b in BLOCKS], dim=-1)
