@@ -1,7 +1,7 @@
 """Fills the tables of README.md and docs/results/README.md from the studies' results; `make pages` runs it.
 
-A table stands between ``<!-- made: NAME -->`` and ``<!-- end -->``, where NAME is a key of `TABLES`. What is between the
-two is replaced. A second run changes nothing.
+A table stands between ``<!-- made: NAME -->`` and ``<!-- end -->``, where NAME is a key of `TABLES`; what is between
+them is replaced. A second run changes nothing.
 """
 
 from __future__ import annotations

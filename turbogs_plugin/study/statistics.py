@@ -62,7 +62,7 @@ class Difference:
 
     @property
     def clear(self) -> bool | None:
-        """Whether noise alone would make so much in less than one case of twenty; None where one seed leaves it open."""
+        """Whether noise alone would make so much in less than one case of twenty; None for one seed."""
         if math.isnan(self.standard_error):
             return None
         return abs(self.mean) > T95[min(self.count - 1, len(T95)) - 1] * self.standard_error
