@@ -77,6 +77,26 @@ def test_the_number_of_gaussians_changed_and_every_part_followed(whole):
     assert len(state["optimizer"]["steps"]) == count
 
 
+def test_moments_and_statistics_follow_their_gaussians(capture):
+    """A change of the set, which the trainer brings into the order of space: every row is still its Gaussian's."""
+    trainer = Trainer(tiny_config(capture).without_plan(), load_scene(capture), torch.device("cpu"))
+    moments, count = trainer.optimizer.moments, len(trainer.gaussians)
+    tags = torch.arange(1.0, count + 1)  # which Gaussian a row is, in all that has rows
+    trainer.gaussians.sh0[:, 0, 0] = moments.exp_avg[:, 0] = moments.exp_avg_shN[:, 0] = tags
+    moments.steps[:] = tags.int()
+    trainer.density.stats.error_sums[:] = tags
+    shuffled = torch.randperm(count, generator=torch.Generator().manual_seed(0))
+    source = torch.cat([shuffled, shuffled[:9]])
+    fresh = torch.arange(count + 9) >= count
+    trainer.follow(RowUpdate(source, fresh, {}))
+    moments, tags = trainer.optimizer.moments, trainer.gaussians.sh0[:, 0, 0]
+    assert sorted(tags.tolist()) == sorted((source + 1.0).tolist()) and not torch.equal(tags, source + 1.0)
+    assert torch.equal(moments.steps, tags.int())
+    for rows in (moments.exp_avg[:, 0], moments.exp_avg_shN[:, 0], trainer.density.stats.error_sums):
+        assert int((rows == 0).sum()) == 9
+        assert torch.equal(rows, torch.where(rows == 0, 0.0, tags))
+
+
 def test_the_exported_model_is_the_trained_one_in_the_capture_frame(whole, capture):
     exported = load_ply(whole.folder.model)
     trained = saved(whole.folder.path)["gaussians"]
