@@ -93,9 +93,17 @@ def test_a_run_by_time_goes_on_after_a_stop(capture, tmp_path, monkeypatch):
     monkeypatch.setattr(Trainer, "step", stopping)
     first = run.train(config, tmp_path / "run")
     assert first.signal == signal.SIGINT
-    monkeypatch.setattr(Trainer, "step", step)
+    pace, lengths = load_checkpoint(latest_checkpoint(tmp_path / "run" / "checkpoints"))["pace"], []
+
+    def recording(trainer):
+        lengths.append((trainer.now.total, trainer.now.refine_until))
+        step(trainer)
+
+    monkeypatch.setattr(Trainer, "step", recording)
     second = run.resume(tmp_path / "run")
     assert second.signal is None
+    assert lengths[0] == (pace["iterations"], pace["refine_until"])  # as it was fitted before the stop
+    assert lengths[0][0] != first.trainer.config.train.iterations
     assert second.history[-1].train_seconds == pytest.approx(4.0, rel=0.1)
     assert second.history[-1].train_seconds == pytest.approx(clock.now - began, abs=0.01)
     assert len(second.history) == 4
