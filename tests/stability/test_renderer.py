@@ -1,5 +1,5 @@
 """The reference renderer in float32 against itself in float64, on its worst inputs. What it does on each of them is in
-test_rendering_extremes.py; here it is how exact that is."""
+tests/engine/test_extremes.py; here it is how exact that is."""
 
 from __future__ import annotations
 
