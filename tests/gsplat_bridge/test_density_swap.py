@@ -77,6 +77,18 @@ def test_the_error_decides_who_is_densified():
     assert (rows_of == 2).nonzero().flatten().tolist() == sorted(hardest.tolist())
 
 
+def test_the_state_has_the_statistics_of_each_step_once():
+    host, seen = Host(TurboDensityStrategy(refine_start_iter=9), tells_errors=True), []
+    for step in range(2):
+        host.step(step)
+        seen.append(vars(iteration_stats(host.info, 40)[0]))
+    assert seen[0]["weight_sums"].any() and seen[0]["grad_sums"].any()
+    for name in GaussianStats.__dataclass_fields__:
+        first, second = seen[0][name], seen[1][name]
+        expected = torch.maximum(first, second) if name == "max_radii" else first + second
+        torch.testing.assert_close(host.state[name], expected, msg=lambda text, name=name: f"{name}: {text}")
+
+
 def test_schedule_events_happen_where_gsplats_do(monkeypatch):
     events = {}
     for cls in (DefaultStrategy, TurboDensityStrategy):
