@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 
-.PHONY: demo ablation pages test lint kernels install clean
+.PHONY: demo ablation results pages test lint kernels install clean
 
 # One thread: the demo's tensors are small, and a second thread gains nothing but waits where the machine is shared.
 demo: export OMP_NUM_THREADS := 1
@@ -22,6 +22,17 @@ ablation: demo/capture
 
 demo/capture: | $(INSTALLED)
 	$(BIN)/turbogs demo $@
+
+# README's tables anew, from nothing, on a GPU machine: make results SCENES="PATH/fox PATH/caliterra PATH/snowmiku".
+# Begins no training after WITHIN and then ends with an error: call it again until it ends without.
+WITHIN ?= 9m
+RECORD := parts paper_parts components views hard_ratio schedule
+results: $(INSTALLED)
+	test -n "$(SCENES)" || { echo 'make results SCENES="CAPTURE CAPTURE ..."'; exit 2; }
+	$(BIN)/turbogs ablate $(RECORD) $(addprefix --scene ,$(SCENES)) --seeds 0 1 2 3 4 --within $(WITHIN) --out results
+	$(BIN)/turbogs ablate baselines $(addprefix --scene ,$(SCENES)) --within $(WITHIN) --out results/baselines
+	for study in $(RECORD) baselines; do cp results/$$study/results.json docs/results/$$study/; done
+	$(MAKE) pages
 
 # The page and the plots of every study in docs/, and the tables of README, from results.json; a second run changes
 # nothing.

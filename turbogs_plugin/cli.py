@@ -207,12 +207,13 @@ def ablate(
     psnr: Decibels = (),
     reuse: Annotated[tuple[Path, ...], arg(metavar="STUDY ...")] = (),
     merge: Annotated[tuple[Path, ...], arg(metavar="STUDY ...")] = (),
+    within: Time = None,
     device: Device = "auto",
 ) -> int:
     """Train named variants over scenes and seeds: error against run time. The same call goes on where it stopped.
 
     Args:
-        names: packaged ablations (components, replacements, optimizer, ...) or .yaml files; then changes of every
+        names: packaged ablations (parts, components, views, ...) or .yaml files; then changes of every
             variant's configuration.
         out: folder of the study, or of one for each of several ablations; finished cells in it are kept.
         scene: folder of a capture; may be given several times.
@@ -223,8 +224,10 @@ def ablate(
         psnr: test PSNRs whose time is asked for; from the baseline's result where absent.
         reuse: take cells of the same settings from these studies where machine and sources are the same.
         merge: put these studies together in --out and write the report, without training.
+        within: begin no further cell after so much time: 9m. The same call then goes on; the exit code is 3.
         device: where to train.
     """
+    from turbogs_plugin.config.units import parse_seconds
     from turbogs_plugin.study import commands
     from turbogs_plugin.study.sweep import SweepOptions
 
@@ -240,7 +243,8 @@ def ablate(
         raise InputError("ablate needs NAME_OR_FILE and --scene SCENE, or --merge STUDY ...")
     if only and len(ablations) > 1:
         raise InputError("--only names variants of one ablation: give it one NAME_OR_FILE")
-    options = SweepOptions(scene, seeds, overrides, steps, device, reuse)
+    limit = None if within is None else parse_seconds(within)
+    options = SweepOptions(scene, seeds, overrides, steps, device, reuse, limit)
     return commands.ablate(ablations, options, out, only, psnr)
 
 

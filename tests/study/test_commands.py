@@ -6,6 +6,7 @@ import json
 import re
 import shutil
 import sys
+import time
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -23,6 +24,7 @@ from turbogs_plugin.plan.decisions import RULES, Verdict
 from turbogs_plugin.report import provenance as provenance_module
 from turbogs_plugin.report.provenance import provenance
 from turbogs_plugin.scene import load_scene, write_demo_capture
+from turbogs_plugin.study import sweep
 from turbogs_plugin.study.cell import capture_digest, train_cell
 from turbogs_plugin.study.compare import study_of_runs
 from turbogs_plugin.study.folder import StudyFolder
@@ -106,7 +108,7 @@ def test_a_sweep_is_complete_and_goes_on_where_it_stopped(turbogs, small, captur
     assert float(rows[1]["worst_psnr_low"]) == pytest.approx(min(worst)) and min(worst) < mean
 
     page, markdown = (out / "report.html").read_text(), (out / "report.md").read_text()
-    assert page.count("data:image/png;base64,") == 2 and not re.search(r"(src|href)=\"(?!data:)", page)
+    assert page.count("data:image/png;base64,") == 3 and not re.search(r"(src|href)=\"(?!data:)", page)
     for word in ("thrown away", "not computed", "not measured", "★", "torch", f"{mean:.2f}", f"{min(worst):.2f}"):
         assert word in page and word in markdown
     assert "a \\| bar" in markdown
@@ -234,6 +236,25 @@ def test_variants_of_one_study_may_be_trained_by_several_calls(turbogs, capture,
         assert ("loss.type=charbonnier" in (out / "report.md").read_text()) is (variant == "l1")
     assert list(StudyFolder(out).read_study().ablation.variants) == ["full", "random", "l1"]
     assert turbogs("ablate", "--merge", out, "--out", tmp_path / "merged")[0] == 0
+
+
+def test_a_sweep_within_a_time_begins_no_further_cell_and_goes_on(turbogs, small, capture, tmp_path, monkeypatch):
+    """The clock stands still but for one hour that the first cell of a call takes."""
+    clock, out = [0.0], tmp_path / "study"
+    train = sweep.train_cell
+
+    def slow(*arguments):
+        clock[0] += 3600
+        return train(*arguments)
+
+    monkeypatch.setattr(sweep, "train_cell", slow)
+    monkeypatch.setattr(time, "monotonic", lambda: clock[0])
+    for cells, code in ((1, 3), (2, 0)):
+        assert turbogs(*call(small, capture, out, "--within", "50m"))[0] == code
+        assert len(StudyFolder(out).read_study().results) == cells
+    code, printed, _ = turbogs(*call(small, capture, tmp_path / "other", "--within", "50m"))
+    assert code == 3 and "with 1 cells left" in printed and (tmp_path / "other/report.md").is_file()
+    assert turbogs(*call(small, capture, tmp_path / "third", "--within", "soon"))[0] == 2
 
 
 def test_a_variant_that_steps_make_a_copy_is_left_out_and_said(turbogs, capture, tmp_path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import time
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -14,6 +15,9 @@ from turbogs_plugin.study.grid import Ablation, alike_at, load_ablation
 from turbogs_plugin.study.pages import write_report
 from turbogs_plugin.study.sweep import SweepOptions, run_sweep
 from turbogs_plugin.train.run import resolve_device
+
+UNFINISHED = 3
+"""Exit code of a sweep that `--within` ended, so that a script can call again."""
 
 
 def ablate(
@@ -32,16 +36,19 @@ def ablate(
     folders = [StudyFolder(out if len(names) == 1 else out / name) for name in ablations]
     here = provenance(resolve_device(options.device).type)
     chosen = [_variants(ablation, only, options) for ablation in ablations.values()]
-    code = 0
+    code, begun = 0, time.monotonic()
     for number, (ablation, variants, folder) in enumerate(zip(ablations.values(), chosen, folders, strict=True)):
         try:
-            run_sweep(ablation, variants, options, here, folder, folders[:number])
+            left = run_sweep(ablation, variants, options, here, folder, folders[:number], begun)
         finally:
             if folder.file.is_file() and folder.read_study().results:  # after a refusal there may be none
                 _report(folder, targets)
         for failure in folder.read_study().failures:
             print(f"failed  {failure.key}: {failure.reason}")
             code = 1
+        if left:
+            print(f"stopped after --within, with {left} cells left in {folder.path}: the same call goes on")
+            return UNFINISHED
     return code
 
 

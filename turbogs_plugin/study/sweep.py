@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import time
 import traceback
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -42,6 +43,7 @@ class SweepOptions:
         device: auto, cpu or cuda.
         reuse: other studies; a cell of the same settings, made by the same sources on the same machine, is taken from
             them. Tables share variants, the baseline above all.
+        within: seconds after which no further cell begins; None: all are trained.
     """
 
     scenes: Sequence[Path]
@@ -50,6 +52,7 @@ class SweepOptions:
     steps: int | None = None
     device: str = "auto"
     reuse: Sequence[Path] = ()
+    within: float | None = None
 
     def __post_init__(self) -> None:
         scenes = [path.resolve() for path in self.scenes]
@@ -68,7 +71,8 @@ def run_sweep(
     here: Provenance,
     folder: StudyFolder,
     siblings: Sequence[StudyFolder] = (),
-) -> None:
+    begun: float | None = None,
+) -> int:
     """Train the cells that are not there yet and keep each result as it comes.
 
     A cell that breaks is kept as a failure and the rest goes on; the same call tries it again.
@@ -78,11 +82,16 @@ def run_sweep(
         variants: of it, the ones to train now.
         here: machine and sources, as they were when the process began.
         siblings: studies by this very process, whose cells of the same settings are taken.
+        begun: `time.monotonic` from which `options.within` counts; now where absent.
+
+    Returns:
+        How many cells are left, for another call, because `options.within` was over.
 
     Raises:
         InputError: anything wrong with the input (then nothing was trained), or a cell made by another configuration.
         TrainingStopped: the GPU can no longer be used by this process.
     """
+    begun = time.monotonic() if begun is None else begun
     folder.require_usable()
     study = folder.read_study() if folder.file.is_file() else Study(ablation, [])
     finished = {result.key: result for result in study.results}
@@ -119,7 +128,7 @@ def run_sweep(
         folder.write(result)
     wanted = len(options.scenes) * len(options.seeds) * len(variants)
     with SweepProgress(len(left), wanted - len(left)) as progress:
-        while left:
+        while left and not (options.within is not None and time.monotonic() - begun > options.within):
             scene, key, config = left.pop(0)  # the photos go with the last cell that needs them
             progress.begin(key)
             try:
@@ -130,6 +139,7 @@ def run_sweep(
             progress.ended(outcome)
             if isinstance(outcome, Failure):
                 _require_working(device)
+    return len(left)
 
 
 def _scene_configs(
