@@ -9,8 +9,10 @@ from __future__ import annotations
 import json
 import math
 import re
+import statistics
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from turbogs_plugin.report.tables import table
 from turbogs_plugin.study.folder import StudyFolder
@@ -18,7 +20,7 @@ from turbogs_plugin.study.pages import difference_text
 from turbogs_plugin.study.summary import VariantRow, summarise
 
 ROOT = Path(__file__).resolve().parent.parent
-PAGES = (ROOT / "README.md", ROOT / "docs/results/README.md")
+PAGES = tuple(ROOT / name for name in ("README.md", "docs/results/README.md", "docs/results/h200/house.md"))
 CAPTURES = ("fox", "caliterra", "snowmiku")
 BLOCK = re.compile(r"(<!-- made: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
@@ -84,8 +86,47 @@ def change(row: VariantRow) -> str:
     return f"{', '.join(filter(None, parts))} ({row.difference('psnr').count})"
 
 
+def house() -> dict[str, Any]:
+    return json.loads((ROOT / "docs/results/h200/house.json").read_text())
+
+
+def house_iterations() -> str:
+    """Milliseconds of an iteration before and after the restructuring, and ratios of the pairs."""
+    lines = []
+    for commit, points in house()["iterations"].items():
+        for point, clocks in points.items():
+            base, new = (statistics.median(clocks["free_running"][build]) for build in ("base", "new"))
+            ratios = []
+            for clock in ("free_running", "wall"):
+                pairs = [after / before for before, after in zip(*clocks[clock].values(), strict=True)]
+                ratios.append(f"{statistics.median(pairs):.3f} [{min(pairs):.3f}, {max(pairs):.3f}]")
+            lines.append((commit, point, f"{base:.3f}", f"{new:.3f}", *ratios, len(pairs)))
+    return table(("new build", "model, views", "base", "new", "ratio, free running", "ratio, wall", "pairs"), lines)
+
+
+def house_runs() -> str:
+    """Whole runs before, as measured then, and `turbogs` of the study `parts`: mean and range of five seeds."""
+    found, lines = rows_of("parts"), []
+    for capture, base in house()["base_runs"].items():
+        row = found[capture]["turbogs"]
+        spreads = [row.spread(measure) for measure in ("seconds", "psnr", "ssim")]
+        after = [[spread.mean, spread.low, spread.high] for spread in spreads]
+        for build, values, size in (
+            ("base", [base[measure] for measure in ("seconds", "psnr", "ssim")], base["gaussians"]),
+            ("new", after, row.spread("gaussians").mean),
+        ):
+            texts = [
+                f"{mean:.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]"
+                for (mean, low, high), digits in zip(values, (1, 2, 4), strict=True)
+            ]
+            lines.append((capture, build, *texts, f"{size:.0f}"))
+    return table(("capture", "build", "s", "PSNR", "SSIM", "Gaussians"), lines)
+
+
 TABLES: dict[str, Callable[[], str]] = {
     "headline": headline,
+    "house_iterations": house_iterations,
+    "house_runs": house_runs,
     "parts": lambda: changes("parts"),
 }
 
