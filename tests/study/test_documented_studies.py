@@ -43,6 +43,7 @@ def test_the_tables_in_the_pages_are_those_of_the_results():
     """`make pages` would change nothing; and every table that it can make stands somewhere."""
     texts = [page.read_text() for page in make_pages.PAGES]
     assert [make_pages.filled(text) for text in texts] == texts, "make pages"
+    assert shown_digest(make_pages.PICTURE) == make_pages.picture_digest(), "make pages"
     assert {name for text in texts for _, name, _ in make_pages.BLOCK.findall(text)} == set(make_pages.TABLES)
 
 

@@ -71,20 +71,21 @@ class Plot:
 
 def write_plots(folder: Path, summary: SceneSummary) -> None:
     """Draw what is not there yet, or is there of other data: ``SCENE-NAME.png`` for each of `PLOTS`."""
-    digest = plot_digest(summary)
     for plot in PLOTS:
-        path = folder / f"{summary.scene}-{plot.name}.png"
-        if shown_digest(path) == digest:
-            continue
-        text = PngImagePlugin.PngInfo()
-        text.add_text(DATA_KEY, digest)
-        drawn = io.BytesIO()
-        with matplotlib.rc_context(STYLE):  # also at the end, where ticks get their labels
-            plot.draw(summary).savefig(drawn, format="png")
-        picture = (
-            Image.open(drawn).convert("RGB").quantize(PALETTE, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
-        )
-        write_atomically(path, lambda file: picture.save(file, "PNG", optimize=True, pnginfo=text))  # noqa: B023
+        save_plot(folder / f"{summary.scene}-{plot.name}.png", partial(plot.draw, summary), plot_digest(summary))
+
+
+def save_plot(path: Path, draw: Callable[[], Figure], digest: str) -> None:
+    """Write a plot as a PNG that holds the digest of what it shows, unless the file there shows the same."""
+    if shown_digest(path) == digest:
+        return
+    text = PngImagePlugin.PngInfo()
+    text.add_text(DATA_KEY, digest)
+    drawn = io.BytesIO()
+    with matplotlib.rc_context(STYLE):  # also at the end, where ticks get their labels
+        draw().savefig(drawn, format="png")
+    picture = Image.open(drawn).convert("RGB").quantize(PALETTE, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
+    write_atomically(path, lambda file: picture.save(file, "PNG", optimize=True, pnginfo=text))
 
 
 def plot_digest(summary: SceneSummary) -> str:
