@@ -6,6 +6,7 @@ import itertools
 import math
 import re
 import sys
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -46,6 +47,8 @@ class RunOptions:
             maps move to the host if need be, then the number of Gaussians is limited.
         time_budget: seconds of training to end after: 20s, 2m (budget.time). The schedule is fitted to it, and
             the pixels of an iteration or the number of Gaussians.
+        init: what to start from (train.init): points of the capture, random points, or a model trained anywhere: a
+            .ply, gsplat's .pt, a checkpoint, or a run's folder.
     """
 
     config: Annotated[str | None, arg(metavar="NAME_OR_FILE")] = None
@@ -54,6 +57,7 @@ class RunOptions:
     max_gaussians: Count = None
     max_memory: Annotated[str | None, arg(metavar="2GiB")] = None
     time_budget: Time = None
+    init: Annotated[str | None, arg(metavar="points|random|MODEL")] = None
 
     def settings(self, scene: Path, overrides: tuple[str, ...]) -> Config:
         """The configuration that a command line asks for."""
@@ -73,11 +77,41 @@ class RunOptions:
             settings.scene.factor = self.factor
         if self.device is not None:
             settings.train.device = self.device
+        if self.init is not None:
+            if not self.init.strip():
+                raise InputError("--init '': write points, random, or a model's file; leave it out for points")
+            settings.train.init = self.init
         return settings
 
 
 NO_OPTIONS = RunOptions()
 Flat = Annotated[RunOptions, arg(name="")]
+
+
+@dataclass(frozen=True)
+class GivenOptions:
+    """What eval, render and export need where they are given a model in the place of a run.
+
+    Args:
+        scene: the capture of a model from a file: a 3DGS .ply, gsplat's .pt, or a checkpoint. Not with a run.
+        factor: scale its photos down by this.
+    """
+
+    scene: Annotated[Path | None, arg(metavar="SCENE")] = None
+    factor: Count = None
+
+    def settings(self, overrides: tuple[str, ...]) -> Config | None:
+        """The capture and how to render it; None for a run, which says that itself."""
+        if self.scene is None:
+            if overrides or self.factor is not None:
+                raise InputError("a run goes by its own configuration: --factor and overrides need --scene SCENE")
+            return None
+        return RunOptions(factor=self.factor).settings(self.scene, overrides).without_plan()
+
+
+NO_SCENE = GivenOptions()
+Given = Annotated[GivenOptions, arg(name="")]
+RunOrModel = Annotated[Positional[Path], arg(metavar="RUN|MODEL")]
 
 
 @app.command
@@ -131,65 +165,77 @@ def plan(
 
 
 @app.command(name="eval")
-def evaluate(run: Positional[Path], /, *, device: Device = "auto") -> int:
-    """Measure the newest model of a run on its test views.
+def evaluate(run: RunOrModel, overrides: Overrides = (), /, *, device: Device = "auto", given: Given = NO_SCENE) -> int:
+    """Measure the newest model of a run, or a model trained anywhere, on the test views.
 
     Args:
-        run: folder of the run.
+        run: folder of the run; or with --scene the file of a model.
+        overrides: with --scene, e.g. scene.test_every=10.
         device: where to render.
     """
     from turbogs_plugin.report.outputs import evaluate_run
 
-    print(evaluate_run(run, device))
+    print(evaluate_run(run, device, given.settings(overrides)))
     return 0
 
 
 @app.command
 def render(
-    run: Positional[Path],
+    run: RunOrModel,
+    overrides: Overrides = (),
     /,
     *,
     split: Literal["test", "train"] = "test",
     depth: bool = False,
+    out: Annotated[Path | None, arg(metavar="FOLDER")] = None,
     device: Device = "auto",
+    given: Given = NO_SCENE,
 ) -> int:
-    """Render the newest model of a run from its cameras, as PNGs in the run's folder.
+    """Render the newest model of a run, or a model trained anywhere, from the capture's cameras, as PNGs.
 
     Args:
-        run: folder of the run.
+        run: folder of the run; or with --scene the file of a model.
+        overrides: with --scene, as in eval.
         split: which cameras.
         depth: also write depth images: .npy (float32, along the camera's axis, in the capture's own units; 0 where
             nothing was hit) and .png (near is bright).
+        out: folder for the pictures; renders in the run's folder where absent.
         device: where to render.
     """
     from turbogs_plugin.report.outputs import render_run
 
-    for name, folder in zip(("renders", "depths"), render_run(run, split, device, depth), strict=False):
+    folders = render_run(run, split, device, depth, given.settings(overrides), out)
+    for name, folder in zip(("renders", "depths"), folders, strict=False):
         print(f"{name:<8} {folder}")
     return 0
 
 
 @app.command
 def export(
-    run: Positional[Path],
+    run: RunOrModel,
+    overrides: Overrides = (),
     /,
     *,
-    format: Literal["ply"] = "ply",
+    format: Literal["ply", "pt"] = "ply",
     out: Path | None = None,
     drop_bands: Annotated[float | None, arg(metavar="SHARE")] = None,
+    given: Given = NO_SCENE,
 ) -> int:
-    """Write the newest model of a run for other programs, in the capture's own coordinates.
+    """Write the newest model of a run, or a model trained anywhere, for other programs, in the capture's own
+    coordinates.
 
     Args:
-        run: folder of the run.
-        format: ply: as the original 3DGS writes it, which viewers read.
-        out: new file; model.ply in the run's folder where absent.
+        run: folder of the run; or with --scene the file of a model.
+        overrides: with --scene, as in eval.
+        format: ply: as the original 3DGS writes it, which viewers read. pt: a checkpoint of gsplat's simple_trainer,
+            which needs --no-normalize-world-space to take it.
+        out: new file; model.ply or model.pt in the run's folder where absent.
         drop_bands: leave out the highest bands of spherical harmonics, as many as together have at most this share of
             the colours' energy, e.g. 1e-4.
     """
     from turbogs_plugin.report.outputs import export_run
 
-    print(f"model  {export_run(run, format, out, drop_bands)}")
+    print(f"model  {export_run(run, format, out, drop_bands, given.settings(overrides))}")
     return 0
 
 
@@ -437,8 +483,14 @@ def _gathered(arguments: list[str]) -> list[str]:
     return [*arguments[:first], *overrides, *rest]
 
 
+def _warning_line(message: Warning | str, *place: object) -> str:
+    """A warning on one line, without the place in the source."""
+    return f"turbogs: warning: {' '.join(str(message).split())}\n"
+
+
 def main() -> None:
     """The `turbogs` command."""
+    warnings.formatwarning = _warning_line
     description = "TurboGS: train 3D Gaussian Splatting on few, well chosen pixels."
     sys.exit(exit_code(lambda: app.cli(prog="turbogs", description=description, args=_gathered(sys.argv[1:]))))
 

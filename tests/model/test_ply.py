@@ -84,15 +84,34 @@ def test_nothing_is_written_over_by_a_failure(tmp_path):
         save_ply(random_gaussians(), tmp_path / "absent" / "model.ply")
 
 
-def test_load_refuses_what_is_not_finite_or_not_there(tmp_path):
-    save_ply(random_gaussians(), tmp_path / "model.ply")
+def test_rows_that_are_not_finite_are_left_out_and_counted(tmp_path):
+    gaussians = random_gaussians()
+    export_splats(**dict(gaussians.items()), save_to=str(tmp_path / "model.ply"))
     content = bytearray((tmp_path / "model.ply").read_bytes())
     content[-4:] = np.float32(np.nan).tobytes()
     (tmp_path / "model.ply").write_bytes(content)
-    with pytest.raises(InputError, match="1 of 40 Gaussians are not finite"):
+    with pytest.warns(UserWarning, match=r"model\.ply: 1 of 40 Gaussians are not finite and left out"):
+        loaded = load_ply(tmp_path / "model.ply")
+    assert torch.equal(loaded.means, gaussians.means[:-1])
+
+
+def test_load_refuses_a_model_without_a_finite_row_and_one_that_is_not_there(tmp_path):
+    save_ply(random_gaussians(1), tmp_path / "model.ply")
+    content = bytearray((tmp_path / "model.ply").read_bytes())
+    content[-4:] = np.float32(np.inf).tobytes()
+    (tmp_path / "model.ply").write_bytes(content)
+    with pytest.raises(InputError, match="none of its 1 Gaussians is finite"):
         load_ply(tmp_path / "model.ply")
     with pytest.raises(InputError, match=r"cannot read .*absent\.ply"):
         load_ply(tmp_path / "absent.ply")
+
+
+def test_a_mesh_is_no_model(tmp_path):
+    lines = ["ply", "format ascii 1.0", "element vertex 3", *(f"property float {axis}" for axis in "xyz")]
+    lines += ["element face 1", "property list uchar int vertex_indices", "end_header"]
+    (tmp_path / "mesh.ply").write_text("\n".join([*lines, "0 0 0", "1 0 0", "0 1 0", "3 0 1 2", ""]))
+    with pytest.raises(InputError, match=r"mesh\.ply is not a 3DGS model: .*f_dc_0.* give the \.ply"):
+        load_ply(tmp_path / "mesh.ply")
 
 
 def test_a_degree_that_no_engine_evaluates_is_refused_by_name(tmp_path):

@@ -53,8 +53,11 @@ class TrainConfig:
         seed: of all randomness.
         device: auto (CUDA where there is one), cpu, or cuda.
         maps_place, photos_place: where error and age maps, and where the photos are. It changes no result.
+        init: what training starts from: ``points`` of the capture; ``random`` points, in a cube about what the cameras
+            look at; or a model's file, a .ply, gsplat's .pt, a checkpoint or a run's folder. A model is taken as it is:
+            all its bands are in use from the start, and `initial_opacity` and `initial_size` change nothing.
         sh_degree: highest degree of the spherical harmonics.
-        sh_interval: iterations between two bands; the run starts with band 0.
+        sh_interval: iterations between two bands; the run starts with band 0, but for a model's file.
         initial_opacity, initial_size: of the Gaussians that training starts with; the size in mean distances to the
             three nearest points. 3DGS has 0.1 and 1, gsplat's MCMC preset 0.5 and 0.1.
         backdrop: start with a far sphere of Gaussians in the photos' mean colour behind the scene.
@@ -72,6 +75,7 @@ class TrainConfig:
     device: str = "auto"
     maps_place: Place = "auto"
     photos_place: Place = "auto"
+    init: str = "points"
     sh_degree: int | Auto = 3
     sh_interval: int = 1000
     initial_opacity: float = 0.1
@@ -89,6 +93,8 @@ class TrainConfig:
         require(self.refine_until >= 0, "refine_until", self.refine_until, "at least 0")
         require(0 <= self.seed < 2**31, "seed", self.seed, "within 0 .. 2^31 - 1")
         require(self.device in ("auto", "cpu", "cuda"), "device", self.device, "auto, cpu or cuda")
+        named = bool(self.init.strip())
+        require(named, "init", self.init, "points, random, or the file of a model (.ply, .pt) or a run's folder")
         valid = self.sh_degree == "auto" or 0 <= self.sh_degree <= 3
         require(valid, "sh_degree", self.sh_degree, "within 0 .. 3")
         require(self.sh_interval >= 1, "sh_interval", self.sh_interval, "at least 1")
@@ -104,13 +110,18 @@ class TrainConfig:
         """The length of run that the settings which count iterations are written for."""
         return self.base_iterations if self.iterations == "auto" else self.iterations
 
+    @property
+    def starts_from_model(self) -> bool:
+        """Whether `init` names a model's file."""
+        return self.init not in ("points", "random")
+
     def evaluation_iterations(self) -> set[int]:
         """Counts of finished iterations after which to evaluate."""
         return {0, self.iterations, *(max(1, round(part * self.iterations)) for part in self.evaluate_at)}
 
     def sh_degree_at(self, iteration: int) -> int:
         """Degree of the bands in use at an iteration."""
-        return min(self.sh_degree, iteration // self.sh_interval)
+        return self.sh_degree if self.starts_from_model else min(self.sh_degree, iteration // self.sh_interval)
 
 
 @dataclass

@@ -39,3 +39,12 @@ def drop_faint_bands(gaussians: Gaussians, threshold: float) -> Gaussians:
     degree = next(degree for degree in range(len(shares)) if sum(shares[degree + 1 :]) <= threshold)
     kept = {**dict(gaussians.items()), "shN": gaussians.shN[:, : (degree + 1) ** 2 - 1].contiguous()}
     return Gaussians(**kept)
+
+
+def with_degree(gaussians: Gaussians, degree: int) -> Gaussians:
+    """The model with room for exactly this degree: higher bands are dropped, missing ones are zero."""
+    bands, present = (degree + 1) ** 2 - 1, gaussians.shN.shape[1]
+    shN = gaussians.shN[:, :bands]
+    if present < bands:
+        shN = torch.cat([shN, shN.new_zeros(len(shN), bands - present, 3)], dim=1)
+    return Gaussians(**{**dict(gaussians.items()), "shN": shN.contiguous()})

@@ -15,6 +15,7 @@ from torch import Tensor
 from turbogs_plugin.engine.layout import MAX_SH_DEGREE
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.files import write_atomically
+from turbogs_plugin.model.similarity import Similarity, placed
 from turbogs_plugin.scene.frame import Frame
 from turbogs_plugin.scene.ply import TYPES, read_vertices
 from turbogs_plugin.types import Gaussians
@@ -78,17 +79,21 @@ def load_ply(path: str | Path, frame: Frame | None = None) -> Gaussians:
     """Read a model from a .ply with the properties of 3DGS; others are ignored.
 
     Args:
-        path: the file.
+        path: the file. Gaussians that are not finite are left out, with a warning that counts them.
         frame: if given, the model is converted from the capture's own coordinates into this frame.
 
     Returns:
         float32, on the CPU.
 
     Raises:
-        InputError: the file is not such a .ply, lacks a property, or has values that are not finite.
+        InputError: the file is not such a .ply, lacks a property, or has no finite Gaussian.
     """
+    return placed(read_ply(path), Similarity.into(frame or Frame(np.zeros(3), 1.0)), path)
+
+
+def read_ply(path: str | Path) -> Gaussians:
+    """`load_ply` in the file's own coordinates and in float64; rows may be not finite."""
     vertices = read_vertices(path)
-    frame = frame or Frame(np.zeros(3), 1.0)
     names = vertices.dtype.names
     rest = sum(name.startswith("f_rest_") for name in names)
     bands = {3 * ((degree + 1) ** 2 - 1): (degree + 1) ** 2 - 1 for degree in range(MAX_SH_DEGREE + 1)}
@@ -101,20 +106,17 @@ def load_ply(path: str | Path, frame: Frame | None = None) -> Gaussians:
     del groups["normals"]  # not part of a model
     missing = [name for group in groups.values() for name in group if name not in names]
     if missing:
-        raise InputError(f"{path} is not a 3DGS model: it lacks the properties {', '.join(missing[:4])}")
+        raise InputError(
+            f"{path} is not a 3DGS model: it lacks the properties {', '.join(missing[:4])}; a mesh or points are "
+            "none: give the .ply that a 3DGS trainer exports"
+        )
     if not len(vertices):
-        raise InputError(f"{path} holds no Gaussians")
+        raise InputError(f"{path} holds no Gaussians: export the model again")
     values = {
         parameter: np.array([vertices[name] for name in group], dtype=np.float64).reshape(len(group), len(vertices)).T
         for parameter, group in groups.items()
     }
-    values["means"] = frame.normalise_points(values["means"])
-    values["scales"] = values["scales"] - math.log(frame.scale)
-    with np.errstate(over="ignore"):
-        tensors = {name: torch.from_numpy(value.astype(np.float32, order="C")) for name, value in values.items()}
-    bad = ~torch.cat(list(tensors.values()), dim=1).isfinite().all(dim=1)
-    if bad.any():
-        raise InputError(f"{path}: {int(bad.sum())} of {len(bad)} Gaussians are not finite")
+    tensors = {name: torch.from_numpy(np.ascontiguousarray(value)) for name, value in values.items()}
     return Gaussians(
         means=tensors["means"],
         quats=tensors["quats"],

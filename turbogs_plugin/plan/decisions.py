@@ -86,6 +86,8 @@ def yaml_text(value: Value) -> str:
 
 def wanted_backdrop(facts: SceneFacts, config: Config) -> Verdict:
     """A far sphere behind the scene, where all cameras look the same way and much of it is seen by few."""
+    if config.train.starts_from_model:
+        return Verdict(False, "train.init names a model, which is taken as it is")
     concentration = facts.direction_concentration
     one_sided = concentration >= ONE_SIDED
     return Verdict(one_sided, f"view directions concentrated to {concentration:.3f} {_sign(one_sided)} {ONE_SIDED}")

@@ -6,10 +6,14 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+import torch
 from PIL import Image
 
+from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.engine.rendering import render_image
 from turbogs_plugin.errors import InputError
+from turbogs_plugin.files import require_writable
+from turbogs_plugin.model.gsplat_file import save_gsplat
 from turbogs_plugin.model.harmonics import band_energy, drop_faint_bands
 from turbogs_plugin.model.ply import save_ply
 from turbogs_plugin.report.plots import depth_picture, to_uint8
@@ -18,7 +22,9 @@ from turbogs_plugin.scene import PosedImages
 from turbogs_plugin.scene.offload import place_views
 from turbogs_plugin.train.evaluate import evaluate, load_lpips
 from turbogs_plugin.train.history import Evaluation
-from turbogs_plugin.train.run import SavedModel, load_model, open_scene, resolve_device
+from turbogs_plugin.train.run import SavedModel, load_given_model, load_model, open_scene, resolve_device
+
+CPU = torch.device("cpu")
 
 
 def history_table(history: list[Evaluation]) -> str:
@@ -32,35 +38,53 @@ def history_table(history: list[Evaluation]) -> str:
     return "\n".join(lines)
 
 
-def evaluate_run(path: Path, device_name: str) -> str:
-    """Errors of a run's newest model on each test view, as a table."""
-    model, views = _open(path, device_name, "test")
+def evaluate_run(path: Path, device_name: str, given: Config | None = None) -> str:
+    """Errors of a run's newest model, or of a given one, on each test view, as a table.
+
+    Args:
+        path: folder of the run, or the file of a model.
+        device_name: where to render.
+        given: the capture of a model from a file, and how to render it; None: `path` is a run.
+    """
+    model, views = _open(path, device_name, "test", given)
     views = place_views(views, model.gaussians.device, model.config.train.photos_place)
     lpips, reason = load_lpips(model.config.report.lpips_weights, model.gaussians.device)
     metrics = evaluate(model.gaussians, views, model.sh_degree, model.config.raster, lpips)
     note = f"\nLPIPS was not computed: {reason}" if reason else ""
-    return (
-        views_table(metrics, with_means=True)
-        + f"\n\niteration {model.iteration}, {len(model.gaussians)} Gaussians, {metrics.fps:.1f} views a second{note}"
-    )
+    which = f"iteration {model.iteration}" if given is None else str(path)
+    speed = f"{len(model.gaussians)} Gaussians, {metrics.fps:.1f} views a second"
+    return f"{views_table(metrics, with_means=True)}\n\n{which}, {speed}{note}"
 
 
-def render_run(path: Path, split: str, device_name: str, with_depth: bool = False) -> list[Path]:
-    """Write the views of a split, rendered from a run's newest model, as PNGs.
+def render_run(
+    path: Path,
+    split: str,
+    device_name: str,
+    with_depth: bool = False,
+    given: Config | None = None,
+    out: Path | None = None,
+) -> list[Path]:
+    """Write the views of a split, rendered from a run's newest model or a given one, as PNGs.
 
     Args:
-        path: folder of the run.
+        path, given: as in `evaluate_run`.
         split: test or train.
         device_name: where to render.
         with_depth: also write each view's expected depth along the camera's axis, in the capture's own units, 0 where
             nothing was hit: as ``.npy`` ([H, W] float32) and as a coloured PNG (`depth_picture`).
+        out: folder for the folder of the views; None: ``renders`` of the run.
 
     Returns:
         The folder of the views, and with depth that of the depths.
     """
-    model, views = _open(path, device_name, split)
+    if given is not None and out is None:
+        raise InputError(f"'{path}' has no run's folder to render into: name one by --out FOLDER")
+    if out is not None:
+        require_writable(out, f"--out '{out}'")
+    model, views = _open(path, device_name, split, given)
+    target = model.folder.renders if out is None else out
     cameras = views.cameras.to(model.gaussians.device)
-    folders = [model.folder.renders / name for name in ([split, f"{split}-depth"] if with_depth else [split])]
+    folders = [target / name for name in ([split, f"{split}-depth"] if with_depth else [split])]
     for folder in folders:
         folder.mkdir(parents=True, exist_ok=True)
     for view_id, name in enumerate(distinct_stems(views.names)):
@@ -87,12 +111,14 @@ def distinct_stems(names: Sequence[str]) -> list[str]:
     return list(stems)
 
 
-def export_run(path: Path, file_format: str, out: Path | None, drop_bands: float | None = None) -> str:
-    """Write a run's newest model; returns in words what was written.
+def export_run(
+    path: Path, file_format: str, out: Path | None, drop_bands: float | None = None, given: Config | None = None
+) -> str:
+    """Write a run's newest model or a given one; returns in words what was written.
 
     Args:
-        path: folder of the run.
-        file_format: ply, the only one yet.
+        path, given: as in `evaluate_run`.
+        file_format: ply, or pt: as gsplat's trainer saves it.
         out: new file; None: the model in the run's folder.
         drop_bands: threshold of `drop_faint_bands`; None: all bands are written.
     """
@@ -100,10 +126,15 @@ def export_run(path: Path, file_format: str, out: Path | None, drop_bands: float
         raise InputError(f"--drop-bands {drop_bands}: it must be a share, at least 0 and less than 1")
     if out is not None and out.exists():
         raise InputError(f"--out '{out}' exists: choose a new file")
-    model = load_model(path, resolve_device("cpu"))
-    target = model.folder.model if out is None else out
+    if given is not None and out is None:
+        raise InputError(f"'{path}' has no run's folder to export into: name a new file by --out")
+    model = load_model(path, resolve_device("cpu")) if given is None else load_given_model(path, given, CPU)[0]
+    target = model.folder.model.with_suffix(f".{file_format}") if out is None else out
     gaussians = model.gaussians if drop_bands is None else drop_faint_bands(model.gaussians, drop_bands)
-    save_ply(gaussians, target, model.frame)
+    if file_format == "pt":
+        save_gsplat(gaussians, target, model.frame, model.iteration or 0)
+    else:
+        save_ply(gaussians, target, model.frame)
     if drop_bands is None:
         return f"{target}"
     before, after = model.gaussians.sh_degree, gaussians.sh_degree
@@ -113,8 +144,12 @@ def export_run(path: Path, file_format: str, out: Path | None, drop_bands: float
     return f"{target} (degree {before} -> {after}, without {share:.2g} of the colours' energy)"
 
 
-def _open(path: Path, device_name: str, split: str) -> tuple[SavedModel, PosedImages]:
-    """A run's newest model on a device, and the views of a split on the CPU."""
-    model = load_model(path, resolve_device(device_name))
-    scene = open_scene(model.config, model.folder)
+def _open(path: Path, device_name: str, split: str, given: Config | None) -> tuple[SavedModel, PosedImages]:
+    """A run's newest model or a given one on a device, and the views of a split on the CPU."""
+    device = resolve_device(device_name)
+    if given is not None:
+        model, scene = load_given_model(path, given, device)
+    else:
+        model = load_model(path, device)
+        scene = open_scene(model.config, model.folder)
     return model, scene.test if split == "test" else scene.train

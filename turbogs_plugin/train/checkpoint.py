@@ -9,10 +9,7 @@ are removed after that. So at every moment `latest` names a complete file. What 
 from __future__ import annotations
 
 import math
-import os
 import re
-import zipfile
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +18,7 @@ from torch import Tensor
 
 from turbogs_plugin.errors import InputError, TrainingStopped
 from turbogs_plugin.files import read_text, write_atomically, write_text_atomically
+from turbogs_plugin.model.torch_file import leaves, load_plain
 
 FORMAT = 2
 KEPT = 2
@@ -47,7 +45,7 @@ def save_checkpoint(folder: Path, iteration: int, state: dict[str, Any]) -> Path
         TrainingStopped: the disk refused; the newest checkpoint is the one before.
         TypeError: something in `state` is not plain.
     """
-    for place, value in _leaves(state, "state"):
+    for place, value in leaves(state, "state"):
         if type(value) not in (Tensor, int, float, bool, str, type(None)):
             raise TypeError(f"{place}: a checkpoint holds tensors and plain values, not {type(value).__name__}")
     path = folder / f"iteration-{iteration:06d}.pt"
@@ -90,20 +88,15 @@ def latest_checkpoint(folder: Path) -> Path | None:
 def load_checkpoint(path: Path) -> dict[str, Any]:
     """The state in a checkpoint, on the CPU.
 
-    Only plain tensors and values are read (``weights_only``). They must be uncompressed and no larger than the file. So
-    a file from an untrusted source can neither run code nor fill the memory.
+    Only plain tensors and values are read (`load_plain`).
 
     Raises:
         InputError: not a checkpoint of TurboGS, truncated, or with anything else in it.
     """
     try:
-        _require_bounded(path)
-        state = torch.load(path, map_location="cpu", weights_only=True)
+        state = load_plain(path)
         if not isinstance(state, dict) or state.pop("format", None) != FORMAT:
             raise ValueError("not a checkpoint of this version of TurboGS")
-        tensors = [value for _, value in _leaves(state, "state") if isinstance(value, Tensor)]
-        if any(tensor.numel() * tensor.element_size() > tensor.untyped_storage().nbytes() for tensor in tensors):
-            raise ValueError("it has a tensor that is not stored whole")
     except OSError as error:
         raise InputError(f"cannot read checkpoint '{path}': {error.strerror or error}") from None
     except Exception as error:  # torch and zipfile raise a dozen kinds for malformed files
@@ -145,26 +138,3 @@ def require_like(saved: Any, present: Any, place: str) -> None:
 
 def _layout(tensor: Tensor) -> str:
     return f"{str(tensor.dtype).removeprefix('torch.')} {tuple(tensor.shape)}"
-
-
-def _require_bounded(path: Path) -> None:
-    """Refuse archives that unpack to more than their size."""
-    with zipfile.ZipFile(path) as archive:
-        entries = archive.infolist()
-    if any(entry.compress_type != zipfile.ZIP_STORED for entry in entries):
-        raise ValueError("its entries are compressed")
-    if sum(entry.file_size for entry in entries) > os.path.getsize(path):
-        raise ValueError("its entries overlap")
-
-
-def _leaves(value: Any, place: str) -> Iterator[tuple[str, Any]]:
-    """(place, value) of every value in nested dicts, lists and tuples, and of the dicts' keys."""
-    if isinstance(value, dict):
-        for key, item in value.items():
-            yield f"{place}.{key}", key
-            yield from _leaves(item, f"{place}.{key}")
-    elif isinstance(value, list | tuple):
-        for index, item in enumerate(value):
-            yield from _leaves(item, f"{place}[{index}]")
-    else:
-        yield place, value

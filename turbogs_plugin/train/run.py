@@ -25,6 +25,7 @@ from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint, 
 from turbogs_plugin.train.evaluate import load_lpips
 from turbogs_plugin.train.evaluations import Evaluations
 from turbogs_plugin.train.folder import RunFolder
+from turbogs_plugin.train.given_model import load_given, require_model
 from turbogs_plugin.train.history import Evaluation, append_evaluation, rewind_history
 from turbogs_plugin.train.interrupts import Interrupts
 from turbogs_plugin.train.loop import Listener, TrainingLoop
@@ -36,17 +37,23 @@ from turbogs_plugin.types import Gaussians
 
 @dataclass
 class SavedModel:
-    """The parts of a run needed to render or export its model."""
+    """The parts of a run needed to render or export its model, or a model from a file.
 
-    folder: RunFolder
+    Args:
+        folder, iteration: of the run; None of a model from a file.
+    """
+
+    folder: RunFolder | None
     config: Config
     gaussians: Gaussians
     frame: Frame
-    iteration: int
+    iteration: int | None
 
     @property
     def sh_degree(self) -> int:
-        return self.config.train.sh_degree_at(self.iteration)
+        """Degree of the bands in use; a file does not say, so it is all that there are."""
+        given = self.iteration is None
+        return self.gaussians.sh_degree if given else self.config.train.sh_degree_at(self.iteration)
 
 
 def resolve_device(name: str, remedy: str = "use --device cpu, or see 'turbogs doctor'") -> torch.device:
@@ -139,6 +146,8 @@ def train(config: Config, out: Path, report: Callable[[RunSession], object] | No
     folder = RunFolder(out)
     folder.require_new()
     device = resolve_device(config.train.device)
+    if config.train.starts_from_model:
+        require_model(config.train.init)  # before the photos are read
     scene = open_scene(config)
     load_lpips(config.report.lpips_weights, device)
     plan = make_plan(config, scene, device)
@@ -179,7 +188,7 @@ def resume(path: Path, report: Callable[[RunSession], object] | None = None) -> 
     if limit is not None:
         hold_to(limit, device)
     with _fitting(scene, "end what else is in that memory, or go on with this run where there is more"):
-        loop = TrainingLoop(Trainer(config, scene, device), pace_of(config))
+        loop = TrainingLoop(Trainer(config, scene, device, resuming=state is not None), pace_of(config))
         session = RunSession(folder, plan, scene, loop)
         if state is not None:
             session.load_state_dict(state, str(checkpoint))
@@ -199,6 +208,8 @@ def _fitting(scene: Scene, remedy: str) -> Iterator[None]:
 def _independent(config: Config, device: torch.device) -> Config:
     """The configuration with absolute paths and the device in use, so that a resume finds the same from any folder."""
     config.scene.path = str(Path(config.scene.path).resolve())
+    if config.train.starts_from_model:
+        config.train.init = str(Path(config.train.init).resolve())
     if config.report.lpips_weights is not None:
         config.report.lpips_weights = str(Path(config.report.lpips_weights).resolve())
     config.train.device = device.type
@@ -212,6 +223,8 @@ def load_model(path: Path, device: torch.device) -> SavedModel:
         InputError: no run there, no checkpoint, or an unusable one.
     """
     folder = RunFolder(path)
+    if path.is_file():
+        raise InputError(f"'{path}' is a file, not a run's folder: name the capture of a model by --scene SCENE")
     config = folder.read_config()
     checkpoint = latest_checkpoint(folder.checkpoints)
     if checkpoint is None:
@@ -224,6 +237,22 @@ def load_model(path: Path, device: torch.device) -> SavedModel:
         return SavedModel(folder, config, gaussians_of_state(trained, device), frame, iteration)
     except (KeyError, TypeError, AttributeError, IndexError, ValueError, RuntimeError) as error:
         raise InputError(f"checkpoint '{checkpoint}' is not one of a run: {error}") from None
+
+
+def load_given_model(path: Path, config: Config, device: torch.device) -> tuple[SavedModel, Scene]:
+    """A model from a file, with the capture that it belongs to.
+
+    Args:
+        path: as `require_model` takes it.
+        config: says which capture, and how to render.
+
+    Raises:
+        InputError: no such model, or no usable capture.
+    """
+    require_model(path)
+    scene = open_scene(config)
+    gaussians = load_given(path, scene, device).map(lambda value: value.to(device))
+    return SavedModel(None, config, gaussians, scene.frame, None), scene
 
 
 class RunSession(Listener):

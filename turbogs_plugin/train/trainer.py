@@ -16,14 +16,17 @@ from turbogs_plugin.engine.layout import MAX_SH_DEGREE
 from turbogs_plugin.engine.protocol import MapUpdate
 from turbogs_plugin.engine.rendered import RenderOptions, ScreenGradients
 from turbogs_plugin.engine.rendering import render_image
-from turbogs_plugin.errors import TrainingStopped
+from turbogs_plugin.errors import InputError, TrainingStopped
 from turbogs_plugin.model.distant import RESTRAIN_EVERY, restrain_distant
+from turbogs_plugin.model.harmonics import with_degree
 from turbogs_plugin.model.initial import BACKDROP_COUNT, backdrop_gaussians, gaussians_from_points
 from turbogs_plugin.model.row_order import in_order_of_space
 from turbogs_plugin.plan.caps import cap_of, chosen_points
 from turbogs_plugin.scene import Scene
 from turbogs_plugin.scene.offload import place_maps, place_views
 from turbogs_plugin.scene.photos import PhotoSamples
+from turbogs_plugin.scene.transforms import random_points
+from turbogs_plugin.train.given_model import load_given
 from turbogs_plugin.types import PARAMETER_NAMES, Gaussians, GaussianStats, LossOutput, RowUpdate, Step
 
 COLOR_STRIDE = 97
@@ -40,9 +43,10 @@ class Trainer:
         config: that of the run, in which nothing is ``auto`` any more.
         scene: on any device.
         device: where everything is computed and kept.
+        resuming: a state is loaded next, so that the model of `train.init` need not be there.
     """
 
-    def __init__(self, config: Config, scene: Scene, device: torch.device) -> None:
+    def __init__(self, config: Config, scene: Scene, device: torch.device, resuming: bool = False) -> None:
         config.require_decided()
         self.config = config
         self.views = place_views(scene.train, device, config.train.photos_place)
@@ -54,7 +58,8 @@ class Trainer:
         self.optimizer = config.build("optimizer")
         self.density = config.build("density")
         self.maps = place_maps(self.views.cameras.sizes, device, config.train.maps_place, config.maps.beta)
-        self.gaussians = initial_gaussians(scene, config).map(lambda tensor: tensor.to(device))
+        init = "points" if resuming else config.train.init
+        self.gaussians = initial_gaussians(scene, config, init, device).map(lambda tensor: tensor.to(device))
         self.view_sampler.setup(self.views.cameras, scene.extent)
         self.optimizer.setup(self.gaussians)
         self.density.setup(self.gaussians)
@@ -233,17 +238,38 @@ class Trainer:
             getattr(self, name).load_state_dict(state[name])
 
 
-def initial_gaussians(scene: Scene, config: Config) -> Gaussians:
-    """The model that training starts from: the capture's points, and a backdrop if one is wanted.
+def initial_gaussians(scene: Scene, config: Config, init: str, device: torch.device) -> Gaussians:
+    """The model that training starts from: a given one, or one of points; and a backdrop if one is wanted.
 
     If there are more points than `density.max_gaussians` allows, as many as it allows are taken, evenly in their order.
+
+    Args:
+        init: as `train.init`.
+        device: where a given model is tried on training views.
+
+    Returns:
+        On the CPU.
+
+    Raises:
+        InputError: the given model cannot be read, or has more Gaussians than are allowed.
     """
-    train = config.train
-    rows = chosen_points(len(scene.points), cap_of(config), BACKDROP_COUNT if train.backdrop else 0)
-    points, colors = scene.points[rows], scene.point_colors[rows]
-    gaussians = gaussians_from_points(
-        points, colors, train.sh_degree, scene.extent, train.initial_opacity, train.initial_size
-    )
+    train, cap = config.train, cap_of(config)
+    backdrop_count = BACKDROP_COUNT if train.backdrop else 0
+    if init in ("points", "random"):
+        points, colors = scene.points, scene.point_colors
+        if init == "random":
+            places, drawn = random_points(scene.train.cameras.viewmats.cpu().double().numpy())
+            points, colors = torch.from_numpy(places).float(), torch.from_numpy(drawn)
+        rows = chosen_points(len(points), cap, backdrop_count)
+        settings = (train.sh_degree, scene.extent, train.initial_opacity, train.initial_size)
+        gaussians = gaussians_from_points(points[rows], colors[rows], *settings)
+    else:
+        gaussians = with_degree(load_given(init, scene, device), train.sh_degree)
+        if cap and len(gaussians) + backdrop_count > cap:
+            raise InputError(
+                f"'{init}' has {len(gaussians)} Gaussians, more than density.max_gaussians {cap} allows beside "
+                f"{backdrop_count} of a backdrop: allow more, or start from points"
+            )
     if not train.backdrop:
         return gaussians
     color = scene.train.photos.stored[::COLOR_STRIDE].float().mean(dim=0).cpu() / 255.0

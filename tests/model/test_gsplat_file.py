@@ -1,0 +1,75 @@
+"""Models to and from gsplat's .pt."""
+
+import numpy as np
+import pytest
+import torch
+from helpers.models import random_gaussians
+
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.model.gsplat_file import read_gsplat, save_gsplat
+from turbogs_plugin.model.similarity import Similarity, placed
+from turbogs_plugin.scene import Frame
+
+
+@pytest.mark.parametrize("sh_degree", [0, 2, 3])
+def test_what_is_written_is_what_gsplat_loads(tmp_path, sh_degree):
+    """The keys, shapes and types that `simple_trainer.py --ckpt` copies into its own parameters."""
+    gaussians, frame = random_gaussians(sh_degree=sh_degree), Frame(np.array([0.1, -0.2, 3.0]), 6.0)
+    save_gsplat(gaussians, tmp_path / "model.pt", frame, step=7)
+    state = torch.load(tmp_path / "model.pt", weights_only=True)
+    assert state["step"] == 7 and set(state) == {"step", "splats"}
+    bands = (sh_degree + 1) ** 2 - 1
+    shapes = {"means": (40, 3), "quats": (40, 4), "scales": (40, 3), "opacities": (40,), "sh0": (40, 1, 3)}
+    shapes["shN"] = (40, bands, 3)
+    assert {name: tuple(value.shape) for name, value in state["splats"].items()} == shapes
+    assert all(value.dtype == torch.float32 for value in state["splats"].values())
+    torch.testing.assert_close(state["splats"]["means"], gaussians.means * 6 + torch.tensor([0.1, -0.2, 3.0]))
+    torch.testing.assert_close(state["splats"]["scales"].exp(), gaussians.scales.exp() * 6)
+    back = placed(read_gsplat(state, "model.pt"), Similarity.into(frame), "model.pt")
+    for (name, value), (_, read) in zip(gaussians.items(), back.items(), strict=True):
+        torch.testing.assert_close(read, value, msg=name)
+
+
+def test_rows_that_are_not_finite_are_not_written(tmp_path):
+    gaussians = random_gaussians()
+    gaussians.means[3, 0] = torch.nan
+    with pytest.warns(UserWarning, match="1 of 40 Gaussians are not finite"):
+        save_gsplat(gaussians, tmp_path / "model.pt", Frame(np.zeros(3), 1.0))
+    assert len(torch.load(tmp_path / "model.pt", weights_only=True)["splats"]["means"]) == 39
+
+
+def test_what_cannot_be_written_is_refused(tmp_path):
+    frame = Frame(np.zeros(3), 1.0)
+    with pytest.raises(InputError, match="no Gaussians"):
+        save_gsplat(random_gaussians(0), tmp_path / "model.pt", frame)
+    with pytest.raises(InputError, match="cannot write .*absent"):
+        save_gsplat(random_gaussians(), tmp_path / "absent" / "model.pt", frame)
+    with pytest.raises(InputError, match=r"4e\+06 units from its origin.*--format ply"):
+        save_gsplat(random_gaussians(), tmp_path / "model.pt", Frame(np.array([5e5, -4e6, 120.0]), 80.0))
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"shN": torch.zeros(40, 24, 3)}, "shN has 24 bands: .* 0, 3, 8 or 15"),
+        ({"shN": None}, "its splats lack shN"),
+        ({"sh0": None, "shN": None, "features": torch.zeros(40, 32)}, "appearance network"),
+        ({"quats": torch.zeros(39, 4)}, r"quats is float32 \(39, 4\) where gsplat has float32 \(40, 4\)"),
+        ({"opacities": torch.zeros(40, dtype=torch.int64)}, r"opacities is int64 \(40,\)"),
+        ({"means": torch.tensor(1.0)}, r"means is float32 \(\)"),
+    ],
+)
+def test_splats_that_are_no_model(changes, words):
+    splats = {
+        name: value for name, value in {**dict(random_gaussians().items()), **changes}.items() if value is not None
+    }
+    with pytest.raises(InputError, match=words):
+        read_gsplat({"splats": splats}, "model.pt")
+
+
+def test_no_splats_at_all():
+    with pytest.raises(InputError, match="holds no Gaussians"):
+        read_gsplat({"splats": dict(random_gaussians(0).items())}, "model.pt")
+    with pytest.raises(InputError, match="not a table"):
+        read_gsplat({"splats": [1]}, "model.pt")

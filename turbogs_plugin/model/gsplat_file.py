@@ -1,0 +1,101 @@
+"""Models as gsplat's example trainer saves them: ``{"step": int, "splats": {parameter: tensor}}`` by `torch.save`."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from turbogs_plugin.engine.layout import MAX_SH_DEGREE
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.files import write_atomically
+from turbogs_plugin.model.similarity import finite_rows
+from turbogs_plugin.scene.frame import Frame
+from turbogs_plugin.types import PARAMETER_NAMES, Gaussians
+
+LARGEST_ROUNDING = 1e-4
+"""Largest rounding error of exported positions, in units of the frame's scale: the file has float32 alone."""
+
+
+def save_gsplat(gaussians: Gaussians, path: str | Path, frame: Frame, step: int = 0) -> None:
+    """Write a model as gsplat's trainer does, in the capture's own coordinates. The file is written whole or not.
+
+    Args:
+        gaussians: the model. Gaussians that are not finite are left out, with a warning that counts them.
+        path: the file to write; its folder must exist.
+        frame: of the model's coordinates.
+        step: iterations of its training.
+
+    Raises:
+        InputError: nothing to write, a capture too far from its origin for float32, or the file cannot be written.
+    """
+    rows = gaussians.map(lambda value: value.detach().cpu())
+    finite = finite_rows(rows)
+    if not finite.all():
+        warnings.warn(f"{int((~finite).sum())} of {len(rows)} Gaussians are not finite and left out", stacklevel=2)
+    rows = rows.map(lambda value: value[finite].contiguous())
+    if not len(rows):
+        raise InputError(f"there are no Gaussians to write to {path}")
+    if np.abs(frame.center).max() * np.finfo(np.float32).eps / 2 > LARGEST_ROUNDING * frame.scale:
+        raise InputError(
+            f"the capture lies {np.abs(frame.center).max():.3g} units from its origin, too far for the float32 of a "
+            ".pt: export with --format ply"
+        )
+    rows.means = torch.from_numpy(frame.restore_points(rows.means.numpy())).float()
+    rows.scales = rows.scales + math.log(frame.scale)
+    state = {"step": step, "splats": dict(rows.items())}
+    try:
+        write_atomically(Path(path), lambda file: torch.save(state, file))
+    except (OSError, RuntimeError) as error:  # torch raises a RuntimeError where a write fails
+        cause = error.__context__ if isinstance(error.__context__, OSError) else error
+        reason = getattr(cause, "strerror", None) or str(cause).splitlines()[0]
+        raise InputError(f"cannot write {path}: {reason}; choose another place or make room") from error
+
+
+def read_gsplat(state: Mapping[str, Any], path: str | Path) -> Gaussians:
+    """The model in a state that gsplat's trainer saved, in the file's own coordinates.
+
+    Args:
+        state: plain tensors and values, with ``splats``.
+        path: the file, for messages.
+
+    Returns:
+        float64, on the CPU; rows may be not finite.
+
+    Raises:
+        InputError: parameters that are missing, of other shapes, or none at all.
+    """
+    splats = state["splats"]
+    if not isinstance(splats, Mapping):
+        raise InputError(f"{path}: its 'splats' are not a table of tensors: export the model again, or as a .ply")
+    if "features" in splats and "sh0" not in splats:
+        raise InputError(
+            f"{path} has the colours of gsplat's appearance network (app_opt), not spherical harmonics: export it "
+            "there as a .ply, or train it without app_opt"
+        )
+    missing = [name for name in PARAMETER_NAMES if not isinstance(splats.get(name), Tensor)]
+    if missing:
+        present = ", ".join(sorted(map(str, splats))[:8]) or "nothing"
+        raise InputError(f"{path}: its splats lack {', '.join(missing)} (there is {present}): give a 3DGS model")
+    count = len(splats["means"]) if splats["means"].dim() else 0
+    bands = splats["shN"].shape[1] if splats["shN"].dim() == 3 else -1
+    shapes = ((count, 3), (count, 4), (count, 3), (count,), (count, 1, 3), (count, bands, 3))
+    for name, shape in zip(PARAMETER_NAMES, shapes, strict=True):
+        value = splats[name]
+        if value.shape != shape or not value.is_floating_point() or value.layout != torch.strided:
+            kind = f"{str(value.dtype).removeprefix('torch.')} {tuple(value.shape)}"
+            raise InputError(f"{path}: {name} is {kind} where gsplat has float32 {shape}: export the model again")
+    if bands not in [(degree + 1) ** 2 - 1 for degree in range(MAX_SH_DEGREE + 1)]:
+        raise InputError(
+            f"{path}: shN has {bands} bands: spherical harmonics of degree 0 .. {MAX_SH_DEGREE}, the largest here, "
+            "have 0, 3, 8 or 15"
+        )
+    if not count:
+        raise InputError(f"{path} holds no Gaussians")
+    return Gaussians(**{name: splats[name].detach().double() for name in PARAMETER_NAMES})

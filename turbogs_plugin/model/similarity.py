@@ -1,0 +1,144 @@
+"""A change of coordinates of a whole model: means, shapes, and the colours that depend on the direction."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from turbogs_plugin.engine.reference.spherical_harmonics import basis, num_bands
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.scene.frame import Frame
+from turbogs_plugin.types import Gaussians
+
+SAMPLED_DIRECTIONS = 64
+"""Directions by which the rotation of harmonics is found; the largest degree has 7 functions."""
+
+
+@dataclass(frozen=True)
+class Similarity:
+    """``new = scale * rotation @ old + translation``, in float64.
+
+    Args:
+        rotation: [3, 3], with determinant 1.
+        scale: positive.
+        translation: [3].
+    """
+
+    rotation: np.ndarray
+    scale: float
+    translation: np.ndarray
+
+    @classmethod
+    def into(cls, frame: Frame) -> Similarity:
+        """From a capture's own coordinates into a frame."""
+        return cls(np.eye(3), 1.0 / frame.scale, -frame.center / frame.scale)
+
+    def inverse(self) -> Similarity:
+        back = self.rotation.T
+        return Similarity(back, 1.0 / self.scale, -(back @ self.translation) / self.scale)
+
+    def after(self, first: Similarity) -> Similarity:
+        """The change that makes `first` and then this one."""
+        moved = self.scale * self.rotation @ first.translation + self.translation
+        return Similarity(self.rotation @ first.rotation, self.scale * first.scale, moved)
+
+    def apply(self, gaussians: Gaussians) -> Gaussians:
+        """The same model in the new coordinates, in its own dtype. Without a rotation, quaternions and harmonics keep
+        their bits."""
+        rotation = torch.from_numpy(self.rotation).to(gaussians.means)
+        translation = torch.from_numpy(self.translation).to(gaussians.means)
+        turned = not np.array_equal(self.rotation, np.eye(3))
+        means = gaussians.means @ rotation.T if turned else gaussians.means
+        return Gaussians(
+            means=self.scale * means + translation,
+            quats=_product(_quaternion(self.rotation).to(means), gaussians.quats) if turned else gaussians.quats,
+            scales=gaussians.scales + math.log(self.scale),
+            opacities=gaussians.opacities,
+            sh0=gaussians.sh0,
+            shN=_turned_harmonics(gaussians.shN, self.rotation) if turned else gaussians.shN,
+        )
+
+
+def placed(gaussians: Gaussians, change: Similarity, source: str | Path) -> Gaussians:
+    """A file's model in other coordinates, as training and rendering take it.
+
+    Args:
+        gaussians: float64, as the file has them. Those that are not finite are left out, with a warning that counts
+            them.
+        change: from the file's coordinates.
+        source: the file, for messages.
+
+    Returns:
+        float32, on the CPU.
+
+    Raises:
+        InputError: no Gaussian is finite.
+    """
+    rows = change.apply(gaussians).map(lambda value: value.float().contiguous())
+    finite = finite_rows(rows)
+    bad = int((~finite).sum())
+    if bad == len(rows):
+        raise InputError(f"{source}: none of its {bad} Gaussians is finite: export the model again")
+    if bad:
+        warnings.warn(f"{source}: {bad} of {len(rows)} Gaussians are not finite and left out", stacklevel=3)
+        rows = rows.map(lambda value: value[finite])
+    return rows
+
+
+def finite_rows(gaussians: Gaussians) -> Tensor:
+    """[N] bool: every number of the Gaussian is finite."""
+    return torch.stack([value[:, None].isfinite().flatten(1).all(dim=1) for _, value in gaussians.items()]).all(dim=0)
+
+
+def _quaternion(rotation: np.ndarray) -> Tensor:
+    """[4] float64 (wxyz) of a rotation: the eigenvector of Davenport's matrix with the largest eigenvalue."""
+    trace = np.trace(rotation)
+    cross = np.array(
+        [rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]]
+    )
+    matrix = np.empty((4, 4))
+    matrix[0, 0], matrix[0, 1:], matrix[1:, 0] = trace, cross, cross
+    matrix[1:, 1:] = rotation + rotation.T - trace * np.eye(3)
+    return torch.from_numpy(np.linalg.eigh(matrix)[1][:, -1].copy())
+
+
+def _product(left: Tensor, right: Tensor) -> Tensor:
+    """[N, 4] Hamilton products of one quaternion [4] with others [N, 4], wxyz."""
+    w, x, y, z = left.unbind()
+    matrix = torch.stack(
+        [
+            torch.stack([w, -x, -y, -z]),
+            torch.stack([x, w, -z, y]),
+            torch.stack([y, z, w, -x]),
+            torch.stack([z, -y, x, w]),
+        ]
+    )
+    return right @ matrix.T
+
+
+def _turned_harmonics(shN: Tensor, rotation: np.ndarray) -> Tensor:
+    """[N, B, 3] coefficients whose colour in direction ``rotation @ d`` is that of `shN` in direction d.
+
+    The functions of one degree turn among themselves, so the matrix of a degree follows from their values in a few
+    directions.
+    """
+    if shN.shape[1] == 0:
+        return shN
+    degree = round((shN.shape[1] + 1) ** 0.5) - 1
+    generator = torch.Generator().manual_seed(0)
+    directions = torch.randn(SAMPLED_DIRECTIONS, 3, generator=generator, dtype=torch.float64)
+    directions = torch.nn.functional.normalize(directions, dim=1)
+    before = basis(directions, degree)  # [R, B]
+    after = basis(directions @ torch.from_numpy(rotation).T, degree)  # [R, B]
+    parts = []
+    for of in range(1, degree + 1):
+        rows = slice(num_bands(of - 1), num_bands(of))
+        matrix = torch.linalg.lstsq(after[:, rows], before[:, rows]).solution  # [2 d + 1, 2 d + 1]
+        parts.append(torch.einsum("ij,njc->nic", matrix.to(shN), shN[:, rows]))
+    return torch.cat(parts, dim=1)

@@ -1,0 +1,62 @@
+"""Files of `torch.save` from anybody: plain tensors and values only, no larger in memory than on the disk."""
+
+from __future__ import annotations
+
+import os
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+
+def load_plain(path: Path) -> Any:
+    """What a file of `torch.save` holds, on the CPU.
+
+    Only plain tensors and values are read (``weights_only``). They must be uncompressed and no larger than the file. So
+    a file from an untrusted source can neither run code nor fill the memory.
+
+    Raises:
+        OSError: the file cannot be read.
+        Exception: anything else wrong with it; torch and zipfile raise a dozen kinds for malformed files.
+    """
+    _require_bounded(path)
+    state = torch.load(path, map_location="cpu", weights_only=True)
+    tensors = [value for _, value in leaves(state, "state") if isinstance(value, Tensor)]
+    if any(tensor.numel() * tensor.element_size() > tensor.untyped_storage().nbytes() for tensor in tensors):
+        raise ValueError("it has a tensor that is not stored whole")
+    return state
+
+
+def reason_of(error: Exception) -> str:
+    """Why `load_plain` failed, in a line."""
+    if isinstance(error, zipfile.BadZipFile):
+        return "it is not a whole file of torch.save"
+    if "weights_only" in str(error) or "Weights only" in str(error):
+        return "it holds more than plain tensors and values"
+    return str(error).splitlines()[0][:160] if str(error) else type(error).__name__
+
+
+def leaves(value: Any, place: str) -> Iterator[tuple[str, Any]]:
+    """(place, value) of every value in nested dicts, lists and tuples, and of the dicts' keys."""
+    if isinstance(value, dict):
+        for key, item in value.items():
+            yield f"{place}.{key}", key
+            yield from leaves(item, f"{place}.{key}")
+    elif isinstance(value, list | tuple):
+        for index, item in enumerate(value):
+            yield from leaves(item, f"{place}[{index}]")
+    else:
+        yield place, value
+
+
+def _require_bounded(path: Path) -> None:
+    """Refuse archives that unpack to more than their size."""
+    with zipfile.ZipFile(path) as archive:
+        entries = archive.infolist()
+    if any(entry.compress_type != zipfile.ZIP_STORED for entry in entries):
+        raise ValueError("its entries are compressed")
+    if sum(entry.file_size for entry in entries) > os.path.getsize(path):
+        raise ValueError("its entries overlap")
