@@ -15,13 +15,17 @@ import pytest
 import torch
 from helpers.bounded_memory import outcome_within
 from helpers.framework_runs import tiny_capture, tiny_config
+from helpers.models import random_gaussians
 
 from turbogs_plugin.config.configuration import load_config
 from turbogs_plugin.config.yaml_text import parse_yaml
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.scene import load_scene
+from turbogs_plugin.model.gsplat_file import save_gsplat
+from turbogs_plugin.scene import Frame, load_scene
 from turbogs_plugin.train import run
 from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint, save_checkpoint
+from turbogs_plugin.train.given_model import load_given
+from turbogs_plugin.types import Gaussians
 
 MEMORY = 64 * 2**20
 """Python and numpy may allocate this much for files of less than a megabyte."""
@@ -211,3 +215,31 @@ def test_damaged_photos(capture, tmp_path, kind):
         else:
             assert np.isfinite(result.train.photos.colors.float().mean().item())
     assert refused >= (1 if kind != "damaged" else 20)
+
+
+# ---- Models trained anywhere -------------------------------------------------------------------------------------
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_damaged_models_of_gsplat(capture, tmp_path):
+    """Bytes of the file, and values in it: a model that is whole and finite, or a refusal."""
+    scene, target, choice = load_scene(capture), tmp_path / "model.pt", random.Random(6)
+    save_gsplat(random_gaussians(20, sh_degree=1), target, Frame(np.zeros(3), 1.0))
+    content, state = target.read_bytes(), torch.load(target, weights_only=True)
+    refused = 0
+    for case in range(120):
+        if case % 2:
+            target.write_bytes(damaged(content, choice))
+        else:
+            path, value = choice.choice(list(leaves(state)))
+            changed = copy.deepcopy(state)
+            parent = changed if len(path) == 1 else changed[path[0]]
+            parent[path[-1]] = hostile_leaf(value, choice)
+            torch.save(changed, target)
+        result = outcome_within(MEMORY, load_given, target, scene, torch.device("cpu"))
+        refused += isinstance(result, InputError)
+        if isinstance(result, Gaussians):
+            assert all(value.isfinite().all() and len(value) == len(result) for _, value in result.items())
+        else:
+            assert isinstance(result, InputError)
+    assert 60 < refused < 120

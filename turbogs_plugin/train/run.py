@@ -89,6 +89,7 @@ def plan_run(config: Config) -> Plan:
         InputError: anything wrong with the input.
     """
     device = resolve_device(config.train.device)
+    _require_start(config)
     return make_plan(config, open_scene(config), device)
 
 
@@ -146,8 +147,7 @@ def train(config: Config, out: Path, report: Callable[[RunSession], object] | No
     folder = RunFolder(out)
     folder.require_new()
     device = resolve_device(config.train.device)
-    if config.train.starts_from_model:
-        require_model(config.train.init)  # before the photos are read
+    _require_start(config)
     scene = open_scene(config)
     load_lpips(config.report.lpips_weights, device)
     plan = make_plan(config, scene, device)
@@ -194,6 +194,12 @@ def resume(path: Path, report: Callable[[RunSession], object] | None = None) -> 
             session.load_state_dict(state, str(checkpoint))
     session.history += rewind_history(folder.history, loop.trainer.iteration if session.resumed else -1)
     return session.run(report)
+
+
+def _require_start(config: Config) -> None:
+    """Raise `InputError`, before photos are read, where the model to start from is not there."""
+    if config.train.starts_from_model:
+        require_model(config.train.init)
 
 
 @contextmanager

@@ -1,0 +1,298 @@
+"""Models trained anywhere: a start for training, and evaluated, rendered and exported with a capture named."""
+
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from gsplat import export_splats
+from helpers.framework_runs import tiny_capture, tiny_config
+from helpers.models import random_gaussians
+from PIL import Image
+
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.model.gsplat_world import gsplat_worlds
+from turbogs_plugin.model.ply import read_ply
+from turbogs_plugin.plan.decisions import wanted_backdrop
+from turbogs_plugin.scene import load_scene
+from turbogs_plugin.scene.colmap import load_pycolmap
+from turbogs_plugin.scene.transforms import random_points
+from turbogs_plugin.train import run
+from turbogs_plugin.train.checkpoint import latest_checkpoint
+from turbogs_plugin.train.given_model import load_given
+from turbogs_plugin.train.trainer import Trainer
+from turbogs_plugin.types import Gaussians
+
+CPU = torch.device("cpu")
+LENGTH = ("train.iterations=30", "train.refine_until=15", "train.evaluate_at=[]")
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory) -> Path:
+    return tiny_capture(tmp_path_factory.mktemp("given"))
+
+
+@pytest.fixture(scope="module")
+def finished(capture, tmp_path_factory) -> Path:
+    """The folder of a run that has learnt something, with all its bands in use."""
+    config = tiny_config(capture, *LENGTH)
+    return run.train(config, tmp_path_factory.mktemp("given-runs") / "run").folder.path
+
+
+def save_splats(path: Path, gaussians: Gaussians, **others) -> Path:
+    """As gsplat's simple_trainer does: the state of a ParameterDict."""
+    splats = torch.nn.ParameterDict({name: torch.nn.Parameter(value.float()) for name, value in gaussians.items()})
+    torch.save({"step": 6999, "splats": splats.state_dict(), **others}, path)
+    return path
+
+
+def worlds_of(capture: Path):
+    """gsplat's worlds, from what pycolmap reads."""
+    model = load_pycolmap().Reconstruction(capture / "sparse/0")
+    viewmats = np.tile(np.eye(4), (model.num_images(), 1, 1))
+    for i, image in enumerate(model.images.values()):
+        viewmats[i, :3] = image.cam_from_world().matrix()
+    return gsplat_worlds(viewmats, np.array([point.xyz for point in model.points3D.values()]))
+
+
+def table(text: str) -> str:
+    """The lines of an evaluation that depend on the model alone."""
+    return text.partition("\n\n")[0]
+
+
+def assert_alike(a: Gaussians, b: Gaussians) -> None:
+    for (name, value), (_, other) in zip(a.items(), b.items(), strict=True):
+        torch.testing.assert_close(value, other, msg=name, rtol=1e-4, atol=1e-5)
+
+
+def files_of(finished: Path, folder: Path) -> dict[str, Path]:
+    """The run's model in every form in which it can be given."""
+    model = read_ply(finished / "model.ply")
+    theirs = {name: value.float() for name, value in model.items()}
+    export_splats(**theirs, save_to=str(folder / "gsplat.ply"))
+    return {
+        "ours": finished / "model.ply",
+        "gsplat's ply": folder / "gsplat.ply",
+        "gsplat's pt": save_splats(folder / "ckpt_6999_rank0.pt", model),
+        "checkpoint": latest_checkpoint(finished / "checkpoints"),
+        "run": finished,
+    }
+
+
+def test_a_model_is_the_same_in_every_form(finished, capture, tmp_path, recwarn):
+    scene = load_scene(capture)
+    trained = run.load_model(finished, CPU).gaussians
+    for file in files_of(finished, tmp_path).values():
+        assert_alike(load_given(file, scene, CPU), trained)
+    assert not [warning for warning in recwarn if issubclass(warning.category, UserWarning)]
+
+
+def test_a_given_model_has_the_tables_and_pictures_of_its_run(turbogs, finished, capture, tmp_path):
+    asked, pictures = table(turbogs("eval", finished, "--device", "cpu")[1]), tmp_path / "pictures"
+    for file in files_of(finished, tmp_path).values():
+        code, out, error = turbogs("eval", file, "--scene", capture, "--device", "cpu")
+        assert (code, table(out), error) == (0, asked, "")
+        assert f"{file}, " in out
+    assert turbogs("render", finished, "--device", "cpu", "--depth")[0] == 0
+    given = ("--scene", capture, "--out", pictures, "--device", "cpu", "--depth")
+    assert turbogs("render", finished / "model.ply", *given)[0] == 0
+    for folder in ("test", "test-depth"):
+        names = [path.name for path in sorted((finished / "renders" / folder).glob("*.png"))]
+        assert names == [path.name for path in sorted((pictures / folder).glob("*.png"))] and names
+        for name in names:
+            ours, theirs = (np.asarray(Image.open(place / folder / name), dtype=int) for place in (
+                finished / "renders", pictures))  # fmt: skip
+            assert np.abs(ours - theirs).mean() < 0.1
+
+
+def test_the_settings_of_a_given_model_come_from_the_command_line(turbogs, finished, capture):
+    code, out, _ = turbogs(
+        "eval", finished / "model.ply", "scene.test_every=4", "--scene", capture, "--factor", "2", "--device", "cpu"
+    )
+    assert code == 0 and "view_004.png" in out and "mean of 2" in out
+
+
+@pytest.mark.parametrize("form", ["pt", "ply"])
+def test_an_export_of_a_run_reads_back(turbogs, finished, capture, tmp_path, form):
+    target = tmp_path / f"exported.{form}"
+    code, out, _ = turbogs("export", finished, "--format", form, "--out", target)
+    assert code == 0 and str(target) in out
+    assert_alike(load_given(target, load_scene(capture), CPU), run.load_model(finished, CPU).gaussians)
+    again = tmp_path / ("again.ply" if form == "pt" else "again.pt")
+    code, _, error = turbogs("export", target, "--format", again.suffix[1:], "--scene", capture, "--out", again)
+    assert (code, error) == (0, "")
+    assert_alike(load_given(again, load_scene(capture), CPU), run.load_model(finished, CPU).gaussians)
+
+
+@pytest.mark.parametrize("world", range(4))
+def test_gsplats_normalised_world_is_recognised(finished, capture, tmp_path, world):
+    theirs = worlds_of(capture)[world].apply(read_ply(finished / "model.ply"))
+    file = save_splats(tmp_path / "ckpt.pt", theirs)
+    with pytest.warns(UserWarning, match=r"ckpt\.pt is in gsplat's normalised world .*: brought back"):
+        loaded = load_given(file, load_scene(capture), CPU)
+    trained = run.load_model(finished, CPU).gaussians
+    for name in ("means", "scales", "opacities", "sh0", "shN"):
+        torch.testing.assert_close(getattr(loaded, name), getattr(trained, name), rtol=1e-3, atol=1e-3)
+    aligned = torch.nn.functional.cosine_similarity(loaded.quats, trained.quats).abs()
+    torch.testing.assert_close(aligned, torch.ones_like(aligned))
+
+
+def test_gsplats_normalised_world_is_said_on_one_line(turbogs, finished, capture, tmp_path):
+    file = save_splats(tmp_path / "ckpt.pt", worlds_of(capture)[0].apply(read_ply(finished / "model.ply")))
+    command = [sys.executable, "-m", "turbogs_plugin.cli", "eval", file, "--scene", capture, "--device", "cpu"]
+    ended = subprocess.run(list(map(str, command)), check=True, capture_output=True, text=True)
+    assert ended.stderr.count("\n") == 1 and ended.stderr.startswith(f"turbogs: warning: {file} is in gsplat's")
+    assert float(re.search(r"mean of 1\W+([\d.]+)", ended.stdout)[1]) == pytest.approx(
+        float(re.search(r"mean of 1\W+([\d.]+)", turbogs("eval", finished, "--device", "cpu")[1])[1]), abs=0.05
+    )
+
+
+def test_a_model_of_another_capture_is_named_with_gsplats_flag(capture, tmp_path):
+    elsewhere = random_gaussians(200, sh_degree=1)
+    file = save_splats(tmp_path / "other.pt", elsewhere)
+    with pytest.warns(UserWarning, match=r"other\.pt does not fit the photos of capture: .*--no-normalize-world-space"):
+        load_given(file, load_scene(capture), CPU)
+
+
+def test_ranks_of_one_model_are_put_together(finished, capture, tmp_path):
+    model = read_ply(finished / "model.ply")
+    half = len(model) // 2
+    first = save_splats(tmp_path / "ckpt_6999_rank0.pt", model.map(lambda value: value[:half]))
+    save_splats(tmp_path / "ckpt_6999_rank1.pt", model.map(lambda value: value[half:]))
+    save_splats(tmp_path / "ckpt_29999_rank1.pt", model)
+    assert_alike(load_given(first, load_scene(capture), CPU), run.load_model(finished, CPU).gaussians)
+
+
+# ---- Starts ------------------------------------------------------------------------------------------------------
+
+
+def test_training_starts_from_a_model_where_that_had_ended(finished, capture, tmp_path):
+    before = run.load_model(finished, CPU)
+    config = tiny_config(capture, "train.iterations=1", "train.evaluate_at=[]")
+    config.train.init = str(finished / "model.ply")
+    session = run.train(config, tmp_path / "run")
+    assert len(session.trainer.gaussians) == len(before.gaussians)
+    ended = run.RunFolder(finished).history.read_text().splitlines()[-1]
+    assert session.history[0].psnr == pytest.approx(float(re.search(r'"psnr": ([\d.]+)', ended)[1]), abs=0.01)
+    assert Path(run.RunFolder(tmp_path / "run").read_config().train.init) == finished / "model.ply"
+
+
+def test_bands_are_added_or_dropped_as_the_run_has_them(finished, capture):
+    scene, model = load_scene(capture), run.load_model(finished, CPU).gaussians
+    for degree, bands in ((0, 0), (1, 3), (3, 15)):
+        config = tiny_config(capture, f"train.sh_degree={degree}", f"train.init={finished}").without_plan()
+        trainer = Trainer(config, scene, CPU)
+        shared = min(bands, model.shN.shape[1])
+        assert trainer.sh_degree == degree and trainer.gaussians.shN.shape[1] == bands
+        torch.testing.assert_close(trainer.gaussians.shN[:, :shared], model.shN[:, :shared])
+        assert not trainer.gaussians.shN[:, shared:].any()
+
+
+def test_a_stopped_run_goes_on_without_the_model_that_it_started_from(finished, capture, tmp_path):
+    start = Path(shutil.copy(finished / "model.ply", tmp_path / "start.ply"))
+    short = ("train.iterations=6", "train.refine_until=5", "train.checkpoint_every=3", "train.evaluate_at=[]")
+    config = tiny_config(capture, f"train.init={start}", "train.sh_degree=1", *short)
+    whole = run.train(config, tmp_path / "whole")
+    shutil.copytree(tmp_path / "whole", tmp_path / "stopped")
+    checkpoints = tmp_path / "stopped" / "checkpoints"
+    (checkpoints / "latest").write_text("iteration-000003.pt")
+    start.unlink()
+    resumed = run.resume(tmp_path / "stopped")
+    assert resumed.resumed
+    for (_, value), (_, other) in zip(whole.trainer.gaussians.items(), resumed.trainer.gaussians.items(), strict=True):
+        assert torch.equal(value, other)
+
+
+def test_random_points_are_those_of_a_capture_without_points(capture):
+    scene = load_scene(capture)
+    trainer = Trainer(tiny_config(capture, "train.init=random").without_plan(), scene, CPU)
+    points, _ = random_points(scene.train.cameras.viewmats.double().numpy())
+    assert len(trainer.gaussians) == len(points) == 50_000
+    assert (trainer.gaussians.means - torch.from_numpy(points).float()).abs().max() == 0
+
+
+def test_a_model_gets_no_backdrop_unless_it_is_asked_for(finished, capture):
+    config = tiny_config(capture, f"train.init={finished}")
+    facts = run.plan_run(tiny_config(capture)).facts
+    assert wanted_backdrop(facts, config).value is False
+    model = run.load_model(finished, CPU).gaussians
+    asked = tiny_config(capture, f"train.init={finished}", "train.backdrop=true").without_plan()
+    assert len(Trainer(asked, load_scene(capture), CPU).gaussians) == len(model) + 3000
+
+
+def test_a_model_that_is_larger_than_the_cap_is_refused(finished, capture):
+    config = tiny_config(capture, f"train.init={finished}", "density.max_gaussians=100").without_plan()
+    with pytest.raises(InputError, match=r"more than density\.max_gaussians 100 allows.*start from points"):
+        Trainer(config, load_scene(capture), CPU)
+
+
+# ---- Bad input ---------------------------------------------------------------------------------------------------
+
+
+def bad_files(folder: Path) -> dict[str, tuple[Path, str]]:
+    """What -> (a file, words of the answer)."""
+
+    def written(name: str, content: bytes) -> Path:
+        (folder / name).write_bytes(content)
+        return folder / name
+
+    def saved(name: str, value: object) -> Path:
+        torch.save(value, folder / name)
+        return folder / name
+
+    empty = folder / "empty"
+    empty.mkdir()
+    model = random_gaussians(5)
+    broken = random_gaussians(5).map(lambda value: value * torch.nan)
+    whole = save_splats(folder / "whole.pt", model).read_bytes()
+    return {
+        "absent": (folder / "absent.ply", "no such model"),
+        "another kind": (written("model.splat", b"x"), "a .ply or gsplat's .pt"),
+        "empty folder": (empty, "without a checkpoint of a run"),
+        "no archive": (written("text.pt", b"text"), "not a whole file of torch.save"),
+        "cut": (written("cut.pt", whole[:-300]), "cannot be used"),
+        "other keys": (saved("weights.pt", {"conv1": torch.zeros(3), "bias": torch.zeros(1)}), "bias, conv1"),
+        "a list": (saved("list.pt", [torch.zeros(3)]), "it has list"),
+        "code": (saved("code.pt", {"splats": Path("x")}), "more than plain tensors"),
+        "not finite": (save_splats(folder / "nan.pt", broken), "none of its 5 Gaussians is finite"),
+        "no rows": (save_splats(folder / "none.pt", model.map(lambda value: value[:0])), "holds no Gaussians"),
+        "not a ply": (written("text.ply", b"text"), "not a .ply file"),
+    }
+
+
+def test_what_is_no_model_is_one_line(turbogs, capture, tmp_path):
+    out = tmp_path / "out"
+    for what, (file, words) in bad_files(tmp_path).items():
+        calls = [
+            ("train", capture, "--init", file, "--out", out),
+            ("eval", file, "--scene", capture),
+            ("render", file, "--scene", capture, "--out", out),
+            ("export", file, "--scene", capture, "--out", out),
+        ]
+        for call in calls:
+            code, printed, error = turbogs(*call)
+            assert code == 2 and printed == "" and error.count("\n") == 1, (what, call[0], error)
+            assert words in error and str(file) in error, (what, error)
+            assert not out.exists()
+
+
+def test_calls_that_lack_something(turbogs, finished, capture, tmp_path):
+    model = finished / "model.ply"
+    for call, words in (
+        (("eval", model), "--scene SCENE"),
+        (("export", model), "--scene SCENE"),
+        (("render", model, "--scene", capture), "--out FOLDER"),
+        (("export", model, "--scene", capture), "--out"),
+        (("eval", finished, "--factor", "2"), "need --scene"),
+        (("eval", finished, "scene.factor=2"), "need --scene"),
+        (("train", capture, "--init", "", "--out", tmp_path / "out"), "points, random, or a model's file"),
+        (("train", capture, "train.init=''", "--out", tmp_path / "out"), "init"),
+        (("eval", model, "--scene", tmp_path / "absent"), "no such scene"),
+    ):
+        code, _, error = turbogs(*call)
+        assert code == 2 and error.count("\n") == 1 and words in error, error
+    assert not (tmp_path / "out").exists()
