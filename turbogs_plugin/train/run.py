@@ -188,7 +188,8 @@ def resume(path: Path, report: Callable[[RunSession], object] | None = None) -> 
     if limit is not None:
         hold_to(limit, device)
     with _fitting(scene, "end what else is in that memory, or go on with this run where there is more"):
-        loop = TrainingLoop(Trainer(config, scene, device, resuming=state is not None), pace_of(config))
+        resuming = state is not None
+        loop = TrainingLoop(Trainer(config, scene, device, resuming), pace_of(config))
         session = RunSession(folder, plan, scene, loop)
         if state is not None:
             session.load_state_dict(state, str(checkpoint))
