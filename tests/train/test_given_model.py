@@ -158,6 +158,20 @@ def test_a_model_of_another_capture_is_named_with_gsplats_flag(capture, tmp_path
         load_given(file, load_scene(capture), CPU)
 
 
+def test_rows_that_are_not_finite_are_left_out_and_counted_once(finished, capture, tmp_path):
+    model = read_ply(finished / "model.ply")
+    kept = torch.ones(len(model), dtype=torch.bool)
+    kept[[2, 5, 9]] = False
+    model.means[2, 1], model.opacities[5], model.shN[9, 0, 0] = torch.nan, torch.inf, -torch.inf
+    file = save_splats(tmp_path / "ckpt.pt", model)
+    with pytest.warns(UserWarning) as warned:
+        loaded = load_given(file, load_scene(capture), CPU)
+    assert [str(line.message) for line in warned] == [
+        f"{file}: 3 of {len(model)} Gaussians are not finite and left out"
+    ]
+    assert_alike(loaded, run.load_model(finished, CPU).gaussians.map(lambda value: value[kept]))
+
+
 def test_ranks_of_one_model_are_put_together(finished, capture, tmp_path):
     model = read_ply(finished / "model.ply")
     half = len(model) // 2

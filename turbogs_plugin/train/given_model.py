@@ -148,8 +148,8 @@ def _fitted(gaussians: Gaussians, into: Similarity, scene: Scene, device: torch.
         return best
     warnings.warn(
         f"{file} does not fit the photos of {scene.name}: PSNR {found:.1f} dB {views}, whose mean colours alone have "
-        f"{needed:.1f}, nor from gsplat's normalised world: give the capture that it was trained on, or train it in "
-        "the capture's own coordinates (gsplat: --no-normalize-world-space)",
+        f"{needed:.1f}, nor from gsplat's normalised world: it is hardly trained, or belongs to another capture, or "
+        "was trained in other coordinates than this capture's own (gsplat: --no-normalize-world-space keeps them)",
         stacklevel=2,
     )
     return as_given
