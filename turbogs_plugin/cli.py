@@ -490,8 +490,8 @@ def _warning_line(message: Warning | str, *place: object) -> str:
 
 def main() -> None:
     """The `turbogs` command."""
-    warnings.formatwarning = _warning_line
     description = "TurboGS: train 3D Gaussian Splatting on few, well chosen pixels."
+    warnings.formatwarning = _warning_line
     sys.exit(exit_code(lambda: app.cli(prog="turbogs", description=description, args=_gathered(sys.argv[1:]))))
 
 

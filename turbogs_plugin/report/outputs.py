@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-import torch
 from PIL import Image
 
 from turbogs_plugin.config.configuration import Config
@@ -23,8 +22,6 @@ from turbogs_plugin.scene.offload import place_views
 from turbogs_plugin.train.evaluate import evaluate, load_lpips
 from turbogs_plugin.train.history import Evaluation
 from turbogs_plugin.train.run import SavedModel, load_given_model, load_model, open_scene, resolve_device
-
-CPU = torch.device("cpu")
 
 
 def history_table(history: list[Evaluation]) -> str:
@@ -128,7 +125,8 @@ def export_run(
         raise InputError(f"--out '{out}' exists: choose a new file")
     if given is not None and out is None:
         raise InputError(f"'{path}' has no run's folder to export into: name a new file by --out")
-    model = load_model(path, resolve_device("cpu")) if given is None else load_given_model(path, given, CPU)[0]
+    device = resolve_device("cpu")
+    model = load_model(path, device) if given is None else load_given_model(path, given, device)[0]
     target = model.folder.model.with_suffix(f".{file_format}") if out is None else out
     gaussians = model.gaussians if drop_bands is None else drop_faint_bands(model.gaussians, drop_bands)
     if file_format == "pt":

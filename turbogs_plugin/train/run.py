@@ -146,8 +146,8 @@ def train(config: Config, out: Path, report: Callable[[RunSession], object] | No
     """
     folder = RunFolder(out)
     folder.require_new()
-    device = resolve_device(config.train.device)
     _require_start(config)
+    device = resolve_device(config.train.device)
     scene = open_scene(config)
     load_lpips(config.report.lpips_weights, device)
     plan = make_plan(config, scene, device)
