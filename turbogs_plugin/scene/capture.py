@@ -26,6 +26,10 @@ class Capture:
         sizes: [V, 2] int64 (width, height) of the full-size photos.
         points: [M, 3] float64.
         point_colors: [M, 3] uint8.
+        kind: what the folder was taken for, in a few words.
+        notes: what else a user should know of how it was read; they follow `kind` in one line.
+        test: [V] bool, the test views of the capture's own split; None: views are split by their order.
+        reduction: the photos are already smaller than the capture's full size by this factor.
     """
 
     names: tuple[str, ...]
@@ -35,6 +39,10 @@ class Capture:
     sizes: np.ndarray
     points: np.ndarray
     point_colors: np.ndarray
+    kind: str = ""
+    notes: tuple[str, ...] = ()
+    test: np.ndarray | None = None
+    reduction: int = 1
 
     def check(self, source: Path) -> None:
         """Raise `InputError` unless every number is finite and in range. `source` is named in messages."""

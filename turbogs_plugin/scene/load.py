@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from turbogs_plugin.errors import InputError
+from turbogs_plugin.scene import blender, llff
 from turbogs_plugin.scene.capture import Capture
 from turbogs_plugin.scene.colmap import find_model, read_colmap
 from turbogs_plugin.scene.frame import Frame
@@ -55,6 +56,7 @@ class Scene:
         frame: back to the capture's own coordinates.
         extent: 1.1 times the largest distance of a training camera from their mean, as in 3DGS; 1 by the choice of
             frame, also where the cameras only turn on the spot.
+        description: one line that says what kind of capture the folder was taken for, and how it was read.
     """
 
     name: str
@@ -64,17 +66,20 @@ class Scene:
     point_colors: Tensor
     frame: Frame
     extent: float
+    description: str = ""
 
 
 def load_scene(path: str | Path, factor: int = 1, test_every: int = 8) -> Scene:
-    """Load a COLMAP reconstruction (binary or text) or a ``transforms.json`` with its photos.
+    """Load a capture with its photos.
 
     Args:
-        path: the scene's folder. A reconstruction in ``sparse/0``, ``sparse`` or ``colmap/sparse/0`` goes before a
-            ``transforms.json``.
+        path: the scene's folder. Where it could be of several kinds, the first of these is taken: a COLMAP
+            reconstruction (binary or text, in ``sparse/0``, ``sparse`` or ``colmap/sparse/0``), a ``transforms.json``,
+            NeRF-synthetic's ``transforms_train.json``, LLFF's ``poses_bounds.npy``.
         factor: photos and intrinsics are reduced by this. Copies in ``images_<factor>`` are used where all are there
             in the right size; otherwise ``images`` are reduced by area averaging.
         test_every: the first of each `test_every` photos in name order is a test view, the others are for training.
+            Captures with a split of their own (NeRF-synthetic) keep it.
 
     Raises:
         InputError: anything wrong with the scene or the arguments, in one line.
@@ -84,10 +89,12 @@ def load_scene(path: str | Path, factor: int = 1, test_every: int = 8) -> Scene:
         raise InputError(f"factor is {factor}: it must be an integer of at least 1")
     if not isinstance(test_every, int) or test_every < 1:
         raise InputError(f"test_every is {test_every}: it must be an integer of at least 2")
-    capture = _read(scene)
-    test = np.arange(len(capture.names)) % test_every == 0
+    capture = _read(scene, factor)
+    test = np.arange(len(capture.names)) % test_every == 0 if capture.test is None else capture.test
     if len(test) < FEWEST_VIEWS:
         raise InputError(f"{scene} has {len(test)} images: at least {FEWEST_VIEWS} are needed")
+    if capture.test is not None and (~test).sum() < FEWEST_VIEWS:
+        raise InputError(f"{scene} has {(~test).sum()} training images: at least {FEWEST_VIEWS} are needed")
     if test.all():
         raise InputError(f"test_every is {test_every}: every image of {scene} would be a test image; use 2 or more")
 
@@ -97,7 +104,7 @@ def load_scene(path: str | Path, factor: int = 1, test_every: int = 8) -> Scene:
     far = ~points.isfinite().all(dim=1)
     if far.any():
         raise InputError(f"{scene}: {int(far.sum())} of {len(far)} 3D points lie too far from the cameras for float32")
-    paths, file_sizes, sizes = _find_photos(scene, capture, factor)
+    paths, file_sizes, sizes = _find_photos(scene, capture, max(1, factor // capture.reduction))
     ratios = sizes / capture.sizes  # [V, 2]
     intrinsics = capture.Ks.copy()
     intrinsics[:, :2] *= ratios[:, :, None]
@@ -117,21 +124,43 @@ def load_scene(path: str | Path, factor: int = 1, test_every: int = 8) -> Scene:
         point_colors=torch.from_numpy(capture.point_colors),
         frame=frame,
         extent=1.0,
+        description=_description(capture, test, sizes),
     )
 
 
-def _read(scene: Path) -> Capture:
+def _read(scene: Path, factor: int) -> Capture:
+    """The capture, of the first kind in the order that `load_scene` states."""
     if not scene.is_dir():
         raise InputError(f"no such scene: {scene} is not a folder")
     model = find_model(scene)
+    files = [file for file in (FILE, *blender.FILES, llff.FILE) if (scene / file).is_file()]
     if model is not None:
-        return read_colmap(scene, *model)
-    if (scene / FILE).is_file():
-        return read_transforms(scene)
-    raise InputError(
-        f"{scene} has neither a COLMAP reconstruction (cameras, images and points3D as .bin or .txt in sparse/0) nor a "
-        f"{FILE}"
+        folder, suffix = model
+        capture = replace(read_colmap(scene, *model), kind=f"COLMAP ({folder.relative_to(scene)}, {suffix})")
+        unused = files
+    elif FILE in files:
+        capture, unused = replace(read_transforms(scene), kind=FILE), files[1:]
+    elif any(file in files for file in blender.FILES):
+        capture, unused = blender.read_blender(scene), [file for file in files if file == llff.FILE]
+    elif files:
+        capture, unused = llff.read_llff(scene, factor), []
+    else:
+        raise InputError(
+            f"{scene} has neither a COLMAP reconstruction (cameras, images and points3D as .bin or .txt in sparse/0) "
+            f"nor a {FILE}, a {blender.TRAIN_FILE} or a {llff.FILE}"
+        )
+    passed_over = (f"{' and '.join(unused)} not used",) if unused else ()
+    return replace(capture, notes=(*capture.notes, *passed_over))
+
+
+def _description(capture: Capture, test: np.ndarray, sizes: np.ndarray) -> str:
+    """One line about a capture whose photos have these final `sizes` [V, 2]."""
+    smallest, largest = (
+        f"{width}x{height}" for width, height in (sizes[view] for view in np.argsort(sizes.prod(axis=1))[[0, -1]])
     )
+    size = smallest if smallest == largest else f"{smallest} to {largest}"
+    found = f"{(~test).sum()} training and {test.sum()} test photos {size}"
+    return f"{capture.kind}: {', '.join((found, *capture.notes))}"
 
 
 def _find_photos(scene: Path, capture: Capture, factor: int) -> tuple[list[Path], np.ndarray, np.ndarray]:
