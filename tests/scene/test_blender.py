@@ -74,9 +74,10 @@ def test_its_own_split(tmp_path):
     scene = load_scene(write_blender(tmp_path / "lego"))
     assert scene.train.names == tuple(f"train/r_{view}.png" for view in range(6))
     assert scene.test.names == tuple(f"test/r_{view}.png" for view in range(4))
-    assert scene.description == (
-        "NeRF-synthetic: 6 training and 4 test photos 60x40, RGBA on black, "
-        "50000 random points (seed 0) about what the cameras look at"
+    (note,) = scene.notes
+    assert note == (
+        "NeRF-synthetic: 6 training and 4 test photos 60x40, RGBA on black; "
+        "no points, so 50,000 random ones (seed 0) about what the cameras look at"
     )
 
 
@@ -87,6 +88,7 @@ def test_without_test_photos_those_for_validation_are_tested_and_without_these_e
     (folder / "transforms_val.json").unlink()
     scene = load_scene(folder)
     assert scene.test.names == ("train/r_0.png",) and len(scene.train) == 5
+    assert scene.notes[0].startswith("NeRF-synthetic: 6 photos, none for testing, 60x40, RGBA")
 
 
 def test_reduced_photos_mix_with_black(tmp_path):
@@ -110,7 +112,7 @@ def test_opaque_photos_and_intrinsics_of_newer_exporters(tmp_path):
             (folder / part / f"r_{view}.png").unlink()
     edit(folder, lambda content: content["frames"][0].update(file_path="train/r_0.JPG"))
     scene = load_scene(folder)
-    assert scene.train.names[0] == "train/r_0.JPG" and "RGBA" not in scene.description
+    assert scene.train.names[0] == "train/r_0.JPG" and "RGBA" not in scene.notes[0]
     np.testing.assert_allclose(scene.train.cameras.Ks[0], [[80, 0, 31], [0, 82, 19], [0, 0, 1]])
 
 
@@ -125,27 +127,25 @@ def test_points_are_seeded_and_about_the_object(tmp_path):
 
 def test_which_kind_is_taken_of_several(tmp_path):
     """COLMAP, transforms.json, NeRF-synthetic, LLFF, in this order; what is passed over is named."""
-    folder = write_blender(tmp_path / "all")
+    folder = write_blender(tmp_path / "all", {"train": 6, "val": 3, "test": 4})
     (folder / "poses_bounds.npy").write_bytes(b"never read")
-    assert load_scene(folder).description.startswith("NeRF-synthetic: 6 training")
-    assert load_scene(folder).description.endswith(", poses_bounds.npy not used")
+    scene = load_scene(folder)
+    assert scene.notes[0].startswith("NeRF-synthetic: 6 training") and scene.notes[-1] == "poses_bounds.npy not used"
     shutil.copy(folder / "transforms_val.json", folder / "transforms.json")
-    edit(folder, lambda content: content["frames"].extend([{**content["frames"][0], "file_path": "train/r_0"}]), "val")
-    shutil.copy(folder / "transforms_val.json", folder / "transforms.json")
-    description = load_scene(folder).description
-    assert description.startswith("transforms.json: 2 training and 1 test photos 60x40")
-    assert (
-        "transforms_train.json and transforms_test.json and transforms_val.json and poses_bounds.npy not" in description
-    )
+    scene = load_scene(folder)
+    assert scene.train.names == ("r_1.png", "r_2.png")
+    passed_over = "transforms_train.json, transforms_test.json, transforms_val.json, poses_bounds.npy not used"
+    assert scene.notes[-1] == passed_over
     demo = write_demo_capture(tmp_path / "demo", views=4, width=32, height=24)
     for part in ("sparse", "images"):
         shutil.copytree(demo / part, folder / part)
-    assert load_scene(folder).description.startswith("COLMAP (sparse/0, .bin): 3 training and 1 test photos 32x24")
+    scene = load_scene(folder)
+    assert scene.notes[-1] == f"transforms.json, {passed_over}" and scene.train.cameras.sizes[0].tolist() == [32, 24]
 
 
-def test_what_was_found_is_said_before_training(turbogs, tmp_path):
-    code, out, _ = turbogs("plan", write_blender(tmp_path / "lego"), "--device", "cpu")
-    assert code == 0 and out.startswith("NeRF-synthetic: 6 training and 4 test photos 60x40, RGBA on black, 50000")
+def test_what_the_folder_was_taken_for_is_said(turbogs, tmp_path):
+    code, _, said = turbogs("plan", write_blender(tmp_path / "lego"), "--device", "cpu")
+    assert code == 0 and said.startswith("NeRF-synthetic: 6 training and 4 test photos 60x40, RGBA on black;")
 
 
 def frame(**values):
@@ -189,7 +189,7 @@ def test_what_is_refused(tmp_path, change, words):
 def test_without_its_training_file(tmp_path):
     folder = write_blender(tmp_path / "lego")
     (folder / "transforms_train.json").unlink()
-    with pytest.raises(InputError, match="has no transforms_train.json"):
+    with pytest.raises(InputError, match=r"has no transforms_train\.json"):
         load_scene(folder)
 
 

@@ -68,9 +68,10 @@ def test_painted_points_are_where_the_cameras_see_them(tmp_path):
     require_points_at_their_pixels(scene, scene.train, POINTS)
     require_points_at_their_pixels(scene, scene.test, POINTS)
     assert scene.test.names == ("IMG_000.png", "IMG_008.png") and len(scene.train) == 7
-    assert scene.description == (
-        "LLFF: 7 training and 2 test photos 120x80, from images, "
-        "50000 random points (seed 0) within the views at depths of 2 to 10"
+    (note,) = scene.notes
+    assert note == (
+        "LLFF: 9 photos 120x80 of images; "
+        "no points, so 50,000 random ones (seed 0) within the views at depths of 2 to 10"
     )
 
 
@@ -79,7 +80,7 @@ def test_reduced_copies_alone(tmp_path, size):
     """A side may be rounded either way."""
     scene = load_scene(write_llff(tmp_path / "fern", images_4=(30, 20), images_8=(15, 10)))
     require_points_at_their_pixels(scene, scene.train, POINTS)
-    assert "photos 30x20, from images_4," in scene.description and scene.train.names[0] == "image001.png"
+    assert "photos 30x20 of images_4;" in scene.notes[0] and scene.train.names[0] == "image001.png"
     np.testing.assert_allclose(scene.train.cameras.Ks[0], [[22.5, 0, 15], [0, 22.5, 10], [0, 0, 1]])
     for file in (tmp_path / "fern/images_4").iterdir():
         Image.new("RGB", size).save(file)
@@ -98,7 +99,7 @@ def test_a_factor_counts_from_the_full_size(tmp_path):
         scene = load_scene(folder, factor=factor)
         assert tuple(scene.train.cameras.sizes[0]) == size
         np.testing.assert_allclose(scene.train.cameras.Ks[0, 0], [FOCAL * size[0] / 128, 0, 0.5 * size[0]])
-    with pytest.raises(InputError, match="--factor 2: the largest photos .* images_4: use --factor 4 or a multiple"):
+    with pytest.raises(InputError, match=r"--factor 2: the largest photos .* images_4: use --factor 4 or a multiple"):
         load_scene(folder, factor=2)
 
 
@@ -106,16 +107,16 @@ def test_copies_are_used_where_they_are_whole(tmp_path):
     """By their order, for their names differ from those of the full-size photos."""
     folder = write_llff(tmp_path / "fern", images=FULL, images_4=(30, 20))
     scene = load_scene(folder, factor=4)
-    assert "from images_4," in scene.description and tuple(scene.train.cameras.sizes[0]) == (30, 20)
+    assert "of images_4;" in scene.notes[0] and tuple(scene.train.cameras.sizes[0]) == (30, 20)
     require_points_at_their_pixels(scene, scene.train, POINTS)
-    assert "photos 120x80, from images," in load_scene(folder).description
+    assert "photos 120x80 of images;" in load_scene(folder).notes[0]
     (folder / "images_4/image003.png").unlink()
     scene = load_scene(folder, factor=4)
-    assert "from images," in scene.description and tuple(scene.train.cameras.sizes[0]) == (30, 20)
+    assert "of images;" in scene.notes[0] and tuple(scene.train.cameras.sizes[0]) == (30, 20)
     for file in (folder / "images_4").iterdir():
         Image.new("RGB", (40, 20)).save(file)
     Image.new("RGB", (40, 20)).save(folder / "images_4/image003.png")
-    assert "from images," in load_scene(folder, factor=4).description
+    assert "of images;" in load_scene(folder, factor=4).notes[0]
 
 
 def test_points_are_seeded_and_within_the_views_and_bounds(tmp_path):
@@ -178,7 +179,7 @@ def drop_photos(folder: Path) -> None:
         (set_at(1, 15, 5e-324), "row 1 has bounds"),
         (set_at(1, 16, 1.0), "row 1 has bounds"),
         (set_at(1, 16, np.nan), "row 1 has bounds"),
-        (set_at(slice(None), 9, 60.0), "IMG_000.png is 120x80, which is no uniform scale of the 60x80 in poses_bounds"),
+        (set_at(slice(None), 9, 60.0), "IMG_000.png is 120x80, no uniform scale of the 60x80 in poses_bounds"),
         (
             lambda folder: Image.new("RGB", (80, 120)).save(folder / "images/IMG_004.png"),
             "IMG_004.png is 80x120 but the first one is 120x80, and poses_bounds.npy has one size for both: use the",

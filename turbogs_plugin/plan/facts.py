@@ -51,7 +51,6 @@ class SceneFacts:
         device_free_bytes, host_free_bytes: memory free for this run; on a CPU both are the same memory.
         memory_limit: bytes of the device that the run was told not to exceed, or None.
         time_budget: seconds that the run was told to take, or None.
-        description: what kind of capture the folder was taken for, in one line; empty where the scene has none.
     """
 
     scene: str
@@ -73,7 +72,6 @@ class SceneFacts:
     host_free_bytes: int
     memory_limit: int | None = None
     time_budget: float | None = None
-    description: str = ""
 
 
 @torch.no_grad()
@@ -113,7 +111,6 @@ def gather_facts(
         host_free_bytes=host_free,
         memory_limit=memory_limit,
         time_budget=time_budget,
-        description=scene.description,
     )
 
 

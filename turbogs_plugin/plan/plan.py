@@ -42,7 +42,7 @@ class Plan:
         return resolve(mapping)
 
     def text(self) -> str:
-        """For a terminal: what the capture was taken for, the facts, and a line a decision."""
+        """For a terminal: the facts, and a line a decision."""
         name = max(len(decision.setting) for decision in self.decisions)
         value = max(len(decision.text) for decision in self.decisions)
         lines = [
@@ -50,8 +50,7 @@ class Plan:
             for decision in self.decisions
         ]
         facts = textwrap.fill(self.facts_text(), 118, initial_indent="plan for ", subsequent_indent="  ")
-        taken_for = [self.facts.description] if self.facts.description else []
-        return "\n".join([*taken_for, facts, *lines])
+        return "\n".join([facts, *lines])
 
     def facts_text(self) -> str:
         """The facts in a sentence."""

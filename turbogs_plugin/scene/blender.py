@@ -16,15 +16,16 @@ import numpy as np
 from PIL import Image
 
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.scene.capture import Capture, check_photo_name
+from turbogs_plugin.scene.capture import Capture, check_photo_name, sizes_text
 from turbogs_plugin.scene.photos import photo_size
 from turbogs_plugin.scene.poses import viewmat_of_pose
-from turbogs_plugin.scene.transforms import DISTORTION, PHOTO_SUFFIXES, random_points
+from turbogs_plugin.scene.transforms import PHOTO_SUFFIXES, random_points
 
 TRAIN_FILE = "transforms_train.json"
 TEST_FILES = ("transforms_test.json", "transforms_val.json")
 """The first of them that is there names the test photos."""
 FILES = (TRAIN_FILE, *TEST_FILES)
+DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 NAMED_AT_MOST = 3
 
 
@@ -65,8 +66,6 @@ def read_blender(scene: Path) -> Capture:
         )
     names, views = zip(*sorted({**train, **test}.items()), strict=True)
     points, colors = random_points(np.array([view.viewmat for view in train.values()]))
-    notes = ["RGBA on black"] if _is_transparent(scene / min(train)) else []
-    notes.append(f"{len(points)} random points (seed 0) about what the cameras look at")
     capture = Capture(
         names=names,
         photo_folder=scene,
@@ -75,8 +74,7 @@ def read_blender(scene: Path) -> Capture:
         sizes=np.array([view.size for view in views], dtype=np.int64),
         points=points,
         point_colors=colors,
-        kind="NeRF-synthetic",
-        notes=tuple(notes),
+        notes=(_note(scene, train, test, len(points)),),
         test=np.array([name in test for name in names]) if test else None,
     )
     capture.check(scene / TRAIN_FILE)
@@ -165,6 +163,17 @@ def _viewmat(matrix: Any, name: str, source: Path) -> np.ndarray:
             f"{source}: the transform_matrix of {name} {error}: give the camera in Blender a scale of 1 and export "
             "again"
         ) from None
+
+
+def _note(scene: Path, train: dict[str, BlenderView], test: dict[str, BlenderView], points: int) -> str:
+    """What the capture was taken for, in one line."""
+    size = sizes_text(np.array([view.size for view in (*train.values(), *test.values())]))
+    split = f"{len(train)} training and {len(test)} test photos" if test else f"{len(train)} photos, none for testing,"
+    alpha = ", RGBA on black" if _is_transparent(scene / min(train)) else ""
+    return (
+        f"NeRF-synthetic: {split} {size}{alpha}; no points, so {points:,} random ones (seed 0) about what the cameras "
+        "look at"
+    )
 
 
 def _is_transparent(photo: Path) -> bool:

@@ -26,8 +26,7 @@ class Capture:
         sizes: [V, 2] int64 (width, height) of the full-size photos.
         points: [M, 3] float64.
         point_colors: [M, 3] uint8.
-        kind: what the folder was taken for, in a few words.
-        notes: what else a user should know of how it was read; they follow `kind` in one line.
+        notes: what the capture was taken for, and what was done with it: lines for the user.
         test: [V] bool, the test views of the capture's own split; None: views are split by their order.
         reduction: the photos are already smaller than the capture's full size by this factor.
     """
@@ -39,7 +38,6 @@ class Capture:
     sizes: np.ndarray
     points: np.ndarray
     point_colors: np.ndarray
-    kind: str = ""
     notes: tuple[str, ...] = ()
     test: np.ndarray | None = None
     reduction: int = 1
@@ -77,3 +75,10 @@ def check_photo_name(name: str, source: Path) -> str:
     if not path.parts or ".." in path.parts or path.drive or path.root or not name.isprintable():
         raise InputError(f"{source}: image name {name!r} leaves the photo folder: names must be relative, without '..'")
     return name
+
+
+def sizes_text(sizes: np.ndarray) -> str:
+    """Of photos of `sizes` [V, 2]: ``800x600``, or the one with fewest and the one with most pixels."""
+    pixels = np.prod(sizes, axis=1)
+    ends = (f"{width:g}x{height:g}" for width, height in (sizes[pixels.argmin()], sizes[pixels.argmax()]))
+    return " to ".join(dict.fromkeys(ends))

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.scene.capture import Capture
+from turbogs_plugin.scene.capture import Capture, sizes_text
 from turbogs_plugin.scene.photos import photo_size
 from turbogs_plugin.scene.poses import viewmat_of_pose
 from turbogs_plugin.scene.transforms import NUM_RANDOM_POINTS, PHOTO_SUFFIXES
@@ -89,7 +89,7 @@ def read_llff(scene: Path, factor: int = 1) -> Capture:
     intrinsics[:, [0, 1], [0, 1]] = table.focals[:, None] * ratios
     intrinsics[:, :2, 2] = 0.5 * sizes
     points, colors = points_in_views(table.viewmats, intrinsics, sizes, table.bounds)
-    near, far = table.bounds[:, 0].min(), table.bounds[:, 1].max()
+    depths = f"{table.bounds[:, 0].min():.4g} to {table.bounds[:, 1].max():.4g}"
     capture = Capture(
         names=folder.names,
         photo_folder=folder.path,
@@ -98,10 +98,9 @@ def read_llff(scene: Path, factor: int = 1) -> Capture:
         sizes=sizes,
         points=points,
         point_colors=colors,
-        kind="LLFF",
         notes=(
-            f"from {folder.path.name}",
-            f"{len(points)} random points (seed 0) within the views at depths of {near:.4g} to {far:.4g}",
+            f"LLFF: {len(sizes)} photos {sizes_text(sizes)} of {folder.path.name}; no points, so {len(points):,} random "
+            f"ones (seed 0) within the views at depths of {depths}",
         ),
         reduction=folder.reduction,
     )
@@ -209,8 +208,8 @@ def _checked_sizes(folder: PhotoFolder, table: LlffTable, source: Path) -> np.nd
     if other.any():
         view = int(np.argmax(other))
         raise InputError(
-            f"photo {folder.path / folder.names[view]} is {_text(sizes[view])} but the first one is {_text(sizes[0])}, "
-            f"and {FILE} has one size for both: use the photos that it was written for"
+            f"photo {folder.path / folder.names[view]} is {sizes_text(sizes[[view]])} but the first one is "
+            f"{sizes_text(sizes[:1])}, and {FILE} has one size for both: use the photos that it was written for"
         )
     # Either side of a reduced photo may be rounded by up to a pixel.
     ratios = sizes / table.sizes
@@ -218,11 +217,7 @@ def _checked_sizes(folder: PhotoFolder, table: LlffTable, source: Path) -> np.nd
     if bent.any():
         view = int(np.argmax(bent))
         raise InputError(
-            f"photo {folder.path / folder.names[view]} is {_text(sizes[view])}, which is no uniform scale of the "
-            f"{_text(table.sizes[view])} in {FILE}: use the photos that it was written for"
+            f"photo {folder.path / folder.names[view]} is {sizes_text(sizes[[view]])}, no uniform scale of the "
+            f"{sizes_text(table.sizes[[view]])} in {FILE}: use the photos that it was written for"
         )
     return sizes
-
-
-def _text(size: np.ndarray) -> str:
-    return f"{size[0]:g}x{size[1]:g}"

@@ -56,7 +56,7 @@ class Scene:
         frame: back to the capture's own coordinates.
         extent: 1.1 times the largest distance of a training camera from their mean, as in 3DGS; 1 by the choice of
             frame, also where the cameras only turn on the spot.
-        description: one line that says what kind of capture the folder was taken for, and how it was read.
+        notes: what the capture was taken for, and what was done with its photos: lines for the user.
     """
 
     name: str
@@ -66,7 +66,7 @@ class Scene:
     point_colors: Tensor
     frame: Frame
     extent: float
-    description: str = ""
+    notes: tuple[str, ...] = ()
 
 
 def load_scene(path: str | Path, factor: int = 1, test_every: int = 8) -> Scene:
@@ -124,7 +124,7 @@ def load_scene(path: str | Path, factor: int = 1, test_every: int = 8) -> Scene:
         point_colors=torch.from_numpy(capture.point_colors),
         frame=frame,
         extent=1.0,
-        description=_description(capture, test, sizes),
+        notes=capture.notes,
     )
 
 
@@ -135,32 +135,22 @@ def _read(scene: Path, factor: int) -> Capture:
     model = find_model(scene)
     files = [file for file in (FILE, *blender.FILES, llff.FILE) if (scene / file).is_file()]
     if model is not None:
-        folder, suffix = model
-        capture = replace(read_colmap(scene, *model), kind=f"COLMAP ({folder.relative_to(scene)}, {suffix})")
-        unused = files
-    elif FILE in files:
-        capture, unused = replace(read_transforms(scene), kind=FILE), files[1:]
-    elif any(file in files for file in blender.FILES):
-        capture, unused = blender.read_blender(scene), [file for file in files if file == llff.FILE]
-    elif files:
-        capture, unused = llff.read_llff(scene, factor), []
-    else:
-        raise InputError(
-            f"{scene} has neither a COLMAP reconstruction (cameras, images and points3D as .bin or .txt in sparse/0) "
-            f"nor a {FILE}, a {blender.TRAIN_FILE} or a {llff.FILE}"
-        )
-    passed_over = (f"{' and '.join(unused)} not used",) if unused else ()
-    return replace(capture, notes=(*capture.notes, *passed_over))
-
-
-def _description(capture: Capture, test: np.ndarray, sizes: np.ndarray) -> str:
-    """One line about a capture whose photos have these final `sizes` [V, 2]."""
-    smallest, largest = (
-        f"{width}x{height}" for width, height in (sizes[view] for view in np.argsort(sizes.prod(axis=1))[[0, -1]])
+        return _passing_over(files, read_colmap(scene, *model))
+    if FILE in files:
+        return _passing_over(files[1:], read_transforms(scene))
+    if files and files[0] in blender.FILES:
+        return _passing_over([file for file in files if file not in blender.FILES], blender.read_blender(scene))
+    if files:
+        return llff.read_llff(scene, factor)
+    raise InputError(
+        f"{scene} has neither a COLMAP reconstruction (cameras, images and points3D as .bin or .txt in sparse/0) nor a "
+        f"{FILE}, a {blender.TRAIN_FILE} or a {llff.FILE}"
     )
-    size = smallest if smallest == largest else f"{smallest} to {largest}"
-    found = f"{(~test).sum()} training and {test.sum()} test photos {size}"
-    return f"{capture.kind}: {', '.join((found, *capture.notes))}"
+
+
+def _passing_over(files: list[str], capture: Capture) -> Capture:
+    """The capture, whose notes say that these files, which make the folder another kind too, were not used."""
+    return replace(capture, notes=(*capture.notes, f"{', '.join(files)} not used")) if files else capture
 
 
 def _find_photos(scene: Path, capture: Capture, factor: int) -> tuple[list[Path], np.ndarray, np.ndarray]:
