@@ -116,6 +116,15 @@ def test_opaque_photos_and_intrinsics_of_newer_exporters(tmp_path):
     np.testing.assert_allclose(scene.train.cameras.Ks[0], [[80, 0, 31], [0, 82, 19], [0, 0, 1]])
 
 
+def test_photos_of_other_sizes_have_the_same_angle_of_view(tmp_path):
+    folder = write_blender(tmp_path / "lego")
+    Image.new("RGBA", (120, 80)).save(folder / "train/r_1.png")
+    scene = load_scene(folder)
+    focal = 60 / math.tan(0.5 * ANGLE)
+    np.testing.assert_allclose(scene.train.cameras.Ks[1], [[focal, 0, 60], [0, focal, 40], [0, 0, 1]], rtol=1e-6)
+    assert "photos 60x40 to 120x80, RGBA" in scene.notes[0]
+
+
 def test_points_are_seeded_and_about_the_object(tmp_path):
     folder = write_blender(tmp_path / "lego")
     scene, again = load_scene(folder), load_scene(folder)
@@ -174,7 +183,7 @@ def frame(**values):
         (frame(transform_matrix=None), "r_2.png has no transform_matrix of 4x4"),
         (frame(transform_matrix=[[1, 2], [3]]), "r_2.png has no transform_matrix of 4x4"),
         (frame(transform_matrix=np.full((4, 4), math.inf).tolist()), "r_2.png has numbers that are not finite"),
-        (frame(transform_matrix=np.diag([2, 2, 2, 1]).tolist()), "r_2.png is not a rotation .* scale of 1"),
+        (frame(transform_matrix=np.diag([2, 2, 2, 1]).tolist()), "r_2.png is not a rotation .* camera of scale 1"),
         (frame(transform_matrix=np.diag([1, 1, -1, 1]).tolist()), "r_2.png is not a rotation"),
     ],
 )

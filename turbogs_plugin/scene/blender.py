@@ -160,8 +160,7 @@ def _viewmat(matrix: Any, name: str, source: Path) -> np.ndarray:
         return viewmat_of_pose(pose[:3, :3] * [1.0, -1.0, -1.0], pose[:3, 3])
     except ValueError as error:
         raise InputError(
-            f"{source}: the transform_matrix of {name} {error}: give the camera in Blender a scale of 1 and export "
-            "again"
+            f"{source}: the transform_matrix of {name} {error}: export again, from a camera of scale 1 in Blender"
         ) from None
 
 
