@@ -184,8 +184,8 @@ def _require_scaled(paths: list[Path], sizes: np.ndarray, expected: np.ndarray) 
         bad = int(np.argmin(scaled))
         (width, height), (camera_width, camera_height) = sizes[bad].tolist(), expected[bad].tolist()
         raise InputError(
-            f"photo {paths[bad]} is {width}x{height} but its camera is {camera_width}x{camera_height}: it was cropped or "
-            "turned, not scaled; use the photos that the cameras were reconstructed from"
+            f"photo {paths[bad]} is {width}x{height} but its camera is {camera_width}x{camera_height}: it was "
+            "cropped or turned, not scaled; use the photos that the cameras were reconstructed from"
         )
     others = np.flatnonzero((sizes != expected).any(axis=1))
     if not len(others):

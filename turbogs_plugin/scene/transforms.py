@@ -62,8 +62,8 @@ def read_transforms(scene: Path) -> Capture:
         views[name] = (_viewmat(frame, name, source), *_camera({**content, **frame}, scene / name, source, lenses))
     if absent and len(views) < FEWEST_PHOTOS:
         raise InputError(
-            f"{source} names {len(frames)} photos, of which {len(absent)} are missing in {scene} ({absent[0]}, ...): at "
-            f"least {FEWEST_PHOTOS} are needed; copy the photos there"
+            f"{source} names {len(frames)} photos, of which {len(absent)} are missing in {scene} ({absent[0]}, ...): "
+            f"at least {FEWEST_PHOTOS} are needed; copy the photos there"
         )
     names, cameras = zip(*sorted(views.items()), strict=True)
     viewmats, intrinsics, sizes, lens_of_view = zip(*cameras, strict=True)
@@ -156,8 +156,8 @@ def _camera(
     if model not in (*BROWN_MODELS, *FISHEYE_MODELS):
         raise InputError(
             f"{source}: the camera_model of {photo.name} is {str(model)[:40]!r}: known are "
-            f"{', '.join((*BROWN_MODELS, *FISHEYE_MODELS))}; convert the capture with ns-process-data, or use its COLMAP "
-            "reconstruction"
+            f"{', '.join((*BROWN_MODELS, *FISHEYE_MODELS))}; convert the capture with ns-process-data, or use its "
+            "COLMAP reconstruction"
         )
     fisheye = model in FISHEYE_MODELS
     radial = tuple(number(f"k{power}", 0.0) for power in (1, 2, 3, 4))

@@ -32,14 +32,14 @@ LARGEST_GROWTH = 2.0
 """The pinhole image has at most this many times the sides of the photo (COLMAP's `max_scale`)."""
 LATTICE = 129
 """Nodes of a map along either side. Between them it is linear: off by less than 0.05 pixels in strong distortion."""
-SIDE_POINTS, CANDIDATES, ROUNDS = 33, 17, 3
-"""Points of a side that are looked at; rectangles tried in each round; rounds, each within a step of the one before."""
+SIDE_POINTS, CANDIDATES, ROUNDS = 33, 17, 4
+"""Points of a side that are looked at; rectangles tried in a round; rounds, each within a step of the one before."""
 GROWTH = ([0, 1, 2, 3], [0, 2], [1, 3], [0], [1], [2], [3])
-"""Sides (left, top, right, bottom) that a rectangle grows to in turn: its proportions stay the photo's where they can."""
+"""Sides (left, top, right, bottom) that a rectangle grows to in turn: with the photo's proportions at first."""
 SMALLEST_SHARE = 0.1
 """A pinhole image that covers less of the photo's width or height is not one of a lens."""
-EDGE = 0.5
-"""Pixels by which a rectangle's outline may leave the photo: the centres of its pixels do not."""
+EDGE, LATTICE_EDGE = 0.02, 0.5
+"""Pixels by which a rectangle's outline, and a node of the map, may leave the photo: they are between points seen."""
 ROWS_AT_ONCE = 256
 
 
@@ -178,7 +178,7 @@ def make_lens(model: str, photo_size: tuple[int, int], project: Projection, owne
         y = np.linspace(corner[1], corner[1] + height / focal[1], LATTICE)
         nodes = project(np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)).reshape(LATTICE, LATTICE, 2)
         spans = (np.ptp(nodes, axis=(0, 1)) >= SMALLEST_SHARE * sides).all()
-        inside = spans and (nodes >= -2 * EDGE).all() and (nodes <= sides + 2 * EDGE).all()
+        inside = spans and (nodes >= -LATTICE_EDGE).all() and (nodes <= sides + LATTICE_EDGE).all()
         if not inside or not (_turn(nodes[:-1, 1:] - nodes[:-1, :-1], nodes[1:, :-1] - nodes[:-1, :-1]) > 0).all():
             raise _no_lens(model, owner)
     K = np.array([[focal[0], 0.0, -focal[0] * corner[0]], [0.0, focal[1], -focal[1] * corner[1]], [0.0, 0.0, 1.0]])
