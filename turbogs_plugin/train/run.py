@@ -73,8 +73,7 @@ def open_scene(config: Config, folder: RunFolder | None = None) -> Scene:
             f"in {folder.config}"
         )
     scene = load_scene(settings.path, settings.factor, settings.test_every)
-    if scene.notes:
-        print("\n".join(scene.notes), file=sys.stderr)
+    print("\n".join(scene.notes), file=sys.stderr)
     return scene
 
 
