@@ -127,7 +127,7 @@ def train(
     """Train on a capture, or go on with a stopped run.
 
     Args:
-        scene: folder of a COLMAP reconstruction or a transforms.json, with its photos.
+        scene: folder of a capture: a COLMAP reconstruction, a transforms.json, NeRF-synthetic or LLFF, with its photos.
         overrides: changes of the configuration, e.g. train.iterations=8000 density.type=none.
         out: new folder for the run.
         resume: folder of a stopped run to go on with, by its own configuration.

@@ -1,6 +1,8 @@
 """COLMAP captures: what is read, in which frame, at which size; and what is refused, with which words."""
 
 import os
+import re
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +12,8 @@ import torch
 from PIL import Image
 
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.scene import load_scene
+from turbogs_plugin.scene import colmap, load_scene
+from turbogs_plugin.scene.colmap import find_model, read_colmap
 from turbogs_plugin.types import PixelSamples
 
 SCENES = Path(os.environ.get("TURBOGS_SCENES", Path(__file__).resolve().parents[3] / "shared" / "scenes"))
@@ -199,7 +202,7 @@ def truncate_photo(folder: Path) -> None:
 
 
 def wrong_size(folder: Path) -> None:
-    Image.new("RGB", (41, 24)).save(folder / "images" / "photo03.png")
+    Image.new("RGB", (24, 40)).save(folder / "images" / "photo03.png")
 
 
 def deep_photo(folder: Path) -> None:
@@ -223,7 +226,7 @@ def remove_model(folder: Path) -> None:
         (lambda folder: replace_photo(folder, b"\xff"), "cannot read the photo .*photo03.png"),
         (lambda folder: replace_photo(folder, b""), "cannot read the photo .*photo03.png"),
         (truncate_photo, "cannot read the photo .*photo03.png"),
-        (wrong_size, "photo03.png is 41x24 but its camera is 40x24"),
+        (wrong_size, "photo03.png is 24x40 but its camera is 40x24: it was cropped or turned"),
         (deep_photo, "photo03.png has more than 8 bits a channel"),
     ],
 )
@@ -245,10 +248,11 @@ def test_bad_files_are_named(tmp_path, damage, words):
         ({}, {"factor": 0}, "factor is 0"),
         ({}, {"factor": 2.5}, "factor is 2.5"),
         (
-            {"cameras": (("OPENCV", 40, 24, [50.0, 50.0, 20.0, 12.0, 0.1, 0.0, 0.0, 0.0]),)},
+            {"cameras": (("OPENCV", 40, 24, [50.0, 50.0, 20.0, 12.0, np.nan, 0, 0, 0]),)},
             {},
-            "OPENCV, a model with lens distortion: undistort with 'colmap image_undistorter",
+            "not those of a lens|Verify",
         ),
+        ({"cameras": (("EQUIRECTANGULAR", 40, 24, [40, 24]),)}, {}, "camera 1 of .* is EQUIRECTANGULAR, a panorama"),
         ({"cameras": (("PINHOLE", 40, 24, [np.nan, 52.0, 21.0, 11.0]),)}, {}, "intrinsics|VerifyParams"),
     ],
 )
@@ -300,3 +304,121 @@ def test_real_capture():
     differences = image[pixels[shown, 1], pixels[shown, 0]] - scene.point_colors[shown] / 255
     shifted = image[pixels[shown, 1], 209 - pixels[shown, 0]] - scene.point_colors[shown] / 255
     assert differences.abs().mean(dim=1).median() < 0.6 * shifted.abs().mean(dim=1).median()
+
+
+def test_of_several_models_the_largest_is_taken_and_said(tmp_path):
+    folder = write_capture(tmp_path / "cup", views=4)
+    for name, views in (("1", 9), ("2", 7), ("10", 9)):
+        write_capture(tmp_path / name, views=views, suffix=".txt" if name == "2" else ".bin")
+        shutil.copytree(tmp_path / name / "sparse/0", folder / "sparse" / name)
+    shutil.copytree(tmp_path / "1" / "images", folder / "images", dirs_exist_ok=True)
+    scene = load_scene(folder)
+    assert len(scene.train) + len(scene.test) == 9
+    said = "4 reconstructions in .*sparse: 1 is taken for most images .0 has 4, 1 has 9, 2 has 7, 10 has 9."
+    assert re.fullmatch(said, scene.notes[1])
+    assert re.fullmatch("COLMAP reconstruction .*sparse/1 .binary.: 9 images, 20 points", scene.notes[0])
+
+
+@pytest.mark.parametrize("suffix", [".bin", ".txt"])
+def test_images_are_counted_as_pycolmap_does(tmp_path, suffix):
+    for views in (3, 8):
+        folder = write_capture(tmp_path / str(views), views=views, suffix=suffix) / "sparse"
+        assert find_model(folder.parent) == (folder / "0", suffix)
+        assert colmap._count_images(folder / "0", suffix) == views
+
+
+def test_a_hostile_count_of_images_is_no_majority(tmp_path):
+    folder = write_capture(tmp_path / "cup")
+    (folder / "sparse/1").mkdir()
+    for file in ("cameras", "images", "points3D"):
+        (folder / "sparse/1" / f"{file}.bin").write_bytes(b"\xff" * 8)
+    assert len(load_scene(folder).train) == 7
+
+
+@pytest.mark.parametrize("place", [".", "photos", "images/full/jpg", "../images", "rgb/left"])
+def test_photos_in_other_folders(tmp_path, place):
+    folder = write_capture(tmp_path / "captures" / "cup", nested=True)
+    (folder / "images").rename(tmp_path / "photos")
+    if place == ".":
+        (tmp_path / "photos" / "left").rename(folder / "left")
+    else:
+        (folder / place).resolve().parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "photos").rename((folder / place).resolve())
+    scene = load_scene(folder)
+    assert len(scene.train) == 7 and "photos in " in scene.notes[0]
+
+
+def test_reduced_copies_are_no_photos_of_full_size(tmp_path):
+    folder = write_capture(tmp_path / "cup")
+    (folder / "images").rename(folder / "images_4")
+    with pytest.raises(InputError, match=r"9 of 9 photos are missing in .*images: "):
+        load_scene(folder)
+
+
+def test_a_folder_that_is_a_model_itself(tmp_path):
+    folder = write_capture(tmp_path / "cup")
+    assert len(load_scene(folder / "sparse").train) == 7
+
+
+@pytest.mark.parametrize(("size", "fits"), [((20, 12), True), ((21, 12), True), ((80, 48), True), ((20, 15), False)])
+def test_photos_in_other_sizes_than_their_cameras(tmp_path, size, fits):
+    folder = write_capture(tmp_path / "cup")
+    for path in (folder / "images").iterdir():
+        Image.open(path).resize(size, Image.Resampling.BOX).save(path)
+    if not fits:
+        with pytest.raises(InputError, match=r"photo00.png is 20x15 but its camera is 40x24: it was cropped"):
+            load_scene(folder)
+        return
+    scene = load_scene(folder)
+    width, height = size
+    assert scene.train.cameras.sizes.tolist() == [list(size)] * 7
+    expected = [[50 * width / 40, 0, 21 * width / 40], [0, 52 * height / 24, 11 * height / 24], [0, 0, 1]]
+    np.testing.assert_allclose(scene.train.cameras.Ks[0], expected, rtol=1e-6)
+    assert scene.notes[-1].endswith(
+        f"9 photos in another size than their cameras: intrinsics rescaled from 40x24 to {width}x{height}"
+    )
+
+
+def test_rigs(tmp_path):
+    """Two cameras on one rig: every image has its own pose, composed by hand here."""
+    reconstruction = pycolmap.Reconstruction()
+    offset = np.concatenate([rotation(0.3), [[1.0], [0.5], [0.0]]], axis=1)  # the second camera from the rig
+    rig = pycolmap.Rig(rig_id=1)
+    for number in (1, 2):
+        camera = pycolmap.Camera(camera_id=number, model="PINHOLE", width=40, height=24, params=[50.0, 52, 21, 11])
+        reconstruction.add_camera(camera)
+        if number == 1:
+            rig.add_ref_sensor(camera.sensor_id)
+        else:
+            rig.add_sensor(camera.sensor_id, pycolmap.Rigid3d(offset))
+    reconstruction.add_rig(rig)
+    expected = {}
+    for step in range(4):
+        pose = np.concatenate([rotation(0.1 * step), [[step], [0.0], [5.0]]], axis=1)
+        frame = pycolmap.Frame(frame_id=step + 1, rig_id=1, rig_from_world=pycolmap.Rigid3d(pose))
+        images = []
+        for number in (1, 2):
+            name = f"{number}/{step}.png"
+            image = pycolmap.Image(name, np.zeros((5, 2)), camera_id=number, image_id=2 * step + number)
+            image.frame_id = step + 1
+            frame.add_data_id(image.data_id)
+            images.append(image)
+            whole = np.vstack([pose, [0, 0, 0, 1]])
+            expected[name] = whole if number == 1 else np.vstack([offset, [0, 0, 0, 1]]) @ whole
+            path = tmp_path / "images" / name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            Image.new("RGB", (40, 24)).save(path)
+        reconstruction.add_frame(frame)
+        for image in images:
+            reconstruction.add_image(image)
+    for step in range(4):
+        reconstruction.register_frame(step + 1)
+    for point in range(5):
+        track = pycolmap.Track([pycolmap.TrackElement(1, point), pycolmap.TrackElement(2, point)])
+        reconstruction.add_point3D(np.array([point, 1.0, 5.0]), track, np.zeros(3, dtype=np.uint8))
+    (tmp_path / "sparse/0").mkdir(parents=True)
+    reconstruction.write_binary(tmp_path / "sparse/0")
+    capture = read_colmap(tmp_path, *find_model(tmp_path))
+    assert set(capture.names) == set(expected)
+    for name, viewmat in zip(capture.names, capture.viewmats, strict=True):
+        np.testing.assert_allclose(viewmat, expected[name], atol=1e-9)

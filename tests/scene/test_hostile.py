@@ -82,6 +82,34 @@ def test_mutated_models(capture, tmp_path, file, suffix):
     assert errors > (0.5 if suffix == ".bin" else 0.15) * cases
 
 
+@pytest.mark.parametrize("model", ["OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV"])
+def test_mutated_lenses(capture, tmp_path, model):
+    """Lenses of any numbers: a pinhole that the photo fills, or an error; the photos' size bounds the work."""
+    for path in (capture / "sparse/0").iterdir():
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    reconstruction = pycolmap.Reconstruction(capture / "sparse/0")
+    lens = pycolmap.Camera.create_from_model_name(1, model, 30.0, 32, 24)
+    cameras = bytearray(struct.pack("<QIiQQ", 1, next(iter(reconstruction.cameras)), int(lens.model), 32, 24))
+    intact = bytes(cameras) + lens.params.tobytes()
+    choice, errors, target = random.Random(model), 0, tmp_path / "cameras.bin"
+    first = len(cameras)
+    for _ in range(100):
+        data = bytearray(intact)
+        place = choice.randrange(first, len(data), 8)
+        value = choice.choice(
+            [NAN, INF, HUGE, struct.pack("<d", choice.uniform(-2, 2) * 10 ** choice.randrange(-3, 9))]
+        )
+        data[place : place + 8] = value
+        target.write_bytes(data)
+        result = outcome_within(MEMORY, read_colmap, capture, tmp_path, ".bin")
+        if isinstance(result, InputError):
+            errors += 1
+        else:
+            assert np.isfinite(result.Ks).all() and (result.sizes >= 1).all() and (result.sizes <= 64).all()
+            assert all(lens is None or np.abs(lens.sources).max() < 1.1 for lens in result.lenses)
+    assert 10 < errors < 100
+
+
 @pytest.mark.parametrize("file", FILES)
 @pytest.mark.parametrize("length", [0, 1, 7, 8, 20, -1])
 def test_truncated_binaries(capture, tmp_path, file, length):

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from turbogs_plugin.scene.poses import camera_centers, look_at
+from turbogs_plugin.scene.poses import camera_centers, look_at, viewmat_of_pose
 
 
 def test_a_camera_looks_at_its_target_with_up_upwards():
@@ -14,3 +14,11 @@ def test_a_camera_looks_at_its_target_with_up_upwards():
     ahead, above = (viewmat[:3, :3] @ point + viewmat[:3, 3] for point in (target, target + 0.1 * up))
     np.testing.assert_allclose(ahead, [0.0, 0.0, np.linalg.norm(target - center)], atol=1e-12)
     assert abs(above[0]) < 1e-12 and above[1] < 0  # y points down
+
+
+def test_a_pose_whose_decimals_were_cut_has_an_exact_rotation():
+    exact = look_at(np.array([1.0, -2.0, 0.5]), np.zeros(3), np.array([0.0, 0.0, 1.0]))
+    viewmat = viewmat_of_pose(np.round(exact[:3, :3].T, 3), np.array([1.0, -2.0, 0.5]))
+    np.testing.assert_allclose(viewmat[:3, :3] @ viewmat[:3, :3].T, np.eye(3), atol=1e-12)
+    np.testing.assert_allclose(viewmat, exact, atol=3e-3)
+    np.testing.assert_allclose(camera_centers(viewmat[None])[0], [1.0, -2.0, 0.5], atol=1e-12)

@@ -2,6 +2,7 @@
 
 import json
 import math
+import os
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene import load_scene
 from turbogs_plugin.scene.transforms import random_points
 
+SCENES = Path(os.environ.get("TURBOGS_SCENES", Path(__file__).resolve().parents[3] / "shared" / "scenes"))
 TARGET = np.array([3.0, -1.0, 2.0])
 
 
@@ -142,15 +144,24 @@ def set_pose(value):
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (lambda content: content.update(k1=0.01), "lens distortion: undistort"),
-        (lambda content: content["frames"][4].update(p2=-1e-3), "lens distortion: undistort"),
-        (lambda content: content.update(camera_model="OPENCV_FISHEYE"), "lens distortion: undistort"),
+        (
+            lambda content: content.update(camera_model="EQUIRECTANGULAR"),
+            "f0.png is 'EQUIRECTANGULAR': known are OPENCV",
+        ),
+        (lambda content: content.update(camera_model=[3]), r"f0.png is '\[3\]': known are"),
+        (lambda content: content.update(k5=0.1), "OPENCV camera of f0.png has k5, which"),
+        (
+            lambda content: content.update(is_fisheye=True, p1=0.1, p2=0.1),
+            "FISHEYE camera of f0.png has p1 and p2, which",
+        ),
+        (lambda content: content.update(k1="much"), "k1 is 'much': it must be a finite number"),
+        (lambda content: content["frames"][4].update(k1=-1e9), "f4.png is OPENCV with parameters that are not those"),
         (lambda content: content.update(fl_x="wide"), "fl_x is 'wide'"),
         (lambda content: content.update(fl_x=math.nan), "fl_x is 'nan'"),
         (lambda content: content.update(fl_x=10**400), "fl_x is"),
         (lambda content: content.update(fl_x=-1.0), "positive focal lengths"),
         (lambda content: content.pop("fl_x"), "neither fl_x nor a camera_angle_x"),
-        (lambda content: content.update(w=21), "f1.png is 20x10 but its camera is 21x10"),
+        (lambda content: content.update(w=25), "f0.png is 20x10 but its camera is 25x10: it was cropped or turned"),
         (lambda content: content.update(w=2**60), "size of f0.png"),
         (lambda content: content.update(frames=[]), "no list of frames"),
         (lambda content: content.update(frames=3), "no list of frames"),
@@ -159,7 +170,10 @@ def set_pose(value):
         (lambda content: content["frames"][0].pop("file_path"), "a frame without a file_path"),
         (lambda content: content["frames"][0].update(file_path="../other/f0.png"), "leaves the photo folder"),
         (lambda content: content["frames"][0].update(file_path="/etc/passwd"), "leaves the photo folder"),
-        (lambda content: content["frames"][0].update(file_path="images/none.png"), "1 of 9 photos are missing"),
+        (
+            lambda content: [frame.update(file_path=f"none{i}.png") for i, frame in enumerate(content["frames"][2:])],
+            r"names 9 photos, of which 7 are missing in .* \(none0.png, ...\): at least 3",
+        ),
         (lambda content: content.update(ply_file_path="../points.ply"), "leaves the photo folder"),
         (lambda content: content.update(ply_file_path="points.ply"), "cannot read .*points.ply"),
         (set_pose(None), "f2.png' has no transform_matrix"),
@@ -183,3 +197,23 @@ def test_files_that_are_not_such_json(tmp_path, text):
     (folder / "transforms.json").write_text(text, encoding="latin-1")
     with pytest.raises(InputError, match=r"readable JSON|no list of frames"):
         load_scene(folder)
+
+
+def test_frames_without_a_photo_are_left_out_and_counted(tmp_path):
+    folder = write_transforms(tmp_path / "cup")
+    for view in (1, 4):
+        (folder / "images" / f"f{view}.png").unlink()
+    edit(folder, lambda content: content["frames"][4].pop("transform_matrix"))  # nothing is asked of what is left out
+    scene = load_scene(folder)
+    assert scene.test.names == ("f0.png",)
+    assert scene.train.names == ("f2.png", "f3.png", "f5.png", "f6.png", "f7.png", "f8.png")
+    assert "7 photos, no points, so 50,000 random ones" in scene.notes[0]
+    assert scene.notes[1:] == ("2 of 9 frames are left out, their photos do not exist: images/f1.png, ...",)
+
+
+@pytest.mark.skipif(not (SCENES / "fox-raw").is_dir(), reason=f"no real captures in {SCENES}")
+def test_real_capture_as_published():
+    scene = load_scene(SCENES / "fox-raw", factor=8)
+    assert (len(scene.train), len(scene.test)) == (43, 7)
+    assert "17 of 67 frames are left out" in scene.notes[1]
+    assert scene.notes[2].startswith("50 photos undistorted: OPENCV 1080x1920 -> PINHOLE 10")

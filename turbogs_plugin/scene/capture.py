@@ -8,6 +8,7 @@ from pathlib import Path, PureWindowsPath
 import numpy as np
 
 from turbogs_plugin.errors import InputError
+from turbogs_plugin.scene.undistort import Lens
 
 LARGEST_SIDE = 65535
 """Photos wider or higher than this many pixels are refused (it is JPEG's own limit)."""
@@ -22,10 +23,14 @@ class Capture:
         photo_folder: photos of full size are ``photo_folder / name``; copies reduced by a factor may lie beside it, in
             a folder of the same name with ``_2``, ``_4``, ... appended.
         viewmats: [V, 4, 4] float64, world to camera (x right, y down, z forward).
-        Ks: [V, 3, 3] float64, intrinsics of the full-size photos.
-        sizes: [V, 2] int64 (width, height) of the full-size photos.
+        Ks: [V, 3, 3] float64, intrinsics of the full-size photos, undistorted where they have a lens.
+        sizes: [V, 2] int64 (width, height) of the full-size photos, undistorted where they have a lens.
         points: [M, 3] float64.
         point_colors: [M, 3] uint8.
+        lenses: one a view, None where the photo is that of a pinhole camera; or empty, where all are.
+        notes: what the capture was taken for, and what was done with it: lines for the user.
+        test: [V] bool, the test views of the capture's own split; None: views are split by their order.
+        reduction: the photos are already smaller than the capture's full size by this factor.
     """
 
     names: tuple[str, ...]
@@ -35,6 +40,22 @@ class Capture:
     sizes: np.ndarray
     points: np.ndarray
     point_colors: np.ndarray
+    lenses: tuple[Lens | None, ...] = ()
+    notes: tuple[str, ...] = ()
+    test: np.ndarray | None = None
+    reduction: int = 1
+
+    def lens(self, view: int) -> Lens | None:
+        return self.lenses[view] if self.lenses else None
+
+    @property
+    def photo_sizes(self) -> np.ndarray:
+        """[V, 2] int64 (width, height) that the full-size photos have on disk, if they are of their cameras' size."""
+        sizes = self.sizes.copy()
+        for view, lens in enumerate(self.lenses):
+            if lens is not None:
+                sizes[view] = lens.photo_size
+        return sizes
 
     def check(self, source: Path) -> None:
         """Raise `InputError` unless every number is finite and in range. `source` is named in messages."""
@@ -69,3 +90,10 @@ def check_photo_name(name: str, source: Path) -> str:
     if not path.parts or ".." in path.parts or path.drive or path.root or not name.isprintable():
         raise InputError(f"{source}: image name {name!r} leaves the photo folder: names must be relative, without '..'")
     return name
+
+
+def sizes_text(sizes: np.ndarray) -> str:
+    """Of photos of `sizes` [V, 2]: ``800x600``, or the one with fewest and the one with most pixels."""
+    pixels = np.prod(sizes, axis=1)
+    ends = (f"{width:g}x{height:g}" for width, height in (sizes[pixels.argmin()], sizes[pixels.argmax()]))
+    return " to ".join(dict.fromkeys(ends))

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import itertools
+import re
 import signal
 import threading
+from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING
@@ -12,16 +14,25 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.scene.capture import Capture, check_photo_name
-from turbogs_plugin.scene.colmap_check import check_binary_model
+from turbogs_plugin.scene.capture import LARGEST_SIDE, Capture, check_photo_name
+from turbogs_plugin.scene.colmap_check import SMALLEST_IMAGE, check_binary_model
+from turbogs_plugin.scene.undistort import Lens, lens_of_camera
 
 if TYPE_CHECKING:
     import pycolmap
 
-MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0")
-"""Where a scene's reconstruction may lie, in order of preference."""
+MODEL_FOLDERS = ("sparse", "colmap/sparse", ".")
+"""Where a scene's reconstructions may lie, in order of preference: there, or in numbered folders of it."""
+
+STRAIGHT_MODELS = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
+"""Camera models that are a pinhole where all their parameters of distortion are 0."""
 
 FILES = ("cameras", "images", "points3D")
+
+REDUCED = re.compile(r"_\d+$")
+FOLDER_DEPTH = 2
+"""Photos are looked for in folders of folders, no deeper."""
+NAMED_AT_MOST = 4
 
 
 def load_pycolmap() -> ModuleType:
@@ -37,23 +48,60 @@ def load_pycolmap() -> ModuleType:
 
 
 def find_model(scene: Path) -> tuple[Path, str] | None:
-    """The scene's reconstruction and its suffix, '.bin' or '.txt'; None where there is none."""
-    for folder in (scene / name for name in MODEL_FOLDERS):
-        for suffix in (".bin", ".txt"):
-            if all((folder / f"{file}{suffix}").is_file() for file in FILES):
-                return folder, suffix
+    """The scene's reconstruction and its suffix, '.bin' or '.txt'; None where there is none.
+
+    Of the several that COLMAP writes where photos did not connect (``sparse/0``, ``sparse/1``, ...), the one with most
+    images is taken.
+    """
+    for place in (scene / name for name in MODEL_FOLDERS):
+        if numbered := _numbered_models(place):
+            return max(numbered, key=lambda model: _count_images(*model))  # the first of equals
+        if suffix := _suffix(place):
+            return place, suffix
     return None
 
 
+def _suffix(folder: Path) -> str:
+    """That of the reconstruction in this very folder; empty where there is none."""
+    complete = (suffix for suffix in (".bin", ".txt") if all((folder / f"{file}{suffix}").is_file() for file in FILES))
+    return next(complete, "")
+
+
+def _numbered_models(place: Path) -> list[tuple[Path, str]]:
+    """The reconstructions in ``place/0``, ``place/1``, ..., in order of their numbers."""
+    folders = (
+        [folder for folder in place.iterdir() if re.fullmatch("[0-9]{1,9}", folder.name)] if place.is_dir() else []
+    )
+    found = (
+        (folder, _suffix(folder)) for folder in sorted(folders, key=lambda folder: (int(folder.name), folder.name))
+    )
+    return [(folder, suffix) for folder, suffix in found if suffix]
+
+
+def _count_images(model: Path, suffix: str) -> int:
+    """Images with a pose, as the file says; damage is left to `read_colmap`."""
+    path = model / f"images{suffix}"
+    try:
+        if suffix == ".bin":
+            with path.open("rb") as file:
+                announced = int.from_bytes(file.read(8), "little")
+            return min(announced, path.stat().st_size // SMALLEST_IMAGE)
+        with path.open(encoding="utf-8", errors="replace") as file:
+            # Two lines an image; the second, of points, may be empty.
+            return sum(1 for line in file if line.strip() and not line.startswith("#") and next(file, "x"))
+    except OSError:
+        return 0
+
+
 def read_colmap(scene: Path, model: Path, suffix: str) -> Capture:
-    """Read a reconstruction whose photos are in ``scene/images``.
+    """Read a reconstruction. Its photos are found by `find_photo_folder`.
 
     Args:
         scene: the scene's folder.
         model, suffix: as `find_model` gives them.
 
     Raises:
-        InputError: files that are damaged, inconsistent, or of a camera model with distortion.
+        InputError: files that are damaged or inconsistent, or a camera that no pinhole can take the place of.
     """
     if suffix == ".bin":
         check_binary_model(model)
@@ -73,37 +121,81 @@ def read_colmap(scene: Path, model: Path, suffix: str) -> Capture:
     viewmats = np.tile(np.eye(4), (len(images), 1, 1))
     intrinsics = np.tile(np.eye(3), (len(images), 1, 1))
     sizes = np.zeros((len(images), 2), dtype=np.int64)
+    lenses = {number: _lens(reconstruction.cameras[number], model) for number in {image.camera_id for image in images}}
     for i, image in enumerate(images):
-        camera = reconstruction.cameras[image.camera_id]
+        camera, lens = reconstruction.cameras[image.camera_id], lenses[image.camera_id]
         viewmats[i, :3] = image.cam_from_world().matrix()
-        intrinsics[i] = pinhole_intrinsics(camera, scene, model)
-        sizes[i] = min(camera.width, 2**31), min(camera.height, 2**31)
+        intrinsics[i] = camera.calibration_matrix() if lens is None else lens.K
+        sizes[i] = (min(camera.width, 2**31), min(camera.height, 2**31)) if lens is None else lens.size
 
+    photo_folder = find_photo_folder(scene, names)
     points = [point for _, point in sorted(reconstruction.points3D.items())]
     capture = Capture(
         names=names,
-        photo_folder=scene / "images",
+        photo_folder=photo_folder,
         viewmats=viewmats,
         Ks=intrinsics,
         sizes=sizes,
         points=np.array([point.xyz for point in points], dtype=np.float64).reshape(-1, 3),
         point_colors=np.array([point.color for point in points], dtype=np.uint8).reshape(-1, 3),
+        lenses=tuple(lenses[image.camera_id] for image in images),
+        notes=(_kind_note(scene, model, suffix, len(images), len(points), photo_folder), *_choice_note(model)),
     )
     capture.check(model)
     return capture
 
 
-def pinhole_intrinsics(camera: pycolmap.Camera, scene: Path, model: Path) -> np.ndarray:
-    """[3, 3] float64 of a PINHOLE or SIMPLE_PINHOLE camera; `InputError` for the others."""
-    if camera.model.name == "PINHOLE":
-        fx, fy, cx, cy = camera.params
-    elif camera.model.name == "SIMPLE_PINHOLE":
-        fx, cx, cy = camera.params
-        fy = fx
-    else:
-        raise InputError(
-            f"camera {camera.camera_id} of {model} is {camera.model.name}, a model with lens distortion: undistort "
-            f"with 'colmap image_undistorter --image_path {scene / 'images'} --input_path {model} --output_path NEW' "
-            "and train on NEW"
-        )
-    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+def _lens(camera: pycolmap.Camera, model: Path) -> Lens | None:
+    """None for a pinhole camera, and for one of an impossible size, which `Capture.check` refuses."""
+    name = camera.model.name
+    if name in ("PINHOLE", "SIMPLE_PINHOLE") or not 0 < max(camera.width, camera.height) <= LARGEST_SIDE:
+        return None
+    if name in STRAIGHT_MODELS and not camera.params[list(camera.extra_params_idxs())].any():
+        return None
+    return lens_of_camera(camera, f"camera {camera.camera_id} of {model}")
+
+
+def find_photo_folder(scene: Path, names: tuple[str, ...]) -> Path:
+    """The folder that the names of the photos are relative to; ``scene/images`` where none has them all.
+
+    Looked at are ``images`` in the scene or beside it, the scene itself, and the folders in them; copies reduced by a
+    factor (``images_4``) are not photos of full size.
+    """
+    first = scene / "images"
+    if not names:
+        return first
+    for place in (first, scene, scene.resolve().parent / "images"):
+        for folder in _folders(place, FOLDER_DEPTH):
+            if all((folder / name).is_file() for name in names):
+                return folder
+    return first
+
+
+def _folders(place: Path, depth: int) -> Iterator[Path]:
+    """The folder and those in it, nearest first."""
+    level = [place]
+    for _ in range(depth + 1):
+        yield from level
+        try:
+            inner = [entry for folder in level if folder.is_dir() for entry in sorted(folder.iterdir())]
+        except OSError:
+            return
+        level = [entry for entry in inner if not REDUCED.search(entry.name) and entry.name[0] != "." and entry.is_dir()]
+
+
+def _kind_note(scene: Path, model: Path, suffix: str, images: int, points: int, photo_folder: Path) -> str:
+    kind = {".bin": "binary", ".txt": "text"}[suffix]
+    where = "" if photo_folder == scene / "images" else f", photos in {photo_folder}"
+    return f"COLMAP reconstruction {model} ({kind}): {images} images, {points:,} points{where}"
+
+
+def _choice_note(model: Path) -> list[str]:
+    """Which of several reconstructions was taken, where there are several."""
+    models = _numbered_models(model.parent)
+    if len(models) < 2 or model not in [folder for folder, _ in models]:
+        return []
+    counts = ", ".join(
+        f"{folder.name} has {_count_images(folder, suffix)}" for folder, suffix in models[:NAMED_AT_MOST]
+    )
+    more = ", ..." if len(models) > NAMED_AT_MOST else ""
+    return [f"{len(models)} reconstructions in {model.parent}: {model.name} is taken for most images ({counts}{more})"]

@@ -18,6 +18,8 @@ POINT2D_BYTES, TRACK_ELEMENT_BYTES = 24, 8
 POINT3D_BYTES = 43
 """Identifier, position, colour and error, without the track."""
 SENSOR_BYTES, FRAME_MEMBER_BYTES = 8, 16
+SMALLEST_IMAGE = 73
+"""Bytes of an image with a name of one letter and without points."""
 LONGEST_NAME = 4096
 
 
@@ -118,7 +120,7 @@ def _check_cameras(reader: _Reader) -> set[int]:
 
 
 def _check_images(reader: _Reader, cameras: set[int]) -> None:
-    for _ in reader.records(73):
+    for _ in reader.records(SMALLEST_IMAGE):
         (image,) = reader.unpack("I")
         reader.pose(f"image {image}")
         (camera,) = reader.unpack("I")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -10,12 +10,14 @@ import torch
 from torch import Tensor
 
 from turbogs_plugin.errors import InputError
+from turbogs_plugin.scene import blender, llff
 from turbogs_plugin.scene.capture import Capture
 from turbogs_plugin.scene.colmap import find_model, read_colmap
 from turbogs_plugin.scene.frame import Frame
-from turbogs_plugin.scene.photos import Photos, load_photos, photo_size, reduced_sizes
+from turbogs_plugin.scene.photos import Photos, load_photos, photo_sizes, reduced_sizes
 from turbogs_plugin.scene.poses import camera_centers
 from turbogs_plugin.scene.transforms import FILE, read_transforms
+from turbogs_plugin.scene.undistort import undistortion_note
 from turbogs_plugin.types import Cameras
 
 FEWEST_VIEWS = 3
@@ -55,6 +57,7 @@ class Scene:
         frame: back to the capture's own coordinates.
         extent: 1.1 times the largest distance of a training camera from their mean, as in 3DGS; 1 by the choice of
             frame, also where the cameras only turn on the spot.
+        notes: what the capture was taken for, and what was done with its photos: lines for the user.
     """
 
     name: str
@@ -64,17 +67,22 @@ class Scene:
     point_colors: Tensor
     frame: Frame
     extent: float
+    notes: tuple[str, ...] = ()
 
 
 def load_scene(path: str | Path, factor: int = 1, test_every: int = 8) -> Scene:
-    """Load a COLMAP reconstruction (binary or text) or a ``transforms.json`` with its photos.
+    """Load a capture with its photos.
+
+    Cameras with distortion become pinhole cameras in the same place, their photos are undistorted.
 
     Args:
-        path: the scene's folder. A reconstruction in ``sparse/0``, ``sparse`` or ``colmap/sparse/0`` goes before a
-            ``transforms.json``.
+        path: the scene's folder. Where it could be of several kinds, the first of these is taken: a COLMAP
+            reconstruction (binary or text, in ``sparse`` or ``colmap/sparse``, there or in numbered folders), a
+            ``transforms.json``, NeRF-synthetic's ``transforms_train.json``, LLFF's ``poses_bounds.npy``.
         factor: photos and intrinsics are reduced by this. Copies in ``images_<factor>`` are used where all are there
             in the right size; otherwise ``images`` are reduced by area averaging.
         test_every: the first of each `test_every` photos in name order is a test view, the others are for training.
+            Captures with a split of their own (NeRF-synthetic) keep it.
 
     Raises:
         InputError: anything wrong with the scene or the arguments, in one line.
@@ -84,10 +92,12 @@ def load_scene(path: str | Path, factor: int = 1, test_every: int = 8) -> Scene:
         raise InputError(f"factor is {factor}: it must be an integer of at least 1")
     if not isinstance(test_every, int) or test_every < 1:
         raise InputError(f"test_every is {test_every}: it must be an integer of at least 2")
-    capture = _read(scene)
-    test = np.arange(len(capture.names)) % test_every == 0
+    capture = _read(scene, factor)
+    test = np.arange(len(capture.names)) % test_every == 0 if capture.test is None else capture.test
     if len(test) < FEWEST_VIEWS:
         raise InputError(f"{scene} has {len(test)} images: at least {FEWEST_VIEWS} are needed")
+    if capture.test is not None and (~test).sum() < FEWEST_VIEWS:
+        raise InputError(f"{scene} has {(~test).sum()} training images: at least {FEWEST_VIEWS} are needed")
     if test.all():
         raise InputError(f"test_every is {test_every}: every image of {scene} would be a test image; use 2 or more")
 
@@ -97,7 +107,8 @@ def load_scene(path: str | Path, factor: int = 1, test_every: int = 8) -> Scene:
     far = ~points.isfinite().all(dim=1)
     if far.any():
         raise InputError(f"{scene}: {int(far.sum())} of {len(far)} 3D points lie too far from the cameras for float32")
-    paths, file_sizes, sizes = _find_photos(scene, capture, factor)
+    remaining = max(1, factor // capture.reduction)
+    paths, file_sizes, sizes, fitted = _find_photos(scene, capture, remaining)
     ratios = sizes / capture.sizes  # [V, 2]
     intrinsics = capture.Ks.copy()
     intrinsics[:, :2] *= ratios[:, :, None]
@@ -105,9 +116,9 @@ def load_scene(path: str | Path, factor: int = 1, test_every: int = 8) -> Scene:
     def select(views: np.ndarray) -> PosedImages:
         cameras = Cameras(viewmats[views], torch.from_numpy(intrinsics[views]).float(), sizes[views])
         names = tuple(capture.names[view] for view in views)
-        return PosedImages(
-            cameras, names, load_photos([paths[view] for view in views], file_sizes[views], sizes[views])
-        )
+        lenses = [capture.lens(view) for view in views]
+        photos = load_photos([paths[view] for view in views], file_sizes[views], sizes[views], lenses)
+        return PosedImages(cameras, names, photos)
 
     return Scene(
         name=scene.resolve().name,
@@ -117,33 +128,47 @@ def load_scene(path: str | Path, factor: int = 1, test_every: int = 8) -> Scene:
         point_colors=torch.from_numpy(capture.point_colors),
         frame=frame,
         extent=1.0,
+        notes=tuple(filter(None, (*capture.notes, fitted, undistortion_note(capture.lenses)))),
     )
 
 
-def _read(scene: Path) -> Capture:
+def _read(scene: Path, factor: int) -> Capture:
+    """The capture, of the first kind in the order that `load_scene` states."""
     if not scene.is_dir():
         raise InputError(f"no such scene: {scene} is not a folder")
     model = find_model(scene)
+    files = [file for file in (FILE, *blender.FILES, llff.FILE) if (scene / file).is_file()]
     if model is not None:
-        return read_colmap(scene, *model)
-    if (scene / FILE).is_file():
-        return read_transforms(scene)
+        return _passing_over(files, read_colmap(scene, *model))
+    if FILE in files:
+        return _passing_over(files[1:], read_transforms(scene))
+    if files and files[0] in blender.FILES:
+        return _passing_over([file for file in files if file not in blender.FILES], blender.read_blender(scene))
+    if files:
+        return llff.read_llff(scene, factor)
     raise InputError(
         f"{scene} has neither a COLMAP reconstruction (cameras, images and points3D as .bin or .txt in sparse/0) nor a "
-        f"{FILE}"
+        f"{FILE}, a {blender.TRAIN_FILE} or a {llff.FILE}"
     )
 
 
-def _find_photos(scene: Path, capture: Capture, factor: int) -> tuple[list[Path], np.ndarray, np.ndarray]:
-    """The files to read, [V, 2] their sizes, and [V, 2] the sizes to give them."""
-    targets = reduced_sizes(capture.sizes, factor)
+def _passing_over(files: list[str], capture: Capture) -> Capture:
+    """The capture, whose notes say that these files, which make the folder another kind too, were not used."""
+    return replace(capture, notes=(*capture.notes, f"{', '.join(files)} not used")) if files else capture
+
+
+def _find_photos(scene: Path, capture: Capture, factor: int) -> tuple[list[Path], np.ndarray, np.ndarray, str]:
+    """The files to read, [V, 2] their sizes, [V, 2] the sizes to give them, and a note on those of other sizes."""
+    if factor > 1:
+        reduced_sizes(capture.sizes, factor)  # refuses a factor that is too large
+    expected = capture.photo_sizes
     if factor > 1 and capture.photo_folder != scene:
         folder = capture.photo_folder.with_name(f"{capture.photo_folder.name}_{factor}")
         paths = [folder / name for name in capture.names]
         if all(path.is_file() for path in paths):
-            sizes = np.array([photo_size(path) for path in paths], dtype=np.int64)
-            if (np.abs(sizes - capture.sizes / factor) <= 1.0).all():
-                return paths, sizes, sizes
+            sizes = photo_sizes(paths)
+            if (np.abs(sizes - expected / factor) <= 1.0).all():
+                return paths, sizes, _undistorted_sizes(capture, sizes), ""
     paths = [capture.photo_folder / name for name in capture.names]
     missing = [name for name, path in zip(capture.names, paths, strict=True) if not path.is_file()]
     if missing:
@@ -152,4 +177,38 @@ def _find_photos(scene: Path, capture: Capture, factor: int) -> tuple[list[Path]
             f"{len(missing)} of {len(paths)} photos are missing in {capture.photo_folder}: "
             f"{', '.join(missing[:NAMED_AT_MOST])}{more}"
         )
-    return paths, capture.sizes, targets
+    sizes = photo_sizes(paths)
+    fitted = _require_scaled(paths, sizes, expected)
+    return paths, sizes, reduced_sizes(_undistorted_sizes(capture, sizes), factor), fitted
+
+
+def _undistorted_sizes(capture: Capture, sizes: np.ndarray) -> np.ndarray:
+    """[V, 2] int64: the sizes that photos of these `sizes` [V, 2] have once they are undistorted."""
+    lenses = [capture.lens(view) for view in range(len(sizes))]
+    pairs = zip(lenses, sizes.tolist(), strict=True)
+    return np.array([size if lens is None else lens.size_of(size) for lens, size in pairs], dtype=np.int64)
+
+
+def _require_scaled(paths: list[Path], sizes: np.ndarray, expected: np.ndarray) -> str:
+    """A note on the photos that are not of their cameras' size; empty where all are.
+
+    Raises:
+        InputError: a photo that is no scaled copy, to a pixel, of one of its camera's size: it was cropped or turned.
+    """
+    ratios = sizes / expected  # [V, 2]
+    scaled = (np.abs(expected * ratios[:, ::-1] - sizes) <= 1.0).any(axis=1)
+    if not scaled.all():
+        bad = int(np.argmin(scaled))
+        (width, height), (camera_width, camera_height) = sizes[bad].tolist(), expected[bad].tolist()
+        raise InputError(
+            f"photo {paths[bad]} is {width}x{height} but its camera is {camera_width}x{camera_height}: it was "
+            "cropped or turned, not scaled; use the photos that the cameras were reconstructed from"
+        )
+    others = np.flatnonzero((sizes != expected).any(axis=1))
+    if not len(others):
+        return ""
+    (width, height), (camera_width, camera_height) = sizes[others[0]].tolist(), expected[others[0]].tolist()
+    return (
+        f"{len(others)} photos in another size than their cameras: intrinsics rescaled from "
+        f"{camera_width}x{camera_height} to {width}x{height}"
+    )

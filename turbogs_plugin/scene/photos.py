@@ -16,6 +16,7 @@ from PIL import Image
 from torch import Tensor
 
 from turbogs_plugin.errors import InputError
+from turbogs_plugin.scene.undistort import Lens
 from turbogs_plugin.types import PixelSamples
 
 PHOTO_BYTES = 3
@@ -119,8 +120,16 @@ def photo_size(path: Path) -> tuple[int, int]:
         return image.size
 
 
-def load_photos(paths: Sequence[Path], sizes: np.ndarray, targets: np.ndarray) -> Photos:
-    """Decode photos in parallel, reduced to their target sizes by area averaging.
+def photo_sizes(paths: Sequence[Path]) -> np.ndarray:
+    """[V, 2] int64 (width, height), from the headers; `InputError` names the first file that cannot be read."""
+    with _threads() as pool:
+        return np.array(list(pool.map(photo_size, paths)), dtype=np.int64).reshape(-1, 2)
+
+
+def load_photos(
+    paths: Sequence[Path], sizes: np.ndarray, targets: np.ndarray, lenses: Sequence[Lens | None] = ()
+) -> Photos:
+    """Decode photos in parallel, undistorted, then reduced to their target sizes by area averaging.
 
     Transparent photos are composited over black, the background that renders have. Photos are taken as stored:
     an orientation in EXIF is ignored, as COLMAP does.
@@ -129,6 +138,7 @@ def load_photos(paths: Sequence[Path], sizes: np.ndarray, targets: np.ndarray) -
         paths: V files.
         sizes: [V, 2] int64 (width, height) that the files must have.
         targets: [V, 2] int64 (width, height) to give them.
+        lenses: one a photo, None for those of pinhole cameras; or empty, where all are.
 
     Raises:
         InputError: a photo that cannot be decoded, or is of another size (the first one in order is named); more
@@ -147,13 +157,20 @@ def load_photos(paths: Sequence[Path], sizes: np.ndarray, targets: np.ndarray) -
     def load(view: int) -> None:
         target = tuple(targets[view].tolist())
         photo = _decode(paths[view], tuple(sizes[view].tolist()))
+        lens = lenses[view] if lenses else None
+        if lens is not None:
+            photo = Image.fromarray(lens.undistort(np.asarray(photo), lens.size_of(photo.size)))
         if photo.size != target:
             photo = photo.resize(target, Image.Resampling.BOX)
         pixels[offsets[view] : offsets[view + 1]] = np.asarray(photo).reshape(-1, 3)
 
-    with ThreadPoolExecutor(min(8, os.cpu_count() or 1)) as pool:
+    with _threads() as pool:
         list(pool.map(load, range(len(paths))))  # raises the first error in order, and cancels what has not begun
     return Photos(colors, targets)
+
+
+def _threads() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(min(8, os.cpu_count() or 1))
 
 
 def _decode(path: Path, size: tuple[int, int]) -> Image.Image:

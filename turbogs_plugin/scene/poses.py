@@ -4,10 +4,36 @@ from __future__ import annotations
 
 import numpy as np
 
+LARGEST_DEVIATION = 1e-2
+"""Axes whose products differ from those of a rotation by more are refused."""
+
 
 def camera_centers(viewmats: np.ndarray) -> np.ndarray:
     """[V, 3] of [V, 4, 4] world to camera."""
     return -np.einsum("vji,vj->vi", viewmats[:, :3, :3], viewmats[:, :3, 3])
+
+
+def viewmat_of_pose(axes: np.ndarray, center: np.ndarray) -> np.ndarray:
+    """[4, 4] float64 world to camera of a camera's place in the world.
+
+    Args:
+        axes: [3, 3] float64, whose columns are the camera's axes in the world: right, down, forward. Decimals that were
+            cut when it was written are made up for: the nearest rotation is taken.
+        center: [3] float64.
+
+    Raises:
+        ValueError: the numbers are not finite, or the axes not a rotation.
+    """
+    if not (np.isfinite(axes).all() and np.isfinite(center).all()):
+        raise ValueError("has numbers that are not finite")
+    with np.errstate(over="ignore", invalid="ignore"):
+        if not np.abs(axes.T @ axes - np.eye(3)).max() < LARGEST_DEVIATION or np.linalg.det(axes) < 0:
+            raise ValueError("is not a rotation and a translation")
+        left, _, right = np.linalg.svd(axes)
+        viewmat = np.eye(4)
+        viewmat[:3, :3] = (left @ right).T
+        viewmat[:3, 3] = -viewmat[:3, :3] @ center
+    return viewmat
 
 
 def look_at(center: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:

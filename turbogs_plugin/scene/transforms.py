@@ -12,13 +12,17 @@ import numpy as np
 
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene.capture import LARGEST_SIDE, Capture, check_photo_name
+from turbogs_plugin.scene.colmap import load_pycolmap
 from turbogs_plugin.scene.photos import photo_size
 from turbogs_plugin.scene.ply import read_vertices
 from turbogs_plugin.scene.poses import camera_centers
+from turbogs_plugin.scene.undistort import Lens, brown_projection, lens_of_camera, make_lens
 
 FILE = "transforms.json"
-DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
-CAMERA_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE")
+BROWN_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL")
+"""Names of one model, whose missing coefficients are 0."""
+FISHEYE_MODELS = ("OPENCV_FISHEYE",)
+FEWEST_PHOTOS = 3
 PHOTO_SUFFIXES = (".png", ".jpg", ".jpeg")
 NUM_RANDOM_POINTS = 50_000
 RANDOM_POINTS_SIDE = 1.0
@@ -28,12 +32,13 @@ RANDOM_POINTS_SIDE = 1.0
 def read_transforms(scene: Path) -> Capture:
     """Read ``scene/transforms.json``.
 
-    Intrinsics may stand in each frame or for all; ``camera_angle_x`` serves where there is no ``fl_x``. Points come
-    from ``ply_file_path`` where it is given, else they are drawn at random (seeded) in a cube about what the cameras
-    look at.
+    Intrinsics and distortion may stand in each frame or for all; ``camera_angle_x`` serves where there is no ``fl_x``.
+    Frames whose photo does not exist are left out. Points come from ``ply_file_path`` where it is given, else they are
+    drawn at random (seeded) in a cube about what the cameras look at.
 
     Raises:
-        InputError: a file that is not such JSON, lacks something, or describes a lens with distortion.
+        InputError: a file that is not such JSON, lacks something, or describes no lens; fewer than `FEWEST_PHOTOS`
+            photos.
     """
     source = scene / FILE
     try:
@@ -44,18 +49,34 @@ def read_transforms(scene: Path) -> Capture:
     if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
         raise InputError(f"{source} has no list of frames")
 
-    views: dict[str, tuple[np.ndarray, np.ndarray, tuple[int, int]]] = {}
+    views: dict[str, tuple[np.ndarray, np.ndarray, tuple[int, int], Lens | None]] = {}
+    absent: list[str] = []
+    lenses: dict[tuple, Lens] = {}
     for frame in frames:
         name = _photo_name(scene, frame.get("file_path"), source)
-        if name in views:
+        if name in views or name in absent:
             raise InputError(f"{source} has two frames for '{name}'")
-        views[name] = (_viewmat(frame, name, source), *_intrinsics({**content, **frame}, scene / name, source))
+        if not (scene / name).is_file():
+            absent.append(name)
+            continue
+        views[name] = (_viewmat(frame, name, source), *_camera({**content, **frame}, scene / name, source, lenses))
+    if absent and len(views) < FEWEST_PHOTOS:
+        raise InputError(
+            f"{source} names {len(frames)} photos, of which {len(absent)} are missing in {scene} ({absent[0]}, ...): "
+            f"at least {FEWEST_PHOTOS} are needed; copy the photos there"
+        )
     names, cameras = zip(*sorted(views.items()), strict=True)
-    viewmats, intrinsics, sizes = (np.array(values) for values in zip(*cameras, strict=True))
+    viewmats, intrinsics, sizes, lens_of_view = zip(*cameras, strict=True)
+    viewmats, intrinsics, sizes = np.array(viewmats), np.array(intrinsics), np.array(sizes)
     if "ply_file_path" in content:
         points, colors = _read_points(scene, content["ply_file_path"], source)
+        origin = f"{len(points):,} points of {content['ply_file_path']}"
     else:
         points, colors = random_points(viewmats)
+        origin = f"no points, so {len(points):,} random ones about what the cameras look at"
+    notes = [f"{source} (nerfstudio, instant-ngp): {len(names)} photos, {origin}"]
+    if absent:
+        notes.append(f"{len(absent)} of {len(frames)} frames are left out, their photos do not exist: {absent[0]}, ...")
     # Reduced copies lie in images_2, images_4, ... beside images.
     common = {PurePosixPath(name).parts[0] for name in names}
     photo_folder = scene
@@ -69,6 +90,8 @@ def read_transforms(scene: Path) -> Capture:
         sizes=sizes,
         points=points,
         point_colors=colors,
+        lenses=lens_of_view,
+        notes=tuple(notes),
     )
     capture.check(source)
     return capture
@@ -118,21 +141,70 @@ def _number(values: dict, source: Path, key: str, default: float | None = None) 
     return float(value)
 
 
-def _intrinsics(values: dict, photo: Path, source: Path) -> tuple[np.ndarray, tuple[int, int]]:
-    """[3, 3] float64 and (width, height) of one frame, whose `values` go before those for all frames."""
+def _camera(
+    values: dict, photo: Path, source: Path, lenses: dict[tuple, Lens]
+) -> tuple[np.ndarray, tuple[int, int], Lens | None]:
+    """[3, 3] float64 intrinsics, (width, height), and the lens where there is distortion, of one frame.
+
+    Args:
+        values: those of the frame, before those for all frames.
+        lenses: those already made, by their numbers; a new one is added.
+    """
+    K, size = _intrinsics(values, photo, source)
     number = partial(_number, values, source)
-    bent = {key: value for key in DISTORTION if (value := number(key))}
-    model = values.get("camera_model", "PINHOLE")
-    if bent or model not in CAMERA_MODELS:
+    model = values.get("camera_model", "OPENCV_FISHEYE" if values.get("is_fisheye") is True else "OPENCV")
+    if model not in (*BROWN_MODELS, *FISHEYE_MODELS):
         raise InputError(
-            f"{source}: the camera of {photo.name} ({str(model)[:40]}, {bent or 'no pinhole'}) has lens distortion: "
-            "undistort with 'colmap image_undistorter --image_path IMAGES --input_path MODEL --output_path NEW' and "
-            "train on NEW"
+            f"{source}: the camera_model of {photo.name} is {str(model)[:40]!r}: known are "
+            f"{', '.join((*BROWN_MODELS, *FISHEYE_MODELS))}; convert the capture with ns-process-data, or use its "
+            "COLMAP reconstruction"
         )
+    fisheye = model in FISHEYE_MODELS
+    radial = tuple(number(f"k{power}", 0.0) for power in (1, 2, 3, 4))
+    tangential = (number("p1", 0.0), number("p2", 0.0))
+    unknown = [key for key in ("k5", "k6", *(("p1", "p2") if fisheye else ())) if number(key, 0.0)]
+    if unknown:
+        raise InputError(
+            f"{source}: the {model} camera of {photo.name} has {' and '.join(unknown)}, which the model does not have: "
+            "use the capture's COLMAP reconstruction"
+        )
+    if not (fisheye or any(radial) or any(tangential)):
+        return K, size, None
+    key = (fisheye, size, *K.ravel().tolist(), *radial, *tangential)
+    if key not in lenses:
+        owner = f"{source}: the camera of {photo.name}"
+        lenses[key] = _make_lens(fisheye, size, K, radial, tangential, owner)
+    return lenses[key].K, lenses[key].size, lenses[key]
+
+
+def _make_lens(
+    fisheye: bool,
+    size: tuple[int, int],
+    K: np.ndarray,
+    radial: tuple[float, ...],
+    tangential: tuple[float, ...],
+    owner: str,
+) -> Lens:
+    pinhole = [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]
+    if not fisheye and radial[3]:
+        # As nerfstudio has it: COLMAP's models, and OpenCV's own fourth coefficient, are other polynomials.
+        projection = brown_projection((K[0, 0], K[1, 1]), (K[0, 2], K[1, 2]), radial, *tangential)
+        return make_lens("OPENCV", size, projection, owner)
+    if fisheye:
+        model, params = "OPENCV_FISHEYE", [*pinhole, *radial]
+    elif radial[2]:
+        model, params = "FULL_OPENCV", [*pinhole, *radial[:2], *tangential, radial[2], 0.0, 0.0, 0.0]
+    else:
+        model, params = "OPENCV", [*pinhole, *radial[:2], *tangential]
+    camera = load_pycolmap().Camera(model=model, width=size[0], height=size[1], params=params)
+    return lens_of_camera(camera, owner)
+
+
+def _intrinsics(values: dict, photo: Path, source: Path) -> tuple[np.ndarray, tuple[int, int]]:
+    """[3, 3] float64 and (width, height) of one frame's photo, as taken."""
+    number = partial(_number, values, source)
     width, height = number("w"), number("h")
     if width is None or height is None:
-        if not photo.is_file():
-            raise InputError(f"{source} gives no w and h for {photo}, and the photo is missing")
         width, height = photo_size(photo)
     if not (1 <= width <= LARGEST_SIDE and 1 <= height <= LARGEST_SIDE):
         raise InputError(f"{source}: the size of {photo.name} is {width:g}x{height:g} pixels")

@@ -65,7 +65,7 @@ def resolve_device(name: str, remedy: str = "use --device cpu, or see 'turbogs d
 
 
 def open_scene(config: Config, folder: RunFolder | None = None) -> Scene:
-    """The capture of a configuration.
+    """The capture of a configuration. What it was taken for is printed.
 
     Args:
         folder: that of the run with this configuration; None if the user names the capture.
@@ -79,7 +79,9 @@ def open_scene(config: Config, folder: RunFolder | None = None) -> Scene:
             f"capture '{settings.path}' of the run in '{folder.path}' is not there: bring it back, or edit scene.path "
             f"in {folder.config}"
         )
-    return load_scene(settings.path, settings.factor, settings.test_every)
+    scene = load_scene(settings.path, settings.factor, settings.test_every)
+    print("\n".join(scene.notes), file=sys.stderr)
+    return scene
 
 
 def plan_run(config: Config) -> Plan:

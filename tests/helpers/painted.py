@@ -1,0 +1,44 @@
+"""Photos with points painted at pixels that a test computed, and what a loaded scene makes of them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from turbogs_plugin.scene import PosedImages, Scene
+
+COLORS = ((255, 40, 40), (40, 255, 40), (40, 40, 255))
+"""Of the painted points; nothing else in a photo may have them."""
+
+
+def painted_photo(size: tuple[int, int], pixels: np.ndarray) -> np.ndarray:
+    """[H, W, 3] uint8, black but for a pixel a point.
+
+    Args:
+        size: (width, height).
+        pixels: [3, 2] float64 image coordinates (x, y), the centre of the first pixel at (0.5, 0.5).
+    """
+    width, height = size
+    photo = np.zeros((height, width, 3), dtype=np.uint8)
+    for color, (x, y) in zip(COLORS, np.floor(pixels).astype(int), strict=True):
+        assert 0 <= x < width and 0 <= y < height and not photo[y, x].any(), "the test paints beside the photo"
+        photo[y, x] = color
+    return photo
+
+
+def require_points_at_their_pixels(scene: Scene, views: PosedImages, points: np.ndarray) -> None:
+    """Each point, projected by each loaded camera, lies within the pixel that has its colour in the loaded photo.
+
+    Args:
+        points: [3, 3] float64 in the capture's own coordinates.
+    """
+    normalised = scene.frame.normalise_points(points)
+    for view in range(len(views)):
+        viewmat, K = (array[view].double().numpy() for array in (views.cameras.viewmats, views.cameras.Ks))
+        in_camera = normalised @ viewmat[:3, :3].T + viewmat[:3, 3]  # [3, 3]
+        assert (in_camera[:, 2] > 0).all()
+        projected = (in_camera @ K.T)[:, :2] / in_camera[:, 2:]
+        photo = (views.photos.image(view) * 255).round().numpy()
+        for color, (x, y) in zip(COLORS, projected, strict=True):
+            rows, columns = np.nonzero((photo == color).all(axis=2))
+            assert len(rows) == 1
+            assert abs(columns[0] + 0.5 - x) < 0.501 and abs(rows[0] + 0.5 - y) < 0.501, views.names[view]

@@ -1,0 +1,223 @@
+"""LLFF captures: ``poses_bounds.npy`` beside ``images`` or copies of them in ``images_4``, ``images_8``, ...
+
+A row has 17 numbers: a 3x5 matrix [R | t | hwf] in row-major order, then the nearest and the farthest depth. The
+columns of R are the camera's axes in the world (down, right, backward), t is the camera's centre, and hwf are height,
+width and focal length of the full-size photos in pixels. The rows are those of the photos in name order.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.scene.capture import Capture, sizes_text
+from turbogs_plugin.scene.photos import photo_size
+from turbogs_plugin.scene.poses import viewmat_of_pose
+from turbogs_plugin.scene.transforms import NUM_RANDOM_POINTS, PHOTO_SUFFIXES
+
+FILE = "poses_bounds.npy"
+COLUMNS = 17
+AGAIN = "write it again with LLFF's imgs2poses.py"
+
+
+@dataclass(frozen=True)
+class LlffTable:
+    """What the file says of V photos, checked.
+
+    Args:
+        viewmats: [V, 4, 4] float64, world to camera (x right, y down, z forward).
+        sizes: [V, 2] float64 (width, height) of the full-size photos.
+        focals: [V] float64, in pixels of the full-size photos.
+        bounds: [V, 2] float64, nearest and farthest depth along the camera's axis, 0 < near < far.
+    """
+
+    viewmats: np.ndarray
+    sizes: np.ndarray
+    focals: np.ndarray
+    bounds: np.ndarray
+
+
+@dataclass(frozen=True)
+class PhotoFolder:
+    """One of the folders with the capture's photos.
+
+    Args:
+        path: the folder.
+        reduction: by which its photos are smaller than the full-size ones.
+        names: of its photos, in order.
+    """
+
+    path: Path
+    reduction: int
+    names: tuple[str, ...]
+
+    @classmethod
+    def of(cls, path: Path, reduction: int) -> PhotoFolder:
+        files = (file for file in path.iterdir() if not file.name.startswith(".") and file.is_file())
+        return cls(path, reduction, tuple(sorted(file.name for file in files if file.suffix.lower() in PHOTO_SUFFIXES)))
+
+    def sizes(self) -> np.ndarray:
+        """[V, 2] int64 (width, height)."""
+        return np.array([photo_size(self.path / name) for name in self.names], dtype=np.int64).reshape(-1, 2)
+
+
+def read_llff(scene: Path, factor: int = 1) -> Capture:
+    """Read a capture. There are no points: they are drawn within the views, between the bounds of depth.
+
+    Args:
+        scene: the folder.
+        factor: the capture is to be loaded at this part of its full size. Of the folders of photos, that of the
+            smallest photos is taken which are not smaller than that; with a factor of 1 and no full-size photos, the
+            largest ones that are there. `Capture.reduction` says which.
+
+    Raises:
+        InputError: a file of another shape, poses or bounds that make no sense, photos that do not belong to it.
+    """
+    source = scene / FILE
+    table = _read_table(source)
+    usable = _usable_folders(scene, factor)
+    for folder in usable:
+        if folder is usable[-1] or _is_whole_copy(folder, table):
+            break
+    sizes = _checked_sizes(folder, table, source)
+    ratios = sizes / table.sizes  # [V, 2]
+    intrinsics = np.tile(np.eye(3), (len(sizes), 1, 1))
+    intrinsics[:, [0, 1], [0, 1]] = table.focals[:, None] * ratios
+    intrinsics[:, :2, 2] = 0.5 * sizes
+    points, colors = points_in_views(table.viewmats, intrinsics, sizes, table.bounds)
+    depths = f"{table.bounds[:, 0].min():.4g} to {table.bounds[:, 1].max():.4g}"
+    capture = Capture(
+        names=folder.names,
+        photo_folder=folder.path,
+        viewmats=table.viewmats,
+        Ks=intrinsics,
+        sizes=sizes,
+        points=points,
+        point_colors=colors,
+        notes=(
+            f"LLFF: {len(sizes)} photos {sizes_text(sizes)} of {folder.path.name}; no points, so {len(points):,} "
+            f"random ones (seed 0) within the views at depths of {depths}",
+        ),
+        reduction=folder.reduction,
+    )
+    capture.check(source)
+    return capture
+
+
+def points_in_views(
+    viewmats: np.ndarray, Ks: np.ndarray, sizes: np.ndarray, bounds: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """([M, 3] float64 points, [M, 3] uint8 colours) drawn at random, the same for the same arguments.
+
+    A view and a place in it are drawn evenly, and the inverse of the depth: so the points lie as densely in the image
+    as in depth, as far as parallax can tell depths apart.
+
+    Args:
+        viewmats: [V, 4, 4] float64, world to camera.
+        Ks: [V, 3, 3] float64 intrinsics.
+        sizes: [V, 2] (width, height).
+        bounds: [V, 2] float64, nearest and farthest depth.
+    """
+    random = np.random.default_rng(0)
+    views = random.integers(0, len(viewmats), NUM_RANDOM_POINTS)
+    pixels = random.uniform(size=(NUM_RANDOM_POINTS, 2)) * sizes[views]
+    shares = random.uniform(size=NUM_RANDOM_POINTS)
+    with np.errstate(over="ignore", invalid="ignore"):  # what overflows is refused by the capture's check
+        near, far = (1.0 / bounds[views]).T
+        depths = 1.0 / (far + shares * (near - far))
+        rays = (pixels - Ks[views, :2, 2]) / Ks[views][:, [0, 1], [0, 1]]  # [M, 2]
+        in_camera = depths[:, None] * np.column_stack([rays, np.ones(len(rays))])
+        points = np.einsum("mji,mj->mi", viewmats[views, :3, :3], in_camera - viewmats[views, :3, 3])
+    return points, random.integers(0, 256, (NUM_RANDOM_POINTS, 3), dtype=np.uint8)
+
+
+def _read_table(source: Path) -> LlffTable:
+    try:
+        # Mapped, so that a header cannot ask for more memory than there is file.
+        rows = np.lib.format.open_memmap(source, mode="r")
+        usable = rows.ndim == 2 and rows.shape[1] == COLUMNS and np.issubdtype(rows.dtype, np.number)
+        usable = usable and not np.iscomplexobj(rows)
+    except Exception as error:  # numpy's parser of headers lets through whatever it runs into
+        reason = " ".join((str(error) or type(error).__name__).split())[:200]
+        raise InputError(f"{source} is not a readable .npy file: {reason}; {AGAIN}") from error
+    if not usable:
+        shape = "x".join(map(str, rows.shape)) or "one value"
+        raise InputError(f"{source} has {shape} of {rows.dtype} where N x {COLUMNS} numbers were expected: {AGAIN}")
+    table = np.array(rows, dtype=np.float64)
+    matrices = table[:, :15].reshape(-1, 3, 5)
+    viewmats = np.empty((len(table), 4, 4))
+    for row, matrix in enumerate(matrices):
+        down, right, backward = matrix[:, :3].T
+        try:
+            viewmats[row] = viewmat_of_pose(np.column_stack([right, down, -backward]), matrix[:, 3])
+        except ValueError as error:
+            raise InputError(f"{source}: the pose in row {row} {error}: {AGAIN}") from None
+    height, width, focal = matrices[:, :, 4].T
+    near, far = table[:, 15:].T
+    with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
+        sized = np.isfinite(matrices[:, :, 4]).all(axis=1) & (matrices[:, :, 4] > 0).all(axis=1)
+        bounded = np.isfinite(far) & np.isfinite(1.0 / near) & (near > 0) & (near < far)
+    for ok, trouble in (
+        (sized, "a height, width or focal length that is not a positive number"),
+        (bounded, "bounds of depth that are not 0 < near < far"),
+    ):
+        if not ok.all():
+            raise InputError(f"{source}: row {int(np.argmin(ok))} has {trouble} ({(~ok).sum()} such rows): {AGAIN}")
+    return LlffTable(viewmats, np.column_stack([width, height]), focal, table[:, 15:])
+
+
+def _usable_folders(scene: Path, factor: int) -> list[PhotoFolder]:
+    """The folders that a capture can be loaded from at this factor, smallest photos first; at least one."""
+    matches = ((path, re.fullmatch(r"images(?:_([1-9]\d{0,3}))?", path.name)) for path in sorted(scene.iterdir()))
+    found = (PhotoFolder.of(path, int(match[1] or 1)) for path, match in matches if match and path.is_dir())
+    folders = sorted((folder for folder in found if folder.names), key=lambda folder: -folder.reduction)
+    if not folders:
+        raise InputError(f"{scene} has {FILE} but no photos ({', '.join(PHOTO_SUFFIXES)}): put them into images")
+    usable = [folder for folder in folders if factor % folder.reduction == 0]
+    if not usable and factor == 1:
+        usable = folders[-1:]
+    if not usable:
+        largest = folders[-1]
+        raise InputError(
+            f"--factor {factor}: the largest photos of {scene} are those of {largest.path.name}: use --factor "
+            f"{largest.reduction} or a multiple of it, or put the full-size photos into images"
+        )
+    return usable
+
+
+def _is_whole_copy(folder: PhotoFolder, table: LlffTable) -> bool:
+    """Whether all photos are there in the size that the folder's name says."""
+    if len(folder.names) != len(table.sizes):
+        return False
+    return bool((np.abs(folder.sizes() - table.sizes / folder.reduction) <= 1.0).all())
+
+
+def _checked_sizes(folder: PhotoFolder, table: LlffTable, source: Path) -> np.ndarray:
+    """[V, 2] int64 sizes of the folder's photos, which are those of the table at a uniform scale."""
+    if len(folder.names) != len(table.sizes):
+        raise InputError(
+            f"{source} has {len(table.sizes)} poses but {folder.path} has {len(folder.names)} photos: take out the "
+            f"photos without a pose (COLMAP leaves out what it cannot place), or {AGAIN}"
+        )
+    sizes = folder.sizes()
+    other = (sizes != sizes[0]).any(axis=1) & (table.sizes == table.sizes[0]).all(axis=1)
+    if other.any():
+        view = int(np.argmax(other))
+        raise InputError(
+            f"photo {folder.path / folder.names[view]} is {sizes_text(sizes[[view]])} but the first one is "
+            f"{sizes_text(sizes[:1])}, and {FILE} has one size for both: use the photos that it was written for"
+        )
+    # Either side of a reduced photo may be rounded by up to a pixel.
+    ratios = sizes / table.sizes
+    bent = np.abs(ratios[:, 0] - ratios[:, 1]) > (1.0 / table.sizes).sum(axis=1)
+    if bent.any():
+        view = int(np.argmax(bent))
+        raise InputError(
+            f"photo {folder.path / folder.names[view]} is {sizes_text(sizes[[view]])}, no uniform scale of the "
+            f"{sizes_text(table.sizes[[view]])} in {FILE}: use the photos that it was written for"
+        )
+    return sizes
