@@ -69,7 +69,7 @@ def find_nvcc() -> Path:
 
 
 def find_torch() -> Path:
-    """The folder of the torch package, of a version that the library can use. Build isolation hides it from imports, but not from the file system."""
+    """The folder of the torch package. Build isolation hides it from imports, but not from the file system."""
     spec = find_spec("torch")
     candidates = [Path(spec.origin).parent] if spec and spec.origin else []
     candidates += [Path(sysconfig.get_path(key), "torch") for key in ("purelib", "platlib")]
@@ -77,9 +77,8 @@ def find_torch() -> Path:
         if (path / "version.py").is_file() and (path / "include/torch").is_dir():
             version = re.search(r"__version__ = '((\d+)\.(\d+)[^']*)'", (path / "version.py").read_text())
             if version and (int(version[2]), int(version[3])) < FIRST_TORCH:
-                raise CannotBuildError(
-                    f"it needs torch {'.'.join(map(str, FIRST_TORCH))} or later, this is {version[1]}"
-                )
+                oldest = ".".join(map(str, FIRST_TORCH))
+                raise CannotBuildError(f"it needs torch {oldest} or later, this is {version[1]}")
             return path
     raise CannotBuildError("torch's headers are not in the build environment (install with --no-build-isolation)")
 

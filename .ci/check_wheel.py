@@ -27,8 +27,8 @@ PTX, MACHINE_CODE = 1, 2
 def architectures(library: bytes) -> set[str]:
     """What a library really holds: ``sm_90`` for machine code, ``compute_90`` for PTX.
 
-    A container has a header (magic, version, its own size, bytes of entries) and entries, whose headers begin with kind,
-    version, header size and payload size, and have the architecture's number at byte 28.
+    A container has a header (magic, version, its own size, bytes of entries) and entries, whose headers begin with
+    kind, version, header size and payload size, and have the architecture's number at byte 28.
     """
     found = set()
     for container in re.finditer(re.escape(struct.pack("<I", CODE_MAGIC)), library):

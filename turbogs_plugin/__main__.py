@@ -9,7 +9,7 @@ from turbogs_plugin.errors import InputError, exit_code
 
 
 def main() -> None:
-    """Run the command line. Without the extra ``train``, one line says what a command lacks; ``doctor`` lacks nothing."""
+    """Run the command line. Where the extra ``train`` is absent, one line says what the command lacks."""
     sys.exit(exit_code(_run))
 
 
@@ -24,7 +24,7 @@ def _run() -> int:
         lacking = lacking_packages()
         if not lacking or _package_of(error) not in COMMAND_PACKAGES:
             raise
-        if sys.argv[1:] == ["doctor"]:
+        if sys.argv[1:] == ["doctor"]:  # which needs none of them, but for the parser of its name
             print(diagnosis())
             return 0
         verb = next((text for text in sys.argv[1:2] if not text.startswith("-")), "")
