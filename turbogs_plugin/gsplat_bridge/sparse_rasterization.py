@@ -74,9 +74,10 @@ def sparse_rasterization(
     Returns:
         Colours [P, 3], or depths [P, 1], or both [P, 4] with the depth last, and alphas [P, 1], in the samples' order
         and zero in empty slots; and gsplat's `info`, unpacked: means2d [C, N, 2], radii [C, N, 2] (gsplat before 1.5:
-        [C, N]), depths, opacities [C, N], conics [C, N, 3], ids (None), width, height, tile_size, tile_width, tile_height, n_batches, n_cameras.
-        Gradients reach the five parameters and ``info["means2d"]``, no other entry. The arrays of gsplat's tile
-        intersection are not there: isect_ids, isect_offsets, flatten_ids and tiles_per_gauss are None.
+        [C, N]), depths, opacities [C, N], conics [C, N, 3], ids (None), width, height, tile_size, tile_width,
+        tile_height, n_batches, n_cameras. Gradients reach the five parameters and ``info["means2d"]``, no other entry.
+        The arrays of gsplat's tile intersection are not there: isect_ids, isect_offsets, flatten_ids and
+        tiles_per_gauss are None.
 
         If "prediction" and "ground_truth" (colours alone, both [P, 3] or both [C, H, W, 3]) are put into `info` before
         backward, "gaussian_stats" is in it after: the pass's `GaussianStats` with their error sums, and "loss_shares",
