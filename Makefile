@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 
-.PHONY: demo ablation results pages test lint kernels install clean
+.PHONY: demo ablation results pages test lint kernels wheel install clean
 
 # One thread: the demo's tensors are small, and a second thread gains nothing but waits where the machine is shared.
 demo: export OMP_NUM_THREADS := 1
@@ -52,6 +52,15 @@ lint: $(INSTALLED)
 # The CUDA library, for development; wants nvcc but no GPU.
 kernels: $(INSTALLED)
 	TURBOGS_CUDA=require TURBOGS_CUDA_ARCH=$${TURBOGS_CUDA_ARCH:-90} $(BIN)/python setup.py build_ext --inplace
+
+# One wheel in dist/, for Python 3.10 and later, torch 2.10 and later, and every GPU from 8.0; wants nvcc but no GPU.
+# What an earlier build left in build/ would land in it.
+WHEEL_ARCHITECTURES := 80 86 89 90 100 120
+wheel: $(INSTALLED)
+	rm -rf build/lib* build/bdist* dist
+	TURBOGS_CUDA=require TURBOGS_CUDA_ARCH="$(WHEEL_ARCHITECTURES)" \
+		$(BIN)/python -m pip wheel --quiet --no-deps --no-build-isolation --wheel-dir dist .
+	$(BIN)/python .ci/check_wheel.py dist/*.whl $(WHEEL_ARCHITECTURES)
 
 install: $(INSTALLED)
 

@@ -5,7 +5,8 @@ Environment:
         fails, ends CPU-only, saying why in one line; ``require`` makes a missing library an error; ``off`` builds
         nothing.
     TURBOGS_CUDA_ARCH: compute capabilities to build for, such as ``90`` or ``80;90``, in place of the GPUs found here;
-        8.0 or newer.
+        8.0 or newer. ``compute_80`` is PTX of 8.0, which the driver compiles when it loads the library: on any GPU from
+        8.0, at the price of a slow first call. Several capabilities bring PTX of the newest, unless PTX is named.
     TURBOGS_EXACT_MATH: ``1`` builds the kernels with correctly rounded functions (csrc/common/approximate_math.cuh).
 """
 
@@ -29,7 +30,9 @@ ROOT = Path(__file__).resolve().parent
 SOURCES = ROOT / "csrc"
 BUILD_COMMANDS = {"build", "build_ext", "bdist_wheel", "editable_wheel", "develop", "install"}
 OLDEST_CAPABILITY = 80  # warp reductions in hardware (__reduce_*_sync)
-TORCH_TARGET = "0x020A000000000000ULL"  # the library loads on torch 2.10 and later
+PTX = "compute_"
+FIRST_TORCH = (2, 10)
+TORCH_TARGET = "0x020A000000000000ULL"  # the same: the library loads on torch 2.10 and later
 
 
 class CannotBuildError(Exception):
@@ -50,8 +53,9 @@ class Toolchain:
     @property
     def code_names(self) -> list[str]:
         """What the library holds: ``sm_90`` is machine code, ``compute_90`` PTX. A library for one GPU has no PTX."""
-        names = [f"sm_{a}" for a in self.architectures]
-        return [*names, f"compute_{self.architectures[-1]}"] if len(names) > 1 else names
+        names = [a if a.startswith(PTX) else f"sm_{a}" for a in self.architectures]
+        has_ptx = any(name.startswith(PTX) for name in names)
+        return names if has_ptx or len(names) == 1 else [*names, f"{PTX}{self.architectures[-1]}"]
 
 
 def find_nvcc() -> Path:
@@ -70,22 +74,28 @@ def find_torch() -> Path:
     candidates = [Path(spec.origin).parent] if spec and spec.origin else []
     candidates += [Path(sysconfig.get_path(key), "torch") for key in ("purelib", "platlib")]
     for path in candidates:
-        if (path / "include/torch/csrc/stable/library.h").is_file():
+        if (path / "version.py").is_file() and (path / "include/torch").is_dir():
+            version = re.search(r"__version__ = '((\d+)\.(\d+)[^']*)'", (path / "version.py").read_text())
+            if version and (int(version[2]), int(version[3])) < FIRST_TORCH:
+                oldest = ".".join(map(str, FIRST_TORCH))
+                raise CannotBuildError(f"it needs torch {oldest} or later, this is {version[1]}")
             return path
     raise CannotBuildError("torch's headers are not in the build environment (install with --no-build-isolation)")
 
 
 def capability(architecture: str) -> int:
-    """90 of ``90``, ``90a``, ``90f``."""
-    return int(architecture.rstrip("af"))
+    """90 of ``90``, ``90a``, ``90f``, ``compute_90``."""
+    return int(architecture.removeprefix(PTX).rstrip("af"))
 
 
 def find_architectures() -> list[str]:
     named = os.environ.get("TURBOGS_CUDA_ARCH", "")
     if named:
         found = [part.replace(".", "") for part in re.split(r"[;,\s]+", named) if part]
-        if not found or not all(re.fullmatch(r"\d{2,3}[af]?", part) for part in found):
-            raise SystemExit(f"TURBOGS_CUDA_ARCH={named!r}: expected compute capabilities such as 90 or 80;90")
+        if not found or not all(re.fullmatch(rf"({PTX})?\d{{2,3}}[af]?", part) for part in found):
+            raise SystemExit(
+                f"TURBOGS_CUDA_ARCH={named!r}: expected compute capabilities such as 90, 80;90 or compute_80"
+            )
         if any(capability(part) < OLDEST_CAPABILITY for part in found):
             raise SystemExit(f"TURBOGS_CUDA_ARCH={named!r}: the CUDA library needs compute capability 8.0 or newer")
     else:
@@ -101,7 +111,7 @@ def find_architectures() -> list[str]:
         found = [part for part in found if capability(part) >= OLDEST_CAPABILITY]
         if not found:
             raise CannotBuildError(f"it needs compute capability 8.0 or newer, the GPU has {newest[:-1]}.{newest[-1]}")
-    return sorted(set(found), key=capability)
+    return sorted(set(found), key=lambda part: (capability(part), part))
 
 
 def run_compiler(command: list[str], what: str) -> None:

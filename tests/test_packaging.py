@@ -156,7 +156,10 @@ def test_architectures_are_those_of_the_gpus_that_have_kernels(build_script, mon
 
 @pytest.mark.parametrize(
     ("named", "wanted"),
-    [("90", ["90"]), ("9.0;8.0", ["80", "90"]), ("100f,90a", ["90a", "100f"]), ("75", None), ("90;7.5", None)],
+    [
+        *[("90", ["90"]), ("9.0;8.0", ["80", "90"]), ("100f,90a", ["90a", "100f"]), ("75", None), ("90;7.5", None)],
+        *[("compute_80", ["compute_80"]), ("compute_8.0,90", ["compute_80", "90"]), ("compute_75", None)],
+    ],
 )
 def test_named_architectures(build_script, monkeypatch, named, wanted):
     monkeypatch.setenv("TURBOGS_CUDA_ARCH", named)
@@ -172,6 +175,22 @@ def test_ptx_is_of_the_newest_of_several(build_script):
     assert several.code_names == ["sm_80", "sm_90", "compute_90"]
     assert several.code_flags[-1] == "-gencode=arch=compute_90,code=compute_90"
     assert build_script.Toolchain(Path("nvcc"), Path("torch"), ["90"]).code_names == ["sm_90"]
+    named = build_script.Toolchain(Path("nvcc"), Path("torch"), ["compute_80", "90"])
+    assert named.code_names == ["compute_80", "sm_90"]
+    assert named.code_flags[0] == "-gencode=arch=compute_80,code=compute_80"
+
+
+@pytest.mark.parametrize(("version", "usable"), [("2.9.1+cu128", False), ("2.10.0", True), ("3.0.0", True)])
+def test_a_torch_without_the_stable_interface_is_named(build_script, monkeypatch, tmp_path, version, usable):
+    (tmp_path / "torch/include/torch").mkdir(parents=True)
+    (tmp_path / "torch/version.py").write_text(f"__version__ = '{version}'\ndebug = False\n")
+    monkeypatch.setattr(build_script, "find_spec", lambda name: None)
+    monkeypatch.setattr(build_script.sysconfig, "get_path", lambda key: str(tmp_path))
+    if usable:
+        assert build_script.find_torch() == tmp_path / "torch"
+    else:
+        with pytest.raises(build_script.CannotBuildError, match=r"needs torch 2\.10 or later, this is 2\.9\.1\+cu128"):
+            build_script.find_torch()
 
 
 @pytest.mark.parametrize("mode", ["auto", "require"])

@@ -5,10 +5,25 @@ from __future__ import annotations
 import importlib.util
 import shutil
 import subprocess
+from importlib.metadata import PackageNotFoundError, version
 
 import torch
+from packaging.requirements import Requirement
 
 from turbogs_plugin.report.machine import hardware, software
+
+COMMAND_PACKAGES = {
+    "pycolmap": "pycolmap>=4.0",
+    "yaml": "pyyaml>=6.0",
+    "omegaconf": "omegaconf>=2.3",
+    "tyro": "tyro>=0.9",
+    "rich": "rich>=13.0",
+    "matplotlib": "matplotlib>=3.8",
+    "torchmetrics": "torchmetrics>=1.4",
+}
+"""Module -> requirement: the extra ``train`` of pyproject.toml. The strategies and the gsplat bridge need none."""
+
+INSTALL_COMMANDS = 'pip install "turbogs-plugin[train]"'
 
 
 def diagnosis() -> str:
@@ -24,7 +39,27 @@ def diagnosis() -> str:
         missing.append("a GPU that answers: training runs on the CPU, by the torch reference")
     if importlib.util.find_spec("torchvision") is None:
         missing.append("torchvision: LPIPS is not computed")
+    if lacking := lacking_packages():
+        missing.append(f"{', '.join(lacking)}: commands that need them refuse; {INSTALL_COMMANDS}")
     return "\n".join([*lines, *(f"{'missing':<16}{line}" for line in missing)])
+
+
+def lacking_packages() -> list[str]:
+    """Requirements of the commands that are not met, with the version found where it is too old."""
+    lacking = []
+    for module, requirement in COMMAND_PACKAGES.items():
+        wanted = Requirement(requirement)
+        try:
+            found = version(wanted.name) if importlib.util.find_spec(module) else None
+        except PackageNotFoundError:  # there, but not installed: its version is not known
+            continue
+        except (ImportError, ValueError):
+            found = None
+        if found is None:
+            lacking.append(wanted.name)
+        elif not wanted.specifier.contains(found, prereleases=True):
+            lacking.append(f"{requirement} ({found} is installed)")
+    return lacking
 
 
 def _gpus() -> list[str]:

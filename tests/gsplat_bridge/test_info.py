@@ -4,6 +4,8 @@ The other side is gsplat's torch reference of the projection, its kernels' rule 
 here for autograd, pixel by pixel in float64.
 """
 
+from importlib import import_module
+
 import pytest
 import torch
 from gsplat import DefaultStrategy
@@ -12,6 +14,10 @@ from helpers.bridge_host import HEIGHT, WIDTH, arguments, make_cameras, make_spl
 
 from turbogs_plugin.engine.rendering import dense_samples
 from turbogs_plugin.gsplat_bridge import gather_pixels, sparse_rasterization
+from turbogs_plugin.gsplat_bridge.gaussian_errors import screen_statistics
+
+sparse_rasterization_module = import_module("turbogs_plugin.gsplat_bridge.sparse_rasterization")
+"""The package has the function under this name."""
 
 ALPHA_MIN, ALPHA_MAX, TRANSMITTANCE_MIN, EXTENT_MAX = 1 / 255, 0.999, 1e-4, 3.33
 
@@ -92,3 +98,21 @@ def test_default_strategys_statistics_are_gsplats(views, absgrad):
     expected = states[1]["grad2d"]
     assert expected.max() > 0
     torch.testing.assert_close(states[0]["grad2d"], expected, rtol=2e-4, atol=2e-5 * float(expected.max()))
+
+
+def test_one_radius_of_each_gaussian_as_before_gsplat_1_5(monkeypatch):
+    """gsplat 1.4's strategies expect radii [C, N]; ours take either shape from its rasterization."""
+    splats, cameras = make_splats(60), make_cameras(2)
+    samples = dense_samples(cameras)
+    infos = []
+    for one_radius in (False, True):
+        monkeypatch.setattr(sparse_rasterization_module, "ONE_RADIUS", one_radius)
+        colors, _, info = sparse_rasterization(**arguments(splats, cameras), samples=samples, sh_degree=1)
+        colors.sum().backward()
+        infos.append(info)
+    assert torch.equal(infos[1]["radii"], infos[0]["radii"].amax(-1))
+    assert torch.equal(infos[1]["radii"] > 0, (infos[0]["radii"] > 0).all(-1))
+    first, second = (screen_statistics(info, 60) for info in infos)
+    assert first.view_counts.sum() > 60
+    for name, sums in vars(first).items():
+        torch.testing.assert_close(vars(second)[name], sums)

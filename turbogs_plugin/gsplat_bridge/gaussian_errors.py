@@ -123,6 +123,8 @@ def screen_statistics(info: dict[str, Any], count: int) -> GaussianStats:
     keys = ("means2d", "radii", "width", "height", "n_cameras", "gaussian_ids")
     require_keys(info, keys, "info", "pass what the rasterization returned")
     means2d, radii = info["means2d"], info["radii"]
+    if radii.dim() < means2d.dim():  # before gsplat 1.5 both axes have one radius
+        radii = radii[..., None]
     if means2d.grad is None:
         raise InputError("info['means2d'] has no gradient: call step_pre_backward before loss.backward()")
     width, height, cameras = info["width"], info["height"], info["n_cameras"]

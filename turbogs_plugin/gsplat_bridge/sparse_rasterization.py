@@ -7,7 +7,9 @@ import weakref
 from collections.abc import Callable
 from typing import Any
 
+import gsplat
 import torch
+from packaging.version import Version
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
@@ -20,6 +22,9 @@ from turbogs_plugin.types import SH_C0, TILE_SIZE, Cameras, Gaussians, GaussianS
 
 LOGIT_MARGIN = 2.0**-23
 """Opacities are kept this far from 0 and 1, where the logit is infinite. An alpha is cut at 0.999 in any case."""
+
+ONE_RADIUS = Version(gsplat.__version__) < Version("1.5")
+"""Whether the installed gsplat's strategies expect one radius of each Gaussian, not one of each axis."""
 
 RENDER_MODES = ("RGB", "ED", "RGB+ED")
 """Those of gsplat's that there are here: colours, expected depth, or both."""
@@ -68,10 +73,11 @@ def sparse_rasterization(
 
     Returns:
         Colours [P, 3], or depths [P, 1], or both [P, 4] with the depth last, and alphas [P, 1], in the samples' order
-        and zero in empty slots; and gsplat's `info`, unpacked: means2d [C, N, 2], radii [C, N, 2], depths, opacities
-        [C, N], conics [C, N, 3], ids (None), width, height, tile_size, tile_width, tile_height, n_batches, n_cameras.
-        Gradients reach the five parameters and ``info["means2d"]``, no other entry. The arrays of gsplat's tile
-        intersection are not there: isect_ids, isect_offsets, flatten_ids and tiles_per_gauss are None.
+        and zero in empty slots; and gsplat's `info`, unpacked: means2d [C, N, 2], radii [C, N, 2] (gsplat before 1.5:
+        [C, N]), depths, opacities [C, N], conics [C, N, 3], ids (None), width, height, tile_size, tile_width,
+        tile_height, n_batches, n_cameras. Gradients reach the five parameters and ``info["means2d"]``, no other entry.
+        The arrays of gsplat's tile intersection are not there: isect_ids, isect_offsets, flatten_ids and
+        tiles_per_gauss are None.
 
         If "prediction" and "ground_truth" (colours alone, both [P, 3] or both [C, H, W, 3]) are put into `info` before
         backward, "gaussian_stats" is in it after: the pass's `GaussianStats` with their error sums, and "loss_shares",
@@ -230,6 +236,8 @@ class _InfoObserver:
 def _info(render: DifferentiableRender, cameras: int, width: int, height: int) -> _Info:
     absent = ("batch_ids", "camera_ids", "gaussian_ids", "tiles_per_gauss", "isect_ids", "flatten_ids", "isect_offsets")
     shown = {name: getattr(render.projected, name) for name in ("radii", "depths", "conics", "opacities")}
+    if ONE_RADIUS:
+        shown["radii"] = shown["radii"].amax(dim=-1)  # [C, N]
     sizes = {"width": width, "height": height, "n_batches": 1, "n_cameras": cameras}
     tiles = {"tile_size": TILE_SIZE, "tile_width": -(-width // TILE_SIZE), "tile_height": -(-height // TILE_SIZE)}
     # means2d is a leaf: `retain_grad` of it is allowed and needless.

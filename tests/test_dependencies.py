@@ -1,0 +1,202 @@
+"""What an installation needs: the core leaves other trainers' packages alone, the commands say what they lack."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+
+from turbogs_plugin.doctor import COMMAND_PACKAGES, INSTALL_COMMANDS
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib  # pytest brings it
+
+ROOT = Path(__file__).resolve().parent.parent
+
+BLOCKED = """
+import sys
+
+class Absent:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in {absent}:
+            raise ModuleNotFoundError(f"No module named '{{name}}'", name=name)
+
+sys.meta_path.insert(0, Absent())
+"""
+"""Python in which modules are absent."""
+
+USE = """
+import torch
+import turbogs_plugin.strategies as strategies
+from turbogs_plugin.error_maps import ErrorMaps
+from turbogs_plugin.gsplat_bridge import SharedOptimizer, TurboDensityStrategy, gather_pixels
+from turbogs_plugin.types import Step
+
+for name in strategies.__all__:
+    getattr(strategies, name)
+
+torch.manual_seed(0)
+photos = torch.rand(2, 32, 32, 3)
+step = Step(0, 100, 50)
+maps = ErrorMaps.from_images(photos.sum(-1))
+samples = strategies.ErrorGuidedPixelSampler().sample(maps, (0, 1), 0.25, step)
+targets = gather_pixels(photos, samples)
+loss = strategies.CharbonnierNccLoss()(torch.full_like(targets, 0.5), targets, samples)
+assert 0 < float(loss.loss) < 10 and loss.color_gradients.shape == targets.shape
+maps.update(samples, loss.pixel_errors, step)
+
+count = 8
+splats = {"means": torch.rand(count, 3), "scales": torch.full((count, 3), -5.0), "quats": torch.rand(count, 4)}
+splats |= {"opacities": torch.zeros(count), "sh0": torch.rand(count, 1, 3), "shN": torch.zeros(count, 3, 3)}
+splats = {name: torch.nn.Parameter(value) for name, value in splats.items()}
+group = SharedOptimizer(strategies.SparseAdam())
+optimizers = {name: group([{"params": value, "lr": 0.01, "name": name}]) for name, value in splats.items()}
+strategy = TurboDensityStrategy(refine_start_iter=0, refine_every=1, opacity_decay=0.0, verbose=False)
+strategy.check_sanity(splats, optimizers)
+state = strategy.initialize_state(scene_scale=1.0)
+means2d = torch.zeros(1, count, 2, requires_grad=True)
+info = {"means2d": means2d, "width": 32, "height": 32, "n_cameras": 1, "gaussian_ids": None}
+info["radii"] = torch.ones(1, count, 2, dtype=torch.int32)
+strategy.step_pre_backward(splats, optimizers, state, 1, info)
+means2d.sum().backward()
+means2d.absgrad = means2d.grad.abs()
+strategy.step_post_backward(splats, optimizers, state, 1, info)
+assert len(splats["means"]) > count, len(splats["means"])
+print("used")
+"""
+
+
+def run(code: str, absent: set[str], *arguments, folder: Path) -> subprocess.CompletedProcess:
+    script = BLOCKED.format(absent=sorted(absent)) + code
+    command = [sys.executable, "-c", script, *map(str, arguments)]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "TURBOGS_LIBRARY": str(folder / "no kernels")}
+    return subprocess.run(command, capture_output=True, text=True, cwd=folder, env=environment, check=False)
+
+
+@pytest.fixture(scope="module")
+def project() -> dict:
+    return tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+
+
+def requirements(lines: list[str]) -> dict[str, Requirement]:
+    return {canonicalize_name(found.name): found for found in map(Requirement, lines)}
+
+
+def test_parts_need_the_core_alone(tmp_path):
+    done = run(USE, set(COMMAND_PACKAGES), folder=tmp_path)
+    assert (done.returncode, done.stdout.split()[-1:]) == (0, ["used"]), done.stderr
+
+
+def test_the_extra_is_what_the_commands_name(project):
+    extras = project["optional-dependencies"]
+    assert sorted(extras["train"]) == sorted(COMMAND_PACKAGES.values())
+    assert extras["dev"][0] == f"{project['name']}[train]" and f'"{extras["dev"][0]}"' in INSTALL_COMMANDS
+    assert set(requirements(project["dependencies"])) == {"torch", "gsplat", "packaging", "numpy", "pillow"}
+
+
+COMMANDS = {
+    "train": ("SCENE", "--out", "RUN"),
+    "plan": ("SCENE",),
+    "eval": ("RUN",),
+    "render": ("RUN",),
+    "export": ("RUN",),
+    "ablate": ("components", "--scene", "SCENE", "--out", "STUDY"),
+    "compare": ("RUN", "RUN", "--out", "STUDY"),
+    "report": ("STUDY",),
+    "bench": ("numerics", "--out", "STUDY", "--device", "cpu"),
+    "demo": ("CAPTURE",),
+}
+COMMAND = "sys.argv[0] = 'turbogs'; from turbogs_plugin.__main__ import main; main()"
+
+ALL_COMMANDS = """
+import contextlib, io, json
+from turbogs_plugin.__main__ import main
+
+answers = {}
+for line in json.loads(sys.argv[1]):
+    sys.argv = ["turbogs", *line]
+    out, err = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        try:
+            main()
+        except SystemExit as end:
+            answers[line[0]] = [end.code, out.getvalue(), err.getvalue()]
+print(json.dumps(answers))
+"""
+
+
+def test_every_command_is_tried_without_the_extra():
+    assert len(re.findall(r"^@app\.command", (ROOT / "turbogs_plugin/cli.py").read_text(), re.M)) == len(COMMANDS) + 1
+
+
+# Without a parser nothing can be read; with it, each command comes to the first package that it lacks itself.
+@pytest.mark.parametrize("parser", [False, True])
+def test_each_command_says_what_it_lacks(parser, tmp_path):
+    absent = set(COMMAND_PACKAGES) - ({"tyro"} if parser else set())
+    names = [Requirement(text).name for module, text in COMMAND_PACKAGES.items() if module in absent]
+    lines = [[command, *arguments] for command, arguments in COMMANDS.items()]
+    done = run(ALL_COMMANDS, absent, json.dumps(lines), folder=tmp_path)
+    assert done.returncode == 0, done.stderr
+    expected = "turbogs: error: turbogs {} needs " + f"{', '.join(names)}: {INSTALL_COMMANDS}\n"
+    assert json.loads(done.stdout) == {command: [2, "", expected.format(command)] for command in COMMANDS}
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_doctor_needs_none_of_them_and_names_them(tmp_path):
+    done = run(COMMAND, set(COMMAND_PACKAGES), "doctor", folder=tmp_path)
+    (line,) = [line for line in done.stdout.splitlines() if INSTALL_COMMANDS in line]
+    assert done.returncode == 0 and line.startswith("missing") and "tyro" in line and "pycolmap" in line
+    assert INSTALL_COMMANDS not in run(COMMAND, set(), "doctor", folder=tmp_path).stdout
+
+
+def test_a_package_of_the_same_name_is_not_taken_for_it(tmp_path):
+    """The pycolmap that gsplat 1.5.3's examples install is another one: it has no Reconstruction."""
+    (tmp_path / "pycolmap").mkdir()
+    (tmp_path / "pycolmap" / "__init__.py").write_text("class SceneManager: pass\n")
+    metadata = tmp_path / "pycolmap-0.0.1.dist-info"
+    metadata.mkdir()
+    (metadata / "METADATA").write_text("Metadata-Version: 2.1\nName: pycolmap\nVersion: 0.0.1\n")
+    first = f"sys.path.insert(0, {str(tmp_path)!r}); "
+    done = run(first + COMMAND, set(), "demo", tmp_path / "capture", folder=tmp_path)
+    needs = "turbogs demo needs pycolmap>=4.0 (0.0.1 is installed)"
+    assert (done.returncode, done.stderr) == (2, f"turbogs: error: {needs}: {INSTALL_COMMANDS}\n")
+    assert not (tmp_path / "capture").exists()
+
+
+def test_other_missing_modules_are_not_blamed_on_the_extra(tmp_path):
+    done = run(COMMAND, {"turbogs_plugin.plan", "shutil", "rich"}, "doctor", folder=tmp_path)
+    assert done.returncode == 1 and "ModuleNotFoundError" in done.stderr and INSTALL_COMMANDS not in done.stderr
+
+
+HOSTS = {
+    # examples/requirements.txt of gsplat's main branch at 90d7b4b, which calls itself 1.6.0: numpy>=2.0,<3.0
+    "gsplat main": ("gsplat 1.6.0", "torch 2.9.1", "numpy 2.0.0"),
+    # the same commit's setup.py: torch>=2.7
+    "gsplat main, oldest torch": ("gsplat 1.6.0", "torch 2.7.0"),
+    # examples/requirements.txt of gsplat v1.5.3: numpy<2.0.0, and rmbrualla's pycolmap at cc7ea4b, called 0.0.1
+    "gsplat 1.5.3": ("gsplat 1.5.3", "numpy 1.26.4", "pycolmap 0.0.1"),
+    # nerfstudio 1.1.5's metadata on PyPI: gsplat==1.4.0, Pillow>=10.3.0, packaging; its guide installs torch 2.1.2
+    "nerfstudio 1.1.5": ("gsplat 1.4.0", "torch 2.1.2", "numpy 1.26.4", "pillow 10.3.0"),
+}
+"""Versions that the environments of other trainers hold, each with the place that pins it."""
+
+
+@pytest.mark.parametrize("host", HOSTS)
+def test_the_core_changes_no_package_of_a_host(host, project):
+    core = requirements(project["dependencies"])
+    for name, version in (text.split() for text in HOSTS[host]):
+        assert name not in core or core[name].specifier.contains(version), f"{core[name]} replaces {name} {version}"
+        assert name not in core or core[name].marker is None
+
+
+def test_what_the_core_refuses(project):
+    core = requirements(project["dependencies"])
+    for name, version in (("gsplat", "1.3.0"), ("gsplat", "2.0.0"), ("torch", "2.0.1")):
+        assert not core[name].specifier.contains(version)

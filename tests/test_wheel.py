@@ -1,0 +1,114 @@
+"""`.ci/check_wheel.py` finds what is wrong with a wheel, and doctor names a GPU that the wheel has no code for."""
+
+import importlib.util
+import re
+import struct
+import zipfile
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from turbogs_plugin import doctor
+from turbogs_plugin.engine.cuda import library as kernels
+
+ROOT = Path(__file__).resolve().parent.parent
+MAKEFILE = (ROOT / "Makefile").read_text(encoding="utf-8")
+ARCHITECTURES = re.search(r"^WHEEL_ARCHITECTURES := (.*)$", MAKEFILE, re.M)[1].split()
+NAME = "turbogs_plugin-0.1.0-cp310-abi3-linux_x86_64.whl"
+SYMBOLS = ["aoti_torch_get_dim", "torch_list_size", "std::locale::locale()", "free", "std::at_quick_exit"]
+
+
+@pytest.fixture
+def checker(monkeypatch):
+    spec = importlib.util.spec_from_file_location("check_wheel", ROOT / ".ci" / "check_wheel.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    monkeypatch.setattr(module, "undefined_symbols", lambda library: SYMBOLS)
+    return module
+
+
+def container(*entries: tuple[int, int]) -> bytes:
+    """GPU code as nvcc embeds it: entries of (kind, architecture), each with some payload."""
+    body = b""
+    for kind, number in entries:
+        payload = bytes(24)
+        body += struct.pack("<HHIQ", kind, 0x101, 64, len(payload)) + bytes(12) + struct.pack("<I", number)
+        body += bytes(64 - 32) + payload
+    return struct.pack("<IHHQ", 0xBA55ED50, 1, 16, len(body)) + body
+
+
+def library(numbers: list[str]) -> bytes:
+    """Two containers, as two sources give, among other bytes; and the record."""
+    machine = [container(*((2, int(number)) for number in numbers)) for _ in range(2)]
+    record = " ".join([*(f"sm_{number}" for number in numbers), f"compute_{numbers[-1]}"])
+    chance = struct.pack("<I", 0xBA55ED50) + bytes(60)  # the first word of a container, and none
+    return b"\x7fELF" + machine[0] + chance + machine[1] + container((1, int(numbers[-1]))) + record.encode() + b"\0"
+
+
+def wheel(folder: Path, content: bytes, name: str = NAME, stray: str | None = None) -> Path:
+    with zipfile.ZipFile(folder / name, "w") as archive:
+        for file in ("turbogs_plugin/cli.py", "turbogs_plugin/configs/ablations/far_sizes.yaml", stray):
+            if file:
+                archive.writestr(file, "")
+        archive.writestr("turbogs_plugin-0.1.0.dist-info/WHEEL", "")
+        archive.writestr("turbogs_plugin/_C.abi3.so", content)
+    return folder / name
+
+
+def test_a_wheel_as_make_wheel_builds_it_has_no_fault(checker, tmp_path):
+    assert ARCHITECTURES == ["80", "86", "89", "90", "100", "120"]
+    assert checker.faults(wheel(tmp_path, library(ARCHITECTURES)), ARCHITECTURES) == []
+
+
+@pytest.mark.parametrize(
+    ("content", "options", "words"),
+    [
+        (library(["80", "90"]), {}, "it holds compute_90, sm_80, sm_90, not sm_80, sm_86, "),
+        (library(ARCHITECTURES).replace(b"sm_89 ", b""), {}, "it does not say of itself that it holds sm_80"),
+        (library(ARCHITECTURES), {"name": NAME.replace("abi3", "cp310")}, "its tag is not cp310-abi3"),
+        (library(ARCHITECTURES), {"stray": "turbogs_plugin/notes.txt"}, "turbogs_plugin/notes.txt: a stray file"),
+        (library(ARCHITECTURES), {"stray": "strategies/losses.py"}, "strategies/losses.py: a stray file"),
+        (library(ARCHITECTURES), {"stray": "turbogs_plugin/_C.cpython-311.so"}, "_C.cpython-311.so: a stray file"),
+    ],
+)
+def test_a_fault_of_a_wheel_is_named(checker, tmp_path, content, options, words):
+    assert words in checker.faults(wheel(tmp_path, content, **options), ARCHITECTURES)[0]
+
+
+@pytest.mark.parametrize(
+    "symbol",
+    ["at::Tensor::dim() const", "c10::Error::what() const", "std::vector<at::Tensor>::~vector()", "PyList_New"],
+)
+def test_what_ties_a_library_to_a_version_is_named(checker, tmp_path, monkeypatch, symbol):
+    monkeypatch.setattr(checker, "undefined_symbols", lambda library: [*SYMBOLS, symbol])
+    (fault,) = checker.faults(wheel(tmp_path, library(ARCHITECTURES)), ARCHITECTURES)
+    assert fault.startswith(symbol)
+
+
+@pytest.mark.parametrize(
+    ("capability", "line"),
+    [
+        ((8, 7), None),
+        ((10, 3), None),
+        ((12, 1), None),
+        ((13, 0), None),  # by PTX
+        ((7, 5), "kernels: this GPU is sm_75: the kernels need compute capability 8.0 or newer"),
+        ((11, 0), "this GPU is sm_110: rebuild with TURBOGS_CUDA_ARCH=110"),
+    ],
+)
+def test_doctor_names_a_gpu_that_the_wheel_lacks(monkeypatch, capability, line):
+    names = (*(f"sm_{number}" for number in ARCHITECTURES), f"compute_{ARCHITECTURES[-1]}")
+    properties = SimpleNamespace(major=capability[0], minor=capability[1], name="Card", total_memory=2**34)
+    monkeypatch.setattr(kernels, "_load_failure", lambda: "")
+    monkeypatch.setattr(kernels, "architectures", lambda: names)
+    monkeypatch.setattr(kernels, "unavailable_reason", kernels.unavailable_reason.__wrapped__)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
+    monkeypatch.setattr(torch.cuda, "get_device_capability", lambda: capability)
+    monkeypatch.setattr(torch.cuda, "get_device_properties", lambda index: properties)
+    said = doctor.diagnosis()
+    assert "Card, sm_{}{}".format(*capability) in said
+    assert ("kernels         loaded from" in said) == (line is None)
+    assert line is None or any(text.startswith("missing") and text.endswith(line) for text in said.splitlines())
