@@ -24,7 +24,7 @@ from turbogs_plugin.types import SamplingBudget
 def test_a_step_has_the_pixels_of_an_image_and_it_says_so(num_views, batch_size, expected, capsys):
     assert sparse_budget(num_views, batch_size) == expected
     (line,) = capsys.readouterr().out.splitlines()
-    given = "as no batch_size was given" if batch_size is None else f"for batch_size {batch_size}"
+    given = "(no batch_size is given)" if batch_size is None else f"(batch_size is {batch_size})"
     assert f"sparse_budget: {expected.views} views a step, {expected.rate:.0%} of the pixels" in line and given in line
 
 
