@@ -6,19 +6,16 @@ from gsplat_host import Options, command_line, report, train
 from sparse_pixels import SparseForward
 from turbogs_plugin.strategies.optimizers.moment_lm import MomentLMOptimizer
 
-from turbogs_plugin.gsplat_bridge import SharedOptimizer, TurboDensityStrategy
+from turbogs_plugin.gsplat_bridge import SharedOptimizer, TurboDensityStrategy, sparse_budget
 
 
-def main(options: Options, rate: float = 0.25) -> None:
-    """Train on a share of the pixels of four views an iteration.
-
-    Args:
-        rate: share of the pixels.
-    """
+def main(options: Options) -> None:
+    """Train on as many views and pixels an iteration as `sparse_budget` has it."""
     capture = options.capture()
+    budget = sparse_budget(len(capture.train))
     strategy, optimizer = options.strategy(TurboDensityStrategy), SharedOptimizer(MomentLMOptimizer())
-    forward = SparseForward(capture, rate, options.iterations)
-    report("all swaps", train(capture, options.iterations, strategy, optimizer, forward, batch_size=4))
+    forward = SparseForward(capture, budget.rate, options.iterations)
+    report("all swaps", train(capture, options.iterations, strategy, optimizer, forward, batch_size=budget.views))
 
 
 if __name__ == "__main__":

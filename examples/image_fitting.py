@@ -22,11 +22,17 @@ def demo_images(size: int = 64) -> Tensor:
 
 
 class ImageNetwork(torch.nn.Module):
-    """(image, x, y) -> colour: random Fourier features and two hidden layers."""
+    """(image, x, y) -> colour: random Fourier features and two hidden layers.
 
-    def __init__(self, images: int, features: int = 64, width: int = 64) -> None:
+    Args:
+        images: number of images.
+        features: number of waves. width: of the hidden layers.
+        frequency: deviation of the waves' numbers, in radians per side of the image.
+    """
+
+    def __init__(self, images: int, features: int = 64, width: int = 64, frequency: float = 20.0) -> None:
         super().__init__()
-        self.register_buffer("waves", 20.0 * torch.randn(2, features))
+        self.register_buffer("waves", frequency * torch.randn(2, features))
         self.embedding = torch.nn.Embedding(images, 16)
         self.layers = torch.nn.Sequential(
             torch.nn.Linear(2 * features + 16, width),

@@ -11,8 +11,7 @@ from torch import Tensor
 from turbogs_plugin.strategies.losses import CharbonnierNccLoss
 from turbogs_plugin.strategies.pixel_sampling import ErrorGuidedPixelSampler
 
-from turbogs_plugin.error_maps import ErrorMaps
-from turbogs_plugin.gsplat_bridge import gather_pixels, sparse_loss, sparse_rasterization
+from turbogs_plugin.gsplat_bridge import gather_pixels, maps_of_photos, sparse_budget, sparse_loss, sparse_rasterization
 from turbogs_plugin.scene import Scene
 from turbogs_plugin.types import Step
 
@@ -21,8 +20,7 @@ class SparseForward:
     """The forward part of a step on a share of the pixels, drawn by the errors of their last visits.
 
     Args:
-        scene: its training views get error maps, which must not start from zero: only visited pixels would have an
-            error, and the share of the samples that goes by error would visit them again and again.
+        scene: its training views get error maps.
         rate: the share.
         iterations: of the run.
     """
@@ -30,8 +28,8 @@ class SparseForward:
     def __init__(self, scene: Scene, rate: float, iterations: int) -> None:
         self.rate, self.iterations = rate, iterations
         device = "cuda" if torch.cuda.is_available() else "cpu"
-        photos = (scene.train.photos.image(view).to(device) for view in range(len(scene.train)))  # [H, W, 3] each
-        self.maps = ErrorMaps.from_images([photo.sum(dim=-1) for photo in photos])  # the errors of a black prediction
+        trainset = [{"image": scene.train.photos.image(view)} for view in range(len(scene.train))]  # [H, W, 3], 0 .. 1
+        self.maps = maps_of_photos(trainset, device, white=1.0)
         self.sampler, self.loss = ErrorGuidedPixelSampler(), CharbonnierNccLoss()
 
     def __call__(self, splats: torch.nn.ParameterDict, batch: Batch, step: int, **render: Any) -> tuple[Tensor, dict]:
@@ -46,16 +44,17 @@ class SparseForward:
         return loss, info
 
 
-def main(options: Options, rate: float = 0.25) -> None:
-    """Train on a share of the pixels of two views an iteration.
+def main(options: Options, batch_size: int | None = None) -> None:
+    """Train on a share of the pixels, as large as `sparse_budget` has it.
 
     Args:
-        rate: share of the pixels.
+        batch_size: views an iteration; None leaves it to `sparse_budget`.
     """
     capture, strategy = options.capture(), options.strategy(DefaultStrategy)
-    forward = SparseForward(capture, rate, options.iterations)
-    result = train(capture, options.iterations, strategy, forward=forward, batch_size=2)
-    report(f"{rate:.0%} of the pixels", result)
+    budget = sparse_budget(len(capture.train), batch_size)
+    forward = SparseForward(capture, budget.rate, options.iterations)
+    result = train(capture, options.iterations, strategy, forward=forward, batch_size=budget.views)
+    report(f"{budget.rate:.0%} of the pixels of {budget.views} views", result)
 
 
 if __name__ == "__main__":

@@ -4,6 +4,7 @@ The scripts take a GPU where there is one, and so do these tests.
 """
 
 import importlib.util
+import re
 import shutil
 import sys
 from pathlib import Path
@@ -12,12 +13,15 @@ import pytest
 import tomllib
 import torch
 from helpers.framework_runs import thin_out_points
+from PIL import Image
 
 from turbogs_plugin.config.configuration import load_config, registry
+from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene import load_scene, write_demo_capture
 from turbogs_plugin.train import run
 from turbogs_plugin.train.history import read_history
+from turbogs_plugin.types import Step
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 PACKAGE = EXAMPLES / "third_party_strategy"
@@ -48,7 +52,7 @@ def example(monkeypatch):
 
 def test_every_script_is_run_here():
     scripts = {path.stem for path in EXAMPLES.glob("*.py")}
-    assert scripts == {*SCRIPTS, "image_fitting", "baselines", "gsplat_host"}
+    assert scripts == {*SCRIPTS, "image_fitting", "pixels_on_an_mlp", "baselines", "gsplat_host"}
 
 
 @pytest.mark.parametrize("name", SCRIPTS)
@@ -75,6 +79,31 @@ def test_sparse_pixels_draws_by_errors_from_the_first_step_on(example, capture):
 def test_image_fitting(example):
     fitting = example("image_fitting")
     assert fitting.main(iterations=60) > fitting.main(iterations=1) + 3
+
+
+def test_pixels_on_an_mlp(example, tmp_path, capsys):
+    """Both variants learn, at equal pixels, and the figure is drawn; a photo from a file is taken."""
+    script = example("pixels_on_an_mlp")
+    figure, photo = tmp_path / "made" / "figure.png", tmp_path / "photo.png"
+    Image.fromarray((255 * script.synthetic_photo(48, 32)).byte().numpy()).save(photo)
+    printed = []
+    for iterations in (1, 60):
+        gain = script.main(str(photo), iterations, rate=0.2, seeds=(0,), figure=str(figure))
+        lines = capsys.readouterr().out.splitlines()
+        values = [float(text) for text in re.findall(r": ([\d.]+) dB", lines[0])]
+        assert len(values) == 2 and f"gain: {gain:+.2f} dB" in lines[1]
+        assert gain == pytest.approx(values[1] - values[0], abs=0.011)
+        printed.append(values)
+    assert all(after > before + 3 for before, after in zip(*printed, strict=True))
+    with Image.open(figure) as drawn:
+        assert drawn.size == (3 * 2 * 48, 2 * 2 * 32 + 14)
+
+
+def test_the_variants_of_pixels_on_an_mlp_draw_equally_many(example):
+    maps = ErrorMaps.from_images(torch.rand(1, 40, 50))
+    samplers = [variant.sampler for variant in example("pixels_on_an_mlp").VARIANTS]
+    counts = [len(sampler.sample(maps, 0, 0.1, Step(0, 9, 9))) for sampler in samplers]
+    assert counts[0] == counts[1] > 0
 
 
 def test_baselines(example, thin_capture, tmp_path, capsys):

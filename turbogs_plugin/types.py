@@ -7,7 +7,7 @@ Every shape below is written with these letters:
 - ``P`` sample slots, ordered by (view of the batch, tile), ``T`` tiles that hold samples;
 - ``X`` pixels of all training views laid end to end ("flat pixels").
 
-This file imports nothing else of the project, so strategies and framework can both import it.
+This file imports nothing of the project but its exception, so strategies and framework can both import it.
 """
 
 from __future__ import annotations
@@ -18,6 +18,8 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 import torch
 from torch import Tensor
+
+from turbogs_plugin.errors import InputError
 
 TILE_SIZE = 16
 """Side of a square tile in pixels (S in the paper). The kernels are built for this value."""
@@ -178,6 +180,89 @@ class PixelSamples:
     tile_offsets: Tensor
     weights: Tensor | None = None
     has_empty_slots: bool = True
+
+    @classmethod
+    def from_mask(cls, mask: Tensor, view_ids: Sequence[int] | None = None) -> PixelSamples:
+        """The pixels of a mask. On a GPU the host waits once, to count them.
+
+        Args:
+            mask: [H, W] bool of one view, or [K, H, W] of a batch. The samples live on its device.
+            view_ids: K training views, for error maps; 0 .. K - 1 where None.
+
+        Raises:
+            InputError: no such mask, one that is False everywhere, or not one view number for each image.
+        """
+        if not isinstance(mask, Tensor) or mask.dtype != torch.bool or mask.dim() not in (2, 3):
+            found = f"{mask.dtype} {tuple(mask.shape)}" if isinstance(mask, Tensor) else type(mask).__name__
+            raise InputError(f"mask is {found}: expected a tensor of bool [H, W] or [K, H, W]")
+        mask = mask[None] if mask.dim() == 2 else mask
+        views, y, x = torch.nonzero(mask, as_tuple=True)
+        return cls.from_coordinates(views, x, y, [(mask.shape[2], mask.shape[1])] * len(mask), view_ids)
+
+    @classmethod
+    def from_coordinates(
+        cls,
+        views: Tensor,
+        x: Tensor,
+        y: Tensor,
+        sizes: np.ndarray | Sequence[tuple[int, int]],
+        view_ids: Sequence[int] | None = None,
+    ) -> PixelSamples:
+        """Given pixels, in the order of samples, which is not that in which they are given: `coordinates` and
+        `view_of_slot` tell it. On a GPU the host waits for the checks.
+
+        Args:
+            views: [P] integers, position in the batch (0 .. K - 1) of each pixel's view.
+            x, y: [P] integers, column and row of each pixel. The samples live on their device.
+            sizes: [K, 2] (width, height) of the batch's images.
+            view_ids: K training views, for error maps; 0 .. K - 1 where None.
+
+        Raises:
+            InputError: other shapes or types, no pixel, one outside its image, one pixel twice, or not one view number
+                for each image.
+        """
+        sizes = np.asarray(sizes, dtype=np.int64)
+        if sizes.ndim != 2 or sizes.shape[1] != 2 or len(sizes) == 0:
+            raise InputError(f"sizes have shape {sizes.shape}: expected [K, 2], the (width, height) of each image")
+        view_ids = tuple(range(len(sizes)) if view_ids is None else map(int, view_ids))
+        if len(view_ids) != len(sizes) or len(set(view_ids)) < len(view_ids):
+            raise InputError(f"view_ids = {view_ids} is not valid: expected {len(sizes)} different numbers of views")
+        for name, value in (("views", views), ("x", x), ("y", y)):
+            if not isinstance(value, Tensor) or value.dtype.is_floating_point or value.dtype == torch.bool:
+                found = value.dtype if isinstance(value, Tensor) else type(value).__name__
+                raise InputError(f"{name} is {found}: expected a tensor of integers [P]")
+            if value.dim() != 1 or value.shape != x.shape or len(value) == 0:
+                raise InputError(f"{name} has shape {tuple(value.shape)}: expected [P] as x and y, P at least 1")
+        views, x, y = views.long(), x.long(), y.long()
+        inside = (views >= 0) & (views < len(sizes))
+        widths, heights = torch.as_tensor(sizes, device=x.device)[views.clamp(0, len(sizes) - 1)].unbind(dim=-1)  # [P]
+        inside &= (x >= 0) & (x < widths) & (y >= 0) & (y < heights)
+
+        def place(pixel: Tensor) -> str:
+            return f"view {int(views[pixel])}, x {int(x[pixel])}, y {int(y[pixel])}"
+
+        if not bool(inside.all()):
+            outside = place((~inside).nonzero()[0])
+            raise InputError(f"a pixel is outside its image ({outside}): sizes (width, height) are {sizes.tolist()}")
+        grid = TileGrid(sizes)
+        columns, starts = (
+            torch.as_tensor(of_view, device=x.device)[views] for of_view in (grid.shapes[:, 0], grid.offsets[:-1])
+        )
+        tiles = starts + y // TILE_SIZE * columns + x // TILE_SIZE  # [P]
+        keys = tiles * TILE_SIZE**2 + sample_order(x % TILE_SIZE, y % TILE_SIZE)  # unique for each pixel
+        keys, order = keys.sort()
+        again = order[1:][keys[1:] == keys[:-1]]
+        if len(again):
+            raise InputError(f"a pixel is given twice ({place(again[0])}): expected each once")
+        tile_ids, counts = torch.unique_consecutive(keys // TILE_SIZE**2, return_counts=True)  # [T] each
+        return cls(
+            view_ids=view_ids,
+            sizes=sizes,
+            pixel_ids=(y * widths + x)[order].int(),
+            tile_ids=tile_ids.int(),
+            tile_offsets=torch.nn.functional.pad(counts.cumsum(dim=0), (1, 0)).int(),
+            has_empty_slots=False,
+        )
 
     def __len__(self) -> int:
         return self.pixel_ids.shape[0]

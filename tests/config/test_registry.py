@@ -4,10 +4,12 @@ import importlib.metadata
 import sys
 import types
 from dataclasses import dataclass
+from pathlib import Path
 
 import pytest
 
 from turbogs_plugin.config import registry
+from turbogs_plugin.config.configuration import load_config
 from turbogs_plugin.errors import InputError
 
 ALL_TYPES = [(kind, name) for kind, types_of_kind in registry.BUILT_IN.items() for name in types_of_kind]
@@ -130,3 +132,58 @@ def test_all_that_a_class_lacks_is_named(monkeypatch):
     _plug_in(monkeypatch, "half", "third_party_samplers:Half")
     with pytest.raises(InputError, match="is no DensityController: it lacks stats, apply, state_dict, load_state_dict"):
         registry.build("density", {"type": "half"})
+
+
+SAMPLER = """
+from dataclasses import dataclass
+
+@dataclass
+class MySampler:
+    share: float = 0.1
+
+    def sample(self, maps, view_ids, rate, step): ...
+"""
+
+
+@pytest.fixture
+def file_here(monkeypatch, tmp_path):
+    """A module in the current folder, which Python's own path does not have."""
+    (tmp_path / "samplers_of_mine.py").write_text(SAMPLER)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [entry for entry in sys.path if entry not in ("", str(tmp_path))])
+    yield "samplers_of_mine:MySampler"
+    sys.modules.pop("samplers_of_mine", None)
+
+
+def test_a_type_may_be_a_class_in_a_file(file_here):
+    Path("mine.yaml").write_text(f"base: demo\npixel_sampler: {{type: {file_here}, share: 0.3}}\n")
+    from_yaml = load_config("mine.yaml")
+    overridden = load_config("demo", [f"pixel_sampler.type={file_here}", "pixel_sampler.share=0.3"])
+    for config in (from_yaml, overridden):
+        sampler = config.build("pixel_sampler")
+        assert (type(sampler).__name__, sampler.share) == ("MySampler", 0.3)
+        assert config.pixel_sampler == {"type": file_here, "share": 0.3}
+
+
+@pytest.mark.parametrize(
+    ("mapping", "words"),
+    [
+        (
+            {"type": "no_such_module:X"},
+            "pixel_sampler.type 'no_such_module:X'.*cannot be imported: ModuleNotFoundError",
+        ),
+        ({"type": "samplers_of_mine:Absent"}, "cannot be imported: AttributeError"),
+        ({"type": "samplers_of_mine:"}, "cannot be imported"),
+        ({"type": "os:sep"}, "'os:sep' .*is not a dataclass"),
+        ({"type": "samplers_of_mine:MySampler", "shar": 1}, "did you mean 'share'"),
+        ({"type": "dataclasses:Field"}, "is not a dataclass"),
+    ],
+)
+def test_a_class_that_does_not_fit_is_refused_as_an_entry_point_is(file_here, mapping, words):
+    with pytest.raises(InputError, match=words):
+        registry.build("pixel_sampler", mapping)
+
+
+def test_a_class_of_another_kind_names_what_it_lacks(file_here):
+    with pytest.raises(InputError, match=rf"loss.type '{file_here}' \({file_here}\) is no SparseLoss: it lacks terms"):
+        registry.build("loss", {"type": file_here})

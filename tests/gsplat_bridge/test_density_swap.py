@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from turbogs_plugin.strategies.density.error_driven import ErrorDrivenDensity
 from turbogs_plugin.strategies.optimizers.moment_lm import MomentLMOptimizer
 
+from turbogs_plugin.config.configuration import load_config
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.gsplat_bridge import SharedOptimizer, TurboDensityStrategy, apply_row_update
 from turbogs_plugin.gsplat_bridge.gaussian_errors import iteration_stats
@@ -31,6 +32,17 @@ def test_it_is_a_default_strategy_with_its_fields_and_hooks():
     for hook in ("step_pre_backward", "step_post_backward"):
         theirs = inspect.signature(getattr(DefaultStrategy, hook)).parameters
         assert list(inspect.signature(getattr(TurboDensityStrategy, hook)).parameters)[: len(theirs)] == list(theirs)
+
+
+def test_its_defaults_are_the_values_of_turbogs():
+    """Those of `configs/turbogs.yaml` as a run takes them; only those of our own scenes' frame are left out."""
+    section = load_config("turbogs").density
+    controller = vars(TurboDensityStrategy()._controller(0))
+    schedule = {"refine_from", "refine_every", "prune_size_from"}  # gsplat's, which its trainers scale
+    own_frame = {"prune_world_reference", "spare_beyond"}
+    tuned = {name: value for name, value in section.items() if name not in {"type", *schedule, *own_frame}}
+    assert {name: controller[name] for name in tuned} == tuned
+    assert tuned["opacity_decay"] == TurboDensityStrategy().opacity_decay > ErrorDrivenDensity().opacity_decay
 
 
 @dataclass
@@ -111,6 +123,8 @@ BASE = {
     "grow_absgrad2d": 0.02,
     "grow_scale3d": 0.17,
     "top_fraction": 0.5,
+    "split": "sample",
+    "opacity_decay": 0.0,
 }
 BASE_OF_CONTROLLER = {
     "refine_from": 3,
@@ -226,7 +240,7 @@ def test_an_event_is_the_controllers_with_these_values(name, tells_errors):
 def test_no_opacity_is_reset():
     """gsplat resets where step % reset_every == 0; here, the optimizers apart, no step changes an opacity."""
     fields = {"refine_start_iter": 1, "refine_every": 2, "reset_every": 2, "grow_grad2d": 1.0}
-    strategy = TurboDensityStrategy(**fields, grow_absgrad2d=1.0, prune_scale3d=0.0)
+    strategy = TurboDensityStrategy(**fields, grow_absgrad2d=1.0, prune_scale3d=0.0, opacity_decay=0.0)
     host = Host(strategy)
     trained = []
     step_post_backward = strategy.step_post_backward

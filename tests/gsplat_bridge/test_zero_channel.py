@@ -3,81 +3,18 @@
 import gsplat
 import pytest
 import torch
-from helpers.bridge_host import HEIGHT, WIDTH, arguments, make_cameras, make_splats
+from helpers.bridge_host import make_splats
+from helpers.gsplat_stand_ins import CAMERAS, COUNT, rendered_info, stand_in, stock_info
 from turbogs_plugin.strategies.optimizers.moment_lm import MomentLMOptimizer
 
-from turbogs_plugin.engine.rendering import dense_samples
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.gsplat_bridge import SharedOptimizer, TurboDensityStrategy, sparse_rasterization
+from turbogs_plugin.gsplat_bridge import SharedOptimizer, TurboDensityStrategy
 from turbogs_plugin.gsplat_bridge.gaussian_errors import iteration_stats, loss_shares
-
-COUNT, CAMERAS = 40, 2
-
-
-def composite(means2d, conics, colors, opacities, order):
-    """[H, W, D] one image: splats [S, ...] drawn in this order, as gsplat defines it."""
-    y, x = torch.meshgrid(torch.arange(HEIGHT) + 0.5, torch.arange(WIDTH) + 0.5, indexing="ij")
-    image = torch.zeros(HEIGHT, WIDTH, colors.shape[-1])
-    through = torch.ones(HEIGHT, WIDTH)
-    ended = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
-    for splat in order.tolist():
-        dx, dy = means2d[splat, 0] - x, means2d[splat, 1] - y
-        a, b, c = conics[splat]
-        alpha = (opacities[splat] * torch.exp(-0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy)).clamp(max=0.999)
-        alpha = torch.where(alpha < 1 / 255, 0.0, alpha)
-        ended = ended | (through * (1 - alpha) <= 1e-4)
-        alpha = torch.where(ended, 0.0, alpha)
-        image = image + (through * alpha)[..., None] * colors[splat]
-        through = through * (1 - alpha)
-    return image
-
-
-def stand_in(camera_of):
-    """`gsplat.rasterize_to_pixels`; `camera_of`: [entries] camera of each row of the flattened arrays."""
-
-    def rasterize_to_pixels(
-        means2d, conics, colors, opacities, width, height, tile_size, isect_offsets, flatten_ids, packed
-    ):
-        assert (width, height, tile_size) == (WIDTH, HEIGHT, 16) and packed == (means2d.dim() == 2)
-        flat = [value.reshape(-1, *value.shape[value.dim() - tail :]) for value, tail in ((means2d, 1), (conics, 1))]
-        flat += [colors.reshape(-1, colors.shape[-1]), opacities.reshape(-1)]
-        images = [composite(*flat, flatten_ids[camera_of[flatten_ids] == camera]) for camera in range(CAMERAS)]
-        return torch.stack(images), None
-
-    return rasterize_to_pixels
-
-
-def stock_info(info, packed: bool):
-    """What gsplat's rasterization would have left in `info`, from ours: the order of drawing, and packed on wish."""
-    visible = (info["radii"] > 0).all(dim=-1)
-    cameras, gaussians = torch.where(visible)
-    by_depth = torch.argsort(info["depths"][visible])
-    if packed:
-        stock = {key: info[key].detach()[visible] for key in ("means2d", "radii", "conics", "opacities")}
-        stock |= {"gaussian_ids": gaussians, "flatten_ids": by_depth}
-        stock["means2d"].grad = info["means2d"].grad[visible]
-        stock["means2d"].absgrad = info["means2d"].absgrad[visible]
-        camera_of = cameras
-    else:
-        stock = {"flatten_ids": (cameras * COUNT + gaussians)[by_depth]}
-        camera_of = torch.arange(CAMERAS).repeat_interleave(COUNT)
-    stock = {**info, **stock, "isect_offsets": torch.zeros(CAMERAS, 2, 3)}
-    for ours in ("gaussian_stats", "loss_shares"):
-        del stock[ours]
-    return stock, camera_of
 
 
 @pytest.fixture
 def rendered():
-    splats, cameras = make_splats(COUNT), make_cameras(CAMERAS)
-    samples = dense_samples(cameras)
-    colors, _, info = sparse_rasterization(**arguments(splats, cameras), samples=samples, sh_degree=1)
-    places = samples.view_of_slot() * WIDTH * HEIGHT + samples.pixel_ids.long()
-    images = torch.zeros_like(colors).index_copy(0, places, colors).reshape(-1, HEIGHT, WIDTH, 3)
-    truth = torch.rand(images.shape, generator=torch.Generator().manual_seed(0))
-    info.update(prediction=images, ground_truth=truth)
-    (images - truth).abs().mean().backward()
-    return info
+    return rendered_info()
 
 
 @pytest.mark.parametrize("packed", [False, True])
@@ -126,3 +63,20 @@ def test_errors_of_other_images_are_refused(rendered):
     info.update(prediction=torch.zeros(CAMERAS, 5, 5, 3), ground_truth=torch.zeros(CAMERAS, 5, 5, 3))
     with pytest.raises(InputError, match=r"of shape \(\d, 5, 5, 3\): expected \(\d, 24, 40, 3\), what gsplat"):
         iteration_stats(info, COUNT)
+
+
+def test_info_of_several_processes_cameras_is_refused(rendered, monkeypatch):
+    """gsplat's distributed mode: the projection is of all processes' cameras, the tiles are of this one's."""
+    info, camera_of = stock_info(rendered, packed=False)
+    monkeypatch.setattr(gsplat, "rasterize_to_pixels", stand_in(camera_of))
+    info |= {key: info[key][:1] for key in ("isect_offsets", "prediction", "ground_truth")}
+    with pytest.raises(InputError, match=r"distributed=True, means2d of 2 cameras and tiles of 1: .*TurboDensityStrat"):
+        iteration_stats(info, COUNT)
+
+
+def test_info_without_a_gradient_on_the_screen_is_refused(rendered):
+    """As from a render with the unscented transform, whose weights are not those of splats."""
+    info, _ = stock_info(rendered, packed=False)
+    info["means2d"] = info["means2d"].detach()
+    with pytest.raises(InputError, match=r"takes no gradient, as from a render with with_ut or with_eval3d"):
+        loss_shares(info, COUNT)

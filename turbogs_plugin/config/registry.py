@@ -5,11 +5,15 @@ A third party adds to its ``pyproject.toml``::
     [project.entry-points."turbogs.pixel_sampler"]
     my_sampler = "my_package.samplers:MySampler"
 
-and a YAML names it by ``pixel_sampler: {type: my_sampler, ...}``. Nothing is imported before it is named.
+and a YAML names it by ``pixel_sampler: {type: my_sampler, ...}``. Without a package, a YAML names the class itself,
+``pixel_sampler: {type: my_samplers:MySampler, ...}``; the module may be a file in the current folder. Nothing is
+imported before it is named.
 """
 
 from __future__ import annotations
 
+import os
+import sys
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from importlib.metadata import EntryPoint, entry_points
@@ -77,14 +81,18 @@ def default_type(kind: str) -> str:
 
 
 def strategy_class(kind: str, name: str) -> type:
-    """The class behind a name.
+    """The class behind a name, or the class ``module:Class`` itself.
 
     Raises:
         InputError: an unknown name (naming the nearest and all that are known), one whose module cannot be imported,
             or one of something else than a dataclass.
     """
     known = _own_types(kind)
-    if isinstance(name, str) and name not in known:
+    if isinstance(name, str) and ":" in name:
+        known = {name: name}
+        if not {"", os.getcwd()} & {*sys.path}:
+            sys.path.append(os.getcwd())  # last, so that a file here hides no installed module
+    elif isinstance(name, str) and name not in known:
         known = known_types(kind)  # which reads the files of every installed package
     if not isinstance(name, str) or name not in known:
         raise InputError(f"unknown {kind}.type '{name}': {nearest(name, known)}")
@@ -119,7 +127,7 @@ def build(kind: str, mapping: Mapping[str, Any]) -> Any:
     missing = [name for name in members if name not in present]
     if missing:
         raise InputError(
-            f"{kind}.type '{name}' ({known_types(kind)[name]}) is no {PROTOCOLS[kind].__name__}: "
+            f"{kind}.type '{name}' ({known_types(kind).get(name, name)}) is no {PROTOCOLS[kind].__name__}: "
             f"it lacks {', '.join(missing)}"
         )
     return strategy

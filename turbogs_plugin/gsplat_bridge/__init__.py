@@ -2,18 +2,22 @@
 
 - `TurboDensityStrategy` for `gsplat.DefaultStrategy`;
 - `SharedOptimizer` for the optimizer class, with `SparseAdam` or `MomentLMOptimizer` in it;
-- `sparse_rasterization`, `gather_pixels` and `sparse_loss` for the render call, the ground truth and the loss.
+- `sparse_rasterization`, `gather_pixels` and `sparse_loss` for the render call, the ground truth and the loss;
+  before the loop, `sparse_budget` and `maps_of_photos`.
 """
 
 from turbogs_plugin.gsplat_bridge.density_swap import TurboDensityStrategy, apply_row_update
 from turbogs_plugin.gsplat_bridge.optimizer_swap import SharedOptimizer
 from turbogs_plugin.gsplat_bridge.sparse_rasterization import gather_pixels, sparse_loss, sparse_rasterization
+from turbogs_plugin.gsplat_bridge.sparse_setup import maps_of_photos, sparse_budget
 
 __all__ = [
     "SharedOptimizer",
     "TurboDensityStrategy",
     "apply_row_update",
     "gather_pixels",
+    "maps_of_photos",
+    "sparse_budget",
     "sparse_loss",
     "sparse_rasterization",
 ]

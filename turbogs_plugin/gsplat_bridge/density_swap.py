@@ -12,7 +12,7 @@ from gsplat.strategy.ops import _update_param_with_optimizer
 from torch import Tensor
 
 from turbogs_plugin.errors import InputError, require
-from turbogs_plugin.gsplat_bridge.gaussian_errors import iteration_stats
+from turbogs_plugin.gsplat_bridge.gaussian_errors import WITHOUT_GRADIENT, iteration_stats
 from turbogs_plugin.gsplat_bridge.host import (
     GEOMETRY,
     GROUND_TRUTH,
@@ -21,7 +21,9 @@ from turbogs_plugin.gsplat_bridge.host import (
     Parameters,
     host_gaussians,
     require_keys,
+    require_one_process,
 )
+from turbogs_plugin.gsplat_bridge.tuned import TUNED_DENSITY
 from turbogs_plugin.model.row_order import in_order_of_space
 from turbogs_plugin.strategies.checks import shared_settings
 from turbogs_plugin.strategies.density.error_driven import ErrorDrivenDensity
@@ -47,7 +49,11 @@ class TurboDensityStrategy(DefaultStrategy):
     refine_start_iter, refine_stop_iter, refine_every, prune_opa, grow_grad2d, grow_scale3d, prune_scale3d, and
     prune_scale2d where refine_scale2d_stop_iter is above 0; any of them may change at any time. Opacities are never
     reset; reset_every only says when pruning by size begins. grow_scale2d has no effect. The fields below are those of
-    `ErrorDrivenDensity` of the same name, with its defaults, except that final pruning is off.
+    `ErrorDrivenDensity` of the same name.
+
+    The defaults are the values of `configs/turbogs.yaml`, read from there, also for grow_grad2d and grow_scale3d. When
+    and how often is refined stays gsplat's, as trainers scale those fields. `prune_world_reference` and `spare_beyond`
+    are left out: they hold where the origin is the cameras' centre and a backdrop stands behind the scene.
 
     Once a line ``info.update(prediction=colors, ground_truth=pixels)`` stands before ``loss.backward()``, Gaussians are
     ranked by the error they carry (see `gaussian_errors`); without it, by their screen gradients. Which of the two
@@ -55,23 +61,25 @@ class TurboDensityStrategy(DefaultStrategy):
 
     Args:
         absgrad: also densify by absolute gradients above grow_absgrad2d; render with ``absgrad=True`` then.
-        grow_absgrad2d: absgrad_threshold of `ErrorDrivenDensity`.
-        final_every, final_keep: final pruning after refine_stop_iter. `ErrorDrivenDensity` is made for few such events;
-            gsplat's schedule has room for 30.
+        grow_grad2d, grow_absgrad2d, grow_scale3d: grad_threshold, absgrad_threshold and percent_dense of
+            `ErrorDrivenDensity`.
+        final_every, final_keep: final pruning after refine_stop_iter, off where final_keep is 1.
         seed: of the positions of split Gaussians.
     """
 
+    grow_grad2d: float = TUNED_DENSITY.grad_threshold
+    grow_scale3d: float = TUNED_DENSITY.percent_dense
     absgrad: bool = True
-    grow_absgrad2d: float = ErrorDrivenDensity.absgrad_threshold
-    lambda_base: float = ErrorDrivenDensity.lambda_base
-    score: str = ErrorDrivenDensity.score
-    top_fraction: float = ErrorDrivenDensity.top_fraction
-    split: str = ErrorDrivenDensity.split
-    max_gaussians: int = ErrorDrivenDensity.max_gaussians
-    prune_score_fraction: float = ErrorDrivenDensity.prune_score_fraction
-    opacity_decay: float = ErrorDrivenDensity.opacity_decay
-    final_every: int = ErrorDrivenDensity.final_every
-    final_keep: float = 1.0
+    grow_absgrad2d: float = TUNED_DENSITY.absgrad_threshold
+    lambda_base: float = TUNED_DENSITY.lambda_base
+    score: str = TUNED_DENSITY.score
+    top_fraction: float = TUNED_DENSITY.top_fraction
+    split: str = TUNED_DENSITY.split
+    max_gaussians: int = TUNED_DENSITY.max_gaussians
+    prune_score_fraction: float = TUNED_DENSITY.prune_score_fraction
+    opacity_decay: float = TUNED_DENSITY.opacity_decay
+    final_every: int = TUNED_DENSITY.final_every
+    final_keep: float = TUNED_DENSITY.final_keep
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -90,7 +98,10 @@ class TurboDensityStrategy(DefaultStrategy):
         self, params: Parameters, optimizers: Optimizers, state: dict[str, Any], step: int, info: dict[str, Any]
     ) -> None:
         """To be called before ``loss.backward()``. Shows `info` to optimizers that want the errors, too."""
+        require_one_process("TurboDensityStrategy")
         require_keys(info, ("means2d",), "info", "pass what the rasterization returned")
+        if not info["means2d"].requires_grad:
+            raise InputError(WITHOUT_GRADIENT)
         super().step_pre_backward(params, optimizers, state, step, info)
         for optimizer in optimizers.values():
             if hasattr(optimizer, "observe"):
@@ -111,13 +122,15 @@ class TurboDensityStrategy(DefaultStrategy):
         """To be called after the optimizers' steps. Changes `params`, `optimizers` and `state` in place.
 
         Args:
-            packed, scene, host_options: what hosts hand to their own strategies; not used. Whether `info` is packed, it
-                says itself.
+            packed, host_options: what hosts hand to their own strategies; not used. Whether `info` is packed, it says
+                itself.
+            scene: of gsplat from 1.6 on, a container with more arrays over Gaussians, whose rows follow.
 
         Raises:
-            InputError: `state` is not one of `initialize_state`, or was not carried along when rows changed; `info`
-                lacks a key; or it changed between having errors and having none.
+            InputError: the host trains in several processes; `state` is not one of `initialize_state`, or was not
+                carried along when rows changed; `info` lacks a key; or it changed between having errors and none.
         """
+        require_one_process("TurboDensityStrategy")
         if step >= self.refine_stop_iter and self.final_keep == 1:
             return
         gaussians = host_gaussians(params, GEOMETRY)
@@ -133,7 +146,7 @@ class TurboDensityStrategy(DefaultStrategy):
         window.zero_()
         if update is None:
             return
-        apply_row_update(in_order_of_space(update, gaussians, now), params, optimizers, state)
+        apply_row_update(in_order_of_space(update, gaussians, now), params, optimizers, state, scene)
         if self.verbose:
             print(
                 f"Step {step}: {update.num_cloned} GSs duplicated, {update.num_split} split, "
@@ -197,13 +210,18 @@ class TurboDensityStrategy(DefaultStrategy):
 
 
 @torch.no_grad()
-def apply_row_update(update: RowUpdate, params: Parameters, optimizers: Optimizers, state: dict[str, Any]) -> None:
+def apply_row_update(
+    update: RowUpdate, params: Parameters, optimizers: Optimizers, state: dict[str, Any], scene: Any = None
+) -> None:
     """Carry a `RowUpdate` out on a gsplat host: its parameters, its optimizers' state and a strategy's running state.
 
     Args:
         update: new rows; parameters that it does not know are copied row by row.
         params, optimizers, state: as in gsplat's operations; changed in place.
+        scene: a `gsplat.scene.Scene`, as gsplat's operations take it from 1.6 on, or None. Its hooks are called, by
+            which `GaussianScene` keeps `component_index` and `signal`: row i becomes a copy of old row `source[i]`.
     """
+    count = len(params["means"])
 
     def new_parameter(name: str, parameter: Tensor) -> torch.nn.Parameter:
         value = update.values[name] if name in update.values else parameter[update.source]
@@ -218,3 +236,6 @@ def apply_row_update(update: RowUpdate, params: Parameters, optimizers: Optimize
     for key, value in state.items():
         if isinstance(value, Tensor):
             state[key] = update.apply_state(value)
+    if scene is not None:  # any choice of rows is a copy of them behind the old ones, which then go
+        scene.on_duplicate(update.source)
+        scene.on_remove(torch.arange(count + len(update.source), device=update.source.device) < count)

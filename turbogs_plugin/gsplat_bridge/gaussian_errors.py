@@ -6,7 +6,8 @@ Three sources, best first:
 2. gsplat's rasterizer, and prediction and ground truth in `info`: the *zero channel*. Colour channels that are zero
    everywhere, with the pixel error as their upstream gradient, have the sum of e * w as the gradient of their values,
    w = T * alpha the compositing weight; with 1 upstream, the sum of w. No other gradient is touched. It costs one
-   further pass over the tiles of two channels. The distance sums stay zero: no upstream gradient gives them.
+   further pass over the tiles, of three channels: gsplat may be built for chosen numbers of them, and always has that
+   of a colour. The distance sums stay zero: no upstream gradient gives them.
 3. Neither: there is no error, only the gradient on the screen.
 """
 
@@ -27,6 +28,12 @@ from turbogs_plugin.gsplat_bridge.host import (
     require_keys,
 )
 from turbogs_plugin.types import GaussianStats
+
+WITHOUT_GRADIENT = (
+    "info['means2d'] takes no gradient, as from a render with with_ut or with_eval3d, or under no_grad: "
+    "TurboDensityStrategy and the errors for MomentLMOptimizer need it; render without these options, or keep gsplat's "
+    "MCMCStrategy"
+)
 
 _INTERSECTION = ("gaussian_ids", "conics", "opacities", "width", "height", "tile_size", "isect_offsets", "flatten_ids")
 
@@ -100,7 +107,8 @@ def _error_sums(info: dict[str, Any], count: int) -> Tensor | None:
             f"info has '{PREDICTION}' and '{GROUND_TRUTH}' but neither '{STATISTICS}' nor 'flatten_ids': put them in "
             "before backward for sparse_rasterization; gsplat's rasterization leaves 'flatten_ids'"
         )
-    sums = zero_channel_sums(info, torch.stack([errors, torch.ones_like(errors)], dim=-1))
+    ones = torch.ones_like(errors)
+    sums = zero_channel_sums(info, torch.stack([errors, ones, torch.zeros_like(ones)], dim=-1))[..., :2]
     ids = info["gaussian_ids"]
     if ids is None:
         info[ERROR_SUMS] = sums.reshape(-1, count, 2).sum(dim=0)
@@ -149,6 +157,22 @@ def screen_statistics(info: dict[str, Any], count: int) -> GaussianStats:
     return stats
 
 
+def _require_one_render(info: dict[str, Any]) -> None:
+    """Raise `InputError` where the entries of `info` are not of one render of the Gaussians as splats.
+
+    ``distributed=True`` of several processes leaves the projection of all their cameras, and the tiles of this one's.
+    """
+    means2d, cameras = info["means2d"], info["isect_offsets"].shape[0]
+    if info["gaussian_ids"] is None and means2d.shape[0] != cameras:
+        raise InputError(
+            f"info is of a render with distributed=True, means2d of {means2d.shape[0]} cameras and tiles of {cameras}: "
+            "the errors of TurboDensityStrategy and MomentLMOptimizer need one process; do not put "
+            f"'{PREDICTION}' and '{GROUND_TRUTH}' into info, or train on one GPU"
+        )
+    if means2d.grad is None and not means2d.requires_grad:
+        raise InputError(WITHOUT_GRADIENT)
+
+
 def zero_channel_sums(info: dict[str, Any], upstream: Tensor) -> Tensor:
     """Sum over pixels of ``upstream * w`` for each Gaussian, by gsplat's rasterizer.
 
@@ -162,6 +186,7 @@ def zero_channel_sums(info: dict[str, Any], upstream: Tensor) -> Tensor:
     from gsplat import rasterize_to_pixels
 
     require_keys(info, _INTERSECTION, "info", "pass what gsplat.rasterization returned")
+    _require_one_render(info)
     images = (info["isect_offsets"].shape[0], info["height"], info["width"])
     if upstream.shape[:-1] != images:
         raise InputError(

@@ -41,6 +41,20 @@ SHAPES = {
 GEOMETRY = ("means", "quats", "scales", "opacities")
 
 
+def require_one_process(swap: str) -> None:
+    """Raise `InputError` where the host trains in several processes.
+
+    gsplat's distributed mode leaves ``means2d`` and its like from before the exchange between processes in `info`, and
+    the tiles from after it. Copies of one model, as DDP keeps them, would be split and pruned differently in each.
+    """
+    distributed = torch.distributed
+    if distributed.is_available() and distributed.is_initialized() and distributed.get_world_size() > 1:
+        raise InputError(
+            f"{swap} works in one process, this process group has {distributed.get_world_size()}: train on one GPU, or "
+            "keep gsplat's own part there"
+        )
+
+
 def require_keys(mapping: Mapping[str, Any] | None, keys: Iterable[str], what: str, remedy: str) -> None:
     """Raise `InputError` naming the `keys` that `mapping` (called `what`) lacks; None lacks all of them."""
     if mapping is None:

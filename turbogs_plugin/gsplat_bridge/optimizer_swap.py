@@ -25,7 +25,7 @@ from turbogs_plugin.engine.moments import COLUMNS, GaussianMoments, check_moment
 from turbogs_plugin.engine.rules import ParameterRates
 from turbogs_plugin.errors import InputError, require
 from turbogs_plugin.gsplat_bridge.gaussian_errors import loss_shares
-from turbogs_plugin.gsplat_bridge.host import host_gaussians
+from turbogs_plugin.gsplat_bridge.host import host_gaussians, require_one_process
 from turbogs_plugin.strategies.optimizers.sparse_adam import SparseAdam
 from turbogs_plugin.types import PARAMETER_NAMES, GaussianGradients, Gaussians, Step
 
@@ -79,6 +79,7 @@ class SharedOptimizer:
             lr, betas, eps: where the group has none; those of the optimizer where None.
             fused: taken for the sake of hosts that pass it; the update is one for all parameters in any case.
         """
+        require_one_process("SharedOptimizer")
         betas = (self.optimizer.beta1, self.optimizer.beta2) if betas is None else tuple(betas)
         defaults = {"lr": lr, "betas": betas, "eps": self.optimizer.eps if eps is None else eps}
         member = MemberOptimizer(self, list(params), defaults)
@@ -109,6 +110,7 @@ class SharedOptimizer:
             self._update()
 
     def _update(self) -> None:
+        require_one_process("SharedOptimizer")
         members, gradients, info = self.members, self._gradients, self._info
         self._gradients, self._info = {}, None
         if all(gradient is None for gradient in gradients.values()):

@@ -17,7 +17,13 @@ from turbogs_plugin.engine.autograd import DifferentiableRender, rasterize_diffe
 from turbogs_plugin.engine.rendered import RasterSettings
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.gsplat_bridge.gaussian_errors import residuals
-from turbogs_plugin.gsplat_bridge.host import GROUND_TRUTH, LOSS_SHARES, PREDICTION, STATISTICS
+from turbogs_plugin.gsplat_bridge.host import (
+    GROUND_TRUTH,
+    LOSS_SHARES,
+    PREDICTION,
+    STATISTICS,
+    require_one_process,
+)
 from turbogs_plugin.types import SH_C0, TILE_SIZE, Cameras, Gaussians, GaussianStats, LossOutput, PixelSamples
 
 LOGIT_MARGIN = 2.0**-23
@@ -87,6 +93,7 @@ def sparse_rasterization(
         InputError: a wrong shape, an option without support here, or cameras that a gradient is wanted of; and from
             a second backward of one pass.
     """
+    require_one_process("sparse_rasterization")
     _check_options(gsplat_options)
     if render_mode not in RENDER_MODES:
         supported = ", ".join(map(repr, RENDER_MODES))

@@ -1,0 +1,72 @@
+"""The protocol of gsplat's main branch (1.6): hosts pass a `Scene`, whose rows follow those of the parameters."""
+
+import functools
+
+import pytest
+import torch
+from gsplat import DefaultStrategy
+from helpers.bridge_host import Host
+from helpers.gsplat_stand_ins import Scene
+
+from turbogs_plugin.gsplat_bridge import TurboDensityStrategy, apply_row_update
+from turbogs_plugin.types import RowUpdate
+
+SOON = {"refine_start_iter": 2, "refine_every": 3, "refine_stop_iter": 8, "grow_grad2d": 1e-6, "prune_opa": 0.2}
+
+
+def with_scene(host: Host) -> Scene:
+    """A scene around the host's splats, which hands it over as gsplat's trainer does. Every row has a number as
+    parameter, as signal and, modulo 3, as component."""
+    count = len(host.splats["means"])
+    tags = torch.arange(float(count))
+    host.splats["tag"] = torch.nn.Parameter(tags.clone(), requires_grad=False)
+    scene = Scene(host.splats, {"tag": tags, "feature": tags[:, None].repeat(1, 5)}, torch.arange(count) % 3)
+    hook = host.strategy.step_post_backward
+    host.strategy.step_post_backward = functools.partial(hook, scene=scene)
+    return scene
+
+
+def assert_rows_follow(scene: Scene) -> None:
+    scene.validate()
+    tags = scene.splats["tag"]
+    assert torch.equal(scene.signal["tag"], tags) and torch.equal(scene.signal["feature"], tags[:, None].repeat(1, 5))
+    assert torch.equal(scene.component_index, tags.long() % 3)
+
+
+@pytest.mark.parametrize("tells_errors", [False, True])
+def test_a_scenes_rows_follow(tells_errors):
+    host = Host(TurboDensityStrategy(**SOON, max_gaussians=60), tells_errors=tells_errors)
+    scene = with_scene(host)
+    host.train(9)
+    tags = scene.splats["tag"].long()
+    assert len(tags) > 40 and len(tags.unique()) < 40  # some were copied, some are gone
+    assert (tags.diff() < 0).any()  # and all are in another order
+    assert_rows_follow(scene)
+
+
+def test_without_a_refinement_a_scene_stays_as_it_is():
+    host = Host(TurboDensityStrategy(refine_start_iter=100))
+    scene = with_scene(host)
+    before = scene.component_index
+    host.train(3)
+    assert scene.component_index is before
+
+
+def test_a_row_update_takes_a_scene_along():
+    host = Host(TurboDensityStrategy())
+    host.step(0)
+    scene = with_scene(host)
+    source = torch.tensor([5, 0, 7, 7, 39])
+    update = RowUpdate(source, torch.tensor([False, False, False, True, True]), {})
+    apply_row_update(update, host.splats, host.optimizers, host.state, scene)
+    assert scene.signal["tag"].tolist() == [5, 0, 7, 7, 39]
+    assert_rows_follow(scene)
+
+
+def test_hooks_have_the_arguments_that_mains_trainer_gives():
+    """``step_post_backward(params=, optimizers=, state=, step=, info=, packed=, scene=)``, all by name."""
+    host = Host(TurboDensityStrategy(**SOON))
+    host.step(0)
+    common = {"params": host.splats, "optimizers": host.optimizers, "state": host.state, "step": 1}
+    host.strategy.step_post_backward(**common, info=host.info, packed=False, scene=None)
+    assert isinstance(host.strategy, DefaultStrategy)

@@ -1,0 +1,68 @@
+"""Views, rate and maps that the sparse swap starts with."""
+
+from dataclasses import dataclass
+
+import pytest
+import torch
+
+from turbogs_plugin.config.configuration import load_config
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.gsplat_bridge import maps_of_photos, sparse_budget
+from turbogs_plugin.types import SamplingBudget
+
+
+@pytest.mark.parametrize(
+    ("num_views", "batch_size", "expected"),
+    [
+        (50, None, SamplingBudget(4, 0.25)),
+        (3, None, SamplingBudget(3, 1 / 3)),
+        (50, 1, SamplingBudget(1, 1.0)),  # all that stock sees
+        (50, 8, SamplingBudget(8, 0.125)),
+        (50, 16, SamplingBudget(16, 0.1)),  # the least of turbogs' schedule
+    ],
+)
+def test_a_step_has_the_pixels_of_an_image_and_it_says_so(num_views, batch_size, expected, capsys):
+    assert sparse_budget(num_views, batch_size) == expected
+    (line,) = capsys.readouterr().out.splitlines()
+    given = "(no batch_size is given)" if batch_size is None else f"(batch_size is {batch_size})"
+    assert f"sparse_budget: {expected.views} views a step, {expected.rate:.0%} of the pixels" in line and given in line
+
+
+def test_the_rule_has_the_numbers_of_turbogs():
+    section = load_config("turbogs").schedule
+    assert sparse_budget(100, 5).rate == section["pixel_budget"] / 5
+    assert sparse_budget(100, 40).rate == section["pixel_budget"] / section["max_views"]
+
+
+@pytest.mark.parametrize(("arguments", "name"), [((0,), "num_views"), ((5, 0), "batch_size"), ((5, 6), "batch_size")])
+def test_impossible_numbers_are_refused(arguments, name):
+    with pytest.raises(InputError, match=name):
+        sparse_budget(*arguments)
+
+
+@dataclass
+class Photos:
+    """A data set as gsplat's: items by number, no iteration."""
+
+    images: torch.Tensor
+    patch_size: int | None = None
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+    def __getitem__(self, item: int) -> dict[str, torch.Tensor]:
+        return {"image": self.images[item % len(self.images)]}
+
+
+def test_maps_start_from_the_errors_of_black():
+    images = torch.randint(256, (3, 20, 30, 3), generator=torch.Generator().manual_seed(0))
+    maps = maps_of_photos(Photos(images))
+    assert maps.sizes.tolist() == [[30, 20]] * 3
+    torch.testing.assert_close(maps.errors, (images.sum(dim=-1) / 255).flatten().half(), rtol=2e-3, atol=0)
+    of_unit = maps_of_photos(Photos(images / 255), white=1.0)
+    torch.testing.assert_close(of_unit.errors, maps.errors, rtol=2e-3, atol=0)
+
+
+def test_random_patches_are_refused():
+    with pytest.raises(InputError, match=r"the sparse swap needs whole images, trainset.patch_size is 8"):
+        maps_of_photos(Photos(torch.zeros(2, 8, 8, 3), patch_size=8))

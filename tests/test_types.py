@@ -1,0 +1,112 @@
+"""`PixelSamples` of given pixels."""
+
+import numpy as np
+import pytest
+import torch
+
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.tiles import dense_pixels
+from turbogs_plugin.types import PixelSamples, TileGrid, sample_order
+
+SIZES = np.array([(37, 21), (16, 50)])
+
+
+def some_pixels(count: int, seed: int = 0):
+    """Views, x and y [P] of distinct pixels of images of `SIZES`, in no order."""
+    generator = torch.Generator().manual_seed(seed)
+    every = [(view, x, y) for view, (width, height) in enumerate(SIZES) for x in range(width) for y in range(height)]
+    chosen = torch.randperm(len(every), generator=generator)[:count]
+    return torch.tensor(every)[chosen].unbind(dim=1)
+
+
+def assert_in_order(samples: PixelSamples) -> None:
+    """What `PixelSamples` promises of the order of slots and tiles."""
+    assert samples.filled.all() and not samples.has_empty_slots
+    assert {samples.pixel_ids.dtype, samples.tile_ids.dtype, samples.tile_offsets.dtype} == {torch.int32}
+    assert samples.tile_offsets[0] == 0 and samples.tile_offsets[-1] == len(samples)
+    assert (samples.tile_offsets.diff() > 0).all() and (samples.tile_ids.diff() > 0).all()
+    assert samples.tile_ids[-1] < len(samples.grid)
+    x, y = samples.coordinates().unbind(dim=-1)
+    tiles, ranks = samples.tile_of_slot(), sample_order(x % 16, y % 16)
+    assert ((tiles.diff() > 0) | (ranks.diff() > 0)).all()
+    starts, columns = TileGrid(samples.sizes).offsets[:-1], TileGrid(samples.sizes).shapes[:, 0]
+    views = samples.view_of_slot()
+    places = torch.as_tensor(starts)[views] + y // 16 * torch.as_tensor(columns)[views] + x // 16
+    assert torch.equal(samples.tile_ids[tiles].long(), places)
+
+
+def as_set(views, x, y) -> set[tuple[int, int, int]]:
+    return set(zip(views.tolist(), x.tolist(), y.tolist(), strict=True))
+
+
+@pytest.mark.parametrize("count", [1, 2, 300])
+def test_coordinates_come_in_the_order_of_samples(count):
+    views, x, y = some_pixels(count)
+    samples = PixelSamples.from_coordinates(views.int(), x, y, SIZES, view_ids=(7, 3))
+    assert samples.view_ids == (7, 3) and len(samples) == count
+    assert_in_order(samples)
+    assert as_set(samples.view_of_slot(), *samples.coordinates().unbind(dim=-1)) == as_set(views, x, y)
+
+
+def test_all_pixels_are_the_dense_samples():
+    expected = dense_pixels((0, 1), SIZES, "cpu")
+    samples = PixelSamples.from_coordinates(*some_pixels(37 * 21 + 16 * 50), SIZES)
+    for name in ("pixel_ids", "tile_ids", "tile_offsets"):
+        assert torch.equal(getattr(samples, name), getattr(expected, name))
+
+
+@pytest.mark.parametrize("views", [None, 1, 3])
+def test_a_mask_is_its_pixels(views):
+    mask = torch.rand(*([] if views is None else [views]), 21, 37, generator=torch.Generator().manual_seed(0)) < 0.1
+    samples = PixelSamples.from_mask(mask)
+    assert_in_order(samples)
+    again = torch.zeros(views or 1, 21, 37, dtype=torch.bool)
+    x, y = samples.coordinates().unbind(dim=-1)
+    again[samples.view_of_slot(), y, x] = True
+    assert torch.equal(again.reshape(mask.shape), mask) and len(samples) == mask.sum()
+    assert samples.sizes.tolist() == [[37, 21]] * (views or 1)
+
+
+def test_a_view_without_pixels_stays_in_the_batch():
+    mask = torch.zeros(3, 21, 37, dtype=torch.bool)
+    mask[2, 20, 36] = True
+    samples = PixelSamples.from_mask(mask, view_ids=(4, 5, 6))
+    assert samples.view_ids == (4, 5, 6) and samples.view_of_slot().tolist() == [2]
+    assert samples.tile_ids.tolist() == [17]  # of 3 * 6
+
+
+ONE = torch.tensor([1])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ((torch.tensor([0, 2]), ONE.repeat(2), ONE.repeat(2), SIZES), r"outside its image \(view 2, x 1, y 1\)"),
+        ((ONE, torch.tensor([16]), ONE, SIZES), r"outside its image \(view 1, x 16, y 1\)"),
+        ((ONE, ONE, -ONE, SIZES), r"outside its image \(view 1, x 1, y -1\)"),
+        ((ONE.repeat(2), ONE.repeat(2), ONE.repeat(2), SIZES), r"twice \(view 1, x 1, y 1\)"),
+        ((ONE, ONE.float(), ONE, SIZES), "x is torch.float32: expected a tensor of integers"),
+        ((ONE, ONE, [1], SIZES), "y is list: expected a tensor of integers"),
+        ((ONE.repeat(2), ONE, ONE, SIZES), r"views has shape \(2,\)"),
+        ((ONE[:0], ONE[:0], ONE[:0], SIZES), "P at least 1"),
+        ((ONE, ONE, ONE, (37, 21)), r"sizes have shape \(2,\)"),
+        ((ONE, ONE, ONE, SIZES, (4, 4)), "expected 2 different numbers of views"),
+    ],
+)
+def test_pixels_that_do_not_fit_are_refused(arguments, words):
+    with pytest.raises(InputError, match=words):
+        PixelSamples.from_coordinates(*arguments)
+
+
+@pytest.mark.parametrize(
+    ("mask", "words"),
+    [
+        (torch.ones(4, 4), r"mask is torch.float32 \(4, 4\): expected a tensor of bool"),
+        (torch.ones(4, dtype=torch.bool), r"mask is torch.bool \(4,\)"),
+        (np.ones((4, 4), bool), "mask is ndarray"),
+        (torch.zeros(4, 4, dtype=torch.bool), "P at least 1"),
+    ],
+)
+def test_a_mask_that_does_not_fit_is_refused(mask, words):
+    with pytest.raises(InputError, match=words):
+        PixelSamples.from_mask(mask)

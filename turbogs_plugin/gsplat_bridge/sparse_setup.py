@@ -1,0 +1,69 @@
+"""What the sparse swap needs once, before the loop: how many views and pixels a step, and the error maps."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+
+from turbogs_plugin.error_maps import ErrorMaps
+from turbogs_plugin.errors import InputError, require
+from turbogs_plugin.gsplat_bridge.tuned import TUNED_SCHEDULE
+from turbogs_plugin.types import SamplingBudget
+
+DEFAULT_VIEWS = 4
+"""Views a step where a trainer leaves it open. Between the 3 and 10 of turbogs' schedule; a quarter of one view's
+pixels alone is less than stock sees."""
+
+
+def sparse_budget(num_views: int, batch_size: int | None = None) -> SamplingBudget:
+    """Views and rate of every step of a gsplat trainer with sparse pixels; prints in one line what it chose.
+
+    The rule: a step sees as many pixels as one whole image has, which is what a stock trainer sees at batch 1, spread
+    over its K views: ``rate = pixel_budget / K``, with the pixel_budget of `configs/turbogs.yaml`, which is 1. So at
+    batch 1 every pixel is drawn, and nothing is lost against stock. The rate is never less than the least of turbogs'
+    schedule, ``pixel_budget / max_views``; batches larger than that see more than one image.
+
+    Args:
+        num_views: V, training views.
+        batch_size: K, where the trainer has settled it; None takes `DEFAULT_VIEWS`, or V if that is less. Give the
+            data loader `views` of the result.
+
+    Raises:
+        InputError: a number below 1, or a batch of more views than there are.
+    """
+    whole = "a whole number, 1 or more"
+    require(isinstance(num_views, int) and num_views >= 1, "num_views", num_views, whole)
+    if batch_size is not None:
+        allowed = f"{whole} and at most num_views ({num_views})"
+        require(isinstance(batch_size, int) and 1 <= batch_size <= num_views, "batch_size", batch_size, allowed)
+    views = min(DEFAULT_VIEWS, num_views) if batch_size is None else batch_size
+    pixels = TUNED_SCHEDULE.pixel_budget
+    rate = min(1.0, max(pixels / views, pixels / TUNED_SCHEDULE.max_views))
+    reason = "no batch_size is given" if batch_size is None else f"batch_size is {batch_size}"
+    print(f"sparse_budget: {views} views a step, {rate:.0%} of the pixels of each ({reason}).")
+    return SamplingBudget(views, rate)
+
+
+def maps_of_photos(
+    trainset: Sequence[dict[str, Any]], device: torch.device | str = "cpu", white: float = 255.0
+) -> ErrorMaps:
+    """Error maps of a trainer's training views, which start from the errors of a black prediction.
+
+    Args:
+        trainset: V items, numbered as the trainer's image_id, each with "image" [H, W, 3], 0 .. `white`.
+        white: the largest value of a photo; gsplat's data sets have 255.
+
+    Raises:
+        InputError: the data set cuts random patches (``patch_size``), whose pixels are others each time.
+    """
+    patch_size = getattr(trainset, "patch_size", None)
+    if patch_size is not None:
+        raise InputError(
+            f"the sparse swap needs whole images, trainset.patch_size is {patch_size}: leave patch_size out, as "
+            "samples are few pixels of a whole image already"
+        )
+    # Not iterated: a data set without __iter__ would be read past its end.
+    photos = (trainset[item]["image"].to(device) for item in range(len(trainset)))  # [H, W, 3]
+    return ErrorMaps.from_images([photo.float().sum(dim=-1) / white for photo in photos])

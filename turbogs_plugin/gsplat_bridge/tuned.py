@@ -1,0 +1,30 @@
+"""The values that `turbogs` uses, read from its configuration: the defaults of what is swapped into a trainer."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from importlib import resources
+from typing import Any
+
+import yaml
+
+from turbogs_plugin.strategies.density.error_driven import ErrorDrivenDensity
+from turbogs_plugin.strategies.schedule import SinusoidalSchedule
+
+
+@lru_cache(maxsize=1)
+def _sections() -> dict[str, Any]:
+    """`configs/turbogs.yaml`. Read with the YAML library alone, as a host's trainer need not have more installed."""
+    text = (resources.files("turbogs_plugin.configs") / "turbogs.yaml").read_text(encoding="utf-8")
+    return yaml.safe_load(text)
+
+
+def _settings(section: str) -> dict[str, Any]:
+    return {name: value for name, value in _sections()[section].items() if name != "type"}
+
+
+TUNED_DENSITY = ErrorDrivenDensity(**_settings("density"))
+"""Density control with the settings of `configs/turbogs.yaml`."""
+
+TUNED_SCHEDULE = SinusoidalSchedule(**_settings("schedule"))
+"""The schedule of views and rate with the settings of `configs/turbogs.yaml`."""
