@@ -9,6 +9,7 @@ import subprocess
 import torch
 
 from turbogs_plugin.report.machine import hardware, software
+from turbogs_plugin.train.evaluate import LPIPS_PACKAGES
 
 
 def diagnosis() -> str:
@@ -22,8 +23,8 @@ def diagnosis() -> str:
         missing.append("CUDA in PyTorch: training runs on the CPU, by the torch reference")
     elif not torch.cuda.is_available():
         missing.append("a GPU that answers: training runs on the CPU, by the torch reference")
-    if importlib.util.find_spec("torchvision") is None:
-        missing.append("torchvision: LPIPS is not computed")
+    absent = [name for name in LPIPS_PACKAGES if importlib.util.find_spec(name) is None]
+    missing += [f"{name}: LPIPS is not computed" for name in absent]
     return "\n".join([*lines, *(f"{'missing':<16}{line}" for line in missing)])
 
 
