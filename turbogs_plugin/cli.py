@@ -15,6 +15,7 @@ import tyro
 from tyro.conf import Positional, UseAppendAction, arg
 
 from turbogs_plugin.errors import InputError, exit_code
+from turbogs_plugin.train.wall import WallClock, process_age
 
 if TYPE_CHECKING:
     from turbogs_plugin.config.configuration import Config
@@ -88,6 +89,7 @@ def train(
     *,
     out: Annotated[Path | None, arg(metavar="RUN")] = None,
     resume: Annotated[Path | None, arg(metavar="RUN")] = None,
+    report: bool = True,
     options: Flat = NO_OPTIONS,
 ) -> int:
     """Train on a capture, or go on with a stopped run.
@@ -97,17 +99,19 @@ def train(
         overrides: changes of the configuration, e.g. train.iterations=8000 density.type=none.
         out: new folder for the run.
         resume: folder of a stopped run to go on with, by its own configuration.
+        report: at the end, write the report and its pictures; --no-report leaves model, history and checkpoints.
     """
     from turbogs_plugin.report.pages import write_report
     from turbogs_plugin.train import run
 
+    clock, page = WallClock(process_age()), write_report if report else None
     if resume is not None:
         if scene or overrides or out or options != NO_OPTIONS:
-            raise InputError("--resume goes on by the run's own configuration: give it nothing else")
-        return _tell(run.resume(resume, write_report))
+            raise InputError("--resume goes on by the run's own configuration: give it nothing else but --no-report")
+        return _tell(run.resume(resume, page, clock), report)
     if scene is None or out is None:
         raise InputError("train needs a SCENE and --out RUN, or --resume RUN")
-    return _tell(run.train(options.settings(scene, overrides), out, write_report))
+    return _tell(run.train(options.settings(scene, overrides), out, page, clock), report)
 
 
 @app.command
@@ -410,16 +414,19 @@ def _require_positive(option: str, values: Sequence[float], most: float = math.i
         raise InputError(f"{option} {' '.join(map(str, values))}: it must be more than 0 and {limit}")
 
 
-def _tell(session: RunSession) -> int:
+def _tell(session: RunSession, reported: bool) -> int:
     """Print how a training call ended; its exit code."""
-    from turbogs_plugin.report.outputs import history_table
+    from turbogs_plugin.report.tables import history_table
 
     folder = session.folder
     if session.signal is not None:
         print(f"stopped and saved: go on with  turbogs train --resume {folder.path}", file=sys.stderr)
         return 128 + session.signal
     print(history_table(session.history))
-    print(f"\nreport  {folder.report}\nmodel   {folder.model}\nrenders {folder.path / 'report'}")
+    print(f"\n{session.wall.text()}")
+    if reported:
+        print(f"report  {folder.report}\nrenders {folder.path / 'report'}")
+    print(f"model   {folder.model}")
     return 0
 
 
