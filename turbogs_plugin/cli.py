@@ -298,7 +298,9 @@ def report(
 
 @app.command
 def bench(
-    what: Annotated[Positional[Literal["step", "raster", "numerics"]], arg(metavar="step|raster|numerics")],
+    what: Annotated[
+        Positional[Literal["step", "raster", "numerics", "wall"]], arg(metavar="step|raster|numerics|wall")
+    ],
     overrides: Overrides = (),
     /,
     *,
@@ -308,7 +310,7 @@ def bench(
     views: Annotated[tuple[int, ...], arg(metavar="K ...")] = (10, 5, 3),
     pixel_budget: Annotated[float, arg(metavar="LAMBDA")] = 1.0,
     training: Count = None,
-    repeats: Annotated[int, arg(metavar="N")] = 100,
+    repeats: Count = None,
     rates: Annotated[tuple[float, ...], arg(metavar="R ...")] = (1.0, 0.1),
     size: Annotated[tuple[int, int], arg(metavar="WIDTH HEIGHT")] = (841, 1500),
     photos: Annotated[int, arg(metavar="N")] = 0,
@@ -318,20 +320,22 @@ def bench(
     device: Device = "auto",
     out: Annotated[Path | None, arg(metavar="FILE_OR_FOLDER")] = None,
 ) -> int:
-    """Time an iteration of training step by step, or the rasterizer stage by stage, beside what the machine allows; or
-    measure how exact and how fast the optimizer's solvers are on stiff systems.
+    """Time an iteration of training step by step, the rasterizer stage by stage, beside what the machine allows, or the
+    command `turbogs train` by the clock on the wall; or measure how exact and how fast the optimizer's solvers are on
+    stiff systems.
 
     Args:
         what: step: from sampling to update; raster: forward and backward, beside gsplat's dense ones; numerics: the
-            solvers of moment-damped LM, which takes --out and --device alone.
-        overrides: step: changes of the configuration whose strategies are timed.
+            solvers of moment-damped LM, which takes --out and --device alone; wall: whole runs, which takes --scene,
+            --repeats, --factor, --device, --out and changes of the configuration.
+        overrides: step, wall: changes of the configuration that is timed.
         scene: a capture, for its cameras and photos; where absent, all is synthetic, the models of raster as well.
         ply: a trained model in place of those trained here; raster: one or more, timed at their own sizes.
         gaussians: sizes of the model.
         views: views of an iteration.
         pixel_budget: pixels of an iteration in images (lambda).
         training: iterations of the model's training before; 1500 where absent, 0 for the initial model.
-        repeats: iterations or passes timed.
+        repeats: iterations or passes timed; 100 where absent. wall: runs; 3 where absent.
         rates: raster: further sampling rates, with the fewest views.
         size: of synthetic images, where there is no scene.
         photos: step: number of synthetic photos, in place of a scene.
@@ -339,7 +343,7 @@ def bench(
         library: raster: other builds of the kernels, measured the same way.
         factor: scale photos down by this.
         device: what to time.
-        out: JSON file; standard output where absent. numerics: folder for its table, plot and JSON.
+        out: JSON file; standard output where absent, but for wall. numerics: folder for its table, plot and JSON.
     """
     from turbogs_plugin.bench import commands
     from turbogs_plugin.bench.models import TRAINING_ITERATIONS
@@ -347,7 +351,8 @@ def bench(
     from turbogs_plugin.bench.step import StepBench
     from turbogs_plugin.train.run import resolve_device
 
-    for name, values in (("gaussians", gaussians), ("views", views), ("repeats", (repeats,)), ("size", size)):
+    times = repeats if repeats is not None else 3 if what == "wall" else 100
+    for name, values in (("gaussians", gaussians), ("views", views), ("repeats", (times,)), ("size", size)):
         if not values or min(values) < 1:
             raise InputError(f"--{name} {' '.join(map(str, values))}: each must be at least 1")
     _require_positive("--rates", rates, most=1.0)
@@ -362,17 +367,24 @@ def bench(
         if out is None or overrides or scene is not None or ply or library:
             raise InputError("bench numerics needs --out FOLDER, and takes --device besides")
         return commands.run_numerics(where, out)
+    if what == "wall":
+        if scene is None or ply or library or photos or offload or training is not None:
+            raise InputError(
+                "bench wall needs --scene SCENE, and takes --repeats, --factor, --device and --out besides"
+            )
+        arguments = [str(scene), *overrides, "--device", where.type, "--factor", str(factor)]
+        return commands.run_wall(arguments, times, where, out)
     if what == "step":
         if len(ply) > 1:
             raise InputError("bench step takes one --ply, at the sizes of --gaussians")
         model = ply[0] if ply else None
-        step = StepBench(gaussians, views, pixel_budget, iterations, repeats, overrides, model, offload, photos, size)
+        step = StepBench(gaussians, views, pixel_budget, iterations, times, overrides, model, offload, photos, size)
         return commands.run_step(step, scene, factor, where, out)
     if overrides:
         raise InputError("bench raster times the rasterizer alone: it has no section.key=value")
     if training is not None and scene is None:
         raise InputError("--training needs --scene: without a capture, bench raster times synthetic models")
-    raster = RasterBench(gaussians, views, rates, pixel_budget, size, repeats, iterations, ply, library)
+    raster = RasterBench(gaussians, views, rates, pixel_budget, size, times, iterations, ply, library)
     return commands.run_raster(raster, scene, factor, where, out)
 
 

@@ -20,4 +20,4 @@ class WallMarks(Listener):
         self.clock.mark("training")
 
     def evaluated(self, loop: TrainingLoop, evaluation: Evaluation) -> None:
-        self.clock.mark("evaluations")
+        self.clock.mark("evaluations" if evaluation.iteration else "first evaluation")
