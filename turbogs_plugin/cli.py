@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import atexit
+import gc
 import itertools
 import math
 import re
@@ -458,6 +460,7 @@ def _gathered(arguments: list[str]) -> list[str]:
 
 def main() -> None:
     """The `turbogs` command."""
+    atexit.register(gc.freeze)  # or the collector walks through all of torch at the end, for a second
     description = "TurboGS: train 3D Gaussian Splatting on few, well chosen pixels."
     sys.exit(exit_code(lambda: app.cli(prog="turbogs", description=description, args=_gathered(sys.argv[1:]))))
 

@@ -136,14 +136,6 @@ def test_only_training_is_on_the_clock(monkeypatch):
     assert loop.clock.seconds == 2.0 + 1.0 + 6.0
 
 
-def test_the_trainer_and_the_loop_load_no_metrics_and_no_plots():
-    code = (
-        "import sys, turbogs_plugin.train.trainer, turbogs_plugin.train.loop\n"
-        "print([name for name in ('torchmetrics', 'matplotlib', 'rich') if name in sys.modules])"
-    )
-    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout == "[]\n"
-
-
 @pytest.mark.parametrize("room", ["report", "study", "bench", "gsplat_bridge", "cli"])
 def test_training_imports_nothing_that_is_above_it(room):
     files = sorted(Path(turbogs_plugin.train.__file__).parent.glob("*.py"))

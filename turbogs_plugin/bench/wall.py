@@ -1,4 +1,4 @@
-"""Where each second of `turbogs train` goes: the command itself, in a process of its own, by the marks that it keeps."""
+"""Where each second of `turbogs train` goes: the command in a process of its own, by the marks that it keeps."""
 
 from __future__ import annotations
 
@@ -13,12 +13,13 @@ from typing import Any
 
 from turbogs_plugin.errors import InputError, TrainingStopped
 from turbogs_plugin.train.folder import RunFolder
+from turbogs_plugin.train.run import DEVICE
 from turbogs_plugin.train.wall import WallRecord
 
 REST = "start of the process, and its end"
 """What a process cannot measure of itself."""
 
-BEFORE_TRAINING = ("CUDA and kernels, after the photos", "plan", "initial model", "initial maps", "first evaluation")
+BEFORE_TRAINING = (DEVICE, "plan", "initial model", "initial maps", "first evaluation")
 """Parts between the photos and the first iteration."""
 
 
