@@ -14,6 +14,7 @@ import turbogs_plugin
 SLOW = {"gsplat", "matplotlib", "pycolmap", "rich", "scipy", "torch._dynamo", "torchmetrics", "torchvision", "tyro"}
 """Modules that take long to import, or bring others that do, and that training alone does not use."""
 
+
 def test_few_modules_stand_beside_the_packages():
     root = Path(turbogs_plugin.__file__).parent
     modules = {path.stem for path in root.glob("*.py")} - {"__init__"}

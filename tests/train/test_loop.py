@@ -1,7 +1,5 @@
 """The one loop: what it tells whom and when, iterations lost at a mark or a stop, and what its imports load."""
 
-import subprocess
-import sys
 from pathlib import Path
 from types import SimpleNamespace
 
