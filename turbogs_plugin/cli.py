@@ -27,6 +27,9 @@ app = tyro.extras.SubcommandApp()
 
 OVERRIDE = re.compile(r"\w+(\.\w+)+=.*", re.DOTALL)
 
+FLAGS = ("--report", "--no-report", "--offload", "--no-offload")
+"""Options without a value, of verbs that have overrides."""
+
 Device = Literal["auto", "cpu", "cuda"]
 
 # Options that several verbs have.
@@ -447,14 +450,15 @@ def _tell(session: RunSession, reported: bool) -> int:
 def _gathered(arguments: list[str]) -> list[str]:
     """Arguments with later overrides brought before the first option, where a word besides the verb stands there.
 
-    What follows an option is its value, whatever it looks like.
+    What follows an option is its value, whatever it looks like, unless the option is one of `FLAGS`.
     """
     first = next((place for place, text in enumerate(arguments) if text.startswith("-")), 0)
     if first < 2:
         return arguments
     overrides, rest = [], arguments[first : first + 1]
     for before, text in itertools.pairwise(arguments[first:]):
-        (overrides if OVERRIDE.fullmatch(text) and not before.startswith("-") else rest).append(text)
+        value = before.startswith("-") and before not in FLAGS
+        (overrides if OVERRIDE.fullmatch(text) and not value else rest).append(text)
     return [*arguments[:first], *overrides, *rest]
 
 
