@@ -412,7 +412,7 @@ def test_a_run_without_a_report_tells_its_model_and_both_clocks(turbogs, capture
     options = ("--device", "cpu", "--no-report")
     code, out, _ = turbogs("train", capture, "--out", tmp_path / "run", *options, *QUICK)
     assert code == 0 and not (tmp_path / "run/report.md").exists() and not (tmp_path / "run/report").exists()
-    assert (tmp_path / "run/model.ply").is_file() and "report" not in out
+    assert (tmp_path / "run/model.ply").is_file() and "report.md" not in out
     assert re.search(r"^trained \d+\.\d s, \d+\.\d s on the wall$", out, re.MULTILINE)
     code, out, _ = turbogs("train", "--resume", tmp_path / "run")
     assert code == 0 and (tmp_path / "run/report.md").is_file() and "report.md" in out
