@@ -406,3 +406,13 @@ def test_the_demo_has_a_horizon_where_it_is_asked_for(turbogs, tmp_path, monkeyp
     monkeypatch.setattr(scene, "write_demo_capture", lambda path, horizon: asked.append(horizon) or path)
     assert turbogs("demo", tmp_path / "in")[0] == turbogs("demo", tmp_path / "out", "--horizon")[0] == 0
     assert asked == [False, True]
+
+
+def test_a_run_without_a_report_tells_its_model_and_both_clocks(turbogs, capture, tmp_path):
+    options = ("--device", "cpu", "--no-report")
+    code, out, _ = turbogs("train", capture, "--out", tmp_path / "run", *options, *QUICK)
+    assert code == 0 and not (tmp_path / "run/report.md").exists() and not (tmp_path / "run/report").exists()
+    assert (tmp_path / "run/model.ply").is_file() and "report.md" not in out
+    assert re.search(r"^trained \d+\.\d s, \d+\.\d s on the wall$", out, re.MULTILINE)
+    code, out, _ = turbogs("train", "--resume", tmp_path / "run")
+    assert code == 0 and (tmp_path / "run/report.md").is_file() and "report.md" in out

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import atexit
+import gc
 import itertools
 import math
 import re
@@ -16,6 +18,7 @@ import tyro
 from tyro.conf import Positional, UseAppendAction, arg
 
 from turbogs_plugin.errors import InputError, exit_code
+from turbogs_plugin.train.wall import WallClock, process_age
 
 if TYPE_CHECKING:
     from turbogs_plugin.config.configuration import Config
@@ -24,6 +27,9 @@ if TYPE_CHECKING:
 app = tyro.extras.SubcommandApp()
 
 OVERRIDE = re.compile(r"\w+(\.\w+)+=.*", re.DOTALL)
+
+FLAGS = ("--report", "--no-report", "--offload", "--no-offload")
+"""Options without a value, of verbs that have overrides."""
 
 Device = Literal["auto", "cpu", "cuda"]
 
@@ -122,6 +128,7 @@ def train(
     *,
     out: Annotated[Path | None, arg(metavar="RUN")] = None,
     resume: Annotated[Path | None, arg(metavar="RUN")] = None,
+    report: bool = True,
     options: Flat = NO_OPTIONS,
 ) -> int:
     """Train on a capture, or go on with a stopped run.
@@ -131,17 +138,19 @@ def train(
         overrides: changes of the configuration, e.g. train.iterations=8000 density.type=none.
         out: new folder for the run.
         resume: folder of a stopped run to go on with, by its own configuration.
+        report: at the end, write the report and its pictures; --no-report leaves model, history and checkpoints.
     """
     from turbogs_plugin.report.pages import write_report
     from turbogs_plugin.train import run
 
+    clock, page = WallClock(process_age()), write_report if report else None
     if resume is not None:
         if scene or overrides or out or options != NO_OPTIONS:
-            raise InputError("--resume goes on by the run's own configuration: give it nothing else")
-        return _tell(run.resume(resume, write_report))
+            raise InputError("--resume goes on by the run's own configuration: give it nothing else but --no-report")
+        return _tell(run.resume(resume, page, clock), report)
     if scene is None or out is None:
         raise InputError("train needs a SCENE and --out RUN, or --resume RUN")
-    return _tell(run.train(options.settings(scene, overrides), out, write_report))
+    return _tell(run.train(options.settings(scene, overrides), out, page, clock), report)
 
 
 @app.command
@@ -340,7 +349,9 @@ def report(
 
 @app.command
 def bench(
-    what: Annotated[Positional[Literal["step", "raster", "numerics"]], arg(metavar="step|raster|numerics")],
+    what: Annotated[
+        Positional[Literal["step", "raster", "numerics", "wall"]], arg(metavar="step|raster|numerics|wall")
+    ],
     overrides: Overrides = (),
     /,
     *,
@@ -350,7 +361,7 @@ def bench(
     views: Annotated[tuple[int, ...], arg(metavar="K ...")] = (10, 5, 3),
     pixel_budget: Annotated[float, arg(metavar="LAMBDA")] = 1.0,
     training: Count = None,
-    repeats: Annotated[int, arg(metavar="N")] = 100,
+    repeats: Count = None,
     rates: Annotated[tuple[float, ...], arg(metavar="R ...")] = (1.0, 0.1),
     size: Annotated[tuple[int, int], arg(metavar="WIDTH HEIGHT")] = (841, 1500),
     photos: Annotated[int, arg(metavar="N")] = 0,
@@ -360,20 +371,22 @@ def bench(
     device: Device = "auto",
     out: Annotated[Path | None, arg(metavar="FILE_OR_FOLDER")] = None,
 ) -> int:
-    """Time an iteration of training step by step, or the rasterizer stage by stage, beside what the machine allows; or
-    measure how exact and how fast the optimizer's solvers are on stiff systems.
+    """Time an iteration of training step by step, the rasterizer stage by stage, beside what the machine allows, or the
+    command `turbogs train` by the clock on the wall; or measure how exact and how fast the optimizer's solvers are on
+    stiff systems.
 
     Args:
         what: step: from sampling to update; raster: forward and backward, beside gsplat's dense ones; numerics: the
-            solvers of moment-damped LM, which takes --out and --device alone.
-        overrides: step: changes of the configuration whose strategies are timed.
+            solvers of moment-damped LM, which takes --out and --device alone; wall: whole runs, which takes --scene,
+            --repeats, --factor, --device, --out and changes of the configuration.
+        overrides: step, wall: changes of the configuration that is timed.
         scene: a capture, for its cameras and photos; where absent, all is synthetic, the models of raster as well.
         ply: a trained model in place of those trained here; raster: one or more, timed at their own sizes.
         gaussians: sizes of the model.
         views: views of an iteration.
         pixel_budget: pixels of an iteration in images (lambda).
         training: iterations of the model's training before; 1500 where absent, 0 for the initial model.
-        repeats: iterations or passes timed.
+        repeats: iterations or passes timed; 100 where absent. wall: runs; 3 where absent.
         rates: raster: further sampling rates, with the fewest views.
         size: of synthetic images, where there is no scene.
         photos: step: number of synthetic photos, in place of a scene.
@@ -381,7 +394,7 @@ def bench(
         library: raster: other builds of the kernels, measured the same way.
         factor: scale photos down by this.
         device: what to time.
-        out: JSON file; standard output where absent. numerics: folder for its table, plot and JSON.
+        out: JSON file; standard output where absent, but for wall. numerics: folder for its table, plot and JSON.
     """
     from turbogs_plugin.bench import commands
     from turbogs_plugin.bench.models import TRAINING_ITERATIONS
@@ -389,7 +402,8 @@ def bench(
     from turbogs_plugin.bench.step import StepBench
     from turbogs_plugin.train.run import resolve_device
 
-    for name, values in (("gaussians", gaussians), ("views", views), ("repeats", (repeats,)), ("size", size)):
+    times = repeats if repeats is not None else 3 if what == "wall" else 100
+    for name, values in (("gaussians", gaussians), ("views", views), ("repeats", (times,)), ("size", size)):
         if not values or min(values) < 1:
             raise InputError(f"--{name} {' '.join(map(str, values))}: each must be at least 1")
     _require_positive("--rates", rates, most=1.0)
@@ -404,17 +418,24 @@ def bench(
         if out is None or overrides or scene is not None or ply or library:
             raise InputError("bench numerics needs --out FOLDER, and takes --device besides")
         return commands.run_numerics(where, out)
+    if what == "wall":
+        if scene is None or ply or library or photos or offload or training is not None:
+            raise InputError(
+                "bench wall needs --scene SCENE, and takes --repeats, --factor, --device and --out besides"
+            )
+        arguments = [str(scene), *overrides, "--device", where.type, "--factor", str(factor)]
+        return commands.run_wall(arguments, times, where, out)
     if what == "step":
         if len(ply) > 1:
             raise InputError("bench step takes one --ply, at the sizes of --gaussians")
         model = ply[0] if ply else None
-        step = StepBench(gaussians, views, pixel_budget, iterations, repeats, overrides, model, offload, photos, size)
+        step = StepBench(gaussians, views, pixel_budget, iterations, times, overrides, model, offload, photos, size)
         return commands.run_step(step, scene, factor, where, out)
     if overrides:
         raise InputError("bench raster times the rasterizer alone: it has no section.key=value")
     if training is not None and scene is None:
         raise InputError("--training needs --scene: without a capture, bench raster times synthetic models")
-    raster = RasterBench(gaussians, views, rates, pixel_budget, size, repeats, iterations, ply, library)
+    raster = RasterBench(gaussians, views, rates, pixel_budget, size, times, iterations, ply, library)
     return commands.run_raster(raster, scene, factor, where, out)
 
 
@@ -456,30 +477,34 @@ def _require_positive(option: str, values: Sequence[float], most: float = math.i
         raise InputError(f"{option} {' '.join(map(str, values))}: it must be more than 0 and {limit}")
 
 
-def _tell(session: RunSession) -> int:
+def _tell(session: RunSession, reported: bool) -> int:
     """Print how a training call ended; its exit code."""
-    from turbogs_plugin.report.outputs import history_table
+    from turbogs_plugin.report.tables import history_table
 
     folder = session.folder
     if session.signal is not None:
         print(f"stopped and saved: go on with  turbogs train --resume {folder.path}", file=sys.stderr)
         return 128 + session.signal
     print(history_table(session.history))
-    print(f"\nreport  {folder.report}\nmodel   {folder.model}\nrenders {folder.path / 'report'}")
+    print(f"\n{session.wall.text()}")
+    if reported:
+        print(f"report  {folder.report}\nrenders {folder.path / 'report'}")
+    print(f"model   {folder.model}")
     return 0
 
 
 def _gathered(arguments: list[str]) -> list[str]:
     """Arguments with later overrides brought before the first option, where a word besides the verb stands there.
 
-    What follows an option is its value, whatever it looks like.
+    What follows an option is its value, whatever it looks like, unless the option is one of `FLAGS`.
     """
     first = next((place for place, text in enumerate(arguments) if text.startswith("-")), 0)
     if first < 2:
         return arguments
     overrides, rest = [], arguments[first : first + 1]
     for before, text in itertools.pairwise(arguments[first:]):
-        (overrides if OVERRIDE.fullmatch(text) and not before.startswith("-") else rest).append(text)
+        value = before.startswith("-") and before not in FLAGS
+        (overrides if OVERRIDE.fullmatch(text) and not value else rest).append(text)
     return [*arguments[:first], *overrides, *rest]
 
 
@@ -490,6 +515,7 @@ def _warning_line(message: Warning | str, *place: object) -> str:
 
 def main() -> None:
     """The `turbogs` command."""
+    atexit.register(gc.freeze)  # or the collector walks through all of torch at the end, for a second
     description = "TurboGS: train 3D Gaussian Splatting on few, well chosen pixels."
     warnings.formatwarning = _warning_line
     sys.exit(exit_code(lambda: app.cli(prog="turbogs", description=description, args=_gathered(sys.argv[1:]))))

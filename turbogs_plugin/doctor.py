@@ -11,15 +11,14 @@ import torch
 from packaging.requirements import Requirement
 
 from turbogs_plugin.report.machine import hardware, software
+from turbogs_plugin.train.evaluate import LPIPS_PACKAGES
 
 COMMAND_PACKAGES = {
     "pycolmap": "pycolmap>=4.0",
-    "yaml": "pyyaml>=6.0",
     "omegaconf": "omegaconf>=2.3",
     "tyro": "tyro>=0.9",
     "rich": "rich>=13.0",
     "matplotlib": "matplotlib>=3.8",
-    "torchmetrics": "torchmetrics>=1.4",
 }
 """Module -> requirement: the extra ``train`` of pyproject.toml. The strategies and the gsplat bridge need none."""
 
@@ -37,8 +36,8 @@ def diagnosis() -> str:
         missing.append("CUDA in PyTorch: training runs on the CPU, by the torch reference")
     elif not torch.cuda.is_available():
         missing.append("a GPU that answers: training runs on the CPU, by the torch reference")
-    if importlib.util.find_spec("torchvision") is None:
-        missing.append("torchvision: LPIPS is not computed")
+    absent = [name for name in LPIPS_PACKAGES if importlib.util.find_spec(name) is None]
+    missing += [f"{name}: LPIPS is not computed" for name in absent]
     if lacking := lacking_packages():
         missing.append(f"{', '.join(lacking)}: commands that need them refuse; {INSTALL_COMMANDS}")
     return "\n".join([*lines, *(f"{'missing':<16}{line}" for line in missing)])

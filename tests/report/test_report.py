@@ -5,6 +5,7 @@ import math
 import subprocess
 from types import SimpleNamespace
 
+import matplotlib
 import numpy as np
 import pytest
 import torch
@@ -15,19 +16,14 @@ from turbogs_plugin.device import peak_memory_bytes
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.report import provenance
 from turbogs_plugin.report.pages import write_report
-from turbogs_plugin.report.plots import (
-    ERROR_FULL_SCALE,
-    GAP,
-    depth_picture,
-    error_picture,
-    plot_against_seconds,
-    save_strip,
-)
+from turbogs_plugin.report.pictures import ERROR_FULL_SCALE, GAP, depth_picture, error_picture, picture_writer, strip
+from turbogs_plugin.report.plots import plot_against_seconds
 from turbogs_plugin.report.tables import number, table
 from turbogs_plugin.train import run
 from turbogs_plugin.train.evaluate import Metrics, ViewMetrics, compare, load_lpips
 from turbogs_plugin.train.history import Evaluation, append_evaluation, read_history, rewind_history
 from turbogs_plugin.train.progress import TrainingProgress, describe_nonfinite
+from turbogs_plugin.train.ssim import ssim
 
 FIELDS = {"iteration", "train_seconds", "psnr", "ssim", "l1", "num_gaussians", "memory_bytes"}
 
@@ -88,6 +84,17 @@ def test_errors_of_an_image_by_numpy():
     assert metrics.ssim == pytest.approx(_ssim(image.double().numpy(), photo.double().numpy()), abs=1e-4)
 
 
+@pytest.mark.parametrize("shape", [(11, 11), (24, 20), (40, 64)])
+def test_ssim_is_that_of_torchmetrics(shape):
+    torchmetrics = pytest.importorskip("torchmetrics.functional.image")
+    generator = torch.Generator().manual_seed(1)
+    photo = torch.rand(*shape, 3, generator=generator)
+    image = (photo + 0.2 * torch.randn(*shape, 3, generator=generator)).clamp(0, 1)
+    pair = [picture.permute(2, 0, 1)[None] for picture in (image, photo)]
+    expected = torchmetrics.structural_similarity_index_measure(*pair, data_range=1.0, kernel_size=11, sigma=1.5)
+    assert ssim(image, photo).item() == pytest.approx(expected.item(), abs=1e-6)
+
+
 def _ssim(x: np.ndarray, y: np.ndarray) -> float:
     """SSIM of Wang et al. 2004 at every pixel, the image mirrored at its borders (as torchmetrics has it)."""
     axis = np.arange(11) - 5
@@ -125,15 +132,34 @@ def test_memory_is_that_of_this_process():
     assert 50 * 2**20 < peak_memory_bytes(torch.device("cpu")) < 2**40
 
 
-def test_a_strip_is_photo_render_and_error(tmp_path):
+def test_a_strip_is_photo_render_and_error():
     photo, image = torch.zeros(5, 7, 3), torch.zeros(5, 7, 3)
     image[2, 3] = 1.0
-    save_strip(tmp_path / "strip.png", photo, image)
-    strip = np.asarray(Image.open(tmp_path / "strip.png"))
-    assert strip.shape == (5, 3 * 7 + 2 * GAP, 3)
-    assert (strip[:, 7 : 7 + GAP] == 255).all()
-    assert strip[2, 3].tolist() == [0, 0, 0] and strip[2, 7 + GAP + 3].tolist() == [255, 255, 255]
-    assert strip[2, 2 * (7 + GAP) + 3].sum() > 500 > strip[0, 2 * (7 + GAP)].sum()
+    made = strip(photo, image)
+    assert made.shape == (5, 3 * 7 + 2 * GAP, 3)
+    assert (made[:, 7 : 7 + GAP] == 255).all()
+    assert made[2, 3].tolist() == [0, 0, 0] and made[2, 7 + GAP + 3].tolist() == [255, 255, 255]
+    assert made[2, 2 * (7 + GAP) + 3].sum() > 500 > made[0, 2 * (7 + GAP)].sum()
+
+
+def test_errors_have_the_colours_of_matplotlib():
+    errors = torch.linspace(0.0, 1.0, 1001)[None]
+    picture = error_picture(errors[..., None].expand(-1, -1, 3) * ERROR_FULL_SCALE, torch.zeros(1, 1001, 3))
+    expected = (matplotlib.colormaps["inferno"](errors.numpy())[..., :3] * 255.0).round()
+    assert (np.abs(picture.numpy() - expected).max(axis=-1) > 0).mean() < 0.01  # but for the rounding of the scale
+    assert np.abs(picture.numpy() - expected).max() <= 6
+
+
+def test_pictures_are_written_in_threads_and_their_errors_are_raised(tmp_path):
+    pixels = np.linspace(0, 255, 24 * 40 * 3).astype(np.uint8).reshape(24, 40, 3)
+    with picture_writer() as write:
+        for name in ("a.png", "b.jpg", "c.jpg"):
+            write(tmp_path / name, pixels)
+    assert (np.asarray(Image.open(tmp_path / "a.png")) == pixels).all()
+    difference = np.abs(np.asarray(Image.open(tmp_path / "c.jpg")).astype(int) - pixels)
+    assert difference.mean() < 2.0
+    with pytest.raises(OSError, match="absent"), picture_writer() as write:
+        write(tmp_path / "absent" / "a.png", pixels)
 
 
 def test_the_error_map_saturates_at_full_scale():
@@ -205,7 +231,7 @@ def test_progress_bar_on_a_terminal(capsys, monkeypatch):
 def test_no_more_strips_than_asked_for(tmp_path, strips):
     config = tiny_config(tiny_capture(tmp_path), "train.iterations=1", "scene.test_every=4", f"report.strips={strips}")
     folder = run.train(config, tmp_path / "run", write_report).folder
-    assert len(list((folder.path / "report").glob("test-*.png"))) == strips
+    assert len(list((folder.path / "report").glob("test-*.jpg"))) == strips
     assert f"{strips} of 2 are shown" in folder.report.read_text()
 
 

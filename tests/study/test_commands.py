@@ -35,6 +35,7 @@ from turbogs_plugin.train.folder import RunFolder
 from turbogs_plugin.train.history import Evaluation, append_evaluation, read_history
 from turbogs_plugin.train.loop import Listener, TrainingLoop
 from turbogs_plugin.train.trainer import Trainer
+from turbogs_plugin.train.wall import WallRecord
 
 SMALL = """
 title: Tiny
@@ -461,6 +462,21 @@ def test_runs_that_were_asked_the_same_are_seeds_whatever_plan_and_budgets_made_
     (tmp_path / "a" / "asked.yaml").unlink()
     with pytest.raises(InputError, match=r"asked\.yaml"):
         study_of_runs(runs)
+
+
+def test_seconds_on_the_wall_are_compared_where_a_run_recorded_them(turbogs, tmp_path):
+    runs = [a_run(tmp_path / name, 30, "scene.path=/a/fox", f"train.seed={seed}") for seed, name in enumerate("xy")]
+    runs.append(a_run(tmp_path / "z", 30, "scene.path=/a/fox", "schedule.pixel_budget=2.0"))
+    assert turbogs("compare", *runs, "--out", tmp_path / "without")[0] == 0
+    assert "wall" not in (tmp_path / "without/table.csv").read_text()
+    assert "| wall in s |" not in (tmp_path / "without/report.md").read_text()
+    for path, seconds in zip(runs, (25.0, 27.0), strict=False):
+        WallRecord(20.0, seconds).write(path / "wall.json")
+    assert turbogs("compare", *runs, "--out", tmp_path / "with")[0] == 0
+    page = (tmp_path / "with/report.md").read_text()
+    assert "| wall in s |" in page and "26.0 [25.0, 27.0]" in page and "not recorded" in page
+    rows = list(csv.DictReader((tmp_path / "with/table.csv").open()))
+    assert [row["wall_seconds_mean"] for row in rows] == ["26.0", ""]
 
 
 def test_the_bar_of_a_cell_has_the_planned_length(tmp_path, monkeypatch):

@@ -15,6 +15,7 @@ from turbogs_plugin.bench.large_capture import synthetic_scene
 from turbogs_plugin.bench.numerics import bench_solvers, solvers_table
 from turbogs_plugin.bench.raster import RasterBench, other_build
 from turbogs_plugin.bench.step import StepBench
+from turbogs_plugin.bench.wall import bench_wall, wall_lines
 from turbogs_plugin.engine import compiled_kernels
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.files import require_writable, write_text_atomically
@@ -69,6 +70,17 @@ def run_numerics(device: torch.device, out: Path) -> int:
     require_writable(out, f"--out '{out}'")
     results = bench_solvers(out, device)
     print(f"{solvers_table(results)}\n\nfolder  {out}")
+    return 0
+
+
+def run_wall(arguments: Sequence[str], repeats: int, device: torch.device, out: Path | None) -> int:
+    """Times `turbogs train` with these arguments; prints the parts, and writes the JSON where there is a file."""
+    _require_new(out)
+    measured = bench_wall(arguments, repeats)
+    print("\n".join(wall_lines(measured)))
+    if out is not None:
+        write_text_atomically(out, json.dumps(_report("wall", measured, device), indent=2) + "\n")
+        print(f"json  {out}")
     return 0
 
 

@@ -10,7 +10,7 @@ import torch
 
 from turbogs_plugin import __version__
 
-PACKAGES = ("torch", "gsplat", "numpy", "pycolmap", "torchmetrics")
+PACKAGES = ("torch", "gsplat", "numpy", "pycolmap")
 
 
 def software() -> list[tuple[str, str]]:

@@ -15,24 +15,12 @@ from turbogs_plugin.files import require_writable
 from turbogs_plugin.model.gsplat_file import save_gsplat
 from turbogs_plugin.model.harmonics import band_energy, drop_faint_bands
 from turbogs_plugin.model.ply import save_ply
-from turbogs_plugin.report.plots import depth_picture, to_uint8
+from turbogs_plugin.report.pictures import depth_picture, to_uint8
 from turbogs_plugin.report.tables import views_table
 from turbogs_plugin.scene import PosedImages
 from turbogs_plugin.scene.offload import place_views
 from turbogs_plugin.train.evaluate import evaluate, load_lpips
-from turbogs_plugin.train.history import Evaluation
 from turbogs_plugin.train.run import SavedModel, load_given_model, load_model, open_scene, resolve_device
-
-
-def history_table(history: list[Evaluation]) -> str:
-    """Error against seconds, for a terminal."""
-    lines = [f"{'iteration':>9}  {'seconds':>8}  {'PSNR':>6}  {'SSIM':>6}  {'L1':>6}  {'Gaussians':>9}"]
-    for evaluation in history:
-        lines.append(
-            f"{evaluation.iteration:>9}  {evaluation.train_seconds:>8.1f}  {evaluation.psnr:>6.2f}  "
-            f"{evaluation.ssim:>6.4f}  {evaluation.l1:>6.4f}  {evaluation.num_gaussians:>9}"
-        )
-    return "\n".join(lines)
 
 
 def evaluate_run(path: Path, device_name: str, given: Config | None = None) -> str:

@@ -8,8 +8,8 @@ from pathlib import Path
 from turbogs_plugin.files import write_text_atomically
 from turbogs_plugin.plan import Plan
 from turbogs_plugin.report.machine import hardware, software
-from turbogs_plugin.report.plots import ERROR_FULL_SCALE, plot_against_seconds, save_strip
-from turbogs_plugin.report.tables import ERRORS, errors, table, views_table
+from turbogs_plugin.report.pictures import ERROR_FULL_SCALE, picture_writer, strip
+from turbogs_plugin.report.tables import ERRORS, errors, number, table, views_table
 from turbogs_plugin.train.evaluate import Metrics, evaluate, load_lpips, render_view
 from turbogs_plugin.train.history import Evaluation
 from turbogs_plugin.train.run import RunSession
@@ -23,17 +23,29 @@ def write_report(run: RunSession) -> Path:
     """
     trainer, config = run.trainer, run.trainer.config
     lpips, lpips_reason = load_lpips(config.report.lpips_weights, trainer.device)
-    metrics = evaluate(trainer.gaussians, run.test, trainer.sh_degree, config.raster, lpips)
+    metrics = None if lpips else run.evaluations.metrics_at(trainer.iteration)
+    if metrics is None:
+        metrics = evaluate(trainer.gaussians, run.test, trainer.sh_degree, config.raster, lpips)
+    run.clock.mark("report")
     pictures = run.folder.path / "report"
     pictures.mkdir(exist_ok=True)
+    shown = min(len(run.test), config.report.strips)
+    with picture_writer() as write:
+        for view_id in range(shown):
+            image = render_view(trainer.gaussians, run.test, view_id, trainer.sh_degree, config.raster)
+            write(pictures / f"test-{view_id:03d}.jpg", strip(run.test.photos.image(view_id), image))
+        _plot(run, pictures)  # while the strips are encoded
+    run.clock.mark("pictures and plots")
+    write_text_atomically(run.folder.report, _page(run, metrics, lpips_reason, shown))
+    run.clock.mark("report")
+    return run.folder.report
+
+
+def _plot(run: RunSession, pictures: Path) -> None:
+    from turbogs_plugin.report.plots import plot_against_seconds  # and with it matplotlib, which takes its time
+
     for name, label in (("psnr", "test PSNR in dB"), ("l1", "mean absolute error on test views (0 .. 1)")):
         plot_against_seconds(pictures / f"{name}.png", run.history, name, label, run.scene.name)
-    shown = min(len(run.test), config.report.strips)
-    for view_id in range(shown):
-        image = render_view(trainer.gaussians, run.test, view_id, trainer.sh_degree, config.raster)
-        save_strip(pictures / f"test-{view_id:03d}.png", run.test.photos.image(view_id), image)
-    write_text_atomically(run.folder.report, _page(run, metrics, lpips_reason, shown))
-    return run.folder.report
 
 
 def _page(run: RunSession, metrics: Metrics, lpips_reason: str, shown: int) -> str:
@@ -47,11 +59,12 @@ def _page(run: RunSession, metrics: Metrics, lpips_reason: str, shown: int) -> s
     last = run.history[-1]
     config = run.trainer.config
     result = table(
-        (*ERRORS, "LPIPS (VGG)", "training in s", "Gaussians", "FPS", "peak memory in MiB"),
+        (*ERRORS, "LPIPS (VGG)", "training in s", "wall in s", "Gaussians", "FPS", "peak memory in MiB"),
         [
             (
                 *errors(metrics.mean),
                 f"{last.train_seconds:.1f}",
+                number(run.wall.wall_seconds, 1, "not recorded"),
                 last.num_gaussians,
                 f"{metrics.fps:.1f}",
                 _mebibytes(last),
@@ -67,7 +80,7 @@ def _page(run: RunSession, metrics: Metrics, lpips_reason: str, shown: int) -> s
         ],
     )
     strips = "\n\n".join(
-        f"{view.name}: {view.psnr:.2f} dB\n\n![{view.name}](report/test-{view_id:03d}.png)"
+        f"{view.name}: {view.psnr:.2f} dB\n\n![{view.name}](report/test-{view_id:03d}.jpg)"
         for view_id, view in enumerate(metrics.views[:shown])
     )
     return f"""# {run.scene.name}
@@ -78,7 +91,8 @@ def _page(run: RunSession, metrics: Metrics, lpips_reason: str, shown: int) -> s
 {result}
 {lpips}
 Means over the test views. Training time is that of iterations and of the initial error maps; loading, evaluation,
-checkpoints and this report are not in it. FPS counts test views rendered one after the other.
+checkpoints and this report are not in it. Wall time is from the start of the process until the model was written.
+FPS counts test views rendered one after the other.
 
 ## Error against run time
 

@@ -36,3 +36,14 @@ def views_table(metrics: Metrics, with_means: bool = False) -> str:
     if with_means:
         rows.append([metrics.mean.name, *errors(metrics.mean, psnr_digits=4)])
     return table(("view", *ERRORS, "LPIPS (VGG)"), rows)
+
+
+def history_table(history: list[Evaluation]) -> str:
+    """Error against seconds, for a terminal."""
+    lines = [f"{'iteration':>9}  {'seconds':>8}  {'PSNR':>6}  {'SSIM':>6}  {'L1':>6}  {'Gaussians':>9}"]
+    for evaluation in history:
+        lines.append(
+            f"{evaluation.iteration:>9}  {evaluation.train_seconds:>8.1f}  {evaluation.psnr:>6.2f}  "
+            f"{evaluation.ssim:>6.4f}  {evaluation.l1:>6.4f}  {evaluation.num_gaussians:>9}"
+        )
+    return "\n".join(lines)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 import re
 from collections.abc import Container, Sequence
 from pathlib import Path
@@ -15,6 +16,7 @@ from turbogs_plugin.study.grid import Ablation
 from turbogs_plugin.study.results import CellResult, Study
 from turbogs_plugin.train.folder import RunFolder
 from turbogs_plugin.train.history import read_history
+from turbogs_plugin.train.wall import WallRecord
 
 UNSHARED = ("scene.", "report.", "train.seed", "train.checkpoint_every", "train.evaluate_at")
 """Sections and settings in which the runs of a variant may differ: seed, photos, and what is only reported or kept."""
@@ -50,6 +52,7 @@ def study_of_runs(paths: Sequence[Path]) -> Study:
             config=config.to_mapping(),
             asked=asked,
             peak_bytes=history[-1].memory_bytes,  # a CPU run records the peak of its process, which is its own
+            wall_seconds=wall.wall_seconds if (wall := WallRecord.read(folder.wall)) else math.nan,
             history=history,
         )
         if any(other.key == result.key for other in results):

@@ -132,8 +132,9 @@ def _machines(provenances: Sequence[Provenance | None]) -> list[Block]:
 
 def _scene(summary: SceneSummary) -> list[Block]:
     against = f" against {summary.baseline}" if summary.baseline else ""
+    wall = ("wall in s",) if _has_wall(summary) else ()
     header = (
-        *("variant", "front", "seeds", "time in s", f"time{against}", "PSNR in dB", f"PSNR{against}"),
+        *("variant", "front", "seeds", "time in s", *wall, f"time{against}", "PSNR in dB", f"PSNR{against}"),
         *("worst view in dB", "SSIM", f"SSIM{against}", "LPIPS (VGG)", "Gaussians", "FPS", "peak MiB"),
     )
     reach_header, reach_lines = ["variant"], [[row.name] for row in summary.rows]
@@ -157,6 +158,11 @@ def _scene(summary: SceneSummary) -> list[Block]:
     return blocks
 
 
+def _has_wall(summary: SceneSummary) -> bool:
+    """Whether any variant has seconds on the wall: runs do, the cells of an ablation share a process."""
+    return not all(math.isnan(row.spread("wall_seconds").mean) for row in summary.rows)
+
+
 def _result_line(row: VariantRow, summary: SceneSummary) -> tuple[str, ...]:
     ratio = psnr = ssim = ""
     if summary.baseline not in ("", row.name):
@@ -167,6 +173,7 @@ def _result_line(row: VariantRow, summary: SceneSummary) -> tuple[str, ...]:
         "★" if row.on_front else "",
         str(len(row.cells)),
         spread_text(row.seconds, 1),
+        *((spread_text(row.spread("wall_seconds"), 1, "not recorded"),) if _has_wall(summary) else ()),
         ratio,
         spread_text(row.psnr, 2),
         psnr,
@@ -228,10 +235,11 @@ def _settings(study: Study) -> list[Block]:
 def table_csv(summaries: Sequence[SceneSummary]) -> str:
     """All numbers of the tables, unrounded; empty where not computed or not measured, ``inf`` where never reached."""
     lines: list[dict[str, Any]] = []
+    measures = [name for name in MEASURES if name != "wall_seconds" or any(map(_has_wall, summaries))]
     for summary in summaries:
         for row in summary.rows:
             line = {"scene": summary.scene, "variant": row.name, "seeds": len(row.cells), "pareto": row.on_front}
-            for measure in MEASURES:
+            for measure in measures:
                 spread = row.spread(measure)
                 line |= {f"{measure}_mean": spread.mean, f"{measure}_low": spread.low, f"{measure}_high": spread.high}
             for measure in ("psnr", "ssim", "seconds"):

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import sys
 import time
-
-from rich.progress import BarColumn, TextColumn
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 from turbogs_plugin.study.grid import CellKey
 from turbogs_plugin.study.results import CellResult, Failure
 from turbogs_plugin.train.progress import TerminalBar
+
+if TYPE_CHECKING:
+    from rich.progress import ProgressColumn
 
 
 class SweepProgress(TerminalBar):
@@ -23,10 +26,14 @@ class SweepProgress(TerminalBar):
     def __init__(self, total: int, kept: int) -> None:
         self.total, self.done = total, 0
         self._started = time.perf_counter()
-        columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[left]}"))
-        super().__init__(*columns, transient=True, total=None, left="")
+        super().__init__(transient=True, total=None, left="")
         if kept:
             self._say(f"{kept} finished cells are kept")
+
+    def _columns(self) -> Sequence[ProgressColumn]:
+        from rich.progress import BarColumn, TextColumn
+
+        return (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[left]}"))
 
     def begin(self, key: CellKey) -> None:
         """Called before a cell."""

@@ -26,6 +26,7 @@ class CellResult:
         asked: the configuration that was asked for: by it a finished cell is recognised.
         lpips: NaN where it was not computed.
         fps: test views rendered a second, one after the other; NaN where it was not recorded.
+        wall_seconds: of a run, from its process's start until its model was written; NaN where a process has many.
         peak_bytes: peak of the GPU's tensors while training, or None where it was not measured.
         history: every evaluation, the last one of the final model.
     """
@@ -42,6 +43,7 @@ class CellResult:
     asked: dict[str, Any]
     lpips: float = math.nan
     fps: float = math.nan
+    wall_seconds: float = math.nan
     peak_bytes: int | None = None
     history: list[Evaluation]
 

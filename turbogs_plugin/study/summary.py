@@ -15,6 +15,7 @@ TARGET_STEP = 0.5
 
 MEASURES = {
     "seconds": attrgetter("final.train_seconds"),
+    "wall_seconds": attrgetter("wall_seconds"),
     "psnr": attrgetter("final.psnr"),
     "worst_psnr": attrgetter("final.worst_psnr"),
     "ssim": attrgetter("final.ssim"),

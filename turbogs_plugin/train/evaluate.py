@@ -12,22 +12,22 @@ from pathlib import Path
 
 import torch
 from torch import Tensor
-from torchmetrics.functional.image import structural_similarity_index_measure
 
 from turbogs_plugin.device import synchronize
 from turbogs_plugin.engine.rendering import RasterSettings, render_image
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene import PosedImages
+from turbogs_plugin.train.ssim import SSIM_SIDE, ssim
 from turbogs_plugin.types import Gaussians
-
-SSIM_SIDE = 11
-"""Side of SSIM's Gaussian window; a smaller image has no SSIM."""
 
 PSNR_LIMIT = 100.0
 """PSNR of an exact match, in dB."""
 
 VGG16_FILE = "vgg16-397923af.pth"
 """The file name under which torchvision looks for the backbone of LPIPS."""
+
+LPIPS_PACKAGES = ("torchvision", "torchmetrics")
+"""What has the network, and LPIPS itself. Importing them takes seconds, so nothing else here uses them."""
 
 Lpips = Callable[[Tensor, Tensor], float]
 """LPIPS of two images [H, W, 3], 0 .. 1."""
@@ -109,15 +109,12 @@ def compare(name: str, image: Tensor, photo: Tensor) -> ViewMetrics:
     """Errors of an image against a photo, both [H, W, 3] float, 0 .. 1. SSIM has its usual Gaussian window of 11."""
     mse = (image - photo).square().mean().item()
     psnr = min(PSNR_LIMIT, -10.0 * math.log10(mse)) if mse > 0 else PSNR_LIMIT if mse == 0 else math.nan
-    ssim = math.nan
-    if min(image.shape[:2]) >= SSIM_SIDE:
-        pair = [picture.permute(2, 0, 1)[None] for picture in (image, photo)]  # [1, 3, H, W]
-        ssim = structural_similarity_index_measure(*pair, data_range=1.0, kernel_size=SSIM_SIDE, sigma=1.5).item()
-    return ViewMetrics(name, psnr, ssim, (image - photo).abs().mean().item())
+    similarity = ssim(image, photo).item() if min(image.shape[:2]) >= SSIM_SIDE else math.nan
+    return ViewMetrics(name, psnr, similarity, (image - photo).abs().mean().item())
 
 
 def load_lpips(weights: str | None, device: torch.device) -> tuple[Lpips | None, str]:
-    """LPIPS (VGG16), if torchvision and the backbone's weights are on this machine. Nothing is downloaded.
+    """LPIPS (VGG16), if `LPIPS_PACKAGES` and the backbone's weights are on this machine. Nothing is downloaded.
 
     Args:
         weights: local file with torchvision's VGG16 weights; None: torch's own cache is searched.
@@ -131,8 +128,9 @@ def load_lpips(weights: str | None, device: torch.device) -> tuple[Lpips | None,
     """
     if weights is not None and not Path(weights).is_file():
         raise InputError(f"report.lpips_weights: no such file '{weights}'")
-    if importlib.util.find_spec("torchvision") is None:
-        return None, "torchvision, which has the network, is not installed"
+    missing = [name for name in LPIPS_PACKAGES if importlib.util.find_spec(name) is None]
+    if missing:
+        return None, f"it needs {' and '.join(LPIPS_PACKAGES)}, and {' and '.join(missing)} is not installed"
     file = Path(weights) if weights else Path(torch.hub.get_dir()) / "checkpoints" / VGG16_FILE
     if not file.is_file():
         return None, f"its weights are not on this machine; name a local {VGG16_FILE} in report.lpips_weights"

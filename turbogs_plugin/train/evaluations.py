@@ -32,6 +32,10 @@ class Evaluations(Listener):
     history: list[Evaluation] = field(default_factory=list, init=False)
     metrics: Metrics | None = field(default=None, init=False)
 
+    def metrics_at(self, iteration: int) -> Metrics | None:
+        """Those of the evaluation that this process made at an iteration, if it is the newest; None otherwise."""
+        return self.metrics if self.history and self.history[-1].iteration == iteration else None
+
     def begun(self, loop: TrainingLoop) -> None:
         if not self.history:
             self.evaluation_due(loop)

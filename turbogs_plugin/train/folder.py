@@ -17,6 +17,7 @@ class RunFolder:
     Attributes:
         asked: the configuration as the user asked for it.
         config: the resolved one, after plan and budgets.
+        wall: the `WallRecord`.
     """
 
     def __init__(self, path: Path) -> None:
@@ -25,6 +26,7 @@ class RunFolder:
         self.config = path / "config.yaml"
         self.plan = path / "plan.json"
         self.history = path / "history.jsonl"
+        self.wall = path / "wall.json"
         self.checkpoints = path / "checkpoints"
         self.report = path / "report.md"
         self.model = path / "model.ply"

@@ -4,22 +4,15 @@ from __future__ import annotations
 
 import sys
 import time
-from typing import Any, TypeVar
-
-from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    ProgressColumn,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from turbogs_plugin.train.history import Evaluation
 from turbogs_plugin.train.loop import Listener, TrainingLoop
 from turbogs_plugin.train.trainer import Trainer
+
+if TYPE_CHECKING:
+    from rich.progress import Progress, ProgressColumn
 
 REFRESH_SECONDS = 0.1
 """Time between two updates of the bar, so that fast iterations are not slowed down."""
@@ -29,20 +22,27 @@ BarType = TypeVar("BarType", bound="TerminalBar")
 
 
 class TerminalBar(Listener):
-    """A bar on stderr that follows the iterations, if stderr is a terminal; otherwise nothing.
+    """A bar on stderr that follows the iterations, if stderr is a terminal; otherwise nothing, and rich stays unloaded.
 
     Args:
-        columns: columns of the bar.
         transient: whether the bar disappears at the end.
         task: first values of the bar.
     """
 
-    def __init__(self, *columns: ProgressColumn, transient: bool = False, **task: Any) -> None:
+    def __init__(self, transient: bool = False, **task: Any) -> None:
         self._next_refresh = 0.0
         self._bar: Progress | None = None
         if sys.stderr.isatty():
-            self._bar = Progress(*columns, console=Console(stderr=True), auto_refresh=False, transient=transient)
+            from rich.console import Console
+            from rich.progress import Progress
+
+            console = Console(stderr=True)
+            self._bar = Progress(*self._columns(), console=console, auto_refresh=False, transient=transient)
             self._task = self._bar.add_task("", **task)
+
+    def _columns(self) -> Sequence[ProgressColumn]:
+        """The columns of the bar, for a class to override."""
+        raise NotImplementedError
 
     def __enter__(self: BarType) -> BarType:
         if self._bar is not None:
@@ -76,7 +76,12 @@ class TrainingProgress(TerminalBar):
     """
 
     def __init__(self, total: int, iteration: int = 0) -> None:
-        super().__init__(
+        super().__init__(total=total, completed=iteration, psnr="-", gaussians="-", warning="")
+
+    def _columns(self) -> Sequence[ProgressColumn]:
+        from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+        return (
             MofNCompleteColumn(),
             BarColumn(),
             TextColumn("test PSNR {task.fields[psnr]} dB · {task.fields[gaussians]} Gaussians"),
@@ -85,11 +90,6 @@ class TrainingProgress(TerminalBar):
             TimeRemainingColumn(),
             TextColumn("left"),
             TextColumn("{task.fields[warning]}", style="bold red"),
-            total=total,
-            completed=iteration,
-            psnr="-",
-            gaussians="-",
-            warning="",
         )
 
     def evaluated(self, loop: TrainingLoop, evaluation: Evaluation) -> None:

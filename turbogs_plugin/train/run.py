@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import operator
 import sys
 from collections.abc import Callable, Iterator
@@ -31,8 +32,14 @@ from turbogs_plugin.train.interrupts import Interrupts
 from turbogs_plugin.train.loop import Listener, TrainingLoop
 from turbogs_plugin.train.pace import pace_of
 from turbogs_plugin.train.progress import TrainingProgress
+from turbogs_plugin.train.start import starting
 from turbogs_plugin.train.trainer import Trainer, gaussians_of_state
+from turbogs_plugin.train.wall import WallClock, WallRecord
+from turbogs_plugin.train.wall_marks import WallMarks
 from turbogs_plugin.types import Gaussians
+
+IMPORTS, PHOTOS, DEVICE = "interpreter and imports", "photos", "CUDA and kernels, after the photos"
+"""Parts of the wall time before a plan is made."""
 
 
 @dataclass
@@ -136,27 +143,38 @@ def fit(scene: Scene, *overrides: str, config: str = DEFAULT_CONFIG) -> Gaussian
     return loop.trainer.gaussians
 
 
-def train(config: Config, out: Path, report: Callable[[RunSession], object] | None = None) -> RunSession:
+def train(
+    config: Config, out: Path, report: Callable[[RunSession], object] | None = None, clock: WallClock | None = None
+) -> RunSession:
     """Train from the start into a new folder. The plan is printed first.
 
     Args:
         report: called with the finished run; `turbogs_plugin.report.pages.write_report` writes its page.
+        clock: of the wall; None: it begins now.
 
     Raises:
         InputError: anything wrong with the input; then nothing was written.
         TrainingStopped: the run cannot go on; the files that it saved stay.
     """
+    clock = clock or WallClock()
+    clock.mark(IMPORTS)
     folder = RunFolder(out)
     folder.require_new()
     _require_start(config)
-    device = resolve_device(config.train.device)
-    scene = open_scene(config)
+    if config.train.device == "cuda":
+        resolve_device("cuda")  # before photos are read for nothing
+    with starting(lambda: resolve_device(config.train.device)) as started:
+        scene = open_scene(config)
+        clock.mark(PHOTOS)
+        device = started.result()
+    clock.mark(DEVICE)
     load_lpips(config.report.lpips_weights, device)
     plan = make_plan(config, scene, device)
+    clock.mark("plan")
     remedy = "use train.photos_place=host and train.maps_place=host, --max-gaussians or a larger --factor"
     with _fitting(scene, remedy):
         loop, calibration = new_loop(_independent(plan.apply(config), device), scene, device)
-        session = RunSession(folder, plan, scene, loop)
+        session = RunSession(folder, plan, scene, loop, clock)
     resolved = loop.trainer.config
     print("\n".join(filter(None, [plan.text(), budget_text(resolved, calibration)])), file=sys.stderr)
     folder.path.mkdir(parents=True, exist_ok=True)
@@ -166,25 +184,34 @@ def train(config: Config, out: Path, report: Callable[[RunSession], object] | No
     return session.run(report)
 
 
-def resume(path: Path, report: Callable[[RunSession], object] | None = None) -> RunSession:
+def resume(
+    path: Path, report: Callable[[RunSession], object] | None = None, clock: WallClock | None = None
+) -> RunSession:
     """Go on with a stopped run from its newest checkpoint, with its own configuration, in which nothing is `auto`.
 
     On a CPU, the result is bit for bit that of a run never stopped; `Trainer.state_dict` says why.
 
     Args:
-        report: as in `train`.
+        report, clock: as in `train`.
 
     Raises:
         InputError: no run there, an unusable checkpoint, a changed capture, or a machine without what the run needs;
             then nothing was changed.
         TrainingStopped: the run cannot go on.
     """
+    clock = clock or WallClock()
+    clock.mark(IMPORTS)
     folder = RunFolder(path)
     config, plan = folder.read_config(), folder.read_plan()
+    earlier = WallRecord.read(folder.wall)
     checkpoint = latest_checkpoint(folder.checkpoints)
     state = None if checkpoint is None else load_checkpoint(checkpoint)
     device = resolve_device(config.train.device, "go on with this run where there is a GPU, or see 'turbogs doctor'")
-    scene = open_scene(config, folder)
+    with starting(lambda: device) as started:
+        scene = open_scene(config, folder)
+        clock.mark(PHOTOS)
+        started.result()
+    clock.mark(DEVICE)
     load_lpips(config.report.lpips_weights, device)
     limit = config.budget.memory_bytes()
     if limit is not None:
@@ -192,9 +219,10 @@ def resume(path: Path, report: Callable[[RunSession], object] | None = None) -> 
     with _fitting(scene, "end what else is in that memory, or go on with this run where there is more"):
         resuming = state is not None
         loop = TrainingLoop(Trainer(config, scene, device, resuming), pace_of(config))
-        session = RunSession(folder, plan, scene, loop)
+        session = RunSession(folder, plan, scene, loop, clock)
         if state is not None:
             session.load_state_dict(state, str(checkpoint))
+            session.earlier_wall = earlier.wall_seconds if earlier else math.nan
     session.history += rewind_history(folder.history, loop.trainer.iteration if session.resumed else -1)
     return session.run(report)
 
@@ -273,10 +301,16 @@ class RunSession(Listener):
         history: every evaluation of the run.
         resumed: whether the trainer's state was loaded.
         signal: the signal that stopped the training; None at the end of the run.
+        clock: of the wall, in this process.
+        earlier_wall: seconds on the wall of the processes before; NaN where one did not record them.
+        wall: what is recorded of it when the model is written.
     """
 
-    def __init__(self, folder: RunFolder, plan: Plan | None, scene: Scene, loop: TrainingLoop) -> None:
+    def __init__(
+        self, folder: RunFolder, plan: Plan | None, scene: Scene, loop: TrainingLoop, clock: WallClock | None = None
+    ) -> None:
         self.folder, self.plan, self.scene, self.loop = folder, plan, scene, loop
+        self.clock, self.earlier_wall, self.wall = clock or WallClock(), 0.0, WallRecord(0.0)
         self.trainer = loop.trainer
         self.test = place_views(scene.test, self.trainer.device, self.trainer.config.train.photos_place)
         self.evaluations = Evaluations(self.test)
@@ -288,17 +322,26 @@ class RunSession(Listener):
     def run(self, report: Callable[[RunSession], object] | None) -> RunSession:
         """Train to the end, or until a signal; both end with a checkpoint."""
         loop, trainer = self.loop, self.trainer
+        finished_before = loop.finished
+        self.folder.wall.unlink(missing_ok=True)  # so that a killed process leaves none, which is then not counted as 0
+        self.clock.mark("initial model")
         try:
             progress = TrainingProgress(trainer.iterations, trainer.iteration)
             with Interrupts(loop.stop) as interrupts, progress:
-                loop.listeners = [self.evaluations, self, progress]
+                loop.listeners = [WallMarks(self.clock), self.evaluations, self, progress]
                 loop.run(self.resumed)
+                self.clock.mark("training")
                 if loop.stopped and trainer.iteration != self._saved_at:
                     self._save()
             if loop.finished:
                 save_ply(trainer.gaussians, self.folder.model, self.scene.frame)
-                if report is not None:
-                    report(self)
+                self.clock.mark("model")
+            seconds = self.earlier_wall + (0.0 if finished_before else self.clock.seconds)
+            self.wall = WallRecord(loop.clock.seconds, seconds, self.clock.parts)
+            self.wall.write(self.folder.wall)
+            if loop.finished and report is not None:
+                report(self)
+                self.wall.write(self.folder.wall)  # with the parts of the report
         except TrainingStopped as stop:
             raise TrainingStopped(f"{stop}; {self._last_good()}") from stop
         except torch.cuda.OutOfMemoryError as error:
@@ -313,7 +356,9 @@ class RunSession(Listener):
         append_evaluation(self.folder.history, evaluation)
 
     def checkpoint_due(self, loop: TrainingLoop) -> None:
+        self.clock.mark("training")
         self._save()
+        self.clock.mark("checkpoints")
 
     def state_dict(self) -> dict[str, Any]:
         return {

@@ -1,0 +1,45 @@
+"""`turbogs bench wall`: the command in a process of its own, part by part."""
+
+import json
+
+import pytest
+from helpers.framework_runs import tiny_capture
+
+from turbogs_plugin.bench import wall
+from turbogs_plugin.bench.wall import REST, WallRun, bench_wall, wall_lines
+
+
+def test_the_parts_of_a_run_are_all_of_its_time(turbogs, tmp_path):
+    options = ("train.iterations=2", "train.sh_degree=0", "--device", "cpu", "--repeats", 1)
+    code, out, _ = turbogs("bench", "wall", "--scene", tiny_capture(tmp_path), *options, "--out", tmp_path / "w.json")
+    assert code == 0
+    report = json.loads((tmp_path / "w.json").read_text())
+    median = report["median"]
+    assert sum(median["parts"].values()) == pytest.approx(median["seconds"])
+    assert {"interpreter and imports", "photos", "training", "pictures and plots", "model", REST} <= set(
+        median["parts"]
+    )
+    assert 0 < median["train_seconds"] < median["model_seconds"] < median["seconds"]
+    assert median["parts"][REST] > 0
+    for part in (*median["parts"], "whole command", "beside training", "from photos to the first iteration"):
+        assert part in out
+
+
+def test_the_run_in_the_middle_is_shown(monkeypatch):
+    runs = iter([WallRun(9.0, 5.0, 8.0, {"plan": 4.0}), WallRun(30.0, 5.0, 8.0, {}), WallRun(9.5, 5.0, 8.0, {})])
+    monkeypatch.setattr(wall, "time_command", lambda arguments: next(runs))
+    measured = bench_wall(["capture"], 3)
+    assert measured["median"]["seconds"] == 9.5 and len(measured["runs"]) == 3
+    assert "4.00, 25.00, 4.50" in wall_lines(measured)[-1]
+    assert WallRun(9.0, 5.0, 8.0, {"plan": 4.0, "photos": 1.0}).to_first_iteration == 4.0
+
+
+@pytest.mark.parametrize("arguments", [(), ("--scene", "nowhere"), ("--scene", "nowhere", "--offload")])
+def test_bad_input_is_one_line(turbogs, arguments):
+    code, out, err = turbogs("bench", "wall", *arguments, "--device", "cpu")
+    assert (code, out) == (2, "") and err.count("\n") == 1
+    assert "bench wall needs --scene" in err or "no such scene: nowhere" in err
+
+
+def test_no_run_is_not_a_measurement(turbogs):
+    assert "--repeats 0" in turbogs("bench", "wall", "--scene", "x", "--repeats", 0)[2]

@@ -1,0 +1,94 @@
+"""Where each second of `turbogs train` goes: the command in a process of its own, by the marks that it keeps."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from turbogs_plugin.errors import InputError, TrainingStopped
+from turbogs_plugin.train.folder import RunFolder
+from turbogs_plugin.train.run import DEVICE
+from turbogs_plugin.train.wall import WallRecord
+
+REST = "start of the process, and its end"
+"""What a process cannot measure of itself."""
+
+BEFORE_TRAINING = (DEVICE, "plan", "initial model", "initial maps", "first evaluation")
+"""Parts between the photos and the first iteration."""
+
+
+@dataclass
+class WallRun:
+    """One run of the command.
+
+    Args:
+        seconds: from its start to its end, seen from outside.
+        train_seconds: training, as the run's history has it.
+        model_seconds: from the start of its process until the model was written.
+        parts: what -> seconds that went into it; together they are `seconds`.
+    """
+
+    seconds: float
+    train_seconds: float
+    model_seconds: float
+    parts: dict[str, float]
+
+    @property
+    def beside_training(self) -> float:
+        return self.seconds - self.train_seconds
+
+    @property
+    def to_first_iteration(self) -> float:
+        """Seconds from decoded photos to the first iteration."""
+        return sum(self.parts.get(part, 0.0) for part in BEFORE_TRAINING)
+
+
+def time_command(arguments: Sequence[str]) -> WallRun:
+    """Run `turbogs train` with these arguments into a folder that is thrown away.
+
+    Raises:
+        InputError: the command refused its input, in its own words.
+        TrainingStopped: it ended in another way without a model.
+    """
+    with tempfile.TemporaryDirectory() as place:
+        out = Path(place) / "run"
+        command = [sys.executable, "-m", "turbogs_plugin.cli", "train", *arguments, "--out", str(out)]
+        started = time.perf_counter()
+        ended = subprocess.run(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+        seconds = time.perf_counter() - started
+        record = WallRecord.read(RunFolder(out).wall)
+    if ended.returncode or record is None:
+        last = (ended.stderr.strip().splitlines() or ["it said nothing"])[-1].removeprefix("turbogs: error: ")
+        raise InputError(last) if ended.returncode == 2 else TrainingStopped(f"turbogs train: {last}")
+    parts = record.parts | {REST: seconds - sum(record.parts.values())}
+    return WallRun(seconds, record.train_seconds, record.wall_seconds, parts)
+
+
+def bench_wall(arguments: Sequence[str], repeats: int) -> dict[str, Any]:
+    """Time the command several times, one after the other.
+
+    Returns:
+        ``runs``, in their order, and ``median``, the one in the middle by what it took beside training.
+    """
+    runs = [time_command(arguments) for _ in range(repeats)]
+    middle = sorted(runs, key=lambda run: run.beside_training)[(len(runs) - 1) // 2]
+    return {"command": ["turbogs", "train", *arguments], "runs": [vars(run) for run in runs], "median": vars(middle)}
+
+
+def wall_lines(measured: dict[str, Any]) -> list[str]:
+    """The run in the middle, part by part, and the sums of all runs."""
+    middle, runs = WallRun(**measured["median"]), [WallRun(**run) for run in measured["runs"]]
+    rows = [*middle.parts.items(), ("whole command", middle.seconds), ("training alone", middle.train_seconds)]
+    rows += [("beside training", middle.beside_training), ("until the model is written", middle.model_seconds)]
+    rows += [("from photos to the first iteration", middle.to_first_iteration)]
+    width = max(len(name) for name, _ in rows)
+    lines = [f"{name:<{width}}  {seconds:7.2f} s" for name, seconds in rows]
+    lines.insert(len(middle.parts), "-" * (width + 11))
+    each = ", ".join(f"{run.beside_training:.2f}" for run in runs)
+    return [*lines, f"beside training, of {len(runs)} runs: {each} s; the one in the middle is shown"]
