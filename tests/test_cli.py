@@ -100,12 +100,11 @@ def photo_of_another_size(capture: Path) -> None:
     Image.fromarray(np.zeros((20, 20, 3), dtype=np.uint8)).save(path)
 
 
-def distorted_camera(capture: Path) -> None:
+def panorama(capture: Path) -> None:
     model = model_of(capture)
     for camera in model.cameras.values():
-        focal = camera.mean_focal_length()
-        camera.model = pycolmap.CameraModelId.OPENCV
-        camera.params = [focal, focal, camera.width / 2, camera.height / 2, 0.1, 0.01, 0.0, 0.0]
+        camera.model = pycolmap.CameraModelId.EQUIRECTANGULAR
+        camera.params = [camera.width, camera.height]
     _replace_model(capture, model)
 
 
@@ -128,7 +127,7 @@ BROKEN = [
     (without_two_photos, ["2 of 8", "view_002.png", "view_003.png"]),
     (truncated_photo, ["view_001.png"]),
     (photo_of_another_size, ["view_001.png", "20x20", "48x40"]),
-    (distorted_camera, ["OPENCV", "undistort"]),
+    (panorama, ["EQUIRECTANGULAR", "panorama"]),
     (two_views, ["3"]),
 ]
 
