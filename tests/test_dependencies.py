@@ -98,7 +98,7 @@ def test_the_extra_is_what_the_commands_name(project):
     extras = project["optional-dependencies"]
     assert sorted(extras["train"]) == sorted(COMMAND_PACKAGES.values())
     assert extras["dev"][0] == f"{project['name']}[train]" and f'"{extras["dev"][0]}"' in INSTALL_COMMANDS
-    assert set(requirements(project["dependencies"])) == {"torch", "gsplat", "packaging", "numpy", "pillow"}
+    assert set(requirements(project["dependencies"])) == {"torch", "gsplat", "packaging", "numpy", "pillow", "pyyaml"}
 
 
 COMMANDS = {

@@ -72,7 +72,7 @@ def resolve_device(name: str, remedy: str = "use --device cpu, or see 'turbogs d
 
 
 def open_scene(config: Config, folder: RunFolder | None = None) -> Scene:
-    """The capture of a configuration. What it was taken for is printed.
+    """The capture of a configuration.
 
     Args:
         folder: that of the run with this configuration; None if the user names the capture.
@@ -86,20 +86,21 @@ def open_scene(config: Config, folder: RunFolder | None = None) -> Scene:
             f"capture '{settings.path}' of the run in '{folder.path}' is not there: bring it back, or edit scene.path "
             f"in {folder.config}"
         )
-    scene = load_scene(settings.path, settings.factor, settings.test_every)
-    print("\n".join(scene.notes), file=sys.stderr)
-    return scene
+    return load_scene(settings.path, settings.factor, settings.test_every)
 
 
 def plan_run(config: Config) -> Plan:
-    """The plan that `train` would make now.
+    """The plan that `train` would make now. What the capture was taken for is printed.
 
     Raises:
         InputError: anything wrong with the input.
     """
     device = resolve_device(config.train.device)
     _require_start(config)
-    return make_plan(config, open_scene(config), device)
+    scene = open_scene(config)
+    plan = make_plan(config, scene, device)
+    print("\n".join(scene.notes), file=sys.stderr)  # last, as an error is one line alone
+    return plan
 
 
 def new_loop(config: Config, scene: Scene, device: torch.device) -> tuple[TrainingLoop, Calibration | None]:
@@ -176,7 +177,8 @@ def train(
         loop, calibration = new_loop(_independent(plan.apply(config), device), scene, device)
         session = RunSession(folder, plan, scene, loop, clock)
     resolved = loop.trainer.config
-    print("\n".join(filter(None, [plan.text(), budget_text(resolved, calibration)])), file=sys.stderr)
+    said = [*scene.notes, plan.text(), budget_text(resolved, calibration)]
+    print("\n".join(filter(None, said)), file=sys.stderr)
     folder.path.mkdir(parents=True, exist_ok=True)
     write_text_atomically(folder.plan, plan.to_json())
     write_text_atomically(folder.asked, config.to_yaml())
