@@ -6,7 +6,6 @@ Training and test photos are told apart by file, and the validation photos are n
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -19,7 +18,7 @@ from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene.capture import Capture, check_photo_name, sizes_text
 from turbogs_plugin.scene.photos import photo_size
 from turbogs_plugin.scene.poses import viewmat_of_pose
-from turbogs_plugin.scene.transforms import PHOTO_SUFFIXES, random_points
+from turbogs_plugin.scene.transforms import PHOTO_SUFFIXES, random_points, read_frames
 
 TRAIN_FILE = "transforms_train.json"
 TEST_FILES = ("transforms_test.json", "transforms_val.json")
@@ -83,13 +82,7 @@ def read_blender(scene: Path) -> Capture:
 
 def _read_views(scene: Path, source: Path) -> dict[str, BlenderView]:
     """The views of one file, by the photos' paths relative to the scene."""
-    try:
-        content = json.loads(source.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
-        raise InputError(f"{source} is not readable JSON: {' '.join(str(error).split())[:200]}") from error
-    frames = content.get("frames") if isinstance(content, dict) else None
-    if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
-        raise InputError(f"{source} has no list of frames: export it again")
+    content, frames = read_frames(source)
     shared = {key: value for key, value in content.items() if key != "frames"}
     named: dict[str, dict[str, Any]] = {}
     for frame in frames:

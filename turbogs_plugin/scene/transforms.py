@@ -29,6 +29,18 @@ RANDOM_POINTS_SIDE = 1.0
 """Side of the cube of random points, in distances of the cameras from what they look at."""
 
 
+def read_frames(source: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """A transforms file, and its frames. Raises `InputError` unless it is JSON with a list of frames."""
+    try:
+        content = json.loads(source.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise InputError(f"{source} is not readable JSON: {' '.join(str(error).split())[:200]}") from error
+    frames = content.get("frames") if isinstance(content, dict) else None
+    if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
+        raise InputError(f"{source} has no list of frames: export it again")
+    return content, frames
+
+
 def read_transforms(scene: Path) -> Capture:
     """Read ``scene/transforms.json``.
 
@@ -41,14 +53,7 @@ def read_transforms(scene: Path) -> Capture:
             photos.
     """
     source = scene / FILE
-    try:
-        content = json.loads(source.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
-        raise InputError(f"{source} is not readable JSON: {' '.join(str(error).split())[:200]}") from error
-    frames = content.get("frames") if isinstance(content, dict) else None
-    if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
-        raise InputError(f"{source} has no list of frames")
-
+    content, frames = read_frames(source)
     views: dict[str, tuple[np.ndarray, np.ndarray, tuple[int, int], Lens | None]] = {}
     absent: list[str] = []
     lenses: dict[tuple, Lens] = {}
