@@ -8,17 +8,18 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from PIL import Image
 
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.scene.capture import Capture, check_photo_name, sizes_text
+from turbogs_plugin.scene.capture import Capture, sizes_text
 from turbogs_plugin.scene.photos import photo_size
 from turbogs_plugin.scene.poses import viewmat_of_pose
-from turbogs_plugin.scene.transforms import PHOTO_SUFFIXES, random_points, read_frames
+from turbogs_plugin.scene.transforms import number_of, photo_name, random_points, read_frames
 
 TRAIN_FILE = "transforms_train.json"
 TEST_FILES = ("transforms_test.json", "transforms_val.json")
@@ -86,7 +87,7 @@ def _read_views(scene: Path, source: Path) -> dict[str, BlenderView]:
     shared = {key: value for key, value in content.items() if key != "frames"}
     named: dict[str, dict[str, Any]] = {}
     for frame in frames:
-        name = _photo_name(scene, frame.get("file_path"), source)
+        name = photo_name(scene, frame.get("file_path"), source)
         if name in named:
             raise InputError(f"{source} has two frames for '{name}': take one of them out")
         named[name] = {**shared, **frame}
@@ -100,24 +101,9 @@ def _read_views(scene: Path, source: Path) -> dict[str, BlenderView]:
     return {name: _read_view(values, scene / name, source) for name, values in named.items()}
 
 
-def _photo_name(scene: Path, name: Any, source: Path) -> str:
-    """The photo's path relative to the scene, with its suffix where such a file is there."""
-    if not isinstance(name, str):
-        raise InputError(f"{source} has a frame without a file_path: export it again")
-    name = str(PurePosixPath(check_photo_name(name, source)))
-    suffixes = ("", *PHOTO_SUFFIXES, *(suffix.upper() for suffix in PHOTO_SUFFIXES))
-    return next((f"{name}{suffix}" for suffix in suffixes if (scene / f"{name}{suffix}").is_file()), name)
-
-
 def _read_view(values: dict[str, Any], photo: Path, source: Path) -> BlenderView:
     """The view of one frame, whose own values go before those that the file has for all."""
-
-    def number(key: str, default: float) -> float:
-        value = values.get(key, default)
-        if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < 1e300:
-            raise InputError(f"{source}: {key} is {str(value)[:40]!r}: it must be a finite number")
-        return float(value)
-
+    number = partial(number_of, values, source)
     bent = [key for key in DISTORTION if number(key, 0.0)]
     if bent:
         raise InputError(

@@ -15,7 +15,7 @@ from turbogs_plugin.scene.capture import LARGEST_SIDE, Capture, check_photo_name
 from turbogs_plugin.scene.colmap import load_pycolmap
 from turbogs_plugin.scene.photos import photo_size
 from turbogs_plugin.scene.ply import read_vertices
-from turbogs_plugin.scene.poses import camera_centers
+from turbogs_plugin.scene.poses import camera_centers, viewmat_of_pose
 from turbogs_plugin.scene.undistort import Lens, brown_projection, lens_of_camera, make_lens
 
 FILE = "transforms.json"
@@ -58,7 +58,7 @@ def read_transforms(scene: Path) -> Capture:
     absent: list[str] = []
     lenses: dict[tuple, Lens] = {}
     for frame in frames:
-        name = _photo_name(scene, frame.get("file_path"), source)
+        name = photo_name(scene, frame.get("file_path"), source)
         if name in views or name in absent:
             raise InputError(f"{source} has two frames for '{name}'")
         if not (scene / name).is_file():
@@ -124,19 +124,16 @@ def random_points(viewmats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return points, random.integers(0, 256, (NUM_RANDOM_POINTS, 3), dtype=np.uint8)
 
 
-def _photo_name(scene: Path, name: Any, source: Path) -> str:
-    """The photo's path relative to the scene; blender's names come without a suffix."""
+def photo_name(scene: Path, name: Any, source: Path) -> str:
+    """The photo's path relative to the scene, with its suffix, which Blender's names come without, if it is there."""
     if not isinstance(name, str):
-        raise InputError(f"{source} has a frame without a file_path")
+        raise InputError(f"{source} has a frame without a file_path: export it again")
     name = str(PurePosixPath(check_photo_name(name, source)))
-    if not (scene / name).is_file():
-        for suffix in PHOTO_SUFFIXES:
-            if (scene / f"{name}{suffix}").is_file():
-                return f"{name}{suffix}"
-    return name
+    suffixes = ("", *PHOTO_SUFFIXES, *(suffix.upper() for suffix in PHOTO_SUFFIXES))
+    return next((f"{name}{suffix}" for suffix in suffixes if (scene / f"{name}{suffix}").is_file()), name)
 
 
-def _number(values: dict, source: Path, key: str, default: float | None = None) -> float | None:
+def number_of(values: dict, source: Path, key: str, default: float | None = None) -> float | None:
     """A finite number, or the default where the key is absent."""
     if key not in values:
         return default
@@ -156,7 +153,7 @@ def _camera(
         lenses: those already made, by their numbers; a new one is added.
     """
     K, size = _intrinsics(values, photo, source)
-    number = partial(_number, values, source)
+    number = partial(number_of, values, source)
     model = values.get("camera_model", "OPENCV_FISHEYE" if values.get("is_fisheye") is True else "OPENCV")
     if model not in (*BROWN_MODELS, *FISHEYE_MODELS):
         raise InputError(
@@ -207,7 +204,7 @@ def _make_lens(
 
 def _intrinsics(values: dict, photo: Path, source: Path) -> tuple[np.ndarray, tuple[int, int]]:
     """[3, 3] float64 and (width, height) of one frame's photo, as taken."""
-    number = partial(_number, values, source)
+    number = partial(number_of, values, source)
     width, height = number("w"), number("h")
     if width is None or height is None:
         width, height = photo_size(photo)
@@ -240,15 +237,10 @@ def _viewmat(frame: dict, name: str, source: Path) -> np.ndarray:
         pose = np.empty(0)
     if pose.shape not in ((3, 4), (4, 4)) or not np.isfinite(pose).all():
         raise InputError(f"{source}: frame '{name}' has no transform_matrix of 4x4 finite numbers")
-    rotation = pose[:3, :3] * [1.0, -1.0, -1.0]
-    if not np.abs(rotation.T @ rotation - np.eye(3)).max() < 1e-2 or np.linalg.det(rotation) < 0:
-        raise InputError(f"{source}: the transform_matrix of frame '{name}' is not a rotation and a translation")
-    left, _, right = np.linalg.svd(rotation)  # decimals are cut in JSON: back to an exact rotation
-    rotation = left @ right
-    viewmat = np.eye(4)
-    viewmat[:3, :3] = rotation.T
-    viewmat[:3, 3] = -rotation.T @ pose[:3, 3]
-    return viewmat
+    try:
+        return viewmat_of_pose(pose[:3, :3] * [1.0, -1.0, -1.0], pose[:3, 3])
+    except ValueError as error:
+        raise InputError(f"{source}: the transform_matrix of frame '{name}' {error}") from None
 
 
 def _read_points(scene: Path, name: Any, source: Path) -> tuple[np.ndarray, np.ndarray]:
