@@ -20,7 +20,7 @@ from turbogs_plugin.report.pictures import ERROR_FULL_SCALE, GAP, depth_picture,
 from turbogs_plugin.report.plots import plot_against_seconds
 from turbogs_plugin.report.tables import number, table
 from turbogs_plugin.train import run
-from turbogs_plugin.train.evaluate import Metrics, ViewMetrics, compare, load_lpips
+from turbogs_plugin.train.evaluate import Metrics, ViewMetrics, compare, load_lpips, psnr
 from turbogs_plugin.train.history import Evaluation, append_evaluation, read_history, rewind_history
 from turbogs_plugin.train.progress import TrainingProgress, describe_nonfinite
 from turbogs_plugin.train.ssim import ssim
@@ -118,6 +118,7 @@ def test_an_exact_image_and_a_small_one():
     photo = torch.rand(12, 12, 3)
     assert compare("view", photo, photo).psnr == 100.0
     assert math.isnan(compare("view", photo[:8], photo[:8]).ssim)
+    assert math.isnan(psnr(torch.full_like(photo, math.nan), photo)), "what cannot be compared does not fit"
 
 
 def test_lpips_says_why_it_is_missing(tmp_path, monkeypatch):

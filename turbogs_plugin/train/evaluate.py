@@ -105,12 +105,16 @@ def render_view(
     return image.colors.clamp(0.0, 1.0)
 
 
+def psnr(image: Tensor, photo: Tensor) -> float:
+    """PSNR in dB of an image against a photo, both [H, W, 3] float, 0 .. 1; NaN if a value is."""
+    mse = (image - photo).square().mean().item()
+    return min(PSNR_LIMIT, -10.0 * math.log10(mse)) if mse > 0 else PSNR_LIMIT if mse == 0 else math.nan
+
+
 def compare(name: str, image: Tensor, photo: Tensor) -> ViewMetrics:
     """Errors of an image against a photo, both [H, W, 3] float, 0 .. 1. SSIM has its usual Gaussian window of 11."""
-    mse = (image - photo).square().mean().item()
-    psnr = min(PSNR_LIMIT, -10.0 * math.log10(mse)) if mse > 0 else PSNR_LIMIT if mse == 0 else math.nan
     similarity = ssim(image, photo).item() if min(image.shape[:2]) >= SSIM_SIDE else math.nan
-    return ViewMetrics(name, psnr, similarity, (image - photo).abs().mean().item())
+    return ViewMetrics(name, psnr(image, photo), similarity, (image - photo).abs().mean().item())
 
 
 def load_lpips(weights: str | None, device: torch.device) -> tuple[Lpips | None, str]:

@@ -7,12 +7,12 @@ photos, and does after it is brought back from gsplat's world, that is done and 
 
 from __future__ import annotations
 
-import math
 import re
 import warnings
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from statistics import fmean
 
 import numpy as np
 import torch
@@ -28,6 +28,7 @@ from turbogs_plugin.model.torch_file import load_plain, reason_of
 from turbogs_plugin.scene import Scene
 from turbogs_plugin.scene.fingerprint import frame_of_state
 from turbogs_plugin.train.checkpoint import latest_checkpoint
+from turbogs_plugin.train.evaluate import psnr
 from turbogs_plugin.types import PARAMETER_NAMES, Cameras, Gaussians
 
 TRIAL_VIEWS = 3
@@ -130,14 +131,14 @@ def _fitted(gaussians: Gaussians, into: Similarity, scene: Scene, device: torch.
     found, needed = trial.psnr(as_given), trial.flat_psnr
     if found >= needed:
         return as_given
-    best, fit = None, max(found + CLEAR_GAIN, needed)
+    best, fit = None, max(needed, found + CLEAR_GAIN)  # in this order: what is found may be NaN
     for world in gsplat_worlds(_own_viewmats(scene), scene.frame.restore_points(scene.points.cpu().numpy())):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # rows that are left out were counted above
             brought_back = placed(gaussians, into.after(world.inverse()), file)
-        psnr = trial.psnr(brought_back)
-        if psnr > fit:
-            best, fit = brought_back, psnr
+        reached = trial.psnr(brought_back)
+        if reached > fit:
+            best, fit = brought_back, reached
     views = f"on {len(trial.photos)} training views"
     if best is not None:
         warnings.warn(
@@ -188,24 +189,19 @@ class _Trial:
             _reduced(views.photos.image(view).to(device), *size)
             for view, size in zip(chosen, small.tolist(), strict=True)
         ]
-        self.flat_psnr = _mean_psnr([(photo - photo.mean(dim=(0, 1))) for photo in self.photos])
+        self.flat_psnr = fmean(psnr(photo.mean(dim=(0, 1)), photo) for photo in self.photos)
 
     def psnr(self, gaussians: Gaussians) -> float:
         """Mean PSNR of a model in the scene's frame, with all its bands."""
         model = gaussians.map(lambda value: value.to(self._device))
-        differences = []
+        values = []
         for view, (photo, settings) in enumerate(zip(self.photos, self._settings, strict=True)):
             image = render_image(model, self._cameras, view, sh_degree=model.sh_degree, settings=settings)
-            differences.append(image.colors.clamp(0.0, 1.0) - photo)
-        return _mean_psnr(differences)
+            values.append(psnr(image.colors.clamp(0.0, 1.0), photo))
+        return fmean(values)
 
 
 def _reduced(photo: Tensor, width: int, height: int) -> Tensor:
     """[height, width, 3]: the means over areas."""
     channels = photo.permute(2, 0, 1)[None]
     return torch.nn.functional.interpolate(channels, (height, width), mode="area")[0].permute(1, 2, 0)
-
-
-def _mean_psnr(differences: list[Tensor]) -> float:
-    values = [-10.0 * math.log10(max(1e-10, float(difference.square().mean()))) for difference in differences]
-    return math.fsum(values) / len(values)
