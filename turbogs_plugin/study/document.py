@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import base64
+import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
 
 from turbogs_plugin.report.tables import table
+
+COLUMNS = 120
+"""Of Markdown's prose."""
 
 
 @dataclass(frozen=True)
@@ -28,7 +32,7 @@ class Paragraph:
     text: str
 
     def markdown(self) -> str:
-        return self.text
+        return textwrap.fill(self.text, COLUMNS, break_long_words=False, break_on_hyphens=False)
 
     def html(self, folder: Path) -> str:
         return f"<p>{escape(self.text)}</p>"
