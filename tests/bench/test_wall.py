@@ -7,6 +7,7 @@ from helpers.framework_runs import tiny_capture
 
 from turbogs_plugin.bench import wall
 from turbogs_plugin.bench.wall import REST, WallRun, bench_wall, wall_lines
+from turbogs_plugin.train.run import FILES
 
 
 def test_the_parts_of_a_run_are_all_of_its_time(turbogs, tmp_path):
@@ -16,9 +17,7 @@ def test_the_parts_of_a_run_are_all_of_its_time(turbogs, tmp_path):
     report = json.loads((tmp_path / "w.json").read_text())
     median = report["median"]
     assert sum(median["parts"].values()) == pytest.approx(median["seconds"])
-    assert {"interpreter and imports", "photos", "training", "pictures and plots", "model", REST} <= set(
-        median["parts"]
-    )
+    assert {"interpreter and imports", "photos", "training", "pictures and plots", FILES, REST} <= set(median["parts"])
     assert 0 < median["train_seconds"] < median["model_seconds"] < median["seconds"]
     assert median["parts"][REST] > 0
     for part in (*median["parts"], "whole command", "beside training", "from photos to the first iteration"):

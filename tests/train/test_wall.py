@@ -2,6 +2,7 @@
 
 import math
 import os
+import threading
 import time
 from pathlib import Path
 
@@ -9,7 +10,7 @@ import pytest
 from helpers.framework_runs import stop_after, tiny_capture, tiny_config
 from helpers.simulated_time import SimulatedTime
 
-from turbogs_plugin.errors import InputError
+from turbogs_plugin.errors import InputError, TrainingStopped
 from turbogs_plugin.report.pages import write_report
 from turbogs_plugin.train import run, wall
 from turbogs_plugin.train.wall import WallClock, WallRecord, process_age
@@ -73,6 +74,7 @@ def test_a_run_records_the_wall_until_its_model_and_the_parts_of_its_report(capt
         save(*arguments)
 
     def reporting(session: run.RunSession) -> None:
+        session.finish_files()  # or the simulated seconds of two threads would mix
         report_at.append(session.clock.seconds)
         clock.passes(100.0)
         write_report(session)
@@ -88,12 +90,36 @@ def test_a_run_records_the_wall_until_its_model_and_the_parts_of_its_report(capt
         "interpreter and imports": 1000.0,
         "initial maps": 0.07,
         "training": 14.0,
-        "model": 10.0,
+        run.FILES: 10.0,
         "report": 100.0,
     }
     assert {name: parts[name] for name in expected} == pytest.approx(expected, abs=2e-3)
     assert {"photos", "plan", "initial model", "first evaluation", "evaluations", "checkpoints"} <= set(parts)
     assert "| 1024.1 |" in session.folder.report.read_text()
+
+
+def test_checkpoint_and_model_are_written_while_the_report_is_made(capture, tmp_path, monkeypatch):
+    reporting, together = threading.Event(), []
+
+    def late(write):
+        def wait_and_write(*arguments) -> object:
+            together.append(reporting.wait(20.0))
+            return write(*arguments)
+
+        return wait_and_write
+
+    for name in ("save_ply", "save_checkpoint"):
+        monkeypatch.setattr(run, name, late(getattr(run, name)))
+    session = run.train(tiny_config(capture, "train.checkpoint_every=0"), tmp_path / "run", lambda _: reporting.set())
+    assert together == [True, True] and session.folder.model.is_file()
+    assert run.latest_checkpoint(session.folder.checkpoints) is not None
+
+
+def test_a_model_that_cannot_be_written_stops_the_run(capture, tmp_path, monkeypatch):
+    monkeypatch.setattr(run, "save_ply", lambda *_: (_ for _ in ()).throw(TrainingStopped("the disk is full")))
+    with pytest.raises(TrainingStopped, match=r"the disk is full; the last good checkpoint is '.*iteration-000014"):
+        run.train(tiny_config(capture), tmp_path / "run", None)
+    assert not (tmp_path / "run" / "wall.json").exists()
 
 
 def test_a_resumed_run_adds_its_processes_and_a_killed_one_is_not_forgotten(capture, tmp_path, monkeypatch):

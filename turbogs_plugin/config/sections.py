@@ -83,7 +83,7 @@ class TrainConfig:
     backdrop: bool | Auto = False
     distant_size: float = 0.0
     evaluate_at: tuple[float, ...] = (0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
-    checkpoint_every: int = 2500
+    checkpoint_every: int = 10_000
 
     def __post_init__(self) -> None:
         for name in ("iterations", "base_iterations"):

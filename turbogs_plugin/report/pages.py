@@ -36,6 +36,7 @@ def write_report(run: RunSession) -> Path:
             write(pictures / f"test-{view_id:03d}.jpg", strip(run.test.photos.image(view_id), image))
         _plot(run, pictures)  # while the strips are encoded
     run.clock.mark("pictures and plots")
+    run.finish_files()  # the page says how long it took until they were there
     write_text_atomically(run.folder.report, _page(run, metrics, lpips_reason, shown))
     run.clock.mark("report")
     return run.folder.report

@@ -6,6 +6,7 @@ import math
 import operator
 import sys
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -40,6 +41,8 @@ from turbogs_plugin.types import Gaussians
 
 IMPORTS, PHOTOS, DEVICE = "interpreter and imports", "photos", "CUDA and kernels, after the photos"
 """Parts of the wall time before a plan is made."""
+FILES = "checkpoint and model, after the pictures"
+"""The part of the wall time at the end in which nothing else is left to do."""
 
 
 @dataclass
@@ -306,6 +309,8 @@ class RunSession(Listener):
         clock: of the wall, in this process.
         earlier_wall: seconds on the wall of the processes before; NaN where one did not record them.
         wall: what is recorded of it when the model is written.
+
+    At the end of a run, threads write checkpoint and model while the report's pictures are made.
     """
 
     def __init__(
@@ -320,11 +325,14 @@ class RunSession(Listener):
         self.resumed = False
         self.signal: int | None = None
         self._saved_at = -1
+        self._finished_before = False
+        self._threads = ThreadPoolExecutor(2, "files")
+        self._written: list[Future[float]] = []
 
     def run(self, report: Callable[[RunSession], object] | None) -> RunSession:
         """Train to the end, or until a signal; both end with a checkpoint."""
         loop, trainer = self.loop, self.trainer
-        finished_before = loop.finished
+        self._finished_before = loop.finished
         self.folder.wall.unlink(missing_ok=True)  # so that a killed process leaves none, which is then not counted as 0
         self.clock.mark("initial model")
         try:
@@ -336,14 +344,11 @@ class RunSession(Listener):
                 if loop.stopped and trainer.iteration != self._saved_at:
                     self._save()
             if loop.finished:
-                save_ply(trainer.gaussians, self.folder.model, self.scene.frame)
-                self.clock.mark("model")
-            seconds = self.earlier_wall + (0.0 if finished_before else self.clock.seconds)
-            self.wall = WallRecord(loop.clock.seconds, seconds, self.clock.parts)
+                self._in_thread(save_ply, trainer.gaussians, self.folder.model, self.scene.frame)
+                if report is not None:
+                    report(self)
+            self.finish_files()
             self.wall.write(self.folder.wall)
-            if loop.finished and report is not None:
-                report(self)
-                self.wall.write(self.folder.wall)  # with the parts of the report
         except TrainingStopped as stop:
             raise TrainingStopped(f"{stop}; {self._last_good()}") from stop
         except torch.cuda.OutOfMemoryError as error:
@@ -351,8 +356,17 @@ class RunSession(Listener):
                 f"iteration {trainer.iteration}: the device's memory was too small for {len(trainer.gaussians)} "
                 f"Gaussians; try --max-gaussians {round(0.7 * len(trainer.gaussians))}; {self._last_good()}"
             ) from error
+        finally:
+            self._threads.shutdown()
         self.signal = None if loop.finished else interrupts.signal
         return self
+
+    def finish_files(self) -> None:
+        """Wait until checkpoint and model are written, and set `wall`. Raises `TrainingStopped` if the disk refused."""
+        ends = [written.result() for written in self._written]
+        self.clock.mark(FILES)
+        seconds = 0.0 if self._finished_before else max(ends, default=self.clock.seconds)
+        self.wall = WallRecord(self.loop.clock.seconds, self.earlier_wall + seconds, self.clock.parts)
 
     def evaluated(self, loop: TrainingLoop, evaluation: Evaluation) -> None:
         append_evaluation(self.folder.history, evaluation)
@@ -393,9 +407,21 @@ class RunSession(Listener):
             )
 
     def _save(self) -> None:
+        """Write a checkpoint; at the end of the run, when nothing changes the state any more, by a thread."""
         self.trainer.require_finite()
-        save_checkpoint(self.folder.checkpoints, self.trainer.iteration, self.state_dict())
+        arguments = (self.folder.checkpoints, self.trainer.iteration, self.state_dict())
+        if self.loop.finished:
+            self._in_thread(save_checkpoint, *arguments)
+        else:
+            save_checkpoint(*arguments)
         self._saved_at = self.trainer.iteration
+
+    def _in_thread(self, write: Callable[..., object], *arguments: object) -> None:
+        def timed() -> float:
+            write(*arguments)
+            return self.clock.seconds
+
+        self._written.append(self._threads.submit(timed))
 
     def _last_good(self) -> str:
         checkpoint = latest_checkpoint(self.folder.checkpoints)
