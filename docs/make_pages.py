@@ -234,7 +234,9 @@ def dropin(file: Path = DROPIN) -> str:
         size = f"{end['gaussians'] / 1e3:.0f}k"
         texts = (f"{end['seconds']:.1f}", f"{end['psnr']:.2f}", f"{end['ssim']:.4f}", size, equal)
         lines.append((run["scene"], DROPIN_NAMES[run["variant"]], end["step"], *texts))
-    return table(("capture", "swap", "steps", "s", "PSNR", "SSIM", "Gaussians", "PSNR beside stock's, equal time"), lines)
+    return table(
+        ("capture", "swap", "steps", "s", "PSNR", "SSIM", "Gaussians", "PSNR beside stock's, equal time"), lines
+    )
 
 
 TABLES: dict[str, Callable[[], str]] = {

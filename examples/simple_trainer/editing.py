@@ -6,12 +6,13 @@ in place; with ``--out COPY.py``, a copy. Each line that an edit stands on must 
 
 from __future__ import annotations
 
+import re
 import sys
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import tyro
-from typing_extensions import Annotated
 
 from turbogs_plugin.errors import InputError
 
@@ -56,6 +57,11 @@ def hunks_of(text: str) -> list[list[Hunk]]:
     return found
 
 
+def places_of(lines: str, source: str) -> list[int]:
+    """Where whole lines begin in a source."""
+    return [found.start() for found in re.finditer(rf"^{re.escape(lines)}", source, re.MULTILINE)]
+
+
 def edited(source: str, edits: str) -> str:
     """`source` after the `edits`.
 
@@ -63,17 +69,16 @@ def edited(source: str, edits: str) -> str:
         InputError: the edits are there already, or a place is not there, or several times.
     """
     for alternatives in hunks_of(edits):
-        if any(line[0] == "+" for line in alternatives[0].lines) and any(
-            f"\n{hunk.new}" in f"\n{source}" for hunk in alternatives
-        ):
+        adds = any(line.startswith("+") for line in alternatives[0].lines)
+        if adds and any(places_of(hunk.new, source) for hunk in alternatives):
             raise InputError(f"already edited: it has {alternatives[0].changes[-1][1:]!r}")
-        counts = [f"\n{source}".count(f"\n{hunk.old}") for hunk in alternatives]
-        if sum(counts) != 1:
+        places = [(hunk, place) for hunk in alternatives for place in places_of(hunk.old, source)]
+        if len(places) != 1:
             anchor = alternatives[0].old.splitlines()[0].strip()
-            where = "is not there" if sum(counts) == 0 else f"is there {sum(counts)} times"
+            where = f"is there {len(places)} times" if places else "is not there"
             raise InputError(f"{anchor!r} and the lines beside it {where}: expected {HOSTS}")
-        hunk = alternatives[counts.index(1)]
-        source = f"\n{source}".replace(f"\n{hunk.old}", f"\n{hunk.new}")[1:]
+        hunk, place = places[0]
+        source = source[:place] + hunk.new + source[place + len(hunk.old) :]
     return source
 
 

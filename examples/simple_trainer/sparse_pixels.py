@@ -7,7 +7,8 @@ from editing import command_line
 
 EDITS = """
  from gsplat.strategy import DefaultStrategy, MCMCStrategy
-+from turbogs_plugin.gsplat_bridge import gather_pixels, maps_of_photos, sparse_budget, sparse_loss, sparse_rasterization
++from turbogs_plugin.gsplat_bridge import gather_pixels, maps_of_photos
++from turbogs_plugin.gsplat_bridge import sparse_budget, sparse_loss, sparse_rasterization
 +from turbogs_plugin.strategies import CharbonnierNccLoss, ErrorGuidedPixelSampler
 +from turbogs_plugin.types import Step
 @@

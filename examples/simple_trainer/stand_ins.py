@@ -1,7 +1,7 @@
 """Stand-ins for what gsplat's trainer imports and a machine lacks, so that it trains without viewer, log and LPIPS.
 
-A package that is there is used. LPIPS always is 0, as its weights come from the network. Where there is no GPU, gsplat's
-rasterization is this project's torch reference: for a few steps on a tiny capture.
+A package that is there is used. LPIPS always is 0, as its weights come from the network. Where there is no GPU,
+gsplat's rasterization is this project's torch reference: for a few steps on a tiny capture.
 """
 
 from __future__ import annotations
@@ -70,8 +70,13 @@ class SceneManager:
             extra = dict(zip(("k1", "k2", "p1", "p2"), camera.params[list(camera.extra_params_idxs())], strict=False))
             self.cameras[int(key)] = SimpleNamespace(
                 camera_type=MODEL_IDS[camera.model.name],
-                **{"width": camera.width, "height": camera.height, "fx": fx, "fy": fy},
-                **{"cx": float(camera.principal_point_x), "cy": float(camera.principal_point_y), **extra},
+                width=camera.width,
+                height=camera.height,
+                fx=fx,
+                fy=fy,
+                cx=float(camera.principal_point_x),
+                cy=float(camera.principal_point_y),
+                **extra,
             )
 
     def load_images(self) -> None:
