@@ -108,6 +108,11 @@ def test_the_command_writes_all_or_nothing(script, tmp_path, monkeypatch, capsys
         assert len(capsys.readouterr().err.splitlines()) == lines
 
 
+def test_a_clock_without_its_place_is_refused(script):
+    with pytest.raises(SystemExit, match=r"set_random_seed.* is there 0 times: expected gsplat's simple_trainer"):
+        script("measured").instrumented("global_tic = time.time()\n")
+
+
 @pytest.mark.parametrize("name", ["1.5.3", "main"])
 def test_gsplats_trainer_runs_with_each_swap(script, name, tmp_path):
     if not (HOSTS / name / "examples" / "simple_trainer.py").exists():
