@@ -15,6 +15,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
 
@@ -25,7 +26,9 @@ from turbogs_plugin.study.plots import save_plot
 from turbogs_plugin.study.summary import VariantRow, summarise
 
 ROOT = Path(__file__).resolve().parent.parent
-PAGES = tuple(ROOT / name for name in ("README.md", "docs/results/README.md", "docs/results/h200/house.md"))
+PAGES = tuple(
+    ROOT / name for name in ("README.md", "docs/drop-in.md", "docs/results/README.md", "docs/results/h200/house.md")
+)
 PICTURE = ROOT / "docs/results/headline.png"
 DRAWING = 1
 """Version of the way in which the picture is drawn: it is drawn anew where its data or this differ."""
@@ -194,7 +197,50 @@ def house_runs() -> str:
     return table(("capture", "build", "s", "PSNR", "SSIM", "Gaussians"), lines)
 
 
+DROPIN = ROOT / "docs/results/h200/dropin.json"
+"""Runs of examples/simple_trainer/compare.py."""
+
+DROPIN_NAMES = {
+    "stock": "stock",
+    "density": "density control",
+    "errors": "the same, ranked by errors",
+    "lm": "and Moment-LM",
+    "sparse": "sparse pixels, 4 views",
+    "all": "all of them",
+}
+
+
+def psnr_at(run: dict[str, Any], seconds: float) -> float:
+    """A run's PSNR after so many seconds of training, on the straight line between its evaluations; NaN before the
+    first."""
+    times, values = ([mark[key] for mark in run["marks"]] for key in ("seconds", "psnr"))
+    return float(np.interp(seconds, times, values, left=math.nan))
+
+
+def dropin(file: Path = DROPIN) -> str:
+    """gsplat's trainer with each swap at its end, and beside stock at the earlier of both ends."""
+    if not file.exists():
+        return "Not measured yet."
+    runs = [run for run in json.loads(file.read_text())["runs"] if "error" not in run]
+    stock = {run["scene"]: run for run in runs if run["variant"] == "stock"}
+    lines = []
+    for run in runs:
+        end, equal = run["marks"][-1], ""
+        if run["variant"] != "stock" and run["scene"] in stock:
+            seconds = min(end["seconds"], stock[run["scene"]]["marks"][-1]["seconds"])
+            ours, theirs = psnr_at(run, seconds), psnr_at(stock[run["scene"]], seconds)
+            if not math.isnan(ours + theirs):
+                equal = f"{ours - theirs:+.2f} dB: {ours:.2f} for {theirs:.2f} at {seconds:.0f} s"
+        size = f"{end['gaussians'] / 1e3:.0f}k"
+        texts = (f"{end['seconds']:.1f}", f"{end['psnr']:.2f}", f"{end['ssim']:.4f}", size, equal)
+        lines.append((run["scene"], DROPIN_NAMES[run["variant"]], end["step"], *texts))
+    return table(
+        ("capture", "swap", "steps", "s", "PSNR", "SSIM", "Gaussians", "PSNR beside stock's, equal time"), lines
+    )
+
+
 TABLES: dict[str, Callable[[], str]] = {
+    "dropin": dropin,
     "headline": headline,
     "house_iterations": house_iterations,
     "house_runs": house_runs,

@@ -5,6 +5,7 @@ import os
 import re
 import subprocess
 import sys
+import zipfile
 from pathlib import Path
 
 import pytest
@@ -200,3 +201,54 @@ def test_what_the_core_refuses(project):
     core = requirements(project["dependencies"])
     for name, version in (("gsplat", "1.3.0"), ("gsplat", "2.0.0"), ("torch", "2.0.1")):
         assert not core[name].specifier.contains(version)
+
+
+REST = ("torch 2.7.0", "numpy 1.26.4", "pillow 10.3.0", "packaging 24.0", "pyyaml 6.0.2")
+"""Versions of what a host does not pin."""
+
+
+def pip_beside(host: tuple[str, ...], project: dict, folder: Path) -> subprocess.CompletedProcess:
+    """What pip would do with the core of our metadata, in an environment where a host's versions are installed.
+
+    No package is built or fetched: the environment has metadata alone, as has our wheel.
+    """
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", folder / "host"], check=True)
+    (site,) = (folder / "host").glob("lib/python*/site-packages")
+    found = dict(text.split() for text in (*REST, *host))
+    for name, version in found.items():
+        metadata = site / f"{name}-{version}.dist-info"
+        metadata.mkdir()
+        (metadata / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n")
+        (metadata / "INSTALLER").write_text("pip\n")
+    lines = ["Metadata-Version: 2.1", f"Name: {project['name']}", "Version: 1.0"]
+    lines += [f"Requires-Dist: {requirement}" for requirement in project["dependencies"]]
+    stem = "turbogs_plugin-1.0"
+    with zipfile.ZipFile(folder / f"{stem}-py3-none-any.whl", "w") as wheel:
+        wheel.writestr(f"{stem}.dist-info/METADATA", "\n".join(lines) + "\n")
+        wheel.writestr(f"{stem}.dist-info/WHEEL", "Wheel-Version: 1.0\nRoot-Is-Purelib: true\n")
+        wheel.writestr(f"{stem}.dist-info/RECORD", "")
+    command = [
+        sys.executable,
+        "-m",
+        "pip",
+        "--python",
+        folder / "host/bin/python",
+        "install",
+        "--dry-run",
+        "--no-index",
+    ]
+    command += ["--quiet", "--report", folder / "report.json", folder / f"{stem}-py3-none-any.whl"]
+    return subprocess.run(list(map(str, command)), capture_output=True, text=True, check=False)
+
+
+@pytest.mark.parametrize("host", HOSTS)
+def test_pip_installs_us_beside_a_host_and_nothing_else(host, project, tmp_path):
+    done = pip_beside(HOSTS[host], project, tmp_path)
+    assert done.returncode == 0, done.stderr
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert [found["metadata"]["name"] for found in report["install"]] == ["turbogs-plugin"]
+
+
+def test_pip_would_replace_a_gsplat_that_we_do_not_take(project, tmp_path):
+    done = pip_beside(("gsplat 1.3.0",), project, tmp_path)
+    assert done.returncode != 0 and "gsplat" in done.stderr

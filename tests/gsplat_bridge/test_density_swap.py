@@ -382,8 +382,8 @@ def test_what_is_missing_is_named():
     without_radii = {key: value for key, value in host.info.items() if key != "radii"}
     with pytest.raises(InputError, match=r"info has no 'radii'"):
         host.strategy.step_post_backward(*common, host.state, 0, without_radii)
-    with pytest.raises(InputError, match=r"'opacities' has shape \(40, 1\): expected \[N\] with N = 40"):
-        bad = {**host.splats, "opacities": torch.nn.Parameter(torch.zeros(40, 1))}
+    with pytest.raises(InputError, match=r"'opacities' has shape \(40, 2\): expected \[N\] with N = 40"):
+        bad = {**host.splats, "opacities": torch.nn.Parameter(torch.zeros(40, 2))}
         host.strategy.step_post_backward(bad, host.optimizers, host.state, 0, host.info)
     host.info["means2d"].grad = None
     with pytest.raises(InputError, match=r"means2d'\] has no gradient"):

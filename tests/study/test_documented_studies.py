@@ -1,6 +1,7 @@
 """The studies in docs/results: their pages and plots are those that `make pages` makes of their results."""
 
 import importlib.util
+import json
 import re
 from pathlib import Path
 
@@ -58,3 +59,37 @@ def test_the_documentation_keeps_summaries_and_no_runs():
     assert max(path.stat().st_size for path in files) < 512 * 1024
     assert sum(path.stat().st_size for path in files if path.name == "results.json") < 1024 * 1024
     assert not [path for path in files if path.suffix in (".jsonl", ".ply", ".pt")]
+
+
+def trainer_run(variant: str, *marks: tuple[float, float], scene: str = "fox") -> dict:
+    """A run of gsplat's trainer, with (seconds, PSNR) of each mark."""
+    ends = [
+        {"step": 1000 * number, "seconds": seconds, "psnr": psnr, "ssim": 0.875, "gaussians": 123_456}
+        for number, (seconds, psnr) in enumerate(marks, start=1)
+    ]
+    return {"scene": scene, "variant": variant, "marks": ends}
+
+
+def test_the_table_of_swaps_reads_both_runs_at_the_earlier_end(tmp_path):
+    runs = [
+        trainer_run("stock", (10, 28), (20, 30), (40, 31)),
+        trainer_run("density", (8, 28), (16, 30), (30, 31)),
+        trainer_run("lm", (20, 29), (60, 32)),
+        trainer_run("sparse", (1, 20), (5, 30)),
+        {"scene": "fox", "variant": "errors", "error": "out of memory"},
+        trainer_run("density", (8, 28), scene="caliterra"),
+    ]
+    (tmp_path / "dropin.json").write_text(json.dumps({"device": "H200", "runs": runs}))
+    lines = make_pages.dropin(tmp_path / "dropin.json").splitlines()
+    cells = {tuple(line.strip("| ").split(" | ")[:2]): line.strip("| ").split(" | ")[2:] for line in lines[2:]}
+    assert len(lines) == 2 + 5
+    # Stock at 30 s is halfway between 30 and 31 dB.
+    assert cells["fox", "density control"] == [
+        *("3000", "30.0", "31.00", "0.8750", "123k"),
+        "+0.50 dB: 31.00 for 30.50 at 30 s",
+    ]
+    assert cells["fox", "and Moment-LM"][-1] == "-0.50 dB: 30.50 for 31.00 at 40 s"
+    assert cells["fox", "stock"] == ["3000", "40.0", "31.00", "0.8750", "123k"]
+    assert cells["fox", "sparse pixels, 4 views"] == ["2000", "5.0", "30.00", "0.8750", "123k"]  # stock: none yet
+    assert cells["caliterra", "density control"] == ["1000", "8.0", "28.00", "0.8750", "123k"]
+    assert make_pages.dropin(tmp_path / "none.json") == "Not measured yet."

@@ -224,7 +224,9 @@ def apply_row_update(
     count = len(params["means"])
 
     def new_parameter(name: str, parameter: Tensor) -> torch.nn.Parameter:
-        value = update.values[name] if name in update.values else parameter[update.source]
+        value = parameter[update.source]
+        if name in update.values:
+            value = update.values[name].reshape(value.shape)  # a host's own layout
         return torch.nn.Parameter(value, requires_grad=parameter.requires_grad)
 
     _update_param_with_optimizer(new_parameter, lambda key, value: update.apply_state(value), params, optimizers)

@@ -38,6 +38,9 @@ SHAPES = {
 }
 """gsplat's layout: N Gaussians, B harmonics above band 0."""
 
+FLAT_SHAPES = {"opacities": "[N, 1]", "sh0": "[N, 3]"}
+"""Layouts taken beside those, as nerfstudio's splatfacto has them."""
+
 GEOMETRY = ("means", "quats", "scales", "opacities")
 
 
@@ -73,16 +76,20 @@ def host_gaussians(params: Mapping[str, Tensor], names: Iterable[str] = PARAMETE
             zeros stand in for it.
 
     Raises:
-        InputError: a parameter is missing, or has another shape than in gsplat's layout, or another number of rows.
+        InputError: a parameter is missing, or has another shape than in gsplat's layout (opacities [N, 1] and sh0
+            [N, 3] are taken, too), or another number of rows.
     """
     require_keys(params, names, "params", f"expected {', '.join(names)}")
     count = params["means"].shape[0]
     for name in [name for name in PARAMETER_NAMES if name in params]:
         shape = tuple(params[name].shape)
         form = SHAPES[name].replace("N", str(count)).replace("B", str(shape[1]) if len(shape) > 1 else "B")
-        if str(list(shape)) != form:
+        flat = FLAT_SHAPES.get(name, "").replace("N", str(count))
+        if str(list(shape)) not in (form, flat):
             raise InputError(
                 f"parameter '{name}' has shape {shape}: expected {SHAPES[name]} with N = {count} as in 'means'"
             )
     absent = params["means"].new_zeros(count, 1, 3)
-    return Gaussians(**{name: params[name].detach() if name in params else absent for name in PARAMETER_NAMES})
+    values = {name: params[name].detach() if name in params else absent for name in PARAMETER_NAMES}
+    values["opacities"], values["sh0"] = values["opacities"].view(count), values["sh0"].view(count, 1, 3)
+    return Gaussians(**values)

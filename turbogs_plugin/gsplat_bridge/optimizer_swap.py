@@ -117,8 +117,8 @@ class SharedOptimizer:
             return
         gaussians = host_gaussians({name: members[name].parameter for name in PARAMETER_NAMES})
         for name, value in gaussians.items():
-            if gradients[name] is None:
-                gradients[name] = torch.zeros_like(value)
+            gradient = gradients[name]
+            gradients[name] = torch.zeros_like(value) if gradient is None else gradient.reshape(value.shape)
         self._take_options()
         moments = self._pack(gaussians)
         self.optimizer.moments = moments

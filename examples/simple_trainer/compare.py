@@ -1,0 +1,165 @@
+"""gsplat's simple_trainer, stock and with each swap, on captures: the numbers of docs/drop-in.md's table.
+
+    git clone --branch v1.5.3 https://github.com/nerfstudio-project/gsplat .hosts/1.5.3
+    python examples/simple_trainer/compare.py --host .hosts/1.5.3 --scenes PATH/fox PATH/caliterra --out dropin
+
+Each run is a process of its own, on a free GPU. ``OUT/dropin.json`` is written anew after each one: every run's marks
+(step, seconds of training alone, PSNR, SSIM, Gaussians), or its error, which stops no other. A run that is there
+already is not done again. For gsplat's own speed, fused-ssim must be installed; a run says what was stood in for.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from queue import SimpleQueue
+from typing import Any
+
+import density
+import errors
+import moment_lm
+import sparse_pixels
+import torch
+import tyro
+from editing import edited
+
+HERE = Path(__file__).resolve().parent
+
+VARIANTS: dict[str, tuple[str, ...]] = {
+    "stock": (),
+    "density": (density.EDITS,),
+    "errors": (density.EDITS, errors.EDITS),
+    "lm": (density.EDITS, errors.EDITS, moment_lm.EDITS),
+    "sparse": (sparse_pixels.EDITS,),
+    "all": (density.EDITS, errors.EDITS, moment_lm.EDITS, sparse_pixels.EDITS),
+}
+"""Name -> the edits of gsplat's file."""
+
+SPARSE_VIEWS = 4
+"""Batch size of the variants with sparse pixels."""
+
+
+@dataclass
+class Options:
+    """
+    Args:
+        host: a copy of gsplat's repository, with examples/simple_trainer.py of 1.5.3 or main.
+        scenes: folders with images/ and sparse/0/.
+        out: folder of the results.
+        variants: some of stock, density, errors, lm, sparse, all.
+        steps: of each run.
+        marks: steps after which it is evaluated, beside the last one.
+        factor: the photos' own, by which they are smaller: images_4/ at 4.
+        seed: of each run; gsplat's own is 42.
+        limit: seconds that one run may take.
+        extra: further arguments of the trainer, in one text.
+    """
+
+    host: Path
+    scenes: tuple[Path, ...]
+    out: Path
+    variants: tuple[str, ...] = ("stock", "density", "errors", "lm", "sparse")
+    steps: int = 7000
+    marks: tuple[int, ...] = (500, 1000, 2000, 3000, 4000, 5000, 6000)
+    factor: int = 1
+    seed: int = 42
+    limit: float = 600.0
+    extra: str = ""
+
+
+def edited_trainer(host: Path, variant: str, folder: Path) -> Path:
+    """A copy of the host's trainer with a variant's edits."""
+    source = (host / "examples" / "simple_trainer.py").read_text(encoding="utf-8")
+    for edits in VARIANTS[variant]:
+        source = edited(source, edits)
+    trainer = folder / f"{variant}.py"
+    trainer.write_text(source, encoding="utf-8")
+    return trainer
+
+
+def train(options: Options, scene: Path, variant: str, gpu: str) -> dict[str, Any]:
+    """One run: its record, or its error."""
+    batch = SPARSE_VIEWS if sparse_pixels.EDITS in VARIANTS[variant] else 1
+    run = {"scene": scene.name, "variant": variant, "steps": options.steps, "batch": batch, "seed": options.seed}
+    host, marks = options.host.resolve(), sorted({*options.marks, options.steps})
+    paths = [str(host), str(host / "examples"), str(HERE.parents[1]), os.environ.get("PYTHONPATH", "")]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, paths)), "MEASURED_SEED": str(options.seed)}
+    environment |= {"CUDA_VISIBLE_DEVICES": gpu} if gpu else {}
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        try:
+            command = [sys.executable, HERE / "measured.py", edited_trainer(host, variant, folder)]
+            command += [folder / "record.json", "default", "--disable_viewer", "--disable_video"]
+            command += ["--data_dir", scene.resolve(), "--data_factor", options.factor, "--result_dir", folder]
+            command += ["--max_steps", options.steps, "--batch_size", batch, "--save_steps", options.steps]
+            command += ["--eval_steps", *(mark for mark in marks if mark <= options.steps), *options.extra.split()]
+            done = subprocess.run(
+                [str(part) for part in command],
+                stdout=subprocess.PIPE,
+                stderr=subprocess.STDOUT,
+                text=True,
+                errors="replace",
+                timeout=options.limit,
+                env=environment,
+                check=False,
+            )
+            if done.returncode:
+                run["error"] = "\n".join(done.stdout.strip().splitlines()[-8:]) or f"exit code {done.returncode}"
+        except (OSError, ValueError, subprocess.TimeoutExpired) as error:
+            run["error"] = str(error)
+        if (folder / "record.json").exists():
+            run |= json.loads((folder / "record.json").read_text())
+    return run
+
+
+def gpus() -> list[str]:
+    """The GPUs' names for CUDA_VISIBLE_DEVICES; one empty name where there is none."""
+    named = os.environ.get("CUDA_VISIBLE_DEVICES", "")
+    return named.split(",") if named else [str(place) for place in range(torch.cuda.device_count())] or [""]
+
+
+def compare(options: Options) -> list[dict[str, Any]]:
+    """All runs of `options`, those that were there before first; writes them as they end."""
+    options.out.mkdir(parents=True, exist_ok=True)
+    file = options.out / "dropin.json"
+    runs = json.loads(file.read_text())["runs"] if file.exists() else []
+    runs = [run for run in runs if "error" not in run]
+    there = {(run["scene"], run["variant"], run["steps"], run["seed"]) for run in runs}
+    wanted = [(scene, variant) for scene in options.scenes for variant in options.variants]
+    wanted = [(s, v) for s, v in wanted if (s.name, v, options.steps, options.seed) not in there]
+    free: SimpleQueue[str] = SimpleQueue()
+    for gpu in gpus():
+        free.put(gpu)
+
+    def on_a_free_gpu(job: tuple[Path, str]) -> dict[str, Any]:
+        gpu = free.get()
+        try:
+            return train(options, *job, gpu)
+        finally:
+            free.put(gpu)
+
+    device = torch.cuda.get_device_name() if torch.cuda.is_available() else "CPU"
+    with ThreadPoolExecutor(len(gpus())) as pool:
+        for run in pool.map(on_a_free_gpu, wanted):
+            runs.append(run)
+            write(file, device, runs)
+            last = {} if "error" in run or not run["marks"] else run["marks"][-1]
+            print(run["scene"], run["variant"], run.get("error", last), flush=True)
+    return runs
+
+
+def write(file: Path, device: str, runs: Iterable[dict[str, Any]]) -> None:
+    file.with_suffix(".part").write_text(json.dumps({"device": device, "runs": list(runs)}, indent=1) + "\n")
+    file.with_suffix(".part").replace(file)
+
+
+if __name__ == "__main__":
+    failed = [run for run in compare(tyro.cli(Options)) if "error" in run]
+    sys.exit(1 if failed else 0)

@@ -1,0 +1,171 @@
+"""The recipe of docs/drop-in.md for nerfstudio's splatfacto, run as printed in stand-ins of its classes.
+
+Of splatfacto's shape: `features_dc` [N, 3] and `features_rest` [N, B, 3] for sh0 and shN, `opacities` [N, 1], a
+strategy made in `populate_modules`, hooks called by the model, and optimizers made from configurations.
+"""
+
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+from gsplat import DefaultStrategy
+from helpers.bridge_host import HEIGHT, RATES, WIDTH, arguments, make_cameras, make_splats
+from turbogs_plugin.strategies import MomentLMOptimizer
+
+from turbogs_plugin.engine.rendering import dense_samples
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.gsplat_bridge import SharedOptimizer, TurboDensityStrategy, sparse_rasterization
+
+DROP_IN = Path(__file__).resolve().parents[2] / "docs" / "drop-in.md"
+OURS = {"features_dc": "sh0", "features_rest": "shN"}
+
+
+@dataclass
+class AdamOptimizerConfig:
+    lr: float
+    eps: float = 1e-15
+    weight_decay: float = 0.0
+    _target: Any = torch.optim.Adam
+
+    def setup(self, params: list[torch.nn.Parameter]) -> torch.optim.Optimizer:
+        return self._target(params, lr=self.lr, eps=self.eps, weight_decay=self.weight_decay)
+
+
+@dataclass
+class SplatfactoModel:
+    """What the recipe touches, and the order of calls; images are rendered by our reference."""
+
+    training: bool = True
+    config: Any = field(
+        default_factory=lambda: SimpleNamespace(
+            warmup_length=2, stop_split_at=20, refine_every=3, reset_alpha_every=4, num_train_data=3
+        )
+    )
+
+    def populate_modules(self) -> None:
+        splats = make_splats()
+        self.gauss_params = torch.nn.ParameterDict(
+            {
+                **{name: splats[name] for name in ("means", "scales", "quats")},
+                "features_dc": torch.nn.Parameter(splats["sh0"].detach()[:, 0].clone()),
+                "features_rest": splats["shN"],
+                "opacities": torch.nn.Parameter(splats["opacities"].detach()[:, None].clone()),
+            }
+        )
+        pause = self.config.num_train_data + self.config.refine_every
+        self.strategy = DefaultStrategy(pause_refine_after_reset=pause)
+        self.strategy_state = self.strategy.initialize_state(scene_scale=1.0)
+        self.cameras = make_cameras(1)
+        self.samples = dense_samples(self.cameras)
+
+    def gsplat_names(self) -> dict[str, torch.Tensor]:
+        values = {OURS.get(name, name): value for name, value in self.gauss_params.items()}
+        return {**values, "sh0": values["sh0"][:, None], "opacities": values["opacities"].squeeze(-1)}
+
+    def get_outputs(self, step: int) -> dict[str, torch.Tensor]:
+        colors, _, self.info = sparse_rasterization(
+            **arguments(self.gsplat_names(), self.cameras), samples=self.samples, sh_degree=1, absgrad=True
+        )
+        self.strategy.step_pre_backward(self.gauss_params, self.optimizers, self.strategy_state, step, self.info)
+        places = self.samples.pixel_ids.long()
+        image = torch.zeros_like(colors).index_copy(0, places, colors).reshape(HEIGHT, WIDTH, 3)
+        return {"rgb": image, "background": torch.zeros(3)}
+
+    def get_gt_img(self, image: torch.Tensor) -> torch.Tensor:
+        return image
+
+    def composite_with_background(self, image: torch.Tensor, background: torch.Tensor) -> torch.Tensor:
+        return image
+
+    def get_loss_dict(self, outputs: dict, batch: dict, metrics_dict: Any = None) -> dict[str, torch.Tensor]:
+        return {"main_loss": (outputs["rgb"] - batch["image"]).abs().mean()}
+
+    def train(self, optimizers: dict[str, dict[str, Any]], steps: int) -> list[float]:
+        self.optimizers = {name: optimizers[name]["optimizer"].setup([p]) for name, p in self.gauss_params.items()}
+        batch, losses = {"image": torch.full((HEIGHT, WIDTH, 3), 0.5)}, []
+        for step in range(steps):
+            loss = self.get_loss_dict(self.get_outputs(step), batch)["main_loss"]
+            loss.backward()
+            for optimizer in self.optimizers.values():
+                optimizer.step()
+                optimizer.zero_grad(set_to_none=True)
+            self.strategy.step_post_backward(
+                self.gauss_params, self.optimizers, self.strategy_state, step, self.info, packed=False
+            )
+            losses.append(float(loss.detach()))
+        return losses
+
+
+@pytest.fixture
+def recipe() -> dict[str, Any]:
+    """The names that the documentation's two blocks make: the model's class, and `optimizers` with members."""
+    section = DROP_IN.read_text(encoding="utf-8").split("## Nerfstudio's splatfacto")[1].split("\n## ")[0]
+    names: dict[str, Any] = {
+        "SplatfactoModel": SplatfactoModel,
+        "TurboDensityStrategy": TurboDensityStrategy,
+        "SharedOptimizer": SharedOptimizer,
+        "MomentLMOptimizer": MomentLMOptimizer,
+        "optimizers": configurations(),
+    }
+    for block in re.findall(r"^```python\n(.*?)^```$", section, re.DOTALL | re.MULTILINE):
+        exec(block, names)
+    return names
+
+
+def configurations() -> dict[str, dict[str, Any]]:
+    keys = ("means", "scales", "quats", "opacities", "features_dc", "features_rest")
+    return {key: {"optimizer": AdamOptimizerConfig(RATES[OURS.get(key, key)])} for key in keys}
+
+
+@pytest.mark.parametrize("ours", [False, True])
+def test_splatfacto_trains_with_the_recipe(recipe, ours, capsys):
+    model = recipe["TurboSplatfactoModel"]()
+    model.populate_modules()
+    shapes = {name: value.shape[1:] for name, value in model.gauss_params.items()}
+    losses = model.train(recipe["optimizers"] if ours else configurations(), 12)
+    said = capsys.readouterr().out
+    count = len(model.gauss_params["means"])
+    assert losses[2] < losses[0]  # nothing is refined, and no opacity decays, before step 3
+    assert count > 40 and "error-driven" in said and "steps are" not in said
+    for name, parameter in model.gauss_params.items():
+        (group,) = model.optimizers[name].param_groups
+        assert parameter.shape == (count, *shapes[name]) and group["params"][0] is parameter
+        assert model.optimizers[name].state[parameter]["exp_avg"].shape == parameter.shape
+
+
+def test_both_layouts_take_the_same_steps():
+    """One update of LM with errors: flat parameters move as gsplat's do."""
+    results = []
+    for flat in (False, True):
+        splats, shared = make_splats(), SharedOptimizer(MomentLMOptimizer())
+        values = {name: value.detach().clone() for name, value in splats.items()}
+        if flat:
+            values["sh0"], values["opacities"] = values["sh0"][:, 0], values["opacities"][:, None]
+        params = {name: torch.nn.Parameter(value) for name, value in values.items()}
+        members = [shared([{"params": [value], "lr": 0.01, "name": name}]) for name, value in params.items()]
+        for step in range(3):
+            for name, value in params.items():
+                generator = torch.Generator().manual_seed(step)
+                value.grad = torch.randn(splats[name].shape, generator=generator).reshape(value.shape)
+            for member in members:
+                member.step()
+        results.append({name: value.detach().reshape(splats[name].shape) for name, value in params.items()})
+    for name in results[0]:
+        torch.testing.assert_close(results[1][name], results[0][name], rtol=0, atol=0)
+
+
+@pytest.mark.parametrize(("name", "shape"), [("opacities", (40, 2)), ("sh0", (40, 1)), ("opacities", (39, 1))])
+def test_other_layouts_are_refused(name, shape):
+    splats = dict(make_splats().items())
+    splats[name] = torch.nn.Parameter(torch.zeros(shape))
+    shared = SharedOptimizer(MomentLMOptimizer())
+    members = [shared([{"params": [value], "lr": 0.01, "name": key}]) for key, value in splats.items()]
+    for value in splats.values():
+        value.grad = torch.ones_like(value)
+    with pytest.raises(InputError, match=f"parameter '{name}' has shape"):
+        for member in members:
+            member.step()
