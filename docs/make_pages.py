@@ -27,10 +27,11 @@ from turbogs_plugin.study.verdict import verdict
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = tuple(
-    ROOT / name for name in ("README.md", "docs/results/README.md", "docs/paper.md", "docs/results/h200/house.md")
+    ROOT / name
+    for name in ("README.md", "docs/results/README.md", "docs/paper.md", "docs/plan.md", "docs/results/h200/house.md")
 )
 PICTURE = ROOT / "docs/results/headline.png"
-DRAWING = 1
+DRAWING = 2
 """Version of the way in which the picture is drawn: it is drawn anew where its data or this differ."""
 
 PICTURE_COLORS = {
@@ -45,6 +46,7 @@ PICTURE_COLORS = {
     "LiteGS": "#1f5fa8",
     "Faster-GS": "#2e8b57",
 }
+PICTURE_LABELS = {"3dgs": "3DGS, ours", "mcmc": "MCMC, ours", "fastgs": "votes as FastGS's, ours"}
 PICTURE_TICKS = (
     {"0.3": 0.3, "1": 1, "3": 3, "10": 10, "30": 30, "100": 100},
     {"50k": 5e4, "100k": 1e5, "200k": 2e5, "500k": 5e5, "1M": 1e6, "2M": 2e6},
@@ -109,21 +111,23 @@ def headline() -> str:
 def changes(study: str) -> str:
     """Every variant of a study against its own baseline, over the same seeds."""
     found = rows_of(study)
+    captures = [capture for capture in CAPTURES if capture in found]
     lines = []
     for variant in StudyFolder(ROOT / "docs/results" / study).read_study().ablation.variants:
         cells = []
-        for capture in CAPTURES:
-            row = found.get(capture, {}).get(variant)
+        for capture in captures:
+            row = found[capture].get(variant)
             cells.append("" if row is None or row.cells == row.base else change(row))
         if any(cells):
             lines.append((variant, *cells))
-    return table(("", *CAPTURES), lines)
+    return table(("", *captures), lines)
 
 
 def change(row: VariantRow) -> str:
     """Differences in PSNR and SSIM, ratios of time and Gaussians, and how many seeds."""
     sizes = row.ratio("gaussians")
-    parts = [f"{difference_text(row.difference('psnr'), 2)} dB", difference_text(row.difference("ssim"), 4)]
+    error, said, clear = difference_text(row.difference("psnr"), 2).partition(" (clear)")
+    parts = [f"{error} dB{said}{clear}", difference_text(row.difference("ssim"), 4)]
     parts += [f"x {row.ratio('seconds'):.2f} s", "" if math.isnan(sizes) else f"x {sizes:.2f} N"]
     return f"{', '.join(filter(None, parts))} ({row.difference('psnr').count})"
 
@@ -157,11 +161,11 @@ def draw(data: dict[str, Any]) -> Figure:
             axes[0, column].plot(seconds, psnr, markersize=size, label=name, **style)
             if gaussians is not None:
                 axes[1, column].plot(gaussians, psnr, markersize=size, label=name, **style)
-        best = max(point[2] for point in shown["points"])
+        best, worst = (pick(point[2] for point in shown["points"]) for pick in (max, min))
         longest = max(250.0, *(1.2 * point[1] for point in shown["points"]))
         axes[0, column].set(title=capture, xlabel="training seconds", xlim=(0.3, longest))
         axes[0, column].set_ylim(best - 5.0, best + 0.4)
-        axes[1, column].set(xlabel="Gaussians", xlim=(4e4, 2.5e6), ylim=(best - 2.4, best + 0.4))
+        axes[1, column].set(xlabel="Gaussians", xlim=(4e4, 2.5e6), ylim=(max(best - 5.0, worst - 0.3), best + 0.4))
         for axis, ticks in zip(axes[:, column], PICTURE_TICKS, strict=True):
             axis.set_xscale("log")
             axis.set_xticks(list(ticks.values()), list(ticks))
@@ -171,7 +175,8 @@ def draw(data: dict[str, Any]) -> Figure:
     handles = {
         label: handle for axis in axes.flat for handle, label in zip(*axis.get_legend_handles_labels(), strict=True)
     }
-    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=len(handles), frameon=False)
+    labels = [PICTURE_LABELS.get(name, name) for name in handles]
+    figure.legend(handles.values(), labels, loc="outside lower center", ncols=min(len(handles), 6), frameon=False)
     return figure
 
 
@@ -348,6 +353,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "headline": headline,
     "house_iterations": house_iterations,
     "house_runs": house_runs,
+    "leave_out": lambda: changes("leave_out"),
     "paper_parts": paper_parts,
     "paper_whole": paper_whole,
     "parts": lambda: changes("parts"),
