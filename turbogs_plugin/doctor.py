@@ -12,6 +12,7 @@ from packaging.requirements import Requirement
 
 from turbogs_plugin.report.machine import hardware, software
 from turbogs_plugin.train.evaluate import LPIPS_PACKAGES
+from turbogs_plugin.train.flip import load_flip
 
 COMMAND_PACKAGES = {
     "pycolmap": "pycolmap>=4.0",
@@ -38,6 +39,8 @@ def diagnosis() -> str:
         missing.append("a GPU that answers: training runs on the CPU, by the torch reference")
     absent = [name for name in LPIPS_PACKAGES if importlib.util.find_spec(name) is None]
     missing += [f"{name}: LPIPS is not computed" for name in absent]
+    if reason := load_flip()[1]:
+        missing.append(f"FLIP is not computed: {reason}")
     if lacking := lacking_packages():
         missing.append(f"{', '.join(lacking)}: commands that need them refuse; {INSTALL_COMMANDS}")
     return "\n".join([*lines, *(f"{'missing':<16}{line}" for line in missing)])

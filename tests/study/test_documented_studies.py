@@ -9,10 +9,13 @@ import pytest
 
 from turbogs_plugin.study.document import to_markdown
 from turbogs_plugin.study.folder import StudyFolder
+from turbogs_plugin.study.grid import load_ablation, variant_config
 from turbogs_plugin.study.pages import report_blocks
 from turbogs_plugin.study.plots import PLOTS, plot_digest, shown_digest
+from turbogs_plugin.study.results import CellResult, Study
 from turbogs_plugin.study.results_file import study_to_json
 from turbogs_plugin.study.summary import summarise
+from turbogs_plugin.train.history import Evaluation
 
 DOCS = Path(__file__).parents[2] / "docs"
 FOLDERS = sorted(path.parent for path in DOCS.glob("results/*/results.json"))
@@ -48,9 +51,63 @@ def test_the_tables_in_the_pages_are_those_of_the_results():
     assert {name for text in texts for _, name, _ in make_pages.BLOCK.findall(text)} == set(make_pages.TABLES)
 
 
+def test_every_part_of_the_paper_has_its_row():
+    pairs = {"parts": [part.ours for part in make_pages.PARTS]}
+    pairs["paper_parts"] = [part.papers for part in make_pages.PARTS if part.papers]
+    for study, named in pairs.items():
+        variants = {variant for pair in named for variant in pair}
+        known = set(load_ablation(study).variants)
+        assert known - variants <= {"paper-literal"} and variants <= known, "paper-literal has its own table"
+    assert {part.default for part in make_pages.PARTS} == {"the paper's", "ours", ""}
+
+
+def a_study(folder: Path, name: str, results: dict[str, tuple[float, ...]]) -> None:
+    """Results of a packaged ablation on every capture, variant -> final PSNRs of its seeds."""
+    ablation, cells = load_ablation(name), []
+    for capture in make_pages.CAPTURES:
+        for variant, psnrs in results.items():
+            config = variant_config(ablation, variant, 0, (), None).without_plan().to_mapping()
+            for seed, psnr in enumerate(psnrs):
+                history = [Evaluation(0, 0.1, 9.0, 0.2, 0.4, 90, 9), Evaluation(5, 3.0, 33.0, 0.9, 0.1, 900, 9)]
+                history.append(Evaluation(9, 7.0, psnr, 0.9, 0.1, 1000, 9))
+                where = {"scene": capture, "variant": variant, "seed": seed}
+                cells.append(CellResult(**where, config=config, asked=config, cell_seconds=12.0, history=history))
+    study = StudyFolder(folder / "docs/results" / name)
+    study.path.mkdir(parents=True)
+    study.write_study(Study(ablation, cells))
+
+
+def test_what_is_not_measured_yet_says_so_until_it_is(tmp_path, monkeypatch):
+    monkeypatch.setattr(make_pages, "ROOT", tmp_path)
+    assert make_pages.paper_parts().count("not measured yet") == len(make_pages.PARTS) + sum(
+        part.papers is not None for part in make_pages.PARTS
+    )
+    assert make_pages.paper_whole().count("not measured yet") == 6 * 3
+    a_study(tmp_path, "parts", {"turbogs": (31.0, 31.1), "geometry-views": (31.0, 31.1), "no-ncc": (31.5, 31.6)})
+    a_study(tmp_path, "paper_parts", {"turbogs-paper": (30.0, 30.1), "random-views": (30.5,), "paper-literal": (8.0,)})
+    a_study(tmp_path, "baselines", {"3dgs": (30.3,)})
+    lines = {line.split(" | ")[0]: line for line in make_pages.paper_parts().splitlines()}
+    (views,) = (line for line in lines.values() if "geometry-aware" in line)
+    assert "fox: +0.00 ± 0.00 dB" in views and "as good<br>in the paper's: one seed" in views
+    assert views.endswith("| ours; **should be the paper's** |") and "fox: -0.50 dB" in views
+    everywhere = ", ".join(f"PSNR on {capture}" for capture in make_pages.CAPTURES)
+    (ncc,) = (line for name, line in lines.items() if name.startswith("| NCC ("))
+    assert ncc.endswith(
+        f"| worse: {everywhere}<br>in the paper's: not measured yet | the paper's; **should be ours** |"
+    )
+    whole = make_pages.paper_whole()
+    assert whole.count("7.0 s, 30.30 dB, .900, 1k; best on the way 33.00 dB (1)") == 3 and whole.count("8.00 dB") == 3
+    assert whole.count("-0.25 dB, within the bound") == 3 and whole.count("-2.95 dB, beyond the bound") == 3
+
+
+def test_the_headline_has_the_wall_beside_the_training():
+    assert make_pages.result(4.12, 32.2, 0.893, 209e3, make_pages.duration(9.54)) == "4.1 / 9.5 s, 32.20 dB, .893, 209k"
+    assert make_pages.result(74.0, 30.9, None, None, make_pages.duration(float("nan"))) == "74 / - s, 30.90 dB"
+
+
 def test_a_number_changed_by_hand_is_found():
     text = make_pages.PAGES[0].read_text()
-    (psnr,) = re.findall(r"\*\*turbogs\*\* \| [\d.]+ s, ([\d.]+) dB", text)
+    (psnr,) = re.findall(r"\*\*turbogs\*\* \| [\d.]+ / [\d.-]+ s, ([\d.]+) dB", text)
     assert make_pages.filled(text.replace(psnr, "33.99")) == text
 
 

@@ -1,7 +1,9 @@
 """`results.json`: what is written is read again, small and to the letter; reports are made from it alone."""
 
+import csv
 import json
 import math
+import re
 from dataclasses import replace
 
 import pytest
@@ -17,6 +19,7 @@ from turbogs_plugin.study.folder import StudyFolder
 from turbogs_plugin.study.grid import Ablation, CellKey
 from turbogs_plugin.study.results import CellResult, Failure, Study
 from turbogs_plugin.study.results_file import study_from_json, study_to_json
+from turbogs_plugin.study.statistics import crossing_gap
 from turbogs_plugin.train.history import Evaluation
 
 HERE = Provenance("a machine", {"torch": "2"}, "none", "abc")
@@ -40,6 +43,7 @@ def study() -> Study:
     results = [result(variant, seed) for variant in ABLATION.variants for seed in (0, 1)]
     elsewhere = replace(HERE, machine="another machine")
     results[3] = replace(results[3], provenance=elsewhere, warmup_iterations=7, lpips=0.25, capture="")
+    results[2] = replace(results[2], flip=0.125, cell_seconds=7.25)  # the others are older than these
     results.append(result("base", 0, "h", provenance=None, resolved=False, capture="beef"))
     results[4].asked = results[4].config
     results[4].history[1].worst_psnr = 25.5
@@ -209,6 +213,33 @@ def test_a_plot_of_other_data_or_a_broken_one_is_drawn_again(turbogs, folder):
         "fox-pareto.png",
         "fox-gaussians.png",
     }
+
+
+def test_flip_and_the_seconds_of_a_cell_are_shown_where_a_cell_has_them(turbogs, folder):
+    assert turbogs("report", folder.path)[0] == 0
+    fox, h = (folder.path / "report.md").read_text().split("\n## h\n")
+    assert "| load, train, evaluate in s |" in fox and "| FLIP |" in fox and "Imports and warm-up are not" in fox
+    assert "| load, train, evaluate in s |" not in h and "| FLIP |" not in h
+    (line,) = re.findall(r"\| other \|.*dB.*|\| other \| .* 30\..*", fox)
+    assert line.count("| - |") == 1 and "| not computed | not computed |" in line, "a mean over some seeds is none"
+    whole = study()
+    for result in whole.results[:4]:
+        result.flip, result.cell_seconds = 0.125 + result.seed / 100, 7.0 + result.seed
+    folder.write_study(whole)
+    assert turbogs("report", folder.path)[0] == 0
+    fox = (folder.path / "report.md").read_text().split("\n## h\n")[0]
+    assert fox.count("| 7.5 [7.0, 8.0] |") == 2 and fox.count("| 0.1300 [0.1250, 0.1350] |") == 2
+    rows = list(csv.DictReader((folder.path / "table.csv").open()))
+    assert [(row["flip_mean"], row["cell_seconds_mean"]) for row in rows] == [("0.13", "7.5")] * 2 + [("", "")]
+    assert "wall_seconds_mean" not in rows[0]
+
+
+def test_a_page_says_how_far_apart_the_marks_about_a_crossing_are(turbogs, folder):
+    assert turbogs("report", folder.path)[0] == 0
+    assert "on either side of a crossing are 2.40 [2.40, 2.40] s of" in (folder.path / "report.md").read_text()
+    history = [Evaluation(n, float(s), p, 0.9, 0.1, 9, 9) for n, s, p in ((0, 0, 10), (1, 2, 20), (2, 5, 30))]
+    assert [crossing_gap(history, psnr) for psnr in (15.0, 20.0, 20.5)] == [2.0, 2.0, 3.0]
+    assert math.isnan(crossing_gap(history, 9.0)) and math.isnan(crossing_gap(history, 31.0))
 
 
 def test_a_merge_keeps_what_its_folder_has(turbogs, folder, tmp_path):

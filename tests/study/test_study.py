@@ -17,7 +17,7 @@ from turbogs_plugin.study.grid import Ablation, ablation_names, alike_at, load_a
 from turbogs_plugin.study.plots import OTHER_COLOR, draw_curves, draw_front, told_apart
 from turbogs_plugin.study.results import CellResult, Study
 from turbogs_plugin.study.statistics import Curve, Difference, Spread, pareto_front, seconds_to_reach
-from turbogs_plugin.study.summary import summarise
+from turbogs_plugin.study.summary import VariantRow, summarise
 from turbogs_plugin.train.history import Evaluation
 
 
@@ -255,6 +255,21 @@ def test_a_summary_of_known_numbers():
     ] * 3
     (default,) = summarise(study)
     assert default.targets == [29.0, 29.5, 30.0]
+
+
+def test_ratios_are_over_the_seeds_that_both_have():
+    """A baseline of more seeds than the variant, one of which is slow and large, changes nothing."""
+    cells = [
+        cell("base", 0, entry(0, 0.0, 10.0), entry(100, 10.0, 30.0, 1000)),
+        cell("base", 1, entry(0, 0.0, 10.0), entry(100, 70.0, 30.0, 7000)),
+        cell("other", 2, entry(0, 0.0, 10.0), entry(100, 99.0, 30.0, 9000)),
+        cell("other", 0, entry(0, 0.0, 10.0), entry(100, 5.0, 30.0, 2000)),
+    ]
+    (summary,) = summarise(Study(Ablation("x", {"base": [], "other": []}), cells, targets=[20.0]))
+    other = summary.rows[1]
+    assert (other.ratio("seconds"), other.ratio("gaussians")) == (0.5, 2.0)
+    assert other.ratio_to(20.0) == 0.5 and other.difference("seconds").count == 1
+    assert math.isnan(VariantRow("lone", cells[:1], []).ratio("seconds"))
 
 
 def test_a_variant_that_failed_does_not_set_the_scale_of_the_plots():

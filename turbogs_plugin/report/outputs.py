@@ -20,6 +20,7 @@ from turbogs_plugin.report.tables import views_table
 from turbogs_plugin.scene import PosedImages
 from turbogs_plugin.scene.offload import place_views
 from turbogs_plugin.train.evaluate import evaluate, load_lpips
+from turbogs_plugin.train.flip import load_flip
 from turbogs_plugin.train.run import SavedModel, load_given_model, load_model, open_scene, resolve_device
 
 
@@ -34,8 +35,10 @@ def evaluate_run(path: Path, device_name: str, given: Config | None = None) -> s
     model, views = _open(path, device_name, "test", given)
     views = place_views(views, model.gaussians.device, model.config.train.photos_place)
     lpips, reason = load_lpips(model.config.report.lpips_weights, model.gaussians.device)
-    metrics = evaluate(model.gaussians, views, model.sh_degree, model.config.raster, lpips)
+    flip, no_flip = load_flip()
+    metrics = evaluate(model.gaussians, views, model.sh_degree, model.config.raster, lpips, flip=flip)
     note = f"\nLPIPS was not computed: {reason}" if reason else ""
+    note += f"\nFLIP was not computed: {no_flip}" if no_flip else ""
     which = f"iteration {model.iteration}" if given is None else str(path)
     speed = f"{len(model.gaussians)} Gaussians, {metrics.fps:.1f} views a second"
     return f"{views_table(metrics, with_means=True)}\n\n{which}, {speed}{note}"

@@ -31,11 +31,16 @@ def errors(measured: ViewMetrics | Evaluation, psnr_digits: int = 2) -> list[str
 
 
 def views_table(metrics: Metrics, with_means: bool = False) -> str:
-    """A table with the errors of each test view, and with their means as its last line if asked for."""
-    rows = [[view.name, *errors(view)] for view in metrics.views]
-    if with_means:
-        rows.append([metrics.mean.name, *errors(metrics.mean, psnr_digits=4)])
-    return table(("view", *ERRORS, "LPIPS (VGG)"), rows)
+    """A table with the errors of each test view, and with their means as its last line if asked for. FLIP has a column
+    where it was computed."""
+    measured = [(view, 2) for view in metrics.views] + ([(metrics.mean, 4)] if with_means else [])
+    rows = [[view.name, *errors(view, digits)] for view, digits in measured]
+    header = ["view", *ERRORS, "LPIPS (VGG)"]
+    if not all(math.isnan(view.flip) for view in metrics.views):
+        header.append("FLIP")
+        for row, (view, _) in zip(rows, measured, strict=True):
+            row.append(number(view.flip, 4))
+    return table(header, rows)
 
 
 def history_table(history: list[Evaluation]) -> str:

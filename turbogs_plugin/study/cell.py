@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -19,10 +20,12 @@ from turbogs_plugin.scene.offload import place_views
 from turbogs_plugin.study.results import CellResult
 from turbogs_plugin.train.evaluate import evaluate, load_lpips
 from turbogs_plugin.train.evaluations import Evaluations
+from turbogs_plugin.train.flip import load_flip
 from turbogs_plugin.train.history import Evaluation
 from turbogs_plugin.train.loop import Listener, TrainingLoop
 from turbogs_plugin.train.run import new_loop
 from turbogs_plugin.train.trainer import Trainer
+from turbogs_plugin.train.wall import WallClock
 
 WARMUP_ITERATIONS = {"cuda": 20, "cpu": 2}
 """Iterations of warm-up: the configuration is scaled to this length and trained once before the clock starts, so that
@@ -85,6 +88,7 @@ def train_cell(
     device: torch.device,
     made_by: Provenance,
     listeners: Sequence[Listener] = (),
+    loading: float = math.nan,
 ) -> CellResult:
     """Train one variant, as `turbogs train` would: by a plan for the scene, within the budgets of the configuration.
 
@@ -95,30 +99,42 @@ def train_cell(
         device: where to train.
         made_by: machine and sources, as they were when the process began.
         listeners: to the training.
+        loading: seconds that the scene took to load; NaN: the cell's own seconds are not known.
 
     Raises:
         InputError: a budget is too small.
         TrainingStopped: the model is lost.
     """
+    lpips, lpips_reason = load_lpips(config.report.lpips_weights, device)
+    flip, _ = load_flip()
+    clock = WallClock()
     planned = make_plan(config, scene, device).apply(config)
     test = place_views(scene.test, device, planned.train.photos_place)
+    clock.mark("cell")
     warmup = min(WARMUP_ITERATIONS[device.type], planned.train.iterations)
     warm_up(planned, scene, test, device, warmup)
-    lpips, lpips_reason = load_lpips(config.report.lpips_weights, device)
+    clock.mark("warm-up")
     memory = PeakMemory(device)
     loop, _ = new_loop(planned, scene, device)
     evaluations = Evaluations(test, lpips, lambda: memory.peak or peak_memory_bytes(device))
     loop.listeners = [evaluations, memory, *listeners]
     loop.run()
+    clock.mark("cell")
+    trainer, mean_flip = loop.trainer, math.nan
+    if flip is not None:  # off the clock
+        seen = evaluate(trainer.gaussians, test, trainer.sh_degree, trainer.config.raster, flip=flip)
+        mean_flip = seen.mean.flip
     return CellResult(
         scene=scene.name,
         variant=variant,
         seed=config.train.seed,
-        config=loop.trainer.config.to_mapping(),
+        config=trainer.config.to_mapping(),
         asked=config.to_mapping(),
         history=evaluations.history,
         lpips=evaluations.metrics.mean.lpips,
         lpips_reason=lpips_reason,
+        flip=mean_flip,
+        cell_seconds=loading + clock.parts["cell"],
         fps=evaluations.metrics.fps,
         peak_bytes=memory.peak,
         warmup_iterations=warmup,

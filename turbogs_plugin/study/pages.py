@@ -22,10 +22,13 @@ from turbogs_plugin.study.folder import StudyFolder
 from turbogs_plugin.study.grid import variant_config
 from turbogs_plugin.study.plots import PLOTS, write_plots
 from turbogs_plugin.study.results import Study
-from turbogs_plugin.study.statistics import Difference, Spread
+from turbogs_plugin.study.statistics import Difference, Spread, crossing_gap
 from turbogs_plugin.study.summary import MEASURES, SceneSummary, VariantRow, summarise
 
 MIB = 2**20
+
+CLOCKS = {"wall_seconds": "wall in s", "cell_seconds": "load, train, evaluate in s"}
+"""Measures of the wall's clock, each with its column, where a cell has it."""
 
 OF_THE_CALL = ("scene.", "report.", "budget.", "train.seed", "train.device", "train.evaluate_at")
 """Settings that belong to a call, or change no result: a page does not go stale by them."""
@@ -33,6 +36,11 @@ OF_THE_CALL = ("scene.", "report.", "budget.", "train.seed", "train.device", "tr
 TIMING_RULES = (
     "Seconds are those of training alone: the initial error maps and the iterations, by one clock for all cells, with "
     "the GPU waited for wherever it is read. Loading, evaluation, and reports are not in them."
+)
+
+CELL_RULES = (
+    "Seconds to load, train and evaluate are a cell's own on the wall: its capture, which all its cells share, the "
+    "plan, training, and every evaluation. Imports and warm-up are not in them."
 )
 
 HOW_TO_READ = (
@@ -94,6 +102,8 @@ def _header(study: Study) -> list[Block]:
     blocks: list[Block] = [Paragraph(f"{said[:1].upper()}{said[1:]}. {TIMING_RULES} {warmup}"), Paragraph(HOW_TO_READ)]
     missing = sorted({result.lpips_reason for result in results if result.lpips_reason})
     blocks += [Paragraph(f"LPIPS was not computed: {reason}.") for reason in missing]
+    if not all(math.isnan(result.cell_seconds) for result in results):
+        blocks.insert(1, Paragraph(CELL_RULES))
     return [*blocks, *_machines(study.provenances), *_changed_since(study)]
 
 
@@ -132,10 +142,11 @@ def _machines(provenances: Sequence[Provenance | None]) -> list[Block]:
 
 def _scene(summary: SceneSummary) -> list[Block]:
     against = f" against {summary.baseline}" if summary.baseline else ""
-    wall = ("wall in s",) if _has_wall(summary) else ()
+    clocks = [label for measure, label in CLOCKS.items() if _has(summary, measure)]
+    flip = ("FLIP",) if _has(summary, "flip") else ()
     header = (
-        *("variant", "front", "seeds", "time in s", *wall, f"time{against}", "PSNR in dB", f"PSNR{against}"),
-        *("worst view in dB", "SSIM", f"SSIM{against}", "LPIPS (VGG)", "Gaussians", "FPS", "peak MiB"),
+        *("variant", "front", "seeds", "time in s", *clocks, f"time{against}", "PSNR in dB", f"PSNR{against}"),
+        *("worst view in dB", "SSIM", f"SSIM{against}", "LPIPS (VGG)", *flip, "Gaussians", "FPS", "peak MiB"),
     )
     reach_header, reach_lines = ["variant"], [[row.name] for row in summary.rows]
     for target in summary.targets:
@@ -148,6 +159,7 @@ def _scene(summary: SceneSummary) -> list[Block]:
         *(Picture(f"{summary.scene}-{plot.name}.png", f"{summary.scene}: {plot.text}") for plot in PLOTS),
         Heading(f"Time to reach a PSNR on {summary.scene}", 3),
         Table(reach_header, reach_lines),
+        *_marks(summary),
     ]
     budgeted = {
         row.name: sorted(cell.final.iteration for cell in row.cells if cell.time_budget) for row in summary.rows
@@ -158,9 +170,28 @@ def _scene(summary: SceneSummary) -> list[Block]:
     return blocks
 
 
-def _has_wall(summary: SceneSummary) -> bool:
-    """Whether any variant has seconds on the wall: runs do, the cells of an ablation share a process."""
-    return not all(math.isnan(row.spread("wall_seconds").mean) for row in summary.rows)
+def _marks(summary: SceneSummary) -> list[Block]:
+    """What interpolation between evaluations may hide of a time to a PSNR."""
+    gaps = [
+        gap
+        for row in summary.rows
+        for cell in row.cells
+        for target in summary.targets
+        if not math.isnan(gap := crossing_gap(cell.history, target))
+    ]
+    if not gaps:
+        return []
+    return [
+        Paragraph(
+            "These seconds are linear between evaluations. The two on either side of a crossing are "
+            f"{spread_text(Spread.of(gaps), 2)} s of training apart: differences smaller than that are not measured."
+        )
+    ]
+
+
+def _has(summary: SceneSummary, measure: str) -> bool:
+    """Whether any cell has it: wall seconds are those of runs, and older cells lack what was recorded later."""
+    return not all(math.isnan(MEASURES[measure](cell)) for row in summary.rows for cell in row.cells)
 
 
 def _result_line(row: VariantRow, summary: SceneSummary) -> tuple[str, ...]:
@@ -173,7 +204,7 @@ def _result_line(row: VariantRow, summary: SceneSummary) -> tuple[str, ...]:
         "★" if row.on_front else "",
         str(len(row.cells)),
         spread_text(row.seconds, 1),
-        *((spread_text(row.spread("wall_seconds"), 1, "not recorded"),) if _has_wall(summary) else ()),
+        *(spread_text(row.spread(clock), 1, "-") for clock in CLOCKS if _has(summary, clock)),
         ratio,
         spread_text(row.psnr, 2),
         psnr,
@@ -181,6 +212,7 @@ def _result_line(row: VariantRow, summary: SceneSummary) -> tuple[str, ...]:
         spread_text(row.spread("ssim"), 4),
         ssim,
         spread_text(row.spread("lpips"), 4),
+        *((spread_text(row.spread("flip"), 4),) if _has(summary, "flip") else ()),
         number(row.spread("gaussians").mean, 0),
         number(row.spread("fps").mean, 0, "not recorded"),
         number(row.spread("peak_bytes").mean / MIB, 0, "not measured"),
@@ -235,7 +267,8 @@ def _settings(study: Study) -> list[Block]:
 def table_csv(summaries: Sequence[SceneSummary]) -> str:
     """All numbers of the tables, unrounded; empty where not computed or not measured, ``inf`` where never reached."""
     lines: list[dict[str, Any]] = []
-    measures = [name for name in MEASURES if name != "wall_seconds" or any(map(_has_wall, summaries))]
+    later = {*CLOCKS, "flip"}
+    measures = [name for name in MEASURES if name not in later or any(_has(summary, name) for summary in summaries)]
     for summary in summaries:
         for row in summary.rows:
             line = {"scene": summary.scene, "variant": row.name, "seeds": len(row.cells), "pareto": row.on_front}

@@ -24,9 +24,11 @@ class CellResult:
         lpips_reason: why LPIPS was not computed; empty where it was.
         config: its configuration, as plan and budgets resolved it.
         asked: the configuration that was asked for: by it a finished cell is recognised.
-        lpips: NaN where it was not computed.
+        lpips, flip: of the final model; NaN where they were not computed.
         fps: test views rendered a second, one after the other; NaN where it was not recorded.
         wall_seconds: of a run, from its process's start until its model was written; NaN where a process has many.
+        cell_seconds: of a study's cell, on the wall: loading its capture (once for all its cells, and counted in each),
+            plan, training and evaluations; NaN for runs, and where it was not recorded.
         peak_bytes: peak of the GPU's tensors while training, or None where it was not measured.
         history: every evaluation, the last one of the final model.
     """
@@ -42,8 +44,10 @@ class CellResult:
     config: dict[str, Any]
     asked: dict[str, Any]
     lpips: float = math.nan
+    flip: float = math.nan
     fps: float = math.nan
     wall_seconds: float = math.nan
+    cell_seconds: float = math.nan
     peak_bytes: int | None = None
     history: list[Evaluation]
 

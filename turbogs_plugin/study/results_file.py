@@ -26,7 +26,18 @@ from turbogs_plugin.train.history import Evaluation
 FORMAT = 2
 """Raised by one whenever an older version of TurboGS would misread a new file."""
 
-DECIMALS = {"train_seconds": 6, "psnr": 5, "worst_psnr": 5, "ssim": 7, "l1": 7, "lpips": 7, "fps": 3, "wall_seconds": 3}
+DECIMALS = {
+    "train_seconds": 6,
+    "psnr": 5,
+    "worst_psnr": 5,
+    "ssim": 7,
+    "l1": 7,
+    "lpips": 7,
+    "flip": 7,
+    "fps": 3,
+    "wall_seconds": 3,
+    "cell_seconds": 3,
+}
 """Digits behind the point that are kept of a measure: for errors those that float32 has."""
 
 SHARED = ("provenance", "resolved", "warmup_iterations", "lpips_reason")

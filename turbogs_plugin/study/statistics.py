@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -77,6 +78,17 @@ def seconds_to_reach(history: Sequence[Evaluation], psnr: float) -> float:
             share = (psnr - before.psnr) / (after.psnr - before.psnr)
             return before.train_seconds + share * (after.train_seconds - before.train_seconds)
     return math.inf
+
+
+def crossing_gap(history: Sequence[Evaluation], psnr: float) -> float:
+    """Seconds of training between the evaluations on either side of the moment of `seconds_to_reach`; NaN where a run
+    never reached it, or began there."""
+    for before, after in itertools.pairwise(history):
+        if before.psnr >= psnr:
+            break
+        if after.psnr >= psnr:
+            return after.train_seconds - before.train_seconds
+    return math.nan
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from operator import attrgetter
 
@@ -16,11 +16,13 @@ TARGET_STEP = 0.5
 MEASURES = {
     "seconds": attrgetter("final.train_seconds"),
     "wall_seconds": attrgetter("wall_seconds"),
+    "cell_seconds": attrgetter("cell_seconds"),
     "psnr": attrgetter("final.psnr"),
     "worst_psnr": attrgetter("final.worst_psnr"),
     "ssim": attrgetter("final.ssim"),
     "l1": attrgetter("final.l1"),
     "lpips": attrgetter("lpips"),
+    "flip": attrgetter("flip"),
     "gaussians": attrgetter("final.num_gaussians"),
     "fps": attrgetter("fps"),
     "peak_bytes": attrgetter("peak_bytes"),
@@ -58,12 +60,12 @@ class VariantRow:
 
     def difference(self, measure: str) -> Difference:
         """From the baseline, over the seeds that both have."""
-        own, base = ({cell.seed: MEASURES[measure](cell) for cell in cells} for cells in (self.cells, self.base))
-        return Difference.of([value - base[seed] for seed, value in own.items() if seed in base])
+        return Difference.of([own - base for own, base in self._pairs(MEASURES[measure])])
 
     def ratio(self, measure: str) -> float:
-        """The mean over the baseline's mean; NaN where there is no baseline."""
-        return self.spread(measure).mean / _spread(self.base, measure).mean
+        """The mean over the baseline's mean, both over the seeds that both have; NaN where there is none."""
+        own, base = self._means(MEASURES[measure])
+        return own / base
 
     def curve(self, name: str) -> Curve:
         """The curve of a field of `Evaluation` against seconds."""
@@ -74,10 +76,20 @@ class VariantRow:
         return [seconds_to_reach(cell.history, psnr) for cell in self.cells]
 
     def ratio_to(self, psnr: float) -> float:
-        """Mean `seconds_to` over the baseline's; NaN where a seed of either never reached it, or began there."""
-        base = Spread.of(seconds_to_reach(cell.history, psnr) for cell in self.base).mean
-        ratio = Spread.of(self.seconds_to(psnr)).mean / base if base > 0 else math.nan
+        """Mean `seconds_to` over the baseline's, both over the seeds that both have; NaN where one of these never
+        reached it, or began there."""
+        own, base = self._means(lambda cell: seconds_to_reach(cell.history, psnr))
+        ratio = own / base if base > 0 else math.nan
         return ratio if 0 < ratio < math.inf else math.nan
+
+    def _pairs(self, value: Callable[[CellResult], float]) -> list[tuple[float, float]]:
+        """(own, baseline's) of every seed that both have."""
+        base = {cell.seed: value(cell) for cell in self.base}
+        return [(value(cell), base[cell.seed]) for cell in self.cells if cell.seed in base]
+
+    def _means(self, value: Callable[[CellResult], float]) -> tuple[float, float]:
+        pairs = self._pairs(value)
+        return Spread.of(own for own, _ in pairs).mean, Spread.of(base for _, base in pairs).mean
 
 
 @dataclass

@@ -102,12 +102,15 @@ def run_sweep(
     reusable = _reusable_cells(options, here, siblings)
     taken: list[CellResult] = []
     left: list[tuple[Scene, CellKey, Config]] = []
+    loading: dict[str, float] = {}  # capture -> seconds
     # All scenes are read before anything is trained, so that a wrong one is known at once.
     for path in options.scenes:
         name = path.resolve().name
         configs = _scene_configs(ablation, variants, options, path.resolve(), device)
         settings = next(iter(configs.values())).scene
+        started = time.perf_counter()
         scene = load_scene(path, settings.factor, settings.test_every)
+        loading[name] = time.perf_counter() - started
         capture = capture_digest(scene)
         for key, config in configs.items():
             known = reusable.get((name, capture, _comparable(config.to_mapping())))
@@ -132,7 +135,7 @@ def run_sweep(
             scene, key, config = left.pop(0)  # the photos go with the last cell that needs them
             progress.begin(key)
             try:
-                outcome = train_cell(key.variant, config, scene, device, here, [progress])
+                outcome = train_cell(key.variant, config, scene, device, here, [progress], loading[key.scene])
             except Exception as error:  # whatever a variant breaks by, the other cells go on
                 outcome = Failure(key, _reason(error))
             folder.write(outcome)

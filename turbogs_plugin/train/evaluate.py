@@ -1,4 +1,4 @@
-"""Test error of a model: PSNR, SSIM, mean absolute error, LPIPS if its weights are there; and rendering speed."""
+"""Test error of a model: PSNR, SSIM, mean absolute error, LPIPS and FLIP if wanted and there; and rendering speed."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from turbogs_plugin.device import synchronize
 from turbogs_plugin.engine.rendering import RasterSettings, render_image
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene import PosedImages
+from turbogs_plugin.train.flip import Flip
 from turbogs_plugin.train.ssim import SSIM_SIDE, ssim
 from turbogs_plugin.types import Gaussians
 
@@ -35,13 +36,14 @@ Lpips = Callable[[Tensor, Tensor], float]
 
 @dataclass
 class ViewMetrics:
-    """Errors of one test view; `ssim` and `lpips` are NaN where they cannot be computed."""
+    """Errors of one test view; `ssim`, `lpips` and `flip` are NaN where they cannot be computed or are not wanted."""
 
     name: str
     psnr: float
     ssim: float
     l1: float
     lpips: float = math.nan
+    flip: float = math.nan
 
 
 @dataclass
@@ -59,7 +61,8 @@ class Metrics:
     @property
     def mean(self) -> ViewMetrics:
         """The means over views; NaN if a view has no value."""
-        columns = zip(*((view.psnr, view.ssim, view.l1, view.lpips) for view in self.views), strict=True)
+        values = ((view.psnr, view.ssim, view.l1, view.lpips, view.flip) for view in self.views)
+        columns = zip(*values, strict=True)
         return ViewMetrics(f"mean of {len(self.views)}", *(math.fsum(column) / len(self.views) for column in columns))
 
     @property
@@ -71,7 +74,12 @@ class Metrics:
 
 @torch.no_grad()
 def evaluate(
-    gaussians: Gaussians, views: PosedImages, sh_degree: int, settings: RasterSettings, lpips: Lpips | None = None
+    gaussians: Gaussians,
+    views: PosedImages,
+    sh_degree: int,
+    settings: RasterSettings,
+    lpips: Lpips | None = None,
+    flip: Flip | None = None,
 ) -> Metrics:
     """Render every view, one at a time, and compare it with its photo.
 
@@ -81,6 +89,7 @@ def evaluate(
         sh_degree: highest degree in use.
         settings: those of the rasterizer.
         lpips: from `load_lpips`, if wanted.
+        flip: from `load_flip`, if wanted.
     """
     metrics, seconds = [], 0.0
     for view_id, name in enumerate(views.names):
@@ -93,6 +102,8 @@ def evaluate(
         metrics.append(compare(name, image, photo))
         if lpips is not None:
             metrics[-1].lpips = lpips(image, photo)
+        if flip is not None:
+            metrics[-1].flip = flip(image, photo)
     return Metrics(metrics, fps=len(metrics) / seconds)
 
 
