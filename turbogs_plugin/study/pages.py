@@ -30,7 +30,15 @@ MIB = 2**20
 CLOCKS = {"wall_seconds": "wall in s", "cell_seconds": "load, train, evaluate in s"}
 """Measures of the wall's clock, each with its column, where a cell has it."""
 
-OF_THE_CALL = ("scene.", "report.", "budget.", "train.seed", "train.device", "train.evaluate_at")
+OF_THE_CALL = (
+    "scene.",
+    "report.",
+    "budget.",
+    "train.seed",
+    "train.device",
+    "train.evaluate_at",
+    "train.checkpoint_every",
+)
 """Settings that belong to a call, or change no result: a page does not go stale by them."""
 
 TIMING_RULES = (
