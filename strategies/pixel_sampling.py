@@ -6,6 +6,7 @@ import math
 import operator
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from torch import Tensor
@@ -47,9 +48,13 @@ def view_numbers(view_ids: ViewIds, maps: ErrorMaps) -> tuple[int, ...]:
 
 
 class RulePixelSampler:
-    """A sampler described by its rule alone: the engine of the maps' device draws."""
+    """A sampler described by its rule alone: the engine of the maps' device draws.
+
+    `heeds_masks` says that no masked pixel is drawn. Those of a sampler without it are taken out after its draw.
+    """
 
     rule: DrawRule
+    heeds_masks: ClassVar[bool] = True
 
     def sample(self, maps: ErrorMaps, view_ids: ViewIds, rate: float, step: Step) -> PixelSamples:
         """Draw the fraction `rate` (r) of the units of each tile, or of the tiles of each view.
@@ -114,8 +119,12 @@ class RandomPixelSampler(RulePixelSampler):
 
 @dataclass
 class DensePixelSampler:
-    """Every pixel of the chosen views, whatever the rate."""
+    """Every pixel of the chosen views that is not masked, whatever the rate."""
+
+    heeds_masks: ClassVar[bool] = True
 
     def sample(self, maps: ErrorMaps, view_ids: ViewIds, rate: float, step: Step) -> PixelSamples:
         view_ids = view_numbers(view_ids, maps)
+        if maps.masks is not None:
+            return maps.masks.pixels(view_ids)
         return dense_pixels(view_ids, maps.sizes[np.asarray(view_ids, dtype=np.int64)], maps.errors.device)

@@ -56,7 +56,11 @@ class PixelSampler(Protocol):
     """Which pixels of the chosen views are rendered (section 3.5)."""
 
     def sample(self, maps: ErrorMaps, view_ids: tuple[int, ...], rate: float, step: Step) -> PixelSamples:
-        """Draw the samples of an iteration from the maps of these views, on the maps' device."""
+        """Draw the samples of an iteration from the maps of these views, on the maps' device.
+
+        ``maps.masks`` says which pixels count. A trainer takes masked ones out of the result (`PixelMasks.strip`),
+        unless the sampler has an attribute ``heeds_masks`` that is True: then it must have drawn none.
+        """
 
 
 @runtime_checkable

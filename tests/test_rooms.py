@@ -18,7 +18,18 @@ SLOW = {"gsplat", "matplotlib", "pycolmap", "rich", "scipy", "torch._dynamo", "t
 def test_few_modules_stand_beside_the_packages():
     root = Path(turbogs_plugin.__file__).parent
     modules = {path.stem for path in root.glob("*.py")} - {"__init__"}
-    assert modules <= {"types", "tiles", "errors", "error_maps", "files", "device", "cli", "doctor", "__main__"}
+    assert modules <= {
+        "types",
+        "tiles",
+        "masks",
+        "errors",
+        "error_maps",
+        "files",
+        "device",
+        "cli",
+        "doctor",
+        "__main__",
+    }
 
 
 def test_documents_name_tests_that_are_there():

@@ -11,6 +11,8 @@ Without Gaussians, from plain error images::
     step = Step(iteration=t, total=1000, refine_until=1000)
     samples = ErrorGuidedPixelSampler().sample(maps, (4, 2), 0.1, step)  # a tenth of views 4 and 2
     maps.update(samples, new_errors, step)                               # [P]
+
+With masks, a masked pixel has no error, is never drawn, and does not count in any mean.
 """
 
 from __future__ import annotations
@@ -24,6 +26,7 @@ import torch
 from torch import Tensor
 
 from turbogs_plugin.errors import InputError, require
+from turbogs_plugin.masks import PixelMasks
 from turbogs_plugin.types import PixelSamples, Step
 
 AGE_MAX = 32767
@@ -48,12 +51,14 @@ class ErrorMaps:
         device: where the maps live.
         beta: EMA weight of a new error.
         refresh: on a device other than the CPU, every `refresh`-th call of `view_means` updates the means.
+        masks: which pixels count, on any device; None for all.
     """
 
     sizes: np.ndarray
     device: torch.device | str = "cpu"
     beta: float = 0.4
     refresh: int = 16
+    masks: PixelMasks | None = None
     errors: Tensor = field(init=False)  # [X] float16
     stamps: Tensor = field(init=False)  # [X] int16, iteration of the last visit minus `stamp_base`
     view_sums: Tensor = field(init=False)  # [V] float64, sum of `errors` in each view
@@ -63,6 +68,12 @@ class ErrorMaps:
         require(0 < self.beta <= 1, "beta", self.beta, "above 0, at most 1")
         require(self.refresh >= 1, "refresh", self.refresh, "1 or more")
         self.sizes = np.asarray(self.sizes, dtype=np.int64)
+        self._pixel_counts = self.sizes.prod(axis=1)  # [V]
+        if self.masks is not None:
+            if not np.array_equal(self.masks.sizes, self.sizes):
+                raise InputError("masks and error maps differ in the number of their views or in the views' sizes")
+            self.masks = self.masks.to(self.device)
+            self._pixel_counts = self.masks.pixel_counts.clip(min=1)
         self._allocate()
         self.view_sums = torch.zeros(len(self.sizes), dtype=torch.float64, device=self.device)
         self._means = _LaggedCopy(self.view_sums, self.refresh)
@@ -76,15 +87,18 @@ class ErrorMaps:
         self.errors, self.stamps = self._errors[:-1], self._stamps[:-1]
 
     @classmethod
-    def from_images(cls, errors: Tensor | Sequence[Tensor], **options: Any) -> ErrorMaps:
+    def from_images(
+        cls, errors: Tensor | Sequence[Tensor], masks: Tensor | Sequence[Tensor] | None = None, **options: Any
+    ) -> ErrorMaps:
         """Maps that start from given error images.
 
         Args:
             errors: [V, H, W] float, or V tensors [H, W] whose sizes may differ; the maps live on their device.
+            masks: of the same shapes, True (nonzero) where a pixel counts; None: all do.
             options: further arguments of `ErrorMaps`.
 
         Raises:
-            InputError: there is no image, or one is not a tensor [H, W].
+            InputError: there is no image, one is not a tensor [H, W], or a mask has another shape.
         """
         if len(errors) == 0:
             raise InputError("error images: there are none, give one [H, W] for each view")
@@ -97,7 +111,8 @@ class ErrorMaps:
             if image.dim() != 2:
                 raise InputError(f"error image of view {view_id} has shape {tuple(image.shape)}, expected [H, W]")
         sizes = np.array([(image.shape[1], image.shape[0]) for image in errors], dtype=np.int64)
-        maps = cls(sizes, device=errors[0].device, **options)
+        of_pixels = None if masks is None else PixelMasks.from_images(masks)
+        maps = cls(sizes, device=errors[0].device, masks=of_pixels, **options)
         for view_id, image in enumerate(errors):
             maps.initialise(view_id, image.reshape(-1))
         return maps
@@ -116,7 +131,8 @@ class ErrorMaps:
         """Set the errors of one whole view.
 
         Args:
-            errors: [H * W] float, detached here; non-finite ones and those below 0 count as zero.
+            errors: [H * W] float, detached here; non-finite ones and those below 0 count as zero, as do those of
+                masked pixels.
 
         Raises:
             InputError: another shape.
@@ -127,6 +143,8 @@ class ErrorMaps:
         self.fetch([view_id])
         place = self._extent(view_id)
         errors = torch.nan_to_num(errors.detach().float(), nan=0.0, posinf=0.0, neginf=0.0).clamp(0.0, ERROR_MAX)
+        if self.masks is not None:
+            errors = torch.where(self.masks.image(view_id).reshape(-1), errors, 0.0)
         self.errors[place] = errors.to(torch.float16)
         self.view_sums[view_id] = self.errors[place].sum(dtype=torch.float64)
         self._means.restart()
@@ -184,14 +202,14 @@ class ErrorMaps:
         return self.now(step)
 
     def view_means(self) -> np.ndarray:
-        """[V] float64 on the host: mean error of each view.
+        """[V] float64 on the host: mean error of each view, over its pixels that are not masked; 0 if all are.
 
         On the CPU they are exact. Elsewhere reading them at every call would stall the device, so a copy is started
         at every `refresh`-th call and read at the next such call. So the means are between `refresh` and
         ``2 * refresh - 1`` calls old (between 0 and ``2 * refresh - 1`` after the first call or `initialise`, which
         wait for the device). They depend on the number of calls alone, never on timing.
         """
-        return np.maximum(self._means.read(), 0.0) / self.sizes.prod(axis=1)
+        return np.maximum(self._means.read(), 0.0) / self._pixel_counts
 
     def mean(self) -> float:
         """Mean over the views of their mean error, the schedule's E_mean. Counts as a call of `view_means`."""

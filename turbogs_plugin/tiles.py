@@ -32,10 +32,7 @@ def cell_of_place(device: torch.device | str) -> Tensor:
 
 def slots_of_tiles(unit: str, wanted: int, widths: np.ndarray, heights: np.ndarray) -> np.ndarray:
     """[T] int64: slots of each tile of which so many units are drawn, `pixel` or `cell`. The rest as `tile_extents`."""
-    if unit == "cell":
-        cells = -(-widths // CELL_SIDE) * -(-heights // CELL_SIDE)
-        wanted = np.minimum(wanted, cells) * CELL_SIDE**2
-    return np.minimum(wanted, widths * heights)
+    return np.minimum(wanted * (CELL_SIDE**2 if unit == "cell" else 1), widths * heights)
 
 
 def pixel_table(sizes: np.ndarray, device: torch.device | str) -> Tensor:

@@ -28,6 +28,7 @@ from torch import Tensor
 
 from turbogs_plugin.device import synchronize
 from turbogs_plugin.error_maps import ErrorMaps
+from turbogs_plugin.masks import PixelMasks
 from turbogs_plugin.scene import PosedImages
 from turbogs_plugin.scene.photos import Photos, pixel_offsets
 
@@ -260,9 +261,12 @@ def place_views(views: PosedImages, device: torch.device, place: str) -> PosedIm
     return replace(views, cameras=views.cameras.to(device), photos=OffloadedPhotos(views.photos, device))
 
 
-def place_maps(sizes: np.ndarray, device: torch.device, place: str, beta: float) -> ErrorMaps:
-    """New maps on the device or, for ``host``, in host memory with a window. Arguments as those of `ErrorMaps`."""
-    return (OffloadedErrorMaps if place == "host" else ErrorMaps)(sizes, device, beta=beta)
+def place_maps(
+    sizes: np.ndarray, device: torch.device, place: str, beta: float, masks: PixelMasks | None = None
+) -> ErrorMaps:
+    """New maps on the device or, for ``host``, in host memory with a window. Arguments as those of `ErrorMaps`. Masks
+    are small, and always on the device."""
+    return (OffloadedErrorMaps if place == "host" else ErrorMaps)(sizes, device, beta=beta, masks=masks)
 
 
 class _CopyStream:

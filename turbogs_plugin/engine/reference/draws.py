@@ -31,6 +31,9 @@ tau stands below for the number in its high bits, the probability of a stage is 
 in a race, ``clamp(((A + 1) << 24) - tau, 0, 2^24) / 2^24`` in the stable stage, and 1 without a tau. It is 0 for a
 stage that takes nothing. Together, ``p = 1 - (1 - p_hard) (1 - p_stable) (1 - p_mixed)``, and 1 where all units of a
 row are drawn.
+
+Where maps have masks, a masked pixel is no unit, adds to no sum, and is in no cell or tile that is drawn. A cell or
+tile without another pixel is no unit either. The number of a tile within its view is then that among its live tiles.
 """
 
 from __future__ import annotations
@@ -148,33 +151,45 @@ def draw_pixels(rule: DrawRule, maps: ErrorMaps, view_ids: tuple[int, ...], rate
 
     Returns:
         Samples whose counts are all known without reading from the device. A tile has min(N, its pixels) slots for
-        unit = pixel; 16 for each drawn cell, at most its pixels, for cell; 256 for tile.
+        unit = pixel; 16 for each drawn cell, at most its pixels, for cell; 256 for tile. With masks there are live
+        tiles alone, each with N, 16 N or 256 slots.
     """
     maps.fetch(view_ids)
     device, views = maps.errors.device, np.asarray(view_ids, dtype=np.int64)
     sizes = maps.sizes[views]
     table = pixel_table(sizes, device)  # [T, 256]
-    inside = table >= 0
-    tile_views = np.repeat(views, TileGrid(sizes).shapes.prod(axis=1))  # [T]
+    exist = table >= 0
+    counts = TileGrid(sizes).shapes.prod(axis=1)  # [K]
+    tile_ids = None
+    if maps.masks is not None:
+        counts = np.array(maps.masks.live_counts(view_ids))
+        tile_ids, unmasked = maps.masks.live_tiles(view_ids)
+        table = table[tile_ids]
+        exist = unmasked & (table >= 0)
+    tile_views = np.repeat(views, counts)  # [T]
     flat = torch.as_tensor(maps.offsets[tile_views], device=device)[:, None] + table.clamp(min=0)
-    errors = torch.where(inside, maps.errors[flat].double(), 0.0)  # [T, 256]
-    ages = torch.where(inside, (maps.now(step) - maps.stamps[flat].int()).clamp(0, AGE_MAX), 0)
+    errors = torch.where(exist, maps.errors[flat].double(), 0.0)  # [T, 256]
+    ages = torch.where(exist, (maps.now(step) - maps.stamps[flat].int()).clamp(0, AGE_MAX), 0)
     view_numbers = torch.as_tensor(tile_views, device=device)[:, None]  # [T, 1]
 
     def words(place: Tensor, purpose: int) -> Words:
         return random_words(place.clamp(min=0).long(), view_numbers, purpose, step.seed, step.iteration)
 
     draw = _draw_tiles if rule.unit == "tile" else _draw_within_tiles
-    return draw(_Batch(view_ids, sizes, table, errors, ages, words), rate, rule)
+    return draw(_Batch(view_ids, sizes, table, exist, counts, tile_ids, errors, ages, words), rate, rule)
 
 
 @dataclass(frozen=True)
 class _Batch:
-    """The tiles of K views with all their pixels; `words` gives the random words of places [T, ...]."""
+    """The tiles of K views, or their live tiles, with all their pixels; `words` gives the random words of places [T,
+    ...]."""
 
     view_ids: tuple[int, ...]
     sizes: np.ndarray
     table: Tensor  # [T, 256] int32
+    exist: Tensor  # [T, 256] bool, the pixel is in the image and not masked
+    counts: np.ndarray  # [K] tiles of each view
+    live_tiles: Tensor | None  # [T] int64 ids of the tiles where there are masks; None: all tiles
     errors: Tensor  # [T, 256] float64
     ages: Tensor  # [T, 256] int32
     words: Callable[[Tensor, int], Words]
@@ -183,26 +198,31 @@ class _Batch:
 def _draw_within_tiles(batch: _Batch, rate: float, rule: DrawRule) -> PixelSamples:
     """Pixels or cells as units, drawn from each tile."""
     first_pixels, errors, ages, purpose = batch.table, batch.errors, batch.ages, PURPOSE_PIXELS
-    by_cell = rule.unit == "cell"
+    by_cell, exist = rule.unit == "cell", batch.exist
     cells = cell_of_place(batch.table.device)  # [256]
     if by_cell:
         places = torch.argsort(cells, stable=True).view(TILE_CELLS, -1)  # [16, 16] of each cell
         first_pixels, purpose = first_pixels[:, places[:, 0]], PURPOSE_CELLS
         errors, ages = errors[:, places].sum(dim=2), ages[:, places].amax(dim=2)
+        exist = exist[:, places].any(dim=2)
     wanted = rule.wanted(rate, errors.shape[1])
     words = batch.words(first_pixels, purpose)
-    drawn, probabilities = draw_units(Units(errors, ages, first_pixels >= 0, words, wanted), rule)
+    drawn, probabilities = draw_units(Units(errors, ages, exist, words, wanted), rule)
     weights = _importance_weights(probabilities, rule)
     if by_cell:
-        drawn, weights = drawn[:, cells] & (batch.table >= 0), None if weights is None else weights[:, cells]
-    slots = slots_of_tiles(rule.unit, wanted, *tile_extents(batch.sizes))
-    tile_ids = torch.arange(len(batch.table), dtype=torch.int32, device=batch.table.device)
-    return compact(batch.view_ids, batch.sizes, batch.table, drawn, tile_ids, slots, weights, full=not by_cell)
+        drawn, weights = drawn[:, cells] & batch.exist, None if weights is None else weights[:, cells]
+    if batch.live_tiles is None:
+        slots = slots_of_tiles(rule.unit, wanted, *tile_extents(batch.sizes))
+        tile_ids, full = torch.arange(len(batch.table), dtype=torch.int32, device=batch.table.device), not by_cell
+    else:
+        slots = np.full(len(batch.table), wanted * TILE_PIXELS // errors.shape[1])
+        tile_ids, full = batch.live_tiles.int(), False
+    return compact(batch.view_ids, batch.sizes, batch.table, drawn, tile_ids, slots, weights, full=full)
 
 
 def _draw_tiles(batch: _Batch, rate: float, rule: DrawRule) -> PixelSamples:
     """Whole tiles as units, drawn from each view."""
-    device, ends = batch.table.device, TileGrid(batch.sizes).offsets
+    device, ends = batch.table.device, np.concatenate([[0], np.cumsum(batch.counts)])
     errors, ages = batch.errors.sum(dim=1), batch.ages.amax(dim=1)  # [T]
     tiles = torch.arange(len(batch.table), device=device)
     firsts = torch.as_tensor(np.repeat(ends[:-1], np.diff(ends)), device=device)
@@ -220,7 +240,9 @@ def _draw_tiles(batch: _Batch, rate: float, rule: DrawRule) -> PixelSamples:
         if rule.importance:
             weights.append(_importance_weights(probabilities, rule)[0, tile_ids])
     tile_ids = torch.cat(chosen)
-    table = batch.table[tile_ids]
+    table, exist = batch.table[tile_ids], batch.exist[tile_ids]
     tile_weights = torch.cat(weights)[:, None].expand(table.shape) if rule.importance else None
     slots = np.full(len(tile_ids), TILE_PIXELS)
-    return compact(batch.view_ids, batch.sizes, table, table >= 0, tile_ids.int(), slots, tile_weights)
+    if batch.live_tiles is not None:
+        tile_ids = batch.live_tiles[tile_ids]
+    return compact(batch.view_ids, batch.sizes, table, exist, tile_ids.int(), slots, tile_weights)

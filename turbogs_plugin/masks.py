@@ -1,0 +1,197 @@
+"""Which pixels of each view count: masks, as lists of the tiles that have a pixel left.
+
+A *live* tile has at least one pixel that is not masked. Draws go over live tiles alone, so the others cost nothing. A
+tile that the mask cuts has a bit for each of its pixels; all whole tiles share one row of bits. That is about an eighth
+of a byte a pixel or less, so masks stay on the device even where photos and error maps do not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.tiles import TILE_PIXELS, pixel_table, tile_extents
+from turbogs_plugin.types import TILE_SIZE, PixelSamples, TileGrid, sample_order
+
+WORD_BITS = 32
+WORDS = TILE_PIXELS // WORD_BITS
+"""32-bit words of a tile's bits; bit n of word j is the pixel with `sample_order` 32 j + n."""
+
+
+@dataclass(frozen=True, eq=False)
+class ViewMask:
+    """The live tiles of one view.
+
+    Args:
+        size: (width, height).
+        tiles: [L] int32, number of each live tile within the view, ascending.
+        cut: [L] bool, the mask takes pixels of the tile.
+        bits: [C, WORDS] int32, of the C tiles that are cut.
+        pixels: how many are not masked.
+    """
+
+    size: tuple[int, int]
+    tiles: np.ndarray
+    cut: np.ndarray
+    bits: np.ndarray
+    pixels: int
+
+    @classmethod
+    def of(cls, keep: np.ndarray) -> ViewMask:
+        """That of an image [H, W], in which True or nonzero pixels count."""
+        height, width = keep.shape
+        rows, columns = -(-height // TILE_SIZE), -(-width // TILE_SIZE)
+        padded = np.zeros((rows * TILE_SIZE, columns * TILE_SIZE), dtype=bool)
+        padded[:height, :width] = keep
+        places = padded.reshape(rows, TILE_SIZE, columns, TILE_SIZE).swapaxes(1, 2).reshape(-1, TILE_PIXELS)
+        counts = places.sum(axis=1)
+        live = np.flatnonzero(counts)
+        widths, heights = tile_extents(np.array([[width, height]]))
+        cut = counts[live] < (widths * heights)[live]
+        packed = np.packbits(places[live[cut]][:, _PLACES], axis=1, bitorder="little")  # [C, 32] bytes
+        bits = np.ascontiguousarray(packed).reshape(-1).view("<i4").astype(np.int32).reshape(-1, WORDS)
+        return cls((width, height), live.astype(np.int32), cut, bits, int(counts.sum()))
+
+    @classmethod
+    def whole(cls, size: tuple[int, int]) -> ViewMask:
+        """Of a view without a mask."""
+        width, height = size
+        tiles = np.arange(-(-width // TILE_SIZE) * -(-height // TILE_SIZE), dtype=np.int32)
+        return cls(size, tiles, np.zeros(len(tiles), dtype=bool), np.zeros((0, WORDS), dtype=np.int32), width * height)
+
+
+def _row_order() -> np.ndarray:
+    """[256] the pixel, counted row by row, that each place of a tile in `sample_order` has."""
+    pixels = torch.arange(TILE_PIXELS)
+    return torch.argsort(sample_order(pixels % TILE_SIZE, pixels // TILE_SIZE)).numpy()
+
+
+_PLACES = _row_order()
+
+
+@dataclass(frozen=True, eq=False)
+class PixelMasks:
+    """The masks of V views.
+
+    Args:
+        sizes: [V, 2] int64 numpy array (width, height).
+        offsets: [V + 1] int64 numpy array, the first live tile of each view, and the count L of all.
+        pixel_counts: [V] int64 numpy array, pixels of each view that are not masked.
+        tiles: [L] int32, number of each live tile within its view, ascending in each.
+        rows: [L] int32, its row of `bits`; row 0 is that of all whole tiles.
+        bits: [B, WORDS] int32, see `WORDS`. Bits outside the image mean nothing.
+    """
+
+    sizes: np.ndarray
+    offsets: np.ndarray
+    pixel_counts: np.ndarray
+    tiles: Tensor
+    rows: Tensor
+    bits: Tensor
+
+    @classmethod
+    def of_views(cls, views: Sequence[ViewMask]) -> PixelMasks:
+        """The masks of these views, on the CPU."""
+        cut = np.concatenate([view.cut for view in views])
+        rows = np.where(cut, np.cumsum(cut), 0).astype(np.int32)
+        bits = np.concatenate([np.full((1, WORDS), -1, dtype=np.int32), *(view.bits for view in views)])
+        return cls(
+            sizes=np.array([view.size for view in views], dtype=np.int64).reshape(-1, 2),
+            offsets=np.concatenate([[0], np.cumsum([len(view.tiles) for view in views])]).astype(np.int64),
+            pixel_counts=np.array([view.pixels for view in views], dtype=np.int64),
+            tiles=torch.from_numpy(np.concatenate([view.tiles for view in views])),
+            rows=torch.from_numpy(rows),
+            bits=torch.from_numpy(bits),
+        )
+
+    @classmethod
+    def from_images(cls, masks: Tensor | Sequence[Tensor | np.ndarray]) -> PixelMasks:
+        """Masks from images, on the images' device.
+
+        Args:
+            masks: [V, H, W] bool, or V images [H, W] whose sizes may differ. True (nonzero) pixels count.
+
+        Raises:
+            InputError: no image, or one of another shape.
+        """
+        if len(masks) == 0 or any(getattr(mask, "ndim", 0) != 2 for mask in masks):
+            shapes = [tuple(getattr(mask, "shape", ())) for mask in masks][:4]
+            raise InputError(f"masks have shapes {shapes}: expected [H, W] for each view, True where a pixel counts")
+        device = masks[0].device if isinstance(masks[0], Tensor) else torch.device("cpu")
+        return cls.of_views([ViewMask.of(torch.as_tensor(mask).cpu().numpy() != 0) for mask in masks]).to(device)
+
+    def to(self, device: torch.device | str) -> PixelMasks:
+        tensors = {name: getattr(self, name).to(device) for name in ("tiles", "rows", "bits")}
+        return replace(self, **tensors)
+
+    def live_counts(self, view_ids: Sequence[int]) -> list[int]:
+        """Live tiles of each of these views."""
+        return [int(self.offsets[view + 1] - self.offsets[view]) for view in view_ids]
+
+    def live_tiles(self, view_ids: Sequence[int]) -> tuple[Tensor, Tensor]:
+        """The live tiles of a batch of views.
+
+        Returns:
+            [T] int64 their ids in ``TileGrid(sizes of these views)``, ascending; and [T, 256] bool, which of a tile's
+            places (`sample_order`) count. Places outside the image may be True.
+        """
+        firsts = TileGrid(self.sizes[list(view_ids)]).offsets.tolist()
+        spans = [slice(int(self.offsets[view]), int(self.offsets[view + 1])) for view in view_ids]
+        tiles = torch.cat([self.tiles[span].long() + first for span, first in zip(spans, firsts, strict=False)])
+        rows = torch.cat([self.rows[span] for span in spans]).long()
+        return tiles, self._places(rows)
+
+    def image(self, view_id: int) -> Tensor:
+        """[H, W] bool on the masks' device: the mask of one view."""
+        width, height = self.sizes[view_id].tolist()
+        image = torch.zeros(height * width, dtype=torch.bool, device=self.tiles.device)
+        image[self.pixels([view_id]).pixel_ids.long()] = True
+        return image.view(height, width)
+
+    def pixels(self, view_ids: Sequence[int]) -> PixelSamples:
+        """Every pixel of these views that is not masked, in the order of samples. The host waits for the device."""
+        view_ids = tuple(view_ids)
+        sizes = self.sizes[list(view_ids)]
+        tiles, live = self.live_tiles(view_ids)
+        table = pixel_table(sizes, self.tiles.device)[tiles]
+        live &= table >= 0
+        offsets = torch.nn.functional.pad(live.sum(dim=1).cumsum(dim=0), (1, 0))
+        return PixelSamples(view_ids, sizes, table[live], tiles.int(), offsets.int(), has_empty_slots=False)
+
+    def strip(self, samples: PixelSamples) -> PixelSamples:
+        """The samples without masked pixels, empty slots and tiles that have nothing left: those of a sampler that
+        knows no masks. Weights have a mean of 1 again. The host waits for the device."""
+        tiles, live = self.live_tiles(samples.view_ids)
+        # A last row for tiles that are not live.
+        tiles = torch.cat([tiles, tiles.new_full((1,), torch.iinfo(torch.int64).max)])
+        live = torch.nn.functional.pad(live, (0, 0, 0, 1))
+        ids, of_slot = samples.tile_ids.long(), samples.tile_of_slot()
+        places = torch.searchsorted(tiles, ids)  # [T]
+        places = torch.where(tiles[places] == ids, places, len(tiles) - 1)
+        x, y = samples.coordinates().unbind(dim=1)
+        keep = samples.filled & live[places[of_slot], sample_order(x % TILE_SIZE, y % TILE_SIZE)]
+        counts = torch.zeros_like(samples.tile_ids).index_add_(0, of_slot, keep.int())
+        left = counts > 0
+        weights = None
+        if samples.weights is not None:
+            weights = samples.weights[keep]
+            weights = weights / weights.mean()
+        return PixelSamples(
+            samples.view_ids,
+            samples.sizes,
+            samples.pixel_ids[keep],
+            samples.tile_ids[left],
+            torch.nn.functional.pad(counts[left].cumsum(dim=0), (1, 0)).int(),
+            weights,
+            has_empty_slots=False,
+        )
+
+    def _places(self, rows: Tensor) -> Tensor:
+        """[T] rows of `bits` -> [T, 256] bool."""
+        shifts = torch.arange(WORD_BITS, dtype=torch.int32, device=rows.device)
+        return ((self.bits[rows][:, :, None] >> shifts) & 1).bool().reshape(len(rows), TILE_PIXELS)
