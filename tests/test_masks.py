@@ -41,7 +41,7 @@ def live_tiles(keep):
     """Per view the numbers of the tiles that have a pixel, and their pixels."""
     found = []
     for mask in keep:
-        height, width = mask.shape
+        width = mask.shape[1]
         columns = -(-width // TILE_SIZE)
         y, x = np.nonzero(mask.numpy())
         tiles = y // TILE_SIZE * columns + x // TILE_SIZE

@@ -41,6 +41,12 @@ def sample_order(x: Tensor, y: Tensor) -> Tensor:
     return patch * (PATCH_WIDTH * PATCH_HEIGHT) + (y % PATCH_HEIGHT) * PATCH_WIDTH + x % PATCH_WIDTH
 
 
+Color = tuple[float, float, float]
+"""Red, green and blue, 0 .. 1."""
+
+BLACK: Color = (0.0, 0.0, 0.0)
+WHITE: Color = (1.0, 1.0, 1.0)
+
 PARAMETER_NAMES = ("means", "quats", "scales", "opacities", "sh0", "shN")
 
 SH_C0 = 0.28209479177387814

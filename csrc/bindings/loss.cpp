@@ -17,7 +17,9 @@ void launches::SparseLoss::run(const Arguments<SparseLoss>& in) {
     const int64_t slots = in.tensor(Tensors::pixel_ids).numel(), tiles = in.tensor(Tensors::tile_ids).numel();
     const bool has_photos = in.has(Tensors::photos), has_maps = in.has(Tensors::errors);
     STD_TORCH_CHECK(in.has(Tensors::targets) != has_photos, "turbogs: give either targets or photos");
-    const int64_t photo_pixels = has_photos ? in.tensor(Tensors::photos).numel() / 3 : -1;
+    const int64_t channels = has_photos && in.tensor(Tensors::photos).dim() == 2 ? in.tensor(Tensors::photos).size(1) : 3;
+    STD_TORCH_CHECK(channels == 3 || channels == 4, "turbogs: photos must have 3 or 4 channels, got ", channels);
+    const int64_t photo_pixels = has_photos ? in.tensor(Tensors::photos).numel() / channels : -1;
     const int64_t map_pixels = has_maps ? in.tensor(Tensors::errors).numel() : -1;
     STD_TORCH_CHECK(!has_photos || !has_maps || photo_pixels == map_pixels,
                     "turbogs: photos and maps must be of the same pixels");
@@ -40,7 +42,11 @@ void launches::SparseLoss::run(const Arguments<SparseLoss>& in) {
     in.set_optional(params.weights, Tensors::weights, {slots});
     in.set(params.colors, Tensors::colors, {slots, 3});
     in.set_optional(params.targets, Tensors::targets, {slots, 3});
-    in.set_optional(params.photos, Tensors::photos, {photo_pixels, 3});
+    in.set_optional(params.photos, Tensors::photos, {photo_pixels, channels});
+    params.channels = static_cast<int>(channels);
+    params.background[0] = in.number(Reals::background_red);
+    params.background[1] = in.number(Reals::background_green);
+    params.background[2] = in.number(Reals::background_blue);
     if (has_maps) {
         const int64_t num_views = in.tensor(Tensors::view_sums).numel();
         in.set(params.errors, Tensors::errors, {map_pixels});

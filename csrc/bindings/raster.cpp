@@ -23,6 +23,9 @@ ForwardParams read_forward(const Arguments<Launch>& in) {
     params.alpha_min = in.number(R::alpha_min);
     params.alpha_max = in.number(R::alpha_max);
     params.transmittance_min = in.number(R::transmittance_min);
+    params.background[0] = in.number(R::background_red);
+    params.background[1] = in.number(R::background_green);
+    params.background[2] = in.number(R::background_blue);
     in.set_structs(params.cameras, T::cameras, num_views);
     in.set_optional(params.tile_ids, T::tile_ids, {num_active});
     in.set(params.tile_offsets, T::tile_offsets, {num_active + 1});

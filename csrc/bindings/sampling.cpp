@@ -15,7 +15,19 @@ void launches::SamplePixels::run(const Arguments<SamplePixels>& in) {
     const int64_t pixels = in.tensor(Tensors::errors).numel(), slots = in.tensor(Tensors::pixel_ids).numel();
     const int64_t chosen = in.tensor(Tensors::tile_ids).numel();
     SamplePixelsParams params = {};
-    const int64_t tiles = params.num_tiles = read_views(in, DrawRow::kSize, pixels, params);
+    read_views(in, DrawRow::kSize, pixels, params);
+    const bool masked = in.has(Tensors::tiles);
+    const int64_t num_live = masked ? in.tensor(Tensors::tiles).numel() : 0;
+    int64_t tiles = 0;
+    for (int i = 0; i < params.num_views; ++i) {
+        const int64_t *row = in.row(i, DrawRow::kSize), first = row[DrawRow::kFirstLive], count = row[DrawRow::kLive];
+        const int64_t all = int64_t{1} * params.views[i].tiles_x * params.views[i].tiles_y;
+        STD_TORCH_CHECK(masked ? first >= 0 && count >= 0 && count <= all && first + count <= num_live : count == all,
+                        "turbogs: the live tiles of view ", params.views[i].view_number, " are not those of the masks");
+        params.live[i] = {to_int(tiles, "tiles"), static_cast<int>(count), to_int(first, "live tiles")};
+        tiles += count;
+    }
+    params.num_tiles = to_int(tiles, "tiles");
     params.unit = to_enumeration<SampleUnit>(in.integer(Integers::unit), kNumSampleUnits,
                                              "unit must be 0 (pixel), 1 (cell) or 2 (tile)");
     STD_TORCH_CHECK(params.unit == SampleUnit::kTile || chosen == tiles,
@@ -39,6 +51,11 @@ void launches::SamplePixels::run(const Arguments<SamplePixels>& in) {
     params.now = static_cast<int>(in.integer(Integers::now));
     in.set(params.errors, Tensors::errors, {pixels});
     in.set(params.stamps, Tensors::stamps, {pixels});
+    in.set_optional(params.live_tiles, Tensors::tiles, {num_live});
+    in.set_optional(params.live_rows, Tensors::rows, {num_live});
+    if (masked) {
+        in.set(params.live_bits, Tensors::bits, {in.tensor(Tensors::bits).size(0), kTilePixels / 32});
+    }
     in.set(params.pixel_ids, Tensors::pixel_ids, {slots});
     in.set(params.tile_ids, Tensors::tile_ids, {chosen});
     in.set(params.tile_offsets, Tensors::tile_offsets, {chosen + 1});

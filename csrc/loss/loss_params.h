@@ -33,7 +33,9 @@ struct SparseLossParams {
     const float* weights;         // [P] or null
     const float* colors;          // [P, 3]
     const float* targets;         // [P, 3], or null: then `photos` are gathered
-    const uint8_t* photos;        // [X, 3]
+    const uint8_t* photos;        // [X, 3], or [X, 4]: colours times alpha, and alpha
+    int channels;                 // of `photos`
+    float background[3];          // shows through photos with an alpha
 
     const int32_t* num_filled;             // [1] filled slots; null where all are
     double* loss;                          // [], zero before the launch

@@ -37,7 +37,7 @@ struct LaneSamples {
     float x[kSlots][3], y[kSlots][3], weight[kSlots];
 };
 
-template <int kSlots>
+template <int kSlots, bool kAlpha>
 __device__ __forceinline__ void load_samples(const SparseLossParams& params, const SampleView& view, int first, int end,
                                              LaneSamples<kSlots>& samples) {
     const int lane = this_lane();
@@ -61,9 +61,15 @@ __device__ __forceinline__ void load_samples(const SparseLossParams& params, con
 #pragma unroll
             for (int c = 0; c < 3; ++c) samples.y[j][c] = params.targets[3 * slot + c];
         } else {
-            const uint8_t* photo = params.photos + 3 * (view.pixel_base + samples.pixel[j]);
+            const uint8_t* photo = params.photos + (kAlpha ? 4 : 3) * (view.pixel_base + samples.pixel[j]);
+            const float through = kAlpha ? __fsub_rn(1.0f, unit_color(photo[3])) : 0.0f;
 #pragma unroll
-            for (int c = 0; c < 3; ++c) samples.y[j][c] = unit_color(photo[c]);
+            for (int c = 0; c < 3; ++c) {
+                samples.y[j][c] = unit_color(photo[c]);
+                if (kAlpha) {
+                    samples.y[j][c] = __fadd_rn(samples.y[j][c], __fmul_rn(through, params.background[c]));
+                }
+            }
         }
     }
 #pragma unroll
@@ -82,7 +88,7 @@ struct TileTotals {
 };
 
 // One tile. Up to kWarpSize * kSlots samples stay in registers; of more, each pass loads them again, in as many rounds.
-template <int kSlots>
+template <int kSlots, bool kAlpha>
 __device__ __forceinline__ TileTotals tile_loss(const SparseLossParams& params, const SampleView& view, int first,
                                                 int end, float filled, bool learns) {
     constexpr int kRound = kWarpSize * kSlots;
@@ -99,7 +105,7 @@ __device__ __forceinline__ TileTotals tile_loss(const SparseLossParams& params, 
     {
         float sums[8] = {};  // offsets of x 0-2 and y 3-5, weights, norms of the Charbonnier gradients
         for (int start = first; start < end; start += kRound) {
-            load_samples(params, view, start, end, samples);
+            load_samples<kSlots, kAlpha>(params, view, start, end, samples);
             if (start == first) {
 #pragma unroll
                 for (int c = 0; c < 3; ++c) {
@@ -167,7 +173,7 @@ __device__ __forceinline__ TileTotals tile_loss(const SparseLossParams& params, 
     // Of each sample again, the lane's j-th of a round.
     const auto visit_samples = [&](const auto& visit) {
         for (int start = first; start < end; start += kRound) {
-            if (!resident) load_samples(params, view, start, end, samples);
+            if (!resident) load_samples<kSlots, kAlpha>(params, view, start, end, samples);
 #pragma unroll
             for (int j = 0; j < kSlots; ++j) visit(j, start + kWarpSize * j + lane);
         }
@@ -250,7 +256,7 @@ __device__ __forceinline__ TileTotals tile_loss(const SparseLossParams& params, 
 
 // A warp per tile; its block adds up what belongs together. Up to kWarpSize * kSlots samples of a tile are held in
 // registers.
-template <int kSlots>
+template <int kSlots, bool kAlpha>
 __global__ void __launch_bounds__(kLossThreads, kLossBlocks)
     sparse_loss_kernel(const __grid_constant__ SparseLossParams params) {
     __shared__ double losses[kLossWarps], view_deltas[kLossWarps];
@@ -266,7 +272,7 @@ __global__ void __launch_bounds__(kLossThreads, kLossBlocks)
     if (tile < params.num_tiles) {
         const int first = params.tile_offsets[tile], end = params.tile_offsets[tile + 1];
         view = view_of_tile(params.views, params.num_views, params.tile_ids[tile]);
-        totals = tile_loss<kSlots>(params, params.views[view], first, end, filled, learns);
+        totals = tile_loss<kSlots, kAlpha>(params, params.views[view], first, end, filled, learns);
         totals.view_delta = warp_sum(totals.view_delta);
     }
     if (lane == 0) {
@@ -296,18 +302,24 @@ __global__ void __launch_bounds__(kLossThreads, kLossBlocks)
     }
 }
 
+template <bool kAlpha>
+void launch(const SparseLossParams& params, cudaStream_t stream) {
+    // Slots of a lane, by the average tile: most samplers give every tile as many.
+    const int64_t of_all_lanes = int64_t{kWarpSize} * params.num_tiles;
+    const int64_t slots = (params.num_slots + of_all_lanes - 1) / of_all_lanes;
+    const auto kernel = slots <= 1   ? sparse_loss_kernel<1, kAlpha>
+                        : slots == 2 ? sparse_loss_kernel<2, kAlpha>
+                        : slots == 3 ? sparse_loss_kernel<3, kAlpha>
+                                     : sparse_loss_kernel<4, kAlpha>;
+    kernel<<<blocks_for(params.num_tiles, kLossWarps), kLossThreads, 0, stream>>>(params);
+}
+
 }  // namespace
 
 cudaError_t launch_sparse_loss(const SparseLossParams& params, cudaStream_t stream) {
     if (params.num_slots == 0 || params.num_tiles == 0) return cudaSuccess;
-    // Slots of a lane, by the average tile: most samplers give every tile as many.
-    const int64_t of_all_lanes = int64_t{kWarpSize} * params.num_tiles;
-    const int64_t slots = (params.num_slots + of_all_lanes - 1) / of_all_lanes;
-    const auto kernel = slots <= 1   ? sparse_loss_kernel<1>
-                        : slots == 2 ? sparse_loss_kernel<2>
-                        : slots == 3 ? sparse_loss_kernel<3>
-                                     : sparse_loss_kernel<4>;
-    kernel<<<blocks_for(params.num_tiles, kLossWarps), kLossThreads, 0, stream>>>(params);
+    if (params.photos != nullptr && params.channels == 4) launch<true>(params, stream);
+    else launch<false>(params, stream);
     return cudaGetLastError();
 }
 

@@ -117,6 +117,7 @@ struct ForwardParams {
     int num_active;  // T
     int chunks;      // C, work items of a tile
     float alpha_min, alpha_max, transmittance_min;
+    float background[3];               // the colour that shows through
     const RasterCamera* cameras;
     const int32_t* tile_ids;           // [T], or null where every tile is active
     const int32_t* tile_offsets;       // [T + 1] first slot of each tile

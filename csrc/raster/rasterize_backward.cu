@@ -80,8 +80,10 @@ __device__ __forceinline__ Sample load_sample(const BackwardParams& params, int 
             sample.depth = params.depth_gradients[slot] / fmaxf(alpha, kAlphaTiny);
             if (alpha > kAlphaTiny) alpha_gradient -= sample.depth * forward.depths[slot];
         }
-        // alpha = 1 - transmittance: a background of value -1 per unit of its gradient.
-        sample.behind = -sample.transmittance * alpha_gradient;
+        // Behind all splats lies the background; alpha = 1 - transmittance is one of value -1 per unit of its gradient.
+        const float background = forward.background[0] * sample.red + forward.background[1] * sample.green +
+                                 forward.background[2] * sample.blue;
+        sample.behind = sample.transmittance * (background - alpha_gradient);
     }
     shared.positions[lane] = make_float4(sample.x, sample.y, sample.red, sample.green);
     shared.others[lane] = make_float4(sample.blue, error, sample.depth, 0.0f);

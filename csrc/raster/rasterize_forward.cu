@@ -174,9 +174,9 @@ __global__ void __launch_bounds__(kForwardWarps* kWarpSize, forward_blocks(kItem
             const int slot = slot_base + item * kWarpSize + lane;
             if (slot >= slot_end) continue;
             const float alpha = 1.0f - transmittance[item];
-            params.colors[3 * static_cast<size_t>(slot)] = red[item];
-            params.colors[3 * static_cast<size_t>(slot) + 1] = green[item];
-            params.colors[3 * static_cast<size_t>(slot) + 2] = blue[item];
+            params.colors[3 * static_cast<size_t>(slot)] = red[item] + transmittance[item] * params.background[0];
+            params.colors[3 * static_cast<size_t>(slot) + 1] = green[item] + transmittance[item] * params.background[1];
+            params.colors[3 * static_cast<size_t>(slot) + 2] = blue[item] + transmittance[item] * params.background[2];
             params.alphas[slot] = alpha;
             params.transmittances[slot] = transmittance[item];
             params.last_intersections[slot] = last[item];

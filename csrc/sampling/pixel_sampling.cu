@@ -47,13 +47,13 @@ __device__ __forceinline__ int first_slot(const SamplePixelsParams& params, cons
            pixels.column * tile_slots<kUnit>(params, kTileSize, pixels.height);
 }
 
-template <SampleUnit kUnit, bool kWeighted>
+template <SampleUnit kUnit, bool kWeighted, bool kMasked>
 __global__ void __launch_bounds__(kSampleThreads, kSampleBlocks) sample_tiles_kernel(
     const __grid_constant__ SamplePixelsParams params) {
     const int tile = (blockIdx.x * kSampleThreads + threadIdx.x) / kWarpSize;
     if (tile >= params.num_tiles) return;  // a whole warp
     const int lane = this_lane();
-    const TilePixels pixels = locate_tile(params, tile);
+    const TilePixels pixels = locate_tile<kMasked>(params, tile);
     const uint32_t view_number = static_cast<uint32_t>(params.views[pixels.view].view_number);
     const PixelUnits units = load_maps(params, pixels);
 
@@ -91,12 +91,13 @@ __global__ void __launch_bounds__(kSampleThreads, kSampleBlocks) sample_tiles_ke
             const double source_sum = __shfl_sync(kFullWarp, sum, source);
             const int source_age = __shfl_sync(kFullWarp, oldest, source);
             const uint32_t source_place = __shfl_sync(kFullWarp, pixels.id(j), source);
-            const uint32_t source_exists = __shfl_sync(kFullWarp, pixels.inside >> j & 1u, source);
+            const uint32_t left_cell = 0x0F0F0F0Fu;  // lanes of the left one
+            const uint32_t exist = __ballot_sync(kFullWarp, (pixels.inside >> j & 1u) != 0u);
             if (lane < kTileCells && patch == j) {
                 cell_error = source_sum;
                 cell.oldest = source_age;
                 cell.first_pixel = source_place;
-                cell_exists = source_exists;
+                cell_exists = (exist & (lane % 2 == 0 ? left_cell : ~left_cell)) != 0u ? 1u : 0u;
             }
         }
         error_sum = warp_sum(cell_error);
@@ -115,15 +116,27 @@ __global__ void __launch_bounds__(kSampleThreads, kSampleBlocks) sample_tiles_ke
         drawn &= pixels.inside;
     }
 
-    const int first = first_slot<kUnit>(params, pixels);
-    const int end = first + tile_slots<kUnit>(params, pixels.width, pixels.height);
+    const int first = kMasked ? tile * params.slots_per_tile : first_slot<kUnit>(params, pixels);
+    const int end =
+        first + (kMasked ? params.slots_per_tile : tile_slots<kUnit>(params, pixels.width, pixels.height));
     write_samples(params, pixels, drawn, first, end, kWeighted,
                   [&](int j) { return importance_weight(missed[j], params.importance); });
     if (lane == 0) {
-        params.tile_ids[tile] = tile;
+        params.tile_ids[tile] = kMasked ? pixels.id_of_tile : tile;
         params.tile_offsets[tile] = first;
         if (tile == params.num_tiles - 1) params.tile_offsets[tile + 1] = end;
     }
+}
+
+template <bool kMasked>
+void launch(const SamplePixelsParams& params, cudaStream_t stream) {
+    const bool weighted = params.weights != nullptr;
+    const auto kernel = params.unit == SampleUnit::kPixel
+                            ? (weighted ? sample_tiles_kernel<SampleUnit::kPixel, true, kMasked>
+                                        : sample_tiles_kernel<SampleUnit::kPixel, false, kMasked>)
+                            : (weighted ? sample_tiles_kernel<SampleUnit::kCell, true, kMasked>
+                                        : sample_tiles_kernel<SampleUnit::kCell, false, kMasked>);
+    kernel<<<warp_blocks(params.num_tiles), kSampleThreads, 0, stream>>>(params);
 }
 
 }  // namespace
@@ -131,13 +144,8 @@ __global__ void __launch_bounds__(kSampleThreads, kSampleBlocks) sample_tiles_ke
 cudaError_t launch_sample_pixels(const SamplePixelsParams& params, cudaStream_t stream) {
     if (params.num_tiles == 0) return cudaSuccess;
     if (params.unit == SampleUnit::kTile) return launch_sample_tiles(params, stream);
-    const bool weighted = params.weights != nullptr;
-    const auto kernel = params.unit == SampleUnit::kPixel
-                            ? (weighted ? sample_tiles_kernel<SampleUnit::kPixel, true>
-                                        : sample_tiles_kernel<SampleUnit::kPixel, false>)
-                            : (weighted ? sample_tiles_kernel<SampleUnit::kCell, true>
-                                        : sample_tiles_kernel<SampleUnit::kCell, false>);
-    kernel<<<warp_blocks(params.num_tiles), kSampleThreads, 0, stream>>>(params);
+    if (params.live_tiles != nullptr) launch<true>(params, stream);
+    else launch<false>(params, stream);
     return cudaGetLastError();
 }
 

@@ -13,15 +13,24 @@ namespace turbogs {
 
 constexpr int kPhiloxRounds = 10;  // Philox4x32-10
 
+// The tiles of a view that are drawn from, as a list. Without masks it is all tiles of the view.
+struct LiveTiles {
+    int tile_base;  // place of the view's first, in the list of the batch
+    int count;      // in the view
+    int first;      // with masks: place of the view's first among those of all training views
+};
+
 // turbogs_plugin/engine/reference/draws.py defines the draw, bit for bit.
 struct SamplePixelsParams {
     SampleUnit unit;
     int num_views;   // K
-    int num_tiles;   // of all views
+    int num_tiles;   // to draw from, of all views: with masks the live ones, which have a pixel left
     int num_chosen;  // unit tile: chosen tiles of all views
     SampleView views[kMaxViews];
     int stages[kMaxViews][3];  // units of the hard, stable and mixed stage: of a tile, or for unit tile of the view
-    int slots_per_tile;        // units pixel and cell: slots of a tile that is not cut; also the cap of a cut one
+    LiveTiles live[kMaxViews];
+    int slots_per_tile;        // units pixel and cell: slots of a tile that is not cut; also the cap of a cut one. With
+                               // masks, of every tile
     bool mixed_uniform;
     float importance;  // a of the weights p^-a, 0 for none
     uint32_t seed_high;
@@ -30,6 +39,11 @@ struct SamplePixelsParams {
 
     const uint16_t* errors;  // [X] halves
     const int16_t* stamps;   // [X]
+
+    // Masks of all V training views, or null: L live tiles, view after view.
+    const int32_t* live_tiles;  // [L] number within the view, ascending
+    const int32_t* live_rows;   // [L] row of `live_bits`
+    const int32_t* live_bits;   // [B, kPerLane] bit n of word j: pixel 32 j + n in the order of samples counts
 
     int32_t* pixel_ids;     // [P] out
     int32_t* tile_ids;      // [T] out

@@ -1,4 +1,4 @@
-// A warp's tile in the maps. A lane holds 8 of its pixels: pixel (j, lane) is number 32 j + lane in the order of
+// A warp's tile in the maps, where masks are with them. A lane holds 8 of its pixels: pixel (j, lane) is number 32 j + lane in the order of
 // samples (turbogs_plugin/types.py). That order goes through the tile in patches of 8x4 pixels, two beside each other
 // and four such rows, so lane and j say where a pixel lies.
 #pragma once
@@ -22,9 +22,10 @@ constexpr int kAgeMax = INT16_MAX;   // AGE_MAX of turbogs_plugin/error_maps.py
 // The tile of this warp, and its 8 pixels a lane.
 struct TilePixels {
     int view;                  // in the batch
+    int id_of_tile;            // in the numbering of the batch
     int column, row;           // of the tile
     int width, height;         // of the part inside the image
-    uint32_t inside;           // bit j: pixel (j, lane) exists
+    uint32_t inside;           // bit j: pixel (j, lane) exists and is not masked
     uint32_t first;            // id of pixel (0, lane), y * width + x
     int image_width;
 
@@ -35,11 +36,19 @@ struct TilePixels {
     __device__ __forceinline__ uint32_t id(int j) const { return first + static_cast<uint32_t>(offset(j)); }
 };
 
-__device__ __forceinline__ TilePixels locate_tile(const SamplePixelsParams& params, int tile) {
+// The tile at a place of the list of tiles to draw from.
+template <bool kMasked>
+__device__ __forceinline__ TilePixels locate_tile(const SamplePixelsParams& params, int place) {
     TilePixels pixels;
-    pixels.view = view_of_tile(params.views, params.num_views, tile);
+    pixels.view = kMasked ? view_of_tile(params.live, params.num_views, place)
+                          : view_of_tile(params.views, params.num_views, place);
     const SampleView& view = params.views[pixels.view];
-    const int number = tile - view.tile_base;
+    int number = place - view.tile_base, live = 0;
+    if (kMasked) {
+        live = params.live[pixels.view].first + place - params.live[pixels.view].tile_base;
+        number = params.live_tiles[live];
+    }
+    pixels.id_of_tile = view.tile_base + number;
     pixels.row = number / view.tiles_x;
     pixels.column = number - pixels.row * view.tiles_x;
     pixels.width = min(kTileSize, view.width - kTileSize * pixels.column);
@@ -53,6 +62,13 @@ __device__ __forceinline__ TilePixels locate_tile(const SamplePixelsParams& para
         const bool exists = x + j % kRowPatches * kPatchWidth < pixels.width &&
                             y + j / kRowPatches * kPatchHeight < pixels.height;
         pixels.inside |= static_cast<uint32_t>(exists) << j;
+    }
+    if (kMasked) {
+        const int32_t* words = params.live_bits + static_cast<size_t>(kPerLane) * params.live_rows[live];
+#pragma unroll
+        for (int j = 0; j < kPerLane; ++j) {
+            if ((static_cast<uint32_t>(words[j]) >> lane & 1u) == 0u) pixels.inside &= ~(1u << j);
+        }
     }
     return pixels;
 }

@@ -17,10 +17,11 @@ constexpr int kRankBits = 20;  // of a key, below the age or the race: RANK_BITS
 constexpr int kAgeBits = 15;
 constexpr int kTopBit = kRankBits + kAgeTieBits + kAgeBits - 1;  // highest bit of a key; a race's are shorter
 
+template <bool kMasked>
 __global__ void __launch_bounds__(kSampleThreads) tile_sums_kernel(const __grid_constant__ SamplePixelsParams params) {
     const int tile = (blockIdx.x * kSampleThreads + threadIdx.x) / kWarpSize;
     if (tile >= params.num_tiles) return;
-    const TilePixels pixels = locate_tile(params, tile);
+    const TilePixels pixels = locate_tile<kMasked>(params, tile);
     const PixelUnits units = load_maps(params, pixels);
     double error_sum = 0.0;
     int oldest = 0;
@@ -57,11 +58,11 @@ __global__ void __launch_bounds__(kChooseThreads) choose_tiles_kernel(
     __shared__ long long scratch[kChooseWarps];
     const int batch_view = blockIdx.x;
     const SampleView& view = params.views[batch_view];
-    const int count = view.tiles_x * view.tiles_y;
-    const double* errors = params.tile_errors + view.tile_base;
-    const int32_t* ages = params.tile_ages + view.tile_base;
-    int64_t* keys = params.tile_keys + view.tile_base;
-    float* missed = params.tile_missed + view.tile_base;
+    const int count = params.live[batch_view].count, base = params.live[batch_view].tile_base;
+    const double* errors = params.tile_errors + base;
+    const int32_t* ages = params.tile_ages + base;
+    int64_t* keys = params.tile_keys + base;
+    float* missed = params.tile_missed + base;
     const bool weighted = params.weights != nullptr;
 
     double error_part = 0.0;
@@ -129,7 +130,7 @@ __global__ void __launch_bounds__(kChooseThreads) choose_tiles_kernel(
         }
     }
 
-    // The drawn tiles in their order.
+    // The places of the drawn tiles, in their order.
     int next = view.slot_base;
     for (int start = 0; start < count; start += kChooseThreads) {
         const int i = start + threadIdx.x;
@@ -144,34 +145,42 @@ __global__ void __launch_bounds__(kChooseThreads) choose_tiles_kernel(
             before += warp < this_warp() ? size : 0;
             total += size;
         }
-        if (mine) params.tile_ids[next + before + __popc(lanes & lanes_below(this_lane()))] = view.tile_base + i;
+        if (mine) params.tile_ids[next + before + __popc(lanes & lanes_below(this_lane()))] = base + i;
         next += total;
     }
 }
 
+template <bool kMasked>
 __global__ void __launch_bounds__(kSampleThreads) fill_tiles_kernel(const __grid_constant__ SamplePixelsParams params) {
     const int chosen = (blockIdx.x * kSampleThreads + threadIdx.x) / kWarpSize;
     if (chosen >= params.num_chosen) return;
     const int tile = params.tile_ids[chosen], first = chosen * kTilePixels, end = first + kTilePixels;
-    const TilePixels pixels = locate_tile(params, tile);
+    const TilePixels pixels = locate_tile<kMasked>(params, tile);
     const float weight =
         params.weights != nullptr ? importance_weight(params.tile_missed[tile], params.importance) : 0.0f;
     write_samples(params, pixels, pixels.inside, first, end, params.weights != nullptr, [&](int) { return weight; });
+    __syncwarp();
     if (this_lane() == 0) {
+        if (kMasked) params.tile_ids[chosen] = pixels.id_of_tile;  // in place of the place in the list
         params.tile_offsets[chosen] = first;
         if (chosen == params.num_chosen - 1) params.tile_offsets[chosen + 1] = end;
     }
 }
 
-}  // namespace
-
-cudaError_t launch_sample_tiles(const SamplePixelsParams& params, cudaStream_t stream) {
-    tile_sums_kernel<<<warp_blocks(params.num_tiles), kSampleThreads, 0, stream>>>(params);
+template <bool kMasked>
+cudaError_t launch(const SamplePixelsParams& params, cudaStream_t stream) {
+    tile_sums_kernel<kMasked><<<warp_blocks(params.num_tiles), kSampleThreads, 0, stream>>>(params);
     if (const cudaError_t error = cudaGetLastError()) return error;
     choose_tiles_kernel<<<params.num_views, kChooseThreads, 0, stream>>>(params);
     if (const cudaError_t error = cudaGetLastError()) return error;
-    fill_tiles_kernel<<<warp_blocks(params.num_chosen), kSampleThreads, 0, stream>>>(params);
+    fill_tiles_kernel<kMasked><<<warp_blocks(params.num_chosen), kSampleThreads, 0, stream>>>(params);
     return cudaGetLastError();
+}
+
+}  // namespace
+
+cudaError_t launch_sample_tiles(const SamplePixelsParams& params, cudaStream_t stream) {
+    return params.live_tiles != nullptr ? launch<true>(params, stream) : launch<false>(params, stream);
 }
 
 }  // namespace turbogs

@@ -17,6 +17,7 @@ AUTO = "auto"
 
 AUTO_SETTINGS: dict[str, Any] = {
     "train.backdrop": False,
+    "train.background": "black",
     "loss.type": registry.default_type("loss"),
     "schedule.type": registry.default_type("schedule"),
     "train.sh_degree": 3,

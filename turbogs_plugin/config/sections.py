@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
-from turbogs_plugin.config.units import parse_bytes, parse_seconds
+from turbogs_plugin.config.units import parse_bytes, parse_color, parse_seconds
 from turbogs_plugin.errors import require, require_not_negative
 
 LONGEST_TIME = 100 * 3600.0
@@ -60,6 +60,9 @@ class TrainConfig:
         sh_interval: iterations between two bands; the run starts with band 0, but for a model's file.
         initial_opacity, initial_size: of the Gaussians that training starts with; the size in mean distances to the
             three nearest points. 3DGS has 0.1 and 1, gsplat's MCMC preset 0.5 and 0.1.
+        background: colour that shows through the model: ``black``, ``white``, another that Pillow knows (``#336699``),
+            or ``random``, another one each iteration, so that nothing dark is taken for empty. ``auto``: random where
+            photos are transparent, else black. Transparent photos are composited on it.
         backdrop: start with a far sphere of Gaussians in the photos' mean colour behind the scene.
         distant_size: largest standard deviation of a Gaussian beyond 2 scene extents, over its distance from the
             cameras (`restrain_distant`). 0: no bound.
@@ -80,6 +83,7 @@ class TrainConfig:
     sh_interval: int = 1000
     initial_opacity: float = 0.1
     initial_size: float = 1.0
+    background: str = "black"
     backdrop: bool | Auto = False
     distant_size: float = 0.0
     evaluate_at: tuple[float, ...] = (0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
@@ -97,6 +101,8 @@ class TrainConfig:
         require(named, "init", self.init, "points, random, or the file of a model (.ply, .pt) or a run's folder")
         valid = self.sh_degree == "auto" or 0 <= self.sh_degree <= 3
         require(valid, "sh_degree", self.sh_degree, "within 0 .. 3")
+        if self.background not in ("auto", "random"):
+            parse_color(self.background)
         require(self.sh_interval >= 1, "sh_interval", self.sh_interval, "at least 1")
         require(0 < self.initial_opacity < 1, "initial_opacity", self.initial_opacity, "more than 0 and less than 1")
         require(0 < self.initial_size <= 100, "initial_size", self.initial_size, "more than 0 and at most 100")

@@ -112,7 +112,9 @@ class DrawRow(ViewRow):
     FIRST_SLOT = 4  # for unit = tile the first chosen tile
     WANTED = 5  # tiles to choose; only for unit = tile
     STAGES = slice(6, 9)  # units of the hard, the stable and the mixed stage: of a tile, or for unit = tile of the view
-    SIZE = 9
+    FIRST_LIVE = 9  # with masks: of the view, among the live tiles of all training views
+    LIVE = 10  # tiles to draw from: with masks the live ones of the view, else all
+    SIZE = 11
 
 
 def columns(row: type) -> dict[str, slice]:

@@ -61,7 +61,7 @@ class Engine(ABC):
     def render(
         self, gaussians: Gaussians, cameras: Cameras, samples: PixelSamples, options: RenderOptions = DEFAULT_OPTIONS
     ) -> Rendered:
-        """Render samples of K views with gsplat's conventions, on a black background.
+        """Render samples of K views with gsplat's conventions.
 
         Args:
             cameras: the K views of the batch, in the order of `samples.view_ids`.

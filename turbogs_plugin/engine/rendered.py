@@ -12,7 +12,7 @@ from torch import Tensor
 
 from turbogs_plugin.engine.layout import MAX_SH_DEGREE
 from turbogs_plugin.errors import InputError, require
-from turbogs_plugin.types import GaussianGradients, Gaussians, GaussianStats
+from turbogs_plugin.types import BLACK, Color, GaussianGradients, Gaussians, GaussianStats
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class Rendered(ABC):
     """One forward pass.
 
     Args:
-        colors: [P, 3]; zero in empty slots.
+        colors: [P, 3] on the background, which fills empty slots.
         alphas: [P]; zero in empty slots.
         depths: [P] expected depth (sum of w * z over alpha), or None if not asked for.
     """
@@ -169,11 +169,13 @@ class RenderOptions:
         sh_degree: highest degree of spherical harmonics to use; None for all that the model holds.
         settings: thresholds and planes.
         with_depth: also render expected depths.
+        background: colour that shows through: a sample's is ``colour + (1 - alpha) * background``.
     """
 
     sh_degree: int | None = None
     settings: RasterSettings = DEFAULT_SETTINGS
     with_depth: bool = False
+    background: Color = BLACK
 
     def used_degree(self, gaussians: Gaussians) -> int:
         """The degree of spherical harmonics to evaluate.

@@ -84,6 +84,13 @@ def yaml_text(value: Value) -> str:
     return str(value).lower() if isinstance(value, bool) else str(value)
 
 
+def wanted_background(facts: SceneFacts, config: Config) -> Verdict:
+    """One that no model can imitate, where photos say what is empty."""
+    if facts.transparent:
+        return Verdict("random", "photos are transparent: what is empty in them stays empty")
+    return Verdict("black", "photos are opaque")
+
+
 def wanted_backdrop(facts: SceneFacts, config: Config) -> Verdict:
     """A far sphere behind the scene, where all cameras look the same way and much of it is seen by few."""
     if config.train.starts_from_model:
@@ -178,6 +185,7 @@ def _sign(reached: bool) -> str:
 
 RULES: dict[str, Callable[[SceneFacts, Config], Verdict]] = {
     "train.backdrop": wanted_backdrop,
+    "train.background": wanted_background,
     "loss.type": wanted_loss,
     "schedule.type": wanted_schedule,
     "train.sh_degree": wanted_sh_degree,

@@ -12,6 +12,7 @@ from torch import Tensor
 from turbogs_plugin.error_maps import MAP_BYTES
 from turbogs_plugin.scene import PosedImages, Scene
 from turbogs_plugin.scene.photos import PHOTO_BYTES
+from turbogs_plugin.tiles import TILE_PIXELS
 from turbogs_plugin.types import TILE_SIZE
 
 FLAT_DEVIATION = 0.01
@@ -51,6 +52,7 @@ class SceneFacts:
         device_free_bytes, host_free_bytes: memory free for this run; on a CPU both are the same memory.
         memory_limit: bytes of the device that the run was told not to exceed, or None.
         time_budget: seconds that the run was told to take, or None.
+        transparent: training photos have an alpha.
     """
 
     scene: str
@@ -72,6 +74,7 @@ class SceneFacts:
     host_free_bytes: int
     memory_limit: int | None = None
     time_budget: float | None = None
+    transparent: bool = False
 
 
 @torch.no_grad()
@@ -103,7 +106,7 @@ def gather_facts(
         flat_tiles=flat_tile_share(views),
         exposure_spread=_exposure_spread(views, sight),
         direction_concentration=float(views.cameras.directions.double().mean(dim=0).norm()),
-        photo_bytes=PHOTO_BYTES * (pixels + test_pixels),
+        photo_bytes=(PHOTO_BYTES + views.photos.transparent) * (pixels + test_pixels),
         map_bytes=MAP_BYTES * pixels,
         model_bytes=MODEL_BYTES_PER_GAUSSIAN * len(scene.points),
         device=device.type,
@@ -111,25 +114,31 @@ def gather_facts(
         host_free_bytes=host_free,
         memory_limit=memory_limit,
         time_budget=time_budget,
+        transparent=views.photos.transparent,
     )
 
 
 def flat_tile_share(views: PosedImages) -> float:
-    """Share of whole 16x16 tiles whose luminance deviates less than `FLAT_DEVIATION`, of tiles spread evenly."""
+    """Share of whole 16x16 tiles whose luminance deviates less than `FLAT_DEVIATION`, of tiles spread evenly. Those
+    with masked pixels are left out."""
     colors, offsets = views.photos.stored, views.photos.offsets
     per_photo = max(1, min(TILES_PER_PHOTO, TILES_AT_MOST // len(views)))
     within = np.arange(TILE_SIZE)
     places = []
-    for (width, height), start in zip(views.photos.sizes.tolist(), offsets[:-1].tolist(), strict=True):
+    for view, (width, height) in enumerate(views.photos.sizes.tolist()):
         columns, rows = width // TILE_SIZE, height // TILE_SIZE
         if columns * rows:
             tiles = np.unique(np.linspace(0, columns * rows - 1, per_photo).astype(np.int64))
             y = (tiles // columns * TILE_SIZE)[:, None, None] + within[:, None]
             x = (tiles % columns * TILE_SIZE)[:, None, None] + within
-            places.append((start + y * width + x).reshape(len(tiles), -1))
-    if not places:
+            inside = (y * width + x).reshape(len(tiles), -1)
+            if views.masks is not None:
+                inside = inside[views.masks.image(view).reshape(-1).numpy()[inside].all(axis=1)]
+            places.append(int(offsets[view]) + inside)
+    flat = torch.from_numpy(np.concatenate(places or [np.zeros((0, TILE_PIXELS), dtype=np.int64)]))  # [T, 256]
+    if not len(flat):
         return 0.0
-    flat = torch.from_numpy(np.concatenate(places)).to(colors.device)  # [T, 256]
+    flat = flat.to(colors.device)
     deviations = _luminance(colors[flat]).std(dim=1, correction=0)
     return float((deviations < FLAT_DEVIATION).float().mean())
 
@@ -140,7 +149,7 @@ class _Sight:
 
     Args:
         depths: [V, Q].
-        inside: [V, Q] bool, in front of the camera and within the photo.
+        inside: [V, Q] bool, in front of the camera, within the photo and not masked.
         flat: [V, Q] int64, flat pixel; 0 where not inside.
         distances: [V, V] between camera centres, infinite on the diagonal.
     """
@@ -160,6 +169,9 @@ class _Sight:
         sizes = torch.from_numpy(cameras.sizes)[:, None]  # [V, 1, 2]
         inside = (depths > 1e-9) & (pixels >= 0).all(dim=-1) & (pixels < sizes).all(dim=-1)
         x, y = torch.where(inside[..., None], pixels, 0.0).long().unbind(dim=-1)
+        if views.masks is not None:
+            unmasked = [views.masks.image(view)[y[view], x[view]] for view in range(len(views))]
+            inside &= torch.stack(unmasked)
         flat = torch.from_numpy(views.photos.offsets[:-1])[:, None] + y * sizes[..., 0] + x
         distances = torch.cdist(cameras.centers, cameras.centers, compute_mode="donot_use_mm_for_euclid_dist")
         return cls(depths, inside, torch.where(inside, flat, 0), distances.fill_diagonal_(torch.inf))
@@ -187,8 +199,8 @@ def _exposure_spread(views: PosedImages, sight: _Sight) -> float:
 
 
 def _luminance(colors: Tensor) -> Tensor:
-    """[..., 3] uint8 -> [...] float32, 0 .. 1."""
-    return colors.float() @ (torch.tensor(LUMINANCE, device=colors.device) / 255.0)
+    """[..., 3 or 4] uint8 -> [...] float32, 0 .. 1; transparent colours on black."""
+    return colors[..., :3].float() @ (torch.tensor(LUMINANCE, device=colors.device) / 255.0)
 
 
 def _free_device_bytes(device: torch.device, scene: Scene) -> int:

@@ -19,6 +19,7 @@ from turbogs_plugin.report.pictures import depth_picture, to_uint8
 from turbogs_plugin.report.tables import views_table
 from turbogs_plugin.scene import PosedImages
 from turbogs_plugin.scene.offload import place_views
+from turbogs_plugin.train.background import Background
 from turbogs_plugin.train.evaluate import evaluate, load_lpips
 from turbogs_plugin.train.flip import load_flip
 from turbogs_plugin.train.run import SavedModel, load_given_model, load_model, open_scene, resolve_device
@@ -36,7 +37,9 @@ def evaluate_run(path: Path, device_name: str, given: Config | None = None) -> s
     views = place_views(views, model.gaussians.device, model.config.train.photos_place)
     lpips, reason = load_lpips(model.config.report.lpips_weights, model.gaussians.device)
     flip, no_flip = load_flip()
-    metrics = evaluate(model.gaussians, views, model.sh_degree, model.config.raster, lpips, flip=flip)
+    background = Background.of(model.config.train.background, views.photos.transparent).evaluated
+    settings = model.config.raster
+    metrics = evaluate(model.gaussians, views, model.sh_degree, settings, lpips, flip=flip, background=background)
     note = f"\nLPIPS was not computed: {reason}" if reason else ""
     note += f"\nFLIP was not computed: {no_flip}" if no_flip else ""
     which = f"iteration {model.iteration}" if given is None else str(path)
@@ -75,8 +78,10 @@ def render_run(
     folders = [target / name for name in ([split, f"{split}-depth"] if with_depth else [split])]
     for folder in folders:
         folder.mkdir(parents=True, exist_ok=True)
+    background = Background.of(model.config.train.background, views.photos.transparent).evaluated
     for view_id, name in enumerate(distinct_stems(views.names)):
         options = {"sh_degree": model.sh_degree, "settings": model.config.raster, "with_depth": with_depth}
+        options["background"] = background
         image = render_image(model.gaussians, cameras, view_id, **options)
         Image.fromarray(to_uint8(image.colors)).save(folders[0] / f"{name}.png")
         if with_depth:

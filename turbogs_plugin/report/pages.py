@@ -9,7 +9,7 @@ from turbogs_plugin.files import write_text_atomically
 from turbogs_plugin.plan import Plan
 from turbogs_plugin.report.machine import hardware, software
 from turbogs_plugin.report.pictures import ERROR_FULL_SCALE, picture_writer, strip
-from turbogs_plugin.report.tables import ERRORS, errors, number, table, views_table
+from turbogs_plugin.report.tables import ERRORS, WHOLE_ERRORS, errors, number, table, views_table, whole_errors
 from turbogs_plugin.train.evaluate import Metrics, evaluate, load_lpips, render_view
 from turbogs_plugin.train.history import Evaluation
 from turbogs_plugin.train.run import RunSession
@@ -22,18 +22,20 @@ def write_report(run: RunSession) -> Path:
         The page.
     """
     trainer, config = run.trainer, run.trainer.config
+    background = trainer.background.evaluated
     lpips, lpips_reason = load_lpips(config.report.lpips_weights, trainer.device)
     metrics = None if lpips else run.evaluations.metrics_at(trainer.iteration)
     if metrics is None:
-        metrics = evaluate(trainer.gaussians, run.test, trainer.sh_degree, config.raster, lpips)
+        metrics = evaluate(trainer.gaussians, run.test, trainer.sh_degree, config.raster, lpips, background=background)
     run.clock.mark("report")
     pictures = run.folder.path / "report"
     pictures.mkdir(exist_ok=True)
     shown = min(len(run.test), config.report.strips)
     with picture_writer() as write:
         for view_id in range(shown):
-            image = render_view(trainer.gaussians, run.test, view_id, trainer.sh_degree, config.raster)
-            write(pictures / f"test-{view_id:03d}.jpg", strip(run.test.photos.image(view_id), image))
+            image = render_view(trainer.gaussians, run.test, view_id, trainer.sh_degree, config.raster, background)
+            photo = run.test.photos.image(view_id, background)
+            write(pictures / f"test-{view_id:03d}.jpg", strip(photo, image, run.test.mask(view_id)))
         _plot(run, pictures)  # while the strips are encoded
     run.clock.mark("pictures and plots")
     run.finish_files()  # the page says how long it took until they were there
@@ -59,11 +61,15 @@ def _page(run: RunSession, metrics: Metrics, lpips_reason: str, shown: int) -> s
     """
     last = run.history[-1]
     config = run.trainer.config
+    whole = WHOLE_ERRORS if whole_errors(metrics.mean) else ()
+    unmasked = ", without their masked pixels where nothing else is said" if whole else ""
+    grey = "; masked pixels of photo and error are grey" if whole else ""
     result = table(
-        (*ERRORS, "LPIPS (VGG)", "training in s", "wall in s", "Gaussians", "FPS", "peak memory in MiB"),
+        (*ERRORS, "LPIPS (VGG)", *whole, "training in s", "wall in s", "Gaussians", "FPS", "peak memory in MiB"),
         [
             (
                 *errors(metrics.mean),
+                *whole_errors(metrics.mean),
                 f"{last.train_seconds:.1f}",
                 number(run.wall.wall_seconds, 1, "not recorded"),
                 last.num_gaussians,
@@ -91,7 +97,7 @@ def _page(run: RunSession, metrics: Metrics, lpips_reason: str, shown: int) -> s
 
 {result}
 {lpips}
-Means over the test views. Training time is that of iterations and of the initial error maps; loading, evaluation,
+Means over the test views{unmasked}. Training time is that of iterations and of the initial error maps; loading, evaluation,
 checkpoints and this report are not in it. Wall time is from the start of the process until the model was written.
 FPS counts test views rendered one after the other.
 
@@ -105,7 +111,7 @@ FPS counts test views rendered one after the other.
 ## Test views
 
 From left to right: photo, render, error (mean absolute difference over RGB: black is 0, bright yellow is
-{ERROR_FULL_SCALE} or more). {shown} of {len(metrics.views)} are shown.
+{ERROR_FULL_SCALE} or more{grey}). {shown} of {len(metrics.views)} are shown.
 
 {strips}
 

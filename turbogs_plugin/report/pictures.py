@@ -20,6 +20,9 @@ ERROR_FULL_SCALE = 0.25
 FAINTEST = 0.1
 """Place of the farthest depth on the scale of colours, 0 .. 1: it can be told from black."""
 
+MASKED = 128
+"""Grey of masked pixels."""
+
 GAP = 6
 """White pixels between the pictures of a strip."""
 
@@ -48,14 +51,18 @@ def _save(path: Path, pixels: np.ndarray) -> None:
     Image.fromarray(pixels).save(path, **options)
 
 
-def strip(photo: Tensor, image: Tensor) -> np.ndarray:
+def strip(photo: Tensor, image: Tensor, mask: Tensor | None = None) -> np.ndarray:
     """[H, 3 W + 2 `GAP`, 3] uint8: ground truth, render and error map side by side.
 
     Args:
         photo, image: [H, W, 3] float, 0 .. 1, on one device, where the strip is made.
+        mask: [H, W] bool; where it is False, photo and error are `MASKED`. None: nowhere.
     """
     white = torch.full((photo.shape[0], GAP, 3), 255, dtype=torch.uint8, device=photo.device)
-    parts = (_rounded(photo), white, _rounded(image), white, error_picture(photo, image))
+    truth, errors = _rounded(photo), error_picture(photo, image)
+    if mask is not None:
+        truth, errors = (torch.where(mask[:, :, None], part, MASKED) for part in (truth, errors))
+    parts = (truth, white, _rounded(image), white, errors)
     return torch.cat(parts, dim=1).cpu().numpy()
 
 

@@ -9,7 +9,10 @@ from turbogs_plugin.train.evaluate import Metrics, ViewMetrics
 from turbogs_plugin.train.history import Evaluation
 
 ERRORS = ("PSNR in dB", "SSIM", "mean absolute error")
-"""Heads of the columns that every table of errors has."""
+"""Heads of the columns that every table of errors has. Masked pixels do not count in them."""
+
+WHOLE_ERRORS = tuple(f"{name} with masked pixels" for name in ERRORS)
+"""Heads of the further columns where test views have masks."""
 
 
 def table(header: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
@@ -30,9 +33,16 @@ def errors(measured: ViewMetrics | Evaluation, psnr_digits: int = 2) -> list[str
     return [number(getattr(measured, name), psnr_digits if name == "psnr" else 4) for name in names]
 
 
+def whole_errors(measured: ViewMetrics | Evaluation, psnr_digits: int = 2) -> list[str]:
+    """The numbers for the columns `WHOLE_ERRORS`; none where no test view has a mask."""
+    if math.isnan(measured.whole_l1):
+        return []
+    return [number(measured.whole_psnr, psnr_digits), number(measured.whole_ssim, 4), number(measured.whole_l1, 4)]
+
+
 def views_table(metrics: Metrics, with_means: bool = False) -> str:
     """A table with the errors of each test view, and with their means as its last line if asked for. FLIP has a column
-    where it was computed."""
+    where it was computed, and errors with masked pixels have theirs where there are any."""
     measured = [(view, 2) for view in metrics.views] + ([(metrics.mean, 4)] if with_means else [])
     rows = [[view.name, *errors(view, digits)] for view, digits in measured]
     header = ["view", *ERRORS, "LPIPS (VGG)"]
@@ -40,6 +50,10 @@ def views_table(metrics: Metrics, with_means: bool = False) -> str:
         header.append("FLIP")
         for row, (view, _) in zip(rows, measured, strict=True):
             row.append(number(view.flip, 4))
+    if whole_errors(metrics.mean):
+        header += WHOLE_ERRORS
+        for row, (view, digits) in zip(rows, measured, strict=True):
+            row += whole_errors(view, digits)
     return table(header, rows)
 
 

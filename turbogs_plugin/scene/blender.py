@@ -13,11 +13,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image
 
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene.capture import Capture, sizes_text
-from turbogs_plugin.scene.photos import photo_size
+from turbogs_plugin.scene.photos import is_transparent, opened_image, photo_size
 from turbogs_plugin.scene.poses import viewmat_of_pose
 from turbogs_plugin.scene.transforms import number_of, photo_name, random_points, read_frames
 
@@ -147,14 +146,9 @@ def _note(scene: Path, train: dict[str, BlenderView], test: dict[str, BlenderVie
     """What the capture was taken for, in one line."""
     size = sizes_text(np.array([view.size for view in (*train.values(), *test.values())]))
     split = f"{len(train)} training and {len(test)} test photos" if test else f"{len(train)} photos, none for testing,"
-    alpha = ", RGBA on black" if _is_transparent(scene / min(train)) else ""
+    with opened_image(scene / min(train)) as photo:
+        alpha = ", RGBA" if is_transparent(photo) else ""
     return (
         f"NeRF-synthetic: {split} {size}{alpha}; no points, so {points:,} random ones (seed 0) about what the cameras "
         "look at"
     )
-
-
-def _is_transparent(photo: Path) -> bool:
-    """Whether this photo, whose header could be read, has an alpha channel."""
-    with Image.open(photo) as image:
-        return "A" in image.getbands() or "transparency" in image.info

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path, PureWindowsPath
+from typing import Literal
 
 import numpy as np
 
@@ -31,6 +32,9 @@ class Capture:
         notes: what the capture was taken for, and what was done with it: lines for the user.
         test: [V] bool, the test views of the capture's own split; None: views are split by their order.
         reduction: the photos are already smaller than the capture's full size by this factor.
+        alpha: what the alpha of a transparent photo is: the object's ``opacity``, so that the background shows through
+            and training makes the model as transparent; or a ``mask``, whose zero pixels are ignored.
+        mask_files: files of masks that the capture names, one a view or None; or empty.
     """
 
     names: tuple[str, ...]
@@ -44,6 +48,8 @@ class Capture:
     notes: tuple[str, ...] = ()
     test: np.ndarray | None = None
     reduction: int = 1
+    alpha: Literal["opacity", "mask"] = "opacity"
+    mask_files: tuple[Path | None, ...] = ()
 
     def lens(self, view: int) -> Lens | None:
         return self.lenses[view] if self.lenses else None

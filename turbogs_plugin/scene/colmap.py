@@ -140,6 +140,7 @@ def read_colmap(scene: Path, model: Path, suffix: str) -> Capture:
         point_colors=np.array([point.color for point in points], dtype=np.uint8).reshape(-1, 3),
         lenses=tuple(lenses[image.camera_id] for image in images),
         notes=(_kind_note(scene, model, suffix, len(images), len(points), photo_folder), *_choice_note(model)),
+        alpha="mask",
     )
     capture.check(model)
     return capture
@@ -180,7 +181,11 @@ def _folders(place: Path, depth: int) -> Iterator[Path]:
             inner = [entry for folder in level if folder.is_dir() for entry in sorted(folder.iterdir())]
         except OSError:
             return
-        level = [entry for entry in inner if not REDUCED.search(entry.name) and entry.name[0] != "." and entry.is_dir()]
+        level = [entry for entry in inner if _may_hold_photos(entry)]
+
+
+def _may_hold_photos(entry: Path) -> bool:
+    return not (REDUCED.search(entry.name) or entry.name[0] == "." or entry.name == "masks") and entry.is_dir()
 
 
 def _kind_note(scene: Path, model: Path, suffix: str, images: int, points: int, photo_folder: Path) -> str:

@@ -9,6 +9,7 @@ import torch
 
 from turbogs_plugin.scene import Frame, PosedImages, Scene
 
+NO_MASKS = torch.zeros(0, dtype=torch.int64)
 ROUNDING = 1e-5
 """Two readings of one reconstruction differ by less: in extents, and relative to each intrinsic."""
 
@@ -43,6 +44,8 @@ def capture_difference(saved: dict[str, Any], present: dict[str, Any]) -> str:
             return f"other {split} images"
         if not torch.equal(before["sizes"], now["sizes"]):
             return f"other sizes of {split} images"
+        if not torch.equal(before.get("unmasked", NO_MASKS), now.get("unmasked", NO_MASKS)):
+            return f"other masks of {split} images"
         if not _close(before["Ks"], now["Ks"], ROUNDING * now["Ks"].abs()):
             return f"other intrinsics of {split} images"
         if not _close(before["viewmats"], now["viewmats"], torch.tensor(ROUNDING)):
@@ -56,7 +59,9 @@ def capture_difference(saved: dict[str, Any], present: dict[str, Any]) -> str:
 
 def _views_state(views: PosedImages) -> dict[str, Any]:
     cameras = views.cameras
+    masks = {} if views.masks is None else {"unmasked": torch.from_numpy(views.masks.pixel_counts)}  # [V] int64
     return {
+        **masks,
         "names": list(views.names),
         "sizes": torch.from_numpy(cameras.sizes),  # [V, 2] int64
         "viewmats": cameras.viewmats,  # [V, 4, 4] float32

@@ -103,6 +103,7 @@ def read_llff(scene: Path, factor: int = 1) -> Capture:
             f"random ones (seed 0) within the views at depths of {depths}",
         ),
         reduction=folder.reduction,
+        alpha="mask",
     )
     capture.check(source)
     return capture

@@ -10,10 +10,12 @@ import torch
 from torch import Tensor
 
 from turbogs_plugin.errors import InputError
+from turbogs_plugin.masks import PixelMasks, ViewMask
 from turbogs_plugin.scene import blender, llff
 from turbogs_plugin.scene.capture import Capture
 from turbogs_plugin.scene.colmap import find_model, read_colmap
 from turbogs_plugin.scene.frame import Frame
+from turbogs_plugin.scene.mask_files import find_masks, load_masks
 from turbogs_plugin.scene.photos import Photos, load_photos, photo_sizes, reduced_sizes
 from turbogs_plugin.scene.poses import camera_centers
 from turbogs_plugin.scene.transforms import FILE, read_transforms
@@ -32,17 +34,25 @@ class PosedImages:
         cameras: float32, in the scene's normalised frame.
         names: of the photos, in name order.
         photos: their pixels.
+        masks: which pixels count, on the CPU; None for all.
     """
 
     cameras: Cameras
     names: tuple[str, ...]
     photos: Photos
+    masks: PixelMasks | None = None
 
     def __len__(self) -> int:
         return len(self.names)
 
     def to(self, device: torch.device | str) -> PosedImages:
-        return PosedImages(self.cameras.to(device), self.names, self.photos.to(device))
+        return replace(self, cameras=self.cameras.to(device), photos=self.photos.to(device))
+
+    def mask(self, view_id: int) -> Tensor | None:
+        """[H, W] bool on the cameras' device, True where a pixel of a view counts; None where all do."""
+        if self.masks is None or self.masks.pixel_counts[view_id] == self.cameras.sizes[view_id].prod():
+            return None
+        return self.masks.image(view_id).to(self.cameras.viewmats.device)
 
 
 @dataclass
@@ -73,7 +83,9 @@ class Scene:
 def load_scene(path: str | Path, factor: int = 1, test_every: int = 8) -> Scene:
     """Load a capture with its photos.
 
-    Cameras with distortion become pinhole cameras in the same place, their photos are undistorted.
+    Cameras with distortion become pinhole cameras in the same place, their photos are undistorted. Masks are read from
+    where `find_masks` looks, and from the photos' alpha where that is no opacity (`Capture.alpha`); views that are
+    masked whole are left out.
 
     Args:
         path: the scene's folder. Where it could be of several kinds, the first of these is taken: a COLMAP
@@ -113,23 +125,58 @@ def load_scene(path: str | Path, factor: int = 1, test_every: int = 8) -> Scene:
     intrinsics = capture.Ks.copy()
     intrinsics[:, :2] *= ratios[:, :, None]
 
+    mask_files, mask_note = find_masks(scene, capture, paths)
+    masks = load_masks(mask_files, paths, capture, file_sizes, sizes)
+    seen = np.array([mask is None or mask.pixels > 0 for mask in masks])
+    for name, part in (("training", ~test), ("test", test)):
+        if not (part & seen).any():
+            raise InputError(f"{scene}: all {part.sum()} {name} photos are masked whole: zero in a mask is masked")
+
     def select(views: np.ndarray) -> PosedImages:
         cameras = Cameras(viewmats[views], torch.from_numpy(intrinsics[views]).float(), sizes[views])
         names = tuple(capture.names[view] for view in views)
         lenses = [capture.lens(view) for view in views]
-        photos = load_photos([paths[view] for view in views], file_sizes[views], sizes[views], lenses)
-        return PosedImages(cameras, names, photos)
+        with_alpha = capture.alpha == "opacity"
+        photos = load_photos([paths[view] for view in views], file_sizes[views], sizes[views], lenses, with_alpha)
+        return PosedImages(cameras, names, photos, _pixel_masks([masks[view] for view in views], sizes[views]))
 
+    train, tested = (select(np.flatnonzero(part & seen)) for part in (~test, test))
+    notes = (
+        fitted,
+        undistortion_note(capture.lenses),
+        mask_note,
+        _masked_note(capture.names, masks, sizes, seen),
+        "transparent photos are composited on a background (train.background)" if train.photos.transparent else "",
+    )
     return Scene(
         name=scene.resolve().name,
-        train=select(np.flatnonzero(~test)),
-        test=select(np.flatnonzero(test)),
+        train=train,
+        test=tested,
         points=points,
         point_colors=torch.from_numpy(capture.point_colors),
         frame=frame,
         extent=1.0,
-        notes=tuple(filter(None, (*capture.notes, fitted, undistortion_note(capture.lenses)))),
+        notes=tuple(filter(None, (*capture.notes, *notes))),
     )
+
+
+def _pixel_masks(masks: list[ViewMask | None], sizes: np.ndarray) -> PixelMasks | None:
+    """The masks of views of these `sizes` [V, 2]; None where none has a masked pixel."""
+    if all(mask is None for mask in masks):
+        return None
+    pairs = zip(masks, sizes.tolist(), strict=True)
+    return PixelMasks.of_views([ViewMask.whole(tuple(size)) if mask is None else mask for mask, size in pairs])
+
+
+def _masked_note(names: tuple[str, ...], masks: list[ViewMask | None], sizes: np.ndarray, seen: np.ndarray) -> str:
+    """How much is masked, and which views are left out for it, in one line; empty where nothing is masked."""
+    cut = [view for view, mask in enumerate(masks) if mask is not None]
+    if not cut:
+        return ""
+    share = 1.0 - sum(masks[view].pixels for view in cut) / int(sizes[cut].prod(axis=1).sum())
+    gone = [name for name, kept in zip(names, seen, strict=True) if not kept]
+    left_out = f"; {len(gone)} masked whole are left out: {gone[0]}, ..." if gone else ""
+    return f"{len(cut)} photos have masked pixels, {share:.1%} of them{left_out}"
 
 
 def _read(scene: Path, factor: int) -> Capture:

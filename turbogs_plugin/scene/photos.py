@@ -17,12 +17,16 @@ from torch import Tensor
 
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene.undistort import Lens
-from turbogs_plugin.types import PixelSamples
+from turbogs_plugin.types import BLACK, Color, PixelSamples
 
 PHOTO_BYTES = 3
-"""Bytes of a pixel."""
+"""Bytes of a pixel of an opaque photo; a transparent one has one more."""
+MODES = {3: "RGB", 4: "RGBa"}
+"""Pillow's modes, by channels; the latter's colours are multiplied by alpha."""
 SMALLEST_SIDE = 4
 """The shorter side of a reduced photo has at least so many pixels: those of a cell."""
+OPAQUE_SUFFIXES = (".jpg", ".jpeg")
+"""Of files whose headers need not be read again, as their format has no alpha."""
 MEMORY_SHARE = 0.8
 """Photos may take this share of the machine's memory."""
 
@@ -32,7 +36,8 @@ class Photos:
     """The photos of V views.
 
     Args:
-        colors: [X, 3] uint8, row-major pixels of one view after the other.
+        colors: [X, 3] uint8, row-major pixels of one view after the other. Or [X, 4] where photos are transparent:
+            colours times alpha, and alpha; the background shows through them.
         sizes: [V, 2] int64 numpy array (width, height).
     """
 
@@ -49,8 +54,13 @@ class Photos:
 
     @property
     def stored(self) -> Tensor:
-        """[X, 3] uint8: the pixels of all views end to end, wherever they are."""
+        """[X, 3 or 4] uint8: the pixels of all views end to end, wherever they are."""
         return self.colors
+
+    @property
+    def transparent(self) -> bool:
+        """Whether a pixel has an alpha."""
+        return self.stored.shape[1] == 4
 
     def fetch(self, view_ids: Sequence[int]) -> None:
         """Make the photos of these views available in `colors`, from `offsets` on.
@@ -58,17 +68,18 @@ class Photos:
         Call it before reading these arrays. Here all views are always there; see `scene/offload.py`.
         """
 
-    def at(self, samples: PixelSamples) -> PhotoSamples:
-        """The photos at the samples. To be used before the photos of other views are fetched."""
+    def at(self, samples: PixelSamples, background: Color = BLACK) -> PhotoSamples:
+        """The photos at the samples, on a background. To be used before the photos of other views are fetched."""
         self.fetch(samples.view_ids)
-        return PhotoSamples(self, samples)
+        return PhotoSamples(self, samples, background)
 
-    def image(self, view_id: int) -> Tensor:
-        """[H, W, 3] float32, 0 .. 1: one whole photo."""
+    def image(self, view_id: int, background: Color = BLACK) -> Tensor:
+        """[H, W, 3] float32, 0 .. 1: one whole photo, on a background."""
         self.fetch([view_id])
         width, height = self.sizes[view_id].tolist()
         start = int(self.offsets[view_id])
-        return self.colors[start : start + width * height].view(height, width, 3).float().div_(255.0)
+        pixels = self.colors[start : start + width * height]
+        return _on_background(pixels, background).view(height, width, 3)
 
     def to(self, device: torch.device | str) -> Photos:
         return Photos(self.colors.to(device), self.sizes)
@@ -80,6 +91,7 @@ class PhotoSamples:
 
     photos: Photos
     samples: PixelSamples
+    background: Color = BLACK
 
     @property
     def starts(self) -> np.ndarray:
@@ -89,7 +101,15 @@ class PhotoSamples:
     def colors(self) -> Tensor:
         """[P, 3] float32, 0 .. 1: the colours at the samples, 0 in empty slots."""
         pixels = self.samples.flat_pixels(self.photos.offsets)
-        return self.photos.colors[pixels].float().div_(255.0).mul_(self.samples.filled[:, None])
+        return _on_background(self.photos.colors[pixels], self.background).mul_(self.samples.filled[:, None])
+
+
+def _on_background(pixels: Tensor, background: Color) -> Tensor:
+    """[P, 3] float32, 0 .. 1, of [P, 3 or 4] uint8: ``colour + (1 - alpha) * background``."""
+    colors = pixels.float().div_(255.0)
+    if colors.shape[1] == 3 or not any(background):
+        return colors[:, :3]
+    return torch.stack([colors[:, c] + (1.0 - colors[:, 3]) * background[c] for c in range(3)], dim=1)
 
 
 def pixel_offsets(sizes: np.ndarray) -> np.ndarray:
@@ -116,66 +136,89 @@ def reduced_sizes(sizes: np.ndarray, factor: int) -> np.ndarray:
 
 def photo_size(path: Path) -> tuple[int, int]:
     """(width, height) from the file's header alone; `InputError` where it cannot be read."""
-    with _opened(path) as image:
+    with opened_image(path) as image:
         return image.size
+
+
+def is_transparent(image: Image.Image) -> bool:
+    """Whether an image may have pixels that are not opaque, by its header."""
+    return "A" in image.getbands() or "transparency" in image.info
+
+
+def _any_transparent(paths: Sequence[Path]) -> bool:
+    def transparent(path: Path) -> bool:
+        with opened_image(path) as image:
+            return is_transparent(image)
+
+    candidates = [path for path in paths if path.suffix.lower() not in OPAQUE_SUFFIXES]
+    with decoding_threads() as pool:
+        return any(pool.map(transparent, candidates))
 
 
 def photo_sizes(paths: Sequence[Path]) -> np.ndarray:
     """[V, 2] int64 (width, height), from the headers; `InputError` names the first file that cannot be read."""
-    with _threads() as pool:
+    with decoding_threads() as pool:
         return np.array(list(pool.map(photo_size, paths)), dtype=np.int64).reshape(-1, 2)
 
 
 def load_photos(
-    paths: Sequence[Path], sizes: np.ndarray, targets: np.ndarray, lenses: Sequence[Lens | None] = ()
+    paths: Sequence[Path],
+    sizes: np.ndarray,
+    targets: np.ndarray,
+    lenses: Sequence[Lens | None] = (),
+    with_alpha: bool = True,
 ) -> Photos:
     """Decode photos in parallel, undistorted, then reduced to their target sizes by area averaging.
 
-    Transparent photos are composited over black, the background that renders have. Photos are taken as stored:
-    an orientation in EXIF is ignored, as COLMAP does.
+    Photos are taken as stored: an orientation in EXIF is ignored, as COLMAP does.
 
     Args:
         paths: V files.
         sizes: [V, 2] int64 (width, height) that the files must have.
         targets: [V, 2] int64 (width, height) to give them.
         lenses: one a photo, None for those of pinhole cameras; or empty, where all are.
+        with_alpha: keep the alpha of transparent photos; else their colours are taken as they are stored.
 
     Raises:
         InputError: a photo that cannot be decoded, or is of another size (the first one in order is named); more
             photos than fit in memory.
     """
     offsets = pixel_offsets(targets)
-    needed, present = PHOTO_BYTES * int(offsets[-1]), os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    channels = 4 if with_alpha and _any_transparent(paths) else 3
+    needed, present = channels * int(offsets[-1]), os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     if needed > MEMORY_SHARE * present:
         raise InputError(
             f"{len(paths)} photos take {needed / 2**30:.1f} GiB of the machine's {present / 2**30:.1f} GiB: "
             "use a larger --factor"
         )
-    colors = torch.empty(int(offsets[-1]), 3, dtype=torch.uint8)
+    colors = torch.empty(int(offsets[-1]), channels, dtype=torch.uint8)
     pixels = colors.numpy()
 
     def load(view: int) -> None:
         target = tuple(targets[view].tolist())
-        photo = _decode(paths[view], tuple(sizes[view].tolist()))
+        photo = _decode(paths[view], tuple(sizes[view].tolist()), MODES[channels])
         lens = lenses[view] if lenses else None
         if lens is not None:
-            photo = Image.fromarray(lens.undistort(np.asarray(photo), lens.size_of(photo.size)))
+            size = lens.size_of(photo.size)
+            photo = Image.frombytes(photo.mode, size, lens.undistort(np.asarray(photo), size).tobytes())
         if photo.size != target:
             photo = photo.resize(target, Image.Resampling.BOX)
-        pixels[offsets[view] : offsets[view + 1]] = np.asarray(photo).reshape(-1, 3)
+        pixels[offsets[view] : offsets[view + 1]] = np.asarray(photo).reshape(-1, channels)
 
-    with _threads() as pool:
+    with decoding_threads() as pool:
         list(pool.map(load, range(len(paths))))  # raises the first error in order, and cancels what has not begun
+    if channels == 4 and bool((colors[:, 3] == 255).all()):  # opaque after all
+        colors = colors[:, :3].contiguous()
     return Photos(colors, targets)
 
 
-def _threads() -> ThreadPoolExecutor:
+def decoding_threads() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(min(8, os.cpu_count() or 1))
 
 
-def _decode(path: Path, size: tuple[int, int]) -> Image.Image:
-    """An RGB image of exactly this size, or `InputError`. The size is checked before any pixel is decoded."""
-    with _opened(path) as image:
+def _decode(path: Path, size: tuple[int, int], mode: str) -> Image.Image:
+    """An image of exactly this size and mode, or `InputError`. The size is checked before any pixel is decoded."""
+    with opened_image(path) as image:
         if image.size != size:
             raise InputError(
                 f"photo {path} is {image.size[0]}x{image.size[1]} but its camera is {size[0]}x{size[1]}: "
@@ -183,15 +226,14 @@ def _decode(path: Path, size: tuple[int, int]) -> Image.Image:
             )
         if image.mode.startswith(("I", "F")):
             raise InputError(f"photo {path} has more than 8 bits a channel: convert it to 8-bit RGB")
-        if "A" in image.getbands() or "transparency" in image.info:
+        if mode == "RGBa" or is_transparent(image):
             image = image.convert("RGBA")
-            return Image.alpha_composite(Image.new("RGBA", size, (0, 0, 0, 255)), image).convert("RGB")
-        return image.convert("RGB")
+        return image.convert(mode)
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[Image.Image]:
-    """The photo with its header read; `InputError` for whatever goes wrong with it while entered."""
+def opened_image(path: Path, what: str = "photo") -> Iterator[Image.Image]:
+    """The file with its header read; `InputError` for whatever goes wrong with it while entered."""
     try:
         with Image.open(path) as image:
             yield image
@@ -199,4 +241,4 @@ def _opened(path: Path) -> Iterator[Image.Image]:
         raise
     except Exception as error:  # a broken file can raise anything in its decoder
         reason = " ".join((str(error) or type(error).__name__).split())
-        raise InputError(f"cannot read the photo {path}: {reason}") from error
+        raise InputError(f"cannot read the {what} {path}: {reason}") from error

@@ -45,8 +45,9 @@ def read_transforms(scene: Path) -> Capture:
     """Read ``scene/transforms.json``.
 
     Intrinsics and distortion may stand in each frame or for all; ``camera_angle_x`` serves where there is no ``fl_x``.
-    Frames whose photo does not exist are left out. Points come from ``ply_file_path`` where it is given, else they are
-    drawn at random (seeded) in a cube about what the cameras look at.
+    Frames whose photo does not exist are left out. A frame's ``mask_path`` is its mask. Points come from
+    ``ply_file_path`` where it is given, else they are drawn at random (seeded) in a cube about what the cameras look
+    at.
 
     Raises:
         InputError: a file that is not such JSON, lacks something, or describes no lens; fewer than `FEWEST_PHOTOS`
@@ -55,6 +56,7 @@ def read_transforms(scene: Path) -> Capture:
     source = scene / FILE
     content, frames = read_frames(source)
     views: dict[str, tuple[np.ndarray, np.ndarray, tuple[int, int], Lens | None]] = {}
+    masks: dict[str, Path | None] = {}
     absent: list[str] = []
     lenses: dict[tuple, Lens] = {}
     for frame in frames:
@@ -64,6 +66,7 @@ def read_transforms(scene: Path) -> Capture:
         if not (scene / name).is_file():
             absent.append(name)
             continue
+        masks[name] = _mask_file(scene, frame, name, source)
         views[name] = (_viewmat(frame, name, source), *_camera({**content, **frame}, scene / name, source, lenses))
     if absent and len(views) < FEWEST_PHOTOS:
         raise InputError(
@@ -97,6 +100,7 @@ def read_transforms(scene: Path) -> Capture:
         point_colors=colors,
         lenses=lens_of_view,
         notes=tuple(notes),
+        mask_files=tuple(masks[name] for name in names),
     )
     capture.check(source)
     return capture
@@ -131,6 +135,19 @@ def photo_name(scene: Path, name: Any, source: Path) -> str:
     name = str(PurePosixPath(check_photo_name(name, source)))
     suffixes = ("", *PHOTO_SUFFIXES, *(suffix.upper() for suffix in PHOTO_SUFFIXES))
     return next((f"{name}{suffix}" for suffix in suffixes if (scene / f"{name}{suffix}").is_file()), name)
+
+
+def _mask_file(scene: Path, frame: dict, name: str, source: Path) -> Path | None:
+    """The mask that a frame names; `InputError` where it is not there."""
+    path = frame.get("mask_path")
+    if path is None:
+        return None
+    if not isinstance(path, str):
+        raise InputError(f"{source}: mask_path of frame '{name}' is not a path")
+    file = scene / check_photo_name(path, source)
+    if not file.is_file():
+        raise InputError(f"{source}: frame '{name}' names the mask {file}, which is not there: bring it back")
+    return file
 
 
 def number_of(values: dict, source: Path, key: str, default: float | None = None) -> float | None:

@@ -147,6 +147,6 @@ def warm_up(config: Config, scene: Scene, test: PosedImages, device: torch.devic
     """Train and evaluate a model that is thrown away, with every kind of event that the configuration has."""
     trainer = Trainer(with_iterations(config, iterations), scene, device)
     TrainingLoop(trainer).run()
-    evaluate(trainer.gaussians, test, trainer.sh_degree, config.raster)
+    evaluate(trainer.gaussians, test, trainer.sh_degree, config.raster, background=trainer.background.evaluated)
     del trainer
     free_device_memory(device)

@@ -1,4 +1,7 @@
-"""Test error of a model: PSNR, SSIM, mean absolute error, LPIPS and FLIP if wanted and there; and rendering speed."""
+"""Test error of a model: PSNR, SSIM, mean absolute error, LPIPS and FLIP if wanted and there; and rendering speed.
+
+Where views have masks, errors are of the pixels that are not masked, and those of whole photos are given beside them.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +10,7 @@ import math
 import tempfile
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from pathlib import Path
 
 import torch
@@ -19,7 +22,7 @@ from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene import PosedImages
 from turbogs_plugin.train.flip import Flip
 from turbogs_plugin.train.ssim import SSIM_SIDE, ssim
-from turbogs_plugin.types import Gaussians
+from turbogs_plugin.types import BLACK, Color, Gaussians
 
 PSNR_LIMIT = 100.0
 """PSNR of an exact match, in dB."""
@@ -36,7 +39,12 @@ Lpips = Callable[[Tensor, Tensor], float]
 
 @dataclass
 class ViewMetrics:
-    """Errors of one test view; `ssim`, `lpips` and `flip` are NaN where they cannot be computed or are not wanted."""
+    """Errors of one test view, without its masked pixels; `ssim`, `lpips` and `flip` are NaN where they cannot be
+    computed or are not wanted.
+
+    Args:
+        whole_psnr, whole_ssim, whole_l1: with the masked pixels; NaN where no view has a mask.
+    """
 
     name: str
     psnr: float
@@ -44,6 +52,9 @@ class ViewMetrics:
     l1: float
     lpips: float = math.nan
     flip: float = math.nan
+    whole_psnr: float = math.nan
+    whole_ssim: float = math.nan
+    whole_l1: float = math.nan
 
 
 @dataclass
@@ -61,8 +72,7 @@ class Metrics:
     @property
     def mean(self) -> ViewMetrics:
         """The means over views; NaN if a view has no value."""
-        values = ((view.psnr, view.ssim, view.l1, view.lpips, view.flip) for view in self.views)
-        columns = zip(*values, strict=True)
+        columns = zip(*(astuple(view)[1:] for view in self.views), strict=True)
         return ViewMetrics(f"mean of {len(self.views)}", *(math.fsum(column) / len(self.views) for column in columns))
 
     @property
@@ -80,6 +90,7 @@ def evaluate(
     settings: RasterSettings,
     lpips: Lpips | None = None,
     flip: Flip | None = None,
+    background: Color = BLACK,
 ) -> Metrics:
     """Render every view, one at a time, and compare it with its photo.
 
@@ -89,43 +100,66 @@ def evaluate(
         sh_degree: highest degree in use.
         settings: those of the rasterizer.
         lpips: from `load_lpips`, if wanted.
-        flip: from `load_flip`, if wanted.
+        flip: from `load_flip`, if wanted. Masked pixels are the photo's in both images that these two get.
+        background: behind the model, and behind transparent photos.
     """
     metrics, seconds = [], 0.0
     for view_id, name in enumerate(views.names):
         synchronize(gaussians.device)
         started = time.perf_counter()
-        image = render_view(gaussians, views, view_id, sh_degree, settings)
+        image = render_view(gaussians, views, view_id, sh_degree, settings, background)
         synchronize(gaussians.device)
         seconds += time.perf_counter() - started
-        photo = views.photos.image(view_id)
-        metrics.append(compare(name, image, photo))
+        photo, mask = views.photos.image(view_id, background), views.mask(view_id)
+        metrics.append(compare(name, image, photo, mask))
+        if views.masks is not None:
+            whole = compare(name, image, photo)
+            metrics[-1].whole_psnr, metrics[-1].whole_ssim, metrics[-1].whole_l1 = whole.psnr, whole.ssim, whole.l1
         if lpips is not None:
-            metrics[-1].lpips = lpips(image, photo)
+            metrics[-1].lpips = lpips(image if mask is None else _unmasked(image, photo, mask), photo)
         if flip is not None:
-            metrics[-1].flip = flip(image, photo)
+            metrics[-1].flip = flip(image if mask is None else _unmasked(image, photo, mask), photo)
     return Metrics(metrics, fps=len(metrics) / seconds)
 
 
 @torch.no_grad()
 def render_view(
-    gaussians: Gaussians, views: PosedImages, view_id: int, sh_degree: int, settings: RasterSettings
+    gaussians: Gaussians,
+    views: PosedImages,
+    view_id: int,
+    sh_degree: int,
+    settings: RasterSettings,
+    background: Color = BLACK,
 ) -> Tensor:
     """[H, W, 3] float32, 0 .. 1: the model seen by one of the cameras."""
-    image = render_image(gaussians, views.cameras, view_id, sh_degree=sh_degree, settings=settings)
+    options = {"sh_degree": sh_degree, "settings": settings, "background": background}
+    image = render_image(gaussians, views.cameras, view_id, **options)
     return image.colors.clamp(0.0, 1.0)
 
 
 def psnr(image: Tensor, photo: Tensor) -> float:
-    """PSNR in dB of an image against a photo, both [H, W, 3] float, 0 .. 1; NaN if a value is."""
+    """PSNR in dB of an image against a photo, both [..., 3] float, 0 .. 1; NaN if a value is."""
     mse = (image - photo).square().mean().item()
     return min(PSNR_LIMIT, -10.0 * math.log10(mse)) if mse > 0 else PSNR_LIMIT if mse == 0 else math.nan
 
 
-def compare(name: str, image: Tensor, photo: Tensor) -> ViewMetrics:
-    """Errors of an image against a photo, both [H, W, 3] float, 0 .. 1. SSIM has its usual Gaussian window of 11."""
-    similarity = ssim(image, photo).item() if min(image.shape[:2]) >= SSIM_SIDE else math.nan
+def compare(name: str, image: Tensor, photo: Tensor, mask: Tensor | None = None) -> ViewMetrics:
+    """Errors of an image against a photo, both [H, W, 3] float, 0 .. 1. SSIM has its usual Gaussian window of 11.
+
+    Args:
+        mask: [H, W] bool, the pixels to compare, at least one; None: all. SSIM's is the mean over their windows, in
+            which masked pixels are the photo's in both images.
+    """
+    of_windows = image if mask is None else _unmasked(image, photo, mask)
+    similarity = ssim(of_windows, photo, mask).item() if min(image.shape[:2]) >= SSIM_SIDE else math.nan
+    if mask is not None:
+        image, photo = image[mask], photo[mask]  # [P, 3]
     return ViewMetrics(name, psnr(image, photo), similarity, (image - photo).abs().mean().item())
+
+
+def _unmasked(image: Tensor, photo: Tensor, mask: Tensor) -> Tensor:
+    """[H, W, 3]: the image with the photo's pixels where the mask [H, W] is False."""
+    return torch.where(mask[:, :, None], image, photo)
 
 
 def load_lpips(weights: str | None, device: torch.device) -> tuple[Lpips | None, str]:

@@ -46,18 +46,23 @@ class Evaluations(Listener):
         trainer = loop.trainer
         trainer.require_finite()
         lpips = self.lpips if loop.finished else None
-        metrics = evaluate(trainer.gaussians, self.test, trainer.sh_degree, trainer.config.raster, lpips)
+        settings, background = trainer.config.raster, trainer.background.evaluated
+        metrics = evaluate(trainer.gaussians, self.test, trainer.sh_degree, settings, lpips, background=background)
+        mean = metrics.mean
         evaluation = Evaluation(
             iteration=trainer.iteration,
             train_seconds=loop.clock.seconds,
-            psnr=metrics.mean.psnr,
-            ssim=metrics.mean.ssim,
-            l1=metrics.mean.l1,
+            psnr=mean.psnr,
+            ssim=mean.ssim,
+            l1=mean.l1,
             num_gaussians=len(trainer.gaussians),
             memory_bytes=self.peak_memory() if self.peak_memory else peak_memory_bytes(trainer.device),
             nonfinite_losses=int(trainer.nonfinite_losses),
             skipped_updates=int(trainer.optimizer.skipped),
             worst_psnr=metrics.worst_psnr,
+            whole_psnr=mean.whole_psnr,
+            whole_ssim=mean.whole_ssim,
+            whole_l1=mean.whole_l1,
         )
         self.history.append(evaluation)
         self.metrics = metrics

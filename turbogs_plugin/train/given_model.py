@@ -27,6 +27,7 @@ from turbogs_plugin.model.similarity import Similarity, placed
 from turbogs_plugin.model.torch_file import load_plain, reason_of
 from turbogs_plugin.scene import Scene
 from turbogs_plugin.scene.fingerprint import frame_of_state
+from turbogs_plugin.train.background import Background
 from turbogs_plugin.train.checkpoint import latest_checkpoint
 from turbogs_plugin.train.evaluate import psnr
 from turbogs_plugin.types import PARAMETER_NAMES, Cameras, Gaussians
@@ -175,6 +176,7 @@ class _Trial:
 
     def __init__(self, scene: Scene, device: torch.device) -> None:
         views, self._device = scene.train, device
+        self._background = Background.of("auto", views.photos.transparent).evaluated
         chosen = np.unique(np.linspace(0, len(views) - 1, TRIAL_VIEWS).round().astype(int)).tolist()
         cameras = views.cameras.to(device).select(chosen)
         sizes = cameras.sizes
@@ -186,7 +188,7 @@ class _Trial:
         # A pixel stands for several of the photo, so its blur is less.
         self._settings = [replace(DEFAULT_SETTINGS, eps2d=DEFAULT_SETTINGS.eps2d / by**2) for by in reductions]
         self.photos = [
-            _reduced(views.photos.image(view).to(device), *size)
+            _reduced(views.photos.image(view, self._background).to(device), *size)
             for view, size in zip(chosen, small.tolist(), strict=True)
         ]
         self.flat_psnr = fmean(psnr(photo.mean(dim=(0, 1)), photo) for photo in self.photos)
@@ -196,7 +198,8 @@ class _Trial:
         model = gaussians.map(lambda value: value.to(self._device))
         values = []
         for view, (photo, settings) in enumerate(zip(self.photos, self._settings, strict=True)):
-            image = render_image(model, self._cameras, view, sh_degree=model.sh_degree, settings=settings)
+            options = {"sh_degree": model.sh_degree, "settings": settings, "background": self._background}
+            image = render_image(model, self._cameras, view, **options)
             values.append(psnr(image.colors.clamp(0.0, 1.0), photo))
         return fmean(values)
 

@@ -24,6 +24,8 @@ class Evaluation:
         nonfinite_losses: iterations so far whose loss was not finite.
         skipped_updates: updates of Gaussians skipped so far because their gradient was not finite.
         worst_psnr: PSNR of the worst test view; NaN in old files, which lack it.
+        whole_psnr, whole_ssim, whole_l1: means with masked pixels, which have no part in `psnr`, `ssim` and `l1`; NaN,
+            and not written, where no test view has any.
     """
 
     iteration: int
@@ -36,10 +38,14 @@ class Evaluation:
     nonfinite_losses: int = 0
     skipped_updates: int = 0
     worst_psnr: float = math.nan
+    whole_psnr: float = math.nan
+    whole_ssim: float = math.nan
+    whole_l1: float = math.nan
 
     def to_json(self) -> str:
         """One line; NaN is written as null."""
-        return json.dumps({name: None if value != value else value for name, value in asdict(self).items()})
+        written = {name: value for name, value in asdict(self).items() if name[:6] != "whole_" or value == value}
+        return json.dumps({name: None if value != value else value for name, value in written.items()})
 
 
 def append_evaluation(path: Path, evaluation: Evaluation) -> None:

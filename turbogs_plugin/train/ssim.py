@@ -18,11 +18,12 @@ C1, C2 = 0.01**2, 0.03**2
 """The paper's constants for values 0 .. 1."""
 
 
-def ssim(image: Tensor, photo: Tensor) -> Tensor:
+def ssim(image: Tensor, photo: Tensor, mask: Tensor | None = None) -> Tensor:
     """Structural similarity, the mean over all pixels and channels; borders are mirrored, as torchmetrics does.
 
     Args:
         image, photo: [H, W, 3] float, 0 .. 1, with sides of at least `SSIM_SIDE`.
+        mask: [H, W] bool, the pixels to take the mean over; None: all.
 
     Returns:
         A scalar on the images' device.
@@ -32,7 +33,8 @@ def ssim(image: Tensor, photo: Tensor) -> Tensor:
     variances = (xx - mean_x.square()).clamp(min=0.0) + (yy - mean_y.square()).clamp(min=0.0)
     covariance = xy - mean_x * mean_y
     similar_means = (2.0 * mean_x * mean_y + C1) / (mean_x.square() + mean_y.square() + C1)
-    return (similar_means * (2.0 * covariance + C2) / (variances + C2)).mean()
+    similarity = similar_means * (2.0 * covariance + C2) / (variances + C2)  # [3, H, W]
+    return similarity.mean() if mask is None else similarity[:, mask].mean()
 
 
 def _blurred(images: Tensor) -> Tensor:

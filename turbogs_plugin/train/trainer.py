@@ -15,17 +15,18 @@ from turbogs_plugin.engine import engine_of
 from turbogs_plugin.engine.layout import MAX_SH_DEGREE
 from turbogs_plugin.engine.protocol import MapUpdate
 from turbogs_plugin.engine.rendered import RenderOptions, ScreenGradients
-from turbogs_plugin.engine.rendering import render_image
+from turbogs_plugin.engine.rendering import rasterize, render_image
 from turbogs_plugin.errors import InputError, TrainingStopped
 from turbogs_plugin.model.distant import RESTRAIN_EVERY, restrain_distant
 from turbogs_plugin.model.harmonics import with_degree
 from turbogs_plugin.model.initial import BACKDROP_COUNT, backdrop_gaussians, gaussians_from_points
 from turbogs_plugin.model.row_order import in_order_of_space
 from turbogs_plugin.plan.caps import cap_of, chosen_points
-from turbogs_plugin.scene import Scene
+from turbogs_plugin.scene import PosedImages, Scene
 from turbogs_plugin.scene.offload import place_maps, place_views
 from turbogs_plugin.scene.photos import PhotoSamples
 from turbogs_plugin.scene.transforms import random_points
+from turbogs_plugin.train.background import Background
 from turbogs_plugin.train.given_model import load_given
 from turbogs_plugin.types import PARAMETER_NAMES, Gaussians, GaussianStats, LossOutput, RowUpdate, Step
 
@@ -57,7 +58,10 @@ class Trainer:
         self.loss = config.build("loss")
         self.optimizer = config.build("optimizer")
         self.density = config.build("density")
-        self.maps = place_maps(self.views.cameras.sizes, device, config.train.maps_place, config.maps.beta)
+        self.maps = place_maps(
+            self.views.cameras.sizes, device, config.train.maps_place, config.maps.beta, self.views.masks
+        )
+        self.background = Background.of(config.train.background, self.views.photos.transparent)
         init = "points" if resuming else config.train.init
         self.gaussians = initial_gaussians(scene, config, init, device).map(lambda tensor: tensor.to(device))
         self.view_sampler.setup(self.views.cameras, scene.extent)
@@ -77,11 +81,18 @@ class Trainer:
         self.initial_error = self.maps.mean()
 
     def initialise_map(self, view_id: int) -> None:
-        """Set the map of one view to the errors of its dense render."""
-        image = render_image(
-            self.gaussians, self.views.cameras, view_id, sh_degree=self.sh_degree, settings=self.config.raster
-        )
-        errors = (image.colors - self.views.photos.image(view_id)).abs().sum(dim=-1)  # [H, W]
+        """Set the map of one view to the errors of its dense render, in which masked pixels have no part."""
+        background = self.background.at(self.now)
+        options = {"sh_degree": self.sh_degree, "settings": self.config.raster, "background": background}
+        if self.maps.masks is None:
+            image = render_image(self.gaussians, self.views.cameras, view_id, **options)
+            errors = (image.colors - self.views.photos.image(view_id, background)).abs().sum(dim=-1)  # [H, W]
+        else:
+            samples = self.maps.masks.pixels([view_id])
+            rendered = rasterize(self.gaussians, self.views.cameras.select([view_id]), samples, **options)
+            truth = self.views.photos.at(samples, background).colors()  # [P, 3]
+            errors = truth.new_zeros(int(self.maps.sizes[view_id].prod()))  # [H * W]
+            errors[samples.pixel_ids.long()] = (rendered.colors - truth).abs().sum(dim=-1)
         self.maps.initialise(view_id, errors.reshape(-1))
 
     def step(self) -> None:
@@ -98,12 +109,16 @@ class Trainer:
 
         # 3) Pixel sampling
         samples = self.pixel_sampler.sample(self.maps, view_ids, budget.rate, step)
+        if self.maps.masks is not None and not getattr(self.pixel_sampler, "heeds_masks", False):
+            samples = self.maps.masks.strip(samples)
 
         # 4) Ground truth at the samples
-        truth = self.views.photos.at(samples)
+        background = self.background.at(step)
+        truth = self.views.photos.at(samples, background)
 
         # 5) Sparse forward rendering
-        cameras, options = self.views.cameras.select(view_ids), RenderOptions(self.sh_degree, self.config.raster)
+        cameras = self.views.cameras.select(view_ids)
+        options = RenderOptions(self.sh_degree, self.config.raster, background=background)
         rendered = self.engine.render(self.gaussians, cameras, samples, options)
 
         # 6) Sparse loss and its gradients, and 7) EMA update of the error maps
@@ -272,9 +287,19 @@ def initial_gaussians(scene: Scene, config: Config, init: str, device: torch.dev
             )
     if not train.backdrop:
         return gaussians
-    color = scene.train.photos.stored[::COLOR_STRIDE].float().mean(dim=0).cpu() / 255.0
+    color = _mean_color(scene.train)
     backdrop = backdrop_gaussians(color, train.sh_degree, scene.extent)
     return Gaussians(**{name: torch.cat([tensor, getattr(backdrop, name)]) for name, tensor in gaussians.items()})
+
+
+def _mean_color(views: PosedImages) -> Tensor:
+    """[3] float32, 0 .. 1: the mean of every `COLOR_STRIDE`-th pixel that is not masked; transparent ones on black."""
+    pixels = views.photos.stored[::COLOR_STRIDE, :3].float().cpu()
+    if views.masks is not None:
+        keep = [views.masks.image(view).reshape(-1) for view in range(len(views))]
+        kept = torch.cat(keep)[::COLOR_STRIDE]
+        pixels = pixels[kept] if kept.any() else pixels
+    return pixels.mean(dim=0) / 255.0
 
 
 def gaussians_of_state(state: dict[str, Any], device: torch.device) -> Gaussians:

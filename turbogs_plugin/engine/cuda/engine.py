@@ -46,7 +46,7 @@ class CudaEngine(Engine):
         photos, starts = truth.photos.colors, update.maps.offsets[list(truth.samples.view_ids)]
         aligned = len(photos) == len(update.maps.errors) and np.array_equal(truth.starts, starts)
         targets = photos if aligned else truth.colors()
-        return training.sparse_loss(terms, colors, targets, truth.samples, update, self.overflow)
+        return training.sparse_loss(terms, colors, targets, truth.samples, update, self.overflow, truth.background)
 
     def settle(self, wait: bool = False) -> int:
         return 0 if self.workspace is None else self.workspace.take_lost(wait)

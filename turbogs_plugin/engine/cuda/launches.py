@@ -198,6 +198,15 @@ BlendSettings = fields_of("float", "alpha_min alpha_max transmittance_min")
 
 
 @dataclass
+class Background:
+    """The colour that shows through, 0 .. 1."""
+
+    background_red: float
+    background_green: float
+    background_blue: float
+
+
+@dataclass
 class RasterForward(Launch):
     """Stage 5: colours, alphas and, if asked for, depths at the samples."""
 
@@ -217,6 +226,7 @@ class RasterForward(Launch):
     bucket_counts: Tensor  # [T * chunks] int32
     chunks: int  # work items of a tile
     settings: BlendSettings
+    background: Background
 
 
 @dataclass
@@ -250,6 +260,14 @@ NO_SCRATCH = TileScratch(None, None, None, None)
 """For the other units."""
 
 
+MaskArrays = fields_of("Tensor | None", "tiles rows bits")
+"""`masks.PixelMasks`, or `NO_MASKS`: [L] int32, [L] int32, [B, 8] int32."""
+
+
+NO_MASKS = SimpleNamespace(**dict.fromkeys(MaskArrays.__annotations__))
+"""Where every pixel counts."""
+
+
 @dataclass
 class SamplePixels(Launch):
     """Draw samples: writes `pixel_ids`, `tile_ids`, `tile_offsets` and `weights`."""
@@ -258,7 +276,8 @@ class SamplePixels(Launch):
     stamps: Tensor  # [X] int16
     views: list[int]  # [K] layout.DrawRow
     unit: int  # of layout.UNITS
-    slots_per_tile: int  # slots of a tile that the image's edge does not cut; 0 for unit = tile
+    masks: MaskArrays
+    slots_per_tile: int  # slots of a tile that the image's edge does not cut; with masks, of every tile
     mixed_uniform: bool
     importance: float
     seed: int
@@ -304,7 +323,7 @@ class SparseLoss(Launch):
 
     colors: Tensor  # [P, 3] float32
     targets: Tensor | None  # [P, 3] float32
-    photos: Tensor | None  # [X, 3] uint8, from which to gather the colours; instead of `targets`
+    photos: Tensor | None  # [X, 3 or 4] uint8, from which to gather the colours; instead of `targets`
     samples: SampleArrays
     views: list[int]  # [K] layout.ViewRow
     structure: int  # of layout.STRUCTURES
@@ -318,6 +337,7 @@ class SparseLoss(Launch):
     pixel_errors: Tensor  # [P] float32
     nonfinite_losses: Tensor | None  # [] int64, 1 is added if the loss is not finite
     overflow: Tensor | None  # [1] int32; if not 0, the maps stay as they are
+    background: Background  # shows through photos with an alpha
 
 
 # ---- From the screen to the parameters ------------------------------------------------------------------------------

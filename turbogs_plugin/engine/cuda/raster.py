@@ -279,6 +279,7 @@ def rasterize_cuda(
         bucket_counts=buffers.integers("bucket_counts", num_active * chunks),
         chunks=chunks,
         settings=settings,
+        background=launches.Background(*options.background),
     )
     library.launch(forward)
     return CudaRendered(

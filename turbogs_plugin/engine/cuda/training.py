@@ -24,7 +24,16 @@ from turbogs_plugin.engine.protocol import MapUpdate
 from turbogs_plugin.engine.rules import DrawRule, LossTerms, UpdateRule
 from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.tiles import CELL_SIDE, TILE_PIXELS, slots_of_tiles, tile_extents
-from turbogs_plugin.types import TILE_SIZE, Gaussians, GaussianStats, LossOutput, PixelSamples, Step
+from turbogs_plugin.types import (
+    BLACK,
+    TILE_SIZE,
+    Color,
+    Gaussians,
+    GaussianStats,
+    LossOutput,
+    PixelSamples,
+    Step,
+)
 
 
 def sample_pixels(rule: DrawRule, maps: ErrorMaps, view_ids: tuple[int, ...], rate: float, step: Step) -> PixelSamples:
@@ -34,7 +43,10 @@ def sample_pixels(rule: DrawRule, maps: ErrorMaps, view_ids: tuple[int, ...], ra
     views = np.asarray(view_ids, dtype=np.int64)
     device, sizes = maps.errors.device, maps.sizes[views]
     shapes = sizes.tolist()
+    masks, live_starts = maps.masks or launches.NO_MASKS, [0] * len(shapes)
     tiles = [-(-width // TILE_SIZE) * -(-height // TILE_SIZE) for width, height in shapes]  # [K]
+    if maps.masks is not None:
+        live_starts, tiles = maps.masks.offsets[views].tolist(), maps.masks.live_counts(view_ids)
     scratch, by_tile = launches.NO_SCRATCH, rule.unit == "tile"
     if by_tile:
         wanted, slots_per_tile = [rule.wanted(rate, count) for count in tiles], 0
@@ -46,16 +58,24 @@ def sample_pixels(rule: DrawRule, maps: ErrorMaps, view_ids: tuple[int, ...], ra
         unit_pixels = CELL_SIDE**2 if rule.unit == "cell" else 1
         wanted = [rule.wanted(rate, TILE_PIXELS // unit_pixels)] * len(tiles)  # of each tile
         slots_per_tile = wanted[0] * unit_pixels
-        ends = list(accumulate(_view_slots(*size, rule.unit, wanted[0]) for size in shapes))
+        if maps.masks is None:
+            ends = list(accumulate(_view_slots(*size, rule.unit, wanted[0]) for size in shapes))
+        else:
+            ends = list(accumulate(slots_per_tile * count for count in tiles))
         chosen, slots = sum(tiles), ends[-1]
     stages = {count: rule.stages(count) for count in set(wanted)}
     firsts = zip([0, *ends[:-1]], wanted, strict=True)
-    draws = [(first, count if by_tile else 0, *stages[count]) for first, count in firsts]
+    live = zip(live_starts, tiles, strict=True)
+    draws = [
+        (first, count if by_tile else 0, *stages[count], *of_view)
+        for (first, count), of_view in zip(firsts, live, strict=True)
+    ]
     draw = launches.SamplePixels(
         errors=maps.errors,
         stamps=maps.stamps,
         views=view_rows(maps.offsets[views], sizes, view_ids, draws),
         unit=UNITS.index(rule.unit),
+        masks=masks,
         slots_per_tile=slots_per_tile,
         mixed_uniform=rule.mixed_uniform,
         importance=rule.importance,
@@ -68,12 +88,16 @@ def sample_pixels(rule: DrawRule, maps: ErrorMaps, view_ids: tuple[int, ...], ra
         weights=torch.empty(slots, device=device) if rule.importance else None,
         scratch=scratch,
     )
-    library.launch(draw)
+    if slots:  # else every pixel is masked
+        library.launch(draw)
+    else:
+        draw.tile_offsets.zero_()
     weights = draw.weights
+    has_empty_slots = rule.unit != "pixel" or maps.masks is not None
     if weights is not None:
         weights = weights * ((draw.pixel_ids >= 0).sum() / weights.sum())
     return PixelSamples(
-        tuple(view_ids), sizes, draw.pixel_ids, draw.tile_ids, draw.tile_offsets, weights, rule.unit != "pixel"
+        tuple(view_ids), sizes, draw.pixel_ids, draw.tile_ids, draw.tile_offsets, weights, has_empty_slots
     )
 
 
@@ -99,6 +123,7 @@ def sparse_loss(
     samples: PixelSamples,
     update: MapUpdate | None = None,
     overflow: Tensor | None = None,
+    background: Color = BLACK,
 ) -> LossOutput:
     """Loss, gradient and pixel errors, in one launch. With `update` it also does what `ErrorMaps.update` does.
 
@@ -107,10 +132,11 @@ def sparse_loss(
 
     Args:
         colors: [P, 3] float32 or float16.
-        targets: [P, 3] float32, the truth at the samples. Or [X, 3] uint8, the photos of all views, from which the
+        targets: [P, 3] float32, the truth at the samples. Or [X, 3 or 4] uint8, the photos of all views, from which the
             kernel gathers; they are laid out like the maps, so `update` is then needed.
         samples: of at most `MAX_VIEWS` views.
         overflow: [1] int32 on the device, or None; if it is not 0, maps and count of `update` stay as they are.
+        background: shows through photos that have an alpha.
 
     Returns:
         The loss (a float64 scalar on the device), gradients [P, 3] float32 and errors [P] float32.
@@ -143,6 +169,7 @@ def sparse_loss(
         pixel_errors=torch.empty(len(samples), device=colors.device),
         nonfinite_losses=nonfinite_losses,
         overflow=overflow,
+        background=launches.Background(*background),
     )
     library.launch(loss)
     return LossOutput(loss.loss, loss.color_gradients, loss.pixel_errors)

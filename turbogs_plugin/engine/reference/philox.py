@@ -6,8 +6,8 @@ words under a key of two to four random words. The layout that every sampler of 
 =========  ==================================================================================
 word       value
 =========  ==================================================================================
-counter 0  the place: pixel id, cell id, tile id (see `draws`), or view number
-counter 1  the training view's number; 0 where the place is a view
+counter 0  the place: pixel id, cell id, tile id (see `draws`), or view number; 0 where there is none
+counter 1  the training view's number; 0 where the place is a view, or there is none
 counter 2  the purpose, one of `PURPOSE_*`
 counter 3  the high 32 bits of the seed
 key 0      the low 32 bits of the seed
@@ -28,7 +28,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-PURPOSE_PIXELS, PURPOSE_CELLS, PURPOSE_TILES, PURPOSE_VIEWS, PURPOSE_STACK = range(5)
+PURPOSE_PIXELS, PURPOSE_CELLS, PURPOSE_TILES, PURPOSE_VIEWS, PURPOSE_STACK, PURPOSE_BACKGROUND = range(6)
 
 MASK = 0xFFFFFFFF
 ROUNDS = 10

@@ -95,6 +95,7 @@ class ReferenceRendered(Rendered):
     _rows: Rows = field(repr=False)
     _splats: Splats = field(repr=False)
     _leaves: Gaussians = field(repr=False)
+    _background: Tensor | None = field(repr=False)  # [3]; None: black
 
     @torch.no_grad()
     def projected(self) -> Projected:
@@ -112,7 +113,10 @@ class ReferenceRendered(Rendered):
         alphas = self._sums[:, 3].clamp(min=ALPHA_TINY)
         divided = given["depth_gradients"] / alphas
         through_alpha = torch.where(self._sums[:, 3] >= ALPHA_TINY, divided * self._sums[:, 4] / alphas, 0.0)
-        columns = [given["color_gradients"], (given["alpha_gradients"] - through_alpha)[:, None], divided[:, None]]
+        to_alpha = given["alpha_gradients"] - through_alpha
+        if self._background is not None:
+            to_alpha = to_alpha - given["color_gradients"].to(self._background) @ self._background
+        columns = [given["color_gradients"], to_alpha[:, None], divided[:, None]]
         gradients = torch.cat(columns, dim=1).to(self._sums.dtype)
         records = compositing.composite_backward(
             self._compositor, self._table, self._sums, gradients, given["pixel_errors"]
@@ -136,4 +140,8 @@ def rasterize_reference(
         table = compositing.splat_table(splats.means2d, splats.conics, splats.colors, splats.opacities, splats.depths)
         sums = compositing.composite(compositor, table)
         depths = sums[:, 4] / sums[:, 3].clamp(min=ALPHA_TINY) if options.with_depth else None
-    return ReferenceRendered(sums[:, :3], sums[:, 3], depths, sums, table, compositor, rows, splats, leaves)
+        colors, background = sums[:, :3], None
+        if any(options.background):
+            background = sums.new_tensor(options.background)
+            colors = colors + (1.0 - sums[:, 3:4]) * background
+    return ReferenceRendered(colors, sums[:, 3], depths, sums, table, compositor, rows, splats, leaves, background)

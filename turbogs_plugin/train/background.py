@@ -1,0 +1,61 @@
+"""The colour behind the model, in training and in evaluations."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from turbogs_plugin.config.units import parse_color
+from turbogs_plugin.engine.reference.philox import MASK, PURPOSE_BACKGROUND, philox4x32
+from turbogs_plugin.types import BLACK, WHITE, Color, Step
+
+_BLOCK = 64
+"""Colours are made for this many iterations at once, which costs numpy the same as for one."""
+
+
+@dataclass(frozen=True)
+class Background:
+    """What `train.background` means for a capture.
+
+    Args:
+        fixed: the colour of every iteration; None: a random one each.
+        evaluated: that of evaluations and pictures.
+    """
+
+    fixed: Color | None
+    evaluated: Color
+
+    @classmethod
+    def of(cls, setting: str, transparent: bool) -> Background:
+        """That of a setting.
+
+        A random background is one that no colour of the model can stand for, so what is empty or opaque in the photos
+        becomes so in the model. It is evaluated as the kind of capture has it: transparent photos on white, as
+        published numbers of NeRF-synthetic are, opaque ones on black.
+
+        Args:
+            setting: `train.background`; ``auto``, where no plan was made, is ``random`` for transparent photos.
+            transparent: whether the photos have an alpha.
+        """
+        if setting == "random" or (setting == "auto" and transparent):
+            return cls(None, WHITE if transparent else BLACK)
+        color = BLACK if setting == "auto" else parse_color(setting)
+        return cls(color, color)
+
+    def at(self, step: Step) -> Color:
+        """The colour of an iteration, a function of (seed, iteration) alone."""
+        if self.fixed is not None:
+            return self.fixed
+        red, green, blue = _random_block(step.seed, step.iteration // _BLOCK)[step.iteration % _BLOCK]
+        return red, green, blue
+
+
+@lru_cache(maxsize=4)
+def _random_block(seed: int, block: int) -> list[list[float]]:
+    """[_BLOCK, 3] uniform numbers in 0 .. 1, of the iterations from ``block * _BLOCK`` on."""
+    iterations = np.arange(block * _BLOCK, (block + 1) * _BLOCK) & MASK
+    counter = (np.zeros_like(iterations), *(np.array([word]) for word in (0, PURPOSE_BACKGROUND, seed >> 32 & MASK)))
+    words = philox4x32(counter, (seed & MASK, iterations))[:3]
+    return ((np.stack(words, axis=1) + 0.5) / 2.0**32).tolist()
