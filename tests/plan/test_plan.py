@@ -59,6 +59,8 @@ ONE_VIEW = ("schedule.type=fixed", "schedule.views=1")
 BOTH_SIDES = [
     ("train.backdrop", {"direction_concentration": 0.95}, (), True, "0.950 >= 0.95"),
     ("train.backdrop", {"direction_concentration": 0.9499}, (), False, "< 0.95"),
+    ("train.background", {"transparent": False}, (), "black", "opaque"),
+    ("train.background", {"transparent": True}, (), "random", "transparent"),
     ("loss.type", {"flat_tiles": 0.5}, (), "charbonnier", "50.0% of tiles"),
     ("loss.type", {"flat_tiles": 0.49}, (), "charbonnier_ncc", "49.0% of tiles"),
     ("schedule.type", {"train_views": 10}, (), "fixed", "10 training views <= at most 10"),
@@ -105,6 +107,8 @@ def test_every_setting_that_may_be_auto_has_both_sides_above():
 SET = [
     ("train.backdrop", "true", {}, lambda config: config.train.backdrop is True),
     ("train.backdrop", "false", {"direction_concentration": 1.0}, lambda config: config.train.backdrop is False),
+    ("train.background", "white", {}, lambda config: config.train.background == "white"),
+    ("train.background", "black", {"transparent": True}, lambda config: config.train.background == "black"),
     ("loss.type", "charbonnier", {}, lambda config: config.loss == {"type": "charbonnier", "epsilon": 1e-3}),
     ("loss.type", "charbonnier_ncc", {"flat_tiles": 1.0}, lambda config: config.loss == load_config("turbogs").loss),
     ("schedule.type", "fixed", {"train_views": 2}, lambda config: config.schedule["views"] == 3),
@@ -170,11 +174,13 @@ def test_plan_configuration_yaml_and_back(name, changes):
 
 @pytest.mark.parametrize("name", ["3dgs", "3dgs-as-shipped", "mcmc", "fastgs", "turbogs-paper"])
 def test_the_baselines_leave_nothing_out(name):
-    """A plan decides where their photos and maps are, and that alone."""
+    """A plan decides where their photos and maps are, and the background by the kind of photos, and that alone."""
     config = load_config(name)
     planned = plan_from_facts(facts(train_views=2, direction_concentration=1.0, flat_tiles=1.0), config).apply(config)
     assert (config.train.maps_place, config.train.photos_place) == ("auto", "auto")
+    assert config.train.background == "auto"
     config.train.maps_place = config.train.photos_place = "device"
+    config.train.background = "black"
     assert planned == config
 
 
@@ -254,6 +260,7 @@ def test_the_verb_prints_the_plan_of_a_capture(turbogs, capture):
     lines = {line.split()[0]: line.split()[1:3] for line in out.splitlines() if line.split()[0] in RULES}
     assert lines == {
         "train.backdrop": ["false", "auto"],
+        "train.background": ["black", "auto"],
         "loss.type": ["charbonnier_ncc", "auto"],
         "schedule.type": ["fixed", "auto"],
         "train.sh_degree": ["1", "auto"],

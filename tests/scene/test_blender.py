@@ -74,10 +74,10 @@ def test_its_own_split(tmp_path):
     scene = load_scene(write_blender(tmp_path / "lego"))
     assert scene.train.names == tuple(f"train/r_{view}.png" for view in range(6))
     assert scene.test.names == tuple(f"test/r_{view}.png" for view in range(4))
-    (note,) = scene.notes
-    assert note == (
-        "NeRF-synthetic: 6 training and 4 test photos 60x40, RGBA on black; "
-        "no points, so 50,000 random ones (seed 0) about what the cameras look at"
+    assert scene.notes == (
+        "NeRF-synthetic: 6 training and 4 test photos 60x40, RGBA; "
+        "no points, so 50,000 random ones (seed 0) about what the cameras look at",
+        "transparent photos are composited on a background (train.background)",
     )
 
 
@@ -139,22 +139,22 @@ def test_which_kind_is_taken_of_several(tmp_path):
     folder = write_blender(tmp_path / "all", {"train": 6, "val": 3, "test": 4})
     (folder / "poses_bounds.npy").write_bytes(b"never read")
     scene = load_scene(folder)
-    assert scene.notes[0].startswith("NeRF-synthetic: 6 training") and scene.notes[-1] == "poses_bounds.npy not used"
+    assert scene.notes[0].startswith("NeRF-synthetic: 6 training") and scene.notes[1] == "poses_bounds.npy not used"
     shutil.copy(folder / "transforms_val.json", folder / "transforms.json")
     scene = load_scene(folder)
     assert scene.train.names == ("r_1.png", "r_2.png")
     passed_over = "transforms_train.json, transforms_test.json, transforms_val.json, poses_bounds.npy not used"
-    assert scene.notes[-1] == passed_over
+    assert scene.notes[1] == passed_over
     demo = write_demo_capture(tmp_path / "demo", views=4, width=32, height=24)
     for part in ("sparse", "images"):
         shutil.copytree(demo / part, folder / part)
     scene = load_scene(folder)
-    assert scene.notes[-1] == f"transforms.json, {passed_over}" and scene.train.cameras.sizes[0].tolist() == [32, 24]
+    assert scene.notes[1] == f"transforms.json, {passed_over}" and scene.train.cameras.sizes[0].tolist() == [32, 24]
 
 
 def test_what_the_folder_was_taken_for_is_said(turbogs, tmp_path):
     code, _, said = turbogs("plan", write_blender(tmp_path / "lego"), "--device", "cpu")
-    assert code == 0 and said.startswith("NeRF-synthetic: 6 training and 4 test photos 60x40, RGBA on black;")
+    assert code == 0 and said.startswith("NeRF-synthetic: 6 training and 4 test photos 60x40, RGBA;")
 
 
 def frame(**values):

@@ -284,10 +284,17 @@ def test_a_model_without_images_is_refused(tmp_path):
         load_scene(tmp_path)
 
 
-def test_transparent_photos_are_composited_over_black(tmp_path):
+def test_the_alpha_of_a_photo_is_a_mask(tmp_path):
+    """Any that is not zero keeps its pixel, in the colour that it has."""
     folder = write_capture(tmp_path / "cup")
-    Image.new("RGBA", (40, 24), (200, 100, 50, 51)).save(folder / "images" / "photo01.png")
-    np.testing.assert_allclose(load_scene(folder).train.photos.colors[0], [40, 20, 10], atol=1)
+    photo = Image.new("RGBA", (40, 24), (200, 100, 50, 51))
+    photo.paste((255, 255, 255, 0), (0, 0, 40, 6))
+    photo.save(folder / "images" / "photo01.png")
+    train = load_scene(folder).train
+    assert train.photos.image(0)[10, 0].mul(255).tolist() == [200, 100, 50]
+    expected = np.zeros((24, 40), dtype=bool)
+    expected[6:] = True
+    assert np.array_equal(train.mask(0), expected) and train.mask(1) is None
 
 
 @pytest.mark.skipif(not (SCENES / "fox").is_dir(), reason=f"no real captures in {SCENES}")

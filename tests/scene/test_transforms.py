@@ -94,9 +94,13 @@ def test_reduced_copies(tmp_path):
     assert load_scene(folder, factor=2).train.photos.colors[0].tolist() == [1, 2, 3]
 
 
-def test_transparency_is_composited_over_black(tmp_path):
+def test_transparency_is_opacity(tmp_path):
+    """Colours are kept as multiplied by alpha, and shown on any background."""
     scene = load_scene(write_transforms(tmp_path / "cup", mode="RGBA"))
-    np.testing.assert_allclose(scene.train.photos.colors[0], [5, 100, 15], atol=1)
+    np.testing.assert_allclose(scene.train.photos.colors[0], [5, 100, 15, 128], atol=1)
+    for background in ((0.0, 0.0, 0.0), (1.0, 0.5, 0.0)):
+        expected = 128 / 255 * np.array([10, 200, 30]) / 255 + 127 / 255 * np.array(background)
+        np.testing.assert_allclose(scene.train.photos.image(0, background)[0, 0], expected, atol=0.004)
 
 
 def test_random_points_are_seeded_and_about_what_the_cameras_see(tmp_path):

@@ -59,8 +59,8 @@ class PeakMemory(Listener):
 
 
 def capture_digest(scene: Scene) -> str:
-    """A digest that tells captures of the same name apart: of the photos' names, sizes and cameras, and the number of
-    points.
+    """A digest that tells captures of the same name apart: of the photos' names, sizes, cameras and counts of unmasked
+    pixels, and the number of points.
 
     Pixels are not in it, for decoders of different versions give different ones. Of the cameras' coordinates it takes
     four digits of a sum, for the last bits differ from machine to machine.
@@ -73,6 +73,8 @@ def capture_digest(scene: Scene) -> str:
             values = array.cpu().double().abs().flatten()
             places = torch.linspace(1.0, 2.0, len(values), dtype=torch.float64)  # so that their order counts
             digest.update(f"{float(values @ places):.4g}".encode())
+        if part.masks is not None:
+            digest.update(np.ascontiguousarray(part.masks.pixel_counts, dtype="<i8").tobytes())
     return digest.hexdigest()[:16]
 
 
