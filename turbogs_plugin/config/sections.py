@@ -60,9 +60,9 @@ class TrainConfig:
         sh_interval: iterations between two bands; the run starts with band 0, but for a model's file.
         initial_opacity, initial_size: of the Gaussians that training starts with; the size in mean distances to the
             three nearest points. 3DGS has 0.1 and 1, gsplat's MCMC preset 0.5 and 0.1.
-        background: colour that shows through the model: ``black``, ``white``, another that Pillow knows (``#336699``),
-            or ``random``, another one each iteration, so that nothing dark is taken for empty. ``auto``: random where
-            photos are transparent, else black. Transparent photos are composited on it.
+        background: colour that shows through the model: ``black``, ``white``, another that Pillow knows, as
+            ``rgb(51, 102, 153)``; or ``random``, another one each iteration, so that nothing dark is taken for empty.
+            ``auto``: random where photos are transparent, else black. Transparent photos are composited on it.
         backdrop: start with a far sphere of Gaussians in the photos' mean colour behind the scene.
         distant_size: largest standard deviation of a Gaussian beyond 2 scene extents, over its distance from the
             cameras (`restrain_distant`). 0: no bound.

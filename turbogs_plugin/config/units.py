@@ -26,11 +26,11 @@ def parse_seconds(text: str) -> float:
 
 
 def parse_color(text: str) -> Color:
-    """``white``, ``#336699``, ``rgb(51, 102, 153)``, as Pillow's `ImageColor` takes them. Raises `InputError`."""
+    """``white``, ``rgb(51, 102, 153)``, ``#336699``, as Pillow's `ImageColor` takes them. Raises `InputError`."""
     try:
         red, green, blue = ImageColor.getrgb(text)[:3]
     except ValueError:
-        raise InputError(f"'{text[:40]}' is no colour: write black, white, #336699 or rgb(51, 102, 153)") from None
+        raise InputError(f"'{text[:40]}' is no colour: write black, white, grey or rgb(51, 102, 153)") from None
     return red / 255.0, green / 255.0, blue / 255.0
 
 

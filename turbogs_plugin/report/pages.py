@@ -98,8 +98,8 @@ def _page(run: RunSession, metrics: Metrics, lpips_reason: str, shown: int) -> s
 {result}
 {lpips}
 Means over the test views{unmasked}. Training time is that of iterations and of the initial error maps; loading,
-evaluation, checkpoints and this report are not in it. Wall time is from the start of the process until the model was written.
-FPS counts test views rendered one after the other.
+evaluation, checkpoints and this report are not in it. Wall time is from the start of the process until the model was
+written. FPS counts test views rendered one after the other.
 
 ## Error against run time
 
