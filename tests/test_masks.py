@@ -1,5 +1,7 @@
 """Masks: the live tiles against plain numpy, and what every sampler makes of them."""
 
+import hashlib
+
 import numpy as np
 import pytest
 import torch
@@ -160,6 +162,25 @@ def test_masked_pixels_have_no_part_in_means():
     maps.update(maps.masks.pixels((4, 0)), torch.ones(int(keep[4].sum()) + 1), step(0))
     np.testing.assert_allclose(maps.view_means(), [0.7, 0.5, 0.0, 0.5, 0.7], rtol=1e-3)
     assert (maps.errors[maps.offsets[4] :][~keep[4].reshape(-1)] == 0).all()
+
+
+BEFORE_MASKS = {
+    "pixel": ("4a00f6ccb61fa1da", "5eb3cb40ead87b29"),
+    "cell": ("f2d949e6b840b812", "330e59140c25e735"),
+    "tile": ("c4fa37c82a021bb1", "01ed71d2f70b22df"),
+}
+"""Digests of draws, error-guided and random, as they were before there were masks."""
+
+
+@pytest.mark.parametrize("unit", UNITS)
+def test_draws_without_masks_are_the_same_as_before_there_were_any(unit):
+    found = []
+    for sampler in (ErrorGuidedPixelSampler(unit=unit, importance=0.5), RandomPixelSampler(unit=unit)):
+        samples, digest = sampler.sample(random_maps(), (4, 0, 3), 0.2, step(8, 1)), hashlib.sha256()
+        for tensor in (samples.pixel_ids, samples.tile_ids, samples.tile_offsets):
+            digest.update(tensor.numpy().astype("<i4").tobytes())
+        found.append(digest.hexdigest()[:16])
+    assert tuple(found) == BEFORE_MASKS[unit]
 
 
 def test_whole_maps_are_as_without_masks():

@@ -111,7 +111,7 @@ class PixelMasks:
 
     @classmethod
     def from_images(cls, masks: Tensor | Sequence[Tensor | np.ndarray]) -> PixelMasks:
-        """Masks from images, on the images' device.
+        """Masks from images, on the CPU.
 
         Args:
             masks: [V, H, W] bool, or V images [H, W] whose sizes may differ. True (nonzero) pixels count.
@@ -122,8 +122,7 @@ class PixelMasks:
         if len(masks) == 0 or any(getattr(mask, "ndim", 0) != 2 for mask in masks):
             shapes = [tuple(getattr(mask, "shape", ())) for mask in masks][:4]
             raise InputError(f"masks have shapes {shapes}: expected [H, W] for each view, True where a pixel counts")
-        device = masks[0].device if isinstance(masks[0], Tensor) else torch.device("cpu")
-        return cls.of_views([ViewMask.of(torch.as_tensor(mask).cpu().numpy() != 0) for mask in masks]).to(device)
+        return cls.of_views([ViewMask.of(torch.as_tensor(mask).cpu().numpy() != 0) for mask in masks])
 
     def to(self, device: torch.device | str) -> PixelMasks:
         tensors = {name: getattr(self, name).to(device) for name in ("tiles", "rows", "bits")}

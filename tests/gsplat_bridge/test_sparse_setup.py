@@ -4,11 +4,12 @@ from dataclasses import dataclass
 
 import pytest
 import torch
+from turbogs_plugin.strategies.pixel_sampling import ErrorGuidedPixelSampler
 
 from turbogs_plugin.config.configuration import load_config
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.gsplat_bridge import maps_of_photos, sparse_budget
-from turbogs_plugin.types import SamplingBudget
+from turbogs_plugin.types import SamplingBudget, Step
 
 
 @pytest.mark.parametrize(
@@ -61,6 +62,25 @@ def test_maps_start_from_the_errors_of_black():
     torch.testing.assert_close(maps.errors, (images.sum(dim=-1) / 255).flatten().half(), rtol=2e-3, atol=0)
     of_unit = maps_of_photos(Photos(images / 255), white=1.0)
     torch.testing.assert_close(of_unit.errors, maps.errors, rtol=2e-3, atol=0)
+
+
+@pytest.mark.parametrize("of_first", [True, False])
+def test_masks_of_a_trainset_are_heeded(of_first):
+    """gsplat's data sets have "mask" where a photo has one: True counts."""
+    images = torch.randint(1, 256, (3, 20, 30, 3), generator=torch.Generator().manual_seed(0))
+    mask = torch.zeros(20, 30, dtype=torch.bool)
+    mask[:, :7] = True
+
+    class Masked(Photos):
+        def __getitem__(self, item):
+            return super().__getitem__(item) | ({"mask": mask} if item == 0 or not of_first else {})
+
+    maps = maps_of_photos(Masked(images))
+    samples = ErrorGuidedPixelSampler().sample(maps, (1, 0), 0.5, Step(0, 10, 5))
+    x = samples.coordinates()[samples.filled, 0]
+    views = samples.view_of_slot()[samples.filled]
+    assert (x[views == 1] < 7).all() and (x[views == 0] < 7).all() != of_first and (views == 1).any()
+    assert maps.view_means()[0] == pytest.approx(float((images[0].sum(dim=-1) / 255)[mask].mean()), rel=1e-3)
 
 
 def test_random_patches_are_refused():

@@ -16,6 +16,7 @@ import torch
 from helpers.bounded_memory import outcome_within
 from helpers.framework_runs import tiny_capture, tiny_config
 from helpers.models import random_gaussians
+from PIL import Image
 
 from turbogs_plugin.config.configuration import load_config
 from turbogs_plugin.config.yaml_text import parse_yaml
@@ -215,6 +216,32 @@ def test_damaged_photos(capture, tmp_path, kind):
         else:
             assert np.isfinite(result.train.photos.colors.float().mean().item())
     assert refused >= (1 if kind != "damaged" else 20)
+
+
+@pytest.mark.parametrize("kind", ["masks", "transforms"])
+def test_damaged_masks(capture, transforms, tmp_path, kind):
+    """Of a folder, and of a transforms.json: named, or read as an image of the photo's size."""
+    folder = transforms if kind == "transforms" else shutil.copytree(capture, tmp_path / "capture")
+    photos, choice, refused = sorted((folder / "images").iterdir()), random.Random(8), 0
+    mask = np.random.default_rng(0).integers(0, 2, (40, 48)).astype(np.uint8) * 255
+    (folder / "masks").mkdir()
+    name = f"{photos[2].stem}.png" if kind == "masks" else "any.png"
+    if kind == "transforms":
+        content = json.loads((folder / "transforms.json").read_text())
+        content["frames"][1]["mask_path"] = "masks/any.png"
+        (folder / "transforms.json").write_text(json.dumps(content))
+    Image.fromarray(mask).save(folder / "masks" / name)
+    content = (folder / "masks" / name).read_bytes()
+    bomb = b"\x89PNG\r\n\x1a\n\x00\x00\x00\rIHDR\x7f\xff\xff\xff\x7f\xff\xff\xff" + content[24:]
+    for changed in [b"", b"\xff", bomb, *(damaged(content, choice) for _ in range(60))]:
+        (folder / "masks" / name).write_bytes(changed)
+        result = outcome_within(MEMORY, load_scene, folder)
+        refused += isinstance(result, InputError)
+        if isinstance(result, InputError):
+            assert name in str(result) and "\n" not in str(result)
+        else:
+            assert result.train.masks is None or (result.train.masks.pixel_counts > 0).all()
+    assert 20 < refused < 63
 
 
 # ---- Models trained anywhere -------------------------------------------------------------------------------------

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,8 +15,10 @@ from helpers.framework_runs import TINY, tiny_capture
 from helpers.tolerances import PSNR_BOUND
 from PIL import Image
 from torch.utils._python_dispatch import TorchDispatchMode
+from turbogs_plugin.strategies.pixel_sampling import ErrorGuidedPixelSampler
 
 from turbogs_plugin.config.configuration import Config, load_config
+from turbogs_plugin.masks import PixelMasks
 from turbogs_plugin.report.pages import write_report
 from turbogs_plugin.scene import load_scene
 from turbogs_plugin.train import run
@@ -145,6 +148,49 @@ def test_identical_cameras(variant, tmp_path, copies):
     assert len(centers.unique(dim=0)) == (6 if copies == 2 else 1)
     # Cameras that look one way get a backdrop of 3000, which the cap counts from the start.
     train_to_the_end(variant, tmp_path / "run", "density.max_gaussians=4500")
+
+
+def write_masks(capture: Path, keep: Callable[[int], np.ndarray]) -> None:
+    (capture / "masks").mkdir()
+    for number, photo in enumerate(sorted((capture / "images").iterdir())):
+        Image.fromarray(keep(number)).save(capture / "masks" / f"{photo.stem}.png")
+
+
+@pytest.mark.parametrize("unit", ["pixel", "cell", "tile"])
+def test_masks_of_one_pixel(variant, tmp_path, unit):
+    """Of every training photo one pixel is left: it is drawn in each iteration, as often as there are views of it."""
+
+    def keep(number: int) -> np.ndarray:
+        mask = np.zeros((40, 48), dtype=bool)
+        mask[5 * (number % 7), 6 * number] = True
+        return mask
+
+    write_masks(variant, keep)
+    outcome = train_to_the_end(variant, tmp_path / "run", f"pixel_sampler.unit={unit}")
+    last = outcome.history[-1]
+    assert last.nonfinite_losses == last.skipped_updates == 0 and last.num_gaussians > 0
+
+
+def test_a_view_masked_whole(variant, tmp_path):
+    """Left out; the maps of one that is not (a trainer's own masks) stay as they are, and it gives no sample."""
+    write_masks(variant, lambda number: np.full((40, 48), number % 3 != 2))
+    scene = load_scene(variant)
+    assert len(scene.train) == 5 and scene.train.masks is None
+    masks = [torch.full((40, 48), number > 0) for number in range(5)]
+    trainer = Trainer(
+        small_config(variant).without_plan(),
+        replace(scene, train=replace(scene.train, masks=PixelMasks.from_images(masks))),
+        torch.device("cpu"),
+    )
+    trainer.initialise_maps()
+    for unit in ("pixel", "cell", "tile"):
+        trainer.pixel_sampler = ErrorGuidedPixelSampler(unit=unit, importance=0.5)
+        for views in ((0,), (0, 3)):
+            trainer.view_sampler.select = lambda *_, views=views: views
+            trainer.step()
+    assert not trainer.maps.errors[: 40 * 48].any() and (trainer.maps.stamps[: 40 * 48] == -1).all()
+    assert int(trainer.nonfinite_losses) == int(trainer.optimizer.skipped) == 0
+    trainer.require_finite()
 
 
 def test_points_that_no_camera_sees(variant, tmp_path):

@@ -52,7 +52,8 @@ def maps_of_photos(
     """Error maps of a trainer's training views, which start from the errors of a black prediction.
 
     Args:
-        trainset: V items, numbered as the trainer's image_id, each with "image" [H, W, 3], 0 .. `white`.
+        trainset: V items, numbered as the trainer's image_id, each with "image" [H, W, 3], 0 .. `white`. Where they
+            have a "mask" [H, W] too, samplers draw only where it is True.
         white: the largest value of a photo; gsplat's data sets have 255.
 
     Raises:
@@ -65,5 +66,14 @@ def maps_of_photos(
             "samples are few pixels of a whole image already"
         )
     # Not iterated: a data set without __iter__ would be read past its end.
-    photos = (trainset[item]["image"].to(device) for item in range(len(trainset)))  # [H, W, 3]
-    return ErrorMaps.from_images([photo.float().sum(dim=-1) / white for photo in photos])
+    errors, masks = [], []
+    for number in range(len(trainset)):
+        item = trainset[number]
+        errors.append(item["image"].to(device).float().sum(dim=-1) / white)  # [H, W]
+        masks.append(item.get("mask"))
+    if all(mask is None for mask in masks):
+        return ErrorMaps.from_images(errors)
+    whole = (torch.ones(image.shape, dtype=torch.bool) for image in errors)
+    return ErrorMaps.from_images(
+        errors, [every if mask is None else mask for every, mask in zip(whole, masks, strict=True)]
+    )

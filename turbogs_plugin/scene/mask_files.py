@@ -16,7 +16,7 @@ from PIL import Image
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.masks import ViewMask
 from turbogs_plugin.scene.capture import Capture
-from turbogs_plugin.scene.photos import decoding_threads, is_transparent, opened_image
+from turbogs_plugin.scene.photos import OPAQUE_SUFFIXES, decoding_threads, is_transparent, opened_image
 from turbogs_plugin.scene.undistort import Lens
 
 FOLDER = "masks"
@@ -82,15 +82,16 @@ def load_masks(
 
     def load(view: int) -> ViewMask | None:
         size = tuple(sizes[view].tolist())
-        keep = np.ones((size[1], size[0]), dtype=bool)
+        parts = []
         if files[view] is not None:
-            keep &= _read(files[view], photos[view], size, tuple(full_sizes[view].tolist()))
-        if capture.alpha == "mask":
+            parts.append(_read(files[view], photos[view], size, tuple(full_sizes[view].tolist())))
+        if capture.alpha == "mask" and photos[view].suffix.lower() not in OPAQUE_SUFFIXES:
             with opened_image(photos[view]) as image:
                 if is_transparent(image):
-                    keep &= np.asarray(image.convert("RGBA").getchannel("A")) > 0
-        if keep.all():
+                    parts.append(np.asarray(image.convert("RGBA").getchannel("A")) > 0)
+        if all(part.all() for part in parts):
             return None
+        keep = np.logical_and.reduce(parts)
         return ViewMask.of(_placed(keep, capture.lens(view), tuple(targets[view].tolist())))
 
     with decoding_threads() as pool:

@@ -124,7 +124,8 @@ def train_cell(
     clock.mark("cell")
     trainer, mean_flip = loop.trainer, math.nan
     if flip is not None:  # off the clock
-        seen = evaluate(trainer.gaussians, test, trainer.sh_degree, trainer.config.raster, flip=flip)
+        options = {"flip": flip, "background": trainer.background.evaluated}
+        seen = evaluate(trainer.gaussians, test, trainer.sh_degree, trainer.config.raster, **options)
         mean_flip = seen.mean.flip
     return CellResult(
         scene=scene.name,
