@@ -57,7 +57,7 @@ def sparse_loss(terms: LossTerms, colors: Tensor, targets: Tensor, samples: Pixe
         factors = (norm_l1 / (norm_structure + BALANCE_EPSILON)).clamp(max=1.0)[:, None]
     if terms.gate:
         factors = factors * (moments.variance_y / (moments.variance_y + terms.variance_constant))
-    factors = factors * (terms.structure_weight / (3 * groups.tiles))
+    factors = factors * (terms.structure_weight / (3 * max(1, groups.tiles)))
     loss = loss + (factors * (1.0 - similarity)).sum()
     gradients = gradients - groups.spread(factors.expand_as(similarity)) * groups.shares * slopes
     return LossOutput(loss, gradients, problem.pixel_errors)
