@@ -45,13 +45,22 @@ class MemoryDemand:
     per_image: int
 
     @classmethod
-    def of(cls, config: Config, pixels: int, test_pixels: int, largest: int, num_views: int) -> MemoryDemand:
+    def of(
+        cls,
+        config: Config,
+        pixels: int,
+        test_pixels: int,
+        largest: int,
+        num_views: int,
+        photo_bytes: int = PHOTO_BYTES,
+    ) -> MemoryDemand:
         """The demand of a configuration whose places of maps and photos are decided.
 
         Args:
             pixels, test_pixels: of all training photos, of all test photos.
             largest: pixels of the largest photo.
             num_views: V.
+            photo_bytes: of a pixel of a photo.
         """
         views = most_views(config, num_views)
         window = SETS * views * largest
@@ -61,7 +70,7 @@ class MemoryDemand:
         bands = (config.train.sh_degree + 1) ** 2 - 1
         numbers = 14 + 3 * bands
         return cls(
-            fixed=PHOTO_BYTES * photos + MAP_BYTES * maps + SAMPLE_BYTES * samples + IMAGE_BYTES * largest,
+            fixed=photo_bytes * photos + MAP_BYTES * maps + SAMPLE_BYTES * samples + IMAGE_BYTES * largest,
             per_gaussian=2 * (3 * 4 * numbers + 4 + 7 * 4) + VIEW_BYTES * views,
             per_image=SAMPLE_BYTES * largest,
         )

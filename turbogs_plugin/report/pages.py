@@ -63,6 +63,10 @@ def _page(run: RunSession, metrics: Metrics, lpips_reason: str, shown: int) -> s
     config = run.trainer.config
     whole = WHOLE_ERRORS if whole_errors(metrics.mean) else ()
     unmasked = ", without their masked pixels where nothing else is said" if whole else ""
+    on = ""
+    if run.test.photos.transparent:
+        red, green, blue = (round(255 * value) for value in run.trainer.background.evaluated)
+        on = f" Photos are transparent; they and the model are compared on rgb({red}, {green}, {blue})."
     grey = "; masked pixels of photo and error are grey" if whole else ""
     result = table(
         (*ERRORS, "LPIPS (VGG)", *whole, "training in s", "wall in s", "Gaussians", "FPS", "peak memory in MiB"),
@@ -99,7 +103,7 @@ def _page(run: RunSession, metrics: Metrics, lpips_reason: str, shown: int) -> s
 {lpips}
 Means over the test views{unmasked}. Training time is that of iterations and of the initial error maps; loading,
 evaluation, checkpoints and this report are not in it. Wall time is from the start of the process until the model was
-written. FPS counts test views rendered one after the other.
+written. FPS counts test views rendered one after the other.{on}
 
 ## Error against run time
 

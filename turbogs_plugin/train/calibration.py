@@ -137,7 +137,8 @@ def hold_to(limit: int, device: torch.device) -> None:
 def _memory_demand(config: Config, scene: Scene) -> MemoryDemand:
     train, test = scene.train.cameras.sizes.prod(axis=1), scene.test.cameras.sizes.prod(axis=1)
     largest = int(max(train.max(), test.max()))
-    return MemoryDemand.of(config, int(train.sum()), int(test.sum()), largest, len(train))
+    channels = scene.train.photos.stored.shape[1]
+    return MemoryDemand.of(config, int(train.sum()), int(test.sum()), largest, len(train), channels)
 
 
 def _fit(config: Config, seconds: float, cost: IterationCost, gaussians: int) -> tuple[int, int]:

@@ -187,21 +187,37 @@ class _Trial:
         self._cameras = Cameras(cameras.viewmats, Ks, small)
         # A pixel stands for several of the photo, so its blur is less.
         self._settings = [replace(DEFAULT_SETTINGS, eps2d=DEFAULT_SETTINGS.eps2d / by**2) for by in reductions]
+        kept = (_kept(views.mask(view), *size) for view, size in zip(chosen, small.tolist(), strict=True))
+        self._masks = [mask.to(device) for mask in kept]
         self.photos = [
             _reduced(views.photos.image(view, self._background).to(device), *size)
             for view, size in zip(chosen, small.tolist(), strict=True)
         ]
-        self.flat_psnr = fmean(psnr(photo.mean(dim=(0, 1)), photo) for photo in self.photos)
+        flat = (photo[mask].mean(dim=0) for photo, mask in zip(self.photos, self._masks, strict=True))
+        self.flat_psnr = fmean(map(self._psnr, range(len(self.photos)), flat))
 
     def psnr(self, gaussians: Gaussians) -> float:
         """Mean PSNR of a model in the scene's frame, with all its bands."""
         model = gaussians.map(lambda value: value.to(self._device))
         values = []
-        for view, (photo, settings) in enumerate(zip(self.photos, self._settings, strict=True)):
+        for view, settings in enumerate(self._settings):
             options = {"sh_degree": model.sh_degree, "settings": settings, "background": self._background}
             image = render_image(model, self._cameras, view, **options)
-            values.append(psnr(image.colors.clamp(0.0, 1.0), photo))
+            values.append(self._psnr(view, image.colors.clamp(0.0, 1.0)))
         return fmean(values)
+
+    def _psnr(self, view: int, image: Tensor) -> float:
+        """Of an image [H, W, 3] or a colour [3], over the pixels that are not masked."""
+        photo, mask = self.photos[view], self._masks[view]
+        return psnr(image.expand_as(photo)[mask], photo[mask])
+
+
+def _kept(mask: Tensor | None, width: int, height: int) -> Tensor:
+    """[height, width] bool, the reduced pixels of which nothing is masked; all where nothing is, or none is left."""
+    kept = torch.ones(height, width, dtype=torch.bool)
+    if mask is not None:
+        kept = _reduced(mask[:, :, None].float(), width, height)[:, :, 0] > 0.999
+    return kept if kept.any() else torch.ones_like(kept)
 
 
 def _reduced(photo: Tensor, width: int, height: int) -> Tensor:
