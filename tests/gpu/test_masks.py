@@ -26,6 +26,7 @@ from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.masks import PixelMasks
 from turbogs_plugin.scene import load_scene
 from turbogs_plugin.scene.photos import Photos
+from turbogs_plugin.train.loop import TrainingLoop
 from turbogs_plugin.train.trainer import Trainer
 from turbogs_plugin.types import BLACK, PixelSamples, Step
 
@@ -163,13 +164,25 @@ def masked_capture(tmp_path_factory):
         (),
         ("pixel_sampler.unit=tile",),
         ("pixel_sampler.unit=cell", "train.background=random"),
-        ("train.maps_place=host", "train.photos_place=host"),
     ],
 )
 def test_training_with_masks_waits_for_nothing_and_learns_no_masked_pixel(masked_capture, overrides):
-    config = tiny_config("capture", "train.device=cuda", "density.type=none", *overrides).without_plan()
+    config = tiny_config("capture", "train.device=cuda", "density.refine_from=1000", *overrides).without_plan()
     trainer = Trainer(config, masked_capture, DEVICE)
     assert_iterations_wait_for_nothing(trainer)
+    assert_unmasked_alone_is_learnt(trainer)
+
+
+def test_maps_and_photos_on_the_host_have_the_same_masks(masked_capture):
+    config = tiny_config("capture", "train.device=cuda", "train.maps_place=host", "train.photos_place=host")
+    trainer = Trainer(config.without_plan(), masked_capture, DEVICE)
+    loop = TrainingLoop(trainer)
+    loop.run()
+    assert loop.finished
+    assert_unmasked_alone_is_learnt(trainer)
+
+
+def assert_unmasked_alone_is_learnt(trainer):
     errors, stamps = (trainer.state_dict()["maps"][name].cpu().view(7, 40, 48) for name in ("errors", "stamps"))
     assert not errors[:, :, 20:].any() and (stamps[:, :, 20:] == -1).all() and (stamps[:, :, :20] >= 0).any()
     assert all(value.isfinite().all() for _, value in trainer.gaussians.items())
