@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -14,7 +16,8 @@ from turbogs_plugin.scene import blender, llff
 from turbogs_plugin.scene.capture import Capture
 from turbogs_plugin.scene.colmap import find_model, read_colmap
 from turbogs_plugin.scene.frame import Frame
-from turbogs_plugin.scene.photos import Photos, load_photos, photo_sizes, reduced_sizes
+from turbogs_plugin.scene.host_arrays import file_note
+from turbogs_plugin.scene.photos import Photos, load_photos, photo_array, photo_sizes, reduced_sizes
 from turbogs_plugin.scene.poses import camera_centers
 from turbogs_plugin.scene.transforms import FILE, read_transforms
 from turbogs_plugin.scene.undistort import undistortion_note
@@ -70,7 +73,9 @@ class Scene:
     notes: tuple[str, ...] = ()
 
 
-def load_scene(path: str | Path, factor: int = 1, test_every: int = 8) -> Scene:
+def load_scene(
+    path: str | Path, factor: int = 1, test_every: int = 8, progress: Callable[[int, int], object] | None = None
+) -> Scene:
     """Load a capture with its photos.
 
     Cameras with distortion become pinhole cameras in the same place, their photos are undistorted.
@@ -83,6 +88,7 @@ def load_scene(path: str | Path, factor: int = 1, test_every: int = 8) -> Scene:
             in the right size; otherwise ``images`` are reduced by area averaging.
         test_every: the first of each `test_every` photos in name order is a test view, the others are for training.
             Captures with a split of their own (NeRF-synthetic) keep it.
+        progress: called with the number of photos decoded so far, and of all.
 
     Raises:
         InputError: anything wrong with the scene or the arguments, in one line.
@@ -113,22 +119,32 @@ def load_scene(path: str | Path, factor: int = 1, test_every: int = 8) -> Scene:
     intrinsics = capture.Ks.copy()
     intrinsics[:, :2] *= ratios[:, :, None]
 
-    def select(views: np.ndarray) -> PosedImages:
+    parts = [np.flatnonzero(~test), np.flatnonzero(test)]
+    colors = [photo_array(sizes[views]) for views in parts]  # before minutes go into photos that have no room
+    counter = itertools.count(1)
+
+    def loaded() -> None:
+        if progress is not None:
+            progress(next(counter), len(test))
+
+    def select(views: np.ndarray, colors: Tensor) -> PosedImages:
         cameras = Cameras(viewmats[views], torch.from_numpy(intrinsics[views]).float(), sizes[views])
         names = tuple(capture.names[view] for view in views)
         lenses = [capture.lens(view) for view in views]
-        photos = load_photos([paths[view] for view in views], file_sizes[views], sizes[views], lenses)
+        photos = load_photos([paths[view] for view in views], file_sizes[views], sizes[views], lenses, colors, loaded)
         return PosedImages(cameras, names, photos)
 
+    train, tested = (select(*part) for part in zip(parts, colors, strict=True))
+    notes = (fitted, undistortion_note(capture.lenses), file_note(colors, "photos"))
     return Scene(
         name=scene.resolve().name,
-        train=select(np.flatnonzero(~test)),
-        test=select(np.flatnonzero(test)),
+        train=train,
+        test=tested,
         points=points,
         point_colors=torch.from_numpy(capture.point_colors),
         frame=frame,
         extent=1.0,
-        notes=tuple(filter(None, (*capture.notes, fitted, undistortion_note(capture.lenses)))),
+        notes=tuple(filter(None, (*capture.notes, *notes))),
     )
 
 

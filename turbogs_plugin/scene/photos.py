@@ -1,9 +1,9 @@
-"""Photos in memory: uint8, the pixels of all views laid end to end."""
+"""Photos as training wants them: uint8, the pixels of all views laid end to end."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -16,6 +16,7 @@ from PIL import Image
 from torch import Tensor
 
 from turbogs_plugin.errors import InputError
+from turbogs_plugin.scene.host_arrays import free_host_bytes, host_array
 from turbogs_plugin.scene.undistort import Lens
 from turbogs_plugin.types import PixelSamples
 
@@ -23,8 +24,12 @@ PHOTO_BYTES = 3
 """Bytes of a pixel."""
 SMALLEST_SIDE = 4
 """The shorter side of a reduced photo has at least so many pixels: those of a cell."""
-MEMORY_SHARE = 0.8
-"""Photos may take this share of the machine's memory."""
+DECODING_BYTES = 24
+"""Bytes of a pixel while its photo is decoded, undistorted and reduced: several copies, one of them in float32."""
+MEMORY_SHARE = 0.25
+"""Photos that are being decoded may take this share of the free memory, with one thread more if need be."""
+SMALL_WORK = 2**30
+"""Bytes that are not worth a question."""
 
 
 @dataclass
@@ -126,8 +131,22 @@ def photo_sizes(paths: Sequence[Path]) -> np.ndarray:
         return np.array(list(pool.map(photo_size, paths)), dtype=np.int64).reshape(-1, 2)
 
 
+def photo_array(sizes: np.ndarray) -> Tensor:
+    """[X, 3] uint8 for photos of these `sizes` [V, 2], with any content, wherever there is room (`host_array`).
+
+    Raises:
+        InputError: more photos than fit in memory or on the disk.
+    """
+    return host_array((int(pixel_offsets(sizes)[-1]), 3), torch.uint8, f"{len(sizes)} photos")
+
+
 def load_photos(
-    paths: Sequence[Path], sizes: np.ndarray, targets: np.ndarray, lenses: Sequence[Lens | None] = ()
+    paths: Sequence[Path],
+    sizes: np.ndarray,
+    targets: np.ndarray,
+    lenses: Sequence[Lens | None] = (),
+    colors: Tensor | None = None,
+    loaded: Callable[[], object] = lambda: None,
 ) -> Photos:
     """Decode photos in parallel, undistorted, then reduced to their target sizes by area averaging.
 
@@ -139,19 +158,15 @@ def load_photos(
         sizes: [V, 2] int64 (width, height) that the files must have.
         targets: [V, 2] int64 (width, height) to give them.
         lenses: one a photo, None for those of pinhole cameras; or empty, where all are.
+        colors: where to put them, as `photo_array` gives it; None: it is asked for it.
+        loaded: called after each photo, in their order.
 
     Raises:
         InputError: a photo that cannot be decoded, or is of another size (the first one in order is named); more
-            photos than fit in memory.
+            photos than there is room for.
     """
     offsets = pixel_offsets(targets)
-    needed, present = PHOTO_BYTES * int(offsets[-1]), os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    if needed > MEMORY_SHARE * present:
-        raise InputError(
-            f"{len(paths)} photos take {needed / 2**30:.1f} GiB of the machine's {present / 2**30:.1f} GiB: "
-            "use a larger --factor"
-        )
-    colors = torch.empty(int(offsets[-1]), 3, dtype=torch.uint8)
+    colors = photo_array(targets) if colors is None else colors
     pixels = colors.numpy()
 
     def load(view: int) -> None:
@@ -164,13 +179,18 @@ def load_photos(
             photo = photo.resize(target, Image.Resampling.BOX)
         pixels[offsets[view] : offsets[view + 1]] = np.asarray(photo).reshape(-1, 3)
 
-    with _threads() as pool:
-        list(pool.map(load, range(len(paths))))  # raises the first error in order, and cancels what has not begun
+    largest = int(sizes.prod(axis=1).max(initial=1))
+    with _threads(DECODING_BYTES * largest) as pool:
+        for _ in pool.map(load, range(len(paths))):  # raises the first error in order, and cancels what has not begun
+            loaded()
     return Photos(colors, targets)
 
 
-def _threads() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(min(8, os.cpu_count() or 1))
+def _threads(bytes_each: int = 0) -> ThreadPoolExecutor:
+    """As many as there are processors, but no more than `MEMORY_SHARE` of the free memory allows."""
+    wanted = min(8, os.cpu_count() or 1)
+    affordable = int(MEMORY_SHARE * free_host_bytes()) // bytes_each if wanted * bytes_each > SMALL_WORK else wanted
+    return ThreadPoolExecutor(max(1, min(wanted, affordable)))
 
 
 def _decode(path: Path, size: tuple[int, int]) -> Image.Image:

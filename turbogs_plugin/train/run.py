@@ -32,7 +32,7 @@ from turbogs_plugin.train.history import Evaluation, append_evaluation, rewind_h
 from turbogs_plugin.train.interrupts import Interrupts
 from turbogs_plugin.train.loop import Listener, TrainingLoop
 from turbogs_plugin.train.pace import pace_of
-from turbogs_plugin.train.progress import TrainingProgress
+from turbogs_plugin.train.progress import LoadingProgress, TrainingProgress
 from turbogs_plugin.train.start import starting
 from turbogs_plugin.train.trainer import Trainer, gaussians_of_state
 from turbogs_plugin.train.wall import WallClock, WallRecord
@@ -89,7 +89,7 @@ def open_scene(config: Config, folder: RunFolder | None = None) -> Scene:
             f"capture '{settings.path}' of the run in '{folder.path}' is not there: bring it back, or edit scene.path "
             f"in {folder.config}"
         )
-    return load_scene(settings.path, settings.factor, settings.test_every)
+    return load_scene(settings.path, settings.factor, settings.test_every, LoadingProgress())
 
 
 def plan_run(config: Config) -> Plan:
