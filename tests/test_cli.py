@@ -72,13 +72,6 @@ def without_images(capture: Path) -> None:
     _replace_model(capture, empty)
 
 
-def without_points(capture: Path) -> None:
-    model = model_of(capture)
-    for point in list(model.points3D):
-        model.delete_point3D(point)
-    _replace_model(capture, model)
-
-
 def _replace_model(capture: Path, model: pycolmap.Reconstruction) -> None:
     for file in (capture / "sparse" / "0").iterdir():
         file.unlink()
@@ -123,7 +116,6 @@ def two_views(capture: Path) -> None:
 BROKEN = [
     (without_model, ["copy"]),
     (without_images, ["no images"]),
-    (without_points, ["no 3D points"]),
     (without_two_photos, ["2 of 8", "view_002.png", "view_003.png"]),
     (truncated_photo, ["view_001.png"]),
     (photo_of_another_size, ["view_001.png", "20x20", "48x40"]),

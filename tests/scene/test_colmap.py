@@ -242,7 +242,6 @@ def test_bad_files_are_named(tmp_path, damage, words):
     ("capture", "arguments", "words"),
     [
         ({"views": 2}, {}, "has 2 images: at least 3"),
-        ({"num_points": 0}, {}, "no 3D points"),
         ({}, {"test_every": 1}, "every image of .* would be a test image"),
         ({}, {"test_every": 0}, "test_every is 0"),
         ({}, {"factor": 0}, "factor is 0"),
@@ -261,6 +260,14 @@ def test_bad_captures_are_refused(tmp_path, capture, arguments, words):
     with pytest.raises(InputError, match=words) as caught:
         load_scene(folder, **arguments)
     assert "\n" not in str(caught.value)
+
+
+def test_without_points_random_ones_are_drawn(tmp_path):
+    scene = load_scene(write_capture(tmp_path / "cup", num_points=0))
+    assert len(scene.points) == len(scene.point_colors) == 50_000
+    assert scene.notes[0].endswith("9 images, no points, so 50,000 random ones about what the cameras look at")
+    again = load_scene(tmp_path / "cup")
+    assert torch.equal(scene.points, again.points)
 
 
 def test_points_beyond_float32_are_refused(tmp_path):

@@ -11,7 +11,7 @@ from PIL import Image
 
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene import load_scene
-from turbogs_plugin.scene.transforms import random_points
+from turbogs_plugin.scene.starting_points import random_points
 
 SCENES = Path(os.environ.get("TURBOGS_SCENES", Path(__file__).resolve().parents[3] / "shared" / "scenes"))
 TARGET = np.array([3.0, -1.0, 2.0])

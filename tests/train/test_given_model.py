@@ -20,7 +20,7 @@ from turbogs_plugin.model.ply import read_ply
 from turbogs_plugin.plan.decisions import wanted_backdrop
 from turbogs_plugin.scene import load_scene
 from turbogs_plugin.scene.colmap import load_pycolmap
-from turbogs_plugin.scene.transforms import random_points
+from turbogs_plugin.scene.starting_points import random_points
 from turbogs_plugin.train import run
 from turbogs_plugin.train.checkpoint import latest_checkpoint
 from turbogs_plugin.train.given_model import load_given

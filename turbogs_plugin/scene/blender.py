@@ -19,7 +19,8 @@ from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene.capture import Capture, sizes_text
 from turbogs_plugin.scene.photos import photo_size
 from turbogs_plugin.scene.poses import viewmat_of_pose
-from turbogs_plugin.scene.transforms import number_of, photo_name, random_points, read_frames
+from turbogs_plugin.scene.starting_points import random_points
+from turbogs_plugin.scene.transforms import number_of, photo_name, read_frames
 
 TRAIN_FILE = "transforms_train.json"
 TEST_FILES = ("transforms_test.json", "transforms_val.json")

@@ -61,8 +61,6 @@ class Capture:
         """Raise `InputError` unless every number is finite and in range. `source` is named in messages."""
         if not self.names:
             raise InputError(f"{source} has no images with a pose: reconstruct the capture again")
-        if not len(self.points):
-            raise InputError(f"{source} has no 3D points: training starts from them, so reconstruct the capture again")
         bad = ~np.isfinite(self.points).all(axis=1)
         if bad.any():
             raise InputError(f"{source}: {bad.sum()} of {len(bad)} 3D points are not finite")

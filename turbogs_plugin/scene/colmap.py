@@ -16,6 +16,7 @@ import numpy as np
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene.capture import LARGEST_SIDE, Capture, check_photo_name
 from turbogs_plugin.scene.colmap_check import SMALLEST_IMAGE, check_binary_model
+from turbogs_plugin.scene.starting_points import NUM_RANDOM_POINTS, about_cameras, random_points
 from turbogs_plugin.scene.undistort import Lens, lens_of_camera
 
 if TYPE_CHECKING:
@@ -94,7 +95,7 @@ def _count_images(model: Path, suffix: str) -> int:
 
 
 def read_colmap(scene: Path, model: Path, suffix: str) -> Capture:
-    """Read a reconstruction. Its photos are found by `find_photo_folder`.
+    """Read a reconstruction. Its photos are found by `find_photo_folder`. Without points, random ones are drawn.
 
     Args:
         scene: the scene's folder.
@@ -129,17 +130,21 @@ def read_colmap(scene: Path, model: Path, suffix: str) -> Capture:
         sizes[i] = (min(camera.width, 2**31), min(camera.height, 2**31)) if lens is None else lens.size
 
     photo_folder = find_photo_folder(scene, names)
-    points = [point for _, point in sorted(reconstruction.points3D.items())]
+    found = [point for _, point in sorted(reconstruction.points3D.items())]
+    points = np.array([point.xyz for point in found], dtype=np.float64).reshape(-1, 3)
+    colors = np.array([point.color for point in found], dtype=np.uint8).reshape(-1, 3)
+    if not found and images and np.isfinite(viewmats).all():
+        points, colors = random_points(viewmats)
     capture = Capture(
         names=names,
         photo_folder=photo_folder,
         viewmats=viewmats,
         Ks=intrinsics,
         sizes=sizes,
-        points=np.array([point.xyz for point in points], dtype=np.float64).reshape(-1, 3),
-        point_colors=np.array([point.color for point in points], dtype=np.uint8).reshape(-1, 3),
+        points=points,
+        point_colors=colors,
         lenses=tuple(lenses[image.camera_id] for image in images),
-        notes=(_kind_note(scene, model, suffix, len(images), len(points), photo_folder), *_choice_note(model)),
+        notes=(_kind_note(scene, model, suffix, len(images), len(found), photo_folder), *_choice_note(model)),
     )
     capture.check(model)
     return capture
@@ -185,8 +190,9 @@ def _folders(place: Path, depth: int) -> Iterator[Path]:
 
 def _kind_note(scene: Path, model: Path, suffix: str, images: int, points: int, photo_folder: Path) -> str:
     kind = {".bin": "binary", ".txt": "text"}[suffix]
+    shown = f"{points:,} points" if points else f"no points, so {about_cameras(NUM_RANDOM_POINTS)}"
     where = "" if photo_folder == scene / "images" else f", photos in {photo_folder}"
-    return f"COLMAP reconstruction {model} ({kind}): {images} images, {points:,} points{where}"
+    return f"COLMAP reconstruction {model} ({kind}): {images} images, {shown}{where}"
 
 
 def _choice_note(model: Path) -> list[str]:

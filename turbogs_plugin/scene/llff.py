@@ -17,7 +17,8 @@ from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene.capture import Capture, sizes_text
 from turbogs_plugin.scene.photos import photo_size
 from turbogs_plugin.scene.poses import viewmat_of_pose
-from turbogs_plugin.scene.transforms import NUM_RANDOM_POINTS, PHOTO_SUFFIXES
+from turbogs_plugin.scene.starting_points import NUM_RANDOM_POINTS
+from turbogs_plugin.scene.transforms import PHOTO_SUFFIXES
 
 FILE = "poses_bounds.npy"
 COLUMNS = 17

@@ -25,7 +25,7 @@ from turbogs_plugin.plan.caps import cap_of, chosen_points
 from turbogs_plugin.scene import Scene
 from turbogs_plugin.scene.offload import place_maps, place_views
 from turbogs_plugin.scene.photos import PhotoSamples
-from turbogs_plugin.scene.transforms import random_points
+from turbogs_plugin.scene.starting_points import random_points
 from turbogs_plugin.train.given_model import load_given
 from turbogs_plugin.types import PARAMETER_NAMES, Gaussians, GaussianStats, LossOutput, RowUpdate, Step
 
