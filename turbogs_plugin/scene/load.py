@@ -113,6 +113,11 @@ def load_scene(
     far = ~points.isfinite().all(dim=1)
     if far.any():
         raise InputError(f"{scene}: {int(far.sum())} of {len(far)} 3D points lie too far from the cameras for float32")
+    if factor > 1 and factor % capture.reduction:
+        raise InputError(
+            f"--factor {factor}: the largest photos of {scene} are those of {capture.photo_folder.name}: use --factor "
+            f"{capture.reduction} or a multiple of it, or bring the full-size photos back"
+        )
     remaining = max(1, factor // capture.reduction)
     paths, file_sizes, sizes, fitted = _find_photos(scene, capture, remaining)
     ratios = sizes / capture.sizes  # [V, 2]
@@ -152,10 +157,20 @@ def _read(scene: Path, factor: int) -> Capture:
     """The capture, of the first kind in the order that `load_scene` states."""
     if not scene.is_dir():
         raise InputError(f"no such scene: {scene} is not a folder")
-    model = find_model(scene)
     files = [file for file in (FILE, *blender.FILES, llff.FILE) if (scene / file).is_file()]
+    model = find_model(scene, anywhere=not files)
     if model is not None:
-        return _passing_over(files, read_colmap(scene, *model))
+        capture = read_colmap(scene, *model)
+        if not files or any((capture.photo_folder / name).is_file() for name in capture.names):
+            return _passing_over(files, capture)
+        # LLFF's poses are of the reduced copies too, which have other names than COLMAP's photos.
+        other = _read_other(scene, files, factor)
+        return replace(other, notes=(*other.notes, f"{model[0]} not used, its photos are not there"))
+    return _read_other(scene, files, factor)
+
+
+def _read_other(scene: Path, files: list[str], factor: int) -> Capture:
+    """The capture of the first of these files, none of them COLMAP's."""
     if FILE in files:
         return _passing_over(files[1:], read_transforms(scene))
     if files and files[0] in blender.FILES:
