@@ -355,9 +355,15 @@ def test_photos_in_other_folders(tmp_path, place):
     assert len(scene.train) == 7 and "photos in " in scene.notes[0]
 
 
-def test_reduced_copies_are_no_photos_of_full_size(tmp_path):
+def test_copies_that_the_cameras_were_reconstructed_from(tmp_path):
+    """Nothing of full size is there, neither photos nor cameras: factors count from the copies."""
     folder = write_capture(tmp_path / "cup")
     (folder / "images").rename(folder / "images_4")
+    scene = load_scene(folder)
+    assert scene.train.cameras.sizes[0].tolist() == [40, 24] and len(scene.notes) == 1
+    assert "photos in " in scene.notes[0] and "images_4" in scene.notes[0]
+    assert load_scene(folder, factor=2).train.cameras.sizes[0].tolist() == [20, 12]
+    (folder / "images_4" / "photo03.png").unlink()
     with pytest.raises(InputError, match=r"9 of 9 photos are missing in .*images: "):
         load_scene(folder)
 

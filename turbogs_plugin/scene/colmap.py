@@ -16,6 +16,7 @@ import numpy as np
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene.capture import LARGEST_SIDE, Capture, check_photo_name
 from turbogs_plugin.scene.colmap_check import SMALLEST_IMAGE, check_binary_model
+from turbogs_plugin.scene.photos import photo_size
 from turbogs_plugin.scene.starting_points import NUM_RANDOM_POINTS, about_cameras, random_points
 from turbogs_plugin.scene.undistort import Lens, lens_of_camera
 
@@ -135,6 +136,11 @@ def read_colmap(scene: Path, model: Path, suffix: str) -> Capture:
         sizes[i] = (min(camera.width, 2**31), min(camera.height, 2**31)) if lens is None else lens.size
 
     photo_folder, reduction = find_photo_folder(scene, names)
+    if (
+        reduction > 1
+        and 1.5 * photo_size(photo_folder / names[0])[0] > reconstruction.cameras[images[0].camera_id].width
+    ):
+        reduction = 1  # the cameras are those of the copies
     found = [point for _, point in sorted(reconstruction.points3D.items())]
     points = np.array([point.xyz for point in found], dtype=np.float64).reshape(-1, 3)
     colors = np.array([point.color for point in found], dtype=np.uint8).reshape(-1, 3)
