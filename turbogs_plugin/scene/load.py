@@ -98,7 +98,8 @@ def load_scene(
         raise InputError(f"factor is {factor}: it must be an integer of at least 1")
     if not isinstance(test_every, int) or test_every < 1:
         raise InputError(f"test_every is {test_every}: it must be an integer of at least 2")
-    capture = _read(scene, factor)
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # what is not finite is refused by its name
+        capture = _read(scene, factor)
     test = np.arange(len(capture.names)) % test_every == 0 if capture.test is None else capture.test
     if len(test) < FEWEST_VIEWS:
         raise InputError(f"{scene} has {len(test)} images: at least {FEWEST_VIEWS} are needed")
@@ -107,7 +108,8 @@ def load_scene(
     if test.all():
         raise InputError(f"test_every is {test_every}: every image of {scene} would be a test image; use 2 or more")
 
-    frame = Frame.around(camera_centers(capture.viewmats[~test]), capture.points)
+    with np.errstate(over="ignore", invalid="ignore"):
+        frame = Frame.around(camera_centers(capture.viewmats[~test]), capture.points)
     viewmats = torch.from_numpy(frame.normalise_poses(capture.viewmats)).float()
     points = torch.from_numpy(frame.normalise_points(capture.points)).float()
     far = ~points.isfinite().all(dim=1)
