@@ -66,7 +66,7 @@ def read_blender(scene: Path) -> Capture:
             f"them out of one; without {' and '.join(TEST_FILES)} every 8th photo is for testing"
         )
     names, views = zip(*sorted({**train, **test}.items()), strict=True)
-    points, colors = random_points(np.array([view.viewmat for view in train.values()]))
+    points = random_points(np.array([view.viewmat for view in train.values()]))
     capture = Capture(
         names=names,
         photo_folder=scene,
@@ -74,7 +74,7 @@ def read_blender(scene: Path) -> Capture:
         Ks=np.array([view.K for view in views]),
         sizes=np.array([view.size for view in views], dtype=np.int64),
         points=points,
-        point_colors=colors,
+        point_colors=None,
         notes=(_note(scene, train, test, len(points)),),
         test=np.array([name in test for name in names]) if test else None,
     )

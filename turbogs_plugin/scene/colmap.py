@@ -143,9 +143,9 @@ def read_colmap(scene: Path, model: Path, suffix: str) -> Capture:
         reduction = 1  # the cameras are those of the copies
     found = [point for _, point in sorted(reconstruction.points3D.items())]
     points = np.array([point.xyz for point in found], dtype=np.float64).reshape(-1, 3)
-    colors = np.array([point.color for point in found], dtype=np.uint8).reshape(-1, 3)
+    colors = np.array([point.color for point in found], dtype=np.uint8).reshape(-1, 3) if found else None
     if not found and images and np.isfinite(viewmats).all():
-        points, colors = random_points(viewmats)
+        points = random_points(viewmats)
     capture = Capture(
         names=names,
         photo_folder=photo_folder,

@@ -19,6 +19,7 @@ from turbogs_plugin.scene.frame import Frame
 from turbogs_plugin.scene.host_arrays import file_note
 from turbogs_plugin.scene.photos import Photos, load_photos, photo_array, photo_sizes, reduced_sizes
 from turbogs_plugin.scene.poses import camera_centers
+from turbogs_plugin.scene.starting_points import colors_in_photos
 from turbogs_plugin.scene.transforms import FILE, read_transforms
 from turbogs_plugin.scene.undistort import undistortion_note
 from turbogs_plugin.types import Cameras
@@ -142,13 +143,17 @@ def load_scene(
         return PosedImages(cameras, names, photos)
 
     train, tested = (select(*part) for part in zip(parts, colors, strict=True))
+    if capture.point_colors is None:
+        point_colors = colors_in_photos(points, train.cameras, train.photos)
+    else:
+        point_colors = torch.from_numpy(capture.point_colors)
     notes = (fitted, undistortion_note(capture.lenses), file_note(colors, "photos"))
     return Scene(
         name=scene.resolve().name,
         train=train,
         test=tested,
         points=points,
-        point_colors=torch.from_numpy(capture.point_colors),
+        point_colors=point_colors,
         frame=frame,
         extent=1.0,
         notes=tuple(filter(None, (*capture.notes, *notes))),

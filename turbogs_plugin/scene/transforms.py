@@ -75,10 +75,10 @@ def read_transforms(scene: Path) -> Capture:
         points, colors = _read_points(scene, content["ply_file_path"], source)
         origin = f"{len(points):,} points of {content['ply_file_path']}"
     else:
-        points, colors = np.empty((0, 3)), np.empty((0, 3), dtype=np.uint8)
+        points, colors = np.empty((0, 3)), None
         origin = "no points"
     if not len(points):
-        points, colors = random_points(viewmats)
+        points, colors = random_points(viewmats), None
         origin += f", so {about_cameras(len(points))}"
     notes = [f"{source} (nerfstudio, instant-ngp): {len(names)} photos, {origin}"]
     if absent:

@@ -25,7 +25,7 @@ from turbogs_plugin.plan.caps import cap_of, chosen_points
 from turbogs_plugin.scene import Scene
 from turbogs_plugin.scene.offload import place_maps, place_views
 from turbogs_plugin.scene.photos import PhotoSamples
-from turbogs_plugin.scene.starting_points import random_points
+from turbogs_plugin.scene.starting_points import colors_in_photos, random_points
 from turbogs_plugin.train.given_model import load_given
 from turbogs_plugin.types import PARAMETER_NAMES, Gaussians, GaussianStats, LossOutput, RowUpdate, Step
 
@@ -258,8 +258,8 @@ def initial_gaussians(scene: Scene, config: Config, init: str, device: torch.dev
     if init in ("points", "random"):
         points, colors = scene.points, scene.point_colors
         if init == "random":
-            places, drawn = random_points(scene.train.cameras.viewmats.cpu().double().numpy())
-            points, colors = torch.from_numpy(places).float(), torch.from_numpy(drawn)
+            points = torch.from_numpy(random_points(scene.train.cameras.viewmats.cpu().double().numpy())).float()
+            colors = colors_in_photos(points, scene.train.cameras, scene.train.photos)
         rows = chosen_points(len(points), cap, backdrop_count)
         settings = (train.sh_degree, scene.extent, train.initial_opacity, train.initial_size)
         gaussians = gaussians_from_points(points[rows], colors[rows], *settings)
