@@ -14,6 +14,7 @@ from turbogs_plugin.scene import blender, llff
 from turbogs_plugin.scene.capture import Capture
 from turbogs_plugin.scene.colmap import find_model, read_colmap
 from turbogs_plugin.scene.frame import Frame
+from turbogs_plugin.scene.photo_folder import find_photos
 from turbogs_plugin.scene.photos import Photos, load_photos, photo_sizes, reduced_sizes
 from turbogs_plugin.scene.poses import camera_centers
 from turbogs_plugin.scene.transforms import FILE, read_transforms
@@ -132,12 +133,21 @@ def load_scene(path: str | Path, factor: int = 1, test_every: int = 8) -> Scene:
     )
 
 
+def holds_photos_alone(scene: Path) -> bool:
+    """Whether a folder has photos, and nothing that says where they were taken from."""
+    return scene.is_dir() and _cameras(scene) == (None, []) and bool(find_photos(scene)[1])
+
+
+def _cameras(scene: Path) -> tuple[tuple[Path, str] | None, list[str]]:
+    """What a folder has of cameras: the reconstruction, as `find_model` gives it, and the names of other files."""
+    return find_model(scene), [file for file in (FILE, *blender.FILES, llff.FILE) if (scene / file).is_file()]
+
+
 def _read(scene: Path, factor: int) -> Capture:
     """The capture, of the first kind in the order that `load_scene` states."""
     if not scene.is_dir():
         raise InputError(f"no such scene: {scene} is not a folder")
-    model = find_model(scene)
-    files = [file for file in (FILE, *blender.FILES, llff.FILE) if (scene / file).is_file()]
+    model, files = _cameras(scene)
     if model is not None:
         return _passing_over(files, read_colmap(scene, *model))
     if FILE in files:
@@ -146,6 +156,11 @@ def _read(scene: Path, factor: int) -> Capture:
         return _passing_over([file for file in files if file not in blender.FILES], blender.read_blender(scene))
     if files:
         return llff.read_llff(scene, factor)
+    if count := len(find_photos(scene)[1]):
+        raise InputError(
+            f"{scene} has {count} photos and nothing that says where they were taken from: find that by "
+            f"'turbogs reconstruct {scene} --out SCENE', then use SCENE"
+        )
     raise InputError(
         f"{scene} has neither a COLMAP reconstruction (cameras, images and points3D as .bin or .txt in sparse/0) nor a "
         f"{FILE}, a {blender.TRAIN_FILE} or a {llff.FILE}"

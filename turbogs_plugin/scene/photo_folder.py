@@ -1,0 +1,38 @@
+"""Folders that hold photos and nothing that says where they were taken from."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp")
+"""Files that are photos: what both pillow and COLMAP read."""
+OTHER_SUFFIXES = (".heic", ".heif", ".webp", ".avif", ".jxl", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".rw2")
+"""Photos that at least one of them does not read."""
+NO_PHOTOS = re.compile(r"\..*|.*_\d+|masks?", re.IGNORECASE)
+"""Folders that hold none: hidden ones, copies reduced by a factor (``images_4``), masks."""
+FOLDER_DEPTH = 2
+"""Photos are looked for in folders of folders, no deeper."""
+
+
+def find_photos(folder: Path) -> tuple[Path, list[Path], list[Path]]:
+    """The photos of a folder; where it has a folder ``images``, of that one.
+
+    Returns:
+        The folder that their names are relative to; the photos in the order of their names; and files of kinds that
+        are not read.
+    """
+    place = folder / "images" if (folder / "images").is_dir() else folder
+    files = _files(place, FOLDER_DEPTH)
+    photos = [path for path in files if path.suffix.lower() in PHOTO_SUFFIXES]
+    others = [path for path in files if path.suffix.lower() in OTHER_SUFFIXES]
+    return place, sorted(photos, key=lambda path: path.relative_to(place).as_posix()), others
+
+
+def _files(folder: Path, depth: int) -> list[Path]:
+    entries = sorted(folder.iterdir()) if folder.is_dir() else []
+    files = [entry for entry in entries if entry.name[0] != "." and entry.is_file()]
+    if depth:
+        inner = [entry for entry in entries if not NO_PHOTOS.fullmatch(entry.name) and entry.is_dir()]
+        files += [file for entry in inner for file in _files(entry, depth - 1)]
+    return files
