@@ -20,8 +20,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
+STRONGEST = 10
+"""Of each photo, so many pairs with the most matches are its evidence. They see the same place. The others, which a
+large capture has many times as many of, may see the same pattern only ..."""
+WEAK = 1e-3
+"""... and count so much: they decide where there is no other evidence."""
+POWER = 1.5
+"""Of the number of matches in a pair's weight: above 1, since pairs that see the same place have more matches."""
 DOUBT = 2.0
-"""A group is named as doubtful where contradicting matches, times this, outweigh the agreeing ones."""
+"""A group is named as doubtful where what contradicts, times this, outweighs what agrees."""
 FEWEST_LINKS = 30
 """Photos hold together where a pair agrees by so many matches: COLMAP registers a photo by no fewer points."""
 
@@ -51,13 +58,14 @@ def consistent_groups(agreement: Agreement, doubt: float = 1.0) -> list[list[int
     """Photos in groups that the matches hold together, the largest group first.
 
     Args:
-        doubt: contradicting matches count so many times. With 1, groups are apart where the contradicting matches
-            between them outnumber the agreeing ones.
+        doubt: what contradicts counts so many times. With 1, groups are apart where between them the contradicting
+            matches outweigh the agreeing ones.
 
     Returns:
         Ascending indices of photos. All photos in one group: nothing contradicts the solve by majority.
     """
-    weights = agreement.agreeing - doubt * agreement.contradicting
+    weights = agreement.agreeing**POWER - doubt * agreement.contradicting**POWER
+    weights[~_strongest(agreement)] *= WEAK
     return _contracted(len(agreement.names), agreement.pairs, weights)
 
 
@@ -77,6 +85,18 @@ def ghost_pairs(agreement: Agreement, groups: list[list[int]]) -> np.ndarray:
         group[members] = number
     first, second = agreement.pairs.reshape(-1, 2).T
     return (group[first] != group[second]) & ~agreement.contradicts
+
+
+def _strongest(agreement: Agreement) -> np.ndarray:
+    """[P] bool: pairs that are among the `STRONGEST` of either photo."""
+    strongest = np.zeros(len(agreement.pairs), dtype=bool)
+    count = np.zeros(len(agreement.names), dtype=np.int64)
+    order = np.argsort(-(agreement.agreeing + agreement.contradicting), kind="stable")
+    for pair, (first, second) in zip(order.tolist(), agreement.pairs[order].tolist(), strict=True):
+        strongest[pair] = count[first] < STRONGEST or count[second] < STRONGEST
+        count[first] += 1
+        count[second] += 1
+    return strongest
 
 
 def _contracted(count: int, pairs: np.ndarray, weights: np.ndarray) -> list[list[int]]:
