@@ -3,7 +3,13 @@
 import numpy as np
 import pytest
 
-from turbogs_plugin.reconstruct.agreement import Agreement, consistent_groups, ghost_pairs, linked_groups
+from turbogs_plugin.reconstruct.agreement import (
+    Agreement,
+    consistent_groups,
+    fewest_links,
+    ghost_pairs,
+    linked_groups,
+)
 from turbogs_plugin.reconstruct.solver import epipolar_distances
 
 
@@ -60,13 +66,19 @@ def test_doubt_names_what_the_majority_does_not():
     assert consistent_groups(agreement, doubt=2.0) == [[0, 1], [2]]
 
 
-def test_photos_that_few_matches_hold_are_named():
-    agreement = walk(8, 3)
-    few = Agreement(
-        agreement.names, agreement.pairs, np.where((agreement.pairs == 7).any(1), 12, 200), 0 * agreement.agreeing
-    )
-    assert linked_groups(few) == [list(range(7)), [7]]
-    assert linked_groups(few, fewest=12) == [list(range(8))]
+@pytest.mark.parametrize(("matches", "held"), [(12, False), (29, False), (30, True)])
+def test_photos_that_few_matches_hold_are_named(matches, held):
+    pairs = walk(8, 3).pairs
+    few = np.where((pairs == 7).any(axis=1), matches, 200)
+    few[(pairs < 2).all(axis=1)] = 900  # of one pair, which the median does not follow
+    agreement = Agreement(walk(8, 3).names, pairs, few, 0 * few)
+    assert fewest_links(agreement) == 30
+    assert linked_groups(agreement) == ([list(range(8))] if held else [list(range(7)), [7]])
+
+
+def test_few_matches_hold_nothing_however_few_there_are():
+    pair = Agreement(("a", "b"), np.array([[0, 1]]), np.array([29]), np.array([0]))
+    assert linked_groups(pair) == [[0], [1]]
 
 
 def test_many_weak_pairs_of_a_large_capture_do_not_outweigh_the_strong_ones():

@@ -14,6 +14,7 @@ from turbogs_plugin.reconstruct import Solution, reconstruct, run, scene_beside,
 from turbogs_plugin.reconstruct.agreement import Agreement, consistent_groups
 from turbogs_plugin.reconstruct.workspace import Workspace
 from turbogs_plugin.scene import load_scene
+from turbogs_plugin.scene.load import holds_photos_alone
 
 COUNT = 10
 
@@ -275,3 +276,49 @@ def test_the_similar_photos_of_many_are_found_without_a_download(solved, tmp_pat
 def test_where_the_capture_of_a_run_lies(tmp_path):
     assert scene_beside(tmp_path / "garden", tmp_path / "runs/first") == tmp_path / "runs/garden-scene"
     assert scene_beside(tmp_path / "garden/images", tmp_path / "run") == tmp_path / "garden-scene"
+
+
+def test_train_finds_the_cameras_of_photos_first(solved, tmp_path, turbogs, monkeypatch):
+    """Here they are found already, by the run before: `reconstruct` itself is tested above."""
+    photos, solution = solved
+    shutil.copytree(solution.scene, tmp_path / "corner-scene")
+    monkeypatch.setattr(run, "solver", None)
+    short = ("train.iterations=2", "train.sh_degree=0", "train.evaluate_at=[]", "--factor", "4", "--device", "cpu")
+    code, _, err = turbogs("train", photos, "--out", tmp_path / "run", "--no-report", *short)
+    assert code == 0, err
+    first, *others = err.splitlines()
+    assert first == f"{photos} has photos alone: their cameras are found first, into {tmp_path / 'corner-scene'}"
+    assert others[: len(solution.notes)] == list(solution.notes)
+    assert f"path: {tmp_path / 'corner-scene'}" in (tmp_path / "run/config.yaml").read_text()
+
+
+def test_bad_settings_are_refused_before_cameras_are_looked_for(solved, tmp_path, turbogs, monkeypatch):
+    monkeypatch.setattr(run, "read_photos", lambda folder: pytest.fail("photos were read"))
+    (tmp_path / "used").mkdir()
+    (tmp_path / "used/file").write_text("x")
+    for arguments in (("--out", tmp_path / "used"), ("--out", tmp_path / "run", "--init", "absent.ply")):
+        code, out, err = turbogs("train", solved[0], *arguments, "--device", "cpu")
+        assert (code, out) == (2, "") and err.count("\n") == 1, err
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["used"]
+
+
+def test_commands_that_cannot_look_for_cameras_say_what_does(solved, tmp_path, turbogs):
+    photos, _ = solved
+    code, out, err = turbogs("plan", photos, "--device", "cpu")
+    assert (code, out) == (2, "") and err.count("\n") == 1
+    assert f"{photos} has 11 photos and nothing" in err and "turbogs reconstruct" in err
+
+
+def test_the_command_refuses_in_one_line(tmp_path, turbogs):
+    (tmp_path / "photos").mkdir()
+    Image.new("RGB", (64, 48)).save(tmp_path / "photos/a.jpg")
+    code, out, err = turbogs("reconstruct", tmp_path / "photos", "--out", tmp_path / "scene")
+    assert (code, out) == (2, "") and err.count("\n") == 1 and "has 1 photo: at least 3 are needed" in err
+    assert [path.name for path in tmp_path.iterdir()] == ["photos"]
+
+
+def test_a_reconstruction_in_parts_is_not_taken_for_photos_alone(solved, tmp_path):
+    scene = shutil.copytree(solved[1].scene, tmp_path / "scene")
+    (scene / "sparse/0/points3D.bin").unlink()
+    assert not holds_photos_alone(scene) and holds_photos_alone(scene / "images")
+    assert holds_photos_alone(solved[0].parent) and not holds_photos_alone(tmp_path)

@@ -30,7 +30,9 @@ POWER = 1.5
 DOUBT = 2.0
 """A group is named as doubtful where what contradicts, times this, outweighs what agrees."""
 FEWEST_LINKS = 30
-"""Photos hold together where a pair agrees by so many matches: COLMAP registers a photo by no fewer points."""
+"""Photos hold together where a pair agrees by so many matches: COLMAP registers a photo by no fewer points. And ..."""
+LINK_SHARE = 0.15
+"""... by this share of what the strongest pair of a photo has, as the median."""
 
 
 @dataclass(frozen=True)
@@ -69,10 +71,22 @@ def consistent_groups(agreement: Agreement, doubt: float = 1.0) -> list[list[int
     return _contracted(len(agreement.names), agreement.pairs, weights)
 
 
-def linked_groups(agreement: Agreement, fewest: int = FEWEST_LINKS) -> list[list[int]]:
-    """Photos in groups that are connected by pairs with at least `fewest` agreeing matches, the largest group first."""
-    strong = agreement.agreeing >= fewest
+def linked_groups(agreement: Agreement) -> list[list[int]]:
+    """Photos in groups that are connected by pairs with `fewest_links` agreeing matches, the largest group first."""
+    strong = agreement.agreeing >= fewest_links(agreement)
     return _contracted(len(agreement.names), agreement.pairs[strong], np.ones(int(strong.sum())))
+
+
+def fewest_links(agreement: Agreement) -> int:
+    """Agreeing matches of a pair by which two photos hold together.
+
+    A group that is held to the others by weaker pairs alone may be at a ghost though nothing contradicts it: where the
+    photos between were not taken, repeated structure may be all that there is.
+    """
+    strongest = np.zeros(len(agreement.names))
+    for photos in agreement.pairs.T:
+        np.maximum.at(strongest, photos, agreement.agreeing)
+    return max(FEWEST_LINKS, round(LINK_SHARE * float(np.median(strongest))))
 
 
 def ghost_pairs(agreement: Agreement, groups: list[list[int]]) -> np.ndarray:

@@ -14,9 +14,9 @@ from turbogs_plugin.errors import InputError
 from turbogs_plugin.reconstruct import solver
 from turbogs_plugin.reconstruct.agreement import (
     DOUBT,
-    FEWEST_LINKS,
     Agreement,
     consistent_groups,
+    fewest_links,
     ghost_pairs,
     linked_groups,
 )
@@ -257,7 +257,7 @@ def _notes(
     main = {agreement.names[view] for view in solve.groups[0]}
     for groups, reason in (
         (consistent_groups(agreement, DOUBT), "many matches contradict their place"),
-        (linked_groups(agreement), f"no pair holds them to the others by {FEWEST_LINKS} matches"),
+        (linked_groups(agreement), f"no pair has {fewest_links(agreement)} matches that hold them to the others"),
     ):
         doubtful = [name for group in groups[1:] for name in (agreement.names[view] for view in group) if name in main]
         if doubtful:

@@ -110,13 +110,19 @@ def solve_cameras(database: Path, images: Path, scratch: Path) -> list[pycolmap.
     place.mkdir(parents=True)
     registered = 0
 
-    def count() -> None:
+    def count(images: int = 1) -> None:
         nonlocal registered
-        registered += 1
+        registered += images
 
     def step(token: pycolmap.CancellationToken) -> dict[int, pycolmap.Reconstruction]:
         return pycolmap.incremental_mapping(
-            database, images, place, options, next_image_callback=count, cancellation_token=token
+            database,
+            images,
+            place,
+            options,
+            initial_image_pair_callback=lambda: count(2),
+            next_image_callback=count,
+            cancellation_token=token,
         )
 
     models = watched("cameras solved", None, lambda: registered, step)

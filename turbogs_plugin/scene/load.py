@@ -12,7 +12,7 @@ from torch import Tensor
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene import blender, llff
 from turbogs_plugin.scene.capture import Capture
-from turbogs_plugin.scene.colmap import find_model, read_colmap
+from turbogs_plugin.scene.colmap import MODEL_FOLDERS, find_model, read_colmap
 from turbogs_plugin.scene.frame import Frame
 from turbogs_plugin.scene.photo_folder import find_photos
 from turbogs_plugin.scene.photos import Photos, load_photos, photo_sizes, reduced_sizes
@@ -134,8 +134,9 @@ def load_scene(path: str | Path, factor: int = 1, test_every: int = 8) -> Scene:
 
 
 def holds_photos_alone(scene: Path) -> bool:
-    """Whether a folder has photos, and nothing that says where they were taken from."""
-    return scene.is_dir() and _cameras(scene) == (None, []) and bool(find_photos(scene)[1])
+    """Whether a folder has photos, and nothing that says where they were taken from: no reconstruction in parts."""
+    begun = any((scene / place.partition("/")[0]).is_dir() for place in MODEL_FOLDERS if place != ".")
+    return scene.is_dir() and not begun and _cameras(scene) == (None, []) and bool(find_photos(scene)[1])
 
 
 def _cameras(scene: Path) -> tuple[tuple[Path, str] | None, list[str]]:
@@ -156,10 +157,10 @@ def _read(scene: Path, factor: int) -> Capture:
         return _passing_over([file for file in files if file not in blender.FILES], blender.read_blender(scene))
     if files:
         return llff.read_llff(scene, factor)
-    if count := len(find_photos(scene)[1]):
+    if holds_photos_alone(scene):
         raise InputError(
-            f"{scene} has {count} photos and nothing that says where they were taken from: find that by "
-            f"'turbogs reconstruct {scene} --out SCENE', then use SCENE"
+            f"{scene} has {len(find_photos(scene)[1])} photos and nothing that says where they were taken from: find "
+            f"that by 'turbogs reconstruct {scene} --out SCENE', then use SCENE"
         )
     raise InputError(
         f"{scene} has neither a COLMAP reconstruction (cameras, images and points3D as .bin or .txt in sparse/0) nor a "
