@@ -23,6 +23,7 @@ from turbogs_plugin.reconstruct.agreement import (
 from turbogs_plugin.reconstruct.matching import Matching, choose_matching
 from turbogs_plugin.reconstruct.photos import PhotoFile, place_photos, read_photos
 from turbogs_plugin.reconstruct.workspace import Solution, Workspace
+from turbogs_plugin.scene.colmap import load_pycolmap
 from turbogs_plugin.scene.load import FEWEST_VIEWS
 
 if TYPE_CHECKING:
@@ -83,6 +84,7 @@ def reconstruct(photos: Path, out: Path) -> Solution:
         InputError: photos or folder are not usable, or the photos cannot be solved. Then what this call began is gone.
         KeyboardInterrupt: what was finished is kept.
     """
+    load_pycolmap()  # where it is absent, that is said before photos are read
     found = read_photos(photos)
     if photos.resolve() in (out.resolve(), *out.resolve().parents):
         raise InputError(f"--out '{out}' lies in the folder of photos: choose a folder beside it")

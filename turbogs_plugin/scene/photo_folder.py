@@ -11,8 +11,9 @@ OTHER_SUFFIXES = (".heic", ".heif", ".webp", ".avif", ".jxl", ".dng", ".cr2", ".
 """Photos that at least one of them does not read."""
 NO_PHOTOS = re.compile(r"\..*|.*_\d+|masks?", re.IGNORECASE)
 """Folders that hold none: hidden ones, copies reduced by a factor (``images_4``), masks."""
-FOLDER_DEPTH = 2
-"""Photos are looked for in folders of folders, no deeper."""
+FOLDER_DEPTH = 1
+"""Photos are looked for in a folder and in the folders in it. Those of several captures beside each other lie deeper,
+in the ``images`` of each."""
 
 
 def find_photos(folder: Path) -> tuple[Path, list[Path], list[Path]]:
