@@ -20,7 +20,7 @@ from turbogs_plugin.reconstruct.agreement import (
     ghost_pairs,
     linked_groups,
 )
-from turbogs_plugin.reconstruct.matching import Matching, choose_matching
+from turbogs_plugin.reconstruct.matching import FEW, Matching, choose_matching
 from turbogs_plugin.reconstruct.photos import PhotoFile, place_photos, read_photos
 from turbogs_plugin.reconstruct.workspace import Solution, Workspace
 from turbogs_plugin.scene.colmap import load_pycolmap
@@ -30,8 +30,10 @@ if TYPE_CHECKING:
     import pycolmap
 
 LONG_SIDES = (1600, 3200)
-"""Photos are reduced to the first for their features. Where not all photos register, all is done again at the second,
-COLMAP's own default, and the better solve is taken."""
+"""Photos are reduced to the first for their features. Where too few register, all is done again at the second, COLMAP's
+own default, and the better solve is taken."""
+ENOUGH_OF_MANY = 0.95
+"""Of more than `FEW` photos so many are enough; of fewer, all."""
 REPAIRS = 3
 """So many times a solve with ghosts is repeated without the pairs that made them."""
 SMALLEST_SHARE = 0.5
@@ -116,6 +118,7 @@ def _reconstruct(photos: Sequence[PhotoFile], workspace: Workspace) -> Solution:
     names = [photo.name for photo in photos]
     matching = choose_matching(names, np.array([photo.position for photo in photos]))
     longest = max(max(photo.size) for photo in photos)
+    enough = len(photos) if len(photos) <= FEW else ENOUGH_OF_MANY * len(photos)
     best: Solve | None = None
     repaired: list[str] = []
     for long_side in LONG_SIDES:
@@ -127,7 +130,7 @@ def _reconstruct(photos: Sequence[PhotoFile], workspace: Workspace) -> Solution:
         solve, moved = _solve(database, workspace)
         if solve is not None and (best is None or solve.rank > best.rank):
             best, repaired, verified = solve, moved, solver.count_verified_pairs(database)
-        if longest <= long_side or (best is not None and best.placed == len(photos)):
+        if longest <= long_side or (best is not None and best.placed >= enough):
             break
     _require_solved(best, len(photos), solver.count_verified_pairs(database), matching)
     _leave_out(best.model, best.ghosts)
