@@ -26,6 +26,8 @@ MANY = 10
 radial coefficient, as COLMAP's default. On fox OPENCV halves the error of the cameras."""
 EPIPOLAR_SHARE = 3e-3
 """A match agrees with two cameras that are nearer to its epipolar line than this share of the photos' longer side."""
+BLOCK = 128
+"""Pairs that are matched, verified and written together: a stop waits for them."""
 FEATURES_OF_A_PHOTO = 1000
 FEATURES_OF_A_WORD = 40
 MOST_WORDS = 16384
@@ -89,7 +91,7 @@ def match_features(database: Path, scratch: Path, names: Sequence[str], matching
             listed = scratch / "pairs.txt"
             _write_pairs(listed, pairs)
             pairing = pycolmap.ImportedPairingOptions()
-            pairing.match_list_path = listed
+            pairing.match_list_path, pairing.block_size = listed, BLOCK
             pycolmap.match_image_pairs(database, options, pairing, geometry, cancellation_token=token)
         if matching.similar and not token.is_cancelled:
             likeness.vocab_tree_path = _build_vocabulary(database, scratch / "words.bin")

@@ -41,12 +41,15 @@ def watched(
     token = load_pycolmap().CancellationToken()
     outcome: list[Result] = []
     failure: list[BaseException] = []
+    ended = threading.Event()  # an interrupted Thread.join takes the thread for ended
 
     def run() -> None:
         try:
             outcome.append(step(token))
         except BaseException as error:  # handed to the thread that waits
             failure.append(error)
+        finally:
+            ended.set()
 
     start = time.monotonic()
     thread = threading.Thread(target=run, daemon=True)
@@ -55,13 +58,12 @@ def watched(
         task = None if bar is None else bar.add_task(title, total=total)
         thread.start()
         try:
-            while thread.is_alive():
-                thread.join(POLL_SECONDS)
+            while not ended.wait(POLL_SECONDS):
                 if bar is not None:
                     bar.update(task, completed=done())
         except KeyboardInterrupt:
             token.cancel()
-            thread.join()
+            ended.wait()
             raise
     if failure:
         raise failure[0]
