@@ -56,14 +56,15 @@ def watched(
     bar = _bar()
     with nullcontext() if bar is None else bar:
         task = None if bar is None else bar.add_task(title, total=total)
-        thread.start()
         try:
+            thread.start()
             while not ended.wait(POLL_SECONDS):
                 if bar is not None:
                     bar.update(task, completed=done())
         except KeyboardInterrupt:
             token.cancel()
-            ended.wait()
+            if thread.ident is not None:  # or it has not begun
+                ended.wait()
             raise
     if failure:
         raise failure[0]
