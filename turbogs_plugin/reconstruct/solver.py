@@ -127,7 +127,8 @@ def solve_cameras(database: Path, images: Path, scratch: Path) -> list[pycolmap.
             cancellation_token=token,
         )
 
-    models = watched("cameras solved", None, lambda: registered, step)
+    total = row_counter(database, "images")()
+    models = watched("cameras solved", total, lambda: registered, step)
     return sorted(models.values(), key=lambda model: -model.num_reg_images())
 
 

@@ -61,6 +61,8 @@ def watched(
             while not ended.wait(POLL_SECONDS):
                 if bar is not None:
                     bar.update(task, completed=done())
+            if bar is not None:
+                bar.update(task, completed=done())
         except KeyboardInterrupt:
             token.cancel()
             if thread.ident is not None:  # or it has not begun
