@@ -71,6 +71,18 @@ def test_upright_copies_keep_focal_length_and_gps(tmp_path):
     assert turned.exif_latitude() == pytest.approx(-33.5) and turned.exif_longitude() == pytest.approx(151.25)
 
 
+def test_a_phones_photo_with_a_second_one_behind_it_is_a_jpeg(tmp_path):
+    for number in range(3):
+        exif = Image.Exif()
+        exif[0x0112] = 8
+        path = tmp_path / "raw" / f"{number}.jpg"
+        path.parent.mkdir(exist_ok=True)
+        picture().save(path, format="MPO", save_all=True, append_images=[picture(1)], exif=exif, quality=95)
+    place_photos(read_photos(tmp_path / "raw"), tmp_path / "images")
+    with Image.open(tmp_path / "images/0.jpg") as upright:
+        assert (upright.format, upright.size) == ("JPEG", (32, 48))
+
+
 def test_lenses_are_told_apart_by_exif_and_size(tmp_path):
     for name, focal in (("a", 28), ("b", 28), ("c", 85)):
         write(tmp_path / f"{name}.jpg", model="Phone", focal=focal)
@@ -106,6 +118,9 @@ def test_a_folder_images_is_where_the_photos_are(tmp_path):
         write(tmp_path / "images" / f"{number}.jpg")
     write(tmp_path / "poster.jpg")
     assert [photo.name for photo in read_photos(tmp_path)] == ["0.jpg", "1.jpg", "2.jpg"]
+    (tmp_path / "images").rename(tmp_path / "walk_2")
+    (tmp_path / "images").mkdir()
+    assert [photo.name for photo in read_photos(tmp_path)] == ["poster.jpg", *(f"walk_2/{n}.jpg" for n in range(3))]
 
 
 def four(folder) -> None:

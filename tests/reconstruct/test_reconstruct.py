@@ -61,7 +61,7 @@ def test_the_solution_says_what_was_done_and_names_what_did_not_register(solved)
     assert (solution.photos, solution.registered, solution.left_out) == (COUNT + 1, COUNT, ("other.jpg",))
     text = solution.text()
     assert "11 photos of 1 lens, 2 turned upright by EXIF; matched each with each" in text
-    assert "10 of 11 photos registered" in text and "1 photos did not register: other.jpg;" in text
+    assert "10 of 11 photos registered" in text and "1 photo did not register: other.jpg;" in text
     assert "ghost" not in text and "wrong place" not in text
 
 
@@ -143,7 +143,7 @@ def test_a_place_that_holds_something_else_is_refused(solved, tmp_path):
     (tmp_path / "file").write_text("x")
     with pytest.raises(InputError, match="holds something else"):
         reconstruct(photos, tmp_path)
-    with pytest.raises(InputError, match="lies in the folder of photos"):
+    with pytest.raises(InputError, match="would lie among the photos"):
         reconstruct(photos, photos / "scene")
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
 

@@ -147,7 +147,7 @@ def _position(gps: dict[int, Any]) -> tuple[float, float]:
 def _write_upright(source: Path, target: Path) -> None:
     """The photo as EXIF says that it is to be seen, with the rest of its EXIF data (focal length, GPS)."""
     with Image.open(source) as image:
-        form = image.format
+        form = "JPEG" if image.format == "MPO" else image.format  # of phones: a JPEG with a second one behind it
         upright = ImageOps.exif_transpose(image)
     exif = upright.getexif()
     options = {"quality": JPEG_QUALITY, "subsampling": 0} if form == "JPEG" else {}

@@ -25,6 +25,7 @@ from turbogs_plugin.reconstruct.photos import PhotoFile, place_photos, read_phot
 from turbogs_plugin.reconstruct.workspace import Solution, Workspace
 from turbogs_plugin.scene.colmap import load_pycolmap
 from turbogs_plugin.scene.load import FEWEST_VIEWS
+from turbogs_plugin.scene.photo_folder import find_photos
 
 if TYPE_CHECKING:
     import pycolmap
@@ -88,8 +89,9 @@ def reconstruct(photos: Path, out: Path) -> Solution:
     """
     load_pycolmap()  # where it is absent, that is said before photos are read
     found = read_photos(photos)
-    if photos.resolve() in (out.resolve(), *out.resolve().parents):
-        raise InputError(f"--out '{out}' lies in the folder of photos: choose a folder beside it")
+    place, _, _ = find_photos(photos)
+    if place.resolve() in (out.resolve(), *out.resolve().parents):
+        raise InputError(f"the scene '{out}' would lie among the photos of '{place}': choose an --out elsewhere")
     workspace = Workspace(out)
     missing = [parent for parent in (out, *out.parents) if not parent.exists()]
     new = workspace.begin(found)
@@ -106,7 +108,7 @@ def reconstruct(photos: Path, out: Path) -> Solution:
 
 
 def scene_beside(photos: Path, run: Path) -> Path:
-    """Where training puts the capture of photos: beside its run, so that the next run beside it finds it there."""
+    """Where training puts the capture of photos: beside its run, where the next run beside that finds it."""
     folder = photos.resolve()
     name = folder.parent.name if folder.name == "images" and folder.parent.name else folder.name
     return run.absolute().parent / f"{name}-scene"
@@ -238,20 +240,19 @@ def _notes(
     ]
     if repaired:
         notes.append(
-            f"{len(repaired)} photos were at a ghost, as repeated structure misled the first solve; they were solved "
-            f"again without the pairs that put them there: {_listed(repaired)}"
+            f"{_photos(repaired)} at a ghost, as repeated structure misled the first solve; solved again without the "
+            f"pairs that put them there: {_listed(repaired)}"
         )
     if solve.ghosts:
         notes.append(
-            f"{len(solve.ghosts)} photos are left out, as more of their matches contradict their place than confirm "
-            f"it (repeated structure): {_listed(solve.ghosts)}"
+            f"{_photos(solve.ghosts)} left out, as more matches contradict their place than confirm it (repeated "
+            f"structure): {_listed(solve.ghosts)}"
         )
     unplaced = [name for name in left_out if name not in set(solve.ghosts)]
     if unplaced:
         others = f", {len(solve.sizes) - 1} smaller models besides" if len(solve.sizes) > 1 else ""
         notes.append(
-            f"{len(unplaced)} photos did not register{others}: {_listed(unplaced)}; add photos between them and the "
-            "others"
+            f"{_photos(unplaced)} did not register{others}: {_listed(unplaced)}; add photos between them and the others"
         )
     contradicting = int(agreement.contradicts.sum())
     if contradicting:
@@ -266,12 +267,16 @@ def _notes(
     ):
         doubtful = [name for group in groups[1:] for name in (agreement.names[view] for view in group) if name in main]
         if doubtful:
-            notes.append(f"{len(doubtful)} photos may be in a wrong place, {reason}: {_listed(doubtful)}")
+            notes.append(f"{_photos(doubtful)} may be in a wrong place, {reason}: {_listed(doubtful)}")
     return notes
 
 
 def _matches(agreement: Agreement) -> int:
     return int(agreement.agreeing.sum() + agreement.contradicting.sum())
+
+
+def _photos(names: Sequence[str]) -> str:
+    return f"{len(names)} {'photo' if len(names) == 1 else 'photos'}"
 
 
 def _listed(names: Sequence[str]) -> str:

@@ -9,7 +9,7 @@ PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp")
 """Files that are photos: what both pillow and COLMAP read."""
 OTHER_SUFFIXES = (".heic", ".heif", ".webp", ".avif", ".jxl", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".rw2")
 """Photos that at least one of them does not read."""
-NO_PHOTOS = re.compile(r"\..*|.*_\d+|masks?", re.IGNORECASE)
+NO_PHOTOS = re.compile(r"\..*|images_\d+|masks?", re.IGNORECASE)
 """Folders that hold none: hidden ones, copies reduced by a factor (``images_4``), masks."""
 FOLDER_DEPTH = 1
 """Photos are looked for in a folder and in the folders in it. Those of several captures beside each other lie deeper,
@@ -23,9 +23,11 @@ def find_photos(folder: Path) -> tuple[Path, list[Path], list[Path]]:
         The folder that their names are relative to; the photos in the order of their names; and files of kinds that
         are not read.
     """
-    place = folder / "images" if (folder / "images").is_dir() else folder
-    files = _files(place, FOLDER_DEPTH)
-    photos = [path for path in files if path.suffix.lower() in PHOTO_SUFFIXES]
+    for place in (folder / "images", folder):
+        files = _files(place, FOLDER_DEPTH)
+        photos = [path for path in files if path.suffix.lower() in PHOTO_SUFFIXES]
+        if photos:
+            break
     others = [path for path in files if path.suffix.lower() in OTHER_SUFFIXES]
     return place, sorted(photos, key=lambda path: path.relative_to(place).as_posix()), others
 

@@ -40,7 +40,8 @@ from turbogs_plugin.train.wall import WallClock, WallRecord
 from turbogs_plugin.train.wall_marks import WallMarks
 from turbogs_plugin.types import Gaussians
 
-IMPORTS, PHOTOS, DEVICE = "interpreter and imports", "photos", "CUDA and kernels, after the photos"
+IMPORTS, CAMERAS = "interpreter and imports", "cameras of photos alone"
+PHOTOS, DEVICE = "photos", "CUDA and kernels, after the photos"
 """Parts of the wall time before a plan is made."""
 FILES = "checkpoint and model, after the pictures"
 """The part of the wall time at the end in which nothing else is left to do."""
@@ -168,7 +169,10 @@ def train(
     _require_start(config)
     if config.train.device == "cuda":
         resolve_device("cuda")  # before photos are read for nothing
-    config = with_cameras(config, out)
+    posed = with_cameras(config, out)
+    if posed is not config:
+        clock.mark(CAMERAS)
+    config = posed
     with starting(lambda: resolve_device(config.train.device)) as started:
         scene = open_scene(config)
         clock.mark(PHOTOS)
