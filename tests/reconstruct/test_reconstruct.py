@@ -273,6 +273,17 @@ def test_the_similar_photos_of_many_are_found_without_a_download(solved, tmp_pat
     assert solver.count_verified_pairs(database) >= COUNT - 1
 
 
+def test_where_photos_are_left_colmaps_own_defaults_are_tried(solved):
+    """They do not register the other photo either, so that the first solve stays."""
+    workspace = Workspace(solved[1].scene)
+    models = []
+    for long_side in run.LONG_SIDES:
+        with pycolmap.Database.open(workspace.database(long_side)) as opened:
+            (camera,) = opened.read_all_cameras()
+            models.append((camera.model.name, camera.width, camera.focal_length_x, opened.num_keypoints()))
+    assert [model[0] for model in models] == ["OPENCV", "SIMPLE_RADIAL"] and models[0][1:] == models[1][1:]
+
+
 def test_where_the_capture_of_a_run_lies(tmp_path):
     assert scene_beside(tmp_path / "garden", tmp_path / "runs/first") == tmp_path / "runs/garden-scene"
     assert scene_beside(tmp_path / "garden/images", tmp_path / "run") == tmp_path / "garden-scene"

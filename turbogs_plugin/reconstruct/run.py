@@ -31,8 +31,8 @@ if TYPE_CHECKING:
     import pycolmap
 
 LONG_SIDES = (1600, 3200)
-"""Photos are reduced to the first for their features. Where too few register, all is done again at the second, COLMAP's
-own default, and the better solve is taken."""
+"""Photos are reduced to the first for their features. Where too few register, all is done again by COLMAP's own
+defaults, the second and a simple camera model, and the better solve is taken."""
 ENOUGH_OF_MANY = 0.95
 """Of more than `FEW` photos so many are enough; of fewer, all."""
 REPAIRS = 3
@@ -123,16 +123,19 @@ def _reconstruct(photos: Sequence[PhotoFile], workspace: Workspace) -> Solution:
     enough = len(photos) if len(photos) <= FEW else ENOUGH_OF_MANY * len(photos)
     best: Solve | None = None
     repaired: list[str] = []
-    for long_side in LONG_SIDES:
+    for attempt, long_side in enumerate(LONG_SIDES):
         database = workspace.database(long_side)
-        solver.extract_features(database, workspace.images, photos, long_side)
-        if long_side == LONG_SIDES[0]:
-            _require_features(database, photos)
-        solver.match_features(database, workspace.scratch, names, matching)
+        if attempt and longest <= LONG_SIDES[0]:  # the features are the same
+            solver.with_default_cameras(workspace.database(LONG_SIDES[0]), database)
+        else:
+            solver.extract_features(database, workspace.images, photos, long_side, default_cameras=attempt > 0)
+            if not attempt:
+                _require_features(database, photos)
+            solver.match_features(database, workspace.scratch, names, matching)
         solve, moved = _solve(database, workspace)
         if solve is not None and (best is None or solve.rank > best.rank):
             best, repaired, verified = solve, moved, solver.count_verified_pairs(database)
-        if longest <= long_side or (best is not None and best.placed >= enough):
+        if best is not None and best.placed >= enough:
             break
     _require_solved(best, len(photos), solver.count_verified_pairs(database), matching)
     _leave_out(best.model, best.ghosts)

@@ -21,9 +21,9 @@ from turbogs_plugin.scene.colmap import load_pycolmap
 if TYPE_CHECKING:
     import pycolmap
 
-MANY = 10
-"""A lens with so many photos gets COLMAP's OPENCV model (two radial and two tangential coefficients), others one
-radial coefficient, as COLMAP's default. On fox OPENCV halves the error of the cameras."""
+MANY, DEFAULT_MODEL = 10, "SIMPLE_RADIAL"
+"""A lens with so many photos gets COLMAP's OPENCV model (two radial and two tangential coefficients), others its
+default, one radial coefficient. On fox OPENCV halves the error of the cameras."""
 EPIPOLAR_SHARE = 3e-3
 """A match agrees with two cameras that are nearer to its epipolar line than this share of the photos' longer side."""
 BLOCK = 128
@@ -36,11 +36,14 @@ EMBEDDING = 64
 """Dimensions of COLMAP's own vocabularies for SIFT."""
 
 
-def extract_features(database: Path, images: Path, photos: Sequence[PhotoFile], long_side: int) -> None:
+def extract_features(
+    database: Path, images: Path, photos: Sequence[PhotoFile], long_side: int, default_cameras: bool = False
+) -> None:
     """SIFT features of all photos into the database, one camera for each lens; photos that have them are passed over.
 
     Args:
         long_side: larger photos are reduced to it; features stay in pixels of the whole photo.
+        default_cameras: all lenses get COLMAP's default model.
     """
     pycolmap = _pycolmap()
     options = pycolmap.FeatureExtractionOptions()
@@ -54,7 +57,7 @@ def extract_features(database: Path, images: Path, photos: Sequence[PhotoFile], 
             if token.is_cancelled:
                 return
             reader = pycolmap.ImageReaderOptions()
-            reader.camera_model = "OPENCV" if len(names) >= MANY else "SIMPLE_RADIAL"
+            reader.camera_model = "OPENCV" if len(names) >= MANY and not default_cameras else DEFAULT_MODEL
             known = _cameras(database, names)
             if known:  # of an earlier call that was stopped
                 reader.existing_camera_id = known[0]
@@ -187,6 +190,20 @@ def epipolar_distances(relative: np.ndarray, first: np.ndarray, second: np.ndarr
     lines, back = first @ essential.T, second @ essential
     size = np.sqrt((lines[:, :2] ** 2).sum(axis=1) + (back[:, :2] ** 2).sum(axis=1))
     return np.abs((second * lines).sum(axis=1)) / np.maximum(size, 1e-12)
+
+
+def with_default_cameras(database: Path, copy: Path) -> None:
+    """A copy of a database in which all lenses have COLMAP's default model, not solved yet."""
+    pycolmap = _pycolmap()
+    shutil.copyfile(database, copy)
+    with pycolmap.Database.open(copy) as opened:
+        for camera in opened.read_all_cameras():
+            size = camera.width, camera.height
+            plain = pycolmap.Camera.create_from_model_name(
+                camera.camera_id, DEFAULT_MODEL, camera.mean_focal_length(), *size
+            )
+            plain.has_prior_focal_length = camera.has_prior_focal_length
+            opened.update_camera(plain)
 
 
 def without_pairs(database: Path, copy: Path, pairs: Sequence[tuple[str, str]]) -> None:
