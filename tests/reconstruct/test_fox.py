@@ -30,7 +30,7 @@ def errors(model: pycolmap.Reconstruction) -> dict[str, float]:
     true = np.array([published[image.name] for image in images])
     radius = np.linalg.norm(true - true.mean(axis=0), axis=1).mean()
     ransac = pycolmap.RANSACOptions(max_error=0.02 * radius, random_seed=0)
-    change = pycolmap.estimate_sim3d_robust(found, true, ransac)
+    change = pycolmap.estimate_sim3d_robust(found, true, ransac)["tgt_from_src"]
     distances = np.linalg.norm([change * center for center in found] - true, axis=1) / radius
     return {image.name: float(distance) for image, distance in zip(images, distances, strict=True)}
 
