@@ -104,6 +104,7 @@ def test_the_extra_is_what_the_commands_name(project):
 
 COMMANDS = {
     "train": ("SCENE", "--out", "RUN"),
+    "reconstruct": ("PHOTOS", "--out", "SCENE"),
     "plan": ("SCENE",),
     "eval": ("RUN",),
     "render": ("RUN",),

@@ -134,7 +134,8 @@ def train(
     """Train on a capture, or go on with a stopped run.
 
     Args:
-        scene: folder of a capture: a COLMAP reconstruction, a transforms.json, NeRF-synthetic or LLFF, with its photos.
+        scene: folder of a capture: a COLMAP reconstruction, a transforms.json, NeRF-synthetic or LLFF, with its photos;
+            or of photos alone, whose cameras are found first (see reconstruct).
         overrides: changes of the configuration, e.g. train.iterations=8000 density.type=none.
         out: new folder for the run.
         resume: folder of a stopped run to go on with, by its own configuration.
@@ -151,6 +152,20 @@ def train(
     if scene is None or out is None:
         raise InputError("train needs a SCENE and --out RUN, or --resume RUN")
     return _tell(run.train(options.settings(scene, overrides), out, page, clock), report)
+
+
+@app.command
+def reconstruct(photos: Annotated[Positional[Path], arg(metavar="PHOTOS")], /, *, out: Path) -> int:
+    """Find the cameras of photos alone, and write a capture to train on. The same call goes on where it stopped.
+
+    Args:
+        photos: folder of at least three photos of one scene.
+        out: new folder for the capture, with images and sparse/0 (COLMAP).
+    """
+    from turbogs_plugin.reconstruct import reconstruct
+
+    print(reconstruct(photos, out).text())
+    return 0
 
 
 @app.command

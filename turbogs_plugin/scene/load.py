@@ -14,9 +14,10 @@ from torch import Tensor
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene import blender, llff
 from turbogs_plugin.scene.capture import Capture
-from turbogs_plugin.scene.colmap import find_model, read_colmap
+from turbogs_plugin.scene.colmap import MODEL_FOLDERS, find_model, read_colmap
 from turbogs_plugin.scene.frame import Frame
 from turbogs_plugin.scene.host_arrays import file_note
+from turbogs_plugin.scene.photo_folder import find_photos
 from turbogs_plugin.scene.photos import Photos, load_photos, photo_array, photo_sizes, reduced_sizes
 from turbogs_plugin.scene.poses import camera_centers
 from turbogs_plugin.scene.starting_points import colors_in_photos
@@ -160,12 +161,23 @@ def load_scene(
     )
 
 
+def holds_photos_alone(scene: Path) -> bool:
+    """Whether a folder has photos, and nothing that says where they were taken from: no reconstruction in parts."""
+    begun = any((scene / place.partition("/")[0]).is_dir() for place in MODEL_FOLDERS if place != ".")
+    return scene.is_dir() and not begun and _cameras(scene) == (None, []) and bool(find_photos(scene)[1])
+
+
+def _cameras(scene: Path) -> tuple[tuple[Path, str] | None, list[str]]:
+    """What a folder has of cameras: the reconstruction, as `find_model` gives it, and the names of other files."""
+    files = [file for file in (FILE, *blender.FILES, llff.FILE) if (scene / file).is_file()]
+    return find_model(scene, anywhere=not files), files
+
+
 def _read(scene: Path, factor: int) -> Capture:
     """The capture, of the first kind in the order that `load_scene` states."""
     if not scene.is_dir():
         raise InputError(f"no such scene: {scene} is not a folder")
-    files = [file for file in (FILE, *blender.FILES, llff.FILE) if (scene / file).is_file()]
-    model = find_model(scene, anywhere=not files)
+    model, files = _cameras(scene)
     if model is not None:
         capture = read_colmap(scene, *model)
         if not files or any((capture.photo_folder / name).is_file() for name in capture.names):
@@ -184,6 +196,11 @@ def _read_other(scene: Path, files: list[str], factor: int) -> Capture:
         return _passing_over([file for file in files if file not in blender.FILES], blender.read_blender(scene))
     if files:
         return llff.read_llff(scene, factor)
+    if holds_photos_alone(scene):
+        raise InputError(
+            f"{scene} has {len(find_photos(scene)[1])} photos and nothing that says where they were taken from: find "
+            f"that by 'turbogs reconstruct {scene} --out SCENE', then use SCENE"
+        )
     raise InputError(
         f"{scene} has neither a COLMAP reconstruction (cameras, images and points3D as .bin or .txt in sparse/0) nor a "
         f"{FILE}, a {blender.TRAIN_FILE} or a {llff.FILE}"

@@ -19,6 +19,7 @@ from turbogs_plugin.errors import InputError, TrainingStopped
 from turbogs_plugin.files import write_text_atomically
 from turbogs_plugin.model.ply import save_ply
 from turbogs_plugin.plan import Plan, make_plan
+from turbogs_plugin.reconstruct.train_on_photos import with_cameras
 from turbogs_plugin.scene import Frame, Scene, load_scene
 from turbogs_plugin.scene.fingerprint import capture_difference, capture_state, frame_of_state
 from turbogs_plugin.scene.offload import place_views
@@ -39,7 +40,8 @@ from turbogs_plugin.train.wall import WallClock, WallRecord
 from turbogs_plugin.train.wall_marks import WallMarks
 from turbogs_plugin.types import Gaussians
 
-IMPORTS, PHOTOS, DEVICE = "interpreter and imports", "photos", "CUDA and kernels, after the photos"
+IMPORTS, CAMERAS = "interpreter and imports", "cameras of photos alone"
+PHOTOS, DEVICE = "photos", "CUDA and kernels, after the photos"
 """Parts of the wall time before a plan is made."""
 FILES = "checkpoint and model, after the pictures"
 """The part of the wall time at the end in which nothing else is left to do."""
@@ -150,7 +152,7 @@ def fit(scene: Scene, *overrides: str, config: str = DEFAULT_CONFIG) -> Gaussian
 def train(
     config: Config, out: Path, report: Callable[[RunSession], object] | None = None, clock: WallClock | None = None
 ) -> RunSession:
-    """Train from the start into a new folder. The plan is printed first.
+    """Train from the start into a new folder. The plan is printed first. Photos alone are reconstructed before.
 
     Args:
         report: called with the finished run; `turbogs_plugin.report.pages.write_report` writes its page.
@@ -167,6 +169,10 @@ def train(
     _require_start(config)
     if config.train.device == "cuda":
         resolve_device("cuda")  # before photos are read for nothing
+    posed = with_cameras(config, out)
+    if posed is not config:
+        clock.mark(CAMERAS)
+    config = posed
     with starting(lambda: resolve_device(config.train.device)) as started:
         scene = open_scene(config)
         clock.mark(PHOTOS)
