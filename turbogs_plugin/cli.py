@@ -11,6 +11,7 @@ import sys
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -30,6 +31,9 @@ OVERRIDE = re.compile(r"\w+(\.\w+)+=.*", re.DOTALL)
 
 FLAGS = ("--report", "--no-report", "--offload", "--no-offload")
 """Options without a value, of verbs that have overrides."""
+
+LOCAL, PORT = "127.0.0.1", 8080
+"""Where a viewer listens unless told otherwise: for this machine alone."""
 
 Device = Literal["auto", "cpu", "cuda"]
 
@@ -129,6 +133,8 @@ def train(
     out: Annotated[Path | None, arg(metavar="RUN")] = None,
     resume: Annotated[Path | None, arg(metavar="RUN")] = None,
     report: bool = True,
+    viewer: Annotated[int | None, arg(metavar="[PORT]")] = None,
+    viewer_host: str = LOCAL,
     options: Flat = NO_OPTIONS,
 ) -> int:
     """Train on a capture, or go on with a stopped run.
@@ -139,18 +145,38 @@ def train(
         out: new folder for the run.
         resume: folder of a stopped run to go on with, by its own configuration.
         report: at the end, write the report and its pictures; --no-report leaves model, history and checkpoints.
+        viewer: show the training in a browser, at this port (8080 where none is named); afterwards its model, until
+            Ctrl-C.
+        viewer_host: where the viewer listens; 0.0.0.0 lets others on the network look, and pause the training.
     """
     from turbogs_plugin.report.pages import write_report
     from turbogs_plugin.train import run
 
     clock, page = WallClock(process_age()), write_report if report else None
+    if viewer is None and viewer_host != LOCAL:
+        raise InputError("--viewer-host says where a viewer listens: give --viewer, too")
     if resume is not None:
         if scene or overrides or out or options != NO_OPTIONS:
-            raise InputError("--resume goes on by the run's own configuration: give it nothing else but --no-report")
-        return _tell(run.resume(resume, page, clock), report)
-    if scene is None or out is None:
+            raise InputError(
+                "--resume goes on by the run's own configuration: give it nothing else but --no-report and --viewer"
+            )
+        start = partial(run.resume, resume)
+    elif scene is None or out is None:
         raise InputError("train needs a SCENE and --out RUN, or --resume RUN")
-    return _tell(run.train(options.settings(scene, overrides), out, page, clock), report)
+    else:
+        start = partial(run.train, options.settings(scene, overrides), out)
+    if viewer is None:
+        return _tell(start(page, clock), report)
+
+    from turbogs_plugin.viewer.commands import attached
+
+    with attached(viewer, viewer_host) as live:
+        session = start(page, clock, live.watch)
+        code = _tell(session, report)
+        if session.signal is None:
+            print(f"viewer  {live.page.url}  (Ctrl-C ends)", flush=True)
+            live.stay()
+    return code
 
 
 @app.command
@@ -171,6 +197,31 @@ def plan(
 
     print(plan_run(options.settings(scene, overrides)).text())
     return 0
+
+
+@app.command
+def view(
+    run: RunOrModel,
+    overrides: Overrides = (),
+    /,
+    *,
+    port: int = PORT,
+    host: str = LOCAL,
+    device: Device = "auto",
+    given: Given = NO_SCENE,
+) -> int:
+    """Look at the newest model of a run, or a model trained anywhere, in a browser, until Ctrl-C.
+
+    Args:
+        run: folder of the run; or the file of a model, with --scene to see its photos, too.
+        overrides: with --scene, as in eval.
+        port: of the page.
+        host: where it listens; 0.0.0.0 lets others on the network look.
+        device: where to render.
+    """
+    from turbogs_plugin.viewer import commands
+
+    return commands.view(run, port, host, device, given.settings(overrides))
 
 
 @app.command(name="eval")
@@ -508,6 +559,16 @@ def _gathered(arguments: list[str]) -> list[str]:
     return [*arguments[:first], *overrides, *rest]
 
 
+def _with_port(arguments: list[str]) -> list[str]:
+    """Arguments in which --viewer without a port has the usual one."""
+    filled = []
+    for text, following in itertools.zip_longest(arguments, arguments[1:], fillvalue=""):
+        filled.append(text)
+        if text == "--viewer" and not following.isdecimal():
+            filled.append(str(PORT))
+    return filled
+
+
 def _warning_line(message: Warning | str, *place: object) -> str:
     """A warning on one line, without the place in the source."""
     return f"turbogs: warning: {' '.join(str(message).split())}\n"
@@ -518,7 +579,8 @@ def main() -> None:
     atexit.register(gc.freeze)  # or the collector walks through all of torch at the end, for a second
     description = "TurboGS: train 3D Gaussian Splatting on few, well chosen pixels."
     warnings.formatwarning = _warning_line
-    sys.exit(exit_code(lambda: app.cli(prog="turbogs", description=description, args=_gathered(sys.argv[1:]))))
+    arguments = _gathered(_with_port(sys.argv[1:]))
+    sys.exit(exit_code(lambda: app.cli(prog="turbogs", description=description, args=arguments)))
 
 
 if __name__ == "__main__":
