@@ -401,7 +401,8 @@ def report(
 @app.command
 def bench(
     what: Annotated[
-        Positional[Literal["step", "raster", "numerics", "wall"]], arg(metavar="step|raster|numerics|wall")
+        Positional[Literal["step", "raster", "numerics", "wall", "viewer"]],
+        arg(metavar="step|raster|numerics|wall|viewer"),
     ],
     overrides: Overrides = (),
     /,
@@ -423,21 +424,22 @@ def bench(
     out: Annotated[Path | None, arg(metavar="FILE_OR_FOLDER")] = None,
 ) -> int:
     """Time an iteration of training step by step, the rasterizer stage by stage, beside what the machine allows, or the
-    command `turbogs train` by the clock on the wall; or measure how exact and how fast the optimizer's solvers are on
-    stiff systems.
+    command `turbogs train` by the clock on the wall, or a training with and without a viewer; or measure how exact and
+    how fast the optimizer's solvers are on stiff systems.
 
     Args:
         what: step: from sampling to update; raster: forward and backward, beside gsplat's dense ones; numerics: the
             solvers of moment-damped LM, which takes --out and --device alone; wall: whole runs, which takes --scene,
-            --repeats, --factor, --device, --out and changes of the configuration.
-        overrides: step, wall: changes of the configuration that is timed.
+            --repeats, --factor, --device, --out and changes of the configuration; viewer: as wall, iterations a second
+            without a viewer, with one that nobody looks at, and with a client that moves.
+        overrides: step, wall, viewer: changes of the configuration that is timed.
         scene: a capture, for its cameras and photos; where absent, all is synthetic, the models of raster as well.
         ply: a trained model in place of those trained here; raster: one or more, timed at their own sizes.
         gaussians: sizes of the model.
         views: views of an iteration.
         pixel_budget: pixels of an iteration in images (lambda).
         training: iterations of the model's training before; 1500 where absent, 0 for the initial model.
-        repeats: iterations or passes timed; 100 where absent. wall: runs; 3 where absent.
+        repeats: iterations or passes timed; 100 where absent. wall, viewer: runs; 3 where absent.
         rates: raster: further sampling rates, with the fewest views.
         size: of synthetic images, where there is no scene.
         photos: step: number of synthetic photos, in place of a scene.
@@ -445,7 +447,8 @@ def bench(
         library: raster: other builds of the kernels, measured the same way.
         factor: scale photos down by this.
         device: what to time.
-        out: JSON file; standard output where absent, but for wall. numerics: folder for its table, plot and JSON.
+        out: JSON file; standard output where absent, but for wall and viewer. numerics: folder for its table, plot and
+            JSON.
     """
     from turbogs_plugin.bench import commands
     from turbogs_plugin.bench.models import TRAINING_ITERATIONS
@@ -453,7 +456,7 @@ def bench(
     from turbogs_plugin.bench.step import StepBench
     from turbogs_plugin.train.run import resolve_device
 
-    times = repeats if repeats is not None else 3 if what == "wall" else 100
+    times = repeats if repeats is not None else 3 if what in ("wall", "viewer") else 100
     for name, values in (("gaussians", gaussians), ("views", views), ("repeats", (times,)), ("size", size)):
         if not values or min(values) < 1:
             raise InputError(f"--{name} {' '.join(map(str, values))}: each must be at least 1")
@@ -469,11 +472,14 @@ def bench(
         if out is None or overrides or scene is not None or ply or library:
             raise InputError("bench numerics needs --out FOLDER, and takes --device besides")
         return commands.run_numerics(where, out)
-    if what == "wall":
+    if what in ("wall", "viewer"):
         if scene is None or ply or library or photos or offload or training is not None:
             raise InputError(
-                "bench wall needs --scene SCENE, and takes --repeats, --factor, --device and --out besides"
+                f"bench {what} needs --scene SCENE, and takes --repeats, --factor, --device and --out besides"
             )
+        if what == "viewer":
+            options = RunOptions(factor=factor, device=where.type)
+            return commands.run_viewer(options.settings(scene, overrides), times, where, out)
         arguments = [str(scene), *overrides, "--device", where.type, "--factor", str(factor)]
         return commands.run_wall(arguments, times, where, out)
     if what == "step":

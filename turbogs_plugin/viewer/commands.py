@@ -23,7 +23,7 @@ from turbogs_plugin.types import Gaussians, Step
 from turbogs_plugin.viewer.controls import Controls
 from turbogs_plugin.viewer.frames import Frames
 from turbogs_plugin.viewer.live import LiveViewer, described
-from turbogs_plugin.viewer.page import Page, require_viser
+from turbogs_plugin.viewer.page import Page, require_free, require_viser
 from turbogs_plugin.viewer.subject import CaptureViews, Subject
 
 MOST = 0.9
@@ -49,14 +49,13 @@ class Shown:
 
 @contextmanager
 def attached(port: int, host: str) -> Iterator[LiveViewer]:
-    """A viewer for a training, at its address while entered. The address is printed.
+    """A viewer for a training, which listens while entered.
 
     Raises:
         InputError: viser is not installed, or the port is not free.
     """
     page = Page(host, port, Controls())
     try:
-        print(f"viewer  {page.url}", file=sys.stderr)
         yield LiveViewer(page)
     finally:
         page.close()
@@ -76,6 +75,7 @@ def view(path: Path, port: int, host: str, device_name: str, given: Config | Non
         InputError: no model there, viser is not installed, or the port is not free.
     """
     require_viser()
+    require_free(host, port)
     shown = open_shown(path, resolve_device(device_name), given)
     page = Page(host, port)
     try:

@@ -84,6 +84,8 @@ class Pace:
 
     def sized(self, picture: Picture, eye: Eye, moving: bool) -> Eye:
         """The eye with as many pixels as time allows; sizes come in steps, so that tables of pixels are used again."""
+        if not picture.renders:
+            return eye
         if self.share is None:
             seconds = MOVING_INTERVAL if moving else RESTING_FRAME
         else:

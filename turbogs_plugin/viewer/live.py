@@ -7,8 +7,10 @@ draws nothing and keeps nothing.
 from __future__ import annotations
 
 import math
+import sys
 import time
 
+from turbogs_plugin.scene import PosedImages
 from turbogs_plugin.train.history import Evaluation
 from turbogs_plugin.train.loop import Listener, TrainingLoop
 from turbogs_plugin.train.run import RunSession
@@ -48,10 +50,15 @@ class LiveViewer(Listener):
         self._began, self._began_at = time.perf_counter(), 0
 
     def watch(self, session: RunSession) -> LiveViewer:
-        """Take a run that is about to begin; itself, as a listener of its loop."""
-        self._trainer = session.trainer
-        self._capture = CaptureViews(session.trainer.views, session.test)
-        self._trainer.observer = self
+        """Take a run that is about to begin; itself, as a listener of its loop. The page's address is printed."""
+        print(f"viewer  {self.page.url}", file=sys.stderr, flush=True)
+        return self.attach(session.trainer, session.test)
+
+    def attach(self, trainer: Trainer, test: PosedImages) -> LiveViewer:
+        """Take a trainer and the test views of its capture; itself, as a listener of the loop."""
+        self._trainer = trainer
+        self._capture = CaptureViews(trainer.views, test)
+        trainer.observer = self
         self.page.show_capture(self._capture)
         return self
 

@@ -14,6 +14,7 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from types import ModuleType
 from typing import Any
+from urllib.parse import urlsplit
 
 import numpy as np
 
@@ -31,6 +32,8 @@ MOST_FRUSTA = 150
 """Cameras drawn into the scene; of more, as many are taken evenly. The slider reaches all."""
 FRUSTUM_SIZE = 0.06
 """Of a camera in the scene, in units of the scene's extent."""
+FRUSTUM_PIXELS = 2.0
+"""Thickness of its lines."""
 TRAIN_COLOR, TEST_COLOR = (40, 110, 220), (230, 140, 20)
 INSTALL = 'pip install "turbogs-plugin[viewer]"'
 
@@ -91,9 +94,9 @@ class Page:
         if port not in (0, self.port):
             self.close()
             raise InputError(f"the viewer cannot listen at {host}:{port} (taken meanwhile): name another port")
-        # A tunnel into the internet would make the page public at the wish of any client.
-        self.server.request_share_url = lambda *arguments, **options: None
+        _guard(self.server)
         self.server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="large")
+        self.server.gui.main_panel.dock_right()
         shown = "localhost" if host in ("127.0.0.1", "::1", "0.0.0.0", "::") else host
         self.url = f"http://{shown}:{self.port}"
         self._build_panel(controls is not None)
@@ -223,6 +226,8 @@ class Page:
             fov=eye.fov,
             aspect=eye.width / eye.height,
             scale=FRUSTUM_SIZE,
+            thickness=FRUSTUM_PIXELS,
+            thickness_units="screen",
             color=color,
             wxyz=eye.wxyz,
             position=eye.position,
@@ -273,3 +278,18 @@ class Page:
 
         with contextlib.suppress(RuntimeError):  # the page is closing
             self._encoder.submit(encode)
+
+
+def _guard(server: Any) -> None:
+    """Take from clients what viser would let them do: open a tunnel into the internet, which would make the page
+    public; and look from any web page that a browser on this machine has open."""
+    server.request_share_url = lambda *arguments, **options: None
+    sockets = server._websock_server
+
+    async def refuse_foreign_pages(client: Any) -> None:
+        connection = sockets._live_connections[client.client_id]
+        origin, host = (connection.request.headers.get(name) for name in ("Origin", "Host"))
+        if origin is not None and urlsplit(origin).netloc != host:
+            await connection.close(1008, "another page's script")
+
+    sockets.on_client_connect(refuse_foreign_pages)

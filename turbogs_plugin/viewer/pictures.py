@@ -51,6 +51,11 @@ class Picture(str, Enum):
         """Whether it shows a view of the capture, not what the free camera sees."""
         return self in (Picture.COMPARE, Picture.PHOTO, Picture.ERRORS, Picture.AGES, Picture.SAMPLES)
 
+    @property
+    def renders(self) -> bool:
+        """Whether it takes a rendering, so that fewer pixels take less time."""
+        return self in (Picture.RENDER, Picture.DEPTH, Picture.CHANGES, Picture.COMPARE)
+
 
 @dataclass(frozen=True)
 class Request:
