@@ -48,8 +48,10 @@ class Eye:
             return None
         if place.shape != (3,) or turn.shape != (4,):
             return None
+        if not (np.isfinite(numbers).all() and (np.abs(turn) < 1e6).all()):
+            return None
         length = float(np.linalg.norm(turn))
-        if not (np.isfinite(numbers).all() and np.isfinite(length) and 1e-6 < length < 1e6):
+        if length < 1e-6:
             return None
         if not (np.abs(place) <= FARTHEST).all() or numbers[1:].min() < 1 or numbers[0] <= 0:
             return None
