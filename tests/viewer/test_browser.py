@@ -43,7 +43,10 @@ class Tab:
         self.tab = browser.new_page(viewport={"width": 700, "height": 240})
         # A fixed ratio: in a slow browser the page would lower its resolution.
         self.tab.goto(f"{page.url}/?fixedDpr=1")
-        self.tab.add_style_tag(content=".mantine-Notifications-root { display: none }")
+        # Neither a note nor the panel's shadow lies on the picture.
+        self.tab.add_style_tag(
+            content=".mantine-Notifications-root { display: none } * { box-shadow: none !important }"
+        )
         self.tab.wait_for_selector("canvas", timeout=1000 * PATIENCE)
 
     def canvas(self) -> np.ndarray:

@@ -180,7 +180,9 @@ class Page:
         self._training.visible = False
 
     def close(self) -> None:
-        self._encoder.shutdown(wait=False, cancel_futures=True)
+        """Turn everybody away."""
+        self._screens.clear()
+        self._encoder.shutdown(wait=True, cancel_futures=True)
         with contextlib.redirect_stdout(io.StringIO()):
             self.server.stop()
 
@@ -269,7 +271,7 @@ class Page:
     def _send(self, client: Any, screen: Screen, pixels: np.ndarray, lossless: bool) -> None:
         def encode() -> None:
             try:
-                with contextlib.suppress(Exception):  # a client that left meanwhile must not end a training
+                if client.client_id in self._screens:
                     options = {"format": "png"} if lossless else {"format": "jpeg", "jpeg_quality": JPEG_QUALITY}
                     client.scene.set_background_image(pixels, **options)
             finally:
