@@ -174,7 +174,6 @@ def train(
         session = start(page, clock, live.watch)
         code = _tell(session, report)
         if session.signal is None:
-            print(f"viewer  {live.page.url}  (Ctrl-C ends)", flush=True)
             live.stay()
     return code
 

@@ -22,10 +22,10 @@ def scene(capture):
 
 @pytest.fixture
 def new_training(capture, scene):
-    """Makes a training of the tiny configuration that has not begun."""
+    """Makes a training of the tiny configuration, with these changes, that has not begun."""
 
-    def new_training():
-        config = tiny_config(capture)
+    def new_training(*overrides: str):
+        config = tiny_config(capture, *overrides)
         device = scene.train.cameras.viewmats.device
         return new_loop(make_plan(config, scene, device).apply(config), scene, device)[0]
 

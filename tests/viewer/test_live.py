@@ -73,8 +73,8 @@ class At(Listener):
 def watched(new_training, scene):
     """Makes (page, viewer, training)."""
 
-    def watched(looking: bool = True):
-        page, loop = PretendedPage(looking), new_training()
+    def watched(*overrides: str, looking: bool = True):
+        page, loop = PretendedPage(looking), new_training(*overrides)
         live = LiveViewer(page).attach(loop.trainer, scene.test)
         live.frames = Frames(page.screens, page.wish, share=None)  # every frame that is due, whatever it takes
         loop.listeners.append(live)
@@ -83,11 +83,14 @@ def watched(new_training, scene):
     return watched
 
 
-def test_a_watched_training_ends_as_an_unwatched_one(new_training, watched, monkeypatch):
+# In host memory, what a page asks for passes through the window of the training.
+@pytest.mark.parametrize("place", ["device", "host"])
+def test_a_watched_training_ends_as_an_unwatched_one(new_training, watched, monkeypatch, place):
     monkeypatch.setattr("turbogs_plugin.viewer.frames.SHORTEST_INTERVAL", 0.0)
-    alone = new_training()
+    overrides = (f"train.maps_place={place}", f"train.photos_place={place}")
+    alone = new_training(*overrides)
     alone.run()
-    page, live, loop = watched()
+    page, live, loop = watched(*overrides)
     loop.run()
     assert live.frames_drawn >= loop.trainer.iteration > 10 and len({frame.tobytes() for frame in page.frames}) > 8
     assert_identical(loop.trainer.state_dict(), alone.trainer.state_dict())
@@ -182,20 +185,19 @@ def test_a_paused_training_goes_on_when_nobody_looks_any_more(watched, monkeypat
     assert loop.finished
 
 
-def test_after_the_training_its_model_is_shown_until_ctrl_c(watched, monkeypatch):
+def test_after_the_training_its_model_is_shown_until_ctrl_c(watched, monkeypatch, capsys):
     page, live, loop = watched()
     loop.run()
     shown = len(page.frames)
     page.finished = lambda: None
-    waits = iter([None] * 3)
 
     def wait(seconds: float) -> None:
-        if next(waits, "over") == "over":
+        if len(page.frames) > shown:
             raise KeyboardInterrupt
 
     monkeypatch.setattr(page.controls, "wait", wait)
     live.stay()
-    assert len(page.frames) > shown
+    assert capsys.readouterr().out == "viewer  http://nowhere  (Ctrl-C ends)\n"
 
 
 def until(reached, seconds: float = 60.0) -> None:

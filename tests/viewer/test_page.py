@@ -2,7 +2,9 @@
 
 import dataclasses
 import math
+import signal
 import socket
+import subprocess
 import sys
 import threading
 from contextlib import contextmanager
@@ -10,8 +12,9 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 import torch
-from helpers.framework_runs import assert_identical
+from helpers.framework_runs import TINY, assert_identical
 
+from turbogs_plugin import cli
 from turbogs_plugin.engine.rendering import render_image
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.model.ply import save_ply
@@ -197,6 +200,43 @@ def test_without_viser_one_line_names_the_extra(turbogs, tmp_path, capture, monk
     assert not (tmp_path / "run").exists()
 
 
+def test_a_command_with_a_viewer_shows_the_model_until_ctrl_c(capture, tmp_path):
+    pytest.importorskip("viser")
+    out = tmp_path / "run"
+    command = ["train", capture, "--out", out, "--no-report", "--device", "cpu", "--viewer", "0", *TINY]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "turbogs_plugin.cli", *map(str, command)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    said = ""
+    while "Ctrl-C ends" not in said:
+        line = process.stdout.readline()
+        assert line, process.stderr.read()
+        said += line
+    assert (out / "model.ply").is_file()
+    process.send_signal(signal.SIGINT)
+    rest, err = process.communicate(timeout=60)
+    assert process.returncode == 0 and rest == "", err
+    assert "viewer  http://localhost:" in err and "Traceback" not in err and "viser" not in said + err
+
+
+@pytest.mark.parametrize(
+    ("given", "taken"),
+    [
+        (["train", "S", "--viewer"], ["train", "S", "--viewer", "8080"]),
+        (["train", "S", "--viewer", "--out", "R"], ["train", "S", "--viewer", "8080", "--out", "R"]),
+        (["train", "S", "--viewer", "9000", "--out", "R"], ["train", "S", "--viewer", "9000", "--out", "R"]),
+        (["train", "--viewer", "train.iterations=3"], ["train", "--viewer", "8080", "train.iterations=3"]),
+        (["train", "S", "--viewer=9"], ["train", "S", "--viewer=9"]),
+        (["view", "R"], ["view", "R"]),
+    ],
+)
+def test_a_viewer_has_a_usual_port(given, taken):
+    assert cli._with_port(given) == taken
+
+
 @pytest.fixture
 def with_viser(monkeypatch):
     """Commands come as far as if viser were there."""
@@ -241,8 +281,6 @@ def test_a_model_from_a_file_stands_before_the_eye(subject, tmp_path):
 
 
 def test_a_run_is_shown_with_its_error_maps_and_without_its_capture(turbogs, capture, tmp_path):
-    from helpers.framework_runs import TINY
-
     out = tmp_path / "run"
     code, *_ = turbogs("train", capture, "--out", out, "--no-report", "--device", "cpu", *TINY)
     assert code == 0

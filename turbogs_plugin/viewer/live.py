@@ -81,9 +81,10 @@ class LiveViewer(Listener):
         self._change = DensityChange.of(gaussians, update, step.iteration) if self.page.watched else None
 
     def stay(self) -> None:
-        """After the training: show its model until Ctrl-C."""
-        self.page.finished()
+        """After the training: show its model until Ctrl-C, as is said on standard output."""
         try:
+            self.page.finished()
+            print(f"viewer  {self.page.url}  (Ctrl-C ends)", flush=True)
             while True:
                 if not self._serve(running=False):
                     self.page.controls.wait(0.05)
