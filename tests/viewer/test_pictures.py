@@ -41,7 +41,7 @@ def spots(*places: tuple[float, float, float], color: float = 0.5) -> Gaussians:
     """A small opaque grey ball at each place."""
     count = len(places)
     return Gaussians(
-        means=torch.tensor(places),
+        means=torch.tensor(places, dtype=torch.float32),
         quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(count, 1),
         scales=torch.full((count, 3), -3.0),
         opacities=torch.full((count,), 5.0),

@@ -94,6 +94,7 @@ class LiveViewer(Listener):
     def _hold(self, loop: TrainingLoop) -> None:
         """Wait until the page lets the training go on, or nobody is there who could, or it is to be stopped."""
         controls, alone_since = self.page.controls, time.perf_counter()
+        self._next_status = -math.inf  # told at once
         with loop.clock.stopped():
             while controls.paused and not loop.stopped and not controls.take_step():
                 if self.page.watched:
@@ -102,6 +103,7 @@ class LiveViewer(Listener):
                     controls.resume()
                 if not self._serve(running=False):
                     controls.wait(0.05)
+        self._began, self._began_at = time.perf_counter(), loop.trainer.iteration
         self.page.refresh_controls()
 
     def _serve(self, running: bool) -> bool:
