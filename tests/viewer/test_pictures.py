@@ -24,7 +24,7 @@ from turbogs_plugin.viewer.pictures import (
     shown_view,
 )
 from turbogs_plugin.viewer.subject import DensityChange, Subject
-from turbogs_plugin.viewer.texts import PICTURES
+from turbogs_plugin.viewer.texts import PICTURES, plain
 
 VIEW = 2
 FLAT = Eye((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), 1.0, 64, 48)
@@ -199,3 +199,8 @@ def test_test_views_have_photos_and_no_error_maps(subject):
 
 def test_every_picture_is_explained():
     assert set(PICTURES) == set(Picture) and all(len(text) > 10 for text in PICTURES.values())
+
+
+def test_names_are_text_and_nothing_more():
+    assert plain("a/b_1 (2).jpg") == "a/b_1 (2).jpg"
+    assert plain("`{alert(1)}`<b>*.png") == "??alert(1)???b??.png"

@@ -25,6 +25,7 @@ from turbogs_plugin.viewer.frames import Frames
 from turbogs_plugin.viewer.live import LiveViewer, described
 from turbogs_plugin.viewer.page import Page, require_free, require_viser
 from turbogs_plugin.viewer.subject import CaptureViews, Subject
+from turbogs_plugin.viewer.texts import plain
 
 MOST = 0.9
 """Share of a model's Gaussians, those nearest to its middle, that is seen at first where there is no capture."""
@@ -98,7 +99,7 @@ def show(shown: Shown, page: Page, until: Callable[[], bool]) -> None:
     else:
         page.show_model(FIRST_DISTANCE)
     frames = Frames(page.screens, page.wish)
-    line = f"**{shown.title}** · {len(subject.gaussians):,} Gaussians"
+    line = f"**{plain(shown.title)}** · {len(subject.gaussians):,} Gaussians"
     while not until():
         drawn = frames.serve(lambda: subject, 0, running=False)
         page.say("\n\n".join([line, *described(subject, page)]))

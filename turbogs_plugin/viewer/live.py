@@ -20,6 +20,7 @@ from turbogs_plugin.viewer.frames import Frames
 from turbogs_plugin.viewer.page import Page
 from turbogs_plugin.viewer.pictures import Picture, Request, missing, shown_view
 from turbogs_plugin.viewer.subject import CaptureViews, DensityChange, Subject
+from turbogs_plugin.viewer.texts import plain
 
 STATUS_SECONDS = 0.5
 """Between two updates of the page's text."""
@@ -153,7 +154,7 @@ def described(subject: Subject, page: Page) -> list[str]:
         return [f"*{reason}*"]
     lines = [f"*{screen.failed}*" for screen in page.screens() if screen.failed]
     if picture.of_view:
-        lines.append(f"`{subject.capture.name(shown_view(subject, request))}`")
+        lines.append(f"`{plain(subject.capture.name(shown_view(subject, request)))}`")
     if picture is Picture.SAMPLES:
         samples = subject.samples
         lines.append(f"{len(samples):,} pixels of {len(samples.view_ids)} views in this iteration")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 from turbogs_plugin.viewer.pictures import Picture
 
 PICTURES = {
@@ -38,3 +40,8 @@ copied, so that more detail fits there, and useless ones are removed (*Added and
 **Try it.** Pause the training, choose *Samples of this iteration*, and press *One step* a few times. Then look at the
 *Error map* of the same view.
 """
+
+
+def plain(name: str) -> str:
+    """A file's name without what a page's Markdown could take for more than text: names come with captures."""
+    return re.sub(r"[^\w ./()+,-]", "?", name)
