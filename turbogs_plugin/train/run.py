@@ -150,13 +150,18 @@ def fit(scene: Scene, *overrides: str, config: str = DEFAULT_CONFIG) -> Gaussian
 
 
 def train(
-    config: Config, out: Path, report: Callable[[RunSession], object] | None = None, clock: WallClock | None = None
+    config: Config,
+    out: Path,
+    report: Callable[[RunSession], object] | None = None,
+    clock: WallClock | None = None,
+    watch: Callable[[RunSession], Listener] | None = None,
 ) -> RunSession:
     """Train from the start into a new folder. The plan is printed first. Photos alone are reconstructed before.
 
     Args:
         report: called with the finished run; `turbogs_plugin.report.pages.write_report` writes its page.
         clock: of the wall; None: it begins now.
+        watch: called with the run before it trains; gives one more listener of its loop, the last one.
 
     Raises:
         InputError: anything wrong with the input; then nothing was written.
@@ -192,18 +197,21 @@ def train(
     write_text_atomically(folder.plan, plan.to_json())
     write_text_atomically(folder.asked, config.to_yaml())
     write_text_atomically(folder.config, resolved.to_yaml())
-    return session.run(report)
+    return session.run(report, watch)
 
 
 def resume(
-    path: Path, report: Callable[[RunSession], object] | None = None, clock: WallClock | None = None
+    path: Path,
+    report: Callable[[RunSession], object] | None = None,
+    clock: WallClock | None = None,
+    watch: Callable[[RunSession], Listener] | None = None,
 ) -> RunSession:
     """Go on with a stopped run from its newest checkpoint, with its own configuration, in which nothing is `auto`.
 
     On a CPU, the result is bit for bit that of a run never stopped; `Trainer.state_dict` says why.
 
     Args:
-        report, clock: as in `train`.
+        report, clock, watch: as in `train`.
 
     Raises:
         InputError: no run there, an unusable checkpoint, a changed capture, or a machine without what the run needs;
@@ -235,7 +243,7 @@ def resume(
             session.load_state_dict(state, str(checkpoint))
             session.earlier_wall = earlier.wall_seconds if earlier else math.nan
     session.history += rewind_history(folder.history, loop.trainer.iteration if session.resumed else -1)
-    return session.run(report)
+    return session.run(report, watch)
 
 
 def _require_start(config: Config) -> None:
@@ -335,7 +343,11 @@ class RunSession(Listener):
         self._threads = ThreadPoolExecutor(2, "files")
         self._written: list[Future[float]] = []
 
-    def run(self, report: Callable[[RunSession], object] | None) -> RunSession:
+    def run(
+        self,
+        report: Callable[[RunSession], object] | None,
+        watch: Callable[[RunSession], Listener] | None = None,
+    ) -> RunSession:
         """Train to the end, or until a signal; both end with a checkpoint."""
         loop, trainer = self.loop, self.trainer
         self._finished_before = loop.finished
@@ -345,6 +357,7 @@ class RunSession(Listener):
             progress = TrainingProgress(trainer.iterations, trainer.iteration)
             with Interrupts(loop.stop) as interrupts, progress:
                 loop.listeners = [WallMarks(self.clock), self.evaluations, self, progress]
+                loop.listeners += [watch(self)] if watch is not None else []
                 loop.run(self.resumed)
                 self.clock.mark("training")
                 if loop.stopped and trainer.iteration != self._saved_at:
