@@ -10,6 +10,13 @@ import torch
 from torch import Tensor
 from torch.nn.functional import logsigmoid
 from turbogs_plugin.strategies.checks import require_at_least_one, require_each, require_settings, require_share
+from turbogs_plugin.strategies.density.priority import (
+    GrowthOrder,
+    PruneOrder,
+    contribution,
+    drawn_priority,
+    growth_priority,
+)
 from turbogs_plugin.strategies.density.rows import WindowedDensity, finite_rows, leave_one, removal
 from turbogs_plugin.strategies.density.splitting import split_in_two
 
@@ -71,6 +78,18 @@ class ErrorDrivenDensity(WindowedDensity):
             scene, which few photos see. 0: none.
         final_every, final_keep: interval of the final pruning, and the most difficult share of the seen Gaussians,
             which it keeps (Delta_prune, eta_final). 1 keeps all.
+        choose_by: by what the candidates are put in order where the cap has no room for all, see `growth_priority`.
+        draw: they are drawn, with chances in proportion to that; not its largest.
+        pace: with a cap, the share of densification over which the room grows in a straight line from 0 to the cap.
+            0: all of it is there from the start.
+        overshoot: with a cap, densification may grow to so many times the cap; the final prunings take it back in
+            equal ratios.
+        prune_by: what `prune_score_fraction`, `final_keep` and `overshoot` prune by, see `contribution`.
+        prune_score_from: progress from which `prune_score_fraction` holds.
+        final_until: share of the run after which there is no final pruning, so that there is time to recover.
+        drop_unseen: the last iteration removes what no sample has met since the last event.
+        decay_floor: `opacity_decay` takes no opacity below this.
+        opacity_cost: every Gaussian loses this much opacity at each densification event, after the decay.
         stop_when_flat: densification ends early, at the first event where the error has fallen by less than this share
             of itself over the last `FLAT_EVENTS` events. The error of a window is the mean of its samples' e, weighted
             by w. It falls a little by itself as the sampling rate rises, so densification ends later rather than
@@ -98,13 +117,26 @@ class ErrorDrivenDensity(WindowedDensity):
     final_every: int = 500
     final_keep: float = 0.95
     stop_when_flat: float = 0.0
+    choose_by: GrowthOrder = "difficulty"
+    draw: bool = False
+    pace: float = 0.0
+    overshoot: float = 1.0
+    prune_by: PruneOrder = "difficulty"
+    prune_score_from: float = 0.0
+    final_until: float = 1.0
+    drop_unseen: bool = False
+    decay_floor: float = 0.0
+    opacity_cost: float = 0.0
     window_errors: list[float] = field(init=False, repr=False, default_factory=list)
     stopped_at: int = field(init=False, repr=False, default=0)
 
     def __post_init__(self) -> None:
         require_at_least_one(self, "refine_every", "final_every")
         require_share(self, "top_fraction", "final_keep")
-        shares = ("prune_opacity", "prune_score_fraction", "opacity_decay", "stop_when_flat")
+        shares = ("prune_opacity", "prune_score_fraction", "opacity_decay", "stop_when_flat", "decay_floor")
+        shares = (*shares, "opacity_cost")
+        require_each(self, lambda value: 0 <= value <= 1, "between 0 and 1", "pace", "prune_score_from", "final_until")
+        require_each(self, lambda value: value >= 1, "at least 1", "overshoot")
         require_each(self, lambda value: 0 <= value < 1, "at least 0 and less than 1", *shares)
         require_settings(self)
 
@@ -120,6 +152,10 @@ class ErrorDrivenDensity(WindowedDensity):
             update = self._refine(gaussians, step)
         elif final:
             update = self._final_prune(gaussians, step)
+        elif self.drop_unseen and step.iteration == step.total - 1:
+            finite = finite_rows(gaussians)
+            unseen = (self._stats.weight_sums == 0) & ~self._spared(gaussians, finite, step.scene_extent)
+            update = removal(leave_one(unseen, gaussians))
         if densify or final:
             self._stats.zero_()
         if step.iteration >= self._last_event(step):
@@ -161,15 +197,26 @@ class ErrorDrivenDensity(WindowedDensity):
         """Whether this iteration densifies, and whether it makes a final pruning."""
         iteration, after = step.iteration, step.iteration - step.refine_until
         densify = after <= 0 and iteration >= self.refine_from and iteration % self.refine_every == 0
-        return densify and not self.stopped_at, self.final_keep < 1 and after > 0 and after % self.final_every == 0
+        final = 0 < after <= self._final_span(step) and after % self.final_every == 0
+        return densify and not self.stopped_at, self._prunes_finally and final
+
+    @property
+    def _prunes_finally(self) -> bool:
+        return self.final_keep < 1 or (self.overshoot > 1 and self.max_gaussians > 0)
+
+    def _final_span(self, step: Step) -> int:
+        """Iterations after densification within which there are final prunings."""
+        return min(step.total - 1, math.floor(self.final_until * step.total)) - step.refine_until
 
     def _last_event(self, step: Step) -> int:
         """Iteration after which no statistics are needed: that of the last event, or where densification ends.
 
         It is not that of the last densification: until the end a time budget may still move it and allow another one.
         """
-        rest = max(0, step.total - 1 - step.refine_until)
-        if self.final_keep < 1 and rest >= self.final_every:
+        if self.drop_unseen:
+            return step.total - 1
+        rest = max(0, self._final_span(step))
+        if self._prunes_finally and rest >= self.final_every:
             return step.refine_until + rest // self.final_every * self.final_every
         return self.stopped_at or step.refine_until
 
@@ -191,8 +238,9 @@ class ErrorDrivenDensity(WindowedDensity):
         finite = finite_rows(gaussians)
         spared = self._spared(gaussians, finite, extent)
         hopeless = ~finite | (torch.sigmoid(gaussians.opacities) < self.prune_opacity)
-        if self.prune_score_fraction > 0:
-            hopeless |= seen & (score < _quantile(score, seen, self.prune_score_fraction))
+        if self.prune_score_fraction > 0 and step.progress >= self.prune_score_from:
+            worth, known = contribution(self._stats, score, seen, self.prune_by)
+            hopeless |= known & (worth < _quantile(worth, known, self.prune_score_fraction))
         candidates = self._growing(score, seen) & ~hopeless
         largest = gaussians.scales.amax(dim=-1).exp()  # [N]
         small = largest <= self.percent_dense * extent
@@ -208,11 +256,17 @@ class ErrorDrivenDensity(WindowedDensity):
         pruned = leave_one((hopeless | (big & ~(candidates & ~small))) & ~spared, gaussians)
         candidates &= ~pruned
         if self.max_gaussians > 0:
-            chosen = _first(score, candidates, max(0, self.max_gaussians - int((~pruned).sum())))
+            cap = math.floor(self.overshoot * self.max_gaussians) if self._final_events(step) else self.max_gaussians
+            paced = step.progress < self.pace
+            room = math.floor(cap * step.progress / self.pace) if paced else cap
+            priority = growth_priority(self._stats, score, self.choose_by)
+            priority = drawn_priority(priority, step) if self.draw else priority
+            chosen = _first(priority, candidates, max(0, room - int((~pruned).sum())))
             denied = candidates & ~chosen
             candidates = chosen
-            pruned = leave_one(pruned | (big & denied & ~spared), gaussians)  # makes room for the next event
-            excess = int((~pruned).sum()) - self.max_gaussians
+            if not paced:
+                pruned = leave_one(pruned | (big & denied & ~spared), gaussians)  # makes room for the next event
+            excess = int((~pruned).sum()) - cap
             if excess > 0:  # then nothing was chosen
                 pruned = pruned | self._easiest(score, seen, ~pruned, spared, excess)
         return self._compose(gaussians, candidates & small, candidates & ~small, pruned, spared, step)
@@ -239,16 +293,27 @@ class ErrorDrivenDensity(WindowedDensity):
 
     def _final_prune(self, gaussians: Gaussians, step: Step) -> RowUpdate | None:
         finite = finite_rows(gaussians)
-        score, seen = self.scores(step)
-        easy = seen & (score < _quantile(score, seen, 1 - self.final_keep))
-        return removal(leave_one(~finite | easy & ~self._spared(gaussians, finite, step.scene_extent), gaussians))
+        worth, known = contribution(self._stats, *self.scores(step), self.prune_by)
+        spared = self._spared(gaussians, finite, step.scene_extent)
+        pruned = ~finite | known & (worth < _quantile(worth, known, 1 - self.final_keep)) & ~spared
+        if self.overshoot > 1 and self.max_gaussians > 0:
+            events = self._final_events(step)
+            left = events - (step.iteration - step.refine_until) // self.final_every
+            excess = int((~pruned).sum()) - math.floor(self.max_gaussians * self.overshoot ** (left / events))
+            if excess > 0:
+                pruned |= self._easiest(worth, known, ~pruned, spared, excess)
+        return removal(leave_one(pruned, gaussians))
+
+    def _final_events(self, step: Step) -> int:
+        """How many final prunings the run has."""
+        return max(0, self._final_span(step)) // self.final_every if self._prunes_finally else 0
 
     def _compose(
         self, gaussians: Gaussians, cloned: Tensor, split: Tensor, pruned: Tensor, spared: Tensor, step: Step
     ) -> RowUpdate | None:
         """One change from masks [N]. New rows: the Gaussians that stay, the clones, then both halves of the split."""
         rest, copies, halves = (torch.nonzero(mask).squeeze(-1) for mask in (~(pruned | split), cloned, split))
-        if len(rest) == len(gaussians) and len(copies) == 0 and self.opacity_decay == 0:
+        if len(rest) == len(gaussians) and len(copies) == 0 and self.opacity_decay == 0 and self.opacity_cost == 0:
             return None
         source = torch.cat([rest, copies, halves, halves])
         fresh = torch.arange(len(source), device=source.device) >= len(rest)
@@ -257,11 +322,20 @@ class ErrorDrivenDensity(WindowedDensity):
             values = {"means": gaussians.means[source], "scales": gaussians.scales[source]}
             means, scales = split_in_two(gaussians, halves, self.split, step)
             values["means"][-2 * len(halves) :], values["scales"][-2 * len(halves) :] = means, scales
-        if self.opacity_decay > 0:
-            opacities = torch.where(spared, gaussians.opacities, _decayed(gaussians.opacities, self.opacity_decay))
+        if self.opacity_decay > 0 or self.opacity_cost > 0:
+            opacities = torch.where(spared, gaussians.opacities, self._decayed(gaussians.opacities))
             values["opacities"] = opacities[source]
         counts = {"num_cloned": len(copies), "num_split": len(halves), "num_pruned": int(pruned.sum())}
         return RowUpdate(source, fresh, values, **counts)
+
+    def _decayed(self, logits: Tensor) -> Tensor:
+        """The logits [N] after an event."""
+        decayed = _decayed(logits, self.opacity_decay) if self.opacity_decay > 0 else logits
+        if self.decay_floor > 0:
+            decayed = torch.maximum(decayed, logits.clamp(max=math.log(self.decay_floor / (1 - self.decay_floor))))
+        if self.opacity_cost > 0:
+            decayed = torch.logit((torch.sigmoid(decayed) - self.opacity_cost).clamp(min=1e-6))
+        return decayed
 
 
 def _quantile(values: Tensor, mask: Tensor, fraction: float) -> Tensor:

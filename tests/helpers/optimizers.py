@@ -77,6 +77,7 @@ def random_stats(count: int, seed: int, seen: float = 0.8) -> GaussianStats:
         weight_sums=weights,
         grad_sums=4e-4 * uniform() * views,
         absgrad_sums=8e-4 * uniform() * views,
+        square_sums=1e-6 * uniform() * weights,
         view_counts=views,
         max_radii=0.2 * uniform(),
     )
