@@ -83,6 +83,14 @@ def random_stats(count: int, seed: int, seen: float = 0.8) -> GaussianStats:
     )
 
 
+def busy_stats(count: int) -> GaussianStats:
+    """Every Gaussian seen, equally difficult, and passing the gradient threshold."""
+    stats = GaussianStats.zeros(count, "cpu")
+    for name in ("error_sums", "distance_sums", "weight_sums", "grad_sums", "view_counts"):
+        getattr(stats, name).fill_(1.0)
+    return stats
+
+
 def fill(target: GaussianStats, source: GaussianStats) -> None:
     """Write statistics into a controller's window."""
     for field in fields(source):

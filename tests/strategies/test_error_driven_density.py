@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from helpers.optimizers import STEP, all_finite, fill, make_gaussians, make_gradients, random_stats
+from helpers.optimizers import STEP, all_finite, busy_stats, fill, make_gaussians, make_gradients, random_stats
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from turbogs_plugin.strategies.density.error_driven import ErrorDrivenDensity
@@ -29,14 +29,6 @@ def controlled(gaussians, stats: GaussianStats | None = None, **config) -> Error
     if stats is not None:
         fill(density.stats, stats)
     return density
-
-
-def busy_stats(count: int) -> GaussianStats:
-    """Every Gaussian seen, equally difficult, and passing the gradient threshold."""
-    stats = GaussianStats.zeros(count, "cpu")
-    for name in ("error_sums", "distance_sums", "weight_sums", "grad_sums", "view_counts"):
-        getattr(stats, name).fill_(1.0)
-    return stats
 
 
 def rotation(quat: np.ndarray) -> np.ndarray:
