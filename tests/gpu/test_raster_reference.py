@@ -94,7 +94,7 @@ def test_parameter_gradients(case):
         ours, theirs = getattr(gradients, name), getattr(wanted_gradients, name)
         assert_gradients_close(ours.reshape(*theirs.shape[:2], -1), theirs.reshape(*theirs.shape[:2], -1), name)
     assert (gradients.touched.cpu() != wanted_gradients.touched).double().mean() <= 1e-2
-    for name in ("error_sums", "distance_sums", "weight_sums", "grad_sums", "absgrad_sums"):
+    for name in ("error_sums", "distance_sums", "weight_sums", "grad_sums", "absgrad_sums", "square_sums"):
         assert_gradients_close(getattr(stats, name)[:, None], getattr(wanted_stats, name)[:, None], name)
 
 
