@@ -10,13 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import logsigmoid
 from turbogs_plugin.strategies.checks import require_at_least_one, require_each, require_settings, require_share
-from turbogs_plugin.strategies.density.priority import (
-    GrowthOrder,
-    PruneOrder,
-    contribution,
-    drawn_priority,
-    growth_priority,
-)
+from turbogs_plugin.strategies.density.priority import GrowthOrder, PruneOrder, contribution, growth_priority
 from turbogs_plugin.strategies.density.rows import WindowedDensity, finite_rows, leave_one, removal
 from turbogs_plugin.strategies.density.splitting import split_in_two
 
@@ -69,27 +63,21 @@ class ErrorDrivenDensity(WindowedDensity):
         prune_screen_size: pruned where the screen radius exceeds this * the larger side of the image. 0: off, as in
             3DGS in effect.
         prune_size_from: both size rules begin at this progress; 3DGS has 3000 / 15000.
-        prune_score_fraction: the easiest share of the seen Gaussians, which each densification event prunes. Off by
-            default: the paper gives no value, and a Gaussian with little error may be one that is rendered well.
+        prune_score_fraction: the share that each densification event prunes, in the order of `prune_by`. Off by
+            default: the paper gives no value.
         opacity_decay: share of its opacity that every Gaussian loses at each densification event. If the photos need
             it, it grows back; if not, it falls below `prune_opacity`. A gentle substitute for 3DGS's reset.
         spare_beyond: Gaussians farther from the cameras' centre than this * scene extent are neither decayed nor pruned
             (unless they are not finite, or `max_gaussians` leaves no other choice). It protects a backdrop behind the
             scene, which few photos see. 0: none.
-        final_every, final_keep: interval of the final pruning, and the most difficult share of the seen Gaussians,
-            which it keeps (Delta_prune, eta_final). 1 keeps all.
-        choose_by: by what the candidates are put in order where the cap has no room for all, see `growth_priority`.
-        draw: they are drawn, with chances in proportion to that; not its largest.
-        pace: with a cap, the share of densification over which the room grows in a straight line from 0 to the cap.
-            0: all of it is there from the start.
-        overshoot: with a cap, densification may grow to so many times the cap; the final prunings take it back in
-            equal ratios.
-        prune_by: what `prune_score_fraction`, `final_keep` and `overshoot` prune by, see `contribution`.
-        prune_score_from: progress from which `prune_score_fraction` holds.
+        choose_by: which candidates grow where `max_gaussians` has no room for all: the most difficult, or a draw by
+            the squares of their opacity gradients, see `growth_priority`.
+        prune_by: in what order `prune_score_fraction` and `final_keep` prune: the easiest first, or what contributes
+            the least, by blending weight or by squares, see `contribution`. A Gaussian with little error may be one
+            that is rendered well.
+        final_every, final_keep: interval of the final pruning, and the share that it keeps (Delta_prune, eta_final). 1
+            keeps all.
         final_until: share of the run after which there is no final pruning, so that there is time to recover.
-        drop_unseen: the last iteration removes what no sample has met since the last event.
-        decay_floor: `opacity_decay` takes no opacity below this.
-        opacity_cost: every Gaussian loses this much opacity at each densification event, after the decay.
         stop_when_flat: densification ends early, at the first event where the error has fallen by less than this share
             of itself over the last `FLAT_EVENTS` events. The error of a window is the mean of its samples' e, weighted
             by w. It falls a little by itself as the sampling rate rises, so densification ends later rather than
@@ -114,29 +102,19 @@ class ErrorDrivenDensity(WindowedDensity):
     prune_score_fraction: float = 0.0
     opacity_decay: float = 0.0
     spare_beyond: float = 0.0
+    choose_by: GrowthOrder = "difficulty"
+    prune_by: PruneOrder = "difficulty"
     final_every: int = 500
     final_keep: float = 0.95
-    stop_when_flat: float = 0.0
-    choose_by: GrowthOrder = "difficulty"
-    draw: bool = False
-    pace: float = 0.0
-    overshoot: float = 1.0
-    prune_by: PruneOrder = "difficulty"
-    prune_score_from: float = 0.0
     final_until: float = 1.0
-    drop_unseen: bool = False
-    decay_floor: float = 0.0
-    opacity_cost: float = 0.0
+    stop_when_flat: float = 0.0
     window_errors: list[float] = field(init=False, repr=False, default_factory=list)
     stopped_at: int = field(init=False, repr=False, default=0)
 
     def __post_init__(self) -> None:
         require_at_least_one(self, "refine_every", "final_every")
-        require_share(self, "top_fraction", "final_keep")
-        shares = ("prune_opacity", "prune_score_fraction", "opacity_decay", "stop_when_flat", "decay_floor")
-        shares = (*shares, "opacity_cost")
-        require_each(self, lambda value: 0 <= value <= 1, "between 0 and 1", "pace", "prune_score_from", "final_until")
-        require_each(self, lambda value: value >= 1, "at least 1", "overshoot")
+        require_share(self, "top_fraction", "final_keep", "final_until")
+        shares = ("prune_opacity", "prune_score_fraction", "opacity_decay", "stop_when_flat")
         require_each(self, lambda value: 0 <= value < 1, "at least 0 and less than 1", *shares)
         require_settings(self)
 
@@ -152,10 +130,6 @@ class ErrorDrivenDensity(WindowedDensity):
             update = self._refine(gaussians, step)
         elif final:
             update = self._final_prune(gaussians, step)
-        elif self.drop_unseen and step.iteration == step.total - 1:
-            finite = finite_rows(gaussians)
-            unseen = (self._stats.weight_sums == 0) & ~self._spared(gaussians, finite, step.scene_extent)
-            update = removal(leave_one(unseen, gaussians))
         if densify or final:
             self._stats.zero_()
         if step.iteration >= self._last_event(step):
@@ -175,6 +149,12 @@ class ErrorDrivenDensity(WindowedDensity):
                 f"stop_when_flat = {self.stop_when_flat:g}, but the saved run had it at 0 and kept no record of its "
                 "error: continue it with stop_when_flat = 0, or start a new run"
             )
+        for name in ("choose_by", "prune_by"):
+            if getattr(self, name) == "squares" and state["stats"] is not None and "square_sums" not in state["stats"]:
+                raise InputError(
+                    f"{name} = squares, but the saved run kept no squares: continue it with {name} = difficulty, or "
+                    "start a new run"
+                )
         super().load_state_dict(state)
         if self.stop_when_flat > 0:
             self.window_errors = state["window_errors"].tolist()
@@ -198,25 +178,20 @@ class ErrorDrivenDensity(WindowedDensity):
         iteration, after = step.iteration, step.iteration - step.refine_until
         densify = after <= 0 and iteration >= self.refine_from and iteration % self.refine_every == 0
         final = 0 < after <= self._final_span(step) and after % self.final_every == 0
-        return densify and not self.stopped_at, self._prunes_finally and final
-
-    @property
-    def _prunes_finally(self) -> bool:
-        return self.final_keep < 1 or (self.overshoot > 1 and self.max_gaussians > 0)
+        return densify and not self.stopped_at, self.final_keep < 1 and final
 
     def _final_span(self, step: Step) -> int:
         """Iterations after densification within which there are final prunings."""
-        return min(step.total - 1, math.floor(self.final_until * step.total)) - step.refine_until
+        last = min(step.total - 1, math.floor(self.final_until * step.total))
+        return max(0, last - step.refine_until)
 
     def _last_event(self, step: Step) -> int:
         """Iteration after which no statistics are needed: that of the last event, or where densification ends.
 
         It is not that of the last densification: until the end a time budget may still move it and allow another one.
         """
-        if self.drop_unseen:
-            return step.total - 1
-        rest = max(0, self._final_span(step))
-        if self._prunes_finally and rest >= self.final_every:
+        rest = self._final_span(step)
+        if self.final_keep < 1 and rest >= self.final_every:
             return step.refine_until + rest // self.final_every * self.final_every
         return self.stopped_at or step.refine_until
 
@@ -238,7 +213,7 @@ class ErrorDrivenDensity(WindowedDensity):
         finite = finite_rows(gaussians)
         spared = self._spared(gaussians, finite, extent)
         hopeless = ~finite | (torch.sigmoid(gaussians.opacities) < self.prune_opacity)
-        if self.prune_score_fraction > 0 and step.progress >= self.prune_score_from:
+        if self.prune_score_fraction > 0:
             worth, known = contribution(self._stats, score, seen, self.prune_by)
             hopeless |= known & (worth < _quantile(worth, known, self.prune_score_fraction))
         candidates = self._growing(score, seen) & ~hopeless
@@ -256,17 +231,12 @@ class ErrorDrivenDensity(WindowedDensity):
         pruned = leave_one((hopeless | (big & ~(candidates & ~small))) & ~spared, gaussians)
         candidates &= ~pruned
         if self.max_gaussians > 0:
-            cap = math.floor(self.overshoot * self.max_gaussians) if self._final_events(step) else self.max_gaussians
-            paced = step.progress < self.pace
-            room = math.floor(cap * step.progress / self.pace) if paced else cap
-            priority = growth_priority(self._stats, score, self.choose_by)
-            priority = drawn_priority(priority, step) if self.draw else priority
-            chosen = _first(priority, candidates, max(0, room - int((~pruned).sum())))
+            priority = growth_priority(self._stats, score, self.choose_by, step)
+            chosen = _first(priority, candidates, max(0, self.max_gaussians - int((~pruned).sum())))
             denied = candidates & ~chosen
             candidates = chosen
-            if not paced:
-                pruned = leave_one(pruned | (big & denied & ~spared), gaussians)  # makes room for the next event
-            excess = int((~pruned).sum()) - cap
+            pruned = leave_one(pruned | (big & denied & ~spared), gaussians)  # makes room for the next event
+            excess = int((~pruned).sum()) - self.max_gaussians
             if excess > 0:  # then nothing was chosen
                 pruned = pruned | self._easiest(score, seen, ~pruned, spared, excess)
         return self._compose(gaussians, candidates & small, candidates & ~small, pruned, spared, step)
@@ -296,24 +266,14 @@ class ErrorDrivenDensity(WindowedDensity):
         worth, known = contribution(self._stats, *self.scores(step), self.prune_by)
         spared = self._spared(gaussians, finite, step.scene_extent)
         pruned = ~finite | known & (worth < _quantile(worth, known, 1 - self.final_keep)) & ~spared
-        if self.overshoot > 1 and self.max_gaussians > 0:
-            events = self._final_events(step)
-            left = events - (step.iteration - step.refine_until) // self.final_every
-            excess = int((~pruned).sum()) - math.floor(self.max_gaussians * self.overshoot ** (left / events))
-            if excess > 0:
-                pruned |= self._easiest(worth, known, ~pruned, spared, excess)
         return removal(leave_one(pruned, gaussians))
-
-    def _final_events(self, step: Step) -> int:
-        """How many final prunings the run has."""
-        return max(0, self._final_span(step)) // self.final_every if self._prunes_finally else 0
 
     def _compose(
         self, gaussians: Gaussians, cloned: Tensor, split: Tensor, pruned: Tensor, spared: Tensor, step: Step
     ) -> RowUpdate | None:
         """One change from masks [N]. New rows: the Gaussians that stay, the clones, then both halves of the split."""
         rest, copies, halves = (torch.nonzero(mask).squeeze(-1) for mask in (~(pruned | split), cloned, split))
-        if len(rest) == len(gaussians) and len(copies) == 0 and self.opacity_decay == 0 and self.opacity_cost == 0:
+        if len(rest) == len(gaussians) and len(copies) == 0 and self.opacity_decay == 0:
             return None
         source = torch.cat([rest, copies, halves, halves])
         fresh = torch.arange(len(source), device=source.device) >= len(rest)
@@ -322,20 +282,11 @@ class ErrorDrivenDensity(WindowedDensity):
             values = {"means": gaussians.means[source], "scales": gaussians.scales[source]}
             means, scales = split_in_two(gaussians, halves, self.split, step)
             values["means"][-2 * len(halves) :], values["scales"][-2 * len(halves) :] = means, scales
-        if self.opacity_decay > 0 or self.opacity_cost > 0:
-            opacities = torch.where(spared, gaussians.opacities, self._decayed(gaussians.opacities))
+        if self.opacity_decay > 0:
+            opacities = torch.where(spared, gaussians.opacities, _decayed(gaussians.opacities, self.opacity_decay))
             values["opacities"] = opacities[source]
         counts = {"num_cloned": len(copies), "num_split": len(halves), "num_pruned": int(pruned.sum())}
         return RowUpdate(source, fresh, values, **counts)
-
-    def _decayed(self, logits: Tensor) -> Tensor:
-        """The logits [N] after an event."""
-        decayed = _decayed(logits, self.opacity_decay) if self.opacity_decay > 0 else logits
-        if self.decay_floor > 0:
-            decayed = torch.maximum(decayed, logits.clamp(max=math.log(self.decay_floor / (1 - self.decay_floor))))
-        if self.opacity_cost > 0:
-            decayed = torch.logit((torch.sigmoid(decayed) - self.opacity_cost).clamp(min=1e-6))
-        return decayed
 
 
 def _quantile(values: Tensor, mask: Tensor, fraction: float) -> Tensor:

@@ -10,48 +10,43 @@ from torch import Tensor
 
 from turbogs_plugin.types import GaussianStats, Step
 
-GrowthOrder = Literal["difficulty", "gradient", "opposed", "squares", "error"]
+GrowthOrder = Literal["difficulty", "squares"]
 PruneOrder = Literal["difficulty", "weight", "squares"]
 
 TINY = 1e-30
-"""The least priority that a draw tells from 0."""
+"""The least sum of squares that a draw tells from 0."""
 
 
-def growth_priority(stats: GaussianStats, score: Tensor, how: GrowthOrder) -> Tensor:
-    """[N], the larger the sooner: by the difficulty `score`, or by a statistic of the window.
+def growth_priority(stats: GaussianStats, score: Tensor, how: GrowthOrder, step: Step) -> Tensor:
+    """[N] keys: the larger, the sooner a Gaussian grows.
 
-    `gradient` is the mean absolute screen gradient, `opposed` what of it cancels in the signed one, `squares` the sum
-    of (o * d loss / d o)^2 over samples (LiteGS scores by its variance), and `error` E / sqrt(W), between sum and mean.
+    By `difficulty` they are the scores. By `squares`, the largest k are a draw of k without replacement (Gumbel's
+    trick), with chances in proportion to `GaussianStats.square_sums`. That sum is large where samples want a Gaussian
+    more opaque here and less there, which a single one cannot be. LiteGS scores by the variance of the same gradient.
+    The noise is drawn on the host, so it is the same on every device.
+
+    Args:
+        stats: of the window.
+        score: [N] difficulty.
+        step: its seed and iteration are those of the draw.
     """
-    views = stats.view_counts.clamp(min=1)
-    if how == "gradient":
-        value = stats.absgrad_sums / views
-    elif how == "opposed":
-        value = (stats.absgrad_sums - stats.grad_sums) / views
-    elif how == "squares":
-        value = stats.square_sums
-    elif how == "error":
-        value = stats.error_sums / stats.weight_sums.clamp(min=TINY).sqrt()
-    else:
+    if how == "difficulty":
         return score
-    return torch.where(torch.isfinite(value), value, 0.0)
-
-
-def drawn_priority(priority: Tensor, step: Step) -> Tensor:
-    """[N] keys whose largest k are a draw of k without replacement, with chances in proportion to `priority`.
-
-    Gumbel's trick. The noise is drawn on the host: the same numbers on every device.
-    """
+    squares = torch.where(torch.isfinite(stats.square_sums), stats.square_sums, 0.0)
     generator = np.random.Generator(np.random.Philox(np.random.SeedSequence([step.seed, step.iteration, 1])))
-    noise = torch.from_numpy(generator.gumbel(size=len(priority))).to(priority)
-    return priority.clamp(min=TINY).log() + noise
+    noise = torch.from_numpy(generator.gumbel(size=len(squares))).to(squares)
+    return squares.clamp(min=TINY).log() + noise
 
 
 def contribution(stats: GaussianStats, score: Tensor, seen: Tensor, how: PruneOrder) -> tuple[Tensor, Tensor]:
-    """([N] the smaller the sooner it goes, [N] bool which are known).
+    """([N] the smaller, the sooner a Gaussian goes; [N] bool, for which that is known).
 
-    By `weight`, the sum of blending weights, or by `squares`, all with finite sums are known: what was not seen
-    contributes nothing.
+    By `difficulty` these are the score and the seen. By `weight`, the sum of blending weights, or `squares`, the sum of
+    squares of the opacity gradient, all with a finite sum are known: what was not seen contributes nothing.
+
+    Args:
+        stats: of the window.
+        score, seen: [N] difficulty, and bool.
     """
     if how == "difficulty":
         return score, seen

@@ -14,7 +14,6 @@ from helpers.raster_cases import (
 
 from turbogs_plugin.engine.autograd import rasterize_differentiable
 from turbogs_plugin.engine.cuda import raster as cuda
-from turbogs_plugin.engine.layout import ScreenRecord
 from turbogs_plugin.engine.rendering import RenderOptions, rasterize_reference
 from turbogs_plugin.types import GaussianStats
 
@@ -79,7 +78,6 @@ def test_screen_records(case, with_depth):
     wanted_records = wanted.backward(**values).full_records()
     for name, column in RECORD_COLUMNS.items():
         assert_gradients_close(records[..., column], wanted_records[..., column], name)
-    assert (records[..., ScreenRecord.SIZE - 1] == 0).all()
 
 
 def test_parameter_gradients(case):
@@ -135,7 +133,7 @@ def test_every_division_of_the_work_gives_the_same(warps, monkeypatch):
     wanted_records = wanted.backward(**values).full_records()
     for name, column in RECORD_COLUMNS.items():
         assert_gradients_close(records[..., column], wanted_records[..., column], name)
-        if name in ("absolute", "distance_sum"):
+        if name in ("absolute", "distance_sum", "square_sum"):
             assert (plain[..., column] == 0).all()
         else:
             assert_gradients_close(plain[..., column], wanted_records[..., column], f"{name} without a window")
