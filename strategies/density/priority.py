@@ -21,9 +21,9 @@ def growth_priority(stats: GaussianStats, score: Tensor, how: GrowthOrder, step:
     """[N] keys: the larger, the sooner a Gaussian grows.
 
     By `difficulty` they are the scores. By `squares`, the largest k are a draw of k without replacement (Gumbel's
-    trick), with chances in proportion to `GaussianStats.square_sums`. That sum is large where samples want a Gaussian
-    more opaque here and less there, which a single one cannot be. LiteGS scores by the variance of the same gradient.
-    The noise is drawn on the host, so it is the same on every device.
+    trick), with chances in proportion to `GaussianStats.square_sums`. That sum stays large where some samples want a
+    Gaussian more opaque and others less, where the gradient itself cancels. LiteGS scores by the variance of the same
+    gradient. The noise is drawn on the host, so it is the same on every device.
 
     Args:
         stats: of the window.
