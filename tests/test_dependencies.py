@@ -104,7 +104,9 @@ def test_the_extra_is_what_the_commands_name(project):
 
 COMMANDS = {
     "train": ("SCENE", "--out", "RUN"),
+    "reconstruct": ("PHOTOS", "--out", "SCENE"),
     "plan": ("SCENE",),
+    "view": ("RUN",),
     "eval": ("RUN",),
     "render": ("RUN",),
     "export": ("RUN",),
@@ -195,6 +197,13 @@ def test_the_core_changes_no_package_of_a_host(host, project):
     for name, version in (text.split() for text in HOSTS[host]):
         assert name not in core or core[name].specifier.contains(version), f"{core[name]} replaces {name} {version}"
         assert name not in core or core[name].marker is None
+
+
+def test_the_viewers_extra_is_the_one_that_its_message_names(project):
+    from turbogs_plugin.viewer.page import INSTALL
+
+    assert set(requirements(project["optional-dependencies"]["viewer"])) == {"viser"}
+    assert f'"{project["name"]}[viewer]"' in INSTALL
 
 
 def test_what_the_core_refuses(project):

@@ -4,11 +4,15 @@ The scripts take a GPU where there is one, and so do these tests.
 """
 
 import importlib.util
+import json
+import math
+import os
 import re
 import shutil
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 import tomllib
 import torch
@@ -18,12 +22,13 @@ from PIL import Image
 from turbogs_plugin.config.configuration import load_config, registry
 from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.scene import load_scene, write_demo_capture
+from turbogs_plugin.scene import Scene, load_scene, write_demo_capture
 from turbogs_plugin.train import run
 from turbogs_plugin.train.history import read_history
 from turbogs_plugin.types import Step
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
+SCENES = Path(os.environ.get("TURBOGS_SCENES", Path(__file__).resolve().parents[2] / "shared" / "scenes"))
 PACKAGE = EXAMPLES / "third_party_strategy"
 SCRIPTS = ("density_swap", "optimizer_swap", "sparse_pixels", "all_swaps")
 
@@ -52,7 +57,14 @@ def example(monkeypatch):
 
 def test_every_script_is_run_here():
     scripts = {path.stem for path in EXAMPLES.glob("*.py")}
-    assert scripts == {*SCRIPTS, "image_fitting", "pixels_on_an_mlp", "baselines", "gsplat_host"}
+    assert scripts == {
+        *SCRIPTS,
+        "image_fitting",
+        "pixels_on_an_mlp",
+        "baselines",
+        "gsplat_host",
+        "undistort_with_colmap",
+    }
 
 
 @pytest.mark.parametrize("name", SCRIPTS)
@@ -176,3 +188,63 @@ def test_not_installed_it_is_not_known():
     with pytest.raises(InputError, match=r"unknown pixel_sampler\.type 'checkerboard'"):
         registry.build("pixel_sampler", {"type": "checkerboard"})
     assert importlib.util.find_spec("patchwork_strategies") is None
+
+
+def test_colmap_undistorts_to_the_cameras_and_pixels_that_loading_does(example, tmp_path):
+    """Of a capture with random points alone, which are then the same too."""
+    folder = tmp_path / "raw"
+    (folder / "images").mkdir(parents=True)
+    y, x = np.mgrid[:120, :160]
+    photo = np.stack([127 + 100 * np.sin(0.1 * x), 127 + 100 * np.cos(0.13 * y), 0.5 * (x + y)], axis=2).astype(
+        np.uint8
+    )
+    frames = []
+    for view in range(4):
+        Image.fromarray(photo).save(folder / f"images/{view}.png")
+        turn, pose = 0.3 * view, np.eye(4)
+        pose[:3, :3] = [[math.cos(turn), 0, math.sin(turn)], [0, 1, 0], [-math.sin(turn), 0, math.cos(turn)]]
+        pose[:3, 3] = [view, 0.1 * view, 0.0]
+        frames.append({"file_path": f"images/{view}.png", "transform_matrix": pose.tolist()})
+    frames.append({"file_path": "images/never_published.png"})
+    lens = {"w": 160, "h": 120, "fl_x": 140.0, "fl_y": 142.0, "cx": 83.0, "cy": 58.0}
+    bent = {"k1": 0.06, "k2": -0.08, "p1": -0.001, "p2": 0.0002}
+    (folder / "transforms.json").write_text(json.dumps({**lens, **bent, "frames": frames}))
+    example("undistort_with_colmap").main(folder, tmp_path / "plain")
+    loaded, plain = load_scene(folder), load_scene(tmp_path / "plain")
+    require_same_capture(loaded, plain)
+
+
+def require_same_capture(loaded: Scene, plain: Scene) -> None:
+    """Of one lens: the same poses and points, focal lengths within 0.5 %, and what both see the same but for noise."""
+    assert plain.train.names == loaded.train.names and plain.test.names == loaded.test.names
+    assert torch.allclose(plain.train.cameras.viewmats, loaded.train.cameras.viewmats, atol=1e-5)
+    assert torch.allclose(plain.points, loaded.points, atol=1e-5)
+    a, b = (scene.train.cameras.Ks[0].double().numpy() for scene in (loaded, plain))
+    np.testing.assert_allclose(a[[0, 1], [0, 1]], b[[0, 1], [0, 1]], rtol=5e-3)
+    sizes = [scene.train.cameras.sizes[0] for scene in (loaded, plain)]
+    assert np.abs(sizes[0] / sizes[1] - 1.0).max() < 0.02
+    for ours, theirs in zip(*(scene.train.photos.sizes for scene in (loaded, plain)), strict=True):
+        assert (ours == sizes[0]).all() and (theirs == sizes[1]).all()
+    # Our pixels, looked up in their photo where their camera sees the same direction.
+    photos = [scene.train.photos.image(0) for scene in (loaded, plain)]
+    height, width = photos[0].shape[:2]
+    y, x = np.mgrid[:height, :width] + 0.5
+    at_x, at_y = (((place - a[i, 2]) / a[i, i] * b[i, i] + b[i, 2]) for i, place in enumerate((x, y)))
+    grid = torch.from_numpy(np.stack([2 * at_x / sizes[1][0] - 1, 2 * at_y / sizes[1][1] - 1], axis=-1)).float()[None]
+    theirs = torch.nn.functional.grid_sample(photos[1].permute(2, 0, 1)[None], grid, align_corners=False)[0]
+    shared = (grid[0].abs() < 1 - 4 / min(sizes[1])).all(dim=-1)
+    difference = (theirs.permute(1, 2, 0) - photos[0])[shared]
+    assert float(shared.float().mean()) > 0.9
+    assert float(difference.square().mean().sqrt()) < 2.5 / 255
+
+
+@pytest.mark.skipif(not (SCENES / "fox-raw").is_dir(), reason=f"no real captures in {SCENES}")
+def test_fox_undistorted_by_colmap_is_the_capture_that_loading_makes(example, tmp_path):
+    """A few of its photos; those in between are as if they had never been published."""
+    folder = tmp_path / "raw"
+    (folder / "images").mkdir(parents=True)
+    shutil.copy(SCENES / "fox-raw/transforms.json", folder)
+    for photo in sorted((SCENES / "fox-raw/images").iterdir())[::12]:
+        shutil.copy(photo, folder / "images")
+    example("undistort_with_colmap").main(folder, tmp_path / "plain")
+    require_same_capture(load_scene(folder), load_scene(tmp_path / "plain"))

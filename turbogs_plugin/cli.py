@@ -11,6 +11,7 @@ import sys
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -30,6 +31,9 @@ OVERRIDE = re.compile(r"\w+(\.\w+)+=.*", re.DOTALL)
 
 FLAGS = ("--report", "--no-report", "--offload", "--no-offload")
 """Options without a value, of verbs that have overrides."""
+
+LOCAL, PORT = "127.0.0.1", 8080
+"""Where a viewer listens unless told otherwise: for this machine alone."""
 
 Device = Literal["auto", "cpu", "cuda"]
 
@@ -129,28 +133,64 @@ def train(
     out: Annotated[Path | None, arg(metavar="RUN")] = None,
     resume: Annotated[Path | None, arg(metavar="RUN")] = None,
     report: bool = True,
+    viewer: Annotated[int | None, arg(metavar="[PORT]")] = None,
+    viewer_host: str = LOCAL,
     options: Flat = NO_OPTIONS,
 ) -> int:
     """Train on a capture, or go on with a stopped run.
 
     Args:
-        scene: folder of a capture: a COLMAP reconstruction, a transforms.json, NeRF-synthetic or LLFF, with its photos.
+        scene: folder of a capture: a COLMAP reconstruction, a transforms.json, NeRF-synthetic or LLFF, with its photos;
+            or of photos alone, whose cameras are found first (see reconstruct).
         overrides: changes of the configuration, e.g. train.iterations=8000 density.type=none.
         out: new folder for the run.
         resume: folder of a stopped run to go on with, by its own configuration.
         report: at the end, write the report and its pictures; --no-report leaves model, history and checkpoints.
+        viewer: show the training in a browser, at this port (8080 where none is named); afterwards its model, until
+            Ctrl-C.
+        viewer_host: where the viewer listens; 0.0.0.0 lets others on the network look, and pause the training.
     """
     from turbogs_plugin.report.pages import write_report
     from turbogs_plugin.train import run
 
     clock, page = WallClock(process_age()), write_report if report else None
+    if viewer is None and viewer_host != LOCAL:
+        raise InputError("--viewer-host says where a viewer listens: give --viewer, too")
     if resume is not None:
         if scene or overrides or out or options != NO_OPTIONS:
-            raise InputError("--resume goes on by the run's own configuration: give it nothing else but --no-report")
-        return _tell(run.resume(resume, page, clock), report)
-    if scene is None or out is None:
+            raise InputError(
+                "--resume goes on by the run's own configuration: give it nothing else but --no-report and --viewer"
+            )
+        start = partial(run.resume, resume)
+    elif scene is None or out is None:
         raise InputError("train needs a SCENE and --out RUN, or --resume RUN")
-    return _tell(run.train(options.settings(scene, overrides), out, page, clock), report)
+    else:
+        start = partial(run.train, options.settings(scene, overrides), out)
+    if viewer is None:
+        return _tell(start(page, clock), report)
+
+    from turbogs_plugin.viewer.commands import attached
+
+    with attached(viewer, viewer_host) as live:
+        session = start(page, clock, live.watch)
+        code = _tell(session, report)
+        if session.signal is None:
+            live.stay()
+    return code
+
+
+@app.command
+def reconstruct(photos: Annotated[Positional[Path], arg(metavar="PHOTOS")], /, *, out: Path) -> int:
+    """Find the cameras of photos alone, and write a capture to train on. The same call goes on where it stopped.
+
+    Args:
+        photos: folder of at least three photos of one scene.
+        out: new folder for the capture, with images and sparse/0 (COLMAP).
+    """
+    from turbogs_plugin.reconstruct import reconstruct
+
+    print(reconstruct(photos, out).text())
+    return 0
 
 
 @app.command
@@ -171,6 +211,31 @@ def plan(
 
     print(plan_run(options.settings(scene, overrides)).text())
     return 0
+
+
+@app.command
+def view(
+    run: RunOrModel,
+    overrides: Overrides = (),
+    /,
+    *,
+    port: int = PORT,
+    host: str = LOCAL,
+    device: Device = "auto",
+    given: Given = NO_SCENE,
+) -> int:
+    """Look at the newest model of a run, or a model trained anywhere, in a browser, until Ctrl-C.
+
+    Args:
+        run: folder of the run; or the file of a model, with --scene to see its photos, too.
+        overrides: with --scene, as in eval.
+        port: of the page.
+        host: where it listens; 0.0.0.0 lets others on the network look.
+        device: where to render.
+    """
+    from turbogs_plugin.viewer import commands
+
+    return commands.view(run, port, host, device, given.settings(overrides))
 
 
 @app.command(name="eval")
@@ -350,7 +415,8 @@ def report(
 @app.command
 def bench(
     what: Annotated[
-        Positional[Literal["step", "raster", "numerics", "wall"]], arg(metavar="step|raster|numerics|wall")
+        Positional[Literal["step", "raster", "numerics", "wall", "viewer"]],
+        arg(metavar="step|raster|numerics|wall|viewer"),
     ],
     overrides: Overrides = (),
     /,
@@ -372,21 +438,22 @@ def bench(
     out: Annotated[Path | None, arg(metavar="FILE_OR_FOLDER")] = None,
 ) -> int:
     """Time an iteration of training step by step, the rasterizer stage by stage, beside what the machine allows, or the
-    command `turbogs train` by the clock on the wall; or measure how exact and how fast the optimizer's solvers are on
-    stiff systems.
+    command `turbogs train` by the clock on the wall, or a training with and without a viewer; or measure how exact and
+    how fast the optimizer's solvers are on stiff systems.
 
     Args:
         what: step: from sampling to update; raster: forward and backward, beside gsplat's dense ones; numerics: the
             solvers of moment-damped LM, which takes --out and --device alone; wall: whole runs, which takes --scene,
-            --repeats, --factor, --device, --out and changes of the configuration.
-        overrides: step, wall: changes of the configuration that is timed.
+            --repeats, --factor, --device, --out and changes of the configuration; viewer: as wall, iterations a second
+            without a viewer, with one that nobody looks at, and with a client that moves.
+        overrides: step, wall, viewer: changes of the configuration that is timed.
         scene: a capture, for its cameras and photos; where absent, all is synthetic, the models of raster as well.
         ply: a trained model in place of those trained here; raster: one or more, timed at their own sizes.
         gaussians: sizes of the model.
         views: views of an iteration.
         pixel_budget: pixels of an iteration in images (lambda).
         training: iterations of the model's training before; 1500 where absent, 0 for the initial model.
-        repeats: iterations or passes timed; 100 where absent. wall: runs; 3 where absent.
+        repeats: iterations or passes timed; 100 where absent. wall, viewer: runs; 3 where absent.
         rates: raster: further sampling rates, with the fewest views.
         size: of synthetic images, where there is no scene.
         photos: step: number of synthetic photos, in place of a scene.
@@ -394,7 +461,8 @@ def bench(
         library: raster: other builds of the kernels, measured the same way.
         factor: scale photos down by this.
         device: what to time.
-        out: JSON file; standard output where absent, but for wall. numerics: folder for its table, plot and JSON.
+        out: JSON file; standard output where absent, but for wall and viewer. numerics: folder for its table, plot and
+            JSON.
     """
     from turbogs_plugin.bench import commands
     from turbogs_plugin.bench.models import TRAINING_ITERATIONS
@@ -402,7 +470,7 @@ def bench(
     from turbogs_plugin.bench.step import StepBench
     from turbogs_plugin.train.run import resolve_device
 
-    times = repeats if repeats is not None else 3 if what == "wall" else 100
+    times = repeats if repeats is not None else 3 if what in ("wall", "viewer") else 100
     for name, values in (("gaussians", gaussians), ("views", views), ("repeats", (times,)), ("size", size)):
         if not values or min(values) < 1:
             raise InputError(f"--{name} {' '.join(map(str, values))}: each must be at least 1")
@@ -418,11 +486,14 @@ def bench(
         if out is None or overrides or scene is not None or ply or library:
             raise InputError("bench numerics needs --out FOLDER, and takes --device besides")
         return commands.run_numerics(where, out)
-    if what == "wall":
+    if what in ("wall", "viewer"):
         if scene is None or ply or library or photos or offload or training is not None:
             raise InputError(
-                "bench wall needs --scene SCENE, and takes --repeats, --factor, --device and --out besides"
+                f"bench {what} needs --scene SCENE, and takes --repeats, --factor, --device and --out besides"
             )
+        if what == "viewer":
+            options = RunOptions(factor=factor, device=where.type)
+            return commands.run_viewer(options.settings(scene, overrides), times, where, out)
         arguments = [str(scene), *overrides, "--device", where.type, "--factor", str(factor)]
         return commands.run_wall(arguments, times, where, out)
     if what == "step":
@@ -508,6 +579,16 @@ def _gathered(arguments: list[str]) -> list[str]:
     return [*arguments[:first], *overrides, *rest]
 
 
+def _with_port(arguments: list[str]) -> list[str]:
+    """Arguments in which --viewer without a port has the usual one."""
+    filled = []
+    for text, following in itertools.zip_longest(arguments, arguments[1:], fillvalue=""):
+        filled.append(text)
+        if text == "--viewer" and not following.isdecimal():
+            filled.append(str(PORT))
+    return filled
+
+
 def _warning_line(message: Warning | str, *place: object) -> str:
     """A warning on one line, without the place in the source."""
     return f"turbogs: warning: {' '.join(str(message).split())}\n"
@@ -518,7 +599,8 @@ def main() -> None:
     atexit.register(gc.freeze)  # or the collector walks through all of torch at the end, for a second
     description = "TurboGS: train 3D Gaussian Splatting on few, well chosen pixels."
     warnings.formatwarning = _warning_line
-    sys.exit(exit_code(lambda: app.cli(prog="turbogs", description=description, args=_gathered(sys.argv[1:]))))
+    arguments = _gathered(_with_port(sys.argv[1:]))
+    sys.exit(exit_code(lambda: app.cli(prog="turbogs", description=description, args=arguments)))
 
 
 if __name__ == "__main__":

@@ -13,6 +13,7 @@ from packaging.requirements import Requirement
 from turbogs_plugin.report.machine import hardware, software
 from turbogs_plugin.train.evaluate import LPIPS_PACKAGES
 from turbogs_plugin.train.flip import load_flip
+from turbogs_plugin.viewer.page import INSTALL as INSTALL_VIEWER
 
 COMMAND_PACKAGES = {
     "pycolmap": "pycolmap>=4.0",
@@ -41,6 +42,8 @@ def diagnosis() -> str:
     missing += [f"{name}: LPIPS is not computed" for name in absent]
     if reason := load_flip()[1]:
         missing.append(f"FLIP is not computed: {reason}")
+    if importlib.util.find_spec("viser") is None:
+        missing.append(f"viser: no live viewer; {INSTALL_VIEWER}")
     if lacking := lacking_packages():
         missing.append(f"{', '.join(lacking)}: commands that need them refuse; {INSTALL_COMMANDS}")
     return "\n".join([*lines, *(f"{'missing':<16}{line}" for line in missing)])

@@ -217,10 +217,10 @@ class ErrorMaps:
 
     def state_dict(self) -> dict[str, Any]:
         """Plain tensors and numbers; a resume from them gives the same bits."""
-        errors, stamps = self._stored()
+        errors, stamps = self._copies()
         return {
-            "errors": errors.clone(),
-            "stamps": stamps.clone(),
+            "errors": errors,
+            "stamps": stamps,
             "stamp_base": self.stamp_base,
             "view_sums": self.view_sums.clone(),
             **self._means.state_dict(),
@@ -242,9 +242,9 @@ class ErrorMaps:
         start = int(self.offsets[view_id])
         return slice(start, start + int(self.sizes[view_id].prod()))
 
-    def _stored(self) -> tuple[Tensor, Tensor]:
+    def _copies(self) -> tuple[Tensor, Tensor]:
         """([X] errors, [X] stamps) of all views, end to end."""
-        return self.errors, self.stamps
+        return self.errors.clone(), self.stamps.clone()
 
     def _load(self, errors: Tensor, stamps: Tensor) -> None:
         """Load [X] errors and [X] stamps of all views."""

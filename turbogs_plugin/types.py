@@ -362,6 +362,7 @@ class GaussianStats:
         grad_sums: [N] float32, sum over views of the norm of the screen gradient of the mean, in gsplat's units
             (x scaled by K * width / 2, y by K * height / 2).
         absgrad_sums: [N] float32, the same for the absolute gradients (AbsGS).
+        square_sums: [N] float32, sum over views and samples of (o * d loss / d o)^2, o the opacity.
         view_counts: [N] float32, views in which the Gaussian was on screen.
         max_radii: [N] float32, largest screen radius over the larger side of the image.
     """
@@ -371,6 +372,7 @@ class GaussianStats:
     weight_sums: Tensor
     grad_sums: Tensor
     absgrad_sums: Tensor
+    square_sums: Tensor
     view_counts: Tensor
     max_radii: Tensor
 

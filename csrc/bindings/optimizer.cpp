@@ -30,6 +30,7 @@ ScreenBackwardParams read_screen(const Arguments<Launch>& in) {
         in.set(params.weight_sums, T::weight_sums, {count});
         in.set(params.grad_sums, T::grad_sums, {count});
         in.set(params.absgrad_sums, T::absgrad_sums, {count});
+        in.set(params.square_sums, T::square_sums, {count});
         in.set(params.view_counts, T::view_counts, {count});
         in.set(params.max_radii, T::max_radii, {count});
     }

@@ -171,6 +171,7 @@ __device__ __forceinline__ void backward_views(const ScreenBackwardParams& param
                                                const float* coefficients, int gaussian, const StoredGaussian& stored,
                                                const ViewsOf& views_of, Sink& sink) {
     float error_sum = 0.0f, distance_sum = 0.0f, weight_sum = 0.0f, grad_sum = 0.0f, absgrad_sum = 0.0f;
+    float square_sum = 0.0f;
     const int filled = params.num_filled != nullptr ? *params.num_filled : params.num_slots;
     const float inverse_filled = 1.0f / static_cast<float>(max(filled, 1));
     const GaussianShape shape = make_shape(stored.mean, stored.log_scale, stored.quat);
@@ -198,6 +199,7 @@ __device__ __forceinline__ void backward_views(const ScreenBackwardParams& param
             error_sum += record[Place::kErrorSum];
             distance_sum += record[Place::kDistanceSum];
             weight_sum += record[Place::kWeightSum];
+            square_sum += record[Place::kSquareSum];
             const float gx = grad_mean2d[0] * camera.grad_scale_x, gy = grad_mean2d[1] * camera.grad_scale_y;
             const float ax = record[Place::kAbsolute] * camera.grad_scale_x;
             const float ay = record[Place::kAbsolute + 1] * camera.grad_scale_y;
@@ -211,6 +213,7 @@ __device__ __forceinline__ void backward_views(const ScreenBackwardParams& param
         add_stat(params.weight_sums, gaussian, weight_sum);
         add_stat(params.grad_sums, gaussian, grad_sum);
         add_stat(params.absgrad_sums, gaussian, absgrad_sum);
+        add_stat(params.square_sums, gaussian, square_sum);
     }
 }
 

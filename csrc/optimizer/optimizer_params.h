@@ -25,6 +25,7 @@ struct ScreenBackwardParams : SceneParams {
     float* weight_sums;    // [N]
     float* grad_sums;      // [N]
     float* absgrad_sums;   // [N]
+    float* square_sums;    // [N]
     float* view_counts;    // [N]
     float* max_radii;      // [N]
 };

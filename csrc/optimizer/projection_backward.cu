@@ -52,7 +52,7 @@ __device__ __forceinline__ uint32_t views_with_gradient(const ScreenBackwardPara
         load_record(params, first + number, gaussian, record);
         bool any = false;
 #pragma unroll
-        for (int i = 0; i < ScreenRecord::kSize - 1; ++i) any = any || record[i] != 0.0f;  // the last is unused
+        for (int i = 0; i < ScreenRecord::kSize - 1; ++i) any = any || record[i] != 0.0f;  // the last is of squares
         touched = touched || record[ScreenRecord::kWeightSum] > 0.0f;
         if (any) mask |= 1u << number;
     }

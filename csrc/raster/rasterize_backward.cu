@@ -144,6 +144,7 @@ struct SplatSums {
     float absolute_x = 0.0f, absolute_y = 0.0f;  // |g u|, |g (q u + r v)|
     float red = 0.0f, green = 0.0f, blue = 0.0f, depth = 0.0f;
     float error = 0.0f, distance = 0.0f, weight = 0.0f;
+    float square = 0.0f;  // g^2
 };
 
 // Phase 2, lane = splat and share: adds the samples of the share to the lane's sums.
@@ -173,6 +174,7 @@ __device__ __forceinline__ void sum_samples(const BackwardShared& shared, int ro
         if (kDensity) {
             sums.absolute_x += fabsf(slope_u);
             sums.absolute_y += fabsf(own.form.y * slope_u + own.form.z * slope_v);
+            sums.square += slope * slope;
             sums.distance += weight * approximate_sqrt_flushed(f.x * f.x + f.y * f.y);
         }
     };
@@ -207,7 +209,7 @@ __device__ __forceinline__ void make_record(const StagedSplat& own, const SplatS
     record[Place::kDistanceSum] = sqrtf(kTwoLn2) * sums.distance;
     record[Place::kWeightSum] = sums.weight;
     record[Place::kDepth] = sums.depth;
-    record[Place::kSize - 1] = 0.0f;  // unused
+    record[Place::kSquareSum] = sums.square;
 }
 
 // Adds the records of the two lanes that share a splat, and sends them to memory: each lane takes over half of the

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import logsigmoid
 from turbogs_plugin.strategies.checks import require_at_least_one, require_each, require_settings, require_share
+from turbogs_plugin.strategies.density.priority import GrowthOrder, PruneOrder, contribution, growth_priority
 from turbogs_plugin.strategies.density.rows import WindowedDensity, finite_rows, leave_one, removal
 from turbogs_plugin.strategies.density.splitting import split_in_two
 
@@ -62,15 +63,21 @@ class ErrorDrivenDensity(WindowedDensity):
         prune_screen_size: pruned where the screen radius exceeds this * the larger side of the image. 0: off, as in
             3DGS in effect.
         prune_size_from: both size rules begin at this progress; 3DGS has 3000 / 15000.
-        prune_score_fraction: the easiest share of the seen Gaussians, which each densification event prunes. Off by
-            default: the paper gives no value, and a Gaussian with little error may be one that is rendered well.
+        prune_score_fraction: the share that each densification event prunes, in the order of `prune_by`. Off by
+            default: the paper gives no value.
         opacity_decay: share of its opacity that every Gaussian loses at each densification event. If the photos need
             it, it grows back; if not, it falls below `prune_opacity`. A gentle substitute for 3DGS's reset.
         spare_beyond: Gaussians farther from the cameras' centre than this * scene extent are neither decayed nor pruned
             (unless they are not finite, or `max_gaussians` leaves no other choice). It protects a backdrop behind the
             scene, which few photos see. 0: none.
-        final_every, final_keep: interval of the final pruning, and the most difficult share of the seen Gaussians,
-            which it keeps (Delta_prune, eta_final). 1 keeps all.
+        choose_by: which candidates grow where `max_gaussians` has no room for all: the most difficult, or a draw by
+            the squares of their opacity gradients, see `growth_priority`.
+        prune_by: in what order `prune_score_fraction` and `final_keep` prune: the easiest first, or what contributes
+            the least, by blending weight or by squares, see `contribution`. A Gaussian with little error may be one
+            that is rendered well.
+        final_every, final_keep: interval of the final pruning, and the share that it keeps (Delta_prune, eta_final). 1
+            keeps all.
+        final_until: share of the run after which there is no final pruning, so that there is time to recover.
         stop_when_flat: densification ends early, at the first event where the error has fallen by less than this share
             of itself over the last `FLAT_EVENTS` events. The error of a window is the mean of its samples' e, weighted
             by w. It falls a little by itself as the sampling rate rises, so densification ends later rather than
@@ -95,15 +102,18 @@ class ErrorDrivenDensity(WindowedDensity):
     prune_score_fraction: float = 0.0
     opacity_decay: float = 0.0
     spare_beyond: float = 0.0
+    choose_by: GrowthOrder = "difficulty"
+    prune_by: PruneOrder = "difficulty"
     final_every: int = 500
     final_keep: float = 0.95
+    final_until: float = 1.0
     stop_when_flat: float = 0.0
     window_errors: list[float] = field(init=False, repr=False, default_factory=list)
     stopped_at: int = field(init=False, repr=False, default=0)
 
     def __post_init__(self) -> None:
         require_at_least_one(self, "refine_every", "final_every")
-        require_share(self, "top_fraction", "final_keep")
+        require_share(self, "top_fraction", "final_keep", "final_until")
         shares = ("prune_opacity", "prune_score_fraction", "opacity_decay", "stop_when_flat")
         require_each(self, lambda value: 0 <= value < 1, "at least 0 and less than 1", *shares)
         require_settings(self)
@@ -139,6 +149,12 @@ class ErrorDrivenDensity(WindowedDensity):
                 f"stop_when_flat = {self.stop_when_flat:g}, but the saved run had it at 0 and kept no record of its "
                 "error: continue it with stop_when_flat = 0, or start a new run"
             )
+        for name in ("choose_by", "prune_by"):
+            if getattr(self, name) == "squares" and state["stats"] is not None and "square_sums" not in state["stats"]:
+                raise InputError(
+                    f"{name} = squares, but the saved run kept no squares: continue it with {name} = difficulty, or "
+                    "start a new run"
+                )
         super().load_state_dict(state)
         if self.stop_when_flat > 0:
             self.window_errors = state["window_errors"].tolist()
@@ -161,14 +177,20 @@ class ErrorDrivenDensity(WindowedDensity):
         """Whether this iteration densifies, and whether it makes a final pruning."""
         iteration, after = step.iteration, step.iteration - step.refine_until
         densify = after <= 0 and iteration >= self.refine_from and iteration % self.refine_every == 0
-        return densify and not self.stopped_at, self.final_keep < 1 and after > 0 and after % self.final_every == 0
+        final = 0 < after <= self._final_span(step) and after % self.final_every == 0
+        return densify and not self.stopped_at, self.final_keep < 1 and final
+
+    def _final_span(self, step: Step) -> int:
+        """Iterations after densification within which there are final prunings."""
+        last = min(step.total - 1, math.floor(self.final_until * step.total))
+        return max(0, last - step.refine_until)
 
     def _last_event(self, step: Step) -> int:
         """Iteration after which no statistics are needed: that of the last event, or where densification ends.
 
         It is not that of the last densification: until the end a time budget may still move it and allow another one.
         """
-        rest = max(0, step.total - 1 - step.refine_until)
+        rest = self._final_span(step)
         if self.final_keep < 1 and rest >= self.final_every:
             return step.refine_until + rest // self.final_every * self.final_every
         return self.stopped_at or step.refine_until
@@ -192,7 +214,8 @@ class ErrorDrivenDensity(WindowedDensity):
         spared = self._spared(gaussians, finite, extent)
         hopeless = ~finite | (torch.sigmoid(gaussians.opacities) < self.prune_opacity)
         if self.prune_score_fraction > 0:
-            hopeless |= seen & (score < _quantile(score, seen, self.prune_score_fraction))
+            worth, known = contribution(self._stats, score, seen, self.prune_by)
+            hopeless |= known & (worth < _quantile(worth, known, self.prune_score_fraction))
         candidates = self._growing(score, seen) & ~hopeless
         largest = gaussians.scales.amax(dim=-1).exp()  # [N]
         small = largest <= self.percent_dense * extent
@@ -208,7 +231,8 @@ class ErrorDrivenDensity(WindowedDensity):
         pruned = leave_one((hopeless | (big & ~(candidates & ~small))) & ~spared, gaussians)
         candidates &= ~pruned
         if self.max_gaussians > 0:
-            chosen = _first(score, candidates, max(0, self.max_gaussians - int((~pruned).sum())))
+            priority = growth_priority(self._stats, score, self.choose_by, step)
+            chosen = _first(priority, candidates, max(0, self.max_gaussians - int((~pruned).sum())))
             denied = candidates & ~chosen
             candidates = chosen
             pruned = leave_one(pruned | (big & denied & ~spared), gaussians)  # makes room for the next event
@@ -239,9 +263,10 @@ class ErrorDrivenDensity(WindowedDensity):
 
     def _final_prune(self, gaussians: Gaussians, step: Step) -> RowUpdate | None:
         finite = finite_rows(gaussians)
-        score, seen = self.scores(step)
-        easy = seen & (score < _quantile(score, seen, 1 - self.final_keep))
-        return removal(leave_one(~finite | easy & ~self._spared(gaussians, finite, step.scene_extent), gaussians))
+        worth, known = contribution(self._stats, *self.scores(step), self.prune_by)
+        spared = self._spared(gaussians, finite, step.scene_extent)
+        pruned = ~finite | known & (worth < _quantile(worth, known, 1 - self.final_keep)) & ~spared
+        return removal(leave_one(pruned, gaussians))
 
     def _compose(
         self, gaussians: Gaussians, cloned: Tensor, split: Tensor, pruned: Tensor, spared: Tensor, step: Step

@@ -217,6 +217,28 @@ def test_absolute_gradients_are_summed_pixel_by_pixel():
     assert (absolute > total.abs() + 1e-6).any()
 
 
+def test_square_sums_are_those_of_single_pixels():
+    """One pixel at a time the sum of squares is the square of (o * d loss / d o)."""
+    gaussians, cameras = make_gaussians(20), make_cameras([(6, 5)])
+    samples = dense_samples(cameras)
+    colors, _, _, errors = upstream(samples)
+
+    def record(color_gradients):
+        screen = rasterize(gaussians, cameras, samples).backward(color_gradients, errors, with_statistics=True)
+        return screen.full_records()[0]  # [N, 16]
+
+    opacities = torch.sigmoid(gaussians.opacities)
+    single = sum(
+        (
+            opacities * record(torch.where(torch.arange(30)[:, None] == slot, colors, 0))[:, ScreenRecord.OPACITY]
+        ).square()
+        for slot in range(30)
+    )
+    squares = record(colors)[:, ScreenRecord.SQUARE_SUM]
+    assert squares.max() > 0
+    torch.testing.assert_close(squares, single)
+
+
 def test_statistics_are_added_once_as_documented():
     gaussians, cameras = make_gaussians(30), make_cameras(SIZES)
     samples = thin_out(dense_samples(cameras), 0.5)
@@ -234,6 +256,7 @@ def test_statistics_are_added_once_as_documented():
         "weight_sums": record[..., ScreenRecord.WEIGHT_SUM].sum(dim=0),
         "grad_sums": (record[..., ScreenRecord.MEAN] * half[:, None]).norm(dim=-1).sum(dim=0),
         "absgrad_sums": (record[..., ScreenRecord.ABSOLUTE] * half[:, None]).norm(dim=-1).sum(dim=0),
+        "square_sums": record[..., ScreenRecord.SQUARE_SUM].sum(dim=0),
         "view_counts": shown.double().sum(dim=0),
     }
     for name, value in expected.items():

@@ -91,7 +91,7 @@ def test_the_zero_channel_gives_our_error_sums(packed):
     (expected, _), (actual, has_errors) = (iteration_stats(info, COUNT) for info in (our_info, their_info))
     assert has_errors
     for name in GaussianStats.__dataclass_fields__:
-        if name != "distance_sums":
+        if name not in ("distance_sums", "square_sums"):
             assert relative(getattr(actual, name), getattr(expected, name)) < 5e-3, name
     assert relative(loss_shares(their_info, COUNT), loss_shares(our_info, COUNT)) < 5e-3
     assert torch.equal(splats["means"].grad, gradient)

@@ -2,6 +2,7 @@
 
 import inspect
 from dataclasses import dataclass, field
+from itertools import product
 
 import pytest
 import torch
@@ -178,6 +179,16 @@ FIELDS = {
 }
 """Field -> values of the strategy's fields, and the controller's by which the same happens."""
 
+NEED_ERRORS = {
+    name: (fields, fields)
+    for name, fields in {
+        "choose_by": {"max_gaussians": 45, "choose_by": "squares"},
+        "prune_by weight": {"prune_score_fraction": 0.3, "prune_by": "weight"},
+        "prune_by squares": {"prune_score_fraction": 0.3, "prune_by": "squares"},
+    }.items()
+}
+"""The same, of those that only a host with errors can have."""
+
 
 def controlled(options, before, window, seed, extent, refine_until):
     """The Gaussians after the event by an `ErrorDrivenDensity` with exactly these options, in the order of space."""
@@ -196,11 +207,12 @@ def differ(some: Gaussians, other: Gaussians) -> bool:
     )
 
 
-@pytest.mark.parametrize("name", FIELDS)
-@pytest.mark.parametrize("tells_errors", [False, True])
+@pytest.mark.parametrize(
+    ("name", "tells_errors"), [*product(FIELDS, (False, True)), *((name, True) for name in NEED_ERRORS)]
+)
 def test_an_event_is_the_controllers_with_these_values(name, tells_errors):
     """And what a field changes, it changes: with the base's values the controller does something else."""
-    fields, options = FIELDS[name]
+    fields, options = (FIELDS | NEED_ERRORS)[name]
     strategy = TurboDensityStrategy(**{**BASE, **fields})
     host = Host(strategy, tells_errors=tells_errors)
     extent = host.state["scene_scale"] = 1.2 if name == "scene_scale" else 1.0
@@ -416,6 +428,12 @@ def test_changes_in_mid_run_are_refused():
         host.step(1)
 
 
+def test_orders_whose_sums_are_not_there_are_refused():
+    for name, order in (("choose_by", "squares"), ("prune_by", "squares"), ("prune_by", "weight")):
+        with pytest.raises(InputError, match=rf"{name} = '{order}' needs .*'prediction'.*or leave it at 'difficulty'"):
+            Host(TurboDensityStrategy(**SOON, **{name: order})).step(0)
+
+
 def test_absgrad_must_be_there_or_off():
     host = Host(TurboDensityStrategy(**SOON))
     host.step(0)
@@ -427,7 +445,13 @@ def test_absgrad_must_be_there_or_off():
 
 @pytest.mark.parametrize(
     ("field", "value"),
-    [("revised_opacity", True), ("pause_refine_after_reset", 5), ("top_fraction", 0.0), ("split", "x")],
+    [
+        ("revised_opacity", True),
+        ("pause_refine_after_reset", 5),
+        ("top_fraction", 0.0),
+        ("split", "x"),
+        ("choose_by", "x"),
+    ],
 )
 def test_invalid_fields_are_refused(field, value):
     with pytest.raises(InputError, match=field):

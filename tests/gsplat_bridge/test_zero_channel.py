@@ -25,7 +25,7 @@ def test_it_gives_the_sums_that_our_rasterizer_gives(rendered, packed, monkeypat
     assert has_errors and expected.error_sums.sum() > 1
     for name in ("error_sums", "weight_sums", "grad_sums", "absgrad_sums", "view_counts", "max_radii"):
         torch.testing.assert_close(getattr(actual, name), getattr(expected, name), rtol=2e-3, atol=2e-3)
-    assert not actual.distance_sums.any()
+    assert not actual.distance_sums.any() and not actual.square_sums.any()
     torch.testing.assert_close(loss_shares(info, COUNT), rendered["loss_shares"], rtol=2e-3, atol=1e-6)
 
 

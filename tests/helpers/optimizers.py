@@ -77,9 +77,18 @@ def random_stats(count: int, seed: int, seen: float = 0.8) -> GaussianStats:
         weight_sums=weights,
         grad_sums=4e-4 * uniform() * views,
         absgrad_sums=8e-4 * uniform() * views,
+        square_sums=1e-6 * uniform() * weights,
         view_counts=views,
         max_radii=0.2 * uniform(),
     )
+
+
+def busy_stats(count: int) -> GaussianStats:
+    """Every Gaussian seen, equally difficult, and passing the gradient threshold."""
+    stats = GaussianStats.zeros(count, "cpu")
+    for name in ("error_sums", "distance_sums", "weight_sums", "grad_sums", "view_counts"):
+        getattr(stats, name).fill_(1.0)
+    return stats
 
 
 def fill(target: GaussianStats, source: GaussianStats) -> None:

@@ -52,7 +52,7 @@ def test_memory_is_what_is_kept_and_what_is_done_with_it():
     resident, maps, both = (
         demand(*(f"train.{name}_place=host" for name in names)) for names in ([], ["maps"], ["maps", "photos"])
     )
-    assert resident.per_gaussian == both.per_gaussian == 2 * (59 * 4 * 3 + 4 + 28) + 230 * 10
+    assert resident.per_gaussian == both.per_gaussian == 2 * (59 * 4 * 3 + 4 + 32) + 230 * 10
     assert resident.fixed - maps.fixed == 4 * (200 - 20) * 8_294_400
     assert maps.fixed - both.fixed == 3 * (225 - 22) * 8_294_400
     assert demand("train.sh_degree=0").per_gaussian == resident.per_gaussian - 2 * 45 * 12

@@ -242,7 +242,6 @@ def test_bad_files_are_named(tmp_path, damage, words):
     ("capture", "arguments", "words"),
     [
         ({"views": 2}, {}, "has 2 images: at least 3"),
-        ({"num_points": 0}, {}, "no 3D points"),
         ({}, {"test_every": 1}, "every image of .* would be a test image"),
         ({}, {"test_every": 0}, "test_every is 0"),
         ({}, {"factor": 0}, "factor is 0"),
@@ -261,6 +260,14 @@ def test_bad_captures_are_refused(tmp_path, capture, arguments, words):
     with pytest.raises(InputError, match=words) as caught:
         load_scene(folder, **arguments)
     assert "\n" not in str(caught.value)
+
+
+def test_without_points_random_ones_are_drawn(tmp_path):
+    scene = load_scene(write_capture(tmp_path / "cup", num_points=0))
+    assert len(scene.points) == len(scene.point_colors) == 50_000
+    assert scene.notes[0].endswith("9 images, no points, so 50,000 random ones about what the cameras look at")
+    again = load_scene(tmp_path / "cup")
+    assert torch.equal(scene.points, again.points)
 
 
 def test_points_beyond_float32_are_refused(tmp_path):
@@ -355,9 +362,15 @@ def test_photos_in_other_folders(tmp_path, place):
     assert len(scene.train) == 7 and "photos in " in scene.notes[0]
 
 
-def test_reduced_copies_are_no_photos_of_full_size(tmp_path):
+def test_copies_that_the_cameras_were_reconstructed_from(tmp_path):
+    """Nothing of full size is there, neither photos nor cameras: factors count from the copies."""
     folder = write_capture(tmp_path / "cup")
     (folder / "images").rename(folder / "images_4")
+    scene = load_scene(folder)
+    assert scene.train.cameras.sizes[0].tolist() == [40, 24] and len(scene.notes) == 1
+    assert "photos in " in scene.notes[0] and "images_4" in scene.notes[0]
+    assert load_scene(folder, factor=2).train.cameras.sizes[0].tolist() == [20, 12]
+    (folder / "images_4" / "photo03.png").unlink()
     with pytest.raises(InputError, match=r"9 of 9 photos are missing in .*images: "):
         load_scene(folder)
 

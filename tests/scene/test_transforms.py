@@ -11,7 +11,7 @@ from PIL import Image
 
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene import load_scene
-from turbogs_plugin.scene.transforms import random_points
+from turbogs_plugin.scene.starting_points import random_points
 
 SCENES = Path(os.environ.get("TURBOGS_SCENES", Path(__file__).resolve().parents[3] / "shared" / "scenes"))
 TARGET = np.array([3.0, -1.0, 2.0])
@@ -115,7 +115,7 @@ def test_random_points_are_seeded_and_about_what_the_cameras_see(tmp_path):
 def test_random_points_of_parallel_cameras():
     viewmats = np.tile(np.eye(4), (5, 1, 1))
     viewmats[:, 0, 3] = np.arange(5)
-    points, _ = random_points(viewmats)
+    points = random_points(viewmats)
     assert np.isfinite(points).all()
 
 

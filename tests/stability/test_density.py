@@ -13,6 +13,11 @@ from turbogs_plugin.types import Step
 
 EVENT = Step(iteration=200, total=5000, refine_until=3500, seed=7, scene_extent=1.0)
 VALUES = st.sampled_from([0.0, 1e-30, 1e-4, 1.0, 1e30, float("inf"), float("nan")])
+ORDERS = (
+    {},
+    {"prune_by": "weight", "prune_score_fraction": 0.2},
+    {"choose_by": "squares", "prune_by": "squares", "prune_score_fraction": 0.2},
+)
 PARAMETERS = st.sampled_from([0.0, 1.0, -20.0, 20.0, -200.0, 50.0, 88.0, 200.0, 1e30, float("inf"), float("nan")])
 
 
@@ -33,7 +38,8 @@ def test_what_is_too_large_to_split_goes(split, log_scale):
 
 @settings(max_examples=200, deadline=None, derandomize=True)
 @given(
-    sums=st.lists(VALUES, min_size=6, max_size=6),
+    sums=st.lists(VALUES, min_size=7, max_size=7),
+    orders=st.sampled_from(ORDERS),
     parameters=st.lists(PARAMETERS, min_size=5, max_size=5),
     split=st.sampled_from(["sample", "long_axis"]),
     decay=st.sampled_from([0.0, 0.1]),
@@ -41,15 +47,15 @@ def test_what_is_too_large_to_split_goes(split, log_scale):
     final=st.booleans(),
     count=st.sampled_from([1, 2, 9]),
 )
-def test_any_window_and_any_model_end_in_a_finite_model(sums, parameters, split, decay, cap, final, count):
+def test_any_window_and_any_model_end_in_a_finite_model(sums, orders, parameters, split, decay, cap, final, count):
     """Some rows are spoiled, all others are as ever. At least one Gaussian is left, and no row is out of range."""
     gaussians = make_gaussians(count, dtype=torch.float32)
     names = ("means", "quats", "scales", "opacities", "sh0")
     for row, (name, value) in enumerate(zip(names, parameters, strict=True)):
         getattr(gaussians, name)[row % count] = value
-    density = ErrorDrivenDensity(refine_from=0, split=split, opacity_decay=decay, max_gaussians=cap)
+    density = ErrorDrivenDensity(refine_from=0, split=split, opacity_decay=decay, max_gaussians=cap, **orders)
     density.setup(gaussians)
-    fields = ("error_sums", "distance_sums", "weight_sums", "grad_sums", "absgrad_sums", "view_counts")
+    fields = ("error_sums", "distance_sums", "weight_sums", "grad_sums", "absgrad_sums", "square_sums", "view_counts")
     for row, (name, value) in enumerate(zip(fields, sums, strict=True)):
         getattr(density.stats, name)[row % count] = value
     step = Step(iteration=4000 if final else 3500, total=5000, refine_until=3500, seed=7, scene_extent=1.0)

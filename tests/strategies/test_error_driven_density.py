@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from helpers.optimizers import STEP, all_finite, fill, make_gaussians, make_gradients, random_stats
+from helpers.optimizers import STEP, all_finite, busy_stats, fill, make_gaussians, make_gradients, random_stats
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from turbogs_plugin.strategies.density.error_driven import ErrorDrivenDensity
@@ -29,14 +29,6 @@ def controlled(gaussians, stats: GaussianStats | None = None, **config) -> Error
     if stats is not None:
         fill(density.stats, stats)
     return density
-
-
-def busy_stats(count: int) -> GaussianStats:
-    """Every Gaussian seen, equally difficult, and passing the gradient threshold."""
-    stats = GaussianStats.zeros(count, "cpu")
-    for name in ("error_sums", "distance_sums", "weight_sums", "grad_sums", "view_counts"):
-        getattr(stats, name).fill_(1.0)
-    return stats
 
 
 def rotation(quat: np.ndarray) -> np.ndarray:
@@ -412,6 +404,21 @@ def test_resumed_is_bit_identical(cls):
     assert first.stats is None and second.stats is None
 
 
+def test_a_checkpoint_without_squares_goes_on_unless_they_are_needed():
+    gaussians = make_gaussians(4)
+    state = {"stats": dict(vars(controlled(gaussians, busy_stats(4)).stats))}
+    del state["stats"]["square_sums"]
+    resumed = controlled(gaussians)
+    resumed.load_state_dict(state)
+    assert not resumed.stats.square_sums.any() and resumed.stats.weight_sums.all()
+    for name in ("choose_by", "prune_by"):
+        with pytest.raises(InputError, match=rf"{name} = squares, but the saved run kept no squares"):
+            controlled(gaussians, **{name: "squares"}).load_state_dict(state)
+    ended = controlled(gaussians, choose_by="squares", prune_by="squares")
+    ended.load_state_dict({"stats": None})
+    assert ended.stats is None
+
+
 @pytest.mark.parametrize("cls", [ErrorDrivenDensity, GsplatDefaultDensity, FastGsDensity])
 def test_statistics_of_another_model_are_refused(cls):
     small, large, never_set_up = cls(), cls(), cls()
@@ -438,6 +445,9 @@ def test_a_run_without_a_record_of_its_error_cannot_go_on_with_one():
         {"refine_every": 0},
         {"top_fraction": 0.0},
         {"final_keep": 1.5},
+        {"final_until": 0.0},
+        {"choose_by": "weight"},
+        {"prune_by": "gradient"},
         {"opacity_decay": 1.0},
         {"max_gaussians": -1},
         {"lambda_base": math.nan},

@@ -20,7 +20,7 @@ from turbogs_plugin.model.ply import read_ply
 from turbogs_plugin.plan.decisions import wanted_backdrop
 from turbogs_plugin.scene import load_scene
 from turbogs_plugin.scene.colmap import load_pycolmap
-from turbogs_plugin.scene.transforms import random_points
+from turbogs_plugin.scene.starting_points import random_points
 from turbogs_plugin.train import run
 from turbogs_plugin.train.checkpoint import latest_checkpoint
 from turbogs_plugin.train.given_model import load_given
@@ -224,7 +224,7 @@ def test_a_stopped_run_goes_on_without_the_model_that_it_started_from(finished, 
 def test_random_points_are_those_of_a_capture_without_points(capture):
     scene = load_scene(capture)
     trainer = Trainer(tiny_config(capture, "train.init=random").without_plan(), scene, CPU)
-    points, _ = random_points(scene.train.cameras.viewmats.double().numpy())
+    points = random_points(scene.train.cameras.viewmats.double().numpy())
     assert len(trainer.gaussians) == len(points) == 50_000
     assert (trainer.gaussians.means - torch.from_numpy(points).float()).abs().max() == 0
 

@@ -15,7 +15,9 @@ from turbogs_plugin.bench.large_capture import synthetic_scene
 from turbogs_plugin.bench.numerics import bench_solvers, solvers_table
 from turbogs_plugin.bench.raster import RasterBench, other_build
 from turbogs_plugin.bench.step import StepBench
+from turbogs_plugin.bench.viewer import bench_viewer, viewer_lines
 from turbogs_plugin.bench.wall import bench_wall, wall_lines
+from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.engine import compiled_kernels
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.files import require_writable, write_text_atomically
@@ -23,6 +25,8 @@ from turbogs_plugin.report.provenance import provenance
 from turbogs_plugin.scene import load_scene
 from turbogs_plugin.scene.load import FEWEST_VIEWS
 from turbogs_plugin.study.cell import scene_on
+from turbogs_plugin.train.run import open_scene
+from turbogs_plugin.viewer.page import require_viser
 
 AGAIN = "this build, in a process of its own"
 """The name of this build among the others, which compare with it and not with the first measurement: in the process
@@ -80,6 +84,18 @@ def run_wall(arguments: Sequence[str], repeats: int, device: torch.device, out: 
     print("\n".join(wall_lines(measured)))
     if out is not None:
         write_text_atomically(out, json.dumps(_report("wall", measured, device), indent=2) + "\n")
+        print(f"json  {out}")
+    return 0
+
+
+def run_viewer(config: Config, repeats: int, device: torch.device, out: Path | None) -> int:
+    """Times trainings with and without a viewer; prints them side by side, and writes the JSON if there is a file."""
+    _require_new(out)
+    require_viser()
+    measured = bench_viewer(config, open_scene(config), device, repeats)
+    print("\n".join(viewer_lines(measured)))
+    if out is not None:
+        write_text_atomically(out, json.dumps(_report("viewer", measured, device), indent=2) + "\n")
         print(f"json  {out}")
     return 0
 

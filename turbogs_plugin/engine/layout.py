@@ -39,8 +39,8 @@ class ScreenRecord:
     """Gradients and sums of one Gaussian in one view: a row of float32.
 
     w is the weight of a sample (transmittance times alpha), e its error, D its distance from the mean in standard
-    deviations (Mahalanobis). Sums run over the samples. `ABSOLUTE` and `DISTANCE_SUM` are filled only if density
-    control asks for them, and are zero otherwise.
+    deviations (Mahalanobis). Sums run over the samples. `ABSOLUTE`, `DISTANCE_SUM` and `SQUARE_SUM` are filled only if
+    density control asks for them, and are zero otherwise.
     """
 
     MEAN = slice(0, 2)  # d loss / d projected mean, in pixels
@@ -52,7 +52,8 @@ class ScreenRecord:
     DISTANCE_SUM = 12  # sum of D * w
     WEIGHT_SUM = 13  # sum of w
     DEPTH = 14  # d loss / d depth
-    SIZE = 16  # the last one is unused: a record is four quads of 16 bytes
+    SQUARE_SUM = 15  # sum of the squares of each sample's o * d loss / d o, o the opacity
+    SIZE = 16
 
 
 class ParameterRow:

@@ -94,7 +94,7 @@ class Rendered(ABC):
         Args:
             color_gradients: [P, 3] d loss / d colors.
             pixel_errors: [P] the errors to carry to the Gaussians; None for zeros.
-            with_statistics: also sum up what `GaussianStats` needs (absolute gradients, distances).
+            with_statistics: also sum up what `GaussianStats` needs (absolute gradients, squares, distances).
             alpha_gradients, depth_gradients: [P], where the loss has such terms.
 
         Raises:

@@ -17,6 +17,7 @@ from turbogs_plugin.gsplat_bridge.host import (
     GEOMETRY,
     GROUND_TRUTH,
     PREDICTION,
+    STATISTICS,
     Optimizers,
     Parameters,
     host_gaussians,
@@ -63,6 +64,7 @@ class TurboDensityStrategy(DefaultStrategy):
         absgrad: also densify by absolute gradients above grow_absgrad2d; render with ``absgrad=True`` then.
         grow_grad2d, grow_absgrad2d, grow_scale3d: grad_threshold, absgrad_threshold and percent_dense of
             `ErrorDrivenDensity`.
+        choose_by, prune_by: `weight` needs the line above; `squares` also that `sparse_rasterization` renders.
         final_every, final_keep: final pruning after refine_stop_iter, off where final_keep is 1.
         seed: of the positions of split Gaussians.
     """
@@ -77,6 +79,8 @@ class TurboDensityStrategy(DefaultStrategy):
     split: str = TUNED_DENSITY.split
     max_gaussians: int = TUNED_DENSITY.max_gaussians
     prune_score_fraction: float = TUNED_DENSITY.prune_score_fraction
+    choose_by: str = "difficulty"  # not that of turbogs: it must hold for every rasterizer
+    prune_by: str = "difficulty"
     opacity_decay: float = TUNED_DENSITY.opacity_decay
     final_every: int = TUNED_DENSITY.final_every
     final_keep: float = TUNED_DENSITY.final_keep
@@ -128,7 +132,8 @@ class TurboDensityStrategy(DefaultStrategy):
 
         Raises:
             InputError: the host trains in several processes; `state` is not one of `initialize_state`, or was not
-                carried along when rows changed; `info` lacks a key; or it changed between having errors and none.
+                carried along when rows changed; `info` lacks a key, or sums that `choose_by` or `prune_by` needs; or it
+                changed between having errors and none.
         """
         require_one_process("TurboDensityStrategy")
         if step >= self.refine_stop_iter and self.final_keep == 1:
@@ -159,6 +164,7 @@ class TurboDensityStrategy(DefaultStrategy):
             raise InputError("the strategy was called without its state: expected that of strategy.initialize_state()")
         require_keys(state, _STATE_KEYS, "the state", "expected that of TurboDensityStrategy.initialize_state()")
         stats, has_errors = iteration_stats(info, count)
+        self._require_sums(info, has_errors)
         driven_by = "error" if has_errors else "gradient"
         if state[_DRIVEN_BY] is None:
             print(f"TurboDensityStrategy: {_ANNOUNCEMENTS[driven_by]}.")
@@ -187,6 +193,20 @@ class TurboDensityStrategy(DefaultStrategy):
         window = GaussianStats(**{name: state[name] for name in _STATS})
         add_stats(window, stats)
         return window
+
+    def _require_sums(self, info: dict[str, Any], has_errors: bool) -> None:
+        """Raise `InputError` where `choose_by` or `prune_by` needs sums that this step's `info` does not have."""
+        for name in ("choose_by", "prune_by"):
+            order, rest = getattr(self, name), "or leave it at 'difficulty'"
+            if order == "squares" and info.get(STATISTICS) is None:
+                raise InputError(
+                    f"{name} = 'squares' needs the sums that sparse_rasterization leaves where info has "
+                    f"'{PREDICTION}' and '{GROUND_TRUTH}': render with it and add them, {rest}"
+                )
+            if order == "weight" and not has_errors:
+                raise InputError(
+                    f"{name} = 'weight' needs '{PREDICTION}' and '{GROUND_TRUTH}' in info: add them, {rest}"
+                )
 
     def _due(self, step: int) -> bool:
         """Whether a densification or a final pruning happens at this step, at gsplat's places in the schedule."""

@@ -11,19 +11,22 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from turbogs_plugin.scene.host_arrays import too_large
+
 
 def load_plain(path: Path) -> Any:
     """What a file of `torch.save` holds, on the CPU.
 
     Only plain tensors and values are read (``weights_only``). They must be uncompressed and no larger than the file. So
-    a file from an untrusted source can neither run code nor fill the memory.
+    a file from an untrusted source can neither run code nor fill the memory. One that is large beside the free memory
+    stays on the disk, from where tensors are read as they are used; its checksums are not looked at.
 
     Raises:
         OSError: the file cannot be read.
         Exception: anything else wrong with it; torch and zipfile raise a dozen kinds for malformed files.
     """
     _require_bounded(path)
-    state = torch.load(path, map_location="cpu", weights_only=True)
+    state = torch.load(path, map_location="cpu", weights_only=True, mmap=too_large(os.path.getsize(path)))
     tensors = [value for _, value in leaves(state, "state") if isinstance(value, Tensor)]
     if any(tensor.numel() * tensor.element_size() > tensor.untyped_storage().nbytes() for tensor in tensors):
         raise ValueError("it has a tensor that is not stored whole")

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from turbogs_plugin.config.auto import AUTO, AUTO_SETTINGS, value_of
 from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.plan.facts import SceneFacts
 from turbogs_plugin.plan.pixels import images_per_iteration
+from turbogs_plugin.scene.host_arrays import MEMORY_SHARE as HOST_SHARE
 
 ONE_SIDED = 0.95
 """Direction concentration above which a capture is seen from one side. Nadir grids of aircraft have .99; walks around
@@ -153,8 +154,15 @@ def wanted_maps_place(facts: SceneFacts, config: Config) -> Verdict:
 
     Photos are the first to go: of a pixel, 3 bytes travel in, of the maps 4 in and 4 out.
     """
+    room = HOST_SHARE * facts.host_free_bytes
+    in_file = f"> {HOST_SHARE:.0%} of {mebibytes(facts.host_free_bytes)} free on the host: in a file"
+    if facts.device == "cpu" and facts.map_bytes > room:
+        return Verdict("host", f"{mebibytes(facts.map_bytes)} {in_file}")
     photos = facts.photo_bytes if config.train.photos_place == "device" else 0
-    return _place(facts, facts.map_bytes, photos, "photos")
+    verdict = _place(facts, facts.map_bytes, photos, "photos")
+    if verdict.value == "host" and facts.map_bytes > room:
+        return replace(verdict, reason=f"{verdict.reason}, {in_file}")
+    return verdict
 
 
 def wanted_photos_place(facts: SceneFacts, config: Config) -> Verdict:

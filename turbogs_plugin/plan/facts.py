@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,6 +10,7 @@ from torch import Tensor
 
 from turbogs_plugin.error_maps import MAP_BYTES
 from turbogs_plugin.scene import PosedImages, Scene
+from turbogs_plugin.scene.host_arrays import free_host_bytes
 from turbogs_plugin.scene.photos import PHOTO_BYTES
 from turbogs_plugin.tiles import TILE_PIXELS
 from turbogs_plugin.types import TILE_SIZE
@@ -93,7 +93,7 @@ def gather_facts(
     order = np.argsort(sizes.prod(axis=1), kind="stable")
     pixels, test_pixels = int(sizes.prod(axis=1).sum()), int(scene.test.cameras.sizes.prod(axis=1).sum())
     sight = _Sight.of(views, scene.points)
-    host_free = _free_host_bytes()
+    host_free = free_host_bytes()
     return SceneFacts(
         scene=scene.name,
         train_views=len(views),
@@ -208,14 +208,3 @@ def _free_device_bytes(device: torch.device, scene: Scene) -> int:
     free += torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
     ours = (views.photos.stored for views in (scene.train, scene.test))
     return free + sum(colors.numel() for colors in ours if colors.device.type == "cuda")
-
-
-def _free_host_bytes() -> int:
-    try:
-        with open("/proc/meminfo", encoding="ascii") as file:
-            for line in file:
-                if line.startswith("MemAvailable:"):
-                    return 1024 * int(line.split()[1])
-    except OSError:
-        pass  # not Linux
-    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")

@@ -4,7 +4,7 @@ The peak of a run on a GPU is taken to be ``fixed + per_gaussian * N``, all of i
 context comes on top, with its 0.3 to 0.6 GiB). With K views an iteration, degree-d harmonics (B bands above 0) and
 lambda images of S pixels an iteration:
 
-- per Gaussian: 14 + 3 B parameters, two moments of each, a step count and 7 statistics, all of it twice, for an event
+- per Gaussian: 14 + 3 B parameters, two moments of each, a step count and 8 statistics, all of it twice, for an event
   of density control makes the new arrays beside the old; and for each of the K views `VIEW_BYTES`;
 - fixed: photos and maps, or their windows of 2 K views; `SAMPLE_BYTES` for each of lambda S samples; `IMAGE_BYTES` for
   each pixel of the largest photo, which is rendered whole at the start and in evaluations.
@@ -71,7 +71,7 @@ class MemoryDemand:
         numbers = 14 + 3 * bands
         return cls(
             fixed=photo_bytes * photos + MAP_BYTES * maps + SAMPLE_BYTES * samples + IMAGE_BYTES * largest,
-            per_gaussian=2 * (3 * 4 * numbers + 4 + 7 * 4) + VIEW_BYTES * views,
+            per_gaussian=2 * (3 * 4 * numbers + 4 + 8 * 4) + VIEW_BYTES * views,
             per_image=SAMPLE_BYTES * largest,
         )
 

@@ -68,7 +68,7 @@ def strip(photo: Tensor, image: Tensor, mask: Tensor | None = None) -> np.ndarra
 
 def error_picture(photo: Tensor, image: Tensor) -> Tensor:
     """[H, W, 3] uint8: mean absolute error over RGB, black (none) to bright yellow (`ERROR_FULL_SCALE` and more)."""
-    return _colored((photo - image).abs().mean(dim=-1) / ERROR_FULL_SCALE)
+    return colored((photo - image).abs().mean(dim=-1) / ERROR_FULL_SCALE)
 
 
 def depth_picture(depths: np.ndarray) -> np.ndarray:
@@ -83,10 +83,10 @@ def depth_picture(depths: np.ndarray) -> np.ndarray:
     nearness = 1.0 / np.where(seen, depths, 1.0)
     far, near = np.percentile(nearness[seen], [1, 99])
     share = ((nearness - far) / max(near - far, np.finfo(np.float32).tiny)).clip(0.0, 1.0)
-    return _colored(torch.from_numpy(FAINTEST + (1.0 - FAINTEST) * share)).numpy() * seen[..., None]
+    return colored(torch.from_numpy(FAINTEST + (1.0 - FAINTEST) * share)).numpy() * seen[..., None]
 
 
-def _colored(share: Tensor) -> Tensor:
+def colored(share: Tensor) -> Tensor:
     """[H, W, 3] uint8: black (0) to bright yellow (1 and more)."""
     palette = torch.from_numpy(_palette()).to(share.device)  # [256, 3]
     return palette[(share * len(palette)).clamp(0, len(palette) - 1).long()]

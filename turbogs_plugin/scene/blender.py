@@ -18,7 +18,8 @@ from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene.capture import Capture, sizes_text
 from turbogs_plugin.scene.photos import is_transparent, opened_image, photo_size
 from turbogs_plugin.scene.poses import viewmat_of_pose
-from turbogs_plugin.scene.transforms import number_of, photo_name, random_points, read_frames
+from turbogs_plugin.scene.starting_points import random_points
+from turbogs_plugin.scene.transforms import number_of, photo_name, read_frames
 
 TRAIN_FILE = "transforms_train.json"
 TEST_FILES = ("transforms_test.json", "transforms_val.json")
@@ -64,7 +65,7 @@ def read_blender(scene: Path) -> Capture:
             f"them out of one; without {' and '.join(TEST_FILES)} every 8th photo is for testing"
         )
     names, views = zip(*sorted({**train, **test}.items()), strict=True)
-    points, colors = random_points(np.array([view.viewmat for view in train.values()]))
+    points = random_points(np.array([view.viewmat for view in train.values()]))
     capture = Capture(
         names=names,
         photo_folder=scene,
@@ -72,7 +73,7 @@ def read_blender(scene: Path) -> Capture:
         Ks=np.array([view.K for view in views]),
         sizes=np.array([view.size for view in views], dtype=np.int64),
         points=points,
-        point_colors=colors,
+        point_colors=None,
         notes=(_note(scene, train, test, len(points)),),
         test=np.array([name in test for name in names]) if test else None,
     )

@@ -27,7 +27,7 @@ class Capture:
         Ks: [V, 3, 3] float64, intrinsics of the full-size photos, undistorted where they have a lens.
         sizes: [V, 2] int64 (width, height) of the full-size photos, undistorted where they have a lens.
         points: [M, 3] float64.
-        point_colors: [M, 3] uint8.
+        point_colors: [M, 3] uint8; None: they are taken from the photos (`colors_in_photos`).
         lenses: one a view, None where the photo is that of a pinhole camera; or empty, where all are.
         notes: what the capture was taken for, and what was done with it: lines for the user.
         test: [V] bool, the test views of the capture's own split; None: views are split by their order.
@@ -43,7 +43,7 @@ class Capture:
     Ks: np.ndarray
     sizes: np.ndarray
     points: np.ndarray
-    point_colors: np.ndarray
+    point_colors: np.ndarray | None
     lenses: tuple[Lens | None, ...] = ()
     notes: tuple[str, ...] = ()
     test: np.ndarray | None = None
@@ -67,8 +67,6 @@ class Capture:
         """Raise `InputError` unless every number is finite and in range. `source` is named in messages."""
         if not self.names:
             raise InputError(f"{source} has no images with a pose: reconstruct the capture again")
-        if not len(self.points):
-            raise InputError(f"{source} has no 3D points: training starts from them, so reconstruct the capture again")
         bad = ~np.isfinite(self.points).all(axis=1)
         if bad.any():
             raise InputError(f"{source}: {bad.sum()} of {len(bad)} 3D points are not finite")

@@ -16,12 +16,14 @@ import numpy as np
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene.capture import LARGEST_SIDE, Capture, check_photo_name
 from turbogs_plugin.scene.colmap_check import SMALLEST_IMAGE, check_binary_model
+from turbogs_plugin.scene.photos import photo_size
+from turbogs_plugin.scene.starting_points import NUM_RANDOM_POINTS, about_cameras, random_points
 from turbogs_plugin.scene.undistort import Lens, lens_of_camera
 
 if TYPE_CHECKING:
     import pycolmap
 
-MODEL_FOLDERS = ("sparse", "colmap/sparse", ".")
+MODEL_FOLDERS = ("sparse", "colmap/sparse", "colmap", ".")
 """Where a scene's reconstructions may lie, in order of preference: there, or in numbered folders of it."""
 
 STRAIGHT_MODELS = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
@@ -31,7 +33,8 @@ FILES = ("cameras", "images", "points3D")
 
 REDUCED = re.compile(r"_\d+$")
 FOLDER_DEPTH = 2
-"""Photos are looked for in folders of folders, no deeper."""
+"""Photos and models are looked for in folders of folders, no deeper."""
+REDUCTIONS = (2, 4, 8, 16)
 NAMED_AT_MOST = 4
 
 
@@ -47,13 +50,17 @@ def load_pycolmap() -> ModuleType:
     return pycolmap
 
 
-def find_model(scene: Path) -> tuple[Path, str] | None:
+def find_model(scene: Path, anywhere: bool = False) -> tuple[Path, str] | None:
     """The scene's reconstruction and its suffix, '.bin' or '.txt'; None where there is none.
 
     Of the several that COLMAP writes where photos did not connect (``sparse/0``, ``sparse/1``, ...), the one with most
     images is taken.
+
+    Args:
+        anywhere: where there is none in `MODEL_FOLDERS`, look at folders of any name, `FOLDER_DEPTH` deep.
     """
-    for place in (scene / name for name in MODEL_FOLDERS):
+    elsewhere = _folders(scene, FOLDER_DEPTH) if anywhere else ()
+    for place in itertools.chain((scene / name for name in MODEL_FOLDERS), elsewhere):
         if numbered := _numbered_models(place):
             return max(numbered, key=lambda model: _count_images(*model))  # the first of equals
         if suffix := _suffix(place):
@@ -94,7 +101,7 @@ def _count_images(model: Path, suffix: str) -> int:
 
 
 def read_colmap(scene: Path, model: Path, suffix: str) -> Capture:
-    """Read a reconstruction. Its photos are found by `find_photo_folder`.
+    """Read a reconstruction. Its photos are found by `find_photo_folder`. Without points, random ones are drawn.
 
     Args:
         scene: the scene's folder.
@@ -128,18 +135,28 @@ def read_colmap(scene: Path, model: Path, suffix: str) -> Capture:
         intrinsics[i] = camera.calibration_matrix() if lens is None else lens.K
         sizes[i] = (min(camera.width, 2**31), min(camera.height, 2**31)) if lens is None else lens.size
 
-    photo_folder = find_photo_folder(scene, names)
-    points = [point for _, point in sorted(reconstruction.points3D.items())]
+    photo_folder, reduction = find_photo_folder(scene, names)
+    if (
+        reduction > 1
+        and 1.5 * photo_size(photo_folder / names[0])[0] > reconstruction.cameras[images[0].camera_id].width
+    ):
+        reduction = 1  # the cameras are those of the copies
+    found = [point for _, point in sorted(reconstruction.points3D.items())]
+    points = np.array([point.xyz for point in found], dtype=np.float64).reshape(-1, 3)
+    colors = np.array([point.color for point in found], dtype=np.uint8).reshape(-1, 3) if found else None
+    if not found and images and np.isfinite(viewmats).all():
+        points = random_points(viewmats)
     capture = Capture(
         names=names,
         photo_folder=photo_folder,
         viewmats=viewmats,
         Ks=intrinsics,
         sizes=sizes,
-        points=np.array([point.xyz for point in points], dtype=np.float64).reshape(-1, 3),
-        point_colors=np.array([point.color for point in points], dtype=np.uint8).reshape(-1, 3),
+        points=points,
+        point_colors=colors,
         lenses=tuple(lenses[image.camera_id] for image in images),
-        notes=(_kind_note(scene, model, suffix, len(images), len(points), photo_folder), *_choice_note(model)),
+        notes=(_kind_note(scene, model, suffix, len(images), len(found), photo_folder), *_choice_note(model)),
+        reduction=reduction,
         alpha="mask",
     )
     capture.check(model)
@@ -156,20 +173,24 @@ def _lens(camera: pycolmap.Camera, model: Path) -> Lens | None:
     return lens_of_camera(camera, f"camera {camera.camera_id} of {model}")
 
 
-def find_photo_folder(scene: Path, names: tuple[str, ...]) -> Path:
-    """The folder that the names of the photos are relative to; ``scene/images`` where none has them all.
+def find_photo_folder(scene: Path, names: tuple[str, ...]) -> tuple[Path, int]:
+    """The folder that the names of the photos are relative to, and by which factor they are reduced there.
 
-    Looked at are ``images`` in the scene or beside it, the scene itself, and the folders in them; copies reduced by a
-    factor (``images_4``) are not photos of full size.
+    Looked at are ``images`` in the scene or beside it, the scene itself, and the folders in them; then, as not all
+    keep the full-size photos, copies of them in ``images_2``, ``images_4``, ... Where none has all the photos it is
+    ``scene/images``.
     """
     first = scene / "images"
     if not names:
-        return first
+        return first, 1
     for place in (first, scene, scene.resolve().parent / "images"):
         for folder in _folders(place, FOLDER_DEPTH):
             if all((folder / name).is_file() for name in names):
-                return folder
-    return first
+                return folder, 1
+    copies = ((scene / f"images_{factor}", factor) for factor in REDUCTIONS)
+    return next(
+        ((folder, factor) for folder, factor in copies if all((folder / n).is_file() for n in names)), (first, 1)
+    )
 
 
 def _folders(place: Path, depth: int) -> Iterator[Path]:
@@ -190,8 +211,9 @@ def _may_hold_photos(entry: Path) -> bool:
 
 def _kind_note(scene: Path, model: Path, suffix: str, images: int, points: int, photo_folder: Path) -> str:
     kind = {".bin": "binary", ".txt": "text"}[suffix]
+    shown = f"{points:,} points" if points else f"no points, so {about_cameras(NUM_RANDOM_POINTS)}"
     where = "" if photo_folder == scene / "images" else f", photos in {photo_folder}"
-    return f"COLMAP reconstruction {model} ({kind}): {images} images, {points:,} points{where}"
+    return f"COLMAP reconstruction {model} ({kind}): {images} images, {shown}{where}"
 
 
 def _choice_note(model: Path) -> list[str]:

@@ -17,7 +17,8 @@ from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene.capture import Capture, sizes_text
 from turbogs_plugin.scene.photos import photo_size
 from turbogs_plugin.scene.poses import viewmat_of_pose
-from turbogs_plugin.scene.transforms import NUM_RANDOM_POINTS, PHOTO_SUFFIXES
+from turbogs_plugin.scene.starting_points import NUM_RANDOM_POINTS
+from turbogs_plugin.scene.transforms import PHOTO_SUFFIXES
 
 FILE = "poses_bounds.npy"
 COLUMNS = 17
@@ -88,7 +89,7 @@ def read_llff(scene: Path, factor: int = 1) -> Capture:
     intrinsics = np.tile(np.eye(3), (len(sizes), 1, 1))
     intrinsics[:, [0, 1], [0, 1]] = table.focals[:, None] * ratios
     intrinsics[:, :2, 2] = 0.5 * sizes
-    points, colors = points_in_views(table.viewmats, intrinsics, sizes, table.bounds)
+    points = points_in_views(table.viewmats, intrinsics, sizes, table.bounds)
     depths = f"{table.bounds[:, 0].min():.4g} to {table.bounds[:, 1].max():.4g}"
     capture = Capture(
         names=folder.names,
@@ -97,7 +98,7 @@ def read_llff(scene: Path, factor: int = 1) -> Capture:
         Ks=intrinsics,
         sizes=sizes,
         points=points,
-        point_colors=colors,
+        point_colors=None,
         notes=(
             f"LLFF: {len(sizes)} photos {sizes_text(sizes)} of {folder.path.name}; no points, so {len(points):,} "
             f"random ones (seed 0) within the views at depths of {depths}",
@@ -109,10 +110,8 @@ def read_llff(scene: Path, factor: int = 1) -> Capture:
     return capture
 
 
-def points_in_views(
-    viewmats: np.ndarray, Ks: np.ndarray, sizes: np.ndarray, bounds: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """([M, 3] float64 points, [M, 3] uint8 colours) drawn at random, the same for the same arguments.
+def points_in_views(viewmats: np.ndarray, Ks: np.ndarray, sizes: np.ndarray, bounds: np.ndarray) -> np.ndarray:
+    """[M, 3] float64 points drawn at random, the same for the same arguments.
 
     A view and a place in it are drawn evenly, and the inverse of the depth: so the points lie as densely in the image
     as in depth, as far as parallax can tell depths apart.
@@ -132,8 +131,7 @@ def points_in_views(
         depths = 1.0 / (far + shares * (near - far))
         rays = (pixels - Ks[views, :2, 2]) / Ks[views][:, [0, 1], [0, 1]]  # [M, 2]
         in_camera = depths[:, None] * np.column_stack([rays, np.ones(len(rays))])
-        points = np.einsum("mji,mj->mi", viewmats[views, :3, :3], in_camera - viewmats[views, :3, 3])
-    return points, random.integers(0, 256, (NUM_RANDOM_POINTS, 3), dtype=np.uint8)
+        return np.einsum("mji,mj->mi", viewmats[views, :3, :3], in_camera - viewmats[views, :3, 3])
 
 
 def _read_table(source: Path) -> LlffTable:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -13,11 +15,14 @@ from turbogs_plugin.errors import InputError
 from turbogs_plugin.masks import PixelMasks, ViewMask
 from turbogs_plugin.scene import blender, llff
 from turbogs_plugin.scene.capture import Capture
-from turbogs_plugin.scene.colmap import find_model, read_colmap
+from turbogs_plugin.scene.colmap import MODEL_FOLDERS, find_model, read_colmap
 from turbogs_plugin.scene.frame import Frame
+from turbogs_plugin.scene.host_arrays import file_note
 from turbogs_plugin.scene.mask_files import find_masks, load_masks
-from turbogs_plugin.scene.photos import Photos, load_photos, photo_sizes, reduced_sizes
+from turbogs_plugin.scene.photo_folder import find_photos
+from turbogs_plugin.scene.photos import Photos, channels_of, load_photos, photo_array, photo_sizes, reduced_sizes
 from turbogs_plugin.scene.poses import camera_centers
+from turbogs_plugin.scene.starting_points import colors_in_photos
 from turbogs_plugin.scene.transforms import FILE, read_transforms
 from turbogs_plugin.scene.undistort import undistortion_note
 from turbogs_plugin.types import Cameras
@@ -80,7 +85,9 @@ class Scene:
     notes: tuple[str, ...] = ()
 
 
-def load_scene(path: str | Path, factor: int = 1, test_every: int = 8) -> Scene:
+def load_scene(
+    path: str | Path, factor: int = 1, test_every: int = 8, progress: Callable[[int, int], object] | None = None
+) -> Scene:
     """Load a capture with its photos.
 
     Cameras with distortion become pinhole cameras in the same place, their photos are undistorted. Masks are read from
@@ -95,6 +102,7 @@ def load_scene(path: str | Path, factor: int = 1, test_every: int = 8) -> Scene:
             in the right size; otherwise ``images`` are reduced by area averaging.
         test_every: the first of each `test_every` photos in name order is a test view, the others are for training.
             Captures with a split of their own (NeRF-synthetic) keep it.
+        progress: called with the number of photos decoded so far, and of all.
 
     Raises:
         InputError: anything wrong with the scene or the arguments, in one line.
@@ -104,7 +112,8 @@ def load_scene(path: str | Path, factor: int = 1, test_every: int = 8) -> Scene:
         raise InputError(f"factor is {factor}: it must be an integer of at least 1")
     if not isinstance(test_every, int) or test_every < 1:
         raise InputError(f"test_every is {test_every}: it must be an integer of at least 2")
-    capture = _read(scene, factor)
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # what is not finite is refused by its name
+        capture = _read(scene, factor)
     test = np.arange(len(capture.names)) % test_every == 0 if capture.test is None else capture.test
     if len(test) < FEWEST_VIEWS:
         raise InputError(f"{scene} has {len(test)} images: at least {FEWEST_VIEWS} are needed")
@@ -113,12 +122,18 @@ def load_scene(path: str | Path, factor: int = 1, test_every: int = 8) -> Scene:
     if test.all():
         raise InputError(f"test_every is {test_every}: every image of {scene} would be a test image; use 2 or more")
 
-    frame = Frame.around(camera_centers(capture.viewmats[~test]), capture.points)
+    with np.errstate(over="ignore", invalid="ignore"):
+        frame = Frame.around(camera_centers(capture.viewmats[~test]), capture.points)
     viewmats = torch.from_numpy(frame.normalise_poses(capture.viewmats)).float()
     points = torch.from_numpy(frame.normalise_points(capture.points)).float()
     far = ~points.isfinite().all(dim=1)
     if far.any():
         raise InputError(f"{scene}: {int(far.sum())} of {len(far)} 3D points lie too far from the cameras for float32")
+    if factor > 1 and factor % capture.reduction:
+        raise InputError(
+            f"--factor {factor}: the largest photos of {scene} are those of {capture.photo_folder.name}: use --factor "
+            f"{capture.reduction} or a multiple of it, or bring the full-size photos back"
+        )
     remaining = max(1, factor // capture.reduction)
     paths, file_sizes, sizes, fitted = _find_photos(scene, capture, remaining)
     ratios = sizes / capture.sizes  # [V, 2]
@@ -132,28 +147,42 @@ def load_scene(path: str | Path, factor: int = 1, test_every: int = 8) -> Scene:
         if not (part & seen).any():
             raise InputError(f"{scene}: all {part.sum()} {name} photos are masked whole: zero in a mask is masked")
 
-    def select(views: np.ndarray) -> PosedImages:
+    parts = [np.flatnonzero(part & seen) for part in (~test, test)]
+    channels = [channels_of([paths[view] for view in views]) if capture.alpha == "opacity" else 3 for views in parts]
+    # Before minutes go into photos that have no room.
+    colors = [photo_array(sizes[views], count) for views, count in zip(parts, channels, strict=True)]
+    counter = itertools.count(1)
+
+    def loaded() -> None:
+        if progress is not None:
+            progress(next(counter), int(seen.sum()))
+
+    def select(views: np.ndarray, colors: Tensor) -> PosedImages:
         cameras = Cameras(viewmats[views], torch.from_numpy(intrinsics[views]).float(), sizes[views])
         names = tuple(capture.names[view] for view in views)
         lenses = [capture.lens(view) for view in views]
-        with_alpha = capture.alpha == "opacity"
-        photos = load_photos([paths[view] for view in views], file_sizes[views], sizes[views], lenses, with_alpha)
+        photos = load_photos([paths[view] for view in views], file_sizes[views], sizes[views], lenses, colors, loaded)
         return PosedImages(cameras, names, photos, _pixel_masks([masks[view] for view in views], sizes[views]))
 
-    train, tested = (select(np.flatnonzero(part & seen)) for part in (~test, test))
+    train, tested = (select(*part) for part in zip(parts, colors, strict=True))
+    if capture.point_colors is None:
+        point_colors = colors_in_photos(points, train.cameras, train.photos, train.masks)
+    else:
+        point_colors = torch.from_numpy(capture.point_colors)
     notes = (
         fitted,
         undistortion_note(capture.lenses),
         mask_note,
         _masked_note(capture.names, masks, sizes, seen),
         "transparent photos are composited on a background (train.background)" if train.photos.transparent else "",
+        file_note([train.photos.stored, tested.photos.stored], "photos"),
     )
     return Scene(
         name=scene.resolve().name,
         train=train,
         test=tested,
         points=points,
-        point_colors=torch.from_numpy(capture.point_colors),
+        point_colors=point_colors,
         frame=frame,
         extent=1.0,
         notes=tuple(filter(None, (*capture.notes, *notes))),
@@ -179,20 +208,46 @@ def _masked_note(names: tuple[str, ...], masks: list[ViewMask | None], sizes: np
     return f"{len(cut)} photos have masked pixels, {share:.1%} of them{left_out}"
 
 
+def holds_photos_alone(scene: Path) -> bool:
+    """Whether a folder has photos, and nothing that says where they were taken from: no reconstruction in parts."""
+    begun = any((scene / place.partition("/")[0]).is_dir() for place in MODEL_FOLDERS if place != ".")
+    return scene.is_dir() and not begun and _cameras(scene) == (None, []) and bool(find_photos(scene)[1])
+
+
+def _cameras(scene: Path) -> tuple[tuple[Path, str] | None, list[str]]:
+    """What a folder has of cameras: the reconstruction, as `find_model` gives it, and the names of other files."""
+    files = [file for file in (FILE, *blender.FILES, llff.FILE) if (scene / file).is_file()]
+    return find_model(scene, anywhere=not files), files
+
+
 def _read(scene: Path, factor: int) -> Capture:
     """The capture, of the first kind in the order that `load_scene` states."""
     if not scene.is_dir():
         raise InputError(f"no such scene: {scene} is not a folder")
-    model = find_model(scene)
-    files = [file for file in (FILE, *blender.FILES, llff.FILE) if (scene / file).is_file()]
+    model, files = _cameras(scene)
     if model is not None:
-        return _passing_over(files, read_colmap(scene, *model))
+        capture = read_colmap(scene, *model)
+        if not files or any((capture.photo_folder / name).is_file() for name in capture.names):
+            return _passing_over(files, capture)
+        # LLFF's poses are of the reduced copies too, which have other names than COLMAP's photos.
+        other = _read_other(scene, files, factor)
+        return replace(other, notes=(*other.notes, f"{model[0]} not used, its photos are not there"))
+    return _read_other(scene, files, factor)
+
+
+def _read_other(scene: Path, files: list[str], factor: int) -> Capture:
+    """The capture of the first of these files, none of them COLMAP's."""
     if FILE in files:
         return _passing_over(files[1:], read_transforms(scene))
     if files and files[0] in blender.FILES:
         return _passing_over([file for file in files if file not in blender.FILES], blender.read_blender(scene))
     if files:
         return llff.read_llff(scene, factor)
+    if holds_photos_alone(scene):
+        raise InputError(
+            f"{scene} has {len(find_photos(scene)[1])} photos and nothing that says where they were taken from: find "
+            f"that by 'turbogs reconstruct {scene} --out SCENE', then use SCENE"
+        )
     raise InputError(
         f"{scene} has neither a COLMAP reconstruction (cameras, images and points3D as .bin or .txt in sparse/0) nor a "
         f"{FILE}, a {blender.TRAIN_FILE} or a {llff.FILE}"

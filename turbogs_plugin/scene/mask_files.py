@@ -16,7 +16,7 @@ from PIL import Image
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.masks import ViewMask
 from turbogs_plugin.scene.capture import Capture
-from turbogs_plugin.scene.photos import OPAQUE_SUFFIXES, decoding_threads, is_transparent, opened_image
+from turbogs_plugin.scene.photos import DECODING_BYTES, OPAQUE_SUFFIXES, decoding_threads, is_transparent, opened_image
 from turbogs_plugin.scene.undistort import Lens
 
 FOLDER = "masks"
@@ -94,7 +94,7 @@ def load_masks(
         keep = np.logical_and.reduce(parts)
         return ViewMask.of(_placed(keep, capture.lens(view), tuple(targets[view].tolist())))
 
-    with decoding_threads() as pool:
+    with decoding_threads(DECODING_BYTES * int(full_sizes.prod(axis=1).max(initial=1))) as pool:
         return list(pool.map(load, range(len(photos))))
 
 

@@ -12,6 +12,9 @@ still works on the iteration before, whose changed maps are copied out while the
 - work on a slot: after its view has been copied in.
 
 The results are bit for bit those of maps and photos on the device.
+
+What does not fit in host memory either lies in a file (`scene/host_arrays.py`): the disk reads the views of an
+iteration all at once, and the host waits for them.
 """
 
 from __future__ import annotations
@@ -30,6 +33,7 @@ from turbogs_plugin.device import synchronize
 from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.masks import PixelMasks
 from turbogs_plugin.scene import PosedImages
+from turbogs_plugin.scene.host_arrays import host_array, in_file, read_ahead
 from turbogs_plugin.scene.photos import Photos, pixel_offsets
 
 SETS = 2
@@ -44,7 +48,8 @@ class ViewWindow:
 
     Args:
         stores: arrays of one length [X, ...] in host memory. They are page-locked where they lie while the window
-            exists, if there is a GPU to do that; without, copies are slower and all else is the same.
+            exists, if there is a GPU to do that; without, and where they lie in files, copies are slower and all else
+            is the same.
         sizes: [V, 2] int64 numpy array (width, height) of the views laid end to end in them.
         device: of the window. On a CPU, copies are made at once.
         written: the arrays are changed in the window, so views travel back as well.
@@ -91,6 +96,7 @@ class ViewWindow:
         missing = [view for view in dict.fromkeys(view_ids) if view not in self._slot_of]
         slots = [self._free.pop() if self._free else self._evict() for _ in missing]
         self._inward.wait([*self._outward.latest, *(event for slot in slots for event in self._released[slot])])
+        read_ahead([outside for view in missing for outside in self._outside(view)])
         for view, slot in zip(missing, slots, strict=True):
             self._slot_of[view] = slot
             self.offsets[view] = slot * self._slot_pixels
@@ -169,10 +175,14 @@ class ViewWindow:
 
     def _places(self, view: int) -> list[tuple[Tensor, Tensor]]:
         """(window, store) of one view, of each array."""
-        start, end = self._starts[view : view + 2].tolist()
         first = int(self.offsets[view])
-        both = zip(self._arrays, self._stores, strict=True)
-        return [(array[first : first + end - start], store[start:end]) for array, store in both]
+        both = zip(self._arrays, self._outside(view), strict=True)
+        return [(array[first : first + len(outside)], outside) for array, outside in both]
+
+    def _outside(self, view: int) -> list[Tensor]:
+        """The part of each store that is one view's."""
+        start, end = self._starts[view : view + 2].tolist()
+        return [store[start:end] for store in self._stores]
 
 
 class _Windowed:
@@ -241,11 +251,14 @@ class OffloadedErrorMaps(_Windowed, ErrorMaps):
 
     def _allocate(self) -> None:
         pixels = int(self.sizes.prod(axis=1).sum())
-        stores = (torch.zeros(pixels, dtype=torch.float16), torch.full((pixels,), -1, dtype=torch.int16))
+        errors, stamps = (host_array((pixels,), dtype, "error maps") for dtype in (torch.float16, torch.int16))
+        stores = (errors.zero_(), stamps.fill_(-1))
         self._window = ViewWindow(stores, self.sizes, self.device, written=True)
 
-    def _stored(self) -> tuple[Tensor, Tensor]:
-        return self._window.flush()
+    def _copies(self) -> tuple[Tensor, Tensor]:
+        """Maps in a file are given as they lie there, to be saved before training goes on: a copy may find no room."""
+        errors, stamps = (store if in_file(store) else store.clone() for store in self._window.flush())
+        return errors, stamps
 
     def _load(self, errors: Tensor, stamps: Tensor) -> None:
         self._window.load((errors, stamps))
@@ -314,12 +327,12 @@ def _page_lock(window: ViewWindow) -> None:
     """Lock the stores in memory, in place, until the window is gone.
 
     torch's own pinned memory would be a copy, rounded up to a power of two. Memory that another window has locked stays
-    as that one has it.
+    as that one has it. A file's is left alone: locked, all of it would have to be in memory.
     """
     runtime = torch.cuda.cudart()
     locked = []
     for store in window._stores:
-        if store.is_pinned():
+        if in_file(store) or store.is_pinned():
             continue
         if int(runtime.cudaHostRegister(store.data_ptr(), store.nbytes, 0)) == 0:
             locked.append(store)

@@ -1,9 +1,9 @@
-"""Photos in memory: uint8, the pixels of all views laid end to end."""
+"""Photos as training wants them: uint8, the pixels of all views laid end to end."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -16,6 +16,7 @@ from PIL import Image
 from torch import Tensor
 
 from turbogs_plugin.errors import InputError
+from turbogs_plugin.scene.host_arrays import free_host_bytes, host_array
 from turbogs_plugin.scene.undistort import Lens
 from turbogs_plugin.types import BLACK, Color, PixelSamples
 
@@ -27,8 +28,12 @@ SMALLEST_SIDE = 4
 """The shorter side of a reduced photo has at least so many pixels: those of a cell."""
 OPAQUE_SUFFIXES = (".jpg", ".jpeg")
 """Of files whose headers need not be read again, as their format has no alpha."""
-MEMORY_SHARE = 0.8
-"""Photos may take this share of the machine's memory."""
+DECODING_BYTES = 24
+"""Bytes of a pixel while its photo is decoded, undistorted and reduced: several copies, one of them in float32."""
+MEMORY_SHARE = 0.25
+"""Photos that are being decoded may take this share of the free memory, with one thread more if need be."""
+SMALL_WORK = 2**30
+"""Bytes that are not worth a question."""
 
 
 @dataclass
@@ -145,14 +150,16 @@ def is_transparent(image: Image.Image) -> bool:
     return "A" in image.getbands() or "transparency" in image.info
 
 
-def _any_transparent(paths: Sequence[Path]) -> bool:
+def channels_of(paths: Sequence[Path]) -> int:
+    """4 where a photo may be transparent, by the headers, else 3."""
+
     def transparent(path: Path) -> bool:
         with opened_image(path) as image:
             return is_transparent(image)
 
     candidates = [path for path in paths if path.suffix.lower() not in OPAQUE_SUFFIXES]
     with decoding_threads() as pool:
-        return any(pool.map(transparent, candidates))
+        return 4 if any(pool.map(transparent, candidates)) else 3
 
 
 def photo_sizes(paths: Sequence[Path]) -> np.ndarray:
@@ -161,12 +168,22 @@ def photo_sizes(paths: Sequence[Path]) -> np.ndarray:
         return np.array(list(pool.map(photo_size, paths)), dtype=np.int64).reshape(-1, 2)
 
 
+def photo_array(sizes: np.ndarray, channels: int = 3) -> Tensor:
+    """[X, channels] uint8 for photos of these `sizes` [V, 2], with any content, where there is room (`host_array`).
+
+    Raises:
+        InputError: more photos than fit in memory or on the disk.
+    """
+    return host_array((int(pixel_offsets(sizes)[-1]), channels), torch.uint8, f"{len(sizes)} photos")
+
+
 def load_photos(
     paths: Sequence[Path],
     sizes: np.ndarray,
     targets: np.ndarray,
     lenses: Sequence[Lens | None] = (),
-    with_alpha: bool = True,
+    colors: Tensor | None = None,
+    loaded: Callable[[], object] = lambda: None,
 ) -> Photos:
     """Decode photos in parallel, undistorted, then reduced to their target sizes by area averaging.
 
@@ -177,24 +194,22 @@ def load_photos(
         sizes: [V, 2] int64 (width, height) that the files must have.
         targets: [V, 2] int64 (width, height) to give them.
         lenses: one a photo, None for those of pinhole cameras; or empty, where all are.
-        with_alpha: keep the alpha of transparent photos; else their colours are taken as they are stored.
+        colors: where to put them, as `photo_array` gives it; None: it is asked for it. With 3 channels, photos that
+            are transparent lose their alpha and keep their colours as stored.
+        loaded: called after each photo, in their order.
 
     Raises:
         InputError: a photo that cannot be decoded, or is of another size (the first one in order is named); more
-            photos than fit in memory.
+            photos than there is room for.
     """
     offsets = pixel_offsets(targets)
-    channels = 4 if with_alpha and _any_transparent(paths) else 3
-    needed, present = channels * int(offsets[-1]), os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    if needed > MEMORY_SHARE * present:
-        raise InputError(
-            f"{len(paths)} photos take {needed / 2**30:.1f} GiB of the machine's {present / 2**30:.1f} GiB: "
-            "use a larger --factor"
-        )
-    colors = torch.empty(int(offsets[-1]), channels, dtype=torch.uint8)
+    if colors is None:
+        colors = photo_array(targets, channels_of(paths))
+    channels = colors.shape[1]
     pixels = colors.numpy()
 
-    def load(view: int) -> None:
+    def load(view: int) -> bool:
+        """Whether the photo is opaque."""
         target = tuple(targets[view].tolist())
         photo = _decode(paths[view], tuple(sizes[view].tolist()), MODES[channels])
         lens = lenses[view] if lenses else None
@@ -203,17 +218,25 @@ def load_photos(
             photo = Image.frombytes(photo.mode, size, lens.undistort(np.asarray(photo), size).tobytes())
         if photo.size != target:
             photo = photo.resize(target, Image.Resampling.BOX)
-        pixels[offsets[view] : offsets[view + 1]] = np.asarray(photo).reshape(-1, channels)
+        pixels[offsets[view] : offsets[view + 1]] = (values := np.asarray(photo)).reshape(-1, channels)
+        return channels == 3 or bool((values[..., 3] == 255).all())
 
-    with decoding_threads() as pool:
-        list(pool.map(load, range(len(paths))))  # raises the first error in order, and cancels what has not begun
-    if channels == 4 and bool((colors[:, 3] == 255).all()):  # opaque after all
-        colors = colors[:, :3].contiguous()
+    largest = int(sizes.prod(axis=1).max(initial=1))
+    opaque = channels == 4
+    with decoding_threads(DECODING_BYTES * largest) as pool:
+        for whole in pool.map(load, range(len(paths))):  # raises the first error in order, cancels what has not begun
+            opaque &= whole
+            loaded()
+    if opaque:  # after all
+        colors = photo_array(targets).copy_(colors[:, :3])
     return Photos(colors, targets)
 
 
-def decoding_threads() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(min(8, os.cpu_count() or 1))
+def decoding_threads(bytes_each: int = 0) -> ThreadPoolExecutor:
+    """As many as there are processors, but no more than `MEMORY_SHARE` of the free memory allows."""
+    wanted = min(8, os.cpu_count() or 1)
+    affordable = int(MEMORY_SHARE * free_host_bytes()) // bytes_each if wanted * bytes_each > SMALL_WORK else wanted
+    return ThreadPoolExecutor(max(1, min(wanted, affordable)))
 
 
 def _decode(path: Path, size: tuple[int, int], mode: str) -> Image.Image:

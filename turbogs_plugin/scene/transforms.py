@@ -15,7 +15,8 @@ from turbogs_plugin.scene.capture import LARGEST_SIDE, Capture, check_photo_name
 from turbogs_plugin.scene.colmap import load_pycolmap
 from turbogs_plugin.scene.photos import photo_size
 from turbogs_plugin.scene.ply import read_vertices
-from turbogs_plugin.scene.poses import camera_centers, viewmat_of_pose
+from turbogs_plugin.scene.poses import viewmat_of_pose
+from turbogs_plugin.scene.starting_points import about_cameras, random_points
 from turbogs_plugin.scene.undistort import Lens, brown_projection, lens_of_camera, make_lens
 
 FILE = "transforms.json"
@@ -24,9 +25,6 @@ BROWN_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RA
 FISHEYE_MODELS = ("OPENCV_FISHEYE",)
 FEWEST_PHOTOS = 3
 PHOTO_SUFFIXES = (".png", ".jpg", ".jpeg")
-NUM_RANDOM_POINTS = 50_000
-RANDOM_POINTS_SIDE = 1.0
-"""Side of the cube of random points, in distances of the cameras from what they look at."""
 
 
 def read_frames(source: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
@@ -46,8 +44,7 @@ def read_transforms(scene: Path) -> Capture:
 
     Intrinsics and distortion may stand in each frame or for all; ``camera_angle_x`` serves where there is no ``fl_x``.
     Frames whose photo does not exist are left out. A frame's ``mask_path`` is its mask. Points come from
-    ``ply_file_path`` where it is given, else they are drawn at random (seeded) in a cube about what the cameras look
-    at.
+    ``ply_file_path``; where it is not given or has none, they are drawn by `random_points`.
 
     Raises:
         InputError: a file that is not such JSON, lacks something, or describes no lens; fewer than `FEWEST_PHOTOS`
@@ -80,8 +77,11 @@ def read_transforms(scene: Path) -> Capture:
         points, colors = _read_points(scene, content["ply_file_path"], source)
         origin = f"{len(points):,} points of {content['ply_file_path']}"
     else:
-        points, colors = random_points(viewmats)
-        origin = f"no points, so {len(points):,} random ones about what the cameras look at"
+        points, colors = np.empty((0, 3)), None
+        origin = "no points"
+    if not len(points):
+        points, colors = random_points(viewmats), None
+        origin += f", so {about_cameras(len(points))}"
     notes = [f"{source} (nerfstudio, instant-ngp): {len(names)} photos, {origin}"]
     if absent:
         notes.append(f"{len(absent)} of {len(frames)} frames are left out, their photos do not exist: {absent[0]}, ...")
@@ -104,28 +104,6 @@ def read_transforms(scene: Path) -> Capture:
     )
     capture.check(source)
     return capture
-
-
-def random_points(viewmats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """([M, 3] float64 points, [M, 3] uint8 colours), the same for the same cameras.
-
-    The cube's centre is the point nearest to all viewing axes, its side the median distance of the cameras from it.
-
-    Args:
-        viewmats: [V, 4, 4] float64 world to camera.
-    """
-    centers = camera_centers(viewmats)
-    axes = viewmats[:, 2, :3]
-    # A slight pull towards the cameras' mean settles the case of parallel axes.
-    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]  # [V, 3, 3]
-    mean = centers.mean(axis=0)
-    pull = 1e-3 * len(centers) * np.eye(3)
-    offsets = np.einsum("vij,vj->i", across, centers - mean)
-    focus = mean + np.linalg.solve(across.sum(axis=0) + pull, offsets)
-    side = RANDOM_POINTS_SIDE * float(np.median(np.linalg.norm(centers - focus, axis=1)))
-    random = np.random.default_rng(0)
-    points = focus + random.uniform(-0.5, 0.5, (NUM_RANDOM_POINTS, 3)) * (side or 1.0)
-    return points, random.integers(0, 256, (NUM_RANDOM_POINTS, 3), dtype=np.uint8)
 
 
 def photo_name(scene: Path, name: Any, source: Path) -> str:

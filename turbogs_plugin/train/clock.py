@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import torch
 
@@ -32,3 +34,13 @@ class TrainingClock:
     def now(self) -> float:
         """Seconds so far, within the context. Does not wait for the GPU, which is never far behind the trainer."""
         return self.seconds + time.perf_counter() - self._started
+
+    @contextmanager
+    def stopped(self) -> Iterator[None]:
+        """Within the clock's own context: what is done inside is not training, and does not count."""
+        synchronize(self.device)
+        began = time.perf_counter()
+        try:
+            yield
+        finally:
+            self._started += time.perf_counter() - began

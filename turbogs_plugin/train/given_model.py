@@ -87,6 +87,19 @@ def load_given(path: str | Path, scene: Scene, device: torch.device) -> Gaussian
     return _fitted(gaussians, into, scene, device, file)
 
 
+def read_given(path: str | Path) -> Gaussians:
+    """A model from a file alone, whatever capture it belongs to.
+
+    Returns:
+        float64, on the CPU, in the file's own coordinates; rows may be not finite.
+
+    Raises:
+        InputError: the file is no such model (`require_model`).
+    """
+    file = require_model(path)
+    return read_ply(file) if file.suffix.lower() == ".ply" else _read_torch(file)[0]
+
+
 def _read_torch(file: Path) -> tuple[Gaussians, Similarity | None]:
     """The model of a .pt in float64, and where it knows that, the change to the capture's own coordinates."""
     state = _load(file)

@@ -18,6 +18,11 @@ REFRESH_SECONDS = 0.1
 """Time between two updates of the bar, so that fast iterations are not slowed down."""
 
 
+PATIENCE_SECONDS = 2.0
+"""Photos that are loaded sooner are not counted for the user."""
+LINE_SECONDS = 10.0
+"""Time between two lines about photos, where stderr is no terminal."""
+
 BarType = TypeVar("BarType", bound="TerminalBar")
 
 
@@ -65,6 +70,28 @@ class TerminalBar(Listener):
             self._task, completed=trainer.iteration, total=trainer.iterations, gaussians=gaussians, **columns
         )
         self._bar.refresh()
+
+
+class LoadingProgress:
+    """Counts photos on stderr while they are decoded: in one line that is overwritten, or a line now and then."""
+
+    def __init__(self) -> None:
+        self._start = time.perf_counter()
+        self._next = self._start + PATIENCE_SECONDS
+
+    def __call__(self, loaded: int, total: int) -> None:
+        """So many photos of `total` are decoded."""
+        now, terminal = time.perf_counter(), sys.stderr.isatty()
+        begun = self._next > self._start + PATIENCE_SECONDS
+        if now < self._next and not (begun and terminal and loaded == total):
+            return
+        self._next = now + (REFRESH_SECONDS if terminal else LINE_SECONDS)
+        left = (now - self._start) / loaded * (total - loaded)
+        text = f"{loaded} of {total} photos decoded, about {left:.0f} s left"
+        if not terminal:
+            print(text, file=sys.stderr, flush=True)
+        else:
+            print(f"\r{text}\033[K" if loaded < total else "\r\033[K", end="", file=sys.stderr, flush=True)
 
 
 class TrainingProgress(TerminalBar):

@@ -19,6 +19,7 @@ from turbogs_plugin.errors import InputError, TrainingStopped
 from turbogs_plugin.files import write_text_atomically
 from turbogs_plugin.model.ply import save_ply
 from turbogs_plugin.plan import Plan, make_plan
+from turbogs_plugin.reconstruct.train_on_photos import with_cameras
 from turbogs_plugin.scene import Frame, Scene, load_scene
 from turbogs_plugin.scene.fingerprint import capture_difference, capture_state, frame_of_state
 from turbogs_plugin.scene.offload import place_views
@@ -32,14 +33,15 @@ from turbogs_plugin.train.history import Evaluation, append_evaluation, rewind_h
 from turbogs_plugin.train.interrupts import Interrupts
 from turbogs_plugin.train.loop import Listener, TrainingLoop
 from turbogs_plugin.train.pace import pace_of
-from turbogs_plugin.train.progress import TrainingProgress
+from turbogs_plugin.train.progress import LoadingProgress, TrainingProgress
 from turbogs_plugin.train.start import starting
 from turbogs_plugin.train.trainer import Trainer, gaussians_of_state
 from turbogs_plugin.train.wall import WallClock, WallRecord
 from turbogs_plugin.train.wall_marks import WallMarks
 from turbogs_plugin.types import Gaussians
 
-IMPORTS, PHOTOS, DEVICE = "interpreter and imports", "photos", "CUDA and kernels, after the photos"
+IMPORTS, CAMERAS = "interpreter and imports", "cameras of photos alone"
+PHOTOS, DEVICE = "photos", "CUDA and kernels, after the photos"
 """Parts of the wall time before a plan is made."""
 FILES = "checkpoint and model, after the pictures"
 """The part of the wall time at the end in which nothing else is left to do."""
@@ -89,7 +91,7 @@ def open_scene(config: Config, folder: RunFolder | None = None) -> Scene:
             f"capture '{settings.path}' of the run in '{folder.path}' is not there: bring it back, or edit scene.path "
             f"in {folder.config}"
         )
-    return load_scene(settings.path, settings.factor, settings.test_every)
+    return load_scene(settings.path, settings.factor, settings.test_every, LoadingProgress())
 
 
 def plan_run(config: Config) -> Plan:
@@ -148,13 +150,18 @@ def fit(scene: Scene, *overrides: str, config: str = DEFAULT_CONFIG) -> Gaussian
 
 
 def train(
-    config: Config, out: Path, report: Callable[[RunSession], object] | None = None, clock: WallClock | None = None
+    config: Config,
+    out: Path,
+    report: Callable[[RunSession], object] | None = None,
+    clock: WallClock | None = None,
+    watch: Callable[[RunSession], Listener] | None = None,
 ) -> RunSession:
-    """Train from the start into a new folder. The plan is printed first.
+    """Train from the start into a new folder. The plan is printed first. Photos alone are reconstructed before.
 
     Args:
         report: called with the finished run; `turbogs_plugin.report.pages.write_report` writes its page.
         clock: of the wall; None: it begins now.
+        watch: called with the run before it trains; gives one more listener of its loop, the last one.
 
     Raises:
         InputError: anything wrong with the input; then nothing was written.
@@ -167,6 +174,10 @@ def train(
     _require_start(config)
     if config.train.device == "cuda":
         resolve_device("cuda")  # before photos are read for nothing
+    posed = with_cameras(config, out)
+    if posed is not config:
+        clock.mark(CAMERAS)
+    config = posed
     with starting(lambda: resolve_device(config.train.device)) as started:
         scene = open_scene(config)
         clock.mark(PHOTOS)
@@ -186,18 +197,21 @@ def train(
     write_text_atomically(folder.plan, plan.to_json())
     write_text_atomically(folder.asked, config.to_yaml())
     write_text_atomically(folder.config, resolved.to_yaml())
-    return session.run(report)
+    return session.run(report, watch)
 
 
 def resume(
-    path: Path, report: Callable[[RunSession], object] | None = None, clock: WallClock | None = None
+    path: Path,
+    report: Callable[[RunSession], object] | None = None,
+    clock: WallClock | None = None,
+    watch: Callable[[RunSession], Listener] | None = None,
 ) -> RunSession:
     """Go on with a stopped run from its newest checkpoint, with its own configuration, in which nothing is `auto`.
 
     On a CPU, the result is bit for bit that of a run never stopped; `Trainer.state_dict` says why.
 
     Args:
-        report, clock: as in `train`.
+        report, clock, watch: as in `train`.
 
     Raises:
         InputError: no run there, an unusable checkpoint, a changed capture, or a machine without what the run needs;
@@ -229,7 +243,7 @@ def resume(
             session.load_state_dict(state, str(checkpoint))
             session.earlier_wall = earlier.wall_seconds if earlier else math.nan
     session.history += rewind_history(folder.history, loop.trainer.iteration if session.resumed else -1)
-    return session.run(report)
+    return session.run(report, watch)
 
 
 def _require_start(config: Config) -> None:
@@ -329,7 +343,11 @@ class RunSession(Listener):
         self._threads = ThreadPoolExecutor(2, "files")
         self._written: list[Future[float]] = []
 
-    def run(self, report: Callable[[RunSession], object] | None) -> RunSession:
+    def run(
+        self,
+        report: Callable[[RunSession], object] | None,
+        watch: Callable[[RunSession], Listener] | None = None,
+    ) -> RunSession:
         """Train to the end, or until a signal; both end with a checkpoint."""
         loop, trainer = self.loop, self.trainer
         self._finished_before = loop.finished
@@ -339,6 +357,7 @@ class RunSession(Listener):
             progress = TrainingProgress(trainer.iterations, trainer.iteration)
             with Interrupts(loop.stop) as interrupts, progress:
                 loop.listeners = [WallMarks(self.clock), self.evaluations, self, progress]
+                loop.listeners += [watch(self)] if watch is not None else []
                 loop.run(self.resumed)
                 self.clock.mark("training")
                 if loop.stopped and trainer.iteration != self._saved_at:

@@ -5,7 +5,7 @@ The loop over iterations is in `turbogs_plugin.train.loop`.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
@@ -25,16 +25,26 @@ from turbogs_plugin.plan.caps import cap_of, chosen_points
 from turbogs_plugin.scene import PosedImages, Scene
 from turbogs_plugin.scene.offload import place_maps, place_views
 from turbogs_plugin.scene.photos import PhotoSamples
-from turbogs_plugin.scene.transforms import random_points
+from turbogs_plugin.scene.starting_points import colors_in_photos, random_points
 from turbogs_plugin.train.background import Background
 from turbogs_plugin.train.given_model import load_given
-from turbogs_plugin.types import PARAMETER_NAMES, Gaussians, GaussianStats, LossOutput, RowUpdate, Step
+from turbogs_plugin.types import PARAMETER_NAMES, Gaussians, GaussianStats, LossOutput, PixelSamples, RowUpdate, Step
 
 COLOR_STRIDE = 97
 """The mean colour of the photos is taken over every 97th pixel; coprime to usual widths."""
 
 STATEFUL = ("maps", "view_sampler", "optimizer", "density")
 """Attributes of a trainer that have a state of their own."""
+
+
+class IterationObserver(Protocol):
+    """Is told what an iteration does and nothing keeps. It changes nothing, and has to be cheap."""
+
+    def sampled(self, samples: PixelSamples) -> None:
+        """These pixels were drawn."""
+
+    def changing(self, gaussians: Gaussians, update: RowUpdate, step: Step) -> None:
+        """Density control is about to change the model in this way."""
 
 
 class Trainer:
@@ -45,6 +55,9 @@ class Trainer:
         scene: on any device.
         device: where everything is computed and kept.
         resuming: a state is loaded next, so that the model of `train.init` need not be there.
+
+    Attributes:
+        observer: who is told of each iteration, if anybody.
     """
 
     def __init__(self, config: Config, scene: Scene, device: torch.device, resuming: bool = False) -> None:
@@ -70,6 +83,7 @@ class Trainer:
         self.engine = engine_of(device, for_training=True)
         self.set_length(config.train.iterations, config.train.refine_until)
         self.iteration = 0
+        self.observer: IterationObserver | None = None
         self.first_repeatable = 0
         self.initial_error = 0.0
         self.nonfinite_losses = torch.zeros((), dtype=torch.int64, device=device)
@@ -111,6 +125,8 @@ class Trainer:
         samples = self.pixel_sampler.sample(self.maps, view_ids, budget.rate, step)
         if self.maps.masks is not None and not getattr(self.pixel_sampler, "heeds_masks", False):
             samples = self.maps.masks.strip(samples)
+        if self.observer is not None:
+            self.observer.sampled(samples)
 
         # 4) Ground truth at the samples
         background = self.background.at(step)
@@ -164,6 +180,8 @@ class Trainer:
             if len(update.source) == 0:
                 raise TrainingStopped(f"iteration {self.iteration}: density control removed every Gaussian")
             update = in_order_of_space(update, self.gaussians, self.now)
+            if self.observer is not None:
+                self.observer.changing(self.gaussians, update, self.now)
             self.gaussians = update.apply(self.gaussians)
             self.optimizer.apply(update)
             self.density.apply(update)
@@ -273,8 +291,8 @@ def initial_gaussians(scene: Scene, config: Config, init: str, device: torch.dev
     if init in ("points", "random"):
         points, colors = scene.points, scene.point_colors
         if init == "random":
-            places, drawn = random_points(scene.train.cameras.viewmats.cpu().double().numpy())
-            points, colors = torch.from_numpy(places).float(), torch.from_numpy(drawn)
+            points = torch.from_numpy(random_points(scene.train.cameras.viewmats.cpu().double().numpy())).float()
+            colors = colors_in_photos(points, scene.train.cameras, scene.train.photos, scene.train.masks)
         rows = chosen_points(len(points), cap, backdrop_count)
         settings = (train.sh_degree, scene.extent, train.initial_opacity, train.initial_size)
         gaussians = gaussians_from_points(points[rows], colors[rows], *settings)

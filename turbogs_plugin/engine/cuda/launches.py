@@ -123,7 +123,7 @@ class TileLists:
 
 
 StatSums = fields_of(
-    "Tensor | None", "error_sums distance_sums weight_sums grad_sums absgrad_sums view_counts max_radii"
+    "Tensor | None", "error_sums distance_sums weight_sums grad_sums absgrad_sums square_sums view_counts max_radii"
 )
 """`types.GaussianStats`, or `NO_STATS`: each [N] float32."""
 

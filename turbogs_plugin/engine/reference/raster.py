@@ -76,6 +76,7 @@ class ReferenceScreenGradients:
             "weight_sums": records[:, ScreenRecord.WEIGHT_SUM],
             "grad_sums": (records[:, ScreenRecord.MEAN] * half).norm(dim=-1),
             "absgrad_sums": (records[:, ScreenRecord.ABSOLUTE] * half).norm(dim=-1),
+            "square_sums": records[:, ScreenRecord.SQUARE_SUM],
             "view_counts": on_screen,
         }
         for name, values in sums.items():

@@ -1,0 +1,48 @@
+"""What `bench viewer` measures: three ways of one training, with a client in a process of its own."""
+
+import json
+import math
+
+import pytest
+from helpers.framework_runs import TINY, tiny_capture
+
+from turbogs_plugin.bench.viewer import WAYS, ViewerRun, viewer_lines
+from turbogs_plugin.bench.viewer_client import turning
+from turbogs_plugin.viewer.eye import Eye
+
+
+def test_the_ways_stand_side_by_side():
+    runs = [ViewerRun(way, 100, seconds) for seconds in (1.0, 2.0, 4.0) for way in WAYS]
+    for run in runs:
+        if run.way == "client":
+            run.seconds, run.frames, run.frame_rate, run.width = run.seconds * 1.25, 50, 12.5, 640
+    rates = {"without": 50.0, "nobody looks": 50.0, "client": 40.0}
+    lines = viewer_lines({"runs": [vars(run) for run in runs], "rates": rates})
+    assert [line.split("  ")[0].strip() for line in lines] == [*WAYS]
+    assert "+0.0 %" in lines[0] and "(100.00, 50.00, 25.00)" in lines[1]
+    assert "-20.0 %" in lines[2] and "12.5 frames a second, 640 pixels wide" in lines[2]
+
+
+def test_the_client_moves_and_comes_back():
+    eye = Eye((1.0, 2.0, 3.0), (1.0, 0.0, 0.0, 0.0), 1.0, 64, 48)
+    half, whole = turning(eye, 1.0), turning(eye, 2.0)
+    assert math.dist(half.position, whole.position) == pytest.approx(0.1)
+    assert math.dist(whole.position, turning(eye, 0.0).position) < 1e-9
+
+
+def test_a_training_is_measured_with_and_without_a_viewer(turbogs, tmp_path):
+    pytest.importorskip("viser")
+    out = tmp_path / "viewer.json"
+    capture = tiny_capture(tmp_path)
+    command = ("bench", "viewer", "--scene", capture, "--repeats", 1, "--device", "cpu", "--out", out, *TINY)
+    code, said, _ = turbogs(*command)
+    assert code == 0 and said.count("iterations a second") == 3
+    measured = json.loads(out.read_text())
+    assert [run["way"] for run in measured["runs"]] == list(WAYS)
+    assert all(run["iterations"] == 14 and run["seconds"] > 0 for run in measured["runs"])
+    assert measured["runs"][2]["frames"] > 0 and measured["runs"][0]["frames"] == 0
+
+
+def test_it_needs_a_scene(turbogs):
+    code, out, err = turbogs("bench", "viewer", "--device", "cpu")
+    assert (code, out) == (2, "") and "--scene SCENE" in err

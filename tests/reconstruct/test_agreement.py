@@ -1,0 +1,123 @@
+"""Ghosts are found in graphs of pairs that are made up: no photo is needed."""
+
+import numpy as np
+import pytest
+
+from turbogs_plugin.reconstruct.agreement import (
+    Agreement,
+    consistent_groups,
+    fewest_links,
+    ghost_pairs,
+    linked_groups,
+)
+from turbogs_plugin.reconstruct.solver import epipolar_distances
+
+
+def walk(count: int, reach: int, ghosts: range = range(0), repeated: int = 60) -> Agreement:
+    """A walk of photos, each matching the next ones, more the nearer; and all matching all by repeated structure.
+
+    Args:
+        ghosts: photos that the solve has put where the repeated structure says.
+        repeated: matches of a pair by repeated structure.
+    """
+    rows = []
+    for first in range(count):
+        for second in range(first + 1, count):
+            apart = (first in ghosts) != (second in ghosts)
+            true = max(0, 400 - (400 // reach) * (second - first - 1))
+            if true:
+                rows.append((first, second, *((0, true) if apart else (true, 0))))
+            else:
+                rows.append((first, second, *((repeated, 0) if apart else (0, repeated))))
+    table = np.array(rows, dtype=np.int64)
+    names = tuple(f"{view:02d}.jpg" for view in range(count))
+    return Agreement(names, table[:, :2], table[:, 2], table[:, 3])
+
+
+def test_photos_in_their_place_are_one_group_though_many_pairs_contradict():
+    agreement = walk(16, 5, repeated=20)
+    assert agreement.contradicts.sum() > len(agreement.pairs) // 3
+    assert consistent_groups(agreement) == [list(range(16))]
+    assert not ghost_pairs(agreement, [list(range(16))]).any()
+
+
+@pytest.mark.parametrize("repeated", [6, 20])
+@pytest.mark.parametrize("ghosts", [range(4), range(6, 9), range(15, 16)])
+def test_photos_at_a_ghost_are_a_group_of_their_own(ghosts, repeated):
+    """Though more pairs agree with the ghost than contradict it: the true ones have more matches."""
+    agreement = walk(16, 5, ghosts, repeated=repeated)
+    main, *others = consistent_groups(agreement)
+    assert sorted(view for group in others for view in group) == list(ghosts)
+    assert main == [view for view in range(16) if view not in ghosts]
+
+
+def test_the_pairs_of_a_ghost_are_those_that_agree_across():
+    agreement = walk(16, 5, range(4), repeated=20)
+    marked = agreement.pairs[ghost_pairs(agreement, consistent_groups(agreement))]
+    assert len(marked) == 12 * 4 - (5 + 4 + 3 + 2)  # those of the walk contradict
+    assert all((first < 4) != (second < 4) and second - first > 5 for first, second in marked)
+
+
+def test_doubt_names_what_the_majority_does_not():
+    agreement = Agreement(
+        ("a", "b", "c"), np.array([[0, 1], [1, 2], [0, 2]]), np.array([90, 50, 5]), np.array([0, 40, 15])
+    )
+    assert consistent_groups(agreement) == [[0, 1, 2]]
+    assert consistent_groups(agreement, doubt=2.0) == [[0, 1], [2]]
+
+
+@pytest.mark.parametrize(("matches", "held"), [(12, False), (29, False), (30, True)])
+def test_photos_that_few_matches_hold_are_named(matches, held):
+    pairs = walk(8, 3).pairs
+    few = np.where((pairs == 7).any(axis=1), matches, 200)
+    few[(pairs < 2).all(axis=1)] = 900  # of one pair, which the median does not follow
+    agreement = Agreement(walk(8, 3).names, pairs, few, 0 * few)
+    assert fewest_links(agreement) == 30
+    assert linked_groups(agreement) == ([list(range(8))] if held else [list(range(7)), [7]])
+
+
+def test_few_matches_hold_nothing_however_few_there_are():
+    pair = Agreement(("a", "b"), np.array([[0, 1]]), np.array([29]), np.array([0]))
+    assert linked_groups(pair) == [[0], [1]]
+
+
+def test_many_weak_pairs_of_a_large_capture_do_not_outweigh_the_strong_ones():
+    agreement = walk(300, 8, range(40), repeated=20)
+    assert [len(group) for group in consistent_groups(agreement)] == [260, 40]
+    assert len(consistent_groups(walk(300, 8, repeated=20))) == 1
+
+
+def test_parts_that_weak_pairs_alone_connect_are_together_if_these_agree():
+    """Two rooms of 12 photos each, all within reach of each other, and one pair with few matches through the door."""
+    rooms = [(first, second) for first in range(24) for second in range(first + 1, 24) if first // 12 == second // 12]
+    pairs, many = np.array([*rooms, (0, 12)]), np.full(len(rooms) + 1, 300)
+    many[-1] = 40
+    names = tuple(map(str, range(24)))
+    assert consistent_groups(Agreement(names, pairs, many, 0 * many)) == [list(range(24))]
+    contradicting = np.where(many == 40, 40, 0)
+    apart = consistent_groups(Agreement(names, pairs, many - contradicting, contradicting))
+    assert apart == [list(range(12)), list(range(12, 24))]
+
+
+def test_no_pairs_leave_each_photo_alone():
+    none = np.zeros(0, dtype=np.int64)
+    alone = Agreement(("a", "b"), none.reshape(0, 2), none, none)
+    assert consistent_groups(alone) == linked_groups(alone) == [[0], [1]]
+
+
+def test_epipolar_distances_are_zero_for_points_and_not_for_others():
+    generator = np.random.default_rng(0)
+    points = generator.uniform([-1, -1, 4], [1, 1, 8], (50, 3))
+    angle = 0.2
+    relative = np.eye(4)
+    relative[:3, :3] = [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
+    relative[:3, 3] = [1.0, 0.3, 0.1]
+    seen = points @ relative[:3, :3].T + relative[:3, 3]
+    first, second = points / points[:, 2:], seen / seen[:, 2:]
+    assert epipolar_distances(relative, first, second).max() < 1e-12
+    # Sampson's distance of a shift by d across the line, at second order of both views: d / sqrt(2) for equal ones.
+    across = second + np.array([0.0, 0.01, 0.0])
+    moved = epipolar_distances(relative, first, across)
+    assert (moved > 0.004).all() and (moved < 0.0101).all()
+    relative[:3, 3] = 0.0
+    assert (epipolar_distances(relative, first, second) == 0).all()

@@ -1,0 +1,72 @@
+"""Fox, whose wall has repeated paper. It takes minutes, so ``TURBOGS_SCENES`` must name the folder of captures."""
+
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+
+from turbogs_plugin.reconstruct import reconstruct, run, solver
+from turbogs_plugin.reconstruct.agreement import consistent_groups
+from turbogs_plugin.reconstruct.workspace import Workspace
+
+FOX = Path(os.environ.get("TURBOGS_SCENES", "")) / "fox-raw"
+MISLED = {f"{number:04d}.jpg" for number in (1, 2, 3, 4, 6, 7, 8, 9)}
+"""Photos of the wall's left end, which matches its right end."""
+
+pytestmark = pytest.mark.skipif(
+    "TURBOGS_SCENES" not in os.environ or not FOX.is_dir(), reason="set TURBOGS_SCENES to the folder that holds fox-raw"
+)
+
+
+def errors(model: pycolmap.Reconstruction) -> dict[str, float]:
+    """How far each camera is from the published one, in shares of the orbit's radius."""
+    frames = json.loads((FOX / "transforms.json").read_text())["frames"]
+    published = {Path(frame["file_path"]).name: np.array(frame["transform_matrix"])[:3, 3] for frame in frames}
+    images = [image for image in model.images.values() if image.has_pose]
+    found = np.array([image.projection_center() for image in images])
+    true = np.array([published[image.name] for image in images])
+    radius = np.linalg.norm(true - true.mean(axis=0), axis=1).mean()
+    ransac = pycolmap.RANSACOptions(max_error=0.02 * radius, random_seed=0)
+    change = pycolmap.estimate_sim3d_robust(found, true, ransac)["tgt_from_src"]
+    distances = np.linalg.norm([change * center for center in found] - true, axis=1) / radius
+    return {image.name: float(distance) for image, distance in zip(images, distances, strict=True)}
+
+
+@pytest.fixture(scope="module")
+def solved(tmp_path_factory) -> Workspace:
+    """Of smaller photos than usual, which is enough."""
+    scene = tmp_path_factory.mktemp("fox") / "scene"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(run, "LONG_SIDES", (1000,))
+        assert reconstruct(FOX / "images", scene).registered == 50
+    return Workspace(scene)
+
+
+def test_all_cameras_are_where_they_were_published(solved):
+    distances = np.array(list(errors(pycolmap.Reconstruction(solved.model)).values()))
+    assert len(distances) == 50 and np.median(distances) < 0.01 and distances.max() < 0.03
+
+
+def test_a_solve_that_the_wall_has_misled_is_found_and_repaired(solved, monkeypatch):
+    """The first solve is forced to a ghost: it is not given the true pairs of eight photos."""
+    database, misled = solved.database(1000), solved.scratch / "misled.db"
+    agreement = solver.measure_agreement(pycolmap.Reconstruction(solved.model), database)
+    assert len(consistent_groups(agreement)) == 1 and agreement.contradicts.sum() > 100
+    true = [tuple(agreement.names[view] for view in pair) for pair in agreement.pairs[~agreement.contradicts].tolist()]
+    solver.without_pairs(database, misled, [pair for pair in true if len(MISLED & set(pair)) == 1])
+    solve_cameras, models = solver.solve_cameras, []
+
+    def solve(given: Path, *arguments) -> list[pycolmap.Reconstruction]:
+        models.append(solve_cameras(given if models else misled, *arguments)[0])
+        return models[-1:]
+
+    monkeypatch.setattr(solver, "solve_cameras", solve)
+    best, moved = run._solve(database, solved)
+    ghost = errors(models[0])
+    assert {name for name, error in ghost.items() if error > 0.03} == MISLED and min(ghost.values()) < 0.01
+    assert models[0].compute_mean_reprojection_error() < 1.2  # by which nobody would see it
+    assert set(moved) == MISLED and best.placed == 50
+    assert max(errors(best.model).values()) < 0.03

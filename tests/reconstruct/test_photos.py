@@ -1,0 +1,174 @@
+"""What photos' files say, and upright copies."""
+
+import math
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.reconstruct.photos import place_photos, read_photos
+from turbogs_plugin.scene.photos import load_photos, photo_sizes
+
+TURNS = {1: None, 3: Image.Transpose.ROTATE_180, 6: Image.Transpose.ROTATE_90, 8: Image.Transpose.ROTATE_270}
+"""How an upright picture is stored for each orientation."""
+
+
+def picture(seed: int = 0, size: tuple[int, int] = (48, 32)) -> Image.Image:
+    """Of coarse blocks, that JPEG keeps nearly."""
+    width, height = size
+    blocks = np.random.default_rng(seed).integers(0, 256, (height // 16, width // 16, 3), dtype=np.uint8)
+    return Image.fromarray(blocks.repeat(16, axis=0).repeat(16, axis=1))
+
+
+def write(path, orientation: int = 1, gps=None, model: str = "", focal: float = 0.0, **options) -> Image.Image:
+    """Write a photo as a camera would that was held so; the upright picture."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    upright = picture(len(path.name))
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    if model:
+        exif[0x0110] = model
+        exif.get_ifd(0x8769)[0xA405] = int(focal)
+    if gps is not None:
+        latitude, longitude = gps
+        entries = exif.get_ifd(0x8825)
+        for tag, value, letters in ((1, latitude, "NS"), (3, longitude, "EW")):
+            entries[tag] = letters[value < 0]
+            entries[tag + 1] = (float(int(abs(value))), (abs(value) % 1) * 60, 0.0)
+    turn = TURNS[orientation]
+    stored = upright if turn is None else upright.transpose(turn)
+    stored.save(path, exif=exif, **({"quality": 95} if path.suffix == ".jpg" else {}))
+    return upright
+
+
+def test_photos_are_upright_for_everybody(tmp_path):
+    shown = {f"{'x' * turn}.jpg": write(tmp_path / "raw" / f"{'x' * turn}.jpg", turn) for turn in TURNS}
+    photos = read_photos(tmp_path / "raw")
+    assert [photo.turned for photo in photos] == [False, True, True, True]
+    assert {photo.size for photo in photos} == {(48, 32)} and len({photo.lens for photo in photos}) == 1
+    place_photos(photos, tmp_path / "images")
+    paths = [tmp_path / "images" / photo.name for photo in photos]
+    sizes = photo_sizes(paths)
+    loaded = load_photos(paths, sizes, sizes)
+    for view, path in enumerate(paths):
+        assert Image.open(path).getexif().get(0x0112, 1) == 1
+        difference = loaded.image(view).numpy() * 255 - np.asarray(shown[path.name], dtype=np.float32)
+        assert np.abs(difference).mean() < 4, path
+    assert paths[0].read_bytes() == photos[0].path.read_bytes()
+
+
+def test_upright_copies_keep_focal_length_and_gps(tmp_path):
+    import pycolmap
+
+    for number, turn in enumerate((1, 6, 8)):
+        write(tmp_path / "raw" / f"{number}.jpg", turn, gps=(-33.5, 151.25), model="Phone", focal=28)
+    photos = read_photos(tmp_path / "raw")
+    np.testing.assert_allclose([photo.position for photo in photos], [(-33.5, 151.25)] * 3)
+    place_photos(photos, tmp_path / "images")
+    upright, turned, _ = (pycolmap.Bitmap.read(tmp_path / "images" / photo.name, True) for photo in photos)
+    assert turned.exif_focal_length() == pytest.approx(upright.exif_focal_length()) and upright.exif_focal_length() > 30
+    assert turned.exif_latitude() == pytest.approx(-33.5) and turned.exif_longitude() == pytest.approx(151.25)
+
+
+def test_a_phones_photo_with_a_second_one_behind_it_is_a_jpeg(tmp_path):
+    for number in range(3):
+        exif = Image.Exif()
+        exif[0x0112] = 8
+        path = tmp_path / "raw" / f"{number}.jpg"
+        path.parent.mkdir(exist_ok=True)
+        picture().save(path, format="MPO", save_all=True, append_images=[picture(1)], exif=exif, quality=95)
+    place_photos(read_photos(tmp_path / "raw"), tmp_path / "images")
+    with Image.open(tmp_path / "images/0.jpg") as upright:
+        assert (upright.format, upright.size) == ("JPEG", (32, 48))
+
+
+def test_lenses_are_told_apart_by_exif_and_size(tmp_path):
+    for name, focal in (("a", 28), ("b", 28), ("c", 85)):
+        write(tmp_path / f"{name}.jpg", model="Phone", focal=focal)
+    picture(3, (64, 32)).save(tmp_path / "d.jpg")
+    lenses = [photo.lens for photo in read_photos(tmp_path)]
+    assert lenses[0] == lenses[1] and len(set(lenses)) == 3
+
+
+def test_damaged_gps_is_no_position(tmp_path):
+    for number in range(3):
+        exif = Image.Exif()
+        entries = exif.get_ifd(0x8825)
+        entries[1], entries[3] = "N", "E"
+        if number:
+            entries[2] = entries[4] = (0.0, 0.0, 0.0)
+        picture().save(tmp_path / f"{number}.jpg", exif=exif)
+    assert all(math.isnan(photo.position[0]) for photo in read_photos(tmp_path))
+
+
+def test_names_have_no_spaces_and_folders_are_kept(tmp_path):
+    for name in ("a b.jpg", "left/1.JPG", "left/2.png", "images_4/1.jpg", "masks/1.png", ".thumbs/1.jpg"):
+        write(tmp_path / name)
+    photos = read_photos(tmp_path)
+    assert [photo.name for photo in photos] == ["a_b.jpg", "left/1.JPG", "left/2.png"]
+    place_photos(photos, tmp_path / "out")
+    assert sorted(path.relative_to(tmp_path / "out").as_posix() for path in (tmp_path / "out").rglob("*.*")) == [
+        photo.name for photo in photos
+    ]
+
+
+def test_a_folder_images_is_where_the_photos_are(tmp_path):
+    for number in range(3):
+        write(tmp_path / "images" / f"{number}.jpg")
+    write(tmp_path / "poster.jpg")
+    assert [photo.name for photo in read_photos(tmp_path)] == ["0.jpg", "1.jpg", "2.jpg"]
+    (tmp_path / "images").rename(tmp_path / "walk_2")
+    (tmp_path / "images").mkdir()
+    assert [photo.name for photo in read_photos(tmp_path)] == ["poster.jpg", *(f"walk_2/{n}.jpg" for n in range(3))]
+
+
+def four(folder) -> None:
+    for number in range(4):
+        write(folder / f"{number}.jpg")
+
+
+def no_folder(folder) -> str:
+    return "no such folder"
+
+
+def nothing(folder) -> str:
+    folder.mkdir()
+    return "no photos: at least 3"
+
+
+def one(folder) -> str:
+    write(folder / "a.jpg")
+    return "has 1 photo: at least 3"
+
+
+def of_a_phone(folder) -> str:
+    folder.mkdir()
+    (folder / "IMG_1.HEIC").write_bytes(b"x")
+    return "IMG_1.HEIC are not read: convert them to JPEG"
+
+
+def truncated(folder) -> str:
+    four(folder)
+    (folder / "2.jpg").write_bytes((folder / "2.jpg").read_bytes()[:-200])
+    return "cannot read the photo .*2.jpg.*replace it"
+
+
+def of_16_bits(folder) -> str:
+    four(folder)
+    Image.fromarray(np.zeros((32, 48), dtype=np.uint16)).save(folder / "5.png")
+    return "5.png has more than 8 bits"
+
+
+def of_one_name(folder) -> str:
+    four(folder)
+    write(folder / "a b.jpg")
+    write(folder / "a_b.jpg")
+    return "2 photos .*'a_b.jpg' without spaces"
+
+
+@pytest.mark.parametrize("case", [no_folder, nothing, one, of_a_phone, truncated, of_16_bits, of_one_name])
+def test_unusable_photos_are_refused(case, tmp_path):
+    with pytest.raises(InputError, match=case(tmp_path / "photos")) as refused:
+        read_photos(tmp_path / "photos")
+    assert "\n" not in str(refused.value)

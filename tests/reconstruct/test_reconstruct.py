@@ -1,0 +1,335 @@
+"""From photos to cameras, on rendered photos whose cameras are known; what is said of those that cannot be solved."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+from helpers.textured_corner import camera_centers, render_corner, write_photos
+from PIL import Image
+
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.reconstruct import Solution, reconstruct, run, scene_beside, solver
+from turbogs_plugin.reconstruct.agreement import Agreement, consistent_groups
+from turbogs_plugin.reconstruct.workspace import Workspace
+from turbogs_plugin.scene import load_scene
+from turbogs_plugin.scene.load import holds_photos_alone
+
+COUNT = 10
+
+
+def noise(seed: int) -> Image.Image:
+    """A photo of nothing that another one shows."""
+    values = np.random.default_rng(seed).integers(0, 256, (60, 80, 3), dtype=np.uint8)
+    return Image.fromarray(values).resize((320, 240), Image.Resampling.BICUBIC)
+
+
+@pytest.fixture(scope="module")
+def solved(tmp_path_factory) -> tuple[Path, Solution]:
+    """Photos of a corner, some of them stored sideways, and one of something else; and what came of them."""
+    folder = tmp_path_factory.mktemp("reconstruct")
+    photos = folder / "corner" / "images"
+    write_photos(photos, COUNT)
+    for view in (2, 5):
+        exif = Image.Exif()
+        exif[0x0112] = 6
+        path = photos / f"view_{view:02d}.jpg"
+        render_corner(camera_centers(COUNT)[view]).transpose(Image.Transpose.ROTATE_90).save(
+            path, quality=95, exif=exif
+        )
+    noise(5).save(photos / "other.jpg")
+    return photos, reconstruct(photos, folder / "scene")
+
+
+def test_cameras_are_where_the_photos_were_taken_from(solved):
+    _, solution = solved
+    model = pycolmap.Reconstruction(solution.scene / "sparse/0")
+    images = sorted((image for image in model.images.values() if image.has_pose), key=lambda image: image.name)
+    assert [image.name for image in images] == [f"view_{view:02d}.jpg" for view in range(COUNT)]
+    found = np.array([image.projection_center() for image in images])
+    true = camera_centers(COUNT)
+    moved = np.array([pycolmap.estimate_sim3d(found, true) * center for center in found])
+    assert np.linalg.norm(moved - true, axis=1).max() < 0.02  # of 4 from the corner
+    (camera,) = model.cameras.values()
+    assert (camera.model.name, camera.width, camera.height) == ("OPENCV", 320, 240)
+    assert camera.focal_length_x == pytest.approx(300, rel=0.03)
+
+
+def test_the_solution_says_what_was_done_and_names_what_did_not_register(solved):
+    _, solution = solved
+    assert (solution.photos, solution.registered, solution.left_out) == (COUNT + 1, COUNT, ("other.jpg",))
+    text = solution.text()
+    assert "11 photos of 1 lens, 2 turned upright by EXIF; matched each with each" in text
+    assert "10 of 11 photos registered" in text and "1 photo did not register: other.jpg;" in text
+    assert "ghost" not in text and "wrong place" not in text
+
+
+def test_the_scene_loads(solved):
+    _, solution = solved
+    scene = load_scene(solution.scene)
+    assert len(scene.train) + len(scene.test) == COUNT and len(scene.points) == solution.points > 300
+    assert scene.train.photos.sizes[0].tolist() == pytest.approx([320, 240], abs=6)
+
+
+def test_a_second_call_tells_the_solution_again(solved, monkeypatch):
+    photos, solution = solved
+    monkeypatch.setattr(run, "solver", None)
+    assert reconstruct(photos, solution.scene) == solution
+
+
+def test_a_stopped_call_is_gone_on_with(solved, tmp_path, monkeypatch):
+    """Stopped in the mapping: features and matches are those of the first call, and the cameras come out the same."""
+    photos, _ = solved
+    few = tmp_path / "few"
+    few.mkdir()
+    for view in range(5):
+        shutil.copy(photos / f"view_{view:02d}.jpg", few)
+
+    def stop(*arguments) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(solver, "solve_cameras", stop)
+        with pytest.raises(KeyboardInterrupt):
+            reconstruct(few, tmp_path / "scene")
+    database = Workspace(tmp_path / "scene").database(run.LONG_SIDES[0])
+    with pycolmap.Database.open(database) as opened:
+        before = opened.num_keypoints(), opened.num_matches(), len(opened.read_all_cameras())
+        opened.delete_matches(1, 2)
+        opened.delete_two_view_geometry(1, 2)
+    assert reconstruct(few, tmp_path / "scene").registered == 5
+    with pycolmap.Database.open(database) as opened:
+        assert (opened.num_keypoints(), opened.num_matches(), len(opened.read_all_cameras())) == before
+
+
+def test_other_photos_are_not_mixed_in(solved, tmp_path):
+    photos, solution = solved
+    fewer = shutil.copytree(photos, tmp_path / "fewer")
+    (fewer / "other.jpg").unlink()
+    with pytest.raises(InputError, match=r"begun with other photos \(0 new, 1 gone, 0 changed since\)"):
+        reconstruct(fewer, solution.scene)
+    (fewer / "new.jpg").write_bytes((fewer / "view_00.jpg").read_bytes())
+    (fewer / "view_00.jpg").touch()
+    with pytest.raises(InputError, match=r"\(1 new, 1 gone, 1 changed since\)"):
+        reconstruct(fewer, solution.scene)
+
+
+def blank(folder: Path) -> str:
+    for number in range(3):
+        Image.new("RGB", (320, 240), (90, 90, 90)).save(folder / f"{number}.jpg")
+    return "none of the 3 photos shows anything that could be found again"
+
+
+def of_different_things(folder: Path) -> str:
+    for number in range(4):
+        noise(number).save(folder / f"{number}.jpg")
+    return "no cameras were found for 4 photos: of 6 pairs of photos 0 match; take photos that overlap"
+
+
+@pytest.mark.parametrize("case", [blank, of_different_things])
+def test_photos_that_cannot_be_solved_end_in_one_line_and_leave_nothing(case, tmp_path):
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    words = case(photos)
+    with pytest.raises(InputError, match=words) as refused:
+        reconstruct(photos, tmp_path / "deep" / "scene")
+    assert "\n" not in str(refused.value)
+    assert [path.name for path in tmp_path.iterdir()] == ["photos"]
+
+
+def test_a_place_that_holds_something_else_is_refused(solved, tmp_path):
+    photos, _ = solved
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(InputError, match="holds something else"):
+        reconstruct(photos, tmp_path)
+    with pytest.raises(InputError, match="would lie among the photos"):
+        reconstruct(photos, photos / "scene")
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+class FakeModel:
+    """A model of which only the photos and their places are known."""
+
+    def __init__(self, places: str) -> None:
+        self.places = places
+
+    def num_reg_images(self) -> int:
+        return len(self.places)
+
+
+def agreement_of(places: str) -> Agreement:
+    """Of photos on a line, each with 200 matches with its neighbours; those at g agree with the 12 others by 40."""
+    rows = []
+    for first in range(len(places)):
+        for second in range(first + 1, len(places)):
+            agree = places[first] == places[second]
+            near = second - first < 3
+            rows.append((first, second, (200 if near else 40), agree == near))
+    table = np.array(rows)
+    true, agree = table[:, 2], table[:, 3].astype(bool)
+    names = tuple(f"{view}.jpg" for view in range(len(places)))
+    return Agreement(names, table[:, :2], np.where(agree, true, 0), np.where(agree, 0, true))
+
+
+@pytest.fixture
+def attempts(monkeypatch, tmp_path):
+    """Solves that are made up: each takes the next of the given models; the pairs taken out are noted."""
+
+    def prepare(*models: str | None) -> tuple[list, Workspace]:
+        waiting, removed = list(models), []
+
+        def attempt(database, evidence, workspace):
+            places = waiting.pop(0)
+            if places is None:
+                return None
+            agreement = agreement_of(places)
+            return run.Solve(FakeModel(places), (len(places),), agreement, consistent_groups(agreement))
+
+        monkeypatch.setattr(run, "_attempt", attempt)
+        monkeypatch.setattr(solver, "without_pairs", lambda database, copy, pairs: removed.append(pairs))
+        workspace = Workspace(tmp_path / "scene")
+        return removed, workspace
+
+    return prepare
+
+
+GOOD, GHOST = "oooooooooo", "gggooooooo"
+
+
+def test_a_ghost_is_solved_again_without_the_pairs_that_made_it(attempts):
+    removed, workspace = attempts(GHOST, GOOD)
+    best, moved = run._solve(workspace.database(1), workspace)
+    assert best.model.places == GOOD and best.ghosts == [] and moved == ["0.jpg", "1.jpg", "2.jpg"]
+    (pairs,) = removed
+    assert pairs and all((first < "3") != (second < "3") for first, second in pairs)
+
+
+def test_a_repair_that_fails_leaves_the_first_solve_with_its_ghosts_named(attempts):
+    for outcome in (None, GHOST):
+        removed, workspace = attempts(GHOST, outcome)
+        best, moved = run._solve(workspace.database(1), workspace)
+        assert best.model.places == GHOST and moved == [] and len(removed) == 1
+        assert best.ghosts == ["0.jpg", "1.jpg", "2.jpg"]
+
+
+def test_a_solve_without_ghosts_is_taken_as_it_is(attempts):
+    removed, workspace = attempts(GOOD)
+    best, moved = run._solve(workspace.database(1), workspace)
+    assert (best.model.places, moved, removed) == (GOOD, [], [])
+
+
+def test_photos_at_a_ghost_are_taken_out_of_the_model(solved, tmp_path):
+    model = pycolmap.Reconstruction(solved[1].scene / "sparse/0")
+    run._leave_out(model, ["view_00.jpg", "view_07.jpg"])
+    model.write_binary(tmp_path)
+    written = pycolmap.Reconstruction(tmp_path)
+    names = {image.name for image in written.images.values() if image.has_pose}
+    assert len(names) == COUNT - 2 and not names & {"view_00.jpg", "view_07.jpg"}
+
+
+def test_scenes_that_do_not_connect_are_told_by_their_numbers():
+    agreement = agreement_of("ooo")
+    solve = run.Solve(FakeModel("ooo"), (3, 3, 3), agreement, [[0, 1, 2]])
+    matching = run.choose_matching([f"{view}.jpg" for view in range(9)], np.full((9, 2), np.nan))
+    with pytest.raises(InputError, match="9 photos fall into 3 scenes that do not connect, of 3, 3, 3 photos: add"):
+        run._require_solved(solve, 9, 12, matching)
+    alone = run.Solve(FakeModel("ooo"), (3,), agreement, [[0, 1, 2]])
+    with pytest.raises(InputError, match=r"only 3 of 9 photos connect \(12 pairs match\)"):
+        run._require_solved(alone, 9, 12, matching)
+    run._require_solved(alone, 6, 12, matching)
+
+
+def test_matches_agree_with_the_cameras_that_were_solved_and_not_with_moved_ones(solved):
+    _, solution = solved
+    workspace = Workspace(solution.scene)
+    database = workspace.database(run.LONG_SIDES[0])
+    model = pycolmap.Reconstruction(workspace.model)
+    agreement = solver.measure_agreement(model, database)
+    assert agreement.names == tuple(f"view_{view:02d}.jpg" for view in range(COUNT))
+    assert agreement.agreeing.sum() > 50 * agreement.contradicting.sum()
+    assert consistent_groups(agreement) == [list(range(COUNT))]
+    (moved,) = (image for image in model.images.values() if image.name == "view_00.jpg")
+    pose = moved.cam_from_world()
+    pose.translation += np.array([1.5, 0.5, 0.0])
+    moved.frame.rig_from_world = pose
+    assert consistent_groups(solver.measure_agreement(model, database)) == [list(range(1, COUNT)), [0]]
+
+
+def test_the_similar_photos_of_many_are_found_without_a_download(solved, tmp_path):
+    """Each photo matched with the 3 most similar alone, as captures of many photos without an order are."""
+    _, solution = solved
+    workspace = Workspace(solution.scene)
+    database = tmp_path / "features.db"
+    shutil.copy(workspace.database(run.LONG_SIDES[0]), database)
+    with pycolmap.Database.open(database) as opened:
+        opened.clear_matches()
+        opened.clear_two_view_geometries()
+    names = sorted(solver.read_names(database))
+    solver.match_features(database, tmp_path, names, run.Matching(np.zeros((0, 2), dtype=np.int64), 3, "alike"))
+    with pycolmap.Database.open(database) as opened:
+        matched = len(opened.read_all_matches()[0])
+    assert COUNT <= matched <= 3 * (COUNT + 1)
+    assert solver.count_verified_pairs(database) >= COUNT - 1
+
+
+def test_where_photos_are_left_colmaps_own_defaults_are_tried(solved):
+    """They do not register the other photo either, so that the first solve stays."""
+    workspace = Workspace(solved[1].scene)
+    models = []
+    for long_side in run.LONG_SIDES:
+        with pycolmap.Database.open(workspace.database(long_side)) as opened:
+            (camera,) = opened.read_all_cameras()
+            models.append((camera.model.name, camera.width, camera.focal_length_x, opened.num_keypoints()))
+    assert [model[0] for model in models] == ["OPENCV", "SIMPLE_RADIAL"] and models[0][1:] == models[1][1:]
+
+
+def test_where_the_capture_of_a_run_lies(tmp_path):
+    assert scene_beside(tmp_path / "garden", tmp_path / "runs/first") == tmp_path / "runs/garden-scene"
+    assert scene_beside(tmp_path / "garden/images", tmp_path / "run") == tmp_path / "garden-scene"
+
+
+def test_train_finds_the_cameras_of_photos_first(solved, tmp_path, turbogs, monkeypatch):
+    """Here they are found already, by the run before: `reconstruct` itself is tested above."""
+    photos, solution = solved
+    shutil.copytree(solution.scene, tmp_path / "corner-scene")
+    monkeypatch.setattr(run, "solver", None)
+    short = ("train.iterations=2", "train.sh_degree=0", "train.evaluate_at=[]", "--factor", "4", "--device", "cpu")
+    code, _, err = turbogs("train", photos, "--out", tmp_path / "run", "--no-report", *short)
+    assert code == 0, err
+    first, *others = err.splitlines()
+    assert first == f"{photos} has photos alone: their cameras are found first, into {tmp_path / 'corner-scene'}"
+    assert others[: len(solution.notes)] == list(solution.notes)
+    assert f"path: {tmp_path / 'corner-scene'}" in (tmp_path / "run/config.yaml").read_text()
+
+
+def test_bad_settings_are_refused_before_cameras_are_looked_for(solved, tmp_path, turbogs, monkeypatch):
+    monkeypatch.setattr(run, "read_photos", lambda folder: pytest.fail("photos were read"))
+    (tmp_path / "used").mkdir()
+    (tmp_path / "used/file").write_text("x")
+    for arguments in (("--out", tmp_path / "used"), ("--out", tmp_path / "run", "--init", "absent.ply")):
+        code, out, err = turbogs("train", solved[0], *arguments, "--device", "cpu")
+        assert (code, out) == (2, "") and err.count("\n") == 1, err
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["used"]
+
+
+def test_commands_that_cannot_look_for_cameras_say_what_does(solved, tmp_path, turbogs):
+    photos, _ = solved
+    code, out, err = turbogs("plan", photos, "--device", "cpu")
+    assert (code, out) == (2, "") and err.count("\n") == 1
+    assert f"{photos} has 11 photos and nothing" in err and "turbogs reconstruct" in err
+
+
+def test_the_command_refuses_in_one_line(tmp_path, turbogs):
+    (tmp_path / "photos").mkdir()
+    Image.new("RGB", (64, 48)).save(tmp_path / "photos/a.jpg")
+    code, out, err = turbogs("reconstruct", tmp_path / "photos", "--out", tmp_path / "scene")
+    assert (code, out) == (2, "") and err.count("\n") == 1 and "has 1 photo: at least 3 are needed" in err
+    assert [path.name for path in tmp_path.iterdir()] == ["photos"]
+
+
+def test_a_reconstruction_in_parts_is_not_taken_for_photos_alone(solved, tmp_path):
+    scene = shutil.copytree(solved[1].scene, tmp_path / "scene")
+    (scene / "sparse/0/points3D.bin").unlink()
+    assert not holds_photos_alone(scene) and holds_photos_alone(scene / "images")
+    assert holds_photos_alone(solved[0].parent) and not holds_photos_alone(tmp_path)

@@ -1,0 +1,153 @@
+"""Photos and maps that do not fit in host memory: in files, to the same bits; refused where no disk has room."""
+
+import json
+import os
+import shutil
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import torch
+from helpers.framework_runs import assert_identical, stop_after, tiny_capture, tiny_config
+
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.plan import facts
+from turbogs_plugin.scene import Scene, host_arrays, load_scene, photos
+from turbogs_plugin.scene.host_arrays import host_array, in_file
+from turbogs_plugin.train import run
+from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint
+from turbogs_plugin.train.trainer import Trainer
+
+HOST_MEMORY = 1000
+"""Bytes: less than one photo of the capture takes."""
+CPU = torch.device("cpu")
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory) -> Path:
+    return tiny_capture(tmp_path_factory.mktemp("host_arrays"))
+
+
+@pytest.fixture
+def little_memory(monkeypatch, tmp_path) -> Path:
+    """A machine with `HOST_MEMORY`, and the folder in which its files lie."""
+    (tmp_path / "disk").mkdir()
+    monkeypatch.setenv("TMPDIR", str(tmp_path / "disk"))
+    monkeypatch.setattr(host_arrays.tempfile, "tempdir", None)
+    for module in (host_arrays, photos, facts):
+        monkeypatch.setattr(module, "free_host_bytes", lambda: HOST_MEMORY)
+    return tmp_path / "disk"
+
+
+def test_an_array_lies_where_there_is_room(little_memory):
+    small, large = (host_array((count, 3), torch.int16, "maps") for count in (83, 84))
+    assert not in_file(small) and in_file(large) and large.shape == (84, 3) and large.dtype == torch.int16
+    assert os.listdir(little_memory) == []  # nothing stays behind, whatever ends the process
+    large.copy_(torch.arange(252).view(84, 3))
+    host_arrays.read_ahead([large[3:9], small, large[:0]])
+    assert torch.equal(large[40:50].clone(), torch.arange(252, dtype=torch.int16).view(84, 3)[40:50])
+
+
+def test_what_fits_on_no_disk_is_refused(little_memory, monkeypatch):
+    monkeypatch.setattr(host_arrays.shutil, "disk_usage", lambda folder: SimpleNamespace(free=2**31))
+    with pytest.raises(InputError, match=r"^12 photos take 2.0 GiB of 0.0 GiB of free memory, .*2.0 GiB free: set TMP"):
+        host_array((2**31,), torch.uint8, "12 photos")
+    monkeypatch.undo()
+    monkeypatch.setenv("TMPDIR", str(little_memory))
+    monkeypatch.setattr(host_arrays, "free_host_bytes", lambda: HOST_MEMORY)
+    monkeypatch.setattr(host_arrays.os, "posix_fallocate", lambda *_: os.truncate("/nowhere", 3))
+    with pytest.raises(InputError, match=r"cannot be made in .*No such file.*: set TMPDIR to another folder"):
+        host_array((2000,), torch.uint8, "12 photos")
+    assert os.listdir(little_memory) == []
+
+
+@pytest.mark.parametrize(
+    ("files", "left"),
+    [
+        ({}, 8000 * 1024),
+        ({"fs/cgroup/a/memory.max": "max", "fs/cgroup/memory.max": "5000", "fs/cgroup/memory.current": "1000"}, 4000),
+        (
+            {
+                "fs/cgroup/a/memory.max": "3000",
+                "fs/cgroup/a/memory.current": "2900",
+                "fs/cgroup/a/memory.stat": "anon 2000\ninactive_file 800\nactive_file 7",
+            },
+            900,
+        ),
+        (
+            {"fs/cgroup/memory/b/memory.limit_in_bytes": "700", "fs/cgroup/memory/b/memory.usage_in_bytes": "900"},
+            0,
+        ),
+    ],
+)
+def test_free_memory_is_that_of_the_container(monkeypatch, tmp_path, files, left):
+    written = {
+        "proc/meminfo": "MemTotal: 9000 kB\nMemAvailable: 8000 kB",
+        "proc/self/cgroup": "4:cpu,cpuacct:/c\n3:memory:/b\n0::/a",
+        **files,
+    }
+    monkeypatch.setattr(
+        host_arrays, "_lines", lambda path: written.get(str(path).lstrip("/").removeprefix("sys/"), "").splitlines()
+    )
+    assert host_arrays.free_host_bytes() == left
+
+
+def trained(scene: Scene, capture: Path, *overrides: str) -> Trainer:
+    trainer = Trainer(tiny_config(capture, *overrides).without_plan(), scene, CPU)
+    trainer.initialise_maps()
+    for _ in range(9):
+        trainer.step()
+    return trainer
+
+
+@pytest.mark.parametrize("unit", ["pixel", "tile"])
+def test_training_from_files_is_bit_for_bit_that_from_memory(capture, little_memory, monkeypatch, unit):
+    overrides = (f"pixel_sampler.unit={unit}",)
+    streamed = load_scene(capture)
+    from_files = trained(streamed, capture, "train.maps_place=host", "train.photos_place=host", *overrides)
+    assert in_file(streamed.train.photos.stored) and in_file(streamed.test.photos.stored)
+    assert all(in_file(from_files.maps.state_dict()[name]) for name in ("errors", "stamps"))
+    assert streamed.notes[-1].startswith("photos lie in a temporary file, 0.0 GiB in ")
+    monkeypatch.undo()
+    scene = load_scene(capture)
+    assert not in_file(scene.train.photos.stored) and "temporary file" not in scene.notes[-1]
+    assert_identical(trained(scene, capture, *overrides).state_dict(), from_files.state_dict())
+
+
+def test_a_whole_run_streams_and_resumes_to_the_same_model(capture, little_memory, monkeypatch, tmp_path):
+    """What the plan decides; stopped and resumed with little memory, and with much."""
+    stop_after(monkeypatch, 7)
+    streamed = run.train(tiny_config(capture), tmp_path / "streamed")
+    assert streamed.signal and streamed.trainer.config.train.maps_place == "host"
+    plan = json.loads((tmp_path / "streamed/plan.json").read_text())
+    (reason,) = (entry["reason"] for entry in plan["decisions"] if entry["setting"] == "train.maps_place")
+    assert reason == "0 MiB > 50% of 0 MiB free on the host: in a file"
+    shutil.copytree(tmp_path / "streamed", tmp_path / "moved")
+    resumed = [run.resume(tmp_path / "streamed")]
+    assert in_file(resumed[0].trainer.maps.state_dict()["errors"])
+    monkeypatch.undo()
+    resumed.append(run.resume(tmp_path / "moved"))
+    assert not in_file(resumed[1].trainer.maps.state_dict()["errors"])
+    whole = run.train(tiny_config(capture), tmp_path / "whole")
+    states = [
+        load_checkpoint(latest_checkpoint(session.folder.checkpoints))["trainer"] for session in (whole, *resumed)
+    ]
+    for state in states[1:]:
+        assert_identical(states[0], state)
+    models = [session.folder.model.read_bytes() for session in (whole, *resumed)]
+    assert models[0] == models[1] == models[2]
+
+
+def test_fewer_photos_are_decoded_at_a_time_where_memory_is_short(monkeypatch):
+    monkeypatch.setattr(photos.os, "cpu_count", lambda: 8)
+    monkeypatch.setattr(photos, "free_host_bytes", lambda: 16 * 2**30)
+    largest = 8000 * 6000 * photos.DECODING_BYTES
+    for size, threads in ((0, 8), (1920 * 1080 * photos.DECODING_BYTES, 8), (largest, 3), (100 * largest, 1)):
+        with photos.decoding_threads(size) as pool:
+            assert pool._max_workers == threads
+
+
+def test_photos_are_counted_while_they_are_decoded(capture):
+    counts = []
+    load_scene(capture, progress=lambda *count: counts.append(count))
+    assert counts == [(loaded, 8) for loaded in range(1, 9)]

@@ -1,0 +1,222 @@
+"""Values in the files of captures, and models to start from, replaced by hostile ones: a clear error, or a scene and a
+model of finite numbers, in bounded memory. Bytes are damaged in test_loaders.py and beside the readers' own tests."""
+
+from __future__ import annotations
+
+import copy
+import json
+import random
+import shutil
+import struct
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from helpers.bounded_memory import outcome_within
+from helpers.framework_runs import tiny_capture, tiny_config
+from helpers.models import random_gaussians
+from PIL import Image
+
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.model.gsplat_file import save_gsplat
+from turbogs_plugin.model.ply import save_ply
+from turbogs_plugin.scene import Frame, Scene, load_scene
+from turbogs_plugin.train.trainer import initial_gaussians
+from turbogs_plugin.types import Gaussians
+
+MEMORY = 64 * 2**20
+"""Python and numpy may allocate this much for files of less than a megabyte."""
+CPU = torch.device("cpu")
+NUMBERS = (float("nan"), float("inf"), 1e308, -1e308, 5e-324, 1e20, -1e3, 1e5, -1.0, 0.0, 0.3, 2**70, -(2**70))
+OTHERS = (None, "text", "../x", "", True, [], {}, [[1]], [1e400], {"k1": 1})
+
+
+def leaves(value, path=()):
+    """(path, leaf) of nested dicts and lists."""
+    if isinstance(value, dict | list):
+        for key, item in value.items() if isinstance(value, dict) else enumerate(value):
+            yield from leaves(item, (*path, key))
+    yield path, value
+
+
+def with_another(content, choice: random.Random):
+    """Some values of a JSON file replaced, moved in, or left out."""
+    changed = copy.deepcopy(content)
+    for _ in range(choice.choice([1, 1, 3])):
+        path, value = choice.choice([leaf for leaf in leaves(changed) if leaf[0]])
+        parent = changed
+        for key in path[:-1]:
+            parent = parent[key]
+        if choice.random() < 0.1:
+            del parent[path[-1]]
+        elif isinstance(value, float) and choice.random() < 0.3:
+            parent[path[-1]] = value * choice.choice([1.0001, 1.1, -1, 1e-6, 1e6])
+        else:
+            parent[path[-1]] = choice.choice(NUMBERS if choice.random() < 0.6 else OTHERS)
+    return changed
+
+
+def require_whole(scene: Scene) -> None:
+    for views in (scene.train, scene.test):
+        assert views.cameras.viewmats.isfinite().all() and views.cameras.Ks.isfinite().all()
+        assert (views.cameras.sizes >= 1).all() and len(views.photos.stored) == views.cameras.sizes.prod(axis=1).sum()
+    assert scene.points.isfinite().all() and len(scene.points) == len(scene.point_colors) > 0
+
+
+def pose(view: int) -> list[list[float]]:
+    turn = 0.4 * view
+    axes = np.array([[np.cos(turn), 0, np.sin(turn)], [0, 1, 0], [-np.sin(turn), 0, np.cos(turn)]])
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = axes, axes[:, 2] * 4.0
+    return matrix.tolist()
+
+
+def frames(folder: str, count: int) -> list[dict]:
+    return [{"file_path": f"{folder}/{view}.png", "transform_matrix": pose(view)} for view in range(count)]
+
+
+LENS = {"w": 16, "h": 12, "fl_x": 14.0, "fl_y": 14.0, "cx": 8.0, "cy": 6.0}
+FILES = {
+    "brown": ("transforms.json", {**LENS, "k1": 0.05, "k2": -0.02, "k3": 0.01, "k4": 0.001, "p1": 0.001, "p2": 0.001}),
+    "fisheye": ("transforms.json", {**LENS, "camera_model": "OPENCV_FISHEYE", "k1": 0.05, "k2": 0.01, "k3": 0.0}),
+    "points": ("transforms.json", {**LENS, "ply_file_path": "points.ply"}),
+    "blender": ("transforms_train.json", {"camera_angle_x": 1.0}),
+}
+
+
+@pytest.fixture
+def photos(tmp_path) -> Path:
+    (tmp_path / "cup/images").mkdir(parents=True)
+    for view in range(5):
+        Image.new("RGB", (16, 12), (40 * view, 90, 20)).save(tmp_path / f"cup/images/{view}.png")
+    header = "ply\nformat ascii 1.0\nelement vertex 2\n" + "".join(f"property float {axis}\n" for axis in "xyz")
+    (tmp_path / "cup/points.ply").write_text(f"{header}end_header\n0 0 1\n1 0 0\n")
+    return tmp_path / "cup"
+
+
+@pytest.mark.parametrize("kind", FILES)
+def test_other_values_in_files_of_frames(photos, kind):
+    name, content = FILES[kind]
+    content = {**content, "frames": frames("images", 5)}
+    choice, refused = random.Random(kind), 0
+    for _ in range(150):
+        (photos / name).write_text(json.dumps(with_another(content, choice)))
+        result = outcome_within(MEMORY, load_scene, photos)
+        refused += isinstance(result, InputError)
+        if not isinstance(result, InputError):
+            require_whole(result)
+    assert 60 < refused < 150
+
+
+def test_other_values_in_a_table_of_llff(photos):
+    rows = [
+        [*np.c_[np.array(pose(view))[:3, [1, 0, 2, 3]] * [-1, 1, 1, 1], [12, 16, 14]].ravel(), 1, 9]
+        for view in range(5)
+    ]
+    choice, refused = random.Random("llff"), 0
+    for _ in range(300):
+        table = np.array(rows, dtype=choice.choice([np.float64, np.float32]))
+        with np.errstate(over="ignore"):
+            for _ in range(choice.choice([1, 1, 3])):
+                place = choice.randrange(5), choice.randrange(17)
+                table[place] = choice.choice([*NUMBERS, table[place] * choice.choice([1.001, -1, 1e6, 1e-6])])
+        np.save(photos / "poses_bounds.npy", table)
+        result = outcome_within(MEMORY, load_scene, photos)
+        refused += isinstance(result, InputError)
+        if not isinstance(result, InputError):
+            require_whole(result)
+    assert 100 < refused < 300
+
+
+# ---- Models to start from ----------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory) -> Path:
+    return tiny_capture(tmp_path_factory.mktemp("starts"))
+
+
+@pytest.fixture(scope="module")
+def scene(capture) -> Scene:
+    return load_scene(capture, factor=4)
+
+
+def started(scene: Scene, capture: Path, file: Path) -> Gaussians | InputError:
+    config = tiny_config(capture, f"train.init={file}").without_plan()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of Gaussians left out, of models of another capture
+        return outcome_within(MEMORY, initial_gaussians, scene, config, str(file), CPU)
+
+
+def require_whole_model(gaussians: Gaussians) -> None:
+    assert len({len(value) for _, value in gaussians.items()}) == 1 and len(gaussians) > 0
+    assert all(value.isfinite().all() for _, value in gaussians.items())
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".pt"])
+def test_damaged_starts(scene, capture, tmp_path, suffix):
+    """Single numbers among the parameters, and bytes anywhere."""
+    file, model = tmp_path / f"model{suffix}", random_gaussians(20, sh_degree=1)
+    save_ply(model, file) if suffix == ".ply" else save_gsplat(model, file, Frame(np.zeros(3), 1.0))
+    content, choice, refused = file.read_bytes(), random.Random(suffix), 0
+    body = content.index(b"end_header") + 11 if suffix == ".ply" else 0
+    for case in range(40):
+        data = bytearray(content)
+        if case % 2 and suffix == ".ply":
+            for _ in range(choice.choice([1, 5])):
+                place = choice.randrange(body, len(data) - 3, 4)
+                value = choice.choice([*(number for number in NUMBERS if abs(number) < 1e38 or number != number), 3e38])
+                data[place : place + 4] = struct.pack("<f", value)
+        else:
+            for _ in range(choice.choice([1, 4])):
+                data[choice.randrange(len(data))] = choice.randrange(256)
+            del data[choice.choice([len(data), choice.randrange(len(data))]) :]
+        file.write_bytes(data)
+        result = started(scene, capture, file)
+        refused += isinstance(result, InputError)
+        if not isinstance(result, InputError):
+            require_whole_model(result)
+    assert 8 < refused < 40
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".pt"])
+@pytest.mark.parametrize("broken", [1, 20])
+def test_not_finite_in_a_start(scene, capture, tmp_path, suffix, broken):
+    """Left out and counted; refused where none remains."""
+    file, model = tmp_path / f"model{suffix}", random_gaussians(20, sh_degree=1)
+    model.sh0[:broken, 0, 1] = 123.5  # to be found in the file
+    if suffix == ".ply":
+        save_ply(model, file)
+        file.write_bytes(file.read_bytes().replace(struct.pack("<f", 123.5), struct.pack("<f", np.nan)))
+    else:
+        save_gsplat(model, file, Frame(np.zeros(3), 1.0))
+        state = torch.load(file, weights_only=True)
+        state["splats"]["sh0"][:broken, 0, 1] = torch.inf
+        torch.save(state, file)
+    result = started(scene, capture, file)
+    if broken == 20:
+        assert isinstance(result, InputError) and file.name in str(result)
+    else:
+        assert len(result) == 19
+        require_whole_model(result)
+
+
+@pytest.mark.parametrize("kind", ["transforms", "colmap"])
+def test_no_points(capture, photos, tmp_path, kind):
+    """Points are drawn at random, the same each time; training starts from them."""
+    if kind == "transforms":
+        empty = (photos / "points.ply").read_text().replace("vertex 2", "vertex 0").split("end_header")[0]
+        (photos / "points.ply").write_text(empty + "end_header\n")
+        (photos / "transforms.json").write_text(json.dumps({**FILES["points"][1], "frames": frames("images", 5)}))
+        folder = photos
+    else:
+        folder = Path(shutil.copytree(capture, tmp_path / "copy"))
+        (folder / "sparse/0/points3D.bin").write_bytes(bytes(8))
+    found = load_scene(folder)
+    require_whole(found)
+    assert len(found.points) == 50_000 and "so 50,000 random ones" in found.notes[0]
+    gaussians = initial_gaussians(found, tiny_config(folder, "density.max_gaussians=300").without_plan(), "points", CPU)
+    assert len(gaussians) == 300
+    require_whole_model(gaussians)

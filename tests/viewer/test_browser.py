@@ -1,0 +1,135 @@
+"""The page in a real browser: frames arrive as they were drawn, pictures switch, a training is paused and goes on."""
+
+import dataclasses
+import io
+import shutil
+import threading
+import time
+
+import numpy as np
+import pytest
+from helpers.framework_runs import assert_identical
+from PIL import Image
+
+from turbogs_plugin.viewer.commands import Shown, show
+from turbogs_plugin.viewer.controls import Controls
+from turbogs_plugin.viewer.eye import Eye
+from turbogs_plugin.viewer.live import LiveViewer
+from turbogs_plugin.viewer.page import Page
+from turbogs_plugin.viewer.pictures import Picture, Request, draw
+
+pytest.importorskip("viser")
+playwright = pytest.importorskip("playwright.sync_api")
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+if CHROMIUM is None:
+    pytest.skip("there is no chromium", allow_module_level=True)
+
+ARGUMENTS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-dev-shm-usage")
+PATIENCE = 90.0
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with playwright.sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=CHROMIUM, args=list(ARGUMENTS))
+        yield browser
+        browser.close()
+
+
+class Tab:
+    """The page in a tab of a browser."""
+
+    def __init__(self, browser, page: Page) -> None:
+        self.tab = browser.new_page(viewport={"width": 700, "height": 240})
+        # A fixed ratio: in a slow browser the page would lower its resolution.
+        self.tab.goto(f"{page.url}/?fixedDpr=1")
+        # Neither a note nor the panel's shadow lies on the picture.
+        self.tab.add_style_tag(
+            content=".mantine-Notifications-root { display: none } * { box-shadow: none !important }"
+        )
+        self.tab.wait_for_selector("canvas", timeout=1000 * PATIENCE)
+
+    def canvas(self) -> np.ndarray:
+        """[H, W, 3] uint8: what is seen."""
+        shot = self.tab.locator("canvas").first.screenshot()
+        return np.asarray(Image.open(io.BytesIO(shot)).convert("RGB"))
+
+    def comes_to_show(self, expected) -> np.ndarray:
+        """Wait until the canvas shows a picture within 2 grey levels; `expected` gives it for (width, height)."""
+        ends, worst = time.monotonic() + PATIENCE, 255
+        while time.monotonic() < ends:
+            seen = self.canvas()
+            wanted = expected(seen.shape[1], seen.shape[0])
+            worst = min(worst, int(np.abs(seen.astype(int) - wanted).max()))
+            if worst <= 2:
+                return seen
+            self.tab.wait_for_timeout(100)
+        pytest.fail(f"the canvas differs from the picture by {worst} grey levels and more")
+
+    def choose(self, picture: Picture) -> None:
+        self.tab.get_by_label("Picture").first.click()
+        self.tab.get_by_role("option", name=picture.value, exact=True).click()
+
+    def press(self, name: str) -> None:
+        self.tab.get_by_role("button", name=name, exact=True).click()
+
+
+def test_frames_arrive_as_they_were_drawn_and_pictures_switch(browser, subject):
+    over, page = threading.Event(), Page("127.0.0.1", 0)
+    thread = threading.Thread(target=show, args=(Shown(subject, "a model"), page, over.is_set))
+    thread.start()
+    try:
+        tab = Tab(browser, page)
+        tab.tab.get_by_role("checkbox").uncheck()  # the cameras stand in the picture
+
+        def seen_from(view: int):
+            eye = Eye.of_view(subject.capture.train.cameras, view)
+            return lambda width, height: draw(
+                subject, Request(Picture.RENDER, dataclasses.replace(eye, width=width, height=height))
+            )
+
+        renders = [tab.comes_to_show(seen_from(0))]
+        for view in (3, 6):
+            page.choose_view(view)
+            tab.press("Stand at this view")
+            renders.append(tab.comes_to_show(seen_from(view)))
+        assert all(image.std() > 5 for image in renders)
+        for picture in (Picture.DEPTH, Picture.COMPARE, Picture.ERRORS, Picture.RENDER):
+            tab.choose(picture)
+            # A colour of a scale may jump with the last digit of a pose: so by the pose that the browser told.
+            tab.comes_to_show(lambda *size, picture=picture: draw(subject, Request(picture, page.screens()[0].eye, 6)))
+    finally:
+        over.set()
+        thread.join()
+        page.close()
+
+
+def test_a_training_is_paused_stepped_and_goes_on(browser, new_training, scene):
+    alone = new_training()
+    alone.run()
+    loop, page = new_training(), Page("127.0.0.1", 0, Controls())
+    loop.listeners.append(LiveViewer(page).attach(loop.trainer, scene.test))
+    page.controls.pause()
+    page.refresh_controls()
+    tab = Tab(browser, page)
+    thread = threading.Thread(target=loop.run)
+    thread.start()
+    try:
+        tab.tab.get_by_text("paused").wait_for(timeout=1000 * PATIENCE)
+        assert loop.trainer.iteration == 1
+        for iteration in (2, 3):
+            tab.press("One step")
+            tab.tab.get_by_text(f"iteration {iteration} of {loop.trainer.iterations} (paused)").wait_for(
+                timeout=1000 * PATIENCE
+            )
+            assert loop.trainer.iteration == iteration
+        tab.choose(Picture.SAMPLES)
+        tab.tab.get_by_text("views in this iteration").wait_for(timeout=1000 * PATIENCE)
+        tab.press("Go on")
+        thread.join(PATIENCE)
+        assert loop.finished
+    finally:
+        loop.stop()
+        thread.join()
+        page.close()
+    assert_identical(loop.trainer.state_dict(), alone.trainer.state_dict())

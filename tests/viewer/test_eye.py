@@ -1,0 +1,73 @@
+"""Cameras of clients: what is taken, what is refused, and that they are the cameras that they say."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from helpers.framework_runs import tiny_capture
+
+from turbogs_plugin.scene import load_scene
+from turbogs_plugin.viewer.eye import FOV_LIMITS, LARGEST_SIDE, SMALLEST_SIDE, Eye
+
+GOOD = {"position": (1.0, 2.0, 3.0), "wxyz": (2.0, 0.0, 0.0, 0.0), "fov": 1.0, "width": 640, "height": 480}
+
+
+def test_a_sound_camera_is_taken_with_a_unit_quaternion():
+    assert Eye.checked(**GOOD) == Eye((1.0, 2.0, 3.0), (1.0, 0.0, 0.0, 0.0), 1.0, 640, 480)
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        {"position": (math.nan, 0, 0)},
+        {"position": (math.inf, 0, 0)},
+        {"position": (1e30, 0, 0)},
+        {"position": (0, 0)},
+        {"position": "abc"},
+        {"position": None},
+        {"wxyz": (0, 0, 0, 0)},
+        {"wxyz": (math.nan, 0, 0, 1)},
+        {"wxyz": (1e300, 1e300, 0, 0)},
+        {"fov": math.nan},
+        {"fov": 0},
+        {"fov": -1},
+        {"fov": [1, 2]},
+        {"width": 0},
+        {"height": -5},
+        {"width": math.inf},
+        {"height": "high"},
+    ],
+)
+def test_what_is_no_camera_is_refused(bad):
+    assert Eye.checked(**(GOOD | bad)) is None
+
+
+def test_sizes_and_angles_are_brought_within_limits():
+    huge = Eye.checked(**(GOOD | {"width": 10**9, "height": 5 * 10**8, "fov": 100.0}))
+    assert (huge.width, huge.height, huge.fov) == (LARGEST_SIDE, LARGEST_SIDE // 2, FOV_LIMITS[1])
+    thin = Eye.checked(**(GOOD | {"width": 10**6, "height": 1}))
+    assert (thin.width, thin.height) == (LARGEST_SIDE, SMALLEST_SIDE)
+    small = Eye.checked(**GOOD).with_at_most(160 * 120)
+    assert (small.width, small.height) == (160, 120)
+
+
+def test_the_eye_of_a_view_is_its_camera(tmp_path):
+    cameras = load_scene(tiny_capture(tmp_path)).train.cameras
+    for view in range(len(cameras)):
+        found = Eye.of_view(cameras, view).cameras(torch.device("cpu"))
+        torch.testing.assert_close(found.viewmats[0], cameras.viewmats[view], atol=1e-5, rtol=0)
+        assert found.Ks[0, 1, 1].item() == pytest.approx(cameras.Ks[view, 1, 1].item(), rel=1e-5)
+        assert np.array_equal(found.sizes[0], cameras.sizes[view])
+
+
+@pytest.mark.parametrize("axis", [(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0), (0.6, -0.48, 0.64)])
+@pytest.mark.parametrize("angle", [0.0, 1.0, math.pi, 4.0])
+def test_quaternions_go_to_rotations_and_back(axis, angle):
+    from turbogs_plugin.viewer.eye import quaternion_of, rotation_of
+
+    wxyz = (math.cos(angle / 2), *(math.sin(angle / 2) * np.array(axis)))
+    rotation = rotation_of(wxyz)
+    np.testing.assert_allclose(rotation @ np.array(axis), axis, atol=1e-12)
+    np.testing.assert_allclose(rotation_of(quaternion_of(rotation)), rotation, atol=1e-12)
+    assert np.trace(rotation) == pytest.approx(1 + 2 * math.cos(angle))

@@ -1,0 +1,165 @@
+"""When frames are drawn: nothing for nobody, nothing twice, lossless at rest, within the share of a training."""
+
+import numpy as np
+import pytest
+import torch
+
+from turbogs_plugin.types import Gaussians
+from turbogs_plugin.viewer import frames as module
+from turbogs_plugin.viewer.eye import Eye
+from turbogs_plugin.viewer.frames import FEWEST_PIXELS, REST_SECONDS, SHARE, Frames, Pace, Screen
+from turbogs_plugin.viewer.pictures import Picture
+from turbogs_plugin.viewer.subject import Subject
+
+EYE = Eye((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), 1.0, 640, 480)
+NOTHING = Subject(Gaussians(*(torch.zeros(0, *shape) for shape in ((3,), (4,), (3,), (), (1, 3), (0, 3)))), 0)
+
+
+class Desk:
+    """Frames under a clock that only a test and drawing move.
+
+    Args:
+        per_pixel: seconds of a pixel.
+    """
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, per_pixel: float = 0.0, screens: int = 1) -> None:
+        self.now = 100.0
+        self.sent: list[tuple[int, int, bool]] = []  # screen, width, lossless
+        self.screens = [
+            Screen(lambda pixels, lossless, at=at: self._take(at, pixels, lossless)) for at in range(screens)
+        ]
+        self.wish = (Picture.RENDER, 0)
+        self.frames = Frames(lambda: self.screens, lambda: self.wish, clock=lambda: self.now)
+        self.per_pixel = per_pixel
+        monkeypatch.setattr(module, "draw", self._draw)
+
+    def _draw(self, subject: Subject, request) -> np.ndarray:
+        self.now += self.per_pixel * request.eye.width * request.eye.height
+        return np.zeros((request.eye.height, request.eye.width, 3), dtype=np.uint8)
+
+    def _take(self, at: int, pixels: np.ndarray, lossless: bool) -> None:
+        self.sent.append((at, pixels.shape[1], lossless))
+        self.screens[at].busy = False
+
+    def look(self, x: float, at: int = 0) -> None:
+        self.screens[at].look(Eye((x, 0.0, 0.0), EYE.wxyz, EYE.fov, EYE.width, EYE.height), self.now)
+
+    def serve(self, version: int = 0, running: bool = False) -> bool:
+        return self.frames.serve(lambda: NOTHING, version, running)
+
+    def wait(self, seconds: float) -> None:
+        self.now += seconds
+
+
+def refuse() -> Subject:
+    raise AssertionError("a subject was asked for, and nobody looks")
+
+
+def test_nobody_looks_and_nothing_is_drawn(monkeypatch):
+    desk = Desk(monkeypatch, screens=0)
+    assert not desk.frames.serve(refuse, 0, True)
+    desk = Desk(monkeypatch)  # connected, without a usable camera
+    assert not desk.frames.serve(refuse, 0, True)
+
+
+def test_moving_frames_are_small_files_and_the_last_one_is_lossless(monkeypatch):
+    desk = Desk(monkeypatch)
+    desk.look(0.0)
+    assert desk.serve() and not desk.sent[-1][2]
+    desk.wait(0.05)
+    assert not desk.serve(), "the camera stands still for a moment"
+    desk.look(1.0)
+    assert desk.serve() and not desk.sent[-1][2]
+    desk.wait(REST_SECONDS)
+    assert desk.serve() and desk.sent[-1] == (0, EYE.width, True)
+    for _ in range(5):
+        desk.wait(10.0)
+        assert not desk.serve(), "at rest with nothing new"
+
+
+def test_whatever_is_new_is_drawn_again(monkeypatch):
+    desk = Desk(monkeypatch)
+    desk.look(0.0)
+    desk.wait(1.0)
+    assert desk.serve()
+    desk.wait(1.0)
+    assert desk.serve(version=1)
+    desk.wait(1.0)
+    assert not desk.serve(version=1)
+    desk.wish = (Picture.DEPTH, 0)
+    assert desk.serve(version=1)
+    desk.wait(1.0)
+    desk.wish = (Picture.DEPTH, 3)
+    assert desk.serve(version=1) and all(lossless for *_, lossless in desk.sent)
+
+
+def test_a_page_is_not_served_while_its_last_frame_is_encoded(monkeypatch):
+    desk = Desk(monkeypatch)
+    desk.look(0.0)
+    desk.screens[0].busy = True
+    assert not desk.serve()
+    desk.screens[0].busy = False
+    assert desk.serve()
+
+
+def test_pages_are_served_in_turn(monkeypatch):
+    desk = Desk(monkeypatch, per_pixel=1e-7, screens=3)
+    for step in range(9):
+        for at in range(3):
+            desk.look(float(step), at)
+        desk.wait(0.05)
+        assert desk.serve()
+    assert [at for at, *_ in desk.sent] == [0, 1, 2] * 3
+
+
+@pytest.mark.parametrize("per_pixel", [1e-9, 1e-8, 1e-6])
+def test_frames_take_their_share_of_a_training_and_no_more(monkeypatch, per_pixel):
+    desk = Desk(monkeypatch, per_pixel)
+    began, drawing, iterations = desk.now, 0.0, 0
+    while desk.now < began + 20.0:
+        desk.wait(0.001)  # an iteration
+        iterations += 1
+        desk.look(desk.now)
+        before = desk.now
+        desk.serve(version=iterations, running=True)
+        drawing += desk.now - before
+    # The last frame's pause may lie beyond the end.
+    assert drawing <= SHARE * (desk.now - began) + FEWEST_PIXELS * per_pixel
+    rate = len(desk.sent) / 20.0
+    if per_pixel < 1e-7:
+        assert rate >= 10 and desk.sent[-1][1] == EYE.width, "fast enough, and whole"
+    else:
+        assert desk.sent[-1][1] == 160 and 1 < rate < 10, "as small as allowed, and as often as allowed"
+
+
+def test_without_a_training_moving_frames_keep_pace_and_the_one_at_rest_is_whole(monkeypatch):
+    desk = Desk(monkeypatch, per_pixel=1e-6)  # the whole page takes 0.3 s
+    for step in range(10):
+        desk.look(float(step))
+        before = desk.now
+        assert desk.serve()
+        assert desk.now - before <= 0.1
+        desk.wait(0.04)
+    desk.wait(REST_SECONDS)
+    assert desk.serve() and desk.sent[-1] == (0, EYE.width, True)
+
+
+def test_sizes_come_in_steps():
+    pace = Pace(None)
+    widths = set()
+    for step in range(100):
+        pace.spent(Picture.RENDER, 0.0, 0.1 + 0.004 * step, 100_000)
+        widths.add(pace.sized(Picture.RENDER, EYE, moving=True).width)
+    assert len(widths) <= 5
+
+
+def test_a_full_device_ends_no_training(monkeypatch):
+    desk = Desk(monkeypatch)
+
+    def full(subject, request):
+        raise torch.cuda.OutOfMemoryError
+
+    monkeypatch.setattr(module, "draw", full)
+    desk.look(0.0)
+    assert desk.serve() and desk.sent == [] and "memory" in desk.screens[0].failed
+    assert not desk.screens[0].busy

@@ -1,0 +1,223 @@
+"""A training with a viewer: the same to the last bit, stopped and stepped, and told of nothing while nobody looks."""
+
+import threading
+import time
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from helpers.framework_runs import assert_identical
+
+from turbogs_plugin.train.clock import TrainingClock
+from turbogs_plugin.train.loop import Listener
+from turbogs_plugin.viewer import live as module
+from turbogs_plugin.viewer.controls import Controls
+from turbogs_plugin.viewer.eye import Eye
+from turbogs_plugin.viewer.frames import Frames, Screen
+from turbogs_plugin.viewer.live import LiveViewer
+from turbogs_plugin.viewer.pictures import Picture
+
+
+class PretendedPage:
+    """A page without viser, whose screens take every frame, and which wants another picture each time."""
+
+    url = "http://nowhere"
+
+    def __init__(self, looking: bool = True) -> None:
+        self.controls = Controls()
+        self.frames: list[np.ndarray] = []
+        self.said: list[str] = []
+        self._screens = [Screen(self._take)] if looking else []
+        self._wishes = 0
+
+    @property
+    def watched(self) -> bool:
+        return bool(self._screens)
+
+    def screens(self) -> list[Screen]:
+        for screen in self._screens:
+            screen.busy = False
+        return self._screens
+
+    def wish(self) -> tuple[Picture, int]:
+        return list(Picture)[self._wishes % len(Picture)], self._wishes
+
+    def show_capture(self, capture) -> None:
+        for screen in self._screens:
+            screen.eye = Eye.of_view(capture.train.cameras, 1)
+
+    def say(self, text: str) -> None:
+        self.said.append(text)
+
+    def refresh_controls(self) -> None:
+        pass
+
+    def _take(self, pixels: np.ndarray, lossless: bool) -> None:
+        self.frames.append(pixels)
+        self._wishes += 1
+
+
+class At(Listener):
+    """Does something after an iteration."""
+
+    def __init__(self, iteration: int, action) -> None:
+        self.iteration, self.action = iteration, action
+
+    def advanced(self, loop) -> None:
+        if loop.trainer.iteration == self.iteration:
+            self.action()
+
+
+@pytest.fixture
+def watched(new_training, scene):
+    """Makes (page, viewer, training)."""
+
+    def watched(*overrides: str, looking: bool = True):
+        page, loop = PretendedPage(looking), new_training(*overrides)
+        live = LiveViewer(page).attach(loop.trainer, scene.test)
+        live.frames = Frames(page.screens, page.wish, share=None)  # every frame that is due, whatever it takes
+        loop.listeners.append(live)
+        return page, live, loop
+
+    return watched
+
+
+# In host memory, what a page asks for passes through the window of the training.
+@pytest.mark.parametrize("place", ["device", "host"])
+def test_a_watched_training_ends_as_an_unwatched_one(new_training, watched, monkeypatch, place):
+    monkeypatch.setattr("turbogs_plugin.viewer.frames.SHORTEST_INTERVAL", 0.0)
+    overrides = (f"train.maps_place={place}", f"train.photos_place={place}")
+    alone = new_training(*overrides)
+    alone.run()
+    page, live, loop = watched(*overrides)
+    loop.run()
+    assert live.frames_drawn >= loop.trainer.iteration > 10 and len({frame.tobytes() for frame in page.frames}) > 8
+    assert_identical(loop.trainer.state_dict(), alone.trainer.state_dict())
+    assert any("Gaussians" in text and "iteration" in text for text in page.said)
+
+
+def test_nothing_is_drawn_or_kept_while_nobody_looks(watched, monkeypatch):
+    page, live, loop = watched(looking=False)
+    monkeypatch.setattr(LiveViewer, "_subject", lambda self: pytest.fail("a subject was made for nobody"))
+    loop.run()
+    assert page.frames == [] and page.said == [] and live.frames_drawn == 0
+    assert live._samples is None and live._change is None
+
+
+def test_what_an_iteration_did_is_shown(watched):
+    _, live, loop = watched()
+    changes = []
+    loop.listeners.append(At(5, lambda: changes.append(live._subject())))
+    loop.run()
+    (subject,) = changes
+    assert subject.samples is not None and len(subject.samples) > 0
+    assert len(subject.change.added) == len(subject.gaussians)
+    assert int(subject.change.added.sum()) >= subject.change.num_split > 0
+
+
+def test_pause_step_and_go_on(new_training, watched, monkeypatch):
+    page, _, loop = watched()
+    waited, stopped = set(), []
+    wait, clock_stopped = page.controls.wait, loop.clock.stopped
+
+    def waiting(seconds: float) -> None:
+        waited.add(loop.trainer.iteration)
+        wait(seconds)
+
+    def stopping():
+        stopped.append(loop.trainer.iteration)
+        return clock_stopped()
+
+    monkeypatch.setattr(page.controls, "wait", waiting)
+    monkeypatch.setattr(loop.clock, "stopped", stopping)
+
+    def click() -> None:
+        """As a page's thread would."""
+        for iteration, press in ((4, page.controls.step), (5, page.controls.step), (6, page.controls.resume)):
+            until(lambda iteration=iteration: iteration in waited)
+            press()
+
+    loop.listeners.insert(0, At(4, page.controls.pause))
+    thread = threading.Thread(target=click)
+    thread.start()
+    loop.run()
+    thread.join()
+    assert waited == {4, 5, 6} and stopped == [4, 5, 6], "it waited elsewhere, or with the clock running"
+    assert loop.finished and not page.controls.paused
+    assert any("paused" in text for text in page.said)
+    alone = new_training()
+    alone.run()
+    assert_identical(loop.trainer.state_dict(), alone.trainer.state_dict())
+
+
+def test_the_clock_does_not_count_what_is_no_training(monkeypatch):
+    now = [0.0]
+    monkeypatch.setattr("turbogs_plugin.train.clock.time", SimpleNamespace(perf_counter=lambda: now[0]))
+    clock = TrainingClock(torch.device("cpu"), seconds=5.0)
+    with clock:
+        now[0] += 1.0
+        with clock.stopped():
+            now[0] += 100.0
+        now[0] += 2.0
+        assert clock.now() == 8.0
+    assert clock.seconds == 8.0
+
+
+def test_a_paused_training_can_be_stopped(watched, monkeypatch):
+    page, _, loop = watched()
+    loop.listeners.insert(0, At(3, page.controls.pause))
+    monkeypatch.setattr(page.controls, "wait", lambda seconds: loop.stop())
+    loop.run()
+    assert loop.trainer.iteration == 3 and loop.stopped
+
+
+def test_a_paused_training_goes_on_when_nobody_looks_any_more(watched, monkeypatch):
+    monkeypatch.setattr(module, "ABANDONED_SECONDS", 0.1)
+    page, _, loop = watched()
+
+    def pause_and_leave() -> None:
+        page.controls.pause()
+        page._screens.clear()
+
+    loop.listeners.insert(0, At(3, pause_and_leave))
+    loop.run()
+    assert loop.finished
+
+
+def test_after_the_training_its_model_is_shown_until_ctrl_c(watched, monkeypatch, capsys):
+    page, live, loop = watched()
+    loop.run()
+    shown = len(page.frames)
+    page.finished = lambda: None
+
+    def wait(seconds: float) -> None:
+        if len(page.frames) > shown:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(page.controls, "wait", wait)
+    live.stay()
+    assert capsys.readouterr().out == "viewer  http://nowhere  (Ctrl-C ends)\n"
+
+
+def until(reached, seconds: float = 60.0) -> None:
+    ends = time.perf_counter() + seconds
+    while not reached():
+        assert time.perf_counter() < ends, "nothing happened"
+        time.sleep(0.01)
+
+
+def test_steps_are_counted():
+    controls = Controls()
+    assert not controls.paused and not controls.take_step()
+    controls.step()
+    controls.step()
+    assert controls.paused and controls.take_step() and controls.take_step() and not controls.take_step()
+    controls.resume()
+    assert not controls.paused
+
+
+def test_an_evaluation_is_told(watched):
+    _, live, loop = watched()
+    live.evaluated(loop, SimpleNamespace(psnr=21.5))
+    assert "21.50 dB" in live._status(True, time.perf_counter())

@@ -1,0 +1,294 @@
+"""The page as a client without a browser meets it: frames, hostile input, ports, and the commands that open it."""
+
+import dataclasses
+import math
+import signal
+import socket
+import subprocess
+import sys
+import threading
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+import torch
+from helpers.framework_runs import TINY, assert_identical
+
+from turbogs_plugin import cli
+from turbogs_plugin.engine.rendering import render_image
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.model.ply import save_ply
+from turbogs_plugin.report.pictures import to_uint8
+from turbogs_plugin.viewer import page as page_module
+from turbogs_plugin.viewer.commands import Shown, open_shown, show
+from turbogs_plugin.viewer.controls import Controls
+from turbogs_plugin.viewer.eye import Eye
+from turbogs_plugin.viewer.live import LiveViewer
+from turbogs_plugin.viewer.page import INSTALL, Page, require_free
+from turbogs_plugin.viewer.pictures import Picture, Request, draw
+from turbogs_plugin.viewer.subject import Subject
+
+
+@contextmanager
+def shown(subject: Subject):
+    """A page that shows a model, from a thread of its own."""
+    pytest.importorskip("viser")
+    page, over = Page("127.0.0.1", 0), threading.Event()
+    thread = threading.Thread(target=show, args=(Shown(subject, "a model"), page, over.is_set))
+    thread.start()
+    try:
+        yield page
+    finally:
+        over.set()
+        thread.join()
+        page.close()
+
+
+def connected(page: Page, **headers: str):
+    from turbogs_plugin.bench.viewer_client import ScriptedClient
+
+    return ScriptedClient(page.url, **headers)
+
+
+def test_the_first_frames_are_our_renders(subject):
+    cameras = subject.capture.train.cameras
+    with shown(subject) as page:
+        for view in (0, 3, 6):
+            with connected(page) as client:
+                client.look(Eye.of_view(cameras, view))
+                frame = client.next_frame(lossless=True).pixels()
+            image = render_image(subject.gaussians, cameras, view, sh_degree=subject.sh_degree)
+            assert np.abs(frame.astype(int) - to_uint8(image.colors)).max() <= 2
+
+
+def test_pictures_and_views_are_chosen_on_the_page(subject):
+    eye = Eye.of_view(subject.capture.train.cameras, 0)
+    with shown(subject) as page, connected(page) as client:
+        client.look(eye)
+        client.next_frame(lossless=True)
+        for picture, view in ((Picture.DEPTH, 0), (Picture.COMPARE, 2), (Picture.ERRORS, 4), (Picture.TILES, 4)):
+            page.choose_view(view)
+            client.say(
+                {"type": "GuiUpdateMessage", "uuid": page._pictures._impl.uuid, "updates": {"value": picture.value}}
+            )
+            expected = draw(subject, Request(picture, eye, view))
+            for _ in range(5):  # the choice of a view may be drawn on the way
+                if np.array_equal(client.next_frame(lossless=True).pixels(), expected):
+                    break
+            else:
+                pytest.fail(f"{picture.value} did not come")
+
+
+def test_moving_frames_are_jpeg(subject):
+    eye = Eye.of_view(subject.capture.train.cameras, 0)
+    with shown(subject) as page, connected(page) as client:
+        client.look(eye)
+        client.next_frame(lossless=True)
+        client.look(dataclasses.replace(eye, fov=eye.fov * 0.9))
+        assert not client.next_frame().lossless
+        client.next_frame(lossless=True)
+
+
+HOSTILE = (
+    ((math.nan, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), 1.0, 64, 48),
+    ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0), 1.0, 64, 48),
+    ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), math.inf, 64, 48),
+    ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), 1.0, -1, 0),
+    ((0.0,), (1.0,), "wide", None, []),
+)
+
+
+def test_a_hostile_client_ends_nothing(subject):
+    pytest.importorskip("viser")
+    from websockets.exceptions import ConnectionClosed
+
+    eye = Eye.of_view(subject.capture.train.cameras, 0)
+    with shown(subject) as page:
+        with connected(page) as client:
+            client.look(eye)
+            client.next_frame()
+        for camera in HOSTILE:
+            with connected(page) as client:
+                client.say_camera(*camera)
+                with pytest.raises((TimeoutError, ConnectionClosed)):
+                    client.next_frame(timeout=0.3)
+                page.go_to(3)  # moves every client's camera, as far as it has one
+        with connected(page) as client:
+            client.look(eye)
+            client.next_frame(lossless=True)
+            slider, pictures = page._slider._impl.uuid, page._pictures._impl.uuid
+            for uuid, value in ((slider, 10**9), (slider, -5), (pictures, "no such picture"), ("nobody", 1)):
+                client.say({"type": "GuiUpdateMessage", "uuid": uuid, "updates": {"value": value}})
+            client.say_camera(eye.position, eye.wxyz, eye.fov, 10**9, 10**9)
+            wide = client.next_frame(lossless=True).pixels()
+            assert max(wide.shape) <= 1920
+            client.say({"type": "ShareUrlRequest"})
+        assert page.server._share_tunnel is None
+        assert page.picture in Picture and 0 <= page.view < len(subject.capture)
+
+
+def test_scripts_of_other_pages_are_turned_away(subject):
+    pytest.importorskip("viser")
+    from websockets.exceptions import ConnectionClosed
+
+    eye = Eye.of_view(subject.capture.train.cameras, 0)
+    with shown(subject) as page:
+        with pytest.raises(ConnectionClosed), connected(page, Origin="http://elsewhere.example") as client:
+            client.look(eye)
+            client.next_frame(timeout=10.0)
+        with connected(page, Origin=page.url) as client:
+            client.look(eye)
+            client.next_frame()
+
+
+def test_a_training_goes_on_while_a_client_looks(new_training, scene):
+    pytest.importorskip("viser")
+    alone = new_training()
+    alone.run()
+    loop, page = new_training(), Page("127.0.0.1", 0, Controls())
+    live = LiveViewer(page).attach(loop.trainer, scene.test)
+    loop.listeners.append(live)
+    frames = []
+
+    def look() -> None:
+        with connected(page) as client:
+            client.look(Eye.of_view(loop.trainer.views.cameras, 0))
+            frames.append(client.next_frame())
+            client.say({"type": "GuiUpdateMessage", "uuid": page._pause._impl.uuid, "updates": {"value": True}})
+            frames.append(client.next_frame(lossless=True))
+            client.say({"type": "GuiUpdateMessage", "uuid": page._pause._impl.uuid, "updates": {"value": True}})
+
+    page.controls.pause()  # until the client is there
+    thread = threading.Thread(target=look)
+    thread.start()
+    page.refresh_controls()
+    try:
+        while not page.watched:
+            page.controls.wait(0.02)
+        page.controls.resume()
+        loop.run()
+        thread.join()
+    finally:
+        page.close()
+    assert len(frames) == 2 and live.frames_drawn >= 2
+    assert_identical(loop.trainer.state_dict(), alone.trainer.state_dict())
+
+
+def test_a_port_in_use_is_named():
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        with pytest.raises(InputError, match=f"cannot listen at 127.0.0.1:{port} .*: name another port"):
+            require_free("127.0.0.1", port)
+    require_free("127.0.0.1", port)
+
+
+@pytest.mark.parametrize(
+    ("host", "port"), [("127.0.0.1", -1), ("127.0.0.1", 70000), ("no such host", 8080), ("203.0.113.1", 8080)]
+)
+def test_an_address_that_is_none_is_named(host, port):
+    with pytest.raises(InputError, match=str(port)):
+        require_free(host, port)
+
+
+def test_without_viser_one_line_names_the_extra(turbogs, tmp_path, capture, monkeypatch):
+    monkeypatch.setitem(sys.modules, "viser", None)
+    for command in (("view", tmp_path), ("train", capture, "--out", tmp_path / "run", "--viewer")):
+        code, out, err = turbogs(*command)
+        assert (code, out, err) == (2, "", f"turbogs: error: the viewer needs viser: {INSTALL}\n")
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_command_with_a_viewer_shows_the_model_until_ctrl_c(capture, tmp_path):
+    pytest.importorskip("viser")
+    out = tmp_path / "run"
+    command = ["train", capture, "--out", out, "--no-report", "--device", "cpu", "--viewer", "0", *TINY]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "turbogs_plugin.cli", *map(str, command)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    said = ""
+    while "Ctrl-C ends" not in said:
+        line = process.stdout.readline()
+        assert line, process.stderr.read()
+        said += line
+    assert (out / "model.ply").is_file()
+    process.send_signal(signal.SIGINT)
+    rest, err = process.communicate(timeout=60)
+    assert process.returncode == 0 and rest == "", err
+    assert "viewer  http://localhost:" in err and "Traceback" not in err and "viser" not in said + err
+
+
+@pytest.mark.parametrize(
+    ("given", "taken"),
+    [
+        (["train", "S", "--viewer"], ["train", "S", "--viewer", "8080"]),
+        (["train", "S", "--viewer", "--out", "R"], ["train", "S", "--viewer", "8080", "--out", "R"]),
+        (["train", "S", "--viewer", "9000", "--out", "R"], ["train", "S", "--viewer", "9000", "--out", "R"]),
+        (["train", "--viewer", "train.iterations=3"], ["train", "--viewer", "8080", "train.iterations=3"]),
+        (["train", "S", "--viewer=9"], ["train", "S", "--viewer=9"]),
+        (["view", "R"], ["view", "R"]),
+    ],
+)
+def test_a_viewer_has_a_usual_port(given, taken):
+    assert cli._with_port(given) == taken
+
+
+@pytest.fixture
+def with_viser(monkeypatch):
+    """Commands come as far as if viser were there."""
+    from turbogs_plugin.viewer import commands
+
+    for module in (commands, page_module):
+        monkeypatch.setattr(module, "require_viser", lambda: None)
+
+
+def test_bad_input_is_one_line(turbogs, tmp_path, capture, with_viser):
+    points, empty = tmp_path / "points.ply", tmp_path / "empty"
+    points.write_text("ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n0\n")
+    empty.mkdir()
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = str(taken.getsockname()[1])
+        out = tmp_path / "run"
+        cases = {
+            ("view", points, "--port", "0"): "points.ply",
+            ("view", empty, "--port", "0"): "empty",
+            ("view", tmp_path / "absent.ply", "--port", "0"): "absent.ply",
+            ("view", points, "--port", port): f"127.0.0.1:{port}",
+            ("train", capture, "--out", out, "--viewer", port): f"127.0.0.1:{port}",
+            ("train", capture, "--out", out, "--viewer-host", "0.0.0.0"): "--viewer",
+            ("view", points, "--factor", "2"): "--scene",
+        }
+        for command, named in cases.items():
+            code, said, err = turbogs(*command)
+            assert code == 2 and said == "" and err.count("\n") == 1 and named in err, (command, err)
+    assert not out.exists()
+
+
+def test_a_model_from_a_file_stands_before_the_eye(subject, tmp_path):
+    far = subject.gaussians.map(lambda value: value.clone())
+    far.means = far.means * 50.0 + torch.tensor([1000.0, -2000.0, 500.0])
+    save_ply(far, tmp_path / "model.ply")
+    found = open_shown(tmp_path / "model.ply", torch.device("cpu"))
+    distances = found.subject.gaussians.means.norm(dim=1)
+    assert 0.85 < float((distances <= 1.01).float().mean()) < 0.95
+    assert found.subject.capture is None and found.title == "model.ply"
+
+
+def test_a_run_is_shown_with_its_error_maps_and_without_its_capture(turbogs, capture, tmp_path):
+    out = tmp_path / "run"
+    code, *_ = turbogs("train", capture, "--out", out, "--no-report", "--device", "cpu", *TINY)
+    assert code == 0
+    found = open_shown(out, torch.device("cpu"))
+    assert len(found.subject.capture) == 8 and found.note == "" and found.subject.maps.errors.any()
+    eye = Eye.of_view(found.subject.capture.train.cameras, 0)
+    assert draw(found.subject, Request(Picture.AGES, eye, 0)).std() > 1
+    config = out / "config.yaml"
+    config.write_text(config.read_text().replace(str(capture), str(tmp_path / "gone")))
+    found = open_shown(out, torch.device("cpu"))
+    assert found.subject.capture is None and "gone" in found.note

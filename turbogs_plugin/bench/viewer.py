@@ -1,0 +1,145 @@
+"""What a viewer costs a training: iterations a second without one, with one that nobody looks at, and with a client."""
+
+from __future__ import annotations
+
+import json
+import math
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from turbogs_plugin.config.configuration import Config
+from turbogs_plugin.errors import TrainingStopped
+from turbogs_plugin.plan import make_plan
+from turbogs_plugin.scene import Scene
+from turbogs_plugin.scene.offload import place_views
+from turbogs_plugin.train.loop import Listener, TrainingLoop
+from turbogs_plugin.train.run import new_loop
+from turbogs_plugin.viewer.controls import Controls
+from turbogs_plugin.viewer.eye import Eye
+from turbogs_plugin.viewer.live import LiveViewer
+from turbogs_plugin.viewer.page import Page
+
+WAYS = ("without", "nobody looks", "client")
+"""Of each repeat, in this order."""
+SIZE = (640, 480)
+"""Pixels of the client's page."""
+PATIENCE = 60.0
+"""Seconds to wait for the client to connect."""
+
+
+@dataclass
+class ViewerRun:
+    """One training.
+
+    Args:
+        way: one of `WAYS`.
+        iterations, seconds: of training.
+        frames: that the client received.
+        frame_rate: of these, a second; NaN without a client.
+        width: of the frame in the middle by width, pixels; 0 without a client.
+    """
+
+    way: str
+    iterations: int
+    seconds: float
+    frames: int = 0
+    frame_rate: float = math.nan
+    width: int = 0
+
+    @property
+    def rate(self) -> float:
+        """Iterations a second."""
+        return self.iterations / self.seconds
+
+
+def bench_viewer(config: Config, scene: Scene, device: torch.device, repeats: int) -> dict[str, Any]:
+    """Train several times in each way, the ways in turn.
+
+    Args:
+        config: of the training; what is `auto` is decided once.
+        scene: its photos in host memory.
+
+    Returns:
+        ``runs``, in their order, and ``rates``: the median of each way, in iterations a second.
+    """
+    decided = make_plan(config, scene, device).apply(config)
+    _train("without", decided, scene, device)  # what happens once in a process, happens here
+    runs = [_train(way, decided, scene, device) for _ in range(repeats) for way in WAYS]
+    rates = {way: statistics.median(run.rate for run in runs if run.way == way) for way in WAYS}
+    return {"size": SIZE, "runs": [asdict(run) for run in runs], "rates": rates}
+
+
+def viewer_lines(measured: dict[str, Any]) -> list[str]:
+    """One line for each way, side by side with the training alone."""
+    runs, lines = [ViewerRun(**run) for run in measured["runs"]], []
+    alone = measured["rates"]["without"]
+    for way in WAYS:
+        rate, each = measured["rates"][way], [run for run in runs if run.way == way]
+        line = f"{way:<13} {rate:9.2f} iterations a second  {100 * (rate / alone - 1):+6.1f} %"
+        if way == "client":
+            frames = statistics.median(run.frame_rate for run in each)
+            line += f"  {frames:.1f} frames a second, {statistics.median(run.width for run in each):.0f} pixels wide"
+        lines.append(f"{line}  ({', '.join(f'{run.rate:.2f}' for run in each)})")
+    return lines
+
+
+def _train(way: str, config: Config, scene: Scene, device: torch.device) -> ViewerRun:
+    loop, _ = new_loop(config, scene, device)
+    if way == "without":
+        return ViewerRun(way, *_timed(loop, []))
+    page = Page("127.0.0.1", 0, Controls())
+    client = None
+    try:
+        live = LiveViewer(page).attach(loop.trainer, place_views(scene.test, device, config.train.photos_place))
+        if way == "client":
+            client = _start_client(page, Eye.of_view(loop.trainer.views.cameras, 0))
+        iterations, seconds = _timed(loop, [live])
+    finally:
+        page.close()
+        said = client.communicate()[0] if client is not None else None
+    if said is None:
+        return ViewerRun(way, iterations, seconds)
+    found = json.loads(said)
+    frames = found["frames"]
+    rate = (frames - 1) / found["seconds"] if frames > 1 else 0.0
+    return ViewerRun(way, iterations, seconds, frames, rate, int(statistics.median(found["widths"] or [0])))
+
+
+class _Begin(Listener):
+    """Notes when the first iteration begins: the error maps before it are no iteration's."""
+
+    def __init__(self) -> None:
+        self.iteration, self.seconds = 0, 0.0
+
+    def begun(self, loop: TrainingLoop) -> None:
+        self.iteration, self.seconds = loop.trainer.iteration, loop.clock.seconds
+
+
+def _timed(loop: TrainingLoop, listeners: Sequence[Listener]) -> tuple[int, float]:
+    """(iterations, seconds) of a training."""
+    begin = _Begin()
+    loop.listeners = [*listeners, begin]
+    loop.run()
+    return loop.trainer.iteration - begin.iteration, loop.clock.seconds - begin.seconds
+
+
+def _start_client(page: Page, eye: Eye) -> subprocess.Popen:
+    """A scripted client in a process of its own, connected."""
+    numbers = json.dumps([eye.position, eye.wxyz, eye.fov, *SIZE])
+    command = [sys.executable, "-m", "turbogs_plugin.bench.viewer_client", f"http://127.0.0.1:{page.port}", numbers]
+    client = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=Path.cwd())
+    ends = time.perf_counter() + PATIENCE
+    while not page.watched:
+        if client.poll() is not None or time.perf_counter() > ends:
+            client.kill()
+            raise TrainingStopped("bench viewer: its client did not connect")
+        time.sleep(0.02)
+    return client

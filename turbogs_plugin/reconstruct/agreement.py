@@ -1,0 +1,143 @@
+"""Ghosts: cameras that a solve puts in a wrong place, at a low reprojection error, because structure repeats.
+
+Repeated structure (a papered wall, a row of windows) gives pairs of photos many matches that are consistent within the
+pair and wrong. A solver that registers a few photos by such pairs builds a second, shifted copy of what they show. Its
+own error stays low, since it then drops the true matches as outliers. But these are still there: between two photos
+that see the same place there are more of them than the repeated part alone gives. So each verified pair is asked
+whether its matches agree with the cameras as they were solved. Where a group of photos has more matches with the rest
+that contradict the solve than matches that agree, the other explanation is the better one.
+
+Grouping is correlation clustering by greedy edge contraction (GAEC; Keuper et al., Efficient decomposition of image and
+mesh graphs by lifted multicuts, ICCV 2015). The idea of contradicting evidence is that of Zach et al., Disambiguating
+visual relations using loop constraints, CVPR 2010.
+"""
+
+from __future__ import annotations
+
+import heapq
+from collections import defaultdict
+from dataclasses import dataclass
+
+import numpy as np
+
+STRONGEST = 10
+"""Of each photo, so many pairs with the most matches are its evidence. They see the same place. The others, which a
+large capture has many times as many of, may see the same pattern only ..."""
+WEAK = 1e-3
+"""... and count so much: they decide where there is no other evidence."""
+POWER = 1.5
+"""Of the number of matches in a pair's weight: above 1, since pairs that see the same place have more matches."""
+DOUBT = 2.0
+"""A group is named as doubtful where what contradicts, times this, outweighs what agrees."""
+FEWEST_LINKS = 30
+"""Photos hold together where a pair agrees by so many matches: COLMAP registers a photo by no fewer points. And ..."""
+LINK_SHARE = 0.15
+"""... by this share of what the strongest pair of a photo has, as the median."""
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """How the matches of P pairs of V photos agree with the cameras of a solve.
+
+    Args:
+        names: of the V photos.
+        pairs: [P, 2] int64, indices into `names`.
+        agreeing, contradicting: [P] int64, numbers of verified matches on, and off, the epipolar lines of the cameras.
+    """
+
+    names: tuple[str, ...]
+    pairs: np.ndarray
+    agreeing: np.ndarray
+    contradicting: np.ndarray
+
+    @property
+    def contradicts(self) -> np.ndarray:
+        """[P] bool: pairs most of whose matches contradict the cameras."""
+        return self.contradicting > self.agreeing
+
+
+def consistent_groups(agreement: Agreement, doubt: float = 1.0) -> list[list[int]]:
+    """Photos in groups that the matches hold together, the largest group first.
+
+    Args:
+        doubt: what contradicts counts so many times. With 1, groups are apart where between them the contradicting
+            matches outweigh the agreeing ones.
+
+    Returns:
+        Ascending indices of photos. All photos in one group: nothing contradicts the solve by majority.
+    """
+    weights = agreement.agreeing**POWER - doubt * agreement.contradicting**POWER
+    weights[~_strongest(agreement)] *= WEAK
+    return _contracted(len(agreement.names), agreement.pairs, weights)
+
+
+def linked_groups(agreement: Agreement) -> list[list[int]]:
+    """Photos in groups that are connected by pairs with `fewest_links` agreeing matches, the largest group first."""
+    strong = agreement.agreeing >= fewest_links(agreement)
+    return _contracted(len(agreement.names), agreement.pairs[strong], np.ones(int(strong.sum())))
+
+
+def fewest_links(agreement: Agreement) -> int:
+    """Agreeing matches of a pair by which two photos hold together.
+
+    A group that is held to the others by weaker pairs alone may be at a ghost though nothing contradicts it: where the
+    photos between were not taken, repeated structure may be all that there is.
+    """
+    strongest = np.zeros(len(agreement.names))
+    for photos in agreement.pairs.T:
+        np.maximum.at(strongest, photos, agreement.agreeing)
+    return max(FEWEST_LINKS, round(LINK_SHARE * float(np.median(strongest))))
+
+
+def ghost_pairs(agreement: Agreement, groups: list[list[int]]) -> np.ndarray:
+    """[P] bool: pairs that agree with the solve, between groups that more matches say are elsewhere.
+
+    These are what the solve went by when it put the groups in their places.
+    """
+    group = np.zeros(len(agreement.names), dtype=np.int64)
+    for number, members in enumerate(groups):
+        group[members] = number
+    first, second = agreement.pairs.reshape(-1, 2).T
+    return (group[first] != group[second]) & ~agreement.contradicts
+
+
+def _strongest(agreement: Agreement) -> np.ndarray:
+    """[P] bool: pairs that are among the `STRONGEST` of either photo."""
+    strongest = np.zeros(len(agreement.pairs), dtype=bool)
+    count = np.zeros(len(agreement.names), dtype=np.int64)
+    order = np.argsort(-(agreement.agreeing + agreement.contradicting), kind="stable")
+    for pair, (first, second) in zip(order.tolist(), agreement.pairs[order].tolist(), strict=True):
+        strongest[pair] = count[first] < STRONGEST or count[second] < STRONGEST
+        count[first] += 1
+        count[second] += 1
+    return strongest
+
+
+def _contracted(count: int, pairs: np.ndarray, weights: np.ndarray) -> list[list[int]]:
+    """Nodes merged along the heaviest edge, whose weights then add up, until no edge has a positive weight."""
+    links: list[dict[int, float]] = [defaultdict(float) for _ in range(count)]
+    for (first, second), weight in zip(pairs.tolist(), weights.tolist(), strict=True):
+        links[first][second] += weight
+        links[second][first] += weight
+    heap = [(-weight, node, other) for node in range(count) for other, weight in links[node].items() if node < other]
+    heapq.heapify(heap)
+    members = [[node] for node in range(count)]
+    while heap:
+        weight, node, other = heapq.heappop(heap)
+        if weight >= 0:
+            break
+        if links[node].get(other) != -weight:  # merged or changed since: a newer entry is in the heap
+            continue
+        if len(links[node]) < len(links[other]):
+            node, other = other, node
+        members[node] += members[other]
+        members[other] = []
+        del links[node][other], links[other][node]
+        for third, added in links[other].items():
+            del links[third][other]
+            total = links[node][third] + added
+            links[node][third] = links[third][node] = total
+            heapq.heappush(heap, (-total, min(node, third), max(node, third)))
+        links[other] = {}
+    groups = [sorted(group) for group in members if group]
+    return sorted(groups, key=lambda group: (-len(group), group))

@@ -1,0 +1,156 @@
+"""The photos that a reconstruction begins with: what their files say, and upright copies of them."""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+import shutil
+from collections import Counter
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from PIL import Image, ImageOps
+
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.scene.load import FEWEST_VIEWS
+from turbogs_plugin.scene.photo_folder import find_photos
+
+ORIENTATION, MAKE, MODEL, EXIF, GPS = 0x0112, 0x010F, 0x0110, 0x8769, 0x8825
+FOCAL_LENGTH, FOCAL_LENGTH_35MM = 0x920A, 0xA405
+SEPARATORS = re.compile(r"[\s#]")
+JPEG_QUALITY = 95
+"""Of copies that are turned upright. Photos that are upright already stay bit for bit."""
+
+
+@dataclass(frozen=True)
+class PhotoFile:
+    """A photo on the disk.
+
+    Args:
+        name: relative to the folder of photos, with ``/``, and with ``_`` for what COLMAP's lists take for separators.
+        path: of the file.
+        size: (width, height) of the upright photo.
+        turned: EXIF says that the file is not upright.
+        lens: photos of the same lens have the same text: camera, focal length and size.
+        position: degrees of latitude and longitude, NaN where EXIF has none.
+        stamp: bytes and time of the last change in ns, by which a later call knows the file again.
+    """
+
+    name: str
+    path: Path
+    size: tuple[int, int]
+    turned: bool
+    lens: str
+    position: tuple[float, float]
+    stamp: tuple[int, int]
+
+
+def read_photos(folder: Path) -> list[PhotoFile]:
+    """The photos of a folder, in the order of their names. Each is decoded once, coarsely.
+
+    Raises:
+        InputError: no folder; fewer than `FEWEST_VIEWS` photos; one that cannot be read (the first in order).
+    """
+    if not folder.is_dir():
+        raise InputError(f"no such folder of photos: {folder}")
+    place, paths, others = find_photos(folder)
+    if len(paths) < FEWEST_VIEWS:
+        there = "no photos" if not paths else "1 photo" if len(paths) == 1 else f"{len(paths)} photos"
+        unread = f" ({len(others)} files such as {others[0].name} are not read: convert them to JPEG)" if others else ""
+        raise InputError(
+            f"{place} has {there}{unread}: at least {FEWEST_VIEWS} are needed, of one scene from different places"
+        )
+    names = [SEPARATORS.sub("_", path.relative_to(place).as_posix()) for path in paths]
+    for name, number in Counter(names).items():
+        if number > 1:
+            raise InputError(f"{number} photos in {place} would be named '{name}' without spaces: rename them")
+    with ThreadPoolExecutor(min(8, os.cpu_count() or 1)) as pool:
+        photos = list(pool.map(_read, paths, names))
+    return sorted(photos, key=lambda photo: photo.name)
+
+
+def place_photos(photos: Sequence[PhotoFile], folder: Path) -> None:
+    """Put the photos into a folder: upright ones as links where the disk can, else as copies; the others turned.
+
+    Files that are there already stay.
+    """
+
+    def place(photo: PhotoFile) -> None:
+        target = folder / photo.name
+        if target.exists():
+            return
+        target.parent.mkdir(parents=True, exist_ok=True)
+        part = target.with_name(f".{target.name}.part")
+        part.unlink(missing_ok=True)
+        if photo.turned:
+            _write_upright(photo.path, part)
+        else:
+            try:
+                os.link(photo.path.resolve(), part)
+            except OSError:  # another disk, a file of another user
+                shutil.copyfile(photo.path, part)
+        os.replace(part, target)
+
+    with ThreadPoolExecutor(min(8, os.cpu_count() or 1)) as pool:
+        list(pool.map(place, photos))
+
+
+def _read(path: Path, name: str) -> PhotoFile:
+    try:
+        with Image.open(path) as image:
+            size, mode, exif = image.size, image.mode, image.getexif()
+            image.draft("RGB", (size[0] // 8, size[1] // 8))  # JPEG: whole, but at an eighth of the size
+            image.load()
+        status = path.stat()
+    except Exception as error:  # a broken file can raise anything in its decoder
+        reason = " ".join((str(error) or type(error).__name__).split())
+        raise InputError(f"cannot read the photo {path}: {reason}; replace it or take it out") from error
+    if mode.startswith(("I", "F")):
+        raise InputError(f"photo {path} has more than 8 bits a channel: convert it to 8-bit RGB")
+    orientation = exif.get(ORIENTATION, 1)
+    turned = orientation in range(2, 9)
+    upright = size[::-1] if orientation in range(5, 9) else size
+    details = _ifd(exif, EXIF)
+    focal = (details.get(FOCAL_LENGTH, ""), details.get(FOCAL_LENGTH_35MM, ""))
+    lens = " ".join(str(part).strip("\0 ") for part in (exif.get(MAKE, ""), exif.get(MODEL, ""), *focal, *upright))
+    stamp = (status.st_size, status.st_mtime_ns)
+    return PhotoFile(name, path, upright, turned, lens, _position(_ifd(exif, GPS)), stamp)
+
+
+def _ifd(exif: Image.Exif, tag: int) -> dict[int, Any]:
+    """A part of the EXIF data; empty where it is absent or damaged."""
+    try:
+        return dict(exif.get_ifd(tag))
+    except Exception:  # nothing in EXIF is needed
+        return {}
+
+
+def _position(gps: dict[int, Any]) -> tuple[float, float]:
+    """Degrees of latitude and longitude, or NaN."""
+
+    def degrees(reference: int, negative: str) -> float:
+        whole, minutes, seconds = (float(part) for part in gps[reference + 1])
+        return (whole + minutes / 60 + seconds / 3600) * (-1 if str(gps[reference]).strip("\0 ") == negative else 1)
+
+    try:
+        position = degrees(1, "S"), degrees(3, "W")
+    except (KeyError, TypeError, ValueError, ZeroDivisionError):
+        return math.nan, math.nan
+    # (0, 0) is what devices without a fix write.
+    return position if all(map(math.isfinite, position)) and position != (0.0, 0.0) else (math.nan, math.nan)
+
+
+def _write_upright(source: Path, target: Path) -> None:
+    """The photo as EXIF says that it is to be seen, with the rest of its EXIF data (focal length, GPS)."""
+    with Image.open(source) as image:
+        form = "JPEG" if image.format == "MPO" else image.format  # of phones: a JPEG with a second one behind it
+        upright = ImageOps.exif_transpose(image)
+    exif = upright.getexif()
+    options = {"quality": JPEG_QUALITY, "subsampling": 0} if form == "JPEG" else {}
+    if "icc_profile" in upright.info:
+        options["icc_profile"] = upright.info["icc_profile"]
+    upright.save(target, format=form, exif=exif, **options)

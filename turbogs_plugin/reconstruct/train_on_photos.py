@@ -1,0 +1,28 @@
+"""Training on photos alone: their cameras are found first."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+from turbogs_plugin.config.configuration import Config
+from turbogs_plugin.reconstruct.run import reconstruct, scene_beside
+from turbogs_plugin.scene.load import holds_photos_alone
+
+
+def with_cameras(config: Config, run: Path) -> Config:
+    """The configuration with a capture that has cameras; where its photos have none, that of their reconstruction.
+
+    It lies beside the run (`scene_beside`), and is found there by the next run beside this one.
+
+    Raises:
+        InputError: the photos cannot be solved.
+    """
+    photos = Path(config.scene.path)
+    if not holds_photos_alone(photos):
+        return config
+    scene = scene_beside(photos, run)
+    print(f"{photos} has photos alone: their cameras are found first, into {scene}", file=sys.stderr, flush=True)
+    print("\n".join(reconstruct(photos, scene).notes), file=sys.stderr, flush=True)
+    return replace(config, scene=replace(config.scene, path=str(scene)))

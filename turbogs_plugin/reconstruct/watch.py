@@ -1,0 +1,104 @@
+"""Long steps of pycolmap: in a thread, with a bar on a terminal, and stopped by Ctrl-C."""
+
+from __future__ import annotations
+
+import sqlite3
+import sys
+import threading
+import time
+from collections.abc import Callable
+from contextlib import nullcontext
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeVar
+
+if TYPE_CHECKING:
+    import pycolmap
+    from rich.progress import Progress
+
+POLL_SECONDS = 0.2
+
+Result = TypeVar("Result")
+
+
+def watched(
+    title: str, total: int | None, done: Callable[[], int], step: Callable[[pycolmap.CancellationToken], Result]
+) -> Result:
+    """Run a step that does not return to Python for minutes.
+
+    On a terminal a bar follows it; elsewhere one line on stderr says at the end what was done, and in which time.
+
+    Args:
+        title: of the step.
+        total: what `done` will say at the end; None where it is not known.
+        done: how far the step is; called from time to time.
+        step: is given a token by which it can be stopped.
+
+    Raises:
+        KeyboardInterrupt: after the step has stopped; what it had finished is kept.
+    """
+    from turbogs_plugin.scene.colmap import load_pycolmap
+
+    token = load_pycolmap().CancellationToken()
+    outcome: list[Result] = []
+    failure: list[BaseException] = []
+    ended = threading.Event()  # an interrupted Thread.join takes the thread for ended
+
+    def run() -> None:
+        try:
+            outcome.append(step(token))
+        except BaseException as error:  # handed to the thread that waits
+            failure.append(error)
+        finally:
+            ended.set()
+
+    start = time.monotonic()
+    thread = threading.Thread(target=run, daemon=True)
+    bar = _bar()
+    with nullcontext() if bar is None else bar:
+        task = None if bar is None else bar.add_task(title, total=total)
+        try:
+            thread.start()
+            while not ended.wait(POLL_SECONDS):
+                if bar is not None:
+                    bar.update(task, completed=done())
+            if bar is not None:
+                bar.update(task, completed=done())
+        except KeyboardInterrupt:
+            token.cancel()
+            if thread.ident is not None:  # or it has not begun
+                ended.wait()
+            raise
+    if failure:
+        raise failure[0]
+    if bar is None:
+        print(f"{title}: {done():,} in {time.monotonic() - start:.1f} s", file=sys.stderr, flush=True)
+    return outcome[0]
+
+
+def row_counter(database: Path, table: str) -> Callable[[], int]:
+    """A function that counts the rows of a table while another thread writes to the database."""
+    latest = 0
+
+    def count() -> int:
+        nonlocal latest
+        try:
+            connection = sqlite3.connect(f"{database.absolute().as_uri()}?mode=ro", uri=True, timeout=0.1)
+            try:
+                (latest,) = connection.execute(f"SELECT COUNT(*) FROM {table}").fetchone()
+            finally:
+                connection.close()
+        except sqlite3.Error:  # not there yet, or locked just now
+            pass
+        return latest
+
+    return count
+
+
+def _bar() -> Progress | None:
+    if not sys.stderr.isatty():
+        return None
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    return Progress(*columns, console=Console(stderr=True))

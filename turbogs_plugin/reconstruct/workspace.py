@@ -1,0 +1,120 @@
+"""The files of a reconstruction on the disk, which a later call goes on with."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.files import read_text, require_writable, write_text_atomically
+from turbogs_plugin.reconstruct.photos import PhotoFile
+
+if TYPE_CHECKING:
+    import pycolmap
+
+
+@dataclass(frozen=True)
+class Solution:
+    """What a reconstruction came to.
+
+    Args:
+        scene: the capture's folder: ``images`` and ``sparse/0``.
+        photos, registered, points: their numbers.
+        left_out: names of the photos that are not in the model.
+        notes: lines for the user.
+    """
+
+    scene: Path
+    photos: int
+    registered: int
+    points: int
+    left_out: tuple[str, ...]
+    notes: tuple[str, ...]
+
+    def text(self) -> str:
+        return "\n".join([*self.notes, f"scene  {self.scene}"])
+
+
+class Workspace:
+    """The paths of a reconstruction in a capture's folder.
+
+    Attributes:
+        images, model: what a capture consists of.
+        scratch: what only a later call needs: the list of photos, databases, the solver's output.
+    """
+
+    def __init__(self, scene: Path) -> None:
+        self.scene = scene
+        self.images = scene / "images"
+        self.model = scene / "sparse" / "0"
+        self.scratch = scene / "reconstruction"
+        self.listed = self.scratch / "photos.json"
+        self.solved = self.scratch / "solution.json"
+
+    def database(self, long_side: int) -> Path:
+        return self.scratch / f"features-{long_side}.db"
+
+    def begin(self, photos: Sequence[PhotoFile]) -> bool:
+        """Make the folder, or open that of an earlier call.
+
+        Returns:
+            Whether it is new.
+
+        Raises:
+            InputError: the folder holds something else, or a reconstruction of other photos.
+        """
+        listed = {photo.name: list(photo.stamp) for photo in photos}
+        text = read_text(self.listed)
+        if text is None:
+            if self.scene.exists() and (not self.scene.is_dir() or any(self.scene.iterdir())):
+                raise InputError(f"--out '{self.scene}' holds something else: choose a new folder")
+            require_writable(self.scene, f"--out '{self.scene}'")
+            self.scratch.mkdir(parents=True)
+            write_text_atomically(self.listed, json.dumps(listed, indent=1))
+            return True
+        try:
+            known = dict(json.loads(text))
+        except ValueError:
+            known = {}
+        added, removed = len(listed.keys() - known.keys()), len(known.keys() - listed.keys())
+        changed = sum(known[name] != stamp for name, stamp in listed.items() if name in known)
+        if added or removed or changed:
+            raise InputError(
+                f"'{self.scene}' was begun with other photos ({added} new, {removed} gone, {changed} changed since): "
+                "choose a new --out, or delete it"
+            )
+        return False
+
+    def read_solution(self) -> Solution | None:
+        """What an earlier call came to; None where none was finished."""
+        text = read_text(self.solved)
+        if text is None or not self.model.is_dir():
+            return None
+        try:
+            found = json.loads(text)
+            return Solution(
+                self.scene,
+                int(found["photos"]),
+                int(found["registered"]),
+                int(found["points"]),
+                tuple(found["left_out"]),
+                tuple(found["notes"]),
+            )
+        except (ValueError, KeyError, TypeError):
+            return None
+
+    def finish(self, model: pycolmap.Reconstruction, solution: Solution) -> None:
+        """Put the model in place, whole or not at all, then the solution."""
+        part = self.scratch / "sparse"
+        for folder in (part, self.model.parent, self.scratch / "models"):
+            shutil.rmtree(folder, ignore_errors=True)
+        (part / "0").mkdir(parents=True)
+        model.write_binary(part / "0")
+        part.rename(self.model.parent)
+        found = asdict(solution)
+        del found["scene"]  # it may be moved
+        write_text_atomically(self.solved, json.dumps(found, indent=1))

@@ -1,0 +1,157 @@
+"""Large arrays of the host: in its memory, or in a file on a disk where they would take too much of it.
+
+Photos and error maps of a large capture may be larger than the memory. A file that is mapped into memory is an array
+like any other: the system keeps the parts in memory that were used last, as many as fit, and reads and writes the rest.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import shutil
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from turbogs_plugin.errors import InputError
+
+MEMORY_SHARE = 0.5
+"""An array takes at most this share of the memory that is free when it is made."""
+DISK_SHARE = 0.95
+"""A file takes at most this share of what is free on its disk."""
+MADV_WILLNEED = 3
+"""Of ``madvise(2)`` on Linux."""
+LARGE_FILES = Path("/var/tmp")
+"""Where large temporary files belong: /tmp often lies in memory."""
+
+
+def host_array(shape: Sequence[int], dtype: torch.dtype, what: str) -> Tensor:
+    """An array of the host with any content, in a file where it is larger than `MEMORY_SHARE` of the free memory.
+
+    The file lies in ``TMPDIR``, else in /var/tmp. It has no name any more, so it is gone with the array, whatever ends
+    the process.
+
+    Args:
+        what: names the array in messages.
+
+    Raises:
+        InputError: it fits neither in memory nor on the disk.
+    """
+    elements = 1
+    for side in shape:
+        elements *= int(side)
+    size = elements * dtype.itemsize
+    if not too_large(size):
+        return torch.empty(*shape, dtype=dtype)
+    why = f"{what} take {_gibibytes(size)} of {_gibibytes(free_host_bytes())} of free memory"
+    return _mapped(elements, dtype, size, why).view(*shape)
+
+
+def too_large(size: int) -> bool:
+    """Whether so many bytes are more than one array may take of the memory now."""
+    return size > MEMORY_SHARE * free_host_bytes()
+
+
+def in_file(array: Tensor) -> bool:
+    """Whether an array lies in a file."""
+    return getattr(array.untyped_storage(), "filename", None) is not None
+
+
+def read_ahead(arrays: Sequence[Tensor]) -> None:
+    """Have the disk read those that lie in files, all at once and in the background. They must be contiguous."""
+    page = os.sysconf("SC_PAGE_SIZE")
+    for array in arrays:
+        if array.numel() and in_file(array):
+            start = array.data_ptr() // page * page
+            length = array.data_ptr() + array.nbytes - start
+            _libc().madvise(ctypes.c_void_p(start), ctypes.c_size_t(length), MADV_WILLNEED)  # advice: it may fail
+
+
+def file_note(arrays: Sequence[Tensor], what: str) -> str:
+    """A line for the user on those arrays that lie in files; empty where none does."""
+    size = sum(array.nbytes for array in arrays if in_file(array))
+    return (
+        f"{what} lie in a temporary file, {_gibibytes(size)} in {_folder()}: free memory is too small" if size else ""
+    )
+
+
+def free_host_bytes() -> int:
+    """Memory that this process may still take: what is available, or less where a container is limited."""
+    available = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    for line in _lines(Path("/proc/meminfo")):  # absent where the system is not Linux
+        if line.startswith("MemAvailable:"):
+            available = 1024 * int(line.split()[1])
+    return max(0, min([available, *_group_rooms()]))
+
+
+def _group_rooms() -> list[int]:
+    """Bytes left in each control group with a limit that this process is in; what files keep cached counts as left."""
+    rooms = []
+    for line in _lines(Path("/proc/self/cgroup")):
+        _, controllers, place = line.split(":", 2)
+        if controllers not in ("", "memory"):
+            continue
+        root = Path("/sys/fs/cgroup") / controllers
+        limit, usage, cached = (
+            ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file")
+            if controllers
+            else ("memory.max", "memory.current", "inactive_file")
+        )
+        inner = root / place.lstrip("/")
+        for group in (inner, *(parent for parent in inner.parents if parent == root or root in parent.parents), root):
+            numbers = [_lines(group / name) for name in (limit, usage)]
+            if not all(lines and lines[0].isdigit() for lines in numbers):
+                continue  # "max", or a group seen from within a container
+            stat = dict(line.split() for line in _lines(group / "memory.stat"))
+            rooms.append(int(numbers[0][0]) - int(numbers[1][0]) + int(stat.get(cached, 0)))
+    return rooms
+
+
+def _lines(path: Path) -> list[str]:
+    try:
+        return path.read_text(encoding="ascii").splitlines()
+    except (OSError, ValueError):
+        return []
+
+
+def _folder() -> str:
+    if "TMPDIR" not in os.environ and os.access(LARGE_FILES, os.W_OK):
+        return str(LARGE_FILES)
+    return tempfile.gettempdir()
+
+
+def _mapped(elements: int, dtype: torch.dtype, size: int, why: str) -> Tensor:
+    """[elements] in a file. `why` it does not lie in memory."""
+    folder = _folder()
+    try:
+        free = shutil.disk_usage(folder).free
+        if size > DISK_SHARE * free:
+            raise InputError(
+                f"{why}, and a file for them does not fit in {folder} with {_gibibytes(free)} free: set TMPDIR to a "
+                "folder with more, or use a larger --factor"
+            )
+        file, name = tempfile.mkstemp(prefix="turbogs-", dir=folder)
+        try:
+            # All of it now: a disk that is full later would end the process without a word.
+            os.posix_fallocate(file, 0, size)
+            return torch.from_file(name, shared=True, size=elements, dtype=dtype)
+        finally:
+            os.close(file)
+            os.unlink(name)
+    except (OSError, RuntimeError) as error:
+        reason = " ".join(str(error).split())[:160]
+        raise InputError(
+            f"{why}, and a file for them cannot be made in {folder} ({reason}): set TMPDIR to another folder, or use a "
+            "larger --factor"
+        ) from error
+
+
+def _libc() -> ctypes.CDLL:
+    return ctypes.CDLL(None)
+
+
+def _gibibytes(size: int) -> str:
+    return f"{size / 2**30:,.1f} GiB"

@@ -1,0 +1,41 @@
+"""Folders that hold photos and nothing that says where they were taken from."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp")
+"""Files that are photos: what both pillow and COLMAP read."""
+OTHER_SUFFIXES = (".heic", ".heif", ".webp", ".avif", ".jxl", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".rw2")
+"""Photos that at least one of them does not read."""
+NO_PHOTOS = re.compile(r"\..*|images_\d+|masks?", re.IGNORECASE)
+"""Folders that hold none: hidden ones, copies reduced by a factor (``images_4``), masks."""
+FOLDER_DEPTH = 1
+"""Photos are looked for in a folder and in the folders in it. Those of several captures beside each other lie deeper,
+in the ``images`` of each."""
+
+
+def find_photos(folder: Path) -> tuple[Path, list[Path], list[Path]]:
+    """The photos of a folder; where it has a folder ``images``, of that one.
+
+    Returns:
+        The folder that their names are relative to; the photos in the order of their names; and files of kinds that
+        are not read.
+    """
+    for place in (folder / "images", folder):
+        files = _files(place, FOLDER_DEPTH)
+        photos = [path for path in files if path.suffix.lower() in PHOTO_SUFFIXES]
+        if photos:
+            break
+    others = [path for path in files if path.suffix.lower() in OTHER_SUFFIXES]
+    return place, sorted(photos, key=lambda path: path.relative_to(place).as_posix()), others
+
+
+def _files(folder: Path, depth: int) -> list[Path]:
+    entries = sorted(folder.iterdir()) if folder.is_dir() else []
+    files = [entry for entry in entries if entry.name[0] != "." and entry.is_file()]
+    if depth:
+        inner = [entry for entry in entries if not NO_PHOTOS.fullmatch(entry.name) and entry.is_dir()]
+        files += [file for entry in inner for file in _files(entry, depth - 1)]
+    return files

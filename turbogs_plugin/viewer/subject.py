@@ -1,0 +1,96 @@
+"""What is looked at: a model, and where there is one, its capture and the state of its training."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+
+from turbogs_plugin.engine.rendering import DEFAULT_SETTINGS, RasterSettings
+from turbogs_plugin.error_maps import ErrorMaps
+from turbogs_plugin.scene import PosedImages
+from turbogs_plugin.types import Gaussians, PixelSamples, RowUpdate, Step
+
+
+@dataclass
+class DensityChange:
+    """What the last event of density control did.
+
+    Args:
+        iteration: when.
+        added: [N] bool, rows of the present model that it made.
+        removed: the Gaussians that it took away; one that was split is replaced, not removed.
+        num_cloned, num_split, num_pruned: as in `RowUpdate`.
+    """
+
+    iteration: int
+    added: torch.Tensor
+    removed: Gaussians
+    num_cloned: int
+    num_split: int
+    num_pruned: int
+
+    @classmethod
+    def of(cls, before: Gaussians, update: RowUpdate, iteration: int) -> DensityChange:
+        """The change that `update` makes to the model `before` it."""
+        gone = torch.ones(len(before), dtype=torch.bool, device=before.device)
+        gone[update.source] = False
+        removed = before.map(lambda value: value[gone])
+        counts = (update.num_cloned, update.num_split, update.num_pruned)
+        return cls(iteration, update.fresh, removed, *counts)
+
+
+@dataclass(frozen=True)
+class CaptureViews:
+    """The views of a capture under one numbering: those for training, then those for testing.
+
+    Args:
+        train, test: cameras and photos, wherever their photos are kept.
+    """
+
+    train: PosedImages
+    test: PosedImages
+
+    def __len__(self) -> int:
+        return len(self.train) + len(self.test)
+
+    def find(self, number: int) -> tuple[PosedImages, int]:
+        """The set that a view belongs to, and its number there."""
+        count = len(self.train)
+        return (self.train, number) if number < count else (self.test, number - count)
+
+    def training_id(self, number: int) -> int | None:
+        """Its number among the training views, which error maps go by; None for a test view."""
+        return number if number < len(self.train) else None
+
+    def name(self, number: int) -> str:
+        views, view_id = self.find(number)
+        kind = "training" if views is self.train else "test"
+        return f"{views.names[view_id]} ({kind} view {view_id + 1} of {len(views)})"
+
+
+@dataclass
+class Subject:
+    """All that a picture may show. What is None is not there, and pictures that need it say so.
+
+    Args:
+        gaussians: the model, on the device that renders.
+        sh_degree: highest degree of spherical harmonics in use.
+        version: changes whenever a picture may look different.
+        settings: those of the rasterizer.
+        capture: its views, for training and for testing.
+        maps: errors and ages of the training views.
+        step: the time from which ages count.
+        samples: those of the last iteration.
+        change: the last event of density control.
+    """
+
+    gaussians: Gaussians
+    sh_degree: int
+    version: int = 0
+    settings: RasterSettings = DEFAULT_SETTINGS
+    capture: CaptureViews | None = None
+    maps: ErrorMaps | None = None
+    step: Step | None = None
+    samples: PixelSamples | None = None
+    change: DensityChange | None = None
