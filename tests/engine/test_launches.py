@@ -14,6 +14,7 @@ import torch
 from turbogs_plugin.engine import layout
 from turbogs_plugin.engine.cuda import launches, library
 from turbogs_plugin.engine.cuda.training import view_rows
+from turbogs_plugin.engine.exposures import Exposures
 from turbogs_plugin.engine.moments import GaussianMoments
 from turbogs_plugin.engine.rules import LossTerms, ParameterRates
 from turbogs_plugin.tiles import CELL_SIDE
@@ -29,6 +30,7 @@ OBJECTS = {
     "Rates": ParameterRates,
     "SampleArrays": PixelSamples,
     "LossSettings": LossTerms,
+    "ExposureArrays": Exposures,
 }
 """What stands for the protocols of launches.py."""
 

@@ -18,6 +18,7 @@ AUTO = "auto"
 AUTO_SETTINGS: dict[str, Any] = {
     "train.backdrop": False,
     "train.background": "black",
+    "train.exposure": False,
     "loss.type": registry.default_type("loss"),
     "schedule.type": registry.default_type("schedule"),
     "train.sh_degree": 3,

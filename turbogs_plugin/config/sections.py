@@ -64,6 +64,9 @@ class TrainConfig:
             ``rgb(51, 102, 153)``; or ``random``, another one each iteration, so that nothing dark is taken for empty.
             ``auto``: random where photos are transparent, else black. Transparent photos are composited on it.
         backdrop: start with a far sphere of Gaussians in the photos' mean colour behind the scene.
+        exposure: learn an affine colour for each training photo, for captures whose exposure or white balance changes
+            from photo to photo (`turbogs_plugin.engine.exposures`). Test photos are compared without one, and once more
+            after an affine fit of the render's colours. ``auto``: where the photos of neighbouring cameras differ.
         distant_size: largest standard deviation of a Gaussian beyond 2 scene extents, over its distance from the
             cameras (`restrain_distant`). 0: no bound.
         evaluate_at: when to evaluate, as fractions of T; the start and the end are always evaluated.
@@ -85,6 +88,7 @@ class TrainConfig:
     initial_size: float = 1.0
     background: str = "black"
     backdrop: bool | Auto = False
+    exposure: bool | Auto = False
     distant_size: float = 0.0
     evaluate_at: tuple[float, ...] = (0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
     checkpoint_every: int = 10_000

@@ -8,7 +8,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from turbogs_plugin.engine.exposures import Exposures
 from turbogs_plugin.engine.moments import GaussianMoments
+from turbogs_plugin.engine.reference.exposure import expose, exposure_gradients, step_exposures
 from turbogs_plugin.engine.reference.update import apply_update
 from turbogs_plugin.engine.rendered import DEFAULT_OPTIONS, Rendered, RenderOptions, ScreenGradients
 from turbogs_plugin.engine.rules import DrawRule, LossTerms, UpdateRule
@@ -89,6 +91,30 @@ class Engine(ABC):
         update.maps.update(samples, torch.where(drawn, output.pixel_errors, torch.nan), update.step)
         if update.nonfinite_losses is not None:
             update.nonfinite_losses.add_(nonfinite)
+
+    def expose(self, exposures: Exposures, colors: Tensor, samples: PixelSamples) -> Tensor:
+        """[P, 3] float32: rendered colours [P, 3] as the exposure of each sample's photo shows them."""
+        return expose(exposures, colors, samples)
+
+    def learn_exposures(
+        self, exposures: Exposures, colors: Tensor, gradients: Tensor, samples: PixelSamples, rate: float
+    ) -> Tensor:
+        """Take gradients back through `expose`, and make one step of Adam with the exposures of the batch.
+
+        An iteration that did nothing changes no exposure.
+
+        Args:
+            exposures: those that the colours were exposed with; changed in place.
+            colors: [P, 3], as given to `expose`.
+            gradients: [P, 3], d loss / d exposed colours; it cannot be used again.
+            rate: Adam's.
+
+        Returns:
+            [P, 3] float32, d loss / d colours.
+        """
+        of_colors, sums = exposure_gradients(exposures, colors, gradients, samples)
+        step_exposures(exposures, sums, samples.view_ids, rate, self.overflow)
+        return of_colors
 
     def update(
         self,

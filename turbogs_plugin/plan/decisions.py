@@ -19,6 +19,10 @@ from turbogs_plugin.scene.host_arrays import MEMORY_SHARE as HOST_SHARE
 ONE_SIDED = 0.95
 """Direction concentration above which a capture is seen from one side. Nadir grids of aircraft have .99; walks around
 something have .68 (snowmiku) and .83 (fox)."""
+EXPOSURE_STOPS = 0.1
+"""Median difference of neighbouring cameras' photos, in stops, from which on each photo gets an exposure. Photos of one
+setting are .01 to .02 apart (fox, caliterra, snowmiku: docs/plan.md), and a camera's automatic moves by thirds of a
+stop. Caliterra's flight lines differ (gains of .73 to 1.13), but most neighbours are of one line, so it is below."""
 FLAT_TILES = 0.5
 """Share of tiles without texture from which on NCC is left out. It gains SSIM at .09 (caliterra, .0055) and
 at .42 (snowmiku, .002); above, nothing has been measured yet."""
@@ -99,6 +103,15 @@ def wanted_backdrop(facts: SceneFacts, config: Config) -> Verdict:
     concentration = facts.direction_concentration
     one_sided = concentration >= ONE_SIDED
     return Verdict(one_sided, f"view directions concentrated to {concentration:.3f} {_sign(one_sided)} {ONE_SIDED}")
+
+
+def wanted_exposure(facts: SceneFacts, config: Config) -> Verdict:
+    """A colour map for each photo, where photos show the same points differently bright."""
+    if facts.transparent:
+        return Verdict(False, "photos are transparent: their background has no exposure")
+    differ = facts.exposure_spread >= EXPOSURE_STOPS
+    compared = f"{facts.exposure_spread:.2f} stops apart {_sign(differ)} {EXPOSURE_STOPS}"
+    return Verdict(differ, f"neighbouring photos {compared}")
 
 
 def wanted_loss(facts: SceneFacts, config: Config) -> Verdict:
@@ -194,6 +207,7 @@ def _sign(reached: bool) -> str:
 RULES: dict[str, Callable[[SceneFacts, Config], Verdict]] = {
     "train.backdrop": wanted_backdrop,
     "train.background": wanted_background,
+    "train.exposure": wanted_exposure,
     "loss.type": wanted_loss,
     "schedule.type": wanted_schedule,
     "train.sh_degree": wanted_sh_degree,

@@ -39,7 +39,8 @@ def evaluate_run(path: Path, device_name: str, given: Config | None = None) -> s
     flip, no_flip = load_flip()
     background = Background.of(model.config.train.background, views.photos.transparent).evaluated
     settings = model.config.raster
-    metrics = evaluate(model.gaussians, views, model.sh_degree, settings, lpips, flip=flip, background=background)
+    options = {"flip": flip, "background": background, "aligned": True}
+    metrics = evaluate(model.gaussians, views, model.sh_degree, settings, lpips, **options)
     note = f"\nLPIPS was not computed: {reason}" if reason else ""
     note += f"\nFLIP was not computed: {no_flip}" if no_flip else ""
     which = f"iteration {model.iteration}" if given is None else str(path)

@@ -9,7 +9,17 @@ from turbogs_plugin.files import write_text_atomically
 from turbogs_plugin.plan import Plan
 from turbogs_plugin.report.machine import hardware, software
 from turbogs_plugin.report.pictures import ERROR_FULL_SCALE, picture_writer, strip
-from turbogs_plugin.report.tables import ERRORS, WHOLE_ERRORS, errors, number, table, views_table, whole_errors
+from turbogs_plugin.report.tables import (
+    ALIGNED_ERRORS,
+    ERRORS,
+    WHOLE_ERRORS,
+    aligned_errors,
+    errors,
+    number,
+    table,
+    views_table,
+    whole_errors,
+)
 from turbogs_plugin.train.evaluate import Metrics, evaluate, load_lpips, render_view
 from turbogs_plugin.train.history import Evaluation
 from turbogs_plugin.train.run import RunSession
@@ -26,7 +36,8 @@ def write_report(run: RunSession) -> Path:
     lpips, lpips_reason = load_lpips(config.report.lpips_weights, trainer.device)
     metrics = None if lpips else run.evaluations.metrics_at(trainer.iteration)
     if metrics is None:
-        metrics = evaluate(trainer.gaussians, run.test, trainer.sh_degree, config.raster, lpips, background=background)
+        options = {"background": background, "aligned": trainer.exposures is not None}
+        metrics = evaluate(trainer.gaussians, run.test, trainer.sh_degree, config.raster, lpips, **options)
     run.clock.mark("report")
     pictures = run.folder.path / "report"
     pictures.mkdir(exist_ok=True)
@@ -62,18 +73,35 @@ def _page(run: RunSession, metrics: Metrics, lpips_reason: str, shown: int) -> s
     last = run.history[-1]
     config = run.trainer.config
     whole = WHOLE_ERRORS if whole_errors(metrics.mean) else ()
+    aligned = ALIGNED_ERRORS if aligned_errors(metrics.mean) else ()
     unmasked = ", without their masked pixels where nothing else is said" if whole else ""
     on = ""
     if run.test.photos.transparent:
         red, green, blue = (round(255 * value) for value in run.trainer.background.evaluated)
         on = f" Photos are transparent; they and the model are compared on rgb({red}, {green}, {blue})."
+    if aligned:
+        on += (
+            " Training photos have exposures of their own, test photos none: errors are raw, and beside them stand"
+            " those after the affine map of the render's colours that fits each test photo best."
+        )
     grey = "; masked pixels of photo and error are grey" if whole else ""
     result = table(
-        (*ERRORS, "LPIPS (VGG)", *whole, "training in s", "wall in s", "Gaussians", "FPS", "peak memory in MiB"),
+        (
+            *ERRORS,
+            "LPIPS (VGG)",
+            *whole,
+            *aligned,
+            "training in s",
+            "wall in s",
+            "Gaussians",
+            "FPS",
+            "peak memory in MiB",
+        ),
         [
             (
                 *errors(metrics.mean),
                 *whole_errors(metrics.mean),
+                *aligned_errors(metrics.mean),
                 f"{last.train_seconds:.1f}",
                 number(run.wall.wall_seconds, 1, "not recorded"),
                 last.num_gaussians,

@@ -14,6 +14,9 @@ ERRORS = ("PSNR in dB", "SSIM", "mean absolute error")
 WHOLE_ERRORS = tuple(f"{name} with masked pixels" for name in ERRORS)
 """Heads of the further columns where test views have masks."""
 
+ALIGNED_ERRORS = tuple(f"{name} after colour alignment" for name in ERRORS)
+"""Heads of the further columns where renders were also aligned in colour to the test photos."""
+
 
 def table(header: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
     """A Markdown table."""
@@ -40,9 +43,17 @@ def whole_errors(measured: ViewMetrics | Evaluation, psnr_digits: int = 2) -> li
     return [number(measured.whole_psnr, psnr_digits), number(measured.whole_ssim, 4), number(measured.whole_l1, 4)]
 
 
+def aligned_errors(measured: ViewMetrics | Evaluation, psnr_digits: int = 2) -> list[str]:
+    """The numbers for the columns `ALIGNED_ERRORS`; none where no colours were aligned."""
+    if math.isnan(measured.aligned_l1):
+        return []
+    psnr = number(measured.aligned_psnr, psnr_digits)
+    return [psnr, number(measured.aligned_ssim, 4), number(measured.aligned_l1, 4)]
+
+
 def views_table(metrics: Metrics, with_means: bool = False) -> str:
     """A table with the errors of each test view, and with their means as its last line if asked for. FLIP has a column
-    where it was computed, and errors with masked pixels have theirs where there are any."""
+    where it was computed, and so have errors with masked pixels and those after colour alignment."""
     measured = [(view, 2) for view in metrics.views] + ([(metrics.mean, 4)] if with_means else [])
     rows = [[view.name, *errors(view, digits)] for view, digits in measured]
     header = ["view", *ERRORS, "LPIPS (VGG)"]
@@ -54,6 +65,10 @@ def views_table(metrics: Metrics, with_means: bool = False) -> str:
         header += WHOLE_ERRORS
         for row, (view, digits) in zip(rows, measured, strict=True):
             row += whole_errors(view, digits)
+    if aligned_errors(metrics.mean):
+        header += ALIGNED_ERRORS
+        for row, (view, digits) in zip(rows, measured, strict=True):
+            row += aligned_errors(view, digits)
     return table(header, rows)
 
 

@@ -38,7 +38,7 @@ DECIMALS = {
     "wall_seconds": 3,
     "cell_seconds": 3,
 }
-DECIMALS |= {f"whole_{name}": DECIMALS[name] for name in ("psnr", "ssim", "l1")}
+DECIMALS |= {f"{of}_{name}": DECIMALS[name] for of in ("whole", "aligned") for name in ("psnr", "ssim", "l1")}
 """Digits behind the point that are kept of a measure: for errors those that float32 has."""
 
 SHARED = ("provenance", "resolved", "warmup_iterations", "lpips_reason")

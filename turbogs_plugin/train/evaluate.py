@@ -1,6 +1,8 @@
 """Test error of a model: PSNR, SSIM, mean absolute error, LPIPS and FLIP if wanted and there; and rendering speed.
 
 Where views have masks, errors are of the pixels that are not masked, and those of whole photos are given beside them.
+Where photos have exposures of their own, errors after a colour alignment are given beside the raw ones: no model can
+know the exposure of a test photo.
 """
 
 from __future__ import annotations
@@ -44,6 +46,7 @@ class ViewMetrics:
 
     Args:
         whole_psnr, whole_ssim, whole_l1: with the masked pixels; NaN where no view has a mask.
+        aligned_psnr, aligned_ssim, aligned_l1: of the render after `align_colors`; NaN where that was not asked for.
     """
 
     name: str
@@ -55,6 +58,9 @@ class ViewMetrics:
     whole_psnr: float = math.nan
     whole_ssim: float = math.nan
     whole_l1: float = math.nan
+    aligned_psnr: float = math.nan
+    aligned_ssim: float = math.nan
+    aligned_l1: float = math.nan
 
 
 @dataclass
@@ -91,6 +97,7 @@ def evaluate(
     lpips: Lpips | None = None,
     flip: Flip | None = None,
     background: Color = BLACK,
+    aligned: bool = False,
 ) -> Metrics:
     """Render every view, one at a time, and compare it with its photo.
 
@@ -102,6 +109,7 @@ def evaluate(
         lpips: from `load_lpips`, if wanted.
         flip: from `load_flip`, if wanted. Masked pixels are the photo's in both images that these two get.
         background: behind the model, and behind transparent photos.
+        aligned: give the errors after `align_colors`, too.
     """
     metrics, seconds = [], 0.0
     for view_id, name in enumerate(views.names):
@@ -115,6 +123,10 @@ def evaluate(
         if views.masks is not None:
             whole = compare(name, image, photo)
             metrics[-1].whole_psnr, metrics[-1].whole_ssim, metrics[-1].whole_l1 = whole.psnr, whole.ssim, whole.l1
+        if aligned:
+            after = compare(name, align_colors(image, photo, mask), photo, mask)
+            metrics[-1].aligned_psnr, metrics[-1].aligned_ssim = after.psnr, after.ssim
+            metrics[-1].aligned_l1 = after.l1
         if lpips is not None:
             metrics[-1].lpips = lpips(image if mask is None else _unmasked(image, photo, mask), photo)
         if flip is not None:
@@ -155,6 +167,18 @@ def compare(name: str, image: Tensor, photo: Tensor, mask: Tensor | None = None)
     if mask is not None:
         image, photo = image[mask], photo[mask]  # [P, 3]
     return ViewMetrics(name, psnr(image, photo), similarity, (image - photo).abs().mean().item())
+
+
+def align_colors(image: Tensor, photo: Tensor, mask: Tensor | None = None) -> Tensor:
+    """[H, W, 3], 0 .. 1: the image with its colours mapped by the affine map, 3x4, that brings them closest to the
+    photo's, in the sense of least squares over the pixels of the mask [H, W]."""
+    rows = image.reshape(-1, 3) if mask is None else image[mask]
+    targets = photo.reshape(-1, 3) if mask is None else photo[mask]
+    rows, targets = torch.nn.functional.pad(rows, (0, 1), value=1.0).double(), targets.double()  # [P, 4], [P, 3]
+    # Few numbers: on the CPU, and by the pseudo-inverse, as an image of one colour has many such maps.
+    inverse = torch.linalg.pinv((rows.T @ rows).cpu(), hermitian=True)
+    affine = (inverse @ (rows.T @ targets).cpu()).to(image)  # [4, 3]
+    return (image @ affine[:3] + affine[3]).clamp(0.0, 1.0)
 
 
 def _unmasked(image: Tensor, photo: Tensor, mask: Tensor) -> Tensor:

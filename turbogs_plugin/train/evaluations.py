@@ -47,7 +47,8 @@ class Evaluations(Listener):
         trainer.require_finite()
         lpips = self.lpips if loop.finished else None
         settings, background = trainer.config.raster, trainer.background.evaluated
-        metrics = evaluate(trainer.gaussians, self.test, trainer.sh_degree, settings, lpips, background=background)
+        options = {"background": background, "aligned": trainer.exposures is not None}
+        metrics = evaluate(trainer.gaussians, self.test, trainer.sh_degree, settings, lpips, **options)
         mean = metrics.mean
         evaluation = Evaluation(
             iteration=trainer.iteration,
@@ -63,6 +64,9 @@ class Evaluations(Listener):
             whole_psnr=mean.whole_psnr,
             whole_ssim=mean.whole_ssim,
             whole_l1=mean.whole_l1,
+            aligned_psnr=mean.aligned_psnr,
+            aligned_ssim=mean.aligned_ssim,
+            aligned_l1=mean.aligned_l1,
         )
         self.history.append(evaluation)
         self.metrics = metrics

@@ -10,6 +10,9 @@ from pathlib import Path
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.files import read_text, write_text_atomically
 
+OPTIONAL = ("whole_", "aligned_")
+"""Prefixes of measures that only some captures have."""
+
 
 @dataclass
 class Evaluation:
@@ -26,6 +29,8 @@ class Evaluation:
         worst_psnr: PSNR of the worst test view; NaN in old files, which lack it.
         whole_psnr, whole_ssim, whole_l1: means with masked pixels, which have no part in `psnr`, `ssim` and `l1`; NaN,
             and not written, where no test view has any.
+        aligned_psnr, aligned_ssim, aligned_l1: means after a colour alignment (`align_colors`), in runs that learn
+            exposures; NaN, and not written, in others.
     """
 
     iteration: int
@@ -41,10 +46,14 @@ class Evaluation:
     whole_psnr: float = math.nan
     whole_ssim: float = math.nan
     whole_l1: float = math.nan
+    aligned_psnr: float = math.nan
+    aligned_ssim: float = math.nan
+    aligned_l1: float = math.nan
 
     def to_json(self) -> str:
         """One line; NaN is written as null."""
-        written = {name: value for name, value in asdict(self).items() if name[:6] != "whole_" or value == value}
+        absent = {name for name, value in asdict(self).items() if value != value and name.startswith(OPTIONAL)}
+        written = {name: value for name, value in asdict(self).items() if name not in absent}
         return json.dumps({name: None if value != value else value for name, value in written.items()})
 
 

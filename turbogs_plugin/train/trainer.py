@@ -5,6 +5,7 @@ The loop over iterations is in `turbogs_plugin.train.loop`.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, Protocol
 
 import torch
@@ -12,6 +13,7 @@ from torch import Tensor
 
 from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.engine import engine_of
+from turbogs_plugin.engine.exposures import Exposures, exposure_rate
 from turbogs_plugin.engine.layout import MAX_SH_DEGREE
 from turbogs_plugin.engine.protocol import MapUpdate
 from turbogs_plugin.engine.rendered import RenderOptions, ScreenGradients
@@ -75,6 +77,7 @@ class Trainer:
             self.views.cameras.sizes, device, config.train.maps_place, config.maps.beta, self.views.masks
         )
         self.background = Background.of(config.train.background, self.views.photos.transparent)
+        self.exposures = Exposures.identity(len(self.views), device) if config.train.exposure else None
         init = "points" if resuming else config.train.init
         self.gaussians = initial_gaussians(scene, config, init, device).map(lambda tensor: tensor.to(device))
         self.view_sampler.setup(self.views.cameras, scene.extent)
@@ -153,6 +156,15 @@ class Trainer:
         self.iteration += 1
 
     def supervise(self, colors: Tensor, truth: PhotoSamples, step: Step) -> LossOutput:
+        """Loss and error maps, and the exposures of the photos where they are learnt."""
+        if self.exposures is None:
+            return self._supervise(colors, truth, step)
+        loss = self._supervise(self.engine.expose(self.exposures, colors, truth.samples), truth, step)
+        options = {"samples": truth.samples, "rate": exposure_rate(step)}
+        gradients = self.engine.learn_exposures(self.exposures, colors, loss.color_gradients, **options)
+        return replace(loss, color_gradients=gradients)
+
+    def _supervise(self, colors: Tensor, truth: PhotoSamples, step: Step) -> LossOutput:
         """Loss and error maps: in one step if the loss is a rule, else by the loss's own code."""
         update = MapUpdate(self.maps, step, self.nonfinite_losses)
         if self.loss.terms is not None:
@@ -247,6 +259,7 @@ class Trainer:
             "initial_error": self.initial_error,
             "nonfinite_losses": int(self.nonfinite_losses),
             "gaussians": dict(self.gaussians.items()),
+            **({} if self.exposures is None else {"exposures": self.exposures.state_dict()}),
             **{name: getattr(self, name).state_dict() for name in STATEFUL},
         }
 
@@ -265,6 +278,8 @@ class Trainer:
         self.initial_error = state["initial_error"]
         self.nonfinite_losses.fill_(state["nonfinite_losses"])
         self.gaussians = gaussians_of_state(state, self.device)
+        if self.exposures is not None:
+            self.exposures.load_state_dict(state["exposures"])
         self.optimizer.setup(self.gaussians)
         self.density.setup(self.gaussians)
         for name in STATEFUL:

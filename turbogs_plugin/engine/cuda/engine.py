@@ -6,9 +6,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from turbogs_plugin.engine.cuda import training
+from turbogs_plugin.engine.cuda import exposure, training
 from turbogs_plugin.engine.cuda.raster import CudaRendered, rasterize_cuda
 from turbogs_plugin.engine.cuda.workspace import Workspace
+from turbogs_plugin.engine.exposures import Exposures
 from turbogs_plugin.engine.protocol import Engine, MapUpdate
 from turbogs_plugin.engine.rendered import DEFAULT_OPTIONS, RenderOptions
 from turbogs_plugin.engine.rules import LossTerms
@@ -34,6 +35,7 @@ class CudaEngine(Engine):
     draw = staticmethod(training.sample_pixels)
     evaluate = staticmethod(training.sparse_loss)
     update = staticmethod(training.fused_step)
+    expose = staticmethod(exposure.expose_colors)
 
     def render(
         self, gaussians: Gaussians, cameras: Cameras, samples: PixelSamples, options: RenderOptions = DEFAULT_OPTIONS
@@ -47,6 +49,11 @@ class CudaEngine(Engine):
         aligned = len(photos) == len(update.maps.errors) and np.array_equal(truth.starts, starts)
         targets = photos if aligned else truth.colors()
         return training.sparse_loss(terms, colors, targets, truth.samples, update, self.overflow, truth.background)
+
+    def learn_exposures(
+        self, exposures: Exposures, colors: Tensor, gradients: Tensor, samples: PixelSamples, rate: float
+    ) -> Tensor:
+        return exposure.learn_exposures(exposures, colors, gradients, samples, rate, self.overflow)
 
     def settle(self, wait: bool = False) -> int:
         return 0 if self.workspace is None else self.workspace.take_lost(wait)

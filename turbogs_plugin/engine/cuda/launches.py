@@ -340,6 +340,53 @@ class SparseLoss(Launch):
     background: Background  # shows through photos with an alpha
 
 
+# ---- Exposures ------------------------------------------------------------------------------------------------------
+
+
+@dataclass
+class ExposeColors(Launch):
+    """Map rendered colours by the exposures of their photos: writes `exposed`."""
+
+    colors: Tensor  # [P, 3] float32
+    tile_ids: Tensor  # [T] int32
+    tile_offsets: Tensor  # [T + 1] int32
+    views: list[int]  # [K] layout.ViewRow
+    offsets: Tensor  # [V, 3, 4] float32
+    exposed: Tensor  # [P, 3] float32
+
+
+@dataclass
+class ExposureBackward(Launch):
+    """Gradients through `ExposeColors`: changes `gradients` in place, adds to `sums`."""
+
+    colors: Tensor  # [P, 3] float32
+    tile_ids: Tensor  # [T] int32
+    tile_offsets: Tensor  # [T + 1] int32
+    views: list[int]  # [K] layout.ViewRow
+    offsets: Tensor  # [V, 3, 4] float32
+    gradients: Tensor  # [P, 3] float32
+    sums: Tensor  # [K, 3, 4] float64, zero
+
+
+ExposureArrays = fields_of("Tensor", "offsets exp_avg exp_avg_sq steps")
+"""`engine.exposures.Exposures`: [V, 3, 4] float32 each, but for `steps`, [V] int32."""
+
+
+@dataclass
+class ExposureStep(Launch):
+    """One step of Adam for the photos of a batch, in place; then the mean of all offsets is zero."""
+
+    sums: Tensor  # [K, 3, 4] float64
+    views: list[int]  # [K] layout.ViewRow
+    exposures: ExposureArrays
+    overflow: Tensor | None  # [1] int32; if not 0, the launch does nothing
+    rate: float
+    beta1: float
+    beta2: float
+    eps: float
+    pull: float
+
+
 # ---- From the screen to the parameters ------------------------------------------------------------------------------
 
 

@@ -1,0 +1,72 @@
+"""Python functions for the kernels of exposures, the twins of `engine.reference.exposure`.
+
+Each is enqueued on torch's current stream and does not wait.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from turbogs_plugin.engine.cuda import launches, library
+from turbogs_plugin.engine.cuda.training import view_rows
+from turbogs_plugin.engine.exposures import BETA1, BETA2, EPSILON, PULL, Exposures
+from turbogs_plugin.types import PixelSamples
+
+
+def expose_colors(exposures: Exposures, colors: Tensor, samples: PixelSamples) -> Tensor:
+    """`Engine.expose`. `samples`: of at most `MAX_VIEWS` views."""
+    library.require()
+    colors = colors.detach().float().contiguous()
+    launch = launches.ExposeColors(
+        colors=colors,
+        tile_ids=samples.tile_ids,
+        tile_offsets=samples.tile_offsets,
+        views=_rows(samples),
+        offsets=exposures.offsets,
+        exposed=torch.empty_like(colors),
+    )
+    library.launch(launch)
+    return launch.exposed
+
+
+def learn_exposures(
+    exposures: Exposures,
+    colors: Tensor,
+    gradients: Tensor,
+    samples: PixelSamples,
+    rate: float,
+    overflow: Tensor | None = None,
+) -> Tensor:
+    """`Engine.learn_exposures`, in two launches; `gradients`, where float32 and contiguous, is changed in place."""
+    library.require()
+    rows = _rows(samples)
+    backward = launches.ExposureBackward(
+        colors=colors.detach().float().contiguous(),
+        tile_ids=samples.tile_ids,
+        tile_offsets=samples.tile_offsets,
+        views=rows,
+        offsets=exposures.offsets,
+        gradients=gradients.detach().float().contiguous(),
+        sums=torch.zeros(len(samples.view_ids), 3, 4, dtype=torch.float64, device=colors.device),
+    )
+    library.launch(backward)
+    library.launch(
+        launches.ExposureStep(
+            sums=backward.sums,
+            views=rows,
+            exposures=exposures,
+            overflow=overflow,
+            rate=rate,
+            beta1=BETA1,
+            beta2=BETA2,
+            eps=EPSILON,
+            pull=PULL,
+        )
+    )
+    return backward.gradients
+
+
+def _rows(samples: PixelSamples) -> list[int]:
+    return view_rows(np.zeros(len(samples.view_ids), dtype=np.int64), samples.sizes, samples.view_ids)

@@ -1,0 +1,68 @@
+"""Exposure and white balance of each training photo: an affine map of the rendered colour, and its Adam state.
+
+A photo's colour is taken to be ``c + A c + b`` of the model's colour c, with A [3, 3] and b [3] for each photo, as
+Niedermayr et al. (2024) and 3DGS's `train_test_exp` have it. Two rules keep the model's own colours where they are:
+the objective has a term for the distance from the identity, and the mean of A and b over all photos is zero (the
+gauge: else the model could darken and all exposures brighten).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from turbogs_plugin.types import Step
+
+FIRST_RATE = 3e-3
+LAST_RATE = 3e-4
+"""Adam's rates at the start and the end of a run, a third of 3DGS's for exposures. Not yet measured."""
+BETA1 = 0.9
+BETA2 = 0.999
+EPSILON = 1e-15
+PULL = 0.01
+"""Weight of ``mean over the views of a batch of (|A|^2 + |b|^2) / 2`` in the objective. A photo at half the exposure
+has A = -0.5, which the term pulls back with .005, and a photo's error in colour pulls with up to a third of the mean
+colour. Not yet measured."""
+
+
+@dataclass
+class Exposures:
+    """The exposures of V training photos.
+
+    Args:
+        offsets: [V, 3, 4] float32, ``A | b``: the map less the identity. Zeros map every colour to itself, to the bit.
+        exp_avg, exp_avg_sq: [V, 3, 4] float32, Adam's moments.
+        steps: [V] int32, updates of each photo, for the bias correction.
+    """
+
+    offsets: Tensor
+    exp_avg: Tensor
+    exp_avg_sq: Tensor
+    steps: Tensor
+
+    @classmethod
+    def identity(cls, views: int, device: torch.device | str) -> Exposures:
+        """Of photos that were never updated."""
+        maps = (torch.zeros(views, 3, 4, device=device) for _ in range(3))
+        return cls(*maps, torch.zeros(views, dtype=torch.int32, device=device))
+
+    def state_dict(self) -> dict[str, Any]:
+        return {field.name: getattr(self, field.name) for field in fields(self)}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Load a saved state. Raises `ValueError` if it is of another number of photos."""
+        for field in fields(self):
+            present = getattr(self, field.name)
+            if state[field.name].shape != present.shape:
+                found, expected = tuple(state[field.name].shape), tuple(present.shape)
+                raise ValueError(f"exposures.{field.name} has shape {found} where {expected} was expected")
+            present.copy_(state[field.name])
+
+
+def exposure_rate(step: Step) -> float:
+    """Adam's rate, which falls from `FIRST_RATE` to `LAST_RATE` exponentially."""
+    share = min(1.0, step.iteration / max(1, step.total))
+    return FIRST_RATE * (LAST_RATE / FIRST_RATE) ** share
