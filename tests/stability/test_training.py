@@ -127,6 +127,17 @@ def test_photos_without_information(variant, tmp_path, name, loss):
         assert outcome.history[-1].psnr > outcome.history[0].psnr
 
 
+@pytest.mark.parametrize("name", [*PHOTOS, "one black photo"])
+def test_photos_with_exposures(variant, tmp_path, name):
+    """Exposures end near the identity, and those of black photos take no other photo's with them."""
+    change = PHOTOS.get(name, lambda photo, number: 0 * photo if number == 3 else photo)
+    edit_photos(variant, change)
+    outcome = train_to_the_end(variant, tmp_path / "run", "train.exposure=true")
+    offsets = outcome.trainer.exposures.offsets
+    assert offsets.isfinite().all() and offsets.abs().max() < 1.0
+    assert offsets.mean(dim=0).abs().max() < 1e-5
+
+
 def test_one_photo_for_every_camera(variant, tmp_path):
     first = np.asarray(Image.open(sorted((variant / "images").iterdir())[1]))
     edit_photos(variant, lambda photo, number: first)

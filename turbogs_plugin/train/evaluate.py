@@ -176,7 +176,7 @@ def align_colors(image: Tensor, photo: Tensor, mask: Tensor | None = None) -> Te
     targets = photo.reshape(-1, 3) if mask is None else photo[mask]
     rows, targets = torch.nn.functional.pad(rows, (0, 1), value=1.0).double(), targets.double()  # [P, 4], [P, 3]
     # Few numbers: on the CPU, and by the pseudo-inverse, as an image of one colour has many such maps.
-    inverse = torch.linalg.pinv((rows.T @ rows).cpu(), hermitian=True)
+    inverse = torch.linalg.pinv((rows.T @ rows).cpu(), rtol=1e-9, hermitian=True)
     affine = (inverse @ (rows.T @ targets).cpu()).to(image)  # [4, 3]
     return (image @ affine[:3] + affine[3]).clamp(0.0, 1.0)
 
