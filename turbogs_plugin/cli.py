@@ -129,6 +129,7 @@ def train(
     out: Annotated[Path | None, arg(metavar="RUN")] = None,
     resume: Annotated[Path | None, arg(metavar="RUN")] = None,
     report: bool = True,
+    gpus: Count = None,
     options: Flat = NO_OPTIONS,
 ) -> int:
     """Train on a capture, or go on with a stopped run.
@@ -140,18 +141,33 @@ def train(
         out: new folder for the run.
         resume: folder of a stopped run to go on with, by its own configuration.
         report: at the end, write the report and its pictures; --no-report leaves model, history and checkpoints.
+        gpus: of this machine, to train one model on all of them, a process each; torchrun does the same on several
+            machines. docs/scaling.md says what they gain.
     """
+    clock = WallClock(process_age())
+    if resume is not None:
+        if scene or overrides or out or options != NO_OPTIONS:
+            raise InputError(
+                "--resume goes on by the run's own configuration: give it nothing else but --no-report and --gpus"
+            )
+    elif scene is None or out is None:
+        raise InputError("train needs a SCENE and --out RUN, or --resume RUN")
+    if gpus is not None:
+        _require_positive("--gpus", (gpus,))
+    from turbogs_plugin.distributed.processes import joined, launched, restarted, start
     from turbogs_plugin.report.pages import write_report
     from turbogs_plugin.train import run
 
-    clock, page = WallClock(process_age()), write_report if report else None
-    if resume is not None:
-        if scene or overrides or out or options != NO_OPTIONS:
-            raise InputError("--resume goes on by the run's own configuration: give it nothing else but --no-report")
-        return _tell(run.resume(resume, page, clock), report)
-    if scene is None or out is None:
-        raise InputError("train needs a SCENE and --out RUN, or --resume RUN")
-    return _tell(run.train(options.settings(scene, overrides), out, page, clock), report)
+    settings = run.RunFolder(resume).read_config() if resume else options.settings(scene, overrides)
+    device = settings.train.device
+    if gpus is not None and gpus > 1 and not launched():
+        return start(gpus, sys.argv[1:], device)
+    page = write_report if report else None
+    with joined(device) as ranks:
+        if resume is None and restarted() and run.RunFolder(out).config.is_file():
+            resume = out
+        session = run.resume(resume, page, clock, ranks) if resume else run.train(settings, out, page, clock, ranks)
+    return _tell(session, report) if ranks.first else 128 + session.signal if session.signal else 0
 
 
 @app.command
@@ -278,9 +294,11 @@ def ablate(
     reuse: Annotated[tuple[Path, ...], arg(metavar="STUDY ...")] = (),
     merge: Annotated[tuple[Path, ...], arg(metavar="STUDY ...")] = (),
     within: Time = None,
+    gpus: Annotated[str | None, arg(metavar="0,1,...")] = None,
     device: Device = "auto",
 ) -> int:
-    """Train named variants over scenes and seeds: error against run time. The same call goes on where it stopped.
+    """Train named variants over scenes and seeds: error against run time. The same call goes on where it stopped, and
+    may be made on several machines that share the folder --out: no cell is trained twice.
 
     Args:
         names: packaged ablations (parts, components, views, ...) or .yaml files; then changes of every
@@ -295,6 +313,7 @@ def ablate(
         reuse: take cells of the same settings from these studies where machine and sources are the same.
         merge: put these studies together in --out and write the report, without training.
         within: begin no further cell after so much time: 9m. The same call then goes on; the exit code is 3.
+        gpus: numbers of GPUs, a process each, which share the cells.
         device: where to train.
     """
     from turbogs_plugin.config.units import parse_seconds
@@ -314,7 +333,7 @@ def ablate(
     if only and len(ablations) > 1:
         raise InputError("--only names variants of one ablation: give it one NAME_OR_FILE")
     limit = None if within is None else parse_seconds(within)
-    options = SweepOptions(scene, seeds, overrides, steps, device, reuse, limit)
+    options = SweepOptions(scene, seeds, overrides, steps, device, reuse, limit, _numbers("--gpus", gpus))
     return commands.ablate(ablations, options, out, only, psnr)
 
 
@@ -365,7 +384,8 @@ def report(
 @app.command
 def bench(
     what: Annotated[
-        Positional[Literal["step", "raster", "numerics", "wall"]], arg(metavar="step|raster|numerics|wall")
+        Positional[Literal["step", "ranks", "raster", "numerics", "wall"]],
+        arg(metavar="step|ranks|raster|numerics|wall"),
     ],
     overrides: Overrides = (),
     /,
@@ -382,19 +402,22 @@ def bench(
     photos: Annotated[int, arg(metavar="N")] = 0,
     offload: bool = False,
     library: Annotated[tuple[Path, ...], arg(metavar="FILE ...")] = (),
+    gpus: Annotated[tuple[int, ...], arg(metavar="N ...")] = (1, 2),
+    grown: bool = False,
     factor: Annotated[int, arg(metavar="N")] = 1,
     device: Device = "auto",
     out: Annotated[Path | None, arg(metavar="FILE_OR_FOLDER")] = None,
 ) -> int:
-    """Time an iteration of training step by step, the rasterizer stage by stage, beside what the machine allows, or the
-    command `turbogs train` by the clock on the wall; or measure how exact and how fast the optimizer's solvers are on
-    stiff systems.
+    """Time an iteration of training step by step or on several GPUs, the rasterizer stage by stage, beside what the
+    machine allows, or the command `turbogs train` by the clock on the wall; or measure how exact and how fast the
+    optimizer's solvers are on stiff systems.
 
     Args:
-        what: step: from sampling to update; raster: forward and backward, beside gsplat's dense ones; numerics: the
-            solvers of moment-damped LM, which takes --out and --device alone; wall: whole runs, which takes --scene,
-            --repeats, --factor, --device, --out and changes of the configuration.
-        overrides: step, wall: changes of the configuration that is timed.
+        what: step: from sampling to update; ranks: an iteration on several GPUs, of a --scene; raster: forward and
+            backward, beside gsplat's dense ones; numerics: the solvers of moment-damped LM, which takes --out and
+            --device alone; wall: whole runs, which takes --scene, --repeats, --factor, --device, --out and changes of
+            the configuration.
+        overrides: step, ranks, wall: changes of the configuration that is timed.
         scene: a capture, for its cameras and photos; where absent, all is synthetic, the models of raster as well.
         ply: a trained model in place of those trained here; raster: one or more, timed at their own sizes.
         gaussians: sizes of the model.
@@ -407,18 +430,22 @@ def bench(
         photos: step: number of synthetic photos, in place of a scene.
         offload: step: with photos and error maps in host memory, too.
         library: raster: other builds of the kernels, measured the same way.
+        gpus: ranks: numbers of GPUs.
+        grown: ranks: also with views and pixels times the number of GPUs.
         factor: scale photos down by this.
         device: what to time.
         out: JSON file; standard output where absent, but for wall. numerics: folder for its table, plot and JSON.
     """
     from turbogs_plugin.bench import commands
     from turbogs_plugin.bench.models import TRAINING_ITERATIONS
+    from turbogs_plugin.bench.ranks import RanksBench
     from turbogs_plugin.bench.raster import RasterBench
     from turbogs_plugin.bench.step import StepBench
     from turbogs_plugin.train.run import resolve_device
 
     times = repeats if repeats is not None else 3 if what == "wall" else 100
-    for name, values in (("gaussians", gaussians), ("views", views), ("repeats", (times,)), ("size", size)):
+    counts = {"gaussians": gaussians, "views": views, "repeats": (times,), "size": size, "gpus": gpus}
+    for name, values in counts.items():
         if not values or min(values) < 1:
             raise InputError(f"--{name} {' '.join(map(str, values))}: each must be at least 1")
     _require_positive("--rates", rates, most=1.0)
@@ -440,6 +467,11 @@ def bench(
             )
         arguments = [str(scene), *overrides, "--device", where.type, "--factor", str(factor)]
         return commands.run_wall(arguments, times, where, out)
+    if what == "ranks":
+        if scene is None or ply or library or photos or offload:
+            raise InputError("bench ranks needs --scene SCENE; a model, synthetic photos and offload are not for it")
+        ranks = RanksBench(gpus, gaussians, views, pixel_budget, grown, iterations, times, overrides)
+        return commands.run_ranks(ranks, scene, factor, where, out)
     if what == "step":
         if len(ply) > 1:
             raise InputError("bench step takes one --ply, at the sizes of --gaussians")
@@ -484,6 +516,14 @@ def _budget(max_memory: str | None, time_budget: str | None) -> tuple[str, ...]:
             raise InputError(f"{option} '': write an amount; leave it out for no limit")
     given = {"max_memory": max_memory, "time": time_budget}
     return tuple(f"budget.{name}={value!r}" for name, value in given.items() if value is not None)
+
+
+def _numbers(option: str, text: str | None) -> tuple[int, ...]:
+    """``0,1,2`` as numbers; none where the option is absent."""
+    words = [] if text is None else text.split(",")
+    if not all(word.strip().isdecimal() for word in words) or len({int(word) for word in words}) < len(words):
+        raise InputError(f"{option} '{text}': write different numbers with commas between them: 0,1,2")
+    return tuple(map(int, words))
 
 
 def _require_positive(option: str, values: Sequence[float], most: float = math.inf) -> None:

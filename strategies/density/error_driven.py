@@ -163,6 +163,9 @@ class ErrorDrivenDensity(WindowedDensity):
         densify = after <= 0 and iteration >= self.refine_from and iteration % self.refine_every == 0
         return densify and not self.stopped_at, self.final_keep < 1 and after > 0 and after % self.final_every == 0
 
+    def event_due(self, step: Step) -> bool:
+        return any(self.due(step))
+
     def _last_event(self, step: Step) -> int:
         """Iteration after which no statistics are needed: that of the last event, or where densification ends.
 

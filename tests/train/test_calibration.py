@@ -125,7 +125,7 @@ class SyntheticTrial:
 
     gaussians = 1000
 
-    def __init__(self, config, scene, device) -> None:
+    def __init__(self, config, scene, device, ranks) -> None:
         self.configured = config.schedule["pixel_budget"]
 
     def initialisation(self) -> float:

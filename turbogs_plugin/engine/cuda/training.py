@@ -9,7 +9,7 @@ torch's current stream and does not wait. Tensors must be contiguous. A wrong de
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import lru_cache
+from functools import lru_cache, partial
 from itertools import accumulate
 
 import numpy as np
@@ -24,7 +24,7 @@ from turbogs_plugin.engine.protocol import MapUpdate
 from turbogs_plugin.engine.rules import DrawRule, LossTerms, UpdateRule
 from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.tiles import CELL_SIDE, TILE_PIXELS, slots_of_tiles, tile_extents
-from turbogs_plugin.types import TILE_SIZE, Gaussians, GaussianStats, LossOutput, PixelSamples, Step
+from turbogs_plugin.types import TILE_SIZE, Gaussians, GaussianStats, LossOutput, PixelSamples, Step, TileGrid
 
 
 def sample_pixels(rule: DrawRule, maps: ErrorMaps, view_ids: tuple[int, ...], rate: float, step: Step) -> PixelSamples:
@@ -73,8 +73,24 @@ def sample_pixels(rule: DrawRule, maps: ErrorMaps, view_ids: tuple[int, ...], ra
     if weights is not None:
         weights = weights * ((draw.pixel_ids >= 0).sum() / weights.sum())
     return PixelSamples(
-        tuple(view_ids), sizes, draw.pixel_ids, draw.tile_ids, draw.tile_offsets, weights, rule.unit != "pixel"
+        tuple(view_ids),
+        sizes,
+        draw.pixel_ids,
+        draw.tile_ids,
+        draw.tile_offsets,
+        weights,
+        has_empty_slots=rule.unit != "pixel",
+        host_ends=partial(_ends, rule.unit, tuple(map(tuple, shapes)), tuple(wanted)),
     )
+
+
+@lru_cache(maxsize=64)
+def _ends(unit: str, sizes: tuple[tuple[int, int], ...], wanted: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """`PixelSamples.host_ends` of a draw of so many units, of each view's tiles or of each tile."""
+    if unit == "tile":
+        return np.cumsum(wanted), np.cumsum(np.full(sum(wanted), TILE_PIXELS))
+    array = np.array(sizes, dtype=np.int64)
+    return TileGrid(array).offsets[1:], np.cumsum(slots_of_tiles(unit, wanted[0], *tile_extents(array)))
 
 
 @lru_cache(maxsize=4096)

@@ -1,0 +1,447 @@
+"""What an iteration on several processes exchanges, so that all take the same step.
+
+Every process holds the whole model, the photos and the error maps, and draws the samples of all K views: draws are a
+function of (seed, iteration, place), so all draw the same. Then
+
+1. each renders its share of the samples (`shares`), and the colours of all are gathered (12 bytes a sample). So loss,
+   error maps and non-finite counts are those of one process, on each;
+2. each back-propagates its share to the screen. The Gaussians are owned by the processes in equal runs of rows. An
+   owner is sent the records of its rows in all views (72 bytes a Gaussian and view). Where a view has several shares,
+   it adds up their records, in the order of the shares;
+3. it solves for their update, and the new parameters of all rows are gathered (236 bytes a Gaussian).
+
+Every step and statistic is computed by one process, as by a process alone, and copied to the others. So the replicas
+are bit-equal, and a step differs from that of one process only by the order in which the samples of a view are added
+up. Moments and statistics are valid for a process's own rows alone, until `complete`.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from turbogs_plugin.distributed.digest import digest
+from turbogs_plugin.distributed.ranks import ProcessRanks, Ranks
+from turbogs_plugin.distributed.shares import Share, shares_of
+from turbogs_plugin.engine.layout import ScreenRecord
+from turbogs_plugin.engine.moments import GaussianMoments
+from turbogs_plugin.engine.protocol import Engine
+from turbogs_plugin.engine.rendered import Rendered, RenderOptions, ScreenGradients, ScreenRecords
+from turbogs_plugin.engine.rules import UpdateRule
+from turbogs_plugin.errors import TrainingStopped
+from turbogs_plugin.types import (
+    Cameras,
+    GaussianGradients,
+    Gaussians,
+    GaussianStats,
+    PixelSamples,
+    RowUpdate,
+)
+
+ROW_STEP = 4
+"""Runs of rows begin at a multiple of this, so that every parameter of them is aligned to 16 bytes."""
+
+LAG = 4
+"""After so many iterations all processes look at the flags of an iteration, and wait for them if need be: so all know
+of them at the same place, and no host runs farther ahead of its GPU."""
+
+
+class Exchange:
+    """A process alone: every call goes to the engine, and nothing is exchanged."""
+
+    def render(
+        self, engine: Engine, gaussians: Gaussians, cameras: Cameras, samples: PixelSamples, options: RenderOptions
+    ) -> Rendered:
+        """`Engine.render` of all K views."""
+        return engine.render(gaussians, cameras, samples, options)
+
+    def update(
+        self,
+        engine: Engine,
+        rule: UpdateRule,
+        screen: ScreenGradients,
+        gaussians: Gaussians,
+        moments: GaussianMoments,
+        stats: GaussianStats | None,
+    ) -> None:
+        """`Engine.update`."""
+        engine.update(rule, screen, gaussians, moments, stats)
+
+    def settle(self, engine: Engine, wait: bool = False) -> int:
+        """`Engine.settle`."""
+        return engine.settle(wait)
+
+    def initial_errors(
+        self, pixels: Sequence[int], errors_of: Callable[[int], Tensor], device: torch.device
+    ) -> Iterator[Tensor]:
+        """Errors [pixels] of one training view after the other.
+
+        Args:
+            pixels: of each view.
+            errors_of: renders a view.
+            device: where the errors are.
+        """
+        return map(errors_of, range(len(pixels)))
+
+    def refine(
+        self, update: Callable[[], RowUpdate | None], due: Callable[[], bool], complete: Callable[[], None]
+    ) -> RowUpdate | None:
+        """The change that density control proposes.
+
+        Args:
+            update: asks it.
+            due: whether it may have one now, or looks at its statistics.
+            complete: makes moments and statistics complete.
+        """
+        return update()
+
+    def finish(self) -> None:
+        """Wait, on the device, for the parameters of the latest `update`. Call it before they are used."""
+
+    def complete(self, moments: GaussianMoments | None, stats: GaussianStats | None) -> None:
+        """Make moments and statistics valid for all rows."""
+
+    def compare(self, state: Callable[[], dict[str, Any]], iteration: int) -> None:
+        """Raise `TrainingStopped` if a tensor or a number of a state differs between processes.
+
+        Args:
+            state: gives it, flat: name -> value. Whole, see `complete`.
+            iteration: of the message.
+        """
+
+
+ALONE = Exchange()
+
+
+def exchange_of(ranks: Ranks) -> Exchange:
+    """The exchange of these processes."""
+    return RankExchange(ranks) if isinstance(ranks, ProcessRanks) else ALONE
+
+
+class RankExchange(Exchange):
+    """Exchanges by torch.distributed, as the module says.
+
+    Attributes:
+        by_rows: owners of rows make the steps. False: every process gets all records and makes all steps, with more
+            bytes for the records and none for parameters; optimizers without a rule always work like this.
+    """
+
+    def __init__(self, ranks: ProcessRanks, by_rows: bool = True) -> None:
+        self.ranks, self.by_rows = ranks, by_rows
+        self._passes = 0
+        self._flags: deque[_Flags] = deque()
+        self._incomplete = False
+        self._arriving: _Arriving | None = None
+        self._skipped: Tensor | None = None  # [] of all processes, when last complete
+
+    def rows(self, count: int) -> list[slice]:
+        """The rows that each process owns of a model of `count` Gaussians."""
+        size = -(-count // (self.ranks.count * ROW_STEP)) * ROW_STEP
+        return [slice(min(count, rank * size), min(count, (rank + 1) * size)) for rank in range(self.ranks.count)]
+
+    def render(
+        self, engine: Engine, gaussians: Gaussians, cameras: Cameras, samples: PixelSamples, options: RenderOptions
+    ) -> SharedRendered:
+        shares = shares_of(samples, self.ranks.count)
+        own = shares[self.ranks.rank]
+        rendered = None
+        if len(own):
+            part = Cameras(cameras.viewmats[own.views], cameras.Ks[own.views], cameras.sizes[own.views])
+            chosen = samples.of_tiles(own.tiles, own.views, own.slots)
+            rendered = engine.render(gaussians, part, chosen, options)
+        colors = self._gather_colors(engine, rendered, [share.slots for share in shares], gaussians.means)
+        return SharedRendered(colors, self, _Batch(engine, gaussians, cameras, samples, options, shares), rendered)
+
+    def _gather_colors(self, engine: Engine, rendered: Rendered | None, slots: Sequence[slice], like: Tensor) -> Tensor:
+        """[P, 3] of all samples; and all processes learn whether one had too little memory or wants to stop."""
+        counts = [part.stop - part.start for part in slots]
+        most = max(counts)
+        sent = like.new_zeros(most + 1, 3)
+        if rendered is not None:
+            sent[: len(rendered.colors)] = rendered.colors
+        if engine.overflow is not None:
+            sent[most, :1] = engine.overflow
+        if self.ranks.asked:
+            sent[most, 1] = self.ranks.asked
+        gathered = self.ranks.gather(sent)  # [ranks, most + 1, 3]
+        flags = gathered[:, most].amax(dim=0)  # [3]
+        if engine.overflow is not None:
+            engine.overflow.copy_(flags[:1])
+        self._flags.append(_Flags.sent(self._passes, flags))
+        self._passes += 1
+        self.ranks.latest = time.monotonic()
+        return torch.cat([colors[:count] for colors, count in zip(gathered, counts, strict=True)])
+
+    def settle(self, engine: Engine, wait: bool = False) -> int:
+        while self._flags and (wait or self._flags[0].number <= self._passes - LAG):
+            flags = self._flags.popleft()
+            overflow, stop = flags.read()
+            self.ranks.stop_signal = max(self.ranks.stop_signal, stop)
+            if overflow:
+                self._flags.clear()
+                engine.recover()
+                return self._passes - flags.number
+        return 0
+
+    def update(
+        self,
+        engine: Engine,
+        rule: UpdateRule,
+        screen: SharedScreen,
+        gaussians: Gaussians,
+        moments: GaussianMoments,
+        stats: GaussianStats | None,
+    ) -> None:
+        if not self.by_rows:
+            engine.update(rule, screen.whole(), gaussians, moments, stats)
+            return
+        if not self._incomplete:
+            self._incomplete, self._skipped = True, moments.skipped.clone()
+        rows = self.rows(len(gaussians))
+        own = rows[self.ranks.rank]
+        part = gaussians.map(lambda value: value[own])
+        piece = screen.of_rows(rows, part)
+        if len(part):
+            parts = {each.name: getattr(moments, each.name) for each in fields(moments)}
+            parts = {name: value[own] if value.dim() else value for name, value in parts.items()}
+            own_stats = None if stats is None else stats.map(lambda value: value[own])
+            engine.update(rule, piece, part, replace(moments, **parts), own_stats)
+        self._arriving = self._gather_rows([value for _, value in gaussians.items()], rows)
+
+    def initial_errors(
+        self, pixels: Sequence[int], errors_of: Callable[[int], Tensor], device: torch.device
+    ) -> Iterator[Tensor]:
+        for start in range(0, len(pixels), self.ranks.count):
+            group = range(start, min(start + self.ranks.count, len(pixels)))
+            own = errors_of(group[self.ranks.rank]) if self.ranks.rank < len(group) else None
+            for source, view in enumerate(group):
+                errors = own if source == self.ranks.rank else torch.empty(pixels[view], device=device)
+                self.ranks.broadcast(errors, source)
+                yield errors
+
+    def refine(
+        self, update: Callable[[], RowUpdate | None], due: Callable[[], bool], complete: Callable[[], None]
+    ) -> RowUpdate | None:
+        if not due():
+            return update()
+        self.finish()
+        complete()
+        return self._agreed(update())
+
+    def _agreed(self, update: RowUpdate | None) -> RowUpdate | None:
+        """The first process's change. All make one, which advances the state of their density control."""
+        plain = None
+        if update is not None and self.ranks.first:
+            shapes = {name: value.shape for name, value in update.values.items()}
+            counts = (update.num_cloned, update.num_split, update.num_pruned)
+            plain = (len(update.source), shapes, update.reset, counts, update.source.device.type)
+        plain = self.ranks.agree(plain)
+        if plain is None:
+            return None
+        count, shapes, reset, counts, device = plain
+        if self.ranks.first:
+            source, fresh, values = update.source, update.fresh.to(torch.uint8), update.values
+        else:
+            source = torch.empty(count, dtype=torch.int64, device=device)
+            fresh = torch.empty(count, dtype=torch.uint8, device=device)
+            values = {name: torch.empty(shape, device=device) for name, shape in shapes.items()}
+        values = {name: value.contiguous() for name, value in values.items()}
+        for tensor in (source, fresh, *values.values()):
+            self.ranks.broadcast(tensor)
+        return RowUpdate(source, fresh.bool(), values, reset, *counts)
+
+    def complete(self, moments: GaussianMoments | None, stats: GaussianStats | None) -> None:
+        if not self._incomplete or moments is None:
+            return
+        self._incomplete = False
+        tensors = [moments.exp_avg, moments.exp_avg_sq, moments.exp_avg_shN, moments.exp_avg_sq_shN, moments.steps]
+        tensors += [] if stats is None else list(vars(stats).values())
+        self._gather_rows(tensors, self.rows(len(moments))).arrive()
+        before = int(self._skipped)
+        skipped = self.ranks.gather_numbers([int(moments.skipped) - before])
+        moments.skipped.fill_(before + sum(own for (own,) in skipped))
+
+    def finish(self) -> None:
+        if self._arriving is not None:
+            self._arriving.arrive()
+            self._arriving = None
+
+    def _gather_rows(self, tensors: Sequence[Tensor], rows: Sequence[slice]) -> _Arriving:
+        """Begin to overwrite all rows by their owners'. Tensors: [N, ...] contiguous, of four bytes an element."""
+        count = rows[-1].stop
+        flat = [value.view(torch.float32).view(count, -1) for value in tensors if value.numel()]
+        widths = [value.shape[1] for value in flat]
+        own = rows[self.ranks.rank]
+        sent = flat[0].new_empty((rows[0].stop - rows[0].start) * sum(widths))
+        torch.cat([value[own].flatten() for value in flat], out=sent[: (own.stop - own.start) * sum(widths)])
+        gathered, wait = self.ranks.begin_gather(sent)
+        targets, sources = [], []
+        for rank, part in enumerate(rows):
+            if rank == self.ranks.rank or part.start == part.stop:
+                continue
+            ends = (part.stop - part.start) * np.cumsum([0, *widths])
+            for value, first, end in zip(flat, ends[:-1].tolist(), ends[1:].tolist(), strict=True):
+                targets.append(value[part].view(-1))
+                sources.append(gathered[rank, first:end])
+        return _Arriving(wait, targets, sources, sent)
+
+    def compare(self, state: Callable[[], dict[str, Any]], iteration: int) -> None:
+        plain = {name: value for name, value in state().items() if isinstance(value, (Tensor, int, float))}
+        plain = {
+            name: torch.tensor(value, dtype=torch.float64) if isinstance(value, float) else torch.as_tensor(value)
+            for name, value in plain.items()
+        }
+        digests = self.ranks.gather_numbers([digest(value) for value in plain.values()])
+        for name, *values in zip(plain, *digests, strict=True):
+            others = [rank for rank, value in enumerate(values) if value != values[0]]
+            if others:
+                raise TrainingStopped(
+                    f"iteration {iteration}: {name} of rank {others[0]} differs from that of rank 0, though all make "
+                    "the same steps; do the GPUs and their software differ, or is one broken?"
+                )
+
+
+@dataclass
+class _Batch:
+    """What a step renders: all K views; and which of them belong to each process."""
+
+    engine: Engine
+    gaussians: Gaussians
+    cameras: Cameras
+    samples: PixelSamples
+    options: RenderOptions
+    shares: list[Share]
+
+    def screen_gradients(self, gaussians: Gaussians, plain: ScreenRecords) -> ScreenGradients:
+        return self.engine.screen_gradients(gaussians, self.cameras, self.samples, self.options, plain)
+
+
+@dataclass
+class SharedRendered:
+    """One forward pass of several processes.
+
+    Args:
+        colors: [P, 3], of all samples.
+    """
+
+    colors: Tensor
+    _exchange: RankExchange
+    _batch: _Batch
+    _rendered: Rendered | None
+
+    def backward(
+        self, color_gradients: Tensor, pixel_errors: Tensor | None = None, *, with_statistics: bool = False
+    ) -> SharedScreen:
+        """Back-propagate this process's views to the screen. Arguments: of all samples, as in `Rendered.backward`."""
+        plain = None
+        if self._rendered is not None:
+            slots = self._batch.shares[self._exchange.ranks.rank].slots
+            errors = None if pixel_errors is None else pixel_errors[slots]
+            screen = self._rendered.backward(color_gradients[slots], errors, with_statistics=with_statistics)
+            plain = screen.plain()
+        return SharedScreen(self._exchange, self._batch, plain, with_statistics)
+
+
+@dataclass
+class SharedScreen:
+    """Gradients on the screen, each view's on the process that rendered it."""
+
+    _exchange: RankExchange
+    _batch: _Batch
+    _plain: ScreenRecords | None
+    _with_statistics: bool
+
+    def parameter_gradients(self, rows: bool, stats: GaussianStats | None = None) -> GaussianGradients:
+        """`ScreenGradients.parameter_gradients`, of all views and Gaussians, on every process."""
+        return self.whole().parameter_gradients(rows, stats)
+
+    def whole(self) -> ScreenGradients:
+        """Of all views and Gaussians."""
+        gaussians = self._batch.gaussians
+        return self.of_rows([slice(0, len(gaussians))] * self._exchange.ranks.count, gaussians)
+
+    def of_rows(self, rows: Sequence[slice], own: Gaussians) -> ScreenGradients:
+        """Of all views, for some rows.
+
+        Args:
+            rows: those that each process wants.
+            own: the Gaussians of this process's rows.
+        """
+        ranks, device, shares = self._exchange.ranks, own.device, self._batch.shares
+        mine, count = rows[ranks.rank], len(self._batch.samples.view_ids)
+        records = torch.empty(count, mine.stop - mine.start, ScreenRecord.SIZE, device=device)
+        radii = torch.empty(count, mine.stop - mine.start, 2, dtype=torch.int32, device=device)
+        sent: list[tuple[int, Tensor]] = []
+        received: list[tuple[int, Tensor]] = []
+        continued: list[tuple[int, Tensor]] = []  # (view, records of a later share), to be added in this order
+        for rank, share in enumerate(shares):
+            if share.continues:
+                continued.append((share.views.start, torch.empty_like(records[0])))
+            if rank != ranks.rank:
+                received += [(rank, records[share.begun]), (rank, radii[share.begun])]
+                received += [(rank, continued[-1][1])] if share.continues else []
+        if self._plain is not None:
+            share, plain = shares[ranks.rank], self._plain
+            first = int(share.continues)
+            for rank, part in enumerate(rows):
+                if rank != ranks.rank:
+                    pieces = [plain.records[first:, part], plain.radii[first:, part], plain.records[:first, part]]
+                    sent += [(rank, piece.contiguous()) for piece in pieces]
+            records[share.begun], radii[share.begun] = plain.records[first:, mine], plain.radii[first:, mine]
+            if share.continues:
+                place = sum(other.continues for other in shares[: ranks.rank])
+                continued[place][1].copy_(plain.records[0, mine])
+        ranks.send_and_receive(sent, received)
+        for view, later in continued:
+            records[view] += later
+        return self._batch.screen_gradients(own, ScreenRecords(records, radii, self._with_statistics))
+
+
+@dataclass
+class _Arriving:
+    """Rows on their way from their owners. The tensors are kept alive until then."""
+
+    _wait: Callable[[], None]
+    _targets: list[Tensor]
+    _sources: list[Tensor]
+    _sent: Tensor
+
+    def arrive(self) -> None:
+        """What is enqueued next comes after them."""
+        self._wait()
+        if self._targets:
+            torch._foreach_copy_(self._targets, self._sources)
+
+
+@dataclass
+class _Flags:
+    """Flags of a pass on their way to the host: iterations do nothing for lack of memory; a signal to stop."""
+
+    number: int
+    values: Tensor
+    event: torch.cuda.Event | None
+
+    @classmethod
+    def sent(cls, number: int, flags: Tensor) -> _Flags:
+        """`flags`: [3] on the device."""
+        if not flags.is_cuda:
+            return cls(number, flags, None)
+        values = torch.empty(flags.shape, pin_memory=True)
+        values.copy_(flags, non_blocking=True)
+        event = torch.cuda.Event()
+        event.record()
+        return cls(number, values, event)
+
+    def read(self) -> tuple[bool, int]:
+        """Waits until they have arrived."""
+        if self.event is not None:
+            self.event.synchronize()
+        overflow, stop, _ = self.values.tolist()
+        return overflow != 0, int(stop)
