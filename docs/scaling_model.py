@@ -18,9 +18,13 @@ COPY = 4.3e12
 LATENCY = 0.03
 """Milliseconds of a small exchange."""
 
-RECORD, COLOR, PARAMETERS, MOMENTS, INSTANCE = 72, 12, 236, 480, 56
-"""Bytes: record with radii; colour of a sample; parameters of a Gaussian; its moments and statistics; a splat."""
+RECORD, COLOR, PARAMETERS, MOMENTS, PASS = 72, 12, 236, 504, 213
+"""Bytes: record with radii; colour of a sample; parameters of a Gaussian; its moments and statistics; and what a pass
+holds of a Gaussian in a view, records and intersections among it (measured, turbogs_plugin/plan/memory.py)."""
 
+
+DRAW = 0.35
+"""Share of the draw in what every process does: parameters travel meanwhile."""
 
 PROJECTION = 0.15
 """Share of the projection in forward and backward pass: it takes as long for a part of a view as for all of it."""
@@ -54,7 +58,8 @@ class Case:
         records = RECORD * self.gaussians * views * (others if owners else count - 1)
         parameters = PARAMETERS * self.gaussians * others if owners else 0.0
         packed = 2 * (RECORD * self.gaussians * views + 2 * parameters)  # own records are copied, others' are packed
-        exchange = 1e3 * ((colors + records + parameters) / BANDWIDTH + packed / COPY) + LATENCY * (4 if owners else 3)
+        exchange = 1e3 * ((colors + records) / BANDWIDTH + packed / COPY) + LATENCY * (4 if owners else 3)
+        exchange += max(0.0, 1e3 * parameters / BANDWIDTH - DRAW * self.whole)
         passes = self.shared * ((1 - PROJECTION) / count + PROJECTION * views / self.views)
         return self.whole + passes + self.solve / (count if owners else 1) + exchange
 
@@ -69,11 +74,10 @@ class Case:
         return replace(self, gaussians=gaussians, shared=self.shared * (0.5 + 0.5 * factor), solve=self.solve * factor)
 
     def gigabytes(self, count: int) -> float:
-        """Of a GPU: model, moments and statistics, and what passes hold."""
+        """Of a GPU: model, moments and statistics, twice as at an event of density control; passes and exchange."""
         views = self.views_of(count)
-        passes = (RECORD + INSTANCE) * views + (0 if count == 1 else RECORD * (views + self.views / count))
-        gathered = 0 if count == 1 else PARAMETERS
-        return self.gaussians * (PARAMETERS + MOMENTS + gathered + passes) / 1e9
+        exchanged = 0.0 if count == 1 else RECORD * (views * (count - 1) + self.views) / count + PARAMETERS
+        return self.gaussians * (2 * (PARAMETERS + MOMENTS) + PASS * views + exchanged) / 1e9
 
 
 MEASURED = {
