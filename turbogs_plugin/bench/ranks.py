@@ -32,8 +32,8 @@ from turbogs_plugin.train.trainer import Trainer
 from turbogs_plugin.types import Gaussians
 
 PARTS = ("draw", "arrival", "render", "colors", "loss", "backward", "records", "solve", "parameters")
-"""Parts of an iteration. `colors` and `records` are exchanges, with the wait for the slowest process. `parameters` packs
-those of the process, which travel in the next draw; `arrival` is what is left of their way, with the copies."""
+"""Parts of an iteration. `colors` and `records` are exchanges, with the wait for the slowest process. `parameters`
+packs those of the process, which travel in the next draw; `arrival` is what is left of their way, with the copies."""
 
 
 @dataclass
