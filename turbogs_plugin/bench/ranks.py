@@ -21,9 +21,10 @@ from turbogs_plugin.bench.clocks import Recorder, back_to_back, device_times
 from turbogs_plugin.bench.models import trained_model
 from turbogs_plugin.bench.step import StepBench, warm_trainer
 from turbogs_plugin.device import synchronize
-from turbogs_plugin.distributed.exchange import RankExchange, SharedScreen
+from turbogs_plugin.distributed.exchange import RankExchange
 from turbogs_plugin.distributed.processes import joined, start
 from turbogs_plugin.distributed.ranks import ProcessRanks, Ranks
+from turbogs_plugin.distributed.shared_pass import SharedScreen
 from turbogs_plugin.errors import TrainingStopped
 from turbogs_plugin.scene import Scene, load_scene
 from turbogs_plugin.study.cell import scene_on

@@ -157,6 +157,8 @@ def _see_own_gpu() -> None:
     if len(names) < count:
         raise InputError(f"{count} processes need as many GPUs on this machine, {len(names)} answer: start fewer")
     os.environ["CUDA_VISIBLE_DEVICES"] = names[place]
+    if torch.cuda.device_count() > 1:  # the driver had counted them already
+        torch.cuda.set_device(place)
 
 
 class _Watch:
