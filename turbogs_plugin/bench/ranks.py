@@ -24,6 +24,7 @@ from turbogs_plugin.device import synchronize
 from turbogs_plugin.distributed.exchange import RankExchange
 from turbogs_plugin.distributed.processes import joined, start
 from turbogs_plugin.distributed.ranks import ProcessRanks, Ranks
+from turbogs_plugin.distributed.rows import RowGather
 from turbogs_plugin.distributed.shared_pass import SharedScreen
 from turbogs_plugin.errors import TrainingStopped
 from turbogs_plugin.scene import Scene, load_scene
@@ -137,8 +138,8 @@ class RanksBench:
             (engine, "update", "solve"),
         ]
         if isinstance(exchange, RankExchange):
-            places += [(exchange, "_gather_colors", "colors"), (exchange, "_gather_rows", "parameters")]
-            places.append((exchange, "finish", "arrival"))
+            places += [(exchange, "_gather_colors", "colors"), (exchange, "finish", "arrival")]
+            places.append((RowGather, "begin", "parameters"))
         with ExitStack() as stack:
             for owner, name, part in places:
                 stack.enter_context(patch.object(owner, name, recorder.timed(part, getattr(owner, name))))

@@ -20,15 +20,15 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from turbogs_plugin.distributed.digest import digest
 from turbogs_plugin.distributed.ranks import ProcessRanks, Ranks
+from turbogs_plugin.distributed.rows import OwnedRows, RowGather, rows_of
 from turbogs_plugin.distributed.shared_pass import Batch, SharedRendered, SharedScreen
 from turbogs_plugin.distributed.shares import shares_of
 from turbogs_plugin.engine.moments import GaussianMoments
@@ -43,9 +43,6 @@ from turbogs_plugin.types import (
     PixelSamples,
     RowUpdate,
 )
-
-ROW_STEP = 4
-"""Runs of rows begin at a multiple of this, so that every parameter of them is aligned to 16 bytes."""
 
 LAG = 4
 """After so many iterations all processes look at the flags of an iteration, and wait for them if need be: so all know
@@ -137,13 +134,9 @@ class RankExchange(Exchange):
         self._passes = 0
         self._flags: deque[_Flags] = deque()
         self._incomplete = False
-        self._arriving: _Arriving | None = None
+        self._owned: OwnedRows | None = None
+        self._buffers: list[tuple[Tensor, torch.cuda.Event]] = []  # for flags
         self._skipped: Tensor | None = None  # [] of all processes, when last complete
-
-    def rows(self, count: int) -> list[slice]:
-        """The rows that each process owns of a model of `count` Gaussians."""
-        size = -(-count // (self.ranks.count * ROW_STEP)) * ROW_STEP
-        return [slice(min(count, rank * size), min(count, (rank + 1) * size)) for rank in range(self.ranks.count)]
 
     def render(
         self, engine: Engine, gaussians: Gaussians, cameras: Cameras, samples: PixelSamples, options: RenderOptions
@@ -173,10 +166,21 @@ class RankExchange(Exchange):
         flags = gathered[:, most].amax(dim=0)  # [3]
         if engine.overflow is not None:
             engine.overflow.copy_(flags[:1])
-        self._flags.append(_Flags.sent(self._passes, flags))
+        self._flags.append(self._sent_flags(flags))
         self._passes += 1
         self.ranks.latest = time.monotonic()
         return torch.cat([colors[:count] for colors, count in zip(gathered, counts, strict=True)])
+
+    def _sent_flags(self, flags: Tensor) -> _Flags:
+        """`flags` [3] of this pass, on their way to the host."""
+        if not flags.is_cuda:
+            return _Flags(self._passes, flags, None)
+        if not self._buffers:  # more than are ever under way
+            self._buffers = [(torch.empty(3, pin_memory=True), torch.cuda.Event()) for _ in range(2 * LAG)]
+        values, event = self._buffers[self._passes % len(self._buffers)]
+        values.copy_(flags, non_blocking=True)
+        event.record()
+        return _Flags(self._passes, values, event)
 
     def settle(self, engine: Engine, wait: bool = False) -> int:
         while self._flags and (wait or self._flags[0].number <= self._passes - LAG):
@@ -203,16 +207,13 @@ class RankExchange(Exchange):
             return
         if not self._incomplete:
             self._incomplete, self._skipped = True, moments.skipped.clone()
-        rows = self.rows(len(gaussians))
-        own = rows[self.ranks.rank]
-        part = gaussians.map(lambda value: value[own])
-        piece = screen.of_rows(rows, part)
-        if len(part):
-            parts = {each.name: getattr(moments, each.name) for each in fields(moments)}
-            parts = {name: value[own] if value.dim() else value for name, value in parts.items()}
-            own_stats = None if stats is None else stats.map(lambda value: value[own])
-            engine.update(rule, piece, part, replace(moments, **parts), own_stats)
-        self._arriving = self._gather_rows([value for _, value in gaussians.items()], rows)
+        if self._owned is None or not self._owned.fits(gaussians, moments, stats):
+            self._owned = OwnedRows(self.ranks, gaussians, moments, stats)
+        owned = self._owned
+        own_screen = screen.of_rows(owned.rows, owned.gaussians)
+        if len(owned.gaussians):
+            engine.update(rule, own_screen, owned.gaussians, owned.moments, owned.stats)
+        owned.parameters.begin()
 
     def initial_errors(
         self, pixels: Sequence[int], errors_of: Callable[[int], Tensor], device: torch.device
@@ -262,34 +263,16 @@ class RankExchange(Exchange):
         self._incomplete = False
         tensors = [moments.exp_avg, moments.exp_avg_sq, moments.exp_avg_shN, moments.exp_avg_sq_shN, moments.steps]
         tensors += [] if stats is None else list(vars(stats).values())
-        self._gather_rows(tensors, self.rows(len(moments))).arrive()
+        gather = RowGather(self.ranks, tensors, rows_of(len(moments), self.ranks.count))
+        gather.begin()
+        gather.finish()
         before = int(self._skipped)
         skipped = self.ranks.gather_numbers([int(moments.skipped) - before])
         moments.skipped.fill_(before + sum(own for (own,) in skipped))
 
     def finish(self) -> None:
-        if self._arriving is not None:
-            self._arriving.arrive()
-            self._arriving = None
-
-    def _gather_rows(self, tensors: Sequence[Tensor], rows: Sequence[slice]) -> _Arriving:
-        """Begin to overwrite all rows by their owners'. Tensors: [N, ...] contiguous, of four bytes an element."""
-        count = rows[-1].stop
-        flat = [value.view(torch.float32).view(count, -1) for value in tensors if value.numel()]
-        widths = [value.shape[1] for value in flat]
-        own = rows[self.ranks.rank]
-        sent = flat[0].new_empty((rows[0].stop - rows[0].start) * sum(widths))
-        torch.cat([value[own].flatten() for value in flat], out=sent[: (own.stop - own.start) * sum(widths)])
-        gathered, wait = self.ranks.begin_gather(sent)
-        targets, sources = [], []
-        for rank, part in enumerate(rows):
-            if rank == self.ranks.rank or part.start == part.stop:
-                continue
-            ends = (part.stop - part.start) * np.cumsum([0, *widths])
-            for value, first, end in zip(flat, ends[:-1].tolist(), ends[1:].tolist(), strict=True):
-                targets.append(value[part].view(-1))
-                sources.append(gathered[rank, first:end])
-        return _Arriving(wait, targets, sources, sent)
+        if self._owned is not None:
+            self._owned.parameters.finish()
 
     def compare(self, state: Callable[[], dict[str, Any]], iteration: int) -> None:
         plain = {name: value for name, value in state().items() if isinstance(value, (Tensor, int, float))}
@@ -308,39 +291,12 @@ class RankExchange(Exchange):
 
 
 @dataclass
-class _Arriving:
-    """Rows on their way from their owners. The tensors are kept alive until then."""
-
-    _wait: Callable[[], None]
-    _targets: list[Tensor]
-    _sources: list[Tensor]
-    _sent: Tensor
-
-    def arrive(self) -> None:
-        """What is enqueued next comes after them."""
-        self._wait()
-        if self._targets:
-            torch._foreach_copy_(self._targets, self._sources)
-
-
-@dataclass
 class _Flags:
     """Flags of a pass on their way to the host: iterations do nothing for lack of memory; a signal to stop."""
 
     number: int
     values: Tensor
     event: torch.cuda.Event | None
-
-    @classmethod
-    def sent(cls, number: int, flags: Tensor) -> _Flags:
-        """`flags`: [3] on the device."""
-        if not flags.is_cuda:
-            return cls(number, flags, None)
-        values = torch.empty(flags.shape, pin_memory=True)
-        values.copy_(flags, non_blocking=True)
-        event = torch.cuda.Event()
-        event.record()
-        return cls(number, values, event)
 
     def read(self) -> tuple[bool, int]:
         """Waits until they have arrived."""

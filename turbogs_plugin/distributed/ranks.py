@@ -119,17 +119,19 @@ class ProcessRanks(Ranks):
     @_answered
     def gather(self, tensor: Tensor) -> Tensor:
         """[count, ...]: the tensors of all processes, of one shape, rank after rank."""
-        gathered, wait = self.begin_gather(tensor)
-        wait()
+        gathered = tensor.new_empty(self.count, *tensor.shape)
+        self._all_gather(gathered.flatten(0, 1), tensor)
         return gathered
 
     @_answered
-    def begin_gather(self, tensor: Tensor) -> tuple[Tensor, Callable[[], None]]:
-        """Like `gather`, beside other work: the result, and what to call before it is used. `tensor` must live and stay
-        until then."""
-        gathered = tensor.new_empty(self.count * len(tensor), *tensor.shape[1:])
-        work = self._all_gather(gathered, tensor, async_op=True)
-        return gathered.view(self.count, *tensor.shape), lambda: self._wait(work)
+    def begin_gather(self, tensor: Tensor, gathered: Tensor) -> Callable[[], None]:
+        """Like `gather` into `gathered` [count, ...], beside other work.
+
+        Returns:
+            What to call before it is used. Both tensors must live until then, and stay as they are.
+        """
+        work = self._all_gather(gathered.flatten(0, 1), tensor, async_op=True)
+        return lambda: self._wait(work)
 
     @_answered
     def _wait(self, work: Any) -> None:

@@ -7,7 +7,9 @@ have a part of the view. So three views keep two processes equally busy, and one
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -43,7 +45,19 @@ class Share:
 
 def shares_of(samples: PixelSamples, count: int) -> list[Share]:
     """The shares of `count` processes; one without samples has no views."""
-    view_ends, slot_ends = samples.ends()
+    if samples.host_ends is None:
+        return _cut(*samples.ends(), count)
+    return _known(samples.host_ends, count)
+
+
+@lru_cache(maxsize=256)
+def _known(ends: Callable[[], tuple[np.ndarray, np.ndarray]], count: int) -> list[Share]:
+    """Kept, as the draws of most iterations have the same sizes."""
+    return _cut(*ends(), count)
+
+
+def _cut(view_ends: np.ndarray, slot_ends: np.ndarray, count: int) -> list[Share]:
+    """The shares of samples whose views end at these tiles, and whose tiles at these slots."""
     slots = np.concatenate([[0], slot_ends])  # [T + 1]
     views = np.concatenate([[0], view_ends])  # [K + 1]
     even = slots[-1] / count

@@ -9,7 +9,8 @@ torch's current stream and does not wait. Tensors must be contiguous. A wrong de
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import lru_cache, partial
+from dataclasses import dataclass
+from functools import lru_cache
 from itertools import accumulate
 
 import numpy as np
@@ -80,17 +81,29 @@ def sample_pixels(rule: DrawRule, maps: ErrorMaps, view_ids: tuple[int, ...], ra
         draw.tile_offsets,
         weights,
         has_empty_slots=rule.unit != "pixel",
-        host_ends=partial(_ends, rule.unit, tuple(map(tuple, shapes)), tuple(wanted)),
+        host_ends=DrawEnds(rule.unit, tuple(map(tuple, shapes)), tuple(wanted)),
     )
 
 
-@lru_cache(maxsize=64)
-def _ends(unit: str, sizes: tuple[tuple[int, int], ...], wanted: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """`PixelSamples.host_ends` of a draw of so many units, of each view's tiles or of each tile."""
-    if unit == "tile":
-        return np.cumsum(wanted), np.cumsum(np.full(sum(wanted), TILE_PIXELS))
-    array = np.array(sizes, dtype=np.int64)
-    return TileGrid(array).offsets[1:], np.cumsum(slots_of_tiles(unit, wanted[0], *tile_extents(array)))
+@dataclass(frozen=True)
+class DrawEnds:
+    """`PixelSamples.host_ends` of a draw. Equal draws have equal ones.
+
+    Args:
+        unit: of the draw.
+        sizes: K times (width, height).
+        wanted: K times the units drawn of a view's tiles, or of each of its tiles.
+    """
+
+    unit: str
+    sizes: tuple[tuple[int, int], ...]
+    wanted: tuple[int, ...]
+
+    def __call__(self) -> tuple[np.ndarray, np.ndarray]:
+        if self.unit == "tile":
+            return np.cumsum(self.wanted), np.cumsum(np.full(sum(self.wanted), TILE_PIXELS))
+        sizes = np.array(self.sizes, dtype=np.int64)
+        return TileGrid(sizes).offsets[1:], np.cumsum(slots_of_tiles(self.unit, self.wanted[0], *tile_extents(sizes)))
 
 
 @lru_cache(maxsize=4096)
