@@ -261,6 +261,8 @@ class RankExchange(Exchange):
         if not self._incomplete or moments is None:
             return
         self._incomplete = False
+        self.finish()
+        self._owned = None  # an event makes new tensors, beside which the old ones have no room
         tensors = [moments.exp_avg, moments.exp_avg_sq, moments.exp_avg_shN, moments.exp_avg_sq_shN, moments.steps]
         tensors += [] if stats is None else list(vars(stats).values())
         gather = RowGather(self.ranks, tensors, rows_of(len(moments), self.ranks.count))
