@@ -14,9 +14,10 @@ import socket
 import sys
 import threading
 import time
+import traceback
 import uuid
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from datetime import timedelta
 
 import torch
@@ -114,7 +115,8 @@ def joined(device: str) -> Iterator[Ranks]:
     on_gpu = device != "cpu" and torch.cuda.device_count() > 0
     if on_gpu:
         _see_own_gpu()
-    os.environ.setdefault("GLOO_SOCKET_IFNAME", "lo") if _on_one_machine() else None
+    if sys.platform == "linux" and os.environ.get("LOCAL_WORLD_SIZE") == os.environ.get("WORLD_SIZE"):
+        os.environ.setdefault("GLOO_SOCKET_IFNAME", "lo")  # on one machine, whatever its name resolves to
     try:
         store, rank, count = next(distributed.rendezvous("env://", timeout=TIMEOUT))
         # Processes that are started again may find the store as the earlier ones left it.
@@ -136,17 +138,19 @@ def joined(device: str) -> Iterator[Ranks]:
     try:
         yield ranks
         watch.end()
-        distributed.destroy_process_group()
+        with suppress(RuntimeError):  # all is done, whoever has gone already
+            distributed.destroy_process_group()
     except (InputError, TrainingStopped, OSError) as error:
         # At once: taking the group down could wait for processes that wait for this one.
         if speaks():
             print(f"turbogs: error: {' '.join(str(error).split())}", file=sys.stderr, flush=True)
         sys.stdout.flush()
         os._exit(2 if isinstance(error, (InputError, OSError)) else 1)
-
-
-def _on_one_machine() -> bool:
-    return os.environ.get("LOCAL_WORLD_SIZE") == os.environ.get("WORLD_SIZE")
+    except KeyboardInterrupt:
+        os._exit(128 + signal.SIGINT)
+    except Exception:  # a fault of the program
+        traceback.print_exc()
+        os._exit(1)
 
 
 def _see_own_gpu() -> None:

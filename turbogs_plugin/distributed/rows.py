@@ -86,10 +86,8 @@ class OwnedRows:
         self.rows = rows_of(len(gaussians), ranks.count)
         own = self.rows[ranks.rank]
         self.gaussians = gaussians.map(lambda value: value[own])
-        states = {each.name: getattr(moments, each.name) for each in fields(moments)}
-        self.moments = replace(
-            moments, **{name: value[own] if value.dim() else value for name, value in states.items()}
-        )
+        states = ((each.name, getattr(moments, each.name)) for each in fields(moments))
+        self.moments = replace(moments, **{name: value[own] if value.dim() else value for name, value in states})
         self.stats = None if stats is None else stats.map(lambda value: value[own])
         self.parameters = RowGather(ranks, [value for _, value in gaussians.items()], self.rows)
 
