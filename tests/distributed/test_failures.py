@@ -18,7 +18,6 @@ from helpers.processes import ended, said, start_ranks
 
 from turbogs_plugin.distributed import processes as distributed_processes
 from turbogs_plugin.distributed.processes import joined
-from turbogs_plugin.errors import TrainingStopped
 from turbogs_plugin.train import checkpoint, run
 from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint
 from turbogs_plugin.train.history import read_history
@@ -222,8 +221,25 @@ def test_torchrun_starts_a_lost_run_again_from_its_checkpoint(capture, tmp_path)
     assert "TrainingStopped" not in (tmp_path / "err").read_text()
 
 
+def test_the_command_starts_processes_itself(capture, tmp_path, turbogs):
+    settings = ("train.iterations=3", "train.refine_until=2", "train.evaluate_at=[]")
+    folder = tmp_path / "run"
+    code, _, told = turbogs("train", capture, *settings, "--out", folder, "--gpus", 2, "--device", "cpu", "--no-report")
+    assert code == 0, told
+    assert load_checkpoint(latest_checkpoint(folder / "checkpoints"))["trainer"]["iteration"] == 3
+    code, _, told = turbogs("train", tmp_path / "absent", "--out", tmp_path / "no", "--gpus", 2, "--device", "cpu")
+    assert code == 2 and not (tmp_path / "no").exists()
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there may be enough")
+def test_more_gpus_than_there_are_is_one_line(capture, tmp_path, turbogs):
+    code, _, told = turbogs("train", capture, "--out", tmp_path / "run", "--gpus", 3)
+    assert code == 2 and told.count("\n") == 1 and "--gpus 3: no GPU answers here" in told
+    code, _, told = turbogs("train", capture, "--out", tmp_path / "run", "--gpus", 0)
+    assert code == 2 and "--gpus 0" in told
+
+
 def test_a_process_alone_exchanges_nothing(capture):
     with joined("cpu") as ranks:
         assert ranks.count == 1 and ranks.first and ranks.agree("x") == "x" and not ranks.ask_to_stop(15)
     assert not torch.distributed.is_initialized()
-    assert TrainingStopped  # joined raises it where it was started with others

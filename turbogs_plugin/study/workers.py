@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import multiprocessing
 import os
 import signal
@@ -20,6 +21,13 @@ from turbogs_plugin.study.sweep import SweepOptions, run_sweep
 
 UNFINISHED = 3
 """Exit code of a worker that `--within` ended."""
+
+
+class _Lines(io.TextIOWrapper):
+    """A stream without bars: those of several workers would overwrite each other on a terminal."""
+
+    def isatty(self) -> bool:
+        return False
 
 
 def run_on_gpus(
@@ -79,6 +87,8 @@ def _work(gpu: int, place: int, arguments: tuple) -> None:
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     visible = [name for name in os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",") if name]
     os.environ["CUDA_VISIBLE_DEVICES"] = visible[gpu] if gpu < len(visible) else str(gpu)
+
+    sys.stderr = _Lines(os.fdopen(os.dup(2), "wb", 0), write_through=True)
 
     def swept() -> int:
         try:
