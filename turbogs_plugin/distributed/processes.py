@@ -25,8 +25,12 @@ import torch
 from turbogs_plugin.distributed.ranks import ONE, ProcessRanks, RankLost, Ranks
 from turbogs_plugin.errors import InputError, TrainingStopped
 
-TIMEOUT = timedelta(minutes=30)
-"""The longest that processes wait for each other, as while the first one evaluates and saves."""
+TIMEOUT = timedelta(hours=6)
+"""The longest that processes wait for each other, as while the first one finds cameras, evaluates or saves. A process
+that ends is noticed at once."""
+
+MEETING = timedelta(minutes=5)
+"""The longest that processes wait for others to be started."""
 
 GRACE_SECONDS = 15.0
 """A process that was asked to end and makes no iteration for so long is ended: another one is lost."""
@@ -118,7 +122,7 @@ def joined(device: str) -> Iterator[Ranks]:
     if sys.platform == "linux" and os.environ.get("LOCAL_WORLD_SIZE") == os.environ.get("WORLD_SIZE"):
         os.environ.setdefault("GLOO_SOCKET_IFNAME", "lo")  # on one machine, whatever its name resolves to
     try:
-        store, rank, count = next(distributed.rendezvous("env://", timeout=TIMEOUT))
+        store, rank, count = next(distributed.rendezvous("env://", timeout=MEETING))
         # Processes that are started again may find the store as the earlier ones left it.
         store = distributed.PrefixStore(f"turbogs-{os.environ.get('TORCHELASTIC_RESTART_COUNT', '0')}", store)
         distributed.init_process_group(

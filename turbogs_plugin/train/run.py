@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -185,10 +185,10 @@ def train(
     _require_start(config)
     if config.train.device == "cuda":
         resolve_device("cuda")  # before photos are read for nothing
-    posed = with_cameras(config, out)
-    if posed is not config:
+    posed = ranks.agree(with_cameras(config, out).scene.path if ranks.first else None)
+    if posed != config.scene.path:
         clock.mark(CAMERAS)
-    config = posed
+        config = replace(config, scene=replace(config.scene, path=posed))
     with starting(lambda: resolve_device(config.train.device)) as started:
         scene = open_scene(config)
         clock.mark(PHOTOS)
