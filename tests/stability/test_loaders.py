@@ -81,7 +81,7 @@ def hostile_leaf(value, choice: random.Random):
 def test_checkpoints_with_other_values(finished, tmp_path, monkeypatch):
     """Every value of the state in turn replaced by another or left out: no model is given out that is not whole and
     finite, and a run goes on by a step or refuses."""
-    monkeypatch.setattr(run.RunSession, "run", lambda session, report: session.trainer.step())
+    monkeypatch.setattr(run.RunSession, "run", lambda session, *_: session.trainer.step())
     config = run.RunFolder(finished).read_config()
     monkeypatch.setattr(run.RunFolder, "read_config", lambda folder: copy.deepcopy(config))
     scene = load_scene(config.scene.path)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from turbogs_plugin.engine.moments import GaussianMoments
 from turbogs_plugin.engine.reference.update import apply_update
-from turbogs_plugin.engine.rendered import DEFAULT_OPTIONS, Rendered, RenderOptions, ScreenGradients
+from turbogs_plugin.engine.rendered import DEFAULT_OPTIONS, Rendered, RenderOptions, ScreenGradients, ScreenRecords
 from turbogs_plugin.engine.rules import DrawRule, LossTerms, UpdateRule
 from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.scene.photos import PhotoSamples
@@ -68,6 +68,23 @@ class Engine(ABC):
         """
 
     @abstractmethod
+    def screen_gradients(
+        self,
+        gaussians: Gaussians,
+        cameras: Cameras,
+        samples: PixelSamples,
+        options: RenderOptions,
+        plain: ScreenRecords,
+    ) -> ScreenGradients:
+        """Screen gradients of K views from plain tensors, which several passes of engines of this kind gave.
+
+        Args:
+            gaussians: N of those that were rendered, as they were then: all, or rows of them.
+            cameras, samples, options: of all K views, as the passes had them together.
+            plain: of these views and Gaussians.
+        """
+
+    @abstractmethod
     def evaluate(self, terms: LossTerms, colors: Tensor, targets: Tensor, samples: PixelSamples) -> LossOutput:
         """The loss of rendered samples and its gradient. `colors`, `targets`: [P, 3]."""
 
@@ -121,6 +138,11 @@ class Engine(ABC):
             InputError: an iteration has more intersections of a tile and a splat than a pass can have.
         """
         return 0
+
+    @abstractmethod
+    def recover(self) -> None:
+        """Make ready to repeat iterations that did nothing because another process said so: waits for the device,
+        takes in what it learned of the memory needed, and clears `overflow`."""
 
     @property
     def bytes_held(self) -> int:
