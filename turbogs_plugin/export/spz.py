@@ -57,9 +57,8 @@ def packed(gaussians: Gaussians) -> bytes:
     fixed = np.rint(values["means"] * [1.0, -1.0, -1.0] * 2.0**bits).astype("<i4")  # [N, 3]
     opacities = 1.0 / (1.0 + np.exp(-values["opacities"]))
     harmonics = values["shN"] * _flips(gaussians.sh_degree)[:, None]  # [N, B, 3]
-    steps = np.array([2 ** (8 - SH_BITS[band >= 3]) for band in range(harmonics.shape[1])], dtype=np.int64)
-    coded = np.rint(harmonics * 128.0).clip(-512, 512).astype(np.int64) + 128
-    coded = (coded + steps[:, None] // 2) // steps[:, None] * steps[:, None]
+    steps = np.array([2.0 ** (8 - SH_BITS[band >= 3]) for band in range(harmonics.shape[1])])[:, None]
+    coded = np.rint(harmonics * 128.0 / steps) * steps + 128.0  # 0 is among the steps
     parts = [
         HEADER.pack(MAGIC, VERSION, len(gaussians), gaussians.sh_degree, bits, 0, 0),
         fixed.view(np.uint8).reshape(-1, 3, 4)[:, :, :3].tobytes(),
@@ -83,7 +82,7 @@ def read_spz(path: Path) -> Gaussians:
         content = unpacker.decompress(path.read_bytes(), MOST_BYTES)
     except (OSError, zlib.error) as error:
         raise InputError(f"cannot read {path} as .spz: {error}; export it again") from None
-    if len(content) < HEADER.size:
+    if not unpacker.eof or len(content) < HEADER.size:
         raise InputError(f"{path} is not a whole .spz: export it again")
     magic, version, count, degree, bits, _, _ = HEADER.unpack_from(content)
     if magic != MAGIC or version not in (2, 3) or degree > 3:
