@@ -198,6 +198,13 @@ def test_the_core_changes_no_package_of_a_host(host, project):
         assert name not in core or core[name].marker is None
 
 
+def test_the_extra_for_films_is_the_one_that_its_message_names(project):
+    from turbogs_plugin.export.film import INSTALL
+
+    assert set(requirements(project["optional-dependencies"]["video"])) == {"imageio-ffmpeg"}
+    assert f'"{project["name"]}[video]"' in INSTALL
+
+
 def test_what_the_core_refuses(project):
     core = requirements(project["dependencies"])
     for name, version in (("gsplat", "1.3.0"), ("gsplat", "2.0.0"), ("torch", "2.0.1")):
