@@ -99,7 +99,7 @@ def write_page(model: SavedModel, shown: Gaussians, scene: Scene, path: Path) ->
         blocks = {
             "summary": _summary(model, scene, fidelity, history),
             "cost": _cost(len(model.gaussians), packed, change),
-            "scene": json.dumps(_scene(model, scene, packed)).replace("</", "<\\/"),
+            "scene": json.dumps(_scene(model, scene, packed)).replace("<", "\\u003c"),
             "model": base64.b64encode(packed.planes).decode("ascii"),
         }
         return Template(_web("page.html")).substitute({**parts, **blocks})
