@@ -83,6 +83,8 @@ def start(count: int, arguments: Sequence[str], device: str = "auto", module: st
         monitor_interval=0.1,
         local_addr="localhost",
     )
+    asked = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
+    before = {number: signal.getsignal(number) for number in asked}  # the launcher sets its own, and leaves them
     try:
         elastic_launch(config, sys.executable)("-m", module, *arguments)
     except ChildFailedError as error:
@@ -95,6 +97,9 @@ def start(count: int, arguments: Sequence[str], device: str = "auto", module: st
         return failure.exitcode if failure.exitcode > 0 else 1
     except SignalException as stopped:
         return 128 + stopped.sigval
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
     return 0
 
 
