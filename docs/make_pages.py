@@ -15,7 +15,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
+import machine_tables
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
 
@@ -193,28 +193,10 @@ def picture_digest() -> str:
     return hashlib.sha256(json.dumps([DRAWING, picture_data()]).encode()).hexdigest()[:16]
 
 
-def house() -> dict[str, Any]:
-    return json.loads((ROOT / "docs/results/h200/house.json").read_text())
-
-
-def house_iterations() -> str:
-    """Milliseconds of an iteration before and after the restructuring, and ratios of the pairs."""
-    lines = []
-    for commit, points in house()["iterations"].items():
-        for point, clocks in points.items():
-            base, new = (statistics.median(clocks["free_running"][build]) for build in ("base", "new"))
-            ratios = []
-            for clock in ("free_running", "wall"):
-                pairs = [after / before for before, after in zip(*clocks[clock].values(), strict=True)]
-                ratios.append(f"{statistics.median(pairs):.3f} [{min(pairs):.3f}, {max(pairs):.3f}]")
-            lines.append((commit, point, f"{base:.3f}", f"{new:.3f}", *ratios, len(pairs)))
-    return table(("new build", "model, views", "base", "new", "ratio, free running", "ratio, wall", "pairs"), lines)
-
-
 def house_runs() -> str:
     """Whole runs before, as measured then, and `turbogs` of the study `parts`: mean and range of five seeds."""
     found, lines = rows_of("parts"), []
-    for capture, base in house()["base_runs"].items():
+    for capture, base in machine_tables.house()["base_runs"].items():
         row = found[capture]["turbogs"]
         spreads = [row.spread(measure) for measure in ("seconds", "psnr", "ssim")]
         after = [[spread.mean, spread.low, spread.high] for spread in spreads]
@@ -228,48 +210,6 @@ def house_runs() -> str:
             ]
             lines.append((capture, build, *texts, f"{size:.0f}"))
     return table(("capture", "build", "s", "PSNR", "SSIM", "Gaussians"), lines)
-
-
-DROPIN = ROOT / "docs/results/h200/dropin.json"
-"""Runs of examples/simple_trainer/compare.py."""
-
-DROPIN_NAMES = {
-    "stock": "stock",
-    "density": "density control",
-    "errors": "the same, ranked by errors",
-    "lm": "and Moment-LM",
-    "sparse": "sparse pixels, 4 views",
-    "all": "all of them",
-}
-
-
-def psnr_at(run: dict[str, Any], seconds: float) -> float:
-    """A run's PSNR after so many seconds of training, on the straight line between its evaluations; NaN before the
-    first."""
-    times, values = ([mark[key] for mark in run["marks"]] for key in ("seconds", "psnr"))
-    return float(np.interp(seconds, times, values, left=math.nan))
-
-
-def dropin(file: Path = DROPIN) -> str:
-    """gsplat's trainer with each swap at its end, and beside stock at the earlier of both ends."""
-    if not file.exists():
-        return "Not measured yet."
-    runs = [run for run in json.loads(file.read_text())["runs"] if "error" not in run]
-    stock = {run["scene"]: run for run in runs if run["variant"] == "stock"}
-    lines = []
-    for run in runs:
-        end, equal = run["marks"][-1], ""
-        if run["variant"] != "stock" and run["scene"] in stock:
-            seconds = min(end["seconds"], stock[run["scene"]]["marks"][-1]["seconds"])
-            ours, theirs = psnr_at(run, seconds), psnr_at(stock[run["scene"]], seconds)
-            if not math.isnan(ours + theirs):
-                equal = f"{ours - theirs:+.2f} dB: {ours:.2f} for {theirs:.2f} at {seconds:.0f} s"
-        size = f"{end['gaussians'] / 1e3:.0f}k"
-        texts = (f"{end['seconds']:.1f}", f"{end['psnr']:.2f}", f"{end['ssim']:.4f}", size, equal)
-        lines.append((run["scene"], DROPIN_NAMES[run["variant"]], end["step"], *texts))
-    return table(
-        ("capture", "swap", "steps", "s", "PSNR", "SSIM", "Gaussians", "PSNR beside stock's, equal time"), lines
-    )
 
 
 # docs/paper.md
@@ -408,14 +348,15 @@ def within_bound(full: VariantRow | None, paper: VariantRow | None, end: bool) -
 
 
 TABLES: dict[str, Callable[[], str]] = {
-    "dropin": dropin,
+    "dropin": machine_tables.dropin,
     "headline": headline,
-    "house_iterations": house_iterations,
+    "house_iterations": machine_tables.house_iterations,
     "house_runs": house_runs,
     "leave_out": lambda: changes("leave_out"),
     "paper_parts": paper_parts,
     "paper_whole": paper_whole,
     "parts": lambda: changes("parts"),
+    "wall": machine_tables.wall,
 }
 
 

@@ -93,6 +93,16 @@ class DensityController(Protocol):
     def update(self, gaussians: Gaussians, step: Step) -> RowUpdate | None:
         """Propose a change of the set of Gaussians, or None. Called after every optimizer step."""
 
+    def event_due(self, step: Step) -> bool:
+        """Whether `update` looks at the model or the statistics at this iteration, or returns anything but None; on
+        every process alike.
+
+        Where several processes train one model, each adds to the statistics of its own rows, and makes the step of its
+        own rows of the model. Only at such an iteration are both complete when `update` is called. True where nothing
+        is known, which is never wrong.
+        """
+        return True
+
     def apply(self, update: RowUpdate) -> None:
         """Apply the change to the controller's own state, row by row. Called after model and optimizer have followed;
         the rows may be in another order than `update` proposed."""

@@ -53,7 +53,9 @@ def test_the_package_and_the_clock_of_the_wall_load_no_torch():
     assert "turbogs_plugin.train.wall" in loaded and not loaded & (SLOW | {"torch", "numpy"})
 
 
-@pytest.mark.parametrize("room", ["train.trainer", "train.loop", "train.run", "report.pages", "report.outputs"])
+@pytest.mark.parametrize(
+    "room", ["train.trainer", "train.loop", "train.run", "report.pages", "report.outputs", "export.commands"]
+)
 def test_training_and_its_report_load_nothing_slow_before_they_use_it(room):
     loaded = loaded_by(f"import turbogs_plugin.{room}")
     assert "torch" in loaded and not loaded & SLOW

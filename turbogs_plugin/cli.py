@@ -10,6 +10,7 @@ import re
 import sys
 import warnings
 from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -135,6 +136,7 @@ def train(
     report: bool = True,
     viewer: Annotated[int | None, arg(metavar="[PORT]")] = None,
     viewer_host: str = LOCAL,
+    gpus: Count = None,
     options: Flat = NO_OPTIONS,
 ) -> int:
     """Train on a capture, or go on with a stopped run.
@@ -149,32 +151,45 @@ def train(
         viewer: show the training in a browser, at this port (8080 where none is named); afterwards its model, until
             Ctrl-C.
         viewer_host: where the viewer listens; 0.0.0.0 lets others on the network look, and pause the training.
+        gpus: of this machine, to train one model on all of them, a process each; torchrun does the same on several
+            machines. docs/scaling.md says what they gain.
     """
-    from turbogs_plugin.report.pages import write_report
-    from turbogs_plugin.train import run
-
-    clock, page = WallClock(process_age()), write_report if report else None
+    clock = WallClock(process_age())
     if viewer is None and viewer_host != LOCAL:
         raise InputError("--viewer-host says where a viewer listens: give --viewer, too")
     if resume is not None:
         if scene or overrides or out or options != NO_OPTIONS:
             raise InputError(
-                "--resume goes on by the run's own configuration: give it nothing else but --no-report and --viewer"
+                "--resume goes on by the run's own configuration: give it nothing else but --no-report, --viewer and "
+                "--gpus"
             )
-        start = partial(run.resume, resume)
     elif scene is None or out is None:
         raise InputError("train needs a SCENE and --out RUN, or --resume RUN")
-    else:
-        start = partial(run.train, options.settings(scene, overrides), out)
-    if viewer is None:
-        return _tell(start(page, clock), report)
+    if gpus is not None:
+        _require_positive("--gpus", (gpus,))
+    from turbogs_plugin.distributed.processes import joined, launched, restarted, start
+    from turbogs_plugin.report.pages import write_report
+    from turbogs_plugin.train import run
 
-    from turbogs_plugin.viewer.commands import attached
+    settings = run.RunFolder(resume).read_config() if resume else options.settings(scene, overrides)
+    device = settings.train.device
+    if gpus is not None and gpus > 1 and not launched():
+        return start(gpus, sys.argv[1:], device)
+    page = write_report if report else None
+    with joined(device) as ranks, ExitStack() as pages:
+        if resume is None and restarted() and run.RunFolder(out).config.is_file():
+            resume = out
+        live = None
+        if viewer is not None:
+            if ranks.count > 1:
+                raise InputError("--viewer shows a training on one GPU: leave it out, or --gpus")
+            from turbogs_plugin.viewer.commands import attached
 
-    with attached(viewer, viewer_host) as live:
-        session = start(page, clock, live.watch)
-        code = _tell(session, report)
-        if session.signal is None:
+            live = pages.enter_context(attached(viewer, viewer_host))
+        begin = partial(run.resume, resume) if resume else partial(run.train, settings, out)
+        session = begin(page, clock, ranks, live and live.watch)
+        code = _tell(session, report) if ranks.first else 128 + session.signal if session.signal else 0
+        if live is not None and session.signal is None:
             live.stay()
     return code
 
@@ -262,10 +277,13 @@ def render(
     split: Literal["test", "train"] = "test",
     depth: bool = False,
     out: Annotated[Path | None, arg(metavar="FOLDER")] = None,
+    path: Annotated[str, arg(metavar="orbit|views|FILE")] = "orbit",
+    video: Annotated[Path | None, arg(metavar="FILE")] = None,
+    seconds: Annotated[float, arg(metavar="SECONDS")] = 10.0,
     device: Device = "auto",
     given: Given = NO_SCENE,
 ) -> int:
-    """Render the newest model of a run, or a model trained anywhere, from the capture's cameras, as PNGs.
+    """Render the newest model of a run, or a model trained anywhere, from the capture's cameras, as PNGs; or a film.
 
     Args:
         run: folder of the run; or with --scene the file of a model.
@@ -274,8 +292,22 @@ def render(
         depth: also write depth images: .npy (float32, along the camera's axis, in the capture's own units; 0 where
             nothing was hit) and .png (near is bright).
         out: folder for the pictures; renders in the run's folder where absent.
+        path: of a film: orbit, about what the capture shows; views, through its training cameras; or a file of cameras
+            in the layout of transforms.json.
+        video: write a film of 60 frames a second to this new file (.mp4) in the place of pictures.
+        seconds: of the film.
         device: where to render.
     """
+    if video is not None:
+        from turbogs_plugin.export.commands import film_run
+
+        if depth or out is not None or split != "test":
+            raise InputError("--video writes a film: it takes --path and --seconds, not --split, --depth or --out")
+        print(f"film   {film_run(run, path, video, seconds, device, given.settings(overrides))}")
+        return 0
+    if (path, seconds) != ("orbit", 10.0):
+        raise InputError("--path and --seconds are those of a film: give --video FILE, too")
+
     from turbogs_plugin.report.outputs import render_run
 
     folders = render_run(run, split, device, depth, given.settings(overrides), out)
@@ -290,26 +322,29 @@ def export(
     overrides: Overrides = (),
     /,
     *,
-    format: Literal["ply", "pt"] = "ply",
+    format: Annotated[str, arg(metavar="ply|pt|compressed-ply|splat|spz|html")] = "ply",
     out: Path | None = None,
     drop_bands: Annotated[float | None, arg(metavar="SHARE")] = None,
+    max_gaussians: Count = None,
     given: Given = NO_SCENE,
 ) -> int:
     """Write the newest model of a run, or a model trained anywhere, for other programs, in the capture's own
-    coordinates.
+    coordinates; read it again, and say what was lost. Or write all of a run on one page.
 
     Args:
         run: folder of the run; or with --scene the file of a model.
         overrides: with --scene, as in eval.
         format: ply: as the original 3DGS writes it, which viewers read. pt: a checkpoint of gsplat's simple_trainer,
-            which needs --no-normalize-world-space to take it.
-        out: new file; model.ply or model.pt in the run's folder where absent.
+            which needs --no-normalize-world-space to take it. compressed-ply, splat, spz: smaller, with some loss.
+            html: curves, tables, test views and the model in a viewer, in one file below 32 MB.
+        out: new file; model.ply, model.pt, ..., or report.html in the run's folder where absent.
         drop_bands: leave out the highest bands of spherical harmonics, as many as together have at most this share of
             the colours' energy, e.g. 1e-4.
+        max_gaussians: at most so many, those that add most to the training views.
     """
-    from turbogs_plugin.report.outputs import export_run
+    from turbogs_plugin.export.commands import export_run
 
-    print(f"model  {export_run(run, format, out, drop_bands, given.settings(overrides))}")
+    print(f"model  {export_run(run, format, out, drop_bands, max_gaussians, given.settings(overrides))}")
     return 0
 
 
@@ -328,9 +363,11 @@ def ablate(
     reuse: Annotated[tuple[Path, ...], arg(metavar="STUDY ...")] = (),
     merge: Annotated[tuple[Path, ...], arg(metavar="STUDY ...")] = (),
     within: Time = None,
+    gpus: Annotated[str | None, arg(metavar="0,1,...")] = None,
     device: Device = "auto",
 ) -> int:
-    """Train named variants over scenes and seeds: error against run time. The same call goes on where it stopped.
+    """Train named variants over scenes and seeds: error against run time. The same call goes on where it stopped, and
+    may be made on several machines that share the folder --out: no cell is trained twice.
 
     Args:
         names: packaged ablations (parts, components, views, ...) or .yaml files; then changes of every
@@ -345,6 +382,7 @@ def ablate(
         reuse: take cells of the same settings from these studies where machine and sources are the same.
         merge: put these studies together in --out and write the report, without training.
         within: begin no further cell after so much time: 9m. The same call then goes on; the exit code is 3.
+        gpus: numbers of GPUs, a process each, which share the cells.
         device: where to train.
     """
     from turbogs_plugin.config.units import parse_seconds
@@ -364,7 +402,7 @@ def ablate(
     if only and len(ablations) > 1:
         raise InputError("--only names variants of one ablation: give it one NAME_OR_FILE")
     limit = None if within is None else parse_seconds(within)
-    options = SweepOptions(scene, seeds, overrides, steps, device, reuse, limit)
+    options = SweepOptions(scene, seeds, overrides, steps, device, reuse, limit, _numbers("--gpus", gpus))
     return commands.ablate(ablations, options, out, only, psnr)
 
 
@@ -415,8 +453,8 @@ def report(
 @app.command
 def bench(
     what: Annotated[
-        Positional[Literal["step", "raster", "numerics", "wall", "viewer"]],
-        arg(metavar="step|raster|numerics|wall|viewer"),
+        Positional[Literal["step", "ranks", "raster", "numerics", "wall", "viewer"]],
+        arg(metavar="step|ranks|raster|numerics|wall|viewer"),
     ],
     overrides: Overrides = (),
     /,
@@ -433,20 +471,23 @@ def bench(
     photos: Annotated[int, arg(metavar="N")] = 0,
     offload: bool = False,
     library: Annotated[tuple[Path, ...], arg(metavar="FILE ...")] = (),
+    gpus: Annotated[tuple[int, ...], arg(metavar="N ...")] = (1, 2),
+    grown: bool = False,
     factor: Annotated[int, arg(metavar="N")] = 1,
     device: Device = "auto",
     out: Annotated[Path | None, arg(metavar="FILE_OR_FOLDER")] = None,
 ) -> int:
-    """Time an iteration of training step by step, the rasterizer stage by stage, beside what the machine allows, or the
-    command `turbogs train` by the clock on the wall, or a training with and without a viewer; or measure how exact and
-    how fast the optimizer's solvers are on stiff systems.
+    """Time an iteration of training step by step or on several GPUs, the rasterizer stage by stage, beside what the
+    machine allows, or the command `turbogs train` by the clock on the wall, or a training with and without a viewer; or
+    measure how exact and how fast the optimizer's solvers are on stiff systems.
 
     Args:
-        what: step: from sampling to update; raster: forward and backward, beside gsplat's dense ones; numerics: the
-            solvers of moment-damped LM, which takes --out and --device alone; wall: whole runs, which takes --scene,
-            --repeats, --factor, --device, --out and changes of the configuration; viewer: as wall, iterations a second
-            without a viewer, with one that nobody looks at, and with a client that moves.
-        overrides: step, wall, viewer: changes of the configuration that is timed.
+        what: step: from sampling to update; ranks: an iteration on several GPUs, of a --scene; raster: forward and
+            backward, beside gsplat's dense ones; numerics: the solvers of moment-damped LM, which takes --out and
+            --device alone; wall: whole runs, which takes --scene, --repeats, --factor, --device, --out and changes of
+            the configuration; viewer: as wall, iterations a second without a viewer, with one that nobody looks at, and
+            with a client that moves.
+        overrides: step, ranks, wall, viewer: changes of the configuration that is timed.
         scene: a capture, for its cameras and photos; where absent, all is synthetic, the models of raster as well.
         ply: a trained model in place of those trained here; raster: one or more, timed at their own sizes.
         gaussians: sizes of the model.
@@ -459,6 +500,8 @@ def bench(
         photos: step: number of synthetic photos, in place of a scene.
         offload: step: with photos and error maps in host memory, too.
         library: raster: other builds of the kernels, measured the same way.
+        gpus: ranks: numbers of GPUs.
+        grown: ranks: also with views and pixels times the number of GPUs.
         factor: scale photos down by this.
         device: what to time.
         out: JSON file; standard output where absent, but for wall and viewer. numerics: folder for its table, plot and
@@ -466,12 +509,14 @@ def bench(
     """
     from turbogs_plugin.bench import commands
     from turbogs_plugin.bench.models import TRAINING_ITERATIONS
+    from turbogs_plugin.bench.ranks import RanksBench
     from turbogs_plugin.bench.raster import RasterBench
     from turbogs_plugin.bench.step import StepBench
     from turbogs_plugin.train.run import resolve_device
 
     times = repeats if repeats is not None else 3 if what in ("wall", "viewer") else 100
-    for name, values in (("gaussians", gaussians), ("views", views), ("repeats", (times,)), ("size", size)):
+    counts = {"gaussians": gaussians, "views": views, "repeats": (times,), "size": size, "gpus": gpus}
+    for name, values in counts.items():
         if not values or min(values) < 1:
             raise InputError(f"--{name} {' '.join(map(str, values))}: each must be at least 1")
     _require_positive("--rates", rates, most=1.0)
@@ -496,6 +541,11 @@ def bench(
             return commands.run_viewer(options.settings(scene, overrides), times, where, out)
         arguments = [str(scene), *overrides, "--device", where.type, "--factor", str(factor)]
         return commands.run_wall(arguments, times, where, out)
+    if what == "ranks":
+        if scene is None or ply or library or photos or offload:
+            raise InputError("bench ranks needs --scene SCENE; a model, synthetic photos and offload are not for it")
+        ranks = RanksBench(gpus, gaussians, views, pixel_budget, grown, iterations, times, overrides)
+        return commands.run_ranks(ranks, scene, factor, where, out)
     if what == "step":
         if len(ply) > 1:
             raise InputError("bench step takes one --ply, at the sizes of --gaussians")
@@ -540,6 +590,14 @@ def _budget(max_memory: str | None, time_budget: str | None) -> tuple[str, ...]:
             raise InputError(f"{option} '': write an amount; leave it out for no limit")
     given = {"max_memory": max_memory, "time": time_budget}
     return tuple(f"budget.{name}={value!r}" for name, value in given.items() if value is not None)
+
+
+def _numbers(option: str, text: str | None) -> tuple[int, ...]:
+    """``0,1,2`` as numbers; none where the option is absent."""
+    words = [] if text is None else text.split(",")
+    if not all(word.strip().isdecimal() for word in words) or len({int(word) for word in words}) < len(words):
+        raise InputError(f"{option} '{text}': write different numbers with commas between them: 0,1,2")
+    return tuple(map(int, words))
 
 
 def _require_positive(option: str, values: Sequence[float], most: float = math.inf) -> None:

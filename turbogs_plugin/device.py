@@ -21,6 +21,11 @@ def free_device_memory(device: torch.device) -> None:
         torch.cuda.empty_cache()
 
 
+def memory_bytes(device: torch.device) -> int:
+    """Of the tensors on a GPU now, or the peak of this process on a CPU. Does not wait for the GPU."""
+    return torch.cuda.memory_allocated(device) if device.type == "cuda" else peak_memory_bytes(device)
+
+
 def peak_memory_bytes(device: torch.device) -> int:
     """Peak of the tensors' memory on a GPU, or of this process on a CPU."""
     if device.type == "cuda":

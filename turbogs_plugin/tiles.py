@@ -105,6 +105,7 @@ def dense_pixels(view_ids: Sequence[int], sizes: np.ndarray, device: torch.devic
         tile_ids=torch.arange(len(offsets) - 1, dtype=torch.int32, device=device),
         tile_offsets=offsets,
         has_empty_slots=False,
+        host_ends=lambda: (TileGrid(sizes).offsets[1:], np.cumsum(np.multiply(*tile_extents(sizes)))),
     )
 
 

@@ -12,7 +12,7 @@ This file imports nothing of the project but its exception, so strategies and fr
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -177,6 +177,8 @@ class PixelSamples:
         tile_offsets: [T + 1] int32, the first slot of each tile; the last entry is P.
         weights: [P] float32 importance weights with mean 1 over the filled slots, or None where all are 1.
         has_empty_slots: False promises that every slot is filled, so that none has to be counted.
+        host_ends: gives ([K], [T]) int64 numpy arrays, the end of each view's tiles (in `tile_ids`) and of each tile's
+            slots, where the host knows them without asking the device; None: it has to ask.
     """
 
     view_ids: tuple[int, ...]
@@ -186,6 +188,7 @@ class PixelSamples:
     tile_offsets: Tensor
     weights: Tensor | None = None
     has_empty_slots: bool = True
+    host_ends: Callable[[], tuple[np.ndarray, np.ndarray]] | None = None
 
     @classmethod
     def from_mask(cls, mask: Tensor, view_ids: Sequence[int] | None = None) -> PixelSamples:
@@ -276,6 +279,33 @@ class PixelSamples:
     @property
     def grid(self) -> TileGrid:
         return TileGrid(self.sizes)
+
+    def ends(self) -> tuple[np.ndarray, np.ndarray]:
+        """([K], [T]) int64: the end of each view's tiles (in `tile_ids`) and of each tile's slots. Without `host_ends`
+        the host waits for the device."""
+        if self.host_ends is not None:
+            return self.host_ends()
+        views = np.searchsorted(self.tile_ids.cpu().numpy(), self.grid.offsets[1:])
+        return views, self.tile_offsets[1:].cpu().numpy().astype(np.int64)
+
+    def of_tiles(self, tiles: slice, views: slice, slots: slice) -> PixelSamples:
+        """A run of tiles as a batch of its own, of the views that they lie in. Tensors are views of these ones.
+
+        Args:
+            tiles: positions in `tile_ids`.
+            views: positions in the batch of their views.
+            slots: of these tiles.
+        """
+        return replace(
+            self,
+            view_ids=self.view_ids[views],
+            sizes=self.sizes[views],
+            pixel_ids=self.pixel_ids[slots],
+            tile_ids=self.tile_ids[tiles] - int(self.grid.offsets[views.start]),
+            tile_offsets=self.tile_offsets[tiles.start : tiles.stop + 1] - slots.start,
+            weights=None if self.weights is None else self.weights[slots],
+            host_ends=None,
+        )
 
     @property
     def filled(self) -> Tensor:

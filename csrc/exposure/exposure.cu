@@ -14,6 +14,7 @@ namespace {
 constexpr int kExposureThreads = 128;  // of a block; both not measured yet
 constexpr int kExposureWarps = kExposureThreads / kWarpSize;
 constexpr int kWarpTiles = 8;
+constexpr double kSumGrid = 1099511627776.0;  // 2^40: sums below 2^13 of such multiples are exact in any order
 constexpr int kStepThreads = kExposureNumbers * kWarpSize;
 
 // A | b of one photo, row by row.
@@ -60,7 +61,8 @@ __device__ __forceinline__ void flush(const ExposureBackwardParams& params, int 
         sums[i] = 0.0f;
     }
     if (this_lane() < kExposureNumbers && mine != 0.0f) {
-        atomicAdd(params.sums + kExposureNumbers * view + this_lane(), static_cast<double>(mine));
+        const double rounded = rint(static_cast<double>(mine) * kSumGrid) / kSumGrid;
+        atomicAdd(params.sums + kExposureNumbers * view + this_lane(), rounded);
     }
 }
 

@@ -185,6 +185,9 @@ class ErrorDrivenDensity(WindowedDensity):
         last = min(step.total - 1, math.floor(self.final_until * step.total))
         return max(0, last - step.refine_until)
 
+    def event_due(self, step: Step) -> bool:
+        return any(self.due(step))
+
     def _last_event(self, step: Step) -> int:
         """Iteration after which no statistics are needed: that of the last event, or where densification ends.
 

@@ -63,12 +63,18 @@ class GsplatDefaultDensity(WindowedDensity):
         require(0 <= self.prune_opa < 0.5, "prune_opa", self.prune_opa, "at least 0 and less than 0.5")
         require_settings(self)
 
+    def event_due(self, step: Step) -> bool:
+        return step.iteration % self.refine_every == 0 or self._reset_due(step)
+
+    def _reset_due(self, step: Step) -> bool:
+        return step.iteration > 0 and step.iteration % self.reset_every == 0
+
     @torch.no_grad()
     def update(self, gaussians: Gaussians, step: Step) -> RowUpdate | None:
         if step.iteration >= step.refine_until:
             self._stats = None
-        reset_due = step.iteration > 0 and step.iteration % self.reset_every == 0
-        if self._stats is None or not (step.iteration % self.refine_every == 0 or reset_due) or len(gaussians) == 0:
+        reset_due = self._reset_due(step)
+        if self._stats is None or not self.event_due(step) or len(gaussians) == 0:
             return None
         usable = torch.nonzero(finite_rows(gaussians)).squeeze(-1)
         if len(usable) == 0:

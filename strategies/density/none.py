@@ -23,5 +23,8 @@ class NoDensity(DensityController):
     def __post_init__(self) -> None:
         require_settings(self)
 
+    def event_due(self, step: Step) -> bool:
+        return False
+
     def update(self, gaussians: Gaussians, step: Step) -> RowUpdate | None:
         return None

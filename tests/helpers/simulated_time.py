@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable
 
 import pytest
+from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from turbogs_plugin.train.trainer import Trainer
@@ -31,18 +32,19 @@ class SimulatedTime:
 
     def in_iterations(self, monkeypatch: pytest.MonkeyPatch, cost: Callable[[Trainer], float]) -> None:
         """So many seconds pass in every iteration of a trainer; a hundredth of one in the first look at a view."""
-        step, look = Trainer.step, Trainer.initialise_map
+        step, look = Trainer.step, Trainer.dense_errors
 
         def stepping(trainer: Trainer) -> None:
             step(trainer)
             self.passes(cost(trainer))
 
-        def looking(trainer: Trainer, view: int) -> None:
-            look(trainer, view)
+        def looking(trainer: Trainer, view: int) -> Tensor:
+            errors = look(trainer, view)
             self.passes(0.01)
+            return errors
 
         monkeypatch.setattr(Trainer, "step", stepping)
-        monkeypatch.setattr(Trainer, "initialise_map", looking)
+        monkeypatch.setattr(Trainer, "dense_errors", looking)
 
 
 class OperatorTime(TorchDispatchMode):

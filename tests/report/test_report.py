@@ -204,9 +204,11 @@ def test_tables():
     assert number(1.23456, 2) == "1.23" and number(math.nan, 2) == "not computed"
 
 
-def training(iteration: int, gaussians: int) -> SimpleNamespace:
-    """What progress reads of a loop: the iteration, of 100, and the number of Gaussians."""
-    return SimpleNamespace(trainer=SimpleNamespace(iteration=iteration, iterations=100, gaussians=range(gaussians)))
+def training(iteration: int, gaussians: int, seconds: float = 0.0) -> SimpleNamespace:
+    """What progress reads of a loop: the iteration, of 100, the number of Gaussians, and seconds of training."""
+    fields = {"iterations": 100, "gaussians": range(gaussians), "device": torch.device("cpu")}
+    clock = SimpleNamespace(now=lambda: seconds)
+    return SimpleNamespace(trainer=SimpleNamespace(iteration=iteration, **fields), clock=clock)
 
 
 def test_progress_is_a_line_an_evaluation_where_there_is_no_terminal(capsys):
@@ -221,11 +223,15 @@ def test_progress_is_a_line_an_evaluation_where_there_is_no_terminal(capsys):
 
 def test_progress_bar_on_a_terminal(capsys, monkeypatch):
     monkeypatch.setattr("sys.stderr.isatty", lambda: True, raising=False)
+    monkeypatch.setenv("COLUMNS", "200")
+    monkeypatch.setattr("turbogs_plugin.train.progress.REFRESH_SECONDS", 0.0)
     with TrainingProgress(100) as progress:
         progress.evaluated(training(10, 5), evaluation(10))
-        progress.advanced(training(50, 1234))
+        progress.advanced(training(10, 5, 3.0))
+        progress.advanced(training(50, 1234, 5.0))
     shown = capsys.readouterr().err
     assert "50/100" in shown and "20.10" in shown and "1,234" in shown
+    assert "20 it/s" in shown and "2 s left" in shown and "GiB" in shown
 
 
 @pytest.mark.parametrize("strips", [0, 1])

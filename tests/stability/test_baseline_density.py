@@ -233,8 +233,8 @@ def test_cap_reached():
 @settings(max_examples=120, deadline=None, derandomize=True)
 @given(
     name=st.sampled_from(sorted(MAKERS)),
-    sums=st.lists(VALUES, min_size=7, max_size=7),
-    parameters=st.lists(PARAMETERS, min_size=6, max_size=6),
+    sums=st.lists(VALUES, min_size=len(fields(GaussianStats)), max_size=len(fields(GaussianStats))),
+    parameters=st.lists(PARAMETERS, min_size=len(PARAMETER_NAMES), max_size=len(PARAMETER_NAMES)),
     late=st.booleans(),
     count=st.sampled_from([1, 2, 30]),
 )

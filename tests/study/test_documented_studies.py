@@ -3,6 +3,7 @@
 import importlib.util
 import json
 import re
+import sys
 from pathlib import Path
 
 import pytest
@@ -19,6 +20,7 @@ from turbogs_plugin.train.history import Evaluation
 
 DOCS = Path(__file__).parents[2] / "docs"
 FOLDERS = sorted(path.parent for path in DOCS.glob("results/*/results.json"))
+sys.path.insert(0, str(DOCS))  # make_pages.py imports its neighbour
 SPEC = importlib.util.spec_from_file_location("make_pages", DOCS / "make_pages.py")
 make_pages = importlib.util.module_from_spec(SPEC)
 SPEC.loader.exec_module(make_pages)
@@ -137,7 +139,7 @@ def test_the_table_of_swaps_reads_both_runs_at_the_earlier_end(tmp_path):
         trainer_run("density", (8, 28), scene="caliterra"),
     ]
     (tmp_path / "dropin.json").write_text(json.dumps({"device": "H200", "runs": runs}))
-    lines = make_pages.dropin(tmp_path / "dropin.json").splitlines()
+    lines = make_pages.machine_tables.dropin(tmp_path / "dropin.json").splitlines()
     cells = {tuple(line.strip("| ").split(" | ")[:2]): line.strip("| ").split(" | ")[2:] for line in lines[2:]}
     assert len(lines) == 2 + 5
     # Stock at 30 s is halfway between 30 and 31 dB.
@@ -149,4 +151,4 @@ def test_the_table_of_swaps_reads_both_runs_at_the_earlier_end(tmp_path):
     assert cells["fox", "stock"] == ["3000", "40.0", "31.00", "0.8750", "123k"]
     assert cells["fox", "sparse pixels, 4 views"] == ["2000", "5.0", "30.00", "0.8750", "123k"]  # stock: none yet
     assert cells["caliterra", "density control"] == ["1000", "8.0", "28.00", "0.8750", "123k"]
-    assert make_pages.dropin(tmp_path / "none.json") == "Not measured yet."
+    assert make_pages.machine_tables.dropin(tmp_path / "none.json") == "Not measured yet."

@@ -43,6 +43,9 @@ class CountingTrainer:
         self.iteration -= self._unnoticed
         self._unnoticed = 0
 
+    def compare_replicas(self) -> None:
+        self.compared = self.iteration
+
     def set_length(self, iterations: int, refine_until: int) -> None:
         self.length = (iterations, refine_until)
 

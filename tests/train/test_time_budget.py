@@ -143,7 +143,7 @@ def test_a_limit_of_a_gpus_memory_says_nothing_of_a_cpu(capture, tmp_path):
 
 
 def test_a_scene_that_does_not_fit_is_refused(capture, tmp_path, monkeypatch):
-    def full(trainer, *arguments):
+    def full(trainer, *arguments, **options):
         raise torch.cuda.OutOfMemoryError("CUDA out of memory")
 
     monkeypatch.setattr(Trainer, "__init__", full)
@@ -172,7 +172,7 @@ def change_config(folder: Path, **sections: dict) -> None:
 
 @pytest.mark.parametrize("place", [(Trainer, "__init__"), (Trainer, "load_state_dict"), (run, "place_views")])
 def test_a_run_that_no_longer_fits_is_not_resumed(stopped, monkeypatch, place):
-    def full(*arguments):
+    def full(*arguments, **options):
         raise torch.cuda.OutOfMemoryError("CUDA out of memory")
 
     monkeypatch.setattr(*place, full)

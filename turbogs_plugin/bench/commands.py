@@ -13,6 +13,7 @@ import torch
 
 from turbogs_plugin.bench.large_capture import synthetic_scene
 from turbogs_plugin.bench.numerics import bench_solvers, solvers_table
+from turbogs_plugin.bench.ranks import RanksBench
 from turbogs_plugin.bench.raster import RasterBench, other_build
 from turbogs_plugin.bench.step import StepBench
 from turbogs_plugin.bench.viewer import bench_viewer, viewer_lines
@@ -68,6 +69,16 @@ def run_raster(bench: RasterBench, scene: Path | None, factor: int, device: torc
             report["other_builds"][name] = {**measured, **model}
             _keep(report, [f"{name}:", *raster_lines(measured)], out)
     return _finish(report, out)
+
+
+def run_ranks(bench: RanksBench, scene: Path, factor: int, device: torch.device, out: Path | None) -> int:
+    """Prints a line a measurement, and writes the JSON where there is a file."""
+    _require_new(out)
+    measured = bench.run(scene, factor, device)
+    if out is not None:
+        write_text_atomically(out, json.dumps(_report("ranks", measured, device), indent=2) + "\n")
+        print(f"json  {out}")
+    return 0
 
 
 def run_numerics(device: torch.device, out: Path) -> int:

@@ -12,6 +12,7 @@ from gsplat.utils import normalized_quat_to_rotmat
 from torch.nn.functional import normalize
 
 from turbogs_plugin.config.configuration import Config, load_config, resolve
+from turbogs_plugin.distributed.ranks import ONE, Ranks
 from turbogs_plugin.model.row_order import spatial_order
 from turbogs_plugin.scene import Scene
 from turbogs_plugin.scene.poses import look_at
@@ -69,9 +70,9 @@ def changed(config: Config, **sections: dict[str, Any]) -> Config:
     return resolve(mapping)
 
 
-def trainer_of(config: Config, scene: Scene, gaussians: Gaussians, device: torch.device) -> Trainer:
+def trainer_of(config: Config, scene: Scene, gaussians: Gaussians, device: torch.device, ranks: Ranks = ONE) -> Trainer:
     """A trainer that starts from a copy of these Gaussians, and not from the points of the scene."""
-    trainer = Trainer(config, scene, device)
+    trainer = Trainer(config, scene, device, ranks=ranks)
     trainer.gaussians = gaussians.map(lambda value: value.clone())
     trainer.optimizer.setup(trainer.gaussians)
     trainer.density.setup(trainer.gaussians)

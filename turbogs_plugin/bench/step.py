@@ -18,6 +18,7 @@ from turbogs_plugin.bench.models import changed, resized, train, trained_model, 
 from turbogs_plugin.bench.recorder import StepRecorder, recorded
 from turbogs_plugin.config.configuration import Config, load_config
 from turbogs_plugin.device import synchronize
+from turbogs_plugin.distributed.ranks import ONE, Ranks
 from turbogs_plugin.engine.cuda.raster import CudaRendered
 from turbogs_plugin.model.ply import load_ply
 from turbogs_plugin.model.row_order import in_order_of_space
@@ -95,7 +96,7 @@ class StepBench:
     def _measure(
         self, scene: Scene, model: Gaussians, views: int, device: torch.device, bandwidth: float
     ) -> dict[str, Any]:
-        config, on_gpu = self._config(views), device.type == "cuda"
+        config, on_gpu = self.config_of(views), device.type == "cuda"
         held = torch.cuda.memory_allocated(device) if on_gpu else 0
         trainer = warm_trainer(config, scene, model, device)
         if on_gpu:
@@ -166,7 +167,8 @@ class StepBench:
             }
         return results
 
-    def _config(self, views: int) -> Config:
+    def config_of(self, views: int) -> Config:
+        """The configuration that is timed with K views."""
         config = load_config("turbogs", self.overrides).without_plan()
         rates = config.optimizer["learning_rates"]
         return changed(
@@ -190,9 +192,9 @@ class StepBench:
         return device_times(itertools.pairwise(marks))
 
 
-def warm_trainer(config: Config, scene: Scene, model: Gaussians, device: torch.device) -> Trainer:
+def warm_trainer(config: Config, scene: Scene, model: Gaussians, device: torch.device, ranks: Ranks = ONE) -> Trainer:
     """A trainer of this model with every band in use, after the iterations that are unlike all later ones."""
-    trainer = trainer_of(config, scene, model, device)
+    trainer = trainer_of(config, scene, model, device, ranks)
     trainer.iteration = config.train.sh_degree
     train(trainer, WARMUP_ITERATIONS[device.type])
     return trainer

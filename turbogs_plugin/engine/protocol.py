@@ -12,7 +12,7 @@ from turbogs_plugin.engine.exposures import Exposures
 from turbogs_plugin.engine.moments import GaussianMoments
 from turbogs_plugin.engine.reference.exposure import expose, exposure_gradients, step_exposures
 from turbogs_plugin.engine.reference.update import apply_update
-from turbogs_plugin.engine.rendered import DEFAULT_OPTIONS, Rendered, RenderOptions, ScreenGradients
+from turbogs_plugin.engine.rendered import DEFAULT_OPTIONS, Rendered, RenderOptions, ScreenGradients, ScreenRecords
 from turbogs_plugin.engine.rules import DrawRule, LossTerms, UpdateRule
 from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.scene.photos import PhotoSamples
@@ -67,6 +67,23 @@ class Engine(ABC):
 
         Args:
             cameras: the K views of the batch, in the order of `samples.view_ids`.
+        """
+
+    @abstractmethod
+    def screen_gradients(
+        self,
+        gaussians: Gaussians,
+        cameras: Cameras,
+        samples: PixelSamples,
+        options: RenderOptions,
+        plain: ScreenRecords,
+    ) -> ScreenGradients:
+        """Screen gradients of K views from plain tensors, which several passes of engines of this kind gave.
+
+        Args:
+            gaussians: N of those that were rendered, as they were then: all, or rows of them.
+            cameras, samples, options: of all K views, as the passes had them together.
+            plain: of these views and Gaussians.
         """
 
     @abstractmethod
@@ -147,6 +164,11 @@ class Engine(ABC):
             InputError: an iteration has more intersections of a tile and a splat than a pass can have.
         """
         return 0
+
+    @abstractmethod
+    def recover(self) -> None:
+        """Make ready to repeat iterations that did nothing because another process said so: waits for the device,
+        takes in what it learned of the memory needed, and clears `overflow`."""
 
     @property
     def bytes_held(self) -> int:

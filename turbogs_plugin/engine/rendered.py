@@ -34,6 +34,21 @@ class Projected:
     radii: Tensor
 
 
+@dataclass(frozen=True)
+class ScreenRecords:
+    """Gradients on the screen as plain tensors, which other processes can be sent: of K views and N Gaussians.
+
+    Args:
+        records: [K, N, 16], `layout.ScreenRecord`; where a Gaussian is not drawn, a record may hold anything.
+        radii: [K, N, 2] int32 pixels, zero where off screen.
+        with_statistics: whether the columns that only density control asks for were filled.
+    """
+
+    records: Tensor
+    radii: Tensor
+    with_statistics: bool
+
+
 class ScreenGradients(Protocol):
     """Gradients on the screen, not yet taken back to the parameters.
 
@@ -52,6 +67,10 @@ class ScreenGradients(Protocol):
 
     def full_records(self) -> Tensor:
         """[K, N, 16] the gradients on the screen, `layout.ScreenRecord`; zero where a Gaussian is not drawn."""
+        ...
+
+    def plain(self) -> ScreenRecords:
+        """As plain tensors, from which `Engine.screen_gradients` makes them again."""
         ...
 
 

@@ -1,4 +1,4 @@
-"""What `turbogs eval`, `render` and `export` take from a run: its errors, its views, its model."""
+"""What `turbogs eval` and `render` take from a run: its errors and its views."""
 
 from __future__ import annotations
 
@@ -12,9 +12,6 @@ from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.engine.rendering import render_image
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.files import require_writable
-from turbogs_plugin.model.gsplat_file import save_gsplat
-from turbogs_plugin.model.harmonics import band_energy, drop_faint_bands
-from turbogs_plugin.model.ply import save_ply
 from turbogs_plugin.report.pictures import depth_picture, to_uint8
 from turbogs_plugin.report.tables import views_table
 from turbogs_plugin.scene import PosedImages
@@ -103,40 +100,6 @@ def distinct_stems(names: Sequence[str]) -> list[str]:
             stem = f"{flat}-{number}"
         stems[stem] = None
     return list(stems)
-
-
-def export_run(
-    path: Path, file_format: str, out: Path | None, drop_bands: float | None = None, given: Config | None = None
-) -> str:
-    """Write a run's newest model or a given one; returns in words what was written.
-
-    Args:
-        path, given: as in `evaluate_run`.
-        file_format: ply, or pt: as gsplat's trainer saves it.
-        out: new file; None: the model in the run's folder.
-        drop_bands: threshold of `drop_faint_bands`; None: all bands are written.
-    """
-    if drop_bands is not None and not 0 <= drop_bands < 1:
-        raise InputError(f"--drop-bands {drop_bands}: it must be a share, at least 0 and less than 1")
-    if out is not None and out.exists():
-        raise InputError(f"--out '{out}' exists: choose a new file")
-    if given is not None and out is None:
-        raise InputError(f"'{path}' has no run's folder to export into: name a new file by --out")
-    device = resolve_device("cpu")
-    model = load_model(path, device) if given is None else load_given_model(path, given, device)[0]
-    target = model.folder.model.with_suffix(f".{file_format}") if out is None else out
-    gaussians = model.gaussians if drop_bands is None else drop_faint_bands(model.gaussians, drop_bands)
-    if file_format == "pt":
-        save_gsplat(gaussians, target, model.frame, model.iteration or 0)
-    else:
-        save_ply(gaussians, target, model.frame)
-    if drop_bands is None:
-        return f"{target}"
-    before, after = model.gaussians.sh_degree, gaussians.sh_degree
-    if before == after:
-        return f"{target} (degree {before} stays: it has {band_energy(model.gaussians)[-1]:.2g} of the colours' energy)"
-    share = sum(band_energy(model.gaussians)[after + 1 :])
-    return f"{target} (degree {before} -> {after}, without {share:.2g} of the colours' energy)"
 
 
 def _open(path: Path, device_name: str, split: str, given: Config | None) -> tuple[SavedModel, PosedImages]:

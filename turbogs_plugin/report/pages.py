@@ -133,6 +133,9 @@ Means over the test views{unmasked}. Training time is that of iterations and of 
 evaluation, checkpoints and this report are not in it. Wall time is from the start of the process until the model was
 written. FPS counts test views rendered one after the other.{on}
 
+`turbogs export {run.folder.path.name} --format html` writes all of this and the model on one page,
+[report.html](report.html).
+
 ## Error against run time
 
 ![PSNR against seconds](report/psnr.png)

@@ -14,6 +14,7 @@ from turbogs_plugin.study.folder import StudyFolder, merged
 from turbogs_plugin.study.grid import Ablation, alike_at, load_ablation
 from turbogs_plugin.study.pages import write_report
 from turbogs_plugin.study.sweep import SweepOptions, run_sweep
+from turbogs_plugin.study.workers import run_on_gpus
 from turbogs_plugin.train.run import resolve_device
 
 UNFINISHED = 3
@@ -39,7 +40,8 @@ def ablate(
     code, begun = 0, time.monotonic()
     for number, (ablation, variants, folder) in enumerate(zip(ablations.values(), chosen, folders, strict=True)):
         try:
-            left = run_sweep(ablation, variants, options, here, folder, folders[:number], begun)
+            sweep = (ablation, variants, options, here, folder, folders[:number], begun)
+            left = run_sweep(*sweep) if len(options.gpus) < 1 else run_on_gpus(*sweep)
         finally:
             if folder.file.is_file() and folder.read_study().results:  # after a refusal there may be none
                 _report(folder, targets)

@@ -19,13 +19,15 @@ class StudyFolder:
 
     Where a study is trained, each cell also has a file of the same form from the moment that it ends,
     ``cells/SCENE/VARIANT--seedN.json``: no finished cell is lost, whatever stops the process. These files go into
-    ``results.json`` whenever that is written; nothing else needs them.
+    ``results.json`` whenever that is written; nothing else needs them. While cells are trained, ``claims`` says by
+    whom (`turbogs_plugin.study.claims`).
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self.file = path / "results.json"
         self.cells = path / "cells"
+        self.claims = path / "claims"
 
     def require_usable(self) -> None:
         """Raises `InputError` where the folder holds anything but a study, or cannot be one."""
@@ -39,6 +41,11 @@ class StudyFolder:
         path = self.cells / outcome.key.file
         path.parent.mkdir(parents=True, exist_ok=True)
         write_text_atomically(path, _cell_text(outcome))
+
+    def written(self, key: CellKey) -> int:
+        """When a cell's file was last written, whatever it says: nanoseconds; 0: never."""
+        path = self.cells / key.file
+        return path.stat().st_mtime_ns if path.is_file() else 0
 
     def write_study(self, study: Study) -> None:
         """Write ``results.json``."""

@@ -51,6 +51,10 @@ class SweepProgress(TerminalBar):
         left = self._left()
         self._say(f"[{self.done}/{self.total}] {outcome.key}: {text}" + (f"; {left}" if left else ""))
 
+    def ended_elsewhere(self) -> None:
+        """Called in the place of `ended` for a cell that another process has trained."""
+        self.total -= 1
+
     def _left(self) -> str:
         """The time left in words, by the mean time that a cell has taken so far; "" where it is not known."""
         if not self.done or self.done == self.total:

@@ -20,12 +20,16 @@ from turbogs_plugin.errors import InputError, TrainingStopped
 from turbogs_plugin.report.provenance import COMMIT_VARIABLE, MODIFIED, Provenance
 from turbogs_plugin.scene import Scene, load_scene
 from turbogs_plugin.study.cell import capture_digest, train_cell
+from turbogs_plugin.study.claims import Claims
 from turbogs_plugin.study.difference import ABSENT, difference, flattened
 from turbogs_plugin.study.folder import StudyFolder
 from turbogs_plugin.study.grid import Ablation, CellKey, variant_config
 from turbogs_plugin.study.progress import SweepProgress
 from turbogs_plugin.study.results import CellResult, Failure, Study
 from turbogs_plugin.train.run import resolve_device
+
+POLL_SECONDS = 1.0
+"""Between two looks at cells that other processes train."""
 
 UNCOMPARED = ("scene.path", "train.device")
 """Settings that may differ between a kept cell and the present call: where things are changes no result."""
@@ -44,6 +48,7 @@ class SweepOptions:
         reuse: other studies; a cell of the same settings, made by the same sources on the same machine, is taken from
             them. Tables share variants, the baseline above all.
         within: seconds after which no further cell begins; None: all are trained.
+        gpus: numbers of this machine's GPUs, each of which a process of its own uses; none: this process trains.
     """
 
     scenes: Sequence[Path]
@@ -53,6 +58,7 @@ class SweepOptions:
     device: str = "auto"
     reuse: Sequence[Path] = ()
     within: float | None = None
+    gpus: Sequence[int] = ()
 
     def __post_init__(self) -> None:
         scenes = [path.resolve() for path in self.scenes]
@@ -75,7 +81,9 @@ def run_sweep(
 ) -> int:
     """Train the cells that are not there yet and keep each result as it comes.
 
-    A cell that breaks is kept as a failure and the rest goes on; the same call tries it again.
+    A cell that breaks is kept as a failure and the rest goes on; the same call tries it again. Other processes may do
+    the same at the same time, on other machines too: each cell is trained by one of them (`claims`), and this one
+    returns when all are there.
 
     Args:
         ablation: all of it is what the study is of.
@@ -130,15 +138,29 @@ def run_sweep(
     for result in taken:
         folder.write(result)
     wanted = len(options.scenes) * len(options.seeds) * len(variants)
+    claims = Claims(folder.claims)
+    before = {key: folder.written(key) for _, key, _ in left}
     with SweepProgress(len(left), wanted - len(left)) as progress:
         while left and not (options.within is not None and time.monotonic() - begun > options.within):
-            scene, key, config = left.pop(0)  # the photos go with the last cell that needs them
-            progress.begin(key)
-            try:
-                outcome = train_cell(key.variant, config, scene, device, here, [progress], loading[key.scene])
-            except Exception as error:  # whatever a variant breaks by, the other cells go on
-                outcome = Failure(key, _reason(error))
-            folder.write(outcome)
+            taken = next(((place, claim) for place, cell in enumerate(left) if (claim := claims.take(cell[1]))), None)
+            if taken is None:
+                time.sleep(POLL_SECONDS)
+                continue
+            place, claim = taken
+            scene, key, config = left.pop(place)  # the photos go with the last cell that needs them
+            with claim.kept():
+                if folder.written(key) != before[key]:
+                    progress.ended_elsewhere()
+                    continue
+                progress.begin(key)
+                try:
+                    outcome = train_cell(key.variant, config, scene, device, here, [progress], loading[key.scene])
+                except Exception as error:  # whatever a variant breaks by, the other cells go on
+                    outcome = Failure(key, _reason(error))
+                if not claim.held:
+                    progress.ended_elsewhere()
+                    continue
+                folder.write(outcome)
             progress.ended(outcome)
             if isinstance(outcome, Failure):
                 _require_working(device)

@@ -16,6 +16,7 @@ import torch
 from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.config.scaling import with_iterations
 from turbogs_plugin.device import free_device_memory
+from turbogs_plugin.distributed.ranks import ONE, Ranks
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.plan.caps import (
     FEWEST_GAUSSIANS,
@@ -73,11 +74,14 @@ class Calibration:
     pixel_budget: float
 
 
-def within_budget(config: Config, scene: Scene, device: torch.device) -> tuple[Config, Calibration | None]:
+def within_budget(
+    config: Config, scene: Scene, device: torch.device, ranks: Ranks = ONE
+) -> tuple[Config, Calibration | None]:
     """The configuration that keeps its budgets, and what was measured for a time budget, if there is one.
 
     Args:
         config: the places of maps and photos are decided in it.
+        ranks: the processes that will train; all call this together, and the first one's clock counts.
 
     Raises:
         InputError: nothing fits; the message names what would.
@@ -88,7 +92,7 @@ def within_budget(config: Config, scene: Scene, device: torch.device) -> tuple[C
         config = lowered_cap(config, _memory_demand(config, scene).gaussians(limit))
     if seconds is None:
         return config, None
-    measured = calibrate(config, scene, device, seconds)
+    measured = calibrate(config, scene, device, seconds, ranks)
     if measured.pixel_budget > measured.configured_pixel_budget:
         config = with_pixel_budget(config, measured.pixel_budget)
         if limit is not None:
@@ -149,36 +153,39 @@ def _fit(config: Config, seconds: float, cost: IterationCost, gaussians: int) ->
     return fit_to_time(seconds, cost, gaussians, cap, train.iterations, share, keeps_cap(config))
 
 
-def calibrate(config: Config, scene: Scene, device: torch.device, seconds: float) -> Calibration:
+def calibrate(config: Config, scene: Scene, device: torch.device, seconds: float, ranks: Ranks = ONE) -> Calibration:
     """Measure the cost of an iteration. If more than the configured iterations fit, measure it with more pixels too.
 
     Args:
         seconds: the time budget. `CALIBRATION_SHARE` of it is used here, at most `CALIBRATION_SECONDS`; more if the
             fewest iterations to measure take longer.
+        ranks: as in `within_budget`.
 
     Raises:
         InputError: too much of the time would pass before the first iteration.
     """
     started = time.perf_counter()
-    measured = _measure(config, scene, device, seconds, started)
+    measured = _measure(config, scene, device, seconds, started, ranks)
     free_device_memory(device)
-    return replace(measured, seconds=time.perf_counter() - started)
+    return replace(measured, seconds=ranks.agree(time.perf_counter() - started))
 
 
 @torch.no_grad()
-def _measure(config: Config, scene: Scene, device: torch.device, seconds: float, started: float) -> Calibration:
+def _measure(
+    config: Config, scene: Scene, device: torch.device, seconds: float, started: float, ranks: Ranks
+) -> Calibration:
     """`calibrate` without the clean-up."""
-    trial = _Trial(config, scene, device)
+    trial = _Trial(config, scene, device, ranks)
     gaussians, share = trial.gaussians, 0.5 * min(CALIBRATION_SHARE * seconds, CALIBRATION_SECONDS)
     initialisation, cost = trial.initialisation(), trial.cost(share)
-    before = time.perf_counter() - started + initialisation
+    before = ranks.agree(time.perf_counter() - started + initialisation)
     if before > LARGEST_OVERHEAD * seconds:
         raise InputError(
             f"--time-budget {config.budget.time} is too short here: {before:.1f} s pass before the first iteration; "
             f"allow {math.ceil(before / LARGEST_OVERHEAD)}s or more"
         )
     configured, largest = pixel_budget_range(config, len(scene.train))
-    largest = min(largest, configured + _room_for_images(config, scene, device, gaussians))
+    largest = min(largest, configured + ranks.agree(_room_for_images(config, scene, device, gaussians)))
     # More epochs than configured would overfit the photos.
     images = images_per_iteration(config, len(scene.train))
     wanted = max(config.train.iterations, math.ceil(config.train.epochs * len(scene.train) / images))
@@ -192,11 +199,12 @@ def _measure(config: Config, scene: Scene, device: torch.device, seconds: float,
             # Measured with one size of model: with two, the noise of their slope would decide.
             factor = trial.seconds_with(pixel_budget, share / RAISES) / cost.at(gaussians)
             costs[pixel_budget] = IterationCost(factor * cost.base, factor * cost.per_gaussian)
-        left = seconds - initialisation - (time.perf_counter() - started)
+        left = ranks.agree(seconds - initialisation - (time.perf_counter() - started))
         return _fit(config, left, costs[pixel_budget], gaussians)[0]
 
     chosen = pixels_for_time(configured, largest, wanted, raises, fitting)
-    return Calibration(time.perf_counter() - started, initialisation, costs[chosen], gaussians, configured, chosen)
+    taken = ranks.agree(time.perf_counter() - started)
+    return Calibration(taken, initialisation, costs[chosen], gaussians, configured, chosen)
 
 
 def _room_for_images(config: Config, scene: Scene, device: torch.device, gaussians: int) -> float:
@@ -213,9 +221,9 @@ def _room_for_images(config: Config, scene: Scene, device: torch.device, gaussia
 class _Trial:
     """Iterations made before training to time them, with a model that does not grow and all bands in use."""
 
-    def __init__(self, config: Config, scene: Scene, device: torch.device) -> None:
-        self._config = without_growth(config)
-        self._trainer = Trainer(self._config, scene, device)
+    def __init__(self, config: Config, scene: Scene, device: torch.device, ranks: Ranks = ONE) -> None:
+        self._config, self._ranks = without_growth(config), ranks
+        self._trainer = Trainer(self._config, scene, device, ranks=ranks)
         self._model = self._trainer.gaussians
         self._device = device
         self.gaussians = len(self._model)
@@ -225,7 +233,7 @@ class _Trial:
         self._trainer.initialise_map(0)  # loads code
         with TrainingClock(self._device) as clock:
             self._trainer.initialise_map(0)
-        return clock.seconds * len(self._trainer.views)
+        return self._ranks.agree(clock.seconds) * math.ceil(len(self._trainer.views) / self._ranks.count)
 
     def cost(self, seconds: float) -> IterationCost:
         """Cost of an iteration as configured: the line through the times of half the model and of all of it."""
@@ -244,9 +252,10 @@ class _Trial:
         trainer.optimizer.setup(trainer.gaussians)
         # About half way, a schedule's views and rates are near their means.
         trainer.iteration = max(train.sh_degree * train.sh_interval, train.iterations // 2)
-        TrainingLoop(trainer).advance(trainer.iteration + WARMUP_ITERATIONS[self._device.type])
+        warm_up = TrainingLoop(trainer, ranks=self._ranks)
+        warm_up.advance(trainer.iteration + WARMUP_ITERATIONS[self._device.type])
         enough = _Enough(FEWEST_MEASURED[self._device.type], seconds)
-        loop = TrainingLoop(trainer, listeners=[enough])
+        loop = TrainingLoop(trainer, listeners=[enough], ranks=self._ranks)
         loop.advance(sys.maxsize)
         return len(trainer.gaussians), loop.clock.seconds / enough.iterations
 
@@ -261,5 +270,6 @@ class _Enough(Listener):
 
     def advanced(self, loop: TrainingLoop) -> None:
         self.iterations += 1
-        if self.iterations >= self.fewest and loop.clock.now() >= self.seconds:
-            loop.stop()
+        several = loop.ranks.count > 1  # they ask each other, which waits, so not after every iteration
+        if self.iterations >= self.fewest and not (several and self.iterations % self.fewest):
+            loop.stopped = loop.stopped or loop.ranks.agree(loop.clock.now() >= self.seconds)

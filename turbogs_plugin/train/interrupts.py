@@ -14,12 +14,12 @@ class Interrupts:
     It works only in the main thread: in others Python does not allow handlers, so signals keep their usual effect.
 
     Args:
-        stop: called at the first signal.
+        stop: called at the first signal, with its number.
     """
 
     SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
-    def __init__(self, stop: Callable[[], None]) -> None:
+    def __init__(self, stop: Callable[[int], None]) -> None:
         self.signal: int | None = None
         self._stop = stop
 
@@ -36,4 +36,4 @@ class Interrupts:
         if self.signal is not None:
             raise KeyboardInterrupt
         self.signal = number
-        self._stop()
+        self._stop(number)

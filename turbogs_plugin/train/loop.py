@@ -7,7 +7,9 @@ Everything else in a training is a listener of the loop: evaluations, checkpoint
 from __future__ import annotations
 
 from collections.abc import Iterable
+from signal import SIGTERM
 
+from turbogs_plugin.distributed.ranks import ONE, Ranks
 from turbogs_plugin.train.clock import TrainingClock
 from turbogs_plugin.train.history import Evaluation
 from turbogs_plugin.train.pace import IterationPace, Pace
@@ -44,15 +46,22 @@ class TrainingLoop:
         pace: where to stop on the way, and where to end; None: after the configured iterations.
         listeners: called in this order.
         seconds: training time that passed before.
+        ranks: the processes that train this model. Each has such a loop; the first one's clock counts.
     """
 
     def __init__(
-        self, trainer: Trainer, pace: Pace | None = None, listeners: Iterable[Listener] = (), seconds: float = 0.0
+        self,
+        trainer: Trainer,
+        pace: Pace | None = None,
+        listeners: Iterable[Listener] = (),
+        seconds: float = 0.0,
+        ranks: Ranks = ONE,
     ) -> None:
         self.trainer = trainer
         self.pace = pace or IterationPace(trainer.config.train)
         self.listeners = list(listeners)
         self.clock = TrainingClock(trainer.device, seconds)
+        self.ranks = ranks
         self.stopped = False
 
     def run(self, resumed: bool = False) -> None:
@@ -62,12 +71,13 @@ class TrainingLoop:
             resumed: the trainer's state was loaded, so its error maps are there.
 
         Raises:
-            TrainingStopped: the model is lost.
+            TrainingStopped: the model is lost, another process ended, or the processes' models differ.
         """
         trainer, pace, clock = self.trainer, self.pace, self.clock
         if not resumed:
             with clock:
                 trainer.initialise_maps()
+        clock.seconds = self.ranks.agree(clock.seconds)
         for listener in self.listeners:
             listener.begun(self)
         pace.start(trainer.iteration, clock.seconds, len(trainer.gaussians))
@@ -78,6 +88,8 @@ class TrainingLoop:
                 break
             due = pace.reached(trainer.iteration, clock.seconds, len(trainer.gaussians))
             trainer.set_length(pace.iterations, pace.refine_until)
+            if due.evaluate or due.save:
+                trainer.compare_replicas()
             if due.evaluate:
                 for listener in self.listeners:
                     listener.evaluation_due(self)
@@ -90,12 +102,19 @@ class TrainingLoop:
         with self.clock:
             while self._is_short_of(mark):
                 self.trainer.step()
+                self.stopped = self.stopped or self.ranks.stop_signal != 0
                 for listener in self.listeners:
                     listener.advanced(self)
+        self.clock.seconds = self.ranks.agree(self.clock.seconds)
 
-    def stop(self) -> None:
-        """Stop after the present iteration."""
-        self.stopped = True
+    def stop(self, signal: int = SIGTERM) -> None:
+        """Stop after the present iteration; where several processes train, as soon as all know of it.
+
+        Args:
+            signal: number of the one that asks for it.
+        """
+        if not self.ranks.ask_to_stop(signal):
+            self.stopped = True
 
     @property
     def finished(self) -> bool:

@@ -7,6 +7,7 @@ import time
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, TypeVar
 
+from turbogs_plugin.device import memory_bytes
 from turbogs_plugin.train.history import Evaluation
 from turbogs_plugin.train.loop import Listener, TrainingLoop
 from turbogs_plugin.train.trainer import Trainer
@@ -62,7 +63,11 @@ class TerminalBar(Listener):
         if self._bar is None or time.perf_counter() < self._next_refresh:
             return
         self._next_refresh = time.perf_counter() + REFRESH_SECONDS
-        self._show(loop.trainer)
+        self._show(loop.trainer, **self._refreshed(loop))
+
+    def _refreshed(self, loop: TrainingLoop) -> dict[str, str]:
+        """Further columns of the bar, for a class to override."""
+        return {}
 
     def _show(self, trainer: Trainer, **columns: str) -> None:
         gaussians = f"{len(trainer.gaussians):,}"
@@ -95,7 +100,8 @@ class LoadingProgress:
 
 
 class TrainingProgress(TerminalBar):
-    """Shows iteration, test PSNR, number of Gaussians and time left on stderr.
+    """Shows iteration, test PSNR, number of Gaussians, iterations a second of training, memory and seconds left on
+    stderr.
 
     Args:
         total: T, as first known.
@@ -103,21 +109,38 @@ class TrainingProgress(TerminalBar):
     """
 
     def __init__(self, total: int, iteration: int = 0) -> None:
-        super().__init__(total=total, completed=iteration, psnr="-", gaussians="-", warning="")
+        super().__init__(
+            total=total, completed=iteration, psnr="-", gaussians="-", speed="-", memory="-", left="-", warning=""
+        )
+        self._first: tuple[int, float] | None = None  # iteration and seconds of training where the speed counts from
 
     def _columns(self) -> Sequence[ProgressColumn]:
-        from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+        from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
 
         return (
             MofNCompleteColumn(),
             BarColumn(),
             TextColumn("test PSNR {task.fields[psnr]} dB · {task.fields[gaussians]} Gaussians"),
+            TextColumn("· {task.fields[speed]} it/s · {task.fields[memory]} ·"),
             TimeElapsedColumn(),
-            TextColumn("·"),
-            TimeRemainingColumn(),
-            TextColumn("left"),
+            TextColumn("· {task.fields[left]} s left"),
             TextColumn("{task.fields[warning]}", style="bold red"),
         )
+
+    def advanced(self, loop: TrainingLoop) -> None:
+        if self._bar is not None and self._first is None:
+            self._first = (loop.trainer.iteration, loop.clock.now())
+        super().advanced(loop)
+
+    def _refreshed(self, loop: TrainingLoop) -> dict[str, str]:
+        trainer, (first, began) = loop.trainer, self._first
+        done, seconds = trainer.iteration - first, loop.clock.now() - began
+        memory = f"{memory_bytes(trainer.device) / 2**30:.2f} GiB"
+        if done < 1 or seconds <= 0:
+            return {"memory": memory}
+        speed = done / seconds
+        left = (trainer.iterations - trainer.iteration) / speed
+        return {"memory": memory, "speed": f"{speed:.3g}" if speed < 100 else f"{speed:.0f}", "left": f"{left:,.0f}"}
 
     def evaluated(self, loop: TrainingLoop, evaluation: Evaluation) -> None:
         warning, total = describe_nonfinite(evaluation), loop.trainer.iterations

@@ -8,13 +8,14 @@ import sys
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from turbogs_plugin.config.configuration import DEFAULT_CONFIG, Config, load_config
+from turbogs_plugin.config.configuration import DEFAULT_CONFIG, Config, load_config, resolve
+from turbogs_plugin.distributed.ranks import ONE, Ranks
 from turbogs_plugin.errors import InputError, TrainingStopped
 from turbogs_plugin.files import write_text_atomically
 from turbogs_plugin.model.ply import save_ply
@@ -108,11 +109,14 @@ def plan_run(config: Config) -> Plan:
     return plan
 
 
-def new_loop(config: Config, scene: Scene, device: torch.device) -> tuple[TrainingLoop, Calibration | None]:
+def new_loop(
+    config: Config, scene: Scene, device: torch.device, ranks: Ranks = ONE
+) -> tuple[TrainingLoop, Calibration | None]:
     """A training that has not begun, fitted to its budgets. Runs and the cells of studies both begin here.
 
     Args:
         config: nothing in it is `auto` any more (`Plan.apply`). The trainer gets it fitted to the budgets.
+        ranks: the processes that train this model together; each calls this.
 
     Returns:
         The loop, without listeners; and the measurements for a time budget, whose seconds the loop's clock includes.
@@ -120,10 +124,16 @@ def new_loop(config: Config, scene: Scene, device: torch.device) -> tuple[Traini
     Raises:
         InputError: a budget is too small; the message names one that would do.
     """
-    config, calibration = within_budget(config, scene, device)
-    trainer = Trainer(config, scene, device)
+    config, calibration = within_budget(_agreed(config, ranks), scene, device, ranks)
+    trainer = Trainer(config, scene, device, ranks=ranks)
     pace = pace_of(config, calibration and calibration.cost)
-    return TrainingLoop(trainer, pace, seconds=calibration.seconds if calibration else 0.0), calibration
+    seconds = calibration.seconds if calibration else 0.0
+    return TrainingLoop(trainer, pace, seconds=seconds, ranks=ranks), calibration
+
+
+def _agreed(config: Config, ranks: Ranks) -> Config:
+    """The first process's configuration: plans look at the machine's free memory, which differs."""
+    return config if ranks.count == 1 else resolve(ranks.agree(config.to_mapping()))
 
 
 def fit(scene: Scene, *overrides: str, config: str = DEFAULT_CONFIG) -> Gaussians:
@@ -154,6 +164,7 @@ def train(
     out: Path,
     report: Callable[[RunSession], object] | None = None,
     clock: WallClock | None = None,
+    ranks: Ranks = ONE,
     watch: Callable[[RunSession], Listener] | None = None,
 ) -> RunSession:
     """Train from the start into a new folder. The plan is printed first. Photos alone are reconstructed before.
@@ -161,6 +172,7 @@ def train(
     Args:
         report: called with the finished run; `turbogs_plugin.report.pages.write_report` writes its page.
         clock: of the wall; None: it begins now.
+        ranks: the processes that train this model together; each calls this, and the first one writes and prints.
         watch: called with the run before it trains; gives one more listener of its loop, the last one.
 
     Raises:
@@ -170,14 +182,15 @@ def train(
     clock = clock or WallClock()
     clock.mark(IMPORTS)
     folder = RunFolder(out)
-    folder.require_new()
+    if ranks.first:
+        folder.require_new()
     _require_start(config)
     if config.train.device == "cuda":
         resolve_device("cuda")  # before photos are read for nothing
-    posed = with_cameras(config, out)
-    if posed is not config:
+    posed = ranks.agree(with_cameras(config, out).scene.path if ranks.first else None)
+    if posed != config.scene.path:
         clock.mark(CAMERAS)
-    config = posed
+        config = replace(config, scene=replace(config.scene, path=posed))
     with starting(lambda: resolve_device(config.train.device)) as started:
         scene = open_scene(config)
         clock.mark(PHOTOS)
@@ -188,15 +201,16 @@ def train(
     clock.mark("plan")
     remedy = "use train.photos_place=host and train.maps_place=host, --max-gaussians or a larger --factor"
     with _fitting(scene, remedy):
-        loop, calibration = new_loop(_independent(plan.apply(config), device), scene, device)
+        loop, calibration = new_loop(_independent(plan.apply(config), device), scene, device, ranks)
         session = RunSession(folder, plan, scene, loop, clock)
-    resolved = loop.trainer.config
-    said = [*scene.notes, plan.text(), budget_text(resolved, calibration)]
-    print("\n".join(filter(None, said)), file=sys.stderr)
-    folder.path.mkdir(parents=True, exist_ok=True)
-    write_text_atomically(folder.plan, plan.to_json())
-    write_text_atomically(folder.asked, config.to_yaml())
-    write_text_atomically(folder.config, resolved.to_yaml())
+    if ranks.first:
+        resolved = loop.trainer.config
+        said = [*scene.notes, plan.text(), budget_text(resolved, calibration)]
+        print("\n".join(filter(None, said)), file=sys.stderr)
+        folder.path.mkdir(parents=True, exist_ok=True)
+        write_text_atomically(folder.plan, plan.to_json())
+        write_text_atomically(folder.asked, config.to_yaml())
+        write_text_atomically(folder.config, resolved.to_yaml())
     return session.run(report, watch)
 
 
@@ -204,6 +218,7 @@ def resume(
     path: Path,
     report: Callable[[RunSession], object] | None = None,
     clock: WallClock | None = None,
+    ranks: Ranks = ONE,
     watch: Callable[[RunSession], Listener] | None = None,
 ) -> RunSession:
     """Go on with a stopped run from its newest checkpoint, with its own configuration, in which nothing is `auto`.
@@ -211,7 +226,7 @@ def resume(
     On a CPU, the result is bit for bit that of a run never stopped; `Trainer.state_dict` says why.
 
     Args:
-        report, clock, watch: as in `train`.
+        report, clock, ranks, watch: as in `train`. The number of processes may be another than before.
 
     Raises:
         InputError: no run there, an unusable checkpoint, a changed capture, or a machine without what the run needs;
@@ -237,12 +252,13 @@ def resume(
         hold_to(limit, device)
     with _fitting(scene, "end what else is in that memory, or go on with this run where there is more"):
         resuming = state is not None
-        loop = TrainingLoop(Trainer(config, scene, device, resuming), pace_of(config))
+        loop = TrainingLoop(Trainer(config, scene, device, resuming, ranks), pace_of(config), ranks=ranks)
         session = RunSession(folder, plan, scene, loop, clock)
         if state is not None:
             session.load_state_dict(state, str(checkpoint))
             session.earlier_wall = earlier.wall_seconds if earlier else math.nan
-    session.history += rewind_history(folder.history, loop.trainer.iteration if session.resumed else -1)
+    if ranks.first:
+        session.history += rewind_history(folder.history, loop.trainer.iteration if session.resumed else -1)
     return session.run(report, watch)
 
 
@@ -349,19 +365,24 @@ class RunSession(Listener):
         watch: Callable[[RunSession], Listener] | None = None,
     ) -> RunSession:
         """Train to the end, or until a signal; both end with a checkpoint."""
-        loop, trainer = self.loop, self.trainer
+        loop, trainer, ranks = self.loop, self.trainer, self.loop.ranks
         self._finished_before = loop.finished
-        self.folder.wall.unlink(missing_ok=True)  # so that a killed process leaves none, which is then not counted as 0
+        if ranks.first:
+            self.folder.wall.unlink(missing_ok=True)  # so that a killed process leaves none: it is not counted as 0
         self.clock.mark("initial model")
         try:
             progress = TrainingProgress(trainer.iterations, trainer.iteration)
             with Interrupts(loop.stop) as interrupts, progress:
-                loop.listeners = [WallMarks(self.clock), self.evaluations, self, progress]
+                loop.listeners = [WallMarks(self.clock), self.evaluations, self, progress] if ranks.first else [self]
                 loop.listeners += [watch(self)] if watch is not None else []
                 loop.run(self.resumed)
                 self.clock.mark("training")
                 if loop.stopped and trainer.iteration != self._saved_at:
+                    trainer.compare_replicas()
                     self._save()
+            self.signal = None if loop.finished else ranks.stop_signal or interrupts.signal
+            if not ranks.first:
+                return self
             if loop.finished:
                 self._in_thread(save_ply, trainer.gaussians, self.folder.model, self.scene.frame)
                 if report is not None:
@@ -377,7 +398,6 @@ class RunSession(Listener):
             ) from error
         finally:
             self._threads.shutdown()
-        self.signal = None if loop.finished else interrupts.signal
         return self
 
     def finish_files(self) -> None:
@@ -428,11 +448,13 @@ class RunSession(Listener):
     def _save(self) -> None:
         """Write a checkpoint; at the end of the run, when nothing changes the state any more, by a thread."""
         self.trainer.require_finite()
-        arguments = (self.folder.checkpoints, self.trainer.iteration, self.state_dict())
-        if self.loop.finished:
-            self._in_thread(save_checkpoint, *arguments)
-        else:
-            save_checkpoint(*arguments)
+        if self.loop.ranks.first:
+            arguments = (self.folder.checkpoints, self.trainer.iteration, self.state_dict())
+            if self.loop.finished:
+                self._in_thread(save_checkpoint, *arguments)
+            else:
+                with self.loop.ranks.working():
+                    save_checkpoint(*arguments)
         self._saved_at = self.trainer.iteration
 
     def _in_thread(self, write: Callable[..., object], *arguments: object) -> None:

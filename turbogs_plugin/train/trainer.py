@@ -12,6 +12,8 @@ import torch
 from torch import Tensor
 
 from turbogs_plugin.config.configuration import Config
+from turbogs_plugin.distributed.exchange import exchange_of
+from turbogs_plugin.distributed.ranks import ONE, Ranks
 from turbogs_plugin.engine import engine_of
 from turbogs_plugin.engine.exposures import Exposures, exposure_rate
 from turbogs_plugin.engine.layout import MAX_SH_DEGREE
@@ -23,6 +25,7 @@ from turbogs_plugin.model.distant import RESTRAIN_EVERY, restrain_distant
 from turbogs_plugin.model.harmonics import with_degree
 from turbogs_plugin.model.initial import BACKDROP_COUNT, backdrop_gaussians, gaussians_from_points
 from turbogs_plugin.model.row_order import in_order_of_space
+from turbogs_plugin.model.torch_file import leaves
 from turbogs_plugin.plan.caps import cap_of, chosen_points
 from turbogs_plugin.scene import PosedImages, Scene
 from turbogs_plugin.scene.offload import place_maps, place_views
@@ -57,14 +60,18 @@ class Trainer:
         scene: on any device.
         device: where everything is computed and kept.
         resuming: a state is loaded next, so that the model of `train.init` need not be there.
+        ranks: the processes that train this model; each has such a trainer.
 
     Attributes:
         observer: who is told of each iteration, if anybody.
     """
 
-    def __init__(self, config: Config, scene: Scene, device: torch.device, resuming: bool = False) -> None:
+    def __init__(
+        self, config: Config, scene: Scene, device: torch.device, resuming: bool = False, ranks: Ranks = ONE
+    ) -> None:
         config.require_decided()
         self.config = config
+        self.exchange = exchange_of(ranks)
         self.views = place_views(scene.train, device, config.train.photos_place)
         self.extent = scene.extent
         self.schedule = config.build("schedule")
@@ -93,24 +100,28 @@ class Trainer:
 
     def initialise_maps(self) -> None:
         """Set the maps to the errors of a dense render of the initial Gaussians, Algorithm 1's initialization."""
-        for view_id in range(len(self.views)):
-            self.initialise_map(view_id)
+        pixels = self.maps.sizes.prod(axis=1).tolist()
+        for view_id, errors in enumerate(self.exchange.initial_errors(pixels, self.dense_errors, self.device)):
+            self.maps.initialise(view_id, errors)
         self.initial_error = self.maps.mean()
 
     def initialise_map(self, view_id: int) -> None:
         """Set the map of one view to the errors of its dense render, in which masked pixels have no part."""
+        self.maps.initialise(view_id, self.dense_errors(view_id))
+
+    def dense_errors(self, view_id: int) -> Tensor:
+        """[H * W] the errors of a dense render of one view; 0 at masked pixels."""
         background = self.background.at(self.now)
         options = {"sh_degree": self.sh_degree, "settings": self.config.raster, "background": background}
         if self.maps.masks is None:
             image = render_image(self.gaussians, self.views.cameras, view_id, **options)
-            errors = (image.colors - self.views.photos.image(view_id, background)).abs().sum(dim=-1)  # [H, W]
-        else:
-            samples = self.maps.masks.pixels([view_id])
-            rendered = rasterize(self.gaussians, self.views.cameras.select([view_id]), samples, **options)
-            truth = self.views.photos.at(samples, background).colors()  # [P, 3]
-            errors = truth.new_zeros(int(self.maps.sizes[view_id].prod()))  # [H * W]
-            errors[samples.pixel_ids.long()] = (rendered.colors - truth).abs().sum(dim=-1)
-        self.maps.initialise(view_id, errors.reshape(-1))
+            return (image.colors - self.views.photos.image(view_id, background)).abs().sum(dim=-1).reshape(-1)
+        samples = self.maps.masks.pixels([view_id])
+        rendered = rasterize(self.gaussians, self.views.cameras.select([view_id]), samples, **options)
+        truth = self.views.photos.at(samples, background).colors()  # [P, 3]
+        errors = truth.new_zeros(int(self.maps.sizes[view_id].prod()))
+        errors[samples.pixel_ids.long()] = (rendered.colors - truth).abs().sum(dim=-1)
+        return errors
 
     def step(self) -> None:
         """One iteration, in the paper's order."""
@@ -138,7 +149,7 @@ class Trainer:
         # 5) Sparse forward rendering
         cameras = self.views.cameras.select(view_ids)
         options = RenderOptions(self.sh_degree, self.config.raster, background=background)
-        rendered = self.engine.render(self.gaussians, cameras, samples, options)
+        rendered = self.exchange.render(self.engine, self.gaussians, cameras, samples, options)
 
         # 6) Sparse loss and its gradients, and 7) EMA update of the error maps
         loss = self.supervise(rendered.colors, truth, step)
@@ -151,7 +162,7 @@ class Trainer:
         self.update(screen, stats, step)
 
         # 11) Error-driven density control
-        self.follow(self.density.update(self.gaussians, step))
+        self.follow(self.refine(step))
 
         self.iteration += 1
 
@@ -177,10 +188,30 @@ class Trainer:
         """Gradients, statistics and update: in one step if the optimizer has a rule, else by its own code."""
         rule = self.optimizer.rule(step)
         if rule is not None:
-            self.engine.update(rule, screen, self.gaussians, self.optimizer.moments, stats)
+            self.exchange.update(self.engine, rule, screen, self.gaussians, self.optimizer.moments, stats)
         else:
             gradients = screen.parameter_gradients(self.optimizer.per_view, stats)
             self.optimizer.step(self.gaussians, gradients, step)
+
+    def refine(self, step: Step) -> RowUpdate | None:
+        """The change of the set of Gaussians that density control proposes, if any."""
+        density = self.density
+        return self.exchange.refine(
+            lambda: density.update(self._gaussians, step), lambda: density.event_due(step), self.complete
+        )
+
+    def complete(self) -> None:
+        """Where several processes train, make the state whole on each. All must call it."""
+        self.exchange.complete(self.optimizer.moments, self.density.stats)
+
+    def compare_replicas(self) -> None:
+        """Where several processes train, see that all have the same state, to the bit.
+
+        Raises:
+            TrainingStopped: they do not.
+        """
+        self.complete()
+        self.exchange.compare(lambda: dict(leaves(self.state_dict(), "state")), self.iteration)
 
     def follow(self, update: RowUpdate | None) -> None:
         """Apply the change of the set of Gaussians that density control proposed, if any.
@@ -217,7 +248,7 @@ class Trainer:
         Raises:
             InputError: an iteration has more intersections of a tile and a splat than a pass can have.
         """
-        lost = self.engine.settle(wait)
+        lost = self.exchange.settle(self.engine, wait)
         self.iteration = max(self.iteration - lost, min(self.first_repeatable, self.iteration))
 
     @property
@@ -226,9 +257,20 @@ class Trainer:
         return Step(self.iteration, self.iterations, self.refine_until, self.config.train.seed, self.extent)
 
     @property
+    def gaussians(self) -> Gaussians:
+        """The model. Where several processes train, what is enqueued next comes after the latest step of all."""
+        self.exchange.finish()
+        return self._gaussians
+
+    @gaussians.setter
+    def gaussians(self, gaussians: Gaussians) -> None:
+        self.exchange.finish()
+        self._gaussians = gaussians
+
+    @property
     def device(self) -> torch.device:
         """Where everything is computed and kept."""
-        return self.gaussians.device
+        return self._gaussians.device
 
     @property
     def sh_degree(self) -> int:

@@ -7,11 +7,11 @@ import torch
 from torch import Tensor
 
 from turbogs_plugin.engine.cuda import exposure, training
-from turbogs_plugin.engine.cuda.raster import CudaRendered, rasterize_cuda
+from turbogs_plugin.engine.cuda.raster import CudaRendered, CudaScreenGradients, rasterize_cuda, screen_gradients
 from turbogs_plugin.engine.cuda.workspace import Workspace
 from turbogs_plugin.engine.exposures import Exposures
 from turbogs_plugin.engine.protocol import Engine, MapUpdate
-from turbogs_plugin.engine.rendered import DEFAULT_OPTIONS, RenderOptions
+from turbogs_plugin.engine.rendered import DEFAULT_OPTIONS, RenderOptions, ScreenRecords
 from turbogs_plugin.engine.rules import LossTerms
 from turbogs_plugin.scene.photos import PhotoSamples
 from turbogs_plugin.types import Cameras, Gaussians, LossOutput, PixelSamples
@@ -42,6 +42,16 @@ class CudaEngine(Engine):
     ) -> CudaRendered:
         return rasterize_cuda(gaussians, cameras, samples, options, self.workspace)
 
+    def screen_gradients(
+        self,
+        gaussians: Gaussians,
+        cameras: Cameras,
+        samples: PixelSamples,
+        options: RenderOptions,
+        plain: ScreenRecords,
+    ) -> CudaScreenGradients:
+        return screen_gradients(gaussians, cameras, samples, options, plain, self.workspace)
+
     def supervise(self, terms: LossTerms, colors: Tensor, truth: PhotoSamples, update: MapUpdate) -> LossOutput:
         # The kernel gathers the photos' colours itself if the photos and the maps of each view begin at the same pixel.
         # If only one of the two is in host memory, they do not.
@@ -57,6 +67,11 @@ class CudaEngine(Engine):
 
     def settle(self, wait: bool = False) -> int:
         return 0 if self.workspace is None else self.workspace.take_lost(wait)
+
+    def recover(self) -> None:
+        if self.workspace is not None:
+            self.workspace.take_lost(wait=True)
+            self.workspace.status.zero_()
 
     @property
     def bytes_held(self) -> int:

@@ -20,7 +20,14 @@ from turbogs_plugin.engine.cuda import launches, library
 from turbogs_plugin.engine.cuda.workspace import Workspace, require_possible, round_capacity
 from turbogs_plugin.engine.layout import InstanceRow, ParameterRow, ScreenRecord
 from turbogs_plugin.engine.moments import COLUMNS
-from turbogs_plugin.engine.rendered import DEFAULT_OPTIONS, Projected, Rendered, RenderOptions, require_statistics
+from turbogs_plugin.engine.rendered import (
+    DEFAULT_OPTIONS,
+    Projected,
+    Rendered,
+    RenderOptions,
+    ScreenRecords,
+    require_statistics,
+)
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.types import Cameras, GaussianGradients, Gaussians, GaussianStats, PixelSamples
 
@@ -74,6 +81,9 @@ class CudaScreenGradients:
     def full_records(self) -> Tensor:
         """[K, N, 16] the records, zero where a Gaussian is off screen."""
         return torch.where((self.radii > 0).any(dim=-1, keepdim=True), self.records, 0.0)
+
+    def plain(self) -> ScreenRecords:
+        return ScreenRecords(self.records, self.radii, self.with_statistics)
 
     def parameter_gradients(self, rows: bool, stats: GaussianStats | None = None) -> GaussianGradients:
         """The gradients of the parameters: one row per view (`rows`), or their sum. May be called once.
@@ -174,6 +184,32 @@ class CudaRendered(Rendered):
         return CudaScreenGradients(self._scene, self._samples, records, self._radii, with_statistics, overflow)
 
 
+def screen_gradients(
+    gaussians: Gaussians,
+    cameras: Cameras,
+    samples: PixelSamples,
+    options: RenderOptions,
+    plain: ScreenRecords,
+    workspace: Workspace | None = None,
+) -> CudaScreenGradients:
+    """`Engine.screen_gradients`. The Gaussians are contiguous, and their rows begin at a multiple of four."""
+    library.require()
+    scene = _scene(gaussians.map(_prepared), cameras, options.used_degree(gaussians), options.settings.eps2d)
+    overflow = None if workspace is None else workspace.overflow
+    return CudaScreenGradients(scene, samples, plain.records, plain.radii, plain.with_statistics, overflow)
+
+
+def _scene(gaussians: Gaussians, cameras: Cameras, sh_degree: int, eps2d: float) -> launches.Scene:
+    return launches.Scene(
+        gaussians=gaussians,
+        viewmats=cameras.viewmats.detach().contiguous(),
+        Ks=cameras.Ks.detach().contiguous(),
+        sizes=cameras.sizes.reshape(-1).tolist(),
+        sh_degree=sh_degree,
+        eps2d=eps2d,
+    )
+
+
 @dataclass(frozen=True)
 class _Buffers:
     """Uninitialised memory for a pass: from the workspace, or newly allocated without one."""
@@ -218,14 +254,7 @@ def rasterize_cuda(
     # A pass over every tile needs no table of the active ones.
     everywhere = num_active == num_tiles
     tile_ids = None if everywhere else samples.tile_ids.contiguous()
-    scene = launches.Scene(
-        gaussians=gaussians,
-        viewmats=cameras.viewmats.detach().contiguous(),
-        Ks=cameras.Ks.detach().contiguous(),
-        sizes=cameras.sizes.reshape(-1).tolist(),
-        sh_degree=degree,
-        eps2d=settings.eps2d,
-    )
+    scene = _scene(gaussians, cameras, degree, settings.eps2d)
     splats = launches.Splats(
         cameras=buffers.floats("cameras", views, layout.CameraRow.SIZE),
         instances=buffers.floats("instances", views * count, InstanceRow.SIZE),

@@ -5,7 +5,7 @@ from __future__ import annotations
 from turbogs_plugin.engine.protocol import Engine
 from turbogs_plugin.engine.reference.draws import draw_pixels
 from turbogs_plugin.engine.reference.losses import sparse_loss
-from turbogs_plugin.engine.reference.raster import rasterize_reference
+from turbogs_plugin.engine.reference.raster import rasterize_reference, screen_gradients
 
 
 class ReferenceEngine(Engine):
@@ -13,4 +13,8 @@ class ReferenceEngine(Engine):
 
     draw = staticmethod(draw_pixels)
     render = staticmethod(rasterize_reference)
+    screen_gradients = staticmethod(screen_gradients)
     evaluate = staticmethod(sparse_loss)
+
+    def recover(self) -> None:
+        """Nothing is kept, so there is nothing to clear."""

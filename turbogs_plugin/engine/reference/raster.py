@@ -12,7 +12,14 @@ from turbogs_plugin.engine.reference import compositing
 from turbogs_plugin.engine.reference.compositing import ALPHA_TINY, Compositor
 from turbogs_plugin.engine.reference.intersection import intersect_tiles
 from turbogs_plugin.engine.reference.projection import Rows, Splats, drawable_rows, project_rows
-from turbogs_plugin.engine.rendered import DEFAULT_OPTIONS, Projected, Rendered, RenderOptions, require_statistics
+from turbogs_plugin.engine.rendered import (
+    DEFAULT_OPTIONS,
+    Projected,
+    Rendered,
+    RenderOptions,
+    ScreenRecords,
+    require_statistics,
+)
 from turbogs_plugin.types import PARAMETER_NAMES, Cameras, GaussianGradients, Gaussians, GaussianStats, PixelSamples
 
 
@@ -39,6 +46,9 @@ class ReferenceScreenGradients:
     def full_records(self) -> Tensor:
         """[K, N, 16], zero where a Gaussian is not drawn."""
         return self.rows.scatter(self.records)
+
+    def plain(self) -> ScreenRecords:
+        return ScreenRecords(self.full_records(), self.rows.scatter(self.splats.radii), self.with_statistics)
 
     def parameter_gradients(self, rows: bool, stats: GaussianStats | None = None) -> GaussianGradients:
         """The gradients of the parameters: one row per view (`rows`), or their sum. May be called once."""
@@ -131,11 +141,8 @@ def rasterize_reference(
     gaussians: Gaussians, cameras: Cameras, samples: PixelSamples, options: RenderOptions = DEFAULT_OPTIONS
 ) -> ReferenceRendered:
     """`Engine.render`; float32 or float64, CPU or CUDA."""
-    degree, settings = options.used_degree(gaussians), options.settings
-    with torch.enable_grad():
-        rows = drawable_rows(gaussians, cameras, settings)
-        leaves = rows.take(gaussians).map(lambda value: value.detach().requires_grad_())
-        splats = project_rows(rows, leaves, cameras, degree, settings)
+    settings = options.settings
+    rows, leaves, splats = _projected(gaussians, cameras, options)
     with torch.no_grad():
         compositor = Compositor(intersect_tiles(rows, splats, samples, settings), samples, settings)
         table = compositing.splat_table(splats.means2d, splats.conics, splats.colors, splats.opacities, splats.depths)
@@ -146,3 +153,21 @@ def rasterize_reference(
             background = sums.new_tensor(options.background)
             colors = colors + (1.0 - sums[:, 3:4]) * background
     return ReferenceRendered(colors, sums[:, 3], depths, sums, table, compositor, rows, splats, leaves, background)
+
+
+def screen_gradients(
+    gaussians: Gaussians, cameras: Cameras, samples: PixelSamples, options: RenderOptions, plain: ScreenRecords
+) -> ReferenceScreenGradients:
+    """`Engine.screen_gradients`: projects the Gaussians again, so the radii are not needed."""
+    rows, leaves, splats = _projected(gaussians, cameras, options)
+    records = plain.records.flatten(0, 1)[rows.flat]  # [R, 16]
+    return ReferenceScreenGradients(rows, splats, leaves, records, samples, plain.with_statistics)
+
+
+def _projected(gaussians: Gaussians, cameras: Cameras, options: RenderOptions) -> tuple[Rows, Gaussians, Splats]:
+    """The rows that can be drawn, their parameters, and their projection, connected to these by autograd."""
+    degree, settings = options.used_degree(gaussians), options.settings
+    with torch.enable_grad():
+        rows = drawable_rows(gaussians, cameras, settings)
+        leaves = rows.take(gaussians).map(lambda value: value.detach().requires_grad_())
+        return rows, leaves, project_rows(rows, leaves, cameras, degree, settings)

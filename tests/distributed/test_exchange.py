@@ -1,0 +1,267 @@
+"""Steps of 2 and 4 processes: as one process's up to summation, and bit-equal among them whatever happens to one."""
+
+from __future__ import annotations
+
+import copy
+from pathlib import Path
+
+import pytest
+import torch
+from helpers.framework_runs import TINY, tiny_capture
+from helpers.processes import ended, grouped, said, start_ranks
+
+from turbogs_plugin.config.configuration import load_config
+from turbogs_plugin.distributed.digest import digest
+from turbogs_plugin.distributed.ranks import ONE, ProcessRanks, Ranks
+from turbogs_plugin.distributed.rows import rows_of
+from turbogs_plugin.engine.reference.engine import ReferenceEngine
+from turbogs_plugin.engine.reference.raster import rasterize_reference
+from turbogs_plugin.errors import TrainingStopped
+from turbogs_plugin.scene import load_scene
+from turbogs_plugin.train.loop import TrainingLoop
+from turbogs_plugin.train.trainer import Trainer
+
+CPU = torch.device("cpu")
+
+CASES = {
+    "usual": (),
+    "one view": ("schedule.type=fixed", "schedule.views=1"),
+    "one tile": ("schedule.type=fixed", "schedule.views=1", "schedule.pixel_budget=0.1", "pixel_sampler.unit=tile"),
+    "cells": ("pixel_sampler.unit=cell",),
+    "tiles": ("pixel_sampler.unit=tile", "pixel_sampler.importance=0.5"),
+    "summed rows": ("optimizer.rows=summed",),
+    "no rule": ("optimizer.type=adam",),
+    "fastgs": ("density.type=fastgs", "density.refine_from=2", "density.refine_every=3"),
+    "hosted": ("train.maps_place=host", "train.photos_place=host"),
+}
+LONG = 50
+LONG_CASE = ("train.iterations=50", "train.refine_until=30", "schedule.max_views=2")
+
+
+def trainer_of(capture: Path, *overrides: str, ranks: Ranks = ONE) -> Trainer:
+    replaced = tuple(text.partition("type=")[0] for text in overrides if ".type=" in text)  # sections that start afresh
+    settings = [text for text in TINY if not (replaced and text.startswith(replaced))]
+    config = load_config("turbogs", [*settings, "train.device=cpu", *overrides])
+    config.scene.path = str(capture)
+    return Trainer(config.without_plan(), load_scene(capture), CPU, ranks=ranks)
+
+
+def state_of(trainer: Trainer) -> dict:
+    state = {"optimizer": trainer.optimizer.state_dict(), "maps": trainer.maps.state_dict()}
+    return copy.deepcopy(state | {"nonfinite": int(trainer.nonfinite_losses)})
+
+
+def compared_steps(trainer: Trainer, count: int) -> None:
+    for _ in range(count):
+        trainer.step()
+        trainer.compare_replicas()
+
+
+def every_case(capture: Path, out: Path, cases: tuple[str, ...]) -> None:
+    """In every process: these cases, each compared after every step; the first process keeps what they gave."""
+    ranks, results = grouped(), {}
+    for name in cases:
+        trainer = trainer_of(capture, *CASES[name], ranks=ranks)
+        trainer.initialise_maps()
+        trainer.compare_replicas()
+        trainer.step()
+        trainer.compare_replicas()
+        results[name] = state_of(trainer)
+        compared_steps(trainer, 3)  # the fourth has an event of density control
+    trainer = trainer_of(capture, *LONG_CASE, ranks=ranks)
+    trainer.initialise_maps()
+    for _ in range(LONG):
+        trainer.step()
+    trainer.compare_replicas()
+    results["error"] = trainer.maps.mean()
+    results["broken"] = broken_ranks(capture, ranks)
+    results["lost"] = lost_iterations(capture, ranks)
+    if ranks.first:
+        torch.save(results, out / "results.pt")
+
+
+class LosingEngine(ReferenceEngine):
+    """The second pass has too little memory: until `recover`, nothing changes, as on a GPU."""
+
+    def __init__(self, lose: bool) -> None:
+        self.lose, self.passes, self.recovered = lose, 0, 0
+        self.flag = torch.zeros(1, dtype=torch.int32)
+
+    @property
+    def overflow(self) -> torch.Tensor:
+        return self.flag
+
+    def render(self, *arguments):
+        self.passes += 1
+        if self.lose and self.passes == 2:
+            self.flag.fill_(1)
+        return rasterize_reference(*arguments)
+
+    def update(self, *arguments):
+        if not self.flag:
+            super().update(*arguments)
+
+    def recover(self) -> None:
+        self.flag.zero_()
+        self.recovered += 1
+
+
+def lost_iterations(capture: Path, ranks: ProcessRanks) -> dict:
+    """One process has too little memory for one pass: all repeat it."""
+    views = ("schedule.min_views=4", "schedule.max_views=4", "density.type=none")
+    trainer = trainer_of(capture, *views, ranks=ranks)
+    trainer.engine = LosingEngine(lose=ranks.rank == ranks.count - 1)
+    trainer.initialise_maps()
+    loop = TrainingLoop(trainer, ranks=ranks)
+    loop.advance(2)  # the loss is known at this mark alone
+    trainer.compare_replicas()
+    loop.advance(8)
+    trainer.compare_replicas()
+    updates = int(trainer.optimizer.moments.steps.max())
+    return {"passes": trainer.engine.passes, "recovered": trainer.engine.recovered, "updates": updates}
+
+
+def broken_ranks(capture: Path, ranks: ProcessRanks) -> dict:
+    """What not-finite values in one process do to all."""
+    last, found = ranks.count - 1, {}
+    trainer = trainer_of(capture, "schedule.min_views=4", "schedule.max_views=4", ranks=ranks)
+    trainer.initialise_maps()
+    render = trainer.engine.render
+
+    def broken_render(*arguments):
+        rendered = render(*arguments)
+        if ranks.rank == last:
+            rendered.colors[:5] = torch.nan
+        return rendered
+
+    trainer.engine.render = broken_render
+    compared_steps(trainer, 1)
+    trainer.engine.render = render
+    before = int(trainer.optimizer.skipped)
+
+    class Infinite:  # a backward pass whose records of the first Gaussians are lost
+        def __init__(self, rendered):
+            self.rendered = rendered
+
+        def __getattr__(self, name):
+            return getattr(self.rendered, name)
+
+        def backward(self, *arguments, **options):
+            screen = self.rendered.backward(*arguments, **options)
+            drawn = screen.records[:, 13] > 0
+            screen.records[drawn.nonzero()[:3, 0], 0] = torch.inf
+            return screen
+
+    if ranks.rank == last:
+        trainer.engine.render = lambda *arguments: Infinite(render(*arguments))
+    compared_steps(trainer, 1)
+    found["skipped"] = int(trainer.optimizer.skipped) - before
+    trainer.engine.render = render
+    compared_steps(trainer, 2)
+    found["finite"] = all(bool(value.isfinite().all()) for _, value in trainer.gaussians.items())
+    if ranks.rank == last:
+        trainer.gaussians.means[0, 0] += 1e-6
+    try:
+        trainer.compare_replicas()
+    except TrainingStopped as stop:
+        found["differs"] = str(stop)
+    return found
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory) -> Path:
+    return tiny_capture(tmp_path_factory.mktemp("exchange"))
+
+
+@pytest.fixture(scope="module", params=[2, 4])
+def several(request, capture, tmp_path_factory) -> tuple[int, dict]:
+    """(number of processes, what they gave)."""
+    out = tmp_path_factory.mktemp(f"ranks-{request.param}")
+    cases = tuple(CASES) if request.param == 2 else ("usual", "one view", "one tile")
+    codes = ended(start_ranks(request.param, every_case, out, capture, out, cases), 300)
+    assert codes == [0] * request.param, said(out)
+    return request.param, torch.load(out / "results.pt", weights_only=False)
+
+
+@pytest.fixture(scope="module")
+def alone(capture) -> dict:
+    results = {}
+    for name, overrides in CASES.items():
+        trainer = trainer_of(capture, *overrides)
+        trainer.initialise_maps()
+        trainer.step()
+        results[name] = state_of(trainer)
+    return results
+
+
+@pytest.fixture(scope="module")
+def errors_of_seeds(capture) -> list[float]:
+    errors = []
+    for seed in (0, 1, 2):
+        trainer = trainer_of(capture, *LONG_CASE, f"train.seed={seed}")
+        trainer.initialise_maps()
+        for _ in range(LONG):
+            trainer.step()
+        errors.append(trainer.maps.mean())
+    return errors
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_a_step_is_that_of_one_process_up_to_summation(several, alone, case):
+    """Of the moments, which are the gradients: where a gradient is only rounding, Adam's step has its sign alone."""
+    _, results = several
+    if case not in results:
+        pytest.skip("in two processes")
+    for name, value in alone[case]["optimizer"].items():
+        given = results[case]["optimizer"][name].double()
+        assert given.shape == value.shape, name
+        # Gradients of rotations of round Gaussians are rounding alone, 1e-11.
+        bound = 2e-5 * float(value.double().abs().max()) + 1e-9
+        assert float((given - value.double()).abs().max()) <= bound, (case, name)
+    for name in ("errors", "view_sums"):
+        torch.testing.assert_close(results[case]["maps"][name], alone[case]["maps"][name], rtol=1e-3, atol=1e-3)
+    assert torch.equal(results[case]["maps"]["stamps"], alone[case]["maps"]["stamps"]), "the draws differ"
+    assert results[case]["nonfinite"] == 0
+
+
+def test_after_fifty_steps_the_error_is_within_the_spread_of_seeds(several, errors_of_seeds):
+    _, results = several
+    spread = max(errors_of_seeds) - min(errors_of_seeds)
+    assert min(errors_of_seeds) - spread <= results["error"] <= max(errors_of_seeds) + spread
+
+
+def test_what_is_not_finite_in_one_process_is_skipped_by_all(several):
+    _, results = several
+    assert 1 <= results["broken"]["skipped"] <= 3
+    assert results["broken"]["finite"]
+
+
+def test_an_iteration_that_one_process_lost_is_repeated_by_all(several):
+    _, results = several
+    assert results["lost"] == {"passes": 9, "recovered": 1, "updates": 8}
+
+
+def test_replicas_that_differ_end_the_run(several):
+    count, results = several
+    message = results["broken"]["differs"]
+    assert f"gaussians.means of rank {count - 1} differs from that of rank 0" in message
+    assert message.startswith("iteration 4:")
+
+
+def test_rows_are_owned_in_aligned_runs():
+    for count in (1, 3, 4, 17, 32, 33, 1000):
+        rows = rows_of(count, 4)
+        assert [part.start for part in rows[1:]] == [part.stop for part in rows[:-1]]
+        assert rows[0].start == 0 and rows[-1].stop == count
+        assert all(part.start % 4 == 0 or part.start == count for part in rows)
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.int16, torch.float32, torch.int32, torch.float64, torch.uint8])
+def test_a_digest_sees_every_bit_and_the_order(dtype):
+    value = torch.arange(1, 9).to(dtype)
+    assert digest(value) == digest(value.clone()) == digest(value.reshape(2, 4))
+    assert digest(value) != digest(value.flip(0))
+    changed = value.clone()
+    changed.view(torch.uint8)[-1] ^= 1
+    assert digest(value) != digest(changed)
+    assert digest(value[:0]) != digest(value[:1])

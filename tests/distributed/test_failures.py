@@ -1,0 +1,249 @@
+"""Runs of several processes that stop, break or go on with another number: one line, the last good checkpoint."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+from helpers.framework_runs import assert_identical, tiny_capture, tiny_config
+from helpers.processes import ended, said, start_ranks
+
+from turbogs_plugin.distributed import processes as distributed_processes
+from turbogs_plugin.distributed.processes import joined
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.train import checkpoint, run
+from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint
+from turbogs_plugin.train.history import read_history
+from turbogs_plugin.train.trainer import Trainer
+
+ENDLESS = ("train.iterations=100000", "train.refine_until=9", "train.checkpoint_every=3", "train.evaluate_at=[]")
+SECONDS = 30.0
+"""All processes of a training have ended so long after one of them was lost."""
+
+
+def training(capture: Path, out: Path, trouble: str, overrides: tuple[str, ...]) -> None:
+    """In every process: a run, with trouble in one of them."""
+    with joined("cpu") as ranks:
+        config = tiny_config(capture, *overrides)
+        last = ranks.rank == ranks.count - 1
+        step = Trainer.step
+
+        def without_memory(trainer: Trainer) -> None:
+            if trainer.iteration == 4:
+                raise torch.cuda.OutOfMemoryError("CUDA out of memory")
+            step(trainer)
+
+        def interrupted(trainer: Trainer) -> None:
+            if trainer.iteration == 5:
+                signal.raise_signal(signal.SIGTERM)
+            step(trainer)
+
+        def no_room(*arguments: object) -> None:
+            raise OSError(28, "No space left on device")
+
+        def no_capture(*arguments: object) -> None:
+            raise InputError("no such scene: absent on this machine")
+
+        def in_simulated_time() -> None:
+            """Each process has a clock of its own, and the last one's goes three times as fast."""
+            clock, look = itertools.count(), Trainer.dense_errors
+            ticks = [0.0]
+
+            def passing(trainer: Trainer) -> None:
+                step(trainer)
+                ticks[0] += 0.06 if last else 0.02
+
+            def looking(trainer: Trainer, view: int) -> torch.Tensor:
+                ticks[0] += 0.01
+                return look(trainer, view)
+
+            Trainer.step, Trainer.dense_errors = passing, looking
+            time.perf_counter = lambda: ticks[0] + 1e-6 * next(clock)
+
+        if trouble == "short grace":
+            distributed_processes.GRACE_SECONDS = 1.0
+        if trouble == "clock":
+            in_simulated_time()
+        if trouble == "memory" and last:
+            Trainer.step = without_memory
+        if trouble == "signal" and last:
+            Trainer.step = interrupted
+        if trouble == "disk":
+            checkpoint.write_atomically = no_room
+        if trouble == "input" and last:
+            run.load_scene = no_capture
+        session = run.resume(out, ranks=ranks) if out.exists() else run.train(config, out, ranks=ranks)
+    if session.signal:
+        sys.stderr.flush()
+        os._exit(128 + session.signal)
+
+
+def trained(count: int, folder: Path, capture: Path, trouble: str = "", *overrides: str) -> tuple[list[int], str]:
+    """(exit codes, what all said) of a training in `folder`, the run in ``folder/run``."""
+    codes = ended(start_ranks(count, training, folder, capture, folder / "run", trouble, overrides), 120)
+    return codes, said(folder)
+
+
+def children_of(process: int) -> list[int]:
+    """The processes that a process of this machine has started."""
+    stats = [path.read_text() for path in Path("/proc").glob("[0-9]*/stat")]
+    return sorted(int(text.split()[0]) for text in stats if text.rpartition(")")[2].split()[1] == str(process))
+
+
+def errors_in(text: str) -> list[str]:
+    return [line for line in text.splitlines() if "error" in line.lower()]
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory) -> Path:
+    return tiny_capture(tmp_path_factory.mktemp("failures"))
+
+
+@pytest.fixture(scope="module")
+def of_two(capture, tmp_path_factory) -> Path:
+    """A whole run of two processes, which keeps a copy of its checkpoint of iteration 5."""
+    folder = tmp_path_factory.mktemp("of-two")
+    codes, text = trained(2, folder, capture, "", "train.checkpoint_every=10")
+    assert codes == [0, 0], text
+    return folder / "run"
+
+
+def test_a_run_of_two_leaves_what_a_run_of_one_does(of_two):
+    assert [evaluation.iteration for evaluation in read_history(of_two / "history.jsonl")] == [0, 7, 14]
+    assert (of_two / "model.ply").is_file() and (of_two / "wall.json").is_file()
+    assert load_checkpoint(latest_checkpoint(of_two / "checkpoints"))["trainer"]["iteration"] == 14
+
+
+def test_a_run_goes_on_with_another_number_of_processes(of_two, capture, tmp_path):
+    """From iteration 10 of a run of two: one and four processes take it to the end, and two to the same bits."""
+    finals = {}
+    for count in (1, 2, 4):
+        folder = tmp_path / str(count)
+        shutil.copytree(of_two, folder / "run")
+        (folder / "run/checkpoints/latest").write_text("iteration-000010.pt")
+        if count == 1:
+            run.resume(folder / "run")
+        else:
+            codes, text = trained(count, folder, capture)
+            assert codes == [0] * count, text
+        finals[count] = load_checkpoint(latest_checkpoint(folder / "run/checkpoints"))["trainer"]
+        assert finals[count]["iteration"] == 14
+    whole = load_checkpoint(latest_checkpoint(of_two / "checkpoints"))["trainer"]
+    assert_identical(finals[2], whole)
+    for count in (1, 4):
+        assert len(finals[count]["gaussians"]["means"]) == len(whole["gaussians"]["means"])
+        assert torch.equal(finals[count]["maps"]["stamps"], whole["maps"]["stamps"])
+
+
+@pytest.mark.parametrize("lost", [0, 1])
+def test_a_killed_process_ends_all_with_one_line_and_the_last_checkpoint(lost, capture, tmp_path):
+    processes = start_ranks(2, training, tmp_path, capture, tmp_path / "run", "", ENDLESS)
+    newest = tmp_path / "run/checkpoints/iteration-000006.pt"
+    give_up = time.monotonic() + 120
+    while not newest.exists() and time.monotonic() < give_up:
+        time.sleep(0.01)
+    processes[lost].kill()
+    codes = ended(processes, SECONDS)
+    assert codes[lost] == -signal.SIGKILL and codes[1 - lost] == 1
+    (line,) = errors_in(said(tmp_path))
+    assert "another process of this training ended" in line
+    assert f"the last good checkpoint is '{latest_checkpoint(tmp_path / 'run/checkpoints')}'" in line
+    assert load_checkpoint(latest_checkpoint(tmp_path / "run/checkpoints"))["trainer"]["iteration"] >= 3
+
+
+@pytest.mark.parametrize(
+    ("trouble", "message"),
+    [
+        ("memory", "iteration 4: the device's memory was too small"),
+        ("disk", "No space left on device"),
+        ("input", "absent"),
+    ],
+)
+def test_trouble_of_one_process_ends_all_with_its_own_line(trouble, message, capture, tmp_path):
+    codes, text = trained(2, tmp_path, capture, trouble, "train.checkpoint_every=3")
+    assert all(code in (1, 2) for code in codes), (codes, text)
+    (line,) = errors_in(text)
+    assert message in line and "turbogs: error:" in line
+    if trouble == "memory":
+        assert "the last good checkpoint is" in line
+
+
+def test_a_process_that_waits_for_one_that_hangs_ends_when_it_is_asked_to(capture, tmp_path):
+    """As on GPUs, where nothing tells a waiting process that another one is gone: the launcher asks it to end."""
+    processes = start_ranks(2, training, tmp_path, capture, tmp_path / "run", "short grace", ENDLESS)
+    newest = tmp_path / "run/checkpoints/iteration-000006.pt"
+    give_up = time.monotonic() + 120
+    while not newest.exists() and time.monotonic() < give_up:
+        time.sleep(0.01)
+    os.kill(processes[1].pid, signal.SIGSTOP)
+    time.sleep(0.5)
+    processes[0].terminate()
+    assert ended(processes[:1], SECONDS) == [128 + signal.SIGTERM]
+    processes[1].kill()
+    (line,) = errors_in(said(tmp_path))
+    assert "does not answer" in line
+    assert latest_checkpoint(tmp_path / "run/checkpoints") is not None
+
+
+def test_a_signal_to_one_process_stops_and_saves_all(capture, tmp_path):
+    codes, text = trained(2, tmp_path, capture, "signal", *ENDLESS)
+    assert codes == [128 + signal.SIGTERM] * 2, text
+    state = load_checkpoint(latest_checkpoint(tmp_path / "run/checkpoints"))["trainer"]
+    assert 6 <= state["iteration"] <= 12
+
+
+def test_a_time_budget_is_kept_by_the_first_clock(capture, tmp_path):
+    codes, text = trained(2, tmp_path, capture, "clock", "budget.time=2s")
+    assert codes == [0, 0], text
+    final = read_history(tmp_path / "run/history.jsonl")[-1]
+    assert final.train_seconds == pytest.approx(2.0, abs=0.1) and final.iteration > 60
+
+
+def test_torchrun_starts_a_lost_run_again_from_its_checkpoint(capture, tmp_path):
+    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2", "--max-restarts=1"]
+    command += ["--monitor-interval=0.1", "-m", "turbogs_plugin", "train", str(capture), "--out", str(tmp_path / "run")]
+    overrides = ["train.iterations=80", *ENDLESS[1:], "schedule.max_views=2", "schedule.min_views=2"]
+    command += ["--device", "cpu", "--no-report", *overrides]
+    with (tmp_path / "err").open("w") as error:
+        launcher = subprocess.Popen(command, stderr=error, stdout=error)
+    newest = tmp_path / "run/checkpoints/iteration-000006.pt"
+    give_up = time.monotonic() + 120
+    while not newest.exists() and time.monotonic() < give_up:
+        time.sleep(0.01)
+    os.kill(children_of(launcher.pid)[-1], signal.SIGKILL)
+    assert launcher.wait(180) == 0, (tmp_path / "err").read_text()
+    history = read_history(tmp_path / "run/history.jsonl")
+    assert history[-1].iteration == 80
+    assert "TrainingStopped" not in (tmp_path / "err").read_text()
+
+
+def test_the_command_starts_processes_itself(capture, tmp_path, turbogs):
+    settings = ("train.iterations=3", "train.refine_until=2", "train.evaluate_at=[]")
+    folder = tmp_path / "run"
+    code, _, told = turbogs("train", capture, *settings, "--out", folder, "--gpus", 2, "--device", "cpu", "--no-report")
+    assert code == 0, told
+    assert load_checkpoint(latest_checkpoint(folder / "checkpoints"))["trainer"]["iteration"] == 3
+    code, _, told = turbogs("train", tmp_path / "absent", "--out", tmp_path / "no", "--gpus", 2, "--device", "cpu")
+    assert code == 2 and not (tmp_path / "no").exists()
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there may be enough")
+def test_more_gpus_than_there_are_is_one_line(capture, tmp_path, turbogs):
+    code, _, told = turbogs("train", capture, "--out", tmp_path / "run", "--gpus", 3)
+    assert code == 2 and told.count("\n") == 1 and "--gpus 3: no GPU answers here" in told
+    code, _, told = turbogs("train", capture, "--out", tmp_path / "run", "--gpus", 0)
+    assert code == 2 and "--gpus 0" in told
+
+
+def test_a_process_alone_exchanges_nothing(capture):
+    with joined("cpu") as ranks:
+        assert ranks.count == 1 and ranks.first and ranks.agree("x") == "x" and not ranks.ask_to_stop(15)
+    assert not torch.distributed.is_initialized()

@@ -1,0 +1,77 @@
+"""Samples are shared out in runs of tiles with equally many of them, and every sample has one owner."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from turbogs_plugin.strategies import ErrorGuidedPixelSampler
+
+from turbogs_plugin.distributed.shares import NEARLY, shares_of
+from turbogs_plugin.error_maps import ErrorMaps
+from turbogs_plugin.tiles import dense_pixels
+from turbogs_plugin.types import PixelSamples, Step
+
+EQUAL = [(160, 96)] * 6
+MIXED = [(160, 96), (40, 50), (33, 17), (200, 180), (16, 16), (90, 20)]
+
+
+def samples_of(sizes: list[tuple[int, int]], views: int, unit: str = "pixel", rate: float = 0.1) -> PixelSamples:
+    maps = ErrorMaps(np.array(sizes))
+    maps.errors.uniform_(0, 1, generator=torch.Generator().manual_seed(0))
+    return ErrorGuidedPixelSampler(unit=unit).sample(maps, tuple(range(views)), rate, Step(3, 10, 8))
+
+
+@pytest.mark.parametrize("unit", ["pixel", "cell", "tile"])
+@pytest.mark.parametrize("count", [2, 3, 4, 8])
+@pytest.mark.parametrize("views", [1, 2, 3, 6])
+@pytest.mark.parametrize("sizes", [EQUAL, MIXED])
+def test_shares_are_the_samples_in_their_order(sizes, views, count, unit):
+    samples = samples_of(sizes, views, unit)
+    shares = shares_of(samples, count)
+    assert len(shares) == count
+    parts = [samples.of_tiles(share.tiles, share.views, share.slots) for share in shares if len(share)]
+    assert torch.equal(torch.cat([part.pixel_ids for part in parts]), samples.pixel_ids)
+    begun = [view for share in shares for view in range(views)[share.begun]]
+    assert begun == list(range(views))
+    of_slots = samples.view_of_slot()
+    for share, part in zip([share for share in shares if len(share)], parts, strict=True):
+        assert torch.equal(part.view_of_slot() + share.views.start, of_slots[share.slots])
+        assert torch.equal(part.coordinates(), samples.coordinates()[share.slots])
+        assert set(part.view_of_slot().tolist()) == set(range(len(share)))
+        assert len(part.tile_ids) == len(part.tile_offsets) - 1 and int(part.tile_offsets[-1]) == len(part)
+
+
+@pytest.mark.parametrize("count", [2, 3, 4, 8])
+@pytest.mark.parametrize("views", [1, 3, 5])
+def test_shares_are_nearly_even(views, count):
+    samples = samples_of(EQUAL, views)
+    sizes = [share.slots.stop - share.slots.start for share in shares_of(samples, count)]
+    even, tile = len(samples) / count, 256 * 0.1
+    assert max(abs(size - even) for size in sizes) <= 2 * (NEARLY * even + tile)
+
+
+def test_views_that_divide_are_not_cut():
+    shares = shares_of(samples_of(EQUAL, 6), 3)
+    assert [share.views for share in shares] == [slice(0, 2), slice(2, 4), slice(4, 6)]
+    assert not any(share.continues for share in shares)
+
+
+def test_a_view_of_several_shares_begins_in_the_first():
+    shares = shares_of(samples_of(EQUAL, 3), 2)
+    assert [share.views for share in shares] == [slice(0, 2), slice(1, 3)]
+    assert [share.continues for share in shares] == [False, True]
+    assert [share.begun for share in shares] == [slice(0, 2), slice(2, 3)]
+
+
+def test_processes_without_samples_have_no_views():
+    shares = shares_of(samples_of(EQUAL, 1, "tile", 1e-3), 4)
+    assert sorted(len(share) for share in shares) == [0, 0, 0, 1]
+
+
+def test_dense_samples_know_their_ends():
+    samples = dense_pixels((0, 1, 2), np.array(MIXED[:3]), "cpu")
+    known = samples.ends()
+    samples.host_ends = None
+    for given, asked in zip(known, samples.ends(), strict=True):
+        np.testing.assert_array_equal(given, asked)

@@ -1,0 +1,106 @@
+"""Paths of cameras: through given ones, without jumps, about what they look at."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.export.camera_path import (
+    focus_and_up,
+    from_file,
+    interpolated,
+    orbit,
+    quaternions,
+    rotations,
+    through_views,
+)
+from turbogs_plugin.scene import Frame
+from turbogs_plugin.scene.poses import camera_centers, look_at
+from turbogs_plugin.types import Cameras
+
+K = np.array([[50.0, 0, 24], [0, 50.0, 20], [0, 0, 1]])
+UP = np.array([0.0, 0.0, 1.0])
+
+
+def ring(angles, target=(1.0, 2.0, 0.5), radius=3.0) -> Cameras:
+    places = np.asarray(target) + np.stack([radius * np.cos(angles), radius * np.sin(angles), 0 * angles + 1.0], axis=1)
+    viewmats = np.stack([look_at(place, np.asarray(target), UP) for place in places])
+    Ks = np.repeat(K[None], len(viewmats), axis=0)
+    sizes = np.full((len(viewmats), 2), 48)
+    return Cameras(torch.from_numpy(viewmats).float(), torch.from_numpy(Ks).float(), sizes)
+
+
+def test_a_path_goes_through_its_keys_at_even_speed():
+    keys = ring(np.linspace(0, 2, 5))
+    viewmats = keys.viewmats.double().numpy()
+    made = interpolated(viewmats, np.repeat(K[None], 5, axis=0), (48, 40), 81)
+    assert len(made) == 81
+    assert np.allclose(made.viewmats[::20].numpy(), viewmats, atol=1e-5)
+    steps = np.linalg.norm(np.diff(made.centers.double().numpy(), axis=0), axis=1)
+    assert steps.max() < 1.3 * steps.min()
+    assert np.allclose(np.linalg.det(made.viewmats[:, :3, :3].double().numpy()), 1.0, atol=1e-5)
+
+
+def test_rotations_take_the_shorter_way():
+    generator = np.random.default_rng(0)
+    quats = generator.normal(size=(50, 4))
+    quats /= np.linalg.norm(quats, axis=1, keepdims=True)
+    again = quaternions(rotations(quats))
+    assert np.allclose(np.abs((again * quats).sum(axis=1)), 1.0)
+    viewmats = np.tile(np.eye(4), (2, 1, 1))
+    viewmats[1, :3, :3] = rotations(np.array([[np.cos(0.4), 0, np.sin(0.4), 0]]))[0]
+    made = interpolated(viewmats, np.repeat(K[None], 2, axis=0), (48, 40), 3)
+    half = rotations(np.array([[np.cos(0.2), 0, np.sin(0.2), 0]]))[0]
+    assert np.allclose(made.viewmats[1, :3, :3].numpy(), half, atol=1e-6)
+
+
+def test_an_orbit_surrounds_what_cameras_look_at():
+    cameras = ring(np.linspace(0, 2 * np.pi, 12, endpoint=False))
+    focus, up = focus_and_up(cameras)
+    assert np.allclose(focus, [1, 2, 0.5], atol=1e-4) and up @ UP > 0.9
+    made = orbit(cameras, 60).centers.numpy() - focus
+    assert np.allclose(np.linalg.norm(made, axis=1), np.sqrt(10.0), rtol=1e-3)
+    angles = np.unwrap(np.arctan2(made[:, 1], made[:, 0]))
+    assert abs(abs(angles[-1] - angles[0]) - 2 * np.pi * 59 / 60) < 1e-3
+
+
+def test_an_orbit_of_cameras_on_one_side_swings_there():
+    cameras = ring(np.linspace(3.0, 4.0, 6))  # across the place where angles jump
+    made = orbit(cameras, 60).centers.numpy() - np.array([1, 2, 0.5])
+    angles = np.arctan2(made[:, 1], made[:, 0]) % (2 * np.pi)
+    assert angles.min() > 2.99 and angles.max() < 4.01 and np.ptp(angles) > 0.95
+
+
+@pytest.mark.parametrize("make", [orbit, through_views])
+def test_one_camera_alone(make):
+    made = make(ring(np.array([0.3])), 4)
+    assert len(made) == 4 and bool(torch.isfinite(made.viewmats).all())
+
+
+def test_a_file_of_cameras_is_in_the_captures_coordinates(tmp_path):
+    frame = Frame(np.array([10.0, 0.0, 0.0]), 2.0)
+    viewmats = ring(np.array([0.0, 0.5])).viewmats.double().numpy()
+    frames = []
+    for viewmat in viewmats:
+        pose = np.linalg.inv(viewmat)
+        pose[:3, 1:3] *= -1.0  # OpenGL's axes
+        frames.append({"transform_matrix": pose.tolist()})
+    content = {"w": 64, "h": 48, "camera_angle_x": 1.0, "frames": frames}
+    (tmp_path / "a.json").write_text(json.dumps(content))
+    made = from_file(tmp_path / "a.json", frame, 5)
+    expected = (camera_centers(viewmats) - frame.center) / 2.0
+    assert np.allclose(made.centers[[0, -1]].numpy(), expected, atol=1e-5)
+    assert made.sizes.tolist() == [[64, 48]] * 5 and float(made.Ks[0, 0, 0]) == pytest.approx(32 / np.tan(0.5))
+
+
+WRONG = ({"w": None}, {"w": 0}, {"fl_x": -1.0}, {"frames": []}, {"frames": [{}]}, {"frames": [{"transform_matrix": 1}]})
+
+
+@pytest.mark.parametrize("change", WRONG)
+def test_a_file_of_something_else_is_refused(tmp_path, change):
+    content = {"w": 64, "h": 48, "fl_x": 50.0, "frames": [{"transform_matrix": np.eye(4).tolist()}], **change}
+    (tmp_path / "a.json").write_text(json.dumps({name: value for name, value in content.items() if value is not None}))
+    with pytest.raises(InputError, match=r"a\.json"):
+        from_file(tmp_path / "a.json", Frame(np.zeros(3), 1.0), 3)

@@ -1,0 +1,130 @@
+"""`turbogs export` and the films of `turbogs render`: what they say, and what they refuse."""
+
+import json
+import re
+import shutil
+
+import numpy as np
+import pytest
+import torch
+
+from turbogs_plugin.engine.rendering import render_image
+from turbogs_plugin.export import film
+from turbogs_plugin.export.contribution import contributions, pruned
+from turbogs_plugin.export.formats import FORMATS
+from turbogs_plugin.model.ply import load_ply
+
+
+def refused(result: tuple[int, str, str], *words: object) -> None:
+    code, out, err = result
+    assert code == 2 and out == "" and err.startswith("turbogs: error: ") and err.count("\n") == 1, (code, out, err)
+    assert all(str(word) in err for word in words), err
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_an_export_says_bytes_and_what_was_lost(turbogs, finished, tmp_path, name):
+    file = tmp_path / f"m{FORMATS[name].suffix}"
+    code, out, err = turbogs("export", finished, "--format", name, "--out", file)
+    assert code == 0, err
+    assert f"{file.stat().st_size:,} bytes" in out
+    before, after = map(float, re.search(r"PSNR ([\d.]+) -> ([\d.]+) dB on 1 of 1 test views", out).groups())
+    assert abs(before - after) < (0.005 if name in ("ply", "pt") else 1.0)
+
+
+def test_a_run_whose_capture_is_gone_is_exported_unmeasured(turbogs, finished, capture, tmp_path):
+    moved = tmp_path / "moved"
+    shutil.copytree(finished, moved)
+    text = (moved / "config.yaml").read_text()
+    (moved / "config.yaml").write_text(text.replace(str(capture), str(tmp_path / "gone")))
+    code, out, _ = turbogs("export", moved, "--format", "splat")
+    assert code == 0 and "not measured" in out and (moved / "model.splat").is_file()
+    refused(turbogs("export", moved, "--format", "html"), "gone")
+    refused(turbogs("export", moved, "--max-gaussians", "5", "--out", tmp_path / "a.ply"), "gone")
+
+
+def test_pruning_keeps_what_adds_most(model, scene):
+    """Against a sum by hand: the colour of a Gaussian that alone is white is its weight at each pixel."""
+    gaussians, cameras = model.gaussians, scene.train.cameras
+    weights = contributions(gaussians, cameras, model.config.raster)
+    strongest = int(weights.argmax())
+    alone = gaussians.map(torch.clone)
+    alone.sh0[:], alone.shN[:] = -10.0, 0.0
+    alone.sh0[strongest] = 0.5 / 0.28209479177387814
+    images = [render_image(alone, cameras, view, settings=model.config.raster).colors for view in range(len(cameras))]
+    assert sum(float(image[..., 0].sum()) for image in images) == pytest.approx(float(weights[strongest]), rel=1e-3)
+    kept = pruned(gaussians, weights, 100)
+    assert len(kept) == 100 and float(weights.sort(descending=True).values[100]) <= float(
+        contributions(kept, cameras, model.config.raster).max()
+    )
+    least = pruned(gaussians, -weights, 100)
+    seen = [render_image(part, cameras, 0).alphas.mean() for part in (kept, least)]
+    assert seen[0] > seen[1]
+
+
+def test_an_export_of_fewer(turbogs, finished, tmp_path):
+    code, out, err = turbogs("export", finished, "--max-gaussians", "50", "--out", tmp_path / "few.ply")
+    assert code == 0 and len(load_ply(tmp_path / "few.ply")) == 50 and "the 50 of" in out and "lost" in out, err
+    before = (finished / "model.ply").read_bytes()
+    refused(turbogs("export", finished, "--max-gaussians", "50"), "model.ply", "--out")
+    refused(turbogs("export", finished, "--max-gaussians", "0", "--out", tmp_path / "b.ply"), "--max-gaussians 0")
+    assert (finished / "model.ply").read_bytes() == before
+
+
+def test_bad_input_is_one_line(turbogs, finished, capture, tmp_path):
+    points = tmp_path / "points.ply"
+    points.write_text("ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n1\n")
+    refused(turbogs("export", finished, "--format", "obj"), "--format obj", "compressed-ply")
+    refused(turbogs("export", tmp_path, "--format", "spz"), "holds no run")
+    shutil.copytree(finished, tmp_path / "empty")
+    shutil.rmtree(tmp_path / "empty" / "checkpoints")
+    refused(turbogs("export", tmp_path / "empty", "--format", "html"), "no checkpoint yet")
+    call = ("export", points, "--scene", capture, "--format", "spz", "--out")
+    refused(turbogs(*call, tmp_path / "a.spz"), "not a 3DGS model")
+    refused(turbogs(*call, points), "exists")
+    refused(turbogs(*call, tmp_path / "absent" / "a.spz"), "absent")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["empty", "points.ply"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "word"),
+    [
+        (("--path", "views"), "--video"),
+        (("--video", "a.txt"), ".mp4"),
+        (("--video", "a.mp4", "--path", "nowhere"), "nowhere"),
+        (("--video", "a.mp4", "--seconds", "0"), "--seconds 0"),
+        (("--video", "absent/a.mp4"), "absent"),
+        (("--video", "a.mp4", "--depth"), "--depth"),
+    ],
+)
+def test_a_film_that_cannot_be_made(turbogs, finished, tmp_path, monkeypatch, arguments, word):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(film.importlib.util, "find_spec", lambda name: name)
+    refused(turbogs("render", finished, *arguments), word)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_film_without_its_package(turbogs, finished, tmp_path, monkeypatch):
+    monkeypatch.setattr(film.importlib.util, "find_spec", lambda name: None)
+    refused(turbogs("render", finished, "--video", tmp_path / "a.mp4"), "imageio-ffmpeg", "turbogs-plugin[video]")
+
+
+@pytest.mark.parametrize("path", ["orbit", "views", "file"])
+def test_a_film(turbogs, finished, tmp_path, path):
+    ffmpeg = pytest.importorskip("imageio_ffmpeg")
+    if path == "file":
+        pose = np.eye(4).tolist()
+        content = {"w": 33, "h": 24, "fl_x": 30.0, "frames": [{"transform_matrix": pose}] * 2}
+        (tmp_path / "path.json").write_text(json.dumps(content))
+        path = tmp_path / "path.json"
+    video = tmp_path / "a.mp4"
+    code, out, err = turbogs(
+        "render", finished, "--path", path, "--video", video, "--seconds", "0.1", "--device", "cpu"
+    )
+    assert code == 0 and str(video) in out and "frame 6/6" in err, err
+    reader = ffmpeg.read_frames(str(video))
+    facts = next(reader)
+    assert facts["fps"] == 60 and facts["size"] == ((32, 24) if path not in ("orbit", "views") else (48, 40))
+    frames = [np.frombuffer(frame, dtype=np.uint8) for frame in reader]
+    assert len(frames) == 6
+    if path == "views":
+        assert frames[0].std() > 5 and np.abs(frames[0].astype(int) - frames[5]).mean() > 1

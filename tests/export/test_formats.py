@@ -1,0 +1,168 @@
+"""Every format is read back, and by foreign readers where they are installed."""
+
+import gzip
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.export.formats import FORMATS, in_capture, written_and_read
+from turbogs_plugin.export.packing import pack, unpack
+from turbogs_plugin.export.spz import packed, read_spz
+from turbogs_plugin.scene import Frame
+from turbogs_plugin.types import SH_C0, Gaussians
+
+
+def gaussians(count: int = 300, degree: int = 3) -> Gaussians:
+    generator = torch.Generator().manual_seed(3)
+
+    def normal(*shape: int) -> torch.Tensor:
+        return torch.randn(*shape, generator=generator)
+
+    bands = (degree + 1) ** 2 - 1
+    shN = 0.2 * normal(count, bands, 3).clamp(-3, 3)
+    return Gaussians(
+        normal(count, 3), normal(count, 4), normal(count, 3) - 4.0, normal(count), 0.8 * normal(count, 1, 3), shN
+    )
+
+
+def matched(made: Gaussians, read: Gaussians) -> Gaussians:
+    """`read` in the order of `made`, by the nearest mean; formats sort."""
+    order = torch.cdist(made.means.double(), read.means.double()).argmin(dim=1)
+    assert len(order.unique()) == len(made)
+    return read.map(lambda value: value[order])
+
+
+def rotations(quats: torch.Tensor) -> torch.Tensor:
+    """[N, 4] unit quaternions with a positive largest component."""
+    unit = torch.nn.functional.normalize(quats.double(), dim=1)
+    return unit * torch.sign(unit.gather(1, unit.abs().argmax(dim=1, keepdim=True)))
+
+
+# Largest errors of means (share of the extent), rotations, scales, opacities, colours and harmonics.
+STEPS = {
+    "ply": (1e-6, 1e-6, 1e-5, 1e-6, 1e-6, 1e-6),
+    "pt": (1e-6, 1e-6, 1e-5, 1e-6, 1e-6, 1e-6),
+    "compressed-ply": (1e-3, 3e-3, 0.02, 0.003, 0.02, 0.02),
+    "splat": (1e-6, 0.02, 1e-4, 0.005, 0.005, None),
+    "spz": (1e-5, 3e-3, 0.032, 0.003, 0.008, 0.064),
+}
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_a_format_reads_back_within_its_steps(tmp_path, name):
+    made, frame = gaussians(), Frame(np.array([3.0, -2.0, 5.0]), 2.5)
+    read = matched(made, written_and_read(name, made, tmp_path / f"m{FORMATS[name].suffix}", frame, 7))
+    mean, rotation, scale, opacity, color, harmonic = STEPS[name]
+    extent = float(made.means.abs().max())
+    assert float((read.means - made.means).abs().max()) <= mean * extent + 1e-6
+    # Where two components are nearly as large, either may count as the largest: q and -q are one rotation.
+    turned = (rotations(read.quats) * rotations(made.quats)).sum(dim=1).abs().clamp(max=1)
+    assert float((1 - turned**2).sqrt().max()) <= 2 * rotation + 1e-6
+    assert float((read.scales - made.scales).abs().max()) <= scale
+    assert float((torch.sigmoid(read.opacities) - torch.sigmoid(made.opacities)).abs().max()) <= opacity
+    shown = (SH_C0 * made.sh0 + 0.5).clamp(0, 1) if name == "splat" else SH_C0 * made.sh0 + 0.5
+    assert float((SH_C0 * read.sh0 + 0.5 - shown).abs().max()) <= color
+    if harmonic is not None:
+        assert float((read.shN - made.shN).abs().max()) <= harmonic
+    else:
+        assert read.shN.shape[1] == 0
+
+
+@pytest.mark.parametrize("degree", range(4))
+def test_the_pages_model_reads_back(degree):
+    made = gaussians(degree=degree)
+    model = pack(made)
+    read = unpack(model)
+    assert torch.equal(read.means, made.means) and model.stride == 32 + 16 * -(-3 * model.bands // 16)
+    assert float((read.scales - made.scales).abs().max()) < 5e-3
+    assert float((torch.sigmoid(read.opacities) - torch.sigmoid(made.opacities)).abs().max()) < 1e-3
+    turned = (rotations(read.quats) * rotations(made.quats)).sum(dim=1).abs().clamp(max=1)
+    assert float((1 - turned**2).sqrt().max()) < 3e-3
+    if degree:
+        assert float((read.shN - made.shN).abs().max()) < 2 / 127 * float(made.shN.abs().max())
+
+
+def test_spz_by_hand():
+    """One Gaussian, byte by byte, by the published layout of version 3."""
+    one = Gaussians(
+        means=torch.tensor([[1.0, -2.0, 0.5]]),
+        quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
+        scales=torch.tensor([[-4.0, -5.0, -6.5]]),
+        opacities=torch.zeros(1),
+        sh0=torch.tensor([[[0.0, 1.0, -20.0]]]),
+        shN=torch.zeros(1, 3, 3),
+    )
+    content = gzip.decompress(packed(one))
+    magic, version, count, degree, bits, flags, zero = struct.unpack_from("<IIIBBBB", content)
+    assert (magic, version, count, degree, flags, zero) == (0x5053474E, 3, 1, 1, 0, 0)
+    body = content[16:]
+    places = [int.from_bytes(body[at : at + 3], "little", signed=True) / 2**bits for at in (0, 3, 6)]
+    assert places == [1.0, 2.0, -0.5]  # y up, z backward
+    assert body[9] == 128 and list(body[10:13]) == [128, 166, 0]
+    assert list(body[13:16]) == [96, 80, 56]
+    assert int.from_bytes(body[16:20], "little") == 3 << 30  # w is the largest, the others are 0
+    assert list(body[20:]) == [128] * 9
+
+
+def test_spz_of_a_foreign_writer_in_version_2(tmp_path):
+    header = struct.pack("<IIIBBBB", 0x5053474E, 2, 1, 0, 12, 0, 0)
+    place = b"".join(round(value * 4096).to_bytes(3, "little", signed=True) for value in (1.5, -0.25, 2.0))
+    rest = bytes([255, 128, 128, 128, 160, 144, 176, 255, 128, 128])
+    (tmp_path / "a.spz").write_bytes(gzip.compress(header + place + rest))
+    read = read_spz(tmp_path / "a.spz")
+    assert read.means.tolist() == [[1.5, 0.25, -2.0]] and read.scales.tolist() == [[0.0, -1.0, 1.0]]
+    assert read.quats[0].abs().argmax() == 1 and read.shN.shape == (1, 0, 3)
+
+
+@pytest.mark.parametrize("name", ["ply", "compressed-ply", "spz"])
+def test_a_foreign_reader_reads_ours(tmp_path, name):
+    gsply = pytest.importorskip("gsply")
+    file = tmp_path / ("m.spz" if name == "spz" else "m.ply")
+    FORMATS[name].write(gaussians(), file, Frame(np.zeros(3), 1.0), 0)
+    theirs, ours = (gsply.read_spz if name == "spz" else gsply.plyread)(str(file)), FORMATS[name].read(file)
+    # It leaves a .spz in the file's own axes.
+    mirrored = [1.0, -1.0, -1.0] if name == "spz" else [1.0, 1.0, 1.0]
+    assert np.abs(np.asarray(theirs.means) * mirrored - ours.means.numpy()).max() < 1e-5
+    assert np.abs(np.asarray(theirs.quats) * [1.0, *mirrored] - ours.quats.numpy()).max() < 1e-5
+    assert np.abs(np.asarray(theirs.scales) - ours.scales.numpy()).max() < 1e-5
+    assert np.abs(np.asarray(theirs.opacities) - ours.opacities.numpy()).max() < 1e-4
+    assert np.abs(np.asarray(theirs.sh0).reshape(-1, 3) - ours.sh0[:, 0].numpy()).max() < 1e-5
+    assert np.abs(np.abs(np.asarray(theirs.shN)) - np.abs(ours.shN.numpy())).max() < 1e-5
+
+
+@pytest.mark.parametrize("name", ["pt", "compressed-ply", "splat", "spz"])
+def test_a_capture_far_from_its_origin_is_refused_in_single_precision(tmp_path, name):
+    with pytest.raises(InputError, match="--format ply"):
+        FORMATS[name].write(gaussians(), tmp_path / "m", Frame(np.array([5e8, 0.0, 0.0]), 1.0), 0)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("name", ["compressed-ply", "splat", "spz"])
+@pytest.mark.parametrize("damage", ["cut", "longer", "other"])
+def test_a_damaged_file_is_refused(tmp_path, name, damage):
+    file = tmp_path / "m"
+    FORMATS[name].write(gaussians(), file, Frame(np.zeros(3), 1.0), 0)
+    content = file.read_bytes()
+    file.write_bytes({"cut": content[:-5], "longer": content[:40] + b"abc" + content[40:], "other": b"ply\nno"}[damage])
+    with pytest.raises(InputError, match=file.name):
+        FORMATS[name].read(file)
+
+
+def test_gaussians_that_are_not_finite_are_left_out():
+    made = gaussians(10)
+    made.scales[3, 1] = torch.inf
+    assert len(in_capture(made, Frame(np.zeros(3), 1.0), "x")) == 9
+    made.means[:] = torch.nan
+    with pytest.raises(InputError, match="no Gaussians"):
+        in_capture(made, Frame(np.zeros(3), 1.0), "x")
+
+
+def test_a_single_gaussian_and_one_place(tmp_path):
+    for name, form in FORMATS.items():
+        file = Path(tmp_path / name)
+        form.write(gaussians(1), file, Frame(np.zeros(3), 1.0), 0)
+        assert bool(torch.isfinite(form.read(file).means).all())

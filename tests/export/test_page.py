@@ -1,0 +1,114 @@
+"""The page: one file, small enough, and in a real browser without a network it shows what our renderer draws."""
+
+import base64
+import io
+import re
+import shutil
+from html import escape
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from turbogs_plugin.engine.rendering import render_image
+from turbogs_plugin.export import page
+from turbogs_plugin.export.page import write_page
+from turbogs_plugin.types import Cameras
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+ARGUMENTS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-dev-shm-usage")
+PATIENCE = 90_000
+
+
+@pytest.fixture(scope="module")
+def written(finished, scene, tmp_path_factory):
+    from turbogs_plugin.train import run
+
+    file = tmp_path_factory.mktemp("page") / "report.html"
+    model = run.load_model(finished, torch.device("cpu"))
+    return file, write_page(model, model.gaussians, scene, file), model
+
+
+def test_the_page_is_one_file_that_asks_for_nothing(written):
+    file, made, model = written
+    text = file.read_text(encoding="utf-8")
+    assert [path.name for path in file.parent.iterdir()] == ["report.html"]
+    assert made.bytes == file.stat().st_size < 32_000_000 and made.gaussians == len(model.gaussians)
+    assert not re.search(r"""(src|href)=["'](?!data:)""", text) and "default-src 'none'" in text
+    assert escape(made.change.text()) in text and abs(made.change.before - made.change.after) < 0.1
+
+
+def test_a_model_that_is_too_large_is_pruned_and_the_page_says_so(written, scene, tmp_path, monkeypatch):
+    _, made, model = written
+    monkeypatch.setattr(page, "LARGEST_PAGE", made.bytes - 15_000)
+    smaller = write_page(model, model.gaussians, scene, tmp_path / "a.html")
+    assert smaller.bytes < made.bytes - 15_000 and smaller.gaussians < made.gaussians
+    text = (tmp_path / "a.html").read_text(encoding="utf-8")
+    assert f"{smaller.gaussians} of {made.gaussians} Gaussians" in text and escape(smaller.change.text()) in text
+
+
+@pytest.fixture(scope="module")
+def tab(written):
+    playwright = pytest.importorskip("playwright.sync_api")
+    if CHROMIUM is None:
+        pytest.skip("there is no chromium")
+    with playwright.sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=CHROMIUM, args=list(ARGUMENTS))
+        tab = browser.new_context(viewport={"width": 900, "height": 700}, offline=True).new_page()
+        tab.goto(written[0].as_uri())
+        tab.wait_for_selector("#model-status", state="detached", timeout=PATIENCE)
+        tab.add_style_tag(content=".stage { width: 480px !important; height: 400px !important }")
+        tab.wait_for_selector("#model-cameras[width='480'][height='400']", timeout=PATIENCE)
+        yield tab
+        browser.close()
+
+
+def drawn(tab) -> np.ndarray:
+    """[H, W, 3] of the canvas, after the next frame."""
+    frames = "new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))"
+    tab.evaluate(frames)
+    url = tab.evaluate("document.getElementById('model-canvas').toDataURL()")
+    return np.asarray(Image.open(io.BytesIO(base64.b64decode(url.split(",")[1]))).convert("RGB"), dtype=np.float64)
+
+
+def test_the_viewer_draws_what_our_renderer_draws(tab, written, scene):
+    model = written[2]
+    for number, (views, view) in {0: (scene.train, 0), 4: (scene.train, 4), 7: (scene.test, 0)}.items():
+        tab.select_option("#model-choice", str(number))
+        shown = drawn(tab)
+        Ks = views.cameras.Ks.clone()
+        Ks[:, :2] *= 10
+        enlarged = Cameras(views.cameras.viewmats, Ks, views.cameras.sizes * 10)
+        options = {"sh_degree": model.sh_degree, "settings": model.config.raster}
+        expected = 255 * render_image(model.gaussians, enlarged, view, **options).colors.clamp(0, 1).numpy()
+        assert expected.std() > 20 and np.abs(shown - expected).max() <= 3.0
+
+
+def test_the_model_turns_and_its_cameras_are_clicked(tab):
+    tab.select_option("#model-choice", "0")
+    before = drawn(tab)
+    box = tab.locator("#model-canvas").bounding_box()
+    x, y = box["x"] + 240, box["y"] + 200
+    tab.mouse.move(x, y)
+    tab.mouse.down()
+    tab.mouse.move(x + 60, y + 20, steps=3)
+    tab.mouse.up()
+    turned = drawn(tab)
+    assert np.abs(turned - before).mean() > 2 and turned.std() > 10
+    tab.mouse.wheel(0, -200)
+    assert np.abs(drawn(tab) - turned).mean() > 0.5
+    tab.check("#model-show")
+    tab.click("[data-look]")
+    assert tab.input_value("#model-choice") == "7" and np.abs(drawn(tab) - turned).mean() > 0.5
+
+
+def test_the_slider_goes_from_photo_over_render_to_error(tab):
+    seen = {}
+    for value in ("0", "1", "2"):
+        tab.locator(".view input").first.fill(value)
+        shot = tab.locator(".view .pictures").first.screenshot()
+        seen[tab.inner_text(".view .named")] = np.asarray(Image.open(io.BytesIO(shot)).convert("RGB"), dtype=float)
+    assert list(seen) == ["photo", "render", "error"]
+    for one, other in (("photo", "render"), ("render", "error"), ("photo", "error")):
+        assert np.abs(seen[one] - seen[other]).mean() > 3

@@ -1,0 +1,105 @@
+"""Several processes on GPUs: the seam of engine and exchange on one, and whole runs over NCCL where there are two."""
+
+from __future__ import annotations
+
+import copy
+import json
+from dataclasses import fields, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from turbogs_plugin.bench.large_capture import synthetic_scene
+from turbogs_plugin.config.configuration import load_config
+from turbogs_plugin.distributed.digest import digest
+from turbogs_plugin.distributed.processes import start
+from turbogs_plugin.distributed.shares import shares_of
+from turbogs_plugin.engine.cuda import library as kernels
+from turbogs_plugin.engine.rendered import RenderOptions, ScreenRecords
+from turbogs_plugin.scene import write_demo_capture
+from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint
+from turbogs_plugin.train.trainer import Trainer
+
+pytestmark = [
+    pytest.mark.gpu,
+    pytest.mark.skipif(not kernels.available(), reason="needs a GPU and the kernels"),
+]
+
+GPU = torch.device("cuda")
+
+
+@pytest.mark.parametrize("optimizer", ["moment_lm", "sparse_adam"])
+@pytest.mark.parametrize("unit", ["pixel", "cell", "tile"])
+def test_runs_of_rows_make_the_step_of_all_rows(optimizer, unit):
+    """From the same records: parameters, moments and statistics, to the bit."""
+    scene = synthetic_scene(8, 160, 96, GPU, gaussians=5_001)
+    settings = ["schedule.type=fixed", "schedule.views=4", f"optimizer.type={optimizer}", f"pixel_sampler.unit={unit}"]
+    trainer = Trainer(load_config("turbogs", settings).without_plan(), scene, GPU)
+    trainer.initialise_maps()
+    trainer.iteration, views = 3000, (5, 0, 3, 6)
+    step, options = trainer.now, RenderOptions(trainer.sh_degree, trainer.config.raster)
+    samples = trainer.pixel_sampler.sample(trainer.maps, views, 0.25, step)
+    cameras, truth = trainer.views.cameras.select(views), trainer.views.photos.at(samples)
+
+    shares = shares_of(samples, 3)
+    chosen = [samples.of_tiles(share.tiles, share.views, share.slots) for share in shares]
+    parts = [
+        trainer.engine.render(trainer.gaussians, trainer.views.cameras.select(part.view_ids), part, options).colors
+        for part in chosen
+    ]
+    known = samples.ends()
+    samples.host_ends = None  # the device says the same
+    for given, asked in zip(known, samples.ends(), strict=True):
+        np.testing.assert_array_equal(given, asked)
+    rendered = trainer.engine.render(trainer.gaussians, cameras, samples, options)
+    torch.testing.assert_close(torch.cat(parts), rendered.colors, rtol=1e-5, atol=1e-6)
+
+    loss = trainer.supervise(rendered.colors, truth, step)
+    screen = rendered.backward(loss.color_gradients, loss.pixel_errors, with_statistics=True)
+    plain = screen.plain()
+    kept = ScreenRecords(plain.records.clone(), plain.radii.clone(), True)
+    rule = trainer.optimizer.rule(step)
+    model = trainer.gaussians.map(torch.clone)
+    moments, stats = (copy.deepcopy(value) for value in (trainer.optimizer.moments, trainer.density.stats))
+    trainer.engine.update(rule, screen, trainer.gaussians, trainer.optimizer.moments, trainer.density.stats)
+
+    middle = len(model) // 8 * 4  # rows begin at a multiple of four
+    for rows in (slice(0, middle), slice(middle, len(model))):
+        own = model.map(lambda value, rows=rows: value[rows])
+        piece = ScreenRecords(kept.records[:, rows].contiguous(), kept.radii[:, rows].contiguous(), True)
+        states = {each.name: getattr(moments, each.name) for each in fields(moments)}
+        states = {name: value[rows] if value.dim() else value for name, value in states.items()}
+        gradients = trainer.engine.screen_gradients(own, cameras, samples, options, piece)
+        own_stats = stats.map(lambda value, rows=rows: value[rows])
+        trainer.engine.update(rule, gradients, own, replace(moments, **states), own_stats)
+    for name, value in trainer.gaussians.items():
+        assert torch.equal(getattr(model, name), value), name
+    for name, value in vars(trainer.optimizer.moments).items():
+        assert torch.equal(getattr(moments, name), value), name
+    for name, value in vars(trainer.density.stats).items():
+        assert torch.equal(getattr(stats, name), value), name
+    assert int(moments.steps.max()) == 1
+
+
+def test_a_digest_is_the_same_on_both_devices():
+    value = torch.randn(5_000_011, generator=torch.Generator().manual_seed(0))
+    assert digest(value) == digest(value.to(GPU))
+
+
+@pytest.mark.skipif(torch.cuda.device_count() < 2, reason="needs two GPUs")
+@pytest.mark.parametrize("place", ["device", "host"])
+def test_a_run_on_two_gpus_keeps_its_replicas_equal(tmp_path: Path, place):
+    """They are compared at every evaluation; a difference would end the run."""
+    capture = write_demo_capture(tmp_path / "capture", views=12, width=160, height=120)
+    out = tmp_path / "run"
+    settings = ["train.iterations=300", "train.refine_until=200", "train.checkpoint_every=100"]
+    settings += [f"train.maps_place={place}", f"train.photos_place={place}", "density.refine_every=20"]
+    code = start(2, ["train", str(capture), "--out", str(out), "--no-report", "--device", "cuda", *settings], "cuda")
+    assert code == 0
+    lines = [json.loads(line) for line in (out / "history.jsonl").read_text().splitlines()]
+    assert lines[-1]["iteration"] == 300 and lines[-1]["psnr"] > lines[0]["psnr"] + 3
+    assert len({line["num_gaussians"] for line in lines}) > 1
+    state = load_checkpoint(latest_checkpoint(out / "checkpoints"))["trainer"]
+    assert int(state["optimizer"]["steps"].max()) > 100

@@ -1,0 +1,153 @@
+"""Cells shared by several processes: one has a cell, a dead one's is taken over, nothing is trained twice."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from helpers.framework_runs import TINY, tiny_capture
+
+from turbogs_plugin import cli
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.study import claims as claims_module
+from turbogs_plugin.study.claims import STALE_SECONDS, Claims
+from turbogs_plugin.study.folder import StudyFolder
+from turbogs_plugin.study.grid import CellKey
+
+KEY = CellKey("fox", "a.b[1]", 3)
+OTHER = CellKey("fox", "a.b[1]", 31)
+
+
+def claim_many(folder: Path, ready, results) -> None:
+    ready.wait()
+    claims = Claims(folder)
+    results.put([seed for seed in range(30) if claims.take(CellKey("fox", "full", seed)) is not None])
+
+
+def test_of_many_processes_one_has_each_cell(tmp_path):
+    """They live on until all have claimed: a dead one's cells would be taken over."""
+    context = multiprocessing.get_context("fork")
+    ready, results = context.Event(), context.Queue()
+    processes = [context.Process(target=claim_many, args=(tmp_path, ready, results)) for _ in range(3)]
+    for process in processes:
+        process.start()
+        os.kill(process.pid, 0)
+    ready.set()
+    taken = [results.get(timeout=60) for _ in processes]
+    for process in processes:
+        process.join()
+    assert len(taken) == 3
+    claimed = {path.name for path in (tmp_path / "fox").iterdir() if not path.name.startswith(".")}
+    assert {f"full--seed{seed}.0" for seed in range(30)} <= claimed
+    firsts = [seed for seeds in taken for seed in seeds]
+    again = [name for name in claimed if name.endswith(".1")]
+    assert len(firsts) == 30 + len(again)  # a second time only where its first holder had ended
+
+
+def test_a_claim_is_alone_and_gone_when_its_cell_is_trained(tmp_path):
+    claims = Claims(tmp_path)
+    claim = claims.take(KEY)
+    with claim.kept():
+        assert claims.take(KEY) is None and claims.take(OTHER) is not None
+        assert claim.held
+    assert claims.take(KEY) is not None
+
+
+def test_a_dead_process_of_this_host_loses_its_claim_at_once(tmp_path):
+    context = multiprocessing.get_context("fork")
+    dead = context.Process(target=lambda: Claims(tmp_path).take(KEY))
+    dead.start()
+    dead.join()
+    first = json.loads((tmp_path / "fox/a.b[1]--seed3.0").read_text())
+    assert first["process"] == dead.pid
+    claim = Claims(tmp_path).take(KEY)
+    assert claim.generation == 1
+    with claim.kept():
+        pass
+    assert [path.name for path in (tmp_path / "fox").iterdir()] == []
+
+
+@pytest.mark.parametrize("age", [0.5 * STALE_SECONDS, 2 * STALE_SECONDS])
+def test_a_process_of_another_host_loses_its_claim_when_it_is_silent(tmp_path, age):
+    claims = Claims(tmp_path)
+    claim = claims.take(KEY)
+    claim.path.write_text(json.dumps({"host": "elsewhere", "process": 1, "started": "1"}))
+    then = time.time() - age
+    os.utime(claim.path, (then, then))
+    taken = Claims(tmp_path).take(KEY)
+    assert (taken is not None) == (age > STALE_SECONDS)
+    assert claim.held == (taken is None)
+
+
+def test_a_kept_claim_stays_alive(tmp_path, monkeypatch):
+    monkeypatch.setattr(claims_module, "HEARTBEAT_SECONDS", 0.01)
+    claim = Claims(tmp_path).take(KEY)
+    os.utime(claim.path, (0, 0))
+    with claim.kept():
+        give_up = time.monotonic() + 30
+        while claim.path.stat().st_mtime == 0 and time.monotonic() < give_up:
+            time.sleep(0.01)
+        assert claim.path.stat().st_mtime > 0
+
+
+ABLATION = """
+title: Shared
+base: turbogs
+baseline: full
+variants:
+  full: []
+  random: [pixel_sampler.type=random]
+"""
+SETTINGS = [text for text in TINY if text.startswith("schedule")] + ["train.sh_degree=1", "train.evaluate_at=[0.5]"]
+
+
+def call(folder: Path, capture: Path, *more: str) -> list[str]:
+    (folder / "shared.yaml").write_text(ABLATION)
+    names = ["ablate", str(folder / "shared.yaml"), *SETTINGS, "--scene", str(capture), "--out", str(folder / "study")]
+    return [*names, "--device", "cpu", "--steps", "4", "--seeds", "0", "1", *more]
+
+
+def test_two_workers_train_each_cell_once(tmp_path, monkeypatch, capfd):
+    capture = tiny_capture(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["turbogs", *call(tmp_path, capture, "--gpus", "0,1")])
+    with pytest.raises(SystemExit) as end:
+        cli.main()
+    told = capfd.readouterr().err
+    assert not end.value.code, told
+    study = StudyFolder(tmp_path / "study").read_study()
+    assert len(study.results) == 4 and not study.failures
+    trained = [line for line in told.splitlines() if " dB in " in line]
+    assert len(trained) == 4 == len({line.partition("] ")[2].partition(":")[0] for line in trained})
+    assert (tmp_path / "study/report.md").is_file()
+    assert not [path for path in (tmp_path / "study/claims").rglob("*") if path.is_file()]
+
+
+def test_a_cell_that_another_process_trains_is_waited_for(tmp_path, monkeypatch, turbogs):
+    """The other one dies: its cell is taken over."""
+    capture = tiny_capture(tmp_path)
+    folder = StudyFolder(tmp_path / "study")
+    dead = multiprocessing.get_context("fork").Process(
+        target=lambda: Claims(folder.claims).take(CellKey(capture.name, "full", 0))
+    )
+    arguments = call(tmp_path, capture, "--only", "full")
+    arguments[arguments.index("--seeds") + 2] = "1"
+    assert turbogs(*arguments, "--within", "0.001s")[0] == 3  # makes the study, trains nothing
+    dead.start()
+    dead.join()
+    code, _, told = turbogs(*arguments)
+    assert code == 0, told
+    assert {str(result.key) for result in folder.read_study().results} == {
+        f"{capture.name}, full, seed 0",
+        f"{capture.name}, full, seed 1",
+    }
+
+
+@pytest.mark.parametrize("text", ["0,0", "a", "", "0;1"])
+def test_gpus_are_different_numbers(text):
+    with pytest.raises(InputError, match="--gpus"):
+        cli._numbers("--gpus", text)

@@ -1,0 +1,189 @@
+"""`turbogs bench ranks`: an iteration on one GPU and on several, and what of it is exchange.
+
+The models are trained once, on one GPU; then torchrun's processes time the same iterations for each number of GPUs.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import tempfile
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import torch
+
+from turbogs_plugin.bench.clocks import Recorder, back_to_back, device_times
+from turbogs_plugin.bench.models import trained_model
+from turbogs_plugin.bench.step import StepBench, warm_trainer
+from turbogs_plugin.device import synchronize
+from turbogs_plugin.distributed.exchange import RankExchange
+from turbogs_plugin.distributed.processes import joined, start
+from turbogs_plugin.distributed.ranks import ProcessRanks, Ranks
+from turbogs_plugin.distributed.rows import RowGather
+from turbogs_plugin.distributed.shared_pass import SharedScreen
+from turbogs_plugin.errors import TrainingStopped
+from turbogs_plugin.scene import Scene, load_scene
+from turbogs_plugin.study.cell import scene_on
+from turbogs_plugin.train.run import resolve_device
+from turbogs_plugin.train.trainer import Trainer
+from turbogs_plugin.types import Gaussians
+
+PARTS = ("draw", "arrival", "render", "colors", "loss", "backward", "records", "solve", "parameters")
+"""Parts of an iteration. `colors` and `records` are exchanges, with the wait for the slowest process. `parameters`
+packs those of the process, which travel in the next draw; `arrival` is what is left of their way, with the copies."""
+
+
+@dataclass
+class RanksBench:
+    """What is measured.
+
+    Args:
+        gpus: numbers of GPUs, one after the other.
+        gaussians: sizes of the model.
+        views: K, one after the other.
+        pixel_budget: lambda.
+        grown: also K and lambda times the number of GPUs: more views for the same time.
+        training: iterations of the models' training.
+        repeats: iterations timed.
+        overrides: of the configuration.
+    """
+
+    gpus: Sequence[int]
+    gaussians: Sequence[int]
+    views: Sequence[int]
+    pixel_budget: float
+    grown: bool
+    training: int
+    repeats: int
+    overrides: Sequence[str]
+
+    def run(self, path: Path, factor: int, device: torch.device) -> dict[str, Any]:
+        """The measurements, ready for JSON.
+
+        Raises:
+            TrainingStopped: processes ended with an error, which they have told.
+        """
+        results = []
+        with tempfile.TemporaryDirectory() as name:
+            folder = Path(name)
+            scene = scene_on(load_scene(path, factor), device)
+            for count in self.gaussians:
+                model = trained_model(scene, count, self.training, device, self.overrides)
+                torch.save({name: value.cpu() for name, value in model.items()}, folder / f"{count}.pt")
+            scene_name = scene.name
+            del scene, model
+            job = folder / "job.json"
+            job.write_text(json.dumps([asdict(self), str(path.resolve()), factor, device.type]))
+            for count in self.gpus:
+                if start(count, [str(job)], device.type, "turbogs_plugin.bench.ranks"):
+                    raise TrainingStopped(f"bench ranks on {count} GPUs ended early")
+                results += json.loads((folder / f"result-{count}.json").read_text())
+        return {"scene": scene_name, "overrides": list(self.overrides), "passes": results}
+
+    def measure(self, scene: Scene, folder: Path, device: torch.device, ranks: Ranks) -> list[dict[str, Any]]:
+        """In each process: the passes with this number of GPUs."""
+        results = []
+        for count in self.gaussians:
+            state = torch.load(folder / f"{count}.pt", weights_only=True)
+            model = Gaussians(**{name: value.to(device) for name, value in state.items()})
+            factors = sorted({1, ranks.count}) if self.grown else [1]
+            for views, factor in [(views, factor) for views in self.views for factor in factors]:
+                for by_rows in (True, False) if ranks.count > 1 and factor == 1 else (True,):
+                    results.append(self._measure(scene, model, views * factor, factor, by_rows, device, ranks))
+                    if ranks.first:
+                        print(line_of(results[-1]), flush=True)
+        return results
+
+    def _measure(
+        self, scene: Scene, model: Gaussians, views: int, factor: int, by_rows: bool, device: torch.device, ranks: Ranks
+    ) -> dict[str, Any]:
+        budget = factor * self.pixel_budget
+        step = StepBench((), (), budget, 0, self.repeats, self.overrides)
+        trainer = warm_trainer(step.config_of(views), scene, model, device, ranks)
+        if isinstance(trainer.exchange, RankExchange):
+            trainer.complete()
+            trainer.exchange.by_rows = by_rows
+            for _ in range(3):
+                trainer.step()
+        wall = back_to_back(trainer.step, self.repeats, device)
+        parts = self._parts(trainer, device)
+        trainer.repeat_lost(wait=True)
+        trainer.compare_replicas()
+        everywhere = {name: [median] for name, median in parts.items()}
+        if isinstance(ranks, ProcessRanks):
+            medians = ranks.gather_numbers([round(1e3 * parts.get(name, 0.0)) for name in PARTS])
+            everywhere = {name: [of[place] / 1e3 for of in medians] for place, name in enumerate(PARTS)}
+        return {
+            "gpus": ranks.count,
+            "gaussians": len(model),
+            "views": views,
+            "pixel_budget": budget,
+            "exchange": "none" if ranks.count == 1 else "owners of rows" if by_rows else "records to all",
+            "wall": wall,
+            "parts_ms_of_ranks": everywhere,
+        }
+
+    def _parts(self, trainer: Trainer, device: torch.device) -> dict[str, float]:
+        """Median milliseconds of each part on the device, in iterations that follow each other without a pause."""
+        recorder, exchange, engine = Recorder(device), trainer.exchange, trainer.engine
+        places = [
+            (trainer.pixel_sampler, "sample", "draw"),
+            (engine, "render", "render"),
+            (trainer, "supervise", "loss"),
+            (engine, "update", "solve"),
+        ]
+        if isinstance(exchange, RankExchange):
+            places += [(exchange, "_gather_colors", "colors"), (exchange, "finish", "arrival")]
+            places.append((RowGather, "begin", "parameters"))
+        with ExitStack() as stack:
+            for owner, name, part in places:
+                stack.enter_context(patch.object(owner, name, recorder.timed(part, getattr(owner, name))))
+            exchanged = SharedScreen.of_rows
+
+            def of_rows(screen: SharedScreen, *arguments: Any) -> Any:
+                return recorder.timed("records", lambda: exchanged(screen, *arguments))()
+
+            stack.enter_context(patch.object(SharedScreen, "of_rows", of_rows))
+            render = engine.render
+
+            def rendered(*arguments: Any) -> Any:
+                result = render(*arguments)
+                result.backward = recorder.timed("backward", result.backward)
+                return result
+
+            stack.enter_context(patch.object(engine, "render", rendered))
+            for _ in range(self.repeats):
+                trainer.step()
+            synchronize(device)
+        return {name: device_times(spans)["median_ms"] for name, spans in recorder.spans.items()}
+
+
+def line_of(result: dict[str, Any]) -> str:
+    """A measurement for a terminal; of each part the slowest process's time."""
+    parts = ", ".join(f"{name} {max(of):.2f}" for name, of in result["parts_ms_of_ranks"].items() if max(of) > 0)
+    return (
+        f"{result['gpus']} GPU  M={result['gaussians']} K={result['views']} lambda={result['pixel_budget']:g} "
+        f"({result['exchange']}): {result['wall']['median_ms']:.3f} ms; {parts}"
+    )
+
+
+def main() -> None:
+    """A process that `RanksBench.run` started."""
+    job = Path(sys.argv[1])
+    settings, path, factor, kind = json.loads(job.read_text())
+    bench = RanksBench(**settings)
+    with joined(kind) as ranks:
+        device = resolve_device(kind)
+        scene = scene_on(load_scene(Path(path), factor), device)
+        results = bench.measure(scene, job.parent, device, ranks)
+        if ranks.first:
+            (job.parent / f"result-{ranks.count}.json").write_text(json.dumps(results))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,308 @@
+"""What an iteration on several processes exchanges, so that all take the same step.
+
+Every process holds the whole model, the photos and the error maps, and draws the samples of all K views: draws are a
+function of (seed, iteration, place), so all draw the same. Then
+
+1. each renders its share of the samples (`shares`), and the colours of all are gathered (12 bytes a sample). So loss,
+   error maps and non-finite counts are those of one process, on each;
+2. each back-propagates its share to the screen. The Gaussians are owned by the processes in equal runs of rows. An
+   owner is sent the records of its rows in all views (72 bytes a Gaussian and view). Where a view has several shares,
+   it adds up their records, in the order of the shares;
+3. it solves for their update, and the new parameters of all rows are gathered (236 bytes a Gaussian).
+
+Every step and statistic is computed by one process, as by a process alone, and copied to the others. So the replicas
+are bit-equal, and a step differs from that of one process only by the order in which the samples of a view are added
+up. Moments and statistics are valid for a process's own rows alone, until `complete`.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from turbogs_plugin.distributed.digest import digest
+from turbogs_plugin.distributed.ranks import ProcessRanks, Ranks
+from turbogs_plugin.distributed.rows import OwnedRows, RowGather, rows_of
+from turbogs_plugin.distributed.shared_pass import Batch, SharedRendered, SharedScreen
+from turbogs_plugin.distributed.shares import shares_of
+from turbogs_plugin.engine.moments import GaussianMoments
+from turbogs_plugin.engine.protocol import Engine
+from turbogs_plugin.engine.rendered import Rendered, RenderOptions, ScreenGradients
+from turbogs_plugin.engine.rules import UpdateRule
+from turbogs_plugin.errors import TrainingStopped
+from turbogs_plugin.types import (
+    Cameras,
+    Gaussians,
+    GaussianStats,
+    PixelSamples,
+    RowUpdate,
+)
+
+LAG = 4
+"""After so many iterations all processes look at the flags of an iteration, and wait for them if need be: so all know
+of them at the same place, and no host runs farther ahead of its GPU."""
+
+
+class Exchange:
+    """A process alone: every call goes to the engine, and nothing is exchanged."""
+
+    def render(
+        self, engine: Engine, gaussians: Gaussians, cameras: Cameras, samples: PixelSamples, options: RenderOptions
+    ) -> Rendered:
+        """`Engine.render` of all K views."""
+        return engine.render(gaussians, cameras, samples, options)
+
+    def update(
+        self,
+        engine: Engine,
+        rule: UpdateRule,
+        screen: ScreenGradients,
+        gaussians: Gaussians,
+        moments: GaussianMoments,
+        stats: GaussianStats | None,
+    ) -> None:
+        """`Engine.update`."""
+        engine.update(rule, screen, gaussians, moments, stats)
+
+    def settle(self, engine: Engine, wait: bool = False) -> int:
+        """`Engine.settle`."""
+        return engine.settle(wait)
+
+    def initial_errors(
+        self, pixels: Sequence[int], errors_of: Callable[[int], Tensor], device: torch.device
+    ) -> Iterator[Tensor]:
+        """Errors [pixels] of one training view after the other.
+
+        Args:
+            pixels: of each view.
+            errors_of: renders a view.
+            device: where the errors are.
+        """
+        return map(errors_of, range(len(pixels)))
+
+    def refine(
+        self, update: Callable[[], RowUpdate | None], due: Callable[[], bool], complete: Callable[[], None]
+    ) -> RowUpdate | None:
+        """The change that density control proposes.
+
+        Args:
+            update: asks it.
+            due: whether it may have one now, or looks at its statistics.
+            complete: makes moments and statistics complete.
+        """
+        return update()
+
+    def finish(self) -> None:
+        """Wait, on the device, for the parameters of the latest `update`. Call it before they are used."""
+
+    def complete(self, moments: GaussianMoments | None, stats: GaussianStats | None) -> None:
+        """Make moments and statistics valid for all rows."""
+
+    def compare(self, state: Callable[[], dict[str, Any]], iteration: int) -> None:
+        """Raise `TrainingStopped` if a tensor or a number of a state differs between processes.
+
+        Args:
+            state: gives it, flat: name -> value. Whole, see `complete`.
+            iteration: of the message.
+        """
+
+
+ALONE = Exchange()
+
+
+def exchange_of(ranks: Ranks) -> Exchange:
+    """The exchange of these processes."""
+    return RankExchange(ranks) if isinstance(ranks, ProcessRanks) else ALONE
+
+
+class RankExchange(Exchange):
+    """Exchanges by torch.distributed, as the module says.
+
+    Attributes:
+        by_rows: owners of rows make the steps. False: every process gets all records and makes all steps, with more
+            bytes for the records and none for parameters; optimizers without a rule always work like this.
+    """
+
+    def __init__(self, ranks: ProcessRanks, by_rows: bool = True) -> None:
+        self.ranks, self.by_rows = ranks, by_rows
+        self._passes = 0
+        self._flags: deque[_Flags] = deque()
+        self._incomplete = False
+        self._owned: OwnedRows | None = None
+        self._buffers: list[tuple[Tensor, torch.cuda.Event]] = []  # for flags
+        self._skipped: Tensor | None = None  # [] of all processes, when last complete
+
+    def render(
+        self, engine: Engine, gaussians: Gaussians, cameras: Cameras, samples: PixelSamples, options: RenderOptions
+    ) -> SharedRendered:
+        shares = shares_of(samples, self.ranks.count)
+        own = shares[self.ranks.rank]
+        rendered = None
+        if len(own):
+            part = Cameras(cameras.viewmats[own.views], cameras.Ks[own.views], cameras.sizes[own.views])
+            chosen = samples.of_tiles(own.tiles, own.views, own.slots)
+            rendered = engine.render(gaussians, part, chosen, options)
+        colors = self._gather_colors(engine, rendered, [share.slots for share in shares], gaussians.means)
+        return SharedRendered(colors, Batch(self.ranks, engine, gaussians, cameras, samples, options, shares), rendered)
+
+    def _gather_colors(self, engine: Engine, rendered: Rendered | None, slots: Sequence[slice], like: Tensor) -> Tensor:
+        """[P, 3] of all samples; and all processes learn whether one had too little memory or wants to stop."""
+        counts = [part.stop - part.start for part in slots]
+        most = max(counts)
+        sent = like.new_zeros(most + 1, 3)
+        if rendered is not None:
+            sent[: len(rendered.colors)] = rendered.colors
+        if engine.overflow is not None:
+            sent[most, :1] = engine.overflow
+        if self.ranks.asked:
+            sent[most, 1] = self.ranks.asked
+        gathered = self.ranks.gather(sent)  # [ranks, most + 1, 3]
+        flags = gathered[:, most].amax(dim=0)  # [3]
+        if engine.overflow is not None:
+            engine.overflow.copy_(flags[:1])
+        self._flags.append(self._sent_flags(flags))
+        self._passes += 1
+        self.ranks.latest = time.monotonic()
+        return torch.cat([colors[:count] for colors, count in zip(gathered, counts, strict=True)])
+
+    def _sent_flags(self, flags: Tensor) -> _Flags:
+        """`flags` [3] of this pass, on their way to the host."""
+        if not flags.is_cuda:
+            return _Flags(self._passes, flags, None)
+        if not self._buffers:  # more than are ever under way
+            self._buffers = [(torch.empty(3, pin_memory=True), torch.cuda.Event()) for _ in range(2 * LAG)]
+        values, event = self._buffers[self._passes % len(self._buffers)]
+        values.copy_(flags, non_blocking=True)
+        event.record()
+        return _Flags(self._passes, values, event)
+
+    def settle(self, engine: Engine, wait: bool = False) -> int:
+        while self._flags and (wait or self._flags[0].number <= self._passes - LAG):
+            flags = self._flags.popleft()
+            overflow, stop = flags.read()
+            self.ranks.stop_signal = max(self.ranks.stop_signal, stop)
+            if overflow:
+                self._flags.clear()
+                engine.recover()
+                return self._passes - flags.number
+        return 0
+
+    def update(
+        self,
+        engine: Engine,
+        rule: UpdateRule,
+        screen: SharedScreen,
+        gaussians: Gaussians,
+        moments: GaussianMoments,
+        stats: GaussianStats | None,
+    ) -> None:
+        if not self.by_rows:
+            engine.update(rule, screen.whole(), gaussians, moments, stats)
+            return
+        if not self._incomplete:
+            self._incomplete, self._skipped = True, moments.skipped.clone()
+        if self._owned is None or not self._owned.fits(gaussians, moments, stats):
+            self._owned = OwnedRows(self.ranks, gaussians, moments, stats)
+        owned = self._owned
+        own_screen = screen.of_rows(owned.rows, owned.gaussians)
+        if len(owned.gaussians):
+            engine.update(rule, own_screen, owned.gaussians, owned.moments, owned.stats)
+        owned.parameters.begin()
+
+    def initial_errors(
+        self, pixels: Sequence[int], errors_of: Callable[[int], Tensor], device: torch.device
+    ) -> Iterator[Tensor]:
+        for start in range(0, len(pixels), self.ranks.count):
+            group = range(start, min(start + self.ranks.count, len(pixels)))
+            own = errors_of(group[self.ranks.rank]) if self.ranks.rank < len(group) else None
+            for source, view in enumerate(group):
+                errors = own if source == self.ranks.rank else torch.empty(pixels[view], device=device)
+                self.ranks.broadcast(errors, source)
+                yield errors
+
+    def refine(
+        self, update: Callable[[], RowUpdate | None], due: Callable[[], bool], complete: Callable[[], None]
+    ) -> RowUpdate | None:
+        if not due():
+            return update()
+        self.finish()
+        complete()
+        return self._agreed(update())
+
+    def _agreed(self, update: RowUpdate | None) -> RowUpdate | None:
+        """The first process's change. All make one, which advances the state of their density control."""
+        plain = None
+        if update is not None and self.ranks.first:
+            shapes = {name: value.shape for name, value in update.values.items()}
+            counts = (update.num_cloned, update.num_split, update.num_pruned)
+            plain = (len(update.source), shapes, update.reset, counts, update.source.device.type)
+        plain = self.ranks.agree(plain)
+        if plain is None:
+            return None
+        count, shapes, reset, counts, device = plain
+        if self.ranks.first:
+            source, fresh, values = update.source, update.fresh.to(torch.uint8), update.values
+        else:
+            source = torch.empty(count, dtype=torch.int64, device=device)
+            fresh = torch.empty(count, dtype=torch.uint8, device=device)
+            values = {name: torch.empty(shape, device=device) for name, shape in shapes.items()}
+        values = {name: value.contiguous() for name, value in values.items()}
+        for tensor in (source, fresh, *values.values()):
+            self.ranks.broadcast(tensor)
+        return RowUpdate(source, fresh.bool(), values, reset, *counts)
+
+    def complete(self, moments: GaussianMoments | None, stats: GaussianStats | None) -> None:
+        if not self._incomplete or moments is None:
+            return
+        self._incomplete = False
+        self.finish()
+        self._owned = None  # an event makes new tensors, beside which the old ones have no room
+        tensors = [moments.exp_avg, moments.exp_avg_sq, moments.exp_avg_shN, moments.exp_avg_sq_shN, moments.steps]
+        tensors += [] if stats is None else list(vars(stats).values())
+        gather = RowGather(self.ranks, tensors, rows_of(len(moments), self.ranks.count))
+        gather.begin()
+        gather.finish()
+        before = int(self._skipped)
+        skipped = self.ranks.gather_numbers([int(moments.skipped) - before])
+        moments.skipped.fill_(before + sum(own for (own,) in skipped))
+
+    def finish(self) -> None:
+        if self._owned is not None:
+            self._owned.parameters.finish()
+
+    def compare(self, state: Callable[[], dict[str, Any]], iteration: int) -> None:
+        plain = {name: value for name, value in state().items() if isinstance(value, (Tensor, int, float))}
+        plain = {
+            name: torch.tensor(value, dtype=torch.float64) if isinstance(value, float) else torch.as_tensor(value)
+            for name, value in plain.items()
+        }
+        digests = self.ranks.gather_numbers([digest(value) for value in plain.values()])
+        for name, *values in zip(plain, *digests, strict=True):
+            others = [rank for rank, value in enumerate(values) if value != values[0]]
+            if others:
+                raise TrainingStopped(
+                    f"iteration {iteration}: {name} of rank {others[0]} differs from that of rank 0, though all make "
+                    "the same steps; do the GPUs and their software differ, or is one broken?"
+                )
+
+
+@dataclass
+class _Flags:
+    """Flags of a pass on their way to the host: iterations do nothing for lack of memory; a signal to stop."""
+
+    number: int
+    values: Tensor
+    event: torch.cuda.Event | None
+
+    def read(self) -> tuple[bool, int]:
+        """Waits until they have arrived."""
+        if self.event is not None:
+            self.event.synchronize()
+        overflow, stop, _ = self.values.tolist()
+        return overflow != 0, int(stop)

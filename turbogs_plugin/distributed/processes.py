@@ -1,0 +1,208 @@
+"""Starting the processes of a training, joining them, and ending all of them when one is lost.
+
+torchrun, or `start` here by the same means, starts a process for each GPU and watches them: when one ends with an
+error, it ends the others, and starts all again if asked to (`--max-restarts`). A process that waits for a lost one
+inside a collective cannot be told so by Python; `_Watch` ends it.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import socket
+import sys
+import threading
+import time
+import traceback
+import uuid
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from datetime import timedelta
+
+import torch
+
+from turbogs_plugin.distributed.ranks import ONE, ProcessRanks, RankLost, Ranks
+from turbogs_plugin.errors import InputError, TrainingStopped
+
+TIMEOUT = timedelta(hours=6)
+"""The longest that processes wait for each other, as while the first one finds cameras, evaluates or saves. A process
+that ends is noticed at once."""
+
+MEETING = timedelta(minutes=5)
+"""The longest that processes wait for others to be started."""
+
+GRACE_SECONDS = 15.0
+"""A process that was asked to end and makes no iteration for so long is ended: another one is lost."""
+
+
+def launched() -> bool:
+    """Whether torchrun, or `start`, started this process beside others."""
+    return "RANK" in os.environ and int(os.environ.get("WORLD_SIZE", "1")) > 1
+
+
+def restarted() -> bool:
+    """Whether torchrun started the processes again after one was lost."""
+    return int(os.environ.get("TORCHELASTIC_RESTART_COUNT", "0")) > 0
+
+
+def start(count: int, arguments: Sequence[str], device: str = "auto", module: str = "turbogs_plugin") -> int:
+    """Start `count` processes of the `turbogs` command on this machine, as torchrun does, and wait for them.
+
+    Args:
+        arguments: of the command.
+        device: auto, cpu or cuda. On CPUs processes only share the work of tests.
+        module: in the place of the command's.
+
+    Returns:
+        The exit code: 0, or that of the process that ended first with an error. It says itself why.
+
+    Raises:
+        InputError: fewer GPUs answer.
+        TrainingStopped: processes were killed before they could say a word.
+    """
+    from torch.distributed.elastic.multiprocessing.api import SignalException
+    from torch.distributed.elastic.multiprocessing.errors import ChildFailedError
+    from torch.distributed.launcher.api import LaunchConfig, elastic_launch
+
+    present = torch.cuda.device_count()
+    if device != "cpu" and present < count and (present or device == "cuda"):
+        raise InputError(f"--gpus {count}: {present} GPUs answer here; ask for as many, or see 'turbogs doctor'")
+    if device == "auto" and not present:
+        raise InputError(f"--gpus {count}: no GPU answers here; leave it out, or see 'turbogs doctor'")
+    logging.getLogger("torch.distributed.elastic").setLevel(logging.CRITICAL)  # the processes say what happened
+    os.environ.setdefault("OMP_NUM_THREADS", str(max(1, (os.cpu_count() or 1) // count)))
+    config = LaunchConfig(
+        min_nodes=1,
+        max_nodes=1,
+        nproc_per_node=count,
+        run_id=uuid.uuid4().hex,
+        rdzv_backend="c10d",
+        rdzv_endpoint="localhost:0",
+        max_restarts=0,
+        monitor_interval=0.1,
+        local_addr="localhost",
+    )
+    asked = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
+    before = {number: signal.getsignal(number) for number in asked}  # the launcher sets its own, and leaves them
+    try:
+        elastic_launch(config, sys.executable)("-m", module, *arguments)
+    except ChildFailedError as error:
+        rank, failure = error.get_first_failure()
+        if all(each.exitcode < 0 for each in error.failures.values()):
+            raise TrainingStopped(
+                f"process {rank} of this training was killed by signal {-failure.exitcode}: go on from the last "
+                "checkpoint with --resume RUN"
+            ) from None
+        return failure.exitcode if failure.exitcode > 0 else 1
+    except SignalException as stopped:
+        return 128 + stopped.sigval
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+    return 0
+
+
+@contextmanager
+def joined(device: str) -> Iterator[Ranks]:
+    """While entered, this process belongs to those that train one model; `ONE` where it was started alone.
+
+    An error of one process ends all, and one of them says why: the process that it happened to, or the first one that
+    misses another.
+
+    Args:
+        device: auto, cpu or cuda. With a GPU, the process sees only its own.
+
+    Raises:
+        InputError: there are fewer GPUs than processes on this machine, or the processes do not find each other.
+    """
+    if not launched():
+        yield ONE
+        return
+    import torch.distributed as distributed
+
+    on_gpu = device != "cpu" and torch.cuda.device_count() > 0
+    if on_gpu:
+        _see_own_gpu()
+    if sys.platform == "linux" and os.environ.get("LOCAL_WORLD_SIZE") == os.environ.get("WORLD_SIZE"):
+        os.environ.setdefault("GLOO_SOCKET_IFNAME", "lo")  # on one machine, whatever its name resolves to
+    try:
+        store, rank, count = next(distributed.rendezvous("env://", timeout=MEETING))
+        # Processes that are started again may find the store as the earlier ones left it.
+        store = distributed.PrefixStore(f"turbogs-{os.environ.get('TORCHELASTIC_RESTART_COUNT', '0')}", store)
+        distributed.init_process_group(
+            "cpu:gloo,cuda:nccl" if on_gpu else "gloo", store=store, rank=rank, world_size=count, timeout=TIMEOUT
+        )
+    except (RuntimeError, ValueError, OSError) as error:
+        raise InputError(f"the processes of this training do not find each other: {error}") from None
+
+    def speaks() -> bool:
+        try:
+            return store.add("errors", 1) == 1
+        except RuntimeError:  # whoever keeps the store is gone
+            return True
+
+    ranks = ProcessRanks()
+    watch = _Watch(ranks, speaks)
+    try:
+        yield ranks
+        watch.end()
+        with suppress(RuntimeError):  # all is done, whoever has gone already
+            distributed.destroy_process_group()
+    except (InputError, TrainingStopped, OSError) as error:
+        # At once: taking the group down could wait for processes that wait for this one.
+        if speaks():
+            print(f"turbogs: error: {' '.join(str(error).split())}", file=sys.stderr, flush=True)
+        sys.stdout.flush()
+        os._exit(2 if isinstance(error, (InputError, OSError)) else 1)
+    except KeyboardInterrupt:
+        os._exit(128 + signal.SIGINT)
+    except Exception:  # a fault of the program
+        traceback.print_exc()
+        os._exit(1)
+
+
+def _see_own_gpu() -> None:
+    """Leave this process the GPU of its place on this machine, as the only one. Before CUDA starts."""
+    place, count = int(os.environ.get("LOCAL_RANK", "0")), int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
+    visible = os.environ.get("CUDA_VISIBLE_DEVICES", "")
+    names = [name for name in visible.split(",") if name] or [str(gpu) for gpu in range(torch.cuda.device_count())]
+    if len(names) < count:
+        raise InputError(f"{count} processes need as many GPUs on this machine, {len(names)} answer: start fewer")
+    os.environ["CUDA_VISIBLE_DEVICES"] = names[place]
+    if torch.cuda.device_count() > 1:  # the driver had counted them already
+        torch.cuda.set_device(place)
+
+
+class _Watch:
+    """Ends this process `GRACE_SECONDS` after a SIGTERM or SIGINT if it makes no iteration.
+
+    Python's handlers run between two instructions of the main thread, so never while that waits in a collective for a
+    process that is gone. The number of a signal is also written to a socket, from which a thread reads here.
+    """
+
+    def __init__(self, ranks: ProcessRanks, speaks: Callable[[], bool]) -> None:
+        self._ranks, self._speaks = ranks, speaks
+        self._read, self._written = socket.socketpair()
+        self._written.setblocking(False)
+        if threading.current_thread() is threading.main_thread():
+            self._before = signal.set_wakeup_fd(self._written.fileno(), warn_on_full_buffer=False)
+            threading.Thread(target=self._wait, daemon=True).start()
+
+    def end(self) -> None:
+        signal.set_wakeup_fd(self._before)
+        self._written.close()
+
+    def _wait(self) -> None:
+        number = 0
+        while number not in (signal.SIGTERM, signal.SIGINT):
+            message = self._read.recv(1)
+            if not message:
+                return
+            number = message[0]
+        while time.monotonic() - self._ranks.latest < GRACE_SECONDS:
+            time.sleep(0.2)
+        if self._speaks():
+            lost = RankLost("another process of this training does not answer: go on from the last checkpoint")
+            print(f"turbogs: error: {lost}", file=sys.stderr, flush=True)
+        os._exit(128 + number)

@@ -1,0 +1,164 @@
+"""The processes that train one model together: who they are, and what they tell each other on the host.
+
+`Ranks` is one process alone, for which everything here does nothing; `ProcessRanks` are those that torchrun started.
+"""
+
+from __future__ import annotations
+
+import functools
+import re
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor
+
+from turbogs_plugin.errors import TrainingStopped
+
+Value = TypeVar("Value")
+
+
+class RankLost(TrainingStopped):
+    """Another process of the training ended or does not answer."""
+
+
+class Ranks:
+    """One process.
+
+    Attributes:
+        rank: number of this process.
+        count: number of processes.
+        stop_signal: number of the signal by which all stop, as far as they know; 0: none.
+    """
+
+    rank = 0
+    count = 1
+    stop_signal = 0
+
+    @property
+    def first(self) -> bool:
+        """Whether this process writes, prints and evaluates."""
+        return self.rank == 0
+
+    def agree(self, value: Value) -> Value:
+        """The first process's value, on all."""
+        return value
+
+    def ask_to_stop(self, signal: int) -> bool:
+        """Ask that all stop. False: there are no others, so the caller stops by itself."""
+        return False
+
+    @contextmanager
+    def working(self) -> Iterator[None]:
+        """While entered, this process does something long that no iteration shows, such as writing a checkpoint."""
+        yield
+
+
+ONE = Ranks()
+"""A process that trains alone."""
+
+
+def _answered(method: Callable[..., Value]) -> Callable[..., Value]:
+    """Raise `RankLost` where another process does not answer."""
+
+    @functools.wraps(method)
+    def answered(self: ProcessRanks, *arguments: Any, **options: Any) -> Value:
+        try:
+            return method(self, *arguments, **options)
+        except torch.cuda.OutOfMemoryError:
+            raise
+        except RuntimeError as error:  # gloo's and NCCL's errors are of this kind
+            text = re.sub(r"\[/[^]]*\] *", "", str(error)).strip()  # without places in torch's sources
+            reason = re.split(r"\. |\n", text)[0][:200] or type(error).__name__
+            raise RankLost(f"another process of this training ended or does not answer ({reason})") from error
+
+    return answered
+
+
+class ProcessRanks(Ranks):
+    """The processes of torch's default group, which is initialised.
+
+    Tensors travel by the backend of their device: NCCL on GPUs, gloo on CPUs.
+
+    Attributes:
+        asked: number of the signal by which this process wants all to stop; 0: none.
+        latest: `time.monotonic` of the latest sign of progress; infinite while `working`.
+    """
+
+    def __init__(self) -> None:
+        import torch.distributed as distributed
+
+        self._distributed = distributed
+        # Newer versions of torch have another name for it, and warn of the old one.
+        self._all_gather = getattr(distributed, "all_gather_single", None) or distributed.all_gather_into_tensor
+        self.rank, self.count = distributed.get_rank(), distributed.get_world_size()
+        self.stop_signal = self.asked = 0
+        self.latest = time.monotonic()
+
+    @_answered
+    def agree(self, value: Value) -> Value:
+        box = [value]
+        self._distributed.broadcast_object_list(box, src=0, device=torch.device("cpu"))
+        return box[0]
+
+    @_answered
+    def gather_numbers(self, values: list[int]) -> list[list[int]]:
+        """Some integers of every process, as many of each; rank after rank."""
+        own = torch.tensor(values, dtype=torch.int64)
+        parts = [torch.empty_like(own) for _ in range(self.count)]
+        self._distributed.all_gather(parts, own)
+        return [part.tolist() for part in parts]
+
+    @_answered
+    def broadcast(self, tensor: Tensor, source: int = 0) -> None:
+        """Overwrite a contiguous tensor by that of rank `source`."""
+        self._distributed.broadcast(tensor, src=source)
+
+    @_answered
+    def gather(self, tensor: Tensor) -> Tensor:
+        """[count, ...]: the tensors of all processes, of one shape, rank after rank."""
+        gathered = tensor.new_empty(self.count, *tensor.shape)
+        self._all_gather(gathered.flatten(0, 1), tensor)
+        return gathered
+
+    @_answered
+    def begin_gather(self, tensor: Tensor, gathered: Tensor) -> Callable[[], None]:
+        """Like `gather` into `gathered` [count, ...], beside other work.
+
+        Returns:
+            What to call before it is used. Both tensors must live until then, and stay as they are.
+        """
+        work = self._all_gather(gathered.flatten(0, 1), tensor, async_op=True)
+        return lambda: self._wait(work)
+
+    @_answered
+    def _wait(self, work: Any) -> None:
+        work.wait()
+
+    @_answered
+    def send_and_receive(self, sent: list[tuple[int, Tensor]], received: list[tuple[int, Tensor]]) -> None:
+        """Send tensors to other processes and receive theirs, at once. What two send each other is in one order.
+
+        Args:
+            sent: (rank, contiguous tensor) each; empty ones are left out.
+            received: (rank, contiguous tensor to overwrite) each.
+        """
+        distributed = self._distributed
+        operations = [distributed.P2POp(distributed.isend, tensor, rank) for rank, tensor in sent if tensor.numel()]
+        operations += [
+            distributed.P2POp(distributed.irecv, tensor, rank) for rank, tensor in received if tensor.numel()
+        ]
+        for work in distributed.batch_isend_irecv(operations) if operations else ():
+            work.wait()
+
+    def ask_to_stop(self, signal: int) -> bool:
+        self.asked = signal
+        return True
+
+    @contextmanager
+    def working(self) -> Iterator[None]:
+        self.latest = float("inf")
+        yield
+        self.latest = time.monotonic()

@@ -1,0 +1,80 @@
+"""How the samples of an iteration are shared out: runs of tiles with equally many samples.
+
+Runs end between two views where that is nearly even, and within a view where it is not. Then two processes, or more,
+have a part of the view. So three views keep two processes equally busy, and one view does.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from turbogs_plugin.types import PixelSamples
+
+NEARLY = 0.05
+"""A share may be so much larger or smaller, of an even one, for the sake of ending with a view."""
+
+
+@dataclass(frozen=True)
+class Share:
+    """The part of the samples that one process renders.
+
+    Args:
+        tiles, slots: of the samples.
+        views: positions in the batch of the views that the tiles lie in.
+        continues: the first of these views began in an earlier share.
+    """
+
+    tiles: slice
+    slots: slice
+    views: slice
+    continues: bool
+
+    @property
+    def begun(self) -> slice:
+        """The views that begin in this share."""
+        return slice(self.views.start + self.continues, self.views.stop)
+
+    def __len__(self) -> int:
+        return self.views.stop - self.views.start
+
+
+def shares_of(samples: PixelSamples, count: int) -> list[Share]:
+    """The shares of `count` processes; one without samples has no views."""
+    if samples.host_ends is None:
+        return _cut(*samples.ends(), count)
+    return _known(samples.host_ends, count)
+
+
+@lru_cache(maxsize=256)
+def _known(ends: Callable[[], tuple[np.ndarray, np.ndarray]], count: int) -> list[Share]:
+    """Kept, as the draws of most iterations have the same sizes."""
+    return _cut(*ends(), count)
+
+
+def _cut(view_ends: np.ndarray, slot_ends: np.ndarray, count: int) -> list[Share]:
+    """The shares of samples whose views end at these tiles, and whose tiles at these slots."""
+    slots = np.concatenate([[0], slot_ends])  # [T + 1]
+    views = np.concatenate([[0], view_ends])  # [K + 1]
+    even = slots[-1] / count
+    cuts = [0]
+    for wanted in (place * even for place in range(1, count)):
+        view = views[np.abs(slots[views] - wanted).argmin()]
+        after = int(np.searchsorted(slots, wanted))
+        before = max(0, after - 1)
+        tile = before if wanted - slots[before] < slots[after] - wanted else after
+        cuts.append(max(cuts[-1], int(view) if abs(slots[view] - wanted) <= NEARLY * even else tile))
+    shares, begun = [], 0  # views that earlier shares have begun
+    for first, end in itertools.pairwise([*cuts, len(slots) - 1]):
+        seen = slice(begun, begun)
+        if first < end:
+            start, stop = np.searchsorted(views, first, side="right") - 1, np.searchsorted(views, end, side="left")
+            seen = slice(int(start), int(stop))
+        places = slice(int(slots[first]), int(slots[end]))
+        shares.append(Share(slice(first, end), places, seen, seen.start < begun))
+        begun = max(begun, seen.stop)
+    return shares

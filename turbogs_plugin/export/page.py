@@ -1,0 +1,261 @@
+"""A run on one page that opens from the disk, without a network: curves, tables, test views, the model in a viewer."""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from html import escape
+from importlib.resources import files
+from pathlib import Path
+from string import Template
+
+import numpy as np
+import torch
+from PIL import Image
+
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.export.camera_path import focus_and_up
+from turbogs_plugin.export.contribution import contributions, pruned
+from turbogs_plugin.export.fidelity import Change, Fidelity
+from turbogs_plugin.export.packing import PackedModel, pack, unpack
+from turbogs_plugin.files import write_text_atomically
+from turbogs_plugin.model.row_order import spatial_order
+from turbogs_plugin.model.similarity import finite_rows
+from turbogs_plugin.report.pictures import ERROR_FULL_SCALE, error_picture, to_uint8
+from turbogs_plugin.report.plots import plot_against_seconds
+from turbogs_plugin.report.tables import number
+from turbogs_plugin.scene import Scene
+from turbogs_plugin.study.document import CSS, Block, Heading, Paragraph, Table
+from turbogs_plugin.train.evaluate import compare
+from turbogs_plugin.train.history import Evaluation, read_history
+from turbogs_plugin.train.run import SavedModel
+from turbogs_plugin.types import Cameras, Gaussians
+
+LARGEST_PAGE = 32_000_000
+"""Bytes. Mail and chat programs take such files."""
+WIDEST_PICTURE = 1200
+"""Pixels of the longer side of a test view's pictures."""
+JPEG_QUALITY = 88
+MOST_TRIES = 4
+"""Times that a model is made smaller until the page is small enough."""
+CURVES = (
+    ("psnr", "test PSNR in dB"),
+    ("l1", "mean absolute error on test views (0 .. 1)"),
+    ("num_gaussians", "Gaussians"),
+)
+
+
+@dataclass(frozen=True)
+class WrittenPage:
+    """The page, in numbers.
+
+    Args:
+        bytes: of the file.
+        gaussians: in its model.
+        change: what the model lost by being packed and pruned.
+    """
+
+    bytes: int
+    gaussians: int
+    change: Change
+
+
+def write_page(model: SavedModel, shown: Gaussians, scene: Scene, path: Path) -> WrittenPage:
+    """Write the page of a model, smaller than `LARGEST_PAGE`. The file is written whole or not at all.
+
+    Args:
+        model: what the test views show; on the device where it is rendered.
+        shown: what the viewer shows: the model, or what was kept of it; on the same device.
+        scene: its capture, on the CPU.
+
+    Raises:
+        InputError: no Gaussian is finite, or the pictures alone are too large.
+    """
+    finite = finite_rows(shown)
+    gaussians = shown.map(lambda value: value[finite])
+    if not len(gaussians):
+        raise InputError("there are no Gaussians to write")
+    order = spatial_order(gaussians.means, scene.extent)
+    gaussians = gaussians.map(lambda value: value[order])
+    fidelity = Fidelity(model.gaussians, scene.test, model.sh_degree, model.config.raster)
+    history = read_history(model.folder.history) if model.folder is not None else []
+    parts = {
+        "title": escape(scene.name),
+        "style": CSS + _web("page.css"),
+        "viewer": _web("viewer.js"),
+        "page": _web("page.js"),
+        "full_scale": f"{ERROR_FULL_SCALE:g}",
+        "views": "\n".join(_view(fidelity, model.gaussians, scene, view) for view in fidelity.view_ids),
+        "tables": _tables(model, scene, history),
+    }
+    for part in ("viewer", "page"):
+        assert "</script" not in parts[part]
+
+    def filled(packed: PackedModel, change: Change) -> str:
+        blocks = {
+            "summary": _summary(model, scene, fidelity, history),
+            "cost": _cost(len(model.gaussians), packed, change),
+            "scene": json.dumps(_scene(model, scene, packed)).replace("<", "\\u003c"),
+            "model": base64.b64encode(packed.planes).decode("ascii"),
+        }
+        return Template(_web("page.html")).substitute({**parts, **blocks})
+
+    packed = pack(gaussians)
+    unmeasured = Change(0.0, 0.0, 0, 0)
+    weights = None
+    for _ in range(MOST_TRIES):
+        size = len(filled(packed, unmeasured).encode())
+        if size < LARGEST_PAGE - 1000:  # room for the words of what it costs
+            break
+        held = len(packed.planes) * 4 / 3
+        share = 0.98 * (LARGEST_PAGE - (size - held)) / held
+        if share < 0.01:
+            raise InputError("the page's pictures alone take 32 MB: export the model of a smaller --factor")
+        if weights is None:
+            weights = contributions(gaussians, scene.train.cameras, model.config.raster)
+        packed = pack(pruned(gaussians, weights, max(1, int(share * packed.count))))
+    change = fidelity.change(unpack(packed))
+    text = filled(packed, change)
+    write_text_atomically(path, text)
+    return WrittenPage(len(text.encode()), packed.count, change)
+
+
+def _web(name: str) -> str:
+    return files("turbogs_plugin.export").joinpath("web", name).read_text(encoding="utf-8")
+
+
+def _html(blocks: Sequence[Block]) -> str:
+    return "\n".join(block.html(Path()) for block in blocks)
+
+
+def _summary(model: SavedModel, scene: Scene, fidelity: Fidelity, history: list[Evaluation]) -> str:
+    views = f"{len(scene.train)} training views, {len(scene.test)} test views"
+    if not history:
+        return _html([Paragraph(f"{len(model.gaussians)} Gaussians; {views}. PSNR {fidelity.before:.2f} dB.")])
+    last = history[-1]
+    header = ("PSNR in dB", "SSIM", "mean absolute error", "training in s", "iterations", "Gaussians")
+    row = (
+        number(last.psnr, 2),
+        number(last.ssim, 4),
+        number(last.l1, 4),
+        f"{last.train_seconds:.1f}",
+        str(last.iteration),
+        str(last.num_gaussians),
+    )
+    said = f"{views}; seed {model.config.train.seed}. Errors are means over the test views."
+    return _html([Table(header, [row]), Paragraph(said)])
+
+
+def _cost(count: int, packed: PackedModel, change: Change) -> str:
+    kept = f"all {count} Gaussians"
+    if packed.count < count:
+        kept = f"{packed.count} of {count} Gaussians, those that add most to the training views"
+    text = f"The model here has {kept}, rounded to {packed.stride} bytes each. What that costs: {change.text()}."
+    return _html([Paragraph(text)])
+
+
+def _view(fidelity: Fidelity, gaussians: Gaussians, scene: Scene, view: int) -> str:
+    photo, image = fidelity.photo(view), fidelity.image(gaussians, view)
+    name = scene.test.names[view]
+    measured = compare(name, image, photo)
+    error = error_picture(photo, image).cpu().numpy()
+    pictures = (("photo", to_uint8(photo)), ("render", to_uint8(image)), ("error", error))
+    images = "".join(f'<img alt="{kind} of {escape(name)}" src="{_jpeg(pixels)}">' for kind, pixels in pictures)
+    return (
+        f'<figure class="view"><div class="pictures">{images}</div>'
+        f'<input type="range" min="0" max="2" step="0.01" value="1" aria-label="photo, render, error">'
+        f"<figcaption><span>{escape(name)}: {number(measured.psnr, 2)} dB, SSIM {number(measured.ssim, 4)}</span>"
+        f'<b class="named"></b><button data-look="{len(scene.train) + view}">in the model</button></figcaption>'
+        "</figure>"
+    )
+
+
+def _jpeg(pixels: np.ndarray) -> str:
+    """A data URL of a picture [H, W, 3] uint8, reduced to `WIDEST_PICTURE`."""
+    picture = Image.fromarray(pixels)
+    picture.thumbnail((WIDEST_PICTURE, WIDEST_PICTURE), Image.Resampling.LANCZOS)
+    buffer = io.BytesIO()
+    picture.save(buffer, "JPEG", quality=JPEG_QUALITY, subsampling=0)
+    return f"data:image/jpeg;base64,{base64.b64encode(buffer.getvalue()).decode('ascii')}"
+
+
+def _scene(model: SavedModel, scene: Scene, packed: PackedModel) -> dict[str, object]:
+    """What the viewer is told besides the model, in the scene's normalised frame. Training views come first."""
+    views = [(scene.train, False), (scene.test, True)]
+    cameras = [camera for part, test in views for camera in _cameras(part.cameras, part.names, test)]
+    target, up = focus_and_up(_joined(scene))
+    raster = model.config.raster
+    return {
+        "model": {
+            "count": packed.count,
+            "stride": packed.stride,
+            "bands": packed.bands,
+            "ranges": packed.ranges,
+            "eps2d": raster.eps2d,
+            "alpha_min": raster.alpha_min,
+        },
+        "cameras": cameras,
+        "first": len(scene.train),
+        "target": target.tolist(),
+        "up": up.tolist(),
+    }
+
+
+def _joined(scene: Scene) -> Cameras:
+    parts = [part.cameras.to("cpu") for part in (scene.train, scene.test)]
+    viewmats, Ks = (torch.cat([getattr(part, name) for part in parts]) for name in ("viewmats", "Ks"))
+    return Cameras(viewmats, Ks, np.concatenate([part.sizes for part in parts]))
+
+
+def _cameras(cameras: Cameras, names: Sequence[str], test: bool) -> list[dict[str, object]]:
+    cameras = cameras.to("cpu")
+    lenses = cameras.Ks[:, [0, 1, 0, 1], [0, 1, 2, 2]]
+    return [
+        {
+            "name": name,
+            "test": test,
+            "rotation": cameras.viewmats[view, :3, :3].flatten().tolist(),
+            "translation": cameras.viewmats[view, :3, 3].tolist(),
+            "center": cameras.centers[view].tolist(),
+            "lens": lenses[view].tolist(),
+            "size": cameras.sizes[view].tolist(),
+        }
+        for view, name in enumerate(names)
+    ]
+
+
+def _tables(model: SavedModel, scene: Scene, history: list[Evaluation]) -> str:
+    """Curves, the history and the configuration; nothing of a model that is no run's."""
+    if not history:
+        return ""
+    curves = []
+    with tempfile.TemporaryDirectory() as folder:
+        for name, label in CURVES:
+            file = Path(folder) / f"{name}.svg"
+            plot_against_seconds(file, history, name, label, scene.name)
+            data = base64.b64encode(file.read_bytes()).decode("ascii")
+            curves.append(f'<img alt="{escape(label)} against seconds" src="data:image/svg+xml;base64,{data}">')
+    header = ("iteration", "training in s", "PSNR in dB", "SSIM", "mean absolute error", "Gaussians", "memory in MiB")
+    rows = [
+        (
+            str(entry.iteration),
+            f"{entry.train_seconds:.1f}",
+            number(entry.psnr, 2),
+            number(entry.ssim, 4),
+            number(entry.l1, 4),
+            str(entry.num_gaussians),
+            f"{entry.memory_bytes / 2**20:.0f}",
+        )
+        for entry in history
+    ]
+    plan = model.folder.read_plan()
+    blocks: list[Block] = [Table(header, rows)]
+    if plan is not None:
+        decided = [(entry.setting, entry.text, entry.made, entry.reason) for entry in plan.decisions]
+        blocks += [Heading("Plan"), Table(("setting", "value", "made", "reason"), decided, numeric=False)]
+    settings = f"<h2>Configuration</h2>\n<pre>{escape(model.config.to_yaml().rstrip())}</pre>"
+    return f'<h2>Error against run time</h2>\n<div class="curves">{"".join(curves)}</div>\n{_html(blocks)}\n{settings}'

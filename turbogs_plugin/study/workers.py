@@ -1,0 +1,101 @@
+"""A sweep on several GPUs of this machine: a process for each, which share the cells by their claims."""
+
+from __future__ import annotations
+
+import io
+import multiprocessing
+import os
+import signal
+import sys
+from collections.abc import Sequence
+from multiprocessing.connection import wait
+from multiprocessing.process import BaseProcess
+from typing import Any
+
+import torch
+
+from turbogs_plugin.errors import InputError, TrainingStopped, exit_code
+from turbogs_plugin.study.folder import StudyFolder
+from turbogs_plugin.study.grid import Ablation
+from turbogs_plugin.study.sweep import SweepOptions, run_sweep
+
+UNFINISHED = 3
+"""Exit code of a worker that `--within` ended."""
+
+
+class _Lines(io.TextIOWrapper):
+    """A stream without bars: those of several workers would overwrite each other on a terminal."""
+
+    def isatty(self) -> bool:
+        return False
+
+
+def run_on_gpus(
+    ablation: Ablation, variants: Sequence[str], options: SweepOptions, here: Any, folder: StudyFolder, *more: Any
+) -> int:
+    """`run_sweep` by a process for each of `options.gpus`; returns when all have ended.
+
+    A worker that is killed takes nothing along but the cell it trained, which another one takes over.
+
+    Returns:
+        1 if `options.within` left cells for another call; else 0.
+
+    Raises:
+        InputError: a GPU is not there, or what `run_sweep` raises.
+        TrainingStopped: every worker ended without finishing.
+    """
+    present = torch.cuda.device_count()
+    absent = [gpu for gpu in options.gpus if gpu >= present]
+    if options.device != "cpu" and absent:
+        raise InputError(f"--gpus: there is no GPU {absent[0]}, {present} answer; see 'turbogs doctor'")
+    context = multiprocessing.get_context("spawn")
+    arguments = (ablation, variants, options, here, folder, *more)
+    workers = [context.Process(target=_work, args=(gpu, place, arguments)) for place, gpu in enumerate(options.gpus)]
+    for worker in workers:
+        worker.start()
+    try:
+        _wait_for(workers)
+    finally:
+        for worker in workers:
+            if worker.is_alive():
+                worker.terminate()
+            worker.join()
+    codes = [worker.exitcode for worker in workers]
+    if 2 in codes:  # said by the worker
+        sys.stderr.flush()
+        raise SystemExit(2)
+    if not {0, UNFINISHED} & set(codes):
+        raise TrainingStopped("no process of this study lived to its end: the same command goes on")
+    return int(0 not in codes)
+
+
+def _wait_for(workers: Sequence[BaseProcess]) -> None:
+    """Until all have ended, or one found the input wrong. One that was killed is told."""
+    running = {worker.sentinel: (gpu, worker) for gpu, worker in enumerate(workers)}
+    while running:
+        for sentinel in wait(list(running)):
+            number, worker = running.pop(sentinel)
+            worker.join()
+            if worker.exitcode == 2:
+                return
+            if worker.exitcode not in (0, UNFINISHED):
+                print(f"worker {number} ended early (code {worker.exitcode}): others take its cells", file=sys.stderr)
+
+
+def _work(gpu: int, place: int, arguments: tuple) -> None:
+    """In a process of its own, before CUDA starts."""
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    visible = [name for name in os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",") if name]
+    os.environ["CUDA_VISIBLE_DEVICES"] = visible[gpu] if gpu < len(visible) else str(gpu)
+
+    sys.stderr = _Lines(os.fdopen(os.dup(2), "wb", 0), write_through=True)
+
+    def swept() -> int:
+        try:
+            return UNFINISHED if run_sweep(*arguments) else 0
+        except InputError:
+            if place == 0:  # it is the same for all, and one says so
+                raise
+            return 2
+
+    sys.exit(exit_code(swept))
