@@ -32,6 +32,7 @@ CASES = {
     "summed rows": ("optimizer.rows=summed",),
     "no rule": ("optimizer.type=adam",),
     "fastgs": ("density.type=fastgs", "density.refine_from=2", "density.refine_every=3"),
+    "exposures": ("train.exposure=true", "train.background=random"),
     "hosted": ("train.maps_place=host", "train.photos_place=host"),
 }
 LONG = 50
