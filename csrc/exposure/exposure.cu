@@ -103,7 +103,8 @@ __global__ void __launch_bounds__(kExposureThreads)
     flush(params, view, sums);
 }
 
-__global__ void __launch_bounds__(kStepThreads) exposure_step_kernel(const __grid_constant__ ExposureStepParams params) {
+__global__ void __launch_bounds__(kStepThreads)
+    exposure_step_kernel(const __grid_constant__ ExposureStepParams params) {
     __shared__ bool usable[kMaxViews];
     if (params.overflow != nullptr && *params.overflow != 0) return;
     const int number = this_warp(), lane = this_lane();
