@@ -64,8 +64,10 @@ def undefined_symbols(library: Path) -> list[str]:
 
 
 def stray_files(names: list[str]) -> list[str]:
-    """Files of a wheel that are neither modules, configurations, the library nor metadata."""
-    ours = re.compile(rf"turbogs_plugin/([\w/]+\.py|configs/[\w/-]+\.yaml)|{re.escape(LIBRARY)}")
+    """Files of a wheel that are neither modules, configurations, parts of the exported page, the library nor
+    metadata."""
+    modules, pages = r"[\w/]+\.py|configs/[\w/-]+\.yaml", r"export/web/\w+\.(html|css|js)"
+    ours = re.compile(rf"turbogs_plugin/({modules}|{pages})|{re.escape(LIBRARY)}")
     return [name for name in names if not (ours.fullmatch(name) or name.split("/")[0].endswith(".dist-info"))]
 
 

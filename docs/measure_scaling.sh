@@ -1,6 +1,7 @@
 #!/bin/sh
 # Measures docs/scaling.md on a machine with two GPUs: sh docs/measure_scaling.sh OUT FOX CALITERRA [DEVICE]
-# The tests of the exchange, iterations on one GPU and on two, whole runs, which end if their replicas differ, and a study.
+# The tests of the exchange, iterations on one GPU and on two, whole runs, which end if their replicas differ, and a
+# study.
 set -e
 out=$1 fox=$2 caliterra=$3 device=${4:-cuda}
 python=${PYTHON:-python3}

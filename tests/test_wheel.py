@@ -49,7 +49,8 @@ def library(numbers: list[str]) -> bytes:
 
 def wheel(folder: Path, content: bytes, name: str = NAME, stray: str | None = None) -> Path:
     with zipfile.ZipFile(folder / name, "w") as archive:
-        for file in ("turbogs_plugin/cli.py", "turbogs_plugin/configs/ablations/far_sizes.yaml", stray):
+        page = "turbogs_plugin/export/web/page.html"
+        for file in ("turbogs_plugin/cli.py", "turbogs_plugin/configs/ablations/far_sizes.yaml", page, stray):
             if file:
                 archive.writestr(file, "")
         archive.writestr("turbogs_plugin-0.1.0.dist-info/WHEEL", "")
@@ -69,6 +70,7 @@ def test_a_wheel_as_make_wheel_builds_it_has_no_fault(checker, tmp_path):
         (library(ARCHITECTURES).replace(b"sm_89 ", b""), {}, "it does not say of itself that it holds sm_80"),
         (library(ARCHITECTURES), {"name": NAME.replace("abi3", "cp310")}, "its tag is not cp310-abi3"),
         (library(ARCHITECTURES), {"stray": "turbogs_plugin/notes.txt"}, "turbogs_plugin/notes.txt: a stray file"),
+        (library(ARCHITECTURES), {"stray": "turbogs_plugin/viewer.js"}, "turbogs_plugin/viewer.js: a stray file"),
         (library(ARCHITECTURES), {"stray": "strategies/losses.py"}, "strategies/losses.py: a stray file"),
         (library(ARCHITECTURES), {"stray": "turbogs_plugin/_C.cpython-311.so"}, "_C.cpython-311.so: a stray file"),
     ],

@@ -131,7 +131,8 @@ void main() {
   shown = vec4(color.rgb * alpha, alpha);
 }`;
 
-// Sums are kept in 16-bit floats where there are such targets, and shown by one more quad: 8 bits would round them away.
+// Sums are kept in 16-bit floats where there are such targets, and shown by one more quad: 8 bits would round them
+// away.
 const COPY_VERTEX = `#version 300 es
 void main() { gl_Position = vec4(vec2(gl_VertexID & 1, gl_VertexID >> 1) * 2.0 - 1.0, 0.0, 1.0); }`;
 const COPY_FRAGMENT = `#version 300 es
