@@ -76,6 +76,9 @@ def test_pixels_of_masks_are_those_of_the_image():
 class Foreign:
     """A sampler that knows no masks: every third pixel, with weights and empty slots."""
 
+    def __repr__(self) -> str:
+        return "Foreign()"
+
     def sample(self, maps, view_ids, rate, step):
         sizes = maps.sizes[list(view_ids)]
         table = pixel_table(sizes, "cpu")

@@ -123,7 +123,11 @@ def test_black_is_as_without_a_background():
 
 @pytest.mark.parametrize("unit", ["pixel", "tile"])
 def test_the_loss_composites_transparent_photos(unit):
-    """The kernel gathers them as torch does, and learns the same errors."""
+    """The kernel gathers them as torch does, and learns the same errors.
+
+    It composites by one fused multiply-add, torch by two roundings: a colour differs by 6e-8, and the Charbonnier
+    term's gradient, steepest within its epsilon of 1e-3, by up to 6e-5 of its largest value.
+    """
     generator = torch.Generator().manual_seed(1)
     pixels = int(SIZES.prod(axis=1).sum())
     colors = torch.randint(0, 256, (pixels, 4), generator=generator, dtype=torch.uint8)
@@ -136,8 +140,9 @@ def test_the_loss_composites_transparent_photos(unit):
     expected = training_kernels.sparse_loss(terms, rendered, truth, samples)
     update = MapUpdate(maps, step)
     found = training_kernels.sparse_loss(terms, rendered, photos.colors.to(DEVICE), samples, update, None, COLOR)
-    assert torch.equal(found.color_gradients, expected.color_gradients)
-    assert torch.equal(found.pixel_errors, expected.pixel_errors)
+    largest = float(expected.color_gradients.abs().max())
+    torch.testing.assert_close(found.color_gradients, expected.color_gradients, rtol=1e-5, atol=1e-4 * largest)
+    torch.testing.assert_close(found.pixel_errors, expected.pixel_errors, rtol=1e-6, atol=5e-7)
     moved = PixelSamples(
         samples.view_ids, samples.sizes, samples.pixel_ids.cpu(), samples.tile_ids.cpu(), samples.tile_offsets.cpu()
     )
