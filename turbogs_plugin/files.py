@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import glob
 import os
+import socket
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
@@ -44,8 +46,8 @@ def read_text(path: Path) -> str | None:
 def write_atomically(path: Path, write: Callable[[BinaryIO], None]) -> None:
     """Write a file beside its destination, bring it to the disk, and put it in place by one rename.
 
-    Whatever interrupts this (a full disk, a kill), `path` is what it was before or is complete. A leftover of a killed
-    process is overwritten by the next one.
+    Whatever interrupts this (a full disk, a kill), `path` is what it was before or is complete. Several processes may
+    write the same file: one of the writes stays. A write first removes what a killed process of this host has left.
 
     Args:
         path: the destination; its folder exists.
@@ -54,7 +56,10 @@ def write_atomically(path: Path, write: Callable[[BinaryIO], None]) -> None:
     Raises:
         OSError: from the disk, with the name of the file; then nothing is left behind.
     """
-    temporary = path.with_name(f".{path.name}.part")
+    for leftover in path.parent.glob(f"{_own_prefix(path, escaped=True)}*.part"):
+        if not _is_running(leftover.suffixes[-2].lstrip(".")):
+            leftover.unlink(missing_ok=True)
+    temporary = partial_path(path)
     try:
         with open(temporary, "wb") as file:
             write(file)
@@ -67,6 +72,28 @@ def write_atomically(path: Path, write: Callable[[BinaryIO], None]) -> None:
             error.filename = str(path)
         raise
     _sync_folder(path.parent)
+
+
+def partial_path(path: Path) -> Path:
+    """Where this process writes a file until it is complete."""
+    return path.with_name(f"{_own_prefix(path)}{os.getpid()}.part")
+
+
+def _own_prefix(path: Path, escaped: bool = False) -> str:
+    """How the names of a file's partial ones of this host begin; `escaped` for a pattern."""
+    prefix = f".{path.name}.{socket.gethostname()}."
+    return glob.escape(prefix) if escaped else prefix
+
+
+def _is_running(process: str) -> bool:
+    """Whether a process of this host may still write; what is no number is nobody's."""
+    try:
+        os.kill(int(process), 0)
+    except (ProcessLookupError, ValueError):
+        return False
+    except OSError:  # of another user
+        pass
+    return True
 
 
 def write_text_atomically(path: Path, text: str) -> None:

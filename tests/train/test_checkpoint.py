@@ -2,6 +2,7 @@
 
 import os
 import pickle
+import subprocess
 import zipfile
 
 import pytest
@@ -163,7 +164,7 @@ def test_a_kill_in_the_middle_of_a_write_keeps_a_whole_checkpoint(tmp_path, monk
 
 def test_a_torn_temporary_file_is_no_checkpoint(tmp_path):
     path = save_checkpoint(tmp_path, 1, state(1.0))
-    (tmp_path / ".iteration-000002.pt.part").write_bytes(path.read_bytes()[:100])
+    files.partial_path(tmp_path / "iteration-000002.pt").write_bytes(path.read_bytes()[:100])
     assert latest_checkpoint(tmp_path) == path
     save_checkpoint(tmp_path, 3, state(3.0))
     assert {file.name for file in tmp_path.iterdir()} == {path.name, "iteration-000003.pt", "latest"}
@@ -250,14 +251,28 @@ def test_an_atomic_write_leaves_the_old_text_on_failure(tmp_path):
 
 def test_a_model_on_a_full_disk_is_refused_for_what_it_is(tmp_path):
     model = gaussians_from_points(torch.rand(500, 3), torch.zeros(500, 3, dtype=torch.uint8), 0, 1.0)
-    (tmp_path / ".model.ply.part").symlink_to("/dev/full")
+    files.partial_path(tmp_path / "model.ply").symlink_to("/dev/full")
     with pytest.raises(InputError, match=r"model\.ply: No space left on device; .*make room"):
         ply.save_ply(model, tmp_path / "model.ply")
     assert not os.listdir(tmp_path)
 
 
+def test_processes_that_write_the_same_file_do_not_meet(tmp_path, monkeypatch):
+    """As those of a study do with its results: each puts its own complete file in place."""
+    target = tmp_path / "results.json"
+
+    def write_while_another_does(file):
+        with monkeypatch.context() as context:
+            context.setattr(files.os, "getpid", lambda: 1)  # which runs, always
+            files.write_text_atomically(target, "another's")
+        file.write(b"mine")
+
+    files.write_atomically(target, write_while_another_does)
+    assert target.read_text() == "mine" and os.listdir(tmp_path) == ["results.json"]
+
+
 def test_a_failed_write_names_its_file(tmp_path):
-    (tmp_path / ".text.part").symlink_to("/dev/full")
+    files.partial_path(tmp_path / "text").symlink_to("/dev/full")
     with pytest.raises(OSError) as failed:
         files.write_text_atomically(tmp_path / "text", "new")
     assert failed.value.filename == str(tmp_path / "text")
@@ -268,7 +283,9 @@ def test_a_model_is_written_as_atomically_as_a_checkpoint(tmp_path, monkeypatch)
     target = tmp_path / "model.ply"
     model = gaussians_from_points(torch.rand(5, 3), torch.zeros(5, 3, dtype=torch.uint8), 0, 1.0)
     target.write_text("old")
-    (tmp_path / ".model.ply.part").write_text("torn")
+    gone = subprocess.run(["sh", "-c", "echo $$"], capture_output=True, text=True).stdout.strip()
+    own = files.partial_path(target)
+    own.with_name(own.name.replace(f".{os.getpid()}.", f".{gone}.")).write_text("torn")
     whole_write = files.write_atomically
 
     def limited(path, write):

@@ -64,7 +64,7 @@ def save_checkpoint(folder: Path, iteration: int, state: dict[str, Any]) -> Path
             f"iteration {iteration}: the checkpoint could not be written to '{folder}' ({reason}): "
             "once it can be, go on with --resume"
         ) from error
-    for leftover in folder.glob(".iteration-*.pt.part"):  # from a killed process
+    for leftover in folder.glob(".iteration-*.part"):  # from a killed process
         leftover.unlink(missing_ok=True)
     others = [file for file in folder.iterdir() if _NAME.fullmatch(file.name) and file != path]
     others.sort(key=lambda file: int(_NAME.fullmatch(file.name)[1]))
