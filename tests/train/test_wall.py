@@ -152,7 +152,7 @@ def test_the_report_takes_the_last_evaluation(capture, tmp_path, monkeypatch):
     from turbogs_plugin.report import pages
 
     evaluate = pages.evaluate
-    monkeypatch.setattr(pages, "evaluate", lambda *arguments: rendered.append(1) or evaluate(*arguments))
+    monkeypatch.setattr(pages, "evaluate", lambda *args, **options: rendered.append(1) or evaluate(*args, **options))
     session = run.train(tiny_config(capture, "train.iterations=2"), tmp_path / "run", write_report)
     page = session.folder.report.read_text()
     assert not rendered and f"{session.history[-1].psnr:.2f}" in page
