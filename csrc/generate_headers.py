@@ -16,7 +16,10 @@ from types import ModuleType
 ROOT = Path(__file__).resolve().parent.parent
 LAYOUT = ROOT / "turbogs_plugin/engine/layout.py"
 LAUNCHES = ROOT / "turbogs_plugin/engine/cuda/launches.py"
-CONSTANTS = {ROOT / "turbogs_plugin/types.py": ("TILE_SIZE",), ROOT / "turbogs_plugin/tiles.py": ("CELL_SIDE",)}
+CONSTANTS = {
+    ROOT / "turbogs_plugin/types/samples.py": ("TILE_SIZE",),
+    ROOT / "turbogs_plugin/tiles.py": ("CELL_SIDE",),
+}
 """Further numbers, of files that import torch: they are read, not run."""
 
 ENUMERATIONS = {"UNITS": "SampleUnit", "STRUCTURES": "Structure", "UPDATE_KINDS": "UpdateKind"}

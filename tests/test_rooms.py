@@ -19,7 +19,6 @@ def test_few_modules_stand_beside_the_packages():
     root = Path(turbogs_plugin.__file__).parent
     modules = {path.stem for path in root.glob("*.py")} - {"__init__"}
     assert modules <= {
-        "types",
         "tiles",
         "masks",
         "errors",
@@ -40,35 +39,39 @@ def test_documents_name_tests_that_are_there():
     assert [(page, path) for page, path in sorted(named) if not (root / path).is_file()] == []
 
 
-def loaded_by(code: str) -> set[str]:
-    """The modules that a new process has after this code."""
-    code += "\nimport json, sys\nprint(json.dumps(sorted(sys.modules)))"
-    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert ended.returncode == 0, ended.stderr
-    return set(json.loads(ended.stdout.splitlines()[-1]))
+ROOMS = ("train.trainer", "train.loop", "train.run", "report.pages", "report.outputs", "export.commands")
+
+RUN = """
+from pathlib import Path
+from turbogs_plugin.config.configuration import load_config
+from turbogs_plugin.train.run import train
+train(load_config("config.yaml"), Path("run"))
+"""
 
 
-def test_the_package_and_the_clock_of_the_wall_load_no_torch():
-    loaded = loaded_by("import turbogs_plugin, turbogs_plugin.train.wall")
-    assert "turbogs_plugin.train.wall" in loaded and not loaded & (SLOW | {"torch", "numpy"})
+@pytest.fixture(scope="module")
+def loaded(tmp_path_factory) -> list[set[str]]:
+    """The modules that a new process has after the package and its clock, after the rooms of training and report, and
+    after a run without a report."""
+    folder = tmp_path_factory.mktemp("rooms")
+    config = tiny_config(tiny_capture(folder), "train.iterations=2", "train.evaluate_at=[]").to_yaml()
+    (folder / "config.yaml").write_text(config)
+    parts = ("turbogs_plugin.train.wall", ", ".join(f"turbogs_plugin.{room}" for room in ROOMS))
+    steps = ["import turbogs_plugin", *(f"import {part}" for part in parts), RUN]
+    told = "\nimport json, sys\nprint(json.dumps(sorted(sys.modules)))\n"
+    code = told.join(["\n".join(steps[:2]), *steps[2:], ""])
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=folder)
+    assert ended.returncode == 0 and (folder / "run/model.ply").is_file(), ended.stderr
+    return [set(json.loads(line)) for line in ended.stdout.splitlines() if line.startswith("[")]
 
 
-@pytest.mark.parametrize(
-    "room", ["train.trainer", "train.loop", "train.run", "report.pages", "report.outputs", "export.commands"]
-)
-def test_training_and_its_report_load_nothing_slow_before_they_use_it(room):
-    loaded = loaded_by(f"import turbogs_plugin.{room}")
-    assert "torch" in loaded and not loaded & SLOW
+def test_the_package_and_the_clock_of_the_wall_load_no_torch(loaded):
+    assert "turbogs_plugin.train.wall" in loaded[0] and not loaded[0] & (SLOW | {"torch", "numpy"})
 
 
-def test_a_run_without_a_report_loads_nothing_slow_but_the_reader_of_its_capture(tmp_path):
-    config = tiny_config(tiny_capture(tmp_path), "train.iterations=2", "train.evaluate_at=[]").to_yaml()
-    (tmp_path / "config.yaml").write_text(config)
-    loaded = loaded_by(
-        "from pathlib import Path\n"
-        "from turbogs_plugin.config.configuration import load_config\n"
-        "from turbogs_plugin.train.run import train\n"
-        f"train(load_config({str(tmp_path / 'config.yaml')!r}), Path({str(tmp_path / 'run')!r}))"
-    )
-    assert (tmp_path / "run/model.ply").is_file()
-    assert loaded & SLOW == {"pycolmap"}
+def test_training_and_its_report_load_nothing_slow_before_they_use_it(loaded):
+    assert {"torch", *(f"turbogs_plugin.{room}" for room in ROOMS)} <= loaded[1] and not loaded[1] & SLOW
+
+
+def test_a_run_without_a_report_loads_nothing_slow_but_the_reader_of_its_capture(loaded):
+    assert loaded[2] & SLOW == {"pycolmap"}

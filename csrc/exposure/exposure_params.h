@@ -1,4 +1,4 @@
-// Parameters of the kernels of exposures. No torch here. Index spaces as in turbogs_plugin/types.py: K views of the
+// Parameters of the kernels of exposures. No torch here. Index spaces as in turbogs_plugin/types: K views of the
 // batch, P sample slots, T tiles with samples, V training views. turbogs_plugin/engine/reference/exposure.py defines
 // all results.
 #pragma once

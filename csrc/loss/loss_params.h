@@ -1,4 +1,4 @@
-// Parameters of the kernels of the loss. No torch here. Index spaces as in turbogs_plugin/types.py: K views of the
+// Parameters of the kernels of the loss. No torch here. Index spaces as in turbogs_plugin/types: K views of the
 // batch, P sample slots, T tiles with samples, X flat pixels of all V training views.
 #pragma once
 

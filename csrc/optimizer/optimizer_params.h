@@ -1,5 +1,5 @@
 // Parameters of the kernels that take gradients from the screen to the Gaussians. No torch here. Index spaces as in
-// turbogs_plugin/types.py: K views of the batch, N Gaussians, P sample slots, B harmonics above band 0.
+// turbogs_plugin/types: K views of the batch, N Gaussians, P sample slots, B harmonics above band 0.
 #pragma once
 
 #include <cuda_runtime.h>

@@ -1,4 +1,4 @@
-// Parameters of the samplers' kernels. No torch here. Index spaces as in turbogs_plugin/types.py: K views of the
+// Parameters of the samplers' kernels. No torch here. Index spaces as in turbogs_plugin/types: K views of the
 // batch, P sample slots, T tiles with samples, X flat pixels of all training views.
 #pragma once
 

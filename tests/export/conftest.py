@@ -8,6 +8,7 @@ from helpers.framework_runs import tiny_capture, tiny_config
 
 from turbogs_plugin.scene import load_scene
 from turbogs_plugin.train import run
+from turbogs_plugin.train.saved_model import load_model
 
 
 @pytest.fixture(scope="session")
@@ -30,4 +31,4 @@ def finished(capture, tmp_path_factory) -> Path:
 
 @pytest.fixture
 def model(finished):
-    return run.load_model(finished, torch.device("cpu"))
+    return load_model(finished, torch.device("cpu"))

@@ -23,10 +23,10 @@ PATIENCE = 90_000
 
 @pytest.fixture(scope="module")
 def written(finished, scene, tmp_path_factory):
-    from turbogs_plugin.train import run
+    from turbogs_plugin.train.saved_model import load_model
 
     file = tmp_path_factory.mktemp("page") / "report.html"
-    model = run.load_model(finished, torch.device("cpu"))
+    model = load_model(finished, torch.device("cpu"))
     return file, write_page(model, model.gaussians, scene, file), model
 
 

@@ -15,7 +15,8 @@ from turbogs_plugin.strategies.density.error_driven import ErrorDrivenDensity
 
 from turbogs_plugin.engine.rendering import dense_samples, rasterize
 from turbogs_plugin.scene import load_scene
-from turbogs_plugin.train.run import load_model, train
+from turbogs_plugin.train.run import train
+from turbogs_plugin.train.saved_model import load_model
 from turbogs_plugin.train.trainer import Trainer
 from turbogs_plugin.types import GaussianStats, Step
 

@@ -23,9 +23,10 @@ from turbogs_plugin.config.yaml_text import parse_yaml
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.model.gsplat_file import save_gsplat
 from turbogs_plugin.scene import Frame, load_scene
-from turbogs_plugin.train import run
+from turbogs_plugin.train import run, start
 from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint, save_checkpoint
 from turbogs_plugin.train.given_model import load_given
+from turbogs_plugin.train.saved_model import load_model
 from turbogs_plugin.types import Gaussians
 
 MEMORY = 64 * 2**20
@@ -86,7 +87,7 @@ def test_checkpoints_with_other_values(finished, tmp_path, monkeypatch):
     config = run.RunFolder(finished).read_config()
     monkeypatch.setattr(run.RunFolder, "read_config", lambda folder: copy.deepcopy(config))
     scene = load_scene(config.scene.path)
-    monkeypatch.setattr(run, "load_scene", lambda *_: scene)
+    monkeypatch.setattr(start, "load_scene", lambda *_: scene)
     state = load_checkpoint(latest_checkpoint(finished / "checkpoints"))
     (tmp_path / "run").mkdir()
     shutil.copy(finished / "config.yaml", tmp_path / "run")
@@ -104,7 +105,7 @@ def test_checkpoints_with_other_values(finished, tmp_path, monkeypatch):
             save_checkpoint(tmp_path / "run/checkpoints", 3, changed)
             cases += 1
             with contextlib.suppress(InputError):
-                model = run.load_model(tmp_path / "run", torch.device("cpu")).gaussians
+                model = load_model(tmp_path / "run", torch.device("cpu")).gaussians
                 assert all(value.isfinite().all() for _, value in model.items()), path
                 assert len({len(value) for _, value in model.items()}) == 1, path
             try:

@@ -13,6 +13,7 @@ import pytest
 from helpers.framework_runs import TINY, tiny_capture
 
 from turbogs_plugin import cli
+from turbogs_plugin.commands import studies
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.study import claims as claims_module
 from turbogs_plugin.study.claims import STALE_SECONDS, Claims
@@ -150,4 +151,4 @@ def test_a_cell_that_another_process_trains_is_waited_for(tmp_path, monkeypatch,
 @pytest.mark.parametrize("text", ["0,0", "a", "", "0;1"])
 def test_gpus_are_different_numbers(text):
     with pytest.raises(InputError, match="--gpus"):
-        cli._numbers("--gpus", text)
+        studies.numbers("--gpus", text)

@@ -10,7 +10,7 @@ import torch
 
 from turbogs_plugin import files
 from turbogs_plugin.errors import InputError, TrainingStopped
-from turbogs_plugin.model import ply
+from turbogs_plugin.model import ply, torch_file
 from turbogs_plugin.model.initial import gaussians_from_points
 from turbogs_plugin.train import checkpoint
 from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint, save_checkpoint
@@ -82,7 +82,7 @@ def test_a_full_disk_keeps_the_newest_checkpoint(tmp_path, monkeypatch, room):
     def limited(path, write):
         whole_write(path, lambda file: write(DiskFull(file, room)))
 
-    monkeypatch.setattr(checkpoint, "write_atomically", limited)
+    monkeypatch.setattr(torch_file, "write_atomically", limited)
     with pytest.raises(TrainingStopped, match=r"iteration 2: .*not be written.*\(No space left on device\).*--resume"):
         save_checkpoint(tmp_path, 2, state(2.0))
     assert sorted(os.listdir(tmp_path)) == before

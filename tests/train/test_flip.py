@@ -18,6 +18,7 @@ from turbogs_plugin.study.cell import train_cell
 from turbogs_plugin.train import flip as flip_module
 from turbogs_plugin.train import run
 from turbogs_plugin.train.flip import load_flip
+from turbogs_plugin.train.saved_model import load_model
 
 STAND_IN = """
 import numpy
@@ -80,7 +81,7 @@ def test_what_is_not_finite_has_no_flip(library, broken):
 
 def test_eval_prints_it_and_says_why_not(finished, library, monkeypatch):
     text = evaluate_run(finished, "cpu")
-    views = len(load_scene(run.load_model(finished, torch.device("cpu")).config.scene.path).test)
+    views = len(load_scene(load_model(finished, torch.device("cpu")).config.scene.path).test)
     assert "| FLIP |" in text and text.count("| 0.2500 |\n") == views + 1 and len(library.calls) == views
     monkeypatch.setattr(flip_module, "FLIP_PACKAGE", "no_such_package_as_this")
     text = evaluate_run(finished, "cpu")

@@ -24,6 +24,7 @@ from turbogs_plugin.scene.starting_points import random_points
 from turbogs_plugin.train import run
 from turbogs_plugin.train.checkpoint import latest_checkpoint
 from turbogs_plugin.train.given_model import load_given
+from turbogs_plugin.train.saved_model import load_model
 from turbogs_plugin.train.trainer import Trainer
 from turbogs_plugin.types import Gaussians
 
@@ -85,7 +86,7 @@ def files_of(finished: Path, folder: Path) -> dict[str, Path]:
 
 def test_a_model_is_the_same_in_every_form(finished, capture, tmp_path, recwarn):
     scene = load_scene(capture)
-    trained = run.load_model(finished, CPU).gaussians
+    trained = load_model(finished, CPU).gaussians
     for file in files_of(finished, tmp_path).values():
         assert_alike(load_given(file, scene, CPU), trained)
     assert not [warning for warning in recwarn if issubclass(warning.category, UserWarning)]
@@ -121,11 +122,11 @@ def test_an_export_of_a_run_reads_back(turbogs, finished, capture, tmp_path, for
     target = tmp_path / f"exported.{form}"
     code, out, _ = turbogs("export", finished, "--format", form, "--out", target)
     assert code == 0 and str(target) in out
-    assert_alike(load_given(target, load_scene(capture), CPU), run.load_model(finished, CPU).gaussians)
+    assert_alike(load_given(target, load_scene(capture), CPU), load_model(finished, CPU).gaussians)
     again = tmp_path / ("again.ply" if form == "pt" else "again.pt")
     code, _, error = turbogs("export", target, "--format", again.suffix[1:], "--scene", capture, "--out", again)
     assert (code, error) == (0, "")
-    assert_alike(load_given(again, load_scene(capture), CPU), run.load_model(finished, CPU).gaussians)
+    assert_alike(load_given(again, load_scene(capture), CPU), load_model(finished, CPU).gaussians)
 
 
 @pytest.mark.parametrize("world", range(4))
@@ -134,7 +135,7 @@ def test_gsplats_normalised_world_is_recognised(finished, capture, tmp_path, wor
     file = save_splats(tmp_path / "ckpt.pt", theirs)
     with pytest.warns(UserWarning, match=r"ckpt\.pt is in gsplat's normalised world .*: brought back"):
         loaded = load_given(file, load_scene(capture), CPU)
-    trained = run.load_model(finished, CPU).gaussians
+    trained = load_model(finished, CPU).gaussians
     for name in ("means", "scales", "opacities", "sh0", "shN"):
         torch.testing.assert_close(getattr(loaded, name), getattr(trained, name), rtol=1e-3, atol=1e-3)
     aligned = torch.nn.functional.cosine_similarity(loaded.quats, trained.quats).abs()
@@ -169,7 +170,7 @@ def test_rows_that_are_not_finite_are_left_out_and_counted_once(finished, captur
     assert [str(line.message) for line in warned] == [
         f"{file}: 3 of {len(model)} Gaussians are not finite and left out"
     ]
-    assert_alike(loaded, run.load_model(finished, CPU).gaussians.map(lambda value: value[kept]))
+    assert_alike(loaded, load_model(finished, CPU).gaussians.map(lambda value: value[kept]))
 
 
 def test_ranks_of_one_model_are_put_together(finished, capture, tmp_path):
@@ -178,14 +179,14 @@ def test_ranks_of_one_model_are_put_together(finished, capture, tmp_path):
     first = save_splats(tmp_path / "ckpt_6999_rank0.pt", model.map(lambda value: value[:half]))
     save_splats(tmp_path / "ckpt_6999_rank1.pt", model.map(lambda value: value[half:]))
     save_splats(tmp_path / "ckpt_29999_rank1.pt", model)
-    assert_alike(load_given(first, load_scene(capture), CPU), run.load_model(finished, CPU).gaussians)
+    assert_alike(load_given(first, load_scene(capture), CPU), load_model(finished, CPU).gaussians)
 
 
 # ---- Starts ------------------------------------------------------------------------------------------------------
 
 
 def test_training_starts_from_a_model_where_that_had_ended(finished, capture, tmp_path):
-    before = run.load_model(finished, CPU)
+    before = load_model(finished, CPU)
     config = tiny_config(capture, "train.iterations=1", "train.evaluate_at=[]")
     config.train.init = str(finished / "model.ply")
     session = run.train(config, tmp_path / "run")
@@ -196,7 +197,7 @@ def test_training_starts_from_a_model_where_that_had_ended(finished, capture, tm
 
 
 def test_bands_are_added_or_dropped_as_the_run_has_them(finished, capture):
-    scene, model = load_scene(capture), run.load_model(finished, CPU).gaussians
+    scene, model = load_scene(capture), load_model(finished, CPU).gaussians
     for degree, bands in ((0, 0), (1, 3), (3, 15)):
         config = tiny_config(capture, f"train.sh_degree={degree}", f"train.init={finished}").without_plan()
         trainer = Trainer(config, scene, CPU)
@@ -233,7 +234,7 @@ def test_a_model_gets_no_backdrop_unless_it_is_asked_for(finished, capture):
     config = tiny_config(capture, f"train.init={finished}")
     facts = run.plan_run(tiny_config(capture)).facts
     assert wanted_backdrop(facts, config).value is False
-    model = run.load_model(finished, CPU).gaussians
+    model = load_model(finished, CPU).gaussians
     asked = tiny_config(capture, f"train.init={finished}", "train.backdrop=true").without_plan()
     assert len(Trainer(asked, load_scene(capture), CPU).gaussians) == len(model) + 3000
 

@@ -20,6 +20,7 @@ from turbogs_plugin.train import pace as pacing
 from turbogs_plugin.train import run
 from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint, require_like
 from turbogs_plugin.train.history import read_history
+from turbogs_plugin.train.saved_model import load_model
 from turbogs_plugin.train.trainer import Trainer
 
 
@@ -119,7 +120,7 @@ def test_a_cap_is_never_exceeded(capture, tmp_path, counts, cap):
     assert counts[0] == min(points, cap)
     assert max(counts) == cap != points
     assert all(entry.num_gaussians <= cap for entry in outcome.history)
-    assert run.load_model(tmp_path / "run", torch.device("cpu")).config.density["max_gaussians"] == cap
+    assert load_model(tmp_path / "run", torch.device("cpu")).config.density["max_gaussians"] == cap
 
 
 def test_the_points_of_a_smaller_model_are_spread_over_all(capture):

@@ -12,7 +12,7 @@ from helpers.simulated_time import SimulatedTime
 
 from turbogs_plugin.errors import InputError, TrainingStopped
 from turbogs_plugin.report.pages import write_report
-from turbogs_plugin.train import run, wall
+from turbogs_plugin.train import run, start, wall
 from turbogs_plugin.train.wall import WallClock, WallRecord, process_age
 
 
@@ -152,7 +152,7 @@ def test_the_report_takes_the_last_evaluation(capture, tmp_path, monkeypatch):
     from turbogs_plugin.report import pages
 
     evaluate = pages.evaluate
-    monkeypatch.setattr(pages, "evaluate", lambda *args, **options: rendered.append(1) or evaluate(*args, **options))
+    monkeypatch.setattr(pages, "evaluate", lambda *given, **named: rendered.append(1) or evaluate(*given, **named))
     session = run.train(tiny_config(capture, "train.iterations=2"), tmp_path / "run", write_report)
     page = session.folder.report.read_text()
     assert not rendered and f"{session.history[-1].psnr:.2f}" in page
@@ -162,7 +162,7 @@ def test_the_report_takes_the_last_evaluation(capture, tmp_path, monkeypatch):
 
 def test_cuda_that_is_absent_is_named_before_photos_are_read(capture, tmp_path, monkeypatch):
     monkeypatch.setattr(run.torch.cuda, "is_available", lambda: False)
-    monkeypatch.setattr(run, "load_scene", lambda *_: pytest.fail("photos were read"))
+    monkeypatch.setattr(start, "load_scene", lambda *_: pytest.fail("photos were read"))
     with pytest.raises(InputError, match="CUDA was asked for and is absent"):
         run.train(tiny_config(capture, "train.device=cuda"), tmp_path / "run")
     assert not (tmp_path / "run").exists()
@@ -173,7 +173,7 @@ def test_the_device_starts_while_photos_are_read(capture, tmp_path, monkeypatch)
     import threading
 
     meet = threading.Barrier(2, timeout=60)
-    resolve, load = run.resolve_device, run.load_scene
+    resolve, load = run.resolve_device, start.load_scene
     monkeypatch.setattr(run, "resolve_device", lambda *arguments: (meet.wait(), resolve(*arguments))[1])
-    monkeypatch.setattr(run, "load_scene", lambda *arguments: (meet.wait(), load(*arguments))[1])
+    monkeypatch.setattr(start, "load_scene", lambda *arguments: (meet.wait(), load(*arguments))[1])
     assert run.train(tiny_config(capture, "train.iterations=1"), tmp_path / "run").wall.train_seconds > 0

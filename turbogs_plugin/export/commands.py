@@ -12,7 +12,8 @@ from turbogs_plugin.export.film import film_cameras, require_film, write_film
 from turbogs_plugin.export.formats import FORMATS, PAGE, require_format, written_and_read
 from turbogs_plugin.model.harmonics import band_energy, drop_faint_bands
 from turbogs_plugin.scene import Scene
-from turbogs_plugin.train.run import SavedModel, load_given_model, load_model, open_scene, resolve_device
+from turbogs_plugin.train.saved_model import SavedModel, load_given_model, load_model
+from turbogs_plugin.train.start import open_scene, resolve_device
 from turbogs_plugin.types import Gaussians
 
 

@@ -16,7 +16,7 @@ from turbogs_plugin.export.camera_path import from_file, orbit, through_views
 from turbogs_plugin.files import require_writable
 from turbogs_plugin.report.pictures import to_uint8
 from turbogs_plugin.scene import Scene
-from turbogs_plugin.train.run import SavedModel
+from turbogs_plugin.train.saved_model import SavedModel
 from turbogs_plugin.types import Cameras
 
 RATE = 60

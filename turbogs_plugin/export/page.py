@@ -32,7 +32,7 @@ from turbogs_plugin.scene import Scene
 from turbogs_plugin.study.document import CSS, Block, Heading, Paragraph, Table
 from turbogs_plugin.train.evaluate import compare
 from turbogs_plugin.train.history import Evaluation, read_history
-from turbogs_plugin.train.run import SavedModel
+from turbogs_plugin.train.saved_model import SavedModel
 from turbogs_plugin.types import Cameras, Gaussians
 
 LARGEST_PAGE = 32_000_000

@@ -14,8 +14,8 @@ from torch import Tensor
 
 from turbogs_plugin.engine.layout import MAX_SH_DEGREE
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.files import write_atomically
 from turbogs_plugin.model.similarity import finite_rows
+from turbogs_plugin.model.torch_file import save_plain
 from turbogs_plugin.scene.frame import Frame
 from turbogs_plugin.types import PARAMETER_NAMES, Gaussians
 
@@ -51,11 +51,11 @@ def save_gsplat(gaussians: Gaussians, path: str | Path, frame: Frame, step: int 
     rows.scales = rows.scales + math.log(frame.scale)
     state = {"step": step, "splats": dict(rows.items())}
     try:
-        write_atomically(Path(path), lambda file: torch.save(state, file))
-    except (OSError, RuntimeError) as error:  # torch raises a RuntimeError where a write fails
-        cause = error.__context__ if isinstance(error.__context__, OSError) else error
-        reason = getattr(cause, "strerror", None) or str(cause).splitlines()[0]
-        raise InputError(f"cannot write {path}: {reason}; choose another place or make room") from error
+        save_plain(Path(path), state)
+    except OSError as error:
+        raise InputError(
+            f"cannot write {path}: {error.strerror or error}; choose another place or make room"
+        ) from error
 
 
 def read_gsplat(state: Mapping[str, Any], path: str | Path) -> Gaussians:

@@ -11,6 +11,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.files import write_atomically
 from turbogs_plugin.scene.host_arrays import too_large
 
 
@@ -33,13 +35,37 @@ def load_plain(path: Path) -> Any:
     return state
 
 
-def reason_of(error: Exception) -> str:
-    """Why `load_plain` failed, in a line."""
-    if isinstance(error, zipfile.BadZipFile):
-        return "it is not a whole file of torch.save"
-    if "weights_only" in str(error) or "Weights only" in str(error):
-        return "it holds more than plain tensors and values"
-    return str(error).splitlines()[0][:160] if str(error) else type(error).__name__
+def read_plain(path: Path, name: str, remedy: str = "") -> Any:
+    """`load_plain`, where the user named the file.
+
+    Args:
+        name: of the file, for messages.
+        remedy: what to do about a file that cannot be used.
+
+    Raises:
+        InputError: the file cannot be read, or used.
+    """
+    try:
+        return load_plain(path)
+    except OSError as error:
+        raise InputError(f"cannot read {name}: {error.strerror or error}") from None
+    except Exception as error:
+        if isinstance(error, zipfile.BadZipFile):
+            reason = "it is not a whole file of torch.save"
+        elif "weights only" in str(error).lower().replace("_", " "):
+            reason = "it holds more than plain tensors and values"
+        else:
+            reason = str(error).splitlines()[0][:160] if str(error) else type(error).__name__
+        raise InputError(f"{name} cannot be used: {reason}{remedy}") from None
+
+
+def save_plain(path: Path, state: Any) -> None:
+    """`torch.save` into a file that is written whole or not at all. Raises `OSError` if the disk refused."""
+    try:
+        write_atomically(path, lambda file: torch.save(state, file))
+    except RuntimeError as error:  # of torch, about positions in the file
+        cause = error.__context__
+        raise cause if isinstance(cause, OSError) else OSError(str(error).splitlines()[0]) from error
 
 
 def leaves(value: Any, place: str) -> Iterator[tuple[str, Any]]:

@@ -19,7 +19,8 @@ from turbogs_plugin.scene.offload import place_views
 from turbogs_plugin.train.background import Background
 from turbogs_plugin.train.evaluate import evaluate, load_lpips
 from turbogs_plugin.train.flip import load_flip
-from turbogs_plugin.train.run import SavedModel, load_given_model, load_model, open_scene, resolve_device
+from turbogs_plugin.train.saved_model import SavedModel, load_given_model, load_model
+from turbogs_plugin.train.start import open_scene, resolve_device
 
 
 def evaluate_run(path: Path, device_name: str, given: Config | None = None) -> str:

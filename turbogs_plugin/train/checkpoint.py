@@ -16,9 +16,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from turbogs_plugin.engine.layout import MAX_SH_DEGREE
 from turbogs_plugin.errors import InputError, TrainingStopped
-from turbogs_plugin.files import read_text, write_atomically, write_text_atomically
-from turbogs_plugin.model.torch_file import leaves, load_plain
+from turbogs_plugin.files import read_text, write_text_atomically
+from turbogs_plugin.model.torch_file import leaves, read_plain, save_plain
+from turbogs_plugin.types import PARAMETER_NAMES, Gaussians
 
 FORMAT = 2
 KEPT = 2
@@ -54,14 +56,11 @@ def save_checkpoint(folder: Path, iteration: int, state: dict[str, Any]) -> Path
     path = folder / f"iteration-{iteration:06d}.pt"
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        write_atomically(path, lambda file: torch.save({"format": FORMAT, **state}, file))
+        save_plain(path, {"format": FORMAT, **state})
         write_text_atomically(folder / "latest", path.name)
-    except (OSError, RuntimeError) as error:
-        # On a failed write torch raises a RuntimeError about positions in the file.
-        cause = error.__context__ if isinstance(error.__context__, OSError) else error
-        reason = getattr(cause, "strerror", None) or str(cause).splitlines()[0]
+    except OSError as error:
         raise TrainingStopped(
-            f"iteration {iteration}: the checkpoint could not be written to '{folder}' ({reason}): "
+            f"iteration {iteration}: the checkpoint could not be written to '{folder}' ({error.strerror or error}): "
             "once it can be, go on with --resume"
         ) from error
     for leftover in folder.glob(".iteration-*.part"):  # from a killed process
@@ -91,21 +90,32 @@ def latest_checkpoint(folder: Path) -> Path | None:
 def load_checkpoint(path: Path) -> dict[str, Any]:
     """The state in a checkpoint, on the CPU.
 
-    Only plain tensors and values are read (`load_plain`).
+    Raises:
+        InputError: not a checkpoint of TurboGS, truncated, or with anything but plain tensors and values in it.
+    """
+    state = read_plain(path, f"checkpoint '{path}'")
+    if not isinstance(state, dict) or state.pop("format", None) != FORMAT:
+        raise InputError(f"checkpoint '{path}' cannot be used: not a checkpoint of this version of TurboGS")
+    return state
+
+
+def gaussians_of_state(state: dict[str, Any], device: torch.device) -> Gaussians:
+    """The model in a checkpoint's state.
 
     Raises:
-        InputError: not a checkpoint of TurboGS, truncated, or with anything else in it.
+        ValueError: the tensors are not the parameters of one model, or not finite.
     """
-    try:
-        state = load_plain(path)
-        if not isinstance(state, dict) or state.pop("format", None) != FORMAT:
-            raise ValueError("not a checkpoint of this version of TurboGS")
-    except OSError as error:
-        raise InputError(f"cannot read checkpoint '{path}': {error.strerror or error}") from None
-    except Exception as error:  # torch and zipfile raise a dozen kinds for malformed files
-        reason = str(error).splitlines()[0][:160] if str(error) else type(error).__name__
-        raise InputError(f"checkpoint '{path}' cannot be used: {reason}") from None
-    return state
+    gaussians = Gaussians(**{name: state["gaussians"][name].to(device) for name in PARAMETER_NAMES})
+    count, bands = len(gaussians), gaussians.shN.shape[1]
+    shapes = ((count, 3), (count, 4), (count, 3), (count,), (count, 1, 3), (count, bands, 3))
+    for (name, value), shape in zip(gaussians.items(), shapes, strict=True):
+        if value.shape != shape or value.dtype != torch.float32:
+            raise ValueError(f"gaussians.{name} has shape {tuple(value.shape)} where {shape} was expected")
+        if not value.isfinite().all():
+            raise ValueError(f"gaussians.{name} is not finite")
+    if bands not in [(degree + 1) ** 2 - 1 for degree in range(MAX_SH_DEGREE + 1)]:
+        raise ValueError(f"gaussians.shN has {bands} bands")
+    return gaussians
 
 
 def require_like(saved: Any, present: Any, place: str) -> None:

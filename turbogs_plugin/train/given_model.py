@@ -24,7 +24,7 @@ from turbogs_plugin.model.gsplat_file import read_gsplat
 from turbogs_plugin.model.gsplat_world import gsplat_worlds
 from turbogs_plugin.model.ply import read_ply
 from turbogs_plugin.model.similarity import Similarity, placed
-from turbogs_plugin.model.torch_file import load_plain, reason_of
+from turbogs_plugin.model.torch_file import read_plain
 from turbogs_plugin.scene import Scene
 from turbogs_plugin.scene.fingerprint import frame_of_state
 from turbogs_plugin.train.background import Background
@@ -102,9 +102,12 @@ def read_given(path: str | Path) -> Gaussians:
 
 def _read_torch(file: Path) -> tuple[Gaussians, Similarity | None]:
     """The model of a .pt in float64, and where it knows that, the change to the capture's own coordinates."""
-    state = _load(file)
+    state = _read(file)
     if isinstance(state, Mapping) and "splats" in state:
-        parts = [read_gsplat(state, file), *(read_gsplat(_load(other), other) for other in _other_ranks(file))]
+        parts = [
+            read_gsplat(state, file),
+            *(read_gsplat(_read(other), other) for other in _other_ranks(file)),
+        ]
         if len({part.shN.shape[1] for part in parts}) > 1:
             raise InputError(f"{file}: the files of its ranks differ in degree: give those of one run")
         names = PARAMETER_NAMES
@@ -120,13 +123,8 @@ def _read_torch(file: Path) -> tuple[Gaussians, Similarity | None]:
         raise InputError(f"{file}: its frame cannot be read ({error}): give another checkpoint") from None
 
 
-def _load(file: Path) -> object:
-    try:
-        return load_plain(file)
-    except OSError as error:
-        raise InputError(f"cannot read '{file}': {error.strerror or error}") from None
-    except Exception as error:  # torch and zipfile raise a dozen kinds for malformed files
-        raise InputError(f"'{file}' cannot be used: {reason_of(error)}; save the model again, or as a .ply") from None
+def _read(file: Path) -> object:
+    return read_plain(file, f"'{file}'", "; save the model again, or as a .ply")
 
 
 def _other_ranks(file: Path) -> list[Path]:

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import math
-import operator
 import sys
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,22 +20,22 @@ from turbogs_plugin.files import write_text_atomically
 from turbogs_plugin.model.ply import save_ply
 from turbogs_plugin.plan import Plan, make_plan
 from turbogs_plugin.reconstruct.train_on_photos import with_cameras
-from turbogs_plugin.scene import Frame, Scene, load_scene
-from turbogs_plugin.scene.fingerprint import capture_difference, capture_state, frame_of_state
+from turbogs_plugin.scene import Scene
+from turbogs_plugin.scene.fingerprint import capture_difference, capture_state
 from turbogs_plugin.scene.offload import place_views
 from turbogs_plugin.train.calibration import Calibration, budget_text, hold_to, within_budget
 from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint, require_like, save_checkpoint
 from turbogs_plugin.train.evaluate import load_lpips
 from turbogs_plugin.train.evaluations import Evaluations
 from turbogs_plugin.train.folder import RunFolder
-from turbogs_plugin.train.given_model import load_given, require_model
+from turbogs_plugin.train.given_model import require_model
 from turbogs_plugin.train.history import Evaluation, append_evaluation, rewind_history
 from turbogs_plugin.train.interrupts import Interrupts
 from turbogs_plugin.train.loop import Listener, TrainingLoop
 from turbogs_plugin.train.pace import pace_of
-from turbogs_plugin.train.progress import LoadingProgress, TrainingProgress
-from turbogs_plugin.train.start import starting
-from turbogs_plugin.train.trainer import Trainer, gaussians_of_state
+from turbogs_plugin.train.progress import TrainingProgress
+from turbogs_plugin.train.start import open_scene, resolve_device, starting
+from turbogs_plugin.train.trainer import Trainer
 from turbogs_plugin.train.wall import WallClock, WallRecord
 from turbogs_plugin.train.wall_marks import WallMarks
 from turbogs_plugin.types import Gaussians
@@ -46,53 +45,6 @@ PHOTOS, DEVICE = "photos", "CUDA and kernels, after the photos"
 """Parts of the wall time before a plan is made."""
 FILES = "checkpoint and model, after the pictures"
 """The part of the wall time at the end in which nothing else is left to do."""
-
-
-@dataclass
-class SavedModel:
-    """The parts of a run needed to render or export its model, or a model from a file.
-
-    Args:
-        folder, iteration: of the run; None of a model from a file.
-    """
-
-    folder: RunFolder | None
-    config: Config
-    gaussians: Gaussians
-    frame: Frame
-    iteration: int | None
-
-    @property
-    def sh_degree(self) -> int:
-        """Degree of the bands in use; a file does not say, so it is all that there are."""
-        given = self.iteration is None
-        return self.gaussians.sh_degree if given else self.config.train.sh_degree_at(self.iteration)
-
-
-def resolve_device(name: str, remedy: str = "use --device cpu, or see 'turbogs doctor'") -> torch.device:
-    """The device of ``auto``, ``cpu`` or ``cuda``. Raises `InputError` if CUDA is asked for and absent."""
-    if name == "cuda" and not torch.cuda.is_available():
-        build = "this PyTorch is built without CUDA" if torch.version.cuda is None else "no GPU answers"
-        raise InputError(f"CUDA was asked for and is absent ({build}): {remedy}")
-    return torch.device("cuda" if name != "cpu" and torch.cuda.is_available() else "cpu")
-
-
-def open_scene(config: Config, folder: RunFolder | None = None) -> Scene:
-    """The capture of a configuration.
-
-    Args:
-        folder: that of the run with this configuration; None if the user names the capture.
-
-    Raises:
-        InputError: there is no usable capture.
-    """
-    settings = config.scene
-    if folder is not None and not Path(settings.path).exists():
-        raise InputError(
-            f"capture '{settings.path}' of the run in '{folder.path}' is not there: bring it back, or edit scene.path "
-            f"in {folder.config}"
-        )
-    return load_scene(settings.path, settings.factor, settings.test_every, LoadingProgress())
 
 
 def plan_run(config: Config) -> Plan:
@@ -286,45 +238,6 @@ def _independent(config: Config, device: torch.device) -> Config:
         config.report.lpips_weights = str(Path(config.report.lpips_weights).resolve())
     config.train.device = device.type
     return config
-
-
-def load_model(path: Path, device: torch.device) -> SavedModel:
-    """The newest saved model of a run.
-
-    Raises:
-        InputError: no run there, no checkpoint, or an unusable one.
-    """
-    folder = RunFolder(path)
-    if path.is_file():
-        raise InputError(f"'{path}' is a file, not a run's folder: name the capture of a model by --scene SCENE")
-    config = folder.read_config()
-    checkpoint = latest_checkpoint(folder.checkpoints)
-    if checkpoint is None:
-        raise InputError(f"'{path}' has no checkpoint yet: let the run go on with  turbogs train --resume {path}")
-    state = load_checkpoint(checkpoint)
-    try:
-        frame = frame_of_state(state)
-        trained = state["trainer"]
-        iteration = operator.index(trained["iteration"])
-        return SavedModel(folder, config, gaussians_of_state(trained, device), frame, iteration)
-    except (KeyError, TypeError, AttributeError, IndexError, ValueError, RuntimeError) as error:
-        raise InputError(f"checkpoint '{checkpoint}' is not one of a run: {error}") from None
-
-
-def load_given_model(path: Path, config: Config, device: torch.device) -> tuple[SavedModel, Scene]:
-    """A model from a file, with the capture that it belongs to.
-
-    Args:
-        path: as `require_model` takes it.
-        config: says which capture, and how to render.
-
-    Raises:
-        InputError: no such model, or no usable capture.
-    """
-    require_model(path)
-    scene = open_scene(config)
-    gaussians = load_given(path, scene, device).map(lambda value: value.to(device))
-    return SavedModel(None, config, gaussians, scene.frame, None), scene
 
 
 class RunSession(Listener):

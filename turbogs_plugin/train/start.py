@@ -1,20 +1,34 @@
-"""Starting a device beside other work: CUDA takes a second or more until it answers."""
+"""What begins with a configuration: the device, started beside other work, and the capture."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
+from pathlib import Path
 
 import torch
 
+from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.device import synchronize
 from turbogs_plugin.engine import compiled_kernels
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.scene import Scene, load_scene
+from turbogs_plugin.train.folder import RunFolder
+from turbogs_plugin.train.progress import LoadingProgress
+
+
+def resolve_device(name: str, remedy: str = "use --device cpu, or see 'turbogs doctor'") -> torch.device:
+    """The device of ``auto``, ``cpu`` or ``cuda``. Raises `InputError` if CUDA is asked for and absent."""
+    if name == "cuda" and not torch.cuda.is_available():
+        build = "this PyTorch is built without CUDA" if torch.version.cuda is None else "no GPU answers"
+        raise InputError(f"CUDA was asked for and is absent ({build}): {remedy}")
+    return torch.device("cuda" if name != "cpu" and torch.cuda.is_available() else "cpu")
 
 
 @contextmanager
 def starting(resolve: Callable[[], torch.device]) -> Iterator[Future[torch.device]]:
-    """While entered, a thread starts a device and loads its kernels.
+    """While entered, a thread starts a device and loads its kernels: CUDA takes a second or more until it answers.
 
     Args:
         resolve: says which device; what it raises is raised by the future.
@@ -32,3 +46,21 @@ def starting(resolve: Callable[[], torch.device]) -> Iterator[Future[torch.devic
 
     with ThreadPoolExecutor(1) as pool:
         yield pool.submit(start)
+
+
+def open_scene(config: Config, folder: RunFolder | None = None) -> Scene:
+    """The capture of a configuration.
+
+    Args:
+        folder: that of the run with this configuration; None if the user names the capture.
+
+    Raises:
+        InputError: there is no usable capture.
+    """
+    settings = config.scene
+    if folder is not None and not Path(settings.path).exists():
+        raise InputError(
+            f"capture '{settings.path}' of the run in '{folder.path}' is not there: bring it back, or edit scene.path "
+            f"in {folder.config}"
+        )
+    return load_scene(settings.path, settings.factor, settings.test_every, LoadingProgress())

@@ -16,7 +16,6 @@ from turbogs_plugin.distributed.exchange import exchange_of
 from turbogs_plugin.distributed.ranks import ONE, Ranks
 from turbogs_plugin.engine import engine_of
 from turbogs_plugin.engine.exposures import Exposures, exposure_rate
-from turbogs_plugin.engine.layout import MAX_SH_DEGREE
 from turbogs_plugin.engine.protocol import MapUpdate
 from turbogs_plugin.engine.rendered import RenderOptions, ScreenGradients
 from turbogs_plugin.engine.rendering import rasterize, render_image
@@ -32,8 +31,9 @@ from turbogs_plugin.scene.offload import place_maps, place_views
 from turbogs_plugin.scene.photos import PhotoSamples
 from turbogs_plugin.scene.starting_points import colors_in_photos, random_points
 from turbogs_plugin.train.background import Background
+from turbogs_plugin.train.checkpoint import gaussians_of_state
 from turbogs_plugin.train.given_model import load_given
-from turbogs_plugin.types import PARAMETER_NAMES, Gaussians, GaussianStats, LossOutput, PixelSamples, RowUpdate, Step
+from turbogs_plugin.types import Gaussians, GaussianStats, LossOutput, PixelSamples, RowUpdate, Step
 
 COLOR_STRIDE = 97
 """The mean colour of the photos is taken over every 97th pixel; coprime to usual widths."""
@@ -375,22 +375,3 @@ def _mean_color(views: PosedImages) -> Tensor:
         kept = torch.cat(keep)[::COLOR_STRIDE]
         pixels = pixels[kept] if kept.any() else pixels
     return pixels.mean(dim=0) / 255.0
-
-
-def gaussians_of_state(state: dict[str, Any], device: torch.device) -> Gaussians:
-    """The model in a checkpoint's state.
-
-    Raises:
-        ValueError: the tensors are not the parameters of one model, or not finite.
-    """
-    gaussians = Gaussians(**{name: state["gaussians"][name].to(device) for name in PARAMETER_NAMES})
-    count, bands = len(gaussians), gaussians.shN.shape[1]
-    shapes = ((count, 3), (count, 4), (count, 3), (count,), (count, 1, 3), (count, bands, 3))
-    for (name, value), shape in zip(gaussians.items(), shapes, strict=True):
-        if value.shape != shape or value.dtype != torch.float32:
-            raise ValueError(f"gaussians.{name} has shape {tuple(value.shape)} where {shape} was expected")
-        if not value.isfinite().all():
-            raise ValueError(f"gaussians.{name} is not finite")
-    if bands not in [(degree + 1) ** 2 - 1 for degree in range(MAX_SH_DEGREE + 1)]:
-        raise ValueError(f"gaussians.shN has {bands} bands")
-    return gaussians

@@ -18,7 +18,8 @@ from turbogs_plugin.model.similarity import Similarity, placed
 from turbogs_plugin.scene import Frame, Scene
 from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint
 from turbogs_plugin.train.given_model import read_given
-from turbogs_plugin.train.run import load_given_model, load_model, open_scene, resolve_device
+from turbogs_plugin.train.saved_model import load_given_model, load_model
+from turbogs_plugin.train.start import open_scene, resolve_device
 from turbogs_plugin.types import Gaussians, Step
 from turbogs_plugin.viewer.controls import Controls
 from turbogs_plugin.viewer.frames import Frames

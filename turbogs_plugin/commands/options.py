@@ -1,0 +1,123 @@
+"""Options that several commands have, and checks of options."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from tyro.conf import Positional, arg
+
+from turbogs_plugin.errors import InputError
+
+if TYPE_CHECKING:
+    from turbogs_plugin.config.configuration import Config
+
+LOCAL, PORT = "127.0.0.1", 8080
+"""Where a viewer listens unless told otherwise: for this machine alone."""
+
+Device = Literal["auto", "cpu", "cuda"]
+
+Overrides = Annotated[Positional[tuple[str, ...]], arg(metavar="[section.key=value ...]")]
+Count = Annotated[int | None, arg(metavar="N")]
+Time = Annotated[str | None, arg(metavar="20s")]
+Decibels = Annotated[tuple[float, ...], arg(metavar="DB ...")]
+Scene = Annotated[Path | None, arg(metavar="SCENE")]
+Studies = Annotated[tuple[Path, ...], arg(metavar="STUDY ...")]
+RunOrModel = Annotated[Positional[Path], arg(metavar="RUN|MODEL")]
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """What train and plan change in a configuration.
+
+    Args:
+        config: name of a packaged configuration or a .yaml file; turbogs where absent.
+        factor: scale photos down by this.
+        device: where to train; auto takes a GPU where there is one.
+        max_gaussians: never more than this (density.max_gaussians).
+        max_memory: of the GPU, never more than this for tensors: 2GiB, 1500MB (budget.max_memory). Photos and error
+            maps move to the host if need be, then the number of Gaussians is limited.
+        time_budget: seconds of training to end after: 20s, 2m (budget.time). The schedule is fitted to it, and
+            the pixels of an iteration or the number of Gaussians.
+        init: what to start from (train.init): points of the capture, random points, or a model trained anywhere: a
+            .ply, gsplat's .pt, a checkpoint, or a run's folder.
+    """
+
+    config: Annotated[str | None, arg(metavar="NAME_OR_FILE")] = None
+    factor: Count = None
+    device: Annotated[Device | None, arg(metavar="auto|cpu|cuda")] = None
+    max_gaussians: Count = None
+    max_memory: Annotated[str | None, arg(metavar="2GiB")] = None
+    time_budget: Time = None
+    init: Annotated[str | None, arg(metavar="points|random|MODEL")] = None
+
+    def settings(self, scene: Path, overrides: tuple[str, ...]) -> Config:
+        """The configuration that a command line asks for."""
+        from turbogs_plugin.config.configuration import DEFAULT_CONFIG, load_config
+        from turbogs_plugin.plan.caps import with_cap
+
+        budget = budget_overrides(self.max_memory, self.time_budget)
+        if self.max_gaussians is not None and self.max_gaussians < 1:
+            raise InputError(f"--max-gaussians {self.max_gaussians}: it must be at least 1; leave it out for no limit")
+        if any(override.partition("=")[0].strip() == "scene.path" for override in overrides):
+            raise InputError(f"scene.path is '{scene}', as SCENE says: leave the override out")
+        settings = load_config(DEFAULT_CONFIG if self.config is None else self.config, (*overrides, *budget))
+        if self.max_gaussians is not None:
+            settings = with_cap(settings, self.max_gaussians)
+        settings.scene.path = str(scene)
+        if self.factor is not None:
+            settings.scene.factor = self.factor
+        if self.device is not None:
+            settings.train.device = self.device
+        if self.init is not None:
+            if not self.init.strip():
+                raise InputError("--init '': write points, random, or a model's file; leave it out for points")
+            settings.train.init = self.init
+        return settings
+
+
+Flat = Annotated[RunOptions, arg(name="")]
+NO_OPTIONS = RunOptions()
+
+
+@dataclass(frozen=True)
+class GivenOptions:
+    """What eval, render and export need where they are given a model in the place of a run.
+
+    Args:
+        scene: the capture of a model from a file: a 3DGS .ply, gsplat's .pt, or a checkpoint. Not with a run.
+        factor: scale its photos down by this.
+    """
+
+    scene: Scene = None
+    factor: Count = None
+
+    def settings(self, overrides: tuple[str, ...]) -> Config | None:
+        """The capture and how to render it; None for a run, which says that itself."""
+        if self.scene is None:
+            if overrides or self.factor is not None:
+                raise InputError("a run goes by its own configuration: --factor and overrides need --scene SCENE")
+            return None
+        return RunOptions(factor=self.factor).settings(self.scene, overrides).without_plan()
+
+
+Given = Annotated[GivenOptions, arg(name="")]
+NO_SCENE = GivenOptions()
+
+
+def budget_overrides(max_memory: str | None, time_budget: str | None) -> tuple[str, ...]:
+    """The options of a budget as overrides."""
+    for option, amount in (("--max-memory", max_memory), ("--time-budget", time_budget)):
+        if amount == "":
+            raise InputError(f"{option} '': write an amount; leave it out for no limit")
+    given = {"max_memory": max_memory, "time": time_budget}
+    return tuple(f"budget.{name}={value!r}" for name, value in given.items() if value is not None)
+
+
+def require_positive(option: str, values: Sequence[float], most: float = math.inf) -> None:
+    if not all(0 < value <= most and math.isfinite(value) for value in values):
+        limit = f"at most {most:g}" if math.isfinite(most) else "finite"
+        raise InputError(f"{option} {' '.join(map(str, values))}: it must be more than 0 and {limit}")

@@ -1,0 +1,121 @@
+"""`turbogs train` and `turbogs plan`."""
+
+from __future__ import annotations
+
+import sys
+from contextlib import ExitStack
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from tyro.conf import Positional, arg
+
+from turbogs_plugin.commands.options import LOCAL, NO_OPTIONS, Count, Flat, Overrides, Scene, require_positive
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.train.wall import WallClock, process_age
+
+if TYPE_CHECKING:
+    from turbogs_plugin.train.run import RunSession
+
+
+def train(
+    scene: Positional[Scene] = None,
+    overrides: Overrides = (),
+    /,
+    *,
+    out: Annotated[Path | None, arg(metavar="RUN")] = None,
+    resume: Annotated[Path | None, arg(metavar="RUN")] = None,
+    report: bool = True,
+    viewer: Annotated[int | None, arg(metavar="[PORT]")] = None,
+    viewer_host: str = LOCAL,
+    gpus: Count = None,
+    options: Flat = NO_OPTIONS,
+) -> int:
+    """Train on a capture, or go on with a stopped run.
+
+    Args:
+        scene: folder of a capture: a COLMAP reconstruction, a transforms.json, NeRF-synthetic or LLFF, with its photos;
+            or of photos alone, whose cameras are found first (see reconstruct).
+        overrides: changes of the configuration, e.g. train.iterations=8000 density.type=none.
+        out: new folder for the run.
+        resume: folder of a stopped run to go on with, by its own configuration.
+        report: at the end, write the report and its pictures; --no-report leaves model, history and checkpoints.
+        viewer: show the training in a browser, at this port (8080 where none is named); afterwards its model, until
+            Ctrl-C.
+        viewer_host: where the viewer listens; 0.0.0.0 lets others on the network look, and pause the training.
+        gpus: of this machine, to train one model on all of them, a process each; torchrun does the same on several
+            machines. docs/scaling.md says what they gain.
+    """
+    clock = WallClock(process_age())
+    if viewer is None and viewer_host != LOCAL:
+        raise InputError("--viewer-host says where a viewer listens: give --viewer, too")
+    if resume is not None:
+        if scene or overrides or out or options != NO_OPTIONS:
+            raise InputError(
+                "--resume goes on by the run's own configuration: give it nothing else but --no-report, --viewer and "
+                "--gpus"
+            )
+    elif scene is None or out is None:
+        raise InputError("train needs a SCENE and --out RUN, or --resume RUN")
+    if gpus is not None:
+        require_positive("--gpus", (gpus,))
+    from turbogs_plugin.distributed.processes import joined, launched, restarted, start
+    from turbogs_plugin.report.pages import write_report
+    from turbogs_plugin.train import run
+
+    settings = run.RunFolder(resume).read_config() if resume else options.settings(scene, overrides)
+    device = settings.train.device
+    if gpus is not None and gpus > 1 and not launched():
+        return start(gpus, sys.argv[1:], device)
+    page = write_report if report else None
+    with joined(device) as ranks, ExitStack() as pages:
+        if resume is None and restarted() and run.RunFolder(out).config.is_file():
+            resume = out
+        live = None
+        if viewer is not None:
+            if ranks.count > 1:
+                raise InputError("--viewer shows a training on one GPU: leave it out, or --gpus")
+            from turbogs_plugin.viewer.commands import attached
+
+            live = pages.enter_context(attached(viewer, viewer_host))
+        begin = partial(run.resume, resume) if resume else partial(run.train, settings, out)
+        session = begin(page, clock, ranks, live and live.watch)
+        code = _tell(session, report) if ranks.first else 128 + session.signal if session.signal else 0
+        if live is not None and session.signal is None:
+            live.stay()
+    return code
+
+
+def plan(
+    scene: Annotated[Positional[Path], arg(metavar="SCENE")],
+    overrides: Overrides = (),
+    /,
+    *,
+    options: Flat = NO_OPTIONS,
+) -> int:
+    """Print what a run on a capture would decide of the settings that are `auto`, and why, without training.
+
+    Args:
+        scene: as in train.
+        overrides: as in train; train.sh_degree=auto leaves a setting to the plan, any other value forces it.
+    """
+    from turbogs_plugin.train.run import plan_run
+
+    print(plan_run(options.settings(scene, overrides)).text())
+    return 0
+
+
+def _tell(session: RunSession, reported: bool) -> int:
+    """Print how a training call ended; its exit code."""
+    from turbogs_plugin.report.tables import history_table
+
+    folder = session.folder
+    if session.signal is not None:
+        print(f"stopped and saved: go on with  turbogs train --resume {folder.path}", file=sys.stderr)
+        return 128 + session.signal
+    print(history_table(session.history))
+    print(f"\n{session.wall.text()}")
+    if reported:
+        print(f"report  {folder.report}\nrenders {folder.path / 'report'}")
+    print(f"model   {folder.model}")
+    return 0

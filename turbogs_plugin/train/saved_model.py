@@ -1,0 +1,79 @@
+"""Models to render, measure or hand over: the newest one of a run, or one that was trained anywhere."""
+
+from __future__ import annotations
+
+import operator
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from turbogs_plugin.config.configuration import Config
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.scene import Frame, Scene
+from turbogs_plugin.scene.fingerprint import frame_of_state
+from turbogs_plugin.train.checkpoint import gaussians_of_state, latest_checkpoint, load_checkpoint
+from turbogs_plugin.train.folder import RunFolder
+from turbogs_plugin.train.given_model import load_given, require_model
+from turbogs_plugin.train.start import open_scene
+from turbogs_plugin.types import Gaussians
+
+
+@dataclass
+class SavedModel:
+    """The parts of a run needed to render or export its model, or a model from a file.
+
+    Args:
+        folder, iteration: of the run; None of a model from a file.
+    """
+
+    folder: RunFolder | None
+    config: Config
+    gaussians: Gaussians
+    frame: Frame
+    iteration: int | None
+
+    @property
+    def sh_degree(self) -> int:
+        """Degree of the bands in use; a file does not say, so it is all that there are."""
+        given = self.iteration is None
+        return self.gaussians.sh_degree if given else self.config.train.sh_degree_at(self.iteration)
+
+
+def load_model(path: Path, device: torch.device) -> SavedModel:
+    """The newest saved model of a run.
+
+    Raises:
+        InputError: no run there, no checkpoint, or an unusable one.
+    """
+    folder = RunFolder(path)
+    if path.is_file():
+        raise InputError(f"'{path}' is a file, not a run's folder: name the capture of a model by --scene SCENE")
+    config = folder.read_config()
+    checkpoint = latest_checkpoint(folder.checkpoints)
+    if checkpoint is None:
+        raise InputError(f"'{path}' has no checkpoint yet: let the run go on with  turbogs train --resume {path}")
+    state = load_checkpoint(checkpoint)
+    try:
+        frame = frame_of_state(state)
+        trained = state["trainer"]
+        iteration = operator.index(trained["iteration"])
+        return SavedModel(folder, config, gaussians_of_state(trained, device), frame, iteration)
+    except (KeyError, TypeError, AttributeError, IndexError, ValueError, RuntimeError) as error:
+        raise InputError(f"checkpoint '{checkpoint}' is not one of a run: {error}") from None
+
+
+def load_given_model(path: Path, config: Config, device: torch.device) -> tuple[SavedModel, Scene]:
+    """A model from a file, with the capture that it belongs to.
+
+    Args:
+        path: as `require_model` takes it.
+        config: says which capture, and how to render.
+
+    Raises:
+        InputError: no such model, or no usable capture.
+    """
+    require_model(path)
+    scene = open_scene(config)
+    gaussians = load_given(path, scene, device).map(lambda value: value.to(device))
+    return SavedModel(None, config, gaussians, scene.frame, None), scene

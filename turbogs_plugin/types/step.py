@@ -1,0 +1,42 @@
+"""Where training stands."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Step:
+    """Where training stands. Algorithm 1's rho is `progress`; the scheduling appendix's rho is `anneal`.
+
+    Args:
+        iteration: t, from 0.
+        total: T, iterations of the whole run.
+        refine_until: tau_until, the last iteration of density control.
+        seed: of the run; all randomness is a function of (seed, iteration, place).
+        scene_extent: radius of the camera centres about their mean, world units.
+    """
+
+    iteration: int
+    total: int
+    refine_until: int
+    seed: int = 0
+    scene_extent: float = 1.0
+
+    @property
+    def progress(self) -> float:
+        """clip(t / tau_until, 0, 1): 0 at the start, 1 once density control is over."""
+        return min(1.0, self.iteration / max(1, self.refine_until))
+
+    @property
+    def anneal(self) -> float:
+        """1 - progress."""
+        return 1.0 - self.progress
+
+
+@dataclass(frozen=True)
+class SamplingBudget:
+    """How much one iteration samples: `views` (K) views, and the fraction `rate` (r) of each tile's pixels."""
+
+    views: int
+    rate: float
