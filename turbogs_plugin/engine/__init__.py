@@ -6,6 +6,7 @@ this package asks which device it is.
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -42,10 +43,14 @@ def compiled_kernels() -> CompiledKernels:
 def engine_of(device: torch.device, for_training: bool = False) -> Engine:
     """The engine for tensors on a device: the kernels where they are compiled and run, else the torch reference.
 
+    A warning says why, where a GPU has to do without the kernels.
+
     Args:
         for_training: the engine keeps its memory from pass to pass and never waits for the GPU. What it renders is
             valid until its next pass, and the caller must call `Engine.settle` before each iteration.
     """
-    if device.type == "cuda" and library.available():
-        return CudaEngine(device if for_training else None)
+    if device.type == "cuda":
+        if not (reason := library.unavailable_reason()):
+            return CudaEngine(device if for_training else None)
+        warnings.warn(f"kernels are not usable ({reason}): the torch reference runs, many times slower", stacklevel=2)
     return ReferenceEngine()
