@@ -7,7 +7,7 @@ it as plain tensors and numbers.
 
 from __future__ import annotations
 
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
 from torch import Tensor
@@ -80,7 +80,13 @@ class DensityController(Protocol):
     """Where Gaussians are added and removed (section 3.8).
 
     A class that inherits from this one and keeps no state per Gaussian needs only `update`.
+
+    Attributes:
+        watched: what `update` reads or changes at every iteration, not only at events (`event_due`): the ``model``, the
+            ``statistics``, both or nothing.
     """
+
+    watched: tuple[Literal["model", "statistics"], ...] = ()
 
     @property
     def stats(self) -> GaussianStats | None:
@@ -94,12 +100,13 @@ class DensityController(Protocol):
         """Propose a change of the set of Gaussians, or None. Called after every optimizer step."""
 
     def event_due(self, step: Step) -> bool:
-        """Whether `update` looks at the model or the statistics at this iteration, or returns anything but None; on
-        every process alike.
+        """Whether `update` may return a change at this iteration, or looks at more than is `watched`; on every process
+        alike.
 
         Where several processes train one model, each adds to the statistics of its own rows, and makes the step of its
-        own rows of the model. Only at such an iteration are both complete when `update` is called. True where nothing
-        is known, which is never wrong.
+        own rows of the model. Only at such an iteration are both complete when `update` is called, beside what is
+        `watched`, and the hosts of all processes wait for each other. True where nothing is known, which is never
+        wrong.
         """
         return True
 

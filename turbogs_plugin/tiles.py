@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -33,6 +34,33 @@ def cell_of_place(device: torch.device | str) -> Tensor:
 def slots_of_tiles(unit: str, wanted: int, widths: np.ndarray, heights: np.ndarray) -> np.ndarray:
     """[T] int64: slots of each tile of which so many units are drawn, `pixel` or `cell`. The rest as `tile_extents`."""
     return np.minimum(wanted * (CELL_SIDE**2 if unit == "cell" else 1), widths * heights)
+
+
+@dataclass(frozen=True)
+class DrawEnds:
+    """`PixelSamples.host_ends` of a draw whose sizes the host knows. Equal draws have equal ones.
+
+    Args:
+        unit: of the draw, one of `layout.UNITS`.
+        sizes: K times (width, height).
+        wanted: K times the units drawn of a view's tiles, or of each of its tiles.
+        live: K times the tiles that are drawn from, where these are not all tiles: each then has as many slots as a
+            whole one.
+    """
+
+    unit: str
+    sizes: tuple[tuple[int, int], ...]
+    wanted: tuple[int, ...]
+    live: tuple[int, ...] | None = None
+
+    def __call__(self) -> tuple[np.ndarray, np.ndarray]:
+        if self.unit == "tile":
+            return np.cumsum(self.wanted), np.cumsum(np.full(sum(self.wanted), TILE_PIXELS))
+        if self.live is not None:
+            slots = self.wanted[0] * (CELL_SIDE**2 if self.unit == "cell" else 1)
+            return np.cumsum(self.live), np.cumsum(np.full(sum(self.live), slots))
+        sizes = np.array(self.sizes, dtype=np.int64)
+        return TileGrid(sizes).offsets[1:], np.cumsum(slots_of_tiles(self.unit, self.wanted[0], *tile_extents(sizes)))
 
 
 def pixel_table(sizes: np.ndarray, device: torch.device | str) -> Tensor:

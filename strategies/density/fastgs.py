@@ -82,6 +82,7 @@ class FastGsDensity(DensityController):
     consistency: float = 0.5
     prune_every: int = 3000
     blame_threshold: float = 0.9
+    watched = ("statistics",)  # an iteration's batch votes by its mean error, over all Gaussians
     _events: ErrorDrivenDensity = field(init=False, repr=False)
     _batch: GaussianStats | None = field(init=False, repr=False, default=None)
     _window: GaussianStats | None = field(init=False, repr=False, default=None)
@@ -102,6 +103,16 @@ class FastGsDensity(DensityController):
     def setup(self, gaussians: Gaussians) -> None:
         self._restart(len(gaussians), gaussians.device)
 
+    def event_due(self, step: Step) -> bool:
+        return self._batch is not None and (self._densify_due(step) or self._prune_due(step))
+
+    def _densify_due(self, step: Step) -> bool:
+        return self._events.due(step)[0]
+
+    def _prune_due(self, step: Step) -> bool:
+        after = step.iteration - step.refine_until
+        return after > 0 and after % self.prune_every == 0
+
     @torch.no_grad()
     def update(self, gaussians: Gaussians, step: Step) -> RowUpdate | None:
         if self._batch is None:
@@ -109,16 +120,14 @@ class FastGsDensity(DensityController):
         self._votes.add(self._batch, self.error_threshold)
         add_stats(self._window, self._batch)
         self._batch.zero_()
-        after = step.iteration - step.refine_until
-        densify, _ = self._events.due(step)
-        prune = after > 0 and after % self.prune_every == 0
         update = None
-        if densify:
+        if self._densify_due(step):
             update = self._densify(gaussians, step)
-        elif prune:
+        elif self._prune_due(step):
             update = self._prune(gaussians)
-        if densify or prune:
+        if self.event_due(step):
             self._restart(len(gaussians), gaussians.device)
+        after = step.iteration - step.refine_until
         if after > 0 and step.iteration + self.prune_every - after % self.prune_every >= step.total:
             self._batch = self._window = self._votes = None  # no event is left in this run
         return update

@@ -49,6 +49,7 @@ class GsplatMcmcDensity(DensityController):
     refine_every: int = 100
     min_opacity: float = 0.005
     learning_rates: LearningRates = field(default_factory=LearningRates)
+    watched = ("model",)  # its noise
 
     def __post_init__(self) -> None:
         require_at_least_one(self, "max_gaussians", "refine_every")
@@ -61,13 +62,15 @@ class GsplatMcmcDensity(DensityController):
                 "density.type 'mcmc' needs a GPU, as gsplat's relocation does: use gsplat_default on a CPU"
             )
 
+    def event_due(self, step: Step) -> bool:
+        within = self.refine_start_iter < step.iteration < step.refine_until
+        return within and step.iteration % self.refine_every == 0
+
     @torch.no_grad()
     def update(self, gaussians: Gaussians, step: Step) -> RowUpdate | None:
-        iteration = step.iteration
-        due = self.refine_start_iter < iteration < step.refine_until and iteration % self.refine_every == 0
         if len(gaussians) == 0:
             return None
-        if due:
+        if self.event_due(step):
             usable = finite_rows(gaussians) & (gaussians.scales.amax(dim=-1) <= LARGEST_LOG_SCALE)
             if bool((usable & (torch.sigmoid(gaussians.opacities) > self.min_opacity)).any()):
                 return self._refine(gaussians, usable, step)

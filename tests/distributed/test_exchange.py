@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import copy
+import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
+from gsplat.strategy import MCMCStrategy, ops
 from helpers.framework_runs import TINY, tiny_capture
 from helpers.processes import ended, grouped, said, start_ranks
+from PIL import Image
+from torch import Tensor
+from turbogs_plugin.strategies.density.mcmc import GsplatMcmcDensity
 
 from turbogs_plugin.config.configuration import load_config
 from turbogs_plugin.distributed.digest import digest
@@ -17,6 +23,7 @@ from turbogs_plugin.distributed.rows import rows_of
 from turbogs_plugin.engine.reference.engine import ReferenceEngine
 from turbogs_plugin.engine.reference.raster import rasterize_reference
 from turbogs_plugin.errors import TrainingStopped
+from turbogs_plugin.model.torch_file import leaves
 from turbogs_plugin.scene import load_scene
 from turbogs_plugin.train.loop import TrainingLoop
 from turbogs_plugin.train.trainer import Trainer
@@ -31,12 +38,46 @@ CASES = {
     "tiles": ("pixel_sampler.unit=tile", "pixel_sampler.importance=0.5"),
     "summed rows": ("optimizer.rows=summed",),
     "no rule": ("optimizer.type=adam",),
-    "fastgs": ("density.type=fastgs", "density.refine_from=2", "density.refine_every=3"),
+    "fastgs": ("density.type=fastgs", "density.refine_from=2", "density.refine_every=3", "density.grad_threshold=0"),
+    "mcmc": ("density.type=mcmc", "density.refine_start_iter=1", "density.refine_every=3"),
     "exposures": ("train.exposure=true", "train.background=random"),
+    "masked": ("schedule.min_views=7", "schedule.max_views=7"),
+    "masked tiles": ("pixel_sampler.unit=tile", "schedule.type=fixed", "schedule.views=2"),
     "hosted": ("train.maps_place=host", "train.photos_place=host"),
 }
+"""Name -> overrides. A masked case is of the capture with masks."""
+WITH_EVENTS = ("usual", "fastgs", "mcmc")
 LONG = 50
 LONG_CASE = ("train.iterations=50", "train.refine_until=30", "schedule.max_views=2")
+
+
+def masked(capture: Path) -> Path:
+    """A copy of the capture in which a disc of each photo counts, and of one photo nothing."""
+    folder = capture.parent / "masked"
+    shutil.copytree(capture, folder)
+    (folder / "masks").mkdir()
+    y, x = np.mgrid[0:40, 0:48]
+    for view, photo in enumerate(sorted((folder / "images").iterdir())):
+        keep = ((x - 12 - view) ** 2 + (y - 14) ** 2 < 11**2) & (view != 3)
+        Image.fromarray(keep).save(folder / "masks" / f"{photo.stem}.png")
+    return folder
+
+
+def covariances(quats: Tensor, scales: Tensor, **_: bool) -> tuple[Tensor, None]:
+    return torch.diag_embed((2 * scales).exp()), None
+
+
+def without_gsplats_kernels() -> None:
+    """MCMC needs a GPU: relocation that changes nothing, and noise by axes that are not turned, do on a CPU."""
+    ops.compute_relocation = lambda opacities, scales, ratios, binoms: (opacities, scales)
+    ops.quat_scale_to_covar_preci = covariances
+    MCMCStrategy.initialize_state = lambda self: {"binoms": torch.empty(0)}  # of relocation; takes two seconds
+    GsplatMcmcDensity.setup = lambda self, gaussians: None
+
+
+def case_of(capture: Path, name: str, ranks: Ranks = ONE) -> Trainer:
+    place = capture.parent / "masked" if name.startswith("masked") else capture
+    return trainer_of(place, *CASES[name], ranks=ranks)
 
 
 def trainer_of(capture: Path, *overrides: str, ranks: Ranks = ONE) -> Trainer:
@@ -48,7 +89,7 @@ def trainer_of(capture: Path, *overrides: str, ranks: Ranks = ONE) -> Trainer:
 
 
 def state_of(trainer: Trainer) -> dict:
-    state = {"optimizer": trainer.optimizer.state_dict(), "maps": trainer.maps.state_dict()}
+    state = {name: getattr(trainer, name).state_dict() for name in ("optimizer", "maps", "density")}
     return copy.deepcopy(state | {"nonfinite": int(trainer.nonfinite_losses)})
 
 
@@ -58,17 +99,29 @@ def compared_steps(trainer: Trainer, count: int) -> None:
         trainer.compare_replicas()
 
 
+def steps_with_an_event(trainer: Trainer) -> dict:
+    """The second to fourth step, two of them without a look between. The fourth has an event of density control."""
+    waits, agree = [], ProcessRanks.agree
+    ProcessRanks.agree = lambda ranks, value: waits.append(trainer.iteration) or agree(ranks, value)
+    for _ in range(2):
+        trainer.step()
+    compared_steps(trainer, 1)
+    ProcessRanks.agree = agree
+    return {"waits": waits, "count": len(trainer.gaussians)}
+
+
 def every_case(capture: Path, out: Path, cases: tuple[str, ...]) -> None:
     """In every process: these cases, each compared after every step; the first process keeps what they gave."""
     ranks, results = grouped(), {}
+    without_gsplats_kernels()
     for name in cases:
-        trainer = trainer_of(capture, *CASES[name], ranks=ranks)
+        trainer = case_of(capture, name, ranks)
         trainer.initialise_maps()
         trainer.compare_replicas()
         trainer.step()
         trainer.compare_replicas()
         results[name] = state_of(trainer)
-        compared_steps(trainer, 3)  # the fourth has an event of density control
+        results[name]["event"] = steps_with_an_event(trainer)
     trainer = trainer_of(capture, *LONG_CASE, ranks=ranks)
     trainer.initialise_maps()
     for _ in range(LONG):
@@ -171,7 +224,9 @@ def broken_ranks(capture: Path, ranks: ProcessRanks) -> dict:
 
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory) -> Path:
-    return tiny_capture(tmp_path_factory.mktemp("exchange"))
+    capture = tiny_capture(tmp_path_factory.mktemp("exchange"))
+    masked(capture)
+    return capture
 
 
 @pytest.fixture(scope="module", params=[2, 4])
@@ -187,11 +242,20 @@ def several(request, capture, tmp_path_factory) -> tuple[int, dict]:
 @pytest.fixture(scope="module")
 def alone(capture) -> dict:
     results = {}
-    for name, overrides in CASES.items():
-        trainer = trainer_of(capture, *overrides)
-        trainer.initialise_maps()
-        trainer.step()
-        results[name] = state_of(trainer)
+    with pytest.MonkeyPatch.context() as patch:
+        replaced = {ops: ("compute_relocation", "quat_scale_to_covar_preci"), MCMCStrategy: ("initialize_state",)}
+        for owner, names in (replaced | {GsplatMcmcDensity: ("setup",)}).items():
+            for name in names:
+                patch.setattr(owner, name, getattr(owner, name))  # put back afterwards
+        without_gsplats_kernels()
+        for name in CASES:
+            trainer = case_of(capture, name)
+            trainer.initialise_maps()
+            trainer.step()
+            results[name] = state_of(trainer)
+            for _ in range(3 if name in WITH_EVENTS else 0):
+                trainer.step()
+            results[name]["count"] = len(trainer.gaussians)
     return results
 
 
@@ -223,6 +287,24 @@ def test_a_step_is_that_of_one_process_up_to_summation(several, alone, case):
         torch.testing.assert_close(results[case]["maps"][name], alone[case]["maps"][name], rtol=1e-3, atol=1e-3)
     assert torch.equal(results[case]["maps"]["stamps"], alone[case]["maps"]["stamps"]), "the draws differ"
     assert results[case]["nonfinite"] == 0
+    given = dict(leaves(results[case]["density"], "density"))
+    for name, value in leaves(alone[case]["density"], "density"):
+        if isinstance(value, Tensor):
+            torch.testing.assert_close(
+                given[name], value, rtol=1e-3, atol=1e-4, msg=lambda text, name=name: name + text
+            )
+
+
+@pytest.mark.parametrize("case", WITH_EVENTS)
+def test_hosts_wait_for_each_other_at_events_alone(several, alone, case):
+    """And what the iterations between them gather makes the event that of one process."""
+    _, results = several
+    if case not in results:
+        pytest.skip("in two processes")
+    found = results[case]["event"]
+    assert found["waits"] == [3]
+    assert found["count"] == alone[case]["count"]
+    assert found["count"] != len(alone[case]["optimizer"]["steps"]), "the event changed nothing"
 
 
 def test_after_fifty_steps_the_error_is_within_the_spread_of_seeds(several, errors_of_seeds):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -9,6 +11,7 @@ from turbogs_plugin.strategies import ErrorGuidedPixelSampler
 
 from turbogs_plugin.distributed.shares import NEARLY, shares_of
 from turbogs_plugin.error_maps import ErrorMaps
+from turbogs_plugin.masks import PixelMasks
 from turbogs_plugin.tiles import dense_pixels
 from turbogs_plugin.types import PixelSamples, Step
 
@@ -16,8 +19,18 @@ EQUAL = [(160, 96)] * 6
 MIXED = [(160, 96), (40, 50), (33, 17), (200, 180), (16, 16), (90, 20)]
 
 
-def samples_of(sizes: list[tuple[int, int]], views: int, unit: str = "pixel", rate: float = 0.1) -> PixelSamples:
-    maps = ErrorMaps(np.array(sizes))
+def half_masked(sizes: list[tuple[int, int]]) -> PixelMasks:
+    """The left half of each view counts, but of the second view nothing."""
+    keep = [np.zeros((height, width), dtype=bool) for width, height in sizes]
+    for view, (width, _) in enumerate(sizes):
+        keep[view][:, : width // 2] = view != 1
+    return PixelMasks.from_images(keep)
+
+
+def samples_of(
+    sizes: list[tuple[int, int]], views: int, unit: str = "pixel", rate: float = 0.1, masks: PixelMasks | None = None
+) -> PixelSamples:
+    maps = ErrorMaps(np.array(sizes), masks=masks)
     maps.errors.uniform_(0, 1, generator=torch.Generator().manual_seed(0))
     return ErrorGuidedPixelSampler(unit=unit).sample(maps, tuple(range(views)), rate, Step(3, 10, 8))
 
@@ -26,8 +39,9 @@ def samples_of(sizes: list[tuple[int, int]], views: int, unit: str = "pixel", ra
 @pytest.mark.parametrize("count", [2, 3, 4, 8])
 @pytest.mark.parametrize("views", [1, 2, 3, 6])
 @pytest.mark.parametrize("sizes", [EQUAL, MIXED])
-def test_shares_are_the_samples_in_their_order(sizes, views, count, unit):
-    samples = samples_of(sizes, views, unit)
+@pytest.mark.parametrize("masked", [False, True])
+def test_shares_are_the_samples_in_their_order(sizes, views, count, unit, masked):
+    samples = samples_of(sizes, views, unit, masks=half_masked(sizes) if masked else None)
     shares = shares_of(samples, count)
     assert len(shares) == count
     parts = [samples.of_tiles(share.tiles, share.views, share.slots) for share in shares if len(share)]
@@ -38,7 +52,8 @@ def test_shares_are_the_samples_in_their_order(sizes, views, count, unit):
     for share, part in zip([share for share in shares if len(share)], parts, strict=True):
         assert torch.equal(part.view_of_slot() + share.views.start, of_slots[share.slots])
         assert torch.equal(part.coordinates(), samples.coordinates()[share.slots])
-        assert set(part.view_of_slot().tolist()) == set(range(len(share)))
+        seen = [view for view in range(len(share)) if view + share.views.start != 1 or not masked]
+        assert set(part.view_of_slot().tolist()) == set(seen)
         assert len(part.tile_ids) == len(part.tile_offsets) - 1 and int(part.tile_offsets[-1]) == len(part)
 
 
@@ -69,9 +84,35 @@ def test_processes_without_samples_have_no_views():
     assert sorted(len(share) for share in shares) == [0, 0, 0, 1]
 
 
-def test_dense_samples_know_their_ends():
-    samples = dense_pixels((0, 1, 2), np.array(MIXED[:3]), "cpu")
-    known = samples.ends()
-    samples.host_ends = None
-    for given, asked in zip(known, samples.ends(), strict=True):
+@pytest.mark.parametrize("empty", [(), (0,), (1,), (2,), (0, 1), (1, 2), (0, 2), (0, 1, 2)])
+@pytest.mark.parametrize("count", [2, 4])
+def test_a_view_without_samples_is_begun_once(empty, count):
+    """Somebody has to say that nothing of it is on screen."""
+    masks = PixelMasks.from_images([np.full((96, 160), view not in empty) for view in range(6)])
+    samples = samples_of(EQUAL, 3, masks=masks)
+    shares = shares_of(samples, count)
+    assert [view for share in shares for view in range(3)[share.begun]] == [0, 1, 2]
+    assert sum(share.slots.stop - share.slots.start for share in shares) == len(samples)
+
+
+def assert_ends_are_known(samples: PixelSamples) -> None:
+    """On the host, as the samples themselves say them."""
+    known = samples.host_ends()
+    for given, asked in zip(known, replace(samples, host_ends=None).ends(), strict=True):
         np.testing.assert_array_equal(given, asked)
+
+
+def test_dense_samples_know_their_ends():
+    assert_ends_are_known(dense_pixels((0, 1, 2), np.array(MIXED[:3]), "cpu"))
+
+
+@pytest.mark.parametrize("unit", ["pixel", "cell", "tile"])
+@pytest.mark.parametrize("rate", [0.004, 0.3, 1.0])
+@pytest.mark.parametrize("masked", [False, True])
+def test_draws_know_their_ends(unit, rate, masked):
+    """Where masks leave some tiles alone, too: so no process waits for its device to share the samples out."""
+    masks = half_masked(MIXED) if masked else None
+    samples = samples_of(MIXED, 5, unit, rate, masks)
+    assert_ends_are_known(samples)
+    assert samples.host_ends == samples_of(MIXED, 5, unit, rate, masks).host_ends, "shares are kept by them"
+    assert (len(samples.tile_ids) < len(samples_of(MIXED, 5, unit, rate).tile_ids)) == masked

@@ -1,5 +1,7 @@
 """Masks and backgrounds on the kernels: the draws, renders and losses of their torch twins."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -75,6 +77,9 @@ def test_equal_sets(unit, rate, hard, stable, uniform, importance, views):
     expected = draw_pixels(rule, masked_maps("cpu"), views, rate, step)
     for name in ("tile_ids", "tile_offsets", "pixel_ids"):
         assert torch.equal(getattr(found, name).cpu(), getattr(expected, name)), name
+    assert found.host_ends == expected.host_ends  # what several processes share the samples out by
+    for known, asked in zip(found.host_ends(), replace(found, host_ends=None).ends(), strict=True):
+        np.testing.assert_array_equal(known, asked)
     if importance:
         torch.testing.assert_close(found.weights.cpu(), expected.weights, rtol=2e-5, atol=0)
 

@@ -36,12 +36,14 @@ from turbogs_plugin.engine.protocol import Engine
 from turbogs_plugin.engine.rendered import Rendered, RenderOptions, ScreenGradients
 from turbogs_plugin.engine.rules import UpdateRule
 from turbogs_plugin.errors import TrainingStopped
+from turbogs_plugin.strategies.protocols import DensityController
 from turbogs_plugin.types import (
     Cameras,
     Gaussians,
     GaussianStats,
     PixelSamples,
     RowUpdate,
+    Step,
 )
 
 LAG = 4
@@ -87,16 +89,15 @@ class Exchange:
         return map(errors_of, range(len(pixels)))
 
     def refine(
-        self, update: Callable[[], RowUpdate | None], due: Callable[[], bool], complete: Callable[[], None]
+        self, density: DensityController, gaussians: Gaussians, step: Step, complete: Callable[[], None]
     ) -> RowUpdate | None:
         """The change that density control proposes.
 
         Args:
-            update: asks it.
-            due: whether it may have one now, or looks at its statistics.
+            gaussians: the model, which need not be complete yet.
             complete: makes moments and statistics complete.
         """
-        return update()
+        return density.update(gaussians, step)
 
     def finish(self) -> None:
         """Wait, on the device, for the parameters of the latest `update`. Call it before they are used."""
@@ -227,13 +228,17 @@ class RankExchange(Exchange):
                 yield errors
 
     def refine(
-        self, update: Callable[[], RowUpdate | None], due: Callable[[], bool], complete: Callable[[], None]
+        self, density: DensityController, gaussians: Gaussians, step: Step, complete: Callable[[], None]
     ) -> RowUpdate | None:
-        if not due():
-            return update()
-        self.finish()
-        complete()
-        return self._agreed(update())
+        if density.event_due(step):
+            self.finish()
+            complete()
+            return self._agreed(density.update(gaussians, step))
+        if "model" in density.watched:
+            self.finish()
+        if "statistics" in density.watched and self._incomplete and density.stats is not None:
+            self._owned.gather_statistics()
+        return density.update(gaussians, step)
 
     def _agreed(self, update: RowUpdate | None) -> RowUpdate | None:
         """The first process's change. All make one, which advances the state of their density control."""

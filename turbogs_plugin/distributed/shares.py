@@ -69,11 +69,13 @@ def _cut(view_ends: np.ndarray, slot_ends: np.ndarray, count: int) -> list[Share
         tile = before if wanted - slots[before] < slots[after] - wanted else after
         cuts.append(max(cuts[-1], int(view) if abs(slots[view] - wanted) <= NEARLY * even else tile))
     shares, begun = [], 0  # views that earlier shares have begun
-    for first, end in itertools.pairwise([*cuts, len(slots) - 1]):
+    cuts.append(len(slots) - 1)
+    for first, end in itertools.pairwise(cuts):
         seen = slice(begun, begun)
-        if first < end:
+        if first < end or (end == 0 and not shares):  # without any sample, the first process has all views
             start, stop = np.searchsorted(views, first, side="right") - 1, np.searchsorted(views, end, side="left")
-            seen = slice(int(start), int(stop))
+            # Views without samples have records, too: those before the first tile, and behind the last one.
+            seen = slice(min(int(start), begun), len(view_ends) if end == cuts[-1] else int(stop))
         places = slice(int(slots[first]), int(slots[end]))
         shares.append(Share(slice(first, end), places, seen, seen.start < begun))
         begun = max(begun, seen.stop)

@@ -195,10 +195,7 @@ class Trainer:
 
     def refine(self, step: Step) -> RowUpdate | None:
         """The change of the set of Gaussians that density control proposes, if any."""
-        density = self.density
-        return self.exchange.refine(
-            lambda: density.update(self._gaussians, step), lambda: density.event_due(step), self.complete
-        )
+        return self.exchange.refine(self.density, self._gaussians, step, self.complete)
 
     def complete(self) -> None:
         """Where several processes train, make the state whole on each. All must call it."""

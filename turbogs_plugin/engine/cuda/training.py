@@ -9,7 +9,6 @@ torch's current stream and does not wait. Tensors must be contiguous. A wrong de
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import lru_cache
 from itertools import accumulate
 
@@ -24,7 +23,7 @@ from turbogs_plugin.engine.moments import GaussianMoments
 from turbogs_plugin.engine.protocol import MapUpdate
 from turbogs_plugin.engine.rules import DrawRule, LossTerms, UpdateRule
 from turbogs_plugin.error_maps import ErrorMaps
-from turbogs_plugin.tiles import CELL_SIDE, TILE_PIXELS, slots_of_tiles, tile_extents
+from turbogs_plugin.tiles import CELL_SIDE, TILE_PIXELS, DrawEnds, slots_of_tiles, tile_extents
 from turbogs_plugin.types import (
     BLACK,
     TILE_SIZE,
@@ -34,7 +33,6 @@ from turbogs_plugin.types import (
     LossOutput,
     PixelSamples,
     Step,
-    TileGrid,
 )
 
 
@@ -106,30 +104,10 @@ def sample_pixels(rule: DrawRule, maps: ErrorMaps, view_ids: tuple[int, ...], ra
         draw.tile_offsets,
         weights,
         has_empty_slots,
-        # With masks the tiles are the live ones, which the samples themselves have to say.
-        host_ends=None if maps.masks is not None else DrawEnds(rule.unit, tuple(map(tuple, shapes)), tuple(wanted)),
+        host_ends=DrawEnds(
+            rule.unit, tuple(map(tuple, shapes)), tuple(wanted), None if maps.masks is None else tuple(tiles)
+        ),
     )
-
-
-@dataclass(frozen=True)
-class DrawEnds:
-    """`PixelSamples.host_ends` of a draw. Equal draws have equal ones.
-
-    Args:
-        unit: of the draw.
-        sizes: K times (width, height).
-        wanted: K times the units drawn of a view's tiles, or of each of its tiles.
-    """
-
-    unit: str
-    sizes: tuple[tuple[int, int], ...]
-    wanted: tuple[int, ...]
-
-    def __call__(self) -> tuple[np.ndarray, np.ndarray]:
-        if self.unit == "tile":
-            return np.cumsum(self.wanted), np.cumsum(np.full(sum(self.wanted), TILE_PIXELS))
-        sizes = np.array(self.sizes, dtype=np.int64)
-        return TileGrid(sizes).offsets[1:], np.cumsum(slots_of_tiles(self.unit, self.wanted[0], *tile_extents(sizes)))
 
 
 @lru_cache(maxsize=4096)

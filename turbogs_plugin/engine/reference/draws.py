@@ -39,8 +39,8 @@ tile without another pixel is no unit either. The number of a tile within its vi
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -59,6 +59,7 @@ from turbogs_plugin.error_maps import AGE_MAX, ErrorMaps
 from turbogs_plugin.tiles import (
     TILE_CELLS,
     TILE_PIXELS,
+    DrawEnds,
     cell_of_place,
     compact,
     pixel_table,
@@ -194,6 +195,11 @@ class _Batch:
     ages: Tensor  # [T, 256] int32
     words: Callable[[Tensor, int], Words]
 
+    def ends(self, unit: str, wanted: Sequence[int]) -> DrawEnds:
+        """`PixelSamples.host_ends` where so many units are drawn of each view, or of each of its tiles."""
+        live = None if self.live_tiles is None else tuple(self.counts.tolist())
+        return DrawEnds(unit, tuple(map(tuple, self.sizes.tolist())), tuple(wanted), live)
+
 
 def _draw_within_tiles(batch: _Batch, rate: float, rule: DrawRule) -> PixelSamples:
     """Pixels or cells as units, drawn from each tile."""
@@ -217,7 +223,8 @@ def _draw_within_tiles(batch: _Batch, rate: float, rule: DrawRule) -> PixelSampl
     else:
         slots = np.full(len(batch.table), wanted * TILE_PIXELS // errors.shape[1])
         tile_ids, full = batch.live_tiles.int(), False
-    return compact(batch.view_ids, batch.sizes, batch.table, drawn, tile_ids, slots, weights, full=full)
+    samples = compact(batch.view_ids, batch.sizes, batch.table, drawn, tile_ids, slots, weights, full=full)
+    return replace(samples, host_ends=batch.ends(rule.unit, [wanted] * len(batch.counts)))
 
 
 def _draw_tiles(batch: _Batch, rate: float, rule: DrawRule) -> PixelSamples:
@@ -227,10 +234,11 @@ def _draw_tiles(batch: _Batch, rate: float, rule: DrawRule) -> PixelSamples:
     tiles = torch.arange(len(batch.table), device=device)
     firsts = torch.as_tensor(np.repeat(ends[:-1], np.diff(ends)), device=device)
     words = batch.words((tiles - firsts)[:, None], PURPOSE_TILES)  # of the numbers within the view
-    chosen, weights = [], []
+    chosen, weights, numbers = [], [], []
     for first, end in itertools.pairwise(ends.tolist()):
         row = slice(first, end)
         wanted = rule.wanted(rate, end - first)
+        numbers.append(wanted)
         exist = torch.ones(1, end - first, dtype=torch.bool, device=device)
         of_row = tuple(word[row].T for word in words)
         drawn, probabilities = draw_units(Units(errors[None, row], ages[None, row], exist, of_row, wanted), rule)
@@ -245,4 +253,5 @@ def _draw_tiles(batch: _Batch, rate: float, rule: DrawRule) -> PixelSamples:
     slots = np.full(len(tile_ids), TILE_PIXELS)
     if batch.live_tiles is not None:
         tile_ids = batch.live_tiles[tile_ids]
-    return compact(batch.view_ids, batch.sizes, table, exist, tile_ids.int(), slots, tile_weights)
+    samples = compact(batch.view_ids, batch.sizes, table, exist, tile_ids.int(), slots, tile_weights)
+    return replace(samples, host_ends=batch.ends(rule.unit, numbers))

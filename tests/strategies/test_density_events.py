@@ -1,0 +1,98 @@
+"""When density control says that it has an event, and what it really looks at and changes between events."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from gsplat.strategy import MCMCStrategy, ops
+from helpers.optimizers import fill, make_gaussians, random_stats
+from turbogs_plugin.strategies.density.error_driven import ErrorDrivenDensity
+from turbogs_plugin.strategies.density.fastgs import FastGsDensity
+from turbogs_plugin.strategies.density.gsplat_default import GsplatDefaultDensity
+from turbogs_plugin.strategies.density.mcmc import GsplatMcmcDensity
+from turbogs_plugin.strategies.density.none import NoDensity
+
+from turbogs_plugin.types import Gaussians, Step
+
+TOTAL, REFINE_UNTIL, COUNT = 60, 30, 40
+
+
+def error_driven(**options) -> ErrorDrivenDensity:
+    return ErrorDrivenDensity(refine_from=5, refine_every=4, final_every=7, final_keep=0.9, **options)
+
+
+MAKERS = {
+    "error_driven": error_driven,
+    "flat": lambda: error_driven(stop_when_flat=0.9),
+    "no final": lambda: ErrorDrivenDensity(refine_from=5, refine_every=4, final_keep=1.0),
+    "fastgs": lambda: FastGsDensity(refine_from=5, refine_every=4, prune_every=9),
+    "mcmc": lambda: GsplatMcmcDensity(refine_start_iter=5, refine_every=4),
+    "gsplat_default": lambda: GsplatDefaultDensity(refine_start_iter=5, refine_every=4, reset_every=20),
+    "none": NoDensity,
+}
+EXACT = ("error_driven", "no final", "fastgs", "mcmc", "none")
+"""Every event of theirs changes something here."""
+
+
+class Untouchable:
+    """A model or statistics of which only the number of rows may be asked."""
+
+    def __len__(self) -> int:
+        return COUNT
+
+    def __getattr__(self, name: str):
+        raise AssertionError(f"{name} was looked at though no event was due")
+
+
+@pytest.fixture(autouse=True)
+def gsplats_operators_do_little(monkeypatch):
+    monkeypatch.setattr(ops, "compute_relocation", lambda opacities, scales, ratios, binoms: (opacities, scales))
+    still = lambda quats, scales, **_: (scales.new_zeros(len(scales), 3, 3), None)  # noqa: E731
+    monkeypatch.setattr(ops, "quat_scale_to_covar_preci", still)
+    monkeypatch.setattr(MCMCStrategy, "initialize_state", lambda self: {"binoms": torch.empty(0)})
+
+
+def model() -> Gaussians:
+    """With Gaussians that every event prunes or relocates."""
+    gaussians = make_gaussians(COUNT, dtype=torch.float32)
+    gaussians.opacities[:] = 1.0
+    gaussians.opacities[::5] = -9.0
+    return gaussians
+
+
+@pytest.mark.parametrize("name", MAKERS)
+def test_events_are_where_it_says(name):
+    """Over a whole run. Between events nothing but what is watched is looked at, and nothing is changed."""
+    density = MAKERS[name]()
+    if name != "mcmc":  # which has no state, and refuses a CPU
+        density.setup(model())
+    said, changed = [], []
+    for iteration in range(TOTAL):
+        step = Step(iteration, TOTAL, REFINE_UNTIL, seed=3)
+        due, stats = density.event_due(step), density.stats
+        given = model() if due or "model" in density.watched else Untouchable()
+        if stats is not None:
+            fill(stats, random_stats(COUNT, seed=iteration))
+        hidden = stats is not None and not due and "statistics" not in density.watched
+        if hidden:
+            density._stats = Untouchable()
+        update = density.update(given, step)
+        if hidden and density._stats is not None:
+            density._stats = stats
+        said += [iteration] if due else []
+        changed += [iteration] if update is not None else []
+        if update is not None:
+            assert due, iteration  # it is not followed: all models here have as many rows
+    assert set(changed) <= set(said)
+    if name in EXACT:
+        assert changed == said
+    assert len(said) < TOTAL / 3 and (len(changed) > 3 or name in ("none", "flat"))
+
+
+def test_the_noise_of_mcmc_is_why_it_watches_the_model(monkeypatch):
+    gaussians, density = model(), GsplatMcmcDensity()
+    round_ones = lambda quats, scales, **_: (torch.eye(3).expand(len(scales), 3, 3), None)  # noqa: E731
+    monkeypatch.setattr(ops, "quat_scale_to_covar_preci", round_ones)
+    before, step = gaussians.means.clone(), Step(1, TOTAL, REFINE_UNTIL)
+    assert not density.event_due(step) and density.update(gaussians, step) is None
+    assert not torch.equal(gaussians.means, before) and density.watched == ("model",)
