@@ -74,6 +74,15 @@ BOTH_SIDES = [
     ("train.sh_degree", {"train_views": 3}, (), 0, "4 coefficients of degree 1 > 3"),
     ("train.sh_degree", {"direction_concentration": 0.96}, (), 1, "0.960 >= 0.95"),
     ("train.sh_degree", {"direction_concentration": 0.96, "train_views": 3}, (), 0, "4 coefficients of degree 1 > 3"),
+    ("train.batch_for", {}, (), 1, "one process"),
+    ("train.batch_for", {"processes": 2}, (), 2, "2 processes"),
+    ("train.batch_for", {"processes": 4, "train_views": 39}, (), 3, "but 4 times 10 views > 39 training views"),
+    ("train.batch_for", {"processes": 4, "train_views": 9}, (), 1, "but 2 times 10 views > 9 training views"),
+    ("train.batch_for", {"processes": 16, "train_views": 500}, (), 12, "13 times 10 views > an iteration's 128"),
+    ("train.batch_for", {"processes": 2}, ("schedule.type=fixed", "schedule.views=60"), 1, "2 times 60 views > 100"),
+    ("train.iterations", {"train_views": 100, "processes": 2}, (), 6000, "60 epochs"),
+    ("train.iterations", {"train_views": 100, "processes": 2}, ("train.batch_for=2",), 6000, "60 epochs"),
+    ("train.iterations", {"train_views": 100, "processes": 2}, ("train.batch_for=auto",), 3000, "2 times the pixels"),
     ("train.iterations", {"train_views": 100}, ("train.epochs=75",), 7500, "75 epochs of 100 training views"),
     ("train.iterations", {"train_views": 43}, ("train.epochs=75",), 3300, "75 epochs of 43 training views"),
     ("train.iterations", {"train_views": 100}, ("train.epochs=75", "schedule.pixel_budget=0.5"), 15000, "75 epochs"),
@@ -119,6 +128,7 @@ SET = [
     ("schedule.type", "fixed", {"train_views": 2}, lambda config: config.schedule["views"] == 3),
     ("schedule.type", "linear", {"train_views": 2}, lambda config: config.schedule["type"] == "linear"),
     ("train.sh_degree", "3", {"train_views": 3}, lambda config: config.train.sh_degree == 3),
+    ("train.batch_for", "2", {"processes": 2}, lambda config: config.schedule["pixel_budget"] == 1.0),
     ("train.iterations", "700", {"train_views": 250}, lambda config: config.train.refine_until == 3500),
     ("optimizer.type", "moment_lm", {}, lambda config: config.optimizer == load_config("turbogs").optimizer),
     ("optimizer.type", "adam", {"device": "cpu"}, lambda config: config.optimizer["type"] == "adam"),
@@ -162,6 +172,24 @@ def test_the_other_optimizer_keeps_the_learning_rates():
     assert planned.optimizer["type"] == "sparse_adam"
     assert planned.optimizer["learning_rates"] == config.optimizer["learning_rates"]
     assert planned.optimizer["eps"] == planned.build("optimizer").eps == 1e-15, "its own default, not that of moment_lm"
+
+
+@pytest.mark.parametrize("name", ["turbogs", "mcmc", "3dgs"])
+def test_a_batch_for_more_processes_is_that_of_one_where_there_is_one(name):
+    """With more, views and pixels grow by their number, learning rates by its root, and nothing else changes."""
+    config = load_config(name, ["train.batch_for=auto", "train.iterations=700"])
+    written = load_config(name, ["train.iterations=700"])
+    alone = plan_from_facts(FACTS, config).apply(config)
+    assert alone == plan_from_facts(FACTS, written).apply(written)
+    four = plan_from_facts(facts(processes=4), config).apply(config).to_mapping()
+    expected = alone.to_mapping()
+    expected["train"]["batch_for"] = 4
+    for key in {"min_views", "max_views", "views", "pixel_budget"} & set(expected["schedule"]):
+        expected["schedule"][key] *= 4
+    for section in ("optimizer", "density"):
+        if "learning_rates" in expected[section]:
+            expected[section]["learning_rates"]["batch_scale"] *= 2.0
+    assert four == expected
 
 
 @pytest.mark.parametrize("name", config_names())
@@ -209,6 +237,7 @@ def test_nothing_is_built_or_trained_by_what_is_left_to_a_plan(setting, capture)
         ("train.backdrop=maybe", ["train.backdrop", "true or false", "'auto'"]),
         ("train.sh_degree=4", ["sh_degree", "4", "0 .. 3"]),
         ("train.iterations=keep", ["train.iterations", "whole number", "'auto'"]),
+        ("train.batch_for=0", ["batch_for", "at least 1"]),
         ("train.base_iterations=auto", ["train.base_iterations", "whole number"]),
         ("train.epochs=0", ["epochs", "0", "above 0"]),
         ("train.maps_place=disk", ["train.maps_place", "'device'", "'host'"]),
@@ -270,6 +299,7 @@ def test_the_verb_prints_the_plan_of_a_capture(turbogs, capture):
         "loss.type": ["charbonnier_ncc", "auto"],
         "schedule.type": ["fixed", "auto"],
         "train.sh_degree": ["1", "auto"],
+        "train.batch_for": ["1", "auto"],
         "train.iterations": ["2000", "auto"],
         "optimizer.type": ["sparse_adam", "auto"],
         "train.maps_place": ["device", "auto"],
@@ -277,6 +307,11 @@ def test_the_verb_prints_the_plan_of_a_capture(turbogs, capture):
     }
     for fact in ("7 + 1 views of 48x40 pixels", "MiB free on the CPU"):
         assert fact in " ".join(out.split())
+    grown = ("schedule.max_views=2", "schedule.min_views=1", "train.batch_for=auto", "--device", "cpu", "--gpus", 4)
+    code, out, err = turbogs("plan", capture, *grown)
+    assert code == 0 and re.search(r"train.batch_for +3 +auto +4 processes, but 4 times 2 views > 7 training", out)
+    assert "; 4 processes" in out
+    assert turbogs("plan", capture, "--gpus", 0)[0] == 2
     code, out, err = turbogs("plan", capture.parent / "absent")
     assert code == 2 and "no such scene" in err
 

@@ -91,6 +91,7 @@ def plan(
     overrides: Overrides = (),
     /,
     *,
+    gpus: Count = None,
     options: Flat = NO_OPTIONS,
 ) -> int:
     """Print what a run on a capture would decide of the settings that are `auto`, and why, without training.
@@ -98,10 +99,13 @@ def plan(
     Args:
         scene: as in train.
         overrides: as in train; train.sh_degree=auto leaves a setting to the plan, any other value forces it.
+        gpus: as in train; they need not be there.
     """
+    if gpus is not None:
+        require_positive("--gpus", (gpus,))
     from turbogs_plugin.train.run import plan_run
 
-    print(plan_run(options.settings(scene, overrides)).text())
+    print(plan_run(options.settings(scene, overrides), gpus or 1).text())
     return 0
 
 

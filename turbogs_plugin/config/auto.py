@@ -23,6 +23,7 @@ AUTO_SETTINGS: dict[str, Any] = {
     "schedule.type": registry.default_type("schedule"),
     "train.sh_degree": 3,
     "optimizer.type": registry.default_type("optimizer"),
+    "train.batch_for": 1,
     "train.iterations": None,
     "train.maps_place": "device",
     "train.photos_place": "device",

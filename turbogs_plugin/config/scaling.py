@@ -1,4 +1,5 @@
-"""Scaling of schedules: in a run of another length, what counts iterations goes along."""
+"""Scaling of schedules: in a run of another length, what counts iterations goes along; for more processes, what makes
+the batch of an iteration, and the learning rates."""
 
 from __future__ import annotations
 
@@ -44,6 +45,30 @@ def with_iterations(config: Config, iterations: int) -> Config:
     mapping["train"]["iterations"] = mapping["train"]["base_iterations"] = iterations
     if density.get("opacity_decay", 0.0):
         density["opacity_decay"] = decay_at(density["opacity_decay"], interval, density["refine_every"])
+    return resolve(mapping)
+
+
+BATCH_FIELDS = ("min_views", "max_views", "views", "pixel_budget")
+"""Settings of a schedule that grow with the batch."""
+
+RATE_EXPONENT = 0.5
+"""Learning rates grow with this power of the batch: with a gradient that is mostly noise, Adam's step has the length of
+its rate whatever the batch, and so many small steps end as far apart as one of their number's root (Malladi et al.
+2022; Grendel, Zhao et al. 2024, found it for Gaussians). Not measured here yet: `configs/ablations/batch.yaml`."""
+
+
+def with_batch_for(config: Config, processes: int) -> Config:
+    """The configuration whose batch is written for one process, with that of several: so many times the views and
+    pixels of an iteration, and learning rates times its root."""
+    mapping = config.to_mapping()
+    schedule = mapping["schedule"]
+    for name in set(BATCH_FIELDS) & set(schedule):
+        schedule[name] *= processes
+    for section in ("optimizer", "density"):  # of some density control, too: its noise goes by them
+        rates = mapping[section].get("learning_rates")
+        if isinstance(rates, dict) and "batch_scale" in rates:
+            rates["batch_scale"] *= processes**RATE_EXPONENT
+    mapping["train"]["batch_for"] = processes
     return resolve(mapping)
 
 

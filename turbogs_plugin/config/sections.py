@@ -49,6 +49,9 @@ class TrainConfig:
             where `iterations` is ``auto``, and where a time budget allows for more.
         base_iterations: the length for which the settings that count iterations are written. Used where `iterations`
             is ``auto``.
+        batch_for: number of processes that the settings of a batch are written for: views and pixels of an iteration,
+            and learning rates. ``auto``: they are written for one, and scaled to those that train together
+            (`turbogs_plugin.config.scaling.with_batch_for`).
         refine_until: tau_until, the last iteration of density control, which also ends the annealing of the sampling.
         seed: of all randomness.
         device: auto (CUDA where there is one), cpu, or cuda.
@@ -76,6 +79,7 @@ class TrainConfig:
     iterations: int | Auto = 5000
     epochs: float = 60.0
     base_iterations: int = 5000
+    batch_for: int | Auto = 1
     refine_until: int = 3500
     seed: int = 0
     device: str = "auto"
@@ -98,6 +102,8 @@ class TrainConfig:
             value = getattr(self, name)
             require(value == "auto" or 1 <= value < 2**31, name, value, "within 1 .. 2^31 - 1")
         require(math.isfinite(self.epochs) and self.epochs > 0, "epochs", self.epochs, "a finite number above 0")
+        valid = self.batch_for == "auto" or self.batch_for >= 1
+        require(valid, "batch_for", self.batch_for, "at least 1")
         require(self.refine_until >= 0, "refine_until", self.refine_until, "at least 0")
         require(0 <= self.seed < 2**31, "seed", self.seed, "within 0 .. 2^31 - 1")
         require(self.device in ("auto", "cpu", "cuda"), "device", self.device, "auto, cpu or cuda")

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 
 from turbogs_plugin.config.auto import AUTO, AUTO_SETTINGS, value_of
 from turbogs_plugin.config.configuration import Config
+from turbogs_plugin.engine.layout import MAX_VIEWS
 from turbogs_plugin.plan.facts import SceneFacts
 from turbogs_plugin.plan.pixels import images_per_iteration
 from turbogs_plugin.scene.host_arrays import MEMORY_SHARE as HOST_SHARE
@@ -151,12 +152,29 @@ def wanted_optimizer(facts: SceneFacts, config: Config) -> Verdict:
     return Verdict("moment_lm", reason)
 
 
+def wanted_batch_for(facts: SceneFacts, config: Config) -> Verdict:
+    """The batch of all processes, as far as an iteration can have so many different views."""
+    count, views = facts.processes, facts.train_views
+    most = config.schedule.get("max_views", config.schedule.get("views", 0))
+    if count == 1 or not most:
+        return Verdict(1, "one process" if count == 1 else "the schedule has no number of views")
+    fitting = max(1, min(count, min(views, MAX_VIEWS) // most))
+    reason = f"{count} processes"
+    if fitting < count:
+        bound = f"an iteration's {MAX_VIEWS}" if views > MAX_VIEWS else f"{views} training views"
+        reason += f", but {fitting + 1} times {most} views > {bound}"
+    return Verdict(fitting, reason)
+
+
 def wanted_iterations(facts: SceneFacts, config: Config) -> Verdict:
     """As many iterations as `train.epochs` take: error stops falling after epochs, not after iterations."""
     train, views = config.train, facts.train_views
-    wanted = train.epochs * views / images_per_iteration(config, views)
+    batch = decide("train.batch_for", facts, config)
+    factor = batch.value if batch.made == "auto" else 1  # what is set is in the schedule already
+    wanted = train.epochs * views / (factor * images_per_iteration(config, views))
     fewest = SHORTEST_SHARE * train.base_iterations
     reason = f"{train.epochs:g} epochs of {views} training views"
+    reason += f", {factor} times the pixels an iteration" if factor > 1 else ""
     if wanted < fewest:
         reason += f" take fewer than {SHORTEST_SHARE:.0%} of {train.base_iterations}"
     return Verdict(math.ceil(max(wanted, fewest) / 100) * 100, reason)
@@ -212,6 +230,7 @@ RULES: dict[str, Callable[[SceneFacts, Config], Verdict]] = {
     "schedule.type": wanted_schedule,
     "train.sh_degree": wanted_sh_degree,
     "optimizer.type": wanted_optimizer,
+    "train.batch_for": wanted_batch_for,
     "train.iterations": wanted_iterations,
     "train.maps_place": wanted_maps_place,
     "train.photos_place": wanted_photos_place,

@@ -53,6 +53,7 @@ class SceneFacts:
         memory_limit: bytes of the device that the run was told not to exceed, or None.
         time_budget: seconds that the run was told to take, or None.
         transparent: training photos have an alpha.
+        processes: that will train one model together.
     """
 
     scene: str
@@ -75,11 +76,17 @@ class SceneFacts:
     memory_limit: int | None = None
     time_budget: float | None = None
     transparent: bool = False
+    processes: int = 1
 
 
 @torch.no_grad()
 def gather_facts(
-    scene: Scene, device: torch.device, *, memory_limit: int | None = None, time_budget: float | None = None
+    scene: Scene,
+    device: torch.device,
+    *,
+    memory_limit: int | None = None,
+    time_budget: float | None = None,
+    processes: int = 1,
 ) -> SceneFacts:
     """The facts of a scene, to be trained on a device.
 
@@ -88,6 +95,7 @@ def gather_facts(
         device: where training is to be.
         memory_limit: bytes of the device that must not be exceeded.
         time_budget: seconds.
+        processes: that will train together.
     """
     views, sizes = scene.train, scene.train.cameras.sizes
     order = np.argsort(sizes.prod(axis=1), kind="stable")
@@ -115,6 +123,7 @@ def gather_facts(
         memory_limit=memory_limit,
         time_budget=time_budget,
         transparent=views.photos.transparent,
+        processes=processes,
     )
 
 

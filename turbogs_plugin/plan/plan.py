@@ -10,7 +10,7 @@ import torch
 
 from turbogs_plugin.config.auto import of_type
 from turbogs_plugin.config.configuration import Config, resolve
-from turbogs_plugin.config.scaling import with_iterations
+from turbogs_plugin.config.scaling import with_batch_for, with_iterations
 from turbogs_plugin.config.schema import build_dataclass
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.plan.decisions import RULES, Decision, decide, mebibytes
@@ -35,6 +35,8 @@ class Plan:
                 continue
             if key == "type":
                 mapping[section] = of_type(section, mapping[section], decision.value, decision.options)
+            elif decision.setting == "train.batch_for":
+                mapping = with_batch_for(resolve(mapping), decision.value).to_mapping()
             elif decision.setting == "train.iterations":
                 mapping = with_iterations(resolve(mapping), decision.value).to_mapping()
             else:
@@ -60,6 +62,7 @@ class Plan:
         free = f"{mebibytes(facts.device_free_bytes)} free on the {facts.device.upper()}{memory}"
         host = "" if facts.device == "cpu" else f", {mebibytes(facts.host_free_bytes)} on the host"
         seconds = "" if facts.time_budget is None else f"; {facts.time_budget:g} s to train"
+        processes = "" if facts.processes == 1 else f"; {facts.processes} processes"
         return (
             f"{facts.scene}: {facts.train_views} + {facts.test_views} views of "
             f"{small if small == large else f'{small} to {large}'} pixels, {facts.points} points; "
@@ -67,7 +70,7 @@ class Plan:
             f"{facts.direction_concentration:.3f}, {facts.flat_tiles:.1%} of tiles without texture, exposures "
             f"{facts.exposure_spread:.2f} stops apart; {mebibytes(facts.photo_bytes)} of photos, "
             f"{mebibytes(facts.map_bytes)} of maps, {mebibytes(facts.model_bytes)} of model at the start; {free}{host}"
-            f"{seconds}"
+            f"{seconds}{processes}"
         )
 
     def to_json(self) -> str:
@@ -84,16 +87,18 @@ class Plan:
         return build_dataclass(cls, mapping, "plan")
 
 
-def make_plan(config: Config, scene: Scene, device: torch.device) -> Plan:
+def make_plan(config: Config, scene: Scene, device: torch.device, processes: int = 1) -> Plan:
     """Look at scene and machine, and decide what the configuration leaves to decide, within its budgets.
 
     Args:
         config: what is ``auto`` in it is decided.
         scene: loaded.
         device: where training is to be.
+        processes: that will train one model together.
     """
     limit, seconds = config.budget.memory_bytes(), config.budget.seconds()
-    return plan_from_facts(gather_facts(scene, device, memory_limit=limit, time_budget=seconds), config)
+    facts = gather_facts(scene, device, memory_limit=limit, time_budget=seconds, processes=processes)
+    return plan_from_facts(facts, config)
 
 
 def plan_from_facts(facts: SceneFacts, config: Config) -> Plan:

@@ -47,8 +47,11 @@ FILES = "checkpoint and model, after the pictures"
 """The part of the wall time at the end in which nothing else is left to do."""
 
 
-def plan_run(config: Config) -> Plan:
+def plan_run(config: Config, processes: int = 1) -> Plan:
     """The plan that `train` would make now. What the capture was taken for is printed.
+
+    Args:
+        processes: that would train together.
 
     Raises:
         InputError: anything wrong with the input.
@@ -56,7 +59,7 @@ def plan_run(config: Config) -> Plan:
     device = resolve_device(config.train.device)
     _require_start(config)
     scene = open_scene(config)
-    plan = make_plan(config, scene, device)
+    plan = make_plan(config, scene, device, processes)
     print("\n".join(scene.notes), file=sys.stderr)  # last, as an error is one line alone
     return plan
 
@@ -149,7 +152,7 @@ def train(
         device = started.result()
     clock.mark(DEVICE)
     load_lpips(config.report.lpips_weights, device)
-    plan = make_plan(config, scene, device)
+    plan = make_plan(config, scene, device, ranks.count)
     clock.mark("plan")
     remedy = "use train.photos_place=host and train.maps_place=host, --max-gaussians or a larger --factor"
     with _fitting(scene, remedy):
