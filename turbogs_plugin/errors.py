@@ -36,6 +36,15 @@ def require_not_negative(instance: object, *fields: str) -> None:
         require(math.isfinite(value) and value >= 0, field, value, "a finite number >= 0")
 
 
+def error_line(error: Exception) -> str:
+    """What a user is told of an `InputError`, a `TrainingStopped` or an OSError: one line."""
+    said = str(error)
+    if isinstance(error, OSError):
+        place = "" if error.filename is None else f"'{error.filename}': "
+        said = f"{place}{error.strerror or error}; choose another place or make room"
+    return f"turbogs: error: {' '.join(said.split())}"
+
+
 def exit_code(command: Callable[[], int]) -> int:
     """Run a command: 2 for bad input, 1 for a run that could not go on, 128 + n where signal n stopped it."""
     try:
@@ -43,14 +52,13 @@ def exit_code(command: Callable[[], int]) -> int:
         sys.stdout.flush()
         return code
     except (InputError, TrainingStopped) as error:
-        print(f"turbogs: error: {' '.join(str(error).split())}", file=sys.stderr)
+        print(error_line(error), file=sys.stderr)
         return 2 if isinstance(error, InputError) else 1
     except BrokenPipeError:  # whoever read the output, `head` for one, has had enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 128 + signal.SIGPIPE
     except OSError as error:
-        place = "" if error.filename is None else f"'{error.filename}': "
-        print(f"turbogs: error: {place}{error.strerror or error}; choose another place or make room", file=sys.stderr)
+        print(error_line(error), file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         print("turbogs: interrupted", file=sys.stderr)

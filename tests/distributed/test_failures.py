@@ -6,11 +6,15 @@ import itertools
 import math
 import multiprocessing
 import os
+import random
+import resource
 import shutil
 import signal
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import BinaryIO
 
 import pytest
 import torch
@@ -18,17 +22,23 @@ from helpers.framework_runs import TINY, assert_identical, tiny_capture, tiny_co
 from helpers.processes import PRELOADED, ended, said, start_ranks
 from torch.distributed.launcher.api import LaunchConfig, elastic_launch
 
-from turbogs_plugin import cli
+from turbogs_plugin import cli, files
 from turbogs_plugin.distributed import processes as distributed_processes
 from turbogs_plugin.distributed.processes import joined
+from turbogs_plugin.distributed.ranks import ProcessRanks
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.model import torch_file
 from turbogs_plugin.train import run, start
 from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint
+from turbogs_plugin.train.evaluations import Evaluations
 from turbogs_plugin.train.history import read_history
+from turbogs_plugin.train.loop import TrainingLoop
 from turbogs_plugin.train.trainer import Trainer
 from turbogs_plugin.train.wall import WallRecord
 
+EXCHANGES = ("agree", "gather_numbers", "broadcast", "gather", "begin_gather", "_wait", "send_and_receive")
+MOMENTS = 60
+"""A tiny run has more exchanges: four of its maps, four and more of each of its 14 iterations."""
 ENDLESS = ("train.iterations=100000", "train.refine_until=9", "train.checkpoint_every=3", "train.evaluate_at=[]")
 SECONDS = 30.0
 """All processes of a training have ended so long after one of them was lost."""
@@ -51,8 +61,46 @@ def training(capture: Path, out: Path, trouble: str, overrides: tuple[str, ...])
                 signal.raise_signal(signal.SIGTERM)
             step(trainer)
 
-        def no_room(*arguments: object) -> None:
-            raise OSError(28, "No space left on device")
+        def full_from(iteration: int) -> Callable[[Trainer], None]:
+            """No file of this process may be longer than half a checkpoint: a write breaks in its middle."""
+
+            def stepping(trainer: Trainer) -> None:
+                if trainer.iteration == iteration:
+                    size = latest_checkpoint(out / "checkpoints").stat().st_size
+                    resource.setrlimit(resource.RLIMIT_FSIZE, (size // 2, size // 2))
+                step(trainer)
+
+            return stepping
+
+        def killed_at_an_exchange(number: int) -> None:
+            """This process is killed before its exchange of this number."""
+            calls = itertools.count()
+
+            def counted(method: Callable[..., object]) -> Callable[..., object]:
+                def call(*arguments: object, **options: object) -> object:
+                    if next(calls) == number:
+                        os.kill(os.getpid(), signal.SIGKILL)
+                    return method(*arguments, **options)
+
+                return call
+
+            for name in EXCHANGES:
+                setattr(ProcessRanks, name, counted(getattr(ProcessRanks, name)))
+
+        def killed_writing(path: Path, write: Callable[[BinaryIO], None]) -> None:
+            def half(file: BinaryIO) -> None:
+                file.write(b"half of it")
+                file.flush()
+                os.kill(os.getpid(), signal.SIGKILL)
+
+            files.write_atomically(path, half if path.name == "iteration-000006.pt" else write)
+
+        evaluate = Evaluations.evaluation_due
+
+        def without_memory_to_look(evaluations: Evaluations, loop: TrainingLoop) -> None:
+            if loop.trainer.iteration == 7:
+                raise torch.cuda.OutOfMemoryError("CUDA out of memory")
+            evaluate(evaluations, loop)
 
         def no_capture(*arguments: object) -> None:
             raise InputError("no such scene: absent on this machine")
@@ -81,8 +129,16 @@ def training(capture: Path, out: Path, trouble: str, overrides: tuple[str, ...])
             Trainer.step = without_memory
         if trouble == "signal" and last:
             Trainer.step = interrupted
-        if trouble == "disk":
-            torch_file.write_atomically = no_room
+        if trouble == "memory of an evaluation" and ranks.first:
+            Evaluations.evaluation_due = without_memory_to_look
+        if trouble == "disk" and ranks.first:
+            Trainer.step = full_from(4)
+        if trouble == "disk at the end" and ranks.first:
+            Trainer.step = full_from(13)
+        if trouble == "killed writing" and ranks.first:
+            torch_file.write_atomically = killed_writing
+        if trouble.startswith("killed at") and ranks.rank == int(trouble[-1]) % ranks.count:
+            killed_at_an_exchange(random.Random(int(trouble[-1])).randrange(MOMENTS))
         if trouble == "input" and last:
             start.load_scene = no_capture
         session = run.resume(out, ranks=ranks) if out.exists() else run.train(config, out, ranks=ranks)
@@ -142,37 +198,62 @@ def test_a_run_goes_on_with_another_number_of_processes(of_two, capture, tmp_pat
         assert torch.equal(finals[count]["maps"]["stamps"], whole["maps"]["stamps"])
 
 
-@pytest.mark.parametrize("lost", [0, 1])
-def test_a_killed_process_ends_all_with_one_line_and_the_last_checkpoint(lost, capture, tmp_path):
-    processes = start_ranks(2, training, tmp_path, capture, tmp_path / "run", "", ENDLESS)
-    newest = tmp_path / "run/checkpoints/iteration-000006.pt"
-    give_up = time.monotonic() + 120
-    while not newest.exists() and time.monotonic() < give_up:
-        time.sleep(0.01)
-    processes[lost].kill()
+@pytest.mark.parametrize("seed", range(4))
+def test_a_process_killed_at_a_random_moment_ends_all_with_one_line(seed, capture, tmp_path):
+    """Before maps are whole, between two exchanges of an iteration, in an event or a comparison of the replicas."""
+    folder, lost = tmp_path / "run/checkpoints", seed % 2
+    processes = start_ranks(2, training, tmp_path, capture, tmp_path / "run", f"killed at {seed}", ())
     codes = ended(processes, SECONDS)
-    assert codes[lost] == -signal.SIGKILL and codes[1 - lost] == 1
+    assert codes[lost] == -signal.SIGKILL and codes[1 - lost] == 1, said(tmp_path)
     (line,) = errors_in(said(tmp_path))
     assert "another process of this training ended" in line
-    assert f"the last good checkpoint is '{latest_checkpoint(tmp_path / 'run/checkpoints')}'" in line
-    assert load_checkpoint(latest_checkpoint(tmp_path / "run/checkpoints"))["trainer"]["iteration"] >= 3
+    newest = latest_checkpoint(folder)
+    if newest is not None:
+        assert f"the last good checkpoint is '{newest}'" in line
+        assert load_checkpoint(newest)["trainer"]["iteration"] in (5, 10)
+
+
+def test_a_process_killed_as_it_writes_leaves_the_checkpoint_before(capture, tmp_path):
+    codes, text = trained(2, tmp_path, capture, "killed writing", "train.checkpoint_every=3")
+    assert codes == [-signal.SIGKILL, 1], text
+    (line,) = errors_in(text)
+    assert "iteration-000003.pt'" in line
+    assert (tmp_path / "run/checkpoints/.iteration-000006.pt.part").is_file(), "it was not in the middle of writing"
+    assert load_checkpoint(latest_checkpoint(tmp_path / "run/checkpoints"))["trainer"]["iteration"] == 3
 
 
 @pytest.mark.parametrize(
-    ("trouble", "message"),
+    ("trouble", "message", "good"),
     [
-        ("memory", "iteration 4: the device's memory was too small"),
-        ("disk", "No space left on device"),
-        ("input", "absent"),
+        ("memory", "iteration 4: the device's memory was too small", 3),
+        ("memory of an evaluation", "iteration 7: the device's memory was too small", 6),
+        ("disk", "iteration 6: the checkpoint could not be written", 3),
+        ("input", "absent", None),
     ],
+    ids=lambda value: value if value in ("memory", "memory of an evaluation", "disk", "input") else "",
 )
-def test_trouble_of_one_process_ends_all_with_its_own_line(trouble, message, capture, tmp_path):
+def test_trouble_of_one_process_ends_all_with_its_own_line(trouble, message, good, capture, tmp_path):
     codes, text = trained(2, tmp_path, capture, trouble, "train.checkpoint_every=3")
     assert all(code in (1, 2) for code in codes), (codes, text)
     (line,) = errors_in(text)
     assert message in line and "turbogs: error:" in line
-    if trouble == "memory":
-        assert "the last good checkpoint is" in line
+    newest = latest_checkpoint(tmp_path / "run/checkpoints")
+    assert newest == (good and tmp_path / f"run/checkpoints/iteration-{good:06d}.pt")
+    if good:
+        assert f"the last good checkpoint is '{newest}'" in line
+        assert load_checkpoint(newest)["trainer"]["iteration"] == good
+
+
+def test_a_disk_that_is_full_at_the_end_is_said_and_the_run_can_be_ended_later(capture, tmp_path):
+    """The other process has nothing left to do by then."""
+    codes, text = trained(2, tmp_path, capture, "disk at the end")
+    assert codes[0] in (1, 2) and codes[1] in (0, 1), (codes, text)
+    (line,) = errors_in(text)
+    assert "iteration 14: the checkpoint could not be written" in line
+    assert "iteration-000010.pt" in line
+    run.resume(tmp_path / "run")
+    assert (tmp_path / "run/model.ply").is_file()
+    assert load_checkpoint(latest_checkpoint(tmp_path / "run/checkpoints"))["trainer"]["iteration"] == 14
 
 
 def test_a_process_that_waits_for_one_that_hangs_ends_when_it_is_asked_to(capture, tmp_path):
@@ -245,10 +326,14 @@ def test_torchrun_starts_a_lost_run_again_from_its_checkpoint(capture, tmp_path)
 
 def test_the_command_starts_processes_itself(capture, tmp_path, turbogs, monkeypatch):
     settings = ("train.iterations=3", "train.refine_until=2", "train.evaluate_at=[]")
+    settings += ("schedule.min_views=1", "schedule.max_views=2", "train.batch_for=auto")
     folder = tmp_path / "run"
     code, _, told = turbogs("train", capture, *settings, "--out", folder, "--gpus", 2, "--device", "cpu", "--no-report")
     assert code == 0, told
     assert load_checkpoint(latest_checkpoint(folder / "checkpoints"))["trainer"]["iteration"] == 3
+    config = run.RunFolder(folder).read_config()
+    assert (config.schedule["min_views"], config.schedule["max_views"], config.schedule["pixel_budget"]) == (2, 4, 2.0)
+    assert config.optimizer["learning_rates"]["batch_scale"] == pytest.approx(5.0 * 2**0.5)
     (tmp_path / "ending.py").write_text("import sys; sys.exit(int(sys.argv[1]))")
     monkeypatch.setenv("PYTHONPATH", f"{tmp_path}:{os.environ.get('PYTHONPATH', '')}")
     assert distributed_processes.start(2, ["2"], "cpu", "ending") == 2

@@ -23,7 +23,7 @@ from datetime import timedelta
 import torch
 
 from turbogs_plugin.distributed.ranks import ONE, ProcessRanks, RankLost, Ranks
-from turbogs_plugin.errors import InputError, TrainingStopped
+from turbogs_plugin.errors import InputError, TrainingStopped, error_line
 
 TIMEOUT = timedelta(hours=6)
 """The longest that processes wait for each other, as while the first one finds cameras, evaluates or saves. A process
@@ -152,7 +152,7 @@ def joined(device: str) -> Iterator[Ranks]:
     except (InputError, TrainingStopped, OSError) as error:
         # At once: taking the group down could wait for processes that wait for this one.
         if speaks():
-            print(f"turbogs: error: {' '.join(str(error).split())}", file=sys.stderr, flush=True)
+            print(error_line(error), file=sys.stderr, flush=True)
         sys.stdout.flush()
         os._exit(2 if isinstance(error, (InputError, OSError)) else 1)
     except KeyboardInterrupt:
@@ -204,5 +204,5 @@ class _Watch:
             time.sleep(0.2)
         if self._speaks():
             lost = RankLost("another process of this training does not answer: go on from the last checkpoint")
-            print(f"turbogs: error: {lost}", file=sys.stderr, flush=True)
+            print(error_line(lost), file=sys.stderr, flush=True)
         os._exit(128 + number)
