@@ -198,7 +198,7 @@ def test_a_run_goes_on_with_another_number_of_processes(of_two, capture, tmp_pat
         assert torch.equal(finals[count]["maps"]["stamps"], whole["maps"]["stamps"])
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", [1, 4, 5])  # exchanges 8, 15 and 39
 def test_a_process_killed_at_a_random_moment_ends_all_with_one_line(seed, capture, tmp_path):
     """Before maps are whole, between two exchanges of an iteration, in an event or a comparison of the replicas."""
     folder, lost = tmp_path / "run/checkpoints", seed % 2
