@@ -1,4 +1,4 @@
-"""Prints the predictions of docs/scaling.md: what an iteration takes on N GPUs, and what a GPU holds.
+"""Prints the predictions of docs/scaling.md: what an iteration takes on N GPUs, and what GPUs and machines hold.
 
 python docs/scaling_model.py
 """
@@ -14,6 +14,13 @@ BANDWIDTH = 300e9
 
 COPY = 4.3e12
 """Bytes a second that a copy on an H200 reads and writes."""
+
+NETWORK = 50e9
+"""The same between machines: one network card of 400 Gbit/s a GPU."""
+
+HOST_LINK = 56e9
+"""Bytes a second between a GPU and its host, in and out together: .29 + .17 GB in an iteration of 8.19 ms
+(docs/results/h200, photos and maps in host memory)."""
 
 LATENCY = 0.03
 """Milliseconds of a small exchange."""
@@ -49,7 +56,7 @@ class Case:
     solve: float
     samples: float = 1.26e6
 
-    def on(self, count: int, owners: bool = True) -> float:
+    def on(self, count: int, owners: bool = True, bandwidth: float = BANDWIDTH) -> float:
         """Milliseconds on so many GPUs."""
         if count == 1:
             return self.whole + self.shared + self.solve
@@ -58,8 +65,8 @@ class Case:
         records = RECORD * self.gaussians * views * (others if owners else count - 1)
         parameters = PARAMETERS * self.gaussians * others if owners else 0.0
         packed = 2 * (RECORD * self.gaussians * views + 2 * parameters)  # own records are copied, others' are packed
-        exchange = 1e3 * ((colors + records) / BANDWIDTH + packed / COPY) + LATENCY * (4 if owners else 3)
-        exchange += max(0.0, 1e3 * parameters / BANDWIDTH - DRAW * self.whole)
+        exchange = 1e3 * ((colors + records) / bandwidth + packed / COPY) + LATENCY * (4 if owners else 3)
+        exchange += max(0.0, 1e3 * parameters / bandwidth - DRAW * self.whole)
         passes = self.shared * ((1 - PROJECTION) / count + PROJECTION * views / self.views)
         return self.whole + passes + self.solve / (count if owners else 1) + exchange
 
@@ -73,12 +80,50 @@ class Case:
         factor = gaussians / self.gaussians
         return replace(self, gaussians=gaussians, shared=self.shared * (0.5 + 0.5 * factor), solve=self.solve * factor)
 
-    def gigabytes(self, count: int) -> float:
-        """Of a GPU: model, moments and statistics, twice as at an event of density control; passes and exchange."""
-        views = self.views_of(count)
-        exchanged = 0.0 if count == 1 else RECORD * (views * (count - 1) + self.views) / count + PARAMETERS
-        return self.gaussians * (2 * (PARAMETERS + MOMENTS) + PASS * views + exchanged) / 1e9
+    def grown(self, factor: int) -> Case:
+        """With so many times the views and pixels (`train.batch_for`). Of the solve, .4 is a Gaussian's whatever K."""
+        return replace(
+            self,
+            views=self.views * factor,
+            whole=self.whole * factor,
+            shared=self.shared * factor,
+            solve=self.solve * (0.4 + 0.6 * factor),
+            samples=self.samples * factor,
+        )
 
+    def of_pixels(self, samples: float) -> Case:
+        """With so many samples an iteration."""
+        factor = samples / self.samples
+        return replace(self, whole=self.whole * factor, shared=self.shared * (0.5 + 0.5 * factor), samples=samples)
+
+    def gigabytes(self, count: int, sharded: int = 0) -> float:
+        """Of a GPU: model, moments and statistics, twice as at an event of density control; passes and exchange.
+
+        Args:
+            sharded: how many of `NEXT` are done, of which each takes something away.
+        """
+        views, events = self.views_of(count), 1 if sharded >= 2 else 2
+        moments = MOMENTS / count if sharded >= 1 else MOMENTS
+        passes = PASS * (1 if sharded >= 3 else views)
+        exchanged = 0.0 if count == 1 else RECORD * (views * (count - 1) + self.views) / count + PARAMETERS
+        exchanged *= 1 / views if sharded >= 3 else 1
+        parameters = PARAMETERS
+        if sharded >= 4:
+            parameters, passes = PARAMETERS / count, passes * IN_VIEW
+        return self.gaussians * (events * (parameters + moments) + passes + exchanged) / 1e9
+
+
+NEXT = (
+    "today",
+    "moments and statistics with owners alone",
+    "an event that works in place",
+    "passes and records view after view",
+    "parameters by place in space",
+)
+"""What one would shard next, each with those before it."""
+
+IN_VIEW = 0.4
+"""Share of the Gaussians that a view has on screen (docs/performance.md: 31 to 44 %)."""
 
 MEASURED = {
     "150k, K = 3": Case(150e3, 3, 0.18, 0.95, 0.09),
@@ -87,6 +132,9 @@ MEASURED = {
     "600k, K = 10": Case(600e3, 10, 0.37, 2.57, 0.50),
 }
 COUNTS = (1, 2, 4, 8)
+
+PHOTOS, PIXELS, EPOCHS = 10_000, 2e6, 60
+"""A large capture, and how often its pixels are looked at."""
 
 
 def table(head: str, rows: dict[str, list[str]]) -> str:
@@ -104,12 +152,49 @@ def main() -> None:
             times = [case.on(count, owners) for count in COUNTS]
             rows[name] = [f"{time:.2f} ms, {times[0] / time:.2f}x" for time in times]
         print(table(title, rows), end="\n\n")
+    rows = {}
+    for name, case in cases.items():
+        times = [case.grown(count).on(count) for count in COUNTS]
+        faster = zip(times, COUNTS, strict=True)
+        rows[name] = [f"{time:.2f} ms, {count * times[0] / time:.2f}x" for time, count in faster]
+    print(table("N times the views and pixels", rows), end="\n\n")
     rows = {
-        name: [f"{case.gigabytes(count):.0f} GB" for count in COUNTS]
+        name: [f"{case.on(count, bandwidth=NETWORK):.2f} ms" for count in COUNTS]
         for name, case in cases.items()
-        if case.gaussians >= 10e6
+        if case.views == 10
     }
-    print(table("memory of a GPU", rows))
+    print(table("a machine for each GPU", rows), end="\n\n")
+    large = {name: case for name, case in cases.items() if case.gaussians >= 10e6}
+    rows = {name: [f"{case.gigabytes(count):.0f} GB" for count in COUNTS] for name, case in large.items()}
+    print(table("memory of a GPU", rows), end="\n\n")
+    rows = {
+        what: [f"{large['100M, K = 10'].gigabytes(count, place):.0f} GB" for count in COUNTS]
+        for place, what in enumerate(NEXT)
+    }
+    print(table("memory of a GPU, 100M", rows), end="\n\n")
+    print(table(f"{PHOTOS:,} photos of {PIXELS / 1e6:.0f} megapixels", photos(cases)))
+
+
+def photos(cases: dict[str, Case]) -> dict[str, list[str]]:
+    """Rows for a large capture: its memory, what of it travels, and how long the training takes."""
+    stored, bytes_of_pixel = PHOTOS * PIXELS * (3 + 4) / 1e9, 3 + 4 + 4  # in: photo and map; out: map
+    travel = {count: 1e3 * 10 * PIXELS * bytes_of_pixel / HOST_LINK / count for count in COUNTS}
+    rows = {
+        "host memory of the machine, as it is": [f"{stored * count:.0f} GB" for count in COUNTS],
+        "the same, shared by its processes": [f"{stored:.0f} GB" for _ in COUNTS],
+        "or on the GPUs, by view: of each": [f"{stored / count:.0f} GB" for count in COUNTS],
+        "travel of 10 views, as it is": [f"{travel[1]:.1f} ms" for _ in COUNTS],
+        "travel, each process the views it renders": [f"{travel[count]:.1f} ms" for count in COUNTS],
+    }
+    for name in ("600k, K = 10", "10M, K = 10"):
+        case, size = cases[name].of_pixels(PIXELS), name.partition(",")[0]
+        usual = [max(case.on(count), travel[1]) for count in COUNTS]
+        grown = [max(case.grown(count).on(count), count * travel[1]) / count for count in COUNTS]
+        sharded = [max(case.grown(count).on(count), travel[1]) / count for count in COUNTS]
+        for what, times in (("", usual), (", N times the batch", grown), (" and own views alone", sharded)):
+            what = f", N times the batch{what}" if times is sharded else what
+            rows[f"{EPOCHS} epochs at {size}{what}"] = [f"{time * EPOCHS * PHOTOS / 3.6e6:.1f} h" for time in times]
+    return rows
 
 
 if __name__ == "__main__":
