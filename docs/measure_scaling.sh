@@ -1,27 +1,65 @@
 #!/bin/sh
 # Measures docs/scaling.md on a machine with two GPUs: sh docs/measure_scaling.sh OUT FOX CALITERRA [DEVICE]
-# The tests of the exchange, iterations on one GPU and on two, whole runs, which end if their replicas differ, and a
-# study.
-set -e
+#
+# What says the most comes first. No stage stops another one: each has its time, its own OUT/NAME.txt and NAME.err, and
+# after each OUT/results.txt is written anew with all that is known. WITHIN seconds (470) in all; a stage that would
+# not end before is left out. Models and checkpoints go to SCRATCH, as they are large; OUT keeps a few kilobytes.
 out=$1 fox=$2 caliterra=$3 device=${4:-cuda}
-python=${PYTHON:-python3}
-turbogs() { "$python" -m turbogs_plugin "$@"; }
-test "$device" = cpu || "$python" -m pytest -q -p no:cacheprovider tests/gpu/test_ranks.py
-turbogs bench ranks --scene "$fox" --gpus 1 2 --views 3 10 --grown --device "$device" ${BENCH:-} --out "$out/ranks.json"
-for seed in ${SEEDS:-0 1 2}; do
-    for gpus in 1 2; do
-        turbogs train "$caliterra" --out "$out/runs/$gpus-$seed" --gpus $gpus --no-report --device "$device" \
-            train.seed=$seed ${TRAIN:-} 2>/dev/null | tail -2
+test -n "$caliterra" || { echo "sh docs/measure_scaling.sh OUT FOX CALITERRA [DEVICE]"; exit 2; }
+python=${PYTHON:-python3} within=${WITHIN:-470} scratch=${SCRATCH:-$(mktemp -d)} begun=$(date +%s)
+export NCCL_NVLS_ENABLE=0 OMP_NUM_THREADS="${OMP_NUM_THREADS:-8}"
+mkdir -p "$out/runs" "$scratch" || exit 2
+
+elapsed() { echo $(($(date +%s) - begun)); }
+
+say() { echo "[$(elapsed) s] $*" | tee -a "$out/stages.txt"; }
+
+# stage NAME SECONDS COMMAND ...: SECONDS is the least that it needs, on an H200.
+stage() {
+    name=$1 least=$2 started=$(elapsed)
+    shift 2
+    if [ $((within - started)) -lt "$least" ]; then
+        say "$name: left out, it may take $least s"
+        return 1
+    fi
+    timeout -k 5 $((within - started)) "$@" >"$out/$name.txt" 2>"$out/$name.err"
+    code=$?
+    say "$name: $(($(elapsed) - started)) s, exit code $code"
+    [ $code -eq 0 ] || tail -n 5 "$out/$name.err"
+    "$python" docs/scaling_results.py "$out" >"$out/results.new" && mv "$out/results.new" "$out/results.txt"
+    return $code
+}
+
+# run NAME SEED GPUS SETTING ...: a whole training of caliterra, which ends if its replicas differ.
+run() {
+    name=$1 seed=$2 gpus=$3
+    shift 3
+    stage "run-$name-$seed" 25 "$python" -m turbogs_plugin train "$caliterra" --out "$scratch/$name-$seed" \
+        --gpus "$gpus" --no-report --device "$device" "train.seed=$seed" "$@" ${TRAIN:-}
+    mkdir -p "$out/runs/$name-$seed"
+    for file in history.jsonl plan.json config.yaml wall.json; do
+        cp "$scratch/$name-$seed/$file" "$out/runs/$name-$seed/" 2>/dev/null
     done
-    # Twice the pixels and views for the same time, with rates times the root of two.
-    turbogs train "$caliterra" --out "$out/runs/2-more-$seed" --gpus 2 --no-report --device "$device" train.seed=$seed \
-        schedule.pixel_budget=2 schedule.min_views=6 schedule.max_views=20 optimizer.learning_rates.batch_scale=7.07 \
-        ${TRAIN:-} 2>/dev/null | tail -2
-done
-"$python" docs/time_to_psnr.py "$out"/runs/*
+    rm -rf "${scratch:?}/$name-$seed"
+    "$python" docs/scaling_results.py "$out" >"$out/results.txt"
+}
+
+# The numbers that the rest waits for: iterations on one GPU and on two.
+stage machine 0 sh -c "nvidia-smi topo -m; nvidia-smi --query-gpu=name,driver_version --format=csv; git rev-parse HEAD"
+stage ranks 60 "$python" -m turbogs_plugin bench ranks --scene "$fox" --gpus 1 2 --gaussians 600000 150000 \
+    --views 10 3 --grown --device "$device" --out "$out/ranks.json" ${BENCH:-}
+runs() {
+    run one "$1" 1
+    run two "$1" 2
+    run batch "$1" 2 train.batch_for=auto  # twice the views and pixels, rates times the root of two
+}
+runs 0
 for gpus in 0 0,1; do
-    started=$(date +%s)
-    turbogs ablate parts --scene "$caliterra" --only random-pixels --seeds 0 1 2 --gpus $gpus --device "$device" \
-        --out "$out/study-$gpus" ${STUDY:-} >/dev/null
-    echo "study on GPUs $gpus: $(($(date +%s) - started)) s"
+    stage "study-$gpus" 60 "$python" -m turbogs_plugin ablate parts --scene "$caliterra" --only turbogs \
+        --seeds ${CELLS:-0 1 2 3 4 5} --gpus $gpus --device "$device" --out "$out/study-$gpus" ${STUDY:-}
 done
+runs 1
+runs 2
+test "$device" = cpu || stage tests 30 "$python" -m pytest -q -p no:cacheprovider tests/gpu/test_ranks.py tests/gpu/test_masks.py
+rm -rf "$scratch"
+cat "$out/results.txt"

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 BANDWIDTH = 300e9
@@ -137,9 +138,9 @@ PHOTOS, PIXELS, EPOCHS = 10_000, 2e6, 60
 """A large capture, and how often its pixels are looked at."""
 
 
-def table(head: str, rows: dict[str, list[str]]) -> str:
-    """A Markdown table with a column for each number of GPUs."""
-    lines = [f"| {head} | " + " | ".join(map(str, COUNTS)) + " |", "| --- |" + " --- |" * len(COUNTS)]
+def table(head: str, rows: dict[str, list[str]], columns: Sequence[object] = COUNTS) -> str:
+    """A Markdown table, with a column for each number of GPUs unless others are named."""
+    lines = [f"| {head} | " + " | ".join(map(str, columns)) + " |", "| --- |" + " --- |" * len(columns)]
     return "\n".join([*lines, *(f"| {name} | " + " | ".join(cells) + " |" for name, cells in rows.items())])
 
 

@@ -1,0 +1,145 @@
+"""Prints what docs/measure_scaling.sh has measured so far, beside the predictions of docs/scaling_model.py.
+
+python docs/scaling_results.py OUT
+
+Reads what is there of OUT/ranks.json (or the lines of ranks.txt, where the bench was cut short), OUT/runs/*-SEED with
+their histories, and OUT/study-GPUS with the times at which its cells ended.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from statistics import mean
+
+from scaling_model import MEASURED, Case, table
+
+BELOW = (0.0, 0.25, 0.5, 1.0)
+"""Time to so many dB below the last PSNR of the run that ends with the lowest one."""
+
+LINE = re.compile(r"(\d+) GPU  M=(\d+) K=(\d+) lambda=([\d.]+) \(([\w ]+)\): ([\d.]+) ms")
+
+
+def passes(out: Path) -> Iterator[tuple[int, int, int, float, str, float]]:
+    """(GPUs, Gaussians, K, lambda, exchange, milliseconds) of each measurement."""
+    if (out / "ranks.json").is_file():
+        for one in json.loads((out / "ranks.json").read_text())["passes"]:
+            time = one["wall"]["median_ms"]
+            yield one["gpus"], one["gaussians"], one["views"], one["pixel_budget"], one["exchange"], time
+    elif (out / "ranks.txt").is_file():
+        for gpus, gaussians, views, images, exchange, time in LINE.findall((out / "ranks.txt").read_text()):
+            yield int(gpus), int(gaussians), int(views), float(images), exchange, float(time)
+
+
+def iterations(out: Path) -> str:
+    """A table of the iterations, times one GPU's with the same K; where all is N times as much, in pixels a second."""
+    measured = list(passes(out))
+    alone = {(count, views): time for gpus, count, views, _, _, time in measured if gpus == 1}
+    usual = min((images for *_, images, _, _ in measured), default=1.0)
+    rows = {}
+    for gpus, count, views, images, exchange, time in measured:
+        grown = round(images / usual)
+        case: Case | None = MEASURED.get(f"{count // 1000}k, K = {views // grown}")
+        base = alone.get((count, views // grown))
+        found = f"{time:.2f} ms" + (f", {grown * base / time:.2f}x" if base else "")
+        expected = "-"
+        if case is not None:
+            predicted = case.grown(grown).on(gpus, exchange != "records to all")
+            expected = f"{predicted:.2f} ms, {grown * case.on(1) / predicted:.2f}x"
+        batch = f", {grown} times the batch" if grown > 1 else ""
+        rows[f"{count // 1000}k, K = {views}{batch}, {gpus} GPUs, {exchange}"] = [found, expected]
+    return table("an iteration", rows, ("measured", "predicted"))
+
+
+def history_of(run: Path) -> list[dict]:
+    return [json.loads(line) for line in (run / "history.jsonl").read_text().splitlines()]
+
+
+def seconds_to(history: list[dict], psnr: float) -> float:
+    """When a run first reached a PSNR, on a line between two evaluations; NaN: never."""
+    before = None
+    for line in history:
+        if line["psnr"] >= psnr:
+            if before is None:
+                return line["train_seconds"]
+            part = (psnr - before["psnr"]) / (line["psnr"] - before["psnr"])
+            return before["train_seconds"] + part * (line["train_seconds"] - before["train_seconds"])
+        before = line
+    return float("nan")
+
+
+def trainings(out: Path) -> str:
+    """A table of the runs, and their means against those of one GPU with the same seeds."""
+    histories = {
+        run.name: history_of(run) for run in sorted((out / "runs").glob("*-*")) if (run / "history.jsonl").is_file()
+    }
+    histories = {name: history for name, history in histories.items() if history}
+    if not histories:
+        return "no run has ended"
+    wanted = min(max(line["psnr"] for line in history) for history in histories.values())
+    levels = [wanted - below for below in BELOW]
+    times = {name: [seconds_to(history, level) for level in levels] for name, history in histories.items()}
+    rows = {}
+    for name, history in histories.items():
+        last = history[-1]
+        rows[name] = [*(f"{time:.2f} s" for time in times[name]), f"{last['train_seconds']:.2f} s"]
+        rows[name] += [f"{last['psnr']:.2f} dB", f"{last['ssim'] or 0:.4f}", str(last["num_gaussians"])]
+        rows[name].append(str(last["iteration"]))
+    head = (*(f"to {level:.2f} dB" for level in levels), "end", "PSNR", "SSIM", "Gaussians", "iterations")
+    lines = [table("run", rows, head), ""]
+    for kind in ("two", "batch"):
+        seeds = [seed for seed in "012" if f"one-{seed}" in histories and f"{kind}-{seed}" in histories]
+        if not seeds:
+            continue
+        sooner = [
+            mean(times[f"one-{seed}"][place] / times[f"{kind}-{seed}"][place] for seed in seeds)
+            for place in range(len(levels))
+        ]
+        ours, theirs = ([histories[f"{which}-{seed}"][-1]["psnr"] for seed in seeds] for which in (kind, "one"))
+        lines.append(
+            f"{kind}, {len(seeds)} seeds: {', '.join(f'{factor:.2f}' for factor in sooner)} times as soon as one GPU; "
+            f"PSNR {mean(ours):.2f} where one GPU has {mean(theirs):.2f} [{min(theirs):.2f}, {max(theirs):.2f}]"
+        )
+    return "\n".join(lines)
+
+
+def study(out: Path) -> str:
+    """Cells a second of a study, from the end of each GPU's first cell on: without the start of the processes."""
+    rates = {}
+    for gpus in ("0", "0,1"):
+        count = len(gpus.split(","))
+        ends = sorted(file.stat().st_mtime for file in (out / f"study-{gpus}").glob("cells/*/*.json"))
+        if len(ends) > count and ends[-1] > ends[count - 1]:
+            rates[gpus] = (len(ends) - count) / (ends[-1] - ends[count - 1])
+    lines = [f"study on GPUs {gpus}: {60 * rate:.1f} cells a minute" for gpus, rate in rates.items()]
+    if len(rates) == 2:
+        lines.append(f"two GPUs: {rates['0,1'] / rates['0']:.2f} times one (wanted: 1.9)")
+    return "\n".join(lines) or "no study has ended"
+
+
+def wanted(out: Path) -> str:
+    """What issue and page ask of an iteration, so far as it is measured."""
+    found = {
+        (gpus, count, views): time for gpus, count, views, images, how, time in passes(out) if how != "records to all"
+    }
+    lines = []
+    for count, views, least in ((600_000, 10, 1.3), (150_000, 10, 1.0), (150_000, 3, 1.0)):
+        one, two = found.get((1, count, views)), found.get((2, count, views))
+        if one and two:
+            verdict = "reached" if one / two >= least else "missed"
+            lines.append(
+                f"{count // 1000}k, K = {views}: {one / two:.2f} times one GPU, wanted at least {least}: {verdict}"
+            )
+    return "\n".join(lines)
+
+
+def main() -> None:
+    out = Path(sys.argv[1])
+    print("\n\n".join(filter(None, [iterations(out), wanted(out), trainings(out), study(out)])))
+
+
+if __name__ == "__main__":
+    main()
