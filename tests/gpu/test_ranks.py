@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from turbogs_plugin.bench.large_capture import synthetic_scene
 from turbogs_plugin.config.configuration import load_config
@@ -86,6 +87,33 @@ def test_runs_of_rows_make_the_step_of_all_rows(optimizer, unit):
 def test_a_digest_is_the_same_on_both_devices():
     value = torch.randn(5_000_011, generator=torch.Generator().manual_seed(0))
     assert digest(value) == digest(value.to(GPU))
+
+
+OTHERS = {
+    "fastgs": ("density.type=fastgs", "density.refine_from=20", "density.refine_every=20"),
+    "mcmc": ("density.type=mcmc", "density.refine_start_iter=20", "density.refine_every=20"),
+    "masked": ("density.refine_every=20",),
+    "larger batch": ("density.refine_every=20", "train.batch_for=auto"),
+}
+
+
+@pytest.mark.skipif(torch.cuda.device_count() < 2, reason="needs two GPUs")
+@pytest.mark.parametrize("case", OTHERS)
+def test_other_runs_on_two_gpus_keep_their_replicas_equal(tmp_path: Path, case):
+    """What density control reads between its events; draws over live tiles, and a photo of which nothing counts."""
+    capture = write_demo_capture(tmp_path / "capture", views=12, width=160, height=120)
+    if case == "masked":
+        (capture / "masks").mkdir()
+        for number, photo in enumerate(sorted((capture / "images").iterdir())):
+            keep = np.zeros((120, 160), dtype=bool)
+            keep[:, 10 * number :] = number != 3
+            Image.fromarray(keep).save(capture / "masks" / f"{photo.stem}.png")
+    out = tmp_path / "run"
+    settings = ["train.iterations=150", "train.refine_until=100", "schedule.min_views=2", "schedule.max_views=4"]
+    command = ["train", str(capture), "--out", str(out), "--no-report", "--device", "cuda", *settings, *OTHERS[case]]
+    assert start(2, command, "cuda") == 0
+    lines = [json.loads(line) for line in (out / "history.jsonl").read_text().splitlines()]
+    assert lines[-1]["iteration"] == 150 and len({line["num_gaussians"] for line in lines}) > 1
 
 
 @pytest.mark.skipif(torch.cuda.device_count() < 2, reason="needs two GPUs")
