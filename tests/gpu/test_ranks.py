@@ -92,8 +92,8 @@ def test_a_digest_is_the_same_on_both_devices():
 OTHERS = {
     "fastgs": ("density.type=fastgs", "density.refine_from=20", "density.refine_every=20"),
     "mcmc": ("density.type=mcmc", "density.refine_start_iter=20", "density.refine_every=20"),
-    "masked": ("density.refine_every=20",),
-    "larger batch": ("density.refine_every=20", "train.batch_for=auto"),
+    "masked": ("density.refine_from=20", "density.refine_every=20"),
+    "larger batch": ("density.refine_from=20", "density.refine_every=20", "train.batch_for=auto"),
 }
 
 
