@@ -14,6 +14,8 @@ elapsed() { echo $(($(date +%s) - begun)); }
 
 say() { echo "[$(elapsed) s] $*" | tee -a "$out/stages.txt"; }
 
+results() { "$python" docs/scaling_results.py "$out" >"$out/results.new" && mv "$out/results.new" "$out/results.txt"; }
+
 # stage NAME SECONDS COMMAND ...: SECONDS is the least that it needs, on an H200.
 stage() {
     name=$1 least=$2 started=$(elapsed)
@@ -26,22 +28,22 @@ stage() {
     code=$?
     say "$name: $(($(elapsed) - started)) s, exit code $code"
     [ $code -eq 0 ] || tail -n 5 "$out/$name.err"
-    "$python" docs/scaling_results.py "$out" >"$out/results.new" && mv "$out/results.new" "$out/results.txt"
+    results
     return $code
 }
 
-# run NAME SEED GPUS SETTING ...: a whole training of caliterra, which ends if its replicas differ.
+# run KIND SEED GPUS SETTING ...: a whole training of caliterra, which ends if its replicas differ.
 run() {
-    name=$1 seed=$2 gpus=$3
+    kind=$1 seed=$2 gpus=$3
     shift 3
-    stage "run-$name-$seed" 25 "$python" -m turbogs_plugin train "$caliterra" --out "$scratch/$name-$seed" \
+    stage "run-$kind-$seed" 25 "$python" -m turbogs_plugin train "$caliterra" --out "$scratch/$kind-$seed" \
         --gpus "$gpus" --no-report --device "$device" "train.seed=$seed" "$@" ${TRAIN:-}
-    mkdir -p "$out/runs/$name-$seed"
+    mkdir -p "$out/runs/$kind-$seed"
     for file in history.jsonl plan.json config.yaml wall.json; do
-        cp "$scratch/$name-$seed/$file" "$out/runs/$name-$seed/" 2>/dev/null
+        cp "$scratch/$kind-$seed/$file" "$out/runs/$kind-$seed/" 2>/dev/null
     done
-    rm -rf "${scratch:?}/$name-$seed"
-    "$python" docs/scaling_results.py "$out" >"$out/results.txt"
+    rm -rf "${scratch:?}/$kind-$seed"
+    results
 }
 
 # The numbers that the rest waits for: iterations on one GPU and on two.

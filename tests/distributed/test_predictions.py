@@ -65,3 +65,41 @@ def test_results_are_printed_as_they_come(tmp_path):
         partial.unlink()
     again = [sys.executable, ROOT / "docs/scaling_results.py", tmp_path]
     assert "no run has ended" in subprocess.run(again, capture_output=True, text=True, check=True).stdout
+
+
+STAND_IN = """#!/bin/sh
+# In the place of Python: runs, a bench and studies that take no time. The second seed's runs on two GPUs fail.
+case "$*" in
+docs/*) exec PYTHON "$@" ;;
+*" train "*--gpus\\ 2*train.seed=1*) echo "turbogs: error: lost" >&2; exit 1 ;;
+*" train "*)
+    mkdir -p "$6" && echo large >"$6/model.ply"
+    echo '{"iteration": 5, "train_seconds": 2.0, "psnr": 30.0, "ssim": 0.9, "l1": 0.1, "num_gaussians": 7}' \\
+        >"$6/history.jsonl" ;;
+*" bench ranks "*) echo "1 GPU  M=600000 K=10 lambda=1 (none): 3.400 ms; draw 0.10"; exit 1 ;;
+*" ablate "*) mkdir -p "${21}/cells/scene"; touch "${21}/cells/scene/a.json" ;;
+esac
+"""
+
+
+def test_the_script_goes_on_whatever_fails_and_leaves_out_what_has_no_time(tmp_path):
+    python = tmp_path / "python"
+    python.write_text(STAND_IN.replace("PYTHON", sys.executable))
+    python.chmod(0o755)
+    variables = {**os.environ, "PYTHON": str(python), "SCRATCH": str(tmp_path / "scratch")}
+    command = ["sh", "docs/measure_scaling.sh", str(tmp_path / "out"), "fox", "caliterra", "cpu"]
+    ended = subprocess.run(command, cwd=ROOT, env=variables, capture_output=True, text=True)
+    stages = (tmp_path / "out/stages.txt").read_text()
+    names = [line.split()[2].rstrip(":") for line in stages.splitlines()]
+    runs = [[f"run-{kind}-{seed}" for kind in ("one", "two", "batch")] for seed in "012"]
+    assert names == ["machine", "ranks", *runs[0], "study-0", "study-0,1", *runs[1], *runs[2]], ended.stderr
+    assert stages.count("exit code 1") == 3 and "turbogs: error: lost" in ended.stdout
+    results = (tmp_path / "out/results.txt").read_text()
+    assert "| 600k, K = 10, 1 GPUs, none | 3.40 ms, 1.00x |" in results and results in ended.stdout
+    assert "two, 2 seeds: " in results and "| one-2 | " in results
+    assert not (tmp_path / "scratch").exists() and not list((tmp_path / "out").rglob("model.ply"))
+    none = subprocess.run(
+        [*command[:2], str(tmp_path / "none"), *command[3:]], cwd=ROOT, env={**variables, "WITHIN": "9"}
+    )
+    assert none.returncode == 0
+    assert (tmp_path / "none/stages.txt").read_text().count("left out") == 12
