@@ -12,7 +12,8 @@ function of (seed, iteration, place), so all draw the same. Then
 
 Every step and statistic is computed by one process, as by a process alone, and copied to the others. So the replicas
 are bit-equal, and a step differs from that of one process only by the order in which the samples of a view are added
-up. Moments and statistics are valid for a process's own rows alone, until `complete`.
+up. Moments and statistics are valid for a process's own rows alone, until `complete`. A density control that reads the
+statistics at every iteration (`DensityController.watched`) has them gathered, without a host that waits.
 """
 
 from __future__ import annotations
