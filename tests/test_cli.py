@@ -212,7 +212,9 @@ def test_what_the_system_refuses_is_one_line(turbogs, tmp_path, monkeypatch, err
 )
 def test_overrides_stand_anywhere(turbogs, capture, monkeypatch, order):
     seen = []
-    monkeypatch.setattr(run, "plan_run", lambda config: seen.append(config.train) or SimpleNamespace(text=str))
+    monkeypatch.setattr(
+        run, "plan_run", lambda config, processes: seen.append(config.train) or SimpleNamespace(text=str)
+    )
     code, _, error = turbogs(*order.replace("SCENE", str(capture)).split())
     assert code == 0, error
     assert [(train.seed, train.iterations) for train in seen] == [(5, 7)]
