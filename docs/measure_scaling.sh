@@ -62,6 +62,7 @@ for gpus in 0 0,1; do
 done
 runs 1
 runs 2
-test "$device" = cpu || stage tests 30 "$python" -m pytest -q -p no:cacheprovider tests/gpu/test_ranks.py tests/gpu/test_masks.py
+test "$device" = cpu ||
+    stage tests 30 "$python" -m pytest -q -p no:cacheprovider tests/gpu/test_ranks.py tests/gpu/test_masks.py
 rm -rf "$scratch"
 cat "$out/results.txt"
