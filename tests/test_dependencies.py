@@ -213,6 +213,13 @@ def test_the_extra_for_films_is_the_one_that_its_message_names(project):
     assert f'"{project["name"]}[video]"' in INSTALL
 
 
+def test_the_extra_for_tensorboard_is_the_one_that_its_message_names(project):
+    from turbogs_plugin.report.tensorboard import INSTALL
+
+    assert set(requirements(project["optional-dependencies"]["tensorboard"])) == {"tensorboard"}
+    assert f'"{project["name"]}[tensorboard]"' in INSTALL
+
+
 def test_what_the_core_refuses(project):
     core = requirements(project["dependencies"])
     for name, version in (("gsplat", "1.3.0"), ("gsplat", "2.0.0"), ("torch", "2.0.1")):

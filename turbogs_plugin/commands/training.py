@@ -61,13 +61,14 @@ def train(
         require_positive("--gpus", (gpus,))
     from turbogs_plugin.distributed.processes import joined, launched, restarted, start
     from turbogs_plugin.report.pages import write_report
+    from turbogs_plugin.report.tensorboard import event_writers
     from turbogs_plugin.train import run
 
     settings = run.RunFolder(resume).read_config() if resume else options.settings(scene, overrides)
     device = settings.train.device
     if gpus is not None and gpus > 1 and not launched():
         return start(gpus, sys.argv[1:], device)
-    page = write_report if report else None
+    page, watch = write_report if report else None, event_writers(settings)
     with joined(device) as ranks, ExitStack() as pages:
         if resume is None and restarted() and run.RunFolder(out).config.is_file():
             resume = out
@@ -78,8 +79,9 @@ def train(
             from turbogs_plugin.viewer.commands import attached
 
             live = pages.enter_context(attached(viewer, viewer_host))
+            watch.append(live.watch)
         begin = partial(run.resume, resume) if resume else partial(run.train, settings, out)
-        session = begin(page, clock, ranks, live and live.watch)
+        session = begin(page, clock, ranks, watch)
         code = _tell(session, report) if ranks.first else 128 + session.signal if session.signal else 0
         if live is not None and session.signal is None:
             live.stay()

@@ -157,10 +157,13 @@ class ReportConfig:
     Args:
         lpips_weights: a local file with the backbone's weights (torchvision's VGG16), or null: LPIPS is not computed.
         strips: test views shown as pictures, at most.
+        tensorboard: also write the history and those pictures for TensorBoard, at each evaluation, into the run's
+            folder; needs the extra ``tensorboard``.
     """
 
     lpips_weights: str | None = None
     strips: int = 8
+    tensorboard: bool = False
 
     def __post_init__(self) -> None:
         require(self.strips >= 0, "strips", self.strips, "at least 0")

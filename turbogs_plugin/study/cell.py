@@ -119,7 +119,7 @@ def train_cell(
     memory = PeakMemory(device)
     loop, _ = new_loop(planned, scene, device)
     evaluations = Evaluations(test, lpips, lambda: memory.peak or peak_memory_bytes(device))
-    loop.listeners = [evaluations, memory, *listeners]
+    loop.listeners = [evaluations, *listeners, memory]  # last, so that it forgets what the others needed, too
     loop.run()
     clock.mark("cell")
     trainer, mean_flip = loop.trainer, math.nan

@@ -20,7 +20,8 @@ class StudyFolder:
     Where a study is trained, each cell also has a file of the same form from the moment that it ends,
     ``cells/SCENE/VARIANT--seedN.json``: no finished cell is lost, whatever stops the process. These files go into
     ``results.json`` whenever that is written; nothing else needs them. While cells are trained, ``claims`` says by
-    whom (`turbogs_plugin.study.claims`).
+    whom (`turbogs_plugin.study.claims`). Where `report.tensorboard` is on, ``tensorboard/SCENE/VARIANT--seedN/`` has a
+    cell's event files.
     """
 
     def __init__(self, path: Path) -> None:
@@ -28,6 +29,7 @@ class StudyFolder:
         self.file = path / "results.json"
         self.cells = path / "cells"
         self.claims = path / "claims"
+        self.tensorboard = path / "tensorboard"
 
     def require_usable(self) -> None:
         """Raises `InputError` where the folder holds anything but a study, or cannot be one."""

@@ -6,7 +6,8 @@ import itertools
 import json
 import time
 import traceback
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from turbogs_plugin.config.old_spellings import old_spelling
 from turbogs_plugin.device import free_device_memory, synchronize
 from turbogs_plugin.errors import InputError, TrainingStopped
 from turbogs_plugin.report.provenance import COMMIT_VARIABLE, MODIFIED, Provenance
+from turbogs_plugin.report.tensorboard import EventWriter, require_tensorboard
 from turbogs_plugin.scene import Scene, load_scene
 from turbogs_plugin.study.cell import capture_digest, train_cell
 from turbogs_plugin.study.claims import Claims
@@ -31,8 +33,9 @@ from turbogs_plugin.train.start import resolve_device
 POLL_SECONDS = 1.0
 """Between two looks at cells that other processes train."""
 
-UNCOMPARED = ("scene.path", "train.device")
-"""Settings that may differ between a kept cell and the present call: where things are changes no result."""
+UNCOMPARED = ("scene.path", "train.device", "report.tensorboard")
+"""Settings that may differ between a kept cell and the present call: where things are, and who is told, changes no
+result."""
 
 
 @dataclass
@@ -154,7 +157,9 @@ def run_sweep(
                     continue
                 progress.begin(key)
                 try:
-                    outcome = train_cell(key.variant, config, scene, device, here, [progress], loading[key.scene])
+                    with _events(config, folder, key, scene) as events:
+                        listeners = [progress, *events]
+                        outcome = train_cell(key.variant, config, scene, device, here, listeners, loading[key.scene])
                 except Exception as error:  # whatever a variant breaks by, the other cells go on
                     outcome = Failure(key, _reason(error))
                 if not claim.held:
@@ -167,15 +172,32 @@ def run_sweep(
     return len(left)
 
 
+@contextmanager
+def _events(config: Config, folder: StudyFolder, key: CellKey, scene: Scene) -> Iterator[list[EventWriter]]:
+    """What writes a cell's event files, where its configuration asks for them."""
+    path = (folder.tensorboard / key.file).with_suffix("")
+    events = [EventWriter(path, scene.test, config.report.strips)] if config.report.tensorboard else []
+    try:
+        yield events
+    finally:
+        for writer in events:
+            writer.close()
+
+
 def _scene_configs(
     ablation: Ablation, variants: Sequence[str], options: SweepOptions, scene: Path, device: torch.device
 ) -> dict[CellKey, Config]:
-    """The cells of a scene, seed after seed. Raises `InputError` where they would not share its photos."""
+    """The cells of a scene, seed after seed.
+
+    Raises:
+        InputError: they would not share its photos, or event files are asked for and cannot be written.
+    """
     configs: dict[CellKey, Config] = {}
     for seed in options.seeds:
         for variant in variants:
             config = variant_config(ablation, variant, seed, options.overrides, options.steps)
             config.scene.path, config.train.device = str(scene), device.type
+            require_tensorboard(config)
             configs[CellKey(scene.name, variant, seed)] = config
             if config.scene != next(iter(configs.values())).scene:
                 raise InputError(f"variant '{variant}' changes the scene's photos, which all variants share")

@@ -18,6 +18,7 @@ class RunFolder:
         asked: the configuration as the user asked for it.
         config: the resolved one, after plan and budgets.
         wall: the `WallRecord`.
+        tensorboard: folder of event files, where they are asked for.
     """
 
     def __init__(self, path: Path) -> None:
@@ -31,6 +32,7 @@ class RunFolder:
         self.report = path / "report.md"
         self.model = path / "model.ply"
         self.renders = path / "renders"
+        self.tensorboard = path / "tensorboard"
 
     def require_new(self) -> None:
         """Raise `InputError` if the folder holds anything, or cannot be made."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
@@ -120,7 +120,7 @@ def train(
     report: Callable[[RunSession], object] | None = None,
     clock: WallClock | None = None,
     ranks: Ranks = ONE,
-    watch: Callable[[RunSession], Listener] | None = None,
+    watch: Sequence[Callable[[RunSession], Listener]] = (),
 ) -> RunSession:
     """Train from the start into a new folder. The plan is printed first. Photos alone are reconstructed before.
 
@@ -128,7 +128,7 @@ def train(
         report: called with the finished run; `turbogs_plugin.report.pages.write_report` writes its page.
         clock: of the wall; None: it begins now.
         ranks: the processes that train this model together; each calls this, and the first one writes and prints.
-        watch: called with the run before it trains; gives one more listener of its loop, the last one.
+        watch: each is called with the run before it trains, and gives one more listener of the first process's loop.
 
     Raises:
         InputError: anything wrong with the input; then nothing was written.
@@ -174,7 +174,7 @@ def resume(
     report: Callable[[RunSession], object] | None = None,
     clock: WallClock | None = None,
     ranks: Ranks = ONE,
-    watch: Callable[[RunSession], Listener] | None = None,
+    watch: Sequence[Callable[[RunSession], Listener]] = (),
 ) -> RunSession:
     """Go on with a stopped run from its newest checkpoint, with its own configuration, in which nothing is `auto`.
 
@@ -278,7 +278,7 @@ class RunSession(Listener):
     def run(
         self,
         report: Callable[[RunSession], object] | None,
-        watch: Callable[[RunSession], Listener] | None = None,
+        watch: Sequence[Callable[[RunSession], Listener]] = (),
     ) -> RunSession:
         """Train to the end, or until a signal; both end with a checkpoint."""
         loop, trainer, ranks = self.loop, self.trainer, self.loop.ranks
@@ -290,7 +290,7 @@ class RunSession(Listener):
             progress = TrainingProgress(trainer.iterations, trainer.iteration)
             with Interrupts(loop.stop) as interrupts, progress:
                 loop.listeners = [WallMarks(self.clock), self.evaluations, self, progress] if ranks.first else [self]
-                loop.listeners += [watch(self)] if watch is not None else []
+                loop.listeners += [listener_of(self) for listener_of in watch if ranks.first]
                 loop.run(self.resumed)
                 self.clock.mark("training")
                 if loop.stopped and trainer.iteration != self._saved_at:

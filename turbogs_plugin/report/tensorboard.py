@@ -1,0 +1,123 @@
+"""What TensorBoard shows of a training: its history as curves, and strips of its test views (`report.tensorboard`).
+
+Evaluations stop the clock of training, so the event files cost no time that is reported.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from PIL import Image
+
+from turbogs_plugin.config.configuration import Config
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.report.pictures import strip
+from turbogs_plugin.scene import PosedImages
+from turbogs_plugin.train.evaluate import render_view
+from turbogs_plugin.train.history import Evaluation
+from turbogs_plugin.train.loop import Listener, TrainingLoop
+from turbogs_plugin.train.run import RunSession
+
+if TYPE_CHECKING:
+    from torch.utils.tensorboard import SummaryWriter
+
+INSTALL = 'pip install "turbogs-plugin[tensorboard]"'
+WIDEST_STRIP = 900
+"""Pixels. A strip of every view at every evaluation would take hundreds of megabytes at full size."""
+GROUPS = {
+    "num_gaussians": "counts",
+    "nonfinite_losses": "counts",
+    "skipped_updates": "counts",
+    "train_seconds": "cost",
+    "memory_bytes": "cost",
+}
+"""Where TensorBoard shows a field of `Evaluation`; the others are errors on test views."""
+
+
+def require_tensorboard(config: Config) -> bool:
+    """Whether a configuration asks for event files.
+
+    Raises:
+        InputError: it does, and the package is not installed.
+    """
+    if config.report.tensorboard:
+        _writer_class()
+    return config.report.tensorboard
+
+
+def event_writers(config: Config) -> list[Callable[[RunSession], Listener]]:
+    """What a run with this configuration has to be watched by: one that writes event files, or none.
+
+    Raises:
+        InputError: as `require_tensorboard`.
+    """
+    return [EventWriter.of_run] if require_tensorboard(config) else []
+
+
+class EventWriter(Listener):
+    """Writes event files for TensorBoard at each evaluation.
+
+    Args:
+        folder: of the files; made with the first of them.
+        test: the test views, on any device.
+        strips: views shown as pictures, at most.
+        first: what earlier files have from this iteration on is void.
+    """
+
+    def __init__(self, folder: Path, test: PosedImages, strips: int, first: int = 0) -> None:
+        self.folder, self._test, self._shown, self._first = folder, test, min(strips, len(test)), first
+        self._writer: SummaryWriter | None = None
+
+    @classmethod
+    def of_run(cls, session: RunSession) -> EventWriter:
+        """Of a run, new or resumed: the history of a resumed run is that up to its checkpoint."""
+        first = session.trainer.iteration + 1 if session.resumed else 0
+        return cls(session.folder.tensorboard, session.test, session.trainer.config.report.strips, first)
+
+    def evaluated(self, loop: TrainingLoop, evaluation: Evaluation) -> None:
+        iteration = evaluation.iteration
+        if self._writer is None:
+            self._writer = _writer_class()(str(self.folder), purge_step=self._first)
+            if not self._first:
+                settings = loop.trainer.config.to_yaml()
+                self._writer.add_text("configuration", f"```yaml\n{settings}\n```", iteration)
+        for name, value in asdict(evaluation).items():
+            if name != "iteration" and not math.isnan(value):
+                self._writer.add_scalar(f"{GROUPS.get(name, 'test')}/{name}", value, iteration)
+        for view in range(self._shown):
+            pixels = self._strip(loop, view)
+            self._writer.add_image(f"test views/{self._test.names[view]}", pixels, iteration, dataformats="HWC")
+        self._writer.flush()
+        if loop.finished:
+            self.close()
+
+    def close(self) -> None:
+        """End the files, and the thread that writes them."""
+        if self._writer is not None:
+            self._writer.close()
+            self._writer = None
+
+    def _strip(self, loop: TrainingLoop, view: int) -> np.ndarray:
+        """[H, W, 3] uint8, at most `WIDEST_STRIP` wide: photo, render and error of a test view."""
+        trainer, background = loop.trainer, loop.trainer.background.evaluated
+        views = replace(self._test, cameras=self._test.cameras.to(trainer.device))
+        image = render_view(
+            trainer.gaussians, views, view, trainer.sh_degree, trainer.config.raster, background
+        )  # [H, W, 3]
+        photo = views.photos.image(view, background).to(trainer.device)
+        picture = Image.fromarray(strip(photo, image, views.mask(view)))
+        picture.thumbnail((WIDEST_STRIP, WIDEST_STRIP), Image.Resampling.LANCZOS)
+        return np.asarray(picture)
+
+
+def _writer_class() -> type[SummaryWriter]:
+    try:
+        from torch.utils.tensorboard import SummaryWriter
+    except ImportError as error:
+        raise InputError(f"report.tensorboard needs the package tensorboard: {INSTALL}") from error
+    return SummaryWriter
