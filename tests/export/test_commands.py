@@ -11,8 +11,10 @@ import torch
 from turbogs_plugin.engine.rendering import render_image
 from turbogs_plugin.export import film
 from turbogs_plugin.export.contribution import contributions, pruned
+from turbogs_plugin.export.fidelity import Fidelity
 from turbogs_plugin.export.formats import FORMATS
 from turbogs_plugin.model.ply import load_ply
+from turbogs_plugin.train.evaluate import psnr, render_view
 
 
 def refused(result: tuple[int, str, str], *words: object) -> None:
@@ -26,9 +28,41 @@ def test_an_export_says_bytes_and_what_was_lost(turbogs, finished, tmp_path, nam
     file = tmp_path / f"m{FORMATS[name].suffix}"
     code, out, err = turbogs("export", finished, "--format", name, "--out", file)
     assert code == 0, err
-    assert f"{file.stat().st_size:,} bytes" in out
-    before, after = map(float, re.search(r"PSNR ([\d.]+) -> ([\d.]+) dB on 1 of 1 test views", out).groups())
-    assert abs(before - after) < (0.005 if name in ("ply", "pt") else 1.0)
+    model = load_ply(finished / "model.ply")
+    held = sum(4 * value.numel() for _, value in model.items())
+    assert f"{held:,} bytes in float32 -> {file.stat().st_size:,} bytes in the file" in out
+    number = r"(?:less than )?([\d.]+) dB (lost|won)"
+    found = re.search(rf"PSNR ([\d.]+) -> ([\d.]+) dB on 1 of 1 test views: {number}; most in (\S+): {number}", out)
+    before, after, loss, said, view, worst, worst_said = found.groups()
+    signed = float(loss) if said == "lost" else -float(loss)
+    assert abs(float(before) - float(after) - signed) < 0.0021 and abs(signed) < (0.005 if name in ("ply", "pt") else 1)
+    assert (view, worst, worst_said) == ("view_000.png", loss, said) and "nothing" not in out
+
+
+def test_nothing_is_lost_only_where_all_numbers_are_equal(model, scene):
+    fidelity = Fidelity(model.gaussians, scene.test, model.sh_degree, model.config.raster)
+    same = model.gaussians.map(torch.clone)
+    assert fidelity.change(same).text().endswith(": nothing lost, all numbers are equal")
+    same.means[0, 0] += 1e-6
+    moved = fidelity.change(same)
+    assert not moved.equal and "nothing" not in moved.text() and "less than 0.001 dB" in moved.text()
+    none = fidelity.change(same.map(lambda value: value[:0]))
+    assert "no Gaussian is left" in none.text() and "nan" not in none.text()
+
+
+def test_the_view_that_lost_most_is_named(model, scene):
+    views, raster = scene.train, model.config.raster
+    fidelity = Fidelity(model.gaussians, views, model.sh_degree, raster)
+    kept = model.gaussians.map(lambda value: value[::2])
+    change = fidelity.change(kept)
+    before, after = (
+        [psnr(render_view(part, views, view, model.sh_degree, raster), views.photos.image(view)) for view in range(7)]
+        for part in (model.gaussians, kept)
+    )
+    losses = np.array(before) - np.array(after)
+    assert change.worst_view == views.names[int(losses.argmax())] and change.worst_loss == pytest.approx(losses.max())
+    assert change.before - change.after == pytest.approx(losses.mean()) and change.worst_loss > losses.mean() + 0.01
+    assert f"most in {change.worst_view}: {losses.max():.3f} dB lost" in change.text()
 
 
 def test_a_run_whose_capture_is_gone_is_exported_unmeasured(turbogs, finished, capture, tmp_path):

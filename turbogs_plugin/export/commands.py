@@ -59,7 +59,7 @@ def export_run(
         return _export_page(model, kept, scene, out, notes)
     target = model.folder.model.with_suffix(FORMATS[file_format].suffix) if out is None else out
     read = written_and_read(file_format, kept, target, model.frame, model.iteration or 0)
-    lines = [f"{target}{notes}", f"file   {target.stat().st_size:,} bytes, {len(read)} of {len(whole)} Gaussians"]
+    lines = [f"{target}{notes}", _size(target.stat().st_size, len(read), whole)]
     if scene is None:
         return "\n".join([*lines, f"PSNR   not measured: {absent}"])
     if not len(scene.test):
@@ -93,8 +93,14 @@ def _export_page(model: SavedModel, kept: Gaussians, scene: Scene, out: Path | N
         raise InputError("--format html shows test views, and the capture has none")
     target = model.folder.path / "report.html" if out is None else out
     written = write_page(model, kept, scene, target)
-    size = f"file   {written.bytes:,} bytes, {written.gaussians} of {len(model.gaussians)} Gaussians"
+    size = _size(written.bytes, written.gaussians, model.gaussians)
     return f"{target}{notes}\n{size}\n{written.change.text()}"
+
+
+def _size(written: int, count: int, whole: Gaussians) -> str:
+    """Bytes and Gaussians before and after."""
+    held = sum(value.numel() * 4 for _, value in whole.items())
+    return f"size   {held:,} bytes in float32 -> {written:,} bytes in the file, {count} of {len(whole)} Gaussians"
 
 
 def _opened(

@@ -20,22 +20,37 @@ MOST_VIEWS = 8
 
 @dataclass(frozen=True)
 class Change:
-    """Mean PSNR in dB on test views, of the model and of what became of it.
+    """PSNR in dB on test views, of the model and of what became of it.
 
     Args:
-        before, after: in dB.
+        before, after: means; `after` is NaN where no Gaussian is left.
         views, of: how many were measured, of how many.
+        worst_view, worst_loss: name of the measured view that lost most, and how much it lost.
+        equal: whether every number of the model is as it was.
     """
 
     before: float
     after: float
     views: int
     of: int
+    worst_view: str = ""
+    worst_loss: float = 0.0
+    equal: bool = False
 
     def text(self) -> str:
-        loss = self.before - self.after
-        change = "nothing lost" if abs(loss) < 0.005 else f"{loss:.2f} dB lost" if loss > 0 else f"{-loss:.2f} dB won"
-        return f"PSNR {self.before:.2f} -> {self.after:.2f} dB on {self.views} of {self.of} test views: {change}"
+        measured = f"on {self.views} of {self.of} test views"
+        if math.isnan(self.after):
+            return f"PSNR {self.before:.3f} dB before {measured}, and none after: no Gaussian is left"
+        change = f"{_lost(self.before - self.after)}; most in {self.worst_view}: {_lost(self.worst_loss)}"
+        if self.equal:
+            change = "nothing lost, all numbers are equal"
+        return f"PSNR {self.before:.3f} -> {self.after:.3f} dB {measured}: {change}"
+
+
+def _lost(loss: float) -> str:
+    if abs(loss) < 0.0005:
+        return "less than 0.001 dB lost" if loss >= 0 else "less than 0.001 dB won"
+    return f"{loss:.3f} dB lost" if loss > 0 else f"{-loss:.3f} dB won"
 
 
 class Fidelity:
@@ -47,6 +62,10 @@ class Fidelity:
         sh_degree: of the bands in use.
         settings: of rendering.
 
+    Attributes:
+        view_ids: those that are measured.
+        before: mean PSNR in dB of the model.
+
     Raises:
         ValueError: there are no test views.
     """
@@ -57,11 +76,12 @@ class Fidelity:
         self._views, self._device, self._degree, self._settings = views, gaussians.device, sh_degree, settings
         shown = np.linspace(0, len(views) - 1, min(MOST_VIEWS, len(views)))
         self.view_ids = np.unique(shown.round().astype(int)).tolist()
-        self.before = self.psnr(gaussians)
+        self._model, self._before = gaussians, self.psnr(gaussians)
+        self.before = fmean(self._before)
 
-    def psnr(self, gaussians: Gaussians) -> float:
-        """Mean PSNR in dB of a model in the scene's frame, on any device."""
-        return fmean(psnr(self.image(gaussians, view), self.photo(view)) for view in self.view_ids)
+    def psnr(self, gaussians: Gaussians) -> list[float]:
+        """[`view_ids`] PSNR in dB of a model in the scene's frame, on any device."""
+        return [psnr(self.image(gaussians, view), self.photo(view)) for view in self.view_ids]
 
     def image(self, gaussians: Gaussians, view_id: int) -> torch.Tensor:
         """[H, W, 3] float32, 0 .. 1, on the device: a model seen by one of the test cameras."""
@@ -76,5 +96,15 @@ class Fidelity:
 
     def change(self, gaussians: Gaussians) -> Change:
         """What became of the model."""
-        after = self.psnr(gaussians) if len(gaussians) else math.nan
-        return Change(self.before, after, len(self.view_ids), len(self._views))
+        counts = (len(self.view_ids), len(self._views))
+        if not len(gaussians):
+            return Change(self.before, math.nan, *counts)
+        after = self.psnr(gaussians)
+        losses = [before - now for before, now in zip(self._before, after, strict=True)]
+        place = int(np.argmax(losses))
+        worst = (self._views.names[self.view_ids[place]], losses[place])
+        return Change(self.before, fmean(after), *counts, *worst, self._is_equal(gaussians))
+
+    def _is_equal(self, gaussians: Gaussians) -> bool:
+        values = dict(gaussians.items())
+        return all(torch.equal(value, values[name].to(value.device)) for name, value in self._model.items())
