@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from turbogs_plugin.bench.viewer import summarised
 from turbogs_plugin.bench.wall import WallRun
 from turbogs_plugin.report.tables import table
 
@@ -89,3 +90,28 @@ def wall(file: Path = H200 / "wall.json") -> str:
     rows["beside training"] = [run.beside_training for run in runs.values()]
     rows["from decoded photos to the first iteration"] = [run.to_first_iteration for run in runs.values()]
     return table(("s", *runs), [(name, *(f"{value:.2f}" for value in column)) for name, column in rows.items()])
+
+
+def viewer(folder: Path = H200) -> str:
+    """What a viewer costs a training: each ``viewer-CAPTURE.json`` is what `turbogs bench viewer --out` wrote."""
+    lines = []
+    for file in sorted(folder.glob("viewer-*.json")):
+        measured = json.loads(file.read_text())
+        ways = {row.way: row for row in summarised(measured)}
+        alone, client = ways["without"], ways["client"]
+        gaussians = statistics.median(run["gaussians"] for run in measured["runs"])
+        lines.append(
+            (
+                measured["scene"],
+                f"{gaussians / 1e3:.0f}k",
+                f"{statistics.median(alone.rates):.0f}",
+                ways["nobody looks"].change_text(),
+                client.change_text(),
+                f"{client.frame_rate:.1f}",
+                f"{client.width:.0f}",
+            )
+        )
+    if not lines:
+        return "Not measured yet."
+    header = ("capture", "Gaussians", "iterations a second, without", "nobody looks", "a client that moves")
+    return table((*header, "its frames a second", "pixels wide"), lines)

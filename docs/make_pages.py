@@ -36,6 +36,7 @@ PAGES = tuple(
         "docs/plan.md",
         "docs/results/README.md",
         "docs/results/h200/house.md",
+        "docs/viewer.md",
     )
 )
 PICTURE = ROOT / "docs/results/headline.png"
@@ -356,6 +357,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "paper_parts": paper_parts,
     "paper_whole": paper_whole,
     "parts": lambda: changes("parts"),
+    "viewer": machine_tables.viewer,
     "wall": machine_tables.wall,
 }
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from turbogs_plugin.bench.viewer import ViewerRun
 from turbogs_plugin.study.document import to_markdown
 from turbogs_plugin.study.folder import StudyFolder
 from turbogs_plugin.study.grid import load_ablation, variant_config
@@ -105,6 +106,17 @@ def test_what_is_not_measured_yet_says_so_until_it_is(tmp_path, monkeypatch):
 def test_the_headline_has_the_wall_beside_the_training():
     assert make_pages.result(4.12, 32.2, 0.893, 209e3, make_pages.duration(9.54)) == "4.1 / 9.5 s, 32.20 dB, .893, 209k"
     assert make_pages.result(74.0, 30.9, None, None, make_pages.duration(float("nan"))) == "74 / - s, 30.90 dB"
+
+
+def test_what_a_viewer_costs_is_a_row_for_each_capture(tmp_path):
+    assert make_pages.machine_tables.viewer(tmp_path) == "Not measured yet."
+    seconds = {"without": 1.0, "nobody looks": 1.0, "client": 1.25}
+    runs = [ViewerRun(way, 500, value, gaussians=209_400) for way, value in seconds.items()]
+    runs[2].frame_rate, runs[2].width = 24.04, 640
+    text = json.dumps({"scene": "fox", "runs": [vars(run) for run in runs]})
+    (tmp_path / "viewer-fox.json").write_text(text)
+    row = make_pages.machine_tables.viewer(tmp_path).splitlines()[-1]
+    assert row == "| fox | 209k | 500 | +0.0 % [+0.0, +0.0] | -20.0 % [-20.0, -20.0] | 24.0 | 640 |"
 
 
 def test_a_number_changed_by_hand_is_found():

@@ -185,10 +185,16 @@ def test_a_port_in_use_is_named():
 
 
 @pytest.mark.parametrize(
-    ("host", "port"), [("127.0.0.1", -1), ("127.0.0.1", 70000), ("no such host", 8080), ("203.0.113.1", 8080)]
+    ("host", "port", "remedy"),
+    [
+        ("127.0.0.1", -1, "1 to 65535"),
+        ("127.0.0.1", 70000, "1 to 65535"),
+        ("no such host", 8080, "name an address of this machine"),
+        ("203.0.113.1", 8080, "name an address of this machine"),
+    ],
 )
-def test_an_address_that_is_none_is_named(host, port):
-    with pytest.raises(InputError, match=str(port)):
+def test_an_address_that_is_none_is_named(host, port, remedy):
+    with pytest.raises(InputError, match=f"{port}.*{remedy}"):
         require_free(host, port)
 
 

@@ -45,6 +45,7 @@ class ViewerRun:
         frames: that the client received.
         frame_rate: of these, a second; NaN without a client.
         width: of the frame in the middle by width, pixels; 0 without a client.
+        gaussians: at the end.
     """
 
     way: str
@@ -53,11 +54,52 @@ class ViewerRun:
     frames: int = 0
     frame_rate: float = math.nan
     width: int = 0
+    gaussians: int = 0
 
     @property
     def rate(self) -> float:
         """Iterations a second."""
         return self.iterations / self.seconds
+
+
+@dataclass(frozen=True)
+class WaySummary:
+    """All runs of a way.
+
+    Args:
+        way: one of `WAYS`.
+        rates: iterations a second of each run.
+        changes: of each run, beside the run without a viewer of the same repeat: 0.1 is ten percent more iterations a
+            second.
+        frame_rate: median, frames a second; NaN without a client.
+        width: median, pixels; 0 without a client.
+    """
+
+    way: str
+    rates: list[float]
+    changes: list[float]
+    frame_rate: float
+    width: float
+
+    def change_text(self) -> str:
+        """The median, with the least and the most in brackets."""
+        median, least, most = (
+            f"{100 * value:+.1f}" for value in (statistics.median(self.changes), min(self.changes), max(self.changes))
+        )
+        return f"{median} % [{least}, {most}]"
+
+
+def summarised(measured: dict[str, Any]) -> list[WaySummary]:
+    """What `bench_viewer` measured, way by way."""
+    runs = [ViewerRun(**run) for run in measured["runs"]]
+    alone, found = [run.rate for run in runs if run.way == "without"], []
+    for way in WAYS:
+        each = [run for run in runs if run.way == way]
+        rates = [run.rate for run in each]
+        changes = [rate / base - 1 for rate, base in zip(rates, alone, strict=True)]
+        frame_rate, width = (statistics.median(getattr(run, name) for run in each) for name in ("frame_rate", "width"))
+        found.append(WaySummary(way, rates, changes, frame_rate, width))
+    return found
 
 
 def bench_viewer(config: Config, scene: Scene, device: torch.device, repeats: int) -> dict[str, Any]:
@@ -68,33 +110,32 @@ def bench_viewer(config: Config, scene: Scene, device: torch.device, repeats: in
         scene: its photos in host memory.
 
     Returns:
-        ``runs``, in their order, and ``rates``: the median of each way, in iterations a second.
+        ``scene``, its name; ``size`` of the client's page; ``runs``, in their order; and ``rates``: the median of each
+        way, in iterations a second.
     """
     decided = make_plan(config, scene, device).apply(config)
     _train("without", decided, scene, device)  # what happens once in a process, happens here
     runs = [_train(way, decided, scene, device) for _ in range(repeats) for way in WAYS]
     rates = {way: statistics.median(run.rate for run in runs if run.way == way) for way in WAYS}
-    return {"size": SIZE, "runs": [asdict(run) for run in runs], "rates": rates}
+    return {"scene": scene.name, "size": SIZE, "runs": [asdict(run) for run in runs], "rates": rates}
 
 
 def viewer_lines(measured: dict[str, Any]) -> list[str]:
     """One line for each way, side by side with the training alone."""
-    runs, lines = [ViewerRun(**run) for run in measured["runs"]], []
-    alone = measured["rates"]["without"]
-    for way in WAYS:
-        rate, each = measured["rates"][way], [run for run in runs if run.way == way]
-        line = f"{way:<13} {rate:9.2f} iterations a second  {100 * (rate / alone - 1):+6.1f} %"
-        if way == "client":
-            frames = statistics.median(run.frame_rate for run in each)
-            line += f"  {frames:.1f} frames a second, {statistics.median(run.width for run in each):.0f} pixels wide"
-        lines.append(f"{line}  ({', '.join(f'{run.rate:.2f}' for run in each)})")
+    lines = []
+    for row in summarised(measured):
+        line = f"{row.way:<13} {statistics.median(row.rates):9.2f} iterations a second  {row.change_text():>24}"
+        if row.way == "client":
+            line += f"  {row.frame_rate:.1f} frames a second, {row.width:.0f} pixels wide"
+        lines.append(f"{line}  ({', '.join(f'{rate:.2f}' for rate in row.rates)})")
     return lines
 
 
 def _train(way: str, config: Config, scene: Scene, device: torch.device) -> ViewerRun:
     loop, _ = new_loop(config, scene, device)
     if way == "without":
-        return ViewerRun(way, *_timed(loop, []))
+        iterations, seconds = _timed(loop, [])
+        return ViewerRun(way, iterations, seconds, gaussians=len(loop.trainer.gaussians))
     page = Page("127.0.0.1", 0, Controls())
     client = None
     try:
@@ -105,12 +146,14 @@ def _train(way: str, config: Config, scene: Scene, device: torch.device) -> View
     finally:
         page.close()
         said = client.communicate()[0] if client is not None else None
+    gaussians = len(loop.trainer.gaussians)
     if said is None:
-        return ViewerRun(way, iterations, seconds)
+        return ViewerRun(way, iterations, seconds, gaussians=gaussians)
     found = json.loads(said)
     frames = found["frames"]
     rate = (frames - 1) / found["seconds"] if frames > 1 else 0.0
-    return ViewerRun(way, iterations, seconds, frames, rate, int(statistics.median(found["widths"] or [0])))
+    width = int(statistics.median(found["widths"] or [0]))
+    return ViewerRun(way, iterations, seconds, frames, rate, width, gaussians)
 
 
 class _Begin(Listener):

@@ -40,7 +40,10 @@ def read_vertices(path: str | Path) -> np.ndarray:
     # In ASCII a number takes a digit and a separator, though the last separator may be missing.
     wanted = count * (layout.itemsize if binary else 2 * len(layout)) - (not binary)
     if body < wanted or (binary and alone and body > wanted):
-        raise InputError(f"{path} announces {count} vertices, which its {body} bytes after the header do not match")
+        raise InputError(
+            f"{path} announces {count} vertices, which its {body} bytes after the header do not match: it is cut short "
+            "or damaged; copy it again"
+        )
     offset = len(header) + len(separator)
     if binary:
         return np.fromfile(path, dtype=layout, count=count, offset=offset)

@@ -47,7 +47,8 @@ class RunFolder:
     def read_config(self) -> Config:
         """The resolved configuration of the run. Raises `InputError` if this is no run, or part of it is missing."""
         if not self.config.is_file():
-            raise InputError(f"'{self.path}' holds no run: there is no config.yaml")
+            lacks = "config.yaml in it" if self.path.exists() else "such folder"
+            raise InputError(f"'{self.path}' holds no run: there is no {lacks}; give a folder that train --out made")
         return resolve_complete(read_yaml(self.config), str(self.config), decided=True)
 
     def read_asked(self) -> Config:

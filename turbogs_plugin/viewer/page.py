@@ -7,6 +7,7 @@ owns the model (`frames`), encoding in one more thread, which waits for neither.
 from __future__ import annotations
 
 import contextlib
+import errno
 import io
 import math
 import socket
@@ -64,7 +65,13 @@ def require_free(host: str, port: int) -> None:
             probe.bind(address)
     except (OSError, UnicodeError) as error:
         reason = getattr(error, "strerror", None) or error
-        raise InputError(f"the viewer cannot listen at {host}:{port} ({reason}): name another port") from None
+        if getattr(error, "errno", None) == errno.EADDRINUSE:
+            remedy = "name another port (view --port N, train --viewer N)"
+        elif getattr(error, "errno", None) == errno.EACCES:
+            remedy = "name a port above 1023"
+        else:
+            remedy = "name an address of this machine: 127.0.0.1 for itself alone, 0.0.0.0 for the network, too"
+        raise InputError(f"the viewer cannot listen at {host}:{port} ({reason}): {remedy}") from None
 
 
 class Page:
