@@ -32,7 +32,7 @@ from turbogs_plugin.viewer.pictures import Picture, Request, draw
 from turbogs_plugin.viewer.subject import CaptureViews, Subject
 
 FOLDER = Path(__file__).resolve().parent
-WIDTH = 900
+WIDTH = 800
 """Pixels of the render, about as wide as a page shows it."""
 JPEG_QUALITY = 88
 MOST_ITERATIONS = 500

@@ -4,6 +4,7 @@ import base64
 import io
 import re
 import shutil
+from dataclasses import replace
 from html import escape
 
 import numpy as np
@@ -46,6 +47,15 @@ def test_a_model_that_is_too_large_is_pruned_and_the_page_says_so(written, scene
     assert smaller.bytes < made.bytes - 15_000 and smaller.gaussians < made.gaussians
     text = (tmp_path / "a.html").read_text(encoding="utf-8")
     assert f"{smaller.gaussians} of {made.gaussians} Gaussians" in text and escape(smaller.change.text()) in text
+
+
+def test_a_run_stopped_between_evaluations_is_not_summed_up_by_an_older_one(written, scene, tmp_path):
+    _, _, model = written
+    for iteration, said in ((model.iteration, "<td>14</td>"), (11, f"{len(model.gaussians)} Gaussians after 11 iter")):
+        file = tmp_path / f"{iteration}.html"
+        write_page(replace(model, iteration=iteration), model.gaussians, scene, file)
+        summary = file.read_text(encoding="utf-8").partition("<h2>The model</h2>")[0].partition("<h1>")[2]
+        assert said in summary and ("<table" in summary) == (iteration == model.iteration)
 
 
 @pytest.fixture(scope="module")

@@ -134,8 +134,10 @@ def _html(blocks: Sequence[Block]) -> str:
 
 def _summary(model: SavedModel, scene: Scene, fidelity: Fidelity, history: list[Evaluation]) -> str:
     views = f"{len(scene.train)} training views, {len(scene.test)} test views"
-    if not history:
-        return _html([Paragraph(f"{len(model.gaussians)} Gaussians; {views}. PSNR {fidelity.before:.2f} dB.")])
+    if not history or history[-1].iteration != model.iteration:  # a run that was stopped between two evaluations
+        trained = "" if model.iteration is None else f" after {model.iteration} iterations"
+        measured = f"PSNR {fidelity.before:.2f} dB on {len(fidelity.view_ids)} of the test views"
+        return _html([Paragraph(f"{len(model.gaussians)} Gaussians{trained}; {views}. {measured}.")])
     last = history[-1]
     header = ("PSNR in dB", "SSIM", "mean absolute error", "training in s", "iterations", "Gaussians")
     row = (
