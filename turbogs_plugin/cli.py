@@ -57,7 +57,7 @@ def _with_port(arguments: list[str]) -> list[str]:
     filled = []
     for text, following in itertools.zip_longest(arguments, arguments[1:], fillvalue=""):
         filled.append(text)
-        if text == "--viewer" and not following.isdecimal():
+        if text == "--viewer" and not following.lstrip("-").isdecimal():
             filled.append(str(PORT))
     return filled
 
