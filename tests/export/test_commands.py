@@ -32,7 +32,7 @@ def test_an_export_says_bytes_and_what_was_lost(turbogs, finished, tmp_path, nam
     held = sum(4 * value.numel() for _, value in model.items())
     assert f"{held:,} bytes in float32 -> {file.stat().st_size:,} bytes in the file" in out
     number = r"(?:less than )?([\d.]+) dB (lost|won)"
-    found = re.search(rf"PSNR ([\d.]+) -> ([\d.]+) dB on 1 of 1 test views: {number}; most in (\S+): {number}", out)
+    found = re.search(rf"PSNR ([\d.]+) -> ([\d.]+) dB on 1 of 1 test views: {number}; worst in (\S+): {number}", out)
     before, after, loss, said, view, worst, worst_said = found.groups()
     signed = float(loss) if said == "lost" else -float(loss)
     assert abs(float(before) - float(after) - signed) < 0.0021 and abs(signed) < (0.005 if name in ("ply", "pt") else 1)
@@ -62,7 +62,7 @@ def test_the_view_that_lost_most_is_named(model, scene):
     losses = np.array(before) - np.array(after)
     assert change.worst_view == views.names[int(losses.argmax())] and change.worst_loss == pytest.approx(losses.max())
     assert change.before - change.after == pytest.approx(losses.mean()) and change.worst_loss > losses.mean() + 0.01
-    assert f"most in {change.worst_view}: {losses.max():.3f} dB lost" in change.text()
+    assert f"worst in {change.worst_view}: {losses.max():.3f} dB lost" in change.text()
 
 
 def test_a_run_whose_capture_is_gone_is_exported_unmeasured(turbogs, finished, capture, tmp_path):

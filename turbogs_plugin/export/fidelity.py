@@ -41,7 +41,7 @@ class Change:
         measured = f"on {self.views} of {self.of} test views"
         if math.isnan(self.after):
             return f"PSNR {self.before:.3f} dB before {measured}, and none after: no Gaussian is left"
-        change = f"{_lost(self.before - self.after)}; most in {self.worst_view}: {_lost(self.worst_loss)}"
+        change = f"{_lost(self.before - self.after)}; worst in {self.worst_view}: {_lost(self.worst_loss)}"
         if self.equal:
             change = "nothing lost, all numbers are equal"
         return f"PSNR {self.before:.3f} -> {self.after:.3f} dB {measured}: {change}"
