@@ -39,7 +39,15 @@ def test_documents_name_tests_that_are_there():
     assert [(page, path) for page, path in sorted(named) if not (root / path).is_file()] == []
 
 
-ROOMS = ("train.trainer", "train.loop", "train.run", "report.pages", "report.outputs", "export.commands")
+ROOMS = (
+    "train.trainer",
+    "train.loop",
+    "train.run",
+    "report.pages",
+    "report.tensorboard",
+    "report.outputs",
+    "export.commands",
+)
 
 RUN = """
 from pathlib import Path
