@@ -198,6 +198,11 @@ def test_an_address_that_is_none_is_named(host, port, remedy):
         require_free(host, port)
 
 
+def test_a_port_below_zero_is_taken_for_a_port(turbogs, tmp_path, capture):
+    code, out, err = turbogs("train", capture, "--out", tmp_path / "run", "--viewer", -1)
+    assert (code, out, err) == (2, "", "turbogs: error: port -1 of the viewer: it must be 1 to 65535\n")
+
+
 def test_without_viser_one_line_names_the_extra(turbogs, tmp_path, capture, monkeypatch):
     monkeypatch.setitem(sys.modules, "viser", None)
     for command in (("view", tmp_path), ("train", capture, "--out", tmp_path / "run", "--viewer")):
