@@ -101,7 +101,7 @@ def load_scene(
         factor: photos and intrinsics are reduced by this. Copies in ``images_<factor>`` are used where all are there
             in the right size; otherwise ``images`` are reduced by area averaging.
         test_every: the first of each `test_every` photos in name order is a test view, the others are for training.
-            Captures with a split of their own (NeRF-synthetic) keep it.
+            Captures with a split of their own (NeRF-synthetic, lists in a ``transforms.json``) keep it.
         progress: called with the number of photos decoded so far, and of all.
 
     Raises:
