@@ -1,4 +1,4 @@
-"""A split by name: the lists ``train_filenames``, ``val_filenames``, ``test_filenames`` of nerfstudio's transforms.json."""
+"""A split by name: the lists ``train_filenames``, ``val_filenames`` and ``test_filenames`` of a transforms.json."""
 
 from __future__ import annotations
 
