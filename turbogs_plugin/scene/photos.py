@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
 from torch import Tensor
 
 from turbogs_plugin.errors import InputError
@@ -267,4 +267,6 @@ def opened_image(path: Path, what: str = "photo") -> Iterator[Image.Image]:
         raise
     except Exception as error:  # a broken file can raise anything in its decoder
         reason = " ".join((str(error) or type(error).__name__).split())
-        raise InputError(f"cannot read the {what} {path}: {reason}") from error
+        if isinstance(error, UnidentifiedImageError):
+            reason = "it is no image of a known kind" if path.stat().st_size else "the file is empty"
+        raise InputError(f"cannot read the {what} {path}: {reason}; copy it there again") from error

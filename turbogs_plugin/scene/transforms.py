@@ -226,7 +226,10 @@ def _intrinsics(values: dict, photo: Path, source: Path) -> tuple[np.ndarray, tu
 
     focal_x = focal_length("x", width, None)
     if focal_x is None:
-        raise InputError(f"{source}: the camera of {photo.name} has neither fl_x nor a camera_angle_x in 0 .. pi")
+        raise InputError(
+            f"{source}: the camera of {photo.name} has neither fl_x nor a camera_angle_x in 0 .. pi: write one of them "
+            "there (pixels, radians), or find the cameras anew by 'turbogs reconstruct' on a folder of the photos alone"
+        )
     focal_y = focal_length("y", height, focal_x)
     intrinsics = np.array(
         [[focal_x, 0.0, number("cx", 0.5 * width)], [0.0, focal_y, number("cy", 0.5 * height)], [0.0, 0.0, 1.0]]
@@ -241,7 +244,7 @@ def _viewmat(frame: dict, name: str, source: Path) -> np.ndarray:
     except (ValueError, TypeError, OverflowError):
         pose = np.empty(0)
     if pose.shape not in ((3, 4), (4, 4)) or not np.isfinite(pose).all():
-        raise InputError(f"{source}: frame '{name}' has no transform_matrix of 4x4 finite numbers")
+        raise InputError(f"{source}: frame '{name}' has no transform_matrix of 4x4 finite numbers: export it again")
     try:
         return viewmat_of_pose(pose[:3, :3] * [1.0, -1.0, -1.0], pose[:3, 3])
     except ValueError as error:
