@@ -33,6 +33,10 @@ ONE_SIDED_DEGREE = 1
 memory."""
 DEVICE_SHARE = 0.5
 """Share of the device's memory that photos and maps may take: the rest is for the model, its optimizer, workspaces."""
+ITERATION_MS = (1.3, 3.4)
+"""A whole iteration on an H200: 150 thousand Gaussians and 3 views of a megapixel; 600 thousand and 10 views."""
+LONG_RUN = 20_000
+"""Iterations from which on the plan says how long that is, as nobody would expect it."""
 SHORTEST_SHARE = 0.4
 """Least share of `train.base_iterations`: with fewer iterations, however few the photos, the events of density control
 would be too close together. fox has 52 % of them with 60 epochs."""
@@ -181,6 +185,9 @@ def wanted_iterations(facts: SceneFacts, config: Config) -> Verdict:
     reason += f", {factor} times the pixels an iteration" if factor > 1 else ""
     if wanted < fewest:
         reason += f" take fewer than {SHORTEST_SHARE:.0%} of {train.base_iterations}"
+    if wanted >= LONG_RUN:
+        least, most = (wanted * milliseconds / 60_000 for milliseconds in ITERATION_MS)
+        reason += f": {least:.1f} to {most:.1f} min on an H200; --time-budget takes less"
     return Verdict(math.ceil(max(wanted, fewest) / 100) * 100, reason)
 
 
