@@ -1,10 +1,12 @@
 """The command line: bad input is one line on stderr, exit code 2, and nothing written."""
 
+import gc
 import os
 import re
 import shutil
 import subprocess
 import sys
+import threading
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -18,6 +20,7 @@ from PIL import Image
 from turbogs_plugin import scene
 from turbogs_plugin.engine.rendering import render_image
 from turbogs_plugin.model.ply import load_ply
+from turbogs_plugin.report import pages
 from turbogs_plugin.report.outputs import distinct_stems
 from turbogs_plugin.train import run, start
 from turbogs_plugin.train.trainer import Trainer
@@ -361,6 +364,22 @@ def test_doctor(turbogs):
     assert code == 0
     for word in ("torch", "gsplat", "Python", "GPU", "kernels", "nvcc"):
         assert word in out
+
+
+@pytest.mark.parametrize(("option", "loads"), [("--report", 1), ("--no-report", 0)])
+def test_plots_are_loaded_beside_the_photos_if_there_is_a_report(
+    turbogs, capture, tmp_path, monkeypatch, option, loads
+):
+    loading, load = threading.Barrier(2, timeout=60), pages.load_plots
+    threads = []
+    monkeypatch.setattr(pages, "load_plots", lambda: (loading.wait(), threads.append(threading.get_ident()), load()))
+    read = run.load_scene
+    monkeypatch.setattr(run, "load_scene", lambda *arguments: (loads and loading.wait(), read(*arguments))[1])
+    options = ("--device", "cpu", *QUICK)
+    code, _, err = turbogs("train", capture, "--out", tmp_path / "run", option, *options)
+    assert code == 0, err
+    assert len(threads) == loads and threading.get_ident() not in threads
+    assert gc.isenabled() and (tmp_path / "run/report/psnr.png").is_file() == bool(loads)
 
 
 def test_ctrl_c_saves_and_says_how_to_go_on(turbogs, capture, tmp_path, monkeypatch):

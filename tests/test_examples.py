@@ -64,6 +64,7 @@ def test_every_script_is_run_here():
         "baselines",
         "gsplat_host",
         "undistort_with_colmap",
+        "many_photos",
     }
 
 
@@ -248,3 +249,25 @@ def test_fox_undistorted_by_colmap_is_the_capture_that_loading_makes(example, tm
         shutil.copy(photo, folder / "images")
     example("undistort_with_colmap").main(folder, tmp_path / "plain")
     require_same_capture(load_scene(folder), load_scene(tmp_path / "plain"))
+
+
+def test_many_photos_are_a_capture_that_trains(example, tmp_path):
+    """The points lie in the photos where the cameras see them, whichever way the flight goes; and a run begins."""
+    example("many_photos").write_flight(tmp_path / "flight", 60, 64, 48)
+    scene = load_scene(tmp_path / "flight")
+    assert (len(scene.train), len(scene.test)) == (52, 8) and len(scene.points) > 300
+    cameras, photos = scene.train.cameras, scene.train.photos
+    differences = []
+    for view in range(len(scene.train)):
+        seen = scene.points @ cameras.viewmats[view, :3, :3].T + cameras.viewmats[view, :3, 3]
+        pixels = (seen @ cameras.Ks[view].T)[:, :2] / seen[:, 2:]
+        inside = ((pixels > 0) & (pixels < torch.tensor([64.0, 48.0])) & (seen[:, 2:] > 0)).all(dim=1)
+        x, y = pixels[inside].long().T
+        found = photos.image(view)[y, x] * 255.0 - scene.point_colors[inside]
+        differences.append(found.abs().mean(dim=1))
+    assert torch.cat(differences).median() < 20.0 and len(torch.cat(differences)) > 500
+    axes = cameras.viewmats[:, 0, 0]
+    assert (axes > 0.5).sum() > 15 and (axes < -0.5).sum() > 15
+    config = load_config("turbogs", ["train.device=cpu", "train.iterations=1", "train.sh_degree=0"])
+    config.scene.path = str(tmp_path / "flight")
+    assert run.train(config, tmp_path / "run").history[-1].iteration == 1

@@ -10,7 +10,7 @@ from importlib.metadata import PackageNotFoundError, version
 import torch
 from packaging.requirements import Requirement
 
-from turbogs_plugin.report.machine import hardware, software
+from turbogs_plugin.report.machine import hardware, missing_bytecode, software
 from turbogs_plugin.train.evaluate import LPIPS_PACKAGES
 from turbogs_plugin.train.flip import load_flip
 from turbogs_plugin.viewer.page import INSTALL as INSTALL_VIEWER
@@ -38,6 +38,8 @@ def diagnosis() -> str:
         missing.append("CUDA in PyTorch: training runs on the CPU, by the torch reference")
     elif not torch.cuda.is_available():
         missing.append("a GPU that answers: training runs on the CPU, by the torch reference")
+    if reason := missing_bytecode():
+        missing.append(reason)
     absent = [name for name in LPIPS_PACKAGES if importlib.util.find_spec(name) is None]
     missing += [f"{name}: LPIPS is not computed" for name in absent]
     if reason := load_flip()[1]:

@@ -145,7 +145,13 @@ def one(folder) -> str:
 def of_a_phone(folder) -> str:
     folder.mkdir()
     (folder / "IMG_1.HEIC").write_bytes(b"x")
-    return "IMG_1.HEIC are not read: convert them to JPEG"
+    return r"has no photos \(1 file is of a kind that is not read \(IMG_1.HEIC\): convert to JPEG\): at least 3"
+
+
+def videos(folder) -> str:
+    (folder / "images").mkdir(parents=True)
+    (folder / "images" / "walk.MOV").write_bytes(b"x")
+    return r"has no photos \(walk.MOV is a video: take photos out of it, as by  ffmpeg .*\): at least 3"
 
 
 def truncated(folder) -> str:
@@ -167,8 +173,14 @@ def of_one_name(folder) -> str:
     return "2 photos .*'a_b.jpg' without spaces"
 
 
-@pytest.mark.parametrize("case", [no_folder, nothing, one, of_a_phone, truncated, of_16_bits, of_one_name])
+@pytest.mark.parametrize("case", [no_folder, nothing, one, of_a_phone, videos, truncated, of_16_bits, of_one_name])
 def test_unusable_photos_are_refused(case, tmp_path):
     with pytest.raises(InputError, match=case(tmp_path / "photos")) as refused:
         read_photos(tmp_path / "photos")
     assert "\n" not in str(refused.value)
+
+
+def test_a_video_in_the_place_of_a_folder_is_named(tmp_path):
+    (tmp_path / "walk.mp4").write_bytes(b"x")
+    with pytest.raises(InputError, match=r"walk.mp4; walk.mp4 is a video: take photos out of it, as by  ffmpeg"):
+        read_photos(tmp_path / "walk.mp4")

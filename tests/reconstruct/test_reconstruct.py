@@ -127,7 +127,13 @@ def of_different_things(folder: Path) -> str:
     return "no cameras were found for 4 photos: of 6 pairs of photos 0 match; take photos that overlap"
 
 
-@pytest.mark.parametrize("case", [blank, of_different_things])
+def copies_of_one(folder: Path) -> str:
+    for number in range(4):
+        render_corner(camera_centers(COUNT)[3]).save(folder / f"{number}.jpg", quality=95)
+    return "no cameras were found for 4 photos: 6 of 6 pairs match, but they show no depth, .*move between the photos"
+
+
+@pytest.mark.parametrize("case", [blank, of_different_things, copies_of_one])
 def test_photos_that_cannot_be_solved_end_in_one_line_and_leave_nothing(case, tmp_path):
     photos = tmp_path / "photos"
     photos.mkdir()
@@ -326,6 +332,36 @@ def test_the_command_refuses_in_one_line(tmp_path, turbogs):
     code, out, err = turbogs("reconstruct", tmp_path / "photos", "--out", tmp_path / "scene")
     assert (code, out) == (2, "") and err.count("\n") == 1 and "has 1 photo: at least 3 are needed" in err
     assert [path.name for path in tmp_path.iterdir()] == ["photos"]
+
+
+@pytest.mark.parametrize("verb", ["train", "plan"])
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("few/a.jpg", "has 1 photo"),
+        ("phone/IMG_1.HEIC", "nor photos; 1 file is of a kind that is not read (IMG_1.HEIC): convert to JPEG"),
+        ("films/walk.mp4", "nor photos; walk.mp4 is a video: take photos out of it"),
+        ("walk.mp4", "no such scene: walk.mp4 is a video"),
+    ],
+)
+def test_what_is_no_capture_is_refused_in_one_line(tmp_path, turbogs, verb, name, message):
+    place = tmp_path / "captures"
+    (place / name).parent.mkdir(parents=True)
+    Image.new("RGB", (64, 48)).save(place / name, format="JPEG")
+    scene = place / name.partition("/")[0]
+    out = ("--out", tmp_path / "runs" / "run") if verb == "train" else ()
+    code, printed, err = turbogs(verb, scene, "--device", "cpu", *out)
+    assert (code, printed) == (2, "") and err.count("\n") == 1 and message in err
+    assert [path.name for path in tmp_path.iterdir()] == ["captures"]
+
+
+def test_photos_that_are_not_read_are_noted(solved, tmp_path, monkeypatch):
+    photos = Path(shutil.copytree(solved[0].parent, tmp_path / "photos"))
+    (photos / "images" / "IMG_1.HEIC").write_bytes(b"x")
+    monkeypatch.setattr(run, "_reconstruct", lambda found, workspace, others: others)
+    assert (
+        reconstruct(photos, tmp_path / "scene") == "1 file is of a kind that is not read (IMG_1.HEIC): convert to JPEG"
+    )
 
 
 def test_a_reconstruction_in_parts_is_not_taken_for_photos_alone(solved, tmp_path):

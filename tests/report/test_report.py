@@ -3,6 +3,8 @@
 import json
 import math
 import subprocess
+import sys
+from pathlib import Path
 from types import SimpleNamespace
 
 import matplotlib
@@ -14,12 +16,12 @@ from PIL import Image
 
 from turbogs_plugin.device import peak_memory_bytes
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.report import provenance
+from turbogs_plugin.report import machine, provenance
 from turbogs_plugin.report.pages import write_report
 from turbogs_plugin.report.pictures import ERROR_FULL_SCALE, GAP, depth_picture, error_picture, picture_writer, strip
 from turbogs_plugin.report.plots import plot_against_seconds
 from turbogs_plugin.report.tables import number, table
-from turbogs_plugin.train import run
+from turbogs_plugin.train import evaluate, run
 from turbogs_plugin.train.evaluate import Metrics, ViewMetrics, compare, load_lpips, psnr
 from turbogs_plugin.train.history import Evaluation, append_evaluation, read_history, rewind_history
 from turbogs_plugin.train.progress import TrainingProgress, describe_nonfinite
@@ -127,6 +129,39 @@ def test_lpips_says_why_it_is_missing(tmp_path, monkeypatch):
     assert function is None and reason
     with pytest.raises(InputError, match="no such file"):
         load_lpips(str(tmp_path / "absent.pth"), torch.device("cpu"))
+
+
+def test_lpips_is_loaded_once_a_process(tmp_path, monkeypatch):
+    """Before training, to try the file, and for the report."""
+    made = []
+
+    class Network(torch.nn.Module):
+        def __init__(self, **_) -> None:
+            super().__init__()
+            made.append(torch.hub.get_dir())
+
+        def forward(self, image: torch.Tensor, photo: torch.Tensor) -> torch.Tensor:
+            return (image - photo).abs().mean()
+
+    module = SimpleNamespace(LearnedPerceptualImagePatchSimilarity=Network)
+    monkeypatch.setitem(sys.modules, "torchmetrics.image.lpip", module)
+    monkeypatch.setattr(evaluate, "LPIPS_PACKAGES", ())
+    evaluate._lpips_network.cache_clear()
+    (tmp_path / "w.pth").touch()
+    cache = torch.hub.get_dir()
+    for _ in range(2):
+        function, reason = load_lpips(str(tmp_path / "w.pth"), torch.device("cpu"))
+        assert reason == "" and function(torch.ones(4, 5, 3), torch.zeros(4, 5, 3)) == 1.0
+    assert len(made) == 1 and made[0] != cache == torch.hub.get_dir()
+    evaluate._lpips_network.cache_clear()
+
+
+def test_bytecode_that_is_missing_is_named_with_its_remedy(tmp_path, monkeypatch):
+    place = tmp_path / "torch.pyc"
+    monkeypatch.setattr(machine.importlib.util, "cache_from_source", lambda _: str(place))
+    assert f"-m compileall -q -j 0 {Path(torch.__file__).parents[1]}" in machine.missing_bytecode()
+    place.touch()
+    assert machine.missing_bytecode() == ""
 
 
 def test_memory_is_that_of_this_process():

@@ -221,3 +221,67 @@ def test_real_capture_as_published():
     assert (len(scene.train), len(scene.test)) == (43, 7)
     assert "17 of 67 frames are left out" in scene.notes[1]
     assert scene.notes[2].startswith("50 photos undistorted: OPENCV 1080x1920 -> PINHOLE 10")
+
+
+def listed(*views: int) -> list[str]:
+    return [f"./images/f{view}.png" for view in views]
+
+
+@pytest.mark.parametrize(
+    ("lists", "train", "test", "said"),
+    [
+        ({"train": (0, 1, 2, 3), "val": (4, 5), "test": (6, 7)}, "0123", "67", "6 photos, its own split, 4 training"),
+        ({"train": (0, 1, 2, 3), "val": (4, 5)}, "0123", "45", "2 test photos (val_filenames), 3 others not used"),
+        ({"train": (0, 1, 2, 3), "val": (4, 5), "test": ()}, "0123", "45", "(val_filenames), 3 others"),
+        ({"train": (8, 1, 2)}, "128", "034567", "6 test photos (in no train_filenames), "),
+        ({"test": (8,)}, "01234567", "8", "8 training and 1 test photos (test_filenames), "),
+        ({"test": (8,), "val": (7,)}, "0123456", "8", "1 test photos (test_filenames), 1 others not used"),
+        ({"train": (0, 1, 2), "val": (3, 4), "test": (3, 4)}, "012", "34", "4 others not used"),
+    ],
+)
+def test_lists_of_file_names_are_the_split(tmp_path, lists, train, test, said):
+    """As nerfstudio reads them; photos in neither part are not even looked for."""
+    content = {f"{part}_filenames": listed(*views) for part, views in lists.items()}
+    folder = write_transforms(tmp_path / "cup", **content)
+    for view in set(range(9)) - {int(view) for view in train + test}:
+        (folder / "images" / f"f{view}.png").unlink()
+    scene = load_scene(folder, test_every=2)
+    assert scene.train.names == tuple(f"f{view}.png" for view in train)
+    assert scene.test.names == tuple(f"f{view}.png" for view in test)
+    assert said in scene.notes[0]
+
+
+def test_names_of_a_split_are_those_of_frames_without_suffix_too(tmp_path):
+    folder = write_transforms(tmp_path / "cup", test_filenames=["images/f3", "images/f5.png"])
+    edit(folder, lambda content: [frame.update(file_path=frame["file_path"][:-4]) for frame in content["frames"]])
+    assert load_scene(folder).test.names == ("f3.png", "f5.png")
+
+
+def test_random_points_are_about_what_the_training_cameras_see(tmp_path):
+    scene = load_scene(write_transforms(tmp_path / "cup", train_filenames=listed(0, 1, 2, 3, 4)))
+    alone = random_points(np.linalg.inv([camera_to_world(0.5 * view) @ np.diag([1, -1, -1, 1]) for view in range(5)]))
+    np.testing.assert_allclose(scene.frame.restore_points(scene.points.numpy()), alone, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ({"test_filenames": ["images/f3.png", "images/g.png", "h.png"]}, "names 'images/g.png' and 1 more, which no"),
+        ({"test_filenames": ["images/f3.png", "../f1.png"]}, "leaves the photo folder"),
+        ({"val_filenames": "images/f3.png"}, "val_filenames is no list of file names"),
+        ({"train_filenames": [1]}, "train_filenames is no list of file names"),
+        ({"train_filenames": [], "test_filenames": []}, "train_filenames and test_filenames are empty"),
+        ({"train_filenames": [], "test_filenames": listed(1)}, "leave no photo to train on"),
+        ({"train_filenames": listed(*range(9))}, "leave no photo to test on"),
+        ({"train_filenames": listed(1, 2, 3), "test_filenames": listed(3, 4)}, r"1 photos are in .* \(images/f3.png\)"),
+        ({"train_filenames": listed(1, 2), "test_filenames": listed(3, 4)}, "2 training images: at least 3"),
+        ({"test_filenames": listed(0)}, "none of its 1 test photos is in"),
+    ],
+)
+def test_a_split_that_cannot_be_is_one_line(tmp_path, content, message):
+    folder = write_transforms(tmp_path / "cup", **content)
+    if content == {"test_filenames": listed(0)}:
+        (folder / "images" / "f0.png").unlink()
+    with pytest.raises(InputError, match=message) as error:
+        load_scene(folder)
+    assert "\n" not in str(error.value)

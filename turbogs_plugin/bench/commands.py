@@ -22,6 +22,7 @@ from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.engine import compiled_kernels
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.files import require_writable, write_text_atomically
+from turbogs_plugin.report.machine import missing_bytecode
 from turbogs_plugin.report.provenance import provenance
 from turbogs_plugin.scene import load_scene
 from turbogs_plugin.scene.load import FEWEST_VIEWS
@@ -93,6 +94,8 @@ def run_wall(arguments: Sequence[str], repeats: int, device: torch.device, out: 
     _require_new(out)
     measured = bench_wall(arguments, repeats)
     print("\n".join(wall_lines(measured)))
+    if reason := missing_bytecode():
+        print(f"missing  {reason}")
     if out is not None:
         write_text_atomically(out, json.dumps(_report("wall", measured, device), indent=2) + "\n")
         print(f"json  {out}")

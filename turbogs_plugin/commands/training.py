@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import gc
 import sys
+import threading
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
@@ -59,17 +61,22 @@ def train(
         raise InputError("train needs a SCENE and --out RUN, or --resume RUN")
     if gpus is not None:
         require_positive("--gpus", (gpus,))
+    gc.disable()  # imports make a million objects and nothing to collect
     from turbogs_plugin.distributed.processes import joined, launched, restarted, start
-    from turbogs_plugin.report.pages import write_report
+    from turbogs_plugin.report.pages import load_plots, write_report
     from turbogs_plugin.report.tensorboard import event_writers
     from turbogs_plugin.train import run
 
+    gc.freeze()  # so that later collections pass over them
+    gc.enable()
     settings = run.RunFolder(resume).read_config() if resume else options.settings(scene, overrides)
     device = settings.train.device
     if gpus is not None and gpus > 1 and not launched():
         return start(gpus, sys.argv[1:], device)
     page, watch = write_report if report else None, event_writers(settings)
     with joined(device) as ranks, ExitStack() as pages:
+        if report and ranks.first:
+            threading.Thread(target=load_plots, daemon=True).start()  # while photos are decoded
         if resume is None and restarted() and run.RunFolder(out).config.is_file():
             resume = out
         live = None

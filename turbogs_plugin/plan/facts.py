@@ -9,6 +9,8 @@ import torch
 from torch import Tensor
 
 from turbogs_plugin.error_maps import MAP_BYTES
+from turbogs_plugin.plan.exposures import compare_exposures
+from turbogs_plugin.plan.sight import Sight
 from turbogs_plugin.scene import PosedImages, Scene
 from turbogs_plugin.scene.host_arrays import free_host_bytes
 from turbogs_plugin.scene.photos import PHOTO_BYTES
@@ -20,10 +22,6 @@ FLAT_DEVIATION = 0.01
 TILES_AT_MOST = 6400
 """Tiles examined, over all photos."""
 TILES_PER_PHOTO = 64
-POINTS_AT_MOST = 2000
-"""3D points examined."""
-COMMON_POINTS = 32
-"""Points that two photos must share for their exposures to be compared."""
 LUMINANCE = (0.299, 0.587, 0.114)
 MODEL_BYTES_PER_GAUSSIAN = 3 * 4 * 59
 """59 single-precision numbers at degree 3, with two moments each."""
@@ -41,8 +39,8 @@ class SceneFacts:
         extent: radius of the scene in the capture's own unit.
         baseline: median distance of a training camera to its nearest, over the median depth of the points it sees.
         flat_tiles: share of the photos' 16x16 tiles without texture (`FLAT_DEVIATION`).
-        exposure_spread: in stops (factors of 2 of luminance): median over the training views of the difference to the
-            nearest camera's photo at common points.
+        exposure_spread, exposure_jumps, exposure_views: how far photos differ in brightness and white balance, in stops
+            (`compare_exposures`): all from their mean; each from its neighbours; and of how many photos this is.
         direction_concentration: norm of the mean unit viewing direction of the training cameras; 1: all look the same
             way, 0: all around.
         photo_bytes: of all photos, training and test.
@@ -77,6 +75,8 @@ class SceneFacts:
     time_budget: float | None = None
     transparent: bool = False
     processes: int = 1
+    exposure_jumps: float = 0.0
+    exposure_views: int = 0
 
 
 @torch.no_grad()
@@ -100,7 +100,8 @@ def gather_facts(
     views, sizes = scene.train, scene.train.cameras.sizes
     order = np.argsort(sizes.prod(axis=1), kind="stable")
     pixels, test_pixels = int(sizes.prod(axis=1).sum()), int(scene.test.cameras.sizes.prod(axis=1).sum())
-    sight = _Sight.of(views, scene.points)
+    sight = Sight.of(views, scene.points)
+    exposures = compare_exposures(views, sight)
     host_free = free_host_bytes()
     return SceneFacts(
         scene=scene.name,
@@ -112,7 +113,9 @@ def gather_facts(
         extent=scene.extent * scene.frame.scale,
         baseline=_baseline(views, sight, scene.extent),
         flat_tiles=flat_tile_share(views),
-        exposure_spread=_exposure_spread(views, sight),
+        exposure_spread=exposures.spread,
+        exposure_jumps=exposures.jumps,
+        exposure_views=int(exposures.compared.sum()),
         direction_concentration=float(views.cameras.directions.double().mean(dim=0).norm()),
         photo_bytes=(PHOTO_BYTES + views.photos.transparent) * (pixels + test_pixels),
         map_bytes=MAP_BYTES * pixels,
@@ -152,59 +155,11 @@ def flat_tile_share(views: PosedImages) -> float:
     return float((deviations < FLAT_DEVIATION).float().mean())
 
 
-@dataclass(frozen=True)
-class _Sight:
-    """Where Q of the points are in V photos.
-
-    Args:
-        depths: [V, Q].
-        inside: [V, Q] bool, in front of the camera, within the photo and not masked.
-        flat: [V, Q] int64, flat pixel; 0 where not inside.
-        distances: [V, V] between camera centres, infinite on the diagonal.
-    """
-
-    depths: Tensor
-    inside: Tensor
-    flat: Tensor
-    distances: Tensor
-
-    @classmethod
-    def of(cls, views: PosedImages, points: Tensor) -> _Sight:
-        cameras = views.cameras.to("cpu", torch.float64)
-        chosen = points[:: -(-len(points) // POINTS_AT_MOST)].cpu().double()  # [Q, 3]
-        seen = chosen @ cameras.viewmats[:, :3, :3].transpose(1, 2) + cameras.viewmats[:, None, :3, 3]  # [V, Q, 3]
-        depths = seen[..., 2]
-        pixels = (seen @ cameras.Ks.transpose(1, 2))[..., :2] / depths.clamp(min=1e-9)[..., None]
-        sizes = torch.from_numpy(cameras.sizes)[:, None]  # [V, 1, 2]
-        inside = (depths > 1e-9) & (pixels >= 0).all(dim=-1) & (pixels < sizes).all(dim=-1)
-        x, y = torch.where(inside[..., None], pixels, 0.0).long().unbind(dim=-1)
-        if views.masks is not None:
-            unmasked = [views.masks.image(view)[y[view], x[view]] for view in range(len(views))]
-            inside &= torch.stack(unmasked)
-        flat = torch.from_numpy(views.photos.offsets[:-1])[:, None] + y * sizes[..., 0] + x
-        distances = torch.cdist(cameras.centers, cameras.centers, compute_mode="donot_use_mm_for_euclid_dist")
-        return cls(depths, inside, torch.where(inside, flat, 0), distances.fill_diagonal_(torch.inf))
-
-
-def _baseline(views: PosedImages, sight: _Sight, extent: float) -> float:
+def _baseline(views: PosedImages, sight: Sight, extent: float) -> float:
     if len(views) < 2:
         return 0.0
     depth = sight.depths[sight.inside].median() if sight.inside.any() else torch.tensor(extent)
     return float(sight.distances.amin(dim=1).median() / depth)
-
-
-def _exposure_spread(views: PosedImages, sight: _Sight) -> float:
-    """See `SceneFacts`. Medians over points, so that those hidden from one camera do not matter."""
-    if len(views) < 2:
-        return 0.0
-    colors = views.photos.stored
-    stops = torch.log2(_luminance(colors[sight.flat.to(colors.device)]).cpu() + 1.0 / 255.0)  # [V, Q]
-    differences = []
-    for view, nearest in enumerate(sight.distances.argmin(dim=1).tolist()):
-        common = sight.inside[view] & sight.inside[nearest]
-        if int(common.sum()) >= COMMON_POINTS:
-            differences.append((stops[view, common] - stops[nearest, common]).median().abs())
-    return float(torch.stack(differences).median()) if differences else 0.0
 
 
 def _luminance(colors: Tensor) -> Tensor:

@@ -63,12 +63,16 @@ class Plan:
         host = "" if facts.device == "cpu" else f", {mebibytes(facts.host_free_bytes)} on the host"
         seconds = "" if facts.time_budget is None else f"; {facts.time_budget:g} s to train"
         processes = "" if facts.processes == 1 else f"; {facts.processes} processes"
+        exposures = (
+            f"exposures of {facts.exposure_views} photos {facts.exposure_spread:.2f} stops apart and "
+            f"{facts.exposure_jumps:.2f} from their neighbours'"
+        )
         return (
             f"{facts.scene}: {facts.train_views} + {facts.test_views} views of "
             f"{small if small == large else f'{small} to {large}'} pixels, {facts.points} points; "
             f"extent {facts.extent:.4g}, baselines {facts.baseline:.3f} of depth, view directions concentrated to "
-            f"{facts.direction_concentration:.3f}, {facts.flat_tiles:.1%} of tiles without texture, exposures "
-            f"{facts.exposure_spread:.2f} stops apart; {mebibytes(facts.photo_bytes)} of photos, "
+            f"{facts.direction_concentration:.3f}, {facts.flat_tiles:.1%} of tiles without texture, {exposures}; "
+            f"{mebibytes(facts.photo_bytes)} of photos, "
             f"{mebibytes(facts.map_bytes)} of maps, {mebibytes(facts.model_bytes)} of model at the start; {free}{host}"
             f"{seconds}{processes}"
         )

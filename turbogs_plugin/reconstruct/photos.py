@@ -17,7 +17,7 @@ from PIL import Image, ImageOps
 
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene.load import FEWEST_VIEWS
-from turbogs_plugin.scene.photo_folder import find_photos
+from turbogs_plugin.scene.photo_folder import find_photos, unread
 
 ORIENTATION, MAKE, MODEL, EXIF, GPS = 0x0112, 0x010F, 0x0110, 0x8769, 0x8825
 FOCAL_LENGTH, FOCAL_LENGTH_35MM = 0x920A, 0xA405
@@ -49,21 +49,32 @@ class PhotoFile:
     stamp: tuple[int, int]
 
 
+def list_photos(folder: Path) -> tuple[Path, list[Path]]:
+    """The folder that photos' names are relative to, and the photos in the order of their names.
+
+    Raises:
+        InputError: no folder; fewer than `FEWEST_VIEWS` photos.
+    """
+    reason = unread(folder)
+    if not folder.is_dir():
+        raise InputError(f"no such folder of photos: {folder}{f'; {reason}' if reason else ''}")
+    place, paths, _ = find_photos(folder)
+    if len(paths) < FEWEST_VIEWS:
+        there = "no photos" if not paths else "1 photo" if len(paths) == 1 else f"{len(paths)} photos"
+        raise InputError(
+            f"{place if paths else folder} has {there}{f' ({reason})' if reason else ''}: at least {FEWEST_VIEWS} are "
+            "needed, of one scene from different places"
+        )
+    return place, paths
+
+
 def read_photos(folder: Path) -> list[PhotoFile]:
     """The photos of a folder, in the order of their names. Each is decoded once, coarsely.
 
     Raises:
-        InputError: no folder; fewer than `FEWEST_VIEWS` photos; one that cannot be read (the first in order).
+        InputError: as `list_photos`; or one that cannot be read (the first in order).
     """
-    if not folder.is_dir():
-        raise InputError(f"no such folder of photos: {folder}")
-    place, paths, others = find_photos(folder)
-    if len(paths) < FEWEST_VIEWS:
-        there = "no photos" if not paths else "1 photo" if len(paths) == 1 else f"{len(paths)} photos"
-        unread = f" ({len(others)} files such as {others[0].name} are not read: convert them to JPEG)" if others else ""
-        raise InputError(
-            f"{place} has {there}{unread}: at least {FEWEST_VIEWS} are needed, of one scene from different places"
-        )
+    place, paths = list_photos(folder)
     names = [SEPARATORS.sub("_", path.relative_to(place).as_posix()) for path in paths]
     for name, number in Counter(names).items():
         if number > 1:

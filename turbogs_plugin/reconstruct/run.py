@@ -25,7 +25,7 @@ from turbogs_plugin.reconstruct.photos import PhotoFile, place_photos, read_phot
 from turbogs_plugin.reconstruct.workspace import Solution, Workspace
 from turbogs_plugin.scene.colmap import load_pycolmap
 from turbogs_plugin.scene.load import FEWEST_VIEWS
-from turbogs_plugin.scene.photo_folder import find_photos
+from turbogs_plugin.scene.photo_folder import find_photos, unread
 
 if TYPE_CHECKING:
     import pycolmap
@@ -39,6 +39,8 @@ REPAIRS = 3
 """So many times a solve with ghosts is repeated without the pairs that made them."""
 SMALLEST_SHARE = 0.5
 """A model with a smaller share of the photos is not taken for the scene."""
+MATCHING_SHARE = 0.5
+"""Where so many pairs match and yet no camera is found, it is not for want of overlap."""
 NAMED_AT_MOST = 10
 
 
@@ -99,7 +101,7 @@ def reconstruct(photos: Path, out: Path) -> Solution:
     if solution is not None:
         return solution
     try:
-        return _reconstruct(found, workspace)
+        return _reconstruct(found, workspace, unread(photos))
     except InputError:
         if new:
             shutil.rmtree(missing[-1] if missing else workspace.scratch, ignore_errors=True)
@@ -114,7 +116,8 @@ def scene_beside(photos: Path, run: Path) -> Path:
     return run.absolute().parent / f"{name}-scene"
 
 
-def _reconstruct(photos: Sequence[PhotoFile], workspace: Workspace) -> Solution:
+def _reconstruct(photos: Sequence[PhotoFile], workspace: Workspace, others: str) -> Solution:
+    """`others`: files beside the photos that are not read, for a note."""
     workspace.images.mkdir(exist_ok=True)
     place_photos(photos, workspace.images)
     names = [photo.name for photo in photos]
@@ -147,7 +150,7 @@ def _reconstruct(photos: Sequence[PhotoFile], workspace: Workspace) -> Solution:
         len(registered),
         best.model.num_points3D(),
         left_out,
-        tuple(_notes(photos, matching, verified, best, repaired, left_out)),
+        (*([f"not used: {others}"] if others else []), *_notes(photos, matching, verified, best, repaired, left_out)),
     )
     workspace.finish(best.model, solution)
     return solution
@@ -210,6 +213,11 @@ def _require_solved(solve: Solve | None, photos: int, verified: int, matching: M
     """Raise `InputError`, with the numbers and the remedy, unless the solve has enough of the photos."""
     remedy = "take photos that overlap by two thirds with their neighbours, of one scene, from different places"
     if solve is None:
+        if verified >= MATCHING_SHARE * max(1, len(matching.pairs)) and len(matching.pairs):
+            raise InputError(
+                f"no cameras were found for {photos} photos: {verified:,} of {len(matching.pairs):,} pairs match, but "
+                "they show no depth, as photos from one place or copies of one photo do; move between the photos"
+            )
         asked = f"of {len(matching.pairs):,} pairs of photos " if not matching.similar else "of pairs of photos "
         raise InputError(f"no cameras were found for {photos} photos: {asked}{verified:,} match; {remedy}")
     if solve.placed >= max(FEWEST_VIEWS, SMALLEST_SHARE * photos):

@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from turbogs_plugin.config.configuration import Config
+from turbogs_plugin.reconstruct.photos import list_photos
 from turbogs_plugin.reconstruct.run import reconstruct, scene_beside
 from turbogs_plugin.scene.load import holds_photos_alone
 
@@ -22,6 +23,7 @@ def with_cameras(config: Config, run: Path) -> Config:
     photos = Path(config.scene.path)
     if not holds_photos_alone(photos):
         return config
+    list_photos(photos)  # too few are refused before anything is said
     scene = scene_beside(photos, run)
     print(f"{photos} has photos alone: their cameras are found first, into {scene}", file=sys.stderr, flush=True)
     print("\n".join(reconstruct(photos, scene).notes), file=sys.stderr, flush=True)

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import platform
+import shlex
+import sys
 from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
 
 import torch
 
@@ -41,3 +45,14 @@ def _processor_name() -> str:
     except OSError:
         names = []
     return names[0] if names else platform.processor() or platform.machine()
+
+
+def missing_bytecode() -> str:
+    """What to do where Python has to compile all of torch each time that a command begins; empty where it has not."""
+    if Path(importlib.util.cache_from_source(torch.__file__)).is_file():
+        return ""
+    packages = shlex.quote(str(Path(torch.__file__).parents[1]))
+    return (
+        "bytecode of torch: every command compiles it anew, for seconds; make it once by  "
+        f"{shlex.quote(sys.executable)} -m compileall -q -j 0 {packages}"
+    )

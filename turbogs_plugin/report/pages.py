@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import platform
 from pathlib import Path
 
@@ -55,8 +56,13 @@ def write_report(run: RunSession) -> Path:
     return run.folder.report
 
 
+def load_plots() -> None:
+    """Import what the plots need. It takes half a second, in which a thread may do it beside other work."""
+    importlib.import_module("turbogs_plugin.report.plots")
+
+
 def _plot(run: RunSession, pictures: Path) -> None:
-    from turbogs_plugin.report.plots import plot_against_seconds  # and with it matplotlib, which takes its time
+    from turbogs_plugin.report.plots import plot_against_seconds  # see `load_plots`
 
     for name, label in (("psnr", "test PSNR in dB"), ("l1", "mean absolute error on test views (0 .. 1)")):
         plot_against_seconds(pictures / f"{name}.png", run.history, name, label, run.scene.name)

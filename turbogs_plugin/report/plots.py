@@ -20,6 +20,9 @@ STYLE = {
     "lines.markersize": 5,
 }
 
+MARGINS = {"left": 0.14, "right": 0.97, "bottom": 0.13, "top": 0.92}
+"""Of the axes, as shares of the figure: matplotlib's own layout draws everything once more to find them."""
+
 SECONDS_LABEL = "training time in seconds (evaluation excluded)"
 
 
@@ -34,8 +37,9 @@ def plot_against_seconds(path: Path, history: list[Evaluation], name: str, label
         title: of the plot.
     """
     with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(6.4, 4.0), layout="constrained")
+        figure = Figure(figsize=(6.4, 4.0))
         axes = figure.add_subplot()
+        figure.subplots_adjust(**MARGINS)
         seconds = [evaluation.train_seconds for evaluation in history]
         values = [getattr(evaluation, name) for evaluation in history]
         axes.plot(seconds, values, marker="o", color="#1f5fa8")

@@ -19,7 +19,7 @@ from turbogs_plugin.scene.colmap import MODEL_FOLDERS, find_model, read_colmap
 from turbogs_plugin.scene.frame import Frame
 from turbogs_plugin.scene.host_arrays import file_note
 from turbogs_plugin.scene.mask_files import find_masks, load_masks
-from turbogs_plugin.scene.photo_folder import find_photos
+from turbogs_plugin.scene.photo_folder import find_photos, unread
 from turbogs_plugin.scene.photos import Photos, channels_of, load_photos, photo_array, photo_sizes, reduced_sizes
 from turbogs_plugin.scene.poses import camera_centers
 from turbogs_plugin.scene.starting_points import colors_in_photos
@@ -101,7 +101,7 @@ def load_scene(
         factor: photos and intrinsics are reduced by this. Copies in ``images_<factor>`` are used where all are there
             in the right size; otherwise ``images`` are reduced by area averaging.
         test_every: the first of each `test_every` photos in name order is a test view, the others are for training.
-            Captures with a split of their own (NeRF-synthetic) keep it.
+            Captures with a split of their own (NeRF-synthetic, lists in a ``transforms.json``) keep it.
         progress: called with the number of photos decoded so far, and of all.
 
     Raises:
@@ -223,7 +223,7 @@ def _cameras(scene: Path) -> tuple[tuple[Path, str] | None, list[str]]:
 def _read(scene: Path, factor: int) -> Capture:
     """The capture, of the first kind in the order that `load_scene` states."""
     if not scene.is_dir():
-        raise InputError(f"no such scene: {scene} is not a folder")
+        raise InputError(f"no such scene: {unread(scene) or f'{scene} is not a folder'}")
     model, files = _cameras(scene)
     if model is not None:
         capture = read_colmap(scene, *model)
@@ -250,7 +250,8 @@ def _read_other(scene: Path, files: list[str], factor: int) -> Capture:
         )
     raise InputError(
         f"{scene} has neither a COLMAP reconstruction (cameras, images and points3D as .bin or .txt in sparse/0) nor a "
-        f"{FILE}, a {blender.TRAIN_FILE} or a {llff.FILE}"
+        f"{FILE}, a {blender.TRAIN_FILE} or a {llff.FILE}, nor photos"
+        + (f"; {reason}" if (reason := unread(scene)) else "")
     )
 
 

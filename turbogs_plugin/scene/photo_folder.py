@@ -9,6 +9,8 @@ PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp")
 """Files that are photos: what both pillow and COLMAP read."""
 OTHER_SUFFIXES = (".heic", ".heif", ".webp", ".avif", ".jxl", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".rw2")
 """Photos that at least one of them does not read."""
+VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".insv")
+FRAMES_OF_VIDEO = "ffmpeg -i VIDEO -vf fps=2 -q:v 2 PHOTOS/%05d.jpg"
 NO_PHOTOS = re.compile(r"\..*|images_\d+|masks?", re.IGNORECASE)
 """Folders that hold none: hidden ones, copies reduced by a factor (``images_4``), masks."""
 FOLDER_DEPTH = 1
@@ -30,6 +32,20 @@ def find_photos(folder: Path) -> tuple[Path, list[Path], list[Path]]:
             break
     others = [path for path in files if path.suffix.lower() in OTHER_SUFFIXES]
     return place, sorted(photos, key=lambda path: path.relative_to(place).as_posix()), others
+
+
+def unread(path: Path) -> str:
+    """What to do about photos and videos that are not read: the file `path` itself, or those in a folder; empty where
+    there are none."""
+    files = _files(path, FOLDER_DEPTH) if path.is_dir() else [path] if path.is_file() else []
+    photos = [file for file in files if file.suffix.lower() in OTHER_SUFFIXES]
+    videos = [file for file in files if file.suffix.lower() in VIDEO_SUFFIXES]
+    if photos:
+        which = "1 file is" if len(photos) == 1 else f"{len(photos)} files are"
+        return f"{which} of a kind that is not read ({photos[0].name}): convert to JPEG"
+    if videos:
+        return f"{videos[0].name} is a video: take photos out of it, as by  {FRAMES_OF_VIDEO}"
+    return ""
 
 
 def _files(folder: Path, depth: int) -> list[Path]:

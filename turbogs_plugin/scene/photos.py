@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
 from torch import Tensor
 
 from turbogs_plugin.errors import InputError
@@ -32,6 +32,8 @@ DECODING_BYTES = 24
 """Bytes of a pixel while its photo is decoded, undistorted and reduced: several copies, one of them in float32."""
 MEMORY_SHARE = 0.25
 """Photos that are being decoded may take this share of the free memory, with one thread more if need be."""
+MOST_THREADS = 16
+"""Photos are decoded by a thread a processor, but by no more than this."""
 SMALL_WORK = 2**30
 """Bytes that are not worth a question."""
 
@@ -233,8 +235,9 @@ def load_photos(
 
 
 def decoding_threads(bytes_each: int = 0) -> ThreadPoolExecutor:
-    """As many as there are processors, but no more than `MEMORY_SHARE` of the free memory allows."""
-    wanted = min(8, os.cpu_count() or 1)
+    """As many as there are processors for this process, but no more than `MEMORY_SHARE` of the free memory allows."""
+    processors = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    wanted = min(MOST_THREADS, processors)
     affordable = int(MEMORY_SHARE * free_host_bytes()) // bytes_each if wanted * bytes_each > SMALL_WORK else wanted
     return ThreadPoolExecutor(max(1, min(wanted, affordable)))
 
@@ -264,4 +267,6 @@ def opened_image(path: Path, what: str = "photo") -> Iterator[Image.Image]:
         raise
     except Exception as error:  # a broken file can raise anything in its decoder
         reason = " ".join((str(error) or type(error).__name__).split())
-        raise InputError(f"cannot read the {what} {path}: {reason}") from error
+        if isinstance(error, UnidentifiedImageError):
+            reason = "it is no image of a known kind" if path.stat().st_size else "the file is empty"
+        raise InputError(f"cannot read the {what} {path}: {reason}; copy it there again") from error

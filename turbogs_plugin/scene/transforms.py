@@ -13,6 +13,7 @@ import numpy as np
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene.capture import LARGEST_SIDE, Capture, check_photo_name
 from turbogs_plugin.scene.colmap import load_pycolmap
+from turbogs_plugin.scene.named_split import read_split
 from turbogs_plugin.scene.photos import photo_size
 from turbogs_plugin.scene.ply import read_vertices
 from turbogs_plugin.scene.poses import viewmat_of_pose
@@ -43,8 +44,9 @@ def read_transforms(scene: Path) -> Capture:
     """Read ``scene/transforms.json``.
 
     Intrinsics and distortion may stand in each frame or for all; ``camera_angle_x`` serves where there is no ``fl_x``.
-    Frames whose photo does not exist are left out. A frame's ``mask_path`` is its mask. Points come from
-    ``ply_file_path``; where it is not given or has none, they are drawn by `random_points`.
+    Frames whose photo does not exist are left out. A frame's ``mask_path`` is its mask. Lists of file names are the
+    capture's own split (`read_split`). Points come from ``ply_file_path``; where it is not given or has none, they are
+    drawn by `random_points` about what the training cameras look at.
 
     Raises:
         InputError: a file that is not such JSON, lacks something, or describes no lens; fewer than `FEWEST_PHOTOS`
@@ -56,10 +58,13 @@ def read_transforms(scene: Path) -> Capture:
     masks: dict[str, Path | None] = {}
     absent: list[str] = []
     lenses: dict[tuple, Lens] = {}
-    for frame in frames:
-        name = photo_name(scene, frame.get("file_path"), source)
+    names_of_frames = [photo_name(scene, frame.get("file_path"), source) for frame in frames]
+    split = read_split(content, set(names_of_frames), partial(photo_name, scene, source=source), source)
+    for name, frame in zip(names_of_frames, frames, strict=True):
         if name in views or name in absent:
             raise InputError(f"{source} has two frames for '{name}'")
+        if split is not None and name in split.unused:
+            continue
         if not (scene / name).is_file():
             absent.append(name)
             continue
@@ -79,10 +84,14 @@ def read_transforms(scene: Path) -> Capture:
     else:
         points, colors = np.empty((0, 3)), None
         origin = "no points"
+    test = None if split is None else split.test_views(names)
+    if test is not None and not test.any():
+        raise InputError(f"{source}: none of its {len(split.test)} test photos is in {scene}: bring them back")
     if not len(points):
-        points, colors = random_points(viewmats), None
+        points, colors = random_points(viewmats if test is None or test.all() else viewmats[~test]), None
         origin += f", so {about_cameras(len(points))}"
-    notes = [f"{source} (nerfstudio, instant-ngp): {len(names)} photos, {origin}"]
+    parts = "" if split is None else f", {split.text(names)}"
+    notes = [f"{source} (nerfstudio, instant-ngp): {len(names)} photos{parts}, {origin}"]
     if absent:
         notes.append(f"{len(absent)} of {len(frames)} frames are left out, their photos do not exist: {absent[0]}, ...")
     # Reduced copies lie in images_2, images_4, ... beside images.
@@ -100,6 +109,7 @@ def read_transforms(scene: Path) -> Capture:
         point_colors=colors,
         lenses=lens_of_view,
         notes=tuple(notes),
+        test=test,
         mask_files=tuple(masks[name] for name in names),
     )
     capture.check(source)
@@ -216,7 +226,10 @@ def _intrinsics(values: dict, photo: Path, source: Path) -> tuple[np.ndarray, tu
 
     focal_x = focal_length("x", width, None)
     if focal_x is None:
-        raise InputError(f"{source}: the camera of {photo.name} has neither fl_x nor a camera_angle_x in 0 .. pi")
+        raise InputError(
+            f"{source}: the camera of {photo.name} has neither fl_x nor a camera_angle_x in 0 .. pi: write one of them "
+            "there (pixels, radians), or find the cameras anew by 'turbogs reconstruct' on a folder of the photos alone"
+        )
     focal_y = focal_length("y", height, focal_x)
     intrinsics = np.array(
         [[focal_x, 0.0, number("cx", 0.5 * width)], [0.0, focal_y, number("cy", 0.5 * height)], [0.0, 0.0, 1.0]]
@@ -231,7 +244,7 @@ def _viewmat(frame: dict, name: str, source: Path) -> np.ndarray:
     except (ValueError, TypeError, OverflowError):
         pose = np.empty(0)
     if pose.shape not in ((3, 4), (4, 4)) or not np.isfinite(pose).all():
-        raise InputError(f"{source}: frame '{name}' has no transform_matrix of 4x4 finite numbers")
+        raise InputError(f"{source}: frame '{name}' has no transform_matrix of 4x4 finite numbers: export it again")
     try:
         return viewmat_of_pose(pose[:3, :3] * [1.0, -1.0, -1.0], pose[:3, 3])
     except ValueError as error:

@@ -13,6 +13,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import astuple, dataclass
+from functools import lru_cache
 from pathlib import Path
 
 import torch
@@ -211,17 +212,23 @@ def load_lpips(weights: str | None, device: torch.device) -> tuple[Lpips | None,
 
 
 def _load_lpips(file: Path, device: torch.device) -> Lpips:
+    network = _lpips_network(file.resolve()).to(device)
+    return lambda image, photo: network(image.permute(2, 0, 1)[None], photo.permute(2, 0, 1)[None]).item()
+
+
+@lru_cache(maxsize=1)
+def _lpips_network(file: Path) -> torch.nn.Module:
+    """On the CPU until it is used. A run loads it before it trains, to try it, and uses it for its report."""
     from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
 
     cache = torch.hub.get_dir()
     with tempfile.TemporaryDirectory() as folder:  # torchvision loads the file only from a cache
         (Path(folder) / "checkpoints").mkdir()
-        (Path(folder) / "checkpoints" / VGG16_FILE).symlink_to(file.resolve())
+        (Path(folder) / "checkpoints" / VGG16_FILE).symlink_to(file)
         torch.hub.set_dir(folder)
         try:
-            network = LearnedPerceptualImagePatchSimilarity(net_type="vgg", normalize=True).to(device)
+            return LearnedPerceptualImagePatchSimilarity(net_type="vgg", normalize=True)
         except (RuntimeError, OSError, KeyError, EOFError) as error:
             raise InputError(f"report.lpips_weights: '{file}' does not hold VGG16's weights: {error}") from None
         finally:
             torch.hub.set_dir(cache)
-    return lambda image, photo: network(image.permute(2, 0, 1)[None], photo.permute(2, 0, 1)[None]).item()
