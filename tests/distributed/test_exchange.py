@@ -48,7 +48,7 @@ CASES = {
 """Name -> overrides. A masked case is of the capture with masks."""
 WITH_EVENTS = ("usual", "fastgs", "mcmc")
 LONG = 50
-LONG_CASE = ("train.iterations=50", "train.refine_until=30", "schedule.max_views=2")
+LONG_CASE = ("train.iterations=50", "train.refine_until=30", "schedule.max_views=2", "density.max_gaussians=400")
 
 
 def masked(capture: Path) -> Path:

@@ -54,7 +54,7 @@ def saved_model(folder: Path) -> dict[str, torch.Tensor]:
 
 def small_config(capture: Path, *overrides: str) -> Config:
     """14 iterations with densification and pruning; an override may change the type of a strategy."""
-    defaults = [*TINY, "density.max_gaussians=1500", "train.device=cpu"]
+    defaults = [*TINY, "density.max_gaussians=600", "train.device=cpu"]
     replaced = tuple(override.partition("type=")[0] for override in overrides if ".type=" in override)
     config = load_config("turbogs", [*(option for option in defaults if not option.startswith(replaced)), *overrides])
     config.scene.path = str(capture)
