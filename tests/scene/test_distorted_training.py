@@ -26,6 +26,7 @@ LENSES = {
 }
 MODEL = ("optimizer.type=sparse_adam", "density.type=none", "view_sampler.type=random", "pixel_sampler.type=random")
 """Choices that feed on errors would turn a last bit into another choice."""
+STEPS = 40
 BOUND = 0.25
 """dB. Measured: 0.12 (OPENCV) and 0.11 (OPENCV_FISHEYE); 1.5 and 2.6 where the photos are cropped, not undistorted."""
 
@@ -100,14 +101,14 @@ def source(tmp_path_factory) -> Path:
 
 
 def trainer_of(scene: Scene) -> Trainer:
-    lengths = ("train.iterations=80", "train.refine_until=60", "train.sh_degree=0", "schedule.max_views=3")
+    lengths = (f"train.iterations={STEPS}", f"train.refine_until={STEPS}", "train.sh_degree=0", "schedule.max_views=3")
     return Trainer(load_config("turbogs", [*lengths, *MODEL]).without_plan(), scene, CPU)
 
 
 def train(scene: Scene) -> Trainer:
     trainer = trainer_of(scene)
     trainer.initialise_maps()
-    for _ in range(80):
+    for _ in range(STEPS):
         trainer.step()
     return trainer
 

@@ -13,6 +13,8 @@ from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene import load_scene
 from turbogs_plugin.scene.undistort import brown_projection, lens_of_camera, make_lens
 
+pytestmark = pytest.mark.usefixtures("few_random_points")
+
 WIDTH, HEIGHT = 320, 240
 PARAMS = {
     "SIMPLE_RADIAL": [260.0, 163.0, 117.0, -0.12],

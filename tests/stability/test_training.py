@@ -25,6 +25,8 @@ from turbogs_plugin.train import run
 from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint
 from turbogs_plugin.train.trainer import Trainer
 
+pytestmark = pytest.mark.usefixtures("laid_out")
+
 
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory) -> Path:
@@ -120,7 +122,7 @@ PHOTOS = {
     ("name", "loss"),
     [(name, "charbonnier_ncc") for name in PHOTOS] + [("one colour", "sparse_ssim"), ("exposures", "sparse_ssim")],
 )
-def test_photos_without_information(variant, tmp_path, name, loss):
+def test_photos_without_information(variant, tmp_path, name, loss, drawn):
     edit_photos(variant, PHOTOS[name])
     outcome = train_to_the_end(variant, tmp_path / "run", f"loss.type={loss}")
     if name in ("black", "white", "one colour"):
