@@ -12,6 +12,7 @@ import math
 import re
 import statistics
 from collections.abc import Callable, Mapping
+from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,6 +24,7 @@ from turbogs_plugin.report.tables import table
 from turbogs_plugin.study.folder import StudyFolder
 from turbogs_plugin.study.pages import difference_text
 from turbogs_plugin.study.plots import save_plot
+from turbogs_plugin.study.results import Study
 from turbogs_plugin.study.summary import VariantRow, summarise
 from turbogs_plugin.study.verdict import verdict
 
@@ -74,11 +76,16 @@ OURS = (
 """Rows of the headline table that are ours, where they are measured: study, variant, what to call it."""
 
 
+@cache
+def read_study(folder: Path) -> Study:
+    return StudyFolder(folder).read_study()
+
+
 def rows_of(study: str) -> dict[str, dict[str, VariantRow]]:
     """Capture -> variant -> its row; none of a study that is not measured yet."""
     if not (ROOT / "docs/results" / study / "results.json").is_file():
         return {}
-    summaries = summarise(StudyFolder(ROOT / "docs/results" / study).read_study())
+    summaries = summarise(read_study(ROOT / "docs/results" / study))
     return {summary.scene: {row.name: row for row in summary.rows} for summary in summaries}
 
 
@@ -122,7 +129,7 @@ def changes(study: str) -> str:
     found = rows_of(study)
     captures = [capture for capture in CAPTURES if capture in found]
     lines = []
-    for variant in StudyFolder(ROOT / "docs/results" / study).read_study().ablation.variants:
+    for variant in read_study(ROOT / "docs/results" / study).ablation.variants:
         cells = []
         for capture in captures:
             row = found[capture].get(variant)

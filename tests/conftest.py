@@ -6,8 +6,34 @@ import pytest
 import torch
 
 from turbogs_plugin import cli
+from turbogs_plugin.scene import colmap, llff, starting_points
 
 torch.set_num_threads(1)  # the tests' tensors are small: more threads gain nothing and collapse on a busy machine
+
+
+@pytest.fixture
+def drawn() -> None:
+    """For tests of what plots look like."""
+
+
+@pytest.fixture
+def laid_out(request, monkeypatch) -> None:
+    """Plots are made, with all that they show, but not rasterised, which takes a second a report; not with `drawn`."""
+    from matplotlib.figure import Figure
+    from PIL import Image
+
+    def save(figure: Figure, file: object, **options: object) -> None:
+        Image.new("RGB", (8, 8)).save(file, "PNG")
+
+    if "drawn" not in request.fixturenames:
+        monkeypatch.setattr(Figure, "savefig", save)
+
+
+@pytest.fixture
+def few_random_points(monkeypatch) -> None:
+    """Captures without points start from 500 random ones, not 50,000, which take longer than all else of a load."""
+    for module in (starting_points, llff, colmap):
+        monkeypatch.setattr(module, "NUM_RANDOM_POINTS", 500)
 
 
 @pytest.fixture

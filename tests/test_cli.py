@@ -17,7 +17,7 @@ import torch
 from helpers.framework_runs import TINY, stop_after, tiny_capture
 from PIL import Image
 
-from turbogs_plugin import scene
+from turbogs_plugin import cli, scene
 from turbogs_plugin.engine.rendering import render_image
 from turbogs_plugin.model.ply import load_ply
 from turbogs_plugin.report import pages
@@ -43,8 +43,12 @@ def copy(capture, tmp_path) -> Path:
 def finished(capture, tmp_path_factory) -> Path:
     """A finished run, made by the command itself."""
     folder = tmp_path_factory.mktemp("cli-runs") / "run"
-    command = [sys.executable, "-m", "turbogs_plugin.cli", "train", capture, "--out", folder, "--device", "cpu", *QUICK]
-    subprocess.run(list(map(str, command)), check=True, capture_output=True)
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(SystemExit) as end:
+        patch.setattr(
+            sys, "argv", ["turbogs", "train", *map(str, (capture, "--out", folder, "--device", "cpu", *QUICK))]
+        )
+        cli.main()
+    assert not end.value.code
     return folder
 
 

@@ -90,8 +90,8 @@ def requirements(lines: list[str]) -> dict[str, Requirement]:
     return {canonicalize_name(found.name): found for found in map(Requirement, lines)}
 
 
-def test_parts_need_the_core_alone(tmp_path):
-    done = run(USE, set(COMMAND_PACKAGES), folder=tmp_path)
+def test_parts_need_the_core_alone(answers):
+    done = answers[False]
     assert (done.returncode, done.stdout.split()[-1:]) == (0, ["used"]), done.stderr
 
 
@@ -135,28 +135,47 @@ print(json.dumps(answers))
 """
 
 
+@pytest.fixture(scope="module")
+def answers(tmp_path_factory) -> dict[bool, subprocess.CompletedProcess]:
+    """What the commands say without the extra, in one process; without the parser, the parts are used there, too.
+
+    Without a parser nothing can be read; with it, each command comes to the first package that it lacks itself.
+    """
+    lines = json.dumps([["doctor"], *([command, *arguments] for command, arguments in COMMANDS.items())])
+    folders = {parser: tmp_path_factory.mktemp("lacking") for parser in (False, True)}
+    found = {
+        parser: run(ALL_COMMANDS + ("" if parser else USE), lacking(parser), lines, folder=folder)
+        for parser, folder in folders.items()
+    }
+    assert all(list(folder.iterdir()) == [] for folder in folders.values())
+    return found
+
+
+def lacking(parser: bool) -> set[str]:
+    return set(COMMAND_PACKAGES) - ({"tyro"} if parser else set())
+
+
 def test_every_command_is_tried_without_the_extra():
     assert set(cli.COMMANDS) == {*COMMANDS, "doctor"}
 
 
-# Without a parser nothing can be read; with it, each command comes to the first package that it lacks itself.
 @pytest.mark.parametrize("parser", [False, True])
-def test_each_command_says_what_it_lacks(parser, tmp_path):
-    absent = set(COMMAND_PACKAGES) - ({"tyro"} if parser else set())
-    names = [Requirement(text).name for module, text in COMMAND_PACKAGES.items() if module in absent]
-    lines = [[command, *arguments] for command, arguments in COMMANDS.items()]
-    done = run(ALL_COMMANDS, absent, json.dumps(lines), folder=tmp_path)
+def test_each_command_says_what_it_lacks(parser, answers):
+    names = [Requirement(text).name for module, text in COMMAND_PACKAGES.items() if module in lacking(parser)]
+    done = answers[parser]
     assert done.returncode == 0, done.stderr
     expected = "turbogs: error: turbogs {} needs " + f"{', '.join(names)}: {INSTALL_COMMANDS}\n"
-    assert json.loads(done.stdout) == {command: [2, "", expected.format(command)] for command in COMMANDS}
-    assert list(tmp_path.iterdir()) == []
+    said = json.loads(done.stdout.splitlines()[0])
+    assert said.pop("doctor")[0] == 0
+    assert said == {command: [2, "", expected.format(command)] for command in COMMANDS}
 
 
-def test_doctor_needs_none_of_them_and_names_them(tmp_path):
-    done = run(COMMAND, set(COMMAND_PACKAGES), "doctor", folder=tmp_path)
-    (line,) = [line for line in done.stdout.splitlines() if INSTALL_COMMANDS in line]
-    assert done.returncode == 0 and line.startswith("missing") and "tyro" in line and "pycolmap" in line
-    assert INSTALL_COMMANDS not in run(COMMAND, set(), "doctor", folder=tmp_path).stdout
+def test_doctor_needs_none_of_them_and_names_them(answers, turbogs):
+    code, text, _ = json.loads(answers[False].stdout.splitlines()[0])["doctor"]
+    (line,) = [line for line in text.splitlines() if INSTALL_COMMANDS in line]
+    assert code == 0 and line.startswith("missing") and "tyro" in line and "pycolmap" in line
+    code, text, _ = turbogs("doctor")
+    assert code == 0 and INSTALL_COMMANDS not in text
 
 
 def test_a_package_of_the_same_name_is_not_taken_for_it(tmp_path):

@@ -1,8 +1,11 @@
 """A tiny capture and a tiny configuration for tests of whole runs."""
 
+import shutil
 import signal
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import pytest
 import torch
@@ -32,7 +35,16 @@ TINY = (
 
 def tiny_capture(folder: Path) -> Path:
     """8 photos of 48x40, of which 7 train, and some 300 points: every fourth of the demo capture's."""
-    return thin_out_points(write_demo_capture(folder / "capture", views=8, width=48, height=40), 4)
+    return Path(shutil.copytree(_tiny_capture().name, folder / "capture"))
+
+
+@cache
+def _tiny_capture() -> TemporaryDirectory:
+    """Made once in a process; gone with it."""
+    folder = TemporaryDirectory(prefix="tiny-capture-")
+    Path(folder.name).rmdir()
+    thin_out_points(write_demo_capture(Path(folder.name), views=8, width=48, height=40), 4)
+    return folder
 
 
 def thin_out_points(capture: Path, every: int) -> Path:

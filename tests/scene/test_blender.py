@@ -202,6 +202,7 @@ def test_without_its_training_file(tmp_path):
         load_scene(folder)
 
 
+@pytest.mark.usefixtures("few_random_points")
 def test_damaged_files(tmp_path):
     """Bytes changed or cut: refused in one line, or a scene of finite numbers."""
     folder = write_blender(tmp_path / "lego")

@@ -194,6 +194,7 @@ def test_what_is_refused(tmp_path, change, words):
     assert "\n" not in str(caught.value) and len(str(caught.value)) < 400
 
 
+@pytest.mark.usefixtures("few_random_points")
 def test_damaged_files(tmp_path):
     """Bytes changed or cut, a header that announces more than there is: refused in little memory, or finite numbers."""
     folder = write_llff(tmp_path / "fern")

@@ -96,6 +96,7 @@ def photos(tmp_path) -> Path:
     return tmp_path / "cup"
 
 
+@pytest.mark.usefixtures("few_random_points")
 @pytest.mark.parametrize("kind", FILES)
 def test_other_values_in_files_of_frames(photos, kind):
     name, content = FILES[kind]
@@ -110,6 +111,7 @@ def test_other_values_in_files_of_frames(photos, kind):
     assert 60 < refused < 150
 
 
+@pytest.mark.usefixtures("few_random_points")
 def test_other_values_in_a_table_of_llff(photos):
     rows = [
         [*np.c_[np.array(pose(view))[:3, [1, 0, 2, 3]] * [-1, 1, 1, 1], [12, 16, 14]].ravel(), 1, 9]

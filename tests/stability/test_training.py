@@ -25,6 +25,8 @@ from turbogs_plugin.train import run
 from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint
 from turbogs_plugin.train.trainer import Trainer
 
+pytestmark = pytest.mark.usefixtures("laid_out")
+
 
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory) -> Path:
@@ -54,7 +56,7 @@ def saved_model(folder: Path) -> dict[str, torch.Tensor]:
 
 def small_config(capture: Path, *overrides: str) -> Config:
     """14 iterations with densification and pruning; an override may change the type of a strategy."""
-    defaults = [*TINY, "density.max_gaussians=1500", "train.device=cpu"]
+    defaults = [*TINY, "density.max_gaussians=600", "train.device=cpu"]
     replaced = tuple(override.partition("type=")[0] for override in overrides if ".type=" in override)
     config = load_config("turbogs", [*(option for option in defaults if not option.startswith(replaced)), *overrides])
     config.scene.path = str(capture)
@@ -120,7 +122,7 @@ PHOTOS = {
     ("name", "loss"),
     [(name, "charbonnier_ncc") for name in PHOTOS] + [("one colour", "sparse_ssim"), ("exposures", "sparse_ssim")],
 )
-def test_photos_without_information(variant, tmp_path, name, loss):
+def test_photos_without_information(variant, tmp_path, name, loss, drawn):
     edit_photos(variant, PHOTOS[name])
     outcome = train_to_the_end(variant, tmp_path / "run", f"loss.type={loss}")
     if name in ("black", "white", "one colour"):

@@ -48,6 +48,9 @@ notes: {random: "a | bar"}
 """
 
 
+pytestmark = pytest.mark.usefixtures("laid_out")
+
+
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory) -> Path:
     return tiny_capture(tmp_path_factory.mktemp("ablation"))
@@ -88,7 +91,7 @@ def study(trained, tmp_path, monkeypatch) -> Path:
     return Path(shutil.copytree(trained, tmp_path / "study"))
 
 
-def test_a_sweep_is_complete_and_goes_on_where_it_stopped(turbogs, small, capture, tmp_path, monkeypatch):
+def test_a_sweep_is_complete_and_goes_on_where_it_stopped(turbogs, small, capture, tmp_path, monkeypatch, drawn):
     out = tmp_path / "study"
     code, printed, err = turbogs(*call(small, capture, out, "--seeds", "0", "1"))
     assert code == 0 and str(out / "report.html") in printed

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
+from functools import lru_cache
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -73,6 +75,11 @@ def parse_yaml(text: str, where: str) -> dict[str, Any]:
     Raises:
         InputError: not YAML, not one mapping, nested too deeply, or with tags, anchors or aliases.
     """
+    return deepcopy(_parsed(text, where))
+
+
+@lru_cache(maxsize=128)  # bases of variants and texts of overrides come again and again
+def _parsed(text: str, where: str) -> dict[str, Any]:
     try:
         _refuse_unsafe(text, where)
         return OmegaConf.to_container(OmegaConf.create(text), resolve=False)

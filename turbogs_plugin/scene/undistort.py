@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import partial, reduce
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -139,7 +139,7 @@ def brown_projection(
     def project(points: np.ndarray) -> np.ndarray:
         x, y = points.T
         squared = x * x + y * y
-        stretch = 1.0 + sum(k * squared ** (power + 1) for power, k in enumerate(radial))
+        stretch = 1.0 + reduce(lambda rest, k: (rest + k) * squared, reversed(radial), 0.0)
         bent_x = x * stretch + 2.0 * p1 * x * y + p2 * (squared + 2.0 * x * x)
         bent_y = y * stretch + 2.0 * p2 * x * y + p1 * (squared + 2.0 * y * y)
         return np.stack([focal[0] * bent_x + center[0], focal[1] * bent_y + center[1]], axis=1)
