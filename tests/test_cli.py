@@ -377,8 +377,8 @@ def test_plots_are_loaded_beside_the_photos_if_there_is_a_report(
     loading, load = threading.Barrier(2, timeout=60), pages.load_plots
     threads = []
     monkeypatch.setattr(pages, "load_plots", lambda: (loading.wait(), threads.append(threading.get_ident()), load()))
-    read = run.load_scene
-    monkeypatch.setattr(run, "load_scene", lambda *arguments: (loads and loading.wait(), read(*arguments))[1])
+    read = start.load_scene
+    monkeypatch.setattr(start, "load_scene", lambda *arguments: (loads and loading.wait(), read(*arguments))[1])
     options = ("--device", "cpu", *QUICK)
     code, _, err = turbogs("train", capture, "--out", tmp_path / "run", option, *options)
     assert code == 0, err
