@@ -158,7 +158,8 @@ def test_a_common_length_leaves_out_what_it_makes_a_copy():
     alike = {"epochs-50": "nothing", "epochs-75": "nothing"}
     assert alike_at(ablation, list(ablation.variants), (), 1000) == alike
     assert alike_at(ablation, ["nothing", "plan", "epochs-75"], (), 1000) == {"epochs-75": "nothing"}
-    for name in set(ablation_names()) - {"leave_out"}:
+    assert alike_at(load_ablation("batch"), ["x2-same-rates", "x2-longer"], (), 1000) == {"x2-longer": "x2-same-rates"}
+    for name in set(ablation_names()) - {"leave_out", "batch"}:
         assert alike_at(load_ablation(name), list(load_ablation(name).variants), (), 1000) == {}
     same = Ablation(
         "x", {"long": ["train.iterations=5000"], "a": [], "b": [], "last": ["train.epochs=5"]}, baseline="a"

@@ -215,8 +215,10 @@ def test_a_command_with_a_viewer_shows_the_model_until_ctrl_c(capture, tmp_path)
     pytest.importorskip("viser")
     out = tmp_path / "run"
     command = ["train", capture, "--out", out, "--no-report", "--device", "cpu", "--viewer", "0", *TINY]
+    # A shell starts what it puts into the background with SIGINT ignored, and children inherit that.
+    heeding = "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); "
     process = subprocess.Popen(
-        [sys.executable, "-m", "turbogs_plugin.cli", *map(str, command)],
+        [sys.executable, "-c", heeding + "from turbogs_plugin.cli import main; sys.exit(main())", *map(str, command)],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
