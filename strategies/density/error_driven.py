@@ -70,8 +70,9 @@ class ErrorDrivenDensity(WindowedDensity):
         spare_beyond: Gaussians farther from the cameras' centre than this * scene extent are neither decayed nor pruned
             (unless they are not finite, or `max_gaussians` leaves no other choice). It protects a backdrop behind the
             scene, which few photos see. 0: none.
-        choose_by: which candidates grow where `max_gaussians` has no room for all: the most difficult, or a draw by
-            the squares of their opacity gradients, see `growth_priority`.
+        choose_by: who grows. By `difficulty` it is whoever passes the gates, and the most difficult of these where
+            `max_gaussians` has no room for all. By `squares` the gates say how many grow; who, is drawn from all the
+            seen, see `growth_priority`.
         prune_by: in what order `prune_score_fraction` and `final_keep` prune: the easiest first, or what contributes
             the least, by blending weight or by squares, see `contribution`. A Gaussian with little error may be one
             that is rendered well.
@@ -219,7 +220,10 @@ class ErrorDrivenDensity(WindowedDensity):
         if self.prune_score_fraction > 0:
             worth, known = contribution(self._stats, score, seen, self.prune_by)
             hopeless |= known & (worth < _quantile(worth, known, self.prune_score_fraction))
-        candidates = self._growing(score, seen) & ~hopeless
+        candidates = self._passing(score, seen) & ~hopeless
+        priority = growth_priority(self._stats, score, self.choose_by, step)
+        if self.choose_by != "difficulty":
+            candidates = _first(priority, seen & ~hopeless, int(candidates.sum()))
         largest = gaussians.scales.amax(dim=-1).exp()  # [N]
         small = largest <= self.percent_dense * extent
         big = torch.zeros_like(seen)
@@ -234,7 +238,6 @@ class ErrorDrivenDensity(WindowedDensity):
         pruned = leave_one((hopeless | (big & ~(candidates & ~small))) & ~spared, gaussians)
         candidates &= ~pruned
         if self.max_gaussians > 0:
-            priority = growth_priority(self._stats, score, self.choose_by, step)
             chosen = _first(priority, candidates, max(0, self.max_gaussians - int((~pruned).sum())))
             denied = candidates & ~chosen
             candidates = chosen
@@ -244,8 +247,8 @@ class ErrorDrivenDensity(WindowedDensity):
                 pruned = pruned | self._easiest(score, seen, ~pruned, spared, excess)
         return self._compose(gaussians, candidates & small, candidates & ~small, pruned, spared, step)
 
-    def _growing(self, score: Tensor, seen: Tensor) -> Tensor:
-        """[N] bool, which may be densified: among the most difficult, and with a high screen gradient."""
+    def _passing(self, score: Tensor, seen: Tensor) -> Tensor:
+        """[N] bool, which pass the gates: among the most difficult, and with a high screen gradient."""
         stats = self._stats
         views = stats.view_counts.clamp(min=1)
         passes = (stats.grad_sums / views > self.grad_threshold) | (stats.absgrad_sums / views > self.absgrad_threshold)

@@ -84,6 +84,20 @@ def test_a_cap_with_room_for_all_grows_all_whatever_the_order():
     assert torch.equal(updates[0].source, updates[1].source) and torch.equal(updates[0].source, updates[2].source)
 
 
+def test_a_draw_takes_as_many_as_pass_the_gates_from_all_the_seen():
+    """A Gaussian that does not pass may be drawn: what has many samples with opposed gradients needs company."""
+    gaussians, stats = make_gaussians(COUNT), random_stats(COUNT, seed=1, seen=0.9)
+    stats.grad_sums[:] = 0
+    stats.absgrad_sums[:] = 0
+    stats.grad_sums[:8] = 1e3
+    stats.square_sums[:20] = 0  # TINY: these come last
+    gates = GROWS | {"grad_threshold": 1.0, "absgrad_threshold": 1.0}
+    passing = controlled(gaussians, stats, **gates).update(gaussians, FULL)
+    drawn = controlled(gaussians, stats, choose_by="squares", **gates).update(gaussians, FULL)
+    assert grown(passing) <= set(range(8)) and len(grown(drawn)) == len(grown(passing)) > 0
+    assert min(grown(drawn)) >= 20 and all(stats.weight_sums[row] > 0 for row in grown(drawn))
+
+
 @pytest.mark.parametrize(("how", "name"), [("weight", "weight_sums"), ("squares", "square_sums")])
 def test_prunings_take_the_least_contributions_and_the_unseen_first(how, name):
     gaussians, stats = make_gaussians(10), busy_stats(10)
