@@ -199,6 +199,7 @@ def test_an_address_that_is_none_is_named(host, port, remedy):
 
 
 def test_a_port_below_zero_is_taken_for_a_port(turbogs, tmp_path, capture):
+    pytest.importorskip("viser")
     code, out, err = turbogs("train", capture, "--out", tmp_path / "run", "--viewer", -1)
     assert (code, out, err) == (2, "", "turbogs: error: port -1 of the viewer: it must be 1 to 65535\n")
 
