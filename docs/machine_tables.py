@@ -21,10 +21,14 @@ def house() -> dict[str, Any]:
     return json.loads((H200 / "house.json").read_text())
 
 
-def house_iterations() -> str:
-    """Milliseconds of an iteration before and after the restructuring, and ratios of the pairs."""
+def masks() -> dict[str, Any]:
+    return json.loads((H200 / "masks.json").read_text())
+
+
+def iterations(record: dict[str, Any]) -> str:
+    """Milliseconds of an iteration before and after a change, and ratios of the pairs."""
     lines = []
-    for commit, points in house()["iterations"].items():
+    for commit, points in record["iterations"].items():
         for point, clocks in points.items():
             base, new = (statistics.median(clocks["free_running"][build]) for build in ("base", "new"))
             ratios = []
@@ -33,6 +37,18 @@ def house_iterations() -> str:
                 ratios.append(f"{statistics.median(pairs):.3f} [{min(pairs):.3f}, {max(pairs):.3f}]")
             lines.append((commit, point, f"{base:.3f}", f"{new:.3f}", *ratios, len(pairs)))
     return table(("new build", "model, views", "base", "new", "ratio, free running", "ratio, wall", "pairs"), lines)
+
+
+def exposures() -> str:
+    """Milliseconds of an iteration without exposures, of its loss with and without them, and the difference's share."""
+    lines = []
+    for commit, points in masks()["exposures"].items():
+        for point, measured in points.items():
+            off, on = measured["off"], measured["on"]
+            share = (on["loss"] - off["loss"]) / off["iteration"]
+            values = (f"{value:.3f}" for value in (off["iteration"], off["loss"], on["loss"]))
+            lines.append((commit, point, *values, f"{100 * share:.1f} %"))
+    return table(("build", "model, views", "iteration", "loss without", "loss with", "share"), lines)
 
 
 DROPIN = H200 / "dropin.json"

@@ -38,6 +38,7 @@ PAGES = tuple(
         "docs/plan.md",
         "docs/results/README.md",
         "docs/results/h200/house.md",
+        "docs/results/h200/masks.md",
         "docs/viewer.md",
     )
 )
@@ -357,10 +358,12 @@ def within_bound(full: VariantRow | None, paper: VariantRow | None, end: bool) -
 
 TABLES: dict[str, Callable[[], str]] = {
     "dropin": machine_tables.dropin,
+    "exposures": machine_tables.exposures,
     "headline": headline,
-    "house_iterations": machine_tables.house_iterations,
+    "house_iterations": lambda: machine_tables.iterations(machine_tables.house()),
     "house_runs": house_runs,
     "leave_out": lambda: changes("leave_out"),
+    "masks_iterations": lambda: machine_tables.iterations(machine_tables.masks()),
     "paper_parts": paper_parts,
     "paper_whole": paper_whole,
     "parts": lambda: changes("parts"),

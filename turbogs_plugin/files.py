@@ -1,4 +1,5 @@
-"""Reading text, and writing files so that a reader sees the old one or the new one, and never a part."""
+"""Reading text, and writing files so that a reader sees the old one or the new one, and never a part; which of the
+processes that write them still run."""
 
 from __future__ import annotations
 
@@ -57,7 +58,8 @@ def write_atomically(path: Path, write: Callable[[BinaryIO], None]) -> None:
         OSError: from the disk, with the name of the file; then nothing is left behind.
     """
     for leftover in path.parent.glob(f"{_own_prefix(path, escaped=True)}*.part"):
-        if not _is_running(leftover.suffixes[-2].lstrip(".")):
+        writer = leftover.suffixes[-2].lstrip(".")
+        if not writer.isdecimal() or process_started(int(writer)) == "gone":
             leftover.unlink(missing_ok=True)
     temporary = partial_path(path)
     try:
@@ -85,17 +87,6 @@ def _own_prefix(path: Path, escaped: bool = False) -> str:
     return glob.escape(prefix) if escaped else prefix
 
 
-def _is_running(process: str) -> bool:
-    """Whether a process of this host may still write; what is no number is nobody's."""
-    try:
-        os.kill(int(process), 0)
-    except (ProcessLookupError, ValueError):
-        return False
-    except OSError:  # of another user
-        pass
-    return True
-
-
 def write_text_atomically(path: Path, text: str) -> None:
     """`write_atomically` for UTF-8 text."""
     write_atomically(path, lambda file: file.write(text.encode("utf-8")))
@@ -110,3 +101,19 @@ def _sync_folder(folder: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+def process_started(process: int) -> str:
+    """When a process of this host was started, which tells it from a later one of the same number; "gone" where there
+    is none, "" where nothing is known."""
+    try:
+        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[19]
+    except (OSError, IndexError):
+        pass
+    try:  # a system without /proc
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return "gone"
+    except OSError:
+        pass
+    return ""

@@ -17,7 +17,8 @@ void launches::SparseLoss::run(const Arguments<SparseLoss>& in) {
     const int64_t slots = in.tensor(Tensors::pixel_ids).numel(), tiles = in.tensor(Tensors::tile_ids).numel();
     const bool has_photos = in.has(Tensors::photos), has_maps = in.has(Tensors::errors);
     STD_TORCH_CHECK(in.has(Tensors::targets) != has_photos, "turbogs: give either targets or photos");
-    const int64_t channels = has_photos && in.tensor(Tensors::photos).dim() == 2 ? in.tensor(Tensors::photos).size(1) : 3;
+    const bool has_channels = has_photos && in.tensor(Tensors::photos).dim() == 2;
+    const int64_t channels = has_channels ? in.tensor(Tensors::photos).size(1) : 3;
     STD_TORCH_CHECK(channels == 3 || channels == 4, "turbogs: photos must have 3 or 4 channels, got ", channels);
     const int64_t photo_pixels = has_photos ? in.tensor(Tensors::photos).numel() / channels : -1;
     const int64_t map_pixels = has_maps ? in.tensor(Tensors::errors).numel() : -1;

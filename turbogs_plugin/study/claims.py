@@ -18,6 +18,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from turbogs_plugin.files import process_started
 from turbogs_plugin.study.grid import CellKey
 
 HEARTBEAT_SECONDS = 5.0
@@ -90,7 +91,9 @@ class Claims:
         except FileExistsError:
             return None
         with os.fdopen(file, "w", encoding="utf-8") as opened:
-            json.dump({"host": socket.gethostname(), "process": os.getpid(), "started": _started(os.getpid())}, opened)
+            json.dump(
+                {"host": socket.gethostname(), "process": os.getpid(), "started": process_started(os.getpid())}, opened
+            )
         return claim
 
     def _alive(self, path: Path) -> bool:
@@ -103,7 +106,7 @@ class Claims:
         try:
             holder = json.loads(text)
             here = holder["host"] == socket.gethostname()
-            return not here or _started(holder["process"]) == holder["started"]
+            return not here or process_started(holder["process"]) == holder["started"]
         except (ValueError, KeyError, TypeError):
             return True  # not yet written
 
@@ -125,19 +128,3 @@ def _latest(base: Path) -> int | None:
     # By name, not by a pattern: variants may hold its characters.
     found = [path.name[len(base.name) + 1 :] for path in base.parent.iterdir() if path.name.startswith(f"{base.name}.")]
     return max((int(text) for text in found if text.isdigit()), default=None)
-
-
-def _started(process: int) -> str:
-    """When a process of this host was started, which tells it from a later one of the same number; "" where it is gone
-    or nothing is known."""
-    try:
-        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[19]
-    except (OSError, IndexError):
-        pass
-    try:  # a system without /proc
-        os.kill(process, 0)
-    except ProcessLookupError:
-        return "gone"
-    except OSError:
-        pass
-    return ""
