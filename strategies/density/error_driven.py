@@ -3,22 +3,19 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import torch
 from torch import Tensor
 from torch.nn.functional import logsigmoid
 from turbogs_plugin.strategies.checks import require_at_least_one, require_each, require_settings, require_share
-from turbogs_plugin.strategies.density.priority import GrowthOrder, PruneOrder, contribution, growth_priority
+from turbogs_plugin.strategies.density.priority import drawn_by_squares, squares_of
 from turbogs_plugin.strategies.density.rows import WindowedDensity, finite_rows, leave_one, removal
 from turbogs_plugin.strategies.density.splitting import split_in_two
 
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.types import Gaussians, RowUpdate, Step
-
-FLAT_EVENTS = 5
-"""`stop_when_flat` measures the fall of the error over this many events of density control."""
 
 EPS = 1e-12
 """Keeps divisions defined; the least weight a drawn splat can have in a pixel is 1e-4 / 255."""
@@ -63,26 +60,20 @@ class ErrorDrivenDensity(WindowedDensity):
         prune_screen_size: pruned where the screen radius exceeds this * the larger side of the image. 0: off, as in
             3DGS in effect.
         prune_size_from: both size rules begin at this progress; 3DGS has 3000 / 15000.
-        prune_score_fraction: the share that each densification event prunes, in the order of `prune_by`. Off by
+        prune_score_fraction: the share that each densification event prunes first, in the order of `choose_by`. Off by
             default: the paper gives no value.
         opacity_decay: share of its opacity that every Gaussian loses at each densification event. If the photos need
             it, it grows back; if not, it falls below `prune_opacity`. A gentle substitute for 3DGS's reset.
         spare_beyond: Gaussians farther from the cameras' centre than this * scene extent are neither decayed nor pruned
             (unless they are not finite, or `max_gaussians` leaves no other choice). It protects a backdrop behind the
             scene, which few photos see. 0: none.
-        choose_by: who grows. By `difficulty` it is whoever passes the gates, and the most difficult of these where
-            `max_gaussians` has no room for all. By `squares` the gates say how many grow; who, is drawn from all the
-            seen, see `growth_priority`.
-        prune_by: in what order `prune_score_fraction` and `final_keep` prune: the easiest first, or what contributes
-            the least, by blending weight or by squares, see `contribution`. A Gaussian with little error may be one
-            that is rendered well.
+        choose_by: who grows, and who goes. By `difficulty`, the paper's: it grows whoever passes the gates, and the
+            most difficult of these where `max_gaussians` has no room for all; the easiest are pruned first. By
+            `squares` (see `priority`): as many grow as pass the gate of the absolute gradient, and who, is drawn from
+            all the seen; what has the least squares is pruned first. `grad_threshold`, `top_fraction`, `score` and
+            `lambda_base` then mean nothing.
         final_every, final_keep: interval of the final pruning, and the share that it keeps (Delta_prune, eta_final). 1
             keeps all.
-        final_until: share of the run after which there is no final pruning, so that there is time to recover.
-        stop_when_flat: densification ends early, at the first event where the error has fallen by less than this share
-            of itself over the last `FLAT_EVENTS` events. The error of a window is the mean of its samples' e, weighted
-            by w. It falls a little by itself as the sampling rate rises, so densification ends later rather than
-            sooner. 0: never.
     """
 
     lambda_base: float = 0.8
@@ -103,19 +94,14 @@ class ErrorDrivenDensity(WindowedDensity):
     prune_score_fraction: float = 0.0
     opacity_decay: float = 0.0
     spare_beyond: float = 0.0
-    choose_by: GrowthOrder = "difficulty"
-    prune_by: PruneOrder = "difficulty"
+    choose_by: Literal["difficulty", "squares"] = "difficulty"
     final_every: int = 500
     final_keep: float = 0.95
-    final_until: float = 1.0
-    stop_when_flat: float = 0.0
-    window_errors: list[float] = field(init=False, repr=False, default_factory=list)
-    stopped_at: int = field(init=False, repr=False, default=0)
 
     def __post_init__(self) -> None:
         require_at_least_one(self, "refine_every", "final_every")
-        require_share(self, "top_fraction", "final_keep", "final_until")
-        shares = ("prune_opacity", "prune_score_fraction", "opacity_decay", "stop_when_flat")
+        require_share(self, "top_fraction", "final_keep")
+        shares = ("prune_opacity", "prune_score_fraction", "opacity_decay")
         require_each(self, lambda value: 0 <= value < 1, "at least 0 and less than 1", *shares)
         require_settings(self)
 
@@ -125,9 +111,7 @@ class ErrorDrivenDensity(WindowedDensity):
             return None
         densify, final = self.due(step)
         update = None
-        if densify and self.stop_when_flat > 0 and self._error_is_flat():
-            self.stopped_at = step.iteration
-        elif densify:
+        if densify:
             update = self._refine(gaussians, step)
         elif final:
             update = self._final_prune(gaussians, step)
@@ -137,29 +121,13 @@ class ErrorDrivenDensity(WindowedDensity):
             self._stats = None
         return update
 
-    def state_dict(self) -> dict[str, Any]:
-        state = super().state_dict()
-        if self.stop_when_flat > 0:
-            window_errors = torch.tensor(self.window_errors, dtype=torch.float64)
-            state |= {"window_errors": window_errors, "stopped_at": self.stopped_at}
-        return state
-
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        if self.stop_when_flat > 0 and "window_errors" not in state:
+        if self.choose_by == "squares" and state["stats"] is not None and "square_sums" not in state["stats"]:
             raise InputError(
-                f"stop_when_flat = {self.stop_when_flat:g}, but the saved run had it at 0 and kept no record of its "
-                "error: continue it with stop_when_flat = 0, or start a new run"
+                "choose_by = squares, but the saved run kept no squares: continue it with choose_by = difficulty, or "
+                "start a new run"
             )
-        for name in ("choose_by", "prune_by"):
-            if getattr(self, name) == "squares" and state["stats"] is not None and "square_sums" not in state["stats"]:
-                raise InputError(
-                    f"{name} = squares, but the saved run kept no squares: continue it with {name} = difficulty, or "
-                    "start a new run"
-                )
         super().load_state_dict(state)
-        if self.stop_when_flat > 0:
-            self.window_errors = state["window_errors"].tolist()
-            self.stopped_at = state["stopped_at"]
 
     def scores(self, step: Step) -> tuple[Tensor, Tensor]:
         """([N] difficulty score, [N] bool seen) of the present window. The score 0 of an unseen one has no meaning."""
@@ -178,13 +146,8 @@ class ErrorDrivenDensity(WindowedDensity):
         """Whether this iteration densifies, and whether it makes a final pruning."""
         iteration, after = step.iteration, step.iteration - step.refine_until
         densify = after <= 0 and iteration >= self.refine_from and iteration % self.refine_every == 0
-        final = 0 < after <= self._final_span(step) and after % self.final_every == 0
-        return densify and not self.stopped_at, self.final_keep < 1 and final
-
-    def _final_span(self, step: Step) -> int:
-        """Iterations after densification within which there are final prunings."""
-        last = min(step.total - 1, math.floor(self.final_until * step.total))
-        return max(0, last - step.refine_until)
+        final = after > 0 and iteration < step.total and after % self.final_every == 0
+        return densify, self.final_keep < 1 and final
 
     def event_due(self, step: Step) -> bool:
         return any(self.due(step))
@@ -194,35 +157,21 @@ class ErrorDrivenDensity(WindowedDensity):
 
         It is not that of the last densification: until the end a time budget may still move it and allow another one.
         """
-        rest = self._final_span(step)
-        if self.final_keep < 1 and rest >= self.final_every:
-            return step.refine_until + rest // self.final_every * self.final_every
-        return self.stopped_at or step.refine_until
-
-    def _error_is_flat(self) -> bool:
-        """Record the present window's error, and say whether it has stopped falling."""
-        stats = self._stats
-        valid = torch.isfinite(stats.error_sums + stats.weight_sums)
-        sums = torch.stack([stats.error_sums, stats.weight_sums]).where(valid, 0.0).double().sum(dim=1)
-        error, weight = sums.tolist()  # events wait for the device anyway
-        if weight == 0:
-            return False  # nothing was seen, so nothing is known
-        self.window_errors = [*self.window_errors[-FLAT_EVENTS:], error / weight]
-        before, now = self.window_errors[0], self.window_errors[-1]
-        return len(self.window_errors) > FLAT_EVENTS and before - now < self.stop_when_flat * before
+        rest = max(0, step.total - 1 - step.refine_until)
+        return step.refine_until + (rest // self.final_every * self.final_every if self.final_keep < 1 else 0)
 
     def _refine(self, gaussians: Gaussians, step: Step) -> RowUpdate | None:
         extent = step.scene_extent
         score, seen = self.scores(step)
+        worth, known = self._worth(score, seen)
         finite = finite_rows(gaussians)
         spared = self._spared(gaussians, finite, extent)
         hopeless = ~finite | (torch.sigmoid(gaussians.opacities) < self.prune_opacity)
         if self.prune_score_fraction > 0:
-            worth, known = contribution(self._stats, score, seen, self.prune_by)
             hopeless |= known & (worth < _quantile(worth, known, self.prune_score_fraction))
-        candidates = self._passing(score, seen) & ~hopeless
-        priority = growth_priority(self._stats, score, self.choose_by, step)
-        if self.choose_by != "difficulty":
+        candidates, priority = self._passing(score, seen) & ~hopeless, score
+        if self.choose_by == "squares":
+            priority = drawn_by_squares(self._stats, step)
             candidates = _first(priority, seen & ~hopeless, int(candidates.sum()))
         largest = gaussians.scales.amax(dim=-1).exp()  # [N]
         small = largest <= self.percent_dense * extent
@@ -244,32 +193,34 @@ class ErrorDrivenDensity(WindowedDensity):
             pruned = leave_one(pruned | (big & denied & ~spared), gaussians)  # makes room for the next event
             excess = int((~pruned).sum()) - self.max_gaussians
             if excess > 0:  # then nothing was chosen
-                pruned = pruned | self._easiest(score, seen, ~pruned, spared, excess)
+                pruned = pruned | _least(worth, known, ~pruned, spared, excess)
         return self._compose(gaussians, candidates & small, candidates & ~small, pruned, spared, step)
 
     def _passing(self, score: Tensor, seen: Tensor) -> Tensor:
-        """[N] bool, which pass the gates: among the most difficult, and with a high screen gradient."""
+        """[N] bool, which pass the gates: a high screen gradient and, by difficulty, a high score."""
         stats = self._stats
         views = stats.view_counts.clamp(min=1)
-        passes = (stats.grad_sums / views > self.grad_threshold) | (stats.absgrad_sums / views > self.absgrad_threshold)
+        absolute = seen & (stats.absgrad_sums / views > self.absgrad_threshold)
+        if self.choose_by == "squares":
+            return absolute
+        passes = absolute | (stats.grad_sums / views > self.grad_threshold)
         return passes & seen & (score >= _quantile(score, seen, 1 - self.top_fraction))
+
+    def _worth(self, score: Tensor, seen: Tensor) -> tuple[Tensor, Tensor]:
+        """([N] the less, the sooner it is pruned; [N] bool, for which that is known): the score, or the squares.
+
+        What was not seen has no score, but contributes nothing.
+        """
+        return (score, seen) if self.choose_by == "difficulty" else squares_of(self._stats)
 
     def _spared(self, gaussians: Gaussians, finite: Tensor, extent: float) -> Tensor:
         """[N] bool: the finite ones that lie beyond `spare_beyond`."""
         beyond = self.spare_beyond * extent if self.spare_beyond > 0 else math.inf
         return finite & (gaussians.means.norm(dim=-1) > beyond)
 
-    def _easiest(self, score: Tensor, seen: Tensor, present: Tensor, spared: Tensor, count: int) -> Tensor:
-        """[N] bool: the easiest `count` of those `present`; spared ones only if the others do not suffice."""
-        # The unseen count as average: nothing says that they are easy.
-        average = torch.where(seen, score, 0.0).sum() / seen.sum().clamp(min=1)
-        ease = -torch.where(seen, score, average)
-        taken = _first(ease, present & ~spared, count)
-        return taken | _first(ease, present & spared, count - int(taken.sum()))
-
     def _final_prune(self, gaussians: Gaussians, step: Step) -> RowUpdate | None:
         finite = finite_rows(gaussians)
-        worth, known = contribution(self._stats, *self.scores(step), self.prune_by)
+        worth, known = self._worth(*self.scores(step))
         spared = self._spared(gaussians, finite, step.scene_extent)
         pruned = ~finite | known & (worth < _quantile(worth, known, 1 - self.final_keep)) & ~spared
         return removal(leave_one(pruned, gaussians))
@@ -313,6 +264,17 @@ def _first(keys: Tensor, mask: Tensor, count: int) -> Tensor:
     chosen = torch.zeros_like(mask)
     chosen[order[:count]] = True
     return chosen & mask
+
+
+def _least(worth: Tensor, known: Tensor, present: Tensor, spared: Tensor, count: int) -> Tensor:
+    """[N] bool: the `count` of those `present` that are worth the least; spared ones only if the others do not suffice.
+
+    Of which that is not known counts as average: nothing says that it is worth little.
+    """
+    average = torch.where(known, worth, 0.0).sum() / known.sum().clamp(min=1)
+    keys = -torch.where(known, worth, average)
+    taken = _first(keys, present & ~spared, count)
+    return taken | _first(keys, present & spared, count - int(taken.sum()))
 
 
 def _decayed(logits: Tensor, decay: float) -> Tensor:

@@ -45,7 +45,7 @@ def test_the_table_of_the_paper():
 
 
 def test_turbogs_ssim_is_what_was_measured_under_another_name():
-    measured = load_config("turbogs", load_ablation("choices").variants["ssim-unit-tile"])
+    measured = load_config("turbogs", load_ablation("sizes").variants["ssim"])
     assert load_config("turbogs-ssim") == measured
 
 

@@ -18,6 +18,7 @@ from turbogs_plugin.config.configuration import load_config
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.gsplat_bridge import SharedOptimizer, TurboDensityStrategy, apply_row_update
 from turbogs_plugin.gsplat_bridge.gaussian_errors import iteration_stats
+from turbogs_plugin.gsplat_bridge.tuned import GATES
 from turbogs_plugin.model.row_order import in_order_of_space
 from turbogs_plugin.types import PARAMETER_NAMES, Gaussians, GaussianStats, RowUpdate, Step
 
@@ -36,13 +37,14 @@ def test_it_is_a_default_strategy_with_its_fields_and_hooks():
 
 
 def test_its_defaults_are_the_values_of_turbogs():
-    """Those of `configs/turbogs.yaml` as a run takes them; only those of our own scenes' frame are left out."""
+    """Those of `configs/turbogs.yaml` as a run takes them, but for the gates and those of our own scenes' frame."""
     section = load_config("turbogs").density
     controller = vars(TurboDensityStrategy()._controller(0))
     schedule = {"refine_from", "refine_every", "prune_size_from"}  # gsplat's, which its trainers scale
     own_frame = {"prune_world_reference", "spare_beyond"}
-    tuned = {name: value for name, value in section.items() if name not in {"type", *schedule, *own_frame}}
+    tuned = {name: value for name, value in section.items() if name not in {"type", *schedule, *own_frame, *GATES}}
     assert {name: controller[name] for name in tuned} == tuned
+    assert {name: controller[name] for name in GATES} == GATES
     assert tuned["opacity_decay"] == TurboDensityStrategy().opacity_decay > ErrorDrivenDensity().opacity_decay
 
 
@@ -183,8 +185,7 @@ NEED_ERRORS = {
     name: (fields, fields)
     for name, fields in {
         "choose_by": {"max_gaussians": 45, "choose_by": "squares"},
-        "prune_by weight": {"prune_score_fraction": 0.3, "prune_by": "weight"},
-        "prune_by squares": {"prune_score_fraction": 0.3, "prune_by": "squares"},
+        "pruned by squares": {"prune_score_fraction": 0.3, "choose_by": "squares"},
     }.items()
 }
 """The same, of those that only a host with errors can have."""
@@ -429,9 +430,8 @@ def test_changes_in_mid_run_are_refused():
 
 
 def test_orders_whose_sums_are_not_there_are_refused():
-    for name, order in (("choose_by", "squares"), ("prune_by", "squares"), ("prune_by", "weight")):
-        with pytest.raises(InputError, match=rf"{name} = '{order}' needs .*'prediction'.*or leave it at 'difficulty'"):
-            Host(TurboDensityStrategy(**SOON, **{name: order})).step(0)
+    with pytest.raises(InputError, match=r"choose_by = 'squares' needs .*'prediction'.*or leave it at 'difficulty'"):
+        Host(TurboDensityStrategy(**SOON, choose_by="squares")).step(0)
 
 
 def test_absgrad_must_be_there_or_off():

@@ -15,8 +15,8 @@ EVENT = Step(iteration=200, total=5000, refine_until=3500, seed=7, scene_extent=
 VALUES = st.sampled_from([0.0, 1e-30, 1e-4, 1.0, 1e30, float("inf"), float("nan")])
 ORDERS = (
     {},
-    {"prune_by": "weight", "prune_score_fraction": 0.2},
-    {"choose_by": "squares", "prune_by": "squares", "prune_score_fraction": 0.2},
+    {"choose_by": "squares"},
+    {"choose_by": "squares", "prune_score_fraction": 0.2},
 )
 PARAMETERS = st.sampled_from([0.0, 1.0, -20.0, 20.0, -200.0, 50.0, 88.0, 200.0, 1e30, float("inf"), float("nan")])
 

@@ -23,7 +23,6 @@ def error_driven(**options) -> ErrorDrivenDensity:
 
 MAKERS = {
     "error_driven": error_driven,
-    "flat": lambda: error_driven(stop_when_flat=0.9),
     "no final": lambda: ErrorDrivenDensity(refine_from=5, refine_every=4, final_keep=1.0),
     "fastgs": lambda: FastGsDensity(refine_from=5, refine_every=4, prune_every=9),
     "mcmc": lambda: GsplatMcmcDensity(refine_start_iter=5, refine_every=4),
@@ -86,7 +85,7 @@ def test_events_are_where_it_says(name):
     assert set(changed) <= set(said)
     if name in EXACT:
         assert changed == said
-    assert len(said) < TOTAL / 3 and (len(changed) > 3 or name in ("none", "flat"))
+    assert len(said) < TOTAL / 3 and (len(changed) > 3 or name == "none")
 
 
 def test_the_noise_of_mcmc_is_why_it_watches_the_model(monkeypatch):

@@ -52,9 +52,10 @@ class TurboDensityStrategy(DefaultStrategy):
     reset; reset_every only says when pruning by size begins. grow_scale2d has no effect. The fields below are those of
     `ErrorDrivenDensity` of the same name.
 
-    The defaults are the values of `configs/turbogs.yaml`, read from there, also for grow_grad2d and grow_scale3d. When
-    and how often is refined stays gsplat's, as trainers scale those fields. `prune_world_reference` and `spare_beyond`
-    are left out: they hold where the origin is the cameras' centre and a backdrop stands behind the scene.
+    The defaults are the values of `configs/turbogs.yaml`, read from there, also for grow_scale3d. But who grows is
+    gated by gradients (`tuned.GATES`), where turbogs draws by squares. When and how often is refined stays gsplat's, as
+    trainers scale those fields. `prune_world_reference` and `spare_beyond` are left out: they hold where the origin is
+    the cameras' centre and a backdrop stands behind the scene.
 
     Once a line ``info.update(prediction=colors, ground_truth=pixels)`` stands before ``loss.backward()``, Gaussians are
     ranked by the error they carry (see `gaussian_errors`); without it, by their screen gradients. Which of the two
@@ -64,7 +65,8 @@ class TurboDensityStrategy(DefaultStrategy):
         absgrad: also densify by absolute gradients above grow_absgrad2d; render with ``absgrad=True`` then.
         grow_grad2d, grow_absgrad2d, grow_scale3d: grad_threshold, absgrad_threshold and percent_dense of
             `ErrorDrivenDensity`.
-        choose_by, prune_by: `weight` needs the line above; `squares` also that `sparse_rasterization` renders.
+        choose_by: `squares` needs the line above, and that `sparse_rasterization` renders. turbogs has it, with
+            grow_absgrad2d=6.6e-4 and prune_score_fraction=0.05.
         final_every, final_keep: final pruning after refine_stop_iter, off where final_keep is 1.
         seed: of the positions of split Gaussians.
     """
@@ -79,8 +81,7 @@ class TurboDensityStrategy(DefaultStrategy):
     split: str = TUNED_DENSITY.split
     max_gaussians: int = TUNED_DENSITY.max_gaussians
     prune_score_fraction: float = TUNED_DENSITY.prune_score_fraction
-    choose_by: str = "difficulty"  # not that of turbogs: it must hold for every rasterizer
-    prune_by: str = "difficulty"
+    choose_by: str = TUNED_DENSITY.choose_by
     opacity_decay: float = TUNED_DENSITY.opacity_decay
     final_every: int = TUNED_DENSITY.final_every
     final_keep: float = TUNED_DENSITY.final_keep
@@ -164,7 +165,7 @@ class TurboDensityStrategy(DefaultStrategy):
             raise InputError("the strategy was called without its state: expected that of strategy.initialize_state()")
         require_keys(state, _STATE_KEYS, "the state", "expected that of TurboDensityStrategy.initialize_state()")
         stats, has_errors = iteration_stats(info, count)
-        self._require_sums(info, has_errors)
+        self._require_sums(info)
         driven_by = "error" if has_errors else "gradient"
         if state[_DRIVEN_BY] is None:
             print(f"TurboDensityStrategy: {_ANNOUNCEMENTS[driven_by]}.")
@@ -194,19 +195,13 @@ class TurboDensityStrategy(DefaultStrategy):
         add_stats(window, stats)
         return window
 
-    def _require_sums(self, info: dict[str, Any], has_errors: bool) -> None:
-        """Raise `InputError` where `choose_by` or `prune_by` needs sums that this step's `info` does not have."""
-        for name in ("choose_by", "prune_by"):
-            order, rest = getattr(self, name), "or leave it at 'difficulty'"
-            if order == "squares" and info.get(STATISTICS) is None:
-                raise InputError(
-                    f"{name} = 'squares' needs the sums that sparse_rasterization leaves where info has "
-                    f"'{PREDICTION}' and '{GROUND_TRUTH}': render with it and add them, {rest}"
-                )
-            if order == "weight" and not has_errors:
-                raise InputError(
-                    f"{name} = 'weight' needs '{PREDICTION}' and '{GROUND_TRUTH}' in info: add them, {rest}"
-                )
+    def _require_sums(self, info: dict[str, Any]) -> None:
+        """Raise `InputError` where `choose_by` needs sums that this step's `info` does not have."""
+        if self.choose_by == "squares" and info.get(STATISTICS) is None:
+            raise InputError(
+                f"choose_by = 'squares' needs the sums that sparse_rasterization leaves where info has "
+                f"'{PREDICTION}' and '{GROUND_TRUTH}': render with it and add them, or leave it at 'difficulty'"
+            )
 
     def _due(self, step: int) -> bool:
         """Whether a densification or a final pruning happens at this step, at gsplat's places in the schedule."""
