@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import machine_tables
+import sweep_tables
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
 
@@ -40,6 +41,7 @@ PAGES = tuple(
         "docs/results/h200/house.md",
         "docs/results/h200/masks.md",
         "docs/viewer.md",
+        *(f"docs/results/sweeps/{name}.md" for name in sweep_tables.rounds()),
     )
 )
 PICTURE = ROOT / "docs/results/headline.png"
@@ -64,7 +66,7 @@ PICTURE_TICKS = (
     {"50k": 5e4, "100k": 1e5, "200k": 2e5, "500k": 5e5, "1M": 1e6, "2M": 2e6},
 )
 CAPTURES = ("fox", "caliterra", "snowmiku")
-BLOCK = re.compile(r"(<!-- made: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
+BLOCK = re.compile(r"(<!-- made: ([\w ]+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 OURS = (
     ("baselines", "3dgs", "3DGS by gsplat's strategy in our renderer, 30,000 iterations"),
@@ -356,6 +358,15 @@ def within_bound(full: VariantRow | None, paper: VariantRow | None, end: bool) -
     return f"{difference:+.2f} dB, {'within' if difference >= -BOUND else 'beyond'} the bound"
 
 
+@cache
+def round_tables(name: str) -> dict[str, str]:
+    return sweep_tables.tables_of(name)
+
+
+def round_table(name: str, table_name: str) -> str:
+    return round_tables(name)[table_name]
+
+
 TABLES: dict[str, Callable[[], str]] = {
     "dropin": machine_tables.dropin,
     "exposures": machine_tables.exposures,
@@ -370,6 +381,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "viewer": machine_tables.viewer,
     "wall": machine_tables.wall,
 }
+TABLES |= {name: lambda name=name: round_table(*name.split()) for name in sweep_tables.names()}
 
 
 def filled(text: str) -> str:
