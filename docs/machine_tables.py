@@ -5,13 +5,17 @@ from __future__ import annotations
 import json
 import math
 import statistics
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from turbogs_plugin.bench.numerics import SolverResult, solvers_table
 from turbogs_plugin.bench.viewer import summarised
 from turbogs_plugin.bench.wall import WallRun
+from turbogs_plugin.config.configuration import load_config
+from turbogs_plugin.plan.memory import MemoryDemand
 from turbogs_plugin.report.tables import table
 
 H200 = Path(__file__).resolve().parent / "results/h200"
@@ -96,7 +100,8 @@ def dropin(file: Path = DROPIN) -> str:
 def wall(file: Path = H200 / "wall.json") -> str:
     """Where each second of `turbogs train` goes: of each capture the run in the middle, by what it took beside
     training."""
-    runs = {capture: WallRun(**report["median"]) for capture, report in json.loads(file.read_text()).items()}
+    reports = json.loads(file.read_text())
+    runs = {capture: WallRun(**report["median"]) for capture, report in reports.items()}
     rows: dict[str, list[float]] = {part: [] for run in runs.values() for part in run.parts}
     for run in runs.values():
         for part, column in rows.items():
@@ -105,7 +110,8 @@ def wall(file: Path = H200 / "wall.json") -> str:
     rows["training alone"] = [run.train_seconds for run in runs.values()]
     rows["beside training"] = [run.beside_training for run in runs.values()]
     rows["from decoded photos to the first iteration"] = [run.to_first_iteration for run in runs.values()]
-    return table(("s", *runs), [(name, *(f"{value:.2f}" for value in column)) for name, column in rows.items()])
+    made = table(("s", *runs), [(name, *(f"{value:.2f}" for value in column)) for name, column in rows.items()])
+    return f"{'; '.join(dict.fromkeys(map(where, reports.values())))}.\n\n{made}"
 
 
 def viewer(folder: Path = H200) -> str:
@@ -131,3 +137,147 @@ def viewer(folder: Path = H200) -> str:
         return "Not measured yet."
     header = ("capture", "Gaussians", "iterations a second, without", "nobody looks", "a client that moves")
     return table((*header, "its frames a second", "pixels wide"), lines)
+
+
+STEPS = {
+    "EPS": "draw",
+    "FWD": "projection to colour",
+    "gather+L+E": "photo, loss, maps",
+    "BWD": "backward",
+    "solve+update": "solve, update",
+}
+"""The paper's steps of an iteration that take time, and what they are called in a table."""
+
+
+def measured(name: str) -> dict[str, Any]:
+    return json.loads((H200 / name).read_text())
+
+
+def on(name: str, made: Callable[[], str]) -> str:
+    """A table of a file of `turbogs bench`, below a line with what it was measured on."""
+    record = measured(name)
+    width, height = record["image_size"]
+    views = f"{record['training_views']} training views of " if "training_views" in record else ""
+    return f"{where(record)}; {record['scene']}, {views}{width}x{height}.\n\n{made()}"
+
+
+def where(record: dict[str, Any]) -> str:
+    """Machine, commit and torch of a file of `turbogs bench`."""
+    provenance = record["provenance"]
+    machine = provenance["machine"].partition(" (")[0]
+    return f"{machine}, commit {provenance['commit'][:7]}, torch {provenance['software']['torch']}"
+
+
+def steps() -> str:
+    """Milliseconds of a whole iteration [10 %, 90 %], of its steps [floor], and of all with events around each."""
+    lines = []
+    for entry in measured("bench-step.json")["passes"]:
+        whole, parts, floors = entry["free_running"], entry["steps"], entry["floors_ms"]
+        texts = (f"{parts[step]['device']['median_ms']:.3f} [{floors[step]:.3f}]" for step in STEPS)
+        spread = f"{whole['median_ms']:.2f} [{whole['p10_ms']:.2f}, {whole['p90_ms']:.2f}]"
+        events = f"{parts['iteration']['device']['median_ms']:.2f}"
+        density = f"{entry['density_event']['wall']['median_ms']:.1f}"
+        lines.append((f"{entry['gaussians'] // 1000}k", entry["views"], spread, *texts, events, density))
+    return table(("Gaussians", "K", "whole", *STEPS.values(), "with events", "an event of density control"), lines)
+
+
+def memory() -> str:
+    """Bytes of the device at the peak, what they are, and what turbogs_plugin/plan/memory.py predicts."""
+    record = measured("bench-step.json")
+    pixels, views = math.prod(record["image_size"]), record["training_views"]
+    lines = []
+    for entry in record["passes"]:
+        places = (f"train.{of}_place=device" for of in ("photos", "maps"))
+        config = load_config(
+            "turbogs", ["schedule.type=fixed", f"schedule.views={entry['views']}", "train.sh_degree=3", *places]
+        )
+        demand = MemoryDemand.of(config, pixels * views, 0, pixels, views)
+        sizes = entry["memory_bytes"]
+        predicted = (demand.fixed + demand.per_gaussian * entry["gaussians"]) / sizes["peak"]
+        texts = (f"{sizes[part] / 1e9:.2f}" for part in (*MEMORY, "peak"))
+        lines.append((f"{entry['gaussians'] // 1000}k", entry["views"], *texts, f"{predicted:.2f}"))
+    return table(("Gaussians", "K", *MEMORY.values(), "peak", "predicted, times the peak"), lines)
+
+
+MEMORY = {
+    "parameters": "parameters",
+    "optimizer": "optimizer",
+    "density_statistics": "statistics",
+    "error_maps": "maps",
+    "training_photos": "photos",
+    "raster_workspace": "rasterizer",
+    "temporary": "temporaries",
+}
+
+
+def offload() -> str:
+    """Milliseconds of an iteration by the wall clock with photos and maps in host memory, and what travels."""
+    (entry,) = measured("bench-4k.json")["passes"]
+    alone = entry["wall"]["median_ms"]
+    stored = (entry["memory_bytes"]["error_maps"] + entry["memory_bytes"]["training_photos"]) / 1e9
+    lines = [(f"all on the GPU ({stored:.1f} GB of photos and maps)", f"{alone:.2f}", "", "", "")]
+    for place, found in entry["offload"].items():
+        time = found["wall"]["median_ms"]
+        sizes = (
+            f"{found[key] / 1e9:.2f} GB" if found[key] else "" for key in ("window_bytes", "bytes_in", "bytes_out")
+        )
+        lines.append(
+            (
+                f"{place} in host memory",
+                f"{time:.2f} ({time - alone:+.2f})",
+                *(f"{size:.2f} GB" if size else "" for size in sizes),
+            )
+        )
+    return table(("", "ms", "in the windows", "travels in", "travels out"), lines)
+
+
+def builds() -> dict[str, dict[str, Any]]:
+    record = measured("bench-raster.json")
+    (exact,) = record["other_builds"].values()
+    return {"default": record, "exact": exact}
+
+
+def raster() -> str:
+    """Milliseconds of a forward and backward pass of three views, beside gsplat's and beside the exact build."""
+    lines = []
+    for peer in measured("bench-raster.json")["gsplat"]:
+        theirs, cells = peer["unpacked"]["median_ms"], []
+        for record in builds().values():
+            for rate in (1.0, 0.1):
+                ours = pass_ms(record, peer["gaussians"], peer["views"], rate, False)
+                cells.append(f"{ours:.2f} ({ours / theirs:.2f})")
+        lines.append((f"{peer['gaussians'] // 1000}k", peer["views"], f"{theirs:.2f}", *cells))
+    header = (f"{build}, r = {rate}" for build in ("ours", "exact build") for rate in (1, 0.1))
+    return table(("Gaussians", "K", "gsplat 1.5.3, dense", *header), lines)
+
+
+def pass_ms(record: dict[str, Any], gaussians: int, views: int, rate: float, sums: bool) -> float:
+    """Median of the pass that is named."""
+    asked = {"gaussians": gaussians, "views": views, "rate": rate, "density_sums": sums}
+    (entry,) = (entry for entry in record["passes"] if asked.items() <= entry.items())
+    return entry["forward_backward"]["median_ms"]
+
+
+def precision() -> str:
+    """Error against time of both builds: errors against float64, times of 600k Gaussians, K = 10, r = 0.1."""
+    lines = []
+    for build, record in builds().items():
+        errors = record["precision"]
+        gradients = (f"{errors[f'{name}_gradient']:.2e}" for name in ("mean", "conic", "color", "opacity"))
+        colors = (f"{errors[f'forward_{name}']:.2e}" for name in ("mean", "max", "beyond_1e-4"))
+        lines.append((build, f"{pass_ms(record, 600_000, 10, 0.1, True):.2f}", *colors, *gradients))
+    header = ("colours: mean", "maximum", "share beyond 1e-4", "gradient of means", "conics", "colours", "opacities")
+    return table(("build", "ms", *header), lines)
+
+
+def solvers() -> str:
+    """Error and time of the optimizer's solvers, as `turbogs bench numerics` printed it."""
+    record = json.loads((H200.parent / "numerics/solvers.json").read_text())
+    machine = record["machine"]
+    made = solvers_table([SolverResult(**_numbers(result)) for result in record["results"]])
+    return f"{machine['hardware']}, {machine['threads']} thread, torch {machine['software']['torch']}.\n\n{made}"
+
+
+def _numbers(result: dict[str, Any]) -> dict[str, Any]:
+    """JSON has null for NaN."""
+    return {name: math.nan if value is None else value for name, value in result.items()}

@@ -34,10 +34,13 @@ PAGES = tuple(
     ROOT / name
     for name in (
         "README.md",
+        "docs/budgets.md",
         "docs/drop-in.md",
+        "docs/numerics.md",
         "docs/paper.md",
         "docs/plan.md",
         "docs/results/README.md",
+        "docs/results/h200/README.md",
         "docs/results/h200/house.md",
         "docs/results/h200/masks.md",
         "docs/viewer.md",
@@ -379,6 +382,12 @@ TABLES: dict[str, Callable[[], str]] = {
     "paper_whole": paper_whole,
     "parts": lambda: changes("parts"),
     "viewer": machine_tables.viewer,
+    "memory": lambda: machine_tables.on("bench-step.json", machine_tables.memory),
+    "offload": lambda: machine_tables.on("bench-4k.json", machine_tables.offload),
+    "precision": lambda: machine_tables.on("bench-raster.json", machine_tables.precision),
+    "raster": lambda: machine_tables.on("bench-raster.json", machine_tables.raster),
+    "solvers": machine_tables.solvers,
+    "steps": lambda: machine_tables.on("bench-step.json", machine_tables.steps),
     "wall": machine_tables.wall,
 }
 TABLES |= {name: lambda name=name: round_table(*name.split()) for name in sweep_tables.names()}
