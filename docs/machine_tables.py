@@ -97,7 +97,11 @@ def dropin(file: Path = DROPIN) -> str:
     )
 
 
-def wall(file: Path = H200 / "wall.json") -> str:
+WALL = H200 / "wall.json"
+"""Capture -> what `turbogs bench wall` wrote."""
+
+
+def wall(file: Path = WALL) -> str:
     """Where each second of `turbogs train` goes: of each capture the run in the middle, by what it took beside
     training."""
     reports = json.loads(file.read_text())
@@ -218,16 +222,9 @@ def offload() -> str:
     lines = [(f"all on the GPU ({stored:.1f} GB of photos and maps)", f"{alone:.2f}", "", "", "")]
     for place, found in entry["offload"].items():
         time = found["wall"]["median_ms"]
-        sizes = (
-            f"{found[key] / 1e9:.2f} GB" if found[key] else "" for key in ("window_bytes", "bytes_in", "bytes_out")
-        )
-        lines.append(
-            (
-                f"{place} in host memory",
-                f"{time:.2f} ({time - alone:+.2f})",
-                *(f"{size:.2f} GB" if size else "" for size in sizes),
-            )
-        )
+        sizes = (found[key] / 1e9 for key in ("window_bytes", "bytes_in", "bytes_out"))
+        texts = (f"{size:.2f} GB" if size else "" for size in sizes)
+        lines.append((f"{place} in host memory", f"{time:.2f} ({time - alone:+.2f})", *texts))
     return table(("", "ms", "in the windows", "travels in", "travels out"), lines)
 
 

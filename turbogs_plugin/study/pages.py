@@ -112,10 +112,10 @@ def _header(study: Study) -> list[Block]:
     blocks += [Paragraph(f"LPIPS was not computed: {reason}.") for reason in missing]
     if not all(math.isnan(result.cell_seconds) for result in results):
         blocks.insert(1, Paragraph(CELL_RULES))
-    return [*blocks, *_machines(study.provenances), *_changed_since(study)]
+    return [*blocks, *_machines(study.provenances), *changed_since(study)]
 
 
-def _changed_since(study: Study) -> list[Block]:
+def changed_since(study: Study) -> list[Paragraph]:
     """A line that marks a page whose baseline a packaged configuration no longer gives."""
     ablation = study.ablation
     measured = [result for result in study.results if result.variant == ablation.baseline]

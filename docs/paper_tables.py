@@ -1,0 +1,145 @@
+"""Tables of docs/paper.md: what each part of the paper is worth, and the whole of it beside 3DGS."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Mapping
+from typing import NamedTuple
+
+from study_tables import CAPTURES, change, result, rows_of
+
+from turbogs_plugin.report.tables import table
+from turbogs_plugin.study.summary import VariantRow
+from turbogs_plugin.study.verdict import verdict
+
+BOUND = 0.3
+"""dB by which `turbogs-paper` may be worse than 3DGS at its full length."""
+
+
+class Part(NamedTuple):
+    """A part of the paper.
+
+    Args:
+        name: what it is; in brackets what the full method loses without it in the paper's table of components.
+        ours: the variants of `parts` with it and without it; either is `turbogs`, or the row has no default.
+        papers: the same of `paper_parts`, or None where it has none.
+    """
+
+    name: str
+    ours: tuple[str, str]
+    papers: tuple[str, str] | None = None
+
+    @property
+    def default(self) -> str:
+        """Whose way today's `turbogs` has."""
+        with_it, without = self.ours
+        return "the paper's" if with_it == "turbogs" else "ours" if without == "turbogs" else ""
+
+
+PARTS = (
+    Part(
+        "geometry-aware views, not random ones (+0.31 dB)",
+        ("geometry-views", "turbogs"),
+        ("turbogs-paper", "random-views"),
+    ),
+    Part(
+        "error-guided pixels, not random ones (+0.47 dB)",
+        ("turbogs", "random-pixels"),
+        ("turbogs-paper", "random-pixels"),
+    ),
+    Part("Moment-LM, not sparse Adam", ("turbogs", "sparse-adam"), ("turbogs-paper", "sparse-adam")),
+    Part("the error-driven score, not the gradient alone", ("turbogs", "no-score"), ("turbogs-paper", "no-score")),
+    Part("the same without our decay and long-axis splits", ("plain-splits", "plain-splits-no-score")),
+    Part("error-driven density, not gsplat's", ("turbogs", "density-gsplat")),
+    Part("error-driven density, not votes as FastGS's (+0.02 dB)", ("turbogs", "density-fastgs")),
+    Part("final pruning", ("final-pruning", "turbogs"), ("turbogs-paper", "no-final-pruning")),
+    Part("pruning by score at every event", ("prune-by-score", "turbogs")),
+    Part("the raw sum as the score", ("score-raw", "turbogs")),
+    Part("NCC (+0.48 dB)", ("turbogs", "no-ncc"), ("turbogs-paper", "no-ncc")),
+    Part("NCC, not SSIM of a tile's samples (+0.36 dB)", ("turbogs", "sparse-ssim")),
+    Part("NCC at the weight of 1, not 0.4", ("ncc-1", "turbogs")),
+    Part("the printed NCC: a flat tile scores 0", ("printed-ncc", "turbogs")),
+    Part("3DGS's learning rates", ("rates-3dgs", "turbogs"), ("turbogs-paper", "rates-turbogs")),
+    Part("3DGS's splits, no opacity decay", ("plain-splits", "turbogs")),
+    Part("3DGS's splits alone", ("split-sample", "turbogs")),
+    Part("no opacity decay, alone", ("no-decay", "turbogs")),
+    Part("3DGS's percent_dense, .01", ("percent-dense-0.01", "turbogs")),
+    Part("pruning by the scene's extent, as 3DGS", ("prune-by-extent", "turbogs")),
+    Part("a band of harmonics every 1000 iterations, as 3DGS", ("sh-interval-1000", "turbogs")),
+    Part("no backdrop", ("no-backdrop", "turbogs")),
+    Part("no bound on far sizes", ("distant-unbounded", "turbogs")),
+)
+
+
+def comparisons(study: str, variants: tuple[str, str] | None) -> dict[str, VariantRow]:
+    """Capture -> the first variant against the second, where both have a seed in common."""
+    if variants is None:
+        return {}
+    found = {}
+    for capture, rows in rows_of(study).items():
+        if all(name in rows for name in variants):
+            with_it, without = (rows[name].cells for name in variants)
+            row = VariantRow(variants[0], with_it, without)
+            if row.difference("psnr").count:
+                found[capture] = row
+    return {capture: found[capture] for capture in CAPTURES if capture in found}
+
+
+def effects(rows: Mapping[str, VariantRow]) -> str:
+    return "<br>".join(f"{capture}: {change(row)}" for capture, row in rows.items()) or "-"
+
+
+def paper_parts() -> str:
+    """Each part of the paper: what it adds to ours and to the paper's configuration, the verdict, and the default."""
+    lines = []
+    for part in PARTS:
+        ours, papers = comparisons("parts", part.ours), comparisons("paper_parts", part.papers)
+        said, said_there = verdict(ours, CAPTURES), verdict(papers, CAPTURES)
+        told = f"{said.text}<br>in the paper's: {said_there.text}" if part.papers else said.text
+        default = part.default or "-"
+        if part.default and said.decides not in ("", part.default):
+            default = f"{part.default}; **should be {said.decides}**"
+        lines.append((part.name, effects(ours), effects(papers), told, default))
+    header = ("the paper's part", "in our default", "in the paper's configuration", "verdict", "default")
+    return table(header, lines)
+
+
+def paper_whole() -> str:
+    """The paper's configuration with and without its repair, beside full-length 3DGS and ours."""
+    found = {study: rows_of(study) for study in ("baselines", "paper_parts", "parts")}
+    entries = {
+        "3DGS, 30,000 iterations": ("baselines", "3dgs"),
+        "`turbogs-paper`": ("paper_parts", "turbogs-paper"),
+        "`paper-literal`, without the repair": ("paper_parts", "paper-literal"),
+        "`turbogs`": ("parts", "turbogs"),
+    }
+    rows = {
+        name: {capture: found[study].get(capture, {}).get(variant) for capture in CAPTURES}
+        for name, (study, variant) in entries.items()
+    }
+    lines = [(name, *(whole_run(row) for row in by_capture.values())) for name, by_capture in rows.items()]
+    full, paper, *_ = rows.values()
+    for name, end in (("end", True), ("best on the way", False)):
+        cells = [within_bound(full[capture], paper[capture], end) for capture in CAPTURES]
+        lines.append((f"`turbogs-paper`, its end, minus 3DGS, its {name}", *cells))
+    return table(("", *CAPTURES), lines)
+
+
+def best_psnr(row: VariantRow) -> float:
+    """dB: the highest that a run had on its way, mean over seeds."""
+    return statistics.fmean(max(entry.psnr for entry in cell.history) for cell in row.cells)
+
+
+def whole_run(row: VariantRow | None) -> str:
+    if row is None:
+        return "not measured yet"
+    means = [row.spread(measure).mean for measure in ("seconds", "psnr", "ssim", "gaussians")]
+    return f"{result(*means)}; best on the way {best_psnr(row):.2f} dB ({len(row.cells)})"
+
+
+def within_bound(full: VariantRow | None, paper: VariantRow | None, end: bool) -> str:
+    """The difference of means over all seeds of either, and whether the bound is kept."""
+    if full is None or paper is None:
+        return "not measured yet"
+    difference = paper.psnr.mean - (full.psnr.mean if end else best_psnr(full))
+    return f"{difference:+.2f} dB, {'within' if difference >= -BOUND else 'beyond'} the bound"

@@ -1,0 +1,166 @@
+"""Tables of README.md and of pages in docs/ that are made of the studies in docs/results."""
+
+from __future__ import annotations
+
+import json
+import math
+from functools import cache
+from pathlib import Path
+
+import machine_tables
+
+from turbogs_plugin.report.tables import table
+from turbogs_plugin.study.folder import StudyFolder
+from turbogs_plugin.study.pages import changed_since, difference_text
+from turbogs_plugin.study.results import Study
+from turbogs_plugin.study.summary import VariantRow, summarise
+
+ROOT = Path(__file__).resolve().parent.parent
+CAPTURES = ("fox", "caliterra", "snowmiku")
+
+OURS = (
+    ("baselines", "3dgs", "3DGS by gsplat's strategy in our renderer, 30,000 iterations"),
+    ("baselines", "3dgs-as-shipped", "the same with gsplat 1.5.3's reset of opacities, which never happens"),
+    ("baselines", "mcmc", "MCMC by gsplat's strategy in our renderer, 30,000 iterations"),
+    ("baselines", "fastgs", "density by votes of many views, after FastGS, in our renderer, 30,000 iterations"),
+    ("paper_parts", "turbogs-paper", "turbogs-paper"),
+    ("parts", "turbogs", "**turbogs**"),
+)
+"""Rows of the headline table that are ours, where they are measured: study, variant, what to call it."""
+
+
+@cache
+def read_study(folder: Path) -> Study:
+    return StudyFolder(folder).read_study()
+
+
+def rows_of(study: str) -> dict[str, dict[str, VariantRow]]:
+    """Capture -> variant -> its row; none of a study that is not measured yet."""
+    if not (ROOT / "docs/results" / study / "results.json").is_file():
+        return {}
+    summaries = summarise(read_study(ROOT / "docs/results" / study))
+    return {summary.scene: {row.name: row for row in summary.rows} for summary in summaries}
+
+
+def result(seconds: float, psnr: float, ssim: float | None, gaussians: float | None, wall: str | None = None) -> str:
+    """``4.1 s, 32.20 dB, .893, 209k``; what was not recorded is left out. With `wall`, ``4.1 / 9.5 s``."""
+    size = (
+        gaussians if gaussians is None else f"{gaussians / 1e6:.2f}M" if gaussians >= 1e6 else f"{gaussians / 1e3:.0f}k"
+    )
+    clocks = duration(seconds) if wall is None else f"{duration(seconds)} / {wall}"
+    parts = [f"{clocks} s", f"{psnr:.2f} dB"]
+    parts += [] if ssim is None else [f"{ssim:.3f}".lstrip("0")]
+    return ", ".join(parts if size is None else [*parts, size])
+
+
+def duration(seconds: float) -> str:
+    return "-" if math.isnan(seconds) else f"{seconds:.1f}" if seconds < 10 else f"{seconds:.0f}"
+
+
+def headline() -> str:
+    """Ours beside the others, on each capture: seconds of training, and on the wall where they were recorded."""
+    peers = json.loads((ROOT / "docs/results/peers.json").read_text())
+    lines: dict[str, dict[str, str]] = {}
+    for entry in peers["rows"]:
+        beyond = peers["beyond_training"].get(entry["method"].split()[0], ())
+        wall = " to ".join(duration(entry["seconds"] + more) for more in sorted(set(beyond))) or "-"
+        cell = result(entry["seconds"], entry["psnr"], entry["ssim"], entry["gaussians"], wall)
+        lines.setdefault(entry["method"], {})[entry["capture"]] = cell
+    for study, variant, name in OURS:
+        for capture, rows in rows_of(study).items():
+            if row := rows.get(variant):
+                means = [row.spread(measure).mean for measure in ("seconds", "psnr", "ssim", "gaussians")]
+                wall = duration(wall_seconds(variant, capture) or row.spread("cell_seconds").mean)
+                seeds = f" ({len(row.cells)})" if len(row.cells) > 1 else ""
+                lines.setdefault(name, {})[capture] = f"{result(*means, wall)}{seeds}"
+    return table(
+        ("", *CAPTURES), [[name, *(cells.get(capture, "") for capture in CAPTURES)] for name, cells in lines.items()]
+    )
+
+
+def wall_seconds(variant: str, capture: str) -> float | None:
+    """Of a whole `turbogs train`, the run in the middle of `turbogs bench wall`; None where that is not measured."""
+    report = json.loads(machine_tables.WALL.read_text()).get(capture)
+    return report["median"]["seconds"] if report and variant == "turbogs" else None
+
+
+def ahead() -> str:
+    """When `turbogs` had the PSNR that the others end with, how much sooner, and how many times their Gaussians."""
+    peers = json.loads((ROOT / "docs/results/peers.json").read_text())
+    ours = {capture: rows["turbogs"] for capture, rows in rows_of("parts").items()}
+    lines: dict[str, dict[str, str]] = {}
+    for entry in peers["rows"]:
+        row = ours[entry["capture"]]
+        times = [time for time in row.seconds_to(entry["psnr"]) if math.isfinite(time)]
+        parts = ["never"]
+        if times:
+            mean = math.fsum(times) / len(times)
+            parts = [f"{mean:.1f} s, {entry['seconds'] / mean:.0f} times sooner"]
+        parts += [] if len(times) == len(row.cells) else [f"{len(times)} of {len(row.cells)} seeds"]
+        if entry["gaussians"]:
+            parts.append(f"x {row.spread('gaussians').mean / entry['gaussians']:.1f} N")
+        lines.setdefault(entry["method"], {})[entry["capture"]] = ", ".join(parts)
+    return table(
+        ("against", *CAPTURES),
+        [[name, *(cells.get(capture, "") for capture in CAPTURES)] for name, cells in lines.items()],
+    )
+
+
+def headline_sources() -> str:
+    """Machine and commit of each row of ours; a line for what a packaged configuration no longer gives."""
+    lines, stale = [], []
+    for study, variant, name in OURS:
+        rows = [found[variant] for found in rows_of(study).values() if variant in found]
+        places = [place for row in rows for cell in row.cells if (place := cell.provenance)]
+        if rows:
+            said = sorted({f"{place.machine.partition(' (')[0]}, commit {place.commit[:7]}" for place in places})
+            lines.append((name, "; ".join(said) or "not recorded"))
+            stale += [block.markdown() for block in changed_since(read_study(ROOT / "docs/results" / study))]
+    reports = json.loads(machine_tables.WALL.read_text())
+    lines.append(("turbogs, on the wall", "; ".join(dict.fromkeys(map(machine_tables.where, reports.values())))))
+    peers = json.loads((ROOT / "docs/results/peers.json").read_text())
+    lines.append(("the others", peers["measured"]))
+    return "\n\n".join([table(("row", "measured on"), lines), *dict.fromkeys(stale)])
+
+
+def changes(study: str) -> str:
+    """Every variant of a study against its own baseline, over the same seeds."""
+    found = rows_of(study)
+    captures = [capture for capture in CAPTURES if capture in found]
+    lines = []
+    for variant in read_study(ROOT / "docs/results" / study).ablation.variants:
+        cells = []
+        for capture in captures:
+            row = found[capture].get(variant)
+            cells.append("" if row is None or row.cells == row.base else change(row))
+        if any(cells):
+            lines.append((variant, *cells))
+    return table(("", *captures), lines)
+
+
+def change(row: VariantRow) -> str:
+    """Differences in PSNR and SSIM, ratios of time and Gaussians, and how many seeds."""
+    sizes = row.ratio("gaussians")
+    error, said, clear = difference_text(row.difference("psnr"), 2).partition(" (clear)")
+    parts = [f"{error} dB{said}{clear}", difference_text(row.difference("ssim"), 4)]
+    parts += [f"x {row.ratio('seconds'):.2f} s", "" if math.isnan(sizes) else f"x {sizes:.2f} N"]
+    return f"{', '.join(filter(None, parts))} ({row.difference('psnr').count})"
+
+
+def house_runs() -> str:
+    """Whole runs before, as measured then, and `turbogs` of the study `parts`: mean and range of five seeds."""
+    found, lines = rows_of("parts"), []
+    for capture, base in machine_tables.house()["base_runs"].items():
+        row = found[capture]["turbogs"]
+        spreads = [row.spread(measure) for measure in ("seconds", "psnr", "ssim")]
+        after = [[spread.mean, spread.low, spread.high] for spread in spreads]
+        for build, values, size in (
+            ("base", [base[measure] for measure in ("seconds", "psnr", "ssim")], base["gaussians"]),
+            ("new", after, row.spread("gaussians").mean),
+        ):
+            texts = [
+                f"{mean:.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]"
+                for (mean, low, high), digits in zip(values, (1, 2, 4), strict=True)
+            ]
+            lines.append((capture, build, *texts, f"{size:.0f}"))
+    return table(("capture", "build", "s", "PSNR", "SSIM", "Gaussians"), lines)
