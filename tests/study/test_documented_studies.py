@@ -1,6 +1,6 @@
 """The studies in docs/results: their pages and plots are those that `make pages` makes of their results."""
 
-import importlib.util
+import importlib
 import json
 import re
 import sys
@@ -21,10 +21,10 @@ from turbogs_plugin.train.history import Evaluation
 
 DOCS = Path(__file__).parents[2] / "docs"
 FOLDERS = sorted(path.parent for path in DOCS.glob("results/*/results.json"))
-sys.path.insert(0, str(DOCS))  # make_pages.py imports its neighbour
-SPEC = importlib.util.spec_from_file_location("make_pages", DOCS / "make_pages.py")
-make_pages = importlib.util.module_from_spec(SPEC)
-SPEC.loader.exec_module(make_pages)
+sys.path.insert(0, str(DOCS))  # the scripts import their neighbours
+make_pages, machine_tables, paper_tables, study_tables = (
+    importlib.import_module(name) for name in ("make_pages", "machine_tables", "paper_tables", "study_tables")
+)
 NOT_IN_THE_REPOSITORY = {"report.html", "table.csv"}  # .gitignore has them: `make pages` leaves them here
 
 
@@ -55,19 +55,19 @@ def test_the_tables_in_the_pages_are_those_of_the_results():
 
 
 def test_every_part_of_the_paper_has_its_row():
-    pairs = {"parts": [part.ours for part in make_pages.PARTS]}
-    pairs["paper_parts"] = [part.papers for part in make_pages.PARTS if part.papers]
+    pairs = {"parts": [part.ours for part in paper_tables.PARTS]}
+    pairs["paper_parts"] = [part.papers for part in paper_tables.PARTS if part.papers]
     for study, named in pairs.items():
         variants = {variant for pair in named for variant in pair}
         known = set(load_ablation(study).variants)
         assert known - variants <= {"paper-literal"} and variants <= known, "paper-literal has its own table"
-    assert {part.default for part in make_pages.PARTS} == {"the paper's", "ours", ""}
+    assert {part.default for part in paper_tables.PARTS} == {"the paper's", "ours", ""}
 
 
 def a_study(folder: Path, name: str, results: dict[str, tuple[float, ...]]) -> None:
     """Results of a packaged ablation on every capture, variant -> final PSNRs of its seeds."""
     ablation, cells = load_ablation(name), []
-    for capture in make_pages.CAPTURES:
+    for capture in study_tables.CAPTURES:
         for variant, psnrs in results.items():
             config = variant_config(ablation, variant, 0, (), None).without_plan().to_mapping()
             for seed, psnr in enumerate(psnrs):
@@ -81,41 +81,116 @@ def a_study(folder: Path, name: str, results: dict[str, tuple[float, ...]]) -> N
 
 
 def test_what_is_not_measured_yet_says_so_until_it_is(tmp_path, monkeypatch):
-    monkeypatch.setattr(make_pages, "ROOT", tmp_path)
-    assert make_pages.paper_parts().count("not measured yet") == len(make_pages.PARTS) + sum(
-        part.papers is not None for part in make_pages.PARTS
+    monkeypatch.setattr(study_tables, "ROOT", tmp_path)
+    assert paper_tables.paper_parts().count("not measured yet") == len(paper_tables.PARTS) + sum(
+        part.papers is not None for part in paper_tables.PARTS
     )
-    assert make_pages.paper_whole().count("not measured yet") == 6 * 3
+    assert paper_tables.paper_whole().count("not measured yet") == 6 * 3
     a_study(tmp_path, "parts", {"turbogs": (31.0, 31.1), "geometry-views": (31.0, 31.1), "no-ncc": (31.5, 31.6)})
     a_study(tmp_path, "paper_parts", {"turbogs-paper": (30.0, 30.1), "random-views": (30.5,), "paper-literal": (8.0,)})
     a_study(tmp_path, "baselines", {"3dgs": (30.3,)})
-    lines = {line.split(" | ")[0]: line for line in make_pages.paper_parts().splitlines()}
+    lines = {line.split(" | ")[0]: line for line in paper_tables.paper_parts().splitlines()}
     (views,) = (line for line in lines.values() if "geometry-aware" in line)
     assert "fox: +0.00 ± 0.00 dB" in views and "as good<br>in the paper's: one seed" in views
     assert views.endswith("| ours; **should be the paper's** |") and "fox: -0.50 dB" in views
-    everywhere = ", ".join(f"PSNR on {capture}" for capture in make_pages.CAPTURES)
+    everywhere = ", ".join(f"PSNR on {capture}" for capture in study_tables.CAPTURES)
     (ncc,) = (line for name, line in lines.items() if name.startswith("| NCC ("))
     assert ncc.endswith(
         f"| worse: {everywhere}<br>in the paper's: not measured yet | the paper's; **should be ours** |"
     )
-    whole = make_pages.paper_whole()
+    whole = paper_tables.paper_whole()
     assert whole.count("7.0 s, 30.30 dB, .900, 1k; best on the way 33.00 dB (1)") == 3 and whole.count("8.00 dB") == 3
     assert whole.count("-0.25 dB, within the bound") == 3 and whole.count("-2.95 dB, beyond the bound") == 3
 
 
 def test_the_headline_has_the_wall_beside_the_training():
-    assert make_pages.result(4.12, 32.2, 0.893, 209e3, make_pages.duration(9.54)) == "4.1 / 9.5 s, 32.20 dB, .893, 209k"
-    assert make_pages.result(74.0, 30.9, None, None, make_pages.duration(float("nan"))) == "74 / - s, 30.90 dB"
+    assert (
+        study_tables.result(4.12, 32.2, 0.893, 209e3, study_tables.duration(9.54))
+        == "4.1 / 9.5 s, 32.20 dB, .893, 209k"
+    )
+    assert study_tables.result(74.0, 30.9, None, None, study_tables.duration(float("nan"))) == "74 / - s, 30.90 dB"
+
+
+def test_the_headline_says_how_many_seeds_and_where_and_when_ours_had_the_others_psnr(tmp_path, monkeypatch):
+    monkeypatch.setattr(study_tables, "ROOT", tmp_path)
+    monkeypatch.setattr(machine_tables, "WALL", tmp_path / "wall.json")
+    a_study(tmp_path, "parts", {"turbogs": (31.0, 32.0)})
+    a_study(tmp_path, "baselines", {"3dgs": (30.3,)})
+    place = {"machine": "NVIDIA H200 (140 GiB)", "commit": "0123456789", "software": {"torch": "2.11.0"}}
+    (tmp_path / "wall.json").write_text(json.dumps({"fox": {"provenance": place, "median": {"seconds": 12.3}}}))
+    rows = [
+        {"method": "Slow", "capture": "fox", "seconds": 50, "psnr": 21.0, "ssim": 0.9, "gaussians": 500},
+        {"method": "Slow", "capture": "caliterra", "seconds": 50, "psnr": 33.0, "ssim": None, "gaussians": None},
+        {"method": "Best", "capture": "fox", "seconds": 60, "psnr": 34.0, "ssim": 0.9, "gaussians": 4000},
+    ]
+    peers = {"measured": "another day", "beyond_training": {}, "rows": rows}
+    (tmp_path / "docs/results/peers.json").write_text(json.dumps(peers))
+    lines = {line.split(" | ")[0].strip("| "): line for line in study_tables.headline().splitlines()}
+    assert "| 7.0 / 12 s, 31.50 dB, .900, 1k (2) | 7.0 / 12 s, 31.50 dB" in lines["**turbogs**"]  # wall; of the cells
+    assert "30.30 dB, .900, 1k |" in next(line for name, line in lines.items() if "gsplat's strategy" in name)
+    ahead = {line.split(" | ")[0].strip("| "): line for line in study_tables.ahead().splitlines()}
+    # 9 dB at .1 s and 33 at 3 s: 21 dB at 1.55 s.
+    assert ahead["Slow"].startswith("| Slow | 1.6 s, 32 times sooner, x 2.0 N | 3.0 s, 17 times sooner |")
+    assert ahead["Best"].startswith("| Best | never, 0 of 2 seeds, x 0.2 N |")
+    sources = study_tables.headline_sources()
+    assert "| **turbogs** | not recorded |" in sources and "| the others | another day |" in sources
+    assert "| turbogs, on the wall | NVIDIA H200, commit 0123456, torch 2.11.0 |" in sources
+
+
+NUMBER = re.compile(r"\d\.\d+ dB\b|\d (?:ms|us)\b|(?<![\d.])0?\.\d{4}\b")
+"""A number that only a run can give: decibels, milliseconds, SSIM."""
+
+MARKS = ("<!-- made: ", "measured once, by hand")
+
+RULES = {
+    "docs/scaling.md": "predictions, which tests/distributed/test_predictions.py compares with their model",
+    "docs/paper.md## What each part is worth": "what counts as a difference",
+    "docs/paper.md## The whole of it": "the bound",
+}
+"""Pages and sections whose numbers are no measurements, and what they are."""
+
+
+def unmarked(page: Path, name: str) -> list[str]:
+    """Sections of a page with a number of a run, without a table made of results and without saying how it was
+    measured; what the page's head says holds for all of it, and its last section may sum up its tables."""
+    text = re.sub(r"^```.*?^```$", "", page.read_text(), flags=re.DOTALL | re.MULTILINE)
+    head, *sections = re.split(r"^(?=##+ )", text, flags=re.MULTILINE)
+    if "measured once, by hand" in " ".join(head.lower().split()) or name in RULES:
+        return []
+    if MARKS[0] in text and sections and sections[-1].startswith("## What they say\n"):
+        sections.pop()
+    found = []
+    for section in (head, *sections):
+        title = section.partition("\n")[0]
+        if NUMBER.search(section) and not any(mark in " ".join(section.lower().split()) for mark in MARKS):
+            found += [] if name + title in RULES else [f"{name}: {title}: {NUMBER.search(section)[0]}"]
+    return found
+
+
+def test_a_number_of_a_run_is_made_of_results_or_says_how_it_was_measured():
+    pages = [DOCS.parent / "README.md", *(path for path in DOCS.rglob("*.md") if path.name != "report.md")]
+    assert len(pages) > 20
+    assert [line for page in pages for line in unmarked(page, str(page.relative_to(DOCS.parent)))] == []
+
+
+def test_a_number_without_a_mark_is_found(tmp_path):
+    page = tmp_path / "page.md"
+    page.write_text(
+        "# Page\n\nIt has 31.20 dB.\n\n## Times\n\nMeasured once,\nby hand: 2 ms.\n\n## More\n\nSSIM .8912\n"
+    )
+    assert unmarked(page, "page.md") == ["page.md: # Page: 1.20 dB", "page.md: ## More: .8912"]
+    page.write_text("# Page\n\nAll was measured once, by hand.\n\n## More\n\n3 ms\n")
+    assert unmarked(page, "page.md") == []
 
 
 def test_what_a_viewer_costs_is_a_row_for_each_capture(tmp_path):
-    assert make_pages.machine_tables.viewer(tmp_path) == "Not measured yet."
+    assert machine_tables.viewer(tmp_path) == "Not measured yet."
     seconds = {"without": 1.0, "nobody looks": 1.0, "client": 1.25}
     runs = [ViewerRun(way, 500, value, gaussians=209_400) for way, value in seconds.items()]
     runs[2].frame_rate, runs[2].width = 24.04, 640
     text = json.dumps({"scene": "fox", "runs": [vars(run) for run in runs]})
     (tmp_path / "viewer-fox.json").write_text(text)
-    row = make_pages.machine_tables.viewer(tmp_path).splitlines()[-1]
+    row = machine_tables.viewer(tmp_path).splitlines()[-1]
     assert row == "| fox | 209k | 500 | +0.0 % [+0.0, +0.0] | -20.0 % [-20.0, -20.0] | 24.0 | 640 |"
 
 
@@ -151,7 +226,7 @@ def test_the_table_of_swaps_reads_both_runs_at_the_earlier_end(tmp_path):
         trainer_run("density", (8, 28), scene="caliterra"),
     ]
     (tmp_path / "dropin.json").write_text(json.dumps({"device": "H200", "runs": runs}))
-    lines = make_pages.machine_tables.dropin(tmp_path / "dropin.json").splitlines()
+    lines = machine_tables.dropin(tmp_path / "dropin.json").splitlines()
     cells = {tuple(line.strip("| ").split(" | ")[:2]): line.strip("| ").split(" | ")[2:] for line in lines[2:]}
     assert len(lines) == 2 + 5
     # Stock at 30 s is halfway between 30 and 31 dB.
@@ -163,4 +238,4 @@ def test_the_table_of_swaps_reads_both_runs_at_the_earlier_end(tmp_path):
     assert cells["fox", "stock"] == ["3000", "40.0", "31.00", "0.8750", "123k"]
     assert cells["fox", "sparse pixels, 4 views"] == ["2000", "5.0", "30.00", "0.8750", "123k"]  # stock: none yet
     assert cells["caliterra", "density control"] == ["1000", "8.0", "28.00", "0.8750", "123k"]
-    assert make_pages.machine_tables.dropin(tmp_path / "none.json") == "Not measured yet."
+    assert machine_tables.dropin(tmp_path / "none.json") == "Not measured yet."
