@@ -49,6 +49,7 @@ def round_table(name: str, table_name: str) -> str:
 
 TABLES: dict[str, Callable[[], str]] = {
     "ahead": study_tables.ahead,
+    "behind": study_tables.behind,
     "dropin": machine_tables.dropin,
     "exposures": machine_tables.exposures,
     "headline": study_tables.headline,

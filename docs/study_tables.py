@@ -106,6 +106,29 @@ def ahead() -> str:
     )
 
 
+NEAR = {"psnr": 0.1, "ssim": 0.001}
+"""Errors that differ by less are called as good: a run of the others is one seed."""
+
+
+def behind() -> str:
+    """Where the others have less error than `turbogs`, or as little with fewer Gaussians."""
+    lines = []
+    for entry in json.loads((ROOT / "docs/results/peers.json").read_text())["rows"]:
+        row = rows_of("parts")[entry["capture"]]["turbogs"]
+        size = (entry["gaussians"] or math.inf) / row.spread("gaussians").mean
+        for measure, digits in (("psnr", 2), ("ssim", 3)):
+            theirs, ours = entry[measure], row.spread(measure).mean
+            if theirs is None or theirs < ours - NEAR[measure]:
+                continue
+            more = theirs > ours + NEAR[measure]
+            if more or size < 1:
+                texts = (f"{value:.{digits}f}".removeprefix("0") for value in (theirs, ours))
+                how = f"{' for '.join(texts)}{' dB' if measure == 'psnr' else ' SSIM'}"
+                which = f"{entry['method']}, {entry['capture']}"
+                lines.append((which, how, "" if math.isinf(size) else f"x {size:.2f}"))
+    return table(("theirs for ours", "error", "Gaussians"), lines)
+
+
 def headline_sources() -> str:
     """Machine and commit of each row of ours; a line for what a packaged configuration no longer gives."""
     lines, stale = [], []

@@ -132,6 +132,12 @@ def test_the_headline_says_how_many_seeds_and_where_and_when_ours_had_the_others
     # 9 dB at .1 s and 33 at 3 s: 21 dB at 1.55 s.
     assert ahead["Slow"].startswith("| Slow | 1.6 s, 32 times sooner, x 2.0 N | 3.0 s, 17 times sooner |")
     assert ahead["Best"].startswith("| Best | never, 0 of 2 seeds, x 0.2 N |")
+    # Ours: 31.50 dB, .900, 1000.
+    assert study_tables.behind().splitlines()[2:] == [
+        "| Slow, fox | .900 for .900 SSIM | x 0.50 |",
+        "| Slow, caliterra | 33.00 for 31.50 dB |  |",
+        "| Best, fox | 34.00 for 31.50 dB | x 4.00 |",
+    ]
     sources = study_tables.headline_sources()
     assert "| **turbogs** | not recorded |" in sources and "| the others | another day |" in sources
     assert "| turbogs, on the wall | NVIDIA H200, commit 0123456, torch 2.11.0 |" in sources
