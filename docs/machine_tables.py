@@ -185,6 +185,18 @@ def steps() -> str:
     return table(("Gaussians", "K", "whole", *STEPS.values(), "with events", "an event of density control"), lines)
 
 
+MEMORY = {
+    "parameters": "parameters",
+    "optimizer": "optimizer",
+    "density_statistics": "statistics",
+    "error_maps": "maps",
+    "training_photos": "photos",
+    "raster_workspace": "rasterizer",
+    "temporary": "temporaries",
+}
+"""Parts of a peak, and what they are called in a table."""
+
+
 def memory() -> str:
     """Bytes of the device at the peak, what they are, and what turbogs_plugin/plan/memory.py predicts."""
     record = measured("bench-step.json")
@@ -201,17 +213,6 @@ def memory() -> str:
         texts = (f"{sizes[part] / 1e9:.2f}" for part in (*MEMORY, "peak"))
         lines.append((f"{entry['gaussians'] // 1000}k", entry["views"], *texts, f"{predicted:.2f}"))
     return table(("Gaussians", "K", *MEMORY.values(), "peak", "predicted, times the peak"), lines)
-
-
-MEMORY = {
-    "parameters": "parameters",
-    "optimizer": "optimizer",
-    "density_statistics": "statistics",
-    "error_maps": "maps",
-    "training_photos": "photos",
-    "raster_workspace": "rasterizer",
-    "temporary": "temporaries",
-}
 
 
 def offload() -> str:
