@@ -6,7 +6,7 @@ import statistics
 from collections.abc import Mapping
 from typing import NamedTuple
 
-from study_tables import CAPTURES, change, result, rows_of
+from study_tables import CAPTURES, change, result, rows_of, stale
 
 from turbogs_plugin.report.tables import table
 from turbogs_plugin.study.summary import VariantRow
@@ -21,19 +21,20 @@ class Part(NamedTuple):
 
     Args:
         name: what it is; in brackets what the full method loses without it in the paper's table of components.
-        ours: the variants of `parts` with it and without it; either is `turbogs`, or the row has no default.
+        ours: the variants of `parts` with it and without it; either is `turbogs`, or None where it has none.
         papers: the same of `paper_parts`, or None where it has none.
     """
 
     name: str
-    ours: tuple[str, str]
+    ours: tuple[str, str] | None
     papers: tuple[str, str] | None = None
 
     @property
     def default(self) -> str:
         """Whose way today's `turbogs` has."""
-        with_it, without = self.ours
-        return "the paper's" if with_it == "turbogs" else "ours" if without == "turbogs" else ""
+        if self.ours is None:
+            return ""
+        return "the paper's" if self.ours[0] == "turbogs" else "ours"
 
 
 PARTS = (
@@ -48,16 +49,15 @@ PARTS = (
         ("turbogs-paper", "random-pixels"),
     ),
     Part("Moment-LM, not sparse Adam", ("turbogs", "sparse-adam"), ("turbogs-paper", "sparse-adam")),
-    Part("the error-driven score, not the gradient alone", ("turbogs", "no-score"), ("turbogs-paper", "no-score")),
-    Part("the same without our decay and long-axis splits", ("plain-splits", "plain-splits-no-score")),
-    Part("error-driven density, not gsplat's", ("turbogs", "density-gsplat")),
-    Part("error-driven density, not votes as FastGS's (+0.02 dB)", ("turbogs", "density-fastgs")),
+    Part("the error-driven score and its gates, not a draw by squares", ("by-difficulty", "turbogs")),
+    Part("the score, not the gradient alone", None, ("turbogs-paper", "no-score")),
+    Part("no pruning by squares at every event", ("no-turnover", "turbogs")),
+    Part("gsplat's density, not ours", ("density-gsplat", "turbogs")),
+    Part("density by votes, as FastGS's, not ours", ("density-fastgs", "turbogs")),
     Part("final pruning", ("final-pruning", "turbogs"), ("turbogs-paper", "no-final-pruning")),
-    Part("pruning by score at every event", ("prune-by-score", "turbogs")),
-    Part("the raw sum as the score", ("score-raw", "turbogs")),
     Part("NCC (+0.48 dB)", ("turbogs", "no-ncc"), ("turbogs-paper", "no-ncc")),
     Part("NCC, not SSIM of a tile's samples (+0.36 dB)", ("turbogs", "sparse-ssim")),
-    Part("NCC at the weight of 1, not 0.4", ("ncc-1", "turbogs")),
+    Part("NCC at the weight of 1, not 0.4", ("turbogs", "ncc-0.4")),
     Part("the printed NCC: a flat tile scores 0", ("printed-ncc", "turbogs")),
     Part("3DGS's learning rates", ("rates-3dgs", "turbogs"), ("turbogs-paper", "rates-turbogs")),
     Part("3DGS's splits, no opacity decay", ("plain-splits", "turbogs")),
@@ -95,13 +95,17 @@ def paper_parts() -> str:
     for part in PARTS:
         ours, papers = comparisons("parts", part.ours), comparisons("paper_parts", part.papers)
         said, said_there = verdict(ours, CAPTURES), verdict(papers, CAPTURES)
-        told = f"{said.text}<br>in the paper's: {said_there.text}" if part.papers else said.text
+        told = "<br>".join(
+            f"{place}{of.text}"
+            for place, of, variants in (("", said, part.ours), ("in the paper's: ", said_there, part.papers))
+            if variants
+        )
         default = part.default or "-"
         if part.default and said.decides not in ("", part.default):
             default = f"{part.default}; **should be {said.decides}**"
         lines.append((part.name, effects(ours), effects(papers), told, default))
     header = ("the paper's part", "in our default", "in the paper's configuration", "verdict", "default")
-    return table(header, lines)
+    return "\n\n".join([table(header, lines), *stale("parts"), *stale("paper_parts")])
 
 
 def paper_whole() -> str:

@@ -131,19 +131,20 @@ def behind() -> str:
 
 def headline_sources() -> str:
     """Machine and commit of each row of ours; a line for what a packaged configuration no longer gives."""
-    lines, stale = [], []
+    lines: list[tuple[str, str]] = []
+    changed: list[str] = []
     for study, variant, name in OURS:
         rows = [found[variant] for found in rows_of(study).values() if variant in found]
         places = [place for row in rows for cell in row.cells if (place := cell.provenance)]
         if rows:
             said = sorted({f"{place.machine.partition(' (')[0]}, commit {place.commit[:7]}" for place in places})
             lines.append((name, "; ".join(said) or "not recorded"))
-            stale += [block.markdown() for block in changed_since(read_study(ROOT / "docs/results" / study))]
+            changed += stale(study)
     reports = json.loads(machine_tables.WALL.read_text())
     lines.append(("turbogs, on the wall", "; ".join(dict.fromkeys(map(machine_tables.where, reports.values())))))
     peers = json.loads((ROOT / "docs/results/peers.json").read_text())
     lines.append(("the others", peers["measured"]))
-    return "\n\n".join([table(("row", "measured on"), lines), *dict.fromkeys(stale)])
+    return "\n\n".join([table(("row", "measured on"), lines), *dict.fromkeys(changed)])
 
 
 def changes(study: str) -> str:
@@ -158,7 +159,14 @@ def changes(study: str) -> str:
             cells.append("" if row is None or row.cells == row.base else change(row))
         if any(cells):
             lines.append((variant, *cells))
-    return table(("", *captures), lines)
+    return "\n\n".join([table(("", *captures), lines), *stale(study)])
+
+
+def stale(study: str) -> list[str]:
+    """A line that says what was measured where a study's baseline is not today's; none where it is."""
+    folder = ROOT / "docs/results" / study
+    measured = (folder / "results.json").is_file()
+    return [block.markdown() for block in changed_since(read_study(folder))] if measured else []
 
 
 def change(row: VariantRow) -> str:

@@ -87,18 +87,16 @@ def test_a_round_whose_rows_and_cells_disagree_is_refused(tmp_path, cells, layou
 
 
 def test_cells_are_gathered_from_studies(tmp_path):
-    ablation = load_ablation("fewer")
+    ablation = load_ablation("sizes")
     history = [Evaluation(0, 0.123, 9.0, 0.2, 0.4, 90, 9), Evaluation(9, 7.0, 31.23456, 0.9123456, 0.1, 1000, 9)]
-    cells = [
-        CellResult(scene="fox", variant="absgrad-4e-4", seed=3, config={}, asked={}, cell_seconds=9.0, history=history)
-    ]
+    cells = [CellResult(scene="fox", variant="cap-57k", seed=3, config={}, asked={}, cell_seconds=9.0, history=history)]
     study = StudyFolder(tmp_path / "study")
     study.path.mkdir()
     study.write_study(Study(ablation, cells))
     file = sweep_tables.gather("new", {"a": study.path / "results.json"}, tmp_path)
     (cell,) = sweep_tables.read_cells(file)
-    assert (cell.name, cell.scene, cell.seed) == ("a absgrad-4e-4", "fox", 3)
-    assert cell.overrides == ["density.absgrad_threshold=4e-4"]
+    assert (cell.name, cell.scene, cell.seed) == ("a cap-57k", "fox", 3)
+    assert cell.overrides == ["density.max_gaussians=57000"]
     assert (cell.psnr, cell.ssim, cell.num_gaussians) == ([9.0, 31.235], [0.2, 0.91235], [90, 1000])
     assert cell.train_seconds == [0.12, 7.0]
 
