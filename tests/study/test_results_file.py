@@ -220,7 +220,7 @@ def test_flip_and_the_seconds_of_a_cell_are_shown_where_a_cell_has_them(turbogs,
     assert turbogs("report", folder.path)[0] == 0
     fox, h = (folder.path / "report.md").read_text().split("\n## h\n")
     assert "| load, train, evaluate in s |" in fox and "| FLIP |" in fox and "Imports and warm-up are not" in fox
-    assert "| load, train, evaluate in s |" not in h and "| FLIP |" not in h
+    assert "| load, train, evaluate in s |" not in h and "| FLIP |" not in h and "FLIP was not computed" not in fox
     (line,) = re.findall(r"\| other \|.*dB.*|\| other \| .* 30\..*", fox)
     assert line.count("| - |") == 1 and "| not computed | not computed |" in line, "a mean over some seeds is none"
     whole = study()
@@ -233,6 +233,12 @@ def test_flip_and_the_seconds_of_a_cell_are_shown_where_a_cell_has_them(turbogs,
     rows = list(csv.DictReader((folder.path / "table.csv").open()))
     assert [(row["flip_mean"], row["cell_seconds_mean"]) for row in rows] == [("0.13", "7.5")] * 2 + [("", "")]
     assert "wall_seconds_mean" not in rows[0]
+    for result in whole.results:
+        result.flip = math.nan
+    folder.write_study(whole)
+    assert turbogs("report", folder.path)[0] == 0
+    page = (folder.path / "report.md").read_text()
+    assert "FLIP was not computed" in page and "| FLIP |" not in page
 
 
 @pytest.mark.usefixtures("laid_out")

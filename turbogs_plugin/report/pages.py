@@ -137,7 +137,7 @@ def _page(run: RunSession, metrics: Metrics, lpips_reason: str, shown: int) -> s
 {lpips}
 Means over the test views{unmasked}. Training time is that of iterations and of the initial error maps; loading,
 evaluation, checkpoints and this report are not in it. Wall time is from the start of the process until the model was
-written. FPS counts test views rendered one after the other.{on}
+written. FPS counts test views rendered one after the other. FLIP: `turbogs eval {run.folder.path.name}`.{on}
 
 `turbogs export {run.folder.path.name} --format html` writes all of this and the model on one page,
 [report.html](report.html).

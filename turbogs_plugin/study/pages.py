@@ -51,6 +51,11 @@ CELL_RULES = (
     "plan, training, and every evaluation. Imports and warm-up are not in them."
 )
 
+NO_FLIP = (
+    "FLIP was not computed: cells of `turbogs ablate` have it where the package flip-evaluator (the extra flip) is "
+    "installed; `turbogs eval RUN` prints that of a run."
+)
+
 HOW_TO_READ = (
     "A number is the mean over seeds, the smallest and the largest in brackets where they matter. A difference is the "
     "mean over the seeds that both have, with its standard error; it is clear where noise alone would make so much in "
@@ -110,6 +115,7 @@ def _header(study: Study) -> list[Block]:
     blocks: list[Block] = [Paragraph(f"{said[:1].upper()}{said[1:]}. {TIMING_RULES} {warmup}"), Paragraph(HOW_TO_READ)]
     missing = sorted({result.lpips_reason for result in results if result.lpips_reason})
     blocks += [Paragraph(f"LPIPS was not computed: {reason}.") for reason in missing]
+    blocks += [Paragraph(NO_FLIP)] if all(math.isnan(result.flip) for result in results) else []
     if not all(math.isnan(result.cell_seconds) for result in results):
         blocks.insert(1, Paragraph(CELL_RULES))
     return [*blocks, *_machines(study.provenances), *changed_since(study)]
