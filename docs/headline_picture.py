@@ -11,11 +11,13 @@ from matplotlib.ticker import NullLocator
 from study_tables import CAPTURES, OURS, ROOT, rows_of
 
 PICTURE = ROOT / "docs/results/headline.png"
-DRAWING = 2
+DRAWING = 3
 """Version of the way in which the picture is drawn: it is drawn anew where its data or this differ."""
 
 PICTURE_COLORS = {
     "turbogs": "#d1495b",
+    "turbogs with a cap": "#e8a0a8",
+    "turbogs-ssim": "#8a1c3a",
     "turbogs-paper": "#17919e",
     "3dgs": "black",
     "3dgs-as-shipped": "0.6",
@@ -27,6 +29,10 @@ PICTURE_COLORS = {
     "Faster-GS": "#2e8b57",
 }
 PICTURE_LABELS = {"3dgs": "3DGS, ours", "mcmc": "MCMC, ours", "fastgs": "votes as FastGS's, ours"}
+PICTURE_NAMES = {
+    "ssim": "turbogs-ssim",
+    **dict.fromkeys(("cap-57k", "cap-67k", "cap-157k"), "turbogs with a cap"),
+}
 PICTURE_TICKS = (
     {"0.3": 0.3, "1": 1, "3": 3, "10": 10, "30": 30, "100": 100},
     {"50k": 5e4, "100k": 1e5, "200k": 2e5, "500k": 5e5, "1M": 1e6, "2M": 2e6},
@@ -37,12 +43,13 @@ def picture_data() -> dict[str, Any]:
     """Capture -> our curves (seconds, PSNR) and end points, and the others' points: what `draw` shows."""
     data: dict[str, Any] = {capture: {"curves": {}, "points": []} for capture in CAPTURES}
     for study, variant, _ in OURS:
+        name = PICTURE_NAMES.get(variant, variant)
         for capture, rows in rows_of(study).items():
             if row := rows.get(variant):
                 curve = row.curve("psnr")
-                data[capture]["curves"][variant] = [curve.seconds.round(4).tolist(), curve.mean.round(4).tolist()]
+                data[capture]["curves"][name] = [curve.seconds.round(4).tolist(), curve.mean.round(4).tolist()]
                 means = [row.spread(measure).mean for measure in ("seconds", "psnr", "gaussians")]
-                data[capture]["points"].append([variant, *(round(value, 4) for value in means)])
+                data[capture]["points"].append([name, *(round(value, 4) for value in means)])
     for entry in json.loads((ROOT / "docs/results/peers.json").read_text())["rows"]:
         name = entry["method"].split()[0].rstrip(",")
         data[entry["capture"]]["points"].append([name, entry["seconds"], entry["psnr"], entry["gaussians"]])

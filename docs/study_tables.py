@@ -24,6 +24,10 @@ OURS = (
     ("baselines", "mcmc", "MCMC by gsplat's strategy in our renderer, 30,000 iterations"),
     ("baselines", "fastgs", "density by votes of many views, after FastGS, in our renderer, 30,000 iterations"),
     ("paper_parts", "turbogs-paper", "turbogs-paper"),
+    ("sizes", "ssim", "turbogs-ssim"),
+    ("sizes", "cap-67k", "turbogs with a cap, FastGS's numbers"),
+    ("sizes", "cap-157k", "turbogs with a cap, FastGS's numbers"),
+    ("sizes", "cap-57k", "turbogs with a cap, FastGS's numbers"),
     ("parts", "turbogs", "**turbogs**"),
 )
 """Rows of the headline table that are ours, where they are measured: study, variant, what to call it."""
@@ -70,7 +74,7 @@ def headline() -> str:
         for capture, rows in rows_of(study).items():
             if row := rows.get(variant):
                 means = [row.spread(measure).mean for measure in ("seconds", "psnr", "ssim", "gaussians")]
-                wall = duration(wall_seconds(variant, capture) or row.spread("cell_seconds").mean)
+                wall = duration(wall_seconds(variant, capture))
                 seeds = f" ({len(row.cells)})" if len(row.cells) > 1 else ""
                 lines.setdefault(name, {})[capture] = f"{result(*means, wall)}{seeds}"
     return table(
@@ -78,10 +82,10 @@ def headline() -> str:
     )
 
 
-def wall_seconds(variant: str, capture: str) -> float | None:
-    """Of a whole `turbogs train`, the run in the middle of `turbogs bench wall`; None where that is not measured."""
+def wall_seconds(variant: str, capture: str) -> float:
+    """Of a whole `turbogs train`, the run in the middle of `turbogs bench wall`; NaN where that is not measured."""
     report = json.loads(machine_tables.WALL.read_text()).get(capture)
-    return report["median"]["seconds"] if report and variant == "turbogs" else None
+    return report["median"]["seconds"] if report and variant == "turbogs" else math.nan
 
 
 def ahead() -> str:
@@ -131,15 +135,16 @@ def behind() -> str:
 
 def headline_sources() -> str:
     """Machine and commit of each row of ours; a line for what a packaged configuration no longer gives."""
-    lines: list[tuple[str, str]] = []
+    said: dict[str, set[str]] = {}
     changed: list[str] = []
     for study, variant, name in OURS:
         rows = [found[variant] for found in rows_of(study).values() if variant in found]
         places = [place for row in rows for cell in row.cells if (place := cell.provenance)]
         if rows:
-            said = sorted({f"{place.machine.partition(' (')[0]}, commit {place.commit[:7]}" for place in places})
-            lines.append((name, "; ".join(said) or "not recorded"))
+            where = {f"{place.machine.partition(' (')[0]}, commit {place.commit[:7]}" for place in places}
+            said.setdefault(name, set()).update(where)
             changed += stale(study)
+    lines = [(name, "; ".join(sorted(where)) or "not recorded") for name, where in said.items()]
     reports = json.loads(machine_tables.WALL.read_text())
     lines.append(("turbogs, on the wall", "; ".join(dict.fromkeys(map(machine_tables.where, reports.values())))))
     peers = json.loads((ROOT / "docs/results/peers.json").read_text())
