@@ -41,13 +41,12 @@ CASES = {
     "fastgs": ("density.type=fastgs", "density.refine_from=2", "density.refine_every=3", "density.grad_threshold=0"),
     "mcmc": ("density.type=mcmc", "density.refine_start_iter=1", "density.refine_every=3"),
     "exposures": ("train.exposure=true", "train.background=random"),
-    "squares": ("density.choose_by=squares", "density.prune_by=squares", "density.prune_score_fraction=0.05"),
     "masked": ("schedule.min_views=7", "schedule.max_views=7"),
     "masked tiles": ("pixel_sampler.unit=tile", "schedule.type=fixed", "schedule.views=2"),
     "hosted": ("train.maps_place=host", "train.photos_place=host"),
 }
 """Name -> overrides. A masked case is of the capture with masks."""
-WITH_EVENTS = ("usual", "squares", "fastgs", "mcmc")
+WITH_EVENTS = ("usual", "fastgs", "mcmc")
 LONG = 30
 LONG_CASE = (f"train.iterations={LONG}", "train.refine_until=20", "schedule.max_views=2", "density.max_gaussians=400")
 

@@ -10,7 +10,7 @@ import torch
 from helpers.optimizers import all_finite
 from helpers.squares import EVENT, SQUARES, event, event_at, grown, removed, small_model, spread_squares, window
 from turbogs_plugin.strategies.density.error_driven import ErrorDrivenDensity, _decayed
-from turbogs_plugin.strategies.density.priority import TINY, growth_priority
+from turbogs_plugin.strategies.density.priority import TINY, drawn_by_squares
 
 from turbogs_plugin.types import GaussianStats, Step
 
@@ -75,6 +75,29 @@ def test_the_backdrop_stays_and_takes_part_of_the_share(step):
     assert event(gaussians, window(squares, passing=0.0), step, prune_score_fraction=0.05, final_keep=0.95) is None
 
 
+@pytest.mark.parametrize("cap", [1, 2, 4])
+@pytest.mark.parametrize("square", [1e-14, 3e38])
+def test_the_cut_to_a_cap_holds_where_squares_overflow(square, cap):
+    """Sums that are not finite count as average there, and the average of finite ones is finite."""
+    gaussians = small_model(6)
+    gaussians.opacities[0] = -20.0  # goes anyway
+    stats = window([square, math.nan, math.inf, square, square, square])
+    assert len(event(gaussians, stats, max_gaussians=cap).source) == cap
+    stats = window([square, math.nan, math.inf, square / 3, square, square * 1.1])
+    kept = event(gaussians, stats, max_gaussians=3, prune_score_fraction=0.0).source.tolist()
+    assert kept == [2, 4, 5]  # the least, and the first of two average ones
+
+
+@pytest.mark.parametrize("score", ["raw", "balanced"])
+def test_the_cut_to_a_cap_holds_where_difficulties_overflow(score):
+    """By the paper's order: an error over a tiny weight is infinite, and as many go as have to."""
+    gaussians = small_model(6)
+    gaussians.opacities[0] = -20.0
+    stats = window([0.0] * 6)
+    stats.error_sums[1:], stats.weight_sums[1:] = 3e38, 1e-30
+    assert len(event(gaussians, stats, choose_by="difficulty", score=score, max_gaussians=1).source) == 1
+
+
 # ---- What a window may hold ----------------------------------------------------------------------------------------
 
 
@@ -97,8 +120,8 @@ def test_equal_squares_stand_together(value, room):
 
 
 def test_a_draw_among_equals_is_even():
-    stats, score = window([1e-14] * 8), torch.zeros(8)
-    first = [int(growth_priority(stats, score, "squares", event_at(100 * i)).argmax()) for i in range(1600)]
+    stats = window([1e-14] * 8)
+    first = [int(drawn_by_squares(stats, event_at(100 * i)).argmax()) for i in range(1600)]
     counts = torch.bincount(torch.tensor(first), minlength=8)
     assert ((counts - 200).abs() < 5 * 13.3).all()  # 200 +- 5 standard deviations
 
@@ -121,8 +144,8 @@ def test_turnover_tells_the_smallest_numbers_apart():
     for share, rows in ((0.05, {7, 11}), (0.075, {7, 11, 13}), (0.1, {7, 11, 13, 17}), (0.125, {7, 11, 13, 17, 19})):
         update = event(small_model(COUNT), window(squares, passing=0.0), prune_score_fraction=share)
         assert removed(update, COUNT) == rows
-    keys = growth_priority(window(squares), torch.zeros(COUNT), "squares", EVENT)
-    none = growth_priority(window([0.0] * COUNT), torch.zeros(COUNT), "squares", EVENT)
+    keys = drawn_by_squares(window(squares), EVENT)
+    none = drawn_by_squares(window([0.0] * COUNT), EVENT)
     assert all(keys[row] == none[row] for row in (7, 11, 13, 17, 19, 23))
 
 
