@@ -7,11 +7,12 @@ from __future__ import annotations
 
 import pytest
 import torch
-from helpers.raster_extremes import CASES
+from helpers.raster_extremes import CASES, TWO_VIEWS, random_scene
 from helpers.statistics_cases import (
     STIFF,
     assert_gradients_that_vanish_are_survived,
     assert_squares_that_overflow_are_survived,
+    pass_statistics,
     share_of_bound,
 )
 from helpers.tolerances import STATISTICS, STIFF_STATISTICS
@@ -52,3 +53,12 @@ def test_squares_that_overflow():
 
 def test_gradients_that_vanish():
     assert_gradients_that_vanish_are_survived("cpu")
+
+
+def test_a_gaussian_at_the_limit_of_alpha_has_no_square():
+    """Alpha is cut at 0.999 in every pixel of both views, so no sample asks for more or less of it."""
+    walls = random_scene(1, means=[0.0, 0.0, 0.0], scales=[5.0, 5.0, 5.0], opacities=50.0)
+    stats, _ = pass_statistics(walls, TWO_VIEWS, "cpu")
+    assert stats.weight_sums > 1000 and stats.square_sums == 0
+    walls.opacities[:] = 5.0
+    assert pass_statistics(walls, TWO_VIEWS, "cpu")[0].square_sums > 0
