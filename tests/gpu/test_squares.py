@@ -10,6 +10,7 @@ from helpers.raster_extremes import CASES
 from helpers.squares import SQUARES, event_at, small_model, spread_squares, window
 from helpers.statistics_cases import (
     STIFF,
+    assert_gradients_that_overflow_are_survived,
     assert_gradients_that_vanish_are_survived,
     assert_squares_that_overflow_are_survived,
     share_of_bound,
@@ -55,6 +56,10 @@ def test_all_absolute_gradients_share_the_colours_gradient(case):
 
 def test_squares_that_overflow():
     assert_squares_that_overflow_are_survived("cuda")
+
+
+def test_gradients_that_overflow():
+    assert_gradients_that_overflow_are_survived("cuda")
 
 
 def test_gradients_that_vanish():

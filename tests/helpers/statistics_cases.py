@@ -75,3 +75,16 @@ def assert_gradients_that_vanish_are_survived(device: str) -> None:
     assert stats.weight_sums.max() > 0 and not stats.square_sums.any()
     gaussians.opacities[:], gaussians.scales[:] = 1.0, -4.0
     assert event(gaussians, stats) is None
+
+
+def assert_gradients_that_overflow_are_survived(device: str) -> None:
+    """Gradients of 1e38: no square is finite where there is a gradient, so none of these goes, and the event is
+    finite."""
+    gaussians = random_scene(40)
+    stats, _ = pass_statistics(gaussians, TWO_VIEWS, device, size=1e38)
+    drawn = stats.weight_sums > 0
+    assert not stats.square_sums[drawn].isfinite().any() and stats.weight_sums.isfinite().all()
+    gaussians.opacities[:], gaussians.scales[:] = 1.0, -4.0
+    update = event(gaussians, stats, max_gaussians=50, prune_score_fraction=0.3)
+    assert update is not None and set(torch.nonzero(drawn).squeeze(-1).tolist()) <= set(update.source.tolist())
+    assert all(value.isfinite().all() for _, value in update.apply(gaussians).items())

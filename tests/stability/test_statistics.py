@@ -10,6 +10,7 @@ import torch
 from helpers.raster_extremes import CASES, TWO_VIEWS, random_scene
 from helpers.statistics_cases import (
     STIFF,
+    assert_gradients_that_overflow_are_survived,
     assert_gradients_that_vanish_are_survived,
     assert_squares_that_overflow_are_survived,
     pass_statistics,
@@ -49,6 +50,10 @@ def test_all_absolute_gradients_share_the_colours_gradient(case, record_property
 
 def test_squares_that_overflow():
     assert_squares_that_overflow_are_survived("cpu")
+
+
+def test_gradients_that_overflow():
+    assert_gradients_that_overflow_are_survived("cpu")
 
 
 def test_gradients_that_vanish():
