@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from turbogs_plugin.bench.numerics import SolverResult, solvers_table
+from turbogs_plugin.bench.statistics import StatisticsResult, statistics_table
 from turbogs_plugin.bench.viewer import summarised
 from turbogs_plugin.bench.wall import WallRun
 from turbogs_plugin.config.configuration import load_config
@@ -271,9 +272,18 @@ def precision() -> str:
 def solvers() -> str:
     """Error and time of the optimizer's solvers, as `turbogs bench numerics` printed it."""
     record = json.loads((H200.parent / "numerics/solvers.json").read_text())
+    return f"{_where(record)}\n\n{solvers_table([SolverResult(**_numbers(result)) for result in record['results']])}"
+
+
+def density_sums() -> str:
+    """Errors of density control's statistics, as `turbogs bench numerics` printed them."""
+    record = json.loads((H200.parent / "numerics/statistics.json").read_text())
+    return f"{_where(record)}\n\n{statistics_table([StatisticsResult(**result) for result in record['results']])}"
+
+
+def _where(record: dict[str, Any]) -> str:
     machine = record["machine"]
-    made = solvers_table([SolverResult(**_numbers(result)) for result in record["results"]])
-    return f"{machine['hardware']}, {machine['threads']} thread, torch {machine['software']['torch']}.\n\n{made}"
+    return f"{machine['hardware']}, {machine['threads']} thread, torch {machine['software']['torch']}."
 
 
 def _numbers(result: dict[str, Any]) -> dict[str, Any]:

@@ -50,6 +50,7 @@ def round_table(name: str, table_name: str) -> str:
 TABLES: dict[str, Callable[[], str]] = {
     "ahead": study_tables.ahead,
     "behind": study_tables.behind,
+    "density_sums": machine_tables.density_sums,
     "dropin": machine_tables.dropin,
     "exposures": machine_tables.exposures,
     "headline": study_tables.headline,

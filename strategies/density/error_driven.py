@@ -260,10 +260,10 @@ def _quantile(values: Tensor, mask: Tensor, fraction: float) -> Tensor:
 
 def _first(keys: Tensor, mask: Tensor, count: int) -> Tensor:
     """[N] bool: the `count` rows of the mask (or all, if fewer) with the largest keys; of equal keys the lower rows."""
-    order = torch.argsort(torch.where(mask, keys, -torch.inf), descending=True, stable=True)
+    order = torch.argsort(keys, descending=True, stable=True)
     chosen = torch.zeros_like(mask)
-    chosen[order[:count]] = True
-    return chosen & mask
+    chosen[order[mask[order]][:count]] = True
+    return chosen
 
 
 def _least(worth: Tensor, known: Tensor, present: Tensor, spared: Tensor, count: int) -> Tensor:
@@ -271,8 +271,8 @@ def _least(worth: Tensor, known: Tensor, present: Tensor, spared: Tensor, count:
 
     Of which that is not known counts as average: nothing says that it is worth little.
     """
-    average = torch.where(known, worth, 0.0).sum() / known.sum().clamp(min=1)
-    keys = -torch.where(known, worth, average)
+    average = torch.where(known, worth, 0.0).double().sum() / known.sum().clamp(min=1)  # the sum may overflow float32
+    keys = -torch.where(known, worth, average.to(worth))
     taken = _first(keys, present & ~spared, count)
     return taken | _first(keys, present & spared, count - int(taken.sum()))
 

@@ -53,6 +53,7 @@ def test_the_tables_in_the_pages_are_those_of_the_results():
     assert shown_digest(make_pages.PICTURE) == make_pages.picture_digest(), "make pages"
     assert {name for text in texts for _, name, _ in make_pages.BLOCK.findall(text)} == set(make_pages.TABLES)
     assert machine_tables.solvers().endswith((DOCS / "results/numerics/solvers.md").read_text().strip())
+    assert machine_tables.density_sums().endswith((DOCS / "results/numerics/statistics.md").read_text().strip())
 
 
 def test_every_part_of_the_paper_has_its_row():

@@ -15,6 +15,7 @@ from turbogs_plugin.bench.large_capture import synthetic_scene
 from turbogs_plugin.bench.numerics import bench_solvers, solvers_table
 from turbogs_plugin.bench.ranks import RanksBench
 from turbogs_plugin.bench.raster import RasterBench, other_build
+from turbogs_plugin.bench.statistics import bench_statistics, statistics_table
 from turbogs_plugin.bench.step import StepBench
 from turbogs_plugin.bench.viewer import bench_viewer, viewer_lines
 from turbogs_plugin.bench.wall import bench_wall, wall_lines
@@ -84,8 +85,8 @@ def run_ranks(bench: RanksBench, scene: Path, factor: int, device: torch.device,
 
 def run_numerics(device: torch.device, out: Path) -> int:
     require_writable(out, f"--out '{out}'")
-    results = bench_solvers(out, device)
-    print(f"{solvers_table(results)}\n\nfolder  {out}")
+    tables = solvers_table(bench_solvers(out, device)), statistics_table(bench_statistics(out, device))
+    print("\n\n".join((*tables, f"folder  {out}")))
     return 0
 
 

@@ -1,0 +1,69 @@
+"""The statistics that choose Gaussians, in float32: how exact, and what they are on the renderer's worst inputs.
+
+`tests/gpu/test_squares.py` asks the same of the kernels.
+"""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from helpers.raster_extremes import CASES, TWO_VIEWS, random_scene
+from helpers.statistics_cases import (
+    STIFF,
+    assert_gradients_that_overflow_are_survived,
+    assert_gradients_that_vanish_are_survived,
+    assert_squares_that_overflow_are_survived,
+    pass_statistics,
+    share_of_bound,
+)
+from helpers.tolerances import STATISTICS, STIFF_STATISTICS
+
+from turbogs_plugin.bench.statistics import CASES as MEASURED
+from turbogs_plugin.bench.statistics import measure_case, measure_window
+
+
+@pytest.mark.parametrize("case", MEASURED, ids=lambda case: case.name)
+def test_statistics_are_close_to_float64(case, record_property):
+    result = measure_case(case, torch.device("cpu"))
+    record_property("result", str(result))
+    bounds = STIFF_STATISTICS if case.name in STIFF else STATISTICS
+    assert max(result.errors.values()) <= bounds.total, result
+    assert result.median_square <= bounds.median_square and result.worst_square <= bounds.worst_square, result
+    if case.name != STIFF[1]:  # where the squares are rounding
+        assert result.exchanged <= bounds.exchanged, result
+
+
+def test_the_sums_of_a_long_window_are_close_to_float64(record_property):
+    result = measure_window(torch.device("cpu"))
+    record_property("result", str(result))
+    assert max(result.errors.values()) <= STATISTICS.total and result.worst_square <= STATISTICS.total
+    assert result.exchanged == 0
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_all_absolute_gradients_share_the_colours_gradient(case, record_property):
+    """So that a threshold of the absolute gradient bounds how many Gaussians are above it."""
+    share = share_of_bound(case, "cpu")
+    record_property("share", f"{share:.1e}")
+    assert share <= 1
+
+
+def test_squares_that_overflow():
+    assert_squares_that_overflow_are_survived("cpu")
+
+
+def test_gradients_that_overflow():
+    assert_gradients_that_overflow_are_survived("cpu")
+
+
+def test_gradients_that_vanish():
+    assert_gradients_that_vanish_are_survived("cpu")
+
+
+def test_a_gaussian_at_the_limit_of_alpha_has_no_square():
+    """Alpha is cut at 0.999 in every pixel of both views, so no sample asks for more or less of it."""
+    walls = random_scene(1, means=[0.0, 0.0, 0.0], scales=[5.0, 5.0, 5.0], opacities=50.0)
+    stats, _ = pass_statistics(walls, TWO_VIEWS, "cpu")
+    assert stats.weight_sums > 1000 and stats.square_sums == 0
+    walls.opacities[:] = 5.0
+    assert pass_statistics(walls, TWO_VIEWS, "cpu")[0].square_sums > 0

@@ -1,0 +1,37 @@
+"""The NCC term at weight 1, the paper's, on tiles that are hard for it. Claims: docs/numerics.md."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from helpers.stiff_tiles import (
+    TILES,
+    assert_structure_gradients_are_bounded,
+    gradients,
+    structure_gradients,
+    toward_the_photo,
+)
+from helpers.tolerances import STRUCTURE_BOUND
+from turbogs_plugin.strategies.losses import CharbonnierNccLoss
+
+
+def test_the_structure_term_is_bounded_on_every_tile():
+    assert_structure_gradients_are_bounded(structure_gradients("cpu"))
+
+
+@pytest.mark.parametrize("name", ["inverted", "inverted edge", "two samples, inverted", "texture, flat prediction"])
+def test_a_step_turns_an_inverted_contrast_round(name):
+    """Even where the NCC is at its least, -1, and its own gradient is small."""
+    assert toward_the_photo(structure_gradients("cpu"), name) > 0
+
+
+def test_float32_is_close_on_stiff_tiles(record_property):
+    """Means and variances are taken relative to the tile's first sample, so a small variance keeps its digits."""
+    terms = CharbonnierNccLoss(ncc_weight=1.0).terms
+    exact = gradients(terms, "cpu", torch.float64)
+    errors = {
+        name: float((got - wanted).norm() / wanted.norm().clamp(min=1e-9))
+        for name, got, wanted in zip(TILES, gradients(terms, "cpu"), exact, strict=True)
+    }
+    record_property("errors", {name: f"{error:.0e}" for name, error in errors.items()})
+    assert max(errors.values()) <= STRUCTURE_BOUND, errors

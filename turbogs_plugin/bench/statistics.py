@@ -1,0 +1,177 @@
+"""Numerical stability: errors of density control's statistics against float64, on mild and stiff cases."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from turbogs_plugin.bench.models import ring_cameras, surface_gaussians, tile_samples
+from turbogs_plugin.engine.rendering import rasterize, rasterize_reference
+from turbogs_plugin.files import write_text_atomically
+from turbogs_plugin.report.machine import hardware, software
+from turbogs_plugin.report.tables import table
+from turbogs_plugin.types import Cameras, Gaussians, GaussianStats, PixelSamples
+
+COUNT, SIZE, VIEWS, RATE = 2_000, (96, 64), 3, 0.5
+"""Of every case but those of one pixel: Gaussians, pixels of a view, views, share of the pixels that is sampled."""
+
+TURNOVER = 0.05
+"""The share that an event of density control removes."""
+
+SUMS = ("weight_sums", "absgrad_sums", "square_sums")
+"""The statistics that decide who goes, how many grow, and who."""
+
+LOOKS, ROWS = 12_800, 10_000
+"""Of the window whose sums are measured: 100 iterations of 128 views, and Gaussians."""
+
+
+@dataclass(frozen=True)
+class StatisticsCase:
+    """A model, and the gradients that come from above.
+
+    Args:
+        name: for tables.
+        change: makes the model of the case from that of `surface_gaussians`, in place.
+        gradient: size of the colours' gradients times the number of samples.
+    """
+
+    name: str
+    change: Callable[[Gaussians], object] = lambda gaussians: None
+    gradient: float = 1.0
+
+
+CASES = (
+    StatisticsCase("ordinary"),
+    StatisticsCase("needles of aspect 1e6", lambda g: g.scales.copy_(torch.tensor([1.0, -12.8, -12.8]))),
+    StatisticsCase("points, below the low-pass filter", lambda g: g.scales.fill_(-12.0)),
+    StatisticsCase("faint: opacity 1 / 250", lambda g: g.opacities.fill_(-5.5)),
+    StatisticsCase("opaque: alpha up to 0.999, many layers", lambda g: (g.opacities.fill_(6.9), g.scales.add_(1.0))),
+    StatisticsCase("one colour: slopes cancel", lambda g: (g.sh0.fill_(1.0), g.shN.zero_())),
+    StatisticsCase("colours of 1e6", lambda g: g.sh0.mul_(1e6)),
+    StatisticsCase("gradients times 1e-6", gradient=1e-6),
+    StatisticsCase("gradients times 1e-15, squares below float32's range", gradient=1e-15),
+    StatisticsCase("gradients times 1e15", gradient=1e15),
+)
+
+
+@dataclass(frozen=True)
+class StatisticsResult:
+    """Errors of one case.
+
+    Args:
+        case: its name.
+        errors: name of a sum -> L2 of the difference over L2.
+        median_square, worst_square: relative errors of single sums of squares, over the Gaussians with at least 1e-4 of
+            the mean sum. A draw's chances are off by as much.
+        exchanged: of the 5 % of the least sums of squares, the share that float64 has not among them. Over the
+            Gaussians with a sum, as equal ones are not removed.
+    """
+
+    case: str
+    errors: dict[str, float]
+    median_square: float
+    worst_square: float
+    exchanged: float
+
+
+def least_squares(square_sums: Tensor) -> Tensor:
+    """[N] bool: the 5 % with the least sums [N]."""
+    chosen = torch.zeros_like(square_sums, dtype=torch.bool)
+    chosen[square_sums.argsort(stable=True)[: math.floor(TURNOVER * len(square_sums))]] = True
+    return chosen
+
+
+def compared(case: str, given: GaussianStats, exact: GaussianStats) -> StatisticsResult:
+    """What sums [N] in float32 are off by from those in float64."""
+    errors = {}
+    for name in SUMS:
+        got, wanted = getattr(given, name).double().cpu(), getattr(exact, name).double().cpu()
+        errors[name] = float((got - wanted).norm() / wanted.norm().clamp(min=torch.finfo(torch.float64).tiny))
+    got, wanted = given.square_sums.double().cpu(), exact.square_sums.double().cpu()
+    counts = wanted > 1e-4 * wanted.mean()
+    relative = ((got - wanted).abs() / wanted)[counts]
+    seen = wanted > 0
+    removed, kept = least_squares(got[seen]), ~least_squares(wanted[seen])
+    exchanged = float((removed & kept).sum() / removed.sum().clamp(min=1))
+    return StatisticsResult(case, errors, float(relative.median()), float(relative.max()), exchanged)
+
+
+def statistics_of(
+    gaussians: Gaussians, cameras: Cameras, samples: PixelSamples, gradients: Tensor, exact: bool
+) -> GaussianStats:
+    """The statistics of one pass with these gradients [P, 3] of the colours.
+
+    Args:
+        exact: by the reference in float64, its sums kept in float64; else by the engine of the device in float32.
+    """
+    stats = GaussianStats.zeros(len(gaussians), gaussians.device)
+    if exact:
+        gaussians, gradients = gaussians.map(Tensor.double), gradients.double()
+        cameras, stats = cameras.to(dtype=torch.float64), stats.map(Tensor.double)
+    render = rasterize_reference if exact else rasterize
+    errors = torch.ones_like(gradients[:, 0])
+    screen = render(gaussians, cameras, samples).backward(gradients, errors, with_statistics=True)
+    screen.parameter_gradients(rows=False, stats=stats)
+    return stats
+
+
+def measure_case(case: StatisticsCase, device: torch.device) -> StatisticsResult:
+    """One pass of a case."""
+    gaussians, cameras = surface_gaussians(COUNT, device, seed=3), ring_cameras(VIEWS, *SIZE, device)
+    case.change(gaussians)
+    samples = tile_samples(cameras.sizes, RATE, device, seed=4)
+    noise = torch.randn(len(samples), 3, generator=torch.Generator().manual_seed(5)).to(device)
+    inputs = (gaussians, cameras, samples, noise * (case.gradient / len(samples)))
+    return compared(case.name, statistics_of(*inputs, exact=False), statistics_of(*inputs, exact=True))
+
+
+def measure_window(device: torch.device) -> StatisticsResult:
+    """The sums of a long window: squares over eight decades, added one by one in float32."""
+    generator = torch.Generator().manual_seed(6)
+    level = 10 ** (8 * torch.rand(ROWS, generator=generator, dtype=torch.float64) - 18)
+    given, exact = GaussianStats.zeros(ROWS, device), GaussianStats.zeros(ROWS, "cpu").map(Tensor.double)
+    for _ in range(LOOKS):
+        look = (level * torch.rand(ROWS, generator=generator, dtype=torch.float64)).float()
+        for name in SUMS:
+            getattr(given, name).add_(look.to(device))
+            getattr(exact, name).add_(look)
+    return compared(f"window of {LOOKS} looks", given, exact)
+
+
+def bench_statistics(out: Path, device: torch.device) -> list[StatisticsResult]:
+    """Measure all cases, and write ``statistics.json`` (every number and the machine) and ``statistics.md``.
+
+    Args:
+        out: folder for the files; made where absent.
+        device: where the statistics are computed.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    results = [*(measure_case(case, device) for case in CASES), measure_window(device)]
+    machine = {"hardware": hardware(device.type), "software": dict(software()), "threads": torch.get_num_threads()}
+    settings = {"gaussians": COUNT, "size": SIZE, "views": VIEWS, "rate": RATE, "looks": LOOKS, "rows": ROWS}
+    record = {"machine": machine, "settings": settings, "results": [asdict(result) for result in results]}
+    write_text_atomically(out / "statistics.json", json.dumps(record, indent=1).replace("NaN", "null") + "\n")
+    write_text_atomically(out / "statistics.md", statistics_table(results) + "\n")
+    return results
+
+
+def statistics_table(results: list[StatisticsResult]) -> str:
+    """A Markdown table of results."""
+    head = ("statistics", "weights", "absolute gradients", "squares", "one's, median", "one's, worst", "5 % exchanged")
+    rows = [
+        (
+            result.case,
+            *(f"{result.errors[name]:.0e}" for name in SUMS),
+            f"{result.median_square:.0e}",
+            f"{result.worst_square:.0e}",
+            f"{100 * result.exchanged:.0f} %",
+        )
+        for result in results
+    ]
+    return table(head, rows)
