@@ -102,6 +102,7 @@ def source(tmp_path_factory) -> Path:
 
 def trainer_of(scene: Scene) -> Trainer:
     lengths = (f"train.iterations={STEPS}", f"train.refine_until={STEPS}", "train.sh_degree=0", "schedule.max_views=3")
+    lengths += ("schedule.pixel_budget=0.3",)
     return Trainer(load_config("turbogs", [*lengths, *MODEL]).without_plan(), scene, CPU)
 
 
