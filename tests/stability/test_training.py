@@ -25,7 +25,7 @@ from turbogs_plugin.train import run
 from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint
 from turbogs_plugin.train.trainer import Trainer
 
-pytestmark = pytest.mark.usefixtures("laid_out")
+pytestmark = pytest.mark.usefixtures("plotted")
 
 
 @pytest.fixture(scope="module")

@@ -48,7 +48,7 @@ notes: {random: "a | bar"}
 """
 
 
-pytestmark = pytest.mark.usefixtures("laid_out")
+pytestmark = pytest.mark.usefixtures("plotted")
 
 
 @pytest.fixture(scope="module")

@@ -203,7 +203,7 @@ def test_iterations_are_timed_with_the_lambda_asked_for(scene):
     assert rates and rates == pytest.approx([0.5] * len(rates))
 
 
-def test_a_run_with_time_for_more_looks_at_more_pixels(laid_out, tmp_path, monkeypatch):
+def test_a_run_with_time_for_more_looks_at_more_pixels(plotted, tmp_path, monkeypatch):
     """It ends with its time after about the configured iterations, and all that a run writes says with which lambda."""
     clock, draw = SimulatedTime(monkeypatch, tick=1e-6), ErrorGuidedPixelSampler.sample
 
