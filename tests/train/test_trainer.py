@@ -35,6 +35,8 @@ from turbogs_plugin.train.saved_model import load_model
 from turbogs_plugin.train.trainer import Trainer
 from turbogs_plugin.types import RowUpdate
 
+pytestmark = pytest.mark.usefixtures("plotted")
+
 
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory) -> Path:
