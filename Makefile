@@ -41,8 +41,10 @@ pages: $(INSTALLED)
 	$(BIN)/python docs/make_pages.py
 
 # A process a core, each with one thread and a run of files, whose tests share captures and runs. One that is done
-# takes half of what another has left: no large file keeps a core waiting.
+# takes half of what another has left: no large file keeps a core waiting. Bytecode is kept, also where the environment
+# says otherwise: the tests start Python some dozens of times.
 test: export OMP_NUM_THREADS := 1
+test: export PYTHONDONTWRITEBYTECODE :=
 test: $(INSTALLED)
 	$(BIN)/python -m pytest --numprocesses auto --maxprocesses 8 --dist worksteal
 

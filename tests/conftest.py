@@ -17,8 +17,9 @@ def drawn() -> None:
 
 
 @pytest.fixture
-def laid_out(request, monkeypatch) -> None:
-    """Plots are made, with all that they show, but not rasterised, which takes a second a report; not with `drawn`."""
+def plotted(request, monkeypatch) -> None:
+    """Plots are made, with all that they show, but neither laid out nor rasterised, which takes a second a report; not
+    with `drawn`."""
     from matplotlib.figure import Figure
     from PIL import Image
 
@@ -27,6 +28,7 @@ def laid_out(request, monkeypatch) -> None:
 
     if "drawn" not in request.fixturenames:
         monkeypatch.setattr(Figure, "savefig", save)
+        monkeypatch.setattr(Figure, "draw_without_rendering", lambda figure: None)
 
 
 @pytest.fixture

@@ -25,6 +25,8 @@ from turbogs_plugin.report.outputs import distinct_stems
 from turbogs_plugin.train import run, start
 from turbogs_plugin.train.trainer import Trainer
 
+pytestmark = pytest.mark.usefixtures("plotted")
+
 QUICK = ("train.iterations=2", "train.sh_degree=0", "train.evaluate_at=[]")
 
 

@@ -119,7 +119,7 @@ def test_the_variants_of_pixels_on_an_mlp_draw_equally_many(example):
     assert counts[0] == counts[1] > 0
 
 
-@pytest.mark.usefixtures("laid_out")
+@pytest.mark.usefixtures("plotted")
 def test_baselines(example, thin_capture, tmp_path, capsys):
     example("baselines").main(scene=str(thin_capture), output=str(tmp_path / "runs"), iterations=44)
     lines = capsys.readouterr().out.splitlines()

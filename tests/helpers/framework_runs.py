@@ -24,6 +24,7 @@ TINY = (
     "train.checkpoint_every=5",
     "schedule.min_views=2",
     "schedule.max_views=4",
+    "schedule.pixel_budget=0.3",
     "density.refine_from=2",
     "density.refine_every=3",
     "density.final_every=2",

@@ -22,6 +22,8 @@ from turbogs_plugin.study.folder import StudyFolder
 from turbogs_plugin.train import run
 from turbogs_plugin.train.trainer import Trainer
 
+pytestmark = pytest.mark.usefixtures("plotted")
+
 MIB = 2**20
 FACTS = SceneFacts(
     scene="synthetic",
@@ -368,7 +370,6 @@ def test_a_spoiled_plan_is_named_and_a_missing_one_is_not_missed(capture, tmp_pa
     assert "holds no plan" in folder.report.read_text()
 
 
-@pytest.mark.usefixtures("laid_out")
 def test_the_ablation_of_leave_outs_plans_each_cell(turbogs, capture, tmp_path):
     """Forced both ways, and by the plan; where things are changes no result."""
     variants = ["plan", "all-views", "no-ncc", "host-maps", "host-photos"]

@@ -16,7 +16,7 @@ from turbogs_plugin.reconstruct.workspace import Workspace
 from turbogs_plugin.scene import load_scene
 from turbogs_plugin.scene.load import holds_photos_alone
 
-COUNT = 10
+COUNT = 8
 
 
 def noise(seed: int) -> Image.Image:

@@ -15,6 +15,8 @@ from turbogs_plugin.train import run
 from turbogs_plugin.train.history import read_history
 from turbogs_plugin.train.trainer import Trainer
 
+pytestmark = pytest.mark.usefixtures("plotted")
+
 ASKED = "report.tensorboard=true"
 
 

@@ -113,7 +113,7 @@ def call(folder: Path, capture: Path, *more: str) -> list[str]:
     return [*names, "--device", "cpu", "--steps", "4", "--seeds", "0", "1", *more]
 
 
-@pytest.mark.usefixtures("laid_out")
+@pytest.mark.usefixtures("plotted")
 def test_two_workers_train_each_cell_once(tmp_path, monkeypatch, capfd):
     capture = tiny_capture(tmp_path)
     monkeypatch.setattr(sys, "argv", ["turbogs", *call(tmp_path, capture, "--gpus", "0,1")])

@@ -48,7 +48,7 @@ notes: {random: "a | bar"}
 """
 
 
-pytestmark = pytest.mark.usefixtures("laid_out")
+pytestmark = pytest.mark.usefixtures("plotted")
 
 
 @pytest.fixture(scope="module")
@@ -64,6 +64,7 @@ def small(tmp_path) -> Path:
 
 
 SETTINGS = ("train.sh_degree=1", "schedule.min_views=1", "schedule.max_views=2", "train.evaluate_at=[0.5]")
+SETTINGS += ("schedule.pixel_budget=0.3",)
 
 
 def call(small: Path, capture: Path, out: Path, *more) -> list:

@@ -215,7 +215,7 @@ def test_a_plot_of_other_data_or_a_broken_one_is_drawn_again(turbogs, folder):
     }
 
 
-@pytest.mark.usefixtures("laid_out")
+@pytest.mark.usefixtures("plotted")
 def test_flip_and_the_seconds_of_a_cell_are_shown_where_a_cell_has_them(turbogs, folder):
     assert turbogs("report", folder.path)[0] == 0
     fox, h = (folder.path / "report.md").read_text().split("\n## h\n")
@@ -241,7 +241,7 @@ def test_flip_and_the_seconds_of_a_cell_are_shown_where_a_cell_has_them(turbogs,
     assert "FLIP was not computed" in page and "| FLIP |" not in page
 
 
-@pytest.mark.usefixtures("laid_out")
+@pytest.mark.usefixtures("plotted")
 def test_a_page_says_how_far_apart_the_marks_about_a_crossing_are(turbogs, folder):
     assert turbogs("report", folder.path)[0] == 0
     assert "on either side of a crossing are 2.40 [2.40, 2.40] s of" in (folder.path / "report.md").read_text()
@@ -250,7 +250,7 @@ def test_a_page_says_how_far_apart_the_marks_about_a_crossing_are(turbogs, folde
     assert math.isnan(crossing_gap(history, 9.0)) and math.isnan(crossing_gap(history, 31.0))
 
 
-@pytest.mark.usefixtures("laid_out")
+@pytest.mark.usefixtures("plotted")
 def test_a_merge_keeps_what_its_folder_has(turbogs, folder, tmp_path):
     part = StudyFolder(tmp_path / "part")
     part.write_study(Study(ABLATION, [result("base", 7)]))

@@ -12,8 +12,9 @@ from hypothesis import strategies as st
 
 from turbogs_plugin.config.configuration import Config, load_config
 from turbogs_plugin.config.scaling import with_iterations
+from turbogs_plugin.config.yaml_text import packaged_names
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.study.grid import Ablation, ablation_names, alike_at, load_ablation, variant_config
+from turbogs_plugin.study.grid import PACKAGE, Ablation, alike_at, load_ablation, variant_config
 from turbogs_plugin.study.plots import OTHER_COLOR, draw_curves, draw_front, told_apart
 from turbogs_plugin.study.results import CellResult, Study
 from turbogs_plugin.study.statistics import Curve, Difference, Spread, pareto_front, seconds_to_reach
@@ -43,7 +44,7 @@ def configs(name: str) -> dict[str, Config]:
     return {variant: variant_config(ablation, variant, 3, (), None) for variant in ablation.variants}
 
 
-@pytest.mark.parametrize("name", ablation_names())
+@pytest.mark.parametrize("name", packaged_names(PACKAGE))
 def test_every_packaged_ablation_resolves_and_its_variants_differ(name):
     texts = {variant: config.to_yaml() for variant, config in configs(name).items()}
     assert len(set(texts.values())) == len(texts)
@@ -51,7 +52,7 @@ def test_every_packaged_ablation_resolves_and_its_variants_differ(name):
 
 
 def test_the_tables_of_the_paper_are_there():
-    assert set(ablation_names()) >= {
+    assert set(packaged_names(PACKAGE)) >= {
         "baselines",
         "components",
         "paper_parts",
@@ -65,7 +66,7 @@ def test_the_tables_of_the_paper_are_there():
     assert variant_config(components, "turbogs", 0, (), None).to_yaml() == load_config("turbogs").to_yaml()
 
 
-@pytest.mark.parametrize("name", ablation_names())
+@pytest.mark.parametrize("name", packaged_names(PACKAGE))
 def test_what_a_variant_does_not_name_is_as_in_the_base(name):
     """A new type starts its section afresh: an option that both types have must not change unnoticed."""
     ablation = load_ablation(name)
@@ -159,7 +160,7 @@ def test_a_common_length_leaves_out_what_it_makes_a_copy():
     assert alike_at(ablation, list(ablation.variants), (), 1000) == alike
     assert alike_at(ablation, ["nothing", "plan", "epochs-75"], (), 1000) == {"epochs-75": "nothing"}
     assert alike_at(load_ablation("batch"), ["x2-same-rates", "x2-longer"], (), 1000) == {"x2-longer": "x2-same-rates"}
-    for name in set(ablation_names()) - {"leave_out", "batch"}:
+    for name in set(packaged_names(PACKAGE)) - {"leave_out", "batch"}:
         assert alike_at(load_ablation(name), list(load_ablation(name).variants), (), 1000) == {}
     same = Ablation(
         "x", {"long": ["train.iterations=5000"], "a": [], "b": [], "last": ["train.epochs=5"]}, baseline="a"

@@ -140,7 +140,8 @@ class SyntheticTrial:
 
 def planned(scene: Scene, monkeypatch, *overrides: str):
     monkeypatch.setattr(calibration, "_Trial", SyntheticTrial)
-    config = tiny_config(Path("capture"), "schedule.max_views=7", "train.iterations=300", "train.epochs=40", *overrides)
+    settings = ("schedule.pixel_budget=1", "schedule.max_views=7", "train.iterations=300", "train.epochs=40")
+    config = tiny_config(Path("capture"), *settings, *overrides)
     return calibration.within_budget(config.without_plan(), scene, CPU)
 
 
@@ -188,7 +189,8 @@ def test_pixels_and_gaussians_share_the_memory(scene, monkeypatch):
 
 
 def test_iterations_are_timed_with_the_lambda_asked_for(scene):
-    config = tiny_config(Path("capture"), "schedule.min_views=7", "schedule.max_views=7").without_plan()
+    settings = ("schedule.pixel_budget=1", "schedule.min_views=7", "schedule.max_views=7")
+    config = tiny_config(Path("capture"), *settings).without_plan()
     trial = calibration._Trial(config, scene, CPU)
     rates, sampler = [], trial._trainer.pixel_sampler
     draw = sampler.sample
@@ -201,7 +203,7 @@ def test_iterations_are_timed_with_the_lambda_asked_for(scene):
     assert rates and rates == pytest.approx([0.5] * len(rates))
 
 
-def test_a_run_with_time_for_more_looks_at_more_pixels(tmp_path, monkeypatch):
+def test_a_run_with_time_for_more_looks_at_more_pixels(plotted, tmp_path, monkeypatch):
     """It ends with its time after about the configured iterations, and all that a run writes says with which lambda."""
     clock, draw = SimulatedTime(monkeypatch, tick=1e-6), ErrorGuidedPixelSampler.sample
 
@@ -213,12 +215,12 @@ def test_a_run_with_time_for_more_looks_at_more_pixels(tmp_path, monkeypatch):
     clock.in_iterations(monkeypatch, lambda trainer: 0.04)
     monkeypatch.setattr(ErrorGuidedPixelSampler, "sample", drawing)
     monkeypatch.setattr(calibration, "CALIBRATION_SHARE", 0.3)  # so few iterations take long to measure for otherwise
-    overrides = ("budget.time=6s", "density.max_gaussians=400", "schedule.min_views=7", "schedule.max_views=7")
-    lengths = ("train.iterations=30", "train.refine_until=20", "train.epochs=4")
+    overrides = ("budget.time=5s", "density.max_gaussians=300", "schedule.min_views=3", "schedule.max_views=3")
+    lengths = ("train.iterations=30", "train.refine_until=20", "train.epochs=4", "schedule.pixel_budget=1")
     outcome = run.train(tiny_config(tiny_capture(tmp_path), *overrides, *lengths), tmp_path / "run", write_report)
     end = outcome.history[-1]
-    assert end.train_seconds == pytest.approx(6.0, rel=0.1)
+    assert end.train_seconds == pytest.approx(5.0, rel=0.1)
     assert 0.7 * 30 <= end.iteration <= 1.5 * 30
     pixel_budget = outcome.folder.read_config().schedule["pixel_budget"]
-    assert 1.5 < pixel_budget <= 7.0
+    assert 1.5 < pixel_budget <= 3.0
     assert f"pixel_budget: {pixel_budget}" in outcome.folder.report.read_text()

@@ -16,6 +16,8 @@ from turbogs_plugin.train.history import read_history
 from turbogs_plugin.train.run import resume, train
 from turbogs_plugin.train.trainer import Trainer
 
+pytestmark = pytest.mark.usefixtures("plotted")
+
 CPU = torch.device("cpu")
 DARK = 2
 """The training photo that has half the exposure."""

@@ -20,6 +20,8 @@ from turbogs_plugin.train import run
 from turbogs_plugin.train.flip import load_flip
 from turbogs_plugin.train.saved_model import load_model
 
+pytestmark = pytest.mark.usefixtures("plotted")
+
 STAND_IN = """
 import numpy
 

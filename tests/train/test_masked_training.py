@@ -28,6 +28,8 @@ from turbogs_plugin.train.ssim import ssim
 from turbogs_plugin.train.trainer import Trainer
 from turbogs_plugin.types import PARAMETER_NAMES, PixelSamples, Step
 
+pytestmark = pytest.mark.usefixtures("plotted")
+
 CPU = torch.device("cpu")
 SIZE = (48, 40)
 

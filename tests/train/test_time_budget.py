@@ -23,6 +23,8 @@ from turbogs_plugin.train.history import read_history
 from turbogs_plugin.train.saved_model import load_model
 from turbogs_plugin.train.trainer import Trainer
 
+pytestmark = pytest.mark.usefixtures("plotted")
+
 
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory) -> Path:

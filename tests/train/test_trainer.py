@@ -2,6 +2,7 @@
 
 import json
 import math
+import multiprocessing
 import os
 import shutil
 import signal
@@ -15,6 +16,7 @@ import pycolmap
 import pytest
 import torch
 from helpers.framework_runs import TINY, assert_identical, stop_after, tiny_capture, tiny_config
+from helpers.processes import PRELOADED, ended
 from PIL import Image
 
 from turbogs_plugin.config.configuration import load_config, resolve
@@ -32,6 +34,8 @@ from turbogs_plugin.train.history import read_history
 from turbogs_plugin.train.saved_model import load_model
 from turbogs_plugin.train.trainer import Trainer
 from turbogs_plugin.types import RowUpdate
+
+pytestmark = pytest.mark.usefixtures("plotted")
 
 
 @pytest.fixture(scope="module")
@@ -153,29 +157,27 @@ def test_a_run_stopped_again_and_again_is_the_same_bit_for_bit(capture, whole, t
     assert numbers[0] == numbers[1]
 
 
-KILLED = """
-import os, signal
-from turbogs_plugin import cli
-from turbogs_plugin.train.trainer import Trainer
+def killed_at_7(capture: Path, out: Path) -> None:
+    """In a process of its own: a run that is killed."""
+    step = Trainer.step
 
-step = Trainer.step
+    def killed(trainer):
+        step(trainer)
+        if trainer.iteration == 7:
+            os.kill(os.getpid(), signal.SIGKILL)
 
-def killed(trainer):
-    step(trainer)
-    if trainer.iteration == 7:
-        os.kill(os.getpid(), signal.SIGKILL)
-
-Trainer.step = killed
-cli.main()
-"""
+    Trainer.step = killed
+    torch.set_num_threads(1)
+    run.train(tiny_config(capture, "train.checkpoint_every=2"), out)
 
 
 def test_a_run_killed_without_notice_resumes_bit_for_bit(capture, whole, tmp_path):
     """Between two checkpoints. What a kill in the midst of one leaves behind: test_checkpoint.py."""
-    options = [*TINY, "train.checkpoint_every=2", "--device", "cpu"]
-    command = [sys.executable, "-c", KILLED, "train", str(capture), "--out", str(tmp_path / "run"), *options]
-    ended = subprocess.run(command, stderr=subprocess.DEVNULL, env={**os.environ, "OMP_NUM_THREADS": "1"})
-    assert ended.returncode == -signal.SIGKILL
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(PRELOADED)
+    process = context.Process(target=killed_at_7, args=(capture, tmp_path / "run"))
+    process.start()
+    assert ended([process]) == [-signal.SIGKILL]
     assert saved(tmp_path / "run")["iteration"] == 6
     run.resume(tmp_path / "run")
     assert_identical(saved(whole.folder.path), saved(tmp_path / "run"))
@@ -193,8 +195,8 @@ def test_sigterm_before_training_ends_the_process_without_a_trace(capture):
         "import os, signal, sys; from turbogs_plugin.scene import load_scene\n"
         "load_scene(sys.argv[1]); os.kill(os.getpid(), signal.SIGTERM)"
     )
-    ended = subprocess.run([sys.executable, "-c", code, str(capture)], capture_output=True, text=True)
-    assert (ended.returncode, ended.stdout, ended.stderr) == (-signal.SIGTERM, "", "")
+    done = subprocess.run([sys.executable, "-c", code, str(capture)], capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (-signal.SIGTERM, "", "")
 
 
 def test_a_run_without_a_checkpoint_starts_again(capture, whole, tmp_path, monkeypatch):

@@ -15,6 +15,8 @@ from turbogs_plugin.report.pages import write_report
 from turbogs_plugin.train import run, start, wall
 from turbogs_plugin.train.wall import WallClock, WallRecord, process_age
 
+pytestmark = pytest.mark.usefixtures("plotted")
+
 
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory) -> Path:

@@ -1,5 +1,7 @@
 """A training of a few iterations, and what a viewer shows of it."""
 
+import copy
+
 import pytest
 from helpers.framework_runs import tiny_capture, tiny_config
 
@@ -20,7 +22,7 @@ def scene(capture):
     return load_scene(capture)
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def new_training(capture, scene):
     """Makes a training of the tiny configuration, with these changes, that has not begun."""
 
@@ -32,10 +34,16 @@ def new_training(capture, scene):
     return new_training
 
 
-@pytest.fixture
-def subject(new_training, scene):
-    """A model after its maps were made, with its capture."""
+@pytest.fixture(scope="session")
+def untouched(new_training, scene):
+    """Not to be changed: `subject` is a copy."""
     trainer = new_training().trainer
     trainer.initialise_maps()
     views = CaptureViews(trainer.views, scene.test)
     return Subject(trainer.gaussians, trainer.sh_degree, capture=views, maps=trainer.maps, step=trainer.now)
+
+
+@pytest.fixture
+def subject(untouched):
+    """A model after its maps were made, with its capture."""
+    return copy.deepcopy(untouched)

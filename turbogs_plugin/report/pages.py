@@ -10,17 +10,7 @@ from turbogs_plugin.files import write_text_atomically
 from turbogs_plugin.plan import Plan
 from turbogs_plugin.report.machine import hardware, software
 from turbogs_plugin.report.pictures import ERROR_FULL_SCALE, picture_writer, strip
-from turbogs_plugin.report.tables import (
-    ALIGNED_ERRORS,
-    ERRORS,
-    WHOLE_ERRORS,
-    aligned_errors,
-    errors,
-    number,
-    table,
-    views_table,
-    whole_errors,
-)
+from turbogs_plugin.report.tables import ERRORS, error_columns, errors, number, table, views_table
 from turbogs_plugin.train.evaluate import Metrics, evaluate, load_lpips, render_view
 from turbogs_plugin.train.history import Evaluation
 from turbogs_plugin.train.run import RunSession
@@ -78,25 +68,22 @@ def _page(run: RunSession, metrics: Metrics, lpips_reason: str, shown: int) -> s
     """
     last = run.history[-1]
     config = run.trainer.config
-    whole = WHOLE_ERRORS if whole_errors(metrics.mean) else ()
-    aligned = ALIGNED_ERRORS if aligned_errors(metrics.mean) else ()
-    unmasked = ", without their masked pixels where nothing else is said" if whole else ""
+    columns = error_columns(metrics)
+    masked = "whole_l1" in columns
+    unmasked = ", without their masked pixels where nothing else is said" if masked else ""
     on = ""
     if run.test.photos.transparent:
         red, green, blue = (round(255 * value) for value in run.trainer.background.evaluated)
         on = f" Photos are transparent; they and the model are compared on rgb({red}, {green}, {blue})."
-    if aligned:
+    if "aligned_l1" in columns:
         on += (
             " Training photos have exposures of their own, test photos none: errors are raw, and beside them stand"
             " those after the affine map of the render's colours that fits each test photo best."
         )
-    grey = "; masked pixels of photo and error are grey" if whole else ""
+    grey = "; masked pixels of photo and error are grey" if masked else ""
     result = table(
         (
-            *ERRORS,
-            "LPIPS (VGG)",
-            *whole,
-            *aligned,
+            *columns.values(),
             "training in s",
             "wall in s",
             "Gaussians",
@@ -105,9 +92,7 @@ def _page(run: RunSession, metrics: Metrics, lpips_reason: str, shown: int) -> s
         ),
         [
             (
-                *errors(metrics.mean),
-                *whole_errors(metrics.mean),
-                *aligned_errors(metrics.mean),
+                *errors(metrics.mean, columns),
                 f"{last.train_seconds:.1f}",
                 number(run.wall.wall_seconds, 1, "not recorded"),
                 last.num_gaussians,
@@ -118,7 +103,7 @@ def _page(run: RunSession, metrics: Metrics, lpips_reason: str, shown: int) -> s
     )
     lpips = f"\nLPIPS was not computed: {lpips_reason}.\n" if lpips_reason else ""
     history = table(
-        ("iteration", "training in s", *ERRORS, "Gaussians", "peak memory in MiB"),
+        ("iteration", "training in s", *ERRORS.values(), "Gaussians", "peak memory in MiB"),
         [
             (entry.iteration, f"{entry.train_seconds:.1f}", *errors(entry), entry.num_gaussians, _mebibytes(entry))
             for entry in run.history

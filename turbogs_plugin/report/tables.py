@@ -8,14 +8,15 @@ from collections.abc import Iterable
 from turbogs_plugin.train.evaluate import Metrics, ViewMetrics
 from turbogs_plugin.train.history import Evaluation
 
-ERRORS = ("PSNR in dB", "SSIM", "mean absolute error")
-"""Heads of the columns that every table of errors has. Masked pixels do not count in them."""
+ERRORS = {"psnr": "PSNR in dB", "ssim": "SSIM", "l1": "mean absolute error"}
+"""Measure -> head of its column, in every table of errors. Masked pixels do not count in them."""
 
-WHOLE_ERRORS = tuple(f"{name} with masked pixels" for name in ERRORS)
-"""Heads of the further columns where test views have masks."""
-
-ALIGNED_ERRORS = tuple(f"{name} after colour alignment" for name in ERRORS)
-"""Heads of the further columns where renders were also aligned in colour to the test photos."""
+FURTHER = {
+    f"{kind}_{name}": f"{head} {said}"
+    for kind, said in {"whole": "with masked pixels", "aligned": "after colour alignment"}.items()
+    for name, head in ERRORS.items()
+}
+"""The same of `FurtherErrors`."""
 
 
 def table(header: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
@@ -30,46 +31,28 @@ def number(value: float, digits: int, absent: str = "not computed") -> str:
     return absent if math.isnan(value) else f"{value:.{digits}f}"
 
 
-def errors(measured: ViewMetrics | Evaluation, psnr_digits: int = 2) -> list[str]:
-    """The numbers for the columns `ERRORS`, and for "LPIPS (VGG)" where the measurement has one."""
-    names = ("psnr", "ssim", "l1") if isinstance(measured, Evaluation) else ("psnr", "ssim", "l1", "lpips")
-    return [number(getattr(measured, name), psnr_digits if name == "psnr" else 4) for name in names]
+def errors(measured: ViewMetrics | Evaluation, columns: Iterable[str] = ERRORS, psnr_digits: int = 2) -> list[str]:
+    """The numbers of these measures."""
+    return [number(getattr(measured, name), psnr_digits if "psnr" in name else 4) for name in columns]
 
 
-def whole_errors(measured: ViewMetrics | Evaluation, psnr_digits: int = 2) -> list[str]:
-    """The numbers for the columns `WHOLE_ERRORS`; none where no test view has a mask."""
-    if math.isnan(measured.whole_l1):
-        return []
-    return [number(measured.whole_psnr, psnr_digits), number(measured.whole_ssim, 4), number(measured.whole_l1, 4)]
-
-
-def aligned_errors(measured: ViewMetrics | Evaluation, psnr_digits: int = 2) -> list[str]:
-    """The numbers for the columns `ALIGNED_ERRORS`; none where no colours were aligned."""
-    if math.isnan(measured.aligned_l1):
-        return []
-    psnr = number(measured.aligned_psnr, psnr_digits)
-    return [psnr, number(measured.aligned_ssim, 4), number(measured.aligned_l1, 4)]
+def error_columns(metrics: Metrics) -> dict[str, str]:
+    """Measure -> head of its column, of all that a model's test views have: `ERRORS`, LPIPS, FLIP where it was
+    computed, errors with masked pixels where there are any, and those after colour alignment where that was asked for.
+    """
+    computed = {name for name, value in metrics.mean.further().items() if name.endswith("l1") and not math.isnan(value)}
+    further = {name: head for name, head in FURTHER.items() if f"{name.partition('_')[0]}_l1" in computed}
+    flip = {} if all(math.isnan(view.flip) for view in metrics.views) else {"flip": "FLIP"}
+    return ERRORS | {"lpips": "LPIPS (VGG)"} | flip | further
 
 
 def views_table(metrics: Metrics, with_means: bool = False) -> str:
-    """A table with the errors of each test view, and with their means as its last line if asked for. FLIP has a column
-    where it was computed, and so have errors with masked pixels and those after colour alignment."""
-    measured = [(view, 2) for view in metrics.views] + ([(metrics.mean, 4)] if with_means else [])
-    rows = [[view.name, *errors(view, digits)] for view, digits in measured]
-    header = ["view", *ERRORS, "LPIPS (VGG)"]
-    if not all(math.isnan(view.flip) for view in metrics.views):
-        header.append("FLIP")
-        for row, (view, _) in zip(rows, measured, strict=True):
-            row.append(number(view.flip, 4))
-    if whole_errors(metrics.mean):
-        header += WHOLE_ERRORS
-        for row, (view, digits) in zip(rows, measured, strict=True):
-            row += whole_errors(view, digits)
-    if aligned_errors(metrics.mean):
-        header += ALIGNED_ERRORS
-        for row, (view, digits) in zip(rows, measured, strict=True):
-            row += aligned_errors(view, digits)
-    return table(header, rows)
+    """A table with the errors of each test view, and with their means as its last line if asked for."""
+    columns = error_columns(metrics)
+    rows = [[view.name, *errors(view, columns)] for view in metrics.views]
+    if with_means:
+        rows.append([metrics.mean.name, *errors(metrics.mean, columns, psnr_digits=4)])
+    return table(["view", *columns.values()], rows)
 
 
 def history_table(history: list[Evaluation]) -> str:

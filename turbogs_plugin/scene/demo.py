@@ -246,6 +246,7 @@ def _write(folder: Path, random: np.random.Generator, views: int, width: int, he
     solids, seen_height = demo_solids(random), LOOK_AT
     if horizon:
         solids, seen_height = solids + horizon_solids(random), LOOK_AT_WITH_HORIZON
+    reconstruction = load_pycolmap().Reconstruction()  # another package of that name has none: said before photos
     (folder / "images").mkdir(parents=True)
     (folder / "sparse" / "0").mkdir(parents=True)
     focal = FOCAL * width
@@ -270,19 +271,20 @@ def _write(folder: Path, random: np.random.Generator, views: int, width: int, he
         chosen = random.choice(hits, min(POINTS_PER_VIEW, len(hits)), replace=False)
         points.append(origin + distances[chosen, None] * directions[chosen])
         point_colors.append(colors[chosen])
-    reconstruction = _reconstruct(poses, np.concatenate(points), np.concatenate(point_colors), depths, focal, random)
+    _fill(reconstruction, poses, np.concatenate(points), np.concatenate(point_colors), depths, focal, random)
     reconstruction.write_binary(folder / "sparse" / "0")
 
 
-def _reconstruct(
+def _fill(
+    reconstruction: pycolmap.Reconstruction,
     poses: np.ndarray,
     points: np.ndarray,
     colors: np.ndarray,
     depths: np.ndarray,
     focal: float,
     random: np.random.Generator,
-) -> pycolmap.Reconstruction:
-    """A reconstruction as COLMAP would have made it.
+) -> None:
+    """Make an empty reconstruction what COLMAP would have made of the photos.
 
     Args:
         poses: [V, 3, 4] world to camera.
@@ -300,7 +302,6 @@ def _reconstruct(
     visible &= visible.sum(axis=0) >= 2
 
     pycolmap = load_pycolmap()
-    reconstruction = pycolmap.Reconstruction()
     camera = pycolmap.Camera(
         camera_id=1, model="PINHOLE", width=width, height=height, params=[focal, focal, width / 2, height / 2]
     )
@@ -317,4 +318,3 @@ def _reconstruct(
         )
         reconstruction.add_point3D(displaced[point], track, np.round(colors[point] * 255).astype(np.uint8))
     reconstruction.update_point_3d_errors()
-    return reconstruction

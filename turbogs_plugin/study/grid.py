@@ -22,7 +22,7 @@ from turbogs_plugin.config.auto import AUTO
 from turbogs_plugin.config.configuration import Config, load_config
 from turbogs_plugin.config.scaling import with_iterations
 from turbogs_plugin.config.schema import build_dataclass, nearest
-from turbogs_plugin.config.yaml_text import packaged_names, read_named_yaml
+from turbogs_plugin.config.yaml_text import read_named_yaml
 from turbogs_plugin.errors import InputError
 
 PACKAGE = "turbogs_plugin.configs.ablations"
@@ -86,11 +86,6 @@ class CellKey:
 
     def __str__(self) -> str:
         return f"{self.scene}, {self.variant}, seed {self.seed}"
-
-
-def ablation_names() -> list[str]:
-    """Names of the ablations that come with TurboGS."""
-    return packaged_names(PACKAGE)
 
 
 def load_ablation(name_or_file: str) -> Ablation:

@@ -21,7 +21,7 @@ from turbogs_plugin.report.provenance import Provenance
 from turbogs_plugin.study.difference import common_configuration, difference, flattened, nested, restored
 from turbogs_plugin.study.grid import Ablation
 from turbogs_plugin.study.results import CellResult, Failure, Study
-from turbogs_plugin.train.history import Evaluation
+from turbogs_plugin.train.history import MEASURES, Evaluation
 
 FORMAT = 2
 """Raised by one whenever an older version of TurboGS would misread a new file."""
@@ -38,7 +38,7 @@ DECIMALS = {
     "wall_seconds": 3,
     "cell_seconds": 3,
 }
-DECIMALS |= {f"{of}_{name}": DECIMALS[name] for of in ("whole", "aligned") for name in ("psnr", "ssim", "l1")}
+DECIMALS |= {f"{of}_{name}": DECIMALS[name] for of in ("whole", "aligned") for name in MEASURES}
 """Digits behind the point that are kept of a measure: for errors those that float32 has."""
 
 SHARED = ("provenance", "resolved", "warmup_iterations", "lpips_reason")
@@ -50,6 +50,7 @@ Columns = make_dataclass(
         (entry.name, list[int] if entry.type == "int" else list[float | None], field(default=entry.default))
         for entry in fields(Evaluation)
     ],
+    kw_only=True,
 )
 """A history as the file has it: field of `Evaluation` -> its values. One that has its default all along is absent."""
 

@@ -12,7 +12,7 @@ import math
 import tempfile
 import time
 from collections.abc import Callable
-from dataclasses import astuple, dataclass
+from dataclasses import asdict, dataclass
 from functools import lru_cache
 from pathlib import Path
 
@@ -24,6 +24,7 @@ from turbogs_plugin.engine.rendering import RasterSettings, render_image
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene import PosedImages
 from turbogs_plugin.train.flip import Flip
+from turbogs_plugin.train.history import MEASURES, FurtherErrors
 from turbogs_plugin.train.ssim import SSIM_SIDE, ssim
 from turbogs_plugin.types import BLACK, Color, Gaussians
 
@@ -41,14 +42,9 @@ Lpips = Callable[[Tensor, Tensor], float]
 
 
 @dataclass
-class ViewMetrics:
+class ViewMetrics(FurtherErrors):
     """Errors of one test view, without its masked pixels; `ssim`, `lpips` and `flip` are NaN where they cannot be
-    computed or are not wanted.
-
-    Args:
-        whole_psnr, whole_ssim, whole_l1: with the masked pixels; NaN where no view has a mask.
-        aligned_psnr, aligned_ssim, aligned_l1: of the render after `align_colors`; NaN where that was not asked for.
-    """
+    computed or are not wanted."""
 
     name: str
     psnr: float
@@ -56,12 +52,6 @@ class ViewMetrics:
     l1: float
     lpips: float = math.nan
     flip: float = math.nan
-    whole_psnr: float = math.nan
-    whole_ssim: float = math.nan
-    whole_l1: float = math.nan
-    aligned_psnr: float = math.nan
-    aligned_ssim: float = math.nan
-    aligned_l1: float = math.nan
 
 
 @dataclass
@@ -79,8 +69,9 @@ class Metrics:
     @property
     def mean(self) -> ViewMetrics:
         """The means over views; NaN if a view has no value."""
-        columns = zip(*(astuple(view)[1:] for view in self.views), strict=True)
-        return ViewMetrics(f"mean of {len(self.views)}", *(math.fsum(column) / len(self.views) for column in columns))
+        views, count = [asdict(view) for view in self.views], len(self.views)
+        means = {name: math.fsum(view[name] for view in views) / count for name in views[0] if name != "name"}
+        return ViewMetrics(f"mean of {count}", **means)
 
     @property
     def worst_psnr(self) -> float:
@@ -120,18 +111,21 @@ def evaluate(
         synchronize(gaussians.device)
         seconds += time.perf_counter() - started
         photo, mask = views.photos.image(view_id, background), views.mask(view_id)
-        metrics.append(compare(name, image, photo, mask))
+        measured = compare(name, image, photo, mask)
+        further = {}
         if views.masks is not None:
-            whole = compare(name, image, photo)
-            metrics[-1].whole_psnr, metrics[-1].whole_ssim, metrics[-1].whole_l1 = whole.psnr, whole.ssim, whole.l1
+            further["whole"] = compare(name, image, photo)
         if aligned:
-            after = compare(name, align_colors(image, photo, mask), photo, mask)
-            metrics[-1].aligned_psnr, metrics[-1].aligned_ssim = after.psnr, after.ssim
-            metrics[-1].aligned_l1 = after.l1
+            further["aligned"] = compare(name, align_colors(image, photo, mask), photo, mask)
+        for kind, other in further.items():
+            for measure in MEASURES:
+                setattr(measured, f"{kind}_{measure}", getattr(other, measure))
+        unmasked = image if mask is None else _unmasked(image, photo, mask)
         if lpips is not None:
-            metrics[-1].lpips = lpips(image if mask is None else _unmasked(image, photo, mask), photo)
+            measured.lpips = lpips(unmasked, photo)
         if flip is not None:
-            metrics[-1].flip = flip(image if mask is None else _unmasked(image, photo, mask), photo)
+            measured.flip = flip(unmasked, photo)
+        metrics.append(measured)
     return Metrics(metrics, fps=len(metrics) / seconds)
 
 

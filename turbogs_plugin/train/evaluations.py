@@ -61,12 +61,7 @@ class Evaluations(Listener):
             nonfinite_losses=int(trainer.nonfinite_losses),
             skipped_updates=int(trainer.optimizer.skipped),
             worst_psnr=metrics.worst_psnr,
-            whole_psnr=mean.whole_psnr,
-            whole_ssim=mean.whole_ssim,
-            whole_l1=mean.whole_l1,
-            aligned_psnr=mean.aligned_psnr,
-            aligned_ssim=mean.aligned_ssim,
-            aligned_l1=mean.aligned_l1,
+            **mean.further(),
         )
         self.history.append(evaluation)
         self.metrics = metrics

@@ -10,12 +10,35 @@ from pathlib import Path
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.files import read_text, write_text_atomically
 
-OPTIONAL = ("whole_", "aligned_")
-"""Prefixes of measures that only some captures have."""
+MEASURES = ("psnr", "ssim", "l1")
+"""The errors that every comparison of a render with a photo gives."""
+
+
+@dataclass(kw_only=True)
+class FurtherErrors:
+    """Errors beside the plain ones, which only some captures have: NaN where they were not asked for or not computed.
+
+    Args:
+        whole_psnr, whole_ssim, whole_l1: with masked pixels, which have no part in the plain ones; NaN where no test
+            view has a mask.
+        aligned_psnr, aligned_ssim, aligned_l1: of renders after a colour alignment (`align_colors`), in runs that learn
+            exposures.
+    """
+
+    whole_psnr: float = math.nan
+    whole_ssim: float = math.nan
+    whole_l1: float = math.nan
+    aligned_psnr: float = math.nan
+    aligned_ssim: float = math.nan
+    aligned_l1: float = math.nan
+
+    def further(self) -> dict[str, float]:
+        """These errors alone, by name."""
+        return {field.name: getattr(self, field.name) for field in fields(FurtherErrors)}
 
 
 @dataclass
-class Evaluation:
+class Evaluation(FurtherErrors):
     """One evaluation.
 
     Args:
@@ -27,10 +50,8 @@ class Evaluation:
         nonfinite_losses: iterations so far whose loss was not finite.
         skipped_updates: updates of Gaussians skipped so far because their gradient was not finite.
         worst_psnr: PSNR of the worst test view; NaN in old files, which lack it.
-        whole_psnr, whole_ssim, whole_l1: means with masked pixels, which have no part in `psnr`, `ssim` and `l1`; NaN,
-            and not written, where no test view has any.
-        aligned_psnr, aligned_ssim, aligned_l1: means after a colour alignment (`align_colors`), in runs that learn
-            exposures; NaN, and not written, in others.
+
+    The others are means, too, and not written where they are NaN.
     """
 
     iteration: int
@@ -43,18 +64,12 @@ class Evaluation:
     nonfinite_losses: int = 0
     skipped_updates: int = 0
     worst_psnr: float = math.nan
-    whole_psnr: float = math.nan
-    whole_ssim: float = math.nan
-    whole_l1: float = math.nan
-    aligned_psnr: float = math.nan
-    aligned_ssim: float = math.nan
-    aligned_l1: float = math.nan
 
     def to_json(self) -> str:
         """One line; NaN is written as null."""
-        absent = {name for name, value in asdict(self).items() if value != value and name.startswith(OPTIONAL)}
-        written = {name: value for name, value in asdict(self).items() if name not in absent}
-        return json.dumps({name: None if value != value else value for name, value in written.items()})
+        further = self.further()
+        plain = {name: None if value != value else value for name, value in asdict(self).items() if name not in further}
+        return json.dumps(plain | {name: value for name, value in further.items() if value == value})
 
 
 def append_evaluation(path: Path, evaluation: Evaluation) -> None:

@@ -85,11 +85,6 @@ def random_words(place: Tensor, view: Tensor | int, purpose: int, seed: int, ite
     return philox4x32((place, constant[0], constant[1], constant[2] & MASK), (seed & MASK, iteration & MASK))
 
 
-def uniforms(words: Tensor) -> Tensor:
-    """float32 in (0, 1), an odd multiple of 2^-24, from words of 0 .. 2^32 - 1."""
-    return (((words >> 9) << 1) | 1).to(torch.float32) * 2.0**-24
-
-
 def exponentials(words: Tensor) -> Tensor:
     """Exp(1) variates -log(u), float32 in [2^-24, 24 log 2], from words of 0 .. 2^32 - 1.
 
