@@ -37,6 +37,10 @@ ITERATION_MS = (1.3, 3.4)
 """A whole iteration on an H200: 150 thousand Gaussians and 3 views of a megapixel; 600 thousand and 10 views."""
 LONG_RUN = 20_000
 """Iterations from which on the plan says how long that is, as nobody would expect it."""
+LONGEST = 30_000
+"""Most iterations of `auto`, 3DGS's own length, whose iterations have one photo, too. 60 epochs of 500 training views
+take as many; those of more photos would take minutes or hours that nobody has asked for. A time budget is how to ask.
+For several processes, of which each iteration has as many times the pixels, it is that much less."""
 SHORTEST_SHARE = 0.4
 """Least share of `train.base_iterations`: with fewer iterations, however few the photos, the events of density control
 would be too close together. fox has 52 % of them with 60 epochs."""
@@ -181,14 +185,20 @@ def wanted_iterations(facts: SceneFacts, config: Config) -> Verdict:
     factor = batch.value if batch.made == "auto" else 1  # what is set is in the schedule already
     wanted = train.epochs * views / (factor * images_per_iteration(config, views))
     fewest = SHORTEST_SHARE * train.base_iterations
+    longest = max(LONGEST / factor, fewest)
+    given = min(max(wanted, fewest), longest)
     reason = f"{train.epochs:g} epochs of {views} training views"
     reason += f", {factor} times the pixels an iteration" if factor > 1 else ""
     if wanted < fewest:
         reason += f" take fewer than {SHORTEST_SHARE:.0%} of {train.base_iterations}"
-    if wanted >= LONG_RUN:
-        least, most = (wanted * milliseconds / 60_000 for milliseconds in ITERATION_MS)
-        reason += f": {least:.1f} to {most:.1f} min on an H200; --time-budget takes less"
-    return Verdict(math.ceil(max(wanted, fewest) / 100) * 100, reason)
+    if wanted > longest:
+        looks = train.epochs * longest / wanted
+        reason += f" take {wanted:.0f}; at most {longest:.0f}, where a pixel is sampled {looks:.1f} times"
+    if given >= LONG_RUN:
+        least, most = (given * milliseconds / 60_000 for milliseconds in ITERATION_MS)
+        reason += f": {least:.1f} to {most:.1f} min on an H200; --time-budget for less"
+        reason += " or more" if wanted > longest else ""
+    return Verdict(math.ceil(given / 100) * 100, reason)
 
 
 def wanted_maps_place(facts: SceneFacts, config: Config) -> Verdict:
