@@ -61,6 +61,14 @@ ONE_VIEW = ("schedule.type=fixed", "schedule.views=1")
 BOTH_SIDES = [
     ("train.backdrop", {"direction_concentration": 0.95}, (), True, "0.950 >= 0.95"),
     ("train.backdrop", {"direction_concentration": 0.9499}, (), False, "< 0.95"),
+    (
+        "train.backdrop",
+        {"direction_concentration": 0.95},
+        ("density.max_gaussians=3000",),
+        False,
+        "3000 Gaussians leave no room within density.max_gaussians 3000",
+    ),
+    ("train.backdrop", {"direction_concentration": 0.95}, ("density.max_gaussians=3001",), True, "0.950 >= 0.95"),
     ("train.background", {"transparent": False}, (), "black", "opaque"),
     ("train.background", {"transparent": True}, (), "random", "transparent"),
     ("train.exposure", {"exposure_jumps": 0.1}, (), True, "0.10 stops from their neighbours >= 0.1"),

@@ -20,6 +20,9 @@ if TYPE_CHECKING:
     from turbogs_plugin.train.run import RunSession
 
 
+VIEWER_ON_ONE = "--viewer shows a training on one GPU: leave it out, or --gpus"
+
+
 def train(
     scene: Positional[Scene] = None,
     overrides: Overrides = (),
@@ -61,6 +64,8 @@ def train(
         raise InputError("train needs a SCENE and --out RUN, or --resume RUN")
     if gpus is not None:
         require_positive("--gpus", (gpus,))
+    if viewer is not None and (gpus or 1) > 1:
+        raise InputError(VIEWER_ON_ONE)
     gc.disable()  # imports make a million objects and nothing to collect
     from turbogs_plugin.distributed.processes import joined, launched, restarted, start
     from turbogs_plugin.report.pages import load_plots, write_report
@@ -72,6 +77,8 @@ def train(
     settings = run.RunFolder(resume).read_config() if resume else options.settings(scene, overrides)
     device = settings.train.device
     if gpus is not None and gpus > 1 and not launched():
+        if out is not None:
+            run.RunFolder(out).require_new()
         return start(gpus, sys.argv[1:], device)
     page, watch = write_report if report else None, event_writers(settings)
     with joined(device) as ranks, ExitStack() as pages:
@@ -82,7 +89,7 @@ def train(
         live = None
         if viewer is not None:
             if ranks.count > 1:
-                raise InputError("--viewer shows a training on one GPU: leave it out, or --gpus")
+                raise InputError(VIEWER_ON_ONE)  # started by torchrun
             from turbogs_plugin.viewer.commands import attached
 
             live = pages.enter_context(attached(viewer, viewer_host))

@@ -13,6 +13,8 @@ from dataclasses import dataclass, field, replace
 from turbogs_plugin.config.auto import AUTO, AUTO_SETTINGS, value_of
 from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.engine.layout import MAX_VIEWS
+from turbogs_plugin.model.initial import BACKDROP_COUNT
+from turbogs_plugin.plan.caps import cap_of
 from turbogs_plugin.plan.facts import SceneFacts
 from turbogs_plugin.plan.pixels import images_per_iteration
 from turbogs_plugin.scene.host_arrays import MEMORY_SHARE as HOST_SHARE
@@ -110,7 +112,9 @@ def wanted_backdrop(facts: SceneFacts, config: Config) -> Verdict:
     """A far sphere behind the scene, where all cameras look the same way and much of it is seen by few."""
     if config.train.starts_from_model:
         return Verdict(False, "train.init names a model, which is taken as it is")
-    concentration = facts.direction_concentration
+    concentration, cap = facts.direction_concentration, cap_of(config)
+    if 0 < cap <= BACKDROP_COUNT:
+        return Verdict(False, f"its {BACKDROP_COUNT} Gaussians leave no room within density.max_gaussians {cap}")
     one_sided = concentration >= ONE_SIDED
     return Verdict(one_sided, f"view directions concentrated to {concentration:.3f} {_sign(one_sided)} {ONE_SIDED}")
 

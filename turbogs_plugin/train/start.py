@@ -13,8 +13,11 @@ from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.device import synchronize
 from turbogs_plugin.engine import compiled_kernels
 from turbogs_plugin.errors import InputError
+from turbogs_plugin.model.initial import BACKDROP_COUNT
+from turbogs_plugin.plan.caps import cap_of, chosen_points, require_room
 from turbogs_plugin.scene import Scene, load_scene
 from turbogs_plugin.train.folder import RunFolder
+from turbogs_plugin.train.given_model import read_given
 from turbogs_plugin.train.progress import LoadingProgress
 
 
@@ -24,6 +27,31 @@ def resolve_device(name: str, remedy: str = "use --device cpu, or see 'turbogs d
         build = "this PyTorch is built without CUDA" if torch.version.cuda is None else "no GPU answers"
         raise InputError(f"CUDA was asked for and is absent ({build}): {remedy}")
     return torch.device("cuda" if name != "cpu" and torch.cuda.is_available() else "cpu")
+
+
+def require_possible(config: Config) -> None:
+    """What can be refused before the cameras of photos are found, or any photo is decoded.
+
+    Raises:
+        InputError: a device or a limit of its memory that this machine does not have; a model to start from that cannot
+            be read; more Gaussians to start from than are allowed.
+    """
+    train, cap = config.train, cap_of(config)
+    if train.device == "cuda":
+        resolve_device("cuda")
+    if config.budget.max_memory:
+        require_gpu_memory(resolve_device(train.device))
+    backdrop = BACKDROP_COUNT if train.backdrop is True else 0
+    if train.starts_from_model:
+        require_room(train.init, len(read_given(train.init)), cap, backdrop)
+    else:
+        chosen_points(1, cap, backdrop)
+
+
+def require_gpu_memory(device: torch.device) -> None:
+    """Raise `InputError` where the memory of a device that is no GPU is to be limited."""
+    if device.type != "cuda":
+        raise InputError("--max-memory limits the memory of a GPU, and this run would be on a CPU: leave it out")
 
 
 @contextmanager
