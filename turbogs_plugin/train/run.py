@@ -19,9 +19,9 @@ from turbogs_plugin.errors import InputError, TrainingStopped
 from turbogs_plugin.files import require_writable, write_text_atomically
 from turbogs_plugin.model.ply import save_ply
 from turbogs_plugin.plan import Plan, make_plan
-from turbogs_plugin.reconstruct.train_on_photos import with_cameras
 from turbogs_plugin.scene import Scene
 from turbogs_plugin.scene.fingerprint import capture_difference, capture_state
+from turbogs_plugin.scene.load import holds_photos_alone
 from turbogs_plugin.scene.offload import place_views
 from turbogs_plugin.train.calibration import Calibration, budget_text, hold_to, within_budget
 from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint, require_like, save_checkpoint
@@ -140,7 +140,7 @@ def train(
         folder.require_new()
     require_possible(config)
     _try_lpips(config, report is not None)
-    posed = ranks.agree(with_cameras(config, out).scene.path if ranks.first else None)
+    posed = ranks.agree(_posed_capture(config, out) if ranks.first else None)
     if posed != config.scene.path:
         clock.mark(CAMERAS)
         config = replace(config, scene=replace(config.scene, path=posed))
@@ -213,6 +213,15 @@ def resume(
     if ranks.first:
         session.history += rewind_history(folder.history, loop.trainer.iteration if session.resumed else -1)
     return session.run(report, watch)
+
+
+def _posed_capture(config: Config, out: Path) -> str:
+    """The path of the capture; where that is of photos alone, of their reconstruction, which is made."""
+    if not holds_photos_alone(Path(config.scene.path)):
+        return config.scene.path
+    from turbogs_plugin.reconstruct.train_on_photos import with_cameras  # no other run needs that room
+
+    return with_cameras(config, out).scene.path
 
 
 def _try_lpips(config: Config, reported: bool) -> None:
