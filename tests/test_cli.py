@@ -131,6 +131,12 @@ BROKEN = [
 ]
 
 
+def test_photos_of_more_pixels_than_pillow_takes_for_harmless(turbogs, capture, monkeypatch):
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 100)
+    code, out, _ = turbogs("plan", capture, "--device", "cpu")
+    assert code == 0 and "views of 48x40 pixels" in out
+
+
 @pytest.mark.parametrize(("damage", "words"), BROKEN, ids=[damage.__name__ for damage, _ in BROKEN])
 def test_a_broken_capture_is_refused(turbogs, copy, tmp_path, damage, words):
     damage(copy)

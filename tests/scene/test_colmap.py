@@ -406,6 +406,20 @@ def test_images_without_their_photo_are_left_out(tmp_path):
     np.testing.assert_allclose(centers[:, 0], [2, 4, 5, 6, 7, 8], atol=1e-5)
 
 
+@pytest.mark.parametrize(("place", "refused"), [(1e14, False), (1e30, True), (1e300, True)])
+def test_a_point_that_is_too_far_for_float32_is_refused(tmp_path, place, refused):
+    """Squared distances of the first that is refused would be infinite, and so would a Gaussian's size."""
+    folder = write_capture(tmp_path / "cup")
+    model = pycolmap.Reconstruction(folder / "sparse/0")
+    model.add_point3D(np.array([place, 0.0, 0.0]), pycolmap.Track(), np.zeros(3, dtype=np.uint8))
+    model.write(folder / "sparse/0")
+    if not refused:
+        assert len(load_scene(folder).points) == 21
+        return
+    with pytest.raises(InputError, match="1 of 21 3D points lie too far from the cameras for float32: take them out"):
+        load_scene(folder)
+
+
 def test_more_than_8_bits_are_refused_before_any_photo_is_decoded(tmp_path):
     folder = write_capture(tmp_path / "cup")
     deep_photo(folder)

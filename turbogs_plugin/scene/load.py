@@ -36,6 +36,8 @@ from turbogs_plugin.scene.undistort import undistortion_note
 from turbogs_plugin.types import Cameras
 
 NAMED_AT_MOST = 3
+FARTHEST = 1e15
+"""Distance of a point in extents, from which on squares, and squares of these, do not fit into float32."""
 
 
 @dataclass
@@ -133,9 +135,11 @@ def load_scene(
         frame = Frame.around(camera_centers(capture.viewmats[~test]), capture.points)
     viewmats = torch.from_numpy(frame.normalise_poses(capture.viewmats)).float()
     points = torch.from_numpy(frame.normalise_points(capture.points)).float()
-    far = ~points.isfinite().all(dim=1)
+    far = ~(points.abs() < FARTHEST).all(dim=1)
     if far.any():
-        raise InputError(f"{scene}: {int(far.sum())} of {len(far)} 3D points lie too far from the cameras for float32")
+        raise InputError(
+            f"{scene}: {int(far.sum())} of {len(far)} 3D points lie too far from the cameras for float32: take them out"
+        )
     if factor > 1 and factor % capture.reduction:
         raise InputError(
             f"--factor {factor}: the largest photos of {scene} are those of {capture.photo_folder.name}: use --factor "
