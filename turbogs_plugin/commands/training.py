@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import gc
 import sys
-import threading
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
@@ -68,7 +67,8 @@ def train(
         raise InputError(VIEWER_ON_ONE)
     gc.disable()  # imports make a million objects and nothing to collect
     from turbogs_plugin.distributed.processes import joined, launched, restarted, start
-    from turbogs_plugin.report.pages import load_plots, write_report
+    from turbogs_plugin.report.pages import write_report
+    from turbogs_plugin.report.plot_process import PlotProcess
     from turbogs_plugin.report.tensorboard import event_writers
     from turbogs_plugin.train import run
 
@@ -82,8 +82,6 @@ def train(
         return start(gpus, sys.argv[1:], device)
     page, watch = write_report if report else None, event_writers(settings)
     with joined(device) as ranks, ExitStack() as pages:
-        if report and ranks.first:
-            threading.Thread(target=load_plots, daemon=True).start()  # while photos are decoded
         if resume is None and restarted() and run.RunFolder(out).config.is_file():
             resume = out
         live = None
@@ -94,6 +92,8 @@ def train(
 
             live = pages.enter_context(attached(viewer, viewer_host))
             watch.append(live.watch)
+        if report and ranks.first:
+            page = partial(write_report, process=pages.enter_context(PlotProcess()))
         begin = partial(run.resume, resume) if resume else partial(run.train, settings, out)
         session = begin(page, clock, ranks, watch)
         code = _tell(session, report) if ranks.first else 128 + session.signal if session.signal else 0
