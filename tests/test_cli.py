@@ -120,7 +120,7 @@ def two_views(capture: Path) -> None:
 
 
 BROKEN = [
-    (without_model, ["copy", "neither a COLMAP reconstruction"]),
+    (without_model, ["copy", "sparse/0 has no images", "bring that file"]),
     (without_images, ["no images"]),
     (without_six_photos, ["6 of 8", "view_002.png", "view_003.png", "bring them back"]),
     (truncated_photo, ["view_001.png"]),

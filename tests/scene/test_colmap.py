@@ -228,6 +228,11 @@ def remove_photos(folder: Path) -> None:
         (folder / "images" / f"photo{view:02d}.png").unlink()
 
 
+def capitals(folder: Path) -> None:
+    for path in list((folder / "images").iterdir()):
+        path.rename(path.with_suffix(".PNG"))
+
+
 def remove_model(folder: Path) -> None:
     (folder / "sparse/0/points3D.bin").unlink()
 
@@ -235,7 +240,8 @@ def remove_model(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("damage", "words"),
     [
-        (remove_model, "neither a COLMAP reconstruction"),
+        (remove_model, r"sparse/0 has no points3D \(\.bin or \.txt\): bring that file of the reconstruction back"),
+        (capitals, r"9 of 9 photos are missing in .*; photo00\.PNG is there: give the files the letters"),
         (remove_photos, r"7 of 9 photos are missing in .*images: photo02.png, photo03.png, photo04.png, \.\.\.; bring"),
         (lambda folder: replace_photo(folder, b"\xff"), "cannot read the photo .*photo03.png"),
         (lambda folder: replace_photo(folder, b""), "cannot read the photo .*photo03.png"),

@@ -74,6 +74,17 @@ def _suffix(folder: Path) -> str:
     return next(complete, "")
 
 
+def incomplete_model(scene: Path) -> str:
+    """What a reconstruction in `MODEL_FOLDERS` lacks, and where; empty where there is none that lacks something."""
+    for place in (scene / name for name in MODEL_FOLDERS):
+        numbered = sorted(place.glob("[0-9]")) if place.is_dir() else []
+        for folder in (place, *numbered):
+            there = {path.stem for path in folder.glob("*") if path.suffix in (".bin", ".txt")} & set(FILES)
+            if there:
+                return f"{folder} has no {' and no '.join(name for name in FILES if name not in there)} (.bin or .txt)"
+    return ""
+
+
 def _numbered_models(place: Path) -> list[tuple[Path, str]]:
     """The reconstructions in ``place/0``, ``place/1``, ..., in order of their numbers."""
     folders = (

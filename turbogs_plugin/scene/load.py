@@ -15,7 +15,7 @@ from turbogs_plugin.errors import InputError
 from turbogs_plugin.masks import PixelMasks, ViewMask
 from turbogs_plugin.scene import blender, llff
 from turbogs_plugin.scene.capture import FEWEST_PHOTOS, Capture
-from turbogs_plugin.scene.colmap import MODEL_FOLDERS, find_model, read_colmap
+from turbogs_plugin.scene.colmap import MODEL_FOLDERS, find_model, incomplete_model, read_colmap
 from turbogs_plugin.scene.frame import Frame
 from turbogs_plugin.scene.host_arrays import file_note
 from turbogs_plugin.scene.mask_files import find_masks, load_masks
@@ -263,6 +263,8 @@ def _read_other(scene: Path, files: list[str], factor: int) -> Capture:
             f"{scene} has {len(find_photos(scene)[1])} photos and nothing that says where they were taken from: find "
             f"that by 'turbogs reconstruct {scene} --out SCENE', then use SCENE"
         )
+    if lack := incomplete_model(scene):
+        raise InputError(f"{lack}: bring that file of the reconstruction back")
     raise InputError(
         f"{scene} has neither a COLMAP reconstruction (cameras, images and points3D as .bin or .txt in sparse/0) nor a "
         f"{FILE}, a {blender.TRAIN_FILE} or a {llff.FILE}, nor photos"
@@ -293,11 +295,21 @@ def _find_photos(scene: Path, capture: Capture, factor: int) -> tuple[list[Path]
         more = ", ..." if len(missing) > NAMED_AT_MOST else ""
         raise InputError(
             f"{len(missing)} of {len(paths)} photos are missing in {capture.photo_folder}: "
-            f"{', '.join(missing[:NAMED_AT_MOST])}{more}; bring them back"
+            f"{', '.join(missing[:NAMED_AT_MOST])}{more}; {_in_other_letters(paths) or 'bring them back'}"
         )
     sizes = photo_sizes(paths)
     fitted = _require_scaled(paths, sizes, expected)
     return paths, sizes, reduced_sizes(_undistorted_sizes(capture, sizes), factor), fitted
+
+
+def _in_other_letters(paths: list[Path]) -> str:
+    """What to do where a file that is missing is there in capital or small letters; empty where it is not."""
+    for path in paths:
+        if path.parent.is_dir() and not path.is_file():
+            for other in path.parent.iterdir():
+                if other.name.lower() == path.name.lower():
+                    return f"{other.name} is there: give the files the letters that the reconstruction has"
+    return ""
 
 
 def _undistorted_sizes(capture: Capture, sizes: np.ndarray) -> np.ndarray:
