@@ -116,6 +116,7 @@ BOTH_SIDES = [
     ("train.iterations", {"train_views": 501}, (), 30000, "501 training views take 30060; at most 30000, where a"),
     ("train.iterations", {"train_views": 2625}, (), 30000, "take 157500; at most 30000, where a pixel is sampled 11.4"),
     ("train.iterations", {"train_views": 2625}, (), 30000, ": 0.7 to 1.7 min on an H200; --time-budget for less or"),
+    ("train.iterations", {"train_views": 500, "device": "cpu"}, (), 30000, "for less; hours or days on this CPU"),
     ("train.iterations", {"train_views": 2625, "processes": 2}, ("train.batch_for=auto",), 15000, "sampled 11.4 times"),
     ("train.iterations", {"train_views": 2625}, ("train.base_iterations=100000",), 40000, "sampled 15.2 times"),
     ("train.iterations", {"train_views": 20}, ("train.epochs=75",), 2000, "fewer than 40% of 5000"),

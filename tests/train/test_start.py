@@ -8,7 +8,7 @@ from PIL import Image
 
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.files import require_writable
-from turbogs_plugin.train import run
+from turbogs_plugin.train import run, start
 
 
 @pytest.fixture(scope="module")
@@ -20,7 +20,7 @@ def capture(tmp_path_factory) -> Path:
 def unread(monkeypatch) -> None:
     """Nothing looks at a capture."""
 
-    def opened(*_):
+    def opened(*_, **__):
         raise AssertionError("photos are read")
 
     monkeypatch.setattr(run, "open_scene", opened)
@@ -54,6 +54,23 @@ def test_what_needs_no_photo(capture, tmp_path, monkeypatch, overrides, words):
     with pytest.raises(InputError, match=words):
         run.train(tiny_config(capture, *overrides), tmp_path / "run")
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("limit", "words"), [("2MiB", r"--max-memory 2MiB leaves no room .* take \d+MiB here"), ("1GiB", "")]
+)
+def test_a_limit_of_memory_is_compared_with_the_sizes_of_photos(capture, monkeypatch, limit, words):
+    """Before one is decoded: the plan's own check comes after."""
+
+    def decoded(*_):
+        raise AssertionError("photos are decoded")
+
+    monkeypatch.setattr("turbogs_plugin.scene.load.load_photos", decoded)
+    config = tiny_config(capture, f"budget.max_memory={limit}")
+    with pytest.raises(InputError if words else AssertionError, match=words or "photos are decoded"):
+        start.open_scene(config, training=True)
+    with pytest.raises(AssertionError, match="photos are decoded"):
+        start.open_scene(config)
 
 
 def test_a_plan_is_refused_as_the_run(capture):

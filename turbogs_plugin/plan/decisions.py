@@ -202,6 +202,7 @@ def wanted_iterations(facts: SceneFacts, config: Config) -> Verdict:
         least, most = (given * milliseconds / 60_000 for milliseconds in ITERATION_MS)
         reason += f": {least:.1f} to {most:.1f} min on an H200; --time-budget for less"
         reason += " or more" if wanted > longest else ""
+        reason += "; hours or days on this CPU" if facts.device == "cpu" else ""
     return Verdict(math.ceil(given / 100) * 100, reason)
 
 

@@ -95,7 +95,11 @@ class Scene:
 
 
 def load_scene(
-    path: str | Path, factor: int = 1, test_every: int = 8, progress: Callable[[int, int], object] | None = None
+    path: str | Path,
+    factor: int = 1,
+    test_every: int = 8,
+    progress: Callable[[int, int], object] | None = None,
+    sized: Callable[[np.ndarray, np.ndarray], object] | None = None,
 ) -> Scene:
     """Load a capture with its photos.
 
@@ -112,6 +116,8 @@ def load_scene(
         test_every: the first of each `test_every` photos in name order is a test view, the others are for training.
             Captures with a split of their own (NeRF-synthetic, lists in a ``transforms.json``) keep it.
         progress: called with the number of photos decoded so far, and of all.
+        sized: called with the sizes [V, 2] (width, height) of training and of test views, before a photo is decoded;
+            what it raises ends the loading.
 
     Raises:
         InputError: anything wrong with the scene or the arguments, in one line.
@@ -164,6 +170,8 @@ def load_scene(
     parts = [np.flatnonzero(part & seen) for part in (~test, test)]
     channels = [channels_of([paths[view] for view in views]) if capture.alpha == "opacity" else 3 for views in parts]
     # Before minutes go into photos that have no room.
+    if sized is not None:
+        sized(*(sizes[views] for views in parts))
     colors = [photo_array(sizes[views], count) for views, count in zip(parts, channels, strict=True)]
     counter = itertools.count(1)
 

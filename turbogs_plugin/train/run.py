@@ -57,7 +57,7 @@ def plan_run(config: Config, processes: int = 1) -> Plan:
     """
     require_possible(config)
     device = resolve_device(config.train.device)
-    scene = open_scene(config)
+    scene = open_scene(config, training=True)
     plan = make_plan(config, scene, device, processes)
     print("\n".join(scene.notes), file=sys.stderr)  # last, as an error is one line alone
     return plan
@@ -145,7 +145,7 @@ def train(
         clock.mark(CAMERAS)
         config = replace(config, scene=replace(config.scene, path=posed))
     with starting(lambda: resolve_device(config.train.device)) as started:
-        scene = open_scene(config)
+        scene = open_scene(config, training=True)
         clock.mark(PHOTOS)
         device = started.result()
     clock.mark(DEVICE)
@@ -196,7 +196,7 @@ def resume(
     require_writable(folder.path, f"what --resume {folder.path} writes")
     _try_lpips(config, report is not None)
     with starting(lambda: device) as started:
-        scene = open_scene(config, folder)
+        scene = open_scene(config, folder, training=True)
         clock.mark(PHOTOS)
         started.result()
     clock.mark(DEVICE)
