@@ -426,6 +426,16 @@ def test_a_point_that_is_too_far_for_float32_is_refused(tmp_path, place, refused
         load_scene(folder)
 
 
+def test_photos_of_a_capture_beside_it_do_not_stand_in_for_some(tmp_path):
+    """All of them may lie beside the capture; a part may be others of the same names."""
+    folder = write_capture(tmp_path / "cup")
+    (folder / "images").rename(tmp_path / "images")
+    assert len(load_scene(folder).train) == 7
+    (tmp_path / "images" / "photo03.png").unlink()
+    with pytest.raises(InputError, match=r"9 of 9 photos are missing in .*cup/images: .*bring them back"):
+        load_scene(folder)
+
+
 def test_more_than_8_bits_are_refused_before_any_photo_is_decoded(tmp_path):
     folder = write_capture(tmp_path / "cup")
     deep_photo(folder)

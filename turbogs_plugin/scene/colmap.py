@@ -144,7 +144,8 @@ def read_colmap(scene: Path, model: Path, suffix: str) -> Capture:
     absence = ()
     if absent and len(names) - len(absent) >= FEWEST_PHOTOS:
         absence = (f"{len(absent)} of {len(names)} images are left out, their photos do not exist: {absent[0]}, ...",)
-        images = [image for image in images if image.name not in set(absent)]
+        gone = set(absent)
+        images = [image for image in images if image.name not in gone]
         names = tuple(image.name for image in images)
     viewmats = np.tile(np.eye(4), (len(images), 1, 1))
     intrinsics = np.tile(np.eye(3), (len(images), 1, 1))
@@ -199,7 +200,7 @@ def find_photo_folder(scene: Path, names: tuple[str, ...]) -> tuple[Path, int]:
 
     Looked at are ``images`` in the scene or beside it, the scene itself, and the folders in them; then, as not all
     keep the full-size photos, copies of them in ``images_2``, ``images_4``, ... Where none has all the photos it is the
-    first of those that have most.
+    first of those that have most; not one beside the scene, whose photos may be another one's of the same names.
     """
     first = scene / "images"
     if not names:
@@ -207,12 +208,12 @@ def find_photo_folder(scene: Path, names: tuple[str, ...]) -> tuple[Path, int]:
     places = (first, scene, scene.resolve().parent / "images")
     whole = ((folder, 1) for place in places for folder in _folders(place, FOLDER_DEPTH))
     reduced = ((scene / f"images_{factor}", factor) for factor in REDUCTIONS)
-    looked_at = []
+    own = []
     for folder, reduction in itertools.chain(whole, reduced):
         if all((folder / name).is_file() for name in names):
             return folder, reduction
-        looked_at.append((folder, reduction))
-    return max(looked_at, key=lambda place: sum((place[0] / name).is_file() for name in names))
+        own += [(folder, reduction)] if scene in (folder, *folder.parents) else []
+    return max(own, key=lambda place: sum((place[0] / name).is_file() for name in names))
 
 
 def _folders(place: Path, depth: int) -> Iterator[Path]:

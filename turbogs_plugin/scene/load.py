@@ -300,24 +300,22 @@ def _find_photos(scene: Path, capture: Capture, factor: int) -> tuple[list[Path]
     paths = [capture.photo_folder / name for name in capture.names]
     missing = [name for name, path in zip(capture.names, paths, strict=True) if not path.is_file()]
     if missing:
+        remedy = _in_other_letters(capture.photo_folder / missing[0]) or "bring them back"
         more = ", ..." if len(missing) > NAMED_AT_MOST else ""
         raise InputError(
             f"{len(missing)} of {len(paths)} photos are missing in {capture.photo_folder}: "
-            f"{', '.join(missing[:NAMED_AT_MOST])}{more}; {_in_other_letters(paths) or 'bring them back'}"
+            f"{', '.join(missing[:NAMED_AT_MOST])}{more}; {remedy}"
         )
     sizes = photo_sizes(paths)
     fitted = _require_scaled(paths, sizes, expected)
     return paths, sizes, reduced_sizes(_undistorted_sizes(capture, sizes), factor), fitted
 
 
-def _in_other_letters(paths: list[Path]) -> str:
+def _in_other_letters(path: Path) -> str:
     """What to do where a file that is missing is there in capital or small letters; empty where it is not."""
-    for path in paths:
-        if path.parent.is_dir() and not path.is_file():
-            for other in path.parent.iterdir():
-                if other.name.lower() == path.name.lower():
-                    return f"{other.name} is there: give the files the letters that the reconstruction has"
-    return ""
+    beside = path.parent.iterdir() if path.parent.is_dir() else ()
+    other = next((file.name for file in beside if file.name.lower() == path.name.lower()), None)
+    return f"{other} is there: give the files the letters that the reconstruction has" if other else ""
 
 
 def _undistorted_sizes(capture: Capture, sizes: np.ndarray) -> np.ndarray:
