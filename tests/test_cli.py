@@ -6,7 +6,6 @@ import re
 import shutil
 import subprocess
 import sys
-import threading
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -20,7 +19,7 @@ from PIL import Image
 from turbogs_plugin import cli, scene
 from turbogs_plugin.engine.rendering import render_image
 from turbogs_plugin.model.ply import load_ply
-from turbogs_plugin.report import pages
+from turbogs_plugin.report import plot_process
 from turbogs_plugin.report.outputs import distinct_stems
 from turbogs_plugin.train import run, start
 from turbogs_plugin.train.trainer import Trainer
@@ -87,8 +86,8 @@ def _replace_model(capture: Path, model: pycolmap.Reconstruction) -> None:
     model.write_binary(str(capture / "sparse" / "0"))
 
 
-def without_two_photos(capture: Path) -> None:
-    for path in sorted((capture / "images").iterdir())[2:4]:
+def without_six_photos(capture: Path) -> None:
+    for path in sorted((capture / "images").iterdir())[2:]:
         path.unlink()
 
 
@@ -123,14 +122,20 @@ def two_views(capture: Path) -> None:
 
 
 BROKEN = [
-    (without_model, ["copy", "neither a COLMAP reconstruction"]),
+    (without_model, ["copy", "sparse/0 has no images", "bring that file"]),
     (without_images, ["no images"]),
-    (without_two_photos, ["2 of 8", "view_002.png", "view_003.png"]),
+    (without_six_photos, ["6 of 8", "view_002.png", "view_003.png", "bring them back"]),
     (truncated_photo, ["view_001.png"]),
     (photo_of_another_size, ["view_001.png", "20x20", "48x40"]),
     (panorama, ["EQUIRECTANGULAR", "panorama"]),
     (two_views, ["3"]),
 ]
+
+
+def test_photos_of_more_pixels_than_pillow_takes_for_harmless(turbogs, capture, monkeypatch):
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 100)
+    code, out, _ = turbogs("plan", capture, "--device", "cpu")
+    assert code == 0 and "views of 48x40 pixels" in out
 
 
 @pytest.mark.parametrize(("damage", "words"), BROKEN, ids=[damage.__name__ for damage, _ in BROKEN])
@@ -372,20 +377,30 @@ def test_doctor(turbogs):
         assert word in out
 
 
-@pytest.mark.parametrize(("option", "loads"), [("--report", 1), ("--no-report", 0)])
-def test_plots_are_loaded_beside_the_photos_if_there_is_a_report(
-    turbogs, capture, tmp_path, monkeypatch, option, loads
-):
-    loading, load = threading.Barrier(2, timeout=60), pages.load_plots
-    threads = []
-    monkeypatch.setattr(pages, "load_plots", lambda: (loading.wait(), threads.append(threading.get_ident()), load()))
-    read = start.load_scene
-    monkeypatch.setattr(start, "load_scene", lambda *arguments: (loads and loading.wait(), read(*arguments))[1])
-    options = ("--device", "cpu", *QUICK)
-    code, _, err = turbogs("train", capture, "--out", tmp_path / "run", option, *options)
+@pytest.mark.parametrize("ends", ["draws", "fails", "is not asked for"])
+def test_plots_are_drawn_by_a_process_that_begins_before_photos_are_read(turbogs, capture, tmp_path, monkeypatch, ends):
+    made, drawn = [], []
+
+    class Process(plot_process.PlotProcess):
+        def __init__(self):
+            made.append(self)
+            super().__init__()
+
+        def end(self) -> bool:
+            return super().end() and ends == "draws"
+
+    draw, read = plot_process.SecondsPlot.draw, start.load_scene
+    monkeypatch.setattr(plot_process, "PlotProcess", Process)
+    monkeypatch.setattr(plot_process.SecondsPlot, "draw", lambda plot: (drawn.append(plot), draw(plot)))
+    monkeypatch.setattr(start, "load_scene", lambda *arguments: (made.append("photos"), read(*arguments))[1])
+    option = "--no-report" if ends == "is not asked for" else "--report"
+    code, _, err = turbogs("train", capture, "--out", tmp_path / "run", option, "--device", "cpu", *QUICK)
     assert code == 0, err
-    assert len(threads) == loads and threading.get_ident() not in threads
-    assert gc.isenabled() and (tmp_path / "run/report/psnr.png").is_file() == bool(loads)
+    assert len(drawn) == (2 if ends == "fails" else 0)
+    assert made[-1] == "photos" and len(made) == (1 if ends == "is not asked for" else 2)
+    names = ("report/psnr.png", "report/l1.png")
+    assert all((tmp_path / "run" / name).is_file() for name in names) == (ends != "is not asked for")
+    assert gc.isenabled()
 
 
 def test_ctrl_c_saves_and_says_how_to_go_on(turbogs, capture, tmp_path, monkeypatch):

@@ -9,6 +9,7 @@ import re
 import sys
 import warnings
 
+from PIL import Image
 from tyro.extras import subcommand_cli_from_dict
 
 from turbogs_plugin.commands import captures, machine, models, studies, training
@@ -71,6 +72,7 @@ def main() -> None:
     """The `turbogs` command."""
     atexit.register(gc.freeze)  # or the collector walks through all of torch at the end, for a second
     warnings.formatwarning = _warning_line
+    Image.MAX_IMAGE_PIXELS = None  # phones take 200 megapixels; photos are checked against cameras and memory
     words = _gathered(_with_port(sys.argv[1:]))
     about = "TurboGS: train 3D Gaussian Splatting on few, well chosen pixels."
     sys.exit(exit_code(lambda: subcommand_cli_from_dict(COMMANDS, args=words, prog="turbogs", description=about)))

@@ -19,6 +19,7 @@ from turbogs_plugin.errors import InputError
 from turbogs_plugin.report import machine, provenance
 from turbogs_plugin.report.pages import write_report
 from turbogs_plugin.report.pictures import ERROR_FULL_SCALE, GAP, depth_picture, error_picture, picture_writer, strip
+from turbogs_plugin.report.plot_process import PlotProcess, SecondsPlot
 from turbogs_plugin.report.plots import plot_against_seconds
 from turbogs_plugin.report.tables import number, table
 from turbogs_plugin.train import evaluate, run
@@ -207,9 +208,30 @@ def test_the_error_map_saturates_at_full_scale():
 
 @pytest.mark.parametrize("count", [1, 2, 12])
 def test_plots_of_any_length(tmp_path, count):
-    plot_against_seconds(tmp_path / "p.png", [evaluation(i) for i in range(count)], "psnr", "test PSNR in dB", "scene")
+    values = [20.0 + i for i in range(count)]
+    plot_against_seconds(tmp_path / "p.png", list(range(count)), values, "test PSNR in dB", "scene")
     width, height = Image.open(tmp_path / "p.png").size
     assert width > 600 and height > 400
+
+
+def test_a_process_draws_what_this_one_would(tmp_path):
+    plots = [SecondsPlot(str(tmp_path / f"{name}.png"), [0.0, 1.5], [20.0, math.nan], name, "a, ä") for name in "ab"]
+    with PlotProcess() as process:
+        process.begin(plots)
+        assert process.end()
+    drawn = [Path(plot.path).read_bytes() for plot in plots]
+    for plot in plots:
+        plot.draw()
+    assert [Path(plot.path).read_bytes() for plot in plots] == drawn and drawn[0] != drawn[1]
+
+
+def test_a_process_that_is_not_needed_ends_and_one_that_fails_says_so(tmp_path):
+    with PlotProcess() as unused:
+        pass
+    with PlotProcess() as failing:
+        failing.begin([SecondsPlot(str(tmp_path / "absent" / "p.png"), [0.0], [1.0], "x", "y")])
+        assert not failing.end()
+    assert unused._process.returncode < 0 < failing._process.returncode
 
 
 def test_the_commit_of_the_sources(tmp_path, monkeypatch):

@@ -178,7 +178,7 @@ def frame(**values):
         (frame(file_path="./train/r_9"), "1 of 6 photos of .*transforms_train.json are missing .train/r_9.: bring"),
         (frame(file_path="./train/r_1"), "two frames for 'train/r_1.png'"),
         (frame(file_path="./test/r_1"), "1 photos stand both in transforms_train.json and in transforms_test.json"),
-        (frame(file_path="../lego/train/r_2"), "leaves the photo folder"),
+        (frame(file_path="../lego/other/r_2"), "leaves the photo folder"),
         (frame(file_path=None), "a frame without a file_path"),
         (frame(transform_matrix=None), "r_2.png has no transform_matrix of 4x4"),
         (frame(transform_matrix=[[1, 2], [3]]), "r_2.png has no transform_matrix of 4x4"),

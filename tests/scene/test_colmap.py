@@ -9,7 +9,7 @@ import numpy as np
 import pycolmap
 import pytest
 import torch
-from PIL import Image
+from PIL import ExifTags, Image
 
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene import colmap, load_scene
@@ -205,13 +205,32 @@ def wrong_size(folder: Path) -> None:
     Image.new("RGB", (24, 40)).save(folder / "images" / "photo03.png")
 
 
+def turned_photo(folder: Path) -> None:
+    orientation = Image.Exif()
+    orientation[ExifTags.Base.Orientation] = 6
+    Image.new("RGB", (24, 40)).save(folder / "images" / "photo03.png", exif=orientation)
+
+
+def spoilt_text(folder: Path) -> None:
+    pycolmap.Reconstruction(folder / "sparse/0").write_text(folder / "sparse/0")
+    for file in (folder / "sparse/0").glob("*.bin"):
+        file.unlink()
+    images = folder / "sparse/0/images.txt"
+    images.write_text(images.read_text().replace("photo03.png", "photo03.png\nx y"))
+
+
 def deep_photo(folder: Path) -> None:
     Image.fromarray(np.full((24, 40), 3000, dtype=np.uint16)).save(folder / "images" / "photo03.png")
 
 
 def remove_photos(folder: Path) -> None:
-    for view in range(2, 7):
+    for view in range(2, 9):
         (folder / "images" / f"photo{view:02d}.png").unlink()
+
+
+def capitals(folder: Path) -> None:
+    for path in list((folder / "images").iterdir()):
+        path.rename(path.with_suffix(".PNG"))
 
 
 def remove_model(folder: Path) -> None:
@@ -221,13 +240,16 @@ def remove_model(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("damage", "words"),
     [
-        (remove_model, "neither a COLMAP reconstruction"),
-        (remove_photos, r"5 of 9 photos are missing in .*images: photo02.png, photo03.png, photo04.png, \.\.\."),
+        (remove_model, r"sparse/0 has no points3D \(\.bin or \.txt\): bring that file of the reconstruction back"),
+        (capitals, r"9 of 9 photos are missing in .*; photo00\.PNG is there: give the files the letters"),
+        (remove_photos, r"7 of 9 photos are missing in .*images: photo02.png, photo03.png, photo04.png, \.\.\.; bring"),
         (lambda folder: replace_photo(folder, b"\xff"), "cannot read the photo .*photo03.png"),
         (lambda folder: replace_photo(folder, b""), "cannot read the photo .*photo03.png"),
         (truncate_photo, "cannot read the photo .*photo03.png"),
         (wrong_size, "photo03.png is 24x40 but its camera is 40x24: it was cropped or turned"),
+        (turned_photo, "photo03.png is 24x40 but its camera is 40x24: its EXIF orientation turns it, .*-auto-orient"),
         (deep_photo, "photo03.png has more than 8 bits a channel"),
+        (spoilt_text, "is not a COLMAP reconstruction: pycolmap cannot read a part of it; copy"),
     ],
 )
 def test_bad_files_are_named(tmp_path, damage, words):
@@ -371,7 +393,63 @@ def test_copies_that_the_cameras_were_reconstructed_from(tmp_path):
     assert "photos in " in scene.notes[0] and "images_4" in scene.notes[0]
     assert load_scene(folder, factor=2).train.cameras.sizes[0].tolist() == [20, 12]
     (folder / "images_4" / "photo03.png").unlink()
-    with pytest.raises(InputError, match=r"9 of 9 photos are missing in .*images: "):
+    assert len(load_scene(folder).train) == 7
+    for photo in list((folder / "images_4").iterdir())[2:]:
+        photo.unlink()
+    with pytest.raises(InputError, match=r"7 of 9 photos are missing in .*images_4: .*; bring them back"):
+        load_scene(folder)
+
+
+def test_images_without_their_photo_are_left_out(tmp_path):
+    folder = write_capture(tmp_path / "cup")
+    for view in (0, 3):
+        (folder / "images" / f"photo{view:02d}.png").unlink()
+    scene = load_scene(folder)
+    assert scene.test.names == ("photo01.png",) and len(scene.train) == 6
+    assert scene.notes[1:] == ("2 of 9 images are left out, their photos do not exist: photo00.png, ...",)
+    np.testing.assert_allclose(scene.train.photos.image(1)[0, 0] * 255, [0, 0, 80], atol=1e-4)  # photo04's
+    centers = scene.frame.restore_points(scene.train.cameras.centers.numpy())
+    np.testing.assert_allclose(centers[:, 0], [2, 4, 5, 6, 7, 8], atol=1e-5)
+
+
+@pytest.mark.parametrize(("place", "refused"), [(1e14, False), (1e30, True), (1e300, True)])
+def test_a_point_that_is_too_far_for_float32_is_refused(tmp_path, place, refused):
+    """Squared distances of the first that is refused would be infinite, and so would a Gaussian's size."""
+    folder = write_capture(tmp_path / "cup")
+    model = pycolmap.Reconstruction(folder / "sparse/0")
+    model.add_point3D(np.array([place, 0.0, 0.0]), pycolmap.Track(), np.zeros(3, dtype=np.uint8))
+    model.write(folder / "sparse/0")
+    if not refused:
+        assert len(load_scene(folder).points) == 21
+        return
+    with pytest.raises(InputError, match="1 of 21 3D points lie too far from the cameras for float32: take them out"):
+        load_scene(folder)
+
+
+def test_photos_of_a_capture_beside_it_do_not_stand_in_for_some(tmp_path):
+    """All of them may lie beside the capture; a part may be others of the same names."""
+    folder = write_capture(tmp_path / "cup")
+    (folder / "images").rename(tmp_path / "images")
+    assert len(load_scene(folder).train) == 7
+    (tmp_path / "images" / "photo03.png").unlink()
+    with pytest.raises(InputError, match=r"9 of 9 photos are missing in .*cup/images: .*bring them back"):
+        load_scene(folder)
+
+
+def test_more_than_8_bits_are_refused_before_any_photo_is_decoded(tmp_path):
+    folder = write_capture(tmp_path / "cup")
+    deep_photo(folder)
+    decoded = []
+    with pytest.raises(InputError, match=r"photo03\.png has more than 8 bits"):
+        load_scene(folder, progress=lambda *counts: decoded.append(counts))
+    assert not decoded
+
+
+def test_a_name_that_cannot_be_printed_is_refused_as_such(tmp_path):
+    folder = write_capture(tmp_path / "cup")
+    images = folder / "sparse/0/images.bin"
+    images.write_bytes(images.read_bytes().replace(b"photo03.png", b"photo\n3.png"))
+    with pytest.raises(InputError, match="has signs that cannot be printed: rename"):
         load_scene(folder)
 
 

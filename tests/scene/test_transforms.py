@@ -179,7 +179,7 @@ def set_pose(value):
             r"names 9 photos, of which 7 are missing in .* \(none0.png, ...\): at least 3",
         ),
         (lambda content: content.update(ply_file_path="../points.ply"), "leaves the photo folder"),
-        (lambda content: content.update(ply_file_path="points.ply"), "cannot read .*points.ply"),
+        (lambda content: content.update(ply_file_path="points.ply"), "points.ply is not there: bring it back, or take"),
         (set_pose(None), "f2.png' has no transform_matrix"),
         (set_pose([[1, 2], [3]]), "f2.png' has no transform_matrix"),
         (set_pose((np.eye(4) * math.nan).tolist()), "f2.png' has no transform_matrix"),
@@ -193,6 +193,51 @@ def test_what_is_refused(tmp_path, change, words):
     with pytest.raises(InputError, match=words) as caught:
         load_scene(folder)
     assert "\n" not in str(caught.value) and len(str(caught.value)) < 500
+
+
+@pytest.mark.parametrize(
+    "written",
+    [
+        "images\\f{}.png",
+        ".\\images\\f{}.png",
+        "C:\\Users\\me\\cup\\images\\f{}.png",
+        "/home/me/cup/images/f{}.png",
+        "../cup/images/f{}.png",
+        "images/f{}.PNG",
+        "/home/me/cup/images/f{}",
+    ],
+)
+def test_paths_of_the_machine_that_wrote_it(tmp_path, written):
+    """Of Windows, absolute, or from another folder: the end that is there counts."""
+    folder = write_transforms(tmp_path / "cup")
+    (folder / "f3.png").write_bytes((folder / "images" / "f0.png").read_bytes())  # a shorter end
+    (folder / "shade.png").write_bytes((folder / "images" / "f0.png").read_bytes())
+
+    def change(content):
+        for view, frame in enumerate(content["frames"]):
+            frame["file_path"] = written.format(view)
+            frame["mask_path"] = "D:\\cup\\shade.png"
+
+    edit(folder, change)
+    scene = load_scene(folder)
+    assert scene.test.names == ("f0.png", "f8.png") and len(scene.train) == 7
+    np.testing.assert_allclose(scene.train.photos.image(2)[0, 0] * 255, [30, 200, 30], atol=1e-4)
+    assert "masks of 9 of 9 photos" in scene.notes[1]
+
+
+def test_a_mark_at_the_beginning_of_the_file(tmp_path):
+    folder = write_transforms(tmp_path / "cup")
+    source = folder / "transforms.json"
+    source.write_bytes(b"\xef\xbb\xbf" + source.read_bytes())
+    assert len(load_scene(folder).train) == 7
+
+
+def test_its_own_frame_is_kept(tmp_path):
+    """applied_transform and applied_scale say how the poses became what they are: nothing is to be undone."""
+    plain = load_scene(write_transforms(tmp_path / "plain"))
+    turned = [[0, 1, 0, 2], [1, 0, 0, 0], [0, 0, -1, 0]]
+    moved = load_scene(write_transforms(tmp_path / "cup", applied_transform=turned, applied_scale=0.5))
+    np.testing.assert_array_equal(plain.train.cameras.viewmats, moved.train.cameras.viewmats)
 
 
 @pytest.mark.parametrize("text", ["", "[1, 2", "[" * 100_000, "\x00\xff", "3"])

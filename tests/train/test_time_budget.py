@@ -139,12 +139,6 @@ def test_a_cap_without_room_beside_the_backdrop_is_refused(capture):
         Trainer(config, load_scene(capture), torch.device("cpu"))
 
 
-def test_a_limit_of_a_gpus_memory_says_nothing_of_a_cpu(capture, tmp_path):
-    with pytest.raises(InputError, match="--max-memory limits the memory of a GPU"):
-        run.train(tiny_config(capture, "budget.max_memory=2GiB"), tmp_path / "run")
-    assert not (tmp_path / "run").exists()
-
-
 def test_a_scene_that_does_not_fit_is_refused(capture, tmp_path, monkeypatch):
     def full(trainer, *arguments, **options):
         raise torch.cuda.OutOfMemoryError("CUDA out of memory")

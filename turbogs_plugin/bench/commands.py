@@ -26,7 +26,7 @@ from turbogs_plugin.files import require_writable, write_text_atomically
 from turbogs_plugin.report.machine import missing_bytecode
 from turbogs_plugin.report.provenance import provenance
 from turbogs_plugin.scene import load_scene
-from turbogs_plugin.scene.load import FEWEST_VIEWS
+from turbogs_plugin.scene.capture import FEWEST_PHOTOS
 from turbogs_plugin.study.cell import scene_on
 from turbogs_plugin.train.start import open_scene
 from turbogs_plugin.viewer.page import require_viser
@@ -39,8 +39,8 @@ that trained the models, the same kernels take up to 10 % less or more."""
 def run_step(bench: StepBench, scene: Path | None, factor: int, device: torch.device, out: Path | None) -> int:
     if (scene is None) == (bench.photos == 0):
         raise InputError("bench step needs cameras and photos: --scene SCENE, or --photos N for synthetic ones")
-    if scene is None and bench.photos < FEWEST_VIEWS:
-        raise InputError(f"--photos {bench.photos}: at least {FEWEST_VIEWS} are needed, as of any capture")
+    if scene is None and bench.photos < FEWEST_PHOTOS:
+        raise InputError(f"--photos {bench.photos}: at least {FEWEST_PHOTOS} are needed, as of any capture")
     _require_new(out)
     if scene is None:
         capture = synthetic_scene(bench.photos, *bench.size, device)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import gc
 import sys
-import threading
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
@@ -18,6 +17,9 @@ from turbogs_plugin.train.wall import WallClock, process_age
 
 if TYPE_CHECKING:
     from turbogs_plugin.train.run import RunSession
+
+
+VIEWER_ON_ONE = "--viewer shows a training on one GPU: leave it out, or --gpus"
 
 
 def train(
@@ -61,9 +63,12 @@ def train(
         raise InputError("train needs a SCENE and --out RUN, or --resume RUN")
     if gpus is not None:
         require_positive("--gpus", (gpus,))
+    if viewer is not None and (gpus or 1) > 1:
+        raise InputError(VIEWER_ON_ONE)
     gc.disable()  # imports make a million objects and nothing to collect
     from turbogs_plugin.distributed.processes import joined, launched, restarted, start
-    from turbogs_plugin.report.pages import load_plots, write_report
+    from turbogs_plugin.report.pages import write_report
+    from turbogs_plugin.report.plot_process import PlotProcess
     from turbogs_plugin.report.tensorboard import event_writers
     from turbogs_plugin.train import run
 
@@ -72,21 +77,23 @@ def train(
     settings = run.RunFolder(resume).read_config() if resume else options.settings(scene, overrides)
     device = settings.train.device
     if gpus is not None and gpus > 1 and not launched():
+        if out is not None:
+            run.RunFolder(out).require_new()
         return start(gpus, sys.argv[1:], device)
     page, watch = write_report if report else None, event_writers(settings)
     with joined(device) as ranks, ExitStack() as pages:
-        if report and ranks.first:
-            threading.Thread(target=load_plots, daemon=True).start()  # while photos are decoded
         if resume is None and restarted() and run.RunFolder(out).config.is_file():
             resume = out
         live = None
         if viewer is not None:
             if ranks.count > 1:
-                raise InputError("--viewer shows a training on one GPU: leave it out, or --gpus")
+                raise InputError(VIEWER_ON_ONE)  # started by torchrun
             from turbogs_plugin.viewer.commands import attached
 
             live = pages.enter_context(attached(viewer, viewer_host))
             watch.append(live.watch)
+        if report and ranks.first:
+            page = partial(write_report, process=pages.enter_context(PlotProcess()))
         begin = partial(run.resume, resume) if resume else partial(run.train, settings, out)
         session = begin(page, clock, ranks, watch)
         code = _tell(session, report) if ranks.first else 128 + session.signal if session.signal else 0

@@ -43,8 +43,9 @@ class TrainConfig:
     """The run itself.
 
     Args:
-        iterations: T. A number leaves all other settings as they are. ``auto``: as many as `epochs` take, and all
-            settings that count iterations (`turbogs_plugin.config.scaling`) are scaled from `base_iterations`.
+        iterations: T. A number leaves all other settings as they are. ``auto``: as many as `epochs` take, 30,000 at
+            most, and all settings that count iterations (`turbogs_plugin.config.scaling`) are scaled from
+            `base_iterations`.
         epochs: passes over the training photos: iterations times images per iteration, divided by training views. Used
             where `iterations` is ``auto``, and where a time budget allows for more.
         base_iterations: the length for which the settings that count iterations are written. Used where `iterations`

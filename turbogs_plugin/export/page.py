@@ -238,7 +238,8 @@ def _tables(model: SavedModel, scene: Scene, history: list[Evaluation]) -> str:
     with tempfile.TemporaryDirectory() as folder:
         for name, label in CURVES:
             file = Path(folder) / f"{name}.svg"
-            plot_against_seconds(file, history, name, label, scene.name)
+            seconds, values = zip(*((entry.train_seconds, getattr(entry, name)) for entry in history), strict=True)
+            plot_against_seconds(file, seconds, values, label, scene.name)
             data = base64.b64encode(file.read_bytes()).decode("ascii")
             curves.append(f'<img alt="{escape(label)} against seconds" src="data:image/svg+xml;base64,{data}">')
     header = ("iteration", "training in s", "PSNR in dB", "SSIM", "mean absolute error", "Gaussians", "memory in MiB")

@@ -58,6 +58,15 @@ def expected_gaussians(initial: int, cap: int) -> float:
     return max(initial, min(EXPECTED_GROWTH * initial, cap or math.inf))
 
 
+def require_room(model: str, count: int, cap: int, others: int) -> None:
+    """Raise `InputError` where `count` Gaussians of a model's file and `others` are more than a cap (0: none)."""
+    if cap and count + others > cap:
+        raise InputError(
+            f"'{model}' has {count} Gaussians, more than density.max_gaussians {cap} allows beside {others} of a "
+            "backdrop: allow more, or start from points"
+        )
+
+
 def chosen_points(count: int, cap: int, others: int) -> slice | np.ndarray:
     """Which of `count` points a model begins with: all, or as many as leave room for `others` under a cap, evenly.
 

@@ -13,6 +13,8 @@ from dataclasses import dataclass, field, replace
 from turbogs_plugin.config.auto import AUTO, AUTO_SETTINGS, value_of
 from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.engine.layout import MAX_VIEWS
+from turbogs_plugin.model.initial import BACKDROP_COUNT
+from turbogs_plugin.plan.caps import cap_of
 from turbogs_plugin.plan.facts import SceneFacts
 from turbogs_plugin.plan.pixels import images_per_iteration
 from turbogs_plugin.scene.host_arrays import MEMORY_SHARE as HOST_SHARE
@@ -37,6 +39,10 @@ ITERATION_MS = (1.3, 3.4)
 """A whole iteration on an H200: 150 thousand Gaussians and 3 views of a megapixel; 600 thousand and 10 views."""
 LONG_RUN = 20_000
 """Iterations from which on the plan says how long that is, as nobody would expect it."""
+LONGEST = 30_000
+"""Most iterations of `auto`, 3DGS's own length, whose iterations have one photo, too. 60 epochs of 500 training views
+take as many; those of more photos would take minutes or hours that nobody has asked for. A time budget is how to ask.
+For several processes, of which each iteration has as many times the pixels, it is that much less."""
 SHORTEST_SHARE = 0.4
 """Least share of `train.base_iterations`: with fewer iterations, however few the photos, the events of density control
 would be too close together. fox has 52 % of them with 60 epochs."""
@@ -106,7 +112,9 @@ def wanted_backdrop(facts: SceneFacts, config: Config) -> Verdict:
     """A far sphere behind the scene, where all cameras look the same way and much of it is seen by few."""
     if config.train.starts_from_model:
         return Verdict(False, "train.init names a model, which is taken as it is")
-    concentration = facts.direction_concentration
+    concentration, cap = facts.direction_concentration, cap_of(config)
+    if 0 < cap <= BACKDROP_COUNT:
+        return Verdict(False, f"its {BACKDROP_COUNT} Gaussians leave no room within density.max_gaussians {cap}")
     one_sided = concentration >= ONE_SIDED
     return Verdict(one_sided, f"view directions concentrated to {concentration:.3f} {_sign(one_sided)} {ONE_SIDED}")
 
@@ -181,14 +189,21 @@ def wanted_iterations(facts: SceneFacts, config: Config) -> Verdict:
     factor = batch.value if batch.made == "auto" else 1  # what is set is in the schedule already
     wanted = train.epochs * views / (factor * images_per_iteration(config, views))
     fewest = SHORTEST_SHARE * train.base_iterations
+    longest = max(LONGEST / factor, fewest)
+    given = min(max(wanted, fewest), longest)
     reason = f"{train.epochs:g} epochs of {views} training views"
     reason += f", {factor} times the pixels an iteration" if factor > 1 else ""
     if wanted < fewest:
         reason += f" take fewer than {SHORTEST_SHARE:.0%} of {train.base_iterations}"
-    if wanted >= LONG_RUN:
-        least, most = (wanted * milliseconds / 60_000 for milliseconds in ITERATION_MS)
-        reason += f": {least:.1f} to {most:.1f} min on an H200; --time-budget takes less"
-    return Verdict(math.ceil(max(wanted, fewest) / 100) * 100, reason)
+    if wanted > longest:
+        looks = train.epochs * longest / wanted
+        reason += f" take {wanted:.0f}; at most {longest:.0f}, where a pixel is sampled {looks:.1f} times"
+    if given >= LONG_RUN:
+        least, most = (given * milliseconds / 60_000 for milliseconds in ITERATION_MS)
+        reason += f": {least:.1f} to {most:.1f} min on an H200; --time-budget for less"
+        reason += " or more" if wanted > longest else ""
+        reason += "; hours or days on this CPU" if facts.device == "cpu" else ""
+    return Verdict(math.ceil(given / 100) * 100, reason)
 
 
 def wanted_maps_place(facts: SceneFacts, config: Config) -> Verdict:

@@ -16,7 +16,7 @@ from typing import Any
 from PIL import Image, ImageOps
 
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.scene.load import FEWEST_VIEWS
+from turbogs_plugin.scene.capture import FEWEST_PHOTOS
 from turbogs_plugin.scene.photo_folder import find_photos, unread
 
 ORIENTATION, MAKE, MODEL, EXIF, GPS = 0x0112, 0x010F, 0x0110, 0x8769, 0x8825
@@ -53,16 +53,16 @@ def list_photos(folder: Path) -> tuple[Path, list[Path]]:
     """The folder that photos' names are relative to, and the photos in the order of their names.
 
     Raises:
-        InputError: no folder; fewer than `FEWEST_VIEWS` photos.
+        InputError: no folder; fewer than `FEWEST_PHOTOS` photos.
     """
     reason = unread(folder)
     if not folder.is_dir():
         raise InputError(f"no such folder of photos: {folder}{f'; {reason}' if reason else ''}")
     place, paths, _ = find_photos(folder)
-    if len(paths) < FEWEST_VIEWS:
+    if len(paths) < FEWEST_PHOTOS:
         there = "no photos" if not paths else "1 photo" if len(paths) == 1 else f"{len(paths)} photos"
         raise InputError(
-            f"{place if paths else folder} has {there}{f' ({reason})' if reason else ''}: at least {FEWEST_VIEWS} are "
+            f"{place if paths else folder} has {there}{f' ({reason})' if reason else ''}: at least {FEWEST_PHOTOS} are "
             "needed, of one scene from different places"
         )
     return place, paths

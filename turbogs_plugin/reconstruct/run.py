@@ -23,8 +23,8 @@ from turbogs_plugin.reconstruct.agreement import (
 from turbogs_plugin.reconstruct.matching import FEW, Matching, choose_matching
 from turbogs_plugin.reconstruct.photos import PhotoFile, place_photos, read_photos
 from turbogs_plugin.reconstruct.workspace import Solution, Workspace
+from turbogs_plugin.scene.capture import FEWEST_PHOTOS
 from turbogs_plugin.scene.colmap import load_pycolmap
-from turbogs_plugin.scene.load import FEWEST_VIEWS
 from turbogs_plugin.scene.photo_folder import find_photos, unread
 
 if TYPE_CHECKING:
@@ -187,7 +187,7 @@ def _solve(database: Path, workspace: Workspace) -> tuple[Solve | None, list[str
 def _attempt(database: Path, evidence: Path, workspace: Workspace) -> Solve | None:
     """A solve of a database, judged by all the matches of another."""
     models = solver.solve_cameras(database, workspace.images, workspace.scratch)
-    if not models or models[0].num_reg_images() < FEWEST_VIEWS:
+    if not models or models[0].num_reg_images() < FEWEST_PHOTOS:
         return None
     agreement = solver.measure_agreement(models[0], evidence)
     sizes = tuple(model.num_reg_images() for model in models)
@@ -220,7 +220,7 @@ def _require_solved(solve: Solve | None, photos: int, verified: int, matching: M
             )
         asked = f"of {len(matching.pairs):,} pairs of photos " if not matching.similar else "of pairs of photos "
         raise InputError(f"no cameras were found for {photos} photos: {asked}{verified:,} match; {remedy}")
-    if solve.placed >= max(FEWEST_VIEWS, SMALLEST_SHARE * photos):
+    if solve.placed >= max(FEWEST_PHOTOS, SMALLEST_SHARE * photos):
         return
     if len(solve.sizes) > 1:
         sizes = ", ".join(map(str, solve.sizes[:NAMED_AT_MOST]))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import platform
 from pathlib import Path
 
@@ -10,14 +9,18 @@ from turbogs_plugin.files import write_text_atomically
 from turbogs_plugin.plan import Plan
 from turbogs_plugin.report.machine import hardware, software
 from turbogs_plugin.report.pictures import ERROR_FULL_SCALE, picture_writer, strip
+from turbogs_plugin.report.plot_process import PlotProcess, SecondsPlot
 from turbogs_plugin.report.tables import ERRORS, error_columns, errors, number, table, views_table
 from turbogs_plugin.train.evaluate import Metrics, evaluate, load_lpips, render_view
 from turbogs_plugin.train.history import Evaluation
 from turbogs_plugin.train.run import RunSession
 
 
-def write_report(run: RunSession) -> Path:
+def write_report(run: RunSession, process: PlotProcess | None = None) -> Path:
     """Write ``report.md`` and its pictures (in ``report/``) into the run's folder.
+
+    Args:
+        process: draws the plots, meanwhile; None: they are drawn here.
 
     Returns:
         The page.
@@ -33,12 +36,17 @@ def write_report(run: RunSession) -> Path:
     pictures = run.folder.path / "report"
     pictures.mkdir(exist_ok=True)
     shown = min(len(run.test), config.report.strips)
+    plots = _plots(run, pictures)
+    if process is not None:
+        process.begin(plots)
     with picture_writer() as write:
         for view_id in range(shown):
             image = render_view(trainer.gaussians, run.test, view_id, trainer.sh_degree, config.raster, background)
             photo = run.test.photos.image(view_id, background)
             write(pictures / f"test-{view_id:03d}.jpg", strip(photo, image, run.test.mask(view_id)))
-        _plot(run, pictures)  # while the strips are encoded
+        if process is None or not process.end():
+            for plot in plots:  # while the strips are encoded
+                plot.draw()
     run.clock.mark("pictures and plots")
     run.finish_files()  # the page says how long it took until they were there
     write_text_atomically(run.folder.report, _page(run, metrics, lpips_reason, shown))
@@ -46,16 +54,14 @@ def write_report(run: RunSession) -> Path:
     return run.folder.report
 
 
-def load_plots() -> None:
-    """Import what the plots need. It takes half a second, in which a thread may do it beside other work."""
-    importlib.import_module("turbogs_plugin.report.plots")
+def _plots(run: RunSession, pictures: Path) -> list[SecondsPlot]:
+    seconds = [evaluation.train_seconds for evaluation in run.history]
 
+    def plot(name: str, label: str) -> SecondsPlot:
+        values = [getattr(evaluation, name) for evaluation in run.history]
+        return SecondsPlot(str(pictures / f"{name}.png"), seconds, values, label, run.scene.name)
 
-def _plot(run: RunSession, pictures: Path) -> None:
-    from turbogs_plugin.report.plots import plot_against_seconds  # see `load_plots`
-
-    for name, label in (("psnr", "test PSNR in dB"), ("l1", "mean absolute error on test views (0 .. 1)")):
-        plot_against_seconds(pictures / f"{name}.png", run.history, name, label, run.scene.name)
+    return [plot("psnr", "test PSNR in dB"), plot("l1", "mean absolute error on test views (0 .. 1)")]
 
 
 def _page(run: RunSession, metrics: Metrics, lpips_reason: str, shown: int) -> str:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import matplotlib
 from matplotlib.figure import Figure
-
-from turbogs_plugin.train.history import Evaluation
 
 STYLE = {
     "figure.dpi": 120,
@@ -26,13 +25,12 @@ MARGINS = {"left": 0.14, "right": 0.97, "bottom": 0.13, "top": 0.92}
 SECONDS_LABEL = "training time in seconds (evaluation excluded)"
 
 
-def plot_against_seconds(path: Path, history: list[Evaluation], name: str, label: str, title: str) -> None:
+def plot_against_seconds(path: Path, seconds: Sequence[float], values: Sequence[float], label: str, title: str) -> None:
     """One measure of a history against seconds of training, as a PNG.
 
     Args:
         path: the file.
-        history: of one run.
-        name: field of `Evaluation`.
+        seconds, values: of the evaluations of one run, in order.
         label: of the vertical axis, with the unit.
         title: of the plot.
     """
@@ -40,8 +38,6 @@ def plot_against_seconds(path: Path, history: list[Evaluation], name: str, label
         figure = Figure(figsize=(6.4, 4.0))
         axes = figure.add_subplot()
         figure.subplots_adjust(**MARGINS)
-        seconds = [evaluation.train_seconds for evaluation in history]
-        values = [getattr(evaluation, name) for evaluation in history]
         axes.plot(seconds, values, marker="o", color="#1f5fa8")
         axes.annotate(
             f"{values[-1]:.2f}" if abs(values[-1]) >= 1 else f"{values[-1]:.4f}",

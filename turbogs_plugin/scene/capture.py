@@ -11,6 +11,7 @@ import numpy as np
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene.undistort import Lens
 
+FEWEST_PHOTOS = 3
 LARGEST_SIDE = 65535
 """Photos wider or higher than this many pixels are refused (it is JPEG's own limit)."""
 
@@ -89,9 +90,11 @@ class Capture:
 
 
 def check_photo_name(name: str, source: Path) -> str:
-    """The name, if it stays within the photo folder; else `InputError`."""
+    """The name, if it can be printed and stays within the photo folder; else `InputError`."""
     path = PureWindowsPath(name)  # knows both kinds of separators, drives and roots
-    if not path.parts or ".." in path.parts or path.drive or path.root or not name.isprintable():
+    if not name.isprintable():
+        raise InputError(f"{source}: image name {name!r} has signs that cannot be printed: rename the photo")
+    if not path.parts or ".." in path.parts or path.drive or path.root:
         raise InputError(f"{source}: image name {name!r} leaves the photo folder: names must be relative, without '..'")
     return name
 

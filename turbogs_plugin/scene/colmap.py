@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.scene.capture import LARGEST_SIDE, Capture, check_photo_name
+from turbogs_plugin.scene.capture import FEWEST_PHOTOS, LARGEST_SIDE, Capture, check_photo_name
 from turbogs_plugin.scene.colmap_check import SMALLEST_IMAGE, check_binary_model
 from turbogs_plugin.scene.photos import photo_size
 from turbogs_plugin.scene.starting_points import NUM_RANDOM_POINTS, about_cameras, random_points
@@ -74,6 +74,17 @@ def _suffix(folder: Path) -> str:
     return next(complete, "")
 
 
+def incomplete_model(scene: Path) -> str:
+    """What a reconstruction in `MODEL_FOLDERS` lacks, and where; empty where there is none that lacks something."""
+    for place in (scene / name for name in MODEL_FOLDERS):
+        numbered = sorted(place.glob("[0-9]")) if place.is_dir() else []
+        for folder in (place, *numbered):
+            there = {path.stem for path in folder.glob("*") if path.suffix in (".bin", ".txt")} & set(FILES)
+            if there:
+                return f"{folder} has no {' and no '.join(name for name in FILES if name not in there)} (.bin or .txt)"
+    return ""
+
+
 def _numbered_models(place: Path) -> list[tuple[Path, str]]:
     """The reconstructions in ``place/0``, ``place/1``, ..., in order of their numbers."""
     folders = (
@@ -101,7 +112,8 @@ def _count_images(model: Path, suffix: str) -> int:
 
 
 def read_colmap(scene: Path, model: Path, suffix: str) -> Capture:
-    """Read a reconstruction. Its photos are found by `find_photo_folder`. Without points, random ones are drawn.
+    """Read a reconstruction. Its photos are found by `find_photo_folder`; images whose photo does not exist are left
+    out, where `FEWEST_PHOTOS` remain. Without points, random ones are drawn.
 
     Args:
         scene: the scene's folder.
@@ -118,6 +130,8 @@ def read_colmap(scene: Path, model: Path, suffix: str) -> Capture:
         (reconstruction.read_binary if suffix == ".bin" else reconstruction.read_text)(model)
     except Exception as error:  # pycolmap raises whatever C++ threw
         reason = " ".join(str(error).split())[:200]
+        if "Check failed" in reason:  # with some C++
+            reason = "pycolmap cannot read a part of it"
         raise InputError(f"{model} is not a COLMAP reconstruction: {reason}; copy or reconstruct it again") from error
 
     images = sorted((image for image in reconstruction.images.values() if image.has_pose), key=lambda image: image.name)
@@ -125,6 +139,14 @@ def read_colmap(scene: Path, model: Path, suffix: str) -> Capture:
     for name, following in itertools.pairwise(names):
         if name == following:
             raise InputError(f"{model} has two images named '{name}'")
+    photo_folder, reduction = find_photo_folder(scene, names)
+    absent = [name for name in names if not (photo_folder / name).is_file()]
+    absence = ()
+    if absent and len(names) - len(absent) >= FEWEST_PHOTOS:
+        absence = (f"{len(absent)} of {len(names)} images are left out, their photos do not exist: {absent[0]}, ...",)
+        gone = set(absent)
+        images = [image for image in images if image.name not in gone]
+        names = tuple(image.name for image in images)
     viewmats = np.tile(np.eye(4), (len(images), 1, 1))
     intrinsics = np.tile(np.eye(3), (len(images), 1, 1))
     sizes = np.zeros((len(images), 2), dtype=np.int64)
@@ -135,9 +157,9 @@ def read_colmap(scene: Path, model: Path, suffix: str) -> Capture:
         intrinsics[i] = camera.calibration_matrix() if lens is None else lens.K
         sizes[i] = (min(camera.width, 2**31), min(camera.height, 2**31)) if lens is None else lens.size
 
-    photo_folder, reduction = find_photo_folder(scene, names)
     if (
         reduction > 1
+        and names[0] not in absent
         and 1.5 * photo_size(photo_folder / names[0])[0] > reconstruction.cameras[images[0].camera_id].width
     ):
         reduction = 1  # the cameras are those of the copies
@@ -155,7 +177,7 @@ def read_colmap(scene: Path, model: Path, suffix: str) -> Capture:
         points=points,
         point_colors=colors,
         lenses=tuple(lenses[image.camera_id] for image in images),
-        notes=(_kind_note(scene, model, suffix, len(images), len(found), photo_folder), *_choice_note(model)),
+        notes=(_kind_note(scene, model, suffix, len(images), len(found), photo_folder), *_choice_note(model), *absence),
         reduction=reduction,
         alpha="mask",
     )
@@ -177,20 +199,21 @@ def find_photo_folder(scene: Path, names: tuple[str, ...]) -> tuple[Path, int]:
     """The folder that the names of the photos are relative to, and by which factor they are reduced there.
 
     Looked at are ``images`` in the scene or beside it, the scene itself, and the folders in them; then, as not all
-    keep the full-size photos, copies of them in ``images_2``, ``images_4``, ... Where none has all the photos it is
-    ``scene/images``.
+    keep the full-size photos, copies of them in ``images_2``, ``images_4``, ... Where none has all the photos it is the
+    first of those that have most; not one beside the scene, whose photos may be another one's of the same names.
     """
     first = scene / "images"
     if not names:
         return first, 1
-    for place in (first, scene, scene.resolve().parent / "images"):
-        for folder in _folders(place, FOLDER_DEPTH):
-            if all((folder / name).is_file() for name in names):
-                return folder, 1
-    copies = ((scene / f"images_{factor}", factor) for factor in REDUCTIONS)
-    return next(
-        ((folder, factor) for folder, factor in copies if all((folder / n).is_file() for n in names)), (first, 1)
-    )
+    places = (first, scene, scene.resolve().parent / "images")
+    whole = ((folder, 1) for place in places for folder in _folders(place, FOLDER_DEPTH))
+    reduced = ((scene / f"images_{factor}", factor) for factor in REDUCTIONS)
+    own = []
+    for folder, reduction in itertools.chain(whole, reduced):
+        if all((folder / name).is_file() for name in names):
+            return folder, reduction
+        own += [(folder, reduction)] if scene in (folder, *folder.parents) else []
+    return max(own, key=lambda place: sum((place[0] / name).is_file() for name in names))
 
 
 def _folders(place: Path, depth: int) -> Iterator[Path]:

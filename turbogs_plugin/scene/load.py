@@ -14,21 +14,30 @@ from torch import Tensor
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.masks import PixelMasks, ViewMask
 from turbogs_plugin.scene import blender, llff
-from turbogs_plugin.scene.capture import Capture
-from turbogs_plugin.scene.colmap import MODEL_FOLDERS, find_model, read_colmap
+from turbogs_plugin.scene.capture import FEWEST_PHOTOS, Capture
+from turbogs_plugin.scene.colmap import MODEL_FOLDERS, find_model, incomplete_model, read_colmap
 from turbogs_plugin.scene.frame import Frame
 from turbogs_plugin.scene.host_arrays import file_note
 from turbogs_plugin.scene.mask_files import find_masks, load_masks
 from turbogs_plugin.scene.photo_folder import find_photos, unread
-from turbogs_plugin.scene.photos import Photos, channels_of, load_photos, photo_array, photo_sizes, reduced_sizes
+from turbogs_plugin.scene.photos import (
+    Photos,
+    channels_of,
+    is_turned,
+    load_photos,
+    photo_array,
+    photo_sizes,
+    reduced_sizes,
+)
 from turbogs_plugin.scene.poses import camera_centers
 from turbogs_plugin.scene.starting_points import colors_in_photos
 from turbogs_plugin.scene.transforms import FILE, read_transforms
 from turbogs_plugin.scene.undistort import undistortion_note
 from turbogs_plugin.types import Cameras
 
-FEWEST_VIEWS = 3
 NAMED_AT_MOST = 3
+FARTHEST = 1e15
+"""Distance of a point in extents, from which on squares, and squares of these, do not fit into float32."""
 
 
 @dataclass
@@ -86,7 +95,11 @@ class Scene:
 
 
 def load_scene(
-    path: str | Path, factor: int = 1, test_every: int = 8, progress: Callable[[int, int], object] | None = None
+    path: str | Path,
+    factor: int = 1,
+    test_every: int = 8,
+    progress: Callable[[int, int], object] | None = None,
+    sized: Callable[[np.ndarray, np.ndarray], object] | None = None,
 ) -> Scene:
     """Load a capture with its photos.
 
@@ -103,6 +116,8 @@ def load_scene(
         test_every: the first of each `test_every` photos in name order is a test view, the others are for training.
             Captures with a split of their own (NeRF-synthetic, lists in a ``transforms.json``) keep it.
         progress: called with the number of photos decoded so far, and of all.
+        sized: called with the sizes [V, 2] (width, height) of training and of test views, before a photo is decoded;
+            what it raises ends the loading.
 
     Raises:
         InputError: anything wrong with the scene or the arguments, in one line.
@@ -115,10 +130,10 @@ def load_scene(
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # what is not finite is refused by its name
         capture = _read(scene, factor)
     test = np.arange(len(capture.names)) % test_every == 0 if capture.test is None else capture.test
-    if len(test) < FEWEST_VIEWS:
-        raise InputError(f"{scene} has {len(test)} images: at least {FEWEST_VIEWS} are needed")
-    if capture.test is not None and (~test).sum() < FEWEST_VIEWS:
-        raise InputError(f"{scene} has {(~test).sum()} training images: at least {FEWEST_VIEWS} are needed")
+    if len(test) < FEWEST_PHOTOS:
+        raise InputError(f"{scene} has {len(test)} images: at least {FEWEST_PHOTOS} are needed; add photos to it")
+    if capture.test is not None and (~test).sum() < FEWEST_PHOTOS:
+        raise InputError(f"{scene} has {(~test).sum()} training images: at least {FEWEST_PHOTOS} are needed")
     if test.all():
         raise InputError(f"test_every is {test_every}: every image of {scene} would be a test image; use 2 or more")
 
@@ -126,9 +141,11 @@ def load_scene(
         frame = Frame.around(camera_centers(capture.viewmats[~test]), capture.points)
     viewmats = torch.from_numpy(frame.normalise_poses(capture.viewmats)).float()
     points = torch.from_numpy(frame.normalise_points(capture.points)).float()
-    far = ~points.isfinite().all(dim=1)
+    far = ~(points.abs() < FARTHEST).all(dim=1)
     if far.any():
-        raise InputError(f"{scene}: {int(far.sum())} of {len(far)} 3D points lie too far from the cameras for float32")
+        raise InputError(
+            f"{scene}: {int(far.sum())} of {len(far)} 3D points lie too far from the cameras for float32: take them out"
+        )
     if factor > 1 and factor % capture.reduction:
         raise InputError(
             f"--factor {factor}: the largest photos of {scene} are those of {capture.photo_folder.name}: use --factor "
@@ -145,11 +162,16 @@ def load_scene(
     seen = np.array([mask is None or mask.pixels > 0 for mask in masks])
     for name, part in (("training", ~test), ("test", test)):
         if not (part & seen).any():
-            raise InputError(f"{scene}: all {part.sum()} {name} photos are masked whole: zero in a mask is masked")
+            raise InputError(
+                f"{scene}: all {part.sum()} {name} photos are masked whole: zero in a mask, or in "
+                "the alpha of a photo, is masked; mend the masks, or take them away"
+            )
 
     parts = [np.flatnonzero(part & seen) for part in (~test, test)]
     channels = [channels_of([paths[view] for view in views]) if capture.alpha == "opacity" else 3 for views in parts]
     # Before minutes go into photos that have no room.
+    if sized is not None:
+        sized(*(sizes[views] for views in parts))
     colors = [photo_array(sizes[views], count) for views, count in zip(parts, channels, strict=True)]
     counter = itertools.count(1)
 
@@ -223,7 +245,8 @@ def _cameras(scene: Path) -> tuple[tuple[Path, str] | None, list[str]]:
 def _read(scene: Path, factor: int) -> Capture:
     """The capture, of the first kind in the order that `load_scene` states."""
     if not scene.is_dir():
-        raise InputError(f"no such scene: {unread(scene) or f'{scene} is not a folder'}")
+        trouble = f"{scene} is a file" if scene.is_file() else f"{scene} does not exist"
+        raise InputError(f"no such scene: {unread(scene) or f'{trouble}: give the folder of a capture, or of photos'}")
     model, files = _cameras(scene)
     if model is not None:
         capture = read_colmap(scene, *model)
@@ -248,10 +271,12 @@ def _read_other(scene: Path, files: list[str], factor: int) -> Capture:
             f"{scene} has {len(find_photos(scene)[1])} photos and nothing that says where they were taken from: find "
             f"that by 'turbogs reconstruct {scene} --out SCENE', then use SCENE"
         )
+    if lack := incomplete_model(scene):
+        raise InputError(f"{lack}: bring that file of the reconstruction back")
     raise InputError(
         f"{scene} has neither a COLMAP reconstruction (cameras, images and points3D as .bin or .txt in sparse/0) nor a "
         f"{FILE}, a {blender.TRAIN_FILE} or a {llff.FILE}, nor photos"
-        + (f"; {reason}" if (reason := unread(scene)) else "")
+        + f"; {unread(scene) or 'give the folder of a capture, or of photos'}"
     )
 
 
@@ -275,14 +300,22 @@ def _find_photos(scene: Path, capture: Capture, factor: int) -> tuple[list[Path]
     paths = [capture.photo_folder / name for name in capture.names]
     missing = [name for name, path in zip(capture.names, paths, strict=True) if not path.is_file()]
     if missing:
+        remedy = _in_other_letters(capture.photo_folder / missing[0]) or "bring them back"
         more = ", ..." if len(missing) > NAMED_AT_MOST else ""
         raise InputError(
             f"{len(missing)} of {len(paths)} photos are missing in {capture.photo_folder}: "
-            f"{', '.join(missing[:NAMED_AT_MOST])}{more}"
+            f"{', '.join(missing[:NAMED_AT_MOST])}{more}; {remedy}"
         )
     sizes = photo_sizes(paths)
     fitted = _require_scaled(paths, sizes, expected)
     return paths, sizes, reduced_sizes(_undistorted_sizes(capture, sizes), factor), fitted
+
+
+def _in_other_letters(path: Path) -> str:
+    """What to do where a file that is missing is there in capital or small letters; empty where it is not."""
+    beside = path.parent.iterdir() if path.parent.is_dir() else ()
+    other = next((file.name for file in beside if file.name.lower() == path.name.lower()), None)
+    return f"{other} is there: give the files the letters that the reconstruction has" if other else ""
 
 
 def _undistorted_sizes(capture: Capture, sizes: np.ndarray) -> np.ndarray:
@@ -303,9 +336,14 @@ def _require_scaled(paths: list[Path], sizes: np.ndarray, expected: np.ndarray) 
     if not scaled.all():
         bad = int(np.argmin(scaled))
         (width, height), (camera_width, camera_height) = sizes[bad].tolist(), expected[bad].tolist()
+        differ = f"photo {paths[bad]} is {width}x{height} but its camera is {camera_width}x{camera_height}"
+        if is_turned(paths[bad]):
+            raise InputError(
+                f"{differ}: its EXIF orientation turns it, which is not followed here; write its pixels turned, as by  "
+                "magick mogrify -auto-orient PHOTO"
+            )
         raise InputError(
-            f"photo {paths[bad]} is {width}x{height} but its camera is {camera_width}x{camera_height}: it was "
-            "cropped or turned, not scaled; use the photos that the cameras were reconstructed from"
+            f"{differ}: it was cropped or turned, not scaled; use the photos that the cameras were reconstructed from"
         )
     others = np.flatnonzero((sizes != expected).any(axis=1))
     if not len(others):

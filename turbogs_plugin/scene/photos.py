@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from PIL import Image, UnidentifiedImageError
+from PIL import ExifTags, Image, UnidentifiedImageError
 from torch import Tensor
 
 from turbogs_plugin.errors import InputError
@@ -142,14 +142,22 @@ def reduced_sizes(sizes: np.ndarray, factor: int) -> np.ndarray:
 
 
 def photo_size(path: Path) -> tuple[int, int]:
-    """(width, height) from the file's header alone; `InputError` where it cannot be read."""
+    """(width, height) from the file's header alone; `InputError` where it cannot be read, or has more than 8 bits."""
     with opened_image(path) as image:
+        if image.mode.startswith(("I", "F")):
+            raise InputError(f"photo {path} has more than 8 bits a channel: convert it to 8-bit RGB")
         return image.size
 
 
 def is_transparent(image: Image.Image) -> bool:
     """Whether an image may have pixels that are not opaque, by its header."""
     return "A" in image.getbands() or "transparency" in image.info
+
+
+def is_turned(path: Path) -> bool:
+    """Whether the EXIF orientation of a photo says that width and height are to be exchanged."""
+    with opened_image(path) as image:
+        return image.getexif().get(ExifTags.Base.Orientation) in (5, 6, 7, 8)
 
 
 def channels_of(paths: Sequence[Path]) -> int:
@@ -250,8 +258,6 @@ def _decode(path: Path, size: tuple[int, int], mode: str) -> Image.Image:
                 f"photo {path} is {image.size[0]}x{image.size[1]} but its camera is {size[0]}x{size[1]}: "
                 "use the photos that the cameras were reconstructed from"
             )
-        if image.mode.startswith(("I", "F")):
-            raise InputError(f"photo {path} has more than 8 bits a channel: convert it to 8-bit RGB")
         if mode == "RGBa" or is_transparent(image):
             image = image.convert("RGBA")
         return image.convert(mode)

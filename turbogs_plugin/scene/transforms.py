@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Callable
 from functools import partial
-from pathlib import Path, PurePosixPath
+from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
 
 import numpy as np
 
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.scene.capture import LARGEST_SIDE, Capture, check_photo_name
+from turbogs_plugin.scene.capture import FEWEST_PHOTOS, LARGEST_SIDE, Capture, check_photo_name
 from turbogs_plugin.scene.colmap import load_pycolmap
 from turbogs_plugin.scene.named_split import read_split
 from turbogs_plugin.scene.photos import photo_size
@@ -24,14 +25,13 @@ FILE = "transforms.json"
 BROWN_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL")
 """Names of one model, whose missing coefficients are 0."""
 FISHEYE_MODELS = ("OPENCV_FISHEYE",)
-FEWEST_PHOTOS = 3
 PHOTO_SUFFIXES = (".png", ".jpg", ".jpeg")
 
 
 def read_frames(source: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     """A transforms file, and its frames. Raises `InputError` unless it is JSON with a list of frames."""
     try:
-        content = json.loads(source.read_text(encoding="utf-8"))
+        content = json.loads(source.read_text(encoding="utf-8-sig"))  # Windows' editors write a mark at its beginning
     except (OSError, ValueError, RecursionError) as error:
         raise InputError(f"{source} is not readable JSON: {' '.join(str(error).split())[:200]}") from error
     frames = content.get("frames") if isinstance(content, dict) else None
@@ -117,12 +117,46 @@ def read_transforms(scene: Path) -> Capture:
 
 
 def photo_name(scene: Path, name: Any, source: Path) -> str:
-    """The photo's path relative to the scene, with its suffix, which Blender's names come without, if it is there."""
+    """The photo's path relative to the scene (`_file_name`), with its suffix, which Blender's names come without, if it
+    is there."""
     if not isinstance(name, str):
         raise InputError(f"{source} has a frame without a file_path: export it again")
-    name = str(PurePosixPath(check_photo_name(name, source)))
-    suffixes = ("", *PHOTO_SUFFIXES, *(suffix.upper() for suffix in PHOTO_SUFFIXES))
-    return next((f"{name}{suffix}" for suffix in suffixes if (scene / f"{name}{suffix}").is_file()), name)
+    return _file_name(scene, name, source, _photo_there)
+
+
+def _photo_there(scene: Path, name: str) -> str | None:
+    """The name of the photo that is there: with a suffix, or the suffix in other letters, where it lacks that."""
+    suffix = PurePosixPath(name).suffix
+    stem = name.removesuffix(suffix)
+    endings = (*PHOTO_SUFFIXES, *(suffix.upper() for suffix in PHOTO_SUFFIXES))
+    names = (name, *(f"{name}{ending}" for ending in endings), f"{stem}{suffix.lower()}", f"{stem}{suffix.upper()}")
+    return next((each for each in names if (scene / each).is_file()), None)
+
+
+def _file_there(scene: Path, name: str) -> str | None:
+    return name if (scene / name).is_file() else None
+
+
+def _file_name(scene: Path, name: str, source: Path, there: Callable[[Path, str], str | None] = _file_there) -> str:
+    """A file's path relative to the scene, as it is on this machine.
+
+    Separators may be those of Windows. Of a path of the machine that wrote it, absolute or with '..', the longest end
+    counts that is there.
+
+    Args:
+        there: the name of the file that a path relative to the scene stands for, None where there is none.
+
+    Raises:
+        InputError: the path leaves the scene, and no end of it is there; or it cannot be printed.
+    """
+    given = PureWindowsPath(name)  # knows both kinds of separators, drives and roots
+    parts = given.parts[1:] if given.anchor else given.parts
+    if not name.isprintable() or (not given.anchor and parts and ".." not in parts):
+        name = str(PurePosixPath(check_photo_name(name, source)))
+        return there(scene, name) or there(scene, "/".join(parts)) or name
+    ends = ("/".join(parts[first:]) for first in range(len(parts)) if ".." not in parts[first:])
+    found = next(filter(None, (there(scene, end) for end in ends)), None)
+    return check_photo_name(name, source) if found is None else found
 
 
 def _mask_file(scene: Path, frame: dict, name: str, source: Path) -> Path | None:
@@ -132,7 +166,7 @@ def _mask_file(scene: Path, frame: dict, name: str, source: Path) -> Path | None
         return None
     if not isinstance(path, str):
         raise InputError(f"{source}: mask_path of frame '{name}' is not a path")
-    file = scene / check_photo_name(path, source)
+    file = scene / _file_name(scene, path, source)
     if not file.is_file():
         raise InputError(f"{source}: frame '{name}' names the mask {file}, which is not there: bring it back")
     return file
@@ -254,7 +288,12 @@ def _viewmat(frame: dict, name: str, source: Path) -> np.ndarray:
 def _read_points(scene: Path, name: Any, source: Path) -> tuple[np.ndarray, np.ndarray]:
     if not isinstance(name, str):
         raise InputError(f"{source}: ply_file_path is not a path")
-    path = scene / check_photo_name(name, source)
+    path = scene / _file_name(scene, name, source)
+    if not path.is_file():
+        raise InputError(
+            f"{source}: its ply_file_path {path} is not there: bring it back, or take that line out, to begin with "
+            "random points"
+        )
     vertices = read_vertices(path)
     if not {"x", "y", "z"} <= set(vertices.dtype.names):
         raise InputError(f"{path} has no x, y, z")

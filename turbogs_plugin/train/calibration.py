@@ -39,6 +39,7 @@ from turbogs_plugin.plan.time import IterationCost, fit_to_time
 from turbogs_plugin.scene import Scene
 from turbogs_plugin.train.clock import TrainingClock
 from turbogs_plugin.train.loop import Listener, TrainingLoop
+from turbogs_plugin.train.start import require_gpu_memory
 from turbogs_plugin.train.trainer import Trainer
 
 CALIBRATION_SHARE = 0.04
@@ -132,8 +133,7 @@ def hold_to(limit: int, device: torch.device) -> None:
     Raises:
         InputError: the device is no GPU.
     """
-    if device.type != "cuda":
-        raise InputError("--max-memory limits the memory of a GPU: leave it out with --device cpu")
+    require_gpu_memory(device)
     total = torch.cuda.get_device_properties(device).total_memory
     torch.cuda.set_per_process_memory_fraction(min(1.0, limit / total))
 

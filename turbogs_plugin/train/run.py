@@ -16,25 +16,24 @@ import torch
 from turbogs_plugin.config.configuration import DEFAULT_CONFIG, Config, load_config, resolve
 from turbogs_plugin.distributed.ranks import ONE, Ranks
 from turbogs_plugin.errors import InputError, TrainingStopped
-from turbogs_plugin.files import write_text_atomically
+from turbogs_plugin.files import require_writable, write_text_atomically
 from turbogs_plugin.model.ply import save_ply
 from turbogs_plugin.plan import Plan, make_plan
-from turbogs_plugin.reconstruct.train_on_photos import with_cameras
 from turbogs_plugin.scene import Scene
 from turbogs_plugin.scene.fingerprint import capture_difference, capture_state
+from turbogs_plugin.scene.load import holds_photos_alone
 from turbogs_plugin.scene.offload import place_views
 from turbogs_plugin.train.calibration import Calibration, budget_text, hold_to, within_budget
 from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint, require_like, save_checkpoint
 from turbogs_plugin.train.evaluate import load_lpips
 from turbogs_plugin.train.evaluations import Evaluations
 from turbogs_plugin.train.folder import RunFolder
-from turbogs_plugin.train.given_model import require_model
 from turbogs_plugin.train.history import Evaluation, append_evaluation, rewind_history
 from turbogs_plugin.train.interrupts import Interrupts
 from turbogs_plugin.train.loop import Listener, TrainingLoop
 from turbogs_plugin.train.pace import pace_of
 from turbogs_plugin.train.progress import TrainingProgress
-from turbogs_plugin.train.start import open_scene, resolve_device, starting
+from turbogs_plugin.train.start import open_scene, require_possible, resolve_device, starting
 from turbogs_plugin.train.trainer import Trainer
 from turbogs_plugin.train.wall import WallClock, WallRecord
 from turbogs_plugin.train.wall_marks import WallMarks
@@ -56,9 +55,9 @@ def plan_run(config: Config, processes: int = 1) -> Plan:
     Raises:
         InputError: anything wrong with the input.
     """
+    require_possible(config)
     device = resolve_device(config.train.device)
-    _require_start(config)
-    scene = open_scene(config)
+    scene = open_scene(config, training=True)
     plan = make_plan(config, scene, device, processes)
     print("\n".join(scene.notes), file=sys.stderr)  # last, as an error is one line alone
     return plan
@@ -139,19 +138,17 @@ def train(
     folder = RunFolder(out)
     if ranks.first:
         folder.require_new()
-    _require_start(config)
-    if config.train.device == "cuda":
-        resolve_device("cuda")  # before photos are read for nothing
-    posed = ranks.agree(with_cameras(config, out).scene.path if ranks.first else None)
+    require_possible(config)
+    _try_lpips(config, report is not None)
+    posed = ranks.agree(_posed_capture(config, out) if ranks.first else None)
     if posed != config.scene.path:
         clock.mark(CAMERAS)
         config = replace(config, scene=replace(config.scene, path=posed))
     with starting(lambda: resolve_device(config.train.device)) as started:
-        scene = open_scene(config)
+        scene = open_scene(config, training=True)
         clock.mark(PHOTOS)
         device = started.result()
     clock.mark(DEVICE)
-    load_lpips(config.report.lpips_weights, torch.device("cpu"))  # tried; the report uses it
     plan = make_plan(config, scene, device, ranks.count)
     clock.mark("plan")
     remedy = "use train.photos_place=host and train.maps_place=host, --max-gaussians or a larger --factor"
@@ -196,12 +193,13 @@ def resume(
     checkpoint = latest_checkpoint(folder.checkpoints)
     state = None if checkpoint is None else load_checkpoint(checkpoint)
     device = resolve_device(config.train.device, "go on with this run where there is a GPU, or see 'turbogs doctor'")
+    require_writable(folder.path, f"what --resume {folder.path} writes")
+    _try_lpips(config, report is not None)
     with starting(lambda: device) as started:
-        scene = open_scene(config, folder)
+        scene = open_scene(config, folder, training=True)
         clock.mark(PHOTOS)
         started.result()
     clock.mark(DEVICE)
-    load_lpips(config.report.lpips_weights, torch.device("cpu"))  # tried; the report uses it
     limit = config.budget.memory_bytes()
     if limit is not None:
         hold_to(limit, device)
@@ -217,10 +215,19 @@ def resume(
     return session.run(report, watch)
 
 
-def _require_start(config: Config) -> None:
-    """Raise `InputError`, before photos are read, where the model to start from is not there."""
-    if config.train.starts_from_model:
-        require_model(config.train.init)
+def _posed_capture(config: Config, out: Path) -> str:
+    """The path of the capture; where that is of photos alone, of their reconstruction, which is made."""
+    if not holds_photos_alone(Path(config.scene.path)):
+        return config.scene.path
+    from turbogs_plugin.reconstruct.train_on_photos import with_cameras  # no other run needs that room
+
+    return with_cameras(config, out).scene.path
+
+
+def _try_lpips(config: Config, reported: bool) -> None:
+    """Load LPIPS, which the report uses, so that weights that cannot be read are refused before photos are."""
+    if reported or config.report.lpips_weights is not None:
+        load_lpips(config.report.lpips_weights, torch.device("cpu"))
 
 
 @contextmanager

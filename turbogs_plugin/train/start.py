@@ -5,16 +5,23 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 
+import numpy as np
 import torch
 
-from turbogs_plugin.config.configuration import Config
+from turbogs_plugin.config.auto import AUTO
+from turbogs_plugin.config.configuration import Config, resolve
 from turbogs_plugin.device import synchronize
 from turbogs_plugin.engine import compiled_kernels
 from turbogs_plugin.errors import InputError
+from turbogs_plugin.model.initial import BACKDROP_COUNT
+from turbogs_plugin.plan.caps import cap_of, chosen_points, require_room
+from turbogs_plugin.plan.memory import MemoryDemand
 from turbogs_plugin.scene import Scene, load_scene
 from turbogs_plugin.train.folder import RunFolder
+from turbogs_plugin.train.given_model import read_given
 from turbogs_plugin.train.progress import LoadingProgress
 
 
@@ -24,6 +31,55 @@ def resolve_device(name: str, remedy: str = "use --device cpu, or see 'turbogs d
         build = "this PyTorch is built without CUDA" if torch.version.cuda is None else "no GPU answers"
         raise InputError(f"CUDA was asked for and is absent ({build}): {remedy}")
     return torch.device("cuda" if name != "cpu" and torch.cuda.is_available() else "cpu")
+
+
+def require_possible(config: Config) -> None:
+    """What can be refused before the cameras of photos are found, or any photo is decoded.
+
+    Raises:
+        InputError: a device or a limit of its memory that this machine does not have; a model to start from that cannot
+            be read; more Gaussians to start from than are allowed.
+    """
+    train, cap = config.train, cap_of(config)
+    if train.device == "cuda":
+        resolve_device("cuda")
+    if config.budget.max_memory:
+        require_gpu_memory(resolve_device(train.device))
+    backdrop = BACKDROP_COUNT if train.backdrop is True else 0
+    if train.starts_from_model:
+        require_room(train.init, len(read_given(train.init)), cap, backdrop)
+    else:
+        chosen_points(1, cap, backdrop)
+
+
+def require_gpu_memory(device: torch.device) -> None:
+    """Raise `InputError` where the memory of a device that is no GPU is to be limited."""
+    if device.type != "cuda":
+        raise InputError("--max-memory limits the memory of a GPU, and this run would be on a CPU: leave it out")
+
+
+def require_memory(config: Config, train_sizes: np.ndarray, test_sizes: np.ndarray) -> None:
+    """Refuse a limit of memory that leaves no room for a model, whatever the plan decides.
+
+    Args:
+        train_sizes, test_sizes: [V, 2] (width, height) of the views.
+
+    Raises:
+        InputError: as `MemoryDemand.gaussians`.
+    """
+    limit = config.budget.memory_bytes()
+    if limit is None:
+        return
+    mapping = config.to_mapping()
+    for name, least in (("sh_degree", 0), ("maps_place", "host"), ("photos_place", "host")):
+        if mapping["train"][name] == AUTO:
+            mapping["train"][name] = least
+    train, test = train_sizes.prod(axis=1), test_sizes.prod(axis=1)
+    largest = int(max(train.max(), test.max()))
+    least_demand = MemoryDemand.of(
+        resolve(mapping).without_plan(), int(train.sum()), int(test.sum()), largest, len(train)
+    )
+    least_demand.gaussians(limit)
 
 
 @contextmanager
@@ -48,14 +104,15 @@ def starting(resolve: Callable[[], torch.device]) -> Iterator[Future[torch.devic
         yield pool.submit(start)
 
 
-def open_scene(config: Config, folder: RunFolder | None = None) -> Scene:
+def open_scene(config: Config, folder: RunFolder | None = None, training: bool = False) -> Scene:
     """The capture of a configuration.
 
     Args:
         folder: that of the run with this configuration; None if the user names the capture.
+        training: whether a model is to be trained on it, within the configuration's limit of memory.
 
     Raises:
-        InputError: there is no usable capture.
+        InputError: there is no usable capture, or no room to train on it.
     """
     settings = config.scene
     if folder is not None and not Path(settings.path).exists():
@@ -63,4 +120,5 @@ def open_scene(config: Config, folder: RunFolder | None = None) -> Scene:
             f"capture '{settings.path}' of the run in '{folder.path}' is not there: bring it back, or edit scene.path "
             f"in {folder.config}"
         )
-    return load_scene(settings.path, settings.factor, settings.test_every, LoadingProgress())
+    sized = partial(require_memory, config) if training else None
+    return load_scene(settings.path, settings.factor, settings.test_every, LoadingProgress(), sized)

@@ -19,13 +19,13 @@ from turbogs_plugin.engine.exposures import Exposures, exposure_rate
 from turbogs_plugin.engine.protocol import MapUpdate
 from turbogs_plugin.engine.rendered import RenderOptions, ScreenGradients
 from turbogs_plugin.engine.rendering import rasterize, render_image
-from turbogs_plugin.errors import InputError, TrainingStopped
+from turbogs_plugin.errors import TrainingStopped
 from turbogs_plugin.model.distant import RESTRAIN_EVERY, restrain_distant
 from turbogs_plugin.model.harmonics import with_degree
 from turbogs_plugin.model.initial import BACKDROP_COUNT, backdrop_gaussians, gaussians_from_points
 from turbogs_plugin.model.row_order import in_order_of_space
 from turbogs_plugin.model.torch_file import leaves
-from turbogs_plugin.plan.caps import cap_of, chosen_points
+from turbogs_plugin.plan.caps import cap_of, chosen_points, require_room
 from turbogs_plugin.scene import PosedImages, Scene
 from turbogs_plugin.scene.offload import place_maps, place_views
 from turbogs_plugin.scene.photos import PhotoSamples
@@ -352,11 +352,7 @@ def initial_gaussians(scene: Scene, config: Config, init: str, device: torch.dev
         gaussians = gaussians_from_points(points[rows], colors[rows], *settings)
     else:
         gaussians = with_degree(load_given(init, scene, device), train.sh_degree)
-        if cap and len(gaussians) + backdrop_count > cap:
-            raise InputError(
-                f"'{init}' has {len(gaussians)} Gaussians, more than density.max_gaussians {cap} allows beside "
-                f"{backdrop_count} of a backdrop: allow more, or start from points"
-            )
+        require_room(init, len(gaussians), cap, backdrop_count)
     if not train.backdrop:
         return gaussians
     color = _mean_color(scene.train)
