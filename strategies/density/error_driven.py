@@ -168,7 +168,7 @@ class ErrorDrivenDensity(WindowedDensity):
         spared = self._spared(gaussians, finite, extent)
         hopeless = ~finite | (torch.sigmoid(gaussians.opacities) < self.prune_opacity)
         if self.prune_score_fraction > 0:
-            hopeless |= _share(worth, known & ~spared, self.prune_score_fraction)
+            hopeless |= known & (worth < _quantile(worth, known, self.prune_score_fraction))
         candidates, priority = self._passing(score, seen) & ~hopeless, score
         if self.choose_by == "squares":
             priority = drawn_by_squares(self._stats, step)
@@ -207,11 +207,11 @@ class ErrorDrivenDensity(WindowedDensity):
         return passes & seen & (score >= _quantile(score, seen, 1 - self.top_fraction))
 
     def _worth(self, score: Tensor, seen: Tensor) -> tuple[Tensor, Tensor]:
-        """([N] score or squares: the less, the sooner it is pruned; [N] bool, for which that is known)."""
-        if self.choose_by == "difficulty":
-            return score, seen
-        squares, finite = squares_of(self._stats)
-        return squares, finite & seen
+        """([N] the less, the sooner it is pruned; [N] bool, for which that is known): the score, or the squares.
+
+        What was not seen has no score, but contributes nothing.
+        """
+        return (score, seen) if self.choose_by == "difficulty" else squares_of(self._stats)
 
     def _spared(self, gaussians: Gaussians, finite: Tensor, extent: float) -> Tensor:
         """[N] bool: the finite ones that lie beyond `spare_beyond`."""
@@ -222,7 +222,7 @@ class ErrorDrivenDensity(WindowedDensity):
         finite = finite_rows(gaussians)
         worth, known = self._worth(*self.scores(step))
         spared = self._spared(gaussians, finite, step.scene_extent)
-        pruned = ~finite | _share(worth, known & ~spared, 1 - self.final_keep)
+        pruned = ~finite | known & (worth < _quantile(worth, known, 1 - self.final_keep)) & ~spared
         return removal(leave_one(pruned, gaussians))
 
     def _compose(
@@ -256,11 +256,6 @@ def _quantile(values: Tensor, mask: Tensor, fraction: float) -> Tensor:
         return values.new_zeros(())
     rank = min(len(chosen) - 1, math.floor(fraction * len(chosen) + 1e-6))  # 1 - 0.9 of 10 is 1
     return chosen.sort().values[rank]
-
-
-def _share(values: Tensor, mask: Tensor, fraction: float) -> Tensor:
-    """[N] bool: that fraction of the masked rows, rounded down, with the smallest values; fewer in case of ties."""
-    return mask & (values < _quantile(values, mask, fraction))
 
 
 def _first(keys: Tensor, mask: Tensor, count: int) -> Tensor:

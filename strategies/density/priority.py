@@ -34,6 +34,6 @@ def drawn_by_squares(stats: GaussianStats, step: Step) -> Tensor:
 
 
 def squares_of(stats: GaussianStats) -> tuple[Tensor, Tensor]:
-    """([N] sums of squares, 0 where not finite; [N] bool, which are finite)."""
+    """([N] sums of squares, 0 where not finite; [N] bool, which are finite). What was not seen has 0."""
     known = torch.isfinite(stats.square_sums)
     return torch.where(known, stats.square_sums, 0.0), known

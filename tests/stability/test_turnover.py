@@ -114,7 +114,7 @@ def test_without_a_cap_growth_is_bounded_by_the_gradient(photo, monkeypatch, rec
         trainer.step()
         counts.append(len(trainer.gaussians))
     record_property("counts", counts[::10] + counts[-1:])
-    record_property("largest share of the bound", max(shares))
+    record_property("largest share of the bound", float(max(shares)))
     trainer.require_finite()
     assert 0 < max(shares) <= 1 and min(counts) >= 1
 
