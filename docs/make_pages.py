@@ -12,6 +12,7 @@ from functools import cache
 
 import machine_tables
 import paper_tables
+import scaling_results
 import study_tables
 import sweep_tables
 from headline_picture import PICTURE, draw, picture_data, picture_digest
@@ -28,6 +29,7 @@ PAGES = tuple(
         "docs/paper.md",
         "docs/plan.md",
         "docs/results/README.md",
+        "docs/scaling.md",
         "docs/results/h200/README.md",
         "docs/results/h200/house.md",
         "docs/results/h200/masks.md",
@@ -66,6 +68,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "memory": lambda: machine_tables.on("bench-step.json", machine_tables.memory),
     "offload": lambda: machine_tables.on("bench-4k.json", machine_tables.offload),
     "precision": lambda: machine_tables.on("bench-raster.json", machine_tables.precision),
+    "ranks": scaling_results.ranks,
     "raster": lambda: machine_tables.on("bench-raster.json", machine_tables.raster),
     "solvers": machine_tables.solvers,
     "steps": lambda: machine_tables.on("bench-step.json", machine_tables.steps),

@@ -15,6 +15,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from statistics import mean
 
+from machine_tables import H200, where
 from scaling_model import MEASURED, Case, table
 
 BELOW = (0.0, 0.25, 0.5, 1.0)
@@ -50,8 +51,14 @@ def iterations(out: Path) -> str:
             predicted = case.grown(grown).on(gpus, exchange != "records to all")
             expected = f"{predicted:.2f} ms, {grown * case.on(1) / predicted:.2f}x"
         batch = f", {grown} times the batch" if grown > 1 else ""
-        rows[f"{count // 1000}k, K = {views}{batch}, {gpus} GPUs, {exchange}"] = [found, expected]
+        machine = "1 GPU" if gpus == 1 else f"{gpus} GPUs, {exchange}"
+        rows[f"{count // 1000}k, K = {views}{batch}, {machine}"] = [found, expected]
     return table("an iteration", rows, ("measured", "predicted"))
+
+
+def ranks() -> str:
+    """The iterations that docs/scaling.md shows, and where they were measured."""
+    return f"{where(json.loads((H200 / 'ranks.json').read_text()))}.\n\n{iterations(H200)}"
 
 
 def history_of(run: Path) -> list[dict]:

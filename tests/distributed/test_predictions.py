@@ -96,7 +96,7 @@ def test_the_script_goes_on_whatever_fails_and_leaves_out_what_has_no_time(tmp_p
     failed = [line for line in stages.splitlines() if line.endswith("exit code 1")]
     assert len(failed) == 3 and "turbogs: error: lost" in ended.stdout
     results = (tmp_path / "out/results.txt").read_text()
-    assert "| 600k, K = 10, 1 GPUs, none | 3.40 ms, 1.00x |" in results and results in ended.stdout
+    assert "| 600k, K = 10, 1 GPU | 3.40 ms, 1.00x |" in results and results in ended.stdout
     assert "two, 2 seeds: " in results and "| one-2 | " in results
     assert not (tmp_path / "scratch").exists() and not list((tmp_path / "out").rglob("model.ply"))
     none = subprocess.run(
