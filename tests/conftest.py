@@ -1,11 +1,13 @@
 """What all tests share."""
 
 import sys
+from contextlib import nullcontext
 
 import pytest
 import torch
 
 from turbogs_plugin import cli
+from turbogs_plugin.report import plot_process
 from turbogs_plugin.scene import colmap, llff, starting_points
 
 torch.set_num_threads(1)  # the tests' tensors are small: more threads gain nothing and collapse on a busy machine
@@ -18,8 +20,8 @@ def drawn() -> None:
 
 @pytest.fixture
 def plotted(request, monkeypatch) -> None:
-    """Plots are made, with all that they show, but neither laid out nor rasterised, which takes a second a report; not
-    with `drawn`."""
+    """Plots are made, with all that they show, but neither laid out nor rasterised, which takes a second a report, nor
+    in a process of their own, which takes two to start; not with `drawn`."""
     from matplotlib.figure import Figure
     from PIL import Image
 
@@ -29,6 +31,7 @@ def plotted(request, monkeypatch) -> None:
     if "drawn" not in request.fixturenames:
         monkeypatch.setattr(Figure, "savefig", save)
         monkeypatch.setattr(Figure, "draw_without_rendering", lambda figure: None)
+        monkeypatch.setattr(plot_process, "PlotProcess", nullcontext)
 
 
 @pytest.fixture

@@ -377,6 +377,7 @@ def test_doctor(turbogs):
         assert word in out
 
 
+@pytest.mark.usefixtures("drawn")
 @pytest.mark.parametrize("ends", ["draws", "fails", "is not asked for"])
 def test_plots_are_drawn_by_a_process_that_begins_before_photos_are_read(turbogs, capture, tmp_path, monkeypatch, ends):
     made, drawn = [], []
