@@ -16,7 +16,7 @@ from turbogs_plugin.reconstruct.workspace import Workspace
 from turbogs_plugin.scene import load_scene
 from turbogs_plugin.scene.load import holds_photos_alone
 
-COUNT = 8
+COUNT = 10
 
 
 def noise(seed: int) -> Image.Image:
