@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import scaling_results
 
 from turbogs_plugin.bench.numerics import SolverResult, solvers_table
 from turbogs_plugin.bench.statistics import StatisticsResult, statistics_table
@@ -171,6 +172,11 @@ def where(record: dict[str, Any]) -> str:
     provenance = record["provenance"]
     machine = provenance["machine"].partition(" (")[0]
     return f"{machine}, commit {provenance['commit'][:7]}, torch {provenance['software']['torch']}"
+
+
+def ranks() -> str:
+    """Milliseconds of an iteration on one GPU and on two, beside the predictions."""
+    return f"{where(json.loads((H200 / 'ranks.json').read_text()))}.\n\n{scaling_results.iterations(H200)}"
 
 
 def steps() -> str:

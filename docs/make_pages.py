@@ -12,7 +12,6 @@ from functools import cache
 
 import machine_tables
 import paper_tables
-import scaling_results
 import study_tables
 import sweep_tables
 from headline_picture import PICTURE, draw, picture_data, picture_digest
@@ -68,7 +67,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "memory": lambda: machine_tables.on("bench-step.json", machine_tables.memory),
     "offload": lambda: machine_tables.on("bench-4k.json", machine_tables.offload),
     "precision": lambda: machine_tables.on("bench-raster.json", machine_tables.precision),
-    "ranks": scaling_results.ranks,
+    "ranks": machine_tables.ranks,
     "raster": lambda: machine_tables.on("bench-raster.json", machine_tables.raster),
     "solvers": machine_tables.solvers,
     "steps": lambda: machine_tables.on("bench-step.json", machine_tables.steps),

@@ -15,7 +15,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from statistics import mean
 
-from machine_tables import H200, where
 from scaling_model import MEASURED, Case, table
 
 BELOW = (0.0, 0.25, 0.5, 1.0)
@@ -54,11 +53,6 @@ def iterations(out: Path) -> str:
         machine = "1 GPU" if gpus == 1 else f"{gpus} GPUs, {exchange}"
         rows[f"{count // 1000}k, K = {views}{batch}, {machine}"] = [found, expected]
     return table("an iteration", rows, ("measured", "predicted"))
-
-
-def ranks() -> str:
-    """The iterations that docs/scaling.md shows, and where they were measured."""
-    return f"{where(json.loads((H200 / 'ranks.json').read_text()))}.\n\n{iterations(H200)}"
 
 
 def history_of(run: Path) -> list[dict]:
