@@ -23,12 +23,22 @@ from turbogs_plugin.report.tables import table
 H200 = Path(__file__).resolve().parent / "results/h200"
 
 
-def house() -> dict[str, Any]:
-    return json.loads((H200 / "house.json").read_text())
+def measured(name: str) -> dict[str, Any]:
+    return json.loads((H200 / name).read_text())
 
 
-def masks() -> dict[str, Any]:
-    return json.loads((H200 / "masks.json").read_text())
+def house_runs() -> str:
+    """Whole runs of the base and of the new build: mean and range of five seeds."""
+    record, lines = measured("house.json"), []
+    for capture in record["base_runs"]:
+        for build in ("base", "new"):
+            run = record[f"{build}_runs"][capture]
+            texts = [
+                f"{mean:.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]"
+                for (mean, low, high), digits in zip((run["seconds"], run["psnr"], run["ssim"]), (1, 2, 4), strict=True)
+            ]
+            lines.append((capture, build, *texts, run["gaussians"]))
+    return table(("capture", "build", "s", "PSNR", "SSIM", "Gaussians"), lines)
 
 
 def iterations(record: dict[str, Any]) -> str:
@@ -48,9 +58,9 @@ def iterations(record: dict[str, Any]) -> str:
 def exposures() -> str:
     """Milliseconds of an iteration without exposures, of its loss with and without them, and the difference's share."""
     lines = []
-    for commit, points in masks()["exposures"].items():
-        for point, measured in points.items():
-            off, on = measured["off"], measured["on"]
+    for commit, points in measured("masks.json")["exposures"].items():
+        for point, clocks in points.items():
+            off, on = clocks["off"], clocks["on"]
             share = (on["loss"] - off["loss"]) / off["iteration"]
             values = (f"{value:.3f}" for value in (off["iteration"], off["loss"], on["loss"]))
             lines.append((commit, point, *values, f"{100 * share:.1f} %"))
@@ -155,10 +165,6 @@ STEPS = {
 """The paper's steps of an iteration that take time, and what they are called in a table."""
 
 
-def measured(name: str) -> dict[str, Any]:
-    return json.loads((H200 / name).read_text())
-
-
 def on(name: str, made: Callable[[], str]) -> str:
     """A table of a file of `turbogs bench`, below a line with what it was measured on."""
     record = measured(name)
@@ -176,7 +182,7 @@ def where(record: dict[str, Any]) -> str:
 
 def ranks() -> str:
     """Milliseconds of an iteration on one GPU and on two, beside the predictions."""
-    return f"{where(json.loads((H200 / 'ranks.json').read_text()))}.\n\n{scaling_results.iterations(H200)}"
+    return f"{where(measured('ranks.json'))}.\n\n{scaling_results.iterations(H200)}"
 
 
 def steps() -> str:

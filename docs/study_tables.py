@@ -181,22 +181,3 @@ def change(row: VariantRow) -> str:
     parts = [f"{error} dB{said}{clear}", difference_text(row.difference("ssim"), 4)]
     parts += [f"x {row.ratio('seconds'):.2f} s", "" if math.isnan(sizes) else f"x {sizes:.2f} N"]
     return f"{', '.join(filter(None, parts))} ({row.difference('psnr').count})"
-
-
-def house_runs() -> str:
-    """Whole runs before, as measured then, and `turbogs` of the study `parts`: mean and range of five seeds."""
-    found, lines = rows_of("parts"), []
-    for capture, base in machine_tables.house()["base_runs"].items():
-        row = found[capture]["turbogs"]
-        spreads = [row.spread(measure) for measure in ("seconds", "psnr", "ssim")]
-        after = [[spread.mean, spread.low, spread.high] for spread in spreads]
-        for build, values, size in (
-            ("base", [base[measure] for measure in ("seconds", "psnr", "ssim")], base["gaussians"]),
-            ("new", after, row.spread("gaussians").mean),
-        ):
-            texts = [
-                f"{mean:.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]"
-                for (mean, low, high), digits in zip(values, (1, 2, 4), strict=True)
-            ]
-            lines.append((capture, build, *texts, f"{size:.0f}"))
-    return table(("capture", "build", "s", "PSNR", "SSIM", "Gaussians"), lines)
