@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path, PureWindowsPath
 from typing import Literal
@@ -12,6 +13,8 @@ from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene.undistort import Lens
 
 FEWEST_PHOTOS = 3
+"""A capture has at least so many."""
+
 LARGEST_SIDE = 65535
 """Photos wider or higher than this many pixels are refused (it is JPEG's own limit)."""
 
@@ -87,6 +90,11 @@ class Capture:
                 raise InputError(
                     f"{source}: image '{self.names[int(np.argmin(ok))]}' has {trouble} ({(~ok).sum()} such images)"
                 )
+
+
+def left_out(absent: Sequence[str], count: int, called: str) -> str:
+    """The note where `absent` photos of `count` do not exist; `called` is what the capture has of each."""
+    return f"{len(absent)} of {count} {called} are left out, their photos do not exist: {absent[0]}, ..."
 
 
 def check_photo_name(name: str, source: Path) -> str:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.scene.capture import FEWEST_PHOTOS, LARGEST_SIDE, Capture, check_photo_name
+from turbogs_plugin.scene.capture import FEWEST_PHOTOS, LARGEST_SIDE, Capture, check_photo_name, left_out
 from turbogs_plugin.scene.colmap_check import SMALLEST_IMAGE, check_binary_model
 from turbogs_plugin.scene.photos import photo_size
 from turbogs_plugin.scene.starting_points import NUM_RANDOM_POINTS, about_cameras, random_points
@@ -143,7 +143,7 @@ def read_colmap(scene: Path, model: Path, suffix: str) -> Capture:
     absent = [name for name in names if not (photo_folder / name).is_file()]
     absence = ()
     if absent and len(names) - len(absent) >= FEWEST_PHOTOS:
-        absence = (f"{len(absent)} of {len(names)} images are left out, their photos do not exist: {absent[0]}, ...",)
+        absence = (left_out(absent, len(names), "images"),)
         gone = set(absent)
         images = [image for image in images if image.name not in gone]
         names = tuple(image.name for image in images)

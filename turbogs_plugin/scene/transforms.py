@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.scene.capture import FEWEST_PHOTOS, LARGEST_SIDE, Capture, check_photo_name
+from turbogs_plugin.scene.capture import FEWEST_PHOTOS, LARGEST_SIDE, Capture, check_photo_name, left_out
 from turbogs_plugin.scene.colmap import load_pycolmap
 from turbogs_plugin.scene.named_split import read_split
 from turbogs_plugin.scene.photos import photo_size
@@ -93,7 +93,7 @@ def read_transforms(scene: Path) -> Capture:
     parts = "" if split is None else f", {split.text(names)}"
     notes = [f"{source} (nerfstudio, instant-ngp): {len(names)} photos{parts}, {origin}"]
     if absent:
-        notes.append(f"{len(absent)} of {len(frames)} frames are left out, their photos do not exist: {absent[0]}, ...")
+        notes.append(left_out(absent, len(frames), "frames"))
     # Reduced copies lie in images_2, images_4, ... beside images.
     common = {PurePosixPath(name).parts[0] for name in names}
     photo_folder = scene
