@@ -1,6 +1,6 @@
 // A warp's tile in the maps, where masks are with them. A lane holds 8 of its pixels: pixel (j, lane) is number
-// 32 j + lane in the order of samples (turbogs_plugin/types). That order goes through the tile in patches of 8x4 pixels,
-// two beside each other and four such rows, so lane and j say where a pixel lies.
+// 32 j + lane in the order of samples (turbogs_plugin/types). That order goes through the tile in patches of 8x4
+// pixels, two beside each other and four such rows, so lane and j say where a pixel lies.
 #pragma once
 
 #include <cuda_fp16.h>
