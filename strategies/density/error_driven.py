@@ -60,8 +60,8 @@ class ErrorDrivenDensity(WindowedDensity):
         prune_screen_size: pruned where the screen radius exceeds this * the larger side of the image. 0: off, as in
             3DGS in effect.
         prune_size_from: both size rules begin at this progress; 3DGS has 3000 / 15000.
-        prune_score_fraction: the share that each densification event prunes first, in the order of `choose_by`. Off by
-            default: the paper gives no value.
+        prune_score_fraction: the share, of those seen and not spared, that each densification event prunes first, in
+            the order of `choose_by`. Off by default: the paper gives no value.
         opacity_decay: share of its opacity that every Gaussian loses at each densification event. If the photos need
             it, it grows back; if not, it falls below `prune_opacity`. A gentle substitute for 3DGS's reset.
         spare_beyond: Gaussians farther from the cameras' centre than this * scene extent are neither decayed nor pruned
@@ -72,8 +72,8 @@ class ErrorDrivenDensity(WindowedDensity):
             `squares` (see `priority`): as many grow as pass the gate of the absolute gradient, and who, is drawn from
             all the seen; what has the least squares is pruned first. `grad_threshold`, `top_fraction`, `score` and
             `lambda_base` then mean nothing.
-        final_every, final_keep: interval of the final pruning, and the share that it keeps (Delta_prune, eta_final). 1
-            keeps all.
+        final_every, final_keep: interval of the final pruning, and the share of those seen and not spared that it keeps
+            (Delta_prune, eta_final). 1 keeps all.
     """
 
     lambda_base: float = 0.8
@@ -168,7 +168,7 @@ class ErrorDrivenDensity(WindowedDensity):
         spared = self._spared(gaussians, finite, extent)
         hopeless = ~finite | (torch.sigmoid(gaussians.opacities) < self.prune_opacity)
         if self.prune_score_fraction > 0:
-            hopeless |= known & (worth < _quantile(worth, known, self.prune_score_fraction))
+            hopeless |= _lowest(worth, known & seen & ~spared, self.prune_score_fraction)
         candidates, priority = self._passing(score, seen) & ~hopeless, score
         if self.choose_by == "squares":
             priority = drawn_by_squares(self._stats, step)
@@ -220,9 +220,10 @@ class ErrorDrivenDensity(WindowedDensity):
 
     def _final_prune(self, gaussians: Gaussians, step: Step) -> RowUpdate | None:
         finite = finite_rows(gaussians)
-        worth, known = self._worth(*self.scores(step))
+        score, seen = self.scores(step)
+        worth, known = self._worth(score, seen)
         spared = self._spared(gaussians, finite, step.scene_extent)
-        pruned = ~finite | known & (worth < _quantile(worth, known, 1 - self.final_keep)) & ~spared
+        pruned = ~finite | _lowest(worth, known & seen & ~spared, 1 - self.final_keep)
         return removal(leave_one(pruned, gaussians))
 
     def _compose(
@@ -256,6 +257,11 @@ def _quantile(values: Tensor, mask: Tensor, fraction: float) -> Tensor:
         return values.new_zeros(())
     rank = min(len(chosen) - 1, math.floor(fraction * len(chosen) + 1e-6))  # 1 - 0.9 of 10 is 1
     return chosen.sort().values[rank]
+
+
+def _lowest(values: Tensor, mask: Tensor, share: float) -> Tensor:
+    """[N] bool: this share of the masked rows, those with the least values; fewer in case of ties."""
+    return mask & (values < _quantile(values, mask, share))
 
 
 def _first(keys: Tensor, mask: Tensor, count: int) -> Tensor:
