@@ -11,7 +11,7 @@ from turbogs_plugin.types import Gaussians, GaussianStats, RowUpdate, Step
 SQUARES = {
     "choose_by": "squares",
     "prune_score_fraction": 0.05,
-    "absgrad_threshold": 6.6e-4,
+    "absgrad_threshold": 6e-4,
     "spare_beyond": 10.0,
     "final_keep": 1.0,
     "split": "long_axis",
