@@ -10,6 +10,7 @@ import re
 from collections.abc import Callable
 from functools import cache
 
+import capture_tables
 import machine_tables
 import paper_tables
 import study_tables
@@ -23,6 +24,7 @@ PAGES = tuple(
     ROOT / name
     for name in (
         "README.md",
+        "docs/captures.md",
         "docs/drop-in.md",
         "docs/numerics.md",
         "docs/paper.md",
@@ -53,11 +55,16 @@ TABLES: dict[str, Callable[[], str]] = {
     "behind": study_tables.behind,
     "density_sums": machine_tables.density_sums,
     "dropin": machine_tables.dropin,
+    "exposure_runs": capture_tables.exposure_runs,
     "exposures": machine_tables.exposures,
     "headline": study_tables.headline,
     "headline_sources": study_tables.headline_sources,
     "house_iterations": lambda: machine_tables.iterations(machine_tables.measured("house.json")),
     "house_runs": machine_tables.house_runs,
+    "lenses": capture_tables.lenses,
+    "many_photos": capture_tables.many_photos,
+    "masked_iterations": capture_tables.masked_iterations,
+    "masked_runs": capture_tables.masked_runs,
     "leave_out": lambda: study_tables.changes("leave_out"),
     "masks_iterations": lambda: machine_tables.iterations(machine_tables.measured("masks.json")),
     "paper_parts": paper_tables.paper_parts,

@@ -10,6 +10,7 @@ plane z = 0, taken from flight lines there and back, slightly tilted.
 from __future__ import annotations
 
 import argparse
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -79,8 +80,12 @@ def write_flight(folder: Path, photos: int, width: int = 200, height: int = 150,
     (folder / "images").mkdir(parents=True)
     (folder / "sparse" / "0").mkdir(parents=True)
     names = [f"photo_{view:05d}.jpg" for view in range(photos)]
-    for name, pose in zip(names, poses, strict=True):
+
+    def write(name: str, pose: np.ndarray) -> None:
         Image.fromarray(photograph(texture, origin, pose, rays)).save(folder / "images" / name, quality=92)
+
+    with ThreadPoolExecutor() as threads:
+        list(threads.map(write, names, poses))
 
     margin = 0.7 * HEIGHT  # beyond, no photo reaches
     places = random.uniform(size=(POINTS_OF_A_PHOTO * photos, 2)) * (extent - 2 * margin) + origin + margin
@@ -88,7 +93,9 @@ def write_flight(folder: Path, photos: int, width: int = 200, height: int = 150,
     keypoints: list[list[np.ndarray]] = [[] for _ in range(photos)]
     tracks: list[list[pycolmap.TrackElement]] = []
     for point in points:
-        near = np.argsort(((centers - point) ** 2).sum(axis=1))[: 2 * TRACK]
+        distances = ((centers - point) ** 2).sum(axis=1)
+        near = np.argpartition(distances, min(2 * TRACK, photos - 1))[: 2 * TRACK]
+        near = near[distances[near].argsort()]
         local = poses[near, :, :3] @ point + poses[near, :, 3]
         pixels = focal * local[:, :2] / local[:, 2:] + [width / 2, height / 2]
         seen = ((pixels > 0) & (pixels < [width, height])).all(axis=1).nonzero()[0][:TRACK]
