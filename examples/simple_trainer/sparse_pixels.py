@@ -35,8 +35,7 @@ EDITS = """
 -                colors.permute(0, 3, 1, 2), pixels.permute(0, 3, 1, 2), padding="valid"
 -            )
 -            loss = l1loss * (1.0 - cfg.ssim_lambda) + ssimloss * cfg.ssim_lambda
-+            loss = sparse_loss(CharbonnierNccLoss(), colors, pixels, samples)
-+            maps.update(samples, (colors.detach() - pixels).abs().sum(-1), now)
++            loss = sparse_loss(CharbonnierNccLoss(), colors, pixels, samples, maps, now)
 @@ or
 -            if masks is not None:
 -                # Exclude masked pixels (e.g. ego vehicle) from L1.
@@ -53,8 +52,7 @@ EDITS = """
 -                colors_ssim.permute(0, 3, 1, 2), pixels_ssim.permute(0, 3, 1, 2)
 -            )
 -            loss = torch.lerp(l1loss, ssimloss, cfg.ssim_lambda)
-+            loss = sparse_loss(CharbonnierNccLoss(), colors, pixels, samples)
-+            maps.update(samples, (colors.detach() - pixels).abs().sum(-1), now)
++            loss = sparse_loss(CharbonnierNccLoss(), colors, pixels, samples, maps, now)
 @@
 -                self.writer.add_scalar("train/l1loss", l1loss.item(), step)
 -                self.writer.add_scalar("train/ssimloss", ssimloss.item(), step)
