@@ -16,7 +16,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
 from queue import SimpleQueue
@@ -147,7 +147,8 @@ def compare(options: Options) -> list[dict[str, Any]]:
 
     device = torch.cuda.get_device_name() if torch.cuda.is_available() else "CPU"
     with ThreadPoolExecutor(len(gpus())) as pool:
-        for run in pool.map(on_a_free_gpu, wanted):
+        for done in as_completed([pool.submit(on_a_free_gpu, job) for job in wanted]):
+            run = done.result()
             runs.append(run)
             write(file, device, runs)
             last = {} if "error" in run or not run["marks"] else run["marks"][-1]
