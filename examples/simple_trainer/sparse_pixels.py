@@ -1,6 +1,6 @@
 """Sparse pixels in gsplat's trainer: ``python sparse_pixels.py SIMPLE_TRAINER.py``; then train with ``--batch_size 4``.
 
-The trainer's images in tensorboard (``--tb_save_image``), its depth loss and captures with masks need whole images.
+The trainer's images in tensorboard (``--tb_save_image``) and its depth loss need whole images.
 """
 
 from editing import command_line
@@ -20,6 +20,9 @@ EDITS = """
 +        maps = maps_of_photos(self.trainset, device)
 +        sampler = ErrorGuidedPixelSampler()
          # Training loop.
+@@
+-            masks = data["mask"].to(device) if "mask" in data else None  # [1, H, W]
++            masks = None  # the maps have them
 @@
 +            now = Step(step, max_steps, max_steps)
 +            samples = sampler.sample(maps, data["image_id"].tolist(), budget.rate, now)
