@@ -38,9 +38,8 @@ class SparseForward:
         # 1. the render call, at samples
         colors, _, info = sparse_rasterization(**render_arguments(splats, batch), samples=samples, **render)
         pixels = gather_pixels(batch.pixels, samples)  # 2. the ground truth there
-        loss = sparse_loss(self.loss, colors, pixels, samples)  # 3. the loss
+        loss = sparse_loss(self.loss, colors, pixels, samples, self.maps, now)  # 3. the loss, which updates the maps
         info.update(prediction=colors, ground_truth=pixels)  # for error-driven strategies; others do not mind
-        self.maps.update(samples, (colors.detach() - pixels).abs().sum(dim=-1), now)
         return loss, info
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import fields
+from functools import cache
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from turbogs_plugin.errors import require, require_not_negative
@@ -15,7 +16,7 @@ def require_settings(instance: Any) -> None:
 
     A field of a `Literal` type has one of its values; a number is finite and >= 0. Call it after stricter checks.
     """
-    hints = get_type_hints(type(instance))
+    hints = _type_hints(type(instance))
     for name in [field.name for field in fields(instance) if field.init]:
         value = getattr(instance, name)
         if get_origin(hints[name]) is Literal:
@@ -23,6 +24,11 @@ def require_settings(instance: Any) -> None:
             require(value in allowed, name, value, f"one of {', '.join(allowed)}")
         elif isinstance(value, int | float):
             require_not_negative(instance, name)
+
+
+@cache  # it compiles every annotation, and a trainer may make a loss in each step
+def _type_hints(strategy: type) -> dict[str, Any]:
+    return get_type_hints(strategy)
 
 
 def require_each(instance: Any, valid: Callable[[Any], bool], allowed: str, *names: str) -> None:

@@ -170,17 +170,19 @@ class ErrorMaps:
             )
         self.fetch(samples.view_ids)
         stamp = self.stamp(step)
-        views = samples.view_of_slot()
+        tiles, views = samples.tile_of_slot(), samples.view_of_tile()
         errors = pixel_errors.detach().float()
         starts = torch.as_tensor(self.offsets[list(samples.view_ids)], device=errors.device)
         changed = samples.filled & torch.isfinite(errors)
-        flat = torch.where(changed, starts[views] + samples.pixel_ids, len(self.errors))
+        flat = torch.where(changed, starts[views][tiles] + samples.pixel_ids, len(self.errors))
         old = self._errors[flat]
         new = (old.float() * (1.0 - self.beta) + errors * self.beta).clamp(max=ERROR_MAX).to(torch.float16)
         self._errors[flat] = new
         self._stamps[flat] = stamp
         deltas = torch.where(changed, new.double() - old.double(), 0.0)
-        batch_sums = deltas.new_zeros(len(samples.view_ids)).index_add_(0, views, deltas)
+        # Tile by tile first: on a GPU, additions to one number wait for each other.
+        tile_sums = deltas.new_zeros(len(views)).index_add_(0, tiles, deltas)
+        batch_sums = deltas.new_zeros(len(samples.view_ids)).index_add_(0, views, tile_sums)
         view_ids = torch.as_tensor(samples.view_ids, device=errors.device)
         self.view_sums.index_add_(0, view_ids, batch_sums)
 

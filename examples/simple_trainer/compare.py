@@ -16,7 +16,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
 from queue import SimpleQueue
@@ -60,6 +60,8 @@ class Options:
         seed: of each run; gsplat's own is 42.
         limit: seconds that one run may take.
         extra: further arguments of the trainer, in one text.
+        python: that of an environment in which gsplat and this package are installed. None: this one, with the host's
+            gsplat and this repository's package.
     """
 
     host: Path
@@ -72,6 +74,13 @@ class Options:
     seed: int = 42
     limit: float = 600.0
     extra: str = ""
+    python: Path | None = None
+
+    @property
+    def paths(self) -> list[Path]:
+        """Where a run finds what is not installed."""
+        examples = self.host.resolve() / "examples"
+        return [examples] if self.python else [self.host.resolve(), examples, HERE.parents[1]]
 
 
 def edited_trainer(host: Path, variant: str, folder: Path) -> Path:
@@ -88,14 +97,15 @@ def train(options: Options, scene: Path, variant: str, gpu: str) -> dict[str, An
     """One run: its record, or its error."""
     batch = SPARSE_VIEWS if sparse_pixels.EDITS in VARIANTS[variant] else 1
     run = {"scene": scene.name, "variant": variant, "steps": options.steps, "batch": batch, "seed": options.seed}
-    host, marks = options.host.resolve(), sorted({*options.marks, options.steps})
-    paths = [str(host), str(host / "examples"), str(HERE.parents[1]), os.environ.get("PYTHONPATH", "")]
+    marks = sorted({*options.marks, options.steps})
+    paths = [*map(str, options.paths), "" if options.python else os.environ.get("PYTHONPATH", "")]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, paths)), "MEASURED_SEED": str(options.seed)}
     environment |= {"CUDA_VISIBLE_DEVICES": gpu} if gpu else {}
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         try:
-            command = [sys.executable, HERE / "measured.py", edited_trainer(host, variant, folder)]
+            command = [options.python or sys.executable, HERE / "measured.py"]
+            command += [edited_trainer(options.host, variant, folder)]
             command += [folder / "record.json", "default", "--disable_viewer", "--disable_video"]
             command += ["--data_dir", scene.resolve(), "--data_factor", options.factor, "--result_dir", folder]
             command += ["--max_steps", options.steps, "--batch_size", batch, "--save_steps", options.steps]
@@ -147,7 +157,8 @@ def compare(options: Options) -> list[dict[str, Any]]:
 
     device = torch.cuda.get_device_name() if torch.cuda.is_available() else "CPU"
     with ThreadPoolExecutor(len(gpus())) as pool:
-        for run in pool.map(on_a_free_gpu, wanted):
+        for done in as_completed([pool.submit(on_a_free_gpu, job) for job in wanted]):
+            run = done.result()
             runs.append(run)
             write(file, device, runs)
             last = {} if "error" in run or not run["marks"] else run["marks"][-1]

@@ -1,6 +1,6 @@
 """Sparse pixels in gsplat's trainer: ``python sparse_pixels.py SIMPLE_TRAINER.py``; then train with ``--batch_size 4``.
 
-The trainer's images in tensorboard (``--tb_save_image``), its depth loss and captures with masks need whole images.
+The trainer's images in tensorboard (``--tb_save_image``) and its depth loss need whole images.
 """
 
 from editing import command_line
@@ -21,6 +21,9 @@ EDITS = """
 +        sampler = ErrorGuidedPixelSampler()
          # Training loop.
 @@
+-            masks = data["mask"].to(device) if "mask" in data else None  # [1, H, W]
++            masks = None  # the maps have them
+@@
 +            now = Step(step, max_steps, max_steps)
 +            samples = sampler.sample(maps, data["image_id"].tolist(), budget.rate, now)
 +            pixels = gather_pixels(pixels, samples)  # [P, 3]
@@ -35,8 +38,7 @@ EDITS = """
 -                colors.permute(0, 3, 1, 2), pixels.permute(0, 3, 1, 2), padding="valid"
 -            )
 -            loss = l1loss * (1.0 - cfg.ssim_lambda) + ssimloss * cfg.ssim_lambda
-+            loss = sparse_loss(CharbonnierNccLoss(), colors, pixels, samples)
-+            maps.update(samples, (colors.detach() - pixels).abs().sum(-1), now)
++            loss = sparse_loss(CharbonnierNccLoss(), colors, pixels, samples, maps, now)
 @@ or
 -            if masks is not None:
 -                # Exclude masked pixels (e.g. ego vehicle) from L1.
@@ -53,8 +55,7 @@ EDITS = """
 -                colors_ssim.permute(0, 3, 1, 2), pixels_ssim.permute(0, 3, 1, 2)
 -            )
 -            loss = torch.lerp(l1loss, ssimloss, cfg.ssim_lambda)
-+            loss = sparse_loss(CharbonnierNccLoss(), colors, pixels, samples)
-+            maps.update(samples, (colors.detach() - pixels).abs().sum(-1), now)
++            loss = sparse_loss(CharbonnierNccLoss(), colors, pixels, samples, maps, now)
 @@
 -                self.writer.add_scalar("train/l1loss", l1loss.item(), step)
 -                self.writer.add_scalar("train/ssimloss", ssimloss.item(), step)

@@ -15,11 +15,14 @@ from gsplat import DefaultStrategy, MCMCStrategy, rasterization
 from helpers.bridge_host import HEIGHT, RATES, WIDTH, arguments, make_cameras, make_splats
 from helpers.raster_cases import GPU_ONLY
 from turbogs_plugin.strategies.density.mcmc import GsplatMcmcDensity
+from turbogs_plugin.strategies.losses import CharbonnierNccLoss
 from turbogs_plugin.strategies.optimizers.moment_lm import MomentLMOptimizer
 from turbogs_plugin.strategies.optimizers.sparse_adam import SparseAdam
+from turbogs_plugin.strategies.pixel_sampling import ErrorGuidedPixelSampler
 
 from turbogs_plugin.engine.rendering import dense_samples
-from turbogs_plugin.gsplat_bridge import SharedOptimizer, TurboDensityStrategy, sparse_rasterization
+from turbogs_plugin.error_maps import ErrorMaps
+from turbogs_plugin.gsplat_bridge import SharedOptimizer, TurboDensityStrategy, sparse_loss, sparse_rasterization
 from turbogs_plugin.gsplat_bridge.gaussian_errors import iteration_stats, loss_shares
 from turbogs_plugin.scene import load_scene
 from turbogs_plugin.types import PARAMETER_NAMES, Gaussians, GaussianStats, Step
@@ -79,6 +82,24 @@ def test_images_gradients_and_info_are_gsplats():
     assert relative(our_info["means2d"].absgrad, their_info["means2d"].absgrad) < 2e-3
     for name in ("depths", "conics"):
         assert relative(our_info[name][visible], their_info[name][visible]) < 1e-4
+
+
+def test_one_launch_computes_the_loss_and_updates_the_maps():
+    """Large views: a sum of errors is of many tiles."""
+    generator = torch.Generator().manual_seed(0)
+    sampler, now = ErrorGuidedPixelSampler(), Step(7, 10, 10)
+    found, expected = (
+        ErrorMaps.from_images(torch.rand(2, 300, 400, generator=torch.Generator().manual_seed(1)).cuda())
+        for _ in range(2)
+    )
+    samples = sampler.sample(expected, (1, 0), 0.25, now)
+    colors, truth = (torch.rand(len(samples), 3, generator=generator).cuda() for _ in range(2))
+    value = sparse_loss(CharbonnierNccLoss(), colors.requires_grad_(), truth, samples, found, now)
+    torch.testing.assert_close(value, sparse_loss(CharbonnierNccLoss(), colors, truth, samples))
+    expected.update(samples, (colors.detach() - truth).abs().sum(dim=-1), now)
+    assert torch.equal(found.stamps, expected.stamps)
+    torch.testing.assert_close(found.errors, expected.errors)
+    torch.testing.assert_close(found.view_sums, expected.view_sums, rtol=1e-5, atol=0)
 
 
 @pytest.mark.parametrize("packed", [False, True])

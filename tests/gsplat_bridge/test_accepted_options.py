@@ -121,6 +121,33 @@ def density_patch_size(monkeypatch):
     assert len(host.splats["means"]) != 40
 
 
+MASKS = (torch.arange(WIDTH) < WIDTH // 3).expand(CAMERAS, HEIGHT, WIDTH)
+"""True where a pixel counts."""
+
+
+def masked(info: dict) -> dict:
+    """As gsplat's trainer leaves it: the render is black where it is masked."""
+    return {**info, "prediction": info["prediction"] * MASKS[..., None]}
+
+
+def density_masks(monkeypatch):
+    """The errors are those of the pixels that count, where the photo is black too; else those of a black render."""
+    whole, black = masked(stock(monkeypatch)), masked(stock(monkeypatch))
+    black["ground_truth"] = black["ground_truth"] * MASKS[..., None]
+    expected = stock(monkeypatch)
+    errors = MASKS[..., None] * (expected["prediction"] - expected["ground_truth"])
+    expected |= {"prediction": errors, "ground_truth": torch.zeros_like(errors)}
+    sums = [iteration_stats(info, COUNT)[0].error_sums for info in (whole, black, expected)]
+    torch.testing.assert_close(sums[1], sums[2])
+    assert sums[0].sum() > 1.5 * sums[1].sum() > 0
+    densified(black)
+
+
+def density_random_bkgd(monkeypatch):
+    info = stock(monkeypatch)
+    densified({**info, "prediction": info["prediction"] + torch.tensor([0.1, 0.2, 0.3])})
+
+
 def density_several(monkeypatch):
     with several_processes():
         TurboDensityStrategy().step_post_backward({}, {}, {}, 0, {})
@@ -190,6 +217,10 @@ def optimizer_with_ut(monkeypatch):
     info["means2d"] = info["means2d"].detach()
     with pytest.raises(InputError, match="takes no gradient"):
         trained(lm_host(), info)
+
+
+def optimizer_masks(monkeypatch):
+    trained(lm_host(), masked(stock(monkeypatch)))
 
 
 def optimizer_several(monkeypatch):
@@ -271,6 +302,21 @@ def sparse_patch_size(monkeypatch):
     maps_of_photos(Patches([{"image": torch.zeros(16, 16, 3)}]))
 
 
+def sparse_masks(monkeypatch):
+    sparse = Sparse()
+    maps = maps_of_photos([{"image": sparse.images[view], "mask": MASKS[view]} for view in range(CAMERAS)], white=1.0)
+    sparse.samples = RandomPixelSampler().sample(maps, (0, 1), 0.3, Step(0, 9, 9))
+    assert (sparse.samples.coordinates()[sparse.samples.filled, 0] < WIDTH // 3).all()
+    sparse.train(sparse.render()[0])
+
+
+def sparse_random_bkgd(monkeypatch):
+    """As the trainer adds it: one colour for all views."""
+    sparse = Sparse()
+    colors, alphas, _ = sparse.render()
+    sparse.train(colors + torch.rand(1, 3) * (1.0 - alphas))
+
+
 def sparse_several(monkeypatch):
     with several_processes():
         Sparse().render()
@@ -289,6 +335,8 @@ CHECKS: dict[str, tuple[Callable, Callable, Callable]] = {
     "with_ut": (density_with_ut, optimizer_with_ut, sparse_with(with_ut=True)),
     "fisheye": (density_as_stock, optimizer_as_stock, sparse_with(camera_model="fisheye")),
     "patch_size": (density_patch_size, optimizer_as_stock, sparse_patch_size),
+    "masks": (density_masks, optimizer_masks, sparse_masks),
+    "random_bkgd": (density_random_bkgd, optimizer_as_stock, sparse_random_bkgd),
     "several GPUs": (density_several, optimizer_several, sparse_several),
 }
 CELLS = {

@@ -229,6 +229,41 @@ def test_sparse_loss_hands_its_own_gradient_to_autograd(scene, loss):
     torch.testing.assert_close(colors.grad, 3.0 * expected.color_gradients)
 
 
+class OwnLoss(torch.nn.Module):
+    def forward(self, colors, targets, samples):
+        return CharbonnierLoss()(colors, targets, samples)
+
+
+@pytest.mark.parametrize("loss", [CharbonnierNccLoss(), OwnLoss()])
+def test_sparse_loss_updates_the_maps_that_it_is_given(scene, loss):
+    _, cameras, samples = scene
+    generator = torch.Generator().manual_seed(0)
+    colors, truth = (torch.rand(len(samples), 3, generator=generator) for _ in range(2))
+    colors[5] = torch.nan
+    given, expected = ErrorMaps(cameras.sizes), ErrorMaps(cameras.sizes)
+    value = sparse_loss(loss, colors.requires_grad_(), truth, samples, given, Step(7, 10, 10))
+    torch.testing.assert_close(value, sparse_loss(loss, colors, truth, samples), equal_nan=True)
+    expected.update(samples, (colors.detach() - truth).abs().sum(dim=-1), Step(7, 10, 10))
+    assert torch.equal(given.stamps, expected.stamps) and (given.stamps == 7).any()
+    torch.testing.assert_close(given.errors, expected.errors)
+    torch.testing.assert_close(given.view_sums, expected.view_sums)
+
+
+def test_half_of_what_an_update_needs_is_refused(scene):
+    _, cameras, samples = scene
+    colors = torch.rand(len(samples), 3)
+    maps, now = ErrorMaps(cameras.sizes), Step(0, 10, 10)
+    with pytest.raises(InputError, match=r"^step is a NoneType: expected Step, as maps is given"):
+        sparse_loss(CharbonnierLoss(), colors, colors, samples, maps)
+    with pytest.raises(InputError, match=r"^step is a int: expected Step, as maps is given"):
+        sparse_loss(CharbonnierLoss(), colors, colors, samples, maps, 0)
+    with pytest.raises(InputError, match=r"^maps is a Tensor: expected ErrorMaps, as step is given"):
+        sparse_loss(CharbonnierLoss(), colors, colors, samples, maps.errors, now)
+    elsewhere = ErrorMaps(cameras.sizes, "meta")
+    with pytest.raises(InputError, match=r"^maps are on meta: expected cpu as colors"):
+        sparse_loss(CharbonnierLoss(), colors, colors, samples, elsewhere, now)
+
+
 def test_gather_pixels(scene):
     _, _, samples = scene
     images = torch.arange(2 * HEIGHT * WIDTH * 3, dtype=torch.float32).reshape(2, HEIGHT, WIDTH, 3)
@@ -306,13 +341,20 @@ def test_a_loss_of_ones_own_may_be_a_function_or_a_module(scene):
     samples = scene[2]
     colors, targets = torch.rand(len(samples), 3, requires_grad=True), torch.rand(len(samples), 3)
 
-    class Own(torch.nn.Module):
-        def forward(self, colors, targets, samples):
-            return CharbonnierLoss()(colors, targets, samples)
-
     expected = CharbonnierLoss()(colors.detach(), targets, samples).loss
-    for own in (Own(), Own().forward):
+    for own in (OwnLoss(), OwnLoss().forward):
         assert torch.equal(sparse_loss(own, colors, targets, samples), expected)
+
+
+def test_an_error_within_a_loss_of_ones_own_is_passed_on(scene):
+    samples = scene[2]
+    colors = torch.rand(len(samples), 3)
+
+    def own(colors, targets, samples):
+        return colors + "1"
+
+    with pytest.raises(TypeError, match="unsupported operand"):
+        sparse_loss(own, colors, colors, samples)
 
 
 def test_what_does_not_fit_the_samples_is_refused_by_name(scene):

@@ -38,8 +38,8 @@ class Engine(ABC):
     """Does all computation, on the device of the given tensors.
 
     It knows rules, never strategies. `ReferenceEngine` defines every result; any other engine gives the same up to
-    rounding. `supervise` and `update` are two steps each, which an engine may do at once. The host does not wait for an
-    engine made for training: see `settle`.
+    rounding. `supervise`, `evaluate_and_learn` and `update` are two steps each, which an engine may do at once. The
+    host does not wait for an engine made for training: see `settle`.
     """
 
     @property
@@ -92,8 +92,14 @@ class Engine(ABC):
 
     def supervise(self, terms: LossTerms, colors: Tensor, truth: PhotoSamples, update: MapUpdate) -> LossOutput:
         """`evaluate` against the photos at the samples, then `learn`. `colors`: [P, 3], on the engine's device."""
-        output = self.evaluate(terms, colors, truth.colors(), truth.samples)
-        self.learn(truth.samples, colors, output, update)
+        return self.evaluate_and_learn(terms, colors, truth.colors(), truth.samples, update)
+
+    def evaluate_and_learn(
+        self, terms: LossTerms, colors: Tensor, targets: Tensor, samples: PixelSamples, update: MapUpdate
+    ) -> LossOutput:
+        """`evaluate`, then `learn`."""
+        output = self.evaluate(terms, colors, targets, samples)
+        self.learn(samples, colors, output, update)
         return output
 
     def learn(self, samples: PixelSamples, colors: Tensor, output: LossOutput, update: MapUpdate) -> None:

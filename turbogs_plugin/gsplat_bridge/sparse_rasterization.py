@@ -13,8 +13,11 @@ from packaging.version import Version
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from turbogs_plugin.engine import engine_of
 from turbogs_plugin.engine.autograd import DifferentiableRender, rasterize_differentiable
+from turbogs_plugin.engine.protocol import MapUpdate
 from turbogs_plugin.engine.rendered import RasterSettings
+from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.gsplat_bridge.gaussian_errors import residuals
 from turbogs_plugin.gsplat_bridge.host import (
@@ -24,7 +27,7 @@ from turbogs_plugin.gsplat_bridge.host import (
     STATISTICS,
     require_one_process,
 )
-from turbogs_plugin.types import SH_C0, TILE_SIZE, Cameras, Gaussians, GaussianStats, LossOutput, PixelSamples
+from turbogs_plugin.types import SH_C0, TILE_SIZE, Cameras, Gaussians, GaussianStats, LossOutput, PixelSamples, Step
 
 LOGIT_MARGIN = 2.0**-23
 """Opacities are kept this far from 0 and 1, where the logit is infinite. An alpha is cut at 0.999 in any case."""
@@ -158,23 +161,66 @@ def gather_pixels(images: Tensor, samples: PixelSamples) -> Tensor:
 
 
 def sparse_loss(
-    loss: Callable[[Tensor, Tensor, PixelSamples], LossOutput], colors: Tensor, targets: Tensor, samples: PixelSamples
+    loss: Callable[[Tensor, Tensor, PixelSamples], LossOutput],
+    colors: Tensor,
+    targets: Tensor,
+    samples: PixelSamples,
+    maps: ErrorMaps | None = None,
+    step: Step | None = None,
 ) -> Tensor:
     """A `SparseLoss` as a scalar that `backward` can be called on: its own gradient is handed to autograd.
 
     Args:
         loss: an instance, such as ``CharbonnierNccLoss()``.
         colors, targets: [P, 3] float.
+        maps, step: given both, `maps` takes in the samples' errors as visited at `step`, in the same launch where a
+            kernel computes the loss. A sample whose colour or error is not finite changes nothing there.
 
     Raises:
-        InputError: `loss` is something else, as a loss of torch's is; or a tensor does not fit the samples.
+        InputError: `loss` is something else, as a loss of torch's is; or an argument does not fit the samples.
     """
     _check_samples(samples)
     for name, value in (("colors", colors), ("targets", targets)):
         if not isinstance(value, Tensor) or not value.is_floating_point() or value.shape != (len(samples), 3):
             found = f"{value.dtype} {tuple(value.shape)}" if isinstance(value, Tensor) else type(value).__name__
             raise InputError(f"{name} is {found}: expected floating point {(len(samples), 3)}, as there are samples")
-    output = loss(colors.detach(), targets.detach(), samples) if _takes_three(loss) else None
+    update = _map_update(maps, step, colors.device)
+    given = (colors.detach(), targets.detach(), samples)
+    terms = None if update is None or isinstance(loss, type) else getattr(loss, "terms", None)
+    if terms is not None:
+        output = engine_of(colors.device).evaluate_and_learn(terms, *given, update)
+    else:
+        output = _call(loss, *given)
+        if update is not None:
+            engine_of(colors.device).learn(samples, given[0], output, update)
+    return _Loss.apply(colors, output)
+
+
+def _map_update(maps: ErrorMaps | None, step: Step | None, device: torch.device) -> MapUpdate | None:
+    """What is to be done with the errors; None if nothing."""
+    if maps is None and step is None:
+        return None
+    for name, value, kind in (("maps", maps, ErrorMaps), ("step", step, Step)):
+        if not isinstance(value, kind):
+            other = "step" if name == "maps" else "maps"
+            raise InputError(f"{name} is a {type(value).__name__}: expected {kind.__name__}, as {other} is given")
+    if maps.errors.device != device:
+        raise InputError(f"maps are on {maps.errors.device}: expected {device} as colors")
+    return MapUpdate(maps, step)
+
+
+def _call(loss: Any, colors: Tensor, targets: Tensor, samples: PixelSamples) -> LossOutput:
+    """The output of a loss on samples.
+
+    Raises:
+        InputError: it is none.
+    """
+    output = None
+    try:
+        output = None if isinstance(loss, type) else loss(colors, targets, samples)
+    except TypeError:  # of its own, or as it takes other arguments
+        if _takes_three(loss):
+            raise
     if not isinstance(output, LossOutput):
         name = getattr(loss, "__name__", type(loss).__name__)
         found = f"the class {name}" if isinstance(loss, type) else name
@@ -182,16 +228,16 @@ def sparse_loss(
             f"loss is {found}: expected an instance of a loss on samples, as CharbonnierNccLoss() is, which is called "
             "with (colors, targets, samples) and gives a LossOutput"
         )
-    return _Loss.apply(colors, output)
+    return output
 
 
 def _takes_three(loss: Any) -> bool:
-    """Whether it is no class, and can be called with colours, targets and samples."""
+    """Whether it can be called with colours, targets and samples."""
     try:
         inspect.signature(loss.forward if isinstance(loss, torch.nn.Module) else loss).bind(None, None, None)
     except (TypeError, ValueError):  # not callable, of other arguments, or one that does not tell
         return False
-    return not isinstance(loss, type)
+    return True
 
 
 class _Loss(torch.autograd.Function):

@@ -211,10 +211,14 @@ class PixelSamples:
         counts = (self.tile_offsets[1:] - self.tile_offsets[:-1]).long()
         return torch.repeat_interleave(torch.arange(len(counts), device=counts.device), counts, output_size=len(self))
 
+    def view_of_tile(self) -> Tensor:
+        """[T] int64: position in the batch (0 .. K-1) of the view of each tile of `tile_ids`."""
+        ends = torch.as_tensor(self.grid.offsets[1:], device=self.tile_ids.device)
+        return torch.searchsorted(ends, self.tile_ids.long(), right=True)
+
     def view_of_slot(self) -> Tensor:
         """[P] int64: position in the batch (0 .. K-1) of the view of each slot."""
-        ends = torch.as_tensor(self.grid.offsets[1:], device=self.tile_ids.device)
-        return torch.searchsorted(ends, self.tile_ids.long(), right=True)[self.tile_of_slot()]
+        return self.view_of_tile()[self.tile_of_slot()]
 
     def flat_pixels(self, offsets: np.ndarray) -> Tensor:
         """[P] int64: flat pixel of each slot; an empty slot gets the first pixel of its view.

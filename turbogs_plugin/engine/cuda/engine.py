@@ -60,6 +60,11 @@ class CudaEngine(Engine):
         targets = photos if aligned else truth.colors()
         return training.sparse_loss(terms, colors, targets, truth.samples, update, self.overflow, truth.background)
 
+    def evaluate_and_learn(
+        self, terms: LossTerms, colors: Tensor, targets: Tensor, samples: PixelSamples, update: MapUpdate
+    ) -> LossOutput:
+        return training.sparse_loss(terms, colors, targets, samples, update, self.overflow)
+
     def learn_exposures(
         self, exposures: Exposures, colors: Tensor, gradients: Tensor, samples: PixelSamples, rate: float
     ) -> Tensor:

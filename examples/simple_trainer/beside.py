@@ -1,0 +1,87 @@
+"""Installs this package into an environment that a gsplat trainer runs in, and runs the trainer there with every swap.
+
+    make wheel
+    python examples/simple_trainer/beside.py --environment ENV --host .hosts/main --wheel dist/turbogs_plugin-*.whl
+
+ENV is a virtual environment with torch, gsplat and the requirements of the host's examples. No package in it may change
+by the install. Then stock and every swap train a few steps on a small capture, with ENV's own Python, gsplat and this
+package from the wheel. Where there is no GPU, this project's torch reference stands for gsplat's rasterizer.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import compare
+import tyro
+
+from turbogs_plugin.scene import write_demo_capture
+
+OURS = "turbogs-plugin"
+
+
+@dataclass
+class Options:
+    """
+    Args:
+        environment: the folder of a virtual environment; this package is installed into it.
+        host: a copy of gsplat's repository, with examples/simple_trainer.py of 1.5.3 or main.
+        wheel: of this package.
+        steps: of each run.
+    """
+
+    environment: Path
+    host: Path
+    wheel: Path
+    steps: int = 8
+
+
+def packages(python: Path) -> dict[str, str]:
+    """What `pip freeze` tells of an environment: name -> line."""
+    command = [python, "-m", "pip", "freeze", "--all"]
+    lines = subprocess.run(command, capture_output=True, text=True, check=True).stdout.splitlines()
+    return {line.partition("==")[0].partition(" @ ")[0].lower().replace("_", "-"): line for line in lines}
+
+
+def differences(before: dict[str, str], after: dict[str, str]) -> tuple[list[str], list[str]]:
+    """(lines of packages that another version took the place of or that went, lines that are new), but for ours."""
+    changed = [f"{line} -> {after.get(name, 'gone')}" for name, line in before.items() if after.get(name) != line]
+    new = [line for name, line in after.items() if name not in before]
+    return [line for line in changed if not line.startswith(OURS)], [line for line in new if not line.startswith(OURS)]
+
+
+def main(options: Options) -> list[str]:
+    """What went wrong."""
+    python = options.environment / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
+    before = packages(python)
+    command = [python, "-m", "pip", "install", "--quiet", "--force-reinstall", "--no-deps", options.wheel]
+    subprocess.run([python, "-m", "pip", "install", "--quiet", options.wheel], check=True)  # with what it depends on
+    subprocess.run(command, check=True)  # also where a build of the same version was there
+    changed, new = differences(before, packages(python))
+    print(f"{len(before)} packages before; changed: {', '.join(changed) or 'none'}; new: {', '.join(new) or 'none'}")
+    with tempfile.TemporaryDirectory() as folder:
+        capture = write_demo_capture(Path(folder) / "demo", views=9, width=48, height=32)
+        runs = compare.compare(
+            compare.Options(
+                options.host,
+                (capture,),
+                Path(folder),
+                tuple(compare.VARIANTS),
+                options.steps,
+                marks=(),
+                extra="--strategy.refine-start-iter 2 --strategy.refine-every 3",
+                python=python.absolute(),
+            )
+        )
+    return changed + [f"{run['variant']}: {run['error']}" for run in runs if "error" in run]
+
+
+if __name__ == "__main__":
+    wrong = main(tyro.cli(Options))
+    print("\n".join(wrong) or "as it should be")
+    sys.exit(1 if wrong else 0)
