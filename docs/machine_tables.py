@@ -14,7 +14,6 @@ import scaling_results
 
 from turbogs_plugin.bench.numerics import SolverResult, solvers_table
 from turbogs_plugin.bench.statistics import StatisticsResult, statistics_table
-from turbogs_plugin.bench.viewer import summarised
 from turbogs_plugin.bench.wall import WallRun
 from turbogs_plugin.config.configuration import load_config
 from turbogs_plugin.plan.memory import MemoryDemand
@@ -128,31 +127,6 @@ def wall(file: Path = WALL) -> str:
     rows["from decoded photos to the first iteration"] = [run.to_first_iteration for run in runs.values()]
     made = table(("s", *runs), [(name, *(f"{value:.2f}" for value in column)) for name, column in rows.items()])
     return f"{'; '.join(dict.fromkeys(map(where, reports.values())))}.\n\n{made}"
-
-
-def viewer(folder: Path = H200) -> str:
-    """What a viewer costs a training: each ``viewer-CAPTURE.json`` is what `turbogs bench viewer --out` wrote."""
-    lines = []
-    for file in sorted(folder.glob("viewer-*.json")):
-        measured = json.loads(file.read_text())
-        ways = {row.way: row for row in summarised(measured)}
-        alone, client = ways["without"], ways["client"]
-        gaussians = statistics.median(run["gaussians"] for run in measured["runs"])
-        lines.append(
-            (
-                measured["scene"],
-                f"{gaussians / 1e3:.0f}k",
-                f"{statistics.median(alone.rates):.0f}",
-                ways["nobody looks"].change_text(),
-                client.change_text(),
-                f"{client.frame_rate:.1f}",
-                f"{client.width:.0f}",
-            )
-        )
-    if not lines:
-        return "Not measured yet."
-    header = ("capture", "Gaussians", "iterations a second, without", "nobody looks", "a client that moves")
-    return table((*header, "its frames a second", "pixels wide"), lines)
 
 
 STEPS = {

@@ -1,7 +1,7 @@
 """Fills the tables of README.md and of pages in docs/ from results; `make pages` runs it.
 
 A table stands between ``<!-- made: NAME -->`` and ``<!-- end -->``, where NAME is a key of `TABLES`; what is between
-them is replaced. A second run changes nothing.
+them is replaced, unless there is nothing yet to make it of. A second run changes nothing.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import machine_tables
 import paper_tables
 import study_tables
 import sweep_tables
+import viewer_tables
 from headline_picture import PICTURE, draw, picture_data, picture_digest
 from study_tables import ROOT
 
@@ -26,6 +27,7 @@ PAGES = tuple(
         "README.md",
         "docs/captures.md",
         "docs/drop-in.md",
+        "docs/formats.md",
         "docs/numerics.md",
         "docs/paper.md",
         "docs/plan.md",
@@ -50,12 +52,13 @@ def round_table(name: str, table_name: str) -> str:
     return round_tables(name)[table_name]
 
 
-TABLES: dict[str, Callable[[], str]] = {
+TABLES: dict[str, Callable[[], str | None]] = {
     "ahead": study_tables.ahead,
     "behind": study_tables.behind,
     "density_sums": machine_tables.density_sums,
     "dropin": machine_tables.dropin,
     "exposure_runs": capture_tables.exposure_runs,
+    "exports": viewer_tables.exports,
     "exposures": machine_tables.exposures,
     "headline": study_tables.headline,
     "headline_sources": study_tables.headline_sources,
@@ -67,13 +70,15 @@ TABLES: dict[str, Callable[[], str]] = {
     "masked_runs": capture_tables.masked_runs,
     "leave_out": lambda: study_tables.changes("leave_out"),
     "masks_iterations": lambda: machine_tables.iterations(machine_tables.measured("masks.json")),
+    "overlays caption": viewer_tables.overlays_caption,
     "paper_parts": paper_tables.paper_parts,
     "paper_whole": paper_tables.paper_whole,
     "parts": lambda: study_tables.changes("parts"),
-    "viewer": machine_tables.viewer,
+    "viewer": viewer_tables.viewer,
     "memory": lambda: machine_tables.on("bench-step.json", machine_tables.memory),
     "offload": lambda: machine_tables.on("bench-4k.json", machine_tables.offload),
     "precision": lambda: machine_tables.on("bench-raster.json", machine_tables.precision),
+    "render caption": viewer_tables.render_caption,
     "ranks": machine_tables.ranks,
     "raster": lambda: machine_tables.on("bench-raster.json", machine_tables.raster),
     "solvers": machine_tables.solvers,
@@ -85,7 +90,12 @@ TABLES |= {name: lambda name=name: round_table(*name.split()) for name in sweep_
 
 def filled(text: str) -> str:
     """A page with its tables made anew."""
-    return BLOCK.sub(lambda block: f"{block[1]}\n{TABLES[block[2]]()}\n\n{block[3]}", text)
+    return BLOCK.sub(_made, text)
+
+
+def _made(block: re.Match[str]) -> str:
+    made = TABLES[block[2]]()
+    return block[0] if made is None else f"{block[1]}\n{made}\n\n{block[3]}"
 
 
 if __name__ == "__main__":

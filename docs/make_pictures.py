@@ -1,47 +1,60 @@
 """Makes the pictures at the top of README.md from a run and its capture:
 
-    python docs/make_pictures.py RUN VIEW
+    python docs/make_pictures.py RUN VIEW [FOLDER]
 
-VIEW is the number of a training view. `docs/render.jpg` is the model of the run's newest checkpoint from there.
-`docs/overlays.jpg` shows what the viewer of `turbogs train --viewer` shows of that view: the error map, and the samples
-of an iteration. Training goes on from the checkpoint, in memory alone, until an iteration samples the view. The model's
-render stands in for the photo behind the samples: photos of captures stay out of this repository.
+VIEW is the number of a training view. ``render.jpg`` is the model of the run's newest checkpoint from there.
+``overlays.jpg`` shows what the viewer of `turbogs train --viewer` shows of a part of that view halfway through the
+run: the error map, and the samples of an iteration. For this the run is trained again, in memory alone, up to the
+first iteration from its half on that samples the view. The model's render stands in for the photo behind the samples:
+photos of captures stay out of this repository. ``pictures.json`` is what `make pages` writes below the pictures.
+
+FOLDER is where the three go; where absent, docs/ and docs/results/.
 """
 
 from __future__ import annotations
 
+import io
+import json
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import torch
 from PIL import Image
 from torch import Tensor
+from torch.nn.functional import avg_pool2d
 
 from turbogs_plugin.report.pictures import GAP
-from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint
+from turbogs_plugin.report.provenance import provenance
+from turbogs_plugin.scene import Scene
+from turbogs_plugin.tiles import TILE_SIZE
 from turbogs_plugin.train.evaluate import render_view
-from turbogs_plugin.train.folder import RunFolder
-from turbogs_plugin.train.loop import TrainingLoop
-from turbogs_plugin.train.pace import pace_of
-from turbogs_plugin.train.run import RunSession, open_scene, resolve_device
+from turbogs_plugin.train.history import read_history
+from turbogs_plugin.train.loop import Listener, TrainingLoop
+from turbogs_plugin.train.run import new_loop
+from turbogs_plugin.train.saved_model import SavedModel, load_model
+from turbogs_plugin.train.start import open_scene, resolve_device
 from turbogs_plugin.train.trainer import Trainer
 from turbogs_plugin.types import Gaussians, PixelSamples, RowUpdate, Step
 from turbogs_plugin.viewer.eye import Eye
 from turbogs_plugin.viewer.pictures import Picture, Request, draw
 from turbogs_plugin.viewer.subject import CaptureViews, Subject
 
-FOLDER = Path(__file__).resolve().parent
-WIDTH = 800
-"""Pixels of the render, about as wide as a page shows it."""
-JPEG_QUALITY = 88
-MOST_ITERATIONS = 500
+DOCS = Path(__file__).resolve().parent
+PART = 3
+"""The overlays show a part of the view of a third of its width and height, where a page shows single pixels."""
+LARGEST_FILE = 300_000
+"""Bytes of a picture."""
+JPEG_QUALITIES = range(92, 40, -4)
 
 
 @dataclass
-class Observer:
-    """Keeps the samples of the last iteration."""
+class Halfway(Listener):
+    """Stops a training at the first iteration from its half on that samples a view, and keeps its samples."""
 
+    trainer: Trainer
+    view: int
     samples: PixelSamples | None = None
 
     def sampled(self, samples: PixelSamples) -> None:
@@ -49,6 +62,10 @@ class Observer:
 
     def changing(self, gaussians: Gaussians, update: RowUpdate, step: Step) -> None:
         pass
+
+    def advanced(self, loop: TrainingLoop) -> None:
+        if 2 * self.trainer.iteration >= self.trainer.iterations and self.view in self.samples.view_ids:
+            loop.stop()
 
 
 @dataclass
@@ -64,46 +81,87 @@ class Renders:
 
 
 def main() -> None:
-    folder, view = RunFolder(Path(sys.argv[1])), int(sys.argv[2])
-    config = folder.read_config()
-    scene = open_scene(config, folder)
-    trainer = Trainer(config, scene, resolve_device(config.train.device), resuming=True)
-    session = RunSession(folder, None, scene, TrainingLoop(trainer, pace_of(config)))
-    checkpoint = latest_checkpoint(folder.checkpoints)
-    session.load_state_dict(load_checkpoint(checkpoint), str(checkpoint))
-
-    eye = Eye.of_view(trainer.views.cameras, view)
-    large = replace(eye, width=WIDTH, height=round(WIDTH * eye.height / eye.width))
-    _save("render.jpg", draw(_subject(trainer), Request(Picture.RENDER, large)))
-
-    trainer.observer = observer = Observer()
-    for _ in range(MOST_ITERATIONS):
-        trainer.step()
-        if view in observer.samples.view_ids:
-            break
-    subject = _subject(trainer, observer.samples)
-    panels = [draw(subject, Request(picture, eye, view)) for picture in (Picture.ERRORS, Picture.SAMPLES)]
-    gap = np.full((eye.height, GAP, 3), 255, dtype=np.uint8)
-    _save("overlays.jpg", np.concatenate([panels[0], gap, panels[1]], axis=1))
-    own = observer.samples.view_of_slot() == observer.samples.view_ids.index(view)
-    share = float(observer.samples.filled[own].sum()) / (eye.width * eye.height)
-    print(
-        f"{scene.name}, {trainer.views.names[view]}: iteration {trainer.iteration}, "
-        f"{len(trainer.gaussians)} Gaussians, {100 * share:.0f} % of the view's pixels sampled"
-    )
+    run, view = Path(sys.argv[1]), int(sys.argv[2])
+    pictures = facts = Path(sys.argv[3]) if len(sys.argv) > 3 else DOCS
+    facts = facts / "results" if len(sys.argv) <= 3 else facts
+    model = load_model(run, resolve_device("auto"))
+    device, scene = model.gaussians.device, open_scene(model.config, model.folder)
+    last = read_history(model.folder.history)[-1]
+    record = {
+        "provenance": asdict(provenance(device.type)),
+        "scene": scene.name,
+        "view": view,
+        "training_views": len(scene.train),
+        "size": scene.train.cameras.sizes[view].tolist(),
+        "factor": model.config.scene.factor,
+        "iteration": model.iteration,
+        "gaussians": len(model.gaussians),
+        "psnr": last.psnr,
+        "train_seconds": last.train_seconds,
+    }
+    _save(pictures / "render.jpg", _render(model, scene, view))
+    pixels, halfway = _overlays(model, scene, view)
+    _save(pictures / "overlays.jpg", pixels)
+    text = json.dumps(record | {"halfway": halfway}, indent=1)
+    (facts / "pictures.json").write_text(text + "\n")
+    print(text)
 
 
-def _subject(trainer: Trainer, samples: PixelSamples | None = None) -> Subject:
+def _render(model: SavedModel, scene: Scene, view: int) -> np.ndarray:
+    subject = Subject(model.gaussians, model.sh_degree, settings=model.config.raster)
+    return draw(subject, Request(Picture.RENDER, Eye.of_view(scene.train.cameras, view)))
+
+
+def _overlays(model: SavedModel, scene: Scene, view: int) -> tuple[np.ndarray, dict[str, object]]:
+    """[H, W, 3] uint8, error map and samples side by side; and what they are of."""
+    loop, _ = new_loop(model.config, scene, model.gaussians.device)
+    trainer = loop.trainer
+    trainer.observer = halfway = Halfway(trainer, view)
+    loop.listeners = [halfway]
+    loop.run()
     views = replace(trainer.views, photos=Renders(trainer))
-    capture = CaptureViews(views, views)
-    settings = trainer.config.raster
-    state = {"capture": capture, "maps": trainer.maps, "step": trainer.now, "samples": samples}
-    return Subject(trainer.gaussians, trainer.sh_degree, settings=settings, **state)
+    state = {"capture": CaptureViews(views, views), "maps": trainer.maps, "step": trainer.now}
+    samples = halfway.samples
+    subject = Subject(trainer.gaussians, trainer.sh_degree, settings=trainer.config.raster, samples=samples, **state)
+    eye = Eye.of_view(trainer.views.cameras, view)
+    rows, columns = _part(trainer, view)
+    panels = [
+        draw(subject, Request(picture, eye, view))[rows, columns] for picture in (Picture.ERRORS, Picture.SAMPLES)
+    ]
+    height, width = panels[0].shape[:2]
+    gap = np.full((height, GAP, 3), 255, dtype=np.uint8)
+    of_view = samples.view_of_slot() == samples.view_ids.index(view)
+    return np.concatenate([panels[0], gap, panels[1]], axis=1), {
+        "iteration": trainer.iteration,
+        "gaussians": len(trainer.gaussians),
+        "part": [width, height],
+        "views": len(samples.view_ids),
+        "share": float(samples.filled[of_view].sum()) / (eye.width * eye.height),
+    }
 
 
-def _save(name: str, pixels: np.ndarray) -> None:
-    Image.fromarray(pixels).save(FOLDER / name, quality=JPEG_QUALITY, subsampling=0)
-    print(f"{name}  {(FOLDER / name).stat().st_size:,} bytes")
+def _part(trainer: Trainer, view: int) -> tuple[slice, slice]:
+    """The rows and columns, from a tile's corner on, where the view's error map is largest on average."""
+    width, height = trainer.views.cameras.sizes[view].tolist()
+    size = (height // PART, width // PART)
+    start = int(trainer.maps.offsets[view])
+    trainer.maps.fetch([view])
+    errors = trainer.maps.errors[start : start + width * height].float().view(1, height, width)
+    means = avg_pool2d(errors, size, stride=TILE_SIZE)[0]
+    best = int(torch.argmax(means))
+    top, left = (TILE_SIZE * place for place in divmod(best, means.shape[1]))
+    return slice(top, top + size[0]), slice(left, left + size[1])
+
+
+def _save(path: Path, pixels: np.ndarray) -> None:
+    """Write a JPEG, as good as fits into `LARGEST_FILE`."""
+    for quality in JPEG_QUALITIES:
+        buffer = io.BytesIO()
+        Image.fromarray(pixels).save(buffer, "JPEG", quality=quality, subsampling=0)
+        if buffer.tell() <= LARGEST_FILE:
+            break
+    path.write_bytes(buffer.getvalue())
+    print(f"{path}  {pixels.shape[1]}x{pixels.shape[0]}, {buffer.tell():,} bytes at quality {quality}")
 
 
 if __name__ == "__main__":

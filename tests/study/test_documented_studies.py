@@ -22,9 +22,11 @@ from turbogs_plugin.train.history import Evaluation
 DOCS = Path(__file__).parents[2] / "docs"
 FOLDERS = sorted(path.parent for path in DOCS.glob("results/*/results.json"))
 sys.path.insert(0, str(DOCS))  # the scripts import their neighbours
-make_pages, machine_tables, paper_tables, study_tables = (
-    importlib.import_module(name) for name in ("make_pages", "machine_tables", "paper_tables", "study_tables")
+make_pages, machine_tables, paper_tables, study_tables, viewer_tables = (
+    importlib.import_module(name)
+    for name in ("make_pages", "machine_tables", "paper_tables", "study_tables", "viewer_tables")
 )
+PLACE = {"machine": "NVIDIA H200 (140 GiB)", "commit": "0123456789", "software": {"torch": "2.11.0"}}
 NOT_IN_THE_REPOSITORY = {"report.html", "table.csv"}  # .gitignore has them: `make pages` leaves them here
 
 
@@ -117,8 +119,7 @@ def test_the_headline_says_how_many_seeds_and_where_and_when_ours_had_the_others
     monkeypatch.setattr(machine_tables, "WALL", tmp_path / "wall.json")
     a_study(tmp_path, "parts", {"turbogs": (31.0, 32.0)})
     a_study(tmp_path, "baselines", {"3dgs": (30.3,)})
-    place = {"machine": "NVIDIA H200 (140 GiB)", "commit": "0123456789", "software": {"torch": "2.11.0"}}
-    (tmp_path / "wall.json").write_text(json.dumps({"fox": {"provenance": place, "median": {"seconds": 12.3}}}))
+    (tmp_path / "wall.json").write_text(json.dumps({"fox": {"provenance": PLACE, "median": {"seconds": 12.3}}}))
     rows = [
         {"method": "Slow", "capture": "fox", "seconds": 50, "psnr": 21.0, "ssim": 0.9, "gaussians": 500},
         {"method": "Slow", "capture": "caliterra", "seconds": 50, "psnr": 33.0, "ssim": None, "gaussians": None},
@@ -191,14 +192,50 @@ def test_a_number_without_a_mark_is_found(tmp_path):
 
 
 def test_what_a_viewer_costs_is_a_row_for_each_capture(tmp_path):
-    assert machine_tables.viewer(tmp_path) == "Not measured yet."
+    assert viewer_tables.viewer(tmp_path) == "Not measured yet."
     seconds = {"without": 1.0, "nobody looks": 1.0, "client": 1.25}
     runs = [ViewerRun(way, 500, value, gaussians=209_400) for way, value in seconds.items()]
     runs[2].frame_rate, runs[2].width = 24.04, 640
-    text = json.dumps({"scene": "fox", "runs": [vars(run) for run in runs]})
+    text = json.dumps({"scene": "fox", "provenance": PLACE, "runs": [vars(run) for run in runs]})
     (tmp_path / "viewer-fox.json").write_text(text)
-    row = machine_tables.viewer(tmp_path).splitlines()[-1]
-    assert row == "| fox | 209k | 500 | +0.0 % [+0.0, +0.0] | -20.0 % [-20.0, -20.0] | 24.0 | 640 |"
+    lines = viewer_tables.viewer(tmp_path).splitlines()
+    assert lines[0] == "NVIDIA H200, commit 0123456, torch 2.11.0."
+    assert lines[-1] == "| fox | 500 | 209k | 500 | +0.0 % [+0.0, +0.0] | -20.0 % [-20.0, -20.0] | 24.0 | 640 |"
+
+
+def test_exports_are_a_row_for_each_format(tmp_path):
+    change = {"before": 33.853, "after": 33.752, "worst_loss": 0.25}
+    whole = {"bytes": 31_900_000, "gaussians": 200_000, "seconds": 3.21, "change": change}
+    exports = {"splat": whole | {"gaussians": 325_000}, "html": whole}
+    film = {"path": "orbit", "frames": 600, "bytes": 9_950_000, "seconds": 8.04}
+    record = {"scene": "caliterra", "gaussians": 325_000, "held_bytes": 76_700_000, "film": film, "provenance": PLACE}
+    assert viewer_tables.exports(tmp_path / "exports.json") == "Not measured yet."
+    (tmp_path / "exports.json").write_text(json.dumps(record | {"exports": exports}))
+    made = viewer_tables.exports(tmp_path / "exports.json")
+    assert made.splitlines()[-2:] == [
+        "| splat | 31.9 | all | 33.85 | 0.101 | 0.250 | 3.2 |",
+        "| html | 31.9 | 200,000 | 33.85 | 0.101 | 0.250 | 3.2 |",
+    ]
+    assert "325,000 Gaussians, 76.7 MB" in made and "600 frames, took 8.0 s and has 9.9 MB" in " ".join(made.split())
+
+
+def test_captions_are_of_the_pictures_record(tmp_path, monkeypatch):
+    """Without one they stay as they are."""
+    file = tmp_path / "pictures.json"
+    assert viewer_tables.render_caption(file) is None and viewer_tables.overlays_caption(file) is None
+    halfway = {"iteration": 2503, "part": [400, 300], "share": 0.217}
+    record = {"provenance": PLACE, "scene": "caliterra", "factor": 1, "view": 44, "training_views": 66, "psnr": 33.853}
+    record |= {"iteration": 5000, "gaussians": 325_123, "train_seconds": 5.94, "halfway": halfway}
+    file.write_text(json.dumps(record))
+    caption, overlays = (
+        " ".join(made(file).split()) for made in (viewer_tables.render_caption, viewer_tables.overlays_caption)
+    )
+    assert "caliterra, a capture by a drone (CC0), from" in caption and "325,123 Gaussians, 5000 iterations" in caption
+    assert "5.9 s of training on one NVIDIA H200; 33.85 dB" in caption and "--factor" not in caption
+    assert overlays.startswith("*400x300 pixels") and "after 2503 iterations" in overlays and "the 22 % of" in overlays
+    text = "<!-- made: render caption -->\n\nas it was\n\n<!-- end -->\n"
+    monkeypatch.setitem(make_pages.TABLES, "render caption", lambda: None)
+    assert make_pages.filled(text) == text
 
 
 def test_a_number_changed_by_hand_is_found():

@@ -123,5 +123,5 @@ def export(
     """
     from turbogs_plugin.export.commands import export_run
 
-    print(f"model  {export_run(run, format, out, drop_bands, max_gaussians, given.settings(overrides))}")
+    print(f"model  {export_run(run, format, out, drop_bands, max_gaussians, given.settings(overrides)).text()}")
     return 0

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.export.contribution import contributions, pruned
-from turbogs_plugin.export.fidelity import Fidelity
+from turbogs_plugin.export.fidelity import Change, Fidelity
 from turbogs_plugin.export.film import film_cameras, require_film, write_film
 from turbogs_plugin.export.formats import FORMATS, PAGE, require_format, written_and_read
 from turbogs_plugin.model.harmonics import band_energy, drop_faint_bands
@@ -15,6 +17,39 @@ from turbogs_plugin.scene import Scene
 from turbogs_plugin.train.saved_model import SavedModel, load_given_model, load_model
 from turbogs_plugin.train.start import open_scene, resolve_device
 from turbogs_plugin.types import Gaussians
+
+if TYPE_CHECKING:
+    from turbogs_plugin.export.page import WrittenPage
+
+
+@dataclass(frozen=True)
+class Exported:
+    """What was written, beside the model that it was made of.
+
+    Args:
+        file: the new one.
+        bytes, gaussians: of the file.
+        held_bytes, of: bytes of the model in float32, and its Gaussians.
+        change: what the model lost; None where that was not measured.
+        unmeasured: why; empty where it was.
+        notes: what was left out on purpose.
+    """
+
+    file: Path
+    bytes: int
+    gaussians: int
+    held_bytes: int
+    of: int
+    change: Change | None
+    unmeasured: str = ""
+    notes: tuple[str, ...] = ()
+
+    def text(self) -> str:
+        """Three lines: the file, sizes, and what was lost."""
+        notes = f" ({'; '.join(self.notes)})" if self.notes else ""
+        size = f"{self.held_bytes:,} bytes in float32 -> {self.bytes:,} bytes in the file"
+        lost = f"PSNR   not measured: {self.unmeasured}" if self.change is None else self.change.text()
+        return f"{self.file}{notes}\nsize   {size}, {self.gaussians} of {self.of} Gaussians\n{lost}"
 
 
 def export_run(
@@ -24,8 +59,8 @@ def export_run(
     drop_bands: float | None = None,
     max_gaussians: int | None = None,
     given: Config | None = None,
-) -> str:
-    """Write a run's newest model or a given one, read it again, and compare; returns in words what was written.
+) -> Exported:
+    """Write a run's newest model or a given one, read it again, and compare.
 
     Args:
         path: folder of the run, or the file of a model.
@@ -56,16 +91,25 @@ def export_run(
     kept = gaussians if drop_bands is None else drop_faint_bands(gaussians, drop_bands)
     notes = _notes(whole, gaussians, kept, drop_bands)
     if file_format == PAGE:
-        return _export_page(model, kept, scene, out, notes)
-    target = model.folder.model.with_suffix(FORMATS[file_format].suffix) if out is None else out
-    read = written_and_read(file_format, kept, target, model.frame, model.iteration or 0)
-    lines = [f"{target}{notes}", _size(target.stat().st_size, len(read), whole)]
+        file = model.folder.path / "report.html" if out is None else out
+        page = _page(model, kept, scene, file)
+        size, count, change, reason = page.bytes, page.gaussians, page.change, ""
+    else:
+        file = model.folder.model.with_suffix(FORMATS[file_format].suffix) if out is None else out
+        read = written_and_read(file_format, kept, file, model.frame, model.iteration or 0)
+        size, count = file.stat().st_size, len(read)
+        change, reason = _change(model, read, scene, absent)
+    held = sum(value.numel() * 4 for _, value in whole.items())
+    return Exported(file, size, count, held, len(whole), change, reason, notes)
+
+
+def _change(model: SavedModel, read: Gaussians, scene: Scene | None, absent: str) -> tuple[Change | None, str]:
+    """What the model lost, or why that cannot be said."""
     if scene is None:
-        return "\n".join([*lines, f"PSNR   not measured: {absent}"])
+        return None, absent
     if not len(scene.test):
-        return "\n".join([*lines, "PSNR   not measured: the capture has no test views"])
-    change = Fidelity(whole, scene.test, model.sh_degree, model.config.raster).change(read)
-    return "\n".join([*lines, change.text()])
+        return None, "the capture has no test views"
+    return Fidelity(model.gaussians, scene.test, model.sh_degree, model.config.raster).change(read), ""
 
 
 def film_run(
@@ -86,21 +130,12 @@ def film_run(
     return video
 
 
-def _export_page(model: SavedModel, kept: Gaussians, scene: Scene, out: Path | None, notes: str) -> str:
+def _page(model: SavedModel, kept: Gaussians, scene: Scene, file: Path) -> WrittenPage:
     from turbogs_plugin.export.page import write_page
 
     if not len(scene.test):
         raise InputError("--format html shows test views, and the capture has none")
-    target = model.folder.path / "report.html" if out is None else out
-    written = write_page(model, kept, scene, target)
-    size = _size(written.bytes, written.gaussians, model.gaussians)
-    return f"{target}{notes}\n{size}\n{written.change.text()}"
-
-
-def _size(written: int, count: int, whole: Gaussians) -> str:
-    """Bytes and Gaussians before and after."""
-    held = sum(value.numel() * 4 for _, value in whole.items())
-    return f"size   {held:,} bytes in float32 -> {written:,} bytes in the file, {count} of {len(whole)} Gaussians"
+    return write_page(model, kept, scene, file)
 
 
 def _opened(
@@ -119,8 +154,8 @@ def _opened(
         return model, None, str(error)
 
 
-def _notes(whole: Gaussians, kept: Gaussians, written: Gaussians, drop_bands: float | None) -> str:
-    """In brackets, what was left out."""
+def _notes(whole: Gaussians, kept: Gaussians, written: Gaussians, drop_bands: float | None) -> tuple[str, ...]:
+    """What was left out."""
     notes = []
     if len(kept) < len(whole):
         notes.append(f"the {len(kept)} of {len(whole)} Gaussians that add most to the training views")
@@ -131,4 +166,4 @@ def _notes(whole: Gaussians, kept: Gaussians, written: Gaussians, drop_bands: fl
         else:
             share = sum(band_energy(kept)[after + 1 :])
             notes.append(f"degree {before} -> {after}, without {share:.2g} of the colours' energy")
-    return f" ({'; '.join(notes)})" if notes else ""
+    return tuple(notes)

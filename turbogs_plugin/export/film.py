@@ -22,7 +22,9 @@ from turbogs_plugin.types import Cameras
 RATE = 60
 """Frames a second."""
 PATHS = ("orbit", "views")
-SUFFIXES = (".mp4", ".mkv", ".webm", ".mov")
+SUFFIXES = (".mp4", ".mkv", ".mov")
+CODEC = "libx264"
+"""Of H.264, which all of these hold; named, because imageio-ffmpeg would try others first."""
 INSTALL = 'pip install "turbogs-plugin[video]"'
 QUALITY = 8
 """Of imageio-ffmpeg, 0 .. 10."""
@@ -69,9 +71,8 @@ def write_film(model: SavedModel, cameras: Cameras, video: Path) -> None:
     cameras = cameras.to(model.gaussians.device)
     # Its own suffix last, by which ffmpeg knows the container.
     temporary = video.with_name(f".{video.stem}.part{video.suffix}")
-    writer = imageio_ffmpeg.write_frames(
-        str(temporary), (width, height), fps=RATE, quality=QUALITY, macro_block_size=1, ffmpeg_log_level="error"
-    )
+    options = {"fps": RATE, "codec": CODEC, "quality": QUALITY, "macro_block_size": 1, "ffmpeg_log_level": "error"}
+    writer = imageio_ffmpeg.write_frames(str(temporary), (width, height), **options)
     try:
         writer.send(None)
         with _progress(len(cameras)) as advance:
