@@ -163,3 +163,17 @@ def test_a_full_device_ends_no_training(monkeypatch):
     desk.look(0.0)
     assert desk.serve() and desk.sent == [] and "memory" in desk.screens[0].failed
     assert not desk.screens[0].busy
+
+
+def test_waiting_for_the_training_is_no_cost_of_a_frame(monkeypatch):
+    """What `serve` is given may wait for iterations under way; the share is of the time that drawing takes."""
+    desk = Desk(monkeypatch, per_pixel=1e-6)
+    desk.look(0.0)
+
+    def drained() -> Subject:
+        desk.wait(1.0)
+        return NOTHING
+
+    assert desk.frames.serve(drained, 0, True)
+    width = desk.sent[-1][1]
+    assert desk.frames.paces[True].next_at == pytest.approx(101.0 + 1e-6 * width * width * 3 / 4 / SHARE)

@@ -125,7 +125,7 @@ class Frames:
         """Draw and send the frame that has waited longest, if one is due and the pace allows.
 
         Args:
-            subject: what to draw; called only if something is drawn.
+            subject: what to draw; called only if something is drawn, before the frame's time begins.
             version: changes whenever a picture may look different.
             running: a training waits for the frame.
 

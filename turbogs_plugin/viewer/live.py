@@ -10,6 +10,7 @@ import math
 import sys
 import time
 
+from turbogs_plugin.device import synchronize
 from turbogs_plugin.scene import PosedImages
 from turbogs_plugin.train.history import Evaluation
 from turbogs_plugin.train.loop import Listener, TrainingLoop
@@ -109,13 +110,18 @@ class LiveViewer(Listener):
 
     def _serve(self, running: bool) -> bool:
         """Draw a frame if one is due, and keep the page's text up to date."""
-        drawn = self.frames.serve(self._subject, self._trainer.iteration, running)
+        drawn = self.frames.serve(self._drawable, self._trainer.iteration, running)
         self.frames_drawn += drawn
         now = time.perf_counter()
         if self.page.watched and now >= self._next_status:
             self._next_status = now + STATUS_SECONDS
             self.page.say(self._status(running, now))
         return drawn
+
+    def _drawable(self) -> Subject:
+        """The subject, when the device has finished the iterations before: waiting for these is no cost of a frame."""
+        synchronize(self._trainer.device)
+        return self._subject()
 
     def _subject(self) -> Subject:
         trainer = self._trainer
