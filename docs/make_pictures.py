@@ -3,9 +3,9 @@
     python docs/make_pictures.py RUN VIEW [FOLDER]
 
 VIEW is the number of a training view. ``render.jpg`` is the model of the run's newest checkpoint from there.
-``overlays.jpg`` shows what the viewer of `turbogs train --viewer` shows of a part of that view halfway through the
-run: the error map, and the samples of an iteration. For this the run is trained again, in memory alone, up to the
-first iteration from its half on that samples the view. The model's render stands in for the photo behind the samples:
+``overlays.jpg`` shows what the viewer of `turbogs train --viewer` shows of the middle of that view early in the run:
+the error map, and the samples of an iteration. For this the run is trained again, in memory alone, up to the first
+iteration after an eighth of it that samples the view. The model's render stands in for the photo behind the samples:
 photos of captures stay out of this repository. ``pictures.json`` is what `make pages` writes below the pictures.
 
 FOLDER is where the three go; where absent, docs/ and docs/results/.
@@ -20,15 +20,12 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import torch
 from PIL import Image
 from torch import Tensor
-from torch.nn.functional import avg_pool2d
 
 from turbogs_plugin.report.pictures import GAP
 from turbogs_plugin.report.provenance import provenance
 from turbogs_plugin.scene import Scene
-from turbogs_plugin.tiles import TILE_SIZE
 from turbogs_plugin.train.evaluate import render_view
 from turbogs_plugin.train.history import read_history
 from turbogs_plugin.train.loop import Listener, TrainingLoop
@@ -42,6 +39,8 @@ from turbogs_plugin.viewer.pictures import Picture, Request, draw
 from turbogs_plugin.viewer.subject import CaptureViews, Subject
 
 DOCS = Path(__file__).resolve().parent
+EARLY = 8
+"""The overlays are of an eighth of the training: errors are still seen, and an iteration samples few pixels."""
 PART = 3
 """The overlays show a part of the view of a third of its width and height, where a page shows single pixels."""
 LARGEST_FILE = 300_000
@@ -50,8 +49,8 @@ JPEG_QUALITIES = range(92, 40, -4)
 
 
 @dataclass
-class Halfway(Listener):
-    """Stops a training at the first iteration from its half on that samples a view, and keeps its samples."""
+class EarlyLook(Listener):
+    """Stops a training at the first iteration after an eighth of it that samples a view, and keeps its samples."""
 
     trainer: Trainer
     view: int
@@ -64,7 +63,7 @@ class Halfway(Listener):
         pass
 
     def advanced(self, loop: TrainingLoop) -> None:
-        if 2 * self.trainer.iteration >= self.trainer.iterations and self.view in self.samples.view_ids:
+        if EARLY * self.trainer.iteration >= self.trainer.iterations and self.view in self.samples.view_ids:
             loop.stop()
 
 
@@ -100,9 +99,9 @@ def main() -> None:
         "train_seconds": last.train_seconds,
     }
     _save(pictures / "render.jpg", _render(model, scene, view))
-    pixels, halfway = _overlays(model, scene, view)
+    pixels, early = _overlays(model, scene, view)
     _save(pictures / "overlays.jpg", pixels)
-    text = json.dumps(record | {"halfway": halfway}, indent=1)
+    text = json.dumps(record | {"early": early}, indent=1)
     (facts / "pictures.json").write_text(text + "\n")
     print(text)
 
@@ -116,15 +115,15 @@ def _overlays(model: SavedModel, scene: Scene, view: int) -> tuple[np.ndarray, d
     """[H, W, 3] uint8, error map and samples side by side; and what they are of."""
     loop, _ = new_loop(model.config, scene, model.gaussians.device)
     trainer = loop.trainer
-    trainer.observer = halfway = Halfway(trainer, view)
-    loop.listeners = [halfway]
+    trainer.observer = look = EarlyLook(trainer, view)
+    loop.listeners = [look]
     loop.run()
     views = replace(trainer.views, photos=Renders(trainer))
     state = {"capture": CaptureViews(views, views), "maps": trainer.maps, "step": trainer.now}
-    samples = halfway.samples
+    samples = look.samples
     subject = Subject(trainer.gaussians, trainer.sh_degree, settings=trainer.config.raster, samples=samples, **state)
     eye = Eye.of_view(trainer.views.cameras, view)
-    rows, columns = _part(trainer, view)
+    rows, columns = _part((eye.width, eye.height))
     panels = [
         draw(subject, Request(picture, eye, view))[rows, columns] for picture in (Picture.ERRORS, Picture.SAMPLES)
     ]
@@ -140,17 +139,10 @@ def _overlays(model: SavedModel, scene: Scene, view: int) -> tuple[np.ndarray, d
     }
 
 
-def _part(trainer: Trainer, view: int) -> tuple[slice, slice]:
-    """The rows and columns, from a tile's corner on, where the view's error map is largest on average."""
-    width, height = trainer.views.cameras.sizes[view].tolist()
-    size = (height // PART, width // PART)
-    start = int(trainer.maps.offsets[view])
-    trainer.maps.fetch([view])
-    errors = trainer.maps.errors[start : start + width * height].float().view(1, height, width)
-    means = avg_pool2d(errors, size, stride=TILE_SIZE)[0]
-    best = int(torch.argmax(means))
-    top, left = (TILE_SIZE * place for place in divmod(best, means.shape[1]))
-    return slice(top, top + size[0]), slice(left, left + size[1])
+def _part(size: tuple[int, int]) -> tuple[slice, slice]:
+    """The rows and columns of the middle of a view of this (width, height)."""
+    columns, rows = (slice((side - side // PART) // 2, (side + side // PART) // 2) for side in size)
+    return rows, columns
 
 
 def _save(path: Path, pixels: np.ndarray) -> None:

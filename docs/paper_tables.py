@@ -110,12 +110,12 @@ def paper_parts() -> str:
 
 def paper_whole() -> str:
     """The paper's configuration with and without its repair, beside full-length 3DGS and ours."""
-    found = {study: rows_of(study) for study in ("baselines", "paper_parts", "parts")}
+    found = {study: rows_of(study) for study in ("baselines", "paper_parts", "sizes")}
     entries = {
         "3DGS, 30,000 iterations": ("baselines", "3dgs"),
         "`turbogs-paper`": ("paper_parts", "turbogs-paper"),
         "`paper-literal`, without the repair": ("paper_parts", "paper-literal"),
-        "`turbogs`": ("parts", "turbogs"),
+        "`turbogs`": ("sizes", "turbogs"),
     }
     rows = {
         name: {capture: found[study].get(capture, {}).get(variant) for capture in CAPTURES}

@@ -28,7 +28,7 @@ OURS = (
     ("sizes", "cap-67k", "turbogs with a cap, FastGS's numbers"),
     ("sizes", "cap-157k", "turbogs with a cap, FastGS's numbers"),
     ("sizes", "cap-57k", "turbogs with a cap, FastGS's numbers"),
-    ("parts", "turbogs", "**turbogs**"),
+    ("sizes", "turbogs", "**turbogs**"),
 )
 """Rows of the headline table that are ours, where they are measured: study, variant, what to call it."""
 
@@ -91,7 +91,7 @@ def wall_seconds(variant: str, capture: str) -> float:
 def ahead() -> str:
     """When `turbogs` had the PSNR that the others end with, how much sooner, and how many times their Gaussians."""
     peers = json.loads((ROOT / "docs/results/peers.json").read_text())
-    ours = {capture: rows["turbogs"] for capture, rows in rows_of("parts").items()}
+    ours = {capture: rows["turbogs"] for capture, rows in rows_of("sizes").items()}
     lines: dict[str, dict[str, str]] = {}
     for entry in peers["rows"]:
         row = ours[entry["capture"]]
@@ -118,7 +118,7 @@ def behind() -> str:
     """Where the others have less error than `turbogs`, or as little with fewer Gaussians."""
     lines = []
     for entry in json.loads((ROOT / "docs/results/peers.json").read_text())["rows"]:
-        row = rows_of("parts")[entry["capture"]]["turbogs"]
+        row = rows_of("sizes")[entry["capture"]]["turbogs"]
         size = (entry["gaussians"] or math.inf) / row.spread("gaussians").mean
         for measure, digits in (("psnr", 2), ("ssim", 3)):
             theirs, ours = entry[measure], row.spread(measure).mean

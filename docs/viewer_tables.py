@@ -94,15 +94,14 @@ def render_caption(file: Path = PICTURES) -> str | None:
 
 def overlays_caption(file: Path = PICTURES) -> str | None:
     """Below README's second picture; None where that was made without a record."""
-    if not file.exists():
+    early = json.loads(file.read_text()).get("early") if file.exists() else None
+    if early is None:
         return None
-    halfway = json.loads(file.read_text())["halfway"]
-    width, height = halfway["part"]
+    width, height = early["part"]
     return wrapped(
-        f"*{width}x{height} pixels of that view in the middle of the training, after {halfway['iteration']} "
-        f"iterations. Left: its error map. Right: the {100 * halfway['share']:.0f} % of the view's pixels that this "
-        "iteration samples, over the render: as many in each 16x16 tile, and in a tile those with large errors or not "
-        "sampled for long.*"
+        f"*The {width}x{height} pixels in the middle of that view, after {early['iteration']} iterations. Left: its "
+        f"error map. Right: the {100 * early['share']:.0f} % of the view's pixels that this iteration samples, over "
+        "the render: as many in each 16x16 tile, and in a tile those with large errors or not sampled for long.*"
     )
 
 

@@ -117,7 +117,7 @@ def test_the_headline_has_the_wall_beside_the_training():
 def test_the_headline_says_how_many_seeds_and_where_and_when_ours_had_the_others_psnr(tmp_path, monkeypatch):
     monkeypatch.setattr(study_tables, "ROOT", tmp_path)
     monkeypatch.setattr(machine_tables, "WALL", tmp_path / "wall.json")
-    a_study(tmp_path, "parts", {"turbogs": (31.0, 32.0)})
+    a_study(tmp_path, "sizes", {"turbogs": (31.0, 32.0)})
     a_study(tmp_path, "baselines", {"3dgs": (30.3,)})
     (tmp_path / "wall.json").write_text(json.dumps({"fox": {"provenance": PLACE, "median": {"seconds": 12.3}}}))
     rows = [
@@ -223,16 +223,20 @@ def test_captions_are_of_the_pictures_record(tmp_path, monkeypatch):
     """Without one they stay as they are."""
     file = tmp_path / "pictures.json"
     assert viewer_tables.render_caption(file) is None and viewer_tables.overlays_caption(file) is None
-    halfway = {"iteration": 2503, "part": [400, 300], "share": 0.217}
+    early = {"iteration": 2503, "part": [400, 300], "share": 0.217}
     record = {"provenance": PLACE, "scene": "caliterra", "factor": 1, "view": 44, "training_views": 66, "psnr": 33.853}
-    record |= {"iteration": 5000, "gaussians": 325_123, "train_seconds": 5.94, "halfway": halfway}
+    record |= {"iteration": 5000, "gaussians": 325_123, "train_seconds": 5.94}
     file.write_text(json.dumps(record))
+    assert viewer_tables.overlays_caption(file) is None
+    file.write_text(json.dumps(record | {"early": early}))
     caption, overlays = (
         " ".join(made(file).split()) for made in (viewer_tables.render_caption, viewer_tables.overlays_caption)
     )
     assert "caliterra, a capture by a drone (CC0), from" in caption and "325,123 Gaussians, 5000 iterations" in caption
     assert "5.9 s of training on one NVIDIA H200; 33.85 dB" in caption and "--factor" not in caption
-    assert overlays.startswith("*400x300 pixels") and "after 2503 iterations" in overlays and "the 22 % of" in overlays
+    assert (
+        overlays.startswith("*The 400x300 pixels") and "after 2503 iterations" in overlays and "the 22 % of" in overlays
+    )
     text = "<!-- made: render caption -->\n\nas it was\n\n<!-- end -->\n"
     monkeypatch.setitem(make_pages.TABLES, "render caption", lambda: None)
     assert make_pages.filled(text) == text
