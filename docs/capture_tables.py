@@ -85,6 +85,8 @@ def masked_iterations(file: Path = CAPTURES) -> str:
             before, after = (run[clock]["median_ms"] for run in (whole, half))
             cells += [f"{before:.3f}", f"{after:.3f}", f"{100 * (after / before - 1):+.0f} %"]
         rows.append((f"{whole['gaussians'] / 1e3:.0f}k", views, whole["samples"], half["samples"], *cells))
+    if not rows:
+        return ABSENT
     heads = [f"{head}{clock}" for clock in ("", ", wall") for head in ("whole, ms", "half, ms", "change")]
     return table(("Gaussians", "K", "samples", "samples, half", *heads), rows)
 

@@ -253,7 +253,7 @@ def main() -> None:
     parser.add_argument("--factor", type=int, default=1)
     parser.add_argument("--device", default="auto")
     parser.add_argument("--set", nargs="*", default=[], metavar="section.key=value", help="for a quick try")
-    asked = parser.parse_args()
+    asked = parser.parse_intermixed_args()  # names may stand after options
     device = resolve_device(asked.device)
     all_of_it = Measurement(asked.out, device, asked.seeds, asked.factor, asked.photos, asked.set)
     captures = {"lenses": asked.fox_raw, "exposures": asked.caliterra, "masks": asked.caliterra, "many": None}
