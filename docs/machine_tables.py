@@ -88,7 +88,7 @@ def psnr_at(run: dict[str, Any], seconds: float) -> float:
 
 def dropin(folder: Path = H200) -> str:
     """gsplat's trainer with each swap at its end, and beside stock at the earlier of both ends: a table a file."""
-    records = [json.loads(file.read_text()) for file in sorted(folder.glob(DROPIN))]
+    records = sorted((json.loads(file.read_text()) for file in folder.glob(DROPIN)), key=lambda record: record["date"])
     parts = [f"{record['device']}, {record['date']}:\n\n{dropin_table(record['runs'])}" for record in records]
     return "\n\n".join(parts) or "Not measured yet."
 
