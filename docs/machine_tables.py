@@ -66,8 +66,8 @@ def exposures() -> str:
     return table(("build", "model, views", "iteration", "loss without", "loss with", "share"), lines)
 
 
-DROPIN = H200 / "dropin.json"
-"""Runs of examples/simple_trainer/compare.py."""
+DROPIN = "dropin*.json"
+"""What examples/simple_trainer/compare.py wrote: each file is of one machine and day, with its own stock."""
 
 DROPIN_NAMES = {
     "stock": "stock",
@@ -86,11 +86,15 @@ def psnr_at(run: dict[str, Any], seconds: float) -> float:
     return float(np.interp(seconds, times, values, left=math.nan))
 
 
-def dropin(file: Path = DROPIN) -> str:
-    """gsplat's trainer with each swap at its end, and beside stock at the earlier of both ends."""
-    if not file.exists():
-        return "Not measured yet."
-    runs = [run for run in json.loads(file.read_text())["runs"] if "error" not in run]
+def dropin(folder: Path = H200) -> str:
+    """gsplat's trainer with each swap at its end, and beside stock at the earlier of both ends: a table a file."""
+    records = sorted((json.loads(file.read_text()) for file in folder.glob(DROPIN)), key=lambda record: record["date"])
+    parts = [f"{record['device']}, {record['date']}:\n\n{dropin_table(record['runs'])}" for record in records]
+    return "\n\n".join(parts) or "Not measured yet."
+
+
+def dropin_table(runs: list[dict[str, Any]]) -> str:
+    runs = [run for run in runs if "error" not in run]
     stock = {run["scene"]: run for run in runs if run["variant"] == "stock"}
     lines = []
     for run in runs:
@@ -106,6 +110,17 @@ def dropin(file: Path = DROPIN) -> str:
     return table(
         ("capture", "swap", "steps", "s", "PSNR", "SSIM", "Gaussians", "PSNR beside stock's, equal time"), lines
     )
+
+
+def pixels_on_an_mlp(file: Path = H200.parent / "pixels_on_an_mlp.json") -> str:
+    """PSNR of a network without Gaussians by both ways, means of seeds: what examples/pixels_on_an_mlp.py wrote."""
+    lines = []
+    for photo, (plain, ours) in ((name, ways.values()) for name, ways in json.loads(file.read_text()).items()):
+        gains = [after - before for before, after in zip(plain, ours, strict=True)]
+        means = (f"{statistics.mean(values):.2f}" for values in (plain, ours))
+        spread = f"{statistics.mean(gains):+.2f} [{min(gains):+.2f}, {max(gains):+.2f}]"
+        lines.append((photo, *means, spread))
+    return table(("photo", "random pixels, Charbonnier", "error-guided pixels, NCC", "gain in dB"), lines)
 
 
 WALL = H200 / "wall.json"

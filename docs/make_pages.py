@@ -80,6 +80,7 @@ TABLES: dict[str, Callable[[], str | None]] = {
     "precision": lambda: machine_tables.on("bench-raster.json", machine_tables.precision),
     "render caption": viewer_tables.render_caption,
     "ranks": machine_tables.ranks,
+    "pixels_on_an_mlp": machine_tables.pixels_on_an_mlp,
     "raster": lambda: machine_tables.on("bench-raster.json", machine_tables.raster),
     "solvers": machine_tables.solvers,
     "steps": lambda: machine_tables.on("bench-step.json", machine_tables.steps),

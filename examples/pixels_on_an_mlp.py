@@ -3,6 +3,7 @@ comparison, from as many random pixels with a Charbonnier loss."""
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -139,8 +140,20 @@ def draw_figure(path: Path, photo: Tensor, learnt: list[Tensor]) -> None:
     figure.save(path, optimize=True)
 
 
+def record(path: Path, name: str, values: list[list[float]]) -> None:
+    """Write the PSNR of a photo into a file that has those of others: photo -> variant -> a value a seed."""
+    known = json.loads(path.read_text()) if path.exists() else {}
+    known[name] = {variant.name: [row[place] for row in values] for place, variant in enumerate(VARIANTS)}
+    path.write_text(json.dumps(known, indent=1) + "\n")
+
+
 def main(
-    photo: str = "", iterations: int = 400, rate: float = 0.1, seeds: tuple[int, ...] = (0, 1, 2), figure: str = ""
+    photo: str = "",
+    iterations: int = 400,
+    rate: float = 0.1,
+    seeds: tuple[int, ...] = (0, 1, 2),
+    figure: str = "",
+    results: str = "",
 ) -> float:
     """Fit a photo by both variants at equal pixels, print their PSNR, and give the mean gain in dB.
 
@@ -149,17 +162,21 @@ def main(
         rate: share of the pixels that an iteration draws.
         seeds: of network and draws; each variant is run with each.
         figure: file for a PNG of the first seed's images; none where empty.
+        results: JSON file that takes in the PSNR; none where empty.
     """
     target = load_photo(photo) if photo else synthetic_photo()
-    gains = []
+    of_seeds = []
     for seed in seeds:
         learnt = [fit(target, variant, iterations, rate, seed) for variant in VARIANTS]
         values = [psnr(image, target) for image in learnt]
-        gains.append(values[1] - values[0])
+        of_seeds.append(values)
         said = "; ".join(f"{variant.name}: {value:.2f} dB" for variant, value in zip(VARIANTS, values, strict=True))
         print(f"seed {seed}: {said}")
         if figure and seed == seeds[0]:
             draw_figure(Path(figure), target, learnt)
+    if results:
+        record(Path(results), "/".join(Path(photo).parts[-3:]) or "synthetic", of_seeds)
+    gains = [values[1] - values[0] for values in of_seeds]
     gain = float(np.mean(gains))
     print(f"gain: {gain:+.2f} dB, mean of {len(seeds)} seeds ({min(gains):+.2f} to {max(gains):+.2f}), at equal pixels")
     return gain

@@ -99,9 +99,9 @@ def test_pixels_on_an_mlp(example, tmp_path, capsys):
     script = example("pixels_on_an_mlp")
     figure, photo = tmp_path / "made" / "figure.png", tmp_path / "photo.png"
     Image.fromarray((255 * script.synthetic_photo(48, 32)).byte().numpy()).save(photo)
-    printed = []
+    printed, results = [], tmp_path / "results.json"
     for iterations in (1, 60):
-        gain = script.main(str(photo), iterations, rate=0.2, seeds=(0,), figure=str(figure))
+        gain = script.main(str(photo), iterations, rate=0.2, seeds=(0,), figure=str(figure), results=str(results))
         lines = capsys.readouterr().out.splitlines()
         values = [float(text) for text in re.findall(r": ([\d.]+) dB", lines[0])]
         assert len(values) == 2 and f"gain: {gain:+.2f} dB" in lines[1]
@@ -110,6 +110,10 @@ def test_pixels_on_an_mlp(example, tmp_path, capsys):
     assert all(after > before + 3 for before, after in zip(*printed, strict=True))
     with Image.open(figure) as drawn:
         assert drawn.size == (3 * 2 * 48, 2 * 2 * 32 + 14)
+    script.record(results, "another", [[20.0, 21.0], [22.0, 24.0]])
+    first, second = json.loads(results.read_text()).items()
+    assert first[0].endswith("/photo.png") and [len(column) for column in first[1].values()] == [1, 1]
+    assert second == ("another", dict(zip(first[1], [[20.0, 22.0], [21.0, 24.0]], strict=True)))
 
 
 def test_the_variants_of_pixels_on_an_mlp_draw_equally_many(example):

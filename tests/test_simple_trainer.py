@@ -5,6 +5,7 @@ at v1.5.3 and main, each of them trains a few steps with each swap, on the CPU; 
 """
 
 import importlib
+import importlib.metadata
 import json
 import os
 import re
@@ -106,6 +107,19 @@ def test_the_command_writes_all_or_nothing(script, tmp_path, monkeypatch, capsys
             copy.unlink()
         assert trainer.read_text() == source and not copy.exists()
         assert len(capsys.readouterr().err.splitlines()) == lines
+
+
+def test_what_an_install_changed(script):
+    differences = script("beside").differences
+    before = {"numpy": "1.26.4", "pycolmap": "0.0.1", "torch": "2.13.0"}
+    assert differences(before, {**before, "pyyaml": "6.0.3"}) == ([], ["pyyaml 6.0.3"])
+    after = {"numpy": "2.4.6", "torch": "2.13.0"}
+    assert differences(before, after) == (["numpy 1.26.4 -> 2.4.6", "pycolmap 0.0.1 -> gone"], [])
+
+
+def test_packages_of_an_environment_are_all_but_this_one(script):
+    found = script("beside").packages(Path(sys.executable))
+    assert found["torch"] == importlib.metadata.version("torch") and "turbogs-plugin" not in found
 
 
 def test_a_clock_without_its_place_is_refused(script):

@@ -10,6 +10,7 @@ package from the wheel. Where there is no GPU, this project's torch reference st
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
@@ -19,10 +20,9 @@ from pathlib import Path
 
 import compare
 import tyro
+from packaging.utils import canonicalize_name
 
 from turbogs_plugin.scene import write_demo_capture
-
-OURS = "turbogs-plugin"
 
 
 @dataclass
@@ -42,26 +42,25 @@ class Options:
 
 
 def packages(python: Path) -> dict[str, str]:
-    """What `pip freeze` tells of an environment: name -> line."""
-    command = [python, "-m", "pip", "freeze", "--all"]
-    lines = subprocess.run(command, capture_output=True, text=True, check=True).stdout.splitlines()
-    return {line.partition("==")[0].partition(" @ ")[0].lower().replace("_", "-"): line for line in lines}
+    """The packages of an environment but for this one: name -> version."""
+    command = [python, "-m", "pip", "list", "--format", "json"]
+    listed = json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
+    found = {canonicalize_name(package["name"]): package["version"] for package in listed}
+    return {name: version for name, version in found.items() if name != "turbogs-plugin"}
 
 
 def differences(before: dict[str, str], after: dict[str, str]) -> tuple[list[str], list[str]]:
-    """(lines of packages that another version took the place of or that went, lines that are new), but for ours."""
-    changed = [f"{line} -> {after.get(name, 'gone')}" for name, line in before.items() if after.get(name) != line]
-    new = [line for name, line in after.items() if name not in before]
-    return [line for line in changed if not line.startswith(OURS)], [line for line in new if not line.startswith(OURS)]
+    """(packages of another version or gone, packages that are new)."""
+    changed = [f"{name} {old} -> {after.get(name, 'gone')}" for name, old in before.items() if after.get(name) != old]
+    return changed, [f"{name} {version}" for name, version in after.items() if name not in before]
 
 
 def main(options: Options) -> list[str]:
     """What went wrong."""
     python = options.environment / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
-    before = packages(python)
-    command = [python, "-m", "pip", "install", "--quiet", "--force-reinstall", "--no-deps", options.wheel]
-    subprocess.run([python, "-m", "pip", "install", "--quiet", options.wheel], check=True)  # with what it depends on
-    subprocess.run(command, check=True)  # also where a build of the same version was there
+    before, install = packages(python), [python, "-m", "pip", "install", "--quiet", options.wheel]
+    subprocess.run(install, check=True)  # with what it depends on
+    subprocess.run([*install, "--force-reinstall", "--no-deps"], check=True)  # in the place of a build before this one
     changed, new = differences(before, packages(python))
     print(f"{len(before)} packages before; changed: {', '.join(changed) or 'none'}; new: {', '.join(new) or 'none'}")
     with tempfile.TemporaryDirectory() as folder:

@@ -18,6 +18,7 @@ import tempfile
 from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
+from datetime import date
 from pathlib import Path
 from queue import SimpleQueue
 from typing import Any
@@ -167,7 +168,8 @@ def compare(options: Options) -> list[dict[str, Any]]:
 
 
 def write(file: Path, device: str, runs: Iterable[dict[str, Any]]) -> None:
-    file.with_suffix(".part").write_text(json.dumps({"device": device, "runs": list(runs)}, indent=1) + "\n")
+    record = {"device": device, "date": date.today().isoformat(), "runs": list(runs)}
+    file.with_suffix(".part").write_text(json.dumps(record, indent=1) + "\n")
     file.with_suffix(".part").replace(file)
 
 

@@ -273,8 +273,9 @@ def test_the_table_of_swaps_reads_both_runs_at_the_earlier_end(tmp_path):
         {"scene": "fox", "variant": "errors", "error": "out of memory"},
         trainer_run("density", (8, 28), scene="caliterra"),
     ]
-    (tmp_path / "dropin.json").write_text(json.dumps({"device": "H200", "runs": runs}))
-    lines = machine_tables.dropin(tmp_path / "dropin.json").splitlines()
+    (tmp_path / "dropin.json").write_text(json.dumps({"device": "H200", "date": "2026-11-22", "runs": runs}))
+    first, _, *lines = machine_tables.dropin(tmp_path).splitlines()
+    assert first == "H200, 2026-11-22:"
     cells = {tuple(line.strip("| ").split(" | ")[:2]): line.strip("| ").split(" | ")[2:] for line in lines[2:]}
     assert len(lines) == 2 + 5
     # Stock at 30 s is halfway between 30 and 31 dB.
@@ -286,4 +287,13 @@ def test_the_table_of_swaps_reads_both_runs_at_the_earlier_end(tmp_path):
     assert cells["fox", "stock"] == ["3000", "40.0", "31.00", "0.8750", "123k"]
     assert cells["fox", "sparse pixels, 4 views"] == ["2000", "5.0", "30.00", "0.8750", "123k"]  # stock: none yet
     assert cells["caliterra", "density control"] == ["1000", "8.0", "28.00", "0.8750", "123k"]
-    assert machine_tables.dropin(tmp_path / "none.json") == "Not measured yet."
+    assert machine_tables.dropin(tmp_path / "none") == "Not measured yet."
+
+
+def test_runs_of_another_day_are_compared_with_its_own_stock(tmp_path):
+    for day, psnr in ((1, 30), (2, 28)):
+        runs = [trainer_run("stock", (10, psnr)), trainer_run("sparse", (10, 31))]
+        record = {"device": "H200", "date": f"2026-11-0{day}", "runs": runs}
+        (tmp_path / f"dropin-{day}.json").write_text(json.dumps(record))
+    page = machine_tables.dropin(tmp_path)
+    assert page.index("2026-11-01:") < page.index("+1.00 dB") < page.index("2026-11-02:") < page.index("+3.00 dB")

@@ -65,8 +65,8 @@ class TurboDensityStrategy(DefaultStrategy):
         absgrad: also densify by absolute gradients above grow_absgrad2d; render with ``absgrad=True`` then.
         grow_grad2d, grow_absgrad2d, grow_scale3d: grad_threshold, absgrad_threshold and percent_dense of
             `ErrorDrivenDensity`.
-        choose_by: `squares` needs the line above, and that `sparse_rasterization` renders. turbogs has it, with
-            grow_absgrad2d=6e-4 and prune_score_fraction=0.05.
+        choose_by: `squares`, turbogs' own, needs the line above, and that `sparse_rasterization` renders; set
+            grow_absgrad2d and prune_score_fraction to turbogs' values with it.
         final_every, final_keep: final pruning after refine_stop_iter, off where final_keep is 1.
         seed: of the positions of split Gaussians.
     """
