@@ -6,13 +6,14 @@ import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 import torch
 from PIL import Image
 from torch import Tensor
+
+from turbogs_plugin.report.inferno import INFERNO
 
 ERROR_FULL_SCALE = 0.25
 """Mean absolute error over RGB at which an error map has its brightest colour."""
@@ -88,16 +89,8 @@ def depth_picture(depths: np.ndarray) -> np.ndarray:
 
 def colored(share: Tensor) -> Tensor:
     """[H, W, 3] uint8: black (0) to bright yellow (1 and more)."""
-    palette = torch.from_numpy(_palette()).to(share.device)  # [256, 3]
+    palette = torch.from_numpy(INFERNO.copy()).to(share.device)  # [256, 3]
     return palette[(share * len(palette)).clamp(0, len(palette) - 1).long()]
-
-
-@lru_cache(maxsize=1)
-def _palette() -> np.ndarray:
-    """[256, 3] uint8: matplotlib's inferno. The import, without plots or fonts, takes a tenth of a second."""
-    from matplotlib import colormaps
-
-    return (colormaps["inferno"](np.arange(256))[:, :3] * 255.0).round().astype(np.uint8)
 
 
 def to_uint8(image: Tensor) -> np.ndarray:
