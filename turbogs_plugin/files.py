@@ -7,11 +7,17 @@ import glob
 import os
 import socket
 import tempfile
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import BinaryIO
 
 from turbogs_plugin.errors import InputError
+
+PAUSE = 0.02
+"""Seconds between two times that a large file is brought to the disk while it is written."""
 
 
 def require_writable(folder: Path, given: str) -> None:
@@ -44,7 +50,7 @@ def read_text(path: Path) -> str | None:
         raise InputError(f"cannot read '{path}': {error}") from None
 
 
-def write_atomically(path: Path, write: Callable[[BinaryIO], None]) -> None:
+def write_atomically(path: Path, write: Callable[[BinaryIO], None], large: bool = False) -> None:
     """Write a file beside its destination, bring it to the disk, and put it in place by one rename.
 
     Whatever interrupts this (a full disk, a kill), `path` is what it was before or is complete. Several processes may
@@ -53,6 +59,7 @@ def write_atomically(path: Path, write: Callable[[BinaryIO], None]) -> None:
     Args:
         path: the destination; its folder exists.
         write: is given the open file.
+        large: a thread brings it to the disk while it is written, so that less is left to wait for.
 
     Raises:
         OSError: from the disk, with the name of the file; then nothing is left behind.
@@ -64,7 +71,8 @@ def write_atomically(path: Path, write: Callable[[BinaryIO], None]) -> None:
     temporary = partial_path(path)
     try:
         with open(temporary, "wb") as file:
-            write(file)
+            with _brought_to_disk(file) if large else nullcontext():
+                write(file)
             file.flush()
             os.fsync(file.fileno())
         os.replace(temporary, path)
@@ -74,6 +82,24 @@ def write_atomically(path: Path, write: Callable[[BinaryIO], None]) -> None:
             error.filename = str(path)
         raise
     _sync_folder(path.parent)
+
+
+@contextmanager
+def _brought_to_disk(file: BinaryIO) -> Iterator[None]:
+    """While entered, a thread brings what is written of a file to the disk. Leaving raises its `OSError`."""
+    bring, ended = getattr(os, "fdatasync", os.fsync), threading.Event()
+
+    def repeat() -> None:
+        while not ended.wait(PAUSE):
+            bring(file.fileno())
+
+    with ThreadPoolExecutor(1) as pool:
+        repeated = pool.submit(repeat)
+        try:
+            yield
+        finally:
+            ended.set()
+    repeated.result()  # a failure that was told here is not told again at the end
 
 
 def partial_path(path: Path) -> Path:

@@ -87,13 +87,13 @@ def training(capture: Path, out: Path, trouble: str, overrides: tuple[str, ...])
             for name in EXCHANGES:
                 setattr(ProcessRanks, name, counted(getattr(ProcessRanks, name)))
 
-        def killed_writing(path: Path, write: Callable[[BinaryIO], None]) -> None:
+        def killed_writing(path: Path, write: Callable[[BinaryIO], None], large: bool) -> None:
             def half(file: BinaryIO) -> None:
                 file.write(b"half of it")
                 file.flush()
                 os.kill(os.getpid(), signal.SIGKILL)
 
-            files.write_atomically(path, half if path.name == "iteration-000006.pt" else write)
+            files.write_atomically(path, half if path.name == "iteration-000006.pt" else write, large)
 
         evaluate = Evaluations.evaluation_due
 

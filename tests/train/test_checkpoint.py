@@ -1,8 +1,10 @@
 """Checkpoints: never half-written, never executed."""
 
+import errno
 import os
 import pickle
 import subprocess
+import threading
 import zipfile
 
 import pytest
@@ -79,8 +81,8 @@ def test_a_full_disk_keeps_the_newest_checkpoint(tmp_path, monkeypatch, room):
     before = sorted(os.listdir(tmp_path))
     whole_write = files.write_atomically
 
-    def limited(path, write):
-        whole_write(path, lambda file: write(DiskFull(file, room)))
+    def limited(path, write, **options):
+        whole_write(path, lambda file: write(DiskFull(file, room)), **options)
 
     monkeypatch.setattr(torch_file, "write_atomically", limited)
     with pytest.raises(TrainingStopped, match=r"iteration 2: .*not be written.*\(No space left on device\).*--resume"):
@@ -271,6 +273,36 @@ def test_processes_that_write_the_same_file_do_not_meet(tmp_path, monkeypatch):
     assert target.read_text() == "mine" and os.listdir(tmp_path) == ["results.json"]
 
 
+@pytest.mark.skipif(not hasattr(os, "fdatasync"), reason="this system has no fdatasync")
+def test_a_large_file_is_brought_to_the_disk_while_it_is_written(tmp_path, monkeypatch):
+    """And a failure that only this tells, as systems tell each once, leaves the old file."""
+    target, brought = tmp_path / "model", threading.Event()
+    bring = os.fdatasync
+
+    def told(descriptor):
+        bring(descriptor)
+        brought.set()
+
+    def write(file):
+        file.write(b"new")
+        assert brought.wait(60)
+
+    monkeypatch.setattr(os, "fdatasync", told)
+    files.write_atomically(target, write, large=True)
+    assert target.read_bytes() == b"new"
+
+    def full(descriptor):
+        brought.set()
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    brought.clear()
+    monkeypatch.setattr(os, "fdatasync", full)
+    with pytest.raises(OSError, match="No space left") as failed:
+        files.write_atomically(target, lambda file: (write(file), file.write(b"er")), large=True)
+    assert failed.value.filename == str(target)
+    assert target.read_bytes() == b"new" and os.listdir(tmp_path) == ["model"]
+
+
 def test_a_failed_write_names_its_file(tmp_path):
     files.partial_path(tmp_path / "text").symlink_to("/dev/full")
     with pytest.raises(OSError) as failed:
@@ -288,8 +320,8 @@ def test_a_model_is_written_as_atomically_as_a_checkpoint(tmp_path, monkeypatch)
     own.with_name(own.name.replace(f".{os.getpid()}.", f".{gone}.")).write_text("torn")
     whole_write = files.write_atomically
 
-    def limited(path, write):
-        whole_write(path, lambda file: write(DiskFull(file, 10)))
+    def limited(path, write, **options):
+        whole_write(path, lambda file: write(DiskFull(file, 10)), **options)
 
     with monkeypatch.context() as context:
         context.setattr(ply, "write_atomically", limited)
