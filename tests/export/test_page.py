@@ -37,6 +37,7 @@ def test_the_page_is_one_file_that_asks_for_nothing(written):
     assert [path.name for path in file.parent.iterdir()] == ["report.html"]
     assert made.bytes == file.stat().st_size < 32_000_000 and made.gaussians == len(model.gaussians)
     assert not re.search(r"""(src|href)=["'](?!data:)""", text) and "default-src 'none'" in text
+    assert str(file.parents[1]) not in text and f"path: {model.config.scene.path.rpartition('/')[2]}\n" in text
     assert escape(made.change.text()) in text and abs(made.change.before - made.change.after) < 0.1
 
 
@@ -101,6 +102,14 @@ def test_the_model_turns_and_its_cameras_are_clicked(tab):
     box = tab.locator("#model-canvas").bounding_box()
     x, y = box["x"] + 240, box["y"] + 200
     tab.mouse.move(x, y)
+    for by in (100, -100):  # not pressed yet: the page scrolls
+        scrolled = (
+            "new Promise(done => { addEventListener('scrollend', done, { once: true }); setTimeout(done, 5000); })"
+        )
+        tab.evaluate(f"window.scrolled = {scrolled}; 0")
+        tab.mouse.wheel(0, by)
+        tab.evaluate("window.scrolled.then(() => 0)")
+        assert (drawn(tab) == before).all() and tab.evaluate("scrollY > 0") == (by > 0)
     tab.mouse.down()
     tab.mouse.move(x + 60, y + 20, steps=3)
     tab.mouse.up()

@@ -20,7 +20,7 @@ from turbogs_plugin.report import machine, provenance
 from turbogs_plugin.report.pages import write_report
 from turbogs_plugin.report.pictures import ERROR_FULL_SCALE, GAP, depth_picture, error_picture, picture_writer, strip
 from turbogs_plugin.report.plot_process import PlotProcess, SecondsPlot
-from turbogs_plugin.report.plots import plot_against_seconds
+from turbogs_plugin.report.plots import label_of, plot_against_seconds
 from turbogs_plugin.report.tables import number, table
 from turbogs_plugin.train import evaluate, run
 from turbogs_plugin.train.evaluate import Metrics, ViewMetrics, compare, load_lpips, psnr
@@ -212,6 +212,11 @@ def test_plots_of_any_length(tmp_path, count):
     plot_against_seconds(tmp_path / "p.png", list(range(count)), values, "test PSNR in dB", "scene")
     width, height = Image.open(tmp_path / "p.png").size
     assert width > 600 and height > 400
+
+
+def test_a_plot_names_counts_without_digits_behind_the_point():
+    assert [label_of(value) for value in (325_123, 32.3149, -1.5, 0.01234)] == ["325123", "32.31", "-1.50", "0.0123"]
+    assert label_of(math.nan) == "nan"
 
 
 def test_a_process_draws_what_this_one_would(tmp_path):

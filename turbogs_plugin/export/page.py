@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from PIL import Image
 
+from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.export.camera_path import focus_and_up
 from turbogs_plugin.export.contribution import contributions, pruned
@@ -260,5 +261,13 @@ def _tables(model: SavedModel, scene: Scene, history: list[Evaluation]) -> str:
     if plan is not None:
         decided = [(entry.setting, entry.text, entry.made, entry.reason) for entry in plan.decisions]
         blocks += [Heading("Plan"), Table(("setting", "value", "made", "reason"), decided, numeric=False)]
-    settings = f"<h2>Configuration</h2>\n<pre>{escape(model.config.to_yaml().rstrip())}</pre>"
+    settings = f"<h2>Configuration</h2>\n<pre>{escape(_settings(model.config))}</pre>"
     return f'<h2>Error against run time</h2>\n<div class="curves">{"".join(curves)}</div>\n{_html(blocks)}\n{settings}'
+
+
+def _settings(config: Config) -> str:
+    """The run's YAML. Of paths on this machine only the last part is handed over."""
+    text = config.to_yaml().rstrip()
+    for path in filter(None, (config.scene.path, config.train.init, config.report.lpips_weights)):
+        text = text.replace(path, Path(path).name)
+    return text

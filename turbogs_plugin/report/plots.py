@@ -40,7 +40,7 @@ def plot_against_seconds(path: Path, seconds: Sequence[float], values: Sequence[
         figure.subplots_adjust(**MARGINS)
         axes.plot(seconds, values, marker="o", color="#1f5fa8")
         axes.annotate(
-            f"{values[-1]:.2f}" if abs(values[-1]) >= 1 else f"{values[-1]:.4f}",
+            label_of(values[-1]),
             (seconds[-1], values[-1]),
             xytext=(0, 8),
             textcoords="offset points",
@@ -50,3 +50,9 @@ def plot_against_seconds(path: Path, seconds: Sequence[float], values: Sequence[
         axes.set_xlim(left=0)
         axes.margins(y=0.12)
         figure.savefig(path)
+
+
+def label_of(value: float) -> str:
+    """A value as a plot names it: PSNR as 32.31, an error as 0.0123, a number of Gaussians as 325123."""
+    digits = 0 if abs(value) >= 1000 else 2 if abs(value) >= 1 else 4
+    return f"{value:.{digits}f}"

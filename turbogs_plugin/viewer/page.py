@@ -36,6 +36,8 @@ FRUSTUM_SIZE = 0.06
 FRUSTUM_PIXELS = 2.0
 """Thickness of its lines."""
 TRAIN_COLOR, TEST_COLOR = (40, 110, 220), (230, 140, 20)
+NARROW = 600
+"""Pixels of a picture, as on a telephone, beside which the explanation of the method is folded up at first."""
 INSTALL = 'pip install "turbogs-plugin[viewer]"'
 
 
@@ -206,8 +208,6 @@ class Page:
         with self._training:
             self._pause = gui.add_button("Pause")
             self._step = gui.add_button("One step")
-        with gui.add_folder("What is this?"):
-            gui.add_markdown(METHOD)
         self._pictures.on_update(lambda event: self.choose_picture(self._pictures.value))
         self._slider.on_update(lambda event: self.choose_view(self._slider.value))
         self._there.on_click(lambda event: self.go_to(self.view))
@@ -265,6 +265,9 @@ class Page:
         self._screens[client.client_id] = screen
         client.camera.on_update(lambda camera: self._looked(screen, camera))
         self._looked(screen, client.camera)
+        wide = screen.eye is not None and screen.eye.width > NARROW
+        with client.gui.add_folder("What is this?", expand_by_default=wide):
+            client.gui.add_markdown(METHOD)
 
     def _disconnected(self, client: Any) -> None:
         self._screens.pop(client.client_id, None)

@@ -11,7 +11,7 @@ PICTURES = {
     Picture.DEPTH: "How far away things are. Near is bright.",
     Picture.TILES: "The image is drawn in tiles of 16x16 pixels. Bright tiles are reached by many Gaussians: there "
     "rendering takes longest.",
-    Picture.CHANGES: "**Green**: Gaussians that the last event of density control added, where the image was wrong. "
+    Picture.CHANGES: "**Green**: Gaussians that the last event of density control added, where more detail was wanted. "
     "**Red**: those that it removed. Grey: all others.",
     Picture.COMPARE: "A view of the capture: the photo, what the model makes of it, and the difference (bright is "
     "wrong).",
@@ -34,8 +34,8 @@ pixels are right early on and teach nothing more. TurboGS keeps a map of each ph
 was last seen (*Error map*), and how long ago was that (*Age map*)? An iteration takes several photos at once, and of
 each 16x16 tile only pixels with a large error or not seen for a long time (*Samples of this iteration*).
 
-**More where it is wrong.** The same errors say which Gaussians are to blame. From time to time those are split or
-copied, so that more detail fits there, and useless ones are removed (*Added and removed*).
+**More where it is wrong.** From time to time Gaussians are split or copied where the samples ask for more detail, and
+useless ones are removed (*Added and removed*).
 
 **Try it.** Pause the training, choose *Samples of this iteration*, and press *One step* a few times. Then look at the
 *Error map* of the same view.

@@ -99,7 +99,8 @@ function startViewer(scene, model) {
   choice.onchange = () => look(Number(choice.value));
   show.onchange = redraw;
   const pointers = new Map();
-  let moved = 0;
+  let moved = 0, active = false;   // the wheel scrolls the page until the model was pressed
+  document.addEventListener("pointerdown", (event) => { active = event.target === canvas; });
   canvas.oncontextmenu = (event) => event.preventDefault();
   canvas.onpointerdown = (event) => {
     canvas.setPointerCapture(event.pointerId);
@@ -132,6 +133,7 @@ function startViewer(scene, model) {
     if (near.length && near[0][0] < 10 * ratio) look(near[0][1]);
   };
   canvas.addEventListener("wheel", (event) => {
+    if (!active) return;
     event.preventDefault();
     eye.zoom(Math.exp(0.001 * Math.max(-300, Math.min(300, event.deltaY))));
     redraw();
