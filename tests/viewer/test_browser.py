@@ -80,7 +80,6 @@ def test_frames_arrive_as_they_were_drawn_and_pictures_switch(browser, subject):
     thread.start()
     try:
         tab = Tab(browser, page)
-        tab.tab.get_by_role("checkbox").uncheck()  # the cameras stand in the picture
 
         def seen_from(view: int):
             eye = Eye.of_view(subject.capture.train.cameras, view)

@@ -105,8 +105,8 @@ def read_ply(path: str | Path) -> Gaussians:
     missing = [name for group in groups.values() for name in group if name not in names]
     if missing:
         raise InputError(
-            f"{path} is not a 3DGS model: it lacks the properties {', '.join(missing[:4])}; a mesh or points are "
-            "none: give the .ply that a 3DGS trainer exports"
+            f"{path} is not a 3DGS model: it lacks the properties {', '.join(missing[:4])}, as a mesh or a "
+            "cloud of points does: give the .ply that a 3DGS trainer exports"
         )
     if not len(vertices):
         raise InputError(f"{path} holds no Gaussians: export the model again")

@@ -34,7 +34,7 @@ def read_vertices(path: str | Path) -> np.ndarray:
     if not separator:
         header, separator, _ = head.partition(b"end_header\r\n")
     if not head.startswith(b"ply") or not separator or not header.isascii():
-        raise InputError(f"{path} is not a .ply file: it has no header")
+        raise InputError(f"{path} is not a .ply file: it has no header; copy or export it again")
     binary, count, layout, alone = _parse_header(path, header.decode().splitlines()[1:])
     body = path.stat().st_size - len(header) - len(separator)
     # In ASCII a number takes a digit and a separator, though the last separator may be missing.
@@ -72,6 +72,10 @@ def _parse_header(path: Path, lines: list[str]) -> tuple[bool, int, np.dtype, bo
             elements.append(words[1])
             if elements == ["vertex"]:
                 count = int(words[2])
+            elif elements == ["chunk"]:
+                raise fail(
+                    line, "is that of SuperSplat's compressed .ply, not read here: give the .ply that it was made of"
+                )
             elif len(elements) == 1:
                 raise fail(line, "comes before the vertices: they must be the first element")
         elif words[0] == "property" and elements:

@@ -203,7 +203,7 @@ class Page:
         self._about = gui.add_markdown(PICTURES[self.picture])
         self._slider = gui.add_slider("View", 0, 1, 1, 0, visible=False)
         self._there = gui.add_button("Stand at this view", visible=False)
-        self._cameras = gui.add_checkbox("Cameras of the capture", True, visible=False)
+        self._cameras = gui.add_checkbox("Cameras of the capture", False, visible=False)
         self._training = gui.add_folder("Training", visible=training)
         with self._training:
             self._pause = gui.add_button("Pause")

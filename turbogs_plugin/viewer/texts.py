@@ -7,7 +7,8 @@ import re
 from turbogs_plugin.viewer.pictures import Picture
 
 PICTURES = {
-    Picture.RENDER: "The model from where you are. Drag to turn, scroll to come nearer, click a camera to stand there.",
+    Picture.RENDER: "The model from where you are. Drag to turn, scroll to come nearer. *Cameras of the capture* shows "
+    "where its photos were taken: click one to stand there.",
     Picture.DEPTH: "How far away things are. Near is bright.",
     Picture.TILES: "The image is drawn in tiles of 16x16 pixels. Bright tiles are reached by many Gaussians: there "
     "rendering takes longest.",
