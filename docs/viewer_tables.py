@@ -70,7 +70,8 @@ def exports(file: Path = EXPORTS) -> str:
 def _export(entry: dict[str, Any], record: dict[str, Any]) -> tuple[str, ...]:
     change = entry["change"]
     kept = "all" if entry["gaussians"] == record["gaussians"] else f"{entry['gaussians']:,}"
-    lost = (f"{value:.3f}" for value in (change["before"] - change["after"], change["worst_loss"]))
+    losses = (change["before"] - change["after"], change["worst_loss"])
+    lost = (f"{round(value, 3) + 0.0:.3f}" for value in losses)  # no -0.000
     size, seconds = f"{entry['bytes'] / 1e6:.1f}", f"{entry['seconds']:.1f}"
     return size, kept, f"{change['before']:.2f}", *lost, seconds
 

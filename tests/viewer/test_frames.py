@@ -153,6 +153,17 @@ def test_sizes_come_in_steps():
     assert len(widths) <= 5
 
 
+@pytest.mark.parametrize(("running", "most"), [(True, 15), (False, 30)])
+def test_a_training_is_asked_for_fewer_frames(monkeypatch, running, most):
+    """A moving camera, frames that cost nothing to draw: their encoding and sending has no clock."""
+    desk = Desk(monkeypatch)
+    for step in range(100):
+        desk.look(float(step))
+        desk.serve(version=step, running=running)
+        desk.wait(0.01)
+    assert most - 4 <= len(desk.sent) <= most + 1
+
+
 def test_a_full_device_ends_no_training(monkeypatch):
     desk = Desk(monkeypatch)
 

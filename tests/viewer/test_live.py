@@ -11,6 +11,7 @@ from helpers.framework_runs import assert_identical
 
 from turbogs_plugin.train.clock import TrainingClock
 from turbogs_plugin.train.loop import Listener
+from turbogs_plugin.viewer import frames
 from turbogs_plugin.viewer import live as module
 from turbogs_plugin.viewer.controls import Controls
 from turbogs_plugin.viewer.eye import Eye
@@ -86,7 +87,7 @@ def watched(new_training, scene):
 # In host memory, what a page asks for passes through the window of the training.
 @pytest.mark.parametrize("place", ["device", "host"])
 def test_a_watched_training_ends_as_an_unwatched_one(new_training, watched, monkeypatch, place):
-    monkeypatch.setattr("turbogs_plugin.viewer.frames.SHORTEST_INTERVAL", 0.0)
+    monkeypatch.setitem(frames.SHORTEST_INTERVALS, True, 0.0)
     overrides = (f"train.maps_place={place}", f"train.photos_place={place}")
     alone = new_training(*overrides)
     alone.run()
