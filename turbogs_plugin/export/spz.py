@@ -28,8 +28,10 @@ HEADER = struct.Struct("<IIIBBBB")
 """Magic, version, number of Gaussians, degree, fractional bits of positions, flags, zero."""
 MOST_FRACTIONAL_BITS = 20
 COLOR_SCALE = 0.15
-SH_BITS = (5, 4)
-"""Bits of a coefficient of degree 1, and of the degrees above: the format's usual ones."""
+SH_SCALE = 128.0
+"""A coefficient of the harmonics in steps of 1 / 128. Niantic's own writer drops three and four of the eight bits of
+degree 1 and of those above, which a reader does not notice: the small coefficients of a capture whose cameras look one
+way all became 0."""
 LARGEST_COMPONENT = 511
 """Of a quaternion's three stored components: 9 bits and a sign, for 0 .. 1 / sqrt(2)."""
 GZIP_LEVEL = 6
@@ -57,8 +59,6 @@ def packed(gaussians: Gaussians) -> bytes:
     fixed = np.rint(values["means"] * [1.0, -1.0, -1.0] * 2.0**bits).astype("<i4")  # [N, 3]
     opacities = 1.0 / (1.0 + np.exp(-values["opacities"]))
     harmonics = values["shN"] * _flips(gaussians.sh_degree)[:, None]  # [N, B, 3]
-    steps = np.array([2.0 ** (8 - SH_BITS[band >= 3]) for band in range(harmonics.shape[1])])[:, None]
-    coded = np.rint(harmonics * 128.0 / steps) * steps + 128.0  # 0 is among the steps
     parts = [
         HEADER.pack(MAGIC, VERSION, len(gaussians), gaussians.sh_degree, bits, 0, 0),
         fixed.view(np.uint8).reshape(-1, 3, 4)[:, :, :3].tobytes(),
@@ -66,7 +66,7 @@ def packed(gaussians: Gaussians) -> bytes:
         _bytes(values["sh0"][:, 0] * (COLOR_SCALE * 255.0) + 127.5),
         _bytes((values["scales"] + 10.0) * 16.0),
         _packed_rotations(values["quats"]).tobytes(),
-        _bytes(coded),
+        _bytes(harmonics * SH_SCALE + 128.0),
     ]
     return gzip.compress(b"".join(parts), GZIP_LEVEL, mtime=0)
 
@@ -106,7 +106,7 @@ def read_spz(path: Path) -> Gaussians:
         "scales": scales / 16.0 - 10.0,
         "opacities": np.log(shares / (1.0 - shares)),
         "sh0": ((colors / 255.0 - 0.5) / COLOR_SCALE)[:, None],
-        "shN": (harmonics.reshape(count, bands, 3) - 128.0) / 128.0 * _flips(degree)[:, None],
+        "shN": (harmonics.reshape(count, bands, 3) - 128.0) / SH_SCALE * _flips(degree)[:, None],
     }
     return Gaussians(**{name: torch.from_numpy(np.ascontiguousarray(value)) for name, value in values.items()})
 
