@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 import pytest
+from helpers.refusals import assert_refused
 from helpers.textured_corner import camera_centers, render_corner, write_photos
 from PIL import Image
 
@@ -140,9 +141,7 @@ def test_photos_that_cannot_be_solved_end_in_one_line_and_leave_nothing(case, tm
     photos = tmp_path / "photos"
     photos.mkdir()
     words = case(photos)
-    with pytest.raises(InputError, match=words) as refused:
-        reconstruct(photos, tmp_path / "deep" / "scene")
-    assert "\n" not in str(refused.value)
+    assert_refused(words, reconstruct, photos, tmp_path / "deep" / "scene")
     assert [path.name for path in tmp_path.iterdir()] == ["photos"]
 
 
