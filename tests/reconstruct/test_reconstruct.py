@@ -13,6 +13,7 @@ from PIL import Image
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.reconstruct import Solution, reconstruct, run, scene_beside, solver
 from turbogs_plugin.reconstruct.agreement import Agreement, consistent_groups
+from turbogs_plugin.reconstruct.photos import read_photos
 from turbogs_plugin.reconstruct.workspace import Workspace
 from turbogs_plugin.scene import load_scene
 from turbogs_plugin.scene.load import holds_photos_alone
@@ -104,6 +105,15 @@ def test_a_stopped_call_is_gone_on_with(solved, tmp_path, monkeypatch):
     assert reconstruct(few, tmp_path / "scene").registered == 4
     with pycolmap.Database.open(database) as opened:
         assert (opened.num_keypoints(), opened.num_matches(), len(opened.read_all_cameras())) == before
+
+
+def test_features_that_a_stopped_call_left_out_are_of_the_same_camera(solved, tmp_path):
+    photos, solution = solved
+    few, database = read_photos(photos)[1:4], tmp_path / "features.db"  # upright ones, of one lens
+    for known in (few[:1], few):
+        solver.extract_features(database, Workspace(solution.scene).images, known, 320)
+    with pycolmap.Database.open(database) as opened:
+        assert (len(opened.read_all_images()), len(opened.read_all_cameras())) == (3, 1)
 
 
 def test_other_photos_are_not_mixed_in(solved, tmp_path):
