@@ -83,7 +83,7 @@ def launches_header(layout: ModuleType, launches: ModuleType) -> str:
         lines += [f"    static void run(const Arguments<{cls.__name__}>& in);  // in csrc/bindings", "};"]
     lines += ["", "template <class...>", "struct List {};"]
     lines.append(f"using All = List<{', '.join(cls.__name__ for cls in launches.LAUNCHES)}>;")
-    lines += ["", f'constexpr const char* kInterface = R"interface({launches.interface(layout)})interface";']
+    lines += ["", f'constexpr const char* kInterface = R"interface({layout.interface(launches.LAUNCHES)})interface";']
     start = ["template <class>", "class Arguments;", "", "namespace launches {", ""]
     return _header(LAUNCHES, [*start, *lines, "", "}  // namespace launches"])
 

@@ -1,16 +1,34 @@
 """What all tests share."""
 
+import os
 import sys
+from collections.abc import Iterator
 from contextlib import nullcontext
+from pathlib import Path
 
 import pytest
 import torch
+from helpers.framework_runs import tiny_capture
 
 from turbogs_plugin import cli
 from turbogs_plugin.report import plot_process
 from turbogs_plugin.scene import colmap, llff, starting_points
 
 torch.set_num_threads(1)  # the tests' tensors are small: more threads gain nothing and collapse on a busy machine
+
+
+@pytest.fixture(scope="session", autouse=True)
+def disks_are_not_waited_for() -> Iterator[None]:
+    """The tests' files need not outlive a loss of power."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "fsync", lambda descriptor: None)
+        yield
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory) -> Path:
+    """A folder of 7 training photos and a test photo of 48x40. Not to be changed."""
+    return tiny_capture(tmp_path_factory.mktemp("tiny"))
 
 
 @pytest.fixture

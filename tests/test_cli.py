@@ -13,7 +13,7 @@ import numpy as np
 import pycolmap
 import pytest
 import torch
-from helpers.framework_runs import TINY, stop_after, tiny_capture
+from helpers.framework_runs import TINY, stop_after
 from PIL import Image
 
 from turbogs_plugin import cli, scene
@@ -27,11 +27,6 @@ from turbogs_plugin.train.trainer import Trainer
 pytestmark = pytest.mark.usefixtures("plotted")
 
 QUICK = ("train.iterations=2", "train.sh_degree=0", "train.evaluate_at=[]")
-
-
-@pytest.fixture(scope="module")
-def capture(tmp_path_factory) -> Path:
-    return tiny_capture(tmp_path_factory.mktemp("cli"))
 
 
 @pytest.fixture

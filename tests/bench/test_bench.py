@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from helpers.framework_runs import tiny_capture, tiny_config
+from helpers.framework_runs import tiny_config
 from helpers.simulated_time import OperatorTime, SimulatedTime
 
 from turbogs_plugin.bench import commands, floors
@@ -35,11 +35,6 @@ from turbogs_plugin.scene import load_scene
 from turbogs_plugin.train.trainer import Trainer
 
 CPU = torch.device("cpu")
-
-
-@pytest.fixture(scope="module")
-def capture(tmp_path_factory):
-    return tiny_capture(tmp_path_factory.mktemp("bench"))
 
 
 def test_clocks_measure_what_passes(monkeypatch):

@@ -18,7 +18,7 @@ from typing import BinaryIO
 
 import pytest
 import torch
-from helpers.framework_runs import TINY, assert_identical, tiny_capture, tiny_config
+from helpers.framework_runs import TINY, assert_identical, tiny_config
 from helpers.processes import PRELOADED, ended, said, start_ranks
 from torch.distributed.launcher.api import LaunchConfig, elastic_launch
 
@@ -155,11 +155,6 @@ def trained(count: int, folder: Path, capture: Path, trouble: str = "", *overrid
 
 def errors_in(text: str) -> list[str]:
     return [line for line in text.splitlines() if "error" in line.lower()]
-
-
-@pytest.fixture(scope="module")
-def capture(tmp_path_factory) -> Path:
-    return tiny_capture(tmp_path_factory.mktemp("failures"))
 
 
 @pytest.fixture(scope="module")

@@ -57,7 +57,7 @@ def marked(cls, prefix=()):
     """An object of a class of launches.py whose every field names itself, and the fields by list in their order."""
     fields, lists = {}, {"Tensors": [], "Integers": [], "Reals": [], "rows": []}
     kinds = {"Tensor": "Tensors", "Tensor | None": "Tensors", "int": "Integers", "bool": "Integers", "float": "Reals"}
-    for name, annotation in cls.__annotations__.items():
+    for name, annotation in launches.annotations(cls).items():
         if annotation == "list[int]":
             fields[name] = ["rows", *prefix, name]
             lists["rows"] += fields[name]
@@ -178,7 +178,7 @@ def loaded(monkeypatch, tmp_path):
 
 
 def test_a_library_of_other_sources_is_refused(loaded):
-    present = launches.interface(layout)
+    present = layout.interface(launches.LAUNCHES)
     loaded(present)
     assert library._load_failure() == ""
     for other in ("", present.replace("tile_starts", "tile_ends", 1), present.replace("of 16", "of 20", 1)):
@@ -189,9 +189,9 @@ def test_a_library_of_other_sources_is_refused(loaded):
 
 
 def test_the_interface_changes_with_every_order_and_size(monkeypatch):
-    present = launches.interface(layout)
+    present = layout.interface(launches.LAUNCHES)
     monkeypatch.setattr(layout.ScreenRecord, "DEPTH", 15)
-    assert launches.interface(layout) != present
+    assert layout.interface(launches.LAUNCHES) != present
     monkeypatch.undo()
     monkeypatch.setattr(launches, "LAUNCHES", launches.LAUNCHES[1:])
-    assert launches.interface(layout) != present
+    assert layout.interface(launches.LAUNCHES) != present

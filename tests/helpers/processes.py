@@ -19,7 +19,13 @@ import torch.distributed
 STORES: list[torch.distributed.TCPStore] = []
 """Of the latest processes."""
 
-PRELOADED = ["torch", "turbogs_plugin.train.run", "turbogs_plugin.report.pages", "pycolmap"]
+PRELOADED = [
+    "torch",
+    "torch.fx.experimental.symbolic_shapes",  # and sympy: the first gradient of each process would import them
+    "turbogs_plugin.train.run",
+    "turbogs_plugin.report.pages",
+    "pycolmap",
+]
 
 
 def free_port() -> int:

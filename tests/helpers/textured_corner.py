@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -57,6 +58,7 @@ def write_photos(folder: Path, count: int, seed: int = 0) -> np.ndarray:
     return centers
 
 
+@cache
 def _texture(seed: int, size: int = 512) -> np.ndarray:
     """[size, size] blobs of all sizes."""
     generator = np.random.default_rng(seed)

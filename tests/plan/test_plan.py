@@ -6,7 +6,7 @@ import re
 
 import pytest
 import torch
-from helpers.framework_runs import TINY, stop_after, tiny_capture, tiny_config
+from helpers.framework_runs import TINY, stop_after, tiny_config
 
 from turbogs_plugin.config.auto import AUTO_SETTINGS
 from turbogs_plugin.config.configuration import apply_overrides, config_names, load_config, resolve
@@ -314,11 +314,6 @@ def test_a_setting_of_somebody_elses_strategy_is_not_ours_to_rename():
 def test_a_text_that_is_no_plan_is_refused(text):
     with pytest.raises(InputError, match="plan"):
         Plan.from_json(text)
-
-
-@pytest.fixture(scope="module")
-def capture(tmp_path_factory):
-    return tiny_capture(tmp_path_factory.mktemp("plan"))
 
 
 def test_the_verb_prints_the_plan_of_a_capture(turbogs, capture):

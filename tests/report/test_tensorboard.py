@@ -7,7 +7,7 @@ from typing import ClassVar
 
 import numpy as np
 import pytest
-from helpers.framework_runs import TINY, stop_after, tiny_capture, tiny_config
+from helpers.framework_runs import TINY, stop_after, tiny_config
 
 from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.report.tensorboard import EventWriter, event_writers
@@ -56,11 +56,6 @@ def writers(monkeypatch) -> list[Recorder]:
     monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", module)
     monkeypatch.setattr(Recorder, "made", [])
     return Recorder.made
-
-
-@pytest.fixture(scope="module")
-def capture(tmp_path_factory):
-    return tiny_capture(tmp_path_factory.mktemp("tensorboard"))
 
 
 def lose_after_8(config: Config, folder: Path, monkeypatch) -> None:

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from helpers.framework_runs import assert_identical, stop_after, tiny_capture, tiny_config
+from helpers.framework_runs import assert_identical, stop_after, tiny_config
 
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.plan import facts
@@ -21,11 +21,6 @@ from turbogs_plugin.train.trainer import Trainer
 HOST_MEMORY = 1000
 """Bytes: less than one photo of the capture takes."""
 CPU = torch.device("cpu")
-
-
-@pytest.fixture(scope="module")
-def capture(tmp_path_factory) -> Path:
-    return tiny_capture(tmp_path_factory.mktemp("host_arrays"))
 
 
 @pytest.fixture

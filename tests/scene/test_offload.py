@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from helpers.framework_runs import assert_identical, tiny_capture, tiny_config
+from helpers.framework_runs import assert_identical, tiny_config
 from turbogs_plugin.strategies.pixel_sampling import ErrorGuidedPixelSampler
 
 from turbogs_plugin.error_maps import AGE_MAX, ErrorMaps
@@ -21,11 +21,6 @@ from turbogs_plugin.types import Step
 
 SIZES = np.array([[21, 17], [5, 40], [16, 16], [1, 1], [33, 9], [20, 20], [7, 7]])
 CPU = torch.device("cpu")
-
-
-@pytest.fixture(scope="module")
-def capture(tmp_path_factory) -> Path:
-    return tiny_capture(tmp_path_factory.mktemp("offload"))
 
 
 @pytest.fixture(scope="module")

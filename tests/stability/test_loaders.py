@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import torch
 from helpers.bounded_memory import outcome_within
-from helpers.framework_runs import tiny_capture, tiny_config
+from helpers.framework_runs import tiny_config
 from helpers.models import random_gaussians
 from PIL import Image
 
@@ -31,11 +31,6 @@ from turbogs_plugin.types import Gaussians
 
 MEMORY = 64 * 2**20
 """Python and numpy may allocate this much for files of less than a megabyte."""
-
-
-@pytest.fixture(scope="module")
-def capture(tmp_path_factory) -> Path:
-    return tiny_capture(tmp_path_factory.mktemp("loaders"))
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 import torch
 from helpers.bounded_memory import outcome_within
-from helpers.framework_runs import tiny_capture, tiny_config
+from helpers.framework_runs import tiny_config
 from helpers.models import random_gaussians
 from PIL import Image
 
@@ -133,11 +133,6 @@ def test_other_values_in_a_table_of_llff(photos):
 
 
 # ---- Models to start from ----------------------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def capture(tmp_path_factory) -> Path:
-    return tiny_capture(tmp_path_factory.mktemp("starts"))
 
 
 @pytest.fixture(scope="module")

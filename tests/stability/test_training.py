@@ -11,7 +11,7 @@ import numpy as np
 import pycolmap
 import pytest
 import torch
-from helpers.framework_runs import TINY, tiny_capture
+from helpers.framework_runs import TINY
 from helpers.tolerances import PSNR_BOUND
 from PIL import Image
 from torch.utils._python_dispatch import TorchDispatchMode
@@ -26,11 +26,6 @@ from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint
 from turbogs_plugin.train.trainer import Trainer
 
 pytestmark = pytest.mark.usefixtures("plotted")
-
-
-@pytest.fixture(scope="module")
-def capture(tmp_path_factory) -> Path:
-    return tiny_capture(tmp_path_factory.mktemp("extremes"))
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ import numpy as np
 import pycolmap
 import pytest
 import torch
-from helpers.framework_runs import TINY, assert_identical, tiny_capture
+from helpers.framework_runs import TINY, assert_identical
 from helpers.squares import SQUARES
 from torch import Tensor
 
@@ -129,14 +129,9 @@ def small_config(capture: Path, *overrides: str) -> Config:
     return config
 
 
-@pytest.fixture(scope="module")
-def capture(tmp_path_factory) -> Path:
-    return tiny_capture(tmp_path_factory.mktemp("turnover"))
-
-
 def first_change(capture: Path, monkeypatch) -> tuple[Tensor, int]:
     """Rows that the first event keeps and copies, and how many it removes."""
-    config = small_config(capture, *STEADY, "train.device=cpu", "density.max_gaussians=320")
+    config = small_config(capture, *STEADY, "train.device=cpu", "density.max_gaussians=180")
     trainer = Trainer(config.without_plan(), load_scene(capture), CPU)
     trainer.initialise_maps()
     found = []
@@ -161,7 +156,7 @@ def test_in_a_moved_world_the_same_rows_are_drawn(capture, tmp_path, monkeypatch
     reconstruction.write_binary(moved / "sparse/0")
     expected, pruned = first_change(capture, monkeypatch)
     source, same_pruned = first_change(moved, monkeypatch)
-    assert pruned == same_pruned > 0 and len(expected) == 320
+    assert pruned == same_pruned > 0 and len(expected) == 180
     assert torch.equal(source, expected)
 
 

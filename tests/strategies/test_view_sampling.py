@@ -59,15 +59,15 @@ def exact_inclusion(weights, count):
 
 def test_frequencies_are_those_of_draws_without_replacement():
     """5,000 draws of the 3 others around the anchor; each frequency within 4.5 standard deviations."""
-    cameras, trials = orbit(7), 5000
+    sampler, trials = ready(GeometryAwareViewSampler(2.0, 1.0), orbit(7)), 5000
     errors = np.array([0.1, 0.2, 0.9, 0.3, 0.1, 0.1, 0.1])
     counts = np.zeros(7)
     for trial in range(trials):
-        views = ready(GeometryAwareViewSampler(2.0, 1.0), cameras).select(4, errors, step(trial))
+        views = sampler.select(4, errors, step(trial))  # of all 7: three are left, so the stack is filled again
         assert views[0] == 2
         counts[list(views)] += 1
     others = np.delete(np.arange(7), 2)
-    weights = np.exp(ready(GeometryAwareViewSampler(2.0, 1.0), cameras).log_weights(2))[others]
+    weights = np.exp(sampler.log_weights(2))[others]
     expected = exact_inclusion(weights, 3)
     spread = np.sqrt(expected * (1 - expected) / trials)
     assert (np.abs(counts[others] / trials - expected) < 4.5 * spread).all()
@@ -136,10 +136,11 @@ def test_views_a_million_extents_away_do_not_underflow():
 
 @pytest.mark.parametrize("extent", [0.0, 1.0])
 def test_identical_cameras_are_drawn_uniformly(extent):
-    cameras = orbit(1).select([0] * 5)
-    counts = np.zeros(5)
+    sampler = ready(GeometryAwareViewSampler(), orbit(1).select([0] * 5), extent)
+    fresh, counts = sampler.state_dict(), np.zeros(5)
     for t in range(2000):
-        views = ready(GeometryAwareViewSampler(), cameras, extent).select(2, np.zeros(5), step(t))
+        sampler.load_state_dict(fresh)
+        views = sampler.select(2, np.zeros(5), step(t))
         assert len(set(views)) == 2
         counts[list(views)] += 1
     assert (np.abs(counts / 2000 - 0.4) < 4.5 * np.sqrt(0.4 * 0.6 / 2000)).all()

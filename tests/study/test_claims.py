@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 from helpers.framework_runs import TINY, tiny_capture
+from helpers.processes import PRELOADED
 
 from turbogs_plugin import cli
 from turbogs_plugin.commands import studies
@@ -19,6 +20,8 @@ from turbogs_plugin.study import claims as claims_module
 from turbogs_plugin.study.claims import STALE_SECONDS, Claims
 from turbogs_plugin.study.folder import StudyFolder
 from turbogs_plugin.study.grid import CellKey
+
+pytestmark = pytest.mark.usefixtures("plotted")
 
 KEY = CellKey("fox", "a.b[1]", 3)
 OTHER = CellKey("fox", "a.b[1]", 31)
@@ -113,9 +116,11 @@ def call(folder: Path, capture: Path, *more: str) -> list[str]:
     return [*names, "--device", "cpu", "--steps", "4", "--seeds", "0", "1", *more]
 
 
-@pytest.mark.usefixtures("plotted")
 def test_two_workers_train_each_cell_once(tmp_path, monkeypatch, capfd):
-    capture = tiny_capture(tmp_path)
+    """Forked from a server that has torch, where the command starts Python; what they are told is pickled in both."""
+    capture, server = tiny_capture(tmp_path), multiprocessing.get_context("forkserver")
+    server.set_forkserver_preload(PRELOADED)
+    monkeypatch.setattr(multiprocessing, "get_context", {"spawn": server}.__getitem__)
     monkeypatch.setattr(sys, "argv", ["turbogs", *call(tmp_path, capture, "--gpus", "0,1")])
     with pytest.raises(SystemExit) as end:
         cli.main()

@@ -24,6 +24,7 @@ from turbogs_plugin.plan.decisions import RULES, Verdict
 from turbogs_plugin.report import provenance as provenance_module
 from turbogs_plugin.report.provenance import provenance
 from turbogs_plugin.scene import load_scene, write_demo_capture
+from turbogs_plugin.study import cell as cell_module
 from turbogs_plugin.study import sweep
 from turbogs_plugin.study.cell import capture_digest, train_cell
 from turbogs_plugin.study.compare import study_of_runs
@@ -48,12 +49,19 @@ notes: {random: "a | bar"}
 """
 
 
-pytestmark = pytest.mark.usefixtures("plotted")
+pytestmark = pytest.mark.usefixtures("plotted", "cold")
 
 
-@pytest.fixture(scope="module")
-def capture(tmp_path_factory) -> Path:
-    return tiny_capture(tmp_path_factory.mktemp("ablation"))
+@pytest.fixture
+def warm() -> None:
+    """For tests of whole cells."""
+
+
+@pytest.fixture
+def cold(request, monkeypatch) -> None:
+    """Cells are trained without their warm-up, which takes as long and whose model is thrown away; not with `warm`."""
+    if "warm" not in request.fixturenames:
+        monkeypatch.setattr(cell_module, "warm_up", lambda *arguments: None)
 
 
 @pytest.fixture
@@ -92,7 +100,7 @@ def study(trained, tmp_path, monkeypatch) -> Path:
     return Path(shutil.copytree(trained, tmp_path / "study"))
 
 
-def test_a_sweep_is_complete_and_goes_on_where_it_stopped(turbogs, small, capture, tmp_path, monkeypatch, drawn):
+def test_a_sweep_is_complete_and_goes_on_where_it_stopped(turbogs, small, capture, tmp_path, monkeypatch, warm):
     out = tmp_path / "study"
     code, printed, err = turbogs(*call(small, capture, out, "--seeds", "0", "1"))
     assert code == 0 and str(out / "report.html") in printed
@@ -191,7 +199,9 @@ def machine(monkeypatch) -> None:
 @pytest.mark.parametrize(
     "length", [("train.iterations=30",), ("train.iterations=8", "train.epochs=2")], ids=["short", "long"]
 )
-def test_a_cell_with_a_time_budget_is_trained_as_a_run_with_one(turbogs, machine, small, capture, tmp_path, length):
+def test_a_cell_with_a_time_budget_is_trained_as_a_run_with_one(
+    turbogs, machine, small, capture, tmp_path, length, warm
+):
     """Fewer iterations than configured, or more pixels: the same numbers, and the same resolved configuration."""
     budget = ("--time-budget", "3s", "--device", "cpu")
     settings = (*TINY, *length)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from gsplat import export_splats
-from helpers.framework_runs import tiny_capture, tiny_config
+from helpers.framework_runs import tiny_config
 from helpers.models import random_gaussians
 from PIL import Image
 
@@ -30,11 +30,6 @@ from turbogs_plugin.types import Gaussians
 
 CPU = torch.device("cpu")
 LENGTH = ("train.iterations=18", "train.refine_until=9", "train.evaluate_at=[]")
-
-
-@pytest.fixture(scope="module")
-def capture(tmp_path_factory) -> Path:
-    return tiny_capture(tmp_path_factory.mktemp("given"))
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, fields
 
 import pytest
 import torch
-from helpers.framework_runs import tiny_capture, tiny_config
+from helpers.framework_runs import tiny_config
 from turbogs_plugin.strategies.losses import CharbonnierNccLoss
 from turbogs_plugin.strategies.optimizers.moment_lm import MomentLMOptimizer
 from turbogs_plugin.strategies.optimizers.sparse_adam import SparseAdam
@@ -48,11 +48,6 @@ class OwnCode:
 
     def setup(self, gaussians):
         self.inner.setup(gaussians)
-
-
-@pytest.fixture(scope="module")
-def capture(tmp_path_factory):
-    return tiny_capture(tmp_path_factory.mktemp("seam"))
 
 
 def make_trainer(capture):

@@ -3,17 +3,12 @@
 from pathlib import Path
 
 import pytest
-from helpers.framework_runs import tiny_capture, tiny_config
+from helpers.framework_runs import tiny_config
 from PIL import Image
 
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.files import require_writable
 from turbogs_plugin.train import run, start
-
-
-@pytest.fixture(scope="module")
-def capture(tmp_path_factory) -> Path:
-    return tiny_capture(tmp_path_factory.mktemp("start"))
 
 
 @pytest.fixture(autouse=True)

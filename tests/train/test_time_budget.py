@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from helpers.framework_runs import stop_after, tiny_capture, tiny_config
+from helpers.framework_runs import stop_after, tiny_config
 from helpers.simulated_time import SimulatedTime
 
 from turbogs_plugin.config.configuration import TrainConfig, resolve
@@ -24,11 +24,6 @@ from turbogs_plugin.train.saved_model import load_model
 from turbogs_plugin.train.trainer import Trainer
 
 pytestmark = pytest.mark.usefixtures("plotted")
-
-
-@pytest.fixture(scope="module")
-def capture(tmp_path_factory) -> Path:
-    return tiny_capture(tmp_path_factory.mktemp("budget"))
 
 
 @pytest.fixture

@@ -39,11 +39,6 @@ pytestmark = pytest.mark.usefixtures("plotted")
 
 
 @pytest.fixture(scope="module")
-def capture(tmp_path_factory) -> Path:
-    return tiny_capture(tmp_path_factory.mktemp("trainer"))
-
-
-@pytest.fixture(scope="module")
 def whole(capture, tmp_path_factory) -> run.RunSession:
     """A run never stopped."""
     return run.train(tiny_config(capture), tmp_path_factory.mktemp("runs") / "whole", write_report)

@@ -7,7 +7,7 @@ import time
 from pathlib import Path
 
 import pytest
-from helpers.framework_runs import stop_after, tiny_capture, tiny_config
+from helpers.framework_runs import stop_after, tiny_config
 from helpers.simulated_time import SimulatedTime
 
 from turbogs_plugin.errors import InputError, TrainingStopped
@@ -16,11 +16,6 @@ from turbogs_plugin.train import run, start, wall
 from turbogs_plugin.train.wall import WallClock, WallRecord, process_age
 
 pytestmark = pytest.mark.usefixtures("plotted")
-
-
-@pytest.fixture(scope="module")
-def capture(tmp_path_factory) -> Path:
-    return tiny_capture(tmp_path_factory.mktemp("wall"))
 
 
 def test_a_process_is_as_old_as_the_system_says(monkeypatch):

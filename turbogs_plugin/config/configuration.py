@@ -29,8 +29,6 @@ PACKAGE = "turbogs_plugin.configs"
 DEFAULT_CONFIG = "turbogs"
 """The packaged configuration that a run without ``--config`` takes."""
 
-PACKAGE = "turbogs_plugin.configs"
-
 BASE_DEPTH_LIMIT = 8
 """Configurations under one another by ``base``."""
 

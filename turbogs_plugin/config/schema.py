@@ -8,6 +8,7 @@ import types
 import typing
 from collections.abc import Iterable, Mapping
 from dataclasses import MISSING, fields, is_dataclass
+from functools import cache
 from typing import Any, TypeVar
 
 from turbogs_plugin.errors import InputError
@@ -38,7 +39,7 @@ def build_dataclass(cls: type[T], mapping: Mapping[str, Any], where: str) -> T:
     if not isinstance(mapping, Mapping):
         raise InputError(f"{where}: expected a mapping of keys, got {mapping!r}")
     try:
-        hints = typing.get_type_hints(cls)
+        hints = _type_hints(cls)
     except Exception as error:  # whatever the names of a third party's types lead to
         raise InputError(f"{where}: a type of {cls.__name__}'s fields cannot be resolved: {error}") from error
     init_fields = {field.name: field for field in fields(cls) if field.init}
@@ -53,6 +54,9 @@ def build_dataclass(cls: type[T], mapping: Mapping[str, Any], where: str) -> T:
         return cls(**values)
     except (ValueError, TypeError) as error:
         raise InputError(f"{where}: {error}") from error
+
+
+_type_hints = cache(typing.get_type_hints)  # it evaluates every annotation of the class again
 
 
 def dataclass_mapping(instance: Any) -> dict[str, Any]:

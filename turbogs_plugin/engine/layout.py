@@ -126,3 +126,18 @@ def columns(row: type) -> dict[str, slice]:
             if name.isupper() and name != "SIZE":
                 found[name.lower()] = place if isinstance(place, slice) else slice(place, place + 1)
     return found
+
+
+def interface(launches: list[type]) -> str:
+    """The order of the fields of `launches` and the numbers of this file, as text. A library from other sources has
+    another text."""
+    lines = []
+    for cls in launches:
+        lines.append(f"{cls.operator}: " + "; ".join(" ".join(names) for names in cls.paths))
+    for name, value in globals().items():
+        if isinstance(value, type):
+            places = (f"{column} {place.start}:{place.stop}" for column, place in columns(value).items())
+            value = f"{', '.join(places)} of {value.SIZE}"
+        if name[0].isupper():
+            lines.append(f"{name}: {value}")
+    return "\n".join(lines)

@@ -14,7 +14,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
-from types import ModuleType, SimpleNamespace
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, ClassVar, Protocol
 
 if TYPE_CHECKING:
@@ -50,11 +50,17 @@ def fields_of(kind: str, names: str) -> type:
     return type("Fields", (), {"__annotations__": dict.fromkeys(names.split(), kind)})
 
 
+def annotations(cls: type) -> dict[str, str]:
+    """Name -> type of the fields of a class, those of its bases first."""
+    own = (vars(base).get("__annotations__", {}) for base in reversed(cls.__mro__) if base is not Launch)
+    return dict(field for fields in own for field in fields.items())
+
+
 def _paths(cls: type, prefix: str = "") -> tuple[list[str], list[str], list[str], list[str]]:
     """Dotted paths of the tensors, integers, reals and rows of a class, in the order of its fields."""
     paths = [], [], [], []
     kinds = {"Tensor": 0, "Tensor | None": 0, "int": 1, "bool": 1, "float": 2, "list[int]": 3}
-    for name, annotation in cls.__annotations__.items():
+    for name, annotation in annotations(cls).items():
         if annotation in kinds:
             paths[kinds[annotation]].append(prefix + name)
         else:
@@ -67,20 +73,6 @@ def _reader(tensors: list[str], integers: list[str], reals: list[str], rows: lis
     """A function that reads the lists from a launch. It is generated as code, because it runs for every launch."""
     lists = ["(" + "".join(f"launch.{path}, " for path in paths) + ")" for paths in (tensors, integers, reals)]
     return eval(f"lambda launch: ({', '.join(lists)}, {f'launch.{rows[0]}' if rows else '()'})")
-
-
-def interface(layout: ModuleType) -> str:
-    """The order of all fields and the numbers of `layout`, as text. A library from other sources has another text."""
-    lines = []
-    for cls in LAUNCHES:
-        lines.append(f"{cls.operator}: " + "; ".join(" ".join(names) for names in cls.paths))
-    for name, value in vars(layout).items():
-        if isinstance(value, type):
-            places = (f"{column} {place.start}:{place.stop}" for column, place in layout.columns(value).items())
-            value = f"{', '.join(places)} of {value.SIZE}"
-        if name[0].isupper():
-            lines.append(f"{name}: {value}")
-    return "\n".join(lines)
 
 
 # ---- What several launches have in common ---------------------------------------------------------------------------
@@ -344,26 +336,27 @@ class SparseLoss(Launch):
 
 
 @dataclass
-class ExposeColors(Launch):
-    """Map rendered colours by the exposures of their photos: writes `exposed`."""
+class ExposedViews:
+    """Rendered colours, and the exposures of their photos."""
 
     colors: Tensor  # [P, 3] float32
     tile_ids: Tensor  # [T] int32
     tile_offsets: Tensor  # [T + 1] int32
     views: list[int]  # [K] layout.ViewRow
     offsets: Tensor  # [V, 3, 4] float32
+
+
+@dataclass
+class ExposeColors(ExposedViews, Launch):
+    """Map the colours by the exposures: writes `exposed`."""
+
     exposed: Tensor  # [P, 3] float32
 
 
 @dataclass
-class ExposureBackward(Launch):
+class ExposureBackward(ExposedViews, Launch):
     """Gradients through `ExposeColors`: changes `gradients` in place, adds to `sums`."""
 
-    colors: Tensor  # [P, 3] float32
-    tile_ids: Tensor  # [T] int32
-    tile_offsets: Tensor  # [T + 1] int32
-    views: list[int]  # [K] layout.ViewRow
-    offsets: Tensor  # [V, 3, 4] float32
     gradients: Tensor  # [P, 3] float32
     sums: Tensor  # [K, 3, 4] float64, zero
 

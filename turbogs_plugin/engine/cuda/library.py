@@ -43,7 +43,7 @@ def _load_failure() -> str:
         torch.ops.load_library(str(path))
     except OSError as error:
         return f"{path.name} does not load: {str(error).splitlines()[0]}"
-    if _interface() != launches.interface(layout):
+    if _interface() != layout.interface(launches.LAUNCHES):
         return f"{path.name} was built from other sources than this package: build it again"
     return ""
 
