@@ -18,7 +18,7 @@ demo: demo/capture
 ablation: export OMP_NUM_THREADS := 1
 ablation: demo/capture
 	rm -rf demo/components
-	timeout 300 $(BIN)/turbogs ablate configs/ablations/components.yaml --scene $< --steps 60 --out demo/components
+	timeout 300 $(BIN)/turbogs ablate configs/ablations/components.yaml --scene $< --steps 40 --out demo/components
 
 demo/capture: | $(INSTALLED)
 	$(BIN)/turbogs demo $@
