@@ -6,15 +6,13 @@ import json
 from pathlib import Path
 from typing import Any
 
-from machine_tables import H200, where
+from machine_tables import ABSENT, H200, where
 
 from turbogs_plugin.report.tables import table
 from turbogs_plugin.study.pages import difference_text, spread_text
 from turbogs_plugin.study.statistics import Difference, Spread
 
 CAPTURES = H200 / "captures.json"
-
-ABSENT = "Not measured yet."
 
 RAW = {"seconds": ("s", 2), "psnr": ("PSNR", 2), "ssim": ("SSIM", 4)}
 """Measure -> head of its column, and digits behind the point."""
@@ -24,6 +22,15 @@ ALIGNED = {"aligned_psnr": ("PSNR, aligned", 2), "aligned_ssim": ("SSIM, aligned
 def measured(name: str, file: Path = CAPTURES) -> dict[str, Any] | None:
     """What was measured by this name, or None."""
     return json.loads(file.read_text()).get(name) if file.is_file() else None
+
+
+def grouped(record: dict[str, Any], having: str, key: str) -> dict[Any, list[dict[str, Any]]]:
+    """Value of `key` -> the runs that have it, in their order; of those runs alone that have `having`."""
+    groups: dict[Any, list[dict[str, Any]]] = {}
+    for run in record["runs"]:
+        if having in run:
+            groups.setdefault(run[key], []).append(run)
+    return groups
 
 
 def lenses() -> str:
@@ -46,10 +53,7 @@ def trainings(name: str, columns: dict[str, tuple[str, int]], file: Path = CAPTU
     record = measured(name, file)
     if record is None:
         return ABSENT
-    variants: dict[str, list[dict[str, Any]]] = {}
-    for run in record["runs"]:
-        if "seed" in run:
-            variants.setdefault(run["variant"], []).append(run)
+    variants = grouped(record, "seed", "variant")
     rows = []
     for variant, runs in variants.items():
         texts = [spread_text(Spread.of(run[measure] for run in runs), columns[measure][1]) for measure in columns]
@@ -74,10 +78,7 @@ def masked_iterations(file: Path = CAPTURES) -> str:
     record = measured("masks", file)
     if record is None:
         return ABSENT
-    times: dict[int, list[dict[str, Any]]] = {}
-    for run in record["runs"]:
-        if "views" in run:
-            times.setdefault(run["views"], []).append(run)
+    times = grouped(record, "views", "views")
     rows = []
     for views, (whole, half) in ((views, pair) for views, pair in times.items() if len(pair) == 2):
         cells = []

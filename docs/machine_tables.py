@@ -19,6 +19,8 @@ from turbogs_plugin.config.configuration import load_config
 from turbogs_plugin.plan.memory import MemoryDemand
 from turbogs_plugin.report.tables import table
 
+ABSENT = "Not measured yet."
+"""In the place of a table whose record is not there."""
 H200 = Path(__file__).resolve().parent / "results/h200"
 
 
@@ -90,7 +92,7 @@ def dropin(folder: Path = H200) -> str:
     """gsplat's trainer with each swap at its end, and beside stock at the earlier of both ends: a table a file."""
     records = sorted((json.loads(file.read_text()) for file in folder.glob(DROPIN)), key=lambda record: record["date"])
     parts = [f"{record['device']}, {record['date']}:\n\n{dropin_table(record['runs'])}" for record in records]
-    return "\n\n".join(parts) or "Not measured yet."
+    return "\n\n".join(parts) or ABSENT
 
 
 def dropin_table(runs: list[dict[str, Any]]) -> str:

@@ -8,12 +8,11 @@ import textwrap
 from pathlib import Path
 from typing import Any
 
-from machine_tables import H200, where
+from machine_tables import ABSENT, H200, where
 
 from turbogs_plugin.bench.viewer import summarised
 from turbogs_plugin.report.tables import table
 
-NOT_YET = "Not measured yet."
 PICTURES = H200.parent / "pictures.json"
 """What docs/make_pictures.py wrote."""
 EXPORTS = H200 / "exports.json"
@@ -45,7 +44,7 @@ def viewer(folder: Path = H200) -> str:
         )
         places.append(where(measured))
     if not lines:
-        return NOT_YET
+        return ABSENT
     header = ("capture", "iterations", "Gaussians", "iterations a second, without", "nobody looks")
     header += ("a client that moves", "its frames a second", "pixels wide")
     return f"{'; '.join(dict.fromkeys(places))}.\n\n{table(header, lines)}"
@@ -54,7 +53,7 @@ def viewer(folder: Path = H200) -> str:
 def exports(file: Path = EXPORTS) -> str:
     """Every format of a run's model: its bytes, and what was lost."""
     if not file.exists():
-        return NOT_YET
+        return ABSENT
     record = json.loads(file.read_text())
     lines = [(name, *_export(entry, record)) for name, entry in record["exports"].items()]
     film = record["film"]
