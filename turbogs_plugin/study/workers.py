@@ -87,6 +87,8 @@ def _work(gpu: int, place: int, arguments: tuple) -> None:
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     visible = [name for name in os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",") if name]
     os.environ["CUDA_VISIBLE_DEVICES"] = visible[gpu] if gpu < len(visible) else str(gpu)
+    # Each process with as many threads as there are cores would wait for the others' at every parallel loop.
+    torch.set_num_threads(max(1, (os.cpu_count() or 1) // len(arguments[2].gpus)))
 
     sys.stderr = _Lines(os.fdopen(os.dup(2), "wb", 0), write_through=True)
 
