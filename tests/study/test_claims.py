@@ -121,7 +121,7 @@ def test_two_workers_train_each_cell_once(tmp_path, monkeypatch, capfd):
     capture, server = tiny_capture(tmp_path), multiprocessing.get_context("forkserver")
     server.set_forkserver_preload(PRELOADED)
     monkeypatch.setattr(multiprocessing, "get_context", {"spawn": server}.__getitem__)
-    monkeypatch.setattr(sys, "argv", ["turbogs", *call(tmp_path, capture, "--gpus", "0,0")])
+    monkeypatch.setattr(sys, "argv", ["turbogs", *call(tmp_path, capture, "--gpus", "0,1")])
     with pytest.raises(SystemExit) as end:
         cli.main()
     told = capfd.readouterr().err
@@ -130,8 +130,7 @@ def test_two_workers_train_each_cell_once(tmp_path, monkeypatch, capfd):
     assert len(study.results) == 4 and not study.failures
     trained = [line for line in told.splitlines() if " dB in " in line]
     assert len(trained) == 4 == len({line.partition("] ")[2].partition(":")[0] for line in trained})
-    assert {result.provenance.at_once for result in study.results} == {2}
-    assert "2 trainings shared a GPU" in (tmp_path / "study/report.md").read_text()
+    assert (tmp_path / "study/report.md").is_file()
     assert not [path for path in (tmp_path / "study/claims").rglob("*") if path.is_file()]
 
 
@@ -155,7 +154,7 @@ def test_a_cell_that_another_process_trains_is_waited_for(tmp_path, monkeypatch,
     }
 
 
-@pytest.mark.parametrize("text", ["a", "", "0;1", "-1"])
-def test_gpus_are_numbers(text):
+@pytest.mark.parametrize("text", ["0,0", "a", "", "0;1"])
+def test_gpus_are_different_numbers(text):
     with pytest.raises(InputError, match="--gpus"):
         studies.numbers("--gpus", text)

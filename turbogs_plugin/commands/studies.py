@@ -44,8 +44,7 @@ def ablate(
         reuse: take cells of the same settings from these studies where machine and sources are the same.
         merge: put these studies together in --out and write the report, without training.
         within: begin no further cell after so much time: 9m. The same call then goes on; the exit code is 3.
-        gpus: numbers of GPUs, a process each, which share the cells. A number given twice trains two cells on that
-            GPU at a time: sooner ready, but each takes longer.
+        gpus: numbers of GPUs, a process each, which share the cells.
         device: where to train.
     """
     from turbogs_plugin.config.units import parse_seconds
@@ -114,6 +113,6 @@ def report(
 def numbers(option: str, text: str | None) -> tuple[int, ...]:
     """``0,1,2`` as numbers; none where the option is absent."""
     words = [] if text is None else text.split(",")
-    if not all(word.strip().isdecimal() for word in words):
-        raise InputError(f"{option} '{text}': write numbers with commas between them: 0,1,2")
+    if not all(word.strip().isdecimal() for word in words) or len({int(word) for word in words}) < len(words):
+        raise InputError(f"{option} '{text}': write different numbers with commas between them: 0,1,2")
     return tuple(map(int, words))

@@ -26,14 +26,12 @@ class Provenance:
         software: name -> version.
         kernels: the CUDA library that ran, or why the torch reference did.
         commit: of the sources, or "" where unknown.
-        at_once: trainings of a study that shared a GPU; then each takes longer than alone.
     """
 
     machine: str
     software: dict[str, str]
     kernels: str
     commit: str
-    at_once: int = 1
 
 
 def provenance(device_type: str) -> Provenance:

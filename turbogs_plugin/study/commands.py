@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections import Counter
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
 from turbogs_plugin.errors import InputError
@@ -38,7 +36,6 @@ def ablate(
         raise InputError(f"ablations of one name would share a folder: {', '.join(names)}")
     folders = [StudyFolder(out if len(names) == 1 else out / name) for name in ablations]
     here = provenance(resolve_device(options.device).type)
-    here = replace(here, at_once=max(Counter(options.gpus).values(), default=1))
     chosen = [_variants(ablation, only, options) for ablation in ablations.values()]
     code, begun = 0, time.monotonic()
     for number, (ablation, variants, folder) in enumerate(zip(ablations.values(), chosen, folders, strict=True)):

@@ -151,8 +151,6 @@ def _machines(provenances: Sequence[Provenance | None]) -> list[Block]:
         blocks.append(Paragraph("The machine is not recorded for every run; seconds compare only within one machine."))
     if len({entry.machine for entry in recorded}) > 1:
         blocks.append(Paragraph("Cells are from different machines: their seconds do not compare."))
-    if (at_once := max((entry.at_once for entry in recorded), default=1)) > 1:
-        blocks.append(Paragraph(f"Up to {at_once} trainings shared a GPU: each took longer than alone."))
     return blocks
 
 

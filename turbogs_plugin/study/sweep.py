@@ -51,8 +51,7 @@ class SweepOptions:
         reuse: other studies; a cell of the same settings, made by the same sources on the same machine, is taken from
             them. Tables share variants, the baseline above all.
         within: seconds after which no further cell begins; None: all are trained.
-        gpus: numbers of this machine's GPUs, each of which a process of its own uses, two where a number stands twice;
-            none: this process trains.
+        gpus: numbers of this machine's GPUs, each of which a process of its own uses; none: this process trains.
     """
 
     scenes: Sequence[Path]
