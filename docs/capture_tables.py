@@ -110,3 +110,16 @@ def many_photos(file: Path = CAPTURES) -> str:
     heads = ("photos", "limit", "iterations", "s of training", "s on the wall", "PSNR", "Gaussians")
     made = table((*heads, "tensors on the GPU, peak", "main memory of all processes, peak", "ended"), rows)
     return f"{where(record)}.\n\n{made}"
+
+
+def photos_alone(file: Path = CAPTURES) -> str:
+    """Cameras that were found from photos alone, against the published ones."""
+    record = measured("alone", file)
+    if record is None:
+        return ABSENT
+    rows = []
+    for run in record["runs"]:
+        distances = [f"{100 * run[key]:.2f} %" for key in ("median", "largest")]
+        rows.append((f"{run['registered']} of {run['photos']}", *distances, f"{run['seconds'] / 60:.0f} min"))
+    made = table(("photos registered", "error of centers, median", "largest", "time"), rows)
+    return f"{where(record)}.\n\n{made}"

@@ -68,6 +68,7 @@ TABLES: dict[str, Callable[[], str | None]] = {
     "many_photos": capture_tables.many_photos,
     "masked_iterations": capture_tables.masked_iterations,
     "masked_runs": capture_tables.masked_runs,
+    "photos_alone": capture_tables.photos_alone,
     "leave_out": lambda: study_tables.changes("leave_out"),
     "masks_iterations": lambda: machine_tables.iterations(machine_tables.measured("masks.json")),
     "overlays caption": viewer_tables.overlays_caption,

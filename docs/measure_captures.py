@@ -1,6 +1,6 @@
 """Measures what docs/captures.md says of lenses, exposures, masks and many photos, on a machine with a GPU.
 
-    python docs/measure_captures.py OUT --fox-raw CAPTURE --caliterra CAPTURE [lenses exposures masks many ...]
+    python docs/measure_captures.py OUT --fox-raw CAPTURE --caliterra CAPTURE [lenses exposures masks many alone ...]
 
 Run in the project's root. Each measurement is written into OUT/captures.json as it comes, beside what earlier calls
 have measured; `docs/capture_tables.py` makes tables of docs/results/h200/captures.json. Nothing else stays.
@@ -9,6 +9,7 @@ have measured; `docs/capture_tables.py` makes tables of docs/results/h200/captur
     exposures  train.exposure=false and true: whole trainings, errors raw and after colour alignment
     masks      the right half of each photo masked, and none: whole trainings; iterations of one and the same model
     many       3,000 photos under --max-memory 8GiB: the command, with the memory of its processes
+    alone      cameras of a capture found from its photos alone, against the published ones; wants no GPU
 """
 
 from __future__ import annotations
@@ -24,6 +25,8 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import pycolmap
 import torch
 from PIL import Image
 
@@ -33,6 +36,7 @@ from turbogs_plugin.device import free_device_memory
 from turbogs_plugin.files import write_text_atomically
 from turbogs_plugin.model.ply import save_ply
 from turbogs_plugin.plan import make_plan
+from turbogs_plugin.reconstruct import reconstruct
 from turbogs_plugin.report.provenance import provenance
 from turbogs_plugin.scene import Scene, load_scene
 from turbogs_plugin.scene.offload import place_views
@@ -156,6 +160,20 @@ class Measurement:
                 result |= {"tensor_bytes": max(line.memory_bytes for line in history), "parts": wall.parts}
             self.add(runs, {"limit": limit[-1:], **result})
 
+    def alone(self, capture: Path) -> None:
+        runs = self.begin("alone")
+        self.record["alone"]["provenance"] = asdict(provenance("cpu"))
+        with tempfile.TemporaryDirectory() as folder:
+            started = time.perf_counter()
+            reconstruct(capture / "images", Path(folder) / "scene")
+            seconds = time.perf_counter() - started
+            model = pycolmap.Reconstruction(Path(folder) / "scene" / "sparse" / "0")
+        found = {image.name: image.projection_center() for image in model.images.values() if image.has_pose}
+        distances = distances_of_centers(found, published_centers(capture))
+        photos = sum(1 for _ in (capture / "images").iterdir())
+        result = {"photos": photos, "registered": len(found), "seconds": seconds}
+        self.add(runs, result | {"median": float(np.median(distances)), "largest": float(distances.max())})
+
     def load(self, capture: Path) -> Scene:
         return load_scene(capture, self.factor)
 
@@ -198,6 +216,30 @@ class Measurement:
         mean = evaluate(trainer.gaussians, test, trainer.sh_degree, config.raster, **options).mean
         run = {"seconds": loop.clock.seconds, "iterations": trainer.iteration, "gaussians": len(trainer.gaussians)}
         return run | {name: getattr(mean, name) for name in MEASURES}, trainer
+
+
+def published_centers(capture: Path) -> dict[str, np.ndarray]:
+    """Name of each photo of a ``transforms.json`` -> center of its camera [3]."""
+    frames = json.loads((capture / "transforms.json").read_text())["frames"]
+    return {Path(frame["file_path"]).name: np.array(frame["transform_matrix"])[:3, 3] for frame in frames}
+
+
+def distances_of_centers(found: dict[str, np.ndarray], published: dict[str, np.ndarray]) -> np.ndarray:
+    """How far each camera is from the published one, in shares of the mean distance of these from their middle, after
+    the similarity that brings most cameras together.
+
+    Args:
+        found: name of a photo -> center of its camera [3].
+        published: the same, of these photos at least.
+
+    Returns:
+        [F] in the order of `found`.
+    """
+    centers, true = np.array(list(found.values())), np.array([published[name] for name in found])
+    radius = np.linalg.norm(true - true.mean(axis=0), axis=1).mean()
+    ransac = pycolmap.RANSACOptions(max_error=0.02 * radius, random_seed=0)
+    change = pycolmap.estimate_sim3d_robust(centers, true, ransac)["tgt_from_src"]
+    return np.linalg.norm([change * center for center in centers] - true, axis=1) / radius
 
 
 def mask_half(capture: Path) -> None:
@@ -245,7 +287,7 @@ def text_of(file: Path) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("out", type=Path)
-    parser.add_argument("what", nargs="*", help="lenses, exposures, masks, many; all where absent")
+    parser.add_argument("what", nargs="*", help="lenses, exposures, masks, many, alone; all where absent")
     parser.add_argument("--fox-raw", type=Path, help="a capture with a distorted lens")
     parser.add_argument("--caliterra", type=Path, help="a capture whose exposures differ")
     parser.add_argument("--seeds", type=int, default=5)
@@ -256,17 +298,18 @@ def main() -> None:
     asked = parser.parse_intermixed_args()  # names may stand after options
     device = resolve_device(asked.device)
     all_of_it = Measurement(asked.out, device, asked.seeds, asked.factor, asked.photos, asked.set)
-    captures = {"lenses": asked.fox_raw, "exposures": asked.caliterra, "masks": asked.caliterra, "many": None}
+    fox, caliterra = (asked.fox_raw, "--fox-raw"), (asked.caliterra, "--caliterra")
+    captures = {"lenses": fox, "exposures": caliterra, "masks": caliterra, "many": (None, ""), "alone": fox}
     for name in asked.what or captures:
         if name not in captures:
             parser.error(f"{name}: choose of {', '.join(captures)}")
-        if name != "many" and captures[name] is None:
-            parser.error(f"{name} needs {'--fox-raw' if name == 'lenses' else '--caliterra'} CAPTURE")
+        if captures[name][1] and captures[name][0] is None:
+            parser.error(f"{name} needs {captures[name][1]} CAPTURE")
     failed = 0
     for name in asked.what or captures:
         started = time.perf_counter()
         try:
-            getattr(all_of_it, name)(*filter(None, [captures[name]]))
+            getattr(all_of_it, name)(*filter(None, captures[name][:1]))
         except Exception:  # the others are measured all the same
             failed = 1
             traceback.print_exc()

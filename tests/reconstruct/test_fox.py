@@ -1,7 +1,8 @@
 """Fox, whose wall has repeated paper. It takes minutes, so ``TURBOGS_SCENES`` must name the folder of captures."""
 
-import json
+import importlib
 import os
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,8 @@ from turbogs_plugin.reconstruct import reconstruct, run, solver
 from turbogs_plugin.reconstruct.agreement import consistent_groups
 from turbogs_plugin.reconstruct.workspace import Workspace
 
+sys.path.insert(0, str(Path(__file__).parents[2] / "docs"))  # the script imports its neighbours
+measure_captures = importlib.import_module("measure_captures")
 FOX = Path(os.environ.get("TURBOGS_SCENES", "")) / "fox-raw"
 MISLED = {f"{number:04d}.jpg" for number in (1, 2, 3, 4, 6, 7, 8, 9)}
 """Photos of the wall's left end, which matches its right end."""
@@ -23,16 +26,9 @@ pytestmark = pytest.mark.skipif(
 
 def errors(model: pycolmap.Reconstruction) -> dict[str, float]:
     """How far each camera is from the published one, in shares of the orbit's radius."""
-    frames = json.loads((FOX / "transforms.json").read_text())["frames"]
-    published = {Path(frame["file_path"]).name: np.array(frame["transform_matrix"])[:3, 3] for frame in frames}
-    images = [image for image in model.images.values() if image.has_pose]
-    found = np.array([image.projection_center() for image in images])
-    true = np.array([published[image.name] for image in images])
-    radius = np.linalg.norm(true - true.mean(axis=0), axis=1).mean()
-    ransac = pycolmap.RANSACOptions(max_error=0.02 * radius, random_seed=0)
-    change = pycolmap.estimate_sim3d_robust(found, true, ransac)["tgt_from_src"]
-    distances = np.linalg.norm([change * center for center in found] - true, axis=1) / radius
-    return {image.name: float(distance) for image, distance in zip(images, distances, strict=True)}
+    found = {image.name: image.projection_center() for image in model.images.values() if image.has_pose}
+    distances = measure_captures.distances_of_centers(found, measure_captures.published_centers(FOX))
+    return dict(zip(found, distances.tolist(), strict=True))
 
 
 @pytest.fixture(scope="module")

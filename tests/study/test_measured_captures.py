@@ -4,10 +4,14 @@ import importlib
 import json
 import subprocess
 import sys
+from dataclasses import asdict
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
+
+from turbogs_plugin.report.provenance import provenance
 
 ROOT = Path(__file__).parents[2]
 sys.path[:0] = [str(ROOT / "docs"), str(ROOT / "examples")]  # the scripts import their neighbours
@@ -69,6 +73,21 @@ def test_what_came_so_far_is_a_table(measured, tmp_path):
     assert "exit code 1" in capture_tables.many_photos(partial)
     assert capture_tables.trainings("lenses", capture_tables.RAW, partial) == capture_tables.ABSENT
     assert capture_tables.many_photos(tmp_path / "none.json") == capture_tables.ABSENT
+
+
+def test_cameras_are_compared_after_the_similarity_that_brings_most_together(tmp_path):
+    """Nine of ten are equal but for turn, size and place; one stands half a radius away."""
+    corners = np.random.default_rng(0).normal(size=(10, 3))
+    published = {f"{number}.jpg": corner for number, corner in enumerate(corners)}
+    radius = np.linalg.norm(corners - corners.mean(axis=0), axis=1).mean()
+    moved = corners + np.eye(10, 3, k=-9) * radius / 2
+    found = dict(zip(published, 3.0 * moved[:, [1, 2, 0]] + 5.0, strict=True))
+    distances = measure_captures.distances_of_centers(found, published)
+    assert distances[:9] == pytest.approx(0, abs=1e-9) and distances[9] == pytest.approx(0.5)
+    run = {"photos": 11, "registered": 10, "seconds": 120.0, "median": 0.0, "largest": 0.5}
+    record = tmp_path / "captures.json"
+    record.write_text(json.dumps({"alone": {"provenance": asdict(provenance("cpu")), "runs": [run]}}))
+    assert "| 10 of 11 | 0.00 % | 50.00 % | 2 min |" in capture_tables.photos_alone(record)
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="Linux says what processes share")
