@@ -21,7 +21,7 @@ from turbogs_plugin.study.grid import Ablation
 from turbogs_plugin.study.sweep import SweepOptions, run_sweep
 
 UNFINISHED = 3
-"""Exit code of a worker that `--within` ended."""
+"""Exit code of a sweep that `--within` ended, so that a script can call again; and of its workers."""
 
 
 class _Lines(io.TextIOWrapper):
