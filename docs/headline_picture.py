@@ -29,10 +29,7 @@ PICTURE_COLORS = {
     "Faster-GS": "#2e8b57",
 }
 PICTURE_LABELS = {"3dgs": "3DGS, ours", "mcmc": "MCMC, ours", "fastgs": "votes as FastGS's, ours"}
-PICTURE_NAMES = {
-    "ssim": "turbogs-ssim",
-    **dict.fromkeys(("cap-57k", "cap-67k", "cap-157k"), "turbogs with a cap"),
-}
+PICTURE_NAMES = {"ssim": "turbogs-ssim", **dict.fromkeys(("cap-57k", "cap-67k", "cap-157k"), "turbogs with a cap")}
 PICTURE_TICKS = (
     {"0.3": 0.3, "1": 1, "3": 3, "10": 10, "30": 30, "100": 100},
     {"50k": 5e4, "100k": 1e5, "200k": 2e5, "500k": 5e5, "1M": 1e6, "2M": 2e6},

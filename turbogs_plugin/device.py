@@ -1,8 +1,9 @@
-"""Operations on a device as a whole: wait for it, measure its peak memory, free what is unused."""
+"""Devices as a whole: wait for them, measure their peak memory, free what is unused, count the processor's cores."""
 
 from __future__ import annotations
 
 import gc
+import os
 import sys
 
 import torch
@@ -12,6 +13,11 @@ def synchronize(device: torch.device) -> None:
     """Wait for the GPU, so that a clock read next counts what was asked for; nothing on a CPU."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)
+
+
+def processor_cores() -> int:
+    """The cores that this process may use: a container or a job may have fewer than the machine."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def free_device_memory(device: torch.device) -> None:

@@ -26,7 +26,7 @@ from turbogs_plugin.bench.models import (
 )
 from turbogs_plugin.bench.precision import precision
 from turbogs_plugin.bench.raster import RasterBench
-from turbogs_plugin.bench.recorder import STEPS, StepRecorder, recorded
+from turbogs_plugin.bench.recorder import STEPS, Recorder, recorded
 from turbogs_plugin.bench.step import tensor_bytes
 from turbogs_plugin.engine.rendering import rasterize
 from turbogs_plugin.errors import InputError
@@ -55,7 +55,7 @@ def test_the_recorder_marks_the_trainers_own_steps_and_leaves_no_trace(capture, 
     plain, watched = (Trainer(config, load_scene(capture), CPU) for _ in range(2))
     before = {name: set(vars(getattr(watched, name))) for name in ("schedule", "optimizer", "density", "maps")}
     engine, loss = watched.engine, watched.loss
-    recorder, operators = StepRecorder(CPU), OperatorTime(monkeypatch)
+    recorder, operators = Recorder(CPU), OperatorTime(monkeypatch)
     for trainer in (plain, watched):
         trainer.initialise_maps()
     with operators, recorded(watched, recorder) as iteration:

@@ -134,8 +134,7 @@ def test_a_whole_run_streams_and_resumes_to_the_same_model(capture, little_memor
 
 
 def test_fewer_photos_are_decoded_at_a_time_where_memory_is_short(monkeypatch):
-    monkeypatch.setattr(photos.os, "cpu_count", lambda: 8)
-    monkeypatch.setattr(photos.os, "sched_getaffinity", lambda _: set(range(8)), raising=False)
+    monkeypatch.setattr(photos, "processor_cores", lambda: 8)
     monkeypatch.setattr(photos, "free_host_bytes", lambda: 16 * 2**30)
     largest = 8000 * 6000 * photos.DECODING_BYTES
     for size, threads in ((0, 8), (1920 * 1080 * photos.DECODING_BYTES, 8), (largest, 3), (100 * largest, 1)):

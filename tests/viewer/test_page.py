@@ -45,9 +45,9 @@ def shown(subject: Subject):
 
 
 def connected(page: Page, **headers: str):
-    from turbogs_plugin.bench.viewer_client import ScriptedClient
+    from helpers.viewer_client import WaitingClient
 
-    return ScriptedClient(page.url, **headers)
+    return WaitingClient(page.url, **headers)
 
 
 def test_the_first_frames_are_our_renders(subject):
@@ -68,9 +68,7 @@ def test_pictures_and_views_are_chosen_on_the_page(subject):
         client.next_frame(lossless=True)
         for picture, view in ((Picture.DEPTH, 0), (Picture.COMPARE, 2), (Picture.ERRORS, 4), (Picture.TILES, 4)):
             page.choose_view(view)
-            client.say(
-                {"type": "GuiUpdateMessage", "uuid": page._pictures._impl.uuid, "updates": {"value": picture.value}}
-            )
+            client.press(page._pictures._impl.uuid, picture.value)
             expected = draw(subject, Request(picture, eye, view))
             for _ in range(5):  # the choice of a view may be drawn on the way
                 if np.array_equal(client.next_frame(lossless=True).pixels(), expected):
@@ -109,7 +107,7 @@ def test_a_hostile_client_ends_nothing(subject):
             client.next_frame()
         for camera in HOSTILE:
             with connected(page) as client:
-                client.say_camera(*camera)
+                client.look(Eye(*camera))
                 with pytest.raises((TimeoutError, ConnectionClosed)):
                     client.next_frame(timeout=0.3)
                 page.go_to(3)  # moves every client's camera, as far as it has one
@@ -118,8 +116,8 @@ def test_a_hostile_client_ends_nothing(subject):
             client.next_frame(lossless=True)
             slider, pictures = page._slider._impl.uuid, page._pictures._impl.uuid
             for uuid, value in ((slider, 10**9), (slider, -5), (pictures, "no such picture"), ("nobody", 1)):
-                client.say({"type": "GuiUpdateMessage", "uuid": uuid, "updates": {"value": value}})
-            client.say_camera(eye.position, eye.wxyz, eye.fov, 10**9, 10**9)
+                client.press(uuid, value)
+            client.look(dataclasses.replace(eye, width=10**9, height=10**9))
             wide = client.next_frame(lossless=True).pixels()
             assert max(wide.shape) <= 1920
             client.say({"type": "ShareUrlRequest"})
@@ -154,9 +152,9 @@ def test_a_training_goes_on_while_a_client_looks(new_training, scene):
         with connected(page) as client:
             client.look(Eye.of_view(loop.trainer.views.cameras, 0))
             frames.append(client.next_frame())
-            client.say({"type": "GuiUpdateMessage", "uuid": page._pause._impl.uuid, "updates": {"value": True}})
+            client.press(page._pause._impl.uuid, True)
             frames.append(client.next_frame(lossless=True))
-            client.say({"type": "GuiUpdateMessage", "uuid": page._pause._impl.uuid, "updates": {"value": True}})
+            client.press(page._pause._impl.uuid, True)
 
     page.controls.pause()  # until the client is there
     thread = threading.Thread(target=look)

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import statistics
 import time
-from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any
 
 import numpy as np
 import torch
@@ -57,29 +55,6 @@ def device_times(spans: Iterable[Span]) -> Summary:
     return summary([first.until(last) for first, last in spans])
 
 
-class Recorder:
-    """Spans of function calls.
-
-    Attributes:
-        spans: of each name, in the order of the calls.
-    """
-
-    def __init__(self, device: torch.device) -> None:
-        self.device = device
-        self.spans: dict[str, list[Span]] = defaultdict(list)
-
-    def timed(self, name: str, function: Callable) -> Callable:
-        """The function, with the spans of its calls recorded under a name."""
-
-        def call(*arguments: Any, **keywords: Any) -> Any:
-            first = Mark(self.device)
-            result = function(*arguments, **keywords)
-            self.spans[name].append((first, Mark(self.device)))
-            return result
-
-        return call
-
-
 def keep_busy(device: torch.device) -> None:
     """Wait for the GPU, then keep it busy for a while; nothing on a CPU."""
     synchronize(device)
@@ -91,13 +66,14 @@ def measure(function: Callable[[], object], repeats: int, device: torch.device) 
     """Time of the device for `function`: on a GPU without the gaps in which it waits for the host."""
     for _ in range(WARMUP_CALLS if device.type == "cuda" else 1):
         function()
-    recorder = Recorder(device)
-    timed = recorder.timed("", function)
+    spans = []
     for _ in range(repeats):
         keep_busy(device)
-        timed()
+        first = Mark(device)
+        function()
+        spans.append((first, Mark(device)))
     synchronize(device)
-    return device_times(recorder.spans[""])
+    return device_times(spans)
 
 
 def back_to_back(function: Callable[[], object], repeats: int, device: torch.device) -> Summary:

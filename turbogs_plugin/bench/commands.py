@@ -36,7 +36,7 @@ AGAIN = "this build, in a process of its own"
 that trained the models, the same kernels take up to 10 % less or more."""
 
 
-def run_step(bench: StepBench, scene: Path | None, factor: int, device: torch.device, out: Path | None) -> int:
+def run_step(bench: StepBench, scene: Path | None, factor: int, device: torch.device, out: Path | None) -> None:
     if (scene is None) == (bench.photos == 0):
         raise InputError("bench step needs cameras and photos: --scene SCENE, or --photos N for synthetic ones")
     if scene is None and bench.photos < FEWEST_PHOTOS:
@@ -49,10 +49,10 @@ def run_step(bench: StepBench, scene: Path | None, factor: int, device: torch.de
     measured = bench.run(capture, device)
     report = _report("step", measured, device)
     _keep(report, step_lines(measured), out)
-    return _finish(report, out)
+    _finish(report, out)
 
 
-def run_raster(bench: RasterBench, scene: Path | None, factor: int, device: torch.device, out: Path | None) -> int:
+def run_raster(bench: RasterBench, scene: Path | None, factor: int, device: torch.device, out: Path | None) -> None:
     _require_new(out)
     capture = None if scene is None else load_scene(scene, factor)
     place = ["--device", device.type] + ([] if scene is None else ["--scene", str(scene), "--factor", str(factor)])
@@ -70,49 +70,39 @@ def run_raster(bench: RasterBench, scene: Path | None, factor: int, device: torc
             measured = other_build(library, command)
             report["other_builds"][name] = {**measured, **model}
             _keep(report, [f"{name}:", *raster_lines(measured)], out)
-    return _finish(report, out)
+    _finish(report, out)
 
 
-def run_ranks(bench: RanksBench, scene: Path, factor: int, device: torch.device, out: Path | None) -> int:
+def run_ranks(bench: RanksBench, scene: Path, factor: int, device: torch.device, out: Path | None) -> None:
     """Prints a line a measurement, and writes the JSON where there is a file."""
     _require_new(out)
     measured = bench.run(scene, factor, device)
-    if out is not None:
-        write_text_atomically(out, json.dumps(_report("ranks", measured, device), indent=2) + "\n")
-        print(f"json  {out}")
-    return 0
+    _keep(_report("ranks", measured, device), [f"json  {out}"], out)
 
 
-def run_numerics(device: torch.device, out: Path) -> int:
+def run_numerics(device: torch.device, out: Path) -> None:
     require_writable(out, f"--out '{out}'")
     tables = solvers_table(bench_solvers(out, device)), statistics_table(bench_statistics(out, device))
     print("\n\n".join((*tables, f"folder  {out}")))
-    return 0
 
 
-def run_wall(arguments: Sequence[str], repeats: int, device: torch.device, out: Path | None) -> int:
+def run_wall(arguments: Sequence[str], repeats: int, device: torch.device, out: Path | None) -> None:
     """Times `turbogs train` with these arguments; prints the parts, and writes the JSON where there is a file."""
     _require_new(out)
     measured = bench_wall(arguments, repeats)
     print("\n".join(wall_lines(measured)))
     if reason := missing_bytecode():
         print(f"missing  {reason}")
-    if out is not None:
-        write_text_atomically(out, json.dumps(_report("wall", measured, device), indent=2) + "\n")
-        print(f"json  {out}")
-    return 0
+    _keep(_report("wall", measured, device), [f"json  {out}"], out)
 
 
-def run_viewer(config: Config, repeats: int, device: torch.device, out: Path | None) -> int:
+def run_viewer(config: Config, repeats: int, device: torch.device, out: Path | None) -> None:
     """Times trainings with and without a viewer; prints them side by side, and writes the JSON if there is a file."""
     _require_new(out)
     require_viser()
     measured = bench_viewer(config, open_scene(config), device, repeats)
     print("\n".join(viewer_lines(measured)))
-    if out is not None:
-        write_text_atomically(out, json.dumps(_report("viewer", measured, device), indent=2) + "\n")
-        print(f"json  {out}")
-    return 0
+    _keep(_report("viewer", measured, device), [f"json  {out}"], out)
 
 
 def _require_new(out: Path | None) -> None:
@@ -135,9 +125,8 @@ def _keep(report: dict[str, Any], gist: Sequence[str], out: Path | None) -> None
         print("\n".join(gist), flush=True)
 
 
-def _finish(report: dict[str, Any], out: Path | None) -> int:
+def _finish(report: dict[str, Any], out: Path | None) -> None:
     print(json.dumps(report, indent=2) if out is None else f"json  {out}")
-    return 0
 
 
 def step_lines(measured: dict[str, Any]) -> list[str]:

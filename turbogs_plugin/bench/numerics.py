@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -16,6 +15,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from turbogs_plugin.bench.clocks import measure
+from turbogs_plugin.bench.statistics import write_record
 from turbogs_plugin.engine.reference.lm_solvers import (
     ROW_LIMIT,
     solve_float64,
@@ -24,7 +24,6 @@ from turbogs_plugin.engine.reference.lm_solvers import (
     solve_scaled_cholesky,
 )
 from turbogs_plugin.files import write_atomically, write_text_atomically
-from turbogs_plugin.report.machine import hardware, software
 from turbogs_plugin.report.plots import STYLE
 from turbogs_plugin.report.tables import table
 
@@ -163,7 +162,6 @@ def bench_solvers(out: Path, device: torch.device) -> list[SolverResult]:
         out: folder for the three files; made where absent.
         device: where the solvers run.
     """
-    out.mkdir(parents=True, exist_ok=True)
     results = []
     for views in VIEWS:
         times = _nanoseconds(views, device)
@@ -176,10 +174,8 @@ def bench_solvers(out: Path, device: torch.device) -> list[SolverResult]:
                 median, largest = (float(np.median(good)), float(good.max())) if len(good) else (math.nan, math.nan)
                 failed = 1 - len(good) / len(errors)
                 results.append(SolverResult(name, family.name, views, median, largest, failed, times[name]))
-    machine = {"hardware": hardware(device.type), "software": dict(software()), "threads": torch.get_num_threads()}
     settings = {"systems": SYSTEMS, "batch": BATCH, "repeats": REPEATS, "size": SIZE}
-    record = {"machine": machine, "settings": settings, "results": [asdict(result) for result in results]}
-    write_text_atomically(out / "solvers.json", json.dumps(record, indent=1).replace("NaN", "null") + "\n")
+    write_record(out / "solvers.json", settings, results, device)
     write_text_atomically(out / "solvers.md", solvers_table(results) + "\n")
     write_atomically(out / "solvers.png", lambda file: _plot(results).savefig(file, format="png"))
     return results

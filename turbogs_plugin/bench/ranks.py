@@ -9,16 +9,15 @@ import json
 import sys
 import tempfile
 from collections.abc import Sequence
-from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
-from unittest.mock import patch
 
 import torch
 
-from turbogs_plugin.bench.clocks import Recorder, back_to_back, device_times
+from turbogs_plugin.bench.clocks import back_to_back, device_times
 from turbogs_plugin.bench.models import trained_model
+from turbogs_plugin.bench.recorder import Recorder
 from turbogs_plugin.bench.step import StepBench, warm_trainer
 from turbogs_plugin.device import synchronize
 from turbogs_plugin.distributed.exchange import RankExchange
@@ -130,33 +129,16 @@ class RanksBench:
 
     def _parts(self, trainer: Trainer, device: torch.device) -> dict[str, float]:
         """Median milliseconds of each part on the device, in iterations that follow each other without a pause."""
-        recorder, exchange, engine = Recorder(device), trainer.exchange, trainer.engine
+        recorder = Recorder(device)
         places = [
             (trainer.pixel_sampler, "sample", "draw"),
-            (engine, "render", "render"),
             (trainer, "supervise", "loss"),
-            (engine, "update", "solve"),
+            (trainer.engine, "update", "solve"),
         ]
-        if isinstance(exchange, RankExchange):
-            places += [(exchange, "_gather_colors", "colors"), (exchange, "finish", "arrival")]
-            places.append((RowGather, "begin", "parameters"))
-        with ExitStack() as stack:
-            for owner, name, part in places:
-                stack.enter_context(patch.object(owner, name, recorder.timed(part, getattr(owner, name))))
-            exchanged = SharedScreen.of_rows
-
-            def of_rows(screen: SharedScreen, *arguments: Any) -> Any:
-                return recorder.timed("records", lambda: exchanged(screen, *arguments))()
-
-            stack.enter_context(patch.object(SharedScreen, "of_rows", of_rows))
-            render = engine.render
-
-            def rendered(*arguments: Any) -> Any:
-                result = render(*arguments)
-                result.backward = recorder.timed("backward", result.backward)
-                return result
-
-            stack.enter_context(patch.object(engine, "render", rendered))
+        if isinstance(trainer.exchange, RankExchange):
+            places += [(trainer.exchange, "_gather_colors", "colors"), (trainer.exchange, "finish", "arrival")]
+            places += [(RowGather, "begin", "parameters"), (SharedScreen, "of_rows", "records")]
+        with recorder.passes(trainer, "render", "backward"), recorder.calls(*places):
             for _ in range(self.repeats):
                 trainer.step()
             synchronize(device)

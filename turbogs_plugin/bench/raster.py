@@ -7,17 +7,15 @@ import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
-from unittest.mock import patch
 
 import torch
 from torch import Tensor
 
-from turbogs_plugin.bench.clocks import Recorder, back_to_back, copy_bandwidth, device_times, measure
+from turbogs_plugin.bench.clocks import back_to_back, copy_bandwidth, device_times, measure
 from turbogs_plugin.bench.floors import raster_counts, raster_floors
 from turbogs_plugin.bench.gsplat_dense import bench_gsplat
 from turbogs_plugin.bench.models import (
@@ -29,6 +27,7 @@ from turbogs_plugin.bench.models import (
     trained_model,
 )
 from turbogs_plugin.bench.precision import precision
+from turbogs_plugin.bench.recorder import Recorder
 from turbogs_plugin.device import free_device_memory
 from turbogs_plugin.engine import engine_of
 from turbogs_plugin.engine.cuda.library import LIBRARY_VARIABLE
@@ -49,17 +48,6 @@ STAGES = {
     "projection_backward": "projection backward",
 }
 """Operators of the library, and the stage that each of them is."""
-
-
-@contextmanager
-def recorded_operators(device: torch.device) -> Iterator[Recorder]:
-    """While entered, every call of the operators in `STAGES` is recorded under its stage."""
-    recorder = Recorder(device)
-    with ExitStack() as stack:
-        for name, stage in STAGES.items():
-            timed = recorder.timed(stage, getattr(torch.ops.turbogs, name))
-            stack.enter_context(patch.object(torch.ops.turbogs, name, timed))
-        yield recorder
 
 
 @dataclass
@@ -203,7 +191,8 @@ class RasterBench:
         if on_kernels:
             torch.cuda.reset_peak_memory_stats(device)
             whole()
-            with recorded_operators(device) as recorder:
+            recorder = Recorder(device)
+            with recorder.calls(*((torch.ops.turbogs, operator, stage) for operator, stage in STAGES.items())):
                 measure(whole, self.repeats, device)
             spans = recorder.spans.items()
             measured["stages"] = {stage: device_times(calls[-self.repeats :]) for stage, calls in spans}

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -151,14 +152,19 @@ def bench_statistics(out: Path, device: torch.device) -> list[StatisticsResult]:
         out: folder for the files; made where absent.
         device: where the statistics are computed.
     """
-    out.mkdir(parents=True, exist_ok=True)
     results = [*(measure_case(case, device) for case in CASES), measure_window(device)]
-    machine = {"hardware": hardware(device.type), "software": dict(software()), "threads": torch.get_num_threads()}
     settings = {"gaussians": COUNT, "size": SIZE, "views": VIEWS, "rate": RATE, "looks": LOOKS, "rows": ROWS}
-    record = {"machine": machine, "settings": settings, "results": [asdict(result) for result in results]}
-    write_text_atomically(out / "statistics.json", json.dumps(record, indent=1).replace("NaN", "null") + "\n")
+    write_record(out / "statistics.json", settings, results, device)
     write_text_atomically(out / "statistics.md", statistics_table(results) + "\n")
     return results
+
+
+def write_record(path: Path, settings: dict[str, Any], results: Sequence[Any], device: torch.device) -> None:
+    """Write dataclasses of results, with the machine and the settings of their measurement; the folder is made."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    machine = {"hardware": hardware(device.type), "software": dict(software()), "threads": torch.get_num_threads()}
+    record = {"machine": machine, "settings": settings, "results": [asdict(result) for result in results]}
+    write_text_atomically(path, json.dumps(record, indent=1).replace("NaN", "null") + "\n")
 
 
 def statistics_table(results: list[StatisticsResult]) -> str:

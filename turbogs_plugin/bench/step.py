@@ -15,7 +15,7 @@ from torch import Tensor
 from turbogs_plugin.bench.clocks import BLOCKS, Mark, back_to_back, copy_bandwidth, device_times, keep_busy, summary
 from turbogs_plugin.bench.floors import raster_counts, step_floors
 from turbogs_plugin.bench.models import changed, resized, train, trained_model, trainer_of
-from turbogs_plugin.bench.recorder import StepRecorder, recorded
+from turbogs_plugin.bench.recorder import Recorder, recorded
 from turbogs_plugin.config.configuration import Config, load_config
 from turbogs_plugin.device import synchronize
 from turbogs_plugin.distributed.ranks import ONE, Ranks
@@ -104,7 +104,7 @@ class StepBench:
             torch.cuda.reset_peak_memory_stats(device)
         start = trainer.iteration
 
-        recorder = StepRecorder(device)
+        recorder = Recorder(device)
         with recorded(trainer, recorder) as iteration:
             for _ in range(self.repeats):
                 keep_busy(device)

@@ -8,7 +8,7 @@ import statistics
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -133,27 +133,24 @@ def viewer_lines(measured: dict[str, Any]) -> list[str]:
 
 def _train(way: str, config: Config, scene: Scene, device: torch.device) -> ViewerRun:
     loop, _ = new_loop(config, scene, device)
-    if way == "without":
-        iterations, seconds = _timed(loop, [])
-        return ViewerRun(way, iterations, seconds, gaussians=len(loop.trainer.gaussians))
-    page = Page("127.0.0.1", 0, Controls())
-    client = None
-    try:
-        live = LiveViewer(page).attach(loop.trainer, place_views(scene.test, device, config.train.photos_place))
+    begin, client = _Begin(), None
+    loop.listeners = [begin]
+    with ExitStack() as stack:
+        if way != "without":
+            page = Page("127.0.0.1", 0, Controls())
+            stack.callback(page.close)
+            test = place_views(scene.test, device, config.train.photos_place)
+            loop.listeners.insert(0, LiveViewer(page).attach(loop.trainer, test))
         if way == "client":
             client = _start_client(page, Eye.of_view(loop.trainer.views.cameras, 0))
-        iterations, seconds = _timed(loop, [live])
-    finally:
-        page.close()
-        said = client.communicate()[0] if client is not None else None
-    gaussians = len(loop.trainer.gaussians)
-    if said is None:
-        return ViewerRun(way, iterations, seconds, gaussians=gaussians)
-    found = json.loads(said)
-    frames = found["frames"]
-    rate = (frames - 1) / found["seconds"] if frames > 1 else 0.0
-    width = int(statistics.median(found["widths"] or [0]))
-    return ViewerRun(way, iterations, seconds, frames, rate, width, gaussians)
+        loop.run()
+    iterations, seconds = loop.trainer.iteration - begin.iteration, loop.clock.seconds - begin.seconds
+    run = ViewerRun(way, iterations, seconds, gaussians=len(loop.trainer.gaussians))
+    if client is not None:  # it ends with the page
+        found = json.loads(client.communicate()[0])
+        run.frames, run.width = found["frames"], int(statistics.median(found["widths"] or [0]))
+        run.frame_rate = (run.frames - 1) / found["seconds"] if run.frames > 1 else 0.0
+    return run
 
 
 class _Begin(Listener):
@@ -164,14 +161,6 @@ class _Begin(Listener):
 
     def begun(self, loop: TrainingLoop) -> None:
         self.iteration, self.seconds = loop.trainer.iteration, loop.clock.seconds
-
-
-def _timed(loop: TrainingLoop, listeners: Sequence[Listener]) -> tuple[int, float]:
-    """(iterations, seconds) of a training."""
-    begin = _Begin()
-    loop.listeners = [*listeners, begin]
-    loop.run()
-    return loop.trainer.iteration - begin.iteration, loop.clock.seconds - begin.seconds
 
 
 def _start_client(page: Page, eye: Eye) -> subprocess.Popen:

@@ -14,7 +14,7 @@ import math
 import sys
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -72,12 +72,8 @@ class ScriptedClient:
 
     def look(self, eye: Eye) -> None:
         """Tell where this client's camera is."""
-        self.say_camera(eye.position, eye.wxyz, eye.fov, eye.width, eye.height)
-
-    def say_camera(self, position: Any, wxyz: Any, fov: Any, width: Any, height: Any) -> None:
-        """Tell whatever of the camera, as a hostile client might."""
-        message = {"type": "ViewerCameraMessage", "wxyz": wxyz, "position": position, "fov": fov}
-        message |= {"near": 0.01, "far": 1000.0, "image_height": height, "image_width": width}
+        message = {"type": "ViewerCameraMessage", "wxyz": eye.wxyz, "position": eye.position, "fov": eye.fov}
+        message |= {"near": 0.01, "far": 1000.0, "image_height": eye.height, "image_width": eye.width}
         self.say(message | {"look_at": (0.0, 0.0, 0.0), "up_direction": (0.0, 0.0, 1.0)})
 
     def say(self, message: dict[str, Any]) -> None:
@@ -86,8 +82,8 @@ class ScriptedClient:
 
         self._socket.send(msgspec.msgpack.encode(message))
 
-    def messages(self, timeout: float) -> Iterator[dict[str, Any]]:
-        """What arrives in the next parcel; nothing if none comes in time."""
+    def frames(self, timeout: float) -> Iterator[Frame]:
+        """The frames of the next parcel of messages; none if it does not come in time."""
         import msgspec
 
         try:
@@ -95,34 +91,16 @@ class ScriptedClient:
         except TimeoutError:
             return
         size = int.from_bytes(raw[8:16], "little")
-        yield from msgspec.msgpack.decode(self._zstd.decompress(raw[16 : 16 + size]))["messages"]
-
-    def frames(self, timeout: float) -> Iterator[Frame]:
-        """The frames of the next parcel."""
-        for message in self.messages(timeout):
+        for message in msgspec.msgpack.decode(self._zstd.decompress(raw[16 : 16 + size]))["messages"]:
             if message["type"] == "BackgroundImageMessage" and message["rgb_data"] is not None:
                 yield Frame(time.perf_counter(), message["format"] == "png", message["rgb_data"])
-
-    def next_frame(self, lossless: bool | None = None, timeout: float = 60.0) -> Frame:
-        """Wait for a frame, if asked for one of this kind.
-
-        Raises:
-            TimeoutError: none came.
-        """
-        ends = time.perf_counter() + timeout
-        while (left := ends - time.perf_counter()) > 0:
-            for frame in self.frames(left):
-                if lossless in (None, frame.lossless):
-                    return frame
-        raise TimeoutError("no frame came")
 
 
 def turning(eye: Eye, seconds: float) -> Eye:
     """The eye after so long on a small circle, once around in two seconds."""
     angle = math.pi * seconds
     x, y, z = eye.position
-    place = (x + TURN * math.cos(angle), y + TURN * math.sin(angle), z)
-    return Eye(place, eye.wxyz, eye.fov, eye.width, eye.height)
+    return replace(eye, position=(x + TURN * math.cos(angle), y + TURN * math.sin(angle), z))
 
 
 def main() -> None:

@@ -91,34 +91,37 @@ def bench(
     if what == "numerics":
         if out is None or overrides or scene is not None or ply or library:
             raise InputError("bench numerics needs --out FOLDER, and takes --device besides")
-        return commands.run_numerics(where, out)
-    if what in ("wall", "viewer"):
+        commands.run_numerics(where, out)
+    elif what in ("wall", "viewer"):
         if scene is None or of_step_or_raster or training is not None:
             raise InputError(
                 f"bench {what} needs --scene SCENE, and takes --repeats, --factor, --device and --out besides"
             )
         if what == "viewer":
             options = RunOptions(factor=factor, device=where.type)
-            return commands.run_viewer(options.settings(scene, overrides), times, where, out)
-        arguments = [str(scene), *overrides, "--device", where.type, "--factor", str(factor)]
-        return commands.run_wall(arguments, times, where, out)
-    if what == "ranks":
+            commands.run_viewer(options.settings(scene, overrides), times, where, out)
+        else:
+            arguments = [str(scene), *overrides, "--device", where.type, "--factor", str(factor)]
+            commands.run_wall(arguments, times, where, out)
+    elif what == "ranks":
         if scene is None or of_step_or_raster:
             raise InputError("bench ranks needs --scene SCENE; a model, synthetic photos and offload are not for it")
         ranks = RanksBench(gpus, gaussians, views, pixel_budget, grown, iterations, times, overrides)
-        return commands.run_ranks(ranks, scene, factor, where, out)
-    if what == "step":
+        commands.run_ranks(ranks, scene, factor, where, out)
+    elif what == "step":
         if len(ply) > 1:
             raise InputError("bench step takes one --ply, at the sizes of --gaussians")
         model = ply[0] if ply else None
         step = StepBench(gaussians, views, pixel_budget, iterations, times, overrides, model, offload, photos, size)
-        return commands.run_step(step, scene, factor, where, out)
-    if overrides:
-        raise InputError("bench raster times the rasterizer alone: it has no section.key=value")
-    if training is not None and scene is None:
-        raise InputError("--training needs --scene: without a capture, bench raster times synthetic models")
-    raster = RasterBench(gaussians, views, rates, pixel_budget, size, times, iterations, ply, library)
-    return commands.run_raster(raster, scene, factor, where, out)
+        commands.run_step(step, scene, factor, where, out)
+    else:
+        if overrides:
+            raise InputError("bench raster times the rasterizer alone: it has no section.key=value")
+        if training is not None and scene is None:
+            raise InputError("--training needs --scene: without a capture, bench raster times synthetic models")
+        raster = RasterBench(gaussians, views, rates, pixel_budget, size, times, iterations, ply, library)
+        commands.run_raster(raster, scene, factor, where, out)
+    return 0
 
 
 def doctor() -> int:

@@ -69,11 +69,7 @@ def ablate(
 
 
 def compare(
-    runs: Annotated[Positional[tuple[Path, ...]], arg(metavar="RUN RUN ...")],
-    /,
-    *,
-    out: Path,
-    psnr: Decibels = (),
+    runs: Annotated[Positional[tuple[Path, ...]], arg(metavar="RUN RUN ...")], /, *, out: Path, psnr: Decibels = ()
 ) -> int:
     """Report any runs side by side; runs that were asked the same, but for the seed, count as one variant.
 
@@ -90,12 +86,7 @@ def compare(
     return commands.compare(runs, out, psnr)
 
 
-def report(
-    studies: Positional[Studies],
-    /,
-    *,
-    psnr: Decibels = (),
-) -> int:
+def report(studies: Positional[Studies], /, *, psnr: Decibels = ()) -> int:
     """Write the report of studies again, from their results.json. A plot whose data did not change is left as it is.
 
     Args:

@@ -22,6 +22,7 @@ from datetime import timedelta
 
 import torch
 
+from turbogs_plugin.device import processor_cores
 from turbogs_plugin.distributed.ranks import ONE, ProcessRanks, RankLost, Ranks
 from turbogs_plugin.errors import InputError, TrainingStopped, error_line
 
@@ -71,7 +72,7 @@ def start(count: int, arguments: Sequence[str], device: str = "auto", module: st
     if device == "auto" and not present:
         raise InputError(f"--gpus {count}: no GPU answers here; leave it out, or see 'turbogs doctor'")
     logging.getLogger("torch.distributed.elastic").setLevel(logging.CRITICAL)  # the processes say what happened
-    os.environ.setdefault("OMP_NUM_THREADS", str(max(1, (os.cpu_count() or 1) // count)))
+    os.environ.setdefault("OMP_NUM_THREADS", str(max(1, processor_cores() // count)))
     config = LaunchConfig(
         min_nodes=1,
         max_nodes=1,

@@ -46,13 +46,7 @@ class MemoryDemand:
 
     @classmethod
     def of(
-        cls,
-        config: Config,
-        pixels: int,
-        test_pixels: int,
-        largest: int,
-        num_views: int,
-        photo_bytes: int = PHOTO_BYTES,
+        cls, config: Config, pixels: int, test_pixels: int, largest: int, num_views: int, photo_bytes: int = PHOTO_BYTES
     ) -> MemoryDemand:
         """The demand of a configuration whose places of maps and photos are decided.
 

@@ -15,6 +15,7 @@ from typing import Any
 
 from PIL import Image, ImageOps
 
+from turbogs_plugin.device import processor_cores
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene.capture import FEWEST_PHOTOS
 from turbogs_plugin.scene.photo_folder import find_photos, unread
@@ -79,7 +80,7 @@ def read_photos(folder: Path) -> list[PhotoFile]:
     for name, number in Counter(names).items():
         if number > 1:
             raise InputError(f"{number} photos in {place} would be named '{name}' without spaces: rename them")
-    with ThreadPoolExecutor(min(8, os.cpu_count() or 1)) as pool:
+    with ThreadPoolExecutor(min(8, processor_cores())) as pool:
         photos = list(pool.map(_read, paths, names))
     return sorted(photos, key=lambda photo: photo.name)
 
@@ -106,7 +107,7 @@ def place_photos(photos: Sequence[PhotoFile], folder: Path) -> None:
                 shutil.copyfile(photo.path, part)
         os.replace(part, target)
 
-    with ThreadPoolExecutor(min(8, os.cpu_count() or 1)) as pool:
+    with ThreadPoolExecutor(min(8, processor_cores())) as pool:
         list(pool.map(place, photos))
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import os
 import platform
 import shlex
 import sys
@@ -13,6 +12,7 @@ from pathlib import Path
 import torch
 
 from turbogs_plugin import __version__
+from turbogs_plugin.device import processor_cores
 
 PACKAGES = ("torch", "gsplat", "numpy", "pycolmap")
 
@@ -30,8 +30,7 @@ def software() -> list[tuple[str, str]]:
 
 def hardware(device: str) -> str:
     """The machine in words."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    processor = f"{_processor_name()}, {cores} cores"
+    processor = f"{_processor_name()}, {processor_cores()} cores"
     if device != "cuda":
         return processor
     properties = torch.cuda.get_device_properties(0)

@@ -88,14 +88,7 @@ def _page(run: RunSession, metrics: Metrics, lpips_reason: str, shown: int) -> s
         )
     grey = "; masked pixels of photo and error are grey" if masked else ""
     result = table(
-        (
-            *columns.values(),
-            "training in s",
-            "wall in s",
-            "Gaussians",
-            "FPS",
-            "peak memory in MiB",
-        ),
+        (*columns.values(), "training in s", "wall in s", "Gaussians", "FPS", "peak memory in MiB"),
         [
             (
                 *errors(metrics.mean, columns),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -13,6 +12,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
+from turbogs_plugin.device import processor_cores
 from turbogs_plugin.report.inferno import INFERNO
 
 ERROR_FULL_SCALE = 0.25
@@ -41,7 +41,7 @@ def picture_writer() -> Iterator[Callable[[Path, np.ndarray], None]]:
     Leaving waits for all files, and raises the first error.
     """
     jobs = []
-    with ThreadPoolExecutor(min(THREADS, os.cpu_count() or 1)) as pool:
+    with ThreadPoolExecutor(min(THREADS, processor_cores())) as pool:
         yield lambda path, pixels: jobs.append(pool.submit(_save, path, pixels))
     for job in jobs:
         job.result()

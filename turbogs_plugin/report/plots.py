@@ -40,11 +40,7 @@ def plot_against_seconds(path: Path, seconds: Sequence[float], values: Sequence[
         figure.subplots_adjust(**MARGINS)
         axes.plot(seconds, values, marker="o", color="#1f5fa8")
         axes.annotate(
-            label_of(values[-1]),
-            (seconds[-1], values[-1]),
-            xytext=(0, 8),
-            textcoords="offset points",
-            ha="right",
+            label_of(values[-1]), (seconds[-1], values[-1]), xytext=(0, 8), textcoords="offset points", ha="right"
         )
         axes.set(xlabel=SECONDS_LABEL, ylabel=label, title=title)
         axes.set_xlim(left=0)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -15,6 +14,7 @@ import torch
 from PIL import ExifTags, Image, UnidentifiedImageError
 from torch import Tensor
 
+from turbogs_plugin.device import processor_cores
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene.host_arrays import free_host_bytes, host_array
 from turbogs_plugin.scene.undistort import Lens
@@ -244,8 +244,7 @@ def load_photos(
 
 def decoding_threads(bytes_each: int = 0) -> ThreadPoolExecutor:
     """As many as there are processors for this process, but no more than `MEMORY_SHARE` of the free memory allows."""
-    processors = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    wanted = min(MOST_THREADS, processors)
+    wanted = min(MOST_THREADS, processor_cores())
     affordable = int(MEMORY_SHARE * free_host_bytes()) // bytes_each if wanted * bytes_each > SMALL_WORK else wanted
     return ThreadPoolExecutor(max(1, min(wanted, affordable)))
 

@@ -14,11 +14,8 @@ from turbogs_plugin.study.folder import StudyFolder, merged
 from turbogs_plugin.study.grid import Ablation, alike_at, load_ablation
 from turbogs_plugin.study.pages import write_report
 from turbogs_plugin.study.sweep import SweepOptions, run_sweep
-from turbogs_plugin.study.workers import run_on_gpus
+from turbogs_plugin.study.workers import UNFINISHED, run_on_gpus
 from turbogs_plugin.train.start import resolve_device
-
-UNFINISHED = 3
-"""Exit code of a sweep that `--within` ended, so that a script can call again."""
 
 
 def ablate(

@@ -6,8 +6,7 @@ import itertools
 import json
 import time
 import traceback
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -156,12 +155,16 @@ def run_sweep(
                     progress.ended_elsewhere()
                     continue
                 progress.begin(key)
+                path = (folder.tensorboard / key.file).with_suffix("")
+                events = [EventWriter(path, scene.test, config.report.strips)] if config.report.tensorboard else []
+                listeners = [progress, *events]
                 try:
-                    with _events(config, folder, key, scene) as events:
-                        listeners = [progress, *events]
-                        outcome = train_cell(key.variant, config, scene, device, here, listeners, loading[key.scene])
+                    outcome = train_cell(key.variant, config, scene, device, here, listeners, loading[key.scene])
                 except Exception as error:  # whatever a variant breaks by, the other cells go on
                     outcome = Failure(key, _reason(error))
+                finally:
+                    for writer in events:
+                        writer.close()
                 if not claim.held:
                     progress.ended_elsewhere()
                     continue
@@ -170,18 +173,6 @@ def run_sweep(
             if isinstance(outcome, Failure):
                 _require_working(device)
     return len(left)
-
-
-@contextmanager
-def _events(config: Config, folder: StudyFolder, key: CellKey, scene: Scene) -> Iterator[list[EventWriter]]:
-    """What writes a cell's event files, where its configuration asks for them."""
-    path = (folder.tensorboard / key.file).with_suffix("")
-    events = [EventWriter(path, scene.test, config.report.strips)] if config.report.tensorboard else []
-    try:
-        yield events
-    finally:
-        for writer in events:
-            writer.close()
 
 
 def _scene_configs(

@@ -14,13 +14,14 @@ from typing import Any
 
 import torch
 
+from turbogs_plugin.device import processor_cores
 from turbogs_plugin.errors import InputError, TrainingStopped, exit_code
 from turbogs_plugin.study.folder import StudyFolder
 from turbogs_plugin.study.grid import Ablation
 from turbogs_plugin.study.sweep import SweepOptions, run_sweep
 
 UNFINISHED = 3
-"""Exit code of a worker that `--within` ended."""
+"""Exit code of a sweep that `--within` ended, so that a script can call again; and of its workers."""
 
 
 class _Lines(io.TextIOWrapper):
@@ -88,7 +89,7 @@ def _work(gpu: int, place: int, arguments: tuple) -> None:
     visible = [name for name in os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",") if name]
     os.environ["CUDA_VISIBLE_DEVICES"] = visible[gpu] if gpu < len(visible) else str(gpu)
     # Each process with as many threads as there are cores would wait for the others' at every parallel loop.
-    torch.set_num_threads(max(1, (os.cpu_count() or 1) // len(arguments[2].gpus)))
+    torch.set_num_threads(max(1, processor_cores() // len(arguments[2].gpus)))
 
     sys.stderr = _Lines(os.fdopen(os.dup(2), "wb", 0), write_through=True)
 
