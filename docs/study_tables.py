@@ -127,10 +127,10 @@ def behind() -> str:
             more = theirs > ours + NEAR[measure]
             if more or size < 1:
                 texts = (f"{value:.{digits}f}".removeprefix("0") for value in (theirs, ours))
-                how = f"{' for '.join(texts)}{' dB' if measure == 'psnr' else ' SSIM'}"
+                how = f"{', '.join(texts)}{' dB' if measure == 'psnr' else ' SSIM'}"
                 which = f"{entry['method']}, {entry['capture']}"
-                lines.append((which, how, "" if math.isinf(size) else f"x {size:.2f}"))
-    return table(("theirs for ours", "error", "Gaussians"), lines)
+                lines.append((which, how, "" if math.isinf(size) else f"{size:.2f}"))
+    return table(("against", "their error, ours", "their Gaussians / ours"), lines)
 
 
 def headline_sources() -> str:

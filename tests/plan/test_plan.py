@@ -123,7 +123,7 @@ BOTH_SIDES = [
     ("train.iterations", {"train_views": 2625}, ("train.base_iterations=100000",), 40000, "sampled 15.2 times"),
     ("train.iterations", {"train_views": 20}, ("train.epochs=75",), 2000, "fewer than 40% of 5000"),
     ("optimizer.type", {"device": "cpu"}, (), "sparse_adam", "5 to 10 % of an iteration"),
-    ("optimizer.type", {"device": "cuda"}, (), "moment_lm", "within 7 %"),
+    ("optimizer.type", {"device": "cuda"}, (), "moment_lm", "7 % more"),
     ("train.maps_place", {"device_free_bytes": 240 * MIB}, (), "device", "120 MiB <= 50% of 240 MiB free"),
     ("train.maps_place", {"device_free_bytes": 239 * MIB}, (), "host", "120 MiB > 50% of 239 MiB free"),
     ("train.maps_place", {"device_free_bytes": 240 * MIB}, ("train.photos_place=device",), "host", "beside 100 MiB"),

@@ -25,8 +25,8 @@ something have .68 (snowmiku) and .83 (fox)."""
 EXPOSURE_STOPS = 0.1
 """Standard deviation of photos from their neighbours' exposures, in stops, from which on each photo gets one.
 Caliterra, whose flight lines differ, has .13; fox and snowmiku .05 (docs/plan.md). These two change by .17 and .18 in
-all, but by little from photo to photo, and what follows the view a model's harmonics take up. Whether it pays at .13 is
-not measured yet."""
+all, but by little from photo to photo, and what follows the view a model's harmonics take up. At .13 it pays
+only after a fit of colours (docs/captures.md)."""
 FLAT_TILES = 0.5
 """Share of tiles without texture from which on NCC is left out. It gains SSIM at .09 (caliterra, .0055) and
 at .42 (snowmiku, .002); above, nothing has been measured yet."""
@@ -164,7 +164,7 @@ def wanted_optimizer(facts: SceneFacts, config: Config) -> Verdict:
     if facts.device == "cpu":
         reason = "linear systems are 5 to 10 % of an iteration on a CPU, for nothing on the demo capture"
         return Verdict("sparse_adam", reason)
-    reason = "sparse_adam has its errors within the spread of seeds and its time within 7 % on three scenes on an H200"
+    reason = "at most 7 % more time than sparse_adam, errors within the spread of seeds, on three scenes on an H200"
     return Verdict("moment_lm", reason)
 
 
