@@ -4,11 +4,12 @@ processes that write them still run."""
 from __future__ import annotations
 
 import glob
+import itertools
 import os
 import socket
 import tempfile
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Container, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
@@ -100,6 +101,12 @@ def _brought_to_disk(file: BinaryIO) -> Iterator[None]:
         finally:
             ended.set()
     repeated.result()  # a failure that was told here is not told again at the end
+
+
+def unused_name(name: str, taken: Container[str]) -> str:
+    """The name, with a number behind it where that is taken."""
+    names = (name if number == 1 else f"{name}-{number}" for number in itertools.count(1))
+    return next(name for name in names if name not in taken)
 
 
 def partial_path(path: Path) -> Path:
