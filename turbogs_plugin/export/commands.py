@@ -6,13 +6,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import torch
+
 from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.export.contribution import contributions, pruned
 from turbogs_plugin.export.fidelity import Change, Fidelity
 from turbogs_plugin.export.film import film_cameras, require_film, write_film
-from turbogs_plugin.export.formats import FORMATS, PAGE, require_format, written_and_read
+from turbogs_plugin.model.formats import FORMATS
 from turbogs_plugin.model.harmonics import band_energy, drop_faint_bands
+from turbogs_plugin.model.similarity import Similarity
 from turbogs_plugin.scene import Scene
 from turbogs_plugin.train.saved_model import SavedModel, load_given_model, load_model
 from turbogs_plugin.train.start import open_scene, resolve_device
@@ -20,6 +23,9 @@ from turbogs_plugin.types import Gaussians
 
 if TYPE_CHECKING:
     from turbogs_plugin.export.page import WrittenPage
+
+PAGE = "html"
+"""The name of the page with everything in it, which is no format of models."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +76,9 @@ def export_run(
         max_gaussians: keep at most so many, those that add most to the training views.
         given: the capture of a model from a file, and how to render it; None: `path` is a run.
     """
-    require_format(file_format)
+    if file_format not in (*FORMATS, PAGE):
+        known = ", ".join((*FORMATS, PAGE))
+        raise InputError(f"--format {file_format}: there is no such format; choose one of {known}")
     if drop_bands is not None and not 0 <= drop_bands < 1:
         raise InputError(f"--drop-bands {drop_bands}: it must be a share, at least 0 and less than 1")
     if max_gaussians is not None and max_gaussians < 1:
@@ -96,7 +104,8 @@ def export_run(
         size, count, change, reason = page.bytes, page.gaussians, page.change, ""
     else:
         file = model.folder.model.with_suffix(FORMATS[file_format].suffix) if out is None else out
-        read = written_and_read(file_format, kept, file, model.frame, model.iteration or 0)
+        FORMATS[file_format].write(kept, file, model.frame, model.iteration or 0)
+        read = Similarity.into(model.frame).apply(FORMATS[file_format].read(file)).map(torch.Tensor.float)
         size, count = file.stat().st_size, len(read)
         change, reason = _change(model, read, scene, absent)
     held = sum(value.numel() * 4 for _, value in whole.items())

@@ -18,6 +18,8 @@ from turbogs_plugin.types import Gaussians
 
 SAMPLED_DIRECTIONS = 64
 """Directions by which the rotation of harmonics is found; the largest degree has 7 functions."""
+LARGEST_ROUNDING = 1e-4
+"""Largest rounding error of positions in float32, in units of the frame's scale, that a file may have."""
 
 
 @dataclass(frozen=True)
@@ -88,6 +90,34 @@ def placed(gaussians: Gaussians, change: Similarity, source: str | Path) -> Gaus
     if bad:
         warnings.warn(f"{source}: {bad} of {len(rows)} Gaussians are not finite and left out", stacklevel=3)
         rows = rows.map(lambda value: value[finite])
+    return rows
+
+
+def in_capture(gaussians: Gaussians, frame: Frame, target: Path) -> Gaussians:
+    """A model as files of single precision have it: in the capture's own coordinates, float32 on the CPU.
+
+    Args:
+        gaussians: those that are not finite are left out, with a warning that counts them.
+        frame: of the model's coordinates.
+        target: the file, for messages.
+
+    Raises:
+        InputError: none is left, or the capture lies too far from its origin for float32.
+    """
+    rows = gaussians.map(lambda value: value.detach().cpu())
+    finite = finite_rows(rows)
+    if not finite.all():
+        warnings.warn(f"{int((~finite).sum())} of {len(rows)} Gaussians are not finite and left out", stacklevel=3)
+    rows = rows.map(lambda value: value[finite].contiguous())
+    if not len(rows):
+        raise InputError(f"there are no Gaussians to write to {target}")
+    if np.abs(frame.center).max() * np.finfo(np.float32).eps / 2 > LARGEST_ROUNDING * frame.scale:
+        raise InputError(
+            f"the capture lies {np.abs(frame.center).max():.3g} units from its origin, too far for {target} in single "
+            "precision: export with --format ply"
+        )
+    rows.means = torch.from_numpy(frame.restore_points(rows.means.numpy())).float()
+    rows.scales = rows.scales + math.log(frame.scale)
     return rows
 
 
