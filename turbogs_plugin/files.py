@@ -40,6 +40,14 @@ def require_writable(folder: Path, given: str) -> None:
         raise InputError(f"{given} cannot be made in '{place}' ({reason}): choose a folder to write to") from None
 
 
+def require_new_file(path: Path, option: str) -> None:
+    """Raise `InputError`, which names the option, where a file exists or has no folder to be made in."""
+    if path.exists():
+        raise InputError(f"{option} '{path}' exists: choose a new file")
+    if not path.absolute().parent.is_dir():
+        raise InputError(f"{option} '{path}': there is no folder '{path.parent}'")
+
+
 def read_text(path: Path) -> str | None:
     """The UTF-8 text of a file, or None where there is none. Raises `InputError` where it cannot be read."""
     try:
