@@ -16,10 +16,10 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any, TypeVar
 
-from turbogs_plugin.export.commands import export_run, film_run
+from turbogs_plugin.export.commands import PAGE, export_run, film_run
 from turbogs_plugin.export.film import RATE
-from turbogs_plugin.export.formats import FORMATS, PAGE
 from turbogs_plugin.files import write_text_atomically
+from turbogs_plugin.model.formats import FORMATS
 from turbogs_plugin.report.provenance import provenance
 from turbogs_plugin.train.folder import RunFolder
 from turbogs_plugin.train.start import resolve_device

@@ -270,4 +270,5 @@ def test_a_library_that_cannot_be_used_is_said_by_all_who_need_it(another_librar
     assert not kernels.available() and kernels.architectures() == ()
     with pytest.raises(InputError, match=f"CUDA kernels: {words}"):
         kernels.require()
-    assert doctor._kernels() == ("not usable", [f"kernels: {reason}"])
+    lines = doctor.diagnosis().splitlines()
+    assert f"{'kernels':<16}not usable" in lines and f"{'missing':<16}kernels: {reason}" in lines

@@ -57,9 +57,8 @@ def _with_port(arguments: list[str]) -> list[str]:
     """Arguments in which --viewer without a port has the usual one."""
     filled = []
     for text, following in itertools.zip_longest(arguments, arguments[1:], fillvalue=""):
-        filled.append(text)
-        if text == "--viewer" and not following.lstrip("-").isdecimal():
-            filled.append(str(PORT))
+        portless = text == "--viewer" and not following.lstrip("-").isdecimal()
+        filled += [text, str(PORT)] if portless else [text]
     return filled
 
 

@@ -10,6 +10,7 @@ from importlib.metadata import PackageNotFoundError, version
 import torch
 from packaging.requirements import Requirement
 
+from turbogs_plugin.engine import compiled_kernels
 from turbogs_plugin.report.machine import hardware, missing_bytecode, software
 from turbogs_plugin.train.evaluate import LPIPS_PACKAGES
 from turbogs_plugin.train.flip import load_flip
@@ -29,11 +30,13 @@ INSTALL_COMMANDS = 'pip install "turbogs-plugin[train]"'
 
 def diagnosis() -> str:
     """Versions, devices, kernels and what is missing, for a person to read."""
-    kernels, missing = _kernels()
+    kernels = compiled_kernels()
+    missing = [f"kernels: {kernels.unavailable}"] if kernels.unavailable else []
+    usable = "not usable" if missing else f"loaded from {kernels.path}, for {', '.join(kernels.architectures)}"
     lines = [f"{name:<16}{version}" for name, version in software()]
     lines += [f"{'machine':<16}{hardware('cuda' if torch.cuda.is_available() else 'cpu')}"]
     lines += [f"{'GPU':<16}{line}" for line in _gpus()]
-    lines += [f"{'nvcc':<16}{shutil.which('nvcc') or 'not found'}", f"{'kernels':<16}{kernels}"]
+    lines += [f"{'nvcc':<16}{shutil.which('nvcc') or 'not found'}", f"{'kernels':<16}{usable}"]
     if torch.version.cuda is None:
         missing.append("CUDA in PyTorch: training runs on the CPU, by the torch reference")
     elif not torch.cuda.is_available():
@@ -74,10 +77,9 @@ def _gpus() -> list[str]:
         return ["none"]
     names = []
     for index in range(torch.cuda.device_count()):
-        properties = torch.cuda.get_device_properties(index)
-        capability = f"sm_{properties.major}{properties.minor}"
-        memory = f"{properties.total_memory / 2**30:.0f} GiB"
-        names.append(f"{index}: {properties.name}, {capability}, {memory}, driver {_driver()}")
+        gpu = torch.cuda.get_device_properties(index)
+        memory = f"{gpu.total_memory / 2**30:.0f} GiB"
+        names.append(f"{index}: {gpu.name}, sm_{gpu.major}{gpu.minor}, {memory}, driver {_driver()}")
     return names
 
 
@@ -88,12 +90,3 @@ def _driver() -> str:
     except (OSError, subprocess.SubprocessError):
         return "unknown"
     return answer.stdout.split("\n")[0].strip()
-
-
-def _kernels() -> tuple[str, list[str]]:
-    from turbogs_plugin.engine import compiled_kernels
-
-    kernels = compiled_kernels()
-    if kernels.unavailable:
-        return "not usable", [f"kernels: {kernels.unavailable}"]
-    return f"loaded from {kernels.path}, for {', '.join(kernels.architectures)}", []

@@ -4,11 +4,12 @@ processes that write them still run."""
 from __future__ import annotations
 
 import glob
+import itertools
 import os
 import socket
 import tempfile
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Container, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
@@ -38,6 +39,14 @@ def require_writable(folder: Path, given: str) -> None:
     except OSError as error:
         reason = error.strerror if place.is_dir() else "not a folder"
         raise InputError(f"{given} cannot be made in '{place}' ({reason}): choose a folder to write to") from None
+
+
+def require_new_file(path: Path, option: str) -> None:
+    """Raise `InputError`, which names the option, where a file exists or has no folder to be made in."""
+    if path.exists():
+        raise InputError(f"{option} '{path}' exists: choose a new file")
+    if not path.absolute().parent.is_dir():
+        raise InputError(f"{option} '{path}': there is no folder '{path.parent}'")
 
 
 def read_text(path: Path) -> str | None:
@@ -100,6 +109,12 @@ def _brought_to_disk(file: BinaryIO) -> Iterator[None]:
         finally:
             ended.set()
     repeated.result()  # a failure that was told here is not told again at the end
+
+
+def unused_name(name: str, taken: Container[str]) -> str:
+    """The name, with a number behind it where that is taken."""
+    names = (name if number == 1 else f"{name}-{number}" for number in itertools.count(1))
+    return next(name for name in names if name not in taken)
 
 
 def partial_path(path: Path) -> Path:

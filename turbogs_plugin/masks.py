@@ -65,13 +65,8 @@ class ViewMask:
         return cls(size, tiles, np.zeros(len(tiles), dtype=bool), np.zeros((0, WORDS), dtype=np.int32), width * height)
 
 
-def _row_order() -> np.ndarray:
-    """[256] the pixel, counted row by row, that each place of a tile in `sample_order` has."""
-    pixels = torch.arange(TILE_PIXELS)
-    return torch.argsort(sample_order(pixels % TILE_SIZE, pixels // TILE_SIZE)).numpy()
-
-
-_PLACES = _row_order()
+_PLACES = pixel_table(np.full((1, 2), TILE_SIZE), "cpu")[0].numpy()
+"""[256] int32: the pixel, counted row by row, that each place of a tile in `sample_order` has."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,7 +12,7 @@ from turbogs_plugin.engine.rendering import render_image
 from turbogs_plugin.export import film
 from turbogs_plugin.export.contribution import contributions, pruned
 from turbogs_plugin.export.fidelity import Fidelity
-from turbogs_plugin.export.formats import FORMATS
+from turbogs_plugin.model.formats import FORMATS
 from turbogs_plugin.model.ply import load_ply
 from turbogs_plugin.train.evaluate import psnr, render_view
 

@@ -62,7 +62,7 @@ def test_cameras_are_where_the_photos_were_taken_from(solved):
 
 def test_the_solution_says_what_was_done_and_names_what_did_not_register(solved):
     _, solution = solved
-    assert (solution.photos, solution.registered, solution.left_out) == (COUNT + 1, COUNT, ("other.jpg",))
+    assert (solution.photos, solution.registered, solution.left_out) == (COUNT + 1, COUNT, ["other.jpg"])
     text = solution.text()
     assert f"{COUNT + 1} photos of 1 lens, 2 turned upright by EXIF; matched each with each" in text
     assert f"{COUNT} of {COUNT + 1} photos registered" in text and "1 photo did not register: other.jpg;" in text

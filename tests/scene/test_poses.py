@@ -1,8 +1,11 @@
 """Poses: where a camera stands and what it looks at."""
 
-import numpy as np
+import math
 
-from turbogs_plugin.scene.poses import camera_centers, look_at, viewmat_of_pose
+import numpy as np
+import pytest
+
+from turbogs_plugin.scene.poses import camera_centers, look_at, quaternions, rotations, viewmat_of_pose
 
 
 def test_a_camera_looks_at_its_target_with_up_upwards():
@@ -22,3 +25,13 @@ def test_a_pose_whose_decimals_were_cut_has_an_exact_rotation():
     np.testing.assert_allclose(viewmat[:3, :3] @ viewmat[:3, :3].T, np.eye(3), atol=1e-12)
     np.testing.assert_allclose(viewmat, exact, atol=3e-3)
     np.testing.assert_allclose(camera_centers(viewmat[None])[0], [1.0, -2.0, 0.5], atol=1e-12)
+
+
+@pytest.mark.parametrize("axis", [(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0), (0.6, -0.48, 0.64)])
+@pytest.mark.parametrize("angle", [0.0, 1.0, math.pi, 4.0])
+def test_quaternions_go_to_rotations_and_back(axis, angle):
+    wxyz = np.array([math.cos(angle / 2), *(math.sin(angle / 2) * np.array(axis))])
+    rotation = rotations(wxyz)
+    np.testing.assert_allclose(rotation @ np.array(axis), axis, atol=1e-12)
+    np.testing.assert_allclose(rotations(quaternions(rotation[None]))[0], rotation, atol=1e-12)
+    assert np.trace(rotation) == pytest.approx(1 + 2 * math.cos(angle))

@@ -15,6 +15,7 @@ from helpers.models import random_gaussians
 from PIL import Image
 
 from turbogs_plugin.errors import InputError
+from turbogs_plugin.model.formats import FORMATS
 from turbogs_plugin.model.gsplat_world import gsplat_worlds
 from turbogs_plugin.model.ply import read_ply
 from turbogs_plugin.plan.decisions import wanted_backdrop
@@ -122,6 +123,32 @@ def test_an_export_of_a_run_reads_back(turbogs, finished, capture, tmp_path, for
     code, _, error = turbogs("export", target, "--format", again.suffix[1:], "--scene", capture, "--out", again)
     assert (code, error) == (0, "")
     assert_alike(load_given(again, load_scene(capture), CPU), load_model(finished, CPU).gaussians)
+
+
+# Largest losses of PSNR in dB on the test view, and largest mean differences of its picture in grey levels.
+LOSSES = {"ply": (0, 0.1), "pt": (0, 0.1), "compressed-ply": (0.2, 1.0), "splat": (0.5, 2.0), "spz": (0.2, 1.0)}
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_every_format_that_is_written_is_a_model_to_measure_and_render(turbogs, finished, capture, tmp_path, name):
+    file, most = tmp_path / f"model{FORMATS[name].suffix.upper()}", LOSSES[name]
+    assert turbogs("export", finished, "--format", name, "--out", file)[0] == 0
+    options = ("--scene", capture, "--device", "cpu")
+    measured = []
+    for given in ((finished, "--device", "cpu"), (file, *options)):
+        code, said, error = turbogs("eval", *given)
+        assert (code, error) == (0, ""), error
+        measured.append(float(re.search(r"mean of 1\W+([\d.]+)", said)[1]))
+    assert measured[1] == pytest.approx(measured[0], abs=most[0] + 0.011)
+    pictures = []
+    for given in ((finished / "model.ply", *options), (file, *options)):
+        out = tmp_path / f"pictures{len(pictures)}"
+        assert turbogs("render", *given, "--out", out)[0] == 0
+        (picture,) = (out / "test").glob("*.png")
+        pictures.append(np.asarray(Image.open(picture), dtype=int))
+    assert np.abs(pictures[1] - pictures[0]).mean() <= most[1]
+    code, said, error = turbogs("export", file, *options[:2], "--out", tmp_path / "again.ply")
+    assert code == 0 and re.search("nothing lost|less than 0.001 dB", said), error
 
 
 @pytest.mark.parametrize("world", range(4))
@@ -266,7 +293,7 @@ def bad_files(folder: Path) -> dict[str, tuple[Path, str]]:
     whole = save_splats(folder / "whole.pt", model).read_bytes()
     return {
         "absent": (folder / "absent.ply", "no such model"),
-        "another kind": (written("model.splat", b"x"), "a .ply or gsplat's .pt"),
+        "another kind": (written("model.obj", b"x"), "a .ply, .splat, .spz or gsplat's .pt"),
         "empty folder": (empty, "without a checkpoint of a run"),
         "no archive": (written("text.pt", b"text"), "not a whole file of torch.save"),
         "cut": (written("cut.pt", whole[:-300]), "cannot be used"),
@@ -276,6 +303,9 @@ def bad_files(folder: Path) -> dict[str, tuple[Path, str]]:
         "not finite": (save_splats(folder / "nan.pt", broken), "none of its 5 Gaussians is finite"),
         "no rows": (save_splats(folder / "none.pt", model.map(lambda value: value[:0])), "holds no Gaussians"),
         "not a ply": (written("text.ply", b"text"), "not a .ply file"),
+        "not a splat": (written("text.splat", b"text"), "is not a .splat"),
+        "not a spz": (written("text.spz", b"text"), "cannot read"),
+        "not compressed": (written("a.ply", b"ply\nelement chunk 1\nend_header\n"), "not a compressed .ply"),
     }
 
 

@@ -59,15 +59,3 @@ def test_the_eye_of_a_view_is_its_camera(tmp_path):
         torch.testing.assert_close(found.viewmats[0], cameras.viewmats[view], atol=1e-5, rtol=0)
         assert found.Ks[0, 1, 1].item() == pytest.approx(cameras.Ks[view, 1, 1].item(), rel=1e-5)
         assert np.array_equal(found.sizes[0], cameras.sizes[view])
-
-
-@pytest.mark.parametrize("axis", [(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0), (0.6, -0.48, 0.64)])
-@pytest.mark.parametrize("angle", [0.0, 1.0, math.pi, 4.0])
-def test_quaternions_go_to_rotations_and_back(axis, angle):
-    from turbogs_plugin.viewer.eye import quaternion_of, rotation_of
-
-    wxyz = (math.cos(angle / 2), *(math.sin(angle / 2) * np.array(axis)))
-    rotation = rotation_of(wxyz)
-    np.testing.assert_allclose(rotation @ np.array(axis), axis, atol=1e-12)
-    np.testing.assert_allclose(rotation_of(quaternion_of(rotation)), rotation, atol=1e-12)
-    assert np.trace(rotation) == pytest.approx(1 + 2 * math.cos(angle))

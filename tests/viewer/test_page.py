@@ -17,8 +17,9 @@ from helpers.framework_runs import TINY, assert_identical
 from turbogs_plugin import cli
 from turbogs_plugin.engine.rendering import render_image
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.model.ply import save_ply
+from turbogs_plugin.model.formats import FORMATS
 from turbogs_plugin.report.pictures import to_uint8
+from turbogs_plugin.scene import Frame
 from turbogs_plugin.viewer import page as page_module
 from turbogs_plugin.viewer.commands import Shown, open_shown, show
 from turbogs_plugin.viewer.controls import Controls
@@ -282,14 +283,16 @@ def test_bad_input_is_one_line(turbogs, tmp_path, capture, with_viser):
     assert not out.exists()
 
 
-def test_a_model_from_a_file_stands_before_the_eye(subject, tmp_path):
+@pytest.mark.parametrize("name", FORMATS)
+def test_a_model_from_a_file_stands_before_the_eye(subject, tmp_path, name):
     far = subject.gaussians.map(lambda value: value.clone())
     far.means = far.means * 50.0 + torch.tensor([1000.0, -2000.0, 500.0])
-    save_ply(far, tmp_path / "model.ply")
-    found = open_shown(tmp_path / "model.ply", torch.device("cpu"))
+    file = tmp_path / f"model{FORMATS[name].suffix}"
+    FORMATS[name].write(far, file, Frame(np.zeros(3), 1.0), 0)
+    found = open_shown(file, torch.device("cpu"))
     distances = found.subject.gaussians.means.norm(dim=1)
     assert 0.85 < float((distances <= 1.01).float().mean()) < 0.95
-    assert found.subject.capture is None and found.title == "model.ply"
+    assert found.subject.capture is None and found.title == file.name
 
 
 def test_a_run_is_shown_with_its_error_maps_and_without_its_capture(turbogs, capture, tmp_path):

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import torch
 from gsplat.utils import normalized_quat_to_rotmat
 from torch.nn.functional import normalize
 
-from turbogs_plugin.config.configuration import Config, load_config, resolve
+from turbogs_plugin.config.configuration import Config, load_config
 from turbogs_plugin.distributed.ranks import ONE, Ranks
 from turbogs_plugin.model.row_order import spatial_order
 from turbogs_plugin.scene import Scene
@@ -56,18 +55,10 @@ def trained_model(
     trainer = Trainer(config, scene, device)
     if iterations:
         train(trainer, growing)
-    settling = changed(config, train={"sh_interval": 1}, density={"type": "none"})
+    settling = config.changed(train={"sh_interval": 1}, density={"type": "none"})
     trainer = trainer_of(settling, scene, resized(trainer.gaussians, count), device)
     train(trainer, iterations - growing)
     return trainer.gaussians
-
-
-def changed(config: Config, **sections: dict[str, Any]) -> Config:
-    """The configuration with values of some sections replaced; a section with a `type` starts afresh."""
-    mapping = config.to_mapping()
-    for name, values in sections.items():
-        mapping[name] = dict(values) if "type" in values else {**mapping[name], **values}
-    return resolve(mapping)
 
 
 def trainer_of(config: Config, scene: Scene, gaussians: Gaussians, device: torch.device, ranks: Ranks = ONE) -> Trainer:

@@ -6,10 +6,11 @@ The models are trained once, on one GPU; then torchrun's processes time the same
 from __future__ import annotations
 
 import json
+import pickle
 import sys
 import tempfile
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -43,23 +44,13 @@ class RanksBench:
 
     Args:
         gpus: numbers of GPUs, one after the other.
-        gaussians: sizes of the model.
-        views: K, one after the other.
-        pixel_budget: lambda.
         grown: also K and lambda times the number of GPUs: more views for the same time.
-        training: iterations of the models' training.
-        repeats: iterations timed.
-        overrides: of the configuration.
+        step: of the iterations themselves.
     """
 
     gpus: Sequence[int]
-    gaussians: Sequence[int]
-    views: Sequence[int]
-    pixel_budget: float
     grown: bool
-    training: int
-    repeats: int
-    overrides: Sequence[str]
+    step: StepBench
 
     def run(self, path: Path, factor: int, device: torch.device) -> dict[str, Any]:
         """The measurements, ready for JSON.
@@ -71,27 +62,27 @@ class RanksBench:
         with tempfile.TemporaryDirectory() as name:
             folder = Path(name)
             scene = scene_on(load_scene(path, factor), device)
-            for count in self.gaussians:
-                model = trained_model(scene, count, self.training, device, self.overrides)
+            for count in self.step.gaussians:
+                model = trained_model(scene, count, self.step.training, device, self.step.overrides)
                 torch.save({name: value.cpu() for name, value in model.items()}, folder / f"{count}.pt")
             scene_name = scene.name
             del scene, model
-            job = folder / "job.json"
-            job.write_text(json.dumps([asdict(self), str(path.resolve()), factor, device.type]))
+            job = folder / "job"
+            job.write_bytes(pickle.dumps((self, path.resolve(), factor, device.type)))
             for count in self.gpus:
                 if start(count, [str(job)], device.type, "turbogs_plugin.bench.ranks"):
                     raise TrainingStopped(f"bench ranks on {count} GPUs ended early")
                 results += json.loads((folder / f"result-{count}.json").read_text())
-        return {"scene": scene_name, "overrides": list(self.overrides), "passes": results}
+        return {"scene": scene_name, "overrides": list(self.step.overrides), "passes": results}
 
     def measure(self, scene: Scene, folder: Path, device: torch.device, ranks: Ranks) -> list[dict[str, Any]]:
         """In each process: the passes with this number of GPUs."""
         results = []
-        for count in self.gaussians:
+        for count in self.step.gaussians:
             state = torch.load(folder / f"{count}.pt", weights_only=True)
             model = Gaussians(**{name: value.to(device) for name, value in state.items()})
             factors = sorted({1, ranks.count}) if self.grown else [1]
-            for views, factor in [(views, factor) for views in self.views for factor in factors]:
+            for views, factor in [(views, factor) for views in self.step.views for factor in factors]:
                 for by_rows in (True, False) if ranks.count > 1 and factor == 1 else (True,):
                     results.append(self._measure(scene, model, views * factor, factor, by_rows, device, ranks))
                     if ranks.first:
@@ -101,15 +92,14 @@ class RanksBench:
     def _measure(
         self, scene: Scene, model: Gaussians, views: int, factor: int, by_rows: bool, device: torch.device, ranks: Ranks
     ) -> dict[str, Any]:
-        budget = factor * self.pixel_budget
-        step = StepBench((), (), budget, 0, self.repeats, self.overrides)
+        step = replace(self.step, pixel_budget=factor * self.step.pixel_budget)
         trainer = warm_trainer(step.config_of(views), scene, model, device, ranks)
         if isinstance(trainer.exchange, RankExchange):
             trainer.complete()
             trainer.exchange.by_rows = by_rows
             for _ in range(3):
                 trainer.step()
-        wall = back_to_back(trainer.step, self.repeats, device)
+        wall = back_to_back(trainer.step, step.repeats, device)
         parts = self._parts(trainer, device)
         trainer.repeat_lost(wait=True)
         trainer.compare_replicas()
@@ -121,7 +111,7 @@ class RanksBench:
             "gpus": ranks.count,
             "gaussians": len(model),
             "views": views,
-            "pixel_budget": budget,
+            "pixel_budget": step.pixel_budget,
             "exchange": "none" if ranks.count == 1 else "owners of rows" if by_rows else "records to all",
             "wall": wall,
             "parts_ms_of_ranks": everywhere,
@@ -139,7 +129,7 @@ class RanksBench:
             places += [(trainer.exchange, "_gather_colors", "colors"), (trainer.exchange, "finish", "arrival")]
             places += [(RowGather, "begin", "parameters"), (SharedScreen, "of_rows", "records")]
         with recorder.passes(trainer, "render", "backward"), recorder.calls(*places):
-            for _ in range(self.repeats):
+            for _ in range(self.step.repeats):
                 trainer.step()
             synchronize(device)
         return {name: device_times(spans)["median_ms"] for name, spans in recorder.spans.items()}
@@ -157,11 +147,10 @@ def line_of(result: dict[str, Any]) -> str:
 def main() -> None:
     """A process that `RanksBench.run` started."""
     job = Path(sys.argv[1])
-    settings, path, factor, kind = json.loads(job.read_text())
-    bench = RanksBench(**settings)
+    bench, path, factor, kind = pickle.loads(job.read_bytes())
     with joined(kind) as ranks:
         device = resolve_device(kind)
-        scene = scene_on(load_scene(Path(path), factor), device)
+        scene = scene_on(load_scene(path, factor), device)
         results = bench.measure(scene, job.parent, device, ranks)
         if ranks.first:
             (job.parent / f"result-{ranks.count}.json").write_text(json.dumps(results))

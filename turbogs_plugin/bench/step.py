@@ -14,7 +14,7 @@ from torch import Tensor
 
 from turbogs_plugin.bench.clocks import BLOCKS, Mark, back_to_back, copy_bandwidth, device_times, keep_busy, summary
 from turbogs_plugin.bench.floors import raster_counts, step_floors
-from turbogs_plugin.bench.models import changed, resized, train, trained_model, trainer_of
+from turbogs_plugin.bench.models import resized, train, trained_model, trainer_of
 from turbogs_plugin.bench.recorder import Recorder, recorded
 from turbogs_plugin.config.configuration import Config, load_config
 from turbogs_plugin.device import synchronize
@@ -155,7 +155,7 @@ class StepBench:
         pixels = min(config.schedule["views"], len(scene.train)) * view_pixels
         for name, hosted in OFFLOADED.items():
             places = {f"{what}_place": "host" if what in hosted else "device" for what in ("maps", "photos")}
-            trainer = warm_trainer(changed(config, train=places), scene, model, device)
+            trainer = warm_trainer(config.changed(train=places), scene, model, device)
             wall = back_to_back(trainer.step, self.repeats, device)
             trainer.repeat_lost(wait=True)
             owners = (trainer.maps, trainer.views.photos)
@@ -171,8 +171,7 @@ class StepBench:
         """The configuration that is timed with K views."""
         config = load_config("turbogs", self.overrides).without_plan()
         rates = config.optimizer["learning_rates"]
-        return changed(
-            config,
+        return config.changed(
             train={"iterations": 2 * NO_EVENTS, "refine_until": 2 * NO_EVENTS - 1, "sh_interval": 1},
             schedule={"type": "fixed", "views": views, "pixel_budget": self.pixel_budget},
             density={**config.density, **dict.fromkeys(FIRST_EVENT & config.density.keys(), NO_EVENTS)},

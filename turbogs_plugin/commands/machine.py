@@ -106,8 +106,8 @@ def bench(
     elif what == "ranks":
         if scene is None or of_step_or_raster:
             raise InputError("bench ranks needs --scene SCENE; a model, synthetic photos and offload are not for it")
-        ranks = RanksBench(gpus, gaussians, views, pixel_budget, grown, iterations, times, overrides)
-        commands.run_ranks(ranks, scene, factor, where, out)
+        step = StepBench(gaussians, views, pixel_budget, iterations, times, overrides)
+        commands.run_ranks(RanksBench(gpus, grown, step), scene, factor, where, out)
     elif what == "step":
         if len(ply) > 1:
             raise InputError("bench step takes one --ply, at the sizes of --gaussians")

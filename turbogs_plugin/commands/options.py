@@ -43,7 +43,7 @@ class RunOptions:
         time_budget: seconds of training to end after: 20s, 2m (budget.time). The schedule is fitted to it, and
             the pixels of an iteration or the number of Gaussians.
         init: what to start from (train.init): points of the capture, random points, or a model trained anywhere: a
-            .ply, gsplat's .pt, a checkpoint, or a run's folder.
+            .ply, .splat, .spz, gsplat's .pt, a checkpoint, or a run's folder.
     """
 
     config: Annotated[str | None, arg(metavar="NAME_OR_FILE")] = None
@@ -88,7 +88,8 @@ class GivenOptions:
     """What eval, render and export need where they are given a model in the place of a run.
 
     Args:
-        scene: the capture of a model from a file: a 3DGS .ply, gsplat's .pt, or a checkpoint. Not with a run.
+        scene: the capture of a model from a file: a 3DGS .ply, .splat, .spz, gsplat's .pt, or a checkpoint. Not with
+            a run.
         factor: scale its photos down by this.
     """
 

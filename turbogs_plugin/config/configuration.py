@@ -78,6 +78,13 @@ class Config:
             mapping[section][key] = self.train.base_iterations if value is None else value
         return resolve(mapping)
 
+    def changed(self, **sections: Mapping[str, Any]) -> Config:
+        """This configuration with values of some sections replaced; a section with a `type` starts afresh."""
+        mapping = self.to_mapping()
+        for name, values in sections.items():
+            mapping[name] = dict(values) if "type" in values else {**mapping[name], **values}
+        return resolve(mapping)
+
     def to_mapping(self) -> dict[str, Any]:
         """Plain YAML values, every field written out, in sections that may be changed."""
         return dataclass_mapping(self)

@@ -12,7 +12,7 @@ import torch
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene.capture import LARGEST_SIDE
 from turbogs_plugin.scene.frame import Frame
-from turbogs_plugin.scene.poses import camera_centers, look_at, viewmat_of_pose
+from turbogs_plugin.scene.poses import camera_centers, look_at, quaternions, rotations, viewmat_of_pose
 from turbogs_plugin.scene.transforms import number_of, read_frames
 from turbogs_plugin.types import Cameras
 
@@ -143,40 +143,6 @@ def interpolated(viewmats: np.ndarray, Ks: np.ndarray, size: tuple[int, int], fr
     made[:, :3, 3] = -np.einsum("fij,fj->fi", made[:, :3, :3], places)
     between = Ks[left] + share[:, None, None] * (Ks[left + 1] - Ks[left])
     return _cameras(made, between, size)
-
-
-def quaternions(matrices: np.ndarray) -> np.ndarray:
-    """[C, 4] wxyz of rotations [C, 3, 3], by Shepperd's choice of the largest component."""
-    found = []
-    for m in matrices:
-        squares = np.array(
-            [1 + m[0, 0] + m[1, 1] + m[2, 2], 1 + m[0, 0] - m[1, 1] - m[2, 2],
-             1 - m[0, 0] + m[1, 1] - m[2, 2], 1 - m[0, 0] - m[1, 1] + m[2, 2]]
-        )  # fmt: skip
-        signs = m - m.T
-        sums = m + m.T
-        table = np.array(
-            [
-                [squares[0], signs[2, 1], signs[0, 2], signs[1, 0]],
-                [signs[2, 1], squares[1], sums[0, 1], sums[0, 2]],
-                [signs[0, 2], sums[0, 1], squares[2], sums[1, 2]],
-                [signs[1, 0], sums[0, 2], sums[1, 2], squares[3]],
-            ]
-        )
-        row = table[squares.argmax()]
-        found.append(row / np.linalg.norm(row))
-    return np.stack(found)
-
-
-def rotations(quats: np.ndarray) -> np.ndarray:
-    """[F, 3, 3] of unit quaternions [F, 4] wxyz."""
-    w, x, y, z = quats.T
-    entries = [
-        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-    ]  # fmt: skip
-    return np.stack(entries, axis=1).reshape(-1, 3, 3)
 
 
 def _slerp(first: np.ndarray, second: np.ndarray, share: np.ndarray) -> np.ndarray:

@@ -4,22 +4,25 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+
+import torch
 
 from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.export.contribution import contributions, pruned
 from turbogs_plugin.export.fidelity import Change, Fidelity
 from turbogs_plugin.export.film import film_cameras, require_film, write_film
-from turbogs_plugin.export.formats import FORMATS, PAGE, require_format, written_and_read
+from turbogs_plugin.files import require_new_file
+from turbogs_plugin.model.formats import FORMATS
 from turbogs_plugin.model.harmonics import band_energy, drop_faint_bands
+from turbogs_plugin.model.similarity import Similarity
 from turbogs_plugin.scene import Scene
 from turbogs_plugin.train.saved_model import SavedModel, load_given_model, load_model
 from turbogs_plugin.train.start import open_scene, resolve_device
 from turbogs_plugin.types import Gaussians
 
-if TYPE_CHECKING:
-    from turbogs_plugin.export.page import WrittenPage
+PAGE = "html"
+"""The name of the page with everything in it, which is no format of models."""
 
 
 @dataclass(frozen=True)
@@ -70,15 +73,15 @@ def export_run(
         max_gaussians: keep at most so many, those that add most to the training views.
         given: the capture of a model from a file, and how to render it; None: `path` is a run.
     """
-    require_format(file_format)
+    if file_format not in (*FORMATS, PAGE):
+        known = ", ".join((*FORMATS, PAGE))
+        raise InputError(f"--format {file_format}: there is no such format; choose one of {known}")
     if drop_bands is not None and not 0 <= drop_bands < 1:
         raise InputError(f"--drop-bands {drop_bands}: it must be a share, at least 0 and less than 1")
     if max_gaussians is not None and max_gaussians < 1:
         raise InputError(f"--max-gaussians {max_gaussians}: it must be at least 1")
-    if out is not None and out.exists():
-        raise InputError(f"--out '{out}' exists: choose a new file")
-    if out is not None and not out.absolute().parent.is_dir():
-        raise InputError(f"--out '{out}': there is no folder '{out.parent}'")
+    if out is not None:
+        require_new_file(out, "--out")
     if given is not None and out is None:
         raise InputError(f"'{path}' has no run's folder to export into: name a new file by --out")
     if max_gaussians is not None and out is None and file_format == "ply":
@@ -92,15 +95,20 @@ def export_run(
     notes = _notes(whole, gaussians, kept, drop_bands)
     if file_format == PAGE:
         file = model.folder.path / "report.html" if out is None else out
-        page = _page(model, kept, scene, file)
-        size, count, change, reason = page.bytes, page.gaussians, page.change, ""
+        from turbogs_plugin.export.page import write_page
+
+        if not len(scene.test):
+            raise InputError("--format html shows test views, and the capture has none")
+        count, change = write_page(model, kept, scene, file)
+        reason = ""
     else:
         file = model.folder.model.with_suffix(FORMATS[file_format].suffix) if out is None else out
-        read = written_and_read(file_format, kept, file, model.frame, model.iteration or 0)
-        size, count = file.stat().st_size, len(read)
+        FORMATS[file_format].write(kept, file, model.frame, model.iteration or 0)
+        read = Similarity.into(model.frame).apply(FORMATS[file_format].read(file)).map(torch.Tensor.float)
+        count = len(read)
         change, reason = _change(model, read, scene, absent)
     held = sum(value.numel() * 4 for _, value in whole.items())
-    return Exported(file, size, count, held, len(whole), change, reason, notes)
+    return Exported(file, file.stat().st_size, count, held, len(whole), change, reason, notes)
 
 
 def _change(model: SavedModel, read: Gaussians, scene: Scene | None, absent: str) -> tuple[Change | None, str]:
@@ -128,14 +136,6 @@ def film_run(
     model, scene, _ = _opened(path, given, needed=True, device_name=device_name)
     write_film(model, film_cameras(camera_path, scene, seconds), video)
     return video
-
-
-def _page(model: SavedModel, kept: Gaussians, scene: Scene, file: Path) -> WrittenPage:
-    from turbogs_plugin.export.page import write_page
-
-    if not len(scene.test):
-        raise InputError("--format html shows test views, and the capture has none")
-    return write_page(model, kept, scene, file)
 
 
 def _opened(

@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib.util
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +12,7 @@ import numpy as np
 from turbogs_plugin.engine.rendering import render_image
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.export.camera_path import from_file, orbit, through_views
-from turbogs_plugin.files import require_writable
+from turbogs_plugin.files import require_new_file, require_writable
 from turbogs_plugin.report.pictures import to_uint8
 from turbogs_plugin.scene import Scene
 from turbogs_plugin.train.saved_model import SavedModel
@@ -38,12 +37,9 @@ def require_film(path: str, video: Path, seconds: float) -> None:
         raise InputError(f"--seconds {seconds:g}: it must be more than 0 and at most 3600")
     if video.suffix.lower() not in SUFFIXES:
         raise InputError(f"--video '{video}': name a new file that ends in {', '.join(SUFFIXES)}")
-    if video.exists():
-        raise InputError(f"--video '{video}' exists: choose a new file")
     if path not in PATHS and not Path(path).is_file():
         raise InputError(f"--path '{path}': it must be orbit, views, or a file of cameras")
-    if not video.parent.is_dir():
-        raise InputError(f"--video '{video}': there is no folder '{video.parent}'")
+    require_new_file(video, "--video")
     require_writable(video.parent, f"--video '{video}'")
 
 
@@ -75,12 +71,10 @@ def write_film(model: SavedModel, cameras: Cameras, video: Path) -> None:
     writer = imageio_ffmpeg.write_frames(str(temporary), (width, height), **options)
     try:
         writer.send(None)
-        with _progress(len(cameras)) as advance:
-            for frame in range(len(cameras)):
-                settings = model.config.raster
-                image = render_image(model.gaussians, cameras, frame, sh_degree=model.sh_degree, settings=settings)
-                writer.send(np.ascontiguousarray(to_uint8(image.colors)[:height, :width]))
-                advance()
+        for frame in _told(len(cameras)):
+            settings = model.config.raster
+            image = render_image(model.gaussians, cameras, frame, sh_degree=model.sh_degree, settings=settings)
+            writer.send(np.ascontiguousarray(to_uint8(image.colors)[:height, :width]))
         writer.close()
         temporary.replace(video)
     except OSError as error:  # of the pipe to the encoder
@@ -90,23 +84,15 @@ def write_film(model: SavedModel, cameras: Cameras, video: Path) -> None:
         temporary.unlink(missing_ok=True)
 
 
-@contextmanager
-def _progress(total: int) -> Iterator:
-    """Gives a function to be called after each frame: a bar on a terminal, a line for each tenth elsewhere."""
-    if not sys.stderr.isatty():
-        done = 0
+def _told(frames: int) -> Iterator[int]:
+    """The numbers of frames, each told once it is done: by a bar on a terminal, by a line for each tenth elsewhere."""
+    if sys.stderr.isatty():
+        from rich.console import Console
+        from rich.progress import track
 
-        def tell() -> None:
-            nonlocal done
-            done += 1
-            if done * 10 // total != (done - 1) * 10 // total:
-                print(f"frame {done}/{total}", file=sys.stderr, flush=True)
-
-        yield tell
+        yield from track(range(frames), "frames", console=Console(stderr=True))
         return
-    from rich.console import Console
-    from rich.progress import Progress
-
-    with Progress(console=Console(stderr=True)) as bar:
-        task = bar.add_task("frames", total=total)
-        yield lambda: bar.advance(task)
+    for frame in range(frames):
+        yield frame
+        if (frame + 1) * 10 // frames != frame * 10 // frames:
+            print(f"frame {frame + 1}/{frames}", file=sys.stderr, flush=True)

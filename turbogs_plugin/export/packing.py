@@ -23,6 +23,13 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from turbogs_plugin.model.packed import (
+    even_code,
+    even_component,
+    packed_rotations,
+    unpacked_model,
+    unpacked_rotations,
+)
 from turbogs_plugin.types import SH_C0, Gaussians
 
 BASE_BYTES = 32
@@ -65,7 +72,7 @@ def pack(gaussians: Gaussians) -> PackedModel:
     opacities = 1.0 / (1.0 + np.exp(-values["opacities"]))
     halves = [values["scales"], opacities[:, None], SH_C0 * values["sh0"][:, 0] + 0.5]
     rows[:, 12:26] = np.concatenate(halves, axis=1).clip(-60000.0, 60000.0).astype("<f2").view(np.uint8)
-    rows[:, 28:32] = _packed_rotations(values["quats"])[:, None].view(np.uint8)
+    rows[:, 28:32] = packed_rotations(values["quats"], even_code)[:, None].view(np.uint8)
     limits = np.array([max(ranges[_degree(band) - 1], 1e-30) for band in range(bands)]).reshape(bands, 1)
     shares = values["shN"] / limits  # [N, B, 3]
     codes = np.rint(127.0 * np.sign(shares) * np.sqrt(np.abs(shares))).astype(np.int8)
@@ -78,44 +85,19 @@ def unpack(model: PackedModel) -> Gaussians:
     planes = np.frombuffer(zlib.decompress(model.planes), dtype=np.uint8).reshape(model.stride, model.count)
     rows = np.ascontiguousarray(planes.T)
     halves = np.ascontiguousarray(rows[:, 12:26]).view("<f2").astype(np.float64)  # [N, 7]
-    opacities = halves[:, 3].clip(1e-7, 1.0 - 1e-7)
     codes = rows[:, BASE_BYTES : BASE_BYTES + 3 * model.bands].view(np.int8) / 127.0
     limits = np.array([model.ranges[_degree(band) - 1] for band in range(model.bands)]).reshape(model.bands, 1)
-    arrays = (
-        np.ascontiguousarray(rows[:, :12]).view("<f4"),
-        _rotations(np.ascontiguousarray(rows[:, 28:32]).view("<u4")[:, 0]),
-        halves[:, :3],
-        np.log(opacities / (1.0 - opacities)),
-        ((halves[:, 4:] - 0.5) / SH_C0)[:, None],
-        (codes * np.abs(codes)).reshape(model.count, model.bands, 3) * limits,
+    unpacked = unpacked_model(
+        means=np.ascontiguousarray(rows[:, :12]).view("<f4"),
+        quats=unpacked_rotations(np.ascontiguousarray(rows[:, 28:32]).view("<u4")[:, 0], even_component),
+        scales=halves[:, :3],
+        shares=halves[:, 3],
+        sh0=(halves[:, 4:] - 0.5) / SH_C0,
+        shN=(codes * np.abs(codes)).reshape(model.count, model.bands, 3) * limits,
+        least=1e-7,
     )
-    return Gaussians(*(torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32)) for array in arrays))
+    return unpacked.map(torch.Tensor.float)
 
 
 def _degree(band: int) -> int:
     return math.isqrt(band + 1)
-
-
-def _packed_rotations(quats: np.ndarray) -> np.ndarray:
-    """[N] uint32 of [N, 4] wxyz of any norm."""
-    unit = quats / np.maximum(np.linalg.norm(quats, axis=1, keepdims=True), 1e-30)
-    largest = np.abs(unit).argmax(axis=1)
-    unit = np.where(np.take_along_axis(unit, largest[:, None], axis=1) < 0, -unit, unit)
-    words = largest.astype(np.uint32)
-    for place in range(4):
-        code = np.rint((unit[:, place] / math.sqrt(2.0) + 0.5) * 1023.0).clip(0, 1023).astype(np.uint32)
-        words = np.where(largest == place, words, words << np.uint32(10) | code)
-    return words.astype("<u4")
-
-
-def _rotations(words: np.ndarray) -> np.ndarray:
-    """[N, 4] wxyz of `_packed_rotations`."""
-    largest = words >> 30
-    found = np.zeros((len(words), 4))
-    for place in (3, 2, 1, 0):
-        stored = largest != place
-        found[:, place] = np.where(stored, ((words & 1023) / 1023.0 - 0.5) * math.sqrt(2.0), 0.0)
-        words = np.where(stored, words >> 10, words)
-    rest = np.sqrt(np.maximum(0.0, 1.0 - np.square(found).sum(axis=1)))
-    np.put_along_axis(found, largest[:, None].astype(np.int64), rest[:, None], axis=1)
-    return found

@@ -7,7 +7,6 @@ import io
 import json
 import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass
 from html import escape
 from importlib.resources import files
 from pathlib import Path
@@ -50,28 +49,16 @@ CURVES = (
 )
 
 
-@dataclass(frozen=True)
-class WrittenPage:
-    """The page, in numbers.
-
-    Args:
-        bytes: of the file.
-        gaussians: in its model.
-        change: what the model lost by being packed and pruned.
-    """
-
-    bytes: int
-    gaussians: int
-    change: Change
-
-
-def write_page(model: SavedModel, shown: Gaussians, scene: Scene, path: Path) -> WrittenPage:
+def write_page(model: SavedModel, shown: Gaussians, scene: Scene, path: Path) -> tuple[int, Change]:
     """Write the page of a model, smaller than `LARGEST_PAGE`. The file is written whole or not at all.
 
     Args:
         model: what the test views show; on the device where it is rendered.
         shown: what the viewer shows: the model, or what was kept of it; on the same device.
         scene: its capture, on the CPU.
+
+    Returns:
+        The number of Gaussians in it, and what the model lost by being packed and pruned.
 
     Raises:
         InputError: no Gaussian is finite, or the pictures alone are too large.
@@ -120,9 +107,8 @@ def write_page(model: SavedModel, shown: Gaussians, scene: Scene, path: Path) ->
             weights = contributions(gaussians, scene.train.cameras, model.config.raster)
         packed = pack(pruned(gaussians, weights, max(1, int(share * packed.count))))
     change = fidelity.change(unpack(packed))
-    text = filled(packed, change)
-    write_text_atomically(path, text)
-    return WrittenPage(len(text.encode()), packed.count, change)
+    write_text_atomically(path, filled(packed, change))
+    return packed.count, change
 
 
 def _web(name: str) -> str:

@@ -2,28 +2,22 @@
 
 from __future__ import annotations
 
-import math
-import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from turbogs_plugin.engine.layout import MAX_SH_DEGREE
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.model.similarity import finite_rows
+from turbogs_plugin.model.similarity import in_capture
 from turbogs_plugin.model.torch_file import save_plain
 from turbogs_plugin.scene.frame import Frame
 from turbogs_plugin.types import PARAMETER_NAMES, Gaussians
 
-LARGEST_ROUNDING = 1e-4
-"""Largest rounding error of exported positions, in units of the frame's scale: the file has float32 alone."""
 
-
-def save_gsplat(gaussians: Gaussians, path: str | Path, frame: Frame, step: int = 0) -> None:
+def save_gsplat(gaussians: Gaussians, path: Path, frame: Frame, step: int = 0) -> None:
     """Write a model as gsplat's trainer does, in the capture's own coordinates. The file is written whole or not.
 
     Args:
@@ -33,29 +27,11 @@ def save_gsplat(gaussians: Gaussians, path: str | Path, frame: Frame, step: int 
         step: iterations of its training.
 
     Raises:
-        InputError: nothing to write, a capture too far from its origin for float32, or the file cannot be written.
+        InputError: nothing to write, or a capture too far from its origin for float32.
+        OSError: from the disk.
     """
-    rows = gaussians.map(lambda value: value.detach().cpu())
-    finite = finite_rows(rows)
-    if not finite.all():
-        warnings.warn(f"{int((~finite).sum())} of {len(rows)} Gaussians are not finite and left out", stacklevel=2)
-    rows = rows.map(lambda value: value[finite].contiguous())
-    if not len(rows):
-        raise InputError(f"there are no Gaussians to write to {path}")
-    if np.abs(frame.center).max() * np.finfo(np.float32).eps / 2 > LARGEST_ROUNDING * frame.scale:
-        raise InputError(
-            f"the capture lies {np.abs(frame.center).max():.3g} units from its origin, too far for the float32 of a "
-            ".pt: export with --format ply"
-        )
-    rows.means = torch.from_numpy(frame.restore_points(rows.means.numpy())).float()
-    rows.scales = rows.scales + math.log(frame.scale)
-    state = {"step": step, "splats": dict(rows.items())}
-    try:
-        save_plain(Path(path), state)
-    except OSError as error:
-        raise InputError(
-            f"cannot write {path}: {error.strerror or error}; choose another place or make room"
-        ) from error
+    splats = dict(in_capture(gaussians, frame, path).items())
+    save_plain(path, {"step": step, "splats": splats})
 
 
 def read_gsplat(state: Mapping[str, Any], path: str | Path) -> Gaussians:

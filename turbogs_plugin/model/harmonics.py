@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 
 from turbogs_plugin.errors import require
@@ -37,14 +39,11 @@ def drop_faint_bands(gaussians: Gaussians, threshold: float) -> Gaussians:
     require(0 <= threshold < 1, "threshold", threshold, "at least 0 and less than 1")
     shares = band_energy(gaussians)
     degree = next(degree for degree in range(len(shares)) if sum(shares[degree + 1 :]) <= threshold)
-    kept = {**dict(gaussians.items()), "shN": gaussians.shN[:, : (degree + 1) ** 2 - 1].contiguous()}
-    return Gaussians(**kept)
+    return replace(gaussians, shN=gaussians.shN[:, : (degree + 1) ** 2 - 1].contiguous())
 
 
 def with_degree(gaussians: Gaussians, degree: int) -> Gaussians:
     """The model with room for exactly this degree: higher bands are dropped, missing ones are zero."""
-    bands, present = (degree + 1) ** 2 - 1, gaussians.shN.shape[1]
-    shN = gaussians.shN[:, :bands]
-    if present < bands:
-        shN = torch.cat([shN, shN.new_zeros(len(shN), bands - present, 3)], dim=1)
-    return Gaussians(**{**dict(gaussians.items()), "shN": shN.contiguous()})
+    bands = (degree + 1) ** 2 - 1
+    missing = gaussians.shN.new_zeros(len(gaussians), max(0, bands - gaussians.shN.shape[1]), 3)
+    return replace(gaussians, shN=torch.cat([gaussians.shN[:, :bands], missing], dim=1))

@@ -9,14 +9,14 @@ from typing import BinaryIO
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from turbogs_plugin.engine.layout import MAX_SH_DEGREE
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.files import write_atomically
+from turbogs_plugin.model.gsplat_formats import read_compressed_ply
 from turbogs_plugin.model.similarity import Similarity, placed
 from turbogs_plugin.scene.frame import Frame
-from turbogs_plugin.scene.ply import TYPES, read_vertices
+from turbogs_plugin.scene.ply import TYPES, read_header, read_vertices
 from turbogs_plugin.types import Gaussians
 
 POSITION_ERROR = 1e-6
@@ -41,9 +41,10 @@ def save_ply(gaussians: Gaussians, path: str | Path, frame: Frame | None = None)
     path = Path(path)
     frame = frame or Frame(np.zeros(3), 1.0)
     rows = gaussians.map(lambda value: value.detach().cpu())
-    values = {name: value.numpy() for name, value in _columns(rows)}
+    values = {name: value.numpy() for name, value in rows.items()}
     values["means"] = frame.restore_points(values["means"])
     values["scales"] = values["scales"] + math.log(frame.scale)
+    values["shN"] = values["shN"].transpose(0, 2, 1)
 
     groups = _property_groups(rows.shN.shape[1])
     kinds = dict.fromkeys(groups, "float")
@@ -91,6 +92,9 @@ def load_ply(path: str | Path, frame: Frame | None = None) -> Gaussians:
 
 def read_ply(path: str | Path) -> Gaussians:
     """`load_ply` in the file's own coordinates and in float64; rows may be not finite."""
+    path = Path(path)
+    if any(line.startswith("element chunk") for line in read_header(path)[0]):
+        return read_compressed_ply(path)
     vertices = read_vertices(path)
     names = vertices.dtype.names
     rest = sum(name.startswith("f_rest_") for name in names)
@@ -115,14 +119,10 @@ def read_ply(path: str | Path) -> Gaussians:
         for parameter, group in groups.items()
     }
     tensors = {name: torch.from_numpy(np.ascontiguousarray(value)) for name, value in values.items()}
-    return Gaussians(
-        means=tensors["means"],
-        quats=tensors["quats"],
-        scales=tensors["scales"],
-        opacities=tensors["opacities"][:, 0],
-        sh0=tensors["sh0"][:, None, :],
-        shN=tensors["shN"].view(len(vertices), 3, bands[rest]).transpose(1, 2).contiguous(),
-    )
+    tensors["opacities"] = tensors["opacities"][:, 0]
+    tensors["sh0"] = tensors["sh0"][:, None]
+    tensors["shN"] = tensors["shN"].view(len(vertices), 3, bands[rest]).transpose(1, 2).contiguous()
+    return Gaussians(**tensors)
 
 
 def _property_groups(bands: int) -> dict[str, list[str]]:
@@ -139,15 +139,3 @@ def _property_groups(bands: int) -> dict[str, list[str]]:
         "scales": [f"scale_{i}" for i in range(3)],
         "quats": [f"rot_{i}" for i in range(4)],
     }
-
-
-def _columns(gaussians: Gaussians) -> list[tuple[str, Tensor]]:
-    """(parameter, [N, ...]); the flattened last dimensions are in the order of `_property_groups`."""
-    return [
-        ("means", gaussians.means),
-        ("sh0", gaussians.sh0),
-        ("shN", gaussians.shN.transpose(1, 2)),
-        ("opacities", gaussians.opacities[:, None]),
-        ("scales", gaussians.scales),
-        ("quats", gaussians.quats),
-    ]

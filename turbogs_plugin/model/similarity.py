@@ -14,10 +14,13 @@ from torch import Tensor
 from turbogs_plugin.engine.reference.spherical_harmonics import basis, num_bands
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene.frame import Frame
+from turbogs_plugin.scene.poses import quaternions
 from turbogs_plugin.types import Gaussians
 
 SAMPLED_DIRECTIONS = 64
 """Directions by which the rotation of harmonics is found; the largest degree has 7 functions."""
+LARGEST_ROUNDING = 1e-4
+"""Largest rounding error of positions in float32, in units of the frame's scale, that a file may have."""
 
 
 @dataclass(frozen=True)
@@ -54,10 +57,11 @@ class Similarity:
         rotation = torch.from_numpy(self.rotation).to(gaussians.means)
         translation = torch.from_numpy(self.translation).to(gaussians.means)
         turned = not np.array_equal(self.rotation, np.eye(3))
+        turn = torch.from_numpy(quaternions(self.rotation[None])[0]).to(gaussians.means)
         means = gaussians.means @ rotation.T if turned else gaussians.means
         return Gaussians(
             means=self.scale * means + translation,
-            quats=_product(_quaternion(self.rotation).to(means), gaussians.quats) if turned else gaussians.quats,
+            quats=_product(turn, gaussians.quats) if turned else gaussians.quats,
             scales=gaussians.scales + math.log(self.scale),
             opacities=gaussians.opacities,
             sh0=gaussians.sh0,
@@ -91,21 +95,37 @@ def placed(gaussians: Gaussians, change: Similarity, source: str | Path) -> Gaus
     return rows
 
 
+def in_capture(gaussians: Gaussians, frame: Frame, target: Path) -> Gaussians:
+    """A model as files of single precision have it: in the capture's own coordinates, float32 on the CPU.
+
+    Args:
+        gaussians: those that are not finite are left out, with a warning that counts them.
+        frame: of the model's coordinates.
+        target: the file, for messages.
+
+    Raises:
+        InputError: none is left, or the capture lies too far from its origin for float32.
+    """
+    rows = gaussians.map(lambda value: value.detach().cpu())
+    finite = finite_rows(rows)
+    if not finite.all():
+        warnings.warn(f"{int((~finite).sum())} of {len(rows)} Gaussians are not finite and left out", stacklevel=3)
+    rows = rows.map(lambda value: value[finite].contiguous())
+    if not len(rows):
+        raise InputError(f"there are no Gaussians to write to {target}")
+    if np.abs(frame.center).max() * np.finfo(np.float32).eps / 2 > LARGEST_ROUNDING * frame.scale:
+        raise InputError(
+            f"the capture lies {np.abs(frame.center).max():.3g} units from its origin, too far for {target} in single "
+            "precision: export with --format ply"
+        )
+    rows.means = torch.from_numpy(frame.restore_points(rows.means.numpy())).float()
+    rows.scales = rows.scales + math.log(frame.scale)
+    return rows
+
+
 def finite_rows(gaussians: Gaussians) -> Tensor:
     """[N] bool: every number of the Gaussian is finite."""
     return torch.stack([value[:, None].isfinite().flatten(1).all(dim=1) for _, value in gaussians.items()]).all(dim=0)
-
-
-def _quaternion(rotation: np.ndarray) -> Tensor:
-    """[4] float64 (wxyz) of a rotation: the eigenvector of Davenport's matrix with the largest eigenvalue."""
-    trace = np.trace(rotation)
-    cross = np.array(
-        [rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]]
-    )
-    matrix = np.empty((4, 4))
-    matrix[0, 0], matrix[0, 1:], matrix[1:, 0] = trace, cross, cross
-    matrix[1:, 1:] = rotation + rotation.T - trace * np.eye(3)
-    return torch.from_numpy(np.linalg.eigh(matrix)[1][:, -1].copy())
 
 
 def _product(left: Tensor, right: Tensor) -> Tensor:

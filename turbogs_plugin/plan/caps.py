@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from turbogs_plugin.config.configuration import Config, resolve
+from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.errors import InputError
 
 FEWEST_GAUSSIANS = 1000
@@ -35,7 +35,7 @@ def with_cap(config: Config, cap: int) -> Config:
     if not keeps_cap(config):
         kind = config.density["type"]
         raise InputError(f"density.type {kind} keeps no cap on Gaussians: use one of error_driven, mcmc, none")
-    return resolve({**config.to_mapping(), "density": {**config.density, "max_gaussians": cap}})
+    return config.changed(density={"max_gaussians": cap})
 
 
 def lowered_cap(config: Config, cap: int) -> Config:
@@ -45,7 +45,7 @@ def lowered_cap(config: Config, cap: int) -> Config:
 
 def without_growth(config: Config) -> Config:
     """The configuration with the initial model, cut to the cap, in the place of one that grows to it."""
-    return resolve({**config.to_mapping(), "density": {"type": "none", "max_gaussians": cap_of(config)}})
+    return config.changed(density={"type": "none", "max_gaussians": cap_of(config)})
 
 
 def growth_cap(config: Config, initial: int) -> int:

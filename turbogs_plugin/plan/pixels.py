@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
-from turbogs_plugin.config.configuration import Config, resolve
+from turbogs_plugin.config.configuration import Config
 
 WHOLE_VIEWS = ("dense",)
 """Pixel samplers that take every pixel of a view, whatever the rate: to these, lambda says nothing."""
@@ -43,7 +43,7 @@ def pixel_budget_range(config: Config, num_views: int) -> tuple[float, float]:
 
 def with_pixel_budget(config: Config, pixel_budget: float) -> Config:
     """The configuration with another lambda."""
-    return resolve({**config.to_mapping(), "schedule": {**config.schedule, "pixel_budget": pixel_budget}})
+    return config.changed(schedule={"pixel_budget": pixel_budget})
 
 
 def pixels_for_time(

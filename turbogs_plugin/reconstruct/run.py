@@ -143,14 +143,14 @@ def _reconstruct(photos: Sequence[PhotoFile], workspace: Workspace, others: str)
     _require_solved(best, len(photos), solver.count_verified_pairs(database), matching)
     _leave_out(best.model, best.ghosts)
     registered = {image.name for image in best.model.images.values() if image.has_pose}
-    left_out = tuple(name for name in names if name not in registered)
+    left_out = [name for name in names if name not in registered]
     solution = Solution(
         workspace.scene,
         len(photos),
         len(registered),
         best.model.num_points3D(),
         left_out,
-        (*([f"not used: {others}"] if others else []), *_notes(photos, matching, verified, best, repaired, left_out)),
+        [*([f"not used: {others}"] if others else []), *_notes(photos, matching, verified, best, repaired, left_out)],
     )
     workspace.finish(best.model, solution)
     return solution

@@ -7,6 +7,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from concurrent.futures import Future, wait
 from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
@@ -39,17 +40,13 @@ def watched(
     from turbogs_plugin.scene.colmap import load_pycolmap
 
     token = load_pycolmap().CancellationToken()
-    outcome: list[Result] = []
-    failure: list[BaseException] = []
-    ended = threading.Event()  # an interrupted Thread.join takes the thread for ended
+    outcome: Future[Result] = Future()
 
     def run() -> None:
         try:
-            outcome.append(step(token))
+            outcome.set_result(step(token))
         except BaseException as error:  # handed to the thread that waits
-            failure.append(error)
-        finally:
-            ended.set()
+            outcome.set_exception(error)
 
     start = time.monotonic()
     thread = threading.Thread(target=run, daemon=True)
@@ -58,21 +55,20 @@ def watched(
         task = None if bar is None else bar.add_task(title, total=total)
         try:
             thread.start()
-            while not ended.wait(POLL_SECONDS):
+            ended = False
+            while not ended:
+                ended = bool(wait([outcome], POLL_SECONDS).done)
                 if bar is not None:
                     bar.update(task, completed=done())
-            if bar is not None:
-                bar.update(task, completed=done())
         except KeyboardInterrupt:
             token.cancel()
             if thread.ident is not None:  # or it has not begun
-                ended.wait()
+                wait([outcome])
             raise
-    if failure:
-        raise failure[0]
+    result = outcome.result()
     if bar is None:
         print(f"{title}: {done():,} in {time.monotonic() - start:.1f} s", file=sys.stderr, flush=True)
-    return outcome[0]
+    return result
 
 
 def row_counter(database: Path, table: str) -> Callable[[], int]:

@@ -32,8 +32,8 @@ class Solution:
     photos: int
     registered: int
     points: int
-    left_out: tuple[str, ...]
-    notes: tuple[str, ...]
+    left_out: list[str]
+    notes: list[str]
 
     def text(self) -> str:
         return "\n".join([*self.notes, f"scene  {self.scene}"])
@@ -95,16 +95,8 @@ class Workspace:
         if text is None or not self.model.is_dir():
             return None
         try:
-            found = json.loads(text)
-            return Solution(
-                self.scene,
-                int(found["photos"]),
-                int(found["registered"]),
-                int(found["points"]),
-                tuple(found["left_out"]),
-                tuple(found["notes"]),
-            )
-        except (ValueError, KeyError, TypeError):
+            return Solution(self.scene, **json.loads(text))
+        except (ValueError, TypeError):
             return None
 
     def finish(self, model: pycolmap.Reconstruction, solution: Solution) -> None:

@@ -11,7 +11,7 @@ from PIL import Image
 from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.engine.rendering import render_image
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.files import require_writable
+from turbogs_plugin.files import require_writable, unused_name
 from turbogs_plugin.report.pictures import depth_picture, to_uint8
 from turbogs_plugin.report.tables import views_table
 from turbogs_plugin.scene import PosedImages
@@ -94,12 +94,7 @@ def distinct_stems(names: Sequence[str]) -> list[str]:
     """Names of photos without folders and suffixes; one that came before gets a number."""
     stems: dict[str, None] = {}
     for name in names:
-        flat = stem = Path(name).with_suffix("").as_posix().replace("/", "__")
-        number = 1
-        while stem in stems:
-            number += 1
-            stem = f"{flat}-{number}"
-        stems[stem] = None
+        stems[unused_name(Path(name).with_suffix("").as_posix().replace("/", "__"), stems)] = None
     return list(stems)
 
 

@@ -39,24 +39,16 @@ GROUPS = {
 """Where TensorBoard shows a field of `Evaluation`; the others are errors on test views."""
 
 
-def require_tensorboard(config: Config) -> bool:
-    """Whether a configuration asks for event files.
-
-    Raises:
-        InputError: it does, and the package is not installed.
-    """
-    if config.report.tensorboard:
-        _writer_class()
-    return config.report.tensorboard
-
-
 def event_writers(config: Config) -> list[Callable[[RunSession], Listener]]:
     """What a run with this configuration has to be watched by: one that writes event files, or none.
 
     Raises:
-        InputError: as `require_tensorboard`.
+        InputError: event files are asked for, and the package is not installed.
     """
-    return [EventWriter.of_run] if require_tensorboard(config) else []
+    if not config.report.tensorboard:
+        return []
+    _writer_class()
+    return [EventWriter.of_run]
 
 
 class EventWriter(Listener):

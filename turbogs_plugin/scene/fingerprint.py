@@ -42,14 +42,14 @@ def capture_difference(saved: dict[str, Any], present: dict[str, Any]) -> str:
         before, now = saved[f"{split}_views"], present[f"{split}_views"]
         if before["names"] != now["names"]:
             return f"other {split} images"
-        if not torch.equal(before["sizes"], now["sizes"]):
-            return f"other sizes of {split} images"
-        if not torch.equal(before.get("unmasked", NO_MASKS), now.get("unmasked", NO_MASKS)):
-            return f"other masks of {split} images"
-        if not _close(before["Ks"], now["Ks"], ROUNDING * now["Ks"].abs()):
-            return f"other intrinsics of {split} images"
-        if not _close(before["viewmats"], now["viewmats"], torch.tensor(ROUNDING)):
-            return f"other poses of {split} images"
+        for same, what in (
+            (torch.equal(before["sizes"], now["sizes"]), "sizes"),
+            (torch.equal(before.get("unmasked", NO_MASKS), now.get("unmasked", NO_MASKS)), "masks"),
+            (_close(before["Ks"], now["Ks"], ROUNDING * now["Ks"].abs()), "intrinsics"),
+            (_close(before["viewmats"], now["viewmats"], torch.tensor(ROUNDING)), "poses"),
+        ):
+            if not same:
+                return f"other {what} of {split} images"
     before, now = frame_of_state(saved), frame_of_state(present)
     moved = np.abs(before.center - now.center).max()
     if max(moved, abs(before.scale - now.scale)) > ROUNDING * now.scale:

@@ -7,6 +7,7 @@ like any other: the system keeps the parts in memory that were used last, as man
 from __future__ import annotations
 
 import ctypes
+import math
 import os
 import shutil
 import tempfile
@@ -40,9 +41,7 @@ def host_array(shape: Sequence[int], dtype: torch.dtype, what: str) -> Tensor:
     Raises:
         InputError: it fits neither in memory nor on the disk.
     """
-    elements = 1
-    for side in shape:
-        elements *= int(side)
+    elements = math.prod(map(int, shape))
     size = elements * dtype.itemsize
     if not too_large(size):
         return torch.empty(*shape, dtype=dtype)
@@ -67,7 +66,8 @@ def read_ahead(arrays: Sequence[Tensor]) -> None:
         if array.numel() and in_file(array):
             start = array.data_ptr() // page * page
             length = array.data_ptr() + array.nbytes - start
-            _libc().madvise(ctypes.c_void_p(start), ctypes.c_size_t(length), MADV_WILLNEED)  # advice: it may fail
+            # Advice: it may fail.
+            ctypes.CDLL(None).madvise(ctypes.c_void_p(start), ctypes.c_size_t(length), MADV_WILLNEED)
 
 
 def file_note(arrays: Sequence[Tensor], what: str) -> str:
@@ -147,10 +147,6 @@ def _mapped(elements: int, dtype: torch.dtype, size: int, why: str) -> Tensor:
             f"{why}, and a file for them cannot be made in {folder} ({reason}): set TMPDIR to another folder, or use a "
             "larger --factor"
         ) from error
-
-
-def _libc() -> ctypes.CDLL:
-    return ctypes.CDLL(None)
 
 
 def _gibibytes(size: int) -> str:

@@ -25,6 +25,27 @@ def read_vertices(path: str | Path) -> np.ndarray:
             length ("list").
     """
     path = Path(path)
+    header, offset = read_header(path)
+    binary, count, layout, alone = _parse_header(path, header)
+    body = path.stat().st_size - offset
+    # In ASCII a number takes a digit and a separator, though the last separator may be missing.
+    wanted = count * (layout.itemsize if binary else 2 * len(layout)) - (not binary)
+    if body < wanted or (binary and alone and body > wanted):
+        raise InputError(
+            f"{path} announces {count} vertices, which its {body} bytes after the header do not match: it is cut short "
+            "or damaged; copy it again"
+        )
+    if binary:
+        return np.fromfile(path, dtype=layout, count=count, offset=offset)
+    return _read_ascii(path, offset, count, layout)
+
+
+def read_header(path: Path) -> tuple[list[str], int]:
+    """The lines of a .ply's header but for the first and the last, and the byte at which its body begins.
+
+    Raises:
+        InputError: no such file, or not a .ply.
+    """
     try:
         with path.open("rb") as file:
             head = file.read(LONGEST_HEADER)
@@ -35,19 +56,7 @@ def read_vertices(path: str | Path) -> np.ndarray:
         header, separator, _ = head.partition(b"end_header\r\n")
     if not head.startswith(b"ply") or not separator or not header.isascii():
         raise InputError(f"{path} is not a .ply file: it has no header; copy or export it again")
-    binary, count, layout, alone = _parse_header(path, header.decode().splitlines()[1:])
-    body = path.stat().st_size - len(header) - len(separator)
-    # In ASCII a number takes a digit and a separator, though the last separator may be missing.
-    wanted = count * (layout.itemsize if binary else 2 * len(layout)) - (not binary)
-    if body < wanted or (binary and alone and body > wanted):
-        raise InputError(
-            f"{path} announces {count} vertices, which its {body} bytes after the header do not match: it is cut short "
-            "or damaged; copy it again"
-        )
-    offset = len(header) + len(separator)
-    if binary:
-        return np.fromfile(path, dtype=layout, count=count, offset=offset)
-    return _read_ascii(path, offset, count, layout)
+    return header.decode().splitlines()[1:], len(header) + len(separator)
 
 
 def _parse_header(path: Path, lines: list[str]) -> tuple[bool, int, np.dtype, bool]:

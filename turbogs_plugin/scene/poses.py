@@ -51,3 +51,36 @@ def look_at(center: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarra
     viewmat[:3, :3] = np.stack([right, np.cross(forward, right), forward])
     viewmat[:3, 3:] = -viewmat[:3, :3] @ center[:, None]
     return viewmat
+
+
+def quaternions(matrices: np.ndarray) -> np.ndarray:
+    """[C, 4] wxyz of rotations [C, 3, 3]: the largest component first (Shepperd 1978)."""
+    found = []
+    for m in matrices:
+        squares = [
+            1 + m[0, 0] + m[1, 1] + m[2, 2],
+            1 + m[0, 0] - m[1, 1] - m[2, 2],
+            1 - m[0, 0] + m[1, 1] - m[2, 2],
+            1 - m[0, 0] - m[1, 1] + m[2, 2],
+        ]
+        signs, sums = m - m.T, m + m.T
+        table = [
+            [squares[0], signs[2, 1], signs[0, 2], signs[1, 0]],
+            [signs[2, 1], squares[1], sums[0, 1], sums[0, 2]],
+            [signs[0, 2], sums[0, 1], squares[2], sums[1, 2]],
+            [signs[1, 0], sums[0, 2], sums[1, 2], squares[3]],
+        ]
+        row = np.array(table[np.argmax(squares)])
+        found.append(row / np.linalg.norm(row))
+    return np.stack(found)
+
+
+def rotations(quats: np.ndarray) -> np.ndarray:
+    """[..., 3, 3] of unit quaternions [..., 4] wxyz."""
+    w, x, y, z = np.moveaxis(quats, -1, 0)
+    entries = [
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    ]  # fmt: skip
+    return np.stack(entries, axis=-1).reshape(*quats.shape[:-1], 3, 3)

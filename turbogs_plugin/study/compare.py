@@ -11,6 +11,7 @@ from typing import Any
 
 from turbogs_plugin.config.sections import SceneConfig
 from turbogs_plugin.errors import InputError
+from turbogs_plugin.files import unused_name
 from turbogs_plugin.study.difference import ABSENT, difference, flattened
 from turbogs_plugin.study.grid import Ablation
 from turbogs_plugin.study.results import CellResult, Study
@@ -94,6 +95,4 @@ def _shared(asked: dict[str, Any], device: str) -> dict[str, Any]:
 
 def _new_name(path: Path, taken: Container[str]) -> str:
     """The folder's name, made fit for a variant and unique."""
-    name = re.sub(r"[^A-Za-z0-9_+.-]", "-", path.resolve().name)[:40].lstrip("._-") or "run"
-    names = (name if number == 1 else f"{name}-{number}" for number in itertools.count(1))
-    return next(name for name in names if name not in taken)
+    return unused_name(re.sub(r"[^A-Za-z0-9_+.-]", "-", path.resolve().name)[:40].lstrip("._-") or "run", taken)

@@ -62,9 +62,8 @@ def difference(common: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, A
 
 def restored(common: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
     """The configuration whose `difference` from `common` this is."""
-    absent = changes.get(ABSENT, ())
-    kept = {path: value for path, value in common.items() if path not in absent}
-    return kept | {path: value for path, value in changes.items() if path != ABSENT}
+    gone = [ABSENT, *changes.get(ABSENT, ())]
+    return {path: value for path, value in {**common, **changes}.items() if path not in gone}
 
 
 def _text(value: Any) -> str:

@@ -166,15 +166,22 @@ def _scene(summary: SceneSummary) -> list[Block]:
     for target in summary.targets:
         reach_header += [f"s to {target:.1f} dB", f"ratio{against}"]
         for row, line in zip(summary.rows, reach_lines, strict=True):
-            line += [_reach_text(row.seconds_to(target)), _ratio_text(row.ratio_to(target))]
+            ratio = row.ratio_to(target)
+            line += [_reach_text(row.seconds_to(target)), "" if math.isnan(ratio) else f"x {ratio:.2f}"]
     blocks: list[Block] = [
         Heading(summary.scene),
         Table(header, [_result_line(row, summary) for row in summary.rows]),
         *(Picture(f"{summary.scene}-{plot.name}.png", f"{summary.scene}: {plot.text}") for plot in PLOTS),
         Heading(f"Time to reach a PSNR on {summary.scene}", 3),
         Table(reach_header, reach_lines),
-        *_marks(summary),
     ]
+    cells = [cell for row in summary.rows for cell in row.cells]
+    gaps = [crossing_gap(cell.history, target) for cell in cells for target in summary.targets]
+    if crossed := [gap for gap in gaps if not math.isnan(gap)]:
+        apart = spread_text(Spread.of(crossed), 2)
+        text = "These seconds are linear between evaluations. The two on either side of a crossing are "
+        text += f"{apart} s of training apart: differences smaller than that are not measured."
+        blocks.append(Paragraph(text))
     budgeted = {
         row.name: sorted(cell.final.iteration for cell in row.cells if cell.time_budget) for row in summary.rows
     }
@@ -182,25 +189,6 @@ def _scene(summary: SceneSummary) -> list[Block]:
     if fitted:
         blocks.append(Paragraph(f"Iterations that fit into the time budget, of each seed: {', '.join(fitted)}."))
     return blocks
-
-
-def _marks(summary: SceneSummary) -> list[Block]:
-    """What interpolation between evaluations may hide of a time to a PSNR."""
-    gaps = [
-        gap
-        for row in summary.rows
-        for cell in row.cells
-        for target in summary.targets
-        if not math.isnan(gap := crossing_gap(cell.history, target))
-    ]
-    if not gaps:
-        return []
-    return [
-        Paragraph(
-            "These seconds are linear between evaluations. The two on either side of a crossing are "
-            f"{spread_text(Spread.of(gaps), 2)} s of training apart: differences smaller than that are not measured."
-        )
-    ]
 
 
 def _has(summary: SceneSummary, measure: str) -> bool:
@@ -248,10 +236,6 @@ def _reach_text(seconds: Sequence[float]) -> str:
     if not reached:
         return "not reached"
     return f"{reached} of {len(seconds)} seeds" if reached < len(seconds) else spread_text(Spread.of(seconds), 2)
-
-
-def _ratio_text(ratio: float) -> str:
-    return "" if math.isnan(ratio) else f"x {ratio:.2f}"
 
 
 def spread_text(spread: Spread, digits: int, absent: str = "not computed") -> str:

@@ -11,7 +11,8 @@ from turbogs_plugin.study.results import CellResult, Study
 from turbogs_plugin.study.statistics import Curve, Difference, Spread, pareto_front, seconds_to_reach
 
 TARGET_STEP = 0.5
-"""dB between the default targets of the time to a PSNR. The highest one is what every seed of the baseline reached."""
+"""dB between the default targets of the time to a PSNR. The highest one is what every seed of the baseline reached,
+rounded down."""
 
 MEASURES = {
     "seconds": attrgetter("final.train_seconds"),
@@ -56,7 +57,7 @@ class VariantRow:
 
     def spread(self, measure: str) -> Spread:
         """The spread of one of `MEASURES` over the seeds; NaN if a seed lacks it."""
-        return _spread(self.cells, measure)
+        return Spread.of(map(MEASURES[measure], self.cells))
 
     def difference(self, measure: str) -> Difference:
         """From the baseline, over the seeds that both have."""
@@ -115,19 +116,10 @@ def summarise(study: Study) -> list[SceneSummary]:
 def _summarise_scene(study: Study, scene: str) -> SceneSummary:
     cells = {name: results for name in study.ablation.variants if (results := study.of(scene, name))}
     baseline = study.ablation.baseline if study.ablation.baseline in cells else ""
-    targets = study.targets or _default_targets(cells[baseline] if baseline else next(iter(cells.values())))
     rows = [VariantRow(name, results, cells.get(baseline, [])) for name, results in cells.items()]
     points = [(row.seconds.mean, row.psnr.mean) for row in rows]
     for row, on_front in zip(rows, pareto_front(points), strict=True):
         row.on_front = on_front
+    reached = next((row for row in rows if row.name == baseline), rows[0]).psnr.low  # by every seed
+    targets = study.targets or [math.floor(10 * reached) / 10 - step * TARGET_STEP for step in (2, 1, 0)]
     return SceneSummary(scene, baseline, targets, rows)
-
-
-def _default_targets(reference: Sequence[CellResult]) -> list[float]:
-    """What every seed of these reached, rounded down, and `TARGET_STEP` and twice that below it."""
-    reached = _spread(reference, "psnr").low
-    return [math.floor(10 * reached) / 10 - step * TARGET_STEP for step in (2, 1, 0)]
-
-
-def _spread(cells: Sequence[CellResult], measure: str) -> Spread:
-    return Spread.of(map(MEASURES[measure], cells))

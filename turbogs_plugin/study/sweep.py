@@ -18,7 +18,7 @@ from turbogs_plugin.config.old_spellings import old_spelling
 from turbogs_plugin.device import free_device_memory, synchronize
 from turbogs_plugin.errors import InputError, TrainingStopped
 from turbogs_plugin.report.provenance import COMMIT_VARIABLE, MODIFIED, Provenance
-from turbogs_plugin.report.tensorboard import EventWriter, require_tensorboard
+from turbogs_plugin.report.tensorboard import EventWriter, event_writers
 from turbogs_plugin.scene import Scene, load_scene
 from turbogs_plugin.study.cell import capture_digest, train_cell
 from turbogs_plugin.study.claims import Claims
@@ -188,7 +188,7 @@ def _scene_configs(
         for variant in variants:
             config = variant_config(ablation, variant, seed, options.overrides, options.steps)
             config.scene.path, config.train.device = str(scene), device.type
-            require_tensorboard(config)
+            event_writers(config)  # which can be made
             configs[CellKey(scene.name, variant, seed)] = config
             if config.scene != next(iter(configs.values())).scene:
                 raise InputError(f"variant '{variant}' changes the scene's photos, which all variants share")

@@ -20,9 +20,9 @@ from torch import Tensor
 
 from turbogs_plugin.engine.rendering import DEFAULT_SETTINGS, render_image
 from turbogs_plugin.errors import InputError
+from turbogs_plugin.model.formats import FORMATS
 from turbogs_plugin.model.gsplat_file import read_gsplat
 from turbogs_plugin.model.gsplat_world import gsplat_worlds
-from turbogs_plugin.model.ply import read_ply
 from turbogs_plugin.model.similarity import Similarity, placed
 from turbogs_plugin.model.torch_file import read_plain
 from turbogs_plugin.scene import Scene
@@ -38,7 +38,7 @@ TRIAL_SIDE = 400
 """They are reduced to at most this many pixels a side."""
 CLEAR_GAIN = 3.0
 """PSNR in dB by which a model must fit better in gsplat's world before it is taken for one of that world."""
-KINDS = "a .ply or gsplat's .pt of a 3DGS model, a checkpoint of TurboGS, or a run's folder"
+KINDS = "a .ply, .splat, .spz or gsplat's .pt of a 3DGS model, a checkpoint of TurboGS, or a run's folder"
 
 
 def require_model(path: str | Path) -> Path:
@@ -55,7 +55,7 @@ def require_model(path: str | Path) -> Path:
         return checkpoint
     if not path.is_file():
         raise InputError(f"no such model '{path}': give {KINDS}")
-    if path.suffix.lower() not in (".ply", ".pt"):
+    if _format(path) not in FORMATS:
         raise InputError(f"'{path}' is no model: give {KINDS}")
     return path
 
@@ -79,9 +79,7 @@ def load_given(path: str | Path, scene: Scene, device: torch.device) -> Gaussian
     """
     file = require_model(path)
     into = Similarity.into(scene.frame)
-    if file.suffix.lower() == ".ply":
-        return _fitted(read_ply(file), into, scene, device, file)
-    gaussians, frame_change = _read_torch(file)
+    gaussians, frame_change = _read(file)
     if frame_change is not None:  # one of ours, whose coordinates are known
         return placed(gaussians, into.after(frame_change), file)
     return _fitted(gaussians, into, scene, device, file)
@@ -96,17 +94,22 @@ def read_given(path: str | Path) -> Gaussians:
     Raises:
         InputError: the file is no such model (`require_model`).
     """
-    file = require_model(path)
-    return read_ply(file) if file.suffix.lower() == ".ply" else _read_torch(file)[0]
+    return _read(require_model(path))[0]
 
 
-def _read_torch(file: Path) -> tuple[Gaussians, Similarity | None]:
-    """The model of a .pt in float64, and where it knows that, the change to the capture's own coordinates."""
-    state = _read(file)
+def _format(file: Path) -> str:
+    return file.suffix.lower().removeprefix(".")
+
+
+def _read(file: Path) -> tuple[Gaussians, Similarity | None]:
+    """The model of a file in float64, and where it knows that, the change to the capture's own coordinates."""
+    if _format(file) != "pt":
+        return FORMATS[_format(file)].read(file), None
+    state = _state(file)
     if isinstance(state, Mapping) and "splats" in state:
         parts = [
             read_gsplat(state, file),
-            *(read_gsplat(_read(other), other) for other in _other_ranks(file)),
+            *(read_gsplat(_state(other), other) for other in _other_ranks(file)),
         ]
         if len({part.shN.shape[1] for part in parts}) > 1:
             raise InputError(f"{file}: the files of its ranks differ in degree: give those of one run")
@@ -123,7 +126,7 @@ def _read_torch(file: Path) -> tuple[Gaussians, Similarity | None]:
         raise InputError(f"{file}: its frame cannot be read ({error}): give another checkpoint") from None
 
 
-def _read(file: Path) -> object:
+def _state(file: Path) -> object:
     return read_plain(file, f"'{file}'", "; save the model again, or as a .ply")
 
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
+from turbogs_plugin.scene.poses import quaternions, rotations
 from turbogs_plugin.types import Cameras
 
 SMALLEST_SIDE, LARGEST_SIDE = 16, 1920
@@ -68,7 +69,7 @@ class Eye:
         width, height = cameras.sizes[view_id].tolist()
         fov = 2.0 * math.atan(height / (2.0 * float(cameras.Ks[view_id, 1, 1])))
         place = -rotation.T @ translation
-        return cls(tuple(place.tolist()), quaternion_of(rotation.T), fov, width, height)
+        return cls(tuple(place.tolist()), tuple(quaternions(rotation.T[None])[0].tolist()), fov, width, height)
 
     def with_at_most(self, pixels: float) -> Eye:
         """The same view in an image of at most so many pixels."""
@@ -79,7 +80,7 @@ class Eye:
 
     def cameras(self, device: torch.device) -> Cameras:
         """One camera, float32 on a device."""
-        rotation = rotation_of(self.wxyz)
+        rotation = rotations(np.array(self.wxyz))
         viewmat = np.eye(4)
         viewmat[:3, :3] = rotation.T
         viewmat[:3, 3] = -rotation.T @ np.array(self.position)
@@ -87,40 +88,3 @@ class Eye:
         K = np.array([[focal, 0.0, self.width / 2.0], [0.0, focal, self.height / 2.0], [0.0, 0.0, 1.0]])
         tensors = (torch.from_numpy(array[None]).float().to(device) for array in (viewmat, K))
         return Cameras(*tensors, np.array([[self.width, self.height]], dtype=np.int64))
-
-
-def rotation_of(wxyz: Sequence[float]) -> np.ndarray:
-    """[3, 3] float64 of a unit quaternion."""
-    w, x, y, z = wxyz
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-
-
-def quaternion_of(rotation: np.ndarray) -> tuple[float, float, float, float]:
-    """The unit quaternion (wxyz) of a rotation [3, 3]: its largest component first (Shepperd 1978)."""
-    m = rotation
-    squares = np.array(
-        [
-            1 + m[0, 0] + m[1, 1] + m[2, 2],
-            1 + m[0, 0] - m[1, 1] - m[2, 2],
-            1 - m[0, 0] + m[1, 1] - m[2, 2],
-            1 - m[0, 0] - m[1, 1] + m[2, 2],
-        ]
-    )
-    sums = np.array(
-        [
-            [0.0, m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]],
-            [m[2, 1] - m[1, 2], 0.0, m[1, 0] + m[0, 1], m[0, 2] + m[2, 0]],
-            [m[0, 2] - m[2, 0], m[1, 0] + m[0, 1], 0.0, m[2, 1] + m[1, 2]],
-            [m[1, 0] - m[0, 1], m[0, 2] + m[2, 0], m[2, 1] + m[1, 2], 0.0],
-        ]
-    )
-    largest = int(squares.argmax())
-    found = sums[largest].copy()
-    found[largest] = squares[largest]
-    return tuple((found / np.linalg.norm(found)).tolist())

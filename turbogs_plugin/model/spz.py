@@ -20,6 +20,10 @@ import torch
 from turbogs_plugin.engine.reference.spherical_harmonics import basis
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.files import write_atomically
+from turbogs_plugin.model.packed import packed_rotations, unpacked_model, unpacked_rotations
+from turbogs_plugin.model.similarity import in_capture
+from turbogs_plugin.scene.frame import Frame
+from turbogs_plugin.scene.host_arrays import too_large
 from turbogs_plugin.types import Gaussians
 
 MAGIC = 0x5053474E
@@ -35,22 +39,17 @@ way all became 0."""
 LARGEST_COMPONENT = 511
 """Of a quaternion's three stored components: 9 bits and a sign, for 0 .. 1 / sqrt(2)."""
 GZIP_LEVEL = 6
-MOST_BYTES = 1 << 34
-"""A file that unpacks to more is refused."""
 
 
-def save_spz(gaussians: Gaussians, path: Path) -> None:
-    """Write a model, whole or not at all.
-
-    Args:
-        gaussians: finite, in x right, y down, z forward; on the CPU.
-        path: its folder exists.
-    """
-    write_atomically(path, lambda file: file.write(packed(gaussians)))
+def save_spz(gaussians: Gaussians, path: Path, frame: Frame, step: int = 0) -> None:
+    """Write a model, whole or not at all, in the capture's own coordinates. Arguments as for `in_capture`; `step` has
+    no place in this format."""
+    content = packed(in_capture(gaussians, frame, path))
+    write_atomically(path, lambda file: file.write(content))
 
 
 def packed(gaussians: Gaussians) -> bytes:
-    """The file's bytes."""
+    """The file's bytes, of a finite model on the CPU in x right, y down, z forward."""
     values = {name: value.detach().double().numpy() for name, value in gaussians.items()}
     largest = float(np.abs(values["means"]).max())
     bits = min(MOST_FRACTIONAL_BITS, 22 - max(0, math.ceil(math.log2(max(largest, 1e-9)))))
@@ -65,7 +64,7 @@ def packed(gaussians: Gaussians) -> bytes:
         _bytes(opacities * 255.0),
         _bytes(values["sh0"][:, 0] * (COLOR_SCALE * 255.0) + 127.5),
         _bytes((values["scales"] + 10.0) * 16.0),
-        _packed_rotations(values["quats"]).tobytes(),
+        packed_rotations(values["quats"][:, [1, 2, 3, 0]] * [1.0, -1.0, -1.0, 1.0], _code).tobytes(),
         _bytes(harmonics * SH_SCALE + 128.0),
     ]
     return gzip.compress(b"".join(parts), GZIP_LEVEL, mtime=0)
@@ -78,37 +77,36 @@ def read_spz(path: Path) -> Gaussians:
         InputError: the file is not a whole one of this format, in version 2 or 3.
     """
     try:
-        unpacker = zlib.decompressobj(wbits=31)
-        content = unpacker.decompress(path.read_bytes(), MOST_BYTES)
+        unpacker, content = zlib.decompressobj(wbits=31), path.read_bytes()
+        header = unpacker.decompress(content, HEADER.size).ljust(HEADER.size, b"\0")
+        magic, version, count, degree, bits, _, _ = HEADER.unpack(header)
+        if magic != MAGIC or version not in (2, 3) or degree > 3:
+            raise InputError(f"{path} is not a .spz of version 2 or 3 with harmonics up to degree 3: export it again")
+        bands, turning = (degree + 1) ** 2 - 1, 4 if version == 3 else 3
+        widths = (9, 1, 3, 3, turning, 3 * bands)
+        size = count * sum(widths)
+        if too_large(size):
+            raise InputError(f"{path} announces {count} Gaussians, more than fit in the free memory: export it again")
+        body = unpacker.decompress(unpacker.unconsumed_tail, size + 1)
     except (OSError, zlib.error) as error:
         raise InputError(f"cannot read {path} as .spz: {error}; export it again") from None
-    if not unpacker.eof or len(content) < HEADER.size:
-        raise InputError(f"{path} is not a whole .spz: export it again")
-    magic, version, count, degree, bits, _, _ = HEADER.unpack_from(content)
-    if magic != MAGIC or version not in (2, 3) or degree > 3:
-        raise InputError(f"{path} is not a .spz of version 2 or 3 with harmonics up to degree 3: export it again")
-    bands, turning = (degree + 1) ** 2 - 1, 4 if version == 3 else 3
-    widths = (9, 1, 3, 3, turning, 3 * bands)
-    if len(content) != HEADER.size + count * sum(widths):
+    if len(body) != size or not unpacker.eof:
         raise InputError(f"{path} does not hold the {count} Gaussians that it announces: export it again")
-    ends = HEADER.size + count * np.cumsum((0, *widths))
+    ends = count * np.cumsum((0, *widths))
     means, opacities, colors, scales, rotations, harmonics = (
-        np.frombuffer(content[start:end], dtype=np.uint8).reshape(count, width)
+        np.frombuffer(body[start:end], dtype=np.uint8).reshape(count, width)
         for start, end, width in zip(ends, ends[1:], widths, strict=False)
     )
     wide = np.zeros((count, 3, 4), dtype=np.uint8)
     wide[:, :, 1:] = means.reshape(count, 3, 3)  # in the upper bytes, so that the sign is theirs
-    positions = (wide.view("<i4")[:, :, 0] >> 8) / 2.0**bits * [1.0, -1.0, -1.0]
-    shares = (opacities[:, 0] / 255.0).clip(1e-4, 1 - 1e-4)
-    values = {
-        "means": positions,
-        "quats": (_rotations_of_words if version == 3 else _rotations_of_bytes)(rotations),
-        "scales": scales / 16.0 - 10.0,
-        "opacities": np.log(shares / (1.0 - shares)),
-        "sh0": ((colors / 255.0 - 0.5) / COLOR_SCALE)[:, None],
-        "shN": (harmonics.reshape(count, bands, 3) - 128.0) / SH_SCALE * _flips(degree)[:, None],
-    }
-    return Gaussians(**{name: torch.from_numpy(np.ascontiguousarray(value)) for name, value in values.items()})
+    return unpacked_model(
+        means=(wide.view("<i4")[:, :, 0] >> 8) / 2.0**bits * [1.0, -1.0, -1.0],
+        quats=(_rotations_of_words if version == 3 else _rotations_of_bytes)(rotations),
+        scales=scales / 16.0 - 10.0,
+        shares=opacities[:, 0] / 255.0,
+        sh0=(colors / 255.0 - 0.5) / COLOR_SCALE,
+        shN=(harmonics.reshape(count, bands, 3) - 128.0) / SH_SCALE * _flips(degree)[:, None],
+    )
 
 
 def _flips(degree: int) -> np.ndarray:
@@ -118,34 +116,21 @@ def _flips(degree: int) -> np.ndarray:
     return torch.sign(basis(direction, degree) * basis(mirrored, degree))[0].numpy()
 
 
-def _packed_rotations(quats: np.ndarray) -> np.ndarray:
-    """[N] uint32: the place of the largest of (x, y, z, w), then the others in order, each by sign and size."""
-    ordered = quats[:, [1, 2, 3, 0]] * [1.0, -1.0, -1.0, 1.0]
-    ordered = ordered / np.maximum(np.linalg.norm(ordered, axis=1, keepdims=True), 1e-30)
-    largest = np.abs(ordered).argmax(axis=1)  # [N]
-    ordered = np.where(np.take_along_axis(ordered, largest[:, None], axis=1) < 0, -ordered, ordered)
-    words = largest.astype(np.uint32)
-    for place in range(4):
-        value = ordered[:, place]
-        size = np.floor(LARGEST_COMPONENT * np.abs(value) * math.sqrt(2.0) + 0.5).clip(0, LARGEST_COMPONENT)
-        component = (value < 0).astype(np.uint32) << np.uint32(9) | size.astype(np.uint32)
-        words = np.where(largest == place, words, words << np.uint32(10) | component)
-    return words.astype("<u4")
+def _code(components: np.ndarray) -> np.ndarray:
+    """Sign and size."""
+    size = np.floor(LARGEST_COMPONENT * np.abs(components) * math.sqrt(2.0) + 0.5).clip(0, LARGEST_COMPONENT)
+    return np.where(components < 0, size + LARGEST_COMPONENT + 1, size)
+
+
+def _component(codes: np.ndarray) -> np.ndarray:
+    size = (codes & LARGEST_COMPONENT) / (LARGEST_COMPONENT * math.sqrt(2.0))
+    return np.where(codes > LARGEST_COMPONENT, -size, size)
 
 
 def _rotations_of_words(rotations: np.ndarray) -> np.ndarray:
-    """[N, 4] wxyz of `_packed_rotations`, [N, 4] bytes."""
+    """[N, 4] wxyz of version 3: x, y, z and w as `packed_rotations`, [N, 4] bytes."""
     words = np.ascontiguousarray(rotations).view("<u4")[:, 0]
-    largest = words >> 30
-    found = np.zeros((len(words), 4))
-    for place in (3, 2, 1, 0):
-        stored = largest != place
-        size = (words & LARGEST_COMPONENT) / (LARGEST_COMPONENT * math.sqrt(2.0))
-        found[:, place] = np.where(stored, np.where(words >> 9 & 1, -size, size), 0.0)
-        words = np.where(stored, words >> 10, words)
-    rest = np.sqrt(np.maximum(0.0, 1.0 - np.square(found).sum(axis=1)))
-    np.put_along_axis(found, largest[:, None].astype(np.int64), rest[:, None], axis=1)
-    return (found * [1.0, -1.0, -1.0, 1.0])[:, [3, 0, 1, 2]]
+    return (unpacked_rotations(words, _component) * [1.0, -1.0, -1.0, 1.0])[:, [3, 0, 1, 2]]
 
 
 def _rotations_of_bytes(rotations: np.ndarray) -> np.ndarray:
