@@ -1,5 +1,5 @@
 // Loss on sampled pixels with its gradient, and the update of the error maps (EMA and stamp): one pass over the samples
-// in memory, a warp per tile.
+// in memory, a warp per tile. Defined by turbogs_plugin/engine/reference/losses.py and turbogs_plugin/error_maps.py.
 //
 // A lane keeps up to 4 of its tile's samples in registers, so that colour and truth are read once; larger tiles are
 // read again in each pass. The first pass makes the means, relative to the tile's first sample, so that a constant tile

@@ -1,4 +1,5 @@
-// Projection backward and the optimizer's step in one kernel: gradients never reach memory.
+// Projection backward and the optimizer's step in one kernel: gradients never reach memory. Defined by
+// turbogs_plugin/engine/reference/projection.py (its gradients) and turbogs_plugin/engine/reference/update.py.
 //
 // A thread takes one Gaussian and goes through the views that have it on screen. It turns each record that a sample
 // contributed to into a row of 14 gradients, keeps the row, and sums the rows. The sum advances the moments, which give

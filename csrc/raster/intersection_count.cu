@@ -1,4 +1,5 @@
-// Stage 2: the first intersection of each tile, and whether all intersections have room.
+// Stage 2: the first intersection of each tile, and whether all intersections have room. Stages 2 to 4 together are
+// defined by turbogs_plugin/engine/reference/intersection.py.
 //
 // The projection leaves, for each tile, how many more splats reach it than the tile before. The running sum of these
 // differences is the number of splats of each tile. The running sum of those numbers is each tile's first intersection.

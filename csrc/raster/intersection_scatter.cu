@@ -1,4 +1,4 @@
-// Stage 3: intersections to their tiles, in any order.
+// Stage 3: intersections to their tiles, in any order. See stage 2 for its definition.
 //
 // A block takes kScatterInstances instances and keeps those on screen, so that its warps are full. A warp works on 32
 // splats together, first with a lane for each row of tiles that they reach, then with a lane for each intersection of

@@ -1,4 +1,4 @@
-// Stage 4: every tile's intersections in order of depth, then of the instance.
+// Stage 4: every tile's intersections in order of depth, then of the instance. See stage 2 for its definition.
 //
 // One warp sorts a tile of up to kSortRun intersections in registers, with a bitonic network over 32-bit numbers: the
 // leading bits of the depth, and behind them the place among the intersections. Few depths agree in those bits, and a

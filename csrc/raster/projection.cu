@@ -1,5 +1,5 @@
 // Stage 1: projection and colour of every Gaussian in the K views of a batch, and how many splats reach each active
-// tile.
+// tile. Defined by turbogs_plugin/engine/reference/projection.py.
 //
 // A block holds 64 Gaussians, each in up to four threads that share out the views, so parameters are read from memory
 // once. Rows of `shN` are not 16-byte aligned, but a block's rows together are: the block copies them to shared

@@ -1,4 +1,5 @@
-// Stage 6: from the gradients at the samples to a record for every splat on the screen, with the density sums.
+// Stage 6: from the gradients at the samples to a record for every splat on the screen, with the density sums. Defined
+// by turbogs_plugin/engine/reference/compositing.py.
 //
 // One warp takes one work item of the forward pass, 32 samples. It walks back to front the splats that contributed to
 // it, and no others: the forward pass left their bits. It takes `kSplats` at a time, in two phases that exchange their

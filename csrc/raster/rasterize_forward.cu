@@ -1,4 +1,5 @@
-// Stage 5: colour, alpha and, when asked, depth at the sampled pixels.
+// Stage 5: colour, alpha and, when asked, depth at the sampled pixels. Defined by
+// turbogs_plugin/engine/reference/compositing.py.
 //
 // One warp renders one work item of an active tile, or two where a tile has an even number of them. A work item is 32
 // samples, whose state lies in registers, one sample to a lane. So work grows with the samples, and no warp waits for
