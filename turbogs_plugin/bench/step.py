@@ -55,9 +55,9 @@ class StepBench:
         training: iterations of the model's training.
         repeats: iterations timed.
         overrides: of the configuration, whose strategies are timed.
-        ply: a model in place of a trained one.
         offload: time the iteration with photos and error maps in host memory, too.
         photos, size: how many synthetic photos of which (width, height) take the place of a scene; 0: none.
+        ply: a model in place of a trained one.
     """
 
     gaussians: Sequence[int]
@@ -66,10 +66,10 @@ class StepBench:
     training: int
     repeats: int
     overrides: Sequence[str]
-    ply: Path | None = None
     offload: bool = False
     photos: int = 0
     size: tuple[int, int] = (0, 0)
+    ply: Path | None = None
 
     def run(self, scene: Scene, device: torch.device) -> dict[str, Any]:
         """The measurements, ready for JSON. `scene`: on the device, or every trainer copies the photos."""
