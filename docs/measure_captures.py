@@ -131,7 +131,7 @@ class Measurement:
             del trainer
             free_device_memory(self.device)
             repeats = 100 if self.device.type == "cuda" else 2
-            bench = StepBench([count], VIEWS, 1.0, 0, repeats, [*self.overrides, degree], model)
+            bench = StepBench([count], VIEWS, 1.0, 0, repeats, [*self.overrides, degree], ply=model)
             for name, scene in scenes.items():
                 for entry in bench.run(scene_on(scene, self.device), self.device)["passes"]:
                     kept = {key: entry[key] for key in ("gaussians", "views", "free_running", "wall")}

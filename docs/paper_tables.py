@@ -7,10 +7,10 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 from study_tables import CAPTURES, change, result, rows_of, stale
+from verdict import verdict
 
 from turbogs_plugin.report.tables import table
 from turbogs_plugin.study.summary import VariantRow
-from turbogs_plugin.study.verdict import verdict
 
 BOUND = 0.3
 """dB by which `turbogs-paper` may be worse than 3DGS at its full length."""

@@ -73,7 +73,7 @@ def write_atomically(path: Path, write: Callable[[BinaryIO], None], large: bool 
     Raises:
         OSError: from the disk, with the name of the file; then nothing is left behind.
     """
-    for leftover in path.parent.glob(f"{_own_prefix(path, escaped=True)}*.part"):
+    for leftover in path.parent.glob(f"{glob.escape(_own_prefix(path))}*.part"):
         writer = leftover.suffixes[-2].lstrip(".")
         if not writer.isdecimal() or process_started(int(writer)) == "gone":
             leftover.unlink(missing_ok=True)
@@ -122,10 +122,9 @@ def partial_path(path: Path) -> Path:
     return path.with_name(f"{_own_prefix(path)}{os.getpid()}.part")
 
 
-def _own_prefix(path: Path, escaped: bool = False) -> str:
-    """How the names of a file's partial ones of this host begin; `escaped` for a pattern."""
-    prefix = f".{path.name}.{socket.gethostname()}."
-    return glob.escape(prefix) if escaped else prefix
+def _own_prefix(path: Path) -> str:
+    """How the names of a file's partial ones of this host begin."""
+    return f".{path.name}.{socket.gethostname()}."
 
 
 def write_text_atomically(path: Path, text: str) -> None:

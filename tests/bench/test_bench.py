@@ -3,7 +3,7 @@
 import itertools
 import json
 import math
-from pathlib import Path
+import sys
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,7 +13,6 @@ from helpers.framework_runs import tiny_config
 from helpers.simulated_time import OperatorTime, SimulatedTime
 
 from turbogs_plugin.bench import commands, floors
-from turbogs_plugin.bench import raster as raster_module
 from turbogs_plugin.bench.clocks import BLOCKS, Mark, back_to_back, measure, summary
 from turbogs_plugin.bench.commands import raster_lines, step_lines
 from turbogs_plugin.bench.models import (
@@ -30,7 +29,6 @@ from turbogs_plugin.bench.recorder import STEPS, Recorder, recorded
 from turbogs_plugin.bench.step import tensor_bytes
 from turbogs_plugin.engine.rendering import rasterize
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.model.ply import load_ply, save_ply
 from turbogs_plugin.scene import load_scene
 from turbogs_plugin.train.trainer import Trainer
 
@@ -152,13 +150,6 @@ def test_the_reference_is_as_exact_as_single_precision():
     assert all(errors[f"{name}_gradient"] < 1e-2 for name in ("mean", "conic", "color", "opacity"))
 
 
-def test_the_arguments_for_another_build_read_back_as_the_same_bench():
-    bench = RasterBench((10, 20), (3,), (), 1.0, (64, 48), 2)
-    assert bench.arguments() == [
-        *("--gaussians", "10", "20", "--views", "3", "--pixel-budget", "1.0", "--size", "64", "48", "--repeats", "2"),
-    ]
-
-
 def test_bench_step_says_what_it_measured_on(turbogs, capture, tmp_path):
     out = tmp_path / "step.json"
     arguments = ["bench", "step", "train.sh_degree=1", "--scene", capture, "--gaussians", 500, "--views", 3, 2]
@@ -219,62 +210,50 @@ def test_bench_raster_times_models_trained_on_the_scene(turbogs, capture, tmp_pa
         assert seen != {visible(surface_gaussians(count, CPU), scene.train.cameras)}
 
 
-def test_bench_raster_times_the_models_of_files(turbogs, capture, tmp_path):
-    out, scene, files = tmp_path / "raster.json", load_scene(capture), []
-    for count in (40, 90):
-        files.append(tmp_path / f"model-{count}.ply")
-        save_ply(surface_gaussians(count, CPU), files[-1], scene.frame)
-    code, _, error = turbogs("bench", "raster", "--scene", capture, "--ply", *files, *RASTER_PASSES, "--out", out)
-    assert code == 0, error
-    report = json.loads(out.read_text())
-    assert report["model"] == "model-40.ply, model-90.ply"
-    assert [entry["gaussians"] for entry in report["passes"]] == 3 * [40] + 3 * [90]
-    seen = [visible(load_ply(file, scene.frame), scene.train.cameras) for file in files]
-    assert [entry["counts"]["visible_gaussians"] for entry in report["passes"]] == 3 * seen[:1] + 3 * seen[1:]
-
-
 def test_other_builds_get_the_models_that_this_one_times(turbogs, capture, tmp_path, monkeypatch):
-    library, out, timed, handed_on = tmp_path / "other.so", tmp_path / "raster.json", [], []
+    library, out, runs = tmp_path / "other.so", tmp_path / "raster.json", []
     library.touch()
-    measure_one = RasterBench._measure
+    run_one = RasterBench.run
 
-    def watched(bench, model, *others):
-        timed.append(model)
-        return measure_one(bench, model, *others)
+    def watched(bench, *job):
+        runs.append(job)
+        return run_one(bench, *job)
 
-    def other_build(path, command):
-        assert path == library and "--training" not in command
-        files = command[command.index("--ply") + 1 :][:2]
-        handed_on.extend(load_ply(file, load_scene(capture).frame) for file in files)
-        assert (
-            len(json.loads(out.read_text())["passes"]) == 6
-        )  # what is measured is kept, whatever becomes of this build
-        return {"model": "files", "passes": [], "gsplat": []}
+    def run(command, env, **options):
+        assert env["TURBOGS_LIBRARY"] == str(library.resolve())
+        assert len(json.loads(out.read_text())["passes"]) == 6  # kept, whatever becomes of this build
+        monkeypatch.setattr(sys, "argv", command[2:])
+        return SimpleNamespace(returncode=commands.main(), stderr="")
 
-    monkeypatch.setattr(RasterBench, "_measure", watched)
-    monkeypatch.setattr(commands, "other_build", other_build)
+    monkeypatch.setenv("TURBOGS_COMMIT", "one")  # git is not asked
+    monkeypatch.setattr(RasterBench, "run", watched)
+    monkeypatch.setattr(commands.subprocess, "run", run)
     options = ["--scene", capture, "--gaussians", 150, 200, "--training", 0, *RASTER_PASSES, "--library", library]
     code, output, error = turbogs("bench", "raster", *options, "--out", out)
     assert code == 0, error
-    assert output.splitlines()[-2:] == ["other.so:", f"json  {out}"]
-    assert [len(model) for model in handed_on] == [150, 200] and len(timed) == 6
-    for mine, theirs in zip(timed[::3], handed_on, strict=True):
-        assert all(torch.equal(a, b) for (_, a), (_, b) in zip(mine.items(), theirs.items(), strict=True))
+    assert "other.so:" in output.splitlines() and output.splitlines()[-1] == f"json  {out}"
+    (mine, cameras, _), (theirs, their_cameras, device) = runs
+    assert [len(model) for model in theirs] == [150, 200] and device == CPU
+    for model, other in zip(mine, theirs, strict=True):
+        assert all(torch.equal(a, b) for (_, a), (_, b) in zip(model.items(), other.items(), strict=True))
+    assert torch.equal(cameras.viewmats, their_cameras.viewmats)
     report = json.loads(out.read_text())
-    assert report["model"] == report["other_builds"]["other.so"]["model"] == "trained for 0 iterations"
+    other = report["other_builds"]["other.so"]
+    assert report["model"] == other["model"] == "trained for 0 iterations" and len(other["passes"]) == 6
+    assert other["provenance"] == report["provenance"]
 
 
-def test_another_build_measures_in_a_process_of_its_own(monkeypatch, tmp_path):
-    def run(arguments, env, **options):
-        assert env["TURBOGS_LIBRARY"] == str((tmp_path / "other.so").resolve())
-        code, words = (0, "") if "--views" in arguments else (2, "warning\nturbogs: error: no views\n")
-        Path(arguments[arguments.index("--out") + 1]).write_text('{"passes": []}', encoding="utf-8")
-        return SimpleNamespace(returncode=code, stderr=words)
-
-    monkeypatch.setattr(raster_module.subprocess, "run", run)
-    assert raster_module.other_build(tmp_path / "other.so", ["--views", "2"]) == {"passes": []}
+def test_a_build_that_cannot_be_measured_says_so(monkeypatch, tmp_path):
+    ended = SimpleNamespace(returncode=2, stderr="warning\nturbogs: error: no views\n")
+    monkeypatch.setattr(commands.subprocess, "run", lambda *arguments, **options: ended)
     with pytest.raises(InputError, match=r"other\.so.*no views"):
-        raster_module.other_build(tmp_path / "other.so", [])
+        commands.other_build(tmp_path / "other.so", ())
+
+
+def test_another_build_measures_in_a_process_of_its_own(tmp_path):
+    bench = RasterBench((30,), (2,), (), 1.0, (48, 32), 1)
+    measured = commands.other_build(tmp_path / "other.so", (bench, bench.models(None, CPU), bench.cameras(None), CPU))
+    assert measured["bench"] == "raster" and [entry["gaussians"] for entry in measured["passes"]] == [30, 30]
 
 
 @pytest.mark.parametrize(
@@ -287,14 +266,10 @@ def test_another_build_measures_in_a_process_of_its_own(monkeypatch, tmp_path):
         (["step", "--scene", "CAPTURE", "loss.nonsense=1"], "nonsense"),
         (["raster", "loss.type=charbonnier"], "section.key"),
         (["raster", "--views", "0"], "--views"),
-        (["raster", "--ply", "absent.ply"], "--scene"),
         (["raster", "--out", "absent/bench.json"], "absent"),
         (["raster", "--training", "5"], "--scene"),
-        (["raster", "--scene", "CAPTURE", "--training", "5", "--ply", "model.ply"], "--training"),
         (["raster", "--scene", "CAPTURE", "--training", "-1"], "--training"),
-        (["raster", "--scene", "CAPTURE", "--ply", "absent.ply"], "absent.ply"),
         (["raster", "--library", "absent.so"], "absent.so"),
-        (["step", "--scene", "CAPTURE", "--ply", "one.ply", "two.ply"], "--ply"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else None,
 )

@@ -42,7 +42,7 @@ def test_steps_on_the_kernels(tmp_path):
 def test_stages_of_the_rasterizer(density):
     device = torch.device("cuda")
     bench = RasterBench((3000,), (3,), (1.0,), 1.0, (160, 120), 5)
-    report = bench.run(None, device)
+    report = bench.run(bench.models(None, device), bench.cameras(None), device)
     entry = next(entry for entry in report["passes"] if entry["density_sums"] is density)
     assert set(entry["stages"]) == set(STAGES.values()) and entry["lost_passes"] == 0
     assert np.isfinite(report["gsplat"][0]["packed"]["median_ms"])
@@ -58,8 +58,8 @@ def test_the_rasterizer_is_timed_on_models_of_the_scene(tmp_path):
     held = torch.cuda.memory_allocated(device)
     bench.models(scene, device)
     assert torch.cuda.memory_allocated(device) <= held  # no photos, trainers or models stay there
-    report = bench.run(scene, device)
-    assert report["model"] == "trained for 20 iterations" and report["image_size"] == [48, 40]
+    report = bench.run([model], bench.cameras(scene), device)
+    assert report["image_size"] == [48, 40]
     for entry in report["passes"]:
         assert entry["counts"]["visible_gaussians"] > 0.9 * len(model) and entry["lost_passes"] == 0
     assert np.isfinite(report["gsplat"][0]["packed"]["median_ms"])

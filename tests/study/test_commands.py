@@ -317,19 +317,16 @@ def test_studies_are_merged_and_reported_again_without_training(turbogs, small, 
     assert code == 2 and "two different results" in err
 
 
-def test_cells_of_the_same_settings_are_reused_from_another_study(turbogs, capture, study, tmp_path, monkeypatch):
-    first, other = study, tmp_path / "other.yaml"
-    other.write_text("title: Other\nvariants: {same: [], l1: [loss.type=charbonnier]}\n")
-    code, _, err = turbogs(*call(other, capture, tmp_path / "second", "--reuse", first))
-    assert code == 0 and "1 finished cells are kept" in err and "[1/1]" in err
-    taken, (made,) = StudyFolder(tmp_path / "second").read_study().results[0], StudyFolder(first).read_study().results
-    assert taken.variant == "same" and taken.history == made.history
+def test_cells_of_other_sources_are_not_shared(turbogs, small, capture, study, tmp_path, monkeypatch):
+    other, out = tmp_path / "other.yaml", tmp_path / "studies"
+    other.write_text("title: Other\nvariants: {same: []}\n")
+    small.write_text("title: Tiny\nvariants: {full: []}\n")
+    shutil.copytree(study, out / "small")
+    arguments = call(small, capture, out)
+    arguments.insert(2, other)
     monkeypatch.setenv("TURBOGS_COMMIT", "another")
-    code, _, err = turbogs(*call(other, capture, tmp_path / "third", "--reuse", first))
-    assert code == 0 and "kept" not in err and "[2/2]" in err
-    monkeypatch.setenv("TURBOGS_COMMIT", "one-modified")
-    code, _, err = turbogs(*call(other, capture, tmp_path / "fourth", "--reuse", first))
-    assert code == 2 and "known commit" in err and not (tmp_path / "fourth").exists()
+    code, _, err = turbogs(*arguments)
+    assert code == 0 and err.count("1 finished cells are kept") == 1 and "[1/1]" in err
 
 
 def test_another_capture_of_the_same_name_is_not_taken_for_the_first(turbogs, small, capture, study, tmp_path):
@@ -342,13 +339,13 @@ def test_another_capture_of_the_same_name_is_not_taken_for_the_first(turbogs, sm
     for seed in (0, 1):
         code, _, err = turbogs(*call(small, other, first, "--only", "full", "--seeds", seed))
         assert code == 2 and "other photos or cameras" in err
-    code, _, err = turbogs(*call(small, other, second, "--only", "full", "--reuse", first))
+    code, _, err = turbogs(*call(small, other, second, "--only", "full"))
     assert code == 0 and "kept" not in err and "[1/1]" in err
     code, _, err = turbogs("ablate", "--merge", first, second, "--out", tmp_path / "both")
     assert code == 2 and "two different captures" in err
 
 
-def test_a_cell_of_an_unknown_capture_is_kept_and_merged_but_not_reused(turbogs, small, capture, study, tmp_path):
+def test_a_cell_of_an_unknown_capture_is_kept_and_merged_but_not_shared(turbogs, small, capture, study, tmp_path):
     old = study
     for path in (*old.glob("cells/*/*.json"), old / "results.json"):
         document = json.loads(path.read_text())
@@ -357,8 +354,14 @@ def test_a_cell_of_an_unknown_capture_is_kept_and_merged_but_not_reused(turbogs,
     code, _, err = turbogs(*call(small, capture, old, "--only", "full"))
     assert code == 0 and "1 finished cells are kept" in err
     assert turbogs("ablate", "--merge", old, "--out", tmp_path / "merged")[0] == 0
-    code, _, err = turbogs(*call(small, capture, tmp_path / "new", "--only", "full", "--reuse", old))
-    assert code == 0 and "kept" not in err and "[1/1]" in err
+    other, out = tmp_path / "other.yaml", tmp_path / "studies"
+    other.write_text("title: Other\nvariants: {same: []}\n")
+    small.write_text("title: Tiny\nvariants: {full: []}\n")
+    shutil.copytree(old, out / "small")
+    arguments = call(small, capture, out)
+    arguments.insert(2, other)
+    code, _, err = turbogs(*arguments)
+    assert code == 0 and err.count("1 finished cells are kept") == 1 and "[1/1]" in err
 
 
 def test_the_digest_of_a_capture_is_of_names_sizes_and_cameras(capture):

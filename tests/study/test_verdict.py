@@ -1,12 +1,18 @@
 """Verdicts on the paper's parts: the rule of docs/paper.md."""
 
+import importlib
+import sys
+from pathlib import Path
+
 import pytest
 
 from turbogs_plugin.config.configuration import load_config
 from turbogs_plugin.study.results import CellResult
 from turbogs_plugin.study.summary import VariantRow
-from turbogs_plugin.study.verdict import verdict
 from turbogs_plugin.train.history import Evaluation
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "docs"))
+verdict = importlib.import_module("verdict").verdict
 
 CONFIG = load_config("turbogs").to_mapping()
 CAPTURES = ("fox", "h")

@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
+import pickle
+import subprocess
+import sys
 import tempfile
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -14,14 +18,15 @@ import torch
 from turbogs_plugin.bench.large_capture import synthetic_scene
 from turbogs_plugin.bench.numerics import bench_solvers, solvers_table
 from turbogs_plugin.bench.ranks import RanksBench
-from turbogs_plugin.bench.raster import RasterBench, other_build
+from turbogs_plugin.bench.raster import RasterBench
 from turbogs_plugin.bench.statistics import bench_statistics, statistics_table
 from turbogs_plugin.bench.step import StepBench
 from turbogs_plugin.bench.viewer import bench_viewer, viewer_lines
 from turbogs_plugin.bench.wall import bench_wall, wall_lines
 from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.engine import compiled_kernels
-from turbogs_plugin.errors import InputError
+from turbogs_plugin.engine.cuda.library import LIBRARY_VARIABLE
+from turbogs_plugin.errors import InputError, exit_code
 from turbogs_plugin.files import require_writable, write_text_atomically
 from turbogs_plugin.report.machine import missing_bytecode
 from turbogs_plugin.report.provenance import provenance
@@ -55,22 +60,35 @@ def run_step(bench: StepBench, scene: Path | None, factor: int, device: torch.de
 def run_raster(bench: RasterBench, scene: Path | None, factor: int, device: torch.device, out: Path | None) -> None:
     _require_new(out)
     capture = None if scene is None else load_scene(scene, factor)
-    place = ["--device", device.type] + ([] if scene is None else ["--scene", str(scene), "--factor", str(factor)])
-    model = {"model": bench.described(capture)}
-    with tempfile.TemporaryDirectory() as folder:
-        shared = bench.with_saved_models(capture, device, Path(folder)) if bench.libraries else bench
-        command = [*shared.arguments(), *place]
-        measured = shared.run(capture, device)
-        report = _report("raster", {**measured, **model, "other_builds": {}}, device)
-        _keep(report, raster_lines(measured), out)  # a build that fails takes nothing away
-        builds = {library.name: library for library in bench.libraries}
-        if builds and not compiled_kernels().unavailable:
-            builds = {AGAIN: compiled_kernels().path, **builds}
-        for name, library in builds.items():
-            measured = other_build(library, command)
-            report["other_builds"][name] = {**measured, **model}
-            _keep(report, [f"{name}:", *raster_lines(measured)], out)
+    about = {"scene": None, "model": "synthetic"}
+    if capture is not None:
+        about = {"scene": capture.name, "model": f"trained for {bench.training} iterations"}
+    # What another build trains would differ in the last bits: all measure the same models.
+    job = bench, bench.models(capture, device), bench.cameras(capture), device
+    measured = bench.run(*job[1:])
+    report = _report("raster", {**about, **measured, "other_builds": {}}, device)
+    _keep(report, raster_lines(measured), out)  # a build that fails takes nothing away
+    builds = {library.name: library for library in bench.libraries}
+    if builds and not compiled_kernels().unavailable:
+        builds = {AGAIN: compiled_kernels().path, **builds}
+    for name, library in builds.items():
+        measured = other_build(library, job)
+        report["other_builds"][name] = {**about, **measured}
+        _keep(report, [f"{name}:", *raster_lines(measured)], out)
     _finish(report, out)
+
+
+def other_build(library: Path, job: tuple) -> dict[str, Any]:
+    """The same measurements by another build of the library, in a process of its own."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "job"
+        path.write_bytes(pickle.dumps(job))
+        environment = {**os.environ, LIBRARY_VARIABLE: str(library.resolve())}
+        command = [sys.executable, "-m", __name__, str(path)]
+        ended = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+        if ended.returncode:
+            raise InputError(f"library '{library}': {ended.stderr.strip().splitlines()[-1]}")
+        return json.loads(path.with_suffix(".json").read_text(encoding="utf-8"))
 
 
 def run_ranks(bench: RanksBench, scene: Path, factor: int, device: torch.device, out: Path | None) -> None:
@@ -163,3 +181,16 @@ def raster_lines(measured: dict[str, Any]) -> list[str]:
         text = ", ".join(times) or entry["reason"]
         lines.append(f"gsplat {entry['version']} dense, M={entry['gaussians']} K={entry['views']}: {text}")
     return lines
+
+
+def main() -> int:
+    """A process that `other_build` started."""
+    path = Path(sys.argv[1])
+    bench, *rest, device = pickle.loads(path.read_bytes())
+    report = _report("raster", bench.run(*rest, device), device)
+    path.with_suffix(".json").write_text(json.dumps(report), encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(exit_code(main))

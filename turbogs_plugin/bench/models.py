@@ -43,15 +43,9 @@ def trained_model(
         overrides: of the configuration.
     """
     growing = max(1, round(GROWING_SHARE * iterations))
-    config = load_config(
-        "turbogs",
-        [
-            *overrides,
-            *(f"train.iterations={growing}", f"train.refine_until={round(0.9 * growing)}"),
-            f"train.sh_interval={max(1, growing // 5)}",
-            *("density.type=error_driven", f"density.max_gaussians={count}"),
-        ],
-    ).without_plan()
+    lengths = [f"train.iterations={growing}", f"train.refine_until={round(0.9 * growing)}"]
+    lengths += [f"train.sh_interval={max(1, growing // 5)}", "density.type=error_driven"]
+    config = load_config("turbogs", [*overrides, *lengths, f"density.max_gaussians={count}"]).without_plan()
     trainer = Trainer(config, scene, device)
     if iterations:
         train(trainer, growing)
@@ -104,10 +98,9 @@ def resized(gaussians: Gaussians, count: int, seed: int = 0) -> Gaussians:
 def ring_cameras(count: int, width: int, height: int, device: torch.device) -> Cameras:
     """Cameras on a ring that look at the origin."""
     origin, up = np.zeros(3), np.array([0.0, -1.0, 0.0])
-    viewmats = []
-    for angle in np.linspace(0, 2 * math.pi, count, endpoint=False):
-        position = np.array([RING_RADIUS * math.sin(angle), -0.6, -RING_RADIUS * math.cos(angle)])
-        viewmats.append(look_at(position, origin, up))
+    angles = np.linspace(0, 2 * math.pi, count, endpoint=False)
+    positions = [np.array([RING_RADIUS * math.sin(a), -0.6, -RING_RADIUS * math.cos(a)]) for a in angles]
+    viewmats = [look_at(position, origin, up) for position in positions]
     focal = 0.9 * max(width, height)
     intrinsics = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
     sizes = np.array([[width, height]] * count, dtype=np.int64)

@@ -2,13 +2,8 @@
 
 from __future__ import annotations
 
-import json
-import os
-import subprocess
-import sys
-import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -30,11 +25,9 @@ from turbogs_plugin.bench.precision import precision
 from turbogs_plugin.bench.recorder import Recorder
 from turbogs_plugin.device import free_device_memory
 from turbogs_plugin.engine import engine_of
-from turbogs_plugin.engine.cuda.library import LIBRARY_VARIABLE
 from turbogs_plugin.engine.cuda.raster import CudaRendered
 from turbogs_plugin.engine.rendered import Rendered
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.model.ply import load_ply, save_ply
 from turbogs_plugin.scene import Scene
 from turbogs_plugin.study.cell import scene_on
 from turbogs_plugin.types import Cameras, Gaussians, GaussianStats
@@ -55,14 +48,13 @@ class RasterBench:
     """What `turbogs bench raster` measures.
 
     Args:
-        gaussians: sizes of the models; not used with `ply`.
+        gaussians: sizes of the models.
         views: K; each with the rate of the pixel budget.
         rates: further rates, with the fewest views: 1 and 0.1 are compared with gsplat's dense passes of those views.
         pixel_budget: K times the rate (lambda).
         size: (width, height) of the synthetic cameras; not used with a scene.
         repeats: of each pass.
         training: iterations of the models' training on a scene; without one they are synthetic.
-        ply: models in the capture's own coordinates, in place of those trained here.
         libraries: other builds of the kernels, measured each in a process of its own.
 
     Raises:
@@ -76,7 +68,6 @@ class RasterBench:
     size: tuple[int, int]
     repeats: int
     training: int = TRAINING_ITERATIONS
-    ply: Sequence[Path] = ()
     libraries: Sequence[Path] = ()
 
     def __post_init__(self) -> None:
@@ -84,34 +75,13 @@ class RasterBench:
             if not library.is_file():
                 raise InputError(f"no such library: '{library}'")
 
-    def arguments(self) -> list[str]:
-        """Options of a command line that measures the same models, synthetic ones or files, without the libraries."""
-        values = {
-            "--gaussians": self.gaussians,
-            "--views": self.views,
-            "--rates": self.rates,
-            "--pixel-budget": [self.pixel_budget],
-            "--size": self.size,
-            "--repeats": [self.repeats],
-            "--ply": self.ply,
-        }
-        return [text for flag, given in values.items() if given for text in (flag, *map(str, given))]
-
-    def described(self, scene: Scene | None) -> str:
-        """Which models these are."""
-        if self.ply:
-            return ", ".join(path.name for path in self.ply)
-        return "synthetic" if scene is None else f"trained for {self.training} iterations"
-
     def models(self, scene: Scene | None, device: torch.device) -> list[Gaussians]:
         """The models in host memory, so that the device holds the one that is timed.
 
         Args:
-            scene: to train on, its photos in host memory, or whose frame the files' models come into.
+            scene: to train on, its photos in host memory; None: the models are synthetic.
             device: where to train; nothing is left there.
         """
-        if self.ply:
-            return [load_ply(path, scene.frame) for path in self.ply]
         if scene is None:
             return [surface_gaussians(count, torch.device("cpu")) for count in self.gaussians]
         placed = scene_on(scene, device)
@@ -120,27 +90,15 @@ class RasterBench:
         free_device_memory(device)
         return trained
 
-    def with_saved_models(self, scene: Scene | None, device: torch.device, folder: Path) -> RasterBench:
-        """The same bench with its trained models as files in a folder.
-
-        For several builds: what each of them trains would differ in the last bits.
-        """
-        if scene is None or self.ply:
-            return self
-        files = [folder / f"trained-{self.training}-{count}.ply" for count in self.gaussians]
-        for model, file in zip(self.models(scene, device), files, strict=True):
-            save_ply(model, file, scene.frame)
-        return replace(self, ply=files)
-
-    def run(self, scene: Scene | None, device: torch.device) -> dict[str, Any]:
-        """The measurements, ready for JSON. `scene`: whose cameras to use; None: synthetic ones."""
-        if self.ply and scene is None:
-            raise InputError("--ply needs --scene: the model lies in a capture's own coordinates")
+    def cameras(self, scene: Scene | None) -> Cameras:
+        """Those of a scene; where there is none, synthetic ones."""
         if scene is None:
-            cameras = ring_cameras(max(self.views), *self.size, device)
-        else:
-            cameras = scene.train.cameras.to(device, torch.float32)
-        models = self.models(scene, device)
+            return ring_cameras(max(self.views), *self.size, torch.device("cpu"))
+        return scene.train.cameras.to("cpu", torch.float32)
+
+    def run(self, models: Sequence[Gaussians], cameras: Cameras, device: torch.device) -> dict[str, Any]:
+        """The measurements, ready for JSON, of models and cameras in host memory."""
+        cameras = cameras.to(device)
         bandwidth = copy_bandwidth(device)
         passes, dense = [], []
         for held in models:
@@ -154,9 +112,7 @@ class RasterBench:
             chosen = cameras.select(spread_views(min(self.views), len(cameras)))
             dense.append({"gaussians": len(model), "views": len(chosen), **bench_gsplat(model, chosen, self.repeats)})
         return {
-            "scene": None if scene is None else scene.name,
             "image_size": cameras.sizes.max(axis=0).tolist(),
-            "model": self.described(scene),
             "copy_bandwidth_bytes_per_s": bandwidth,
             "precision": precision(device),
             "passes": passes,
@@ -212,15 +168,3 @@ class RasterBench:
             "workspace_bytes": engine.bytes_held,
             "peak_bytes": torch.cuda.max_memory_allocated(device),
         }
-
-
-def other_build(library: Path, command: Sequence[str]) -> dict[str, Any]:
-    """The same measurements by another build of the library, in a process of its own."""
-    with tempfile.TemporaryDirectory() as folder:
-        out = Path(folder) / "bench.json"
-        arguments = [sys.executable, "-m", "turbogs_plugin.cli", "bench", "raster", *command, "--out", str(out)]
-        environment = {**os.environ, LIBRARY_VARIABLE: str(library.resolve())}
-        ended = subprocess.run(arguments, env=environment, capture_output=True, text=True, check=False)
-        if ended.returncode:
-            raise InputError(f"library '{library}': {ended.stderr.strip().splitlines()[-1]}")
-        return json.loads(out.read_text(encoding="utf-8"))

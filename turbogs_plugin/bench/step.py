@@ -55,9 +55,9 @@ class StepBench:
         training: iterations of the model's training.
         repeats: iterations timed.
         overrides: of the configuration, whose strategies are timed.
-        ply: a model in place of a trained one.
         offload: time the iteration with photos and error maps in host memory, too.
         photos, size: how many synthetic photos of which (width, height) take the place of a scene; 0: none.
+        ply: a model in place of a trained one.
     """
 
     gaussians: Sequence[int]
@@ -66,10 +66,10 @@ class StepBench:
     training: int
     repeats: int
     overrides: Sequence[str]
-    ply: Path | None = None
     offload: bool = False
     photos: int = 0
     size: tuple[int, int] = (0, 0)
+    ply: Path | None = None
 
     def run(self, scene: Scene, device: torch.device) -> dict[str, Any]:
         """The measurements, ready for JSON. `scene`: on the device, or every trainer copies the photos."""
@@ -125,7 +125,11 @@ class StepBench:
             if isinstance(recorder.rendered, CudaRendered):
                 counts = {**counts, **raster_counts(recorder.rendered, samples)}
                 floors = step_floors(counts, bandwidth)
-        free_running = self._free_running(trainer, device)
+        marks = [Mark(device)]  # of the ends of iterations on the device, which may have to wait for the host
+        for _ in range(self.repeats):
+            trainer.step()
+            marks.append(Mark(device))
+        synchronize(device)
         wall = back_to_back(trainer.step, self.repeats, device)
         trainer.repeat_lost(wait=True)
         event = density_event(trainer, self.overrides, device)
@@ -136,7 +140,7 @@ class StepBench:
             "views": len(samples.view_ids),
             "pixel_budget": self.pixel_budget,
             "steps": steps,
-            "free_running": free_running,
+            "free_running": device_times(itertools.pairwise(marks)),
             "wall": wall,
             "density_event": event,
             "offload": self._offloaded(scene, model, config, device) if self.offload else None,
@@ -180,15 +184,6 @@ class StepBench:
                 "learning_rates": {**rates, "batch_scale": RATE_FACTOR * rates["batch_scale"]},
             },
         )
-
-    def _free_running(self, trainer: Trainer, device: torch.device) -> dict[str, float]:
-        """Time from one iteration's end to the next one's on the device, which may have to wait for the host."""
-        marks = [Mark(device)]
-        for _ in range(self.repeats):
-            trainer.step()
-            marks.append(Mark(device))
-        synchronize(device)
-        return device_times(itertools.pairwise(marks))
 
 
 def warm_trainer(config: Config, scene: Scene, model: Gaussians, device: torch.device, ranks: Ranks = ONE) -> Trainer:

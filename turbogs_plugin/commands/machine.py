@@ -20,7 +20,6 @@ def bench(
     /,
     *,
     scene: Scene = None,
-    ply: Annotated[tuple[Path, ...], arg(metavar="FILE ...")] = (),
     gaussians: Annotated[tuple[int, ...], arg(metavar="M ...")] = (150_000, 600_000),
     views: Annotated[tuple[int, ...], arg(metavar="K ...")] = (10, 5, 3),
     pixel_budget: Annotated[float, arg(metavar="LAMBDA")] = 1.0,
@@ -49,7 +48,6 @@ def bench(
             with a client that moves.
         overrides: step, ranks, wall, viewer: changes of the configuration that is timed.
         scene: a capture, for its cameras and photos; where absent, all is synthetic, the models of raster as well.
-        ply: a trained model in place of those trained here; raster: one or more, timed at their own sizes.
         gaussians: sizes of the model.
         views: views of an iteration.
         pixel_budget: pixels of an iteration in images (lambda).
@@ -83,13 +81,11 @@ def bench(
     require_positive("--pixel-budget", (pixel_budget,))
     if training is not None and training < 0:
         raise InputError(f"--training {training}: it must be at least 0")
-    if training is not None and ply:
-        raise InputError("--ply names a trained model: leave --training out")
     iterations = TRAINING_ITERATIONS if training is None else training
     where = resolve_device(device)
-    of_step_or_raster = ply or library or photos or offload
+    of_step_or_raster = library or photos or offload
     if what == "numerics":
-        if out is None or overrides or scene is not None or ply or library:
+        if out is None or overrides or scene is not None or library:
             raise InputError("bench numerics needs --out FOLDER, and takes --device besides")
         commands.run_numerics(where, out)
     elif what in ("wall", "viewer"):
@@ -105,21 +101,18 @@ def bench(
             commands.run_wall(arguments, times, where, out)
     elif what == "ranks":
         if scene is None or of_step_or_raster:
-            raise InputError("bench ranks needs --scene SCENE; a model, synthetic photos and offload are not for it")
+            raise InputError("bench ranks needs --scene SCENE; a library, synthetic photos and offload are not for it")
         step = StepBench(gaussians, views, pixel_budget, iterations, times, overrides)
         commands.run_ranks(RanksBench(gpus, grown, step), scene, factor, where, out)
     elif what == "step":
-        if len(ply) > 1:
-            raise InputError("bench step takes one --ply, at the sizes of --gaussians")
-        model = ply[0] if ply else None
-        step = StepBench(gaussians, views, pixel_budget, iterations, times, overrides, model, offload, photos, size)
+        step = StepBench(gaussians, views, pixel_budget, iterations, times, overrides, offload, photos, size)
         commands.run_step(step, scene, factor, where, out)
     else:
         if overrides:
             raise InputError("bench raster times the rasterizer alone: it has no section.key=value")
         if training is not None and scene is None:
             raise InputError("--training needs --scene: without a capture, bench raster times synthetic models")
-        raster = RasterBench(gaussians, views, rates, pixel_budget, size, times, iterations, ply, library)
+        raster = RasterBench(gaussians, views, rates, pixel_budget, size, times, iterations, library)
         commands.run_raster(raster, scene, factor, where, out)
     return 0
 

@@ -22,7 +22,6 @@ def ablate(
     time_budget: Time = None,
     only: Annotated[tuple[str, ...], arg(metavar="VARIANT ...")] = (),
     psnr: Decibels = (),
-    reuse: Studies = (),
     merge: Studies = (),
     within: Time = None,
     gpus: Annotated[str | None, arg(metavar="0,1,...")] = None,
@@ -41,7 +40,6 @@ def ablate(
         time_budget: of every cell, as in train.
         only: these variants and the baseline.
         psnr: test PSNRs whose time is asked for; from the baseline's result where absent.
-        reuse: take cells of the same settings from these studies where machine and sources are the same.
         merge: put these studies together in --out and write the report, without training.
         within: begin no further cell after so much time: 9m. The same call then goes on; the exit code is 3.
         gpus: numbers of GPUs, a process each, which share the cells.
@@ -64,7 +62,7 @@ def ablate(
     if only and len(ablations) > 1:
         raise InputError("--only names variants of one ablation: give it one NAME_OR_FILE")
     limit = None if within is None else parse_seconds(within)
-    options = SweepOptions(scene, seeds, overrides, steps, device, reuse, limit, numbers("--gpus", gpus))
+    options = SweepOptions(scene, seeds, overrides, steps, device, limit, numbers("--gpus", gpus))
     return commands.ablate(ablations, options, out, only, psnr)
 
 

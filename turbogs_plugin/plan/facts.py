@@ -6,10 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from turbogs_plugin.error_maps import MAP_BYTES
-from turbogs_plugin.plan.exposures import compare_exposures
+from turbogs_plugin.plan.exposures import LUMINANCE, compare_exposures
 from turbogs_plugin.plan.sight import Sight
 from turbogs_plugin.scene import PosedImages, Scene
 from turbogs_plugin.scene.host_arrays import free_host_bytes
@@ -22,7 +21,6 @@ FLAT_DEVIATION = 0.01
 TILES_AT_MOST = 6400
 """Tiles examined, over all photos."""
 TILES_PER_PHOTO = 64
-LUMINANCE = (0.299, 0.587, 0.114)
 MODEL_BYTES_PER_GAUSSIAN = 3 * 4 * 59
 """59 single-precision numbers at degree 3, with two moments each."""
 
@@ -150,8 +148,9 @@ def flat_tile_share(views: PosedImages) -> float:
     flat = torch.from_numpy(np.concatenate(places or [np.zeros((0, TILE_PIXELS), dtype=np.int64)]))  # [T, 256]
     if not len(flat):
         return 0.0
-    flat = flat.to(colors.device)
-    deviations = _luminance(colors[flat]).std(dim=1, correction=0)
+    pixels = colors[flat.to(colors.device)][..., :3].float()  # [T, 256, 3], transparent colours on black
+    luminance = pixels @ (torch.from_numpy(LUMINANCE).to(colors.device) / 255.0)
+    deviations = luminance.std(dim=1, correction=0)
     return float((deviations < FLAT_DEVIATION).float().mean())
 
 
@@ -160,11 +159,6 @@ def _baseline(views: PosedImages, sight: Sight, extent: float) -> float:
         return 0.0
     depth = sight.depths[sight.inside].median() if sight.inside.any() else torch.tensor(extent)
     return float(sight.distances.amin(dim=1).median() / depth)
-
-
-def _luminance(colors: Tensor) -> Tensor:
-    """[..., 3 or 4] uint8 -> [...] float32, 0 .. 1; transparent colours on black."""
-    return colors[..., :3].float() @ (torch.tensor(LUMINANCE, device=colors.device) / 255.0)
 
 
 def _free_device_bytes(device: torch.device, scene: Scene) -> int:

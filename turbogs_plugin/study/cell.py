@@ -21,7 +21,6 @@ from turbogs_plugin.study.results import CellResult
 from turbogs_plugin.train.evaluate import evaluate, load_lpips
 from turbogs_plugin.train.evaluations import Evaluations
 from turbogs_plugin.train.flip import load_flip
-from turbogs_plugin.train.history import Evaluation
 from turbogs_plugin.train.loop import Listener, TrainingLoop
 from turbogs_plugin.train.run import new_loop
 from turbogs_plugin.train.trainer import Trainer
@@ -44,16 +43,13 @@ class PeakMemory(Listener):
     def __init__(self, device: torch.device) -> None:
         self.device = device
         self.peak: int | None = None
-        self._begin()
+        self.evaluated()
 
     def evaluating(self, loop: TrainingLoop) -> None:
         if self.device.type == "cuda":
             self.peak = max(self.peak or 0, torch.cuda.max_memory_allocated(self.device))
 
-    def evaluated(self, loop: TrainingLoop, evaluation: Evaluation) -> None:
-        self._begin()
-
-    def _begin(self) -> None:
+    def evaluated(self, *told: object) -> None:
         if self.device.type == "cuda":
             torch.cuda.reset_peak_memory_stats(self.device)
 

@@ -38,7 +38,7 @@ def ablate(
     for number, (ablation, variants, folder) in enumerate(zip(ablations.values(), chosen, folders, strict=True)):
         try:
             sweep = (ablation, variants, options, here, folder, folders[:number], begun)
-            left = run_sweep(*sweep) if len(options.gpus) < 1 else run_on_gpus(*sweep)
+            left = run_sweep(*sweep) if len(options.gpus) < 1 else run_on_gpus(options, sweep)
         finally:
             if folder.file.is_file() and folder.read_study().results:  # after a refusal there may be none
                 _report(folder, targets)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -24,8 +24,6 @@ from turbogs_plugin.study.plots import PLOTS, write_plots
 from turbogs_plugin.study.results import Study
 from turbogs_plugin.study.statistics import Difference, Spread, crossing_gap
 from turbogs_plugin.study.summary import MEASURES, SceneSummary, VariantRow, summarise
-
-MIB = 2**20
 
 CLOCKS = {"wall_seconds": "wall in s", "cell_seconds": "load, train, evaluate in s"}
 """Measures of the wall's clock, each with its column, where a cell has it."""
@@ -156,12 +154,7 @@ def _machines(provenances: Sequence[Provenance | None]) -> list[Block]:
 
 def _scene(summary: SceneSummary) -> list[Block]:
     against = f" against {summary.baseline}" if summary.baseline else ""
-    clocks = [label for measure, label in CLOCKS.items() if _has(summary, measure)]
-    flip = ("FLIP",) if _has(summary, "flip") else ()
-    header = (
-        *("variant", "front", "seeds", "time in s", *clocks, f"time{against}", "PSNR in dB", f"PSNR{against}"),
-        *("worst view in dB", "SSIM", f"SSIM{against}", "LPIPS (VGG)", *flip, "Gaussians", "FPS", "peak MiB"),
-    )
+    columns = _columns(summary, against)
     reach_header, reach_lines = ["variant"], [[row.name] for row in summary.rows]
     for target in summary.targets:
         reach_header += [f"s to {target:.1f} dB", f"ratio{against}"]
@@ -170,7 +163,7 @@ def _scene(summary: SceneSummary) -> list[Block]:
             line += [_reach_text(row.seconds_to(target)), "" if math.isnan(ratio) else f"x {ratio:.2f}"]
     blocks: list[Block] = [
         Heading(summary.scene),
-        Table(header, [_result_line(row, summary) for row in summary.rows]),
+        Table([head for head, _ in columns], [[cell(row) for _, cell in columns] for row in summary.rows]),
         *(Picture(f"{summary.scene}-{plot.name}.png", f"{summary.scene}: {plot.text}") for plot in PLOTS),
         Heading(f"Time to reach a PSNR on {summary.scene}", 3),
         Table(reach_header, reach_lines),
@@ -196,29 +189,36 @@ def _has(summary: SceneSummary, measure: str) -> bool:
     return not all(math.isnan(MEASURES[measure](cell)) for row in summary.rows for cell in row.cells)
 
 
-def _result_line(row: VariantRow, summary: SceneSummary) -> tuple[str, ...]:
-    ratio = psnr = ssim = ""
-    if summary.baseline not in ("", row.name):
-        ratio = f"x {row.ratio('seconds'):.2f}"
-        psnr, ssim = difference_text(row.difference("psnr"), 2), difference_text(row.difference("ssim"), 4)
-    return (
-        row.name,
-        "★" if row.on_front else "",
-        str(len(row.cells)),
-        spread_text(row.seconds, 1),
-        *(spread_text(row.spread(clock), 1, "-") for clock in CLOCKS if _has(summary, clock)),
-        ratio,
-        spread_text(row.psnr, 2),
-        psnr,
-        spread_text(row.spread("worst_psnr"), 2, "not recorded"),
-        spread_text(row.spread("ssim"), 4),
-        ssim,
-        spread_text(row.spread("lpips"), 4),
-        *((spread_text(row.spread("flip"), 4),) if _has(summary, "flip") else ()),
-        number(row.spread("gaussians").mean, 0),
-        number(row.spread("fps").mean, 0, "not recorded"),
-        number(row.spread("peak_bytes").mean / MIB, 0, "not measured"),
-    )
+def _columns(summary: SceneSummary, against: str) -> list[tuple[str, Callable[[VariantRow], str]]]:
+    """Heads of the columns of results, each with what gives a row's cell."""
+
+    def spread(measure: str, digits: int, absent: str = "not computed") -> Callable[[VariantRow], str]:
+        return lambda row: spread_text(row.spread(measure), digits, absent)
+
+    def mean(measure: str, absent: str = "not computed", unit: int = 1) -> Callable[[VariantRow], str]:
+        return lambda row: number(row.spread(measure).mean / unit, 0, absent)
+
+    def compared(text: Callable[[VariantRow], str]) -> Callable[[VariantRow], str]:
+        return lambda row: "" if summary.baseline in ("", row.name) else text(row)
+
+    return [
+        ("variant", lambda row: row.name),
+        ("front", lambda row: "★" if row.on_front else ""),
+        ("seeds", lambda row: str(len(row.cells))),
+        ("time in s", spread("seconds", 1)),
+        *((head, spread(clock, 1, "-")) for clock, head in CLOCKS.items() if _has(summary, clock)),
+        (f"time{against}", compared(lambda row: f"x {row.ratio('seconds'):.2f}")),
+        ("PSNR in dB", spread("psnr", 2)),
+        (f"PSNR{against}", compared(lambda row: difference_text(row.difference("psnr"), 2))),
+        ("worst view in dB", spread("worst_psnr", 2, "not recorded")),
+        ("SSIM", spread("ssim", 4)),
+        (f"SSIM{against}", compared(lambda row: difference_text(row.difference("ssim"), 4))),
+        ("LPIPS (VGG)", spread("lpips", 4)),
+        *([("FLIP", spread("flip", 4))] if _has(summary, "flip") else []),
+        ("Gaussians", mean("gaussians")),
+        ("FPS", mean("fps", "not recorded")),
+        ("peak MiB", mean("peak_bytes", "not measured", 2**20)),
+    ]
 
 
 def difference_text(difference: Difference, digits: int) -> str:

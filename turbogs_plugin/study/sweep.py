@@ -17,7 +17,7 @@ from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.config.old_spellings import old_spelling
 from turbogs_plugin.device import free_device_memory, synchronize
 from turbogs_plugin.errors import InputError, TrainingStopped
-from turbogs_plugin.report.provenance import COMMIT_VARIABLE, MODIFIED, Provenance
+from turbogs_plugin.report.provenance import Provenance
 from turbogs_plugin.report.tensorboard import EventWriter, event_writers
 from turbogs_plugin.scene import Scene, load_scene
 from turbogs_plugin.study.cell import capture_digest, train_cell
@@ -47,8 +47,6 @@ class SweepOptions:
         overrides: ``section.key=value`` of all variants.
         steps: iterations of every cell; None: the configurations' own.
         device: auto, cpu or cuda.
-        reuse: other studies; a cell of the same settings, made by the same sources on the same machine, is taken from
-            them. Tables share variants, the baseline above all.
         within: seconds after which no further cell begins; None: all are trained.
         gpus: numbers of this machine's GPUs, each of which a process of its own uses; none: this process trains.
     """
@@ -58,7 +56,6 @@ class SweepOptions:
     overrides: Sequence[str] = ()
     steps: int | None = None
     device: str = "auto"
-    reuse: Sequence[Path] = ()
     within: float | None = None
     gpus: Sequence[int] = ()
 
@@ -91,7 +88,8 @@ def run_sweep(
         ablation: all of it is what the study is of.
         variants: of it, the ones to train now.
         here: machine and sources, as they were when the process began.
-        siblings: studies by this very process, whose cells of the same settings are taken.
+        siblings: studies by this very process, whose cells of the same settings are taken, if the same sources made
+            them on the same machine. Tables share variants, the baseline above all.
         begun: `time.monotonic` from which `options.within` counts; now where absent.
 
     Returns:
@@ -109,7 +107,7 @@ def run_sweep(
         if result.variant not in ablation.variants:
             raise InputError(f"'{folder.path}' has a cell of another ablation ({result.key}): choose a new --out")
     device = resolve_device(options.device)
-    reusable = _reusable_cells(options, here, siblings)
+    reusable = _reusable_cells(here, siblings)
     taken: list[CellResult] = []
     left: list[tuple[Scene, CellKey, Config]] = []
     loading: dict[str, float] = {}  # capture -> seconds
@@ -207,14 +205,9 @@ def _require_same(present: CellResult, config: Config) -> None:
         )
 
 
-def _reusable_cells(
-    options: SweepOptions, here: Provenance, siblings: Sequence[StudyFolder]
-) -> dict[tuple[str, str, str], CellResult]:
+def _reusable_cells(here: Provenance, siblings: Sequence[StudyFolder]) -> dict[tuple[str, str, str], CellResult]:
     """(scene, capture, settings) -> a result of another study that a cell of these settings would repeat."""
-    if options.reuse and (not here.commit or here.commit.endswith(MODIFIED)):
-        raise InputError(f"--reuse needs sources of a known commit, without changes; {COMMIT_VARIABLE} may name it")
-    folders = [*map(StudyFolder, options.reuse), *siblings]
-    results = [result for folder in folders for result in folder.read_study().results]
+    results = [result for folder in siblings for result in folder.read_study().results]
     return {
         (result.scene, result.capture, _comparable(result.asked)): result
         for result in results

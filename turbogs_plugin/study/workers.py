@@ -10,14 +10,11 @@ import sys
 from collections.abc import Sequence
 from multiprocessing.connection import wait
 from multiprocessing.process import BaseProcess
-from typing import Any
 
 import torch
 
 from turbogs_plugin.device import processor_cores
 from turbogs_plugin.errors import InputError, TrainingStopped, exit_code
-from turbogs_plugin.study.folder import StudyFolder
-from turbogs_plugin.study.grid import Ablation
 from turbogs_plugin.study.sweep import SweepOptions, run_sweep
 
 UNFINISHED = 3
@@ -31,12 +28,13 @@ class _Lines(io.TextIOWrapper):
         return False
 
 
-def run_on_gpus(
-    ablation: Ablation, variants: Sequence[str], options: SweepOptions, here: Any, folder: StudyFolder, *more: Any
-) -> int:
+def run_on_gpus(options: SweepOptions, sweep: tuple) -> int:
     """`run_sweep` by a process for each of `options.gpus`; returns when all have ended.
 
     A worker that is killed takes nothing along but the cell it trained, which another one takes over.
+
+    Args:
+        sweep: arguments of `run_sweep`, with these options.
 
     Returns:
         1 if `options.within` left cells for another call; else 0.
@@ -50,8 +48,7 @@ def run_on_gpus(
     if options.device != "cpu" and absent:
         raise InputError(f"--gpus: there is no GPU {absent[0]}, {present} answer; see 'turbogs doctor'")
     context = multiprocessing.get_context("spawn")
-    arguments = (ablation, variants, options, here, folder, *more)
-    workers = [context.Process(target=_work, args=(gpu, place, arguments)) for place, gpu in enumerate(options.gpus)]
+    workers = [context.Process(target=_work, args=(options.gpus, place, sweep)) for place in range(len(options.gpus))]
     for worker in workers:
         worker.start()
     try:
@@ -83,19 +80,20 @@ def _wait_for(workers: Sequence[BaseProcess]) -> None:
                 print(f"worker {number} ended early (code {worker.exitcode}): others take its cells", file=sys.stderr)
 
 
-def _work(gpu: int, place: int, arguments: tuple) -> None:
+def _work(gpus: Sequence[int], place: int, sweep: tuple) -> None:
     """In a process of its own, before CUDA starts."""
+    gpu = gpus[place]
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     visible = [name for name in os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",") if name]
     os.environ["CUDA_VISIBLE_DEVICES"] = visible[gpu] if gpu < len(visible) else str(gpu)
     # Each process with as many threads as there are cores would wait for the others' at every parallel loop.
-    torch.set_num_threads(max(1, processor_cores() // len(arguments[2].gpus)))
+    torch.set_num_threads(max(1, processor_cores() // len(gpus)))
 
     sys.stderr = _Lines(os.fdopen(os.dup(2), "wb", 0), write_through=True)
 
     def swept() -> int:
         try:
-            return UNFINISHED if run_sweep(*arguments) else 0
+            return UNFINISHED if run_sweep(*sweep) else 0
         except InputError:
             if place == 0:  # it is the same for all, and one says so
                 raise
