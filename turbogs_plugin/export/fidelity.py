@@ -11,6 +11,7 @@ import torch
 
 from turbogs_plugin.engine.rendering import RasterSettings
 from turbogs_plugin.scene import PosedImages
+from turbogs_plugin.scene.poses import evenly
 from turbogs_plugin.train.evaluate import psnr, render_view
 from turbogs_plugin.types import Gaussians
 
@@ -74,8 +75,7 @@ class Fidelity:
         if not len(views):
             raise ValueError("there are no test views")
         self._views, self._device, self._degree, self._settings = views, gaussians.device, sh_degree, settings
-        shown = np.linspace(0, len(views) - 1, min(MOST_VIEWS, len(views)))
-        self.view_ids = np.unique(shown.round().astype(int)).tolist()
+        self.view_ids = evenly(len(views), MOST_VIEWS)
         self._model, self._before = gaussians, self.psnr(gaussians)
         self.before = fmean(self._before)
 
