@@ -8,7 +8,6 @@ import re
 import shutil
 from collections import Counter
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,7 @@ from PIL.ExifTags import IFD, Base
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene.capture import FEWEST_PHOTOS
 from turbogs_plugin.scene.photo_folder import find_photos, unread
-from turbogs_plugin.scene.photos import opened_image, require_8_bits
+from turbogs_plugin.scene.photos import decoding_threads, opened_image, require_8_bits
 
 SEPARATORS = re.compile(r"[\s#]")
 JPEG_QUALITY = 95
@@ -79,7 +78,7 @@ def read_photos(folder: Path) -> list[PhotoFile]:
     for name, number in Counter(names).items():
         if number > 1:
             raise InputError(f"{number} photos in {place} would be named '{name}' without spaces: rename them")
-    with ThreadPoolExecutor(min(8, os.cpu_count() or 1)) as pool:
+    with decoding_threads() as pool:
         photos = list(pool.map(_read, paths, names))
     return sorted(photos, key=lambda photo: photo.name)
 
@@ -106,7 +105,7 @@ def place_photos(photos: Sequence[PhotoFile], folder: Path) -> None:
                 shutil.copyfile(photo.path, part)
         os.replace(part, target)
 
-    with ThreadPoolExecutor(min(8, os.cpu_count() or 1)) as pool:
+    with decoding_threads() as pool:
         list(pool.map(place, photos))
 
 
