@@ -183,7 +183,7 @@ def set_pose(value):
         (lambda content: content.update(ply_file_path="points.ply"), "points.ply is not there: bring it back, or take"),
         (set_pose(None), "f2.png' has no transform_matrix"),
         (set_pose([[1, 2], [3]]), "f2.png' has no transform_matrix"),
-        (set_pose((np.eye(4) * math.nan).tolist()), "f2.png' has no transform_matrix"),
+        (set_pose((np.eye(4) * math.nan).tolist()), "f2.png' has numbers that are not finite"),
         (set_pose((np.eye(4) * 2).tolist()), "f2.png' is not a rotation"),
         (set_pose(np.diag([1, 1, -1, 1]).tolist()), "f2.png' is not a rotation"),
     ],

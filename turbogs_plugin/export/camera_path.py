@@ -12,8 +12,8 @@ import torch
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene.capture import LARGEST_SIDE
 from turbogs_plugin.scene.frame import Frame
-from turbogs_plugin.scene.poses import camera_centers, look_at, quaternions, rotations, viewmat_of_pose
-from turbogs_plugin.scene.transforms import number_of, read_frames
+from turbogs_plugin.scene.poses import camera_centers, evenly, look_at, quaternions, rotations
+from turbogs_plugin.scene.transforms import number_of, opengl_viewmat, pinhole, read_frames
 from turbogs_plugin.types import Cameras
 
 MOST_KEYS = 24
@@ -76,7 +76,7 @@ def orbit(cameras: Cameras, frames: int) -> Cameras:
 
 def through_views(cameras: Cameras, frames: int) -> Cameras:
     """A smooth way through the cameras in their order, at most `MOST_KEYS` of them."""
-    chosen = np.unique(np.linspace(0, len(cameras) - 1, min(MOST_KEYS, len(cameras))).round().astype(int)).tolist()
+    chosen = evenly(len(cameras), MOST_KEYS)
     keys = cameras.to("cpu").select(chosen)
     K, size = _common_lens(cameras)
     return interpolated(keys.viewmats.double().numpy(), np.repeat(K[None], len(chosen), axis=0), size, frames)
@@ -98,21 +98,12 @@ def from_file(path: Path, frame: Frame, frames: int) -> Cameras:
     viewmats, Ks = [], []
     for place, entry in enumerate(entries):
         values = {**content, **entry}
-        focal, angle = (number_of(values, path, name) for name in ("fl_x", "camera_angle_x"))
-        if focal is None and angle is not None and 0 < angle < math.pi:
-            focal = 0.5 * width / math.tan(0.5 * angle)
-        if focal is None or focal <= 0:
+        K = pinhole(values, path, (width, height), angles="x")
+        if K is None or K[0, 0] <= 0:
             raise InputError(f"{path}: camera {place} has neither fl_x nor a camera_angle_x in 0 .. pi")
-        try:
-            pose = np.array(entry.get("transform_matrix"), dtype=np.float64)
-            if pose.shape not in ((3, 4), (4, 4)):
-                raise ValueError("is no matrix of 4x4 numbers")
-            viewmats.append(viewmat_of_pose(pose[:3, :3] * [1.0, -1.0, -1.0], pose[:3, 3]))
-        except (ValueError, TypeError) as error:
-            raise InputError(f"{path}: the transform_matrix of camera {place} {error}") from None
-        middle = [number_of(values, path, name, 0.5 * side) for name, side in (("cx", width), ("cy", height))]
-        upright = number_of(values, path, "fl_y", focal)
-        Ks.append([[focal, 0.0, middle[0]], [0.0, upright, middle[1]], [0.0, 0.0, 1.0]])
+        Ks.append(K)
+        owner = f"{path}: the transform_matrix of camera {place}"
+        viewmats.append(opengl_viewmat(entry.get("transform_matrix"), f"{owner} is no matrix of 4x4 numbers", owner))
     normalised = frame.normalise_poses(np.stack(viewmats))
     return interpolated(normalised, np.array(Ks), (round(width), round(height)), frames)
 

@@ -87,37 +87,27 @@ def export_run(
     if max_gaussians is not None and out is None and file_format == "ply":
         raise InputError("--max-gaussians would take the place of the run's own model.ply: name a new file by --out")
     model, scene, absent = _opened(path, given, needed=max_gaussians is not None or file_format == PAGE)
-    whole = model.gaussians
-    gaussians = whole
+    gaussians = whole = model.gaussians
     if max_gaussians is not None and max_gaussians < len(gaussians):
         gaussians = pruned(gaussians, contributions(gaussians, scene.train.cameras, model.config.raster), max_gaussians)
     kept = gaussians if drop_bands is None else drop_faint_bands(gaussians, drop_bands)
     notes = _notes(whole, gaussians, kept, drop_bands)
     if file_format == PAGE:
-        file = model.folder.path / "report.html" if out is None else out
         from turbogs_plugin.export.page import write_page
 
         if not len(scene.test):
             raise InputError("--format html shows test views, and the capture has none")
-        count, change = write_page(model, kept, scene, file)
-        reason = ""
+        file = model.folder.path / "report.html" if out is None else out
+        (count, change), reason = write_page(model, kept, scene, file), ""
     else:
         file = model.folder.model.with_suffix(FORMATS[file_format].suffix) if out is None else out
         FORMATS[file_format].write(kept, file, model.frame, model.iteration or 0)
         read = Similarity.into(model.frame).apply(FORMATS[file_format].read(file)).map(torch.Tensor.float)
         count = len(read)
-        change, reason = _change(model, read, scene, absent)
+        reason = absent or ("" if len(scene.test) else "the capture has no test views")
+        change = None if reason else Fidelity(whole, scene.test, model.sh_degree, model.config.raster).change(read)
     held = sum(value.numel() * 4 for _, value in whole.items())
     return Exported(file, file.stat().st_size, count, held, len(whole), change, reason, notes)
-
-
-def _change(model: SavedModel, read: Gaussians, scene: Scene | None, absent: str) -> tuple[Change | None, str]:
-    """What the model lost, or why that cannot be said."""
-    if scene is None:
-        return None, absent
-    if not len(scene.test):
-        return None, "the capture has no test views"
-    return Fidelity(model.gaussians, scene.test, model.sh_degree, model.config.raster).change(read), ""
 
 
 def film_run(

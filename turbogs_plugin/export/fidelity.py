@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from statistics import fmean
 
 import numpy as np
@@ -11,6 +11,7 @@ import torch
 
 from turbogs_plugin.engine.rendering import RasterSettings
 from turbogs_plugin.scene import PosedImages
+from turbogs_plugin.scene.poses import evenly
 from turbogs_plugin.train.evaluate import psnr, render_view
 from turbogs_plugin.types import Gaussians
 
@@ -74,8 +75,7 @@ class Fidelity:
         if not len(views):
             raise ValueError("there are no test views")
         self._views, self._device, self._degree, self._settings = views, gaussians.device, sh_degree, settings
-        shown = np.linspace(0, len(views) - 1, min(MOST_VIEWS, len(views)))
-        self.view_ids = np.unique(shown.round().astype(int)).tolist()
+        self.view_ids = evenly(len(views), MOST_VIEWS)
         self._model, self._before = gaussians, self.psnr(gaussians)
         self.before = fmean(self._before)
 
@@ -86,9 +86,8 @@ class Fidelity:
     def image(self, gaussians: Gaussians, view_id: int) -> torch.Tensor:
         """[H, W, 3] float32, 0 .. 1, on the device: a model seen by one of the test cameras."""
         model = gaussians.map(lambda value: value.to(self._device))
-        degree = min(self._degree, model.sh_degree)
-        views = PosedImages(self._views.cameras.to(self._device), self._views.names, self._views.photos)
-        return render_view(model, views, view_id, degree, self._settings)
+        views = replace(self._views, cameras=self._views.cameras.to(self._device), masks=None)
+        return render_view(model, views, view_id, min(self._degree, model.sh_degree), self._settings)
 
     def photo(self, view_id: int) -> torch.Tensor:
         """[H, W, 3] float32, 0 .. 1, on the device."""
@@ -103,8 +102,6 @@ class Fidelity:
         losses = [before - now for before, now in zip(self._before, after, strict=True)]
         place = int(np.argmax(losses))
         worst = (self._views.names[self.view_ids[place]], losses[place])
-        return Change(self.before, fmean(after), *counts, *worst, self._is_equal(gaussians))
-
-    def _is_equal(self, gaussians: Gaussians) -> bool:
-        values = dict(gaussians.items())
-        return all(torch.equal(value, values[name].to(value.device)) for name, value in self._model.items())
+        pairs = zip(self._model.items(), gaussians.items(), strict=True)
+        equal = all(torch.equal(value, other.to(value.device)) for (_, value), (_, other) in pairs)
+        return Change(self.before, fmean(after), *counts, *worst, equal)

@@ -27,7 +27,7 @@ from turbogs_plugin.model.row_order import spatial_order
 from turbogs_plugin.model.similarity import finite_rows
 from turbogs_plugin.report.pictures import ERROR_FULL_SCALE, error_picture, to_uint8
 from turbogs_plugin.report.plots import plot_against_seconds
-from turbogs_plugin.report.tables import number
+from turbogs_plugin.report.tables import ERRORS, errors, number
 from turbogs_plugin.scene import Scene
 from turbogs_plugin.study.document import CSS, Block, Heading, Paragraph, Table
 from turbogs_plugin.train.evaluate import compare
@@ -126,15 +126,8 @@ def _summary(model: SavedModel, scene: Scene, fidelity: Fidelity, history: list[
         measured = f"PSNR {fidelity.before:.2f} dB on {len(fidelity.view_ids)} of the test views"
         return _html([Paragraph(f"{len(model.gaussians)} Gaussians{trained}; {views}. {measured}.")])
     last = history[-1]
-    header = ("PSNR in dB", "SSIM", "mean absolute error", "training in s", "iterations", "Gaussians")
-    row = (
-        number(last.psnr, 2),
-        number(last.ssim, 4),
-        number(last.l1, 4),
-        f"{last.train_seconds:.1f}",
-        str(last.iteration),
-        str(last.num_gaussians),
-    )
+    header = (*ERRORS.values(), "training in s", "iterations", "Gaussians")
+    row = (*errors(last), f"{last.train_seconds:.1f}", str(last.iteration), str(last.num_gaussians))
     said = f"{views}; seed {model.config.train.seed}. Errors are means over the test views."
     return _html([Table(header, [row]), Paragraph(said)])
 
@@ -174,9 +167,9 @@ def _jpeg(pixels: np.ndarray) -> str:
 
 def _scene(model: SavedModel, scene: Scene, packed: PackedModel) -> dict[str, object]:
     """What the viewer is told besides the model, in the scene's normalised frame. Training views come first."""
-    views = [(scene.train, False), (scene.test, True)]
-    cameras = [camera for part, test in views for camera in _cameras(part.cameras, part.names, test)]
-    target, up = focus_and_up(_joined(scene))
+    cameras = _joined(scene)
+    lenses = cameras.Ks[:, [0, 1, 0, 1], [0, 1, 2, 2]]
+    target, up = focus_and_up(cameras)
     raster = model.config.raster
     return {
         "model": {
@@ -187,7 +180,18 @@ def _scene(model: SavedModel, scene: Scene, packed: PackedModel) -> dict[str, ob
             "eps2d": raster.eps2d,
             "alpha_min": raster.alpha_min,
         },
-        "cameras": cameras,
+        "cameras": [
+            {
+                "name": name,
+                "test": view >= len(scene.train),
+                "rotation": cameras.viewmats[view, :3, :3].flatten().tolist(),
+                "translation": cameras.viewmats[view, :3, 3].tolist(),
+                "center": cameras.centers[view].tolist(),
+                "lens": lenses[view].tolist(),
+                "size": cameras.sizes[view].tolist(),
+            }
+            for view, name in enumerate((*scene.train.names, *scene.test.names))
+        ],
         "first": len(scene.train),
         "target": target.tolist(),
         "up": up.tolist(),
@@ -198,23 +202,6 @@ def _joined(scene: Scene) -> Cameras:
     parts = [part.cameras.to("cpu") for part in (scene.train, scene.test)]
     viewmats, Ks = (torch.cat([getattr(part, name) for part in parts]) for name in ("viewmats", "Ks"))
     return Cameras(viewmats, Ks, np.concatenate([part.sizes for part in parts]))
-
-
-def _cameras(cameras: Cameras, names: Sequence[str], test: bool) -> list[dict[str, object]]:
-    cameras = cameras.to("cpu")
-    lenses = cameras.Ks[:, [0, 1, 0, 1], [0, 1, 2, 2]]
-    return [
-        {
-            "name": name,
-            "test": test,
-            "rotation": cameras.viewmats[view, :3, :3].flatten().tolist(),
-            "translation": cameras.viewmats[view, :3, 3].tolist(),
-            "center": cameras.centers[view].tolist(),
-            "lens": lenses[view].tolist(),
-            "size": cameras.sizes[view].tolist(),
-        }
-        for view, name in enumerate(names)
-    ]
 
 
 def _tables(model: SavedModel, scene: Scene, history: list[Evaluation]) -> str:
@@ -229,18 +216,10 @@ def _tables(model: SavedModel, scene: Scene, history: list[Evaluation]) -> str:
             plot_against_seconds(file, seconds, values, label, scene.name)
             data = base64.b64encode(file.read_bytes()).decode("ascii")
             curves.append(f'<img alt="{escape(label)} against seconds" src="data:image/svg+xml;base64,{data}">')
-    header = ("iteration", "training in s", "PSNR in dB", "SSIM", "mean absolute error", "Gaussians", "memory in MiB")
+    header = ("iteration", "training in s", *ERRORS.values(), "Gaussians", "memory in MiB")
     rows = [
-        (
-            str(entry.iteration),
-            f"{entry.train_seconds:.1f}",
-            number(entry.psnr, 2),
-            number(entry.ssim, 4),
-            number(entry.l1, 4),
-            str(entry.num_gaussians),
-            f"{entry.memory_bytes / 2**20:.0f}",
-        )
-        for entry in history
+        (str(entry.iteration), f"{entry.train_seconds:.1f}", *errors(entry), str(entry.num_gaussians), f"{memory:.0f}")
+        for entry, memory in ((entry, entry.memory_bytes / 2**20) for entry in history)
     ]
     plan = model.folder.read_plan()
     blocks: list[Block] = [Table(header, rows)]

@@ -41,7 +41,10 @@ def save_by_gsplat(kind: str, gaussians: Gaussians, path: Path, frame: Frame, st
 
 def read_splat(path: Path) -> Gaussians:
     """The model of a ``.splat``; float64, on the CPU. Raises `InputError` where the file is no such one."""
-    content = _content(path)
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"cannot read {path}: {error.strerror or error}") from None
     if not content or len(content) % SPLAT_ROW.itemsize:
         raise InputError(f"{path} is not a .splat: its {len(content)} bytes are no rows of {SPLAT_ROW.itemsize}")
     rows = np.frombuffer(content, dtype=SPLAT_ROW)
@@ -63,7 +66,7 @@ def read_compressed_ply(path: Path) -> Gaussians:
         InputError: the file is no such one.
     """
     header, offset = read_header(path)
-    body = _content(path)[offset:]
+    body = path.read_bytes()[offset:]
     elements: dict[str, tuple[int, list[str]]] = {}
     try:
         for line in header:
@@ -104,10 +107,3 @@ def read_compressed_ply(path: Path) -> Gaussians:
 def _thirds(words: np.ndarray) -> list[np.ndarray]:
     """Three numbers 0 .. 1 of 11, 10 and 11 bits."""
     return [(words >> 21) / 2047.0, (words >> 11 & 1023) / 1023.0, (words & 2047) / 2047.0]
-
-
-def _content(path: Path) -> bytes:
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise InputError(f"cannot read {path}: {error.strerror or error}") from None

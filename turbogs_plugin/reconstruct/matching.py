@@ -13,8 +13,8 @@ import numpy as np
 FEW = 150
 """So many photos are matched each with each other: 11,175 pairs."""
 OVERLAP = 10
-"""Ordered photos are matched with so many that follow, and with those 16, 32, 64, ... further on."""
-FURTHEST = 512
+FURTHER = (16, 32, 64, 128, 256, 512)
+"""Ordered photos are matched with so many that follow, and with those so much further on."""
 LOOPS, ALIKE = 20, 50
 """So many of the most similar photos are matched with each: beside another choice, and alone."""
 NEIGHBORS = 40
@@ -54,7 +54,7 @@ def choose_matching(names: Sequence[str], positions: np.ndarray) -> Matching:
     """
     count = len(names)
     if count <= FEW:
-        return Matching(exhaustive_pairs(count), 0, f"each with each, as they are at most {FEW}")
+        return Matching(np.stack(np.triu_indices(count, 1), axis=1), 0, f"each with each, as they are at most {FEW}")
     order = natural_order(names)
     ordered = are_ordered([names[view] for view in order])
     following = order[sequential_pairs(count)] if ordered else np.zeros((0, 2), dtype=np.int64)
@@ -69,20 +69,10 @@ def choose_matching(names: Sequence[str], positions: np.ndarray) -> Matching:
     return Matching(following, ALIKE, f"with {ALIKE} most similar, as neither names nor GPS say which are close")
 
 
-def exhaustive_pairs(count: int) -> np.ndarray:
-    """[count * (count - 1) / 2, 2] int64: all pairs."""
-    return np.stack(np.triu_indices(count, 1), axis=1).astype(np.int64)
-
-
 def sequential_pairs(count: int) -> np.ndarray:
-    """[P, 2] int64: each with the `OVERLAP` that follow, and with those at distances 16, 32, ... to `FURTHEST`."""
-    steps = [*range(1, OVERLAP + 1)]
-    while 2 * steps[-1] <= FURTHEST:
-        steps.append(16 if steps[-1] == OVERLAP else 2 * steps[-1])
-    starts = [np.arange(max(0, count - step)) for step in steps]
-    return np.concatenate(
-        [np.stack([start, start + step], axis=1) for start, step in zip(starts, steps, strict=True)]
-    ).astype(np.int64)
+    """[P, 2] int64: each with the `OVERLAP` that follow, and with those at distances of `FURTHER`."""
+    starts = {step: np.arange(max(0, count - step)) for step in (*range(1, OVERLAP + 1), *FURTHER)}
+    return np.concatenate([np.stack([start, start + step], axis=1) for step, start in starts.items()])
 
 
 def nearest_pairs(positions: np.ndarray) -> np.ndarray:

@@ -8,20 +8,18 @@ import re
 import shutil
 from collections import Counter
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from PIL import Image, ImageOps
+from PIL.ExifTags import IFD, Base
 
-from turbogs_plugin.device import processor_cores
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene.capture import FEWEST_PHOTOS
 from turbogs_plugin.scene.photo_folder import find_photos, unread
+from turbogs_plugin.scene.photos import decoding_threads, opened_image, require_8_bits
 
-ORIENTATION, MAKE, MODEL, EXIF, GPS = 0x0112, 0x010F, 0x0110, 0x8769, 0x8825
-FOCAL_LENGTH, FOCAL_LENGTH_35MM = 0x920A, 0xA405
 SEPARATORS = re.compile(r"[\s#]")
 JPEG_QUALITY = 95
 """Of copies that are turned upright. Photos that are upright already stay bit for bit."""
@@ -59,7 +57,7 @@ def list_photos(folder: Path) -> tuple[Path, list[Path]]:
     reason = unread(folder)
     if not folder.is_dir():
         raise InputError(f"no such folder of photos: {folder}{f'; {reason}' if reason else ''}")
-    place, paths, _ = find_photos(folder)
+    place, paths = find_photos(folder)
     if len(paths) < FEWEST_PHOTOS:
         there = "no photos" if not paths else "1 photo" if len(paths) == 1 else f"{len(paths)} photos"
         raise InputError(
@@ -80,7 +78,7 @@ def read_photos(folder: Path) -> list[PhotoFile]:
     for name, number in Counter(names).items():
         if number > 1:
             raise InputError(f"{number} photos in {place} would be named '{name}' without spaces: rename them")
-    with ThreadPoolExecutor(min(8, processor_cores())) as pool:
+    with decoding_threads() as pool:
         photos = list(pool.map(_read, paths, names))
     return sorted(photos, key=lambda photo: photo.name)
 
@@ -107,30 +105,27 @@ def place_photos(photos: Sequence[PhotoFile], folder: Path) -> None:
                 shutil.copyfile(photo.path, part)
         os.replace(part, target)
 
-    with ThreadPoolExecutor(min(8, processor_cores())) as pool:
+    with decoding_threads() as pool:
         list(pool.map(place, photos))
 
 
 def _read(path: Path, name: str) -> PhotoFile:
-    try:
-        with Image.open(path) as image:
-            size, mode, exif = image.size, image.mode, image.getexif()
-            image.draft("RGB", (size[0] // 8, size[1] // 8))  # JPEG: whole, but at an eighth of the size
-            image.load()
+    with opened_image(path, remedy="replace it or take it out") as image:
+        size, exif = image.size, image.getexif()
+        require_8_bits(image, path)
+        image.draft("RGB", (size[0] // 8, size[1] // 8))  # JPEG: whole, but at an eighth of the size
+        image.load()
         status = path.stat()
-    except Exception as error:  # a broken file can raise anything in its decoder
-        reason = " ".join((str(error) or type(error).__name__).split())
-        raise InputError(f"cannot read the photo {path}: {reason}; replace it or take it out") from error
-    if mode.startswith(("I", "F")):
-        raise InputError(f"photo {path} has more than 8 bits a channel: convert it to 8-bit RGB")
-    orientation = exif.get(ORIENTATION, 1)
+    orientation = exif.get(Base.Orientation, 1)
     turned = orientation in range(2, 9)
     upright = size[::-1] if orientation in range(5, 9) else size
-    details = _ifd(exif, EXIF)
-    focal = (details.get(FOCAL_LENGTH, ""), details.get(FOCAL_LENGTH_35MM, ""))
-    lens = " ".join(str(part).strip("\0 ") for part in (exif.get(MAKE, ""), exif.get(MODEL, ""), *focal, *upright))
+    details = _ifd(exif, IFD.Exif)
+    focal = (details.get(Base.FocalLength, ""), details.get(Base.FocalLengthIn35mmFilm, ""))
+    lens = " ".join(
+        str(part).strip("\0 ") for part in (exif.get(Base.Make, ""), exif.get(Base.Model, ""), *focal, *upright)
+    )
     stamp = (status.st_size, status.st_mtime_ns)
-    return PhotoFile(name, path, upright, turned, lens, _position(_ifd(exif, GPS)), stamp)
+    return PhotoFile(name, path, upright, turned, lens, _position(_ifd(exif, IFD.GPSInfo)), stamp)
 
 
 def _ifd(exif: Image.Exif, tag: int) -> dict[int, Any]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -23,7 +24,7 @@ from turbogs_plugin.reconstruct.agreement import (
 from turbogs_plugin.reconstruct.matching import FEW, Matching, choose_matching
 from turbogs_plugin.reconstruct.photos import PhotoFile, place_photos, read_photos
 from turbogs_plugin.reconstruct.workspace import Solution, Workspace
-from turbogs_plugin.scene.capture import FEWEST_PHOTOS
+from turbogs_plugin.scene.capture import FEWEST_PHOTOS, named
 from turbogs_plugin.scene.colmap import load_pycolmap
 from turbogs_plugin.scene.photo_folder import find_photos, unread
 
@@ -42,6 +43,7 @@ SMALLEST_SHARE = 0.5
 MATCHING_SHARE = 0.5
 """Where so many pairs match and yet no camera is found, it is not for want of overlap."""
 NAMED_AT_MOST = 10
+_listed = partial(named, most=NAMED_AT_MOST)
 
 
 @dataclass(frozen=True)
@@ -91,7 +93,7 @@ def reconstruct(photos: Path, out: Path) -> Solution:
     """
     load_pycolmap()  # where it is absent, that is said before photos are read
     found = read_photos(photos)
-    place, _, _ = find_photos(photos)
+    place, _ = find_photos(photos)
     if place.resolve() in (out.resolve(), *out.resolve().parents):
         raise InputError(f"the scene '{out}' would lie among the photos of '{place}': choose an --out elsewhere")
     workspace = Workspace(out)
@@ -267,9 +269,10 @@ def _notes(
         )
     contradicting = int(agreement.contradicts.sum())
     if contradicting:
+        matches = agreement.agreeing.sum() + agreement.contradicting.sum()
         notes.append(
             f"{contradicting:,} of {len(agreement.pairs):,} pairs contradict the cameras, with "
-            f"{agreement.contradicting[agreement.contradicts].sum() / max(1, _matches(agreement)):.1%} of the matches"
+            f"{agreement.contradicting[agreement.contradicts].sum() / max(1, matches):.1%} of the matches"
         )
     main = {agreement.names[view] for view in solve.groups[0]}
     for groups, reason in (
@@ -282,14 +285,5 @@ def _notes(
     return notes
 
 
-def _matches(agreement: Agreement) -> int:
-    return int(agreement.agreeing.sum() + agreement.contradicting.sum())
-
-
 def _photos(names: Sequence[str]) -> str:
     return f"{len(names)} {'photo' if len(names) == 1 else 'photos'}"
-
-
-def _listed(names: Sequence[str]) -> str:
-    """The first names."""
-    return ", ".join(names[:NAMED_AT_MOST]) + (", ..." if len(names) > NAMED_AT_MOST else "")

@@ -6,8 +6,7 @@ Training and test photos are told apart by file, and the validation photos are n
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass
+from collections.abc import Collection
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,33 +14,21 @@ from typing import Any
 import numpy as np
 
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.scene.capture import Capture, sizes_text
+from turbogs_plugin.scene.capture import Capture, named, sizes_text
 from turbogs_plugin.scene.photos import is_transparent, opened_image, photo_size
-from turbogs_plugin.scene.poses import viewmat_of_pose
 from turbogs_plugin.scene.starting_points import random_points
-from turbogs_plugin.scene.transforms import number_of, photo_name, read_frames
+from turbogs_plugin.scene.transforms import number_of, opengl_viewmat, photo_name, pinhole, read_frames
 
 TRAIN_FILE = "transforms_train.json"
 TEST_FILES = ("transforms_test.json", "transforms_val.json")
 """The first of them that is there names the test photos."""
 FILES = (TRAIN_FILE, *TEST_FILES)
 DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
-NAMED_AT_MOST = 3
 
 
-@dataclass(frozen=True)
-class BlenderView:
-    """A photo with its camera.
-
-    Args:
-        viewmat: [4, 4] float64, world to camera (x right, y down, z forward).
-        K: [3, 3] float64 intrinsics.
-        size: (width, height) of the photo.
-    """
-
-    viewmat: np.ndarray
-    K: np.ndarray
-    size: tuple[int, int]
+View = tuple[np.ndarray, np.ndarray, tuple[int, int]]
+"""A photo's camera: [4, 4] float64 world to camera (x right, y down, z forward), [3, 3] float64 intrinsics, (width,
+height) of the photo."""
 
 
 def read_blender(scene: Path) -> Capture:
@@ -65,43 +52,41 @@ def read_blender(scene: Path) -> Capture:
             f"them out of one; without {' and '.join(TEST_FILES)} every 8th photo is for testing"
         )
     names, views = zip(*sorted({**train, **test}.items()), strict=True)
-    points = random_points(np.array([view.viewmat for view in train.values()]))
-    capture = Capture(
+    viewmats, Ks, sizes = (np.array(part) for part in zip(*views, strict=True))
+    points = random_points(np.array([viewmat for viewmat, _, _ in train.values()]))
+    return Capture(
         names=names,
         photo_folder=scene,
-        viewmats=np.array([view.viewmat for view in views]),
-        Ks=np.array([view.K for view in views]),
-        sizes=np.array([view.size for view in views], dtype=np.int64),
+        viewmats=viewmats,
+        Ks=Ks,
+        sizes=sizes,
         points=points,
         point_colors=None,
-        notes=(_note(scene, train, test, len(points)),),
+        notes=(_note(scene, train, test, sizes, len(points)),),
         test=np.array([name in test for name in names]) if test else None,
-    )
-    capture.check(scene / TRAIN_FILE)
-    return capture
+    ).checked(scene / TRAIN_FILE)
 
 
-def _read_views(scene: Path, source: Path) -> dict[str, BlenderView]:
+def _read_views(scene: Path, source: Path) -> dict[str, View]:
     """The views of one file, by the photos' paths relative to the scene."""
     content, frames = read_frames(source)
     shared = {key: value for key, value in content.items() if key != "frames"}
-    named: dict[str, dict[str, Any]] = {}
+    frame_of: dict[str, dict[str, Any]] = {}
     for frame in frames:
         name = photo_name(scene, frame.get("file_path"), source)
-        if name in named:
+        if name in frame_of:
             raise InputError(f"{source} has two frames for '{name}': take one of them out")
-        named[name] = {**shared, **frame}
-    missing = [name for name in named if not (scene / name).is_file()]
+        frame_of[name] = {**shared, **frame}
+    missing = [name for name in frame_of if not (scene / name).is_file()]
     if missing:
-        more = ", ..." if len(missing) > NAMED_AT_MOST else ""
         raise InputError(
-            f"{len(missing)} of {len(named)} photos of {source} are missing ({', '.join(missing[:NAMED_AT_MOST])}"
-            f"{more}): bring them back, or take their frames out of the file"
+            f"{len(missing)} of {len(frame_of)} photos of {source} are missing ({named(missing)}): bring them back, or "
+            "take their frames out of the file"
         )
-    return {name: _read_view(values, scene / name, source) for name, values in named.items()}
+    return {name: _read_view(values, scene / name, source) for name, values in frame_of.items()}
 
 
-def _read_view(values: dict[str, Any], photo: Path, source: Path) -> BlenderView:
+def _read_view(values: dict[str, Any], photo: Path, source: Path) -> View:
     """The view of one frame, whose own values go before those that the file has for all."""
     number = partial(number_of, values, source)
     bent = [key for key in DISTORTION if number(key, 0.0)]
@@ -116,40 +101,26 @@ def _read_view(values: dict[str, Any], photo: Path, source: Path) -> BlenderView
             f"{source}: w and h are {values.get('w', width)}x{values.get('h', height)} but {photo.name} is "
             f"{width}x{height}: use the photos that the file was written for, or take w and h out"
         )
-    angle = number("camera_angle_x", 0.0)
-    if "fl_x" not in values and not 0.0 < angle < math.pi:
-        has = f"has camera_angle_x = {angle:g}" if "camera_angle_x" in values else "has no camera_angle_x"
+    K = pinhole(values, source, size, angles="x")
+    if K is None:
+        angle = number("camera_angle_x")
+        has = "has no camera_angle_x" if angle is None else f"has camera_angle_x = {angle:g}"
         raise InputError(f"{source} {has}: write the horizontal angle of view there, in radians (0 .. pi)")
-    focal_x = number("fl_x", 0.5 * width / math.tan(0.5 * angle) if angle else 0.0)
-    focal_y = number("fl_y", focal_x)
-    center_x, center_y = number("cx", 0.5 * width), number("cy", 0.5 * height)
-    K = np.array([[focal_x, 0.0, center_x], [0.0, focal_y, center_y], [0.0, 0.0, 1.0]])
-    return BlenderView(_viewmat(values.get("transform_matrix"), photo.name, source), K, size)
+    viewmat = opengl_viewmat(
+        values.get("transform_matrix"),
+        absent=f"{source}: the frame of {photo.name} has no transform_matrix of 4x4 numbers: export it again",
+        wrong=f"{source}: the transform_matrix of {photo.name}",
+        remedy=": export again, from a camera of scale 1 in Blender",
+    )
+    return viewmat, K, size
 
 
-def _viewmat(matrix: Any, name: str, source: Path) -> np.ndarray:
-    """[4, 4] float64 world to camera, of a camera-to-world matrix."""
-    try:
-        pose = np.array(matrix, dtype=np.float64)
-    except (ValueError, TypeError, OverflowError):
-        pose = np.empty(0)
-    if pose.shape not in ((3, 4), (4, 4)):
-        raise InputError(f"{source}: the frame of {name} has no transform_matrix of 4x4 numbers: export it again")
-    try:
-        return viewmat_of_pose(pose[:3, :3] * [1.0, -1.0, -1.0], pose[:3, 3])
-    except ValueError as error:
-        raise InputError(
-            f"{source}: the transform_matrix of {name} {error}: export again, from a camera of scale 1 in Blender"
-        ) from None
-
-
-def _note(scene: Path, train: dict[str, BlenderView], test: dict[str, BlenderView], points: int) -> str:
+def _note(scene: Path, train: Collection[str], test: Collection[str], sizes: np.ndarray, points: int) -> str:
     """What the capture was taken for, in one line."""
-    size = sizes_text(np.array([view.size for view in (*train.values(), *test.values())]))
     split = f"{len(train)} training and {len(test)} test photos" if test else f"{len(train)} photos, none for testing,"
     with opened_image(scene / min(train)) as photo:
         alpha = ", RGBA" if is_transparent(photo) else ""
     return (
-        f"NeRF-synthetic: {split} {size}{alpha}; no points, so {points:,} random ones (seed 0) about what the cameras "
-        "look at"
+        f"NeRF-synthetic: {split} {sizes_text(sizes)}{alpha}; no points, so {points:,} random ones (seed 0) about what "
+        "the cameras look at"
     )

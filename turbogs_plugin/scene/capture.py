@@ -67,8 +67,8 @@ class Capture:
                 sizes[view] = lens.photo_size
         return sizes
 
-    def check(self, source: Path) -> None:
-        """Raise `InputError` unless every number is finite and in range. `source` is named in messages."""
+    def checked(self, source: Path) -> Capture:
+        """Itself. Raises `InputError` unless every number is finite and in range. `source` is named in messages."""
         if not self.names:
             raise InputError(f"{source} has no images with a pose: reconstruct the capture again")
         bad = ~np.isfinite(self.points).all(axis=1)
@@ -90,6 +90,12 @@ class Capture:
                 raise InputError(
                     f"{source}: image '{self.names[int(np.argmin(ok))]}' has {trouble} ({(~ok).sum()} such images)"
                 )
+        return self
+
+
+def named(names: Sequence[str], most: int = 3) -> str:
+    """The first of some names."""
+    return ", ".join(names[:most]) + (", ..." if len(names) > most else "")
 
 
 def left_out(absent: Sequence[str], count: int, called: str) -> str:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.scene.capture import FEWEST_PHOTOS, LARGEST_SIDE, Capture, check_photo_name, left_out
+from turbogs_plugin.scene.capture import FEWEST_PHOTOS, LARGEST_SIDE, Capture, check_photo_name, left_out, named
 from turbogs_plugin.scene.colmap_check import SMALLEST_IMAGE, check_binary_model
 from turbogs_plugin.scene.photos import photo_size
 from turbogs_plugin.scene.starting_points import NUM_RANDOM_POINTS, about_cameras, random_points
@@ -35,7 +35,6 @@ REDUCED = re.compile(r"_\d+$")
 FOLDER_DEPTH = 2
 """Photos and models are looked for in folders of folders, no deeper."""
 REDUCTIONS = (2, 4, 8, 16)
-NAMED_AT_MOST = 4
 
 
 def load_pycolmap() -> ModuleType:
@@ -77,8 +76,7 @@ def _suffix(folder: Path) -> str:
 def incomplete_model(scene: Path) -> str:
     """What a reconstruction in `MODEL_FOLDERS` lacks, and where; empty where there is none that lacks something."""
     for place in (scene / name for name in MODEL_FOLDERS):
-        numbered = sorted(place.glob("[0-9]")) if place.is_dir() else []
-        for folder in (place, *numbered):
+        for folder in (place, *sorted(place.glob("[0-9]"))):
             there = {path.stem for path in folder.glob("*") if path.suffix in (".bin", ".txt")} & set(FILES)
             if there:
                 return f"{folder} has no {' and no '.join(name for name in FILES if name not in there)} (.bin or .txt)"
@@ -87,13 +85,9 @@ def incomplete_model(scene: Path) -> str:
 
 def _numbered_models(place: Path) -> list[tuple[Path, str]]:
     """The reconstructions in ``place/0``, ``place/1``, ..., in order of their numbers."""
-    folders = (
-        [folder for folder in place.iterdir() if re.fullmatch("[0-9]{1,9}", folder.name)] if place.is_dir() else []
-    )
-    found = (
-        (folder, _suffix(folder)) for folder in sorted(folders, key=lambda folder: (int(folder.name), folder.name))
-    )
-    return [(folder, suffix) for folder, suffix in found if suffix]
+    folders = [folder for folder in place.glob("[0-9]*") if re.fullmatch("[0-9]{1,9}", folder.name)]
+    folders.sort(key=lambda folder: (int(folder.name), folder.name))
+    return [(folder, suffix) for folder in folders if (suffix := _suffix(folder))]
 
 
 def _count_images(model: Path, suffix: str) -> int:
@@ -168,7 +162,7 @@ def read_colmap(scene: Path, model: Path, suffix: str) -> Capture:
     colors = np.array([point.color for point in found], dtype=np.uint8).reshape(-1, 3) if found else None
     if not found and images and np.isfinite(viewmats).all():
         points = random_points(viewmats)
-    capture = Capture(
+    return Capture(
         names=names,
         photo_folder=photo_folder,
         viewmats=viewmats,
@@ -180,9 +174,7 @@ def read_colmap(scene: Path, model: Path, suffix: str) -> Capture:
         notes=(_kind_note(scene, model, suffix, len(images), len(found), photo_folder), *_choice_note(model), *absence),
         reduction=reduction,
         alpha="mask",
-    )
-    capture.check(model)
-    return capture
+    ).checked(model)
 
 
 def _lens(camera: pycolmap.Camera, model: Path) -> Lens | None:
@@ -244,8 +236,5 @@ def _choice_note(model: Path) -> list[str]:
     models = _numbered_models(model.parent)
     if len(models) < 2 or model not in [folder for folder, _ in models]:
         return []
-    counts = ", ".join(
-        f"{folder.name} has {_count_images(folder, suffix)}" for folder, suffix in models[:NAMED_AT_MOST]
-    )
-    more = ", ..." if len(models) > NAMED_AT_MOST else ""
-    return [f"{len(models)} reconstructions in {model.parent}: {model.name} is taken for most images ({counts}{more})"]
+    counts = named([f"{folder.name} has {_count_images(folder, suffix)}" for folder, suffix in models], most=4)
+    return [f"{len(models)} reconstructions in {model.parent}: {model.name} is taken for most images ({counts})"]

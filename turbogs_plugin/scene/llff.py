@@ -81,9 +81,7 @@ def read_llff(scene: Path, factor: int = 1) -> Capture:
     source = scene / FILE
     table = _read_table(source)
     usable = _usable_folders(scene, factor)
-    for folder in usable:
-        if folder is usable[-1] or _is_whole_copy(folder, table):
-            break
+    folder = next((folder for folder in usable[:-1] if _is_whole_copy(folder, table)), usable[-1])
     sizes = _checked_sizes(folder, table, source)
     ratios = sizes / table.sizes  # [V, 2]
     intrinsics = np.tile(np.eye(3), (len(sizes), 1, 1))
@@ -91,7 +89,7 @@ def read_llff(scene: Path, factor: int = 1) -> Capture:
     intrinsics[:, :2, 2] = 0.5 * sizes
     points = points_in_views(table.viewmats, intrinsics, sizes, table.bounds)
     depths = f"{table.bounds[:, 0].min():.4g} to {table.bounds[:, 1].max():.4g}"
-    capture = Capture(
+    return Capture(
         names=folder.names,
         photo_folder=folder.path,
         viewmats=table.viewmats,
@@ -105,9 +103,7 @@ def read_llff(scene: Path, factor: int = 1) -> Capture:
         ),
         reduction=folder.reduction,
         alpha="mask",
-    )
-    capture.check(source)
-    return capture
+    ).checked(source)
 
 
 def points_in_views(viewmats: np.ndarray, Ks: np.ndarray, sizes: np.ndarray, bounds: np.ndarray) -> np.ndarray:

@@ -14,7 +14,7 @@ from torch import Tensor
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.masks import PixelMasks, ViewMask
 from turbogs_plugin.scene import blender, llff
-from turbogs_plugin.scene.capture import FEWEST_PHOTOS, Capture
+from turbogs_plugin.scene.capture import FEWEST_PHOTOS, Capture, named
 from turbogs_plugin.scene.colmap import MODEL_FOLDERS, find_model, incomplete_model, read_colmap
 from turbogs_plugin.scene.frame import Frame
 from turbogs_plugin.scene.host_arrays import file_note
@@ -35,7 +35,6 @@ from turbogs_plugin.scene.transforms import FILE, read_transforms
 from turbogs_plugin.scene.undistort import undistortion_note
 from turbogs_plugin.types import Cameras
 
-NAMED_AT_MOST = 3
 FARTHEST = 1e15
 """Distance of a point in extents, from which on squares, and squares of these, do not fit into float32."""
 
@@ -301,10 +300,8 @@ def _find_photos(scene: Path, capture: Capture, factor: int) -> tuple[list[Path]
     missing = [name for name, path in zip(capture.names, paths, strict=True) if not path.is_file()]
     if missing:
         remedy = _in_other_letters(capture.photo_folder / missing[0]) or "bring them back"
-        more = ", ..." if len(missing) > NAMED_AT_MOST else ""
         raise InputError(
-            f"{len(missing)} of {len(paths)} photos are missing in {capture.photo_folder}: "
-            f"{', '.join(missing[:NAMED_AT_MOST])}{more}; {remedy}"
+            f"{len(missing)} of {len(paths)} photos are missing in {capture.photo_folder}: {named(missing)}; {remedy}"
         )
     sizes = photo_sizes(paths)
     fitted = _require_scaled(paths, sizes, expected)

@@ -18,20 +18,18 @@ FOLDER_DEPTH = 1
 in the ``images`` of each."""
 
 
-def find_photos(folder: Path) -> tuple[Path, list[Path], list[Path]]:
+def find_photos(folder: Path) -> tuple[Path, list[Path]]:
     """The photos of a folder; where it has a folder ``images``, of that one.
 
     Returns:
-        The folder that their names are relative to; the photos in the order of their names; and files of kinds that
-        are not read.
+        The folder that their names are relative to; the photos in the order of their names.
     """
     for place in (folder / "images", folder):
         files = _files(place, FOLDER_DEPTH)
         photos = [path for path in files if path.suffix.lower() in PHOTO_SUFFIXES]
         if photos:
             break
-    others = [path for path in files if path.suffix.lower() in OTHER_SUFFIXES]
-    return place, sorted(photos, key=lambda path: path.relative_to(place).as_posix()), others
+    return place, sorted(photos, key=lambda path: path.relative_to(place).as_posix())
 
 
 def unread(path: Path) -> str:

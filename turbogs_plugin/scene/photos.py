@@ -144,9 +144,13 @@ def reduced_sizes(sizes: np.ndarray, factor: int) -> np.ndarray:
 def photo_size(path: Path) -> tuple[int, int]:
     """(width, height) from the file's header alone; `InputError` where it cannot be read, or has more than 8 bits."""
     with opened_image(path) as image:
-        if image.mode.startswith(("I", "F")):
-            raise InputError(f"photo {path} has more than 8 bits a channel: convert it to 8-bit RGB")
+        require_8_bits(image, path)
         return image.size
+
+
+def require_8_bits(image: Image.Image, path: Path) -> None:
+    if image.mode.startswith(("I", "F")):
+        raise InputError(f"photo {path} has more than 8 bits a channel: convert it to 8-bit RGB")
 
 
 def is_transparent(image: Image.Image) -> bool:
@@ -263,7 +267,7 @@ def _decode(path: Path, size: tuple[int, int], mode: str) -> Image.Image:
 
 
 @contextmanager
-def opened_image(path: Path, what: str = "photo") -> Iterator[Image.Image]:
+def opened_image(path: Path, what: str = "photo", remedy: str = "copy it there again") -> Iterator[Image.Image]:
     """The file with its header read; `InputError` for whatever goes wrong with it while entered."""
     try:
         with Image.open(path) as image:
@@ -274,4 +278,4 @@ def opened_image(path: Path, what: str = "photo") -> Iterator[Image.Image]:
         reason = " ".join((str(error) or type(error).__name__).split())
         if isinstance(error, UnidentifiedImageError):
             reason = "it is no image of a known kind" if path.stat().st_size else "the file is empty"
-        raise InputError(f"cannot read the {what} {path}: {reason}; copy it there again") from error
+        raise InputError(f"cannot read the {what} {path}: {reason}; {remedy}") from error

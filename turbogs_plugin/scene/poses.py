@@ -13,6 +13,11 @@ def camera_centers(viewmats: np.ndarray) -> np.ndarray:
     return -np.einsum("vji,vj->vi", viewmats[:, :3, :3], viewmats[:, :3, 3])
 
 
+def evenly(count: int, most: int) -> list[int]:
+    """At most `most` of `count` views, evenly spread, ascending; with the first and the last where there are two."""
+    return np.unique(np.linspace(0, count - 1, min(most, count)).round().astype(int)).tolist()
+
+
 def viewmat_of_pose(axes: np.ndarray, center: np.ndarray) -> np.ndarray:
     """[4, 4] float64 world to camera of a camera's place in the world.
 

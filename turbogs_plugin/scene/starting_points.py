@@ -10,7 +10,7 @@ from torch import Tensor
 
 from turbogs_plugin.masks import PixelMasks
 from turbogs_plugin.scene.photos import Photos, pixel_offsets
-from turbogs_plugin.scene.poses import camera_centers
+from turbogs_plugin.scene.poses import camera_centers, evenly
 
 if TYPE_CHECKING:
     from turbogs_plugin.types import Cameras
@@ -18,8 +18,6 @@ if TYPE_CHECKING:
 NUM_RANDOM_POINTS = 50_000
 COLOR_VIEWS = 32
 """Photos that give random points their colours, at most."""
-RANDOM_POINTS_SIDE = 1.0
-"""Side of the cube of random points, in distances of the cameras from what they look at."""
 
 
 def random_points(viewmats: np.ndarray) -> np.ndarray:
@@ -38,7 +36,7 @@ def random_points(viewmats: np.ndarray) -> np.ndarray:
     pull = 1e-3 * len(centers) * np.eye(3)
     offsets = np.einsum("vij,vj->i", across, centers - mean)
     focus = mean + np.linalg.solve(across.sum(axis=0) + pull, offsets)
-    side = RANDOM_POINTS_SIDE * float(np.median(np.linalg.norm(centers - focus, axis=1)))
+    side = float(np.median(np.linalg.norm(centers - focus, axis=1)))
     random = np.random.default_rng(0)
     return focus + random.uniform(-0.5, 0.5, (NUM_RANDOM_POINTS, 3)) * (side or 1.0)
 
@@ -56,7 +54,7 @@ def colors_in_photos(points: Tensor, cameras: Cameras, photos: Photos, masks: Pi
     """
     cameras, points = cameras.to("cpu", torch.float32), points.cpu()
     sums, counts = torch.zeros(len(points), 3), torch.zeros(len(points), 1)
-    for view in np.unique(np.linspace(0, len(photos) - 1, COLOR_VIEWS).round().astype(int)).tolist():
+    for view in evenly(len(photos), COLOR_VIEWS):
         viewmat, (width, height) = cameras.viewmats[view], photos.sizes[view].tolist()
         in_camera = points @ viewmat[:3, :3].T + viewmat[:3, 3]
         depths = in_camera[:, 2]

@@ -69,7 +69,13 @@ def read_transforms(scene: Path) -> Capture:
             absent.append(name)
             continue
         masks[name] = _mask_file(scene, frame, name, source)
-        views[name] = (_viewmat(frame, name, source), *_camera({**content, **frame}, scene / name, source, lenses))
+        viewmat = opengl_viewmat(
+            frame.get("transform_matrix"),
+            absent=f"{source}: frame '{name}' has no transform_matrix of 4x4 finite numbers: export it again",
+            wrong=f"{source}: the transform_matrix of frame '{name}'",
+            remedy=": export it again",
+        )
+        views[name] = (viewmat, *_camera({**content, **frame}, scene / name, source, lenses))
     if absent and len(views) < FEWEST_PHOTOS:
         raise InputError(
             f"{source} names {len(frames)} photos, of which {len(absent)} are missing in {scene} ({absent[0]}, ...): "
@@ -99,7 +105,7 @@ def read_transforms(scene: Path) -> Capture:
     photo_folder = scene
     if len(common) == 1 and all(len(PurePosixPath(name).parts) > 1 for name in names):
         photo_folder = scene / common.pop()
-    capture = Capture(
+    return Capture(
         names=tuple(str((scene / name).relative_to(photo_folder)) for name in names),
         photo_folder=photo_folder,
         viewmats=viewmats,
@@ -111,9 +117,7 @@ def read_transforms(scene: Path) -> Capture:
         notes=tuple(notes),
         test=test,
         mask_files=tuple(masks[name] for name in names),
-    )
-    capture.check(source)
-    return capture
+    ).checked(source)
 
 
 def photo_name(scene: Path, name: Any, source: Path) -> str:
@@ -250,39 +254,52 @@ def _intrinsics(values: dict, photo: Path, source: Path) -> tuple[np.ndarray, tu
     if not (1 <= width <= LARGEST_SIDE and 1 <= height <= LARGEST_SIDE):
         raise InputError(f"{source}: the size of {photo.name} is {width:g}x{height:g} pixels")
 
-    def focal_length(axis: str, side: float, default: float | None) -> float | None:
-        """As given, or by the angle of view."""
-        focal = number(f"fl_{axis}")
-        if focal is not None:
-            return focal
-        angle = number(f"camera_angle_{axis}")
-        return default if angle is None or not 0 < angle < math.pi else 0.5 * side / math.tan(0.5 * angle)
-
-    focal_x = focal_length("x", width, None)
-    if focal_x is None:
+    K = pinhole(values, source, (width, height))
+    if K is None:
         raise InputError(
             f"{source}: the camera of {photo.name} has neither fl_x nor a camera_angle_x in 0 .. pi: write one of them "
             "there (pixels, radians), or find the cameras anew by 'turbogs reconstruct' on a folder of the photos alone"
         )
-    focal_y = focal_length("y", height, focal_x)
-    intrinsics = np.array(
-        [[focal_x, 0.0, number("cx", 0.5 * width)], [0.0, focal_y, number("cy", 0.5 * height)], [0.0, 0.0, 1.0]]
-    )
-    return intrinsics, (round(width), round(height))
+    return K, (round(width), round(height))
 
 
-def _viewmat(frame: dict, name: str, source: Path) -> np.ndarray:
-    """[4, 4] float64 world to camera, of a frame's camera-to-world matrix."""
+def pinhole(values: dict, source: Path, size: tuple[float, float], angles: str = "xy") -> np.ndarray | None:
+    """[3, 3] float64 intrinsics of one frame; None where nothing gives its horizontal focal length.
+
+    Args:
+        values: those of the frame, before those for all frames.
+        size: (width, height), in whose middle the principal point is unless it is given.
+        angles: axes whose ``camera_angle`` serves where there is no ``fl``.
+    """
+    focals: list[float | None] = []
+    for axis, side in zip("xy", size, strict=True):
+        focal = number_of(values, source, f"fl_{axis}")
+        angle = number_of(values, source, f"camera_angle_{axis}") if focal is None and axis in angles else None
+        if angle is not None and 0 < angle < math.pi:
+            focal = 0.5 * side / math.tan(0.5 * angle)
+        focals.append(focals[0] if focal is None and focals else focal)
+    if focals[0] is None:
+        return None
+    x, y = (number_of(values, source, f"c{axis}", 0.5 * side) for axis, side in zip("xy", size, strict=True))
+    return np.array([[focals[0], 0.0, x], [0.0, focals[1], y], [0.0, 0.0, 1.0]])
+
+
+def opengl_viewmat(matrix: Any, absent: str, wrong: str, remedy: str = "") -> np.ndarray:
+    """[4, 4] float64 world to camera, of a camera-to-world matrix in OpenGL's axes.
+
+    Raises:
+        InputError: `absent`, where that is no matrix of numbers; `wrong`, what is wrong with it, and `remedy`.
+    """
     try:
-        pose = np.array(frame.get("transform_matrix"), dtype=np.float64)
+        pose = np.array(matrix, dtype=np.float64)
     except (ValueError, TypeError, OverflowError):
         pose = np.empty(0)
-    if pose.shape not in ((3, 4), (4, 4)) or not np.isfinite(pose).all():
-        raise InputError(f"{source}: frame '{name}' has no transform_matrix of 4x4 finite numbers: export it again")
+    if pose.shape not in ((3, 4), (4, 4)):
+        raise InputError(absent)
     try:
         return viewmat_of_pose(pose[:3, :3] * [1.0, -1.0, -1.0], pose[:3, 3])
     except ValueError as error:
-        raise InputError(f"{source}: the transform_matrix of frame '{name}' {error}") from None
+        raise InputError(f"{wrong} {error}{remedy}") from None
 
 
 def _read_points(scene: Path, name: Any, source: Path) -> tuple[np.ndarray, np.ndarray]:

@@ -27,6 +27,7 @@ from turbogs_plugin.model.similarity import Similarity, placed
 from turbogs_plugin.model.torch_file import read_plain
 from turbogs_plugin.scene import Scene
 from turbogs_plugin.scene.fingerprint import frame_of_state
+from turbogs_plugin.scene.poses import evenly
 from turbogs_plugin.train.background import Background
 from turbogs_plugin.train.checkpoint import latest_checkpoint
 from turbogs_plugin.train.evaluate import psnr
@@ -191,7 +192,7 @@ class _Trial:
     def __init__(self, scene: Scene, device: torch.device) -> None:
         views, self._device = scene.train, device
         self._background = Background.of("auto", views.photos.transparent).evaluated
-        chosen = np.unique(np.linspace(0, len(views) - 1, TRIAL_VIEWS).round().astype(int)).tolist()
+        chosen = evenly(len(views), TRIAL_VIEWS)
         cameras = views.cameras.to(device).select(chosen)
         sizes = cameras.sizes
         reductions = np.maximum(1.0, sizes.max(axis=1) / TRIAL_SIDE)  # [V]

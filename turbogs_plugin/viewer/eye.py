@@ -47,14 +47,10 @@ class Eye:
             numbers = np.array([fov, width, height], dtype=np.float64)
         except (TypeError, ValueError, OverflowError):
             return None
-        if place.shape != (3,) or turn.shape != (4,):
-            return None
-        if not (np.isfinite(numbers).all() and (np.abs(turn) < 1e6).all()):
+        if place.shape != (3,) or turn.shape != (4,) or not (np.isfinite(numbers).all() and (np.abs(turn) < 1e6).all()):
             return None
         length = float(np.linalg.norm(turn))
-        if length < 1e-6:
-            return None
-        if not (np.abs(place) <= FARTHEST).all() or numbers[1:].min() < 1 or numbers[0] <= 0:
+        if length < 1e-6 or not (np.abs(place) <= FARTHEST).all() or numbers[1:].min() < 1 or numbers[0] <= 0:
             return None
         scale = min(1.0, LARGEST_SIDE / float(numbers[1:].max()))
         sides = [min(max(SMALLEST_SIDE, round(side * scale)), LARGEST_SIDE) for side in numbers[1:].tolist()]
@@ -64,8 +60,8 @@ class Eye:
     @classmethod
     def of_view(cls, cameras: Cameras, view_id: int) -> Eye:
         """That of a view of a capture, but for a principal point beside the middle."""
-        rotation = cameras.viewmats[view_id, :3, :3].double().cpu().numpy()
-        translation = cameras.viewmats[view_id, :3, 3].double().cpu().numpy()
+        viewmat = cameras.viewmats[view_id].double().cpu().numpy()
+        rotation, translation = viewmat[:3, :3], viewmat[:3, 3]
         width, height = cameras.sizes[view_id].tolist()
         fov = 2.0 * math.atan(height / (2.0 * float(cameras.Ks[view_id, 1, 1])))
         place = -rotation.T @ translation
@@ -74,8 +70,7 @@ class Eye:
     def with_at_most(self, pixels: float) -> Eye:
         """The same view in an image of at most so many pixels."""
         scale = min(1.0, math.sqrt(pixels / (self.width * self.height)))
-        sides = (max(SMALLEST_SIDE, int(side * scale)) for side in (self.width, self.height))
-        width, height = sides
+        width, height = (max(SMALLEST_SIDE, int(side * scale)) for side in (self.width, self.height))
         return replace(self, width=width, height=height)
 
     def cameras(self, device: torch.device) -> Cameras:

@@ -81,7 +81,7 @@ class Pace:
         per_pixel = seconds / pixels
         # The first frames of a process warm things up, so a faster one counts at once.
         self._per_pixel[picture] = per_pixel if known is None else min(per_pixel, 0.7 * known + 0.3 * per_pixel)
-        self.next_at = begun + seconds / self.share if self.share else begun + seconds
+        self.next_at = begun + seconds / (self.share or 1.0)
 
     def sized(self, picture: Picture, eye: Eye, moving: bool) -> Eye:
         """The eye with as many pixels as time allows; sizes come in steps, so that tables of pixels are used again."""

@@ -20,7 +20,7 @@ from urllib.parse import urlsplit
 import numpy as np
 
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.scene.poses import rotations
+from turbogs_plugin.scene.poses import evenly, rotations
 from turbogs_plugin.types import Cameras
 from turbogs_plugin.viewer.controls import Controls
 from turbogs_plugin.viewer.eye import Eye
@@ -136,8 +136,7 @@ class Page:
         self._slider.disabled = self._there.disabled = len(capture) < 2
         self._slider.visible = self._there.visible = self._cameras.visible = True
         self._start_at(Eye.of_view(cameras, 0))
-        steps = np.unique(np.linspace(0, len(capture) - 1, min(len(capture), MOST_FRUSTA)).round().astype(int))
-        for number in steps.tolist():
+        for number in evenly(len(capture), MOST_FRUSTA):
             views, view_id = capture.find(number)
             self._add_frustum(number, views.cameras, view_id, TRAIN_COLOR if views is capture.train else TEST_COLOR)
         self._refresh_visibility()

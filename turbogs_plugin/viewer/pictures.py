@@ -18,6 +18,7 @@ from torch.nn.functional import adaptive_max_pool2d, interpolate
 
 from turbogs_plugin.engine.rendering import render_image, splats_per_tile
 from turbogs_plugin.report.pictures import ERROR_FULL_SCALE, colored, depth_picture, error_picture
+from turbogs_plugin.scene import PosedImages
 from turbogs_plugin.types import SH_C0, TILE_SIZE, Cameras, Gaussians
 from turbogs_plugin.viewer.eye import Eye
 from turbogs_plugin.viewer.subject import Subject
@@ -76,7 +77,7 @@ class Request:
 def draw(subject: Subject, request: Request) -> np.ndarray:
     """[H, W, 3] uint8 of the eye's size. A picture that cannot be drawn, as `missing` says, is empty."""
     if missing(subject, request):
-        return np.full((request.eye.height, request.eye.width, 3), BACKGROUND, dtype=np.uint8)
+        return _empty(request)
     return DRAWN_BY[request.picture](subject, request)
 
 
@@ -151,11 +152,9 @@ def _changes(subject: Subject, request: Request) -> np.ndarray:
 
 def _compare(subject: Subject, request: Request) -> np.ndarray:
     """Photo, render and error, side by side or one below the other, whichever is larger."""
-    views, view_id = subject.capture.find(shown_view(subject, request))
     width, height = request.eye.width, request.eye.height
-    own = tuple(views.cameras.sizes[view_id].tolist())
-    wide = fitted(own, (max(1, (width - 2 * GAP) // 3), height))
-    tall = fitted(own, (width, max(1, (height - 2 * GAP) // 3)))
+    views, view_id, wide = _fitted_view(subject, request, (max(1, (width - 2 * GAP) // 3), height))
+    _, _, tall = _fitted_view(subject, request, (width, max(1, (height - 2 * GAP) // 3)))
     beside = wide >= tall
     size = wide if beside else tall
     photo = _photo_of(subject, views, view_id, size)
@@ -164,13 +163,11 @@ def _compare(subject: Subject, request: Request) -> np.ndarray:
     gap_shape = (size[1], GAP, 3) if beside else (GAP, size[0], 3)
     gap = torch.full(gap_shape, BACKGROUND, dtype=torch.uint8, device=photo.device)
     strip = torch.cat([parts[0], gap, parts[1], gap, parts[2]], dim=1 if beside else 0)
-    return _centred(strip, width, height)
+    return _centred(strip, request)
 
 
 def _photo(subject: Subject, request: Request) -> np.ndarray:
-    views, view_id = subject.capture.find(shown_view(subject, request))
-    size = fitted(tuple(views.cameras.sizes[view_id].tolist()), (request.eye.width, request.eye.height))
-    return _centred(_rounded(_photo_of(subject, views, view_id, size)), request.eye.width, request.eye.height)
+    return _centred(_rounded(_photo_of(subject, *_fitted_view(subject, request))), request)
 
 
 def _errors(subject: Subject, request: Request) -> np.ndarray:
@@ -187,17 +184,16 @@ def _ages(subject: Subject, request: Request) -> np.ndarray:
 
 def _samples(subject: Subject, request: Request) -> np.ndarray:
     """The photo, dimmed, with the sampled pixels bright. One that falls between the page's pixels is still shown."""
-    view = shown_view(subject, request)
-    views, view_id = subject.capture.find(view)
-    own = tuple(views.cameras.sizes[view_id].tolist())
-    size = fitted(own, (request.eye.width, request.eye.height))
-    sampled = torch.zeros(own[0] * own[1], device=subject.samples.pixel_ids.device)
-    of_view = subject.samples.view_of_slot() == subject.samples.view_ids.index(view)
-    sampled[subject.samples.pixel_ids[of_view & subject.samples.filled].long()] = 1.0
-    mask = _resized(sampled.view(1, own[1], own[0]), size, adaptive_max_pool2d)[0] > 0  # [H, W]
+    views, view_id, size = _fitted_view(subject, request)
+    width, height = views.cameras.sizes[view_id].tolist()
+    samples = subject.samples
+    sampled = torch.zeros(1, height, width, device=samples.pixel_ids.device)
+    of_view = samples.view_of_slot() == samples.view_ids.index(shown_view(subject, request))
+    sampled.view(-1)[samples.pixel_ids[of_view & samples.filled].long()] = 1.0
+    mask = _resized(sampled, size, adaptive_max_pool2d)[0] > 0  # [H, W]
     photo = _rounded(DIMMED * _photo_of(subject, views, view_id, size))
     bright = torch.tensor(SAMPLED, dtype=torch.uint8, device=photo.device)
-    return _centred(torch.where(mask.to(photo.device)[..., None], bright, photo), request.eye.width, request.eye.height)
+    return _centred(torch.where(mask.to(photo.device)[..., None], bright, photo), request)
 
 
 DRAWN_BY: dict[Picture, Callable[[Subject, Request], np.ndarray]] = {
@@ -213,14 +209,24 @@ DRAWN_BY: dict[Picture, Callable[[Subject, Request], np.ndarray]] = {
 }
 
 
-def _photo_of(subject: Subject, views, view_id: int, size: tuple[int, int]) -> Tensor:
+def _fitted_view(
+    subject: Subject, request: Request, box: tuple[int, int] | None = None
+) -> tuple[PosedImages, int, tuple[int, int]]:
+    """The set of the view that is shown, its number there, and the (width, height) that it has within a box, or within
+    the page."""
+    views, view_id = subject.capture.find(shown_view(subject, request))
+    own = tuple(views.cameras.sizes[view_id].tolist())
+    return views, view_id, fitted(own, box or (request.eye.width, request.eye.height))
+
+
+def _photo_of(subject: Subject, views: PosedImages, view_id: int, size: tuple[int, int]) -> Tensor:
     """[height, width, 3] float on the model's device: a photo, reduced by means over areas or enlarged pixel by
     pixel."""
     photo = views.photos.image(view_id).to(subject.gaussians.device)
     return _resized(photo.permute(2, 0, 1), size).permute(1, 2, 0)
 
 
-def _render_of(subject: Subject, views, view_id: int, size: tuple[int, int]) -> Tensor:
+def _render_of(subject: Subject, views: PosedImages, view_id: int, size: tuple[int, int]) -> Tensor:
     """[height, width, 3] float: the model in a view of the capture at another size.
 
     A pixel that stands for several of the photo has less blur (`RasterSettings.eps2d`).
@@ -249,8 +255,7 @@ def _map_of(subject: Subject, request: Request, read: Callable) -> Tensor:
 def _map_picture(share: Tensor, request: Request) -> np.ndarray:
     """A map [H, W], fitted into the page; what is reduced keeps its largest values."""
     size = fitted((share.shape[1], share.shape[0]), (request.eye.width, request.eye.height))
-    pixels = colored(_resized(share[None], size, adaptive_max_pool2d)[0])
-    return _centred(pixels, request.eye.width, request.eye.height)
+    return _centred(colored(_resized(share[None], size, adaptive_max_pool2d)[0]), request)
 
 
 def _resized(planes: Tensor, size: tuple[int, int], reduce: Callable | None = None) -> Tensor:
@@ -264,10 +269,14 @@ def _resized(planes: Tensor, size: tuple[int, int], reduce: Callable | None = No
     return interpolate(planes[None], target, mode="area")[0] if reduce is None else reduce(planes[None], target)[0]
 
 
-def _centred(pixels: Tensor, width: int, height: int) -> np.ndarray:
-    """[height, width, 3] uint8 with smaller pixels [h, w, 3] in its middle."""
-    whole = np.full((height, width, 3), BACKGROUND, dtype=np.uint8)
-    top, left = (height - pixels.shape[0]) // 2, (width - pixels.shape[1]) // 2
+def _empty(request: Request) -> np.ndarray:
+    return np.full((request.eye.height, request.eye.width, 3), BACKGROUND, dtype=np.uint8)
+
+
+def _centred(pixels: Tensor, request: Request) -> np.ndarray:
+    """[H, W, 3] uint8 of the eye's size with smaller pixels [h, w, 3] in its middle."""
+    whole = _empty(request)
+    top, left = (whole.shape[0] - pixels.shape[0]) // 2, (whole.shape[1] - pixels.shape[1]) // 2
     whole[top : top + pixels.shape[0], left : left + pixels.shape[1]] = pixels.cpu().numpy()
     return whole
 

@@ -76,7 +76,6 @@ class Subject:
     Args:
         gaussians: the model, on the device that renders.
         sh_degree: highest degree of spherical harmonics in use.
-        version: changes whenever a picture may look different.
         settings: those of the rasterizer.
         capture: its views, for training and for testing.
         maps: errors and ages of the training views.
@@ -87,7 +86,6 @@ class Subject:
 
     gaussians: Gaussians
     sh_degree: int
-    version: int = 0
     settings: RasterSettings = DEFAULT_SETTINGS
     capture: CaptureViews | None = None
     maps: ErrorMaps | None = None
