@@ -104,10 +104,7 @@ def _read_torch(file: Path) -> tuple[Gaussians, Similarity | None]:
     """The model of a .pt in float64, and where it knows that, the change to the capture's own coordinates."""
     state = _read(file)
     if isinstance(state, Mapping) and "splats" in state:
-        parts = [
-            read_gsplat(state, file),
-            *(read_gsplat(_read(other), other) for other in _other_ranks(file)),
-        ]
+        parts = [read_gsplat(state, file), *(read_gsplat(_read(other), other) for other in _other_ranks(file))]
         if len({part.shN.shape[1] for part in parts}) > 1:
             raise InputError(f"{file}: the files of its ranks differ in degree: give those of one run")
         names = PARAMETER_NAMES
