@@ -46,14 +46,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from turbogs_plugin.engine.reference.philox import (
-    PURPOSE_CELLS,
-    PURPOSE_PIXELS,
-    PURPOSE_TILES,
-    Words,
-    exponentials,
-    random_words,
-)
+from turbogs_plugin.engine.reference import philox
 from turbogs_plugin.engine.rules import DrawRule
 from turbogs_plugin.error_maps import AGE_MAX, ErrorMaps
 from turbogs_plugin.tiles import (
@@ -89,7 +82,7 @@ class Units:
     errors: Tensor
     ages: Tensor
     exist: Tensor
-    words: Words
+    words: philox.Words
     wanted: int
 
 
@@ -117,7 +110,7 @@ def draw_units(units: Units, rule: DrawRule) -> tuple[Tensor, Tensor | None]:
             primary = (ages << AGE_TIE_BITS) | (words >> (32 - AGE_TIE_BITS))
         else:
             weights = weights.clamp(min=WEIGHT_FLOOR)
-            primary = (weights / exponentials(words)).view(torch.int32).long()
+            primary = (weights / philox.exponentials(words)).view(torch.int32).long()
         keys = torch.where(units.exist & ~drawn, (primary << RANK_BITS) | ranks, -1)
         largest = keys.topk(min(count + 1, keys.shape[1]), dim=1).values
         largest = torch.nn.functional.pad(largest, (0, 1), value=-1)  # a stage may take all there are
@@ -190,10 +183,10 @@ class _Batch:
         self.ages = torch.where(self.exist, (maps.now(step) - maps.stamps[flat].int()).clamp(0, AGE_MAX), 0)
         self._views, self._step = torch.as_tensor(tile_views, device=device)[:, None], step  # [T, 1]
 
-    def words(self, place: Tensor, purpose: int) -> Words:
+    def words(self, place: Tensor, purpose: int) -> philox.Words:
         """The random words of places [T, ...]."""
         step = self._step
-        return random_words(place.clamp(min=0).long(), self._views, purpose, step.seed, step.iteration)
+        return philox.random_words(place.clamp(min=0).long(), self._views, purpose, step.seed, step.iteration)
 
     def ends(self, unit: str, wanted: Sequence[int]) -> DrawEnds:
         """`PixelSamples.host_ends` where so many units are drawn of each view, or of each of its tiles."""
@@ -203,12 +196,12 @@ class _Batch:
 
 def _draw_within_tiles(batch: _Batch, rate: float, rule: DrawRule) -> PixelSamples:
     """Pixels or cells as units, drawn from each tile."""
-    first_pixels, errors, ages, purpose = batch.table, batch.errors, batch.ages, PURPOSE_PIXELS
+    first_pixels, errors, ages, purpose = batch.table, batch.errors, batch.ages, philox.PURPOSE_PIXELS
     by_cell, exist = rule.unit == "cell", batch.exist
     cells = cell_of_place(batch.table.device)  # [256]
     if by_cell:
         places = torch.argsort(cells, stable=True).view(TILE_CELLS, -1)  # [16, 16] of each cell
-        first_pixels, purpose = first_pixels[:, places[:, 0]], PURPOSE_CELLS
+        first_pixels, purpose = first_pixels[:, places[:, 0]], philox.PURPOSE_CELLS
         errors, ages = errors[:, places].sum(dim=2), ages[:, places].amax(dim=2)
         exist = exist[:, places].any(dim=2)
     wanted = rule.wanted(rate, errors.shape[1])
@@ -233,7 +226,7 @@ def _draw_tiles(batch: _Batch, rate: float, rule: DrawRule) -> PixelSamples:
     errors, ages = batch.errors.sum(dim=1), batch.ages.amax(dim=1)  # [T]
     tiles = torch.arange(len(batch.table), device=device)
     firsts = torch.as_tensor(np.repeat(ends[:-1], np.diff(ends)), device=device)
-    words = batch.words((tiles - firsts)[:, None], PURPOSE_TILES)  # of the numbers within the view
+    words = batch.words((tiles - firsts)[:, None], philox.PURPOSE_TILES)  # of the numbers within the view
     chosen, weights, numbers = [], [], []
     for first, end in itertools.pairwise(ends.tolist()):
         row = slice(first, end)

@@ -12,8 +12,6 @@ Notation, per tile and channel: n samples x (prediction) and y (truth) with impo
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import torch
 from torch import Tensor
 
@@ -175,12 +173,7 @@ def ssim(moments: TileMoments, groups: TileGroups, constant: float) -> Similarit
     return structure * luminance, gradients
 
 
-SIMILARITIES: dict[str, Callable[[TileMoments, TileGroups, float], Similarity]] = {
-    "ncc": correlation,
-    "contrast": contrast,
-    "ssim": ssim,
-    "printed_ncc": printed_correlation,
-}
+SIMILARITIES = {"ncc": correlation, "contrast": contrast, "ssim": ssim, "printed_ncc": printed_correlation}
 """Name of a structure term -> its definition. `strategies.losses` uses the same names."""
 
 
