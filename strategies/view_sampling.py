@@ -4,33 +4,20 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
 import torch
 from turbogs_plugin.strategies.checks import require_settings
 
-from turbogs_plugin.engine.reference.philox import MASK, PURPOSE_STACK, PURPOSE_VIEWS, philox4x32
+from turbogs_plugin.engine.reference.philox import PURPOSE_STACK, PURPOSE_VIEWS, host_words
 from turbogs_plugin.errors import require
 from turbogs_plugin.types import Cameras, Step
-
-_BLOCK = 64
-"""Random numbers are made for this many iterations at once, which costs numpy the same as for one."""
 
 
 def _uniforms(purpose: int, num_views: int, step: Step) -> np.ndarray:
     """[V] float64 in (0, 1) with 52 random bits, a function of (seed, iteration, view) alone."""
-    return _uniform_block(purpose, num_views, step.seed, step.iteration // _BLOCK)[step.iteration % _BLOCK]
-
-
-@lru_cache(maxsize=8)
-def _uniform_block(purpose: int, num_views: int, seed: int, block: int) -> np.ndarray:
-    """[_BLOCK, V] float64: `_uniforms` of the iterations from ``block * _BLOCK`` on. Shared: do not write to it."""
-    views = np.tile(np.arange(num_views), (_BLOCK, 1))
-    iterations = np.arange(block * _BLOCK, (block + 1) * _BLOCK)[:, None] & MASK
-    constants = (np.array([value]) for value in (0, purpose, seed >> 32 & MASK))
-    high, low = philox4x32((views, *constants), (seed & MASK, iterations))[:2]
+    high, low, *_ = host_words(purpose, num_views, step)
     return (high * 2.0**20 + (low >> 12) + 0.5) / 2.0**52
 
 

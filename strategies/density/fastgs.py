@@ -104,10 +104,7 @@ class FastGsDensity(DensityController):
         self._restart(len(gaussians), gaussians.device)
 
     def event_due(self, step: Step) -> bool:
-        return self._batch is not None and (self._densify_due(step) or self._prune_due(step))
-
-    def _densify_due(self, step: Step) -> bool:
-        return self._events.due(step)[0]
+        return self._batch is not None and (self._events.due(step)[0] or self._prune_due(step))
 
     def _prune_due(self, step: Step) -> bool:
         after = step.iteration - step.refine_until
@@ -121,7 +118,7 @@ class FastGsDensity(DensityController):
         add_stats(self._window, self._batch)
         self._batch.zero_()
         update = None
-        if self._densify_due(step):
+        if self._events.due(step)[0]:
             update = self._densify(gaussians, step)
         elif self._prune_due(step):
             update = self._prune(gaussians)

@@ -38,14 +38,7 @@ from turbogs_plugin.engine.rendered import Rendered, RenderOptions, ScreenGradie
 from turbogs_plugin.engine.rules import UpdateRule
 from turbogs_plugin.errors import TrainingStopped
 from turbogs_plugin.strategies.protocols import DensityController
-from turbogs_plugin.types import (
-    Cameras,
-    Gaussians,
-    GaussianStats,
-    PixelSamples,
-    RowUpdate,
-    Step,
-)
+from turbogs_plugin.types import Cameras, Gaussians, GaussianStats, PixelSamples, RowUpdate, Step
 
 LAG = 4
 """After so many iterations all processes look at the flags of an iteration, and wait for them if need be: so all know

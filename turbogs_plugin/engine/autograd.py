@@ -22,11 +22,9 @@ class PassObserver(Protocol):
 
     def pixel_errors(self) -> Tensor | None:
         """[P] errors to carry to the Gaussians, or None. Called when the backward pass begins."""
-        ...
 
     def passed(self, stats: GaussianStats, view_losses: Tensor) -> None:
         """Receive the pass's statistics and [N] each Gaussian's share of the loss, both for the errors given before."""
-        ...
 
 
 @dataclass

@@ -63,15 +63,12 @@ class ScreenGradients(Protocol):
             stats: the statistics of density control, to which this pass is added; only after a backward pass
                 ``with_statistics``.
         """
-        ...
 
     def full_records(self) -> Tensor:
         """[K, N, 16] the gradients on the screen, `layout.ScreenRecord`; zero where a Gaussian is not drawn."""
-        ...
 
     def plain(self) -> ScreenRecords:
         """As plain tensors, from which `Engine.screen_gradients` makes them again."""
-        ...
 
 
 def require_statistics(with_statistics: bool, stats: GaussianStats | None) -> None:

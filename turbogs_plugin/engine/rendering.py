@@ -13,23 +13,12 @@ from turbogs_plugin.engine import engine_of
 from turbogs_plugin.engine.reference.intersection import intersect_tiles
 from turbogs_plugin.engine.reference.projection import drawable_rows, project_rows
 from turbogs_plugin.engine.reference.raster import rasterize_reference
-from turbogs_plugin.engine.rendered import DEFAULT_SETTINGS, RasterSettings, Rendered, RenderOptions, ScreenGradients
+from turbogs_plugin.engine.rendered import DEFAULT_SETTINGS, RasterSettings, Rendered, RenderOptions
 from turbogs_plugin.tiles import dense_pixels
 from turbogs_plugin.types import Cameras, Gaussians, PixelSamples
 
-__all__ = [
-    "DEFAULT_SETTINGS",
-    "RasterSettings",
-    "RenderOptions",
-    "Rendered",
-    "RenderedImage",
-    "ScreenGradients",
-    "dense_samples",
-    "rasterize",
-    "rasterize_reference",
-    "render_image",
-    "splats_per_tile",
-]
+__all__ = ["DEFAULT_SETTINGS", "RasterSettings", "RenderOptions", "RenderedImage", "dense_samples", "rasterize"]
+__all__ += ["rasterize_reference", "render_image", "splats_per_tile"]
 
 
 def rasterize(gaussians: Gaussians, cameras: Cameras, samples: PixelSamples, **options: Any) -> Rendered:

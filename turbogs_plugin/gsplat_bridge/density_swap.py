@@ -165,7 +165,11 @@ class TurboDensityStrategy(DefaultStrategy):
             raise InputError("the strategy was called without its state: expected that of strategy.initialize_state()")
         require_keys(state, _STATE_KEYS, "the state", "expected that of TurboDensityStrategy.initialize_state()")
         stats, has_errors = iteration_stats(info, count)
-        self._require_sums(info)
+        if self.choose_by == "squares" and info.get(STATISTICS) is None:
+            raise InputError(
+                f"choose_by = 'squares' needs the sums that sparse_rasterization leaves where info has "
+                f"'{PREDICTION}' and '{GROUND_TRUTH}': render with it and add them, or leave it at 'difficulty'"
+            )
         driven_by = "error" if has_errors else "gradient"
         if state[_DRIVEN_BY] is None:
             print(f"TurboDensityStrategy: {_ANNOUNCEMENTS[driven_by]}.")
@@ -194,14 +198,6 @@ class TurboDensityStrategy(DefaultStrategy):
         window = GaussianStats(**{name: state[name] for name in _STATS})
         add_stats(window, stats)
         return window
-
-    def _require_sums(self, info: dict[str, Any]) -> None:
-        """Raise `InputError` where `choose_by` needs sums that this step's `info` does not have."""
-        if self.choose_by == "squares" and info.get(STATISTICS) is None:
-            raise InputError(
-                f"choose_by = 'squares' needs the sums that sparse_rasterization leaves where info has "
-                f"'{PREDICTION}' and '{GROUND_TRUTH}': render with it and add them, or leave it at 'difficulty'"
-            )
 
     def _due(self, step: int) -> bool:
         """Whether a densification or a final pruning happens at this step, at gsplat's places in the schedule."""

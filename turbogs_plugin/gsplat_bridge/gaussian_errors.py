@@ -157,22 +157,6 @@ def screen_statistics(info: dict[str, Any], count: int) -> GaussianStats:
     return stats
 
 
-def _require_one_render(info: dict[str, Any]) -> None:
-    """Raise `InputError` where the entries of `info` are not of one render of the Gaussians as splats.
-
-    ``distributed=True`` of several processes leaves the projection of all their cameras, and the tiles of this one's.
-    """
-    means2d, cameras = info["means2d"], info["isect_offsets"].shape[0]
-    if info["gaussian_ids"] is None and means2d.shape[0] != cameras:
-        raise InputError(
-            f"info is of a render with distributed=True, means2d of {means2d.shape[0]} cameras and tiles of {cameras}: "
-            "the errors of TurboDensityStrategy and MomentLMOptimizer need one process; do not put "
-            f"'{PREDICTION}' and '{GROUND_TRUTH}' into info, or train on one GPU"
-        )
-    if means2d.grad is None and not means2d.requires_grad:
-        raise InputError(WITHOUT_GRADIENT)
-
-
 def zero_channel_sums(info: dict[str, Any], upstream: Tensor) -> Tensor:
     """Sum over pixels of ``upstream * w`` for each Gaussian, by gsplat's rasterizer.
 
@@ -186,14 +170,23 @@ def zero_channel_sums(info: dict[str, Any], upstream: Tensor) -> Tensor:
     from gsplat import rasterize_to_pixels
 
     require_keys(info, _INTERSECTION, "info", "pass what gsplat.rasterization returned")
-    _require_one_render(info)
-    images = (info["isect_offsets"].shape[0], info["height"], info["width"])
+    means2d, cameras = info["means2d"], info["isect_offsets"].shape[0]
+    # distributed=True of several processes leaves the projection of all their cameras, and the tiles of this one's.
+    if info["gaussian_ids"] is None and means2d.shape[0] != cameras:
+        raise InputError(
+            f"info is of a render with distributed=True, means2d of {means2d.shape[0]} cameras and tiles of {cameras}: "
+            "the errors of TurboDensityStrategy and MomentLMOptimizer need one process; do not put "
+            f"'{PREDICTION}' and '{GROUND_TRUTH}' into info, or train on one GPU"
+        )
+    if means2d.grad is None and not means2d.requires_grad:
+        raise InputError(WITHOUT_GRADIENT)
+    images = (cameras, info["height"], info["width"])
     if upstream.shape[:-1] != images:
         raise InputError(
             f"info['{PREDICTION}'] and info['{GROUND_TRUTH}'] are of shape {(*upstream.shape[:-1], 3)}: "
             f"expected {(*images, 3)}, what gsplat.rasterization rendered"
         )
-    means2d = info["means2d"].detach()
+    means2d = means2d.detach()
     with torch.enable_grad():
         channels = means2d.new_zeros(*means2d.shape[:-1], upstream.shape[-1]).requires_grad_()
         conics, opacities = info["conics"].detach(), info["opacities"].detach()

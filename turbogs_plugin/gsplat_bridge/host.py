@@ -28,14 +28,7 @@ LOSS_SHARES = "loss_shares"
 ERROR_SUMS = "error_sums"
 """Key under which the sums of the zero channel, [N, 2], stay for whoever asks for them second."""
 
-SHAPES = {
-    "means": "[N, 3]",
-    "quats": "[N, 4]",
-    "scales": "[N, 3]",
-    "opacities": "[N]",
-    "sh0": "[N, 1, 3]",
-    "shN": "[N, B, 3]",
-}
+SHAPES = dict(means="[N, 3]", quats="[N, 4]", scales="[N, 3]", opacities="[N]", sh0="[N, 1, 3]", shN="[N, B, 3]")
 """gsplat's layout: N Gaussians, B harmonics above band 0."""
 
 FLAT_SHAPES = {"opacities": "[N, 1]", "sh0": "[N, 3]"}

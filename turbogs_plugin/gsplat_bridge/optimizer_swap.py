@@ -21,7 +21,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from turbogs_plugin.engine.moments import COLUMNS, GaussianMoments, check_moments_config
+from turbogs_plugin.engine.moments import GaussianMoments, check_moments_config
 from turbogs_plugin.engine.rules import ParameterRates
 from turbogs_plugin.errors import InputError, require
 from turbogs_plugin.gsplat_bridge.gaussian_errors import loss_shares
@@ -164,11 +164,7 @@ class SharedOptimizer:
         """Each moment of each parameter: its place in the packed form, and the member's own tensor."""
         for name, member in self.members.items():
             state = member.checked_state()
-            for moment in MOMENTS:
-                if name == "shN":
-                    yield getattr(packed, f"{moment}_shN"), state[moment]
-                else:
-                    yield getattr(packed, moment)[:, COLUMNS[name]], state[moment]
+            yield from ((packed.part(moment, name), state[moment]) for moment in MOMENTS)
 
     def _shares(self, gaussians: Gaussians, info: dict[str, Any] | None) -> Tensor:
         """[1, N] the Gaussians' share of the loss, zero where nothing is known of it."""

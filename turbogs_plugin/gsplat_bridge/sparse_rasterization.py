@@ -20,13 +20,7 @@ from turbogs_plugin.engine.rendered import RasterSettings
 from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.gsplat_bridge.gaussian_errors import residuals
-from turbogs_plugin.gsplat_bridge.host import (
-    GROUND_TRUTH,
-    LOSS_SHARES,
-    PREDICTION,
-    STATISTICS,
-    require_one_process,
-)
+from turbogs_plugin.gsplat_bridge.host import GROUND_TRUTH, LOSS_SHARES, PREDICTION, STATISTICS, require_one_process
 from turbogs_plugin.types import SH_C0, TILE_SIZE, Cameras, Gaussians, GaussianStats, LossOutput, PixelSamples, Step
 
 LOGIT_MARGIN = 2.0**-23

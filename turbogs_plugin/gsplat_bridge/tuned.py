@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
 from importlib import resources
 from typing import Any
 
@@ -11,16 +10,12 @@ import yaml
 from turbogs_plugin.strategies.density.error_driven import ErrorDrivenDensity
 from turbogs_plugin.strategies.schedule import SinusoidalSchedule
 
-
-@lru_cache(maxsize=1)
-def _sections() -> dict[str, Any]:
-    """`configs/turbogs.yaml`. Read with the YAML library alone, as a host's trainer need not have more installed."""
-    text = (resources.files("turbogs_plugin.configs") / "turbogs.yaml").read_text(encoding="utf-8")
-    return yaml.safe_load(text)
+# Read with the YAML library alone, as a host's trainer need not have more installed.
+_TURBOGS = yaml.safe_load((resources.files("turbogs_plugin.configs") / "turbogs.yaml").read_text(encoding="utf-8"))
 
 
 def _settings(section: str) -> dict[str, Any]:
-    return {name: value for name, value in _sections()[section].items() if name != "type"}
+    return {name: value for name, value in _TURBOGS[section].items() if name != "type"}
 
 
 GATES = {

@@ -3,16 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
-
-import numpy as np
 
 from turbogs_plugin.config.units import parse_color
-from turbogs_plugin.engine.reference.philox import MASK, PURPOSE_BACKGROUND, philox4x32
+from turbogs_plugin.engine.reference.philox import PURPOSE_BACKGROUND, host_words
 from turbogs_plugin.types import BLACK, WHITE, Color, Step
-
-_BLOCK = 64
-"""Colours are made for this many iterations at once, which costs numpy the same as for one."""
 
 
 @dataclass(frozen=True)
@@ -48,14 +42,5 @@ class Background:
         """The colour of an iteration, a function of (seed, iteration) alone."""
         if self.fixed is not None:
             return self.fixed
-        red, green, blue = _random_block(step.seed, step.iteration // _BLOCK)[step.iteration % _BLOCK]
+        red, green, blue, _ = ((word.item() + 0.5) / 2.0**32 for word in host_words(PURPOSE_BACKGROUND, 1, step))
         return red, green, blue
-
-
-@lru_cache(maxsize=4)
-def _random_block(seed: int, block: int) -> list[list[float]]:
-    """[_BLOCK, 3] uniform numbers in 0 .. 1, of the iterations from ``block * _BLOCK`` on."""
-    iterations = np.arange(block * _BLOCK, (block + 1) * _BLOCK) & MASK
-    counter = (np.zeros_like(iterations), *(np.array([word]) for word in (0, PURPOSE_BACKGROUND, seed >> 32 & MASK)))
-    words = philox4x32(counter, (seed & MASK, iterations))[:3]
-    return ((np.stack(words, axis=1) + 0.5) / 2.0**32).tolist()

@@ -108,10 +108,7 @@ def _read(file: Path) -> tuple[Gaussians, Similarity | None]:
         return FORMATS[_format(file)].read(file), None
     state = _state(file)
     if isinstance(state, Mapping) and "splats" in state:
-        parts = [
-            read_gsplat(state, file),
-            *(read_gsplat(_state(other), other) for other in _other_ranks(file)),
-        ]
+        parts = [read_gsplat(state, file), *(read_gsplat(_state(other), other) for other in _other_ranks(file))]
         if len({part.shN.shape[1] for part in parts}) > 1:
             raise InputError(f"{file}: the files of its ranks differ in degree: give those of one run")
         names = PARAMETER_NAMES

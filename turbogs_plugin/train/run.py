@@ -283,9 +283,7 @@ class RunSession(Listener):
         self._written: list[Future[float]] = []
 
     def run(
-        self,
-        report: Callable[[RunSession], object] | None,
-        watch: Sequence[Callable[[RunSession], Listener]] = (),
+        self, report: Callable[[RunSession], object] | None, watch: Sequence[Callable[[RunSession], Listener]] = ()
     ) -> RunSession:
         """Train to the end, or until a signal; both end with a checkpoint."""
         loop, trainer, ranks = self.loop, self.trainer, self.loop.ranks

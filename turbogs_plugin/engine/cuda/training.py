@@ -24,16 +24,7 @@ from turbogs_plugin.engine.protocol import MapUpdate
 from turbogs_plugin.engine.rules import DrawRule, LossTerms, UpdateRule
 from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.tiles import CELL_SIDE, TILE_PIXELS, DrawEnds, slots_of_tiles, tile_extents
-from turbogs_plugin.types import (
-    BLACK,
-    TILE_SIZE,
-    Color,
-    Gaussians,
-    GaussianStats,
-    LossOutput,
-    PixelSamples,
-    Step,
-)
+from turbogs_plugin.types import BLACK, TILE_SIZE, Color, Gaussians, GaussianStats, LossOutput, PixelSamples, Step
 
 
 def sample_pixels(rule: DrawRule, maps: ErrorMaps, view_ids: tuple[int, ...], rate: float, step: Step) -> PixelSamples:

@@ -224,11 +224,10 @@ def _slice_backward(piece: Slice, upstream: Tensor, behind: Tensor) -> tuple[Ten
     if piece.clamped is not None:
         slope.masked_fill_(piece.clamped, 0)
     a, b, c = piece.conics
-    squares = slope.square().sum(dim=1)  # [B, G]
     slope_x, slope_y = slope * piece.dx, slope * piece.dy
     record = slope.new_zeros(ScreenRecord.SIZE, slope.shape[0], slope.shape[2])
     first = (slope_x.sum(dim=1), slope_y.sum(dim=1))
-    record[ScreenRecord.SQUARE_SUM] = squares
+    record[ScreenRecord.SQUARE_SUM] = slope.square().sum(dim=1)
     record[ScreenRecord.MEAN.start] = a[:, 0] * first[0] + b[:, 0] * first[1]
     record[ScreenRecord.MEAN.start + 1] = b[:, 0] * first[0] + c[:, 0] * first[1]
     record[ScreenRecord.ABSOLUTE.start] = (a * slope_x).addcmul_(b.expand_as(slope_x), slope_y).abs_().sum(dim=1)

@@ -22,11 +22,14 @@ and never 0 or 1. (With 24 random bits it would need 25 bits, and could round to
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import TypeVar
 
 import numpy as np
 import torch
 from torch import Tensor
+
+from turbogs_plugin.types import Step
 
 PURPOSE_PIXELS, PURPOSE_CELLS, PURPOSE_TILES, PURPOSE_VIEWS, PURPOSE_STACK, PURPOSE_BACKGROUND = range(6)
 
@@ -38,6 +41,9 @@ WEYL = (0x9E3779B9, 0xBB67AE85)
 LOG_2 = 0.693147182464599609375  # float32 0x3f317218
 SQRT_HALF_BITS = 0x3F3504F3  # the float32 nearest to sqrt(1/2)
 LOG_COEFFICIENTS = (2 / 3, 2 / 5, 2 / 7, 2 / 9)  # of s^3, s^5, s^7, s^9 in 2 * atanh(s); each rounded to float32
+
+_BLOCK = 64
+"""The host's words are made for this many iterations at once, which costs numpy the same as for one."""
 
 Words = tuple[Tensor, Tensor, Tensor, Tensor]
 Array = TypeVar("Array", Tensor, np.ndarray)
@@ -83,6 +89,21 @@ def random_words(place: Tensor, view: Tensor | int, purpose: int, seed: int, ite
     """
     constant = [torch.as_tensor(value, dtype=torch.int64, device=place.device) for value in (view, purpose, seed >> 32)]
     return philox4x32((place, constant[0], constant[1], constant[2] & MASK), (seed & MASK, iteration & MASK))
+
+
+def host_words(purpose: int, places: int, step: Step) -> tuple[np.ndarray, ...]:
+    """The four random words, [places] int64 each, of the first places at an iteration, in the layout above. Without a
+    view. Shared: do not write to them."""
+    return tuple(_block_words(purpose, places, step.seed, step.iteration // _BLOCK)[:, step.iteration % _BLOCK])
+
+
+@lru_cache(maxsize=16)
+def _block_words(purpose: int, places: int, seed: int, block: int) -> np.ndarray:
+    """[4, _BLOCK, places]: `host_words` of the iterations from ``block * _BLOCK`` on."""
+    place = np.tile(np.arange(places), (_BLOCK, 1))
+    iterations = np.arange(block * _BLOCK, (block + 1) * _BLOCK)[:, None] & MASK
+    constants = (np.array([value]) for value in (0, purpose, seed >> 32 & MASK))
+    return np.stack(philox4x32((place, *constants), (seed & MASK, iterations)))
 
 
 def exponentials(words: Tensor) -> Tensor:

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from turbogs_plugin.engine.reference.spherical_harmonics import evaluate, num_bands, unit_directions
-from turbogs_plugin.engine.rendered import EXTENT_MAX, RasterSettings
+from turbogs_plugin.engine.rendered import EXTENT_MAX, Projected, RasterSettings
 from turbogs_plugin.types import Cameras, Gaussians
 
 SPAN_MAX = 1e7
@@ -59,25 +59,15 @@ class Rows:
         return full.reshape(*self.shape, *values.shape[1:])
 
 
-@dataclass
-class Splats:
-    """The projection of R rows.
+@dataclass(frozen=True)
+class Splats(Projected):
+    """The projection of R rows: [R, ...] in the place of [K, N, ...]; where off screen, the radii alone are zero.
 
     Args:
-        means2d: [R, 2] pixels.
-        conics: [R, 3] upper triangle of the inverse covariance, per pixel squared.
-        depths: [R].
-        opacities: [R] 0 .. 1.
         colors: [R, 3] after the clamp at 0.
-        radii: [R, 2] int32 half-widths in x and y, pixels; both zero where off screen.
     """
 
-    means2d: Tensor
-    conics: Tensor
-    depths: Tensor
-    opacities: Tensor
     colors: Tensor
-    radii: Tensor
 
 
 @torch.no_grad()
@@ -172,4 +162,4 @@ def project_rows(
         radii = torch.ceil(extents[:, None] * variances.sqrt())
         drawn = ((means2d + radii > 0) & (means2d - radii < image)).all(dim=-1) & (radii > 0).any(dim=-1)
         radii = torch.where(drawn[:, None], radii, 0).to(torch.int32)
-    return Splats(means2d, conics, depths, opacities, colors, radii)
+    return Splats(means2d, conics, depths, opacities, radii, colors)

@@ -56,7 +56,9 @@ def apply_update(
         if rule.lm.units == "balanced":
             delta = balanced_delta(rows, losses, terms, rule)
         else:
-            delta = paper_delta(rows, moments.exp_avg[index], moments.exp_avg_sq[index], rule)
+            # The printed equation: the g_k are the rows of J, and m and v have no bias correction.
+            damping = torch.sqrt(moments.exp_avg_sq[index]) + rule.eps
+            delta = _solve(rows, torch.ones_like(losses), damping, moments.exp_avg[index])
     gradient = clipped(gradients.shN[index].flatten(1))
     terms = advance(moments.exp_avg_shN, moments.exp_avg_sq_shN, gradient, index, steps, rule)
     changes = {name: delta[:, columns] for name, columns in COLUMNS.items()}
@@ -146,16 +148,6 @@ def balanced_delta(rows: Tensor, losses: Tensor, terms: AdamTerms, rule: UpdateR
         has_row = (rows[..., block] != 0).any(dim=-1) & (weights > 0)  # [K, n]
         takes_solution[:, block] = has_row.any(dim=0)[:, None]
     return torch.where(takes_solution & (rates > 0), delta, adam)
-
-
-def paper_delta(rows: Tensor, mean: Tensor, square: Tensor, rule: UpdateRule) -> Tensor:
-    """[n, 14] change of the parameters by the printed equation.
-
-    Args:
-        rows: [K, n, 14] gradients of each view, the rows of J.
-        mean, square: [n, 14] the moments m and v, without bias correction, as the equation has them.
-    """
-    return _solve(rows, torch.ones_like(rows[..., 0]), torch.sqrt(square) + rule.eps, mean)
 
 
 def _solve(rows: Tensor, weights: Tensor, damping: Tensor, mean: Tensor) -> Tensor:
