@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import gsplat
@@ -36,8 +37,5 @@ def bench_gsplat(model: Gaussians, cameras: Cameras, repeats: int) -> dict[str, 
         )
         torch.autograd.grad((images * weights).sum(), [value for _, value in leaves.items()])
 
-    return {
-        "version": gsplat.__version__,
-        "unpacked": measure(lambda: whole(False), repeats, model.device),
-        "packed": measure(lambda: whole(True), repeats, model.device),
-    }
+    ways = {"unpacked": partial(whole, False), "packed": partial(whole, True)}
+    return {"version": gsplat.__version__} | {name: measure(way, repeats, model.device) for name, way in ways.items()}

@@ -16,6 +16,7 @@ from turbogs_plugin.errors import InputError
 from turbogs_plugin.files import write_text_atomically
 from turbogs_plugin.report.provenance import Provenance
 from turbogs_plugin.report.tables import number
+from turbogs_plugin.study.compare import UNSHARED
 from turbogs_plugin.study.difference import ABSENT, difference, flattened
 from turbogs_plugin.study.document import Block, Heading, Paragraph, Picture, Table, to_html, to_markdown
 from turbogs_plugin.study.folder import StudyFolder
@@ -28,15 +29,7 @@ from turbogs_plugin.study.summary import MEASURES, SceneSummary, VariantRow, sum
 CLOCKS = {"wall_seconds": "wall in s", "cell_seconds": "load, train, evaluate in s"}
 """Measures of the wall's clock, each with its column, where a cell has it."""
 
-OF_THE_CALL = (
-    "scene.",
-    "report.",
-    "budget.",
-    "train.seed",
-    "train.device",
-    "train.evaluate_at",
-    "train.checkpoint_every",
-)
+OF_THE_CALL = (*UNSHARED, "budget.", "train.device")
 """Settings that belong to a call, or change no result: a page does not go stale by them."""
 
 TIMING_RULES = (
