@@ -175,15 +175,9 @@ class PixelMasks:
         if samples.weights is not None:
             weights = samples.weights[keep]
             weights = weights / weights.mean()
-        return PixelSamples(
-            samples.view_ids,
-            samples.sizes,
-            samples.pixel_ids[keep],
-            samples.tile_ids[left],
-            torch.nn.functional.pad(counts[left].cumsum(dim=0), (1, 0)).int(),
-            weights,
-            has_empty_slots=False,
-        )
+        offsets = torch.nn.functional.pad(counts[left].cumsum(dim=0), (1, 0)).int()
+        kept = (samples.pixel_ids[keep], samples.tile_ids[left], offsets, weights)
+        return PixelSamples(samples.view_ids, samples.sizes, *kept, has_empty_slots=False)
 
     def _places(self, rows: Tensor) -> Tensor:
         """[T] rows of `bits` -> [T, 256] bool."""
