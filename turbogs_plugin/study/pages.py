@@ -246,13 +246,9 @@ def _settings(study: Study) -> list[Block]:
         if name in tried
     ]
     kept = "as resolved" if all(result.resolved for result in study.results) else "as asked for"
-    return [
-        Heading("Variants"),
-        Paragraph(
-            f"Overrides of the configuration '{ablation.base}'. results.json has every cell's configuration, {kept}."
-        ),
-        Table(("variant", "overrides", "note"), rows, numeric=False),
-    ]
+    text = f"Overrides of the configuration '{ablation.base}'. results.json has every cell's configuration, {kept}."
+    variants = Table(("variant", "overrides", "note"), rows, numeric=False)
+    return [Heading("Variants"), Paragraph(text), variants]
 
 
 def table_csv(summaries: Sequence[SceneSummary]) -> str:

@@ -34,14 +34,11 @@ DECIMALS |= {f"{of}_{name}": DECIMALS[name] for of in ("whole", "aligned") for n
 SHARED = ("provenance", "resolved", "warmup_iterations", "lpips_reason")
 """Fields of a cell that are written once, as ``common``, and in a cell only where its value is another one."""
 
-Columns = make_dataclass(
-    "Columns",
-    [
-        (entry.name, list[int] if entry.type == "int" else list[float | None], field(default=entry.default))
-        for entry in fields(Evaluation)
-    ],
-    kw_only=True,
-)
+_COLUMN_FIELDS = [
+    (entry.name, list[int] if entry.type == "int" else list[float | None], field(default=entry.default))
+    for entry in fields(Evaluation)
+]
+Columns = make_dataclass("Columns", _COLUMN_FIELDS, kw_only=True)
 """A history as the file has it: field of `Evaluation` -> its values. One that has its default all along is absent."""
 
 
