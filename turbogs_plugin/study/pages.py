@@ -17,7 +17,7 @@ from turbogs_plugin.files import write_text_atomically
 from turbogs_plugin.report.provenance import Provenance
 from turbogs_plugin.report.tables import number
 from turbogs_plugin.study.compare import UNSHARED
-from turbogs_plugin.study.difference import ABSENT, difference, flattened
+from turbogs_plugin.study.difference import ABSENT, compared, difference, flattened
 from turbogs_plugin.study.document import Block, Heading, Paragraph, Picture, Table, to_html, to_markdown
 from turbogs_plugin.study.folder import StudyFolder
 from turbogs_plugin.study.grid import variant_config
@@ -122,9 +122,8 @@ def changed_since(study: Study) -> list[Paragraph]:
         present = flattened(variant_config(ablation, ablation.baseline, 0, (), None).to_mapping())
     except InputError as error:  # a setting of then, in the ablation's own words
         return [Paragraph(f"Stale: {error}.")]
-    asked = flattened(measured[0].asked)
-    changes = difference(present, {path: value for path, value in asked.items() if not path.startswith(OF_THE_CALL)})
-    changed = sorted(path for path in changes if path != ABSENT and path in present)
+    asked = compared(measured[0].asked, OF_THE_CALL)
+    changed = sorted(path for path in difference(present, asked) if path != ABSENT and path in present)
     if not changed:
         return []
     listed = ", ".join(f"{path} {asked[path]} (now {present[path]})" for path in changed)
