@@ -183,8 +183,7 @@ class ErrorMaps:
         # Tile by tile first: on a GPU, additions to one number wait for each other.
         tile_sums = deltas.new_zeros(len(views)).index_add_(0, tiles, deltas)
         batch_sums = deltas.new_zeros(len(samples.view_ids)).index_add_(0, views, tile_sums)
-        view_ids = torch.as_tensor(samples.view_ids, device=errors.device)
-        self.view_sums.index_add_(0, view_ids, batch_sums)
+        self.view_sums.index_add_(0, torch.as_tensor(samples.view_ids, device=errors.device), batch_sums)
 
     def ages(self, view_id: int, step: Step) -> Tensor:
         """[H * W] int32: iterations since each pixel of a view was last sampled, saturated at `AGE_MAX`."""

@@ -137,8 +137,7 @@ class PixelMasks:
         firsts = TileGrid(self.sizes[list(view_ids)]).offsets.tolist()
         spans = [slice(int(self.offsets[view]), int(self.offsets[view + 1])) for view in view_ids]
         tiles = torch.cat([self.tiles[span].long() + first for span, first in zip(spans, firsts, strict=False)])
-        rows = torch.cat([self.rows[span] for span in spans]).long()
-        return tiles, self._places(rows)
+        return tiles, self._places(torch.cat([self.rows[span] for span in spans]).long())
 
     def image(self, view_id: int) -> Tensor:
         """[H, W] bool on the masks' device: the mask of one view."""

@@ -71,8 +71,7 @@ class EventWriter(Listener):
         if self._writer is None:
             self._writer = _writer_class()(str(self.folder), purge_step=self._first)
             if not self._first:
-                settings = loop.trainer.config.to_yaml()
-                self._writer.add_text("configuration", f"```yaml\n{settings}\n```", iteration)
+                self._writer.add_text("configuration", f"```yaml\n{loop.trainer.config.to_yaml()}\n```", iteration)
         for name, value in asdict(evaluation).items():
             if name != "iteration" and not math.isnan(value):
                 self._writer.add_scalar(f"{GROUPS.get(name, 'test')}/{name}", value, iteration)

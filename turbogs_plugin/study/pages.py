@@ -246,8 +246,7 @@ def _settings(study: Study) -> list[Block]:
     ]
     kept = "as resolved" if all(result.resolved for result in study.results) else "as asked for"
     text = f"Overrides of the configuration '{ablation.base}'. results.json has every cell's configuration, {kept}."
-    variants = Table(("variant", "overrides", "note"), rows, numeric=False)
-    return [Heading("Variants"), Paragraph(text), variants]
+    return [Heading("Variants"), Paragraph(text), Table(("variant", "overrides", "note"), rows, numeric=False)]
 
 
 def table_csv(summaries: Sequence[SceneSummary]) -> str:
