@@ -8,7 +8,7 @@ from typing import Any
 
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
-from study_tables import CAPTURES, OURS, ROOT, rows_of
+from study_tables import CAPTURES, OURS, ROOT, read_peers, rows_of
 
 PICTURE = ROOT / "docs/results/headline.png"
 DRAWING = 3
@@ -47,7 +47,7 @@ def picture_data() -> dict[str, Any]:
                 data[capture]["curves"][name] = [curve.seconds.round(4).tolist(), curve.mean.round(4).tolist()]
                 means = [row.spread(measure).mean for measure in ("seconds", "psnr", "gaussians")]
                 data[capture]["points"].append([name, *(round(value, 4) for value in means)])
-    for entry in json.loads((ROOT / "docs/results/peers.json").read_text())["rows"]:
+    for entry in read_peers()["rows"]:
         name = entry["method"].split()[0].rstrip(",")
         data[entry["capture"]]["points"].append([name, entry["seconds"], entry["psnr"], entry["gaussians"]])
     return data

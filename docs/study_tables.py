@@ -6,6 +6,7 @@ import json
 import math
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import machine_tables
 
@@ -38,6 +39,11 @@ def read_study(folder: Path) -> Study:
     return StudyFolder(folder).read_study()
 
 
+def read_peers() -> dict[str, Any]:
+    """What the others' own programs reach."""
+    return json.loads((ROOT / "docs/results/peers.json").read_text())
+
+
 def rows_of(study: str) -> dict[str, dict[str, VariantRow]]:
     """Capture -> variant -> its row; none of a study that is not measured yet."""
     if not (ROOT / "docs/results" / study / "results.json").is_file():
@@ -63,7 +69,7 @@ def duration(seconds: float) -> str:
 
 def headline() -> str:
     """Ours beside the others, on each capture: seconds of training, and on the wall where they were recorded."""
-    peers = json.loads((ROOT / "docs/results/peers.json").read_text())
+    peers = read_peers()
     lines: dict[str, dict[str, str]] = {}
     for entry in peers["rows"]:
         beyond = peers["beyond_training"].get(entry["method"].split()[0], ())
@@ -77,9 +83,13 @@ def headline() -> str:
                 wall = duration(wall_seconds(variant, capture))
                 seeds = f" ({len(row.cells)})" if len(row.cells) > 1 else ""
                 lines.setdefault(name, {})[capture] = f"{result(*means, wall)}{seeds}"
-    return table(
-        ("", *CAPTURES), [[name, *(cells.get(capture, "") for capture in CAPTURES)] for name, cells in lines.items()]
-    )
+    return by_capture("", lines)
+
+
+def by_capture(head: str, lines: dict[str, dict[str, str]]) -> str:
+    """A table of rows that have a cell for some captures."""
+    rows = [[name, *(cells.get(capture, "") for capture in CAPTURES)] for name, cells in lines.items()]
+    return table((head, *CAPTURES), rows)
 
 
 def wall_seconds(variant: str, capture: str) -> float:
@@ -90,10 +100,9 @@ def wall_seconds(variant: str, capture: str) -> float:
 
 def ahead() -> str:
     """When `turbogs` had the PSNR that the others end with, how much sooner, and how many times their Gaussians."""
-    peers = json.loads((ROOT / "docs/results/peers.json").read_text())
     ours = {capture: rows["turbogs"] for capture, rows in rows_of("sizes").items()}
     lines: dict[str, dict[str, str]] = {}
-    for entry in peers["rows"]:
+    for entry in read_peers()["rows"]:
         row = ours[entry["capture"]]
         times = [time for time in row.seconds_to(entry["psnr"]) if math.isfinite(time)]
         parts = ["never"]
@@ -104,10 +113,7 @@ def ahead() -> str:
         if entry["gaussians"]:
             parts.append(f"x {row.spread('gaussians').mean / entry['gaussians']:.1f} N")
         lines.setdefault(entry["method"], {})[entry["capture"]] = ", ".join(parts)
-    return table(
-        ("against", *CAPTURES),
-        [[name, *(cells.get(capture, "") for capture in CAPTURES)] for name, cells in lines.items()],
-    )
+    return by_capture("against", lines)
 
 
 NEAR = {"psnr": 0.1, "ssim": 0.001}
@@ -117,7 +123,7 @@ NEAR = {"psnr": 0.1, "ssim": 0.001}
 def behind() -> str:
     """Where the others have less error than `turbogs`, or as little with fewer Gaussians."""
     lines = []
-    for entry in json.loads((ROOT / "docs/results/peers.json").read_text())["rows"]:
+    for entry in read_peers()["rows"]:
         row = rows_of("sizes")[entry["capture"]]["turbogs"]
         size = (entry["gaussians"] or math.inf) / row.spread("gaussians").mean
         for measure, digits in (("psnr", 2), ("ssim", 3)):
@@ -147,8 +153,7 @@ def headline_sources() -> str:
     lines = [(name, "; ".join(sorted(where)) or "not recorded") for name, where in said.items()]
     reports = json.loads(machine_tables.WALL.read_text())
     lines.append(("turbogs, on the wall", "; ".join(dict.fromkeys(map(machine_tables.where, reports.values())))))
-    peers = json.loads((ROOT / "docs/results/peers.json").read_text())
-    lines.append(("the others", peers["measured"]))
+    lines.append(("the others", read_peers()["measured"]))
     return "\n\n".join([table(("row", "measured on"), lines), *dict.fromkeys(changed)])
 
 

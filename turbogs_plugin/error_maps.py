@@ -183,8 +183,7 @@ class ErrorMaps:
         # Tile by tile first: on a GPU, additions to one number wait for each other.
         tile_sums = deltas.new_zeros(len(views)).index_add_(0, tiles, deltas)
         batch_sums = deltas.new_zeros(len(samples.view_ids)).index_add_(0, views, tile_sums)
-        view_ids = torch.as_tensor(samples.view_ids, device=errors.device)
-        self.view_sums.index_add_(0, view_ids, batch_sums)
+        self.view_sums.index_add_(0, torch.as_tensor(samples.view_ids, device=errors.device), batch_sums)
 
     def ages(self, view_id: int, step: Step) -> Tensor:
         """[H * W] int32: iterations since each pixel of a view was last sampled, saturated at `AGE_MAX`."""
@@ -220,13 +219,8 @@ class ErrorMaps:
     def state_dict(self) -> dict[str, Any]:
         """Plain tensors and numbers; a resume from them gives the same bits."""
         errors, stamps = self._copies()
-        return {
-            "errors": errors,
-            "stamps": stamps,
-            "stamp_base": self.stamp_base,
-            "view_sums": self.view_sums.clone(),
-            **self._means.state_dict(),
-        }
+        state = {"errors": errors, "stamps": stamps, "stamp_base": self.stamp_base}
+        return {**state, "view_sums": self.view_sums.clone(), **self._means.state_dict()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         pixels, views = (int(self.sizes.prod(axis=1).sum()),), (len(self.sizes),)
@@ -295,11 +289,8 @@ class _LaggedCopy:
 
     def state_dict(self) -> dict[str, Any]:
         self._collect()
-        return {
-            "mean_reads": self.reads,
-            "mean_values": torch.from_numpy(self.values.copy()),
-            "mean_pending": torch.from_numpy(self.pending.copy()),
-        }
+        values, pending = (torch.from_numpy(array.copy()) for array in (self.values, self.pending))
+        return {"mean_reads": self.reads, "mean_values": values, "mean_pending": pending}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         self.reads, self.copy = int(state["mean_reads"]), None

@@ -137,8 +137,7 @@ class PixelMasks:
         firsts = TileGrid(self.sizes[list(view_ids)]).offsets.tolist()
         spans = [slice(int(self.offsets[view]), int(self.offsets[view + 1])) for view in view_ids]
         tiles = torch.cat([self.tiles[span].long() + first for span, first in zip(spans, firsts, strict=False)])
-        rows = torch.cat([self.rows[span] for span in spans]).long()
-        return tiles, self._places(rows)
+        return tiles, self._places(torch.cat([self.rows[span] for span in spans]).long())
 
     def image(self, view_id: int) -> Tensor:
         """[H, W] bool on the masks' device: the mask of one view."""
@@ -175,15 +174,9 @@ class PixelMasks:
         if samples.weights is not None:
             weights = samples.weights[keep]
             weights = weights / weights.mean()
-        return PixelSamples(
-            samples.view_ids,
-            samples.sizes,
-            samples.pixel_ids[keep],
-            samples.tile_ids[left],
-            torch.nn.functional.pad(counts[left].cumsum(dim=0), (1, 0)).int(),
-            weights,
-            has_empty_slots=False,
-        )
+        offsets = torch.nn.functional.pad(counts[left].cumsum(dim=0), (1, 0)).int()
+        kept = (samples.pixel_ids[keep], samples.tile_ids[left], offsets, weights)
+        return PixelSamples(samples.view_ids, samples.sizes, *kept, has_empty_slots=False)
 
     def _places(self, rows: Tensor) -> Tensor:
         """[T] rows of `bits` -> [T, 256] bool."""

@@ -93,5 +93,4 @@ def copy_bandwidth(device: torch.device) -> float:
     """Bytes read and written in a second by a large copy."""
     source = torch.empty(1 << (30 if device.type == "cuda" else 26), dtype=torch.uint8, device=device)
     target = torch.empty_like(source)
-    took = measure(lambda: target.copy_(source), 10, device)
-    return 2 * source.numel() / (1e-3 * took["median_ms"])
+    return 2 * source.numel() / (1e-3 * measure(lambda: target.copy_(source), 10, device)["median_ms"])

@@ -94,8 +94,7 @@ def other_build(library: Path, job: tuple) -> dict[str, Any]:
 def run_ranks(bench: RanksBench, scene: Path, factor: int, device: torch.device, out: Path | None) -> None:
     """Prints a line a measurement, and writes the JSON where there is a file."""
     _require_new(out)
-    measured = bench.run(scene, factor, device)
-    _keep(_report("ranks", measured, device), [f"json  {out}"], out)
+    _keep(_report("ranks", bench.run(scene, factor, device), device), [f"json  {out}"], out)
 
 
 def run_numerics(device: torch.device, out: Path) -> None:

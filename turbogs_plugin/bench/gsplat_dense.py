@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import gsplat
@@ -20,24 +21,11 @@ def bench_gsplat(model: Gaussians, cameras: Cameras, repeats: int) -> dict[str, 
     weights = torch.randn(len(cameras), height, width, 3, device=model.device)
 
     def whole(packed: bool) -> None:
-        images, _, _ = gsplat.rasterization(
-            leaves.means,
-            leaves.quats,
-            leaves.scales.exp(),
-            leaves.opacities.sigmoid(),
-            torch.cat([leaves.sh0, leaves.shN], dim=1),
-            cameras.viewmats,
-            cameras.Ks,
-            width,
-            height,
-            sh_degree=leaves.sh_degree,
-            packed=packed,
-            absgrad=True,
-        )
+        shapes = leaves.means, leaves.quats, leaves.scales.exp(), leaves.opacities.sigmoid()
+        colors, views = torch.cat([leaves.sh0, leaves.shN], dim=1), (cameras.viewmats, cameras.Ks, width, height)
+        options = {"sh_degree": leaves.sh_degree, "packed": packed, "absgrad": True}
+        images, _, _ = gsplat.rasterization(*shapes, colors, *views, **options)
         torch.autograd.grad((images * weights).sum(), [value for _, value in leaves.items()])
 
-    return {
-        "version": gsplat.__version__,
-        "unpacked": measure(lambda: whole(False), repeats, model.device),
-        "packed": measure(lambda: whole(True), repeats, model.device),
-    }
+    ways = {"unpacked": partial(whole, False), "packed": partial(whole, True)}
+    return {"version": gsplat.__version__} | {name: measure(way, repeats, model.device) for name, way in ways.items()}

@@ -16,13 +16,7 @@ from torch import Tensor
 
 from turbogs_plugin.bench.clocks import measure
 from turbogs_plugin.bench.statistics import write_record
-from turbogs_plugin.engine.reference.lm_solvers import (
-    ROW_LIMIT,
-    solve_float64,
-    solve_low_rank,
-    solve_raw_cholesky,
-    solve_scaled_cholesky,
-)
+from turbogs_plugin.engine.reference import lm_solvers
 from turbogs_plugin.files import write_atomically, write_text_atomically
 from turbogs_plugin.report.plots import STYLE
 from turbogs_plugin.report.tables import table
@@ -31,10 +25,10 @@ Problem = tuple[Tensor, Tensor, Tensor, Tensor]
 """rows [K, n, D], weights [K, n], damping [n, D], rhs [n, D], as the solvers take them."""
 
 SOLVERS: dict[str, Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]] = {
-    "raw Cholesky, float32": solve_raw_cholesky,
-    "scaled Cholesky, float32": solve_scaled_cholesky,
-    "low rank, float32": solve_low_rank,
-    "scaled Cholesky, float64": solve_float64,
+    "raw Cholesky, float32": lm_solvers.solve_raw_cholesky,
+    "scaled Cholesky, float32": lm_solvers.solve_scaled_cholesky,
+    "low rank, float32": lm_solvers.solve_low_rank,
+    "scaled Cholesky, float64": lm_solvers.solve_float64,
 }
 COLORS = ("#b3261e", "#1f5fa8", "#2e7d32", "#6d6d6d")
 
@@ -208,7 +202,7 @@ def solvers_table(results: list[SolverResult]) -> str:
 
 
 def _plot(results: list[SolverResult]) -> Figure:
-    """Largest error of every family against time, a panel for each K. Hollow: rows beyond `ROW_LIMIT`."""
+    """Largest error of every family against time, a panel for each K. Hollow: rows beyond `lm_solvers.ROW_LIMIT`."""
     lengths = {family.name: family.length for family in FAMILIES}
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(5.4 * len(VIEWS), 4.6), layout="constrained")
@@ -218,7 +212,7 @@ def _plot(results: list[SolverResult]) -> Figure:
                 time_ns = own[0].nanoseconds
                 for result in own:
                     if result.failed < 1:
-                        within = lengths[result.family] <= ROW_LIMIT
+                        within = lengths[result.family] <= lm_solvers.ROW_LIMIT
                         axes.plot(time_ns, result.max_error, "o", color=color, fillstyle="full" if within else "none")
                 axes.plot([], [], "o", color=color, label=name)
                 failing = sum(result.failed > 0 for result in own)
@@ -233,7 +227,7 @@ def _plot(results: list[SolverResult]) -> Figure:
             axes.set_xlim(left=0)
         figure.axes[0].set_ylabel("largest error, in lengths of Adam's step")
         figure.axes[0].plot(
-            [], [], "o", color="black", fillstyle="none", label=f"rows beyond {ROW_LIMIT:.0f}, cut there"
+            [], [], "o", color="black", fillstyle="none", label=f"rows beyond {lm_solvers.ROW_LIMIT:.0f}, cut there"
         )
         figure.legend(*figure.axes[0].get_legend_handles_labels(), fontsize=9, loc="outside lower center", ncols=3)
     return figure

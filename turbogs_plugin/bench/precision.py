@@ -26,12 +26,8 @@ def precision(device: torch.device) -> dict[str, float]:
     ours = rasterize(model, cameras, samples)
     exact = rasterize_reference(model.map(Tensor.double), cameras.to(dtype=torch.float64), samples)
     difference = (ours.colors - exact.colors).abs()
-    errors = {
-        "gaussians": count,
-        "forward_max": float(difference.max()),
-        "forward_mean": float(difference.mean()),
-        "forward_beyond_1e-4": float((difference.amax(dim=1) > THRESHOLD).double().mean()),
-    }
+    errors = {"gaussians": count, "forward_max": float(difference.max()), "forward_mean": float(difference.mean())}
+    errors["forward_beyond_1e-4"] = float((difference.amax(dim=1) > THRESHOLD).double().mean())
     records, wanted = ours.backward(upstream).full_records(), exact.backward(upstream.double()).full_records()
     for name in COLUMNS:
         place = columns(ScreenRecord)[name]

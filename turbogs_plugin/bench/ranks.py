@@ -120,11 +120,8 @@ class RanksBench:
     def _parts(self, trainer: Trainer, device: torch.device) -> dict[str, float]:
         """Median milliseconds of each part on the device, in iterations that follow each other without a pause."""
         recorder = Recorder(device)
-        places = [
-            (trainer.pixel_sampler, "sample", "draw"),
-            (trainer, "supervise", "loss"),
-            (trainer.engine, "update", "solve"),
-        ]
+        places = [(trainer.pixel_sampler, "sample", "draw"), (trainer, "supervise", "loss")]
+        places.append((trainer.engine, "update", "solve"))
         if isinstance(trainer.exchange, RankExchange):
             places += [(trainer.exchange, "_gather_colors", "colors"), (trainer.exchange, "finish", "arrival")]
             places += [(RowGather, "begin", "parameters"), (SharedScreen, "of_rows", "records")]

@@ -111,13 +111,8 @@ class RasterBench:
                 passes.append(self._measure(model, chosen, min(1.0, rate), density, device, bandwidth))
             chosen = cameras.select(spread_views(min(self.views), len(cameras)))
             dense.append({"gaussians": len(model), "views": len(chosen), **bench_gsplat(model, chosen, self.repeats)})
-        return {
-            "image_size": cameras.sizes.max(axis=0).tolist(),
-            "copy_bandwidth_bytes_per_s": bandwidth,
-            "precision": precision(device),
-            "passes": passes,
-            "gsplat": dense,
-        }
+        about = {"image_size": cameras.sizes.max(axis=0).tolist(), "copy_bandwidth_bytes_per_s": bandwidth}
+        return about | {"precision": precision(device), "passes": passes, "gsplat": dense}
 
     def _measure(
         self, model: Gaussians, cameras: Cameras, rate: float, density: bool, device: torch.device, bandwidth: float
@@ -136,13 +131,8 @@ class RasterBench:
             screen = render().backward(gradients, errors, with_statistics=density)
             screen.parameter_gradients(rows=False, stats=stats)
 
-        measured: dict[str, Any] = {
-            "gaussians": len(model),
-            "views": len(cameras),
-            "rate": rate,
-            "density_sums": density,
-            "samples": len(samples),
-        }
+        measured: dict[str, Any] = {"gaussians": len(model), "views": len(cameras), "rate": rate}
+        measured |= {"density_sums": density, "samples": len(samples)}
         on_kernels = isinstance(render(), CudaRendered)
         if on_kernels:
             torch.cuda.reset_peak_memory_stats(device)

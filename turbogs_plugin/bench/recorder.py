@@ -68,14 +68,11 @@ class Recorder:
 
     def summaries(self) -> dict[str, dict[str, Summary]]:
         """Step -> times on the device and on the host, after the device has been waited for."""
-        return {
-            name: {
-                "device": device_times(self.spans[name]),
-                "host": summary([first.host_until(last) for first, last in self.spans[name]]),
-            }
-            for name in ("iteration", *STEPS)
-            if name in self.spans
-        }
+        summaries = {}
+        for name in (name for name in ("iteration", *STEPS) if name in self.spans):
+            on_host = summary([first.host_until(last) for first, last in self.spans[name]])
+            summaries[name] = {"device": device_times(self.spans[name]), "host": on_host}
+        return summaries
 
 
 @contextmanager

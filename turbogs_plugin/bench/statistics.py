@@ -170,14 +170,8 @@ def write_record(path: Path, settings: dict[str, Any], results: Sequence[Any], d
 def statistics_table(results: list[StatisticsResult]) -> str:
     """A Markdown table of results."""
     head = ("statistics", "weights", "absolute gradients", "squares", "one's, median", "one's, worst", "5 % exchanged")
-    rows = [
-        (
-            result.case,
-            *(f"{result.errors[name]:.0e}" for name in SUMS),
-            f"{result.median_square:.0e}",
-            f"{result.worst_square:.0e}",
-            f"{100 * result.exchanged:.0f} %",
-        )
-        for result in results
-    ]
+    rows = []
+    for result in results:
+        errors = (*(result.errors[name] for name in SUMS), result.median_square, result.worst_square)
+        rows.append((result.case, *(f"{error:.0e}" for error in errors), f"{100 * result.exchanged:.0f} %"))
     return table(head, rows)

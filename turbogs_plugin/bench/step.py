@@ -115,12 +115,9 @@ class StepBench:
             updates = trainer.optimizer.state_dict()["steps"].clone()
             iteration()
             samples = recorder.samples
-            counts = {
-                "gaussians": len(model),
-                "samples": len(samples),
-                "pixels": int(samples.sizes.prod(axis=1).sum()),
-                "touched": int((trainer.optimizer.state_dict()["steps"] != updates).sum()),
-            }
+            touched = int((trainer.optimizer.state_dict()["steps"] != updates).sum())
+            counts = {"gaussians": len(model), "samples": len(samples)}
+            counts |= {"pixels": int(samples.sizes.prod(axis=1).sum()), "touched": touched}
             floors = None
             if isinstance(recorder.rendered, CudaRendered):
                 counts = {**counts, **raster_counts(recorder.rendered, samples)}

@@ -59,8 +59,7 @@ class ScriptedClient:
         import zstandard
         from websockets.sync.client import connect
 
-        protocol = f"viser-v{viser.__version__}"
-        options = {"subprotocols": [protocol], "max_size": None, "compression": None}
+        options = {"subprotocols": [f"viser-v{viser.__version__}"], "max_size": None, "compression": None}
         self._socket = connect(url.replace("http", "ws", 1), additional_headers=headers, **options)
         self._zstd = zstandard.ZstdDecompressor()
 

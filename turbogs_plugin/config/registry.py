@@ -67,8 +67,7 @@ PROTOCOLS: dict[str, type] = {
 
 def known_types(kind: str) -> dict[str, str]:
     """Every name of a kind -> "module:class". A name of ours cannot be taken over by an entry point."""
-    plugged_in = {point.name: point.value for point in entry_points(group=f"turbogs.{kind}")}
-    return plugged_in | _own_types(kind)
+    return {point.name: point.value for point in entry_points(group=f"turbogs.{kind}")} | _own_types(kind)
 
 
 def _own_types(kind: str) -> dict[str, str]:

@@ -39,8 +39,7 @@ def read_named_yaml(name_or_file: str, package: str, kind: str) -> dict[str, Any
     """
     known = packaged_names(package)
     if name_or_file in known:
-        text = (resources.files(package) / f"{name_or_file}.yaml").read_text(encoding="utf-8")
-        return parse_yaml(text, name_or_file)
+        return parse_yaml((resources.files(package) / f"{name_or_file}.yaml").read_text(encoding="utf-8"), name_or_file)
     path = Path(name_or_file)
     if path.suffix in (".yaml", ".yml") or path.is_file():
         return read_yaml(path)

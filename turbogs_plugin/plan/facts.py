@@ -150,8 +150,7 @@ def flat_tile_share(views: PosedImages) -> float:
         return 0.0
     pixels = colors[flat.to(colors.device)][..., :3].float()  # [T, 256, 3], transparent colours on black
     luminance = pixels @ (torch.from_numpy(LUMINANCE).to(colors.device) / 255.0)
-    deviations = luminance.std(dim=1, correction=0)
-    return float((deviations < FLAT_DEVIATION).float().mean())
+    return float((luminance.std(dim=1, correction=0) < FLAT_DEVIATION).float().mean())
 
 
 def _baseline(views: PosedImages, sight: Sight, extent: float) -> float:

@@ -40,8 +40,7 @@ class Sight:
         inside = (depths > 1e-9) & (pixels >= 0).all(dim=-1) & (pixels < sizes).all(dim=-1)
         x, y = torch.where(inside[..., None], pixels, 0.0).long().unbind(dim=-1)
         if views.masks is not None:
-            unmasked = [views.masks.image(view)[y[view], x[view]] for view in range(len(views))]
-            inside &= torch.stack(unmasked)
+            inside &= torch.stack([views.masks.image(view)[y[view], x[view]] for view in range(len(views))])
         flat = torch.from_numpy(views.photos.offsets[:-1])[:, None] + y * sizes[..., 0] + x
         distances = torch.cdist(cameras.centers, cameras.centers, compute_mode="donot_use_mm_for_euclid_dist")
         return cls(depths, inside, torch.where(inside, flat, 0), distances.fill_diagonal_(torch.inf))

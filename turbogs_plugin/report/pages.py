@@ -87,27 +87,16 @@ def _page(run: RunSession, metrics: Metrics, lpips_reason: str, shown: int) -> s
             " those after the affine map of the render's colours that fits each test photo best."
         )
     grey = "; masked pixels of photo and error are grey" if masked else ""
-    result = table(
-        (*columns.values(), "training in s", "wall in s", "Gaussians", "FPS", "peak memory in MiB"),
-        [
-            (
-                *errors(metrics.mean, columns),
-                f"{last.train_seconds:.1f}",
-                number(run.wall.wall_seconds, 1, "not recorded"),
-                last.num_gaussians,
-                f"{metrics.fps:.1f}",
-                _mebibytes(last),
-            )
-        ],
-    )
+    heads = (*columns.values(), "training in s", "wall in s", "Gaussians", "FPS", "peak memory in MiB")
+    seconds = f"{last.train_seconds:.1f}", number(run.wall.wall_seconds, 1, "not recorded")
+    cells = (*errors(metrics.mean, columns), *seconds, last.num_gaussians, f"{metrics.fps:.1f}", _mebibytes(last))
+    result = table(heads, [cells])
     lpips = f"\nLPIPS was not computed: {lpips_reason}.\n" if lpips_reason else ""
-    history = table(
-        ("iteration", "training in s", *ERRORS.values(), "Gaussians", "peak memory in MiB"),
-        [
-            (entry.iteration, f"{entry.train_seconds:.1f}", *errors(entry), entry.num_gaussians, _mebibytes(entry))
-            for entry in run.history
-        ],
-    )
+    rows = [
+        (entry.iteration, f"{entry.train_seconds:.1f}", *errors(entry), entry.num_gaussians, _mebibytes(entry))
+        for entry in run.history
+    ]
+    history = table(("iteration", "training in s", *ERRORS.values(), "Gaussians", "peak memory in MiB"), rows)
     strips = "\n\n".join(
         f"{view.name}: {view.psnr:.2f} dB\n\n![{view.name}](report/test-{view_id:03d}.jpg)"
         for view_id, view in enumerate(metrics.views[:shown])

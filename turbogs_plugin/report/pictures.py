@@ -63,8 +63,7 @@ def strip(photo: Tensor, image: Tensor, mask: Tensor | None = None) -> np.ndarra
     truth, errors = _rounded(photo), error_picture(photo, image)
     if mask is not None:
         truth, errors = (torch.where(mask[:, :, None], part, MASKED) for part in (truth, errors))
-    parts = (truth, white, _rounded(image), white, errors)
-    return torch.cat(parts, dim=1).cpu().numpy()
+    return torch.cat((truth, white, _rounded(image), white, errors), dim=1).cpu().numpy()
 
 
 def error_picture(photo: Tensor, image: Tensor) -> Tensor:

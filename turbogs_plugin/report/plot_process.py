@@ -47,15 +47,10 @@ class PlotProcess:
     """
 
     def __init__(self) -> None:
-        self._process = subprocess.Popen(
-            [sys.executable, "-m", __name__],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-            text=True,
-            encoding="utf-8",
-            start_new_session=True,  # Ctrl-C is for the training, which then tells this process
-        )
+        pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+        # In a session of its own: Ctrl-C is for the training, which then tells this process.
+        command = [sys.executable, "-m", __name__]
+        self._process = subprocess.Popen(command, **pipes, text=True, encoding="utf-8", start_new_session=True)
 
     def begin(self, plots: Sequence[SecondsPlot]) -> None:
         """Have these drawn. Once, as the process ends with it."""

@@ -29,13 +29,8 @@ if TYPE_CHECKING:
 INSTALL = 'pip install "turbogs-plugin[tensorboard]"'
 WIDEST_STRIP = 900
 """Pixels. A strip of every view at every evaluation would take hundreds of megabytes at full size."""
-GROUPS = {
-    "num_gaussians": "counts",
-    "nonfinite_losses": "counts",
-    "skipped_updates": "counts",
-    "train_seconds": "cost",
-    "memory_bytes": "cost",
-}
+GROUPS = dict.fromkeys(("num_gaussians", "nonfinite_losses", "skipped_updates"), "counts")
+GROUPS |= dict.fromkeys(("train_seconds", "memory_bytes"), "cost")
 """Where TensorBoard shows a field of `Evaluation`; the others are errors on test views."""
 
 
@@ -76,8 +71,7 @@ class EventWriter(Listener):
         if self._writer is None:
             self._writer = _writer_class()(str(self.folder), purge_step=self._first)
             if not self._first:
-                settings = loop.trainer.config.to_yaml()
-                self._writer.add_text("configuration", f"```yaml\n{settings}\n```", iteration)
+                self._writer.add_text("configuration", f"```yaml\n{loop.trainer.config.to_yaml()}\n```", iteration)
         for name, value in asdict(evaluation).items():
             if name != "iteration" and not math.isnan(value):
                 self._writer.add_scalar(f"{GROUPS.get(name, 'test')}/{name}", value, iteration)
@@ -98,9 +92,7 @@ class EventWriter(Listener):
         """[H, W, 3] uint8, at most `WIDEST_STRIP` wide: photo, render and error of a test view."""
         trainer, background = loop.trainer, loop.trainer.background.evaluated
         views = replace(self._test, cameras=self._test.cameras.to(trainer.device))
-        image = render_view(
-            trainer.gaussians, views, view, trainer.sh_degree, trainer.config.raster, background
-        )  # [H, W, 3]
+        image = render_view(trainer.gaussians, views, view, trainer.sh_degree, trainer.config.raster, background)
         photo = views.photos.image(view, background).to(trainer.device)
         picture = Image.fromarray(strip(photo, image, views.mask(view)))
         picture.thumbnail((WIDEST_STRIP, WIDEST_STRIP), Image.Resampling.LANCZOS)

@@ -121,8 +121,7 @@ def train_cell(
     trainer, mean_flip = loop.trainer, math.nan
     if flip is not None:  # off the clock
         options = {"flip": flip, "background": trainer.background.evaluated}
-        seen = evaluate(trainer.gaussians, test, trainer.sh_degree, trainer.config.raster, **options)
-        mean_flip = seen.mean.flip
+        mean_flip = evaluate(trainer.gaussians, test, trainer.sh_degree, trainer.config.raster, **options).mean.flip
     return CellResult(
         scene=scene.name,
         variant=variant,

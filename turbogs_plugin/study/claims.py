@@ -90,10 +90,9 @@ class Claims:
             file = os.open(claim.path, os.O_CREAT | os.O_EXCL | os.O_WRONLY)
         except FileExistsError:
             return None
+        process = os.getpid()
         with os.fdopen(file, "w", encoding="utf-8") as opened:
-            json.dump(
-                {"host": socket.gethostname(), "process": os.getpid(), "started": process_started(os.getpid())}, opened
-            )
+            json.dump({"host": socket.gethostname(), "process": process, "started": process_started(process)}, opened)
         return claim
 
     def _alive(self, path: Path) -> bool:

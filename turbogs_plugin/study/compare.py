@@ -12,7 +12,7 @@ from typing import Any
 from turbogs_plugin.config.sections import SceneConfig
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.files import unused_name
-from turbogs_plugin.study.difference import ABSENT, difference, flattened
+from turbogs_plugin.study.difference import ABSENT, compared, difference
 from turbogs_plugin.study.grid import Ablation
 from turbogs_plugin.study.results import CellResult, Study
 from turbogs_plugin.train.folder import RunFolder
@@ -42,7 +42,7 @@ def study_of_runs(paths: Sequence[Path]) -> Study:
         if not history:
             raise InputError(f"'{path}' has no evaluation yet")
         asked = folder.read_asked().to_mapping()
-        shared = _shared(asked, config.train.device)
+        shared = compared(asked, UNSHARED) | {"train.device": config.train.device}  # where it was trained
         name = next((name for name, known in variants.items() if known == shared), None) or _new_name(path, variants)
         variants[name] = shared
         result = CellResult(
@@ -81,16 +81,6 @@ def _scene_names(scenes: Sequence[SceneConfig]) -> list[str]:
                 name += f"-{setting}-{getattr(scene, setting)}"
         names.append(name)
     return names
-
-
-def _shared(asked: dict[str, Any], device: str) -> dict[str, Any]:
-    """What makes two runs seeds of one variant, ``section.key`` -> value: all that is in none of `UNSHARED`.
-
-    Args:
-        device: the one that the run was trained on.
-    """
-    flat = flattened(asked) | {"train.device": device}
-    return {path: value for path, value in flat.items() if not path.startswith(UNSHARED)}
 
 
 def _new_name(path: Path, taken: Container[str]) -> str:

@@ -30,6 +30,11 @@ def flattened(mapping: Mapping[str, Any], place: str = "") -> dict[str, Any]:
     return flat
 
 
+def compared(mapping: Mapping[str, Any], left_out: tuple[str, ...]) -> dict[str, Any]:
+    """`flattened` without the paths that begin with one of these."""
+    return {path: value for path, value in flattened(mapping).items() if not path.startswith(left_out)}
+
+
 def nested(flat: Mapping[str, Any]) -> dict[str, Any]:
     """The inverse of `flattened`, but for the order of keys."""
     mapping: dict[str, Any] = {}

@@ -62,9 +62,8 @@ class Table:
     numeric: bool = True
 
     def markdown(self) -> str:
-        return table(
-            self.header, [[cell.replace("|", "\\|") for cell in row] for row in self.rows]
-        )  # a bar ends a cell
+        rows = [[cell.replace("|", "\\|") for cell in row] for row in self.rows]  # a bar ends a cell
+        return table(self.header, rows)
 
     def html(self, folder: Path) -> str:
         kind = ' class="numeric"' if self.numeric else ""

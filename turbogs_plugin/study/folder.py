@@ -74,11 +74,9 @@ class StudyFolder:
                 results[result.key] = result
             failures |= {failure.key: failure for failure in part.failures}
         order = {name: number for number, name in enumerate(study.ablation.variants)}
-        return replace(
-            study,
-            results=sorted(results.values(), key=lambda result: (result.scene, order[result.variant], result.seed)),
-            failures=[failure for key, failure in failures.items() if key not in results],
-        )
+        found = sorted(results.values(), key=lambda result: (result.scene, order[result.variant], result.seed))
+        broken = [failure for key, failure in failures.items() if key not in results]
+        return replace(study, results=found, failures=broken)
 
 
 def _cell_text(outcome: CellResult | Failure) -> str:

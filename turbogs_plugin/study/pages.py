@@ -16,7 +16,8 @@ from turbogs_plugin.errors import InputError
 from turbogs_plugin.files import write_text_atomically
 from turbogs_plugin.report.provenance import Provenance
 from turbogs_plugin.report.tables import number
-from turbogs_plugin.study.difference import ABSENT, difference, flattened
+from turbogs_plugin.study.compare import UNSHARED
+from turbogs_plugin.study.difference import ABSENT, compared, difference, flattened
 from turbogs_plugin.study.document import Block, Heading, Paragraph, Picture, Table, to_html, to_markdown
 from turbogs_plugin.study.folder import StudyFolder
 from turbogs_plugin.study.grid import variant_config
@@ -28,15 +29,7 @@ from turbogs_plugin.study.summary import MEASURES, SceneSummary, VariantRow, sum
 CLOCKS = {"wall_seconds": "wall in s", "cell_seconds": "load, train, evaluate in s"}
 """Measures of the wall's clock, each with its column, where a cell has it."""
 
-OF_THE_CALL = (
-    "scene.",
-    "report.",
-    "budget.",
-    "train.seed",
-    "train.device",
-    "train.evaluate_at",
-    "train.checkpoint_every",
-)
+OF_THE_CALL = (*UNSHARED, "budget.", "train.device")
 """Settings that belong to a call, or change no result: a page does not go stale by them."""
 
 TIMING_RULES = (
@@ -129,9 +122,8 @@ def changed_since(study: Study) -> list[Paragraph]:
         present = flattened(variant_config(ablation, ablation.baseline, 0, (), None).to_mapping())
     except InputError as error:  # a setting of then, in the ablation's own words
         return [Paragraph(f"Stale: {error}.")]
-    asked = flattened(measured[0].asked)
-    changes = difference(present, {path: value for path, value in asked.items() if not path.startswith(OF_THE_CALL)})
-    changed = sorted(path for path in changes if path != ABSENT and path in present)
+    asked = compared(measured[0].asked, OF_THE_CALL)
+    changed = sorted(path for path in difference(present, asked) if path != ABSENT and path in present)
     if not changed:
         return []
     listed = ", ".join(f"{path} {asked[path]} (now {present[path]})" for path in changed)
@@ -253,13 +245,8 @@ def _settings(study: Study) -> list[Block]:
         if name in tried
     ]
     kept = "as resolved" if all(result.resolved for result in study.results) else "as asked for"
-    return [
-        Heading("Variants"),
-        Paragraph(
-            f"Overrides of the configuration '{ablation.base}'. results.json has every cell's configuration, {kept}."
-        ),
-        Table(("variant", "overrides", "note"), rows, numeric=False),
-    ]
+    text = f"Overrides of the configuration '{ablation.base}'. results.json has every cell's configuration, {kept}."
+    return [Heading("Variants"), Paragraph(text), Table(("variant", "overrides", "note"), rows, numeric=False)]
 
 
 def table_csv(summaries: Sequence[SceneSummary]) -> str:

@@ -90,13 +90,10 @@ def save_plot(path: Path, draw: Callable[[], Figure], digest: str) -> None:
 
 def plot_digest(summary: SceneSummary) -> str:
     """A digest of everything that the plots show, and of how they are drawn."""
-    rows = [
-        (
-            *(row.name, row.on_front),
-            *map(asdict, (row.seconds, row.psnr, row.spread("gaussians"), row.curve("psnr"), row.curve("l1"))),
-        )
-        for row in summary.rows
-    ]
+    rows = []
+    for row in summary.rows:
+        shown = (row.seconds, row.psnr, row.spread("gaussians"), row.curve("psnr"), row.curve("l1"))
+        rows.append((row.name, row.on_front, *map(asdict, shown)))
     text = json.dumps([DRAWING, summary.scene, summary.baseline, rows], default=np.ndarray.tolist)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
@@ -175,17 +172,10 @@ def draw_front(summary: SceneSummary, cost: str = "seconds") -> Figure:
     figure = Figure(figsize=(8.6, 5.2), layout="constrained")
     axes = figure.add_subplot()
     for row, point in zip(rows, points, strict=True):
-        spread = row.spread(cost)
-        axes.errorbar(
-            *point,
-            xerr=[[spread.mean - spread.low], [spread.high - spread.mean]],
-            yerr=[[row.psnr.mean - row.psnr.low], [row.psnr.high - row.psnr.mean]],
-            fmt="*" if point in front else "o",
-            markersize=13 if point in front else 6,
-            color=styles[row.name][0],
-            elinewidth=1.0,
-            alpha=0.9,
-        )
+        errors = [[[of.mean - of.low], [of.high - of.mean]] for of in (row.psnr, row.spread(cost))]
+        marker, size = ("*", 13) if point in front else ("o", 6)
+        style = {"fmt": marker, "markersize": size, "color": styles[row.name][0], "elinewidth": 1.0, "alpha": 0.9}
+        axes.errorbar(*point, *errors, **style)
     steps = np.reshape(sorted(front), (-1, 2)).T  # [2, variants], also of none
     axes.step(*steps, where="post", color="grey", linewidth=1.2, zorder=0, label="Pareto front (stars)")
     axes.set(xlabel=label, ylabel="final test PSNR in dB", title=f"{summary.scene}: {title}")

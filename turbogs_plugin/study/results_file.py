@@ -26,32 +26,19 @@ from turbogs_plugin.train.history import MEASURES, Evaluation
 FORMAT = 2
 """Raised by one whenever an older version of TurboGS would misread a new file."""
 
-DECIMALS = {
-    "train_seconds": 6,
-    "psnr": 5,
-    "worst_psnr": 5,
-    "ssim": 7,
-    "l1": 7,
-    "lpips": 7,
-    "flip": 7,
-    "fps": 3,
-    "wall_seconds": 3,
-    "cell_seconds": 3,
-}
+DECIMALS = {"train_seconds": 6, "psnr": 5, "worst_psnr": 5, **dict.fromkeys(("ssim", "l1", "lpips", "flip"), 7)}
+DECIMALS |= dict.fromkeys(("fps", "wall_seconds", "cell_seconds"), 3)
 DECIMALS |= {f"{of}_{name}": DECIMALS[name] for of in ("whole", "aligned") for name in MEASURES}
 """Digits behind the point that are kept of a measure: for errors those that float32 has."""
 
 SHARED = ("provenance", "resolved", "warmup_iterations", "lpips_reason")
 """Fields of a cell that are written once, as ``common``, and in a cell only where its value is another one."""
 
-Columns = make_dataclass(
-    "Columns",
-    [
-        (entry.name, list[int] if entry.type == "int" else list[float | None], field(default=entry.default))
-        for entry in fields(Evaluation)
-    ],
-    kw_only=True,
-)
+_COLUMN_FIELDS = [
+    (entry.name, list[int] if entry.type == "int" else list[float | None], field(default=entry.default))
+    for entry in fields(Evaluation)
+]
+Columns = make_dataclass("Columns", _COLUMN_FIELDS, kw_only=True)
 """A history as the file has it: field of `Evaluation` -> its values. One that has its default all along is absent."""
 
 
@@ -90,17 +77,9 @@ def study_to_json(study: Study) -> str:
     cells = [_complete(result, provenances) for result in study.results]
     common = {name: Counter(cell[name] for cell in cells).most_common(1)[0][0] for name in SHARED if cells}
     config = common_configuration([cell["config"] for cell in cells])
-    document = Document(
-        format=FORMAT,
-        ablation=study.ablation,
-        targets=list(study.targets),
-        provenances=provenances,
-        captures=captures,
-        common=common,
-        config=config,
-        failures=study.failures,
-        cells=[_reduced(cell, common | {"capture": captures[cell["scene"]]}, config) for cell in cells],
-    )
+    reduced = [_reduced(cell, common | {"capture": captures[cell["scene"]]}, config) for cell in cells]
+    shared = (provenances, captures, common, config)
+    document = Document(FORMAT, study.ablation, list(study.targets), *shared, study.failures, reduced)
     return _text(dataclass_mapping(document), 2) + "\n"
 
 

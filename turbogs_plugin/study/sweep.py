@@ -22,7 +22,7 @@ from turbogs_plugin.report.tensorboard import EventWriter, event_writers
 from turbogs_plugin.scene import Scene, load_scene
 from turbogs_plugin.study.cell import capture_digest, train_cell
 from turbogs_plugin.study.claims import Claims
-from turbogs_plugin.study.difference import ABSENT, difference, flattened
+from turbogs_plugin.study.difference import ABSENT, compared, difference
 from turbogs_plugin.study.folder import StudyFolder
 from turbogs_plugin.study.grid import Ablation, CellKey, variant_config
 from turbogs_plugin.study.progress import SweepProgress
@@ -197,7 +197,7 @@ def _require_same(present: CellResult, config: Config) -> None:
     old = old_spelling(present.asked)
     if old:
         raise InputError(f"the cell '{present.key}' is of an earlier version ({old}): choose a new --out")
-    changes = difference(_settings(present.asked), _settings(config.to_mapping()))
+    changes = difference(compared(present.asked, UNCOMPARED), compared(config.to_mapping(), UNCOMPARED))
     if changes:
         sections = dict.fromkeys(path.partition(".")[0] for path in [*changes.pop(ABSENT, ()), *changes])
         raise InputError(
@@ -216,13 +216,8 @@ def _reusable_cells(here: Provenance, siblings: Sequence[StudyFolder]) -> dict[t
 
 
 def _comparable(mapping: dict[str, Any]) -> str:
-    """`_settings` as a text to compare."""
-    return json.dumps(_settings(mapping), sort_keys=True)
-
-
-def _settings(mapping: dict[str, Any]) -> dict[str, Any]:
-    """``section.key`` -> value, of what decides a result."""
-    return {path: value for path, value in flattened(mapping).items() if path not in UNCOMPARED}
+    """``section.key`` -> value of what decides a result, as a text to compare."""
+    return json.dumps(compared(mapping, UNCOMPARED), sort_keys=True)
 
 
 def _reason(error: Exception) -> str:
