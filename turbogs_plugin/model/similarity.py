@@ -85,14 +85,9 @@ def placed(gaussians: Gaussians, change: Similarity, source: str | Path) -> Gaus
         InputError: no Gaussian is finite.
     """
     rows = change.apply(gaussians).map(lambda value: value.float().contiguous())
-    finite = finite_rows(rows)
-    bad = int((~finite).sum())
-    if bad == len(rows):
-        raise InputError(f"{source}: none of its {bad} Gaussians is finite: export the model again")
-    if bad:
-        warnings.warn(f"{source}: {bad} of {len(rows)} Gaussians are not finite and left out", stacklevel=3)
-        rows = rows.map(lambda value: value[finite])
-    return rows
+    if not finite_rows(rows).any():
+        raise InputError(f"{source}: none of its {len(rows)} Gaussians is finite: export the model again")
+    return _finite(rows, f"{source}: ")
 
 
 def in_capture(gaussians: Gaussians, frame: Frame, target: Path) -> Gaussians:
@@ -106,11 +101,7 @@ def in_capture(gaussians: Gaussians, frame: Frame, target: Path) -> Gaussians:
     Raises:
         InputError: none is left, or the capture lies too far from its origin for float32.
     """
-    rows = gaussians.map(lambda value: value.detach().cpu())
-    finite = finite_rows(rows)
-    if not finite.all():
-        warnings.warn(f"{int((~finite).sum())} of {len(rows)} Gaussians are not finite and left out", stacklevel=3)
-    rows = rows.map(lambda value: value[finite].contiguous())
+    rows = _finite(gaussians.map(lambda value: value.detach().cpu().contiguous()))
     if not len(rows):
         raise InputError(f"there are no Gaussians to write to {target}")
     if np.abs(frame.center).max() * np.finfo(np.float32).eps / 2 > LARGEST_ROUNDING * frame.scale:
@@ -121,6 +112,15 @@ def in_capture(gaussians: Gaussians, frame: Frame, target: Path) -> Gaussians:
     rows.means = torch.from_numpy(frame.restore_points(rows.means.numpy())).float()
     rows.scales = rows.scales + math.log(frame.scale)
     return rows
+
+
+def _finite(gaussians: Gaussians, owner: str = "") -> Gaussians:
+    """The Gaussians of which every number is finite, with a warning that counts the others."""
+    finite = finite_rows(gaussians)
+    if finite.all():
+        return gaussians
+    warnings.warn(f"{owner}{int((~finite).sum())} of {len(finite)} Gaussians are not finite and left out", stacklevel=4)
+    return gaussians.map(lambda value: value[finite])
 
 
 def finite_rows(gaussians: Gaussians) -> Tensor:

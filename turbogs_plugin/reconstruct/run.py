@@ -99,8 +99,7 @@ def reconstruct(photos: Path, out: Path) -> Solution:
     workspace = Workspace(out)
     missing = [parent for parent in (out, *out.parents) if not parent.exists()]
     new = workspace.begin(found)
-    solution = workspace.read_solution()
-    if solution is not None:
+    if (solution := workspace.read_solution()) is not None:
         return solution
     try:
         return _reconstruct(found, workspace, unread(photos))
@@ -261,14 +260,12 @@ def _notes(
             f"{_photos(solve.ghosts)} left out, as more matches contradict their place than confirm it (repeated "
             f"structure): {_listed(solve.ghosts)}"
         )
-    unplaced = [name for name in left_out if name not in set(solve.ghosts)]
-    if unplaced:
+    if unplaced := [name for name in left_out if name not in set(solve.ghosts)]:
         others = f", {len(solve.sizes) - 1} smaller models besides" if len(solve.sizes) > 1 else ""
         notes.append(
             f"{_photos(unplaced)} did not register{others}: {_listed(unplaced)}; add photos between them and the others"
         )
-    contradicting = int(agreement.contradicts.sum())
-    if contradicting:
+    if contradicting := int(agreement.contradicts.sum()):
         matches = agreement.agreeing.sum() + agreement.contradicting.sum()
         notes.append(
             f"{contradicting:,} of {len(agreement.pairs):,} pairs contradict the cameras, with "
