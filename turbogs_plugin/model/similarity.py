@@ -131,15 +131,13 @@ def finite_rows(gaussians: Gaussians) -> Tensor:
 def _product(left: Tensor, right: Tensor) -> Tensor:
     """[N, 4] Hamilton products of one quaternion [4] with others [N, 4], wxyz."""
     w, x, y, z = left.unbind()
-    matrix = torch.stack(
-        [
-            torch.stack([w, -x, -y, -z]),
-            torch.stack([x, w, -z, y]),
-            torch.stack([y, z, w, -x]),
-            torch.stack([z, -y, x, w]),
-        ]
-    )
-    return right @ matrix.T
+    matrix = torch.stack([
+        w, -x, -y, -z,
+        x, w, -z, y,
+        y, z, w, -x,
+        z, -y, x, w,
+    ])  # fmt: skip
+    return right @ matrix.view(4, 4).T
 
 
 def _turned_harmonics(shN: Tensor, rotation: np.ndarray) -> Tensor:

@@ -133,8 +133,11 @@ def _reconstruct(photos: Sequence[PhotoFile], workspace: Workspace, others: str)
             solver.with_default_cameras(workspace.database(LONG_SIDES[0]), database)
         else:
             solver.extract_features(database, workspace.images, photos, long_side, default_cameras=attempt > 0)
-            if not attempt:
-                _require_features(database, photos)
+            if not attempt and not solver.read_names(database):
+                raise InputError(
+                    f"none of the {len(photos)} photos shows anything that could be found again in another one: they "
+                    "are blank, blurred or too small; take sharp photos of a scene with texture"
+                )
             solver.match_features(database, workspace.scratch, names, matching)
         solve, moved = _solve(database, workspace)
         if solve is not None and (best is None or solve.rank > best.rank):
@@ -200,14 +203,6 @@ def _leave_out(model: pycolmap.Reconstruction, names: Sequence[str]) -> None:
     wanted = set(names)
     for frame in {image.frame_id for image in model.images.values() if image.name in wanted}:
         model.deregister_frame(frame)
-
-
-def _require_features(database: Path, photos: Sequence[PhotoFile]) -> None:
-    if not solver.read_names(database):
-        raise InputError(
-            f"none of the {len(photos)} photos shows anything that could be found again in another one: they are "
-            "blank, blurred or too small; take sharp photos of a scene with texture"
-        )
 
 
 def _require_solved(solve: Solve | None, photos: int, verified: int, matching: Matching) -> None:
