@@ -55,8 +55,7 @@ def read_gsplat(state: Mapping[str, Any], path: str | Path) -> Gaussians:
             f"{path} has the colours of gsplat's appearance network (app_opt), not spherical harmonics: export it "
             "there as a .ply, or train it without app_opt"
         )
-    missing = [name for name in PARAMETER_NAMES if not isinstance(splats.get(name), Tensor)]
-    if missing:
+    if missing := [name for name in PARAMETER_NAMES if not isinstance(splats.get(name), Tensor)]:
         present = ", ".join(sorted(map(str, splats))[:8]) or "nothing"
         raise InputError(f"{path}: its splats lack {', '.join(missing)} (there is {present}): give a 3DGS model")
     count = len(splats["means"]) if splats["means"].dim() else 0

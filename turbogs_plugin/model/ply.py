@@ -106,8 +106,7 @@ def read_ply(path: str | Path) -> Gaussians:
         )
     groups = _property_groups(bands[rest])
     del groups["normals"]  # not part of a model
-    missing = [name for group in groups.values() for name in group if name not in names]
-    if missing:
+    if missing := [name for group in groups.values() for name in group if name not in names]:
         raise InputError(
             f"{path} is not a 3DGS model: it lacks the properties {', '.join(missing[:4])}, as a mesh or a "
             "cloud of points does: give the .ply that a 3DGS trainer exports"

@@ -85,14 +85,9 @@ def placed(gaussians: Gaussians, change: Similarity, source: str | Path) -> Gaus
         InputError: no Gaussian is finite.
     """
     rows = change.apply(gaussians).map(lambda value: value.float().contiguous())
-    finite = finite_rows(rows)
-    bad = int((~finite).sum())
-    if bad == len(rows):
-        raise InputError(f"{source}: none of its {bad} Gaussians is finite: export the model again")
-    if bad:
-        warnings.warn(f"{source}: {bad} of {len(rows)} Gaussians are not finite and left out", stacklevel=3)
-        rows = rows.map(lambda value: value[finite])
-    return rows
+    if not finite_rows(rows).any():
+        raise InputError(f"{source}: none of its {len(rows)} Gaussians is finite: export the model again")
+    return _finite(rows, f"{source}: ")
 
 
 def in_capture(gaussians: Gaussians, frame: Frame, target: Path) -> Gaussians:
@@ -106,11 +101,7 @@ def in_capture(gaussians: Gaussians, frame: Frame, target: Path) -> Gaussians:
     Raises:
         InputError: none is left, or the capture lies too far from its origin for float32.
     """
-    rows = gaussians.map(lambda value: value.detach().cpu())
-    finite = finite_rows(rows)
-    if not finite.all():
-        warnings.warn(f"{int((~finite).sum())} of {len(rows)} Gaussians are not finite and left out", stacklevel=3)
-    rows = rows.map(lambda value: value[finite].contiguous())
+    rows = _finite(gaussians.map(lambda value: value.detach().cpu().contiguous()))
     if not len(rows):
         raise InputError(f"there are no Gaussians to write to {target}")
     if np.abs(frame.center).max() * np.finfo(np.float32).eps / 2 > LARGEST_ROUNDING * frame.scale:
@@ -123,6 +114,15 @@ def in_capture(gaussians: Gaussians, frame: Frame, target: Path) -> Gaussians:
     return rows
 
 
+def _finite(gaussians: Gaussians, owner: str = "") -> Gaussians:
+    """The Gaussians of which every number is finite, with a warning that counts the others."""
+    finite = finite_rows(gaussians)
+    if finite.all():
+        return gaussians
+    warnings.warn(f"{owner}{int((~finite).sum())} of {len(finite)} Gaussians are not finite and left out", stacklevel=4)
+    return gaussians.map(lambda value: value[finite])
+
+
 def finite_rows(gaussians: Gaussians) -> Tensor:
     """[N] bool: every number of the Gaussian is finite."""
     return torch.stack([value[:, None].isfinite().flatten(1).all(dim=1) for _, value in gaussians.items()]).all(dim=0)
@@ -131,15 +131,13 @@ def finite_rows(gaussians: Gaussians) -> Tensor:
 def _product(left: Tensor, right: Tensor) -> Tensor:
     """[N, 4] Hamilton products of one quaternion [4] with others [N, 4], wxyz."""
     w, x, y, z = left.unbind()
-    matrix = torch.stack(
-        [
-            torch.stack([w, -x, -y, -z]),
-            torch.stack([x, w, -z, y]),
-            torch.stack([y, z, w, -x]),
-            torch.stack([z, -y, x, w]),
-        ]
-    )
-    return right @ matrix.T
+    matrix = torch.stack([
+        w, -x, -y, -z,
+        x, w, -z, y,
+        y, z, w, -x,
+        z, -y, x, w,
+    ])  # fmt: skip
+    return right @ matrix.view(4, 4).T
 
 
 def _turned_harmonics(shN: Tensor, rotation: np.ndarray) -> Tensor:

@@ -99,8 +99,7 @@ def reconstruct(photos: Path, out: Path) -> Solution:
     workspace = Workspace(out)
     missing = [parent for parent in (out, *out.parents) if not parent.exists()]
     new = workspace.begin(found)
-    solution = workspace.read_solution()
-    if solution is not None:
+    if (solution := workspace.read_solution()) is not None:
         return solution
     try:
         return _reconstruct(found, workspace, unread(photos))
@@ -134,8 +133,11 @@ def _reconstruct(photos: Sequence[PhotoFile], workspace: Workspace, others: str)
             solver.with_default_cameras(workspace.database(LONG_SIDES[0]), database)
         else:
             solver.extract_features(database, workspace.images, photos, long_side, default_cameras=attempt > 0)
-            if not attempt:
-                _require_features(database, photos)
+            if not attempt and not solver.read_names(database):
+                raise InputError(
+                    f"none of the {len(photos)} photos shows anything that could be found again in another one: they "
+                    "are blank, blurred or too small; take sharp photos of a scene with texture"
+                )
             solver.match_features(database, workspace.scratch, names, matching)
         solve, moved = _solve(database, workspace)
         if solve is not None and (best is None or solve.rank > best.rank):
@@ -203,14 +205,6 @@ def _leave_out(model: pycolmap.Reconstruction, names: Sequence[str]) -> None:
         model.deregister_frame(frame)
 
 
-def _require_features(database: Path, photos: Sequence[PhotoFile]) -> None:
-    if not solver.read_names(database):
-        raise InputError(
-            f"none of the {len(photos)} photos shows anything that could be found again in another one: they are "
-            "blank, blurred or too small; take sharp photos of a scene with texture"
-        )
-
-
 def _require_solved(solve: Solve | None, photos: int, verified: int, matching: Matching) -> None:
     """Raise `InputError`, with the numbers and the remedy, unless the solve has enough of the photos."""
     remedy = "take photos that overlap by two thirds with their neighbours, of one scene, from different places"
@@ -261,14 +255,12 @@ def _notes(
             f"{_photos(solve.ghosts)} left out, as more matches contradict their place than confirm it (repeated "
             f"structure): {_listed(solve.ghosts)}"
         )
-    unplaced = [name for name in left_out if name not in set(solve.ghosts)]
-    if unplaced:
+    if unplaced := [name for name in left_out if name not in set(solve.ghosts)]:
         others = f", {len(solve.sizes) - 1} smaller models besides" if len(solve.sizes) > 1 else ""
         notes.append(
             f"{_photos(unplaced)} did not register{others}: {_listed(unplaced)}; add photos between them and the others"
         )
-    contradicting = int(agreement.contradicts.sum())
-    if contradicting:
+    if contradicting := int(agreement.contradicts.sum()):
         matches = agreement.agreeing.sum() + agreement.contradicting.sum()
         notes.append(
             f"{contradicting:,} of {len(agreement.pairs):,} pairs contradict the cameras, with "

@@ -92,7 +92,7 @@ def match_features(database: Path, scratch: Path, names: Sequence[str], matching
     def step(token: pycolmap.CancellationToken) -> None:
         if pairs:
             listed = scratch / "pairs.txt"
-            _write_pairs(listed, pairs)
+            listed.write_text("".join(f"{first} {second}\n" for first, second in pairs), encoding="utf-8")
             pairing = pycolmap.ImportedPairingOptions()
             pairing.match_list_path, pairing.block_size = listed, BLOCK
             pycolmap.match_image_pairs(database, options, pairing, geometry, cancellation_token=token)
@@ -251,10 +251,6 @@ def _rays(camera: pycolmap.Camera, keypoints: np.ndarray) -> np.ndarray:
     """[N, 3] of [N, 2] pixels; NaN where the camera has none."""
     plane = np.array(camera.cam_from_img(keypoints.astype(np.float64))).reshape(-1, 2)
     return np.concatenate([plane, np.ones((len(plane), 1))], axis=1)
-
-
-def _write_pairs(path: Path, pairs: Sequence[tuple[str, str]]) -> None:
-    path.write_text("".join(f"{first} {second}\n" for first, second in pairs), encoding="utf-8")
 
 
 def _build_vocabulary(database: Path, path: Path) -> Path:

@@ -45,8 +45,7 @@ def read_blender(scene: Path) -> Capture:
     train = _read_views(scene, scene / TRAIN_FILE)
     test_file = next((scene / name for name in TEST_FILES if (scene / name).is_file()), None)
     test = {} if test_file is None else _read_views(scene, test_file)
-    in_both = sorted(train.keys() & test.keys())
-    if in_both:
+    if in_both := sorted(train.keys() & test.keys()):
         raise InputError(
             f"{scene}: {len(in_both)} photos stand both in {TRAIN_FILE} and in {test_file.name} ({in_both[0]}): take "
             f"them out of one; without {' and '.join(TEST_FILES)} every 8th photo is for testing"
@@ -77,8 +76,7 @@ def _read_views(scene: Path, source: Path) -> dict[str, View]:
         if name in frame_of:
             raise InputError(f"{source} has two frames for '{name}': take one of them out")
         frame_of[name] = {**shared, **frame}
-    missing = [name for name in frame_of if not (scene / name).is_file()]
-    if missing:
+    if missing := [name for name in frame_of if not (scene / name).is_file()]:
         raise InputError(
             f"{len(missing)} of {len(frame_of)} photos of {source} are missing ({named(missing)}): bring them back, or "
             "take their frames out of the file"
@@ -89,8 +87,7 @@ def _read_views(scene: Path, source: Path) -> dict[str, View]:
 def _read_view(values: dict[str, Any], photo: Path, source: Path) -> View:
     """The view of one frame, whose own values go before those that the file has for all."""
     number = partial(number_of, values, source)
-    bent = [key for key in DISTORTION if number(key, 0.0)]
-    if bent:
+    if bent := [key for key in DISTORTION if number(key, 0.0)]:
         raise InputError(
             f"{source}: {', '.join(bent)} of {photo.name} say that its lens distorts, which Blender's cameras do not: "
             "name the file transforms.json"

@@ -32,13 +32,13 @@ class Capture:
         sizes: [V, 2] int64 (width, height) of the full-size photos, undistorted where they have a lens.
         points: [M, 3] float64.
         point_colors: [M, 3] uint8; None: they are taken from the photos (`colors_in_photos`).
-        lenses: one a view, None where the photo is that of a pinhole camera; or empty, where all are.
+        lenses: one a view, None where the photo is that of a pinhole camera; given as empty where all are.
         notes: what the capture was taken for, and what was done with it: lines for the user.
         test: [V] bool, the test views of the capture's own split; None: views are split by their order.
         reduction: the photos are already smaller than the capture's full size by this factor.
         alpha: what the alpha of a transparent photo is: the object's ``opacity``, so that the background shows through
             and training makes the model as transparent; or a ``mask``, whose zero pixels are ignored.
-        mask_files: files of masks that the capture names, one a view or None; or empty.
+        mask_files: files of masks that the capture names, one a view or None; given as empty where it names none.
     """
 
     names: tuple[str, ...]
@@ -55,17 +55,15 @@ class Capture:
     alpha: Literal["opacity", "mask"] = "opacity"
     mask_files: tuple[Path | None, ...] = ()
 
-    def lens(self, view: int) -> Lens | None:
-        return self.lenses[view] if self.lenses else None
+    def __post_init__(self) -> None:
+        self.lenses = self.lenses or (None,) * len(self.names)
+        self.mask_files = self.mask_files or (None,) * len(self.names)
 
     @property
     def photo_sizes(self) -> np.ndarray:
         """[V, 2] int64 (width, height) that the full-size photos have on disk, if they are of their cameras' size."""
-        sizes = self.sizes.copy()
-        for view, lens in enumerate(self.lenses):
-            if lens is not None:
-                sizes[view] = lens.photo_size
-        return sizes
+        both = zip(self.lenses, self.sizes, strict=True)
+        return np.array([size if lens is None else lens.photo_size for lens, size in both])
 
     def checked(self, source: Path) -> Capture:
         """Itself. Raises `InputError` unless every number is finite and in range. `source` is named in messages."""

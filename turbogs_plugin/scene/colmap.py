@@ -77,8 +77,7 @@ def incomplete_model(scene: Path) -> str:
     """What a reconstruction in `MODEL_FOLDERS` lacks, and where; empty where there is none that lacks something."""
     for place in (scene / name for name in MODEL_FOLDERS):
         for folder in (place, *sorted(place.glob("[0-9]"))):
-            there = {path.stem for path in folder.glob("*") if path.suffix in (".bin", ".txt")} & set(FILES)
-            if there:
+            if there := {path.stem for path in folder.glob("*") if path.suffix in (".bin", ".txt")} & set(FILES):
                 return f"{folder} has no {' and no '.join(name for name in FILES if name not in there)} (.bin or .txt)"
     return ""
 

@@ -181,7 +181,7 @@ def load_scene(
     def select(views: np.ndarray, colors: Tensor) -> PosedImages:
         cameras = Cameras(viewmats[views], torch.from_numpy(intrinsics[views]).float(), sizes[views])
         names = tuple(capture.names[view] for view in views)
-        lenses = [capture.lens(view) for view in views]
+        lenses = [capture.lenses[view] for view in views]
         photos = load_photos([paths[view] for view in views], file_sizes[views], sizes[views], lenses, colors, loaded)
         return PosedImages(cameras, names, photos, _pixel_masks([masks[view] for view in views], sizes[views]))
 
@@ -220,8 +220,7 @@ def _pixel_masks(masks: list[ViewMask | None], sizes: np.ndarray) -> PixelMasks 
 
 def _masked_note(names: tuple[str, ...], masks: list[ViewMask | None], sizes: np.ndarray, seen: np.ndarray) -> str:
     """How much is masked, and which views are left out for it, in one line; empty where nothing is masked."""
-    cut = [view for view, mask in enumerate(masks) if mask is not None]
-    if not cut:
+    if not (cut := [view for view, mask in enumerate(masks) if mask is not None]):
         return ""
     share = 1.0 - sum(masks[view].pixels for view in cut) / int(sizes[cut].prod(axis=1).sum())
     gone = [name for name, kept in zip(names, seen, strict=True) if not kept]
@@ -317,8 +316,7 @@ def _in_other_letters(path: Path) -> str:
 
 def _undistorted_sizes(capture: Capture, sizes: np.ndarray) -> np.ndarray:
     """[V, 2] int64: the sizes that photos of these `sizes` [V, 2] have once they are undistorted."""
-    lenses = [capture.lens(view) for view in range(len(sizes))]
-    pairs = zip(lenses, sizes.tolist(), strict=True)
+    pairs = zip(capture.lenses, sizes.tolist(), strict=True)
     return np.array([size if lens is None else lens.size_of(size) for lens, size in pairs], dtype=np.int64)
 
 

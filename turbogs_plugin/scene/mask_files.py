@@ -37,10 +37,7 @@ def find_masks(scene: Path, capture: Capture, photos: Sequence[Path]) -> tuple[l
     names = [f"{FOLDER}{reduced[0]}", FOLDER] if reduced else [FOLDER]
     parents = dict.fromkeys((scene, capture.photo_folder.parent, capture.photo_folder))
     folders = [parent / name for name in names for parent in parents if (parent / name).is_dir()]
-    found = [
-        capture.mask_files[view] if capture.mask_files and capture.mask_files[view] else _in_folders(folders, name)
-        for view, name in enumerate(capture.names)
-    ]
+    found = [file or _in_folders(folders, name) for file, name in zip(capture.mask_files, capture.names, strict=True)]
     count, views = sum(file is not None for file in found), len(found)
     if count == 0:
         unused = (f"{folder} is not used: it has no NAME.png or NAME.EXTENSION.png of a photo" for folder in folders)
@@ -92,7 +89,7 @@ def load_masks(
         if all(part.all() for part in parts):
             return None
         keep = np.logical_and.reduce(parts)
-        return ViewMask.of(_placed(keep, capture.lens(view), tuple(targets[view].tolist())))
+        return ViewMask.of(_placed(keep, capture.lenses[view], tuple(targets[view].tolist())))
 
     with decoding_threads(DECODING_BYTES * int(full_sizes.prod(axis=1).max(initial=1))) as pool:
         return list(pool.map(load, range(len(photos))))

@@ -68,8 +68,7 @@ def read_split(
     test = lists[test_key] if test_key else frozenset(named) - train
     if train is None:
         train = frozenset(named) - lists.get(TEST, frozenset()) - lists.get(VALIDATION, frozenset())
-    both = sorted(train & test)
-    if both:
+    if both := sorted(train & test):
         raise InputError(
             f"{source}: {len(both)} photos are in {TRAIN} and in {test_key} ({both[0]}): take them out of one of them"
         )
@@ -85,8 +84,7 @@ def _names(
     if not isinstance(listed, list) or not all(isinstance(name, str) for name in listed):
         raise InputError(f"{source}: {key} is no list of file names: write one, or take it out")
     names = {name_of(name): name for name in listed}
-    strange = [text for name, text in names.items() if name not in named]
-    if strange:
+    if strange := [text for name, text in names.items() if name not in named]:
         more = f" and {len(strange) - 1} more" if len(strange) > 1 else ""
         raise InputError(
             f"{source}: {key} names '{strange[0]}'{more}, which no frame has: write it as in its frame's file_path, or "

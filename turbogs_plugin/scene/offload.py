@@ -163,8 +163,7 @@ class ViewWindow:
 
     def _write_back(self, view_ids: Sequence[int]) -> None:
         """Let what has changed of these views, none of them in use, travel out."""
-        changed = [view for view in view_ids if view in self._changed]
-        if not changed:
+        if not (changed := [view for view in view_ids if view in self._changed]):
             return
         self._outward.wait([event for view in changed for event in self._released[self._slot_of[view]]])
         for view in changed:

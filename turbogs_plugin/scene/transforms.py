@@ -207,8 +207,7 @@ def _camera(
     fisheye = model in FISHEYE_MODELS
     radial = tuple(number(f"k{power}", 0.0) for power in (1, 2, 3, 4))
     tangential = (number("p1", 0.0), number("p2", 0.0))
-    unknown = [key for key in ("k5", "k6", *(("p1", "p2") if fisheye else ())) if number(key, 0.0)]
-    if unknown:
+    if unknown := [key for key in ("k5", "k6", *(("p1", "p2") if fisheye else ())) if number(key, 0.0)]:
         raise InputError(
             f"{source}: the {model} camera of {photo.name} has {' and '.join(unknown)}, which the model does not have: "
             "use the capture's COLMAP reconstruction"

@@ -224,8 +224,7 @@ def _no_lens(model: str, owner: str) -> InputError:
 
 def undistortion_note(lenses: Sequence[Lens | None]) -> str:
     """What was done to the photos of these lenses, one each, in one line; empty where nothing was."""
-    bent = [lens for lens in lenses if lens is not None]
-    if not bent:
+    if not (bent := [lens for lens in lenses if lens is not None]):
         return ""
     different = {id(lens): lens for lens in bent}
     first = bent[0]

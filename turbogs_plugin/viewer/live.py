@@ -151,12 +151,10 @@ class LiveViewer(Listener):
 def described(subject: Subject, page: Page) -> list[str]:
     """What the page shows, in lines: view, samples, what density control did; or why it shows nothing."""
     picture, view = page.wish()
-    eyes = [screen.eye for screen in page.screens() if screen.eye is not None]
-    if not eyes:
+    if not (eyes := [screen.eye for screen in page.screens() if screen.eye is not None]):
         return []
     request = Request(picture, eyes[0], view)
-    reason = missing(subject, request)
-    if reason:
+    if reason := missing(subject, request):
         return [f"*{reason}*"]
     lines = [f"*{screen.failed}*" for screen in page.screens() if screen.failed]
     if picture.of_view:

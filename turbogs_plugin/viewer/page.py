@@ -12,6 +12,7 @@ import io
 import math
 import socket
 import time
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from types import ModuleType
 from typing import Any
@@ -212,15 +213,12 @@ class Page:
         self._slider.on_update(lambda event: self.choose_view(self._slider.value))
         self._there.on_click(lambda event: self.go_to(self.view))
         self._cameras.on_update(lambda event: self._refresh_visibility())
-        self._pause.on_click(lambda event: self._toggle())
-        self._step.on_click(lambda event: self._one_step())
+        controls = self.controls
+        self._pause.on_click(lambda event: self._control(controls.resume if controls.paused else controls.pause))
+        self._step.on_click(lambda event: self._control(controls.step))
 
-    def _toggle(self) -> None:
-        (self.controls.resume if self.controls.paused else self.controls.pause)()
-        self.refresh_controls()
-
-    def _one_step(self) -> None:
-        self.controls.step()
+    def _control(self, change: Callable[[], None]) -> None:
+        change()
         self.refresh_controls()
 
     def _refresh_visibility(self) -> None:

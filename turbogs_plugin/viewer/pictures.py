@@ -93,7 +93,7 @@ def missing(subject: Subject, request: Request) -> str:
     if picture in (Picture.ERRORS, Picture.AGES):
         if subject.maps is None or subject.step is None:
             return "Only a training keeps error maps."
-        if subject.capture.training_id(shown_view(subject, request)) is None:
+        if shown_view(subject, request) >= len(subject.capture.train):
             return "This is a test view: error maps are kept of training views alone."
     if picture is Picture.SAMPLES and subject.samples is None:
         return "No samples yet: they are drawn by a running training."

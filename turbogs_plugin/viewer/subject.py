@@ -59,10 +59,6 @@ class CaptureViews:
         count = len(self.train)
         return (self.train, number) if number < count else (self.test, number - count)
 
-    def training_id(self, number: int) -> int | None:
-        """Its number among the training views, which error maps go by; None for a test view."""
-        return number if number < len(self.train) else None
-
     def name(self, number: int) -> str:
         views, view_id = self.find(number)
         kind = "training" if views is self.train else "test"
