@@ -80,7 +80,9 @@ class DenseAdam:
         options = {"beta1": self.beta1, "beta2": self.beta2, "eps": self.eps}
         options |= {"weight_decay": 0.0, "amsgrad": False, "maximize": False}
         for count, (name, parameter) in zip(self.counts.unbind(), gaussians.items(), strict=True):
-            gradient = _of_finite(gradients, name, finite)
+            gradient = gradients.summed(name)  # in the parameter's own shape
+            rows = finite.reshape(-1, *[1] * (gradient.dim() - 1))
+            gradient = clipped(torch.where(rows, gradient, 0.0)).contiguous()
             if name == "opacities" and self.opacity_reg > 0:
                 opacity = torch.sigmoid(parameter)
                 gradient += self.opacity_reg / max(1, parameter.numel()) * opacity * (1 - opacity)
@@ -109,10 +111,3 @@ class DenseAdam:
         check_state(state, present)
         for name, value in present.items():
             value.copy_(state[name])
-
-
-def _of_finite(gradients: GaussianGradients, name: str, finite: Tensor) -> Tensor:
-    """The gradient of one parameter in its own shape, contiguous; zero in rows that are not `finite` [N]."""
-    gradient = gradients.summed(name)
-    rows = finite.reshape(-1, *[1] * (gradient.dim() - 1))
-    return clipped(torch.where(rows, gradient, 0.0)).contiguous()

@@ -169,7 +169,7 @@ def lost_iterations(capture: Path, ranks: ProcessRanks) -> dict:
     trainer = trainer_of(capture, *views, ranks=ranks)
     trainer.engine = LosingEngine(lose=ranks.rank == ranks.count - 1)
     trainer.initialise_maps()
-    loop = TrainingLoop(trainer, ranks=ranks)
+    loop = TrainingLoop(trainer)
     loop.advance(2)  # the loss is known at this mark alone
     trainer.compare_replicas()
     loop.advance(8)

@@ -9,6 +9,7 @@ from helpers.simulated_time import SimulatedTime
 
 import turbogs_plugin.train
 from turbogs_plugin.config.configuration import TrainConfig
+from turbogs_plugin.distributed.ranks import ONE
 from turbogs_plugin.train.loop import Listener, TrainingLoop
 from turbogs_plugin.train.pace import IterationPace
 
@@ -17,6 +18,7 @@ class CountingTrainer:
     """Iterations that do nothing. `lost`: numbers of those that are found lost as soon as the GPU is waited for."""
 
     device = torch.device("cpu")
+    ranks = ONE
 
     def __init__(self, iterations: int, lost: tuple[int, ...] = (), **settings) -> None:
         train = TrainConfig(iterations=iterations, refine_until=iterations, **settings)

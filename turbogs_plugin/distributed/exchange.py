@@ -108,12 +108,9 @@ class Exchange:
         """
 
 
-ALONE = Exchange()
-
-
 def exchange_of(ranks: Ranks) -> Exchange:
     """The exchange of these processes."""
-    return RankExchange(ranks) if isinstance(ranks, ProcessRanks) else ALONE
+    return RankExchange(ranks) if isinstance(ranks, ProcessRanks) else Exchange()
 
 
 class RankExchange(Exchange):
@@ -124,8 +121,8 @@ class RankExchange(Exchange):
             bytes for the records and none for parameters; optimizers without a rule always work like this.
     """
 
-    def __init__(self, ranks: ProcessRanks, by_rows: bool = True) -> None:
-        self.ranks, self.by_rows = ranks, by_rows
+    def __init__(self, ranks: ProcessRanks) -> None:
+        self.ranks, self.by_rows = ranks, True
         self._passes = 0
         self._flags: deque[_Flags] = deque()
         self._incomplete = False

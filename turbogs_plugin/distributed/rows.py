@@ -7,7 +7,7 @@ Gaussians to the next, and an iteration of a small model is bound by the host.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -86,7 +86,7 @@ class OwnedRows:
         self.rows = rows_of(len(gaussians), ranks.count)
         own = self.rows[ranks.rank]
         self.gaussians = gaussians.map(lambda value: value[own])
-        states = ((each.name, getattr(moments, each.name)) for each in fields(moments))
+        states = vars(moments).items()
         self.moments = replace(moments, **{name: value[own] if value.dim() else value for name, value in states})
         self.stats = None if stats is None else stats.map(lambda value: value[own])
         self.parameters = RowGather(ranks, [value for _, value in gaussians.items()], self.rows)

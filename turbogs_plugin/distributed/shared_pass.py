@@ -28,9 +28,6 @@ class Batch:
     options: RenderOptions
     shares: list[Share]
 
-    def screen_gradients(self, gaussians: Gaussians, plain: ScreenRecords) -> ScreenGradients:
-        return self.engine.screen_gradients(gaussians, self.cameras, self.samples, self.options, plain)
-
 
 @dataclass
 class SharedRendered:
@@ -81,8 +78,9 @@ class SharedScreen:
             rows: those that each process wants.
             own: the Gaussians of this process's rows.
         """
-        ranks, device, shares = self._batch.ranks, own.device, self._batch.shares
-        mine, count = rows[ranks.rank], len(self._batch.samples.view_ids)
+        batch, device = self._batch, own.device
+        ranks, shares = batch.ranks, batch.shares
+        mine, count = rows[ranks.rank], len(batch.samples.view_ids)
         records = torch.empty(count, mine.stop - mine.start, ScreenRecord.SIZE, device=device)
         radii = torch.empty(count, mine.stop - mine.start, 2, dtype=torch.int32, device=device)
         sent: list[tuple[int, Tensor]] = []
@@ -108,4 +106,5 @@ class SharedScreen:
         ranks.send_and_receive(sent, received)
         for view, later in continued:
             records[view] += later
-        return self._batch.screen_gradients(own, ScreenRecords(records, radii, self._with_statistics))
+        whole = ScreenRecords(records, radii, self._with_statistics)
+        return batch.engine.screen_gradients(own, batch.cameras, batch.samples, batch.options, whole)

@@ -123,7 +123,9 @@ class SharedOptimizer:
         moments = self._pack(gaussians)
         self.optimizer.moments = moments
         self.optimizer.step(gaussians, _one_row(gradients, self._shares(gaussians, info)), Step(0, 1, 1))
-        self._unpack(moments)
+        for place, moment in self._moments(moments):
+            moment.copy_(place.reshape(moment.shape))
+        members["means"].checked_state()[COUNT] += 1
 
     def _take_options(self) -> None:
         """Learning rates, betas and eps of the members' groups.
@@ -154,11 +156,6 @@ class SharedOptimizer:
             place.copy_(moment.reshape(place.shape))
         packed.steps.fill_(int(self.members["means"].checked_state()[COUNT]))
         return packed
-
-    def _unpack(self, packed: GaussianMoments) -> None:
-        for place, moment in self._moments(packed):
-            moment.copy_(place.reshape(moment.shape))
-        self.members["means"].checked_state()[COUNT] += 1
 
     def _moments(self, packed: GaussianMoments) -> Iterator[tuple[Tensor, Tensor]]:
         """Each moment of each parameter: its place in the packed form, and the member's own tensor."""

@@ -18,28 +18,13 @@ from turbogs_plugin.config.scaling import with_iterations
 from turbogs_plugin.device import free_device_memory
 from turbogs_plugin.distributed.ranks import ONE, Ranks
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.plan.caps import (
-    FEWEST_GAUSSIANS,
-    cap_of,
-    expected_gaussians,
-    growth_cap,
-    keeps_cap,
-    lowered_cap,
-    without_growth,
-)
+from turbogs_plugin.plan import caps, pixels
 from turbogs_plugin.plan.memory import MemoryDemand
-from turbogs_plugin.plan.pixels import (
-    RAISES,
-    images_per_iteration,
-    pixel_budget_range,
-    pixels_for_time,
-    with_pixel_budget,
-)
 from turbogs_plugin.plan.time import IterationCost, fit_to_time
 from turbogs_plugin.scene import Scene
 from turbogs_plugin.train.clock import TrainingClock
 from turbogs_plugin.train.loop import Listener, TrainingLoop
-from turbogs_plugin.train.start import require_gpu_memory
+from turbogs_plugin.train.start import memory_demand, require_gpu_memory
 from turbogs_plugin.train.trainer import Trainer
 
 CALIBRATION_SHARE = 0.04
@@ -90,18 +75,18 @@ def within_budget(
     limit, seconds = config.budget.memory_bytes(), config.budget.seconds()
     if limit is not None:
         hold_to(limit, device)
-        config = lowered_cap(config, _memory_demand(config, scene).gaussians(limit))
+        config = caps.lowered_cap(config, _memory_demand(config, scene).gaussians(limit))
     if seconds is None:
         return config, None
     measured = calibrate(config, scene, device, seconds, ranks)
     if measured.pixel_budget > measured.configured_pixel_budget:
-        config = with_pixel_budget(config, measured.pixel_budget)
+        config = pixels.with_pixel_budget(config, measured.pixel_budget)
         if limit is not None:
-            config = lowered_cap(config, _memory_demand(config, scene).gaussians(limit))
+            config = caps.lowered_cap(config, _memory_demand(config, scene).gaussians(limit))
     left = seconds - (measured.seconds + measured.initialisation)
     iterations, cap = _fit(config, left, measured.cost, measured.gaussians)
-    if cap != growth_cap(config, measured.gaussians):
-        config = lowered_cap(config, cap)
+    if cap != caps.growth_cap(config, measured.gaussians):
+        config = caps.lowered_cap(config, cap)
     return with_iterations(config, iterations), measured
 
 
@@ -112,8 +97,8 @@ def budget_text(config: Config, measured: Calibration | None) -> str:
         config: from `within_budget`.
     """
     parts = []
-    if cap_of(config):
-        parts.append(f"at most {cap_of(config)} Gaussians")
+    if caps.cap_of(config):
+        parts.append(f"at most {caps.cap_of(config)} Gaussians")
     if config.budget.max_memory:
         parts.append(f"{config.budget.max_memory} of device memory")
     if measured is not None:
@@ -139,21 +124,19 @@ def hold_to(limit: int, device: torch.device) -> None:
 
 
 def _memory_demand(config: Config, scene: Scene) -> MemoryDemand:
-    train, test = scene.train.cameras.sizes.prod(axis=1), scene.test.cameras.sizes.prod(axis=1)
-    largest = int(max(train.max(), test.max()))
-    channels = scene.train.photos.stored.shape[1]
-    return MemoryDemand.of(config, int(train.sum()), int(test.sum()), largest, len(train), channels)
+    sizes = (scene.train.cameras.sizes, scene.test.cameras.sizes)
+    return memory_demand(config, *sizes, photo_bytes=scene.train.photos.stored.shape[1])
 
 
 def _fit(config: Config, seconds: float, cost: IterationCost, gaussians: int) -> tuple[int, int]:
     """`fit_to_time` of a configuration: (iterations, cap)."""
     train = config.train
     share = min(1.0, train.refine_until / train.iterations)
-    cap = growth_cap(config, gaussians)
-    return fit_to_time(seconds, cost, gaussians, cap, train.iterations, share, keeps_cap(config))
+    cap = caps.growth_cap(config, gaussians)
+    return fit_to_time(seconds, cost, gaussians, cap, train.iterations, share, caps.keeps_cap(config))
 
 
-def calibrate(config: Config, scene: Scene, device: torch.device, seconds: float, ranks: Ranks = ONE) -> Calibration:
+def calibrate(config: Config, scene: Scene, device: torch.device, seconds: float, ranks: Ranks) -> Calibration:
     """Measure the cost of an iteration. If more than the configured iterations fit, measure it with more pixels too.
 
     Args:
@@ -184,25 +167,25 @@ def _measure(
             f"--time-budget {config.budget.time} is too short here: {before:.1f} s pass before the first iteration; "
             f"allow {math.ceil(before / LARGEST_OVERHEAD)}s or more"
         )
-    configured, largest = pixel_budget_range(config, len(scene.train))
+    configured, largest = pixels.pixel_budget_range(config, len(scene.train))
     largest = min(largest, configured + ranks.agree(_room_for_images(config, scene, device, gaussians)))
     # More epochs than configured would overfit the photos.
-    images = images_per_iteration(config, len(scene.train))
+    images = pixels.images_per_iteration(config, len(scene.train))
     wanted = max(config.train.iterations, math.ceil(config.train.epochs * len(scene.train) / images))
     # A measured iteration with more pixels takes at most about seconds / iterations.
     fewest = WARMUP_ITERATIONS[device.type] + FEWEST_MEASURED[device.type]
-    raises = min(RAISES, max(1, int(CALIBRATION_SHARE * wanted / fewest)))
+    raises = min(pixels.RAISES, max(1, int(CALIBRATION_SHARE * wanted / fewest)))
     costs = {configured: cost}
 
     def fitting(pixel_budget: float) -> int:
         if pixel_budget not in costs:
             # Measured with one size of model: with two, the noise of their slope would decide.
-            factor = trial.seconds_with(pixel_budget, share / RAISES) / cost.at(gaussians)
+            factor = trial.seconds_with(pixel_budget, share / pixels.RAISES) / cost.at(gaussians)
             costs[pixel_budget] = IterationCost(factor * cost.base, factor * cost.per_gaussian)
         left = ranks.agree(seconds - initialisation - (time.perf_counter() - started))
         return _fit(config, left, costs[pixel_budget], gaussians)[0]
 
-    chosen = pixels_for_time(configured, largest, wanted, raises, fitting)
+    chosen = pixels.pixels_for_time(configured, largest, wanted, raises, fitting)
     taken = ranks.agree(time.perf_counter() - started)
     return Calibration(taken, initialisation, costs[chosen], gaussians, configured, chosen)
 
@@ -214,7 +197,7 @@ def _room_for_images(config: Config, scene: Scene, device: torch.device, gaussia
         return math.inf
     if limit is None:
         limit = int(MEMORY_SHARE * (torch.cuda.mem_get_info(device)[0] + torch.cuda.memory_reserved(device)))
-    expected = max(FEWEST_GAUSSIANS, expected_gaussians(gaussians, growth_cap(config, gaussians)))
+    expected = max(caps.FEWEST_GAUSSIANS, caps.expected_gaussians(gaussians, caps.growth_cap(config, gaussians)))
     return _memory_demand(config, scene).more_images(limit, expected)
 
 
@@ -222,7 +205,7 @@ class _Trial:
     """Iterations made before training to time them, with a model that does not grow and all bands in use."""
 
     def __init__(self, config: Config, scene: Scene, device: torch.device, ranks: Ranks = ONE) -> None:
-        self._config, self._ranks = without_growth(config), ranks
+        self._config, self._ranks = caps.without_growth(config), ranks
         self._trainer = Trainer(self._config, scene, device, ranks=ranks)
         self._model = self._trainer.gaussians
         self._device = device
@@ -230,10 +213,11 @@ class _Trial:
 
     def initialisation(self) -> float:
         """Seconds of `Trainer.initialise_maps`, from one view."""
-        self._trainer.initialise_map(0)  # loads code
+        trainer = self._trainer
+        trainer.maps.initialise(0, trainer.dense_errors(0))  # loads code
         with TrainingClock(self._device) as clock:
-            self._trainer.initialise_map(0)
-        return self._ranks.agree(clock.seconds) * math.ceil(len(self._trainer.views) / self._ranks.count)
+            trainer.maps.initialise(0, trainer.dense_errors(0))
+        return self._ranks.agree(clock.seconds) * math.ceil(len(trainer.views) / self._ranks.count)
 
     def cost(self, seconds: float) -> IterationCost:
         """Cost of an iteration as configured: the line through the times of half the model and of all of it."""
@@ -242,7 +226,7 @@ class _Trial:
 
     def seconds_with(self, pixel_budget: float, seconds: float) -> float:
         """Seconds of an iteration with this lambda and the whole model."""
-        self._trainer.schedule = with_pixel_budget(self._config, pixel_budget).build("schedule")
+        self._trainer.schedule = pixels.with_pixel_budget(self._config, pixel_budget).build("schedule")
         return self._timed(1, seconds)[1]
 
     def _timed(self, stride: int, seconds: float) -> tuple[int, float]:
@@ -252,10 +236,9 @@ class _Trial:
         trainer.optimizer.setup(trainer.gaussians)
         # About half way, a schedule's views and rates are near their means.
         trainer.iteration = max(train.sh_degree * train.sh_interval, train.iterations // 2)
-        warm_up = TrainingLoop(trainer, ranks=self._ranks)
-        warm_up.advance(trainer.iteration + WARMUP_ITERATIONS[self._device.type])
+        TrainingLoop(trainer).advance(trainer.iteration + WARMUP_ITERATIONS[self._device.type])
         enough = _Enough(FEWEST_MEASURED[self._device.type], seconds)
-        loop = TrainingLoop(trainer, listeners=[enough], ranks=self._ranks)
+        loop = TrainingLoop(trainer, listeners=[enough])
         loop.advance(sys.maxsize)
         return len(trainer.gaussians), loop.clock.seconds / enough.iterations
 

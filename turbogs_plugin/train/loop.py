@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Iterable
 from signal import SIGTERM
 
-from turbogs_plugin.distributed.ranks import ONE, Ranks
 from turbogs_plugin.train.clock import TrainingClock
 from turbogs_plugin.train.history import Evaluation
 from turbogs_plugin.train.pace import IterationPace, Pace
@@ -46,22 +45,18 @@ class TrainingLoop:
         pace: where to stop on the way, and where to end; None: after the configured iterations.
         listeners: called in this order.
         seconds: training time that passed before.
-        ranks: the processes that train this model. Each has such a loop; the first one's clock counts.
+
+    Where several processes train the model, each has such a loop; the first one's clock counts.
     """
 
     def __init__(
-        self,
-        trainer: Trainer,
-        pace: Pace | None = None,
-        listeners: Iterable[Listener] = (),
-        seconds: float = 0.0,
-        ranks: Ranks = ONE,
+        self, trainer: Trainer, pace: Pace | None = None, listeners: Iterable[Listener] = (), seconds: float = 0.0
     ) -> None:
         self.trainer = trainer
         self.pace = pace or IterationPace(trainer.config.train)
         self.listeners = list(listeners)
         self.clock = TrainingClock(trainer.device, seconds)
-        self.ranks = ranks
+        self.ranks = trainer.ranks
         self.stopped = False
 
     def run(self, resumed: bool = False) -> None:

@@ -158,9 +158,5 @@ class TrainingProgress(TerminalBar):
 
 def describe_nonfinite(evaluation: Evaluation) -> str:
     """The counts of non-finite events in words; empty if there were none."""
-    parts = []
-    if evaluation.nonfinite_losses:
-        parts.append(f"{evaluation.nonfinite_losses} non-finite losses")
-    if evaluation.skipped_updates:
-        parts.append(f"{evaluation.skipped_updates} skipped updates")
-    return ", ".join(parts)
+    counts = {"non-finite losses": evaluation.nonfinite_losses, "skipped updates": evaluation.skipped_updates}
+    return ", ".join(f"{count} {what}" for what, count in counts.items() if count)

@@ -82,7 +82,7 @@ def new_loop(
     trainer = Trainer(config, scene, device, ranks=ranks)
     pace = pace_of(config, calibration and calibration.cost)
     seconds = calibration.seconds if calibration else 0.0
-    return TrainingLoop(trainer, pace, seconds=seconds, ranks=ranks), calibration
+    return TrainingLoop(trainer, pace, seconds=seconds), calibration
 
 
 def _agreed(config: Config, ranks: Ranks) -> Config:
@@ -205,7 +205,7 @@ def resume(
         hold_to(limit, device)
     with _fitting(scene, "end what else is in that memory, or go on with this run where there is more"):
         resuming = state is not None
-        loop = TrainingLoop(Trainer(config, scene, device, resuming, ranks), pace_of(config), ranks=ranks)
+        loop = TrainingLoop(Trainer(config, scene, device, resuming, ranks), pace_of(config))
         session = RunSession(folder, plan, scene, loop, clock)
         if state is not None:
             session.load_state_dict(state, str(checkpoint))

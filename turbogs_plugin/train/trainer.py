@@ -71,6 +71,7 @@ class Trainer:
     ) -> None:
         config.require_decided()
         self.config = config
+        self.ranks = ranks
         self.exchange = exchange_of(ranks)
         self.views = place_views(scene.train, device, config.train.photos_place)
         self.extent = scene.extent
@@ -104,10 +105,6 @@ class Trainer:
         for view_id, errors in enumerate(self.exchange.initial_errors(pixels, self.dense_errors, self.device)):
             self.maps.initialise(view_id, errors)
         self.initial_error = self.maps.mean()
-
-    def initialise_map(self, view_id: int) -> None:
-        """Set the map of one view to the errors of its dense render, in which masked pixels have no part."""
-        self.maps.initialise(view_id, self.dense_errors(view_id))
 
     def dense_errors(self, view_id: int) -> Tensor:
         """[H * W] the errors of a dense render of one view; 0 at masked pixels."""
@@ -167,22 +164,22 @@ class Trainer:
         self.iteration += 1
 
     def supervise(self, colors: Tensor, truth: PhotoSamples, step: Step) -> LossOutput:
-        """Loss and error maps, and the exposures of the photos where they are learnt."""
-        if self.exposures is None:
-            return self._supervise(colors, truth, step)
-        loss = self._supervise(self.engine.expose(self.exposures, colors, truth.samples), truth, step)
-        options = {"samples": truth.samples, "rate": exposure_rate(step)}
-        gradients = self.engine.learn_exposures(self.exposures, colors, loss.color_gradients, **options)
-        return replace(loss, color_gradients=gradients)
+        """Loss and error maps, and the exposures of the photos where they are learnt.
 
-    def _supervise(self, colors: Tensor, truth: PhotoSamples, step: Step) -> LossOutput:
-        """Loss and error maps: in one step if the loss is a rule, else by the loss's own code."""
-        update = MapUpdate(self.maps, step, self.nonfinite_losses)
+        Loss and maps are one step if the loss is a rule, else the loss's own code comes first.
+        """
+        samples, update = truth.samples, MapUpdate(self.maps, step, self.nonfinite_losses)
+        shown = colors if self.exposures is None else self.engine.expose(self.exposures, colors, samples)
         if self.loss.terms is not None:
-            return self.engine.supervise(self.loss.terms, colors, truth, update)
-        loss = self.loss(colors, truth.colors(), truth.samples)
-        self.engine.learn(truth.samples, colors, loss, update)
-        return loss
+            loss = self.engine.supervise(self.loss.terms, shown, truth, update)
+        else:
+            loss = self.loss(shown, truth.colors(), samples)
+            self.engine.learn(samples, shown, loss, update)
+        if self.exposures is None:
+            return loss
+        rate, gradients = exposure_rate(step), loss.color_gradients
+        gradients = self.engine.learn_exposures(self.exposures, colors, gradients, samples=samples, rate=rate)
+        return replace(loss, color_gradients=gradients)
 
     def update(self, screen: ScreenGradients, stats: GaussianStats | None, step: Step) -> None:
         """Gradients, statistics and update: in one step if the optimizer has a rule, else by its own code."""

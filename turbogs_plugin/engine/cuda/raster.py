@@ -311,15 +311,5 @@ def rasterize_cuda(
         background=launches.Background(*options.background),
     )
     library.launch(forward)
-    return CudaRendered(
-        forward.colors,
-        forward.alphas,
-        forward.depths,
-        num_intersections=tiles.status[:1],
-        _scene=scene,
-        _samples=samples,
-        _workspace=workspace,
-        _radii=splats.radii,
-        _forward=forward,
-        _cleared=workspace is not None,
-    )
+    images, cleared = (forward.colors, forward.alphas, forward.depths), workspace is not None
+    return CudaRendered(*images, tiles.status[:1], scene, samples, workspace, splats.radii, forward, cleared)

@@ -87,18 +87,10 @@ def sample_pixels(rule: DrawRule, maps: ErrorMaps, view_ids: tuple[int, ...], ra
     has_empty_slots = rule.unit != "pixel" or maps.masks is not None
     if weights is not None:
         weights = weights * ((draw.pixel_ids >= 0).sum() / weights.sum())
-    return PixelSamples(
-        tuple(view_ids),
-        sizes,
-        draw.pixel_ids,
-        draw.tile_ids,
-        draw.tile_offsets,
-        weights,
-        has_empty_slots,
-        host_ends=DrawEnds(
-            rule.unit, tuple(map(tuple, shapes)), tuple(wanted), None if maps.masks is None else tuple(tiles)
-        ),
-    )
+    live_tiles = None if maps.masks is None else tuple(tiles)
+    ends = DrawEnds(rule.unit, tuple(map(tuple, shapes)), tuple(wanted), live_tiles)
+    drawn = (draw.pixel_ids, draw.tile_ids, draw.tile_offsets, weights)
+    return PixelSamples(tuple(view_ids), sizes, *drawn, has_empty_slots, host_ends=ends)
 
 
 @lru_cache(maxsize=4096)
@@ -193,18 +185,7 @@ def fused_step(
     library.require()
     if any(value.data_ptr() != getattr(screen.scene.gaussians, name).data_ptr() for name, value in gaussians.items()):
         raise ValueError("fused_step: these are not the Gaussians that the gradients were made of")
-    lm = rule.lm
-    library.launch(
-        launches.FusedStep(
-            screen=screen.backward_arguments(stats),
-            moments=moments,
-            kind=UPDATE_KINDS.index("adam" if lm is None else f"{lm.units}_lm"),
-            rows_per_view=rule.per_view,
-            rates=rule.rates,
-            beta1=rule.beta1,
-            beta2=rule.beta2,
-            eps=rule.eps,
-            curvature=0.0 if lm is None else lm.curvature,
-            max_step=0.0 if lm is None else lm.max_step,
-        )
-    )
+    lm, given = rule.lm, screen.backward_arguments(stats)
+    kind, curvature, max_step = ("adam", 0.0, 0.0) if lm is None else (f"{lm.units}_lm", lm.curvature, lm.max_step)
+    numbers = {"beta1": rule.beta1, "beta2": rule.beta2, "eps": rule.eps, "curvature": curvature, "max_step": max_step}
+    library.launch(launches.FusedStep(given, moments, UPDATE_KINDS.index(kind), rule.per_view, rule.rates, **numbers))

@@ -46,19 +46,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from turbogs_plugin import tiles
 from turbogs_plugin.engine.reference import philox
 from turbogs_plugin.engine.rules import DrawRule
 from turbogs_plugin.error_maps import AGE_MAX, ErrorMaps
-from turbogs_plugin.tiles import (
-    TILE_CELLS,
-    TILE_PIXELS,
-    DrawEnds,
-    cell_of_place,
-    compact,
-    pixel_table,
-    slots_of_tiles,
-    tile_extents,
-)
 from turbogs_plugin.types import PixelSamples, Step, TileGrid
 
 RANK_BITS = 20
@@ -169,7 +160,7 @@ class _Batch:
     def __init__(self, maps: ErrorMaps, view_ids: tuple[int, ...], step: Step) -> None:
         device, views = maps.errors.device, np.asarray(view_ids, dtype=np.int64)
         self.view_ids, self.sizes = view_ids, maps.sizes[views]
-        self.table = pixel_table(self.sizes, device)
+        self.table = tiles.pixel_table(self.sizes, device)
         self.exist = self.table >= 0
         self.counts, self.live_tiles = TileGrid(self.sizes).shapes.prod(axis=1), None
         if maps.masks is not None:
@@ -188,19 +179,19 @@ class _Batch:
         step = self._step
         return philox.random_words(place.clamp(min=0).long(), self._views, purpose, step.seed, step.iteration)
 
-    def ends(self, unit: str, wanted: Sequence[int]) -> DrawEnds:
+    def ends(self, unit: str, wanted: Sequence[int]) -> tiles.DrawEnds:
         """`PixelSamples.host_ends` where so many units are drawn of each view, or of each of its tiles."""
         live = None if self.live_tiles is None else tuple(self.counts.tolist())
-        return DrawEnds(unit, tuple(map(tuple, self.sizes.tolist())), tuple(wanted), live)
+        return tiles.DrawEnds(unit, tuple(map(tuple, self.sizes.tolist())), tuple(wanted), live)
 
 
 def _draw_within_tiles(batch: _Batch, rate: float, rule: DrawRule) -> PixelSamples:
     """Pixels or cells as units, drawn from each tile."""
     first_pixels, errors, ages, purpose = batch.table, batch.errors, batch.ages, philox.PURPOSE_PIXELS
     by_cell, exist = rule.unit == "cell", batch.exist
-    cells = cell_of_place(batch.table.device)  # [256]
+    cells = tiles.cell_of_place(batch.table.device)  # [256]
     if by_cell:
-        places = torch.argsort(cells, stable=True).view(TILE_CELLS, -1)  # [16, 16] of each cell
+        places = torch.argsort(cells, stable=True).view(tiles.TILE_CELLS, -1)  # [16, 16] of each cell
         first_pixels, purpose = first_pixels[:, places[:, 0]], philox.PURPOSE_CELLS
         errors, ages = errors[:, places].sum(dim=2), ages[:, places].amax(dim=2)
         exist = exist[:, places].any(dim=2)
@@ -211,12 +202,12 @@ def _draw_within_tiles(batch: _Batch, rate: float, rule: DrawRule) -> PixelSampl
     if by_cell:
         drawn, weights = drawn[:, cells] & batch.exist, None if weights is None else weights[:, cells]
     if batch.live_tiles is None:
-        slots = slots_of_tiles(rule.unit, wanted, *tile_extents(batch.sizes))
+        slots = tiles.slots_of_tiles(rule.unit, wanted, *tiles.tile_extents(batch.sizes))
         tile_ids, full = torch.arange(len(batch.table), dtype=torch.int32, device=batch.table.device), not by_cell
     else:
-        slots = np.full(len(batch.table), wanted * TILE_PIXELS // errors.shape[1])
+        slots = np.full(len(batch.table), wanted * tiles.TILE_PIXELS // errors.shape[1])
         tile_ids, full = batch.live_tiles.int(), False
-    samples = compact(batch.view_ids, batch.sizes, batch.table, drawn, tile_ids, slots, weights, full=full)
+    samples = tiles.compact(batch.view_ids, batch.sizes, batch.table, drawn, tile_ids, slots, weights, full=full)
     return replace(samples, host_ends=batch.ends(rule.unit, [wanted] * len(batch.counts)))
 
 
@@ -224,9 +215,9 @@ def _draw_tiles(batch: _Batch, rate: float, rule: DrawRule) -> PixelSamples:
     """Whole tiles as units, drawn from each view."""
     device, ends = batch.table.device, np.concatenate([[0], np.cumsum(batch.counts)])
     errors, ages = batch.errors.sum(dim=1), batch.ages.amax(dim=1)  # [T]
-    tiles = torch.arange(len(batch.table), device=device)
+    numbers_in_batch = torch.arange(len(batch.table), device=device)
     firsts = torch.as_tensor(np.repeat(ends[:-1], np.diff(ends)), device=device)
-    words = batch.words((tiles - firsts)[:, None], philox.PURPOSE_TILES)  # of the numbers within the view
+    words = batch.words((numbers_in_batch - firsts)[:, None], philox.PURPOSE_TILES)  # of the numbers within the view
     chosen, weights, numbers = [], [], []
     for first, end in itertools.pairwise(ends.tolist()):
         row = slice(first, end)
@@ -243,8 +234,8 @@ def _draw_tiles(batch: _Batch, rate: float, rule: DrawRule) -> PixelSamples:
     tile_ids = torch.cat(chosen)
     table, exist = batch.table[tile_ids], batch.exist[tile_ids]
     tile_weights = torch.cat(weights)[:, None].expand(table.shape) if rule.importance else None
-    slots = np.full(len(tile_ids), TILE_PIXELS)
+    slots = np.full(len(tile_ids), tiles.TILE_PIXELS)
     if batch.live_tiles is not None:
         tile_ids = batch.live_tiles[tile_ids]
-    samples = compact(batch.view_ids, batch.sizes, table, exist, tile_ids.int(), slots, tile_weights)
+    samples = tiles.compact(batch.view_ids, batch.sizes, table, exist, tile_ids.int(), slots, tile_weights)
     return replace(samples, host_ends=batch.ends(rule.unit, numbers))

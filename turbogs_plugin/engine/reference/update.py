@@ -44,7 +44,8 @@ def apply_update(
     index = torch.nonzero(gradients.touched & finite).squeeze(-1)  # [n] Gaussians to update
     moments.steps[index] += 1
     steps = moments.steps[index]
-    rows = packed_rows(gradients, index)  # [K, n, 14]
+    columns = [getattr(gradients, name)[:, index].unsqueeze(-1).flatten(2) for name in COLUMNS]
+    rows = clipped(torch.cat(columns, dim=-1))  # [K, n, 14]
     losses = gradients.view_losses[:, index]  # [K, n]
     gradient = rows.sum(dim=0)
     terms = advance(moments.exp_avg, moments.exp_avg_sq, gradient, index, steps, rule)
@@ -61,7 +62,7 @@ def apply_update(
             delta = _solve(rows, torch.ones_like(losses), damping, moments.exp_avg[index])
     gradient = clipped(gradients.shN[index].flatten(1))
     terms = advance(moments.exp_avg_shN, moments.exp_avg_sq_shN, gradient, index, steps, rule)
-    changes = {name: delta[:, columns] for name, columns in COLUMNS.items()}
+    changes = {name: delta[:, place] for name, place in COLUMNS.items()}
     for name, change in {**changes, "shN": terms.delta(rule.rates.shN)}.items():
         value = getattr(gaussians, name)
         value.index_add_(0, index, change.reshape(len(index), *value.shape[1:]))
@@ -71,12 +72,6 @@ def packed_rates(rates: ParameterRates, like: Tensor) -> Tensor:
     """[14] the rates in the order of a packed row, in the dtype and on the device of `like`."""
     values = [getattr(rates, name) for name, s in COLUMNS.items() for _ in range(s.stop - s.start)]
     return torch.tensor(values, dtype=like.dtype, device=like.device)
-
-
-def packed_rows(gradients: GaussianGradients, index: Tensor) -> Tensor:
-    """[K, n, 14] gradients of the Gaussians `index` [n] in the order of `COLUMNS`, cut at `GRADIENT_LIMIT`."""
-    columns = [getattr(gradients, name)[:, index].unsqueeze(-1).flatten(2) for name in COLUMNS]
-    return clipped(torch.cat(columns, dim=-1))
 
 
 def clipped(gradient: Tensor) -> Tensor:
