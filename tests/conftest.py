@@ -1,4 +1,5 @@
-"""What all tests share."""
+"""What all tests share. Imported by the process that starts the others as well, which needs neither torch nor ours: to
+import them there would keep all cores but one waiting."""
 
 import os
 import sys
@@ -7,14 +8,14 @@ from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
-import torch
-from helpers.framework_runs import tiny_capture
 
-from turbogs_plugin import cli
-from turbogs_plugin.report import plot_process
-from turbogs_plugin.scene import colmap, llff, starting_points
 
-torch.set_num_threads(1)  # the tests' tensors are small: more threads gain nothing and collapse on a busy machine
+def pytest_collection_modifyitems() -> None:
+    """In each process that runs tests. Their tensors are small: more threads gain nothing and collapse on a busy
+    machine."""
+    import torch
+
+    torch.set_num_threads(1)
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -28,6 +29,8 @@ def disks_are_not_waited_for() -> Iterator[None]:
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory) -> Path:
     """A folder of 7 training photos and a test photo of 48x40. Not to be changed."""
+    from helpers.framework_runs import tiny_capture
+
     return tiny_capture(tmp_path_factory.mktemp("tiny"))
 
 
@@ -43,6 +46,8 @@ def plotted(request, monkeypatch) -> None:
     from matplotlib.figure import Figure
     from PIL import Image
 
+    from turbogs_plugin.report import plot_process
+
     def save(figure: Figure, file: object, **options: object) -> None:
         Image.new("RGB", (8, 8)).save(file, "PNG")
 
@@ -55,6 +60,8 @@ def plotted(request, monkeypatch) -> None:
 @pytest.fixture
 def few_random_points(monkeypatch) -> None:
     """Captures without points start from 500 random ones, not 50,000, which take longer than all else of a load."""
+    from turbogs_plugin.scene import colmap, llff, starting_points
+
     for module in (starting_points, llff, colmap):
         monkeypatch.setattr(module, "NUM_RANDOM_POINTS", 500)
 
@@ -62,6 +69,7 @@ def few_random_points(monkeypatch) -> None:
 @pytest.fixture
 def turbogs(monkeypatch, capsys):
     """Run the command in this process: (exit code, stdout, stderr)."""
+    from turbogs_plugin import cli
 
     def turbogs(*arguments) -> tuple[int, str, str]:
         monkeypatch.setattr(sys, "argv", ["turbogs", *map(str, arguments)])
