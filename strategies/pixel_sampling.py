@@ -50,14 +50,16 @@ def view_numbers(view_ids: ViewIds, maps: ErrorMaps) -> tuple[int, ...]:
 class RulePixelSampler:
     """A sampler described by its rule alone: the engine of the maps' device draws.
 
-    `heeds_masks` says that no masked pixel is drawn. Those of a sampler without it are taken out after its draw.
+    `heeds_masks` says that no masked pixel is drawn. Masked pixels that a sampler without it has drawn are removed
+    afterwards.
     """
 
     rule: DrawRule
     heeds_masks: ClassVar[bool] = True
 
     def sample(self, maps: ErrorMaps, view_ids: ViewIds, rate: float, step: Step) -> PixelSamples:
-        """Draw the fraction `rate` (r) of the units of each tile, or of the tiles of each view.
+        """Draw the share `rate` (r) of the units (pixels or cells) of each tile or, with `unit: tile`, of the tiles of
+        each view.
 
         Args:
             view_ids: see `view_numbers`.
@@ -76,7 +78,8 @@ class ErrorGuidedPixelSampler(RulePixelSampler):
         mixed: how the remaining share is drawn, which the paper names but does not define: by `error_age`, the mean of
             the two normalised distributions, or `uniform`.
         unit: `pixel` (the paper), `cell` (4x4 pixels of a tile), or `tile` (whole tiles of a view).
-        importance: a of the importance weights ``p^-a``, 0 (none, as in the paper's runs) to 1 (unbiased).
+        importance: exponent a of the importance weights p^-a, p the probability that a unit is drawn: 0 none, as in the
+            paper's runs; 1 unbiased (exactly so for a draw of a single stage).
     """
 
     hard_ratio: float = 0.4

@@ -32,7 +32,8 @@ class ErrorDrivenDensity(WindowedDensity):
         e = E / (W + eps),  d = D / (W + eps),  s = e + lambda_base * anneal * d
 
     A Gaussian with W = 0, or with non-finite sums, was not seen: it has no score, and is neither densified nor pruned
-    by score. Equal scores are treated alike, except where a cap must choose (then the lower row goes first).
+    by score. Equal scores are treated alike, except where a cap must choose between them: then the lower row is
+    chosen, be it to grow or to be removed.
 
     Until `Step.refine_until`, every `refine_every` iterations from `refine_from` on, one event clones, splits and
     prunes. A Gaussian that is due for pruning is not densified. One that is too large is pruned unless it is split,
@@ -51,27 +52,28 @@ class ErrorDrivenDensity(WindowedDensity):
         split: two draws from the Gaussian, all axes divided by 1.6 as in 3DGS (`sample`); or two halves along its
             longest axis, which is divided by 1.6, placed so that the pair has the parent's mean and covariance
             (`long_axis`).
-        max_gaussians: never more than this. An initial model that has more is cut to it at the first event, easiest
-            first, those of `spare_beyond` last. 0: no cap.
+        max_gaussians: never more than this. An initial model that has more is reduced to it at the first event:
+            those of least worth (`choose_by`) are removed first, those beyond `spare_beyond` last. 0: no cap.
         prune_opacity: less opaque Gaussians are pruned.
         prune_world_size: pruned where the largest standard deviation exceeds this * `prune_world_reference`. 0: off.
         prune_world_reference: the scene extent, as in 3DGS (`extent`). With `distance`, a Gaussian farther than that
             from the cameras' centre is compared with its distance from there, so it may be larger.
-        prune_screen_size: pruned where the screen radius exceeds this * the larger side of the image. 0: off, as in
-            3DGS in effect.
-        prune_size_from: both size rules begin at this progress; 3DGS has 3000 / 15000.
-        prune_score_fraction: the share, of those seen and not spared, that each densification event prunes first, in
-            the order of `choose_by`. Off by default: the paper gives no value.
+        prune_screen_size: pruned where the screen radius exceeds this * the larger side of the image. 0: off;
+            3DGS has such a rule, which never takes effect there.
+        prune_size_from: both size rules begin at this share of `refine_until`; 3DGS: iteration 3000 of 15,000.
+        prune_score_fraction: turnover: the share of the Gaussians (seen, and not spared by `spare_beyond`) that each
+            densification event removes before it adds any: those with the least score or squares, by `choose_by`. 0:
+            off; the paper gives no value.
         opacity_decay: share of its opacity that every Gaussian loses at each densification event. If the photos need
             it, it grows back; if not, it falls below `prune_opacity`. A gentle substitute for 3DGS's reset.
         spare_beyond: Gaussians farther from the cameras' centre than this * scene extent are neither decayed nor pruned
             (unless they are not finite, or `max_gaussians` leaves no other choice). It protects a backdrop behind the
             scene, which few photos see. 0: none.
-        choose_by: who grows, and who goes. By `difficulty`, the paper's: it grows whoever passes the gates, and the
-            most difficult of these where `max_gaussians` has no room for all; the easiest are pruned first. By
-            `squares` (see `priority`): as many grow as pass the gate of the absolute gradient, and who, is drawn from
-            all the seen; what has the least squares is pruned first. `grad_threshold`, `top_fraction`, `score` and
-            `lambda_base` then mean nothing.
+        choose_by: which Gaussians grow and which are removed. `difficulty`, the paper's: all grow that pass the
+            thresholds, or the most difficult of them where `max_gaussians` has no room for all; the easiest are removed first.
+            `squares` (see `priority`): as many grow as pass the threshold of the absolute gradient; which ones is drawn
+            at random among those seen, in proportion to their squares. Those with the least squares are removed first.
+            `grad_threshold`, `top_fraction`, `score` and `lambda_base` then mean nothing.
         final_every, final_keep: interval of the final pruning, and the share of those seen and not spared that it keeps
             (Delta_prune, eta_final). 1 keeps all.
     """
@@ -123,10 +125,7 @@ class ErrorDrivenDensity(WindowedDensity):
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         if self.choose_by == "squares" and state["stats"] is not None and "square_sums" not in state["stats"]:
-            raise InputError(
-                "choose_by = squares, but the saved run kept no squares: continue it with choose_by = difficulty, or "
-                "start a new run"
-            )
+            raise InputError("choose_by = squares, but the saved state has no squares: start a new run")
         super().load_state_dict(state)
 
     def scores(self, step: Step) -> tuple[Tensor, Tensor]:
@@ -155,7 +154,8 @@ class ErrorDrivenDensity(WindowedDensity):
     def _last_event(self, step: Step) -> int:
         """Iteration after which no statistics are needed: that of the last event, or where densification ends.
 
-        It is not that of the last densification: until the end a time budget may still move it and allow another one.
+        Not the iteration of the last densification: a time budget may still move `refine_until` and make room for
+        another one.
         """
         rest = max(0, step.total - 1 - step.refine_until)
         return step.refine_until + (rest // self.final_every * self.final_every if self.final_keep < 1 else 0)
@@ -190,9 +190,9 @@ class ErrorDrivenDensity(WindowedDensity):
             chosen = _first(priority, candidates, max(0, self.max_gaussians - int((~pruned).sum())))
             denied = candidates & ~chosen
             candidates = chosen
-            pruned = leave_one(pruned | (big & denied & ~spared), gaussians)  # makes room for the next event
+            pruned = leave_one(pruned | (big & denied & ~spared), gaussians)  # too large, but no room to split them
             excess = int((~pruned).sum()) - self.max_gaussians
-            if excess > 0:  # then nothing was chosen
+            if excess > 0:  # the model began above the cap; nothing was chosen
                 pruned = pruned | _least(worth, known, ~pruned, spared, excess)
         return self._compose(gaussians, candidates & small, candidates & ~small, pruned, spared, step)
 
@@ -207,9 +207,9 @@ class ErrorDrivenDensity(WindowedDensity):
         return passes & seen & (score >= _quantile(score, seen, 1 - self.top_fraction))
 
     def _worth(self, score: Tensor, seen: Tensor) -> tuple[Tensor, Tensor]:
-        """([N] the less, the sooner it is pruned; [N] bool, for which that is known): the score, or the squares.
+        """([N] worth: the less, the sooner removed; [N] bool, where it is known): the score, or the squares.
 
-        What was not seen has no score, but contributes nothing.
+        A Gaussian that was not seen has no known score; its squares are 0, so by squares it is worth least.
         """
         return (score, seen) if self.choose_by == "difficulty" else squares_of(self._stats)
 
@@ -275,7 +275,7 @@ def _first(keys: Tensor, mask: Tensor, count: int) -> Tensor:
 def _least(worth: Tensor, known: Tensor, present: Tensor, spared: Tensor, count: int) -> Tensor:
     """[N] bool: the `count` of those `present` that are worth the least; spared ones only if the others do not suffice.
 
-    Of which that is not known counts as average: nothing says that it is worth little.
+    A Gaussian whose worth is not known counts as average, as nothing says that it is worth little.
     """
     average = torch.where(known, worth, 0.0).double().sum() / known.sum().clamp(min=1)  # the sum may overflow float32
     keys = -torch.where(known, worth, average.to(worth))

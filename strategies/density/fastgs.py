@@ -46,7 +46,8 @@ class ViewVotes:
 
 @dataclass
 class FastGsDensity(DensityController):
-    """Densify Gaussians that many views find badly rendered; prune those that many views blame.
+    """Densify Gaussians that many views find badly rendered; prune those with the largest *blame*, the sum of the mean
+    errors of the batches that marked them.
 
     FastGS renders some training views in full at each event, marks the pixels of large (normalised) error, and scores
     each Gaussian by the marked pixels in its footprint. For densification the score is their mean number over the

@@ -14,7 +14,8 @@ from turbogs_plugin.types import Gaussians, GaussianStats, RowUpdate
 RowsType = TypeVar("RowsType")  # a dataclass of [N] tensors
 
 ADDED = ("square_sums",)
-"""Statistics that older checkpoints lack. They begin at zero; who needs them refuses such a checkpoint."""
+"""Statistics that a state from another trainer may lack. They begin at zero; `choose_by: squares` refuses such a state.
+Checkpoints of runs are refused before (`checkpoint.require_like`)."""
 
 
 class WindowedDensity(DensityController):

@@ -411,7 +411,7 @@ def test_a_checkpoint_without_squares_goes_on_unless_they_are_needed():
     resumed = controlled(gaussians)
     resumed.load_state_dict(state)
     assert not resumed.stats.square_sums.any() and resumed.stats.weight_sums.all()
-    with pytest.raises(InputError, match="choose_by = squares, but the saved run kept no squares"):
+    with pytest.raises(InputError, match="choose_by = squares, but the saved state has no squares"):
         controlled(gaussians, choose_by="squares").load_state_dict(state)
     ended = controlled(gaussians, choose_by="squares")
     ended.load_state_dict({"stats": None})

@@ -53,7 +53,7 @@ class TrainConfig:
         batch_for: number of processes that the settings of a batch are written for: views and pixels of an iteration,
             and learning rates. ``auto``: they are written for one, and scaled to those that train together
             (`turbogs_plugin.config.scaling.with_batch_for`).
-        refine_until: tau_until, the last iteration of density control, which also ends the annealing of the sampling.
+        refine_until: tau_until, the last iteration of densification, which also ends the annealing of the sampling.
         seed: of all randomness.
         device: auto (CUDA where there is one), cpu, or cuda.
         maps_place, photos_place: where error and age maps, and where the photos are. It changes no result.

@@ -1,7 +1,7 @@
 """The engines, which do all computation: a base class, the torch reference, its CUDA twin, and the choice of one.
 
-`Engine` is the interface: strategies say what is to be done (`rules`), an engine does it on one device. No code outside
-this package asks which device it is.
+`Engine` is the interface: strategies say what is to be done (`rules`), an engine does it on one device. Only this
+package chooses between the kernels and torch.
 """
 
 from __future__ import annotations

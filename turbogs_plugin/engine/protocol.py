@@ -21,7 +21,7 @@ from turbogs_plugin.types import Cameras, Gaussians, GaussianStats, LossOutput, 
 
 @dataclass(frozen=True)
 class MapUpdate:
-    """The error maps, and what else takes in the errors of an iteration.
+    """The error maps, and the counter that the losses of an iteration are added to.
 
     Args:
         maps: of all views; updated in place.
@@ -38,14 +38,14 @@ class Engine(ABC):
     """Does all computation, on the device of the given tensors.
 
     It knows rules, never strategies. `ReferenceEngine` defines every result; any other engine gives the same up to
-    rounding. `supervise`, `evaluate_and_learn` and `update` are two steps each, which an engine may do at once. The
-    host does not wait for an engine made for training: see `settle`.
+    rounding. `supervise`, `evaluate_and_learn` and `update` each consist of two operations, which an engine may fuse
+    into one. With an engine made for training the host does not wait for the device: see `settle`.
     """
 
     @property
     def overflow(self) -> Tensor | None:
-        """[1] int32 on the device, never read on the host: not 0 while iterations do nothing for lack of memory. None
-        if that cannot happen."""
+        """[1] int32 on the device, never read on the host. While it is not 0, iterations are *skipped*: they change
+        nothing, because a buffer was too small. None if that cannot happen."""
         return None
 
     @abstractmethod
@@ -103,10 +103,10 @@ class Engine(ABC):
         return output
 
     def learn(self, samples: PixelSamples, colors: Tensor, output: LossOutput, update: MapUpdate) -> None:
-        """Update the error maps with the errors of an iteration, from any loss.
+        """Update the error maps (nothing is trained here) with the errors of an iteration, from any loss.
 
-        A sample with a non-finite rendered colour (of `colors` [P, 3]) or error changes neither the error of its pixel
-        nor its age. An iteration that did nothing changes nothing here either.
+        A sample with a non-finite rendered colour (of `colors` [P, 3]) or error counts as not sampled: the error and
+        the stamp of its pixel stay. A skipped iteration (see `overflow`) changes nothing here.
         """
         drawn, nonfinite = torch.isfinite(colors).all(dim=1), ~output.loss.isfinite()
         if self.overflow is not None:
@@ -124,7 +124,7 @@ class Engine(ABC):
     ) -> Tensor:
         """Take gradients back through `expose`, and make one step of Adam with the exposures of the batch.
 
-        An iteration that did nothing changes no exposure.
+        A skipped iteration changes no exposure.
 
         Args:
             exposures: those that the colours were exposed with; changed in place.
@@ -158,9 +158,9 @@ class Engine(ABC):
         apply_update(rule, gaussians, screen.parameter_gradients(rule.per_view, stats), moments)
 
     def settle(self, wait: bool = False) -> int:
-        """How many of the latest iterations did nothing for lack of device memory, and must be done again.
+        """How many of the latest iterations were skipped for lack of device memory, and must be done again.
 
-        Until this is called, iterations after such a one do nothing either: no map, parameter, moment or statistic
+        Until this is called, iterations after such a one are skipped, too: no map, parameter, moment or statistic
         changes. A trainer calls it before each iteration.
 
         Args:
@@ -173,8 +173,8 @@ class Engine(ABC):
 
     @abstractmethod
     def recover(self) -> None:
-        """Make ready to repeat iterations that did nothing because another process said so: waits for the device,
-        takes in what it learned of the memory needed, and clears `overflow`."""
+        """Prepare to repeat iterations that were skipped because another process's memory was too small: waits for the
+        device, takes in what it learned of the memory needed, and clears `overflow`."""
 
     @property
     def bytes_held(self) -> int:

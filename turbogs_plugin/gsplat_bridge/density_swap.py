@@ -133,7 +133,7 @@ class TurboDensityStrategy(DefaultStrategy):
 
         Raises:
             InputError: the host trains in several processes; `state` is not one of `initialize_state`, or was not
-                carried along when rows changed; `info` lacks a key, or sums that `choose_by` or `prune_by` needs; or it
+                carried along when rows changed; `info` lacks a key, or sums that `choose_by` needs; or it
                 changed between having errors and none.
         """
         require_one_process("TurboDensityStrategy")

@@ -43,10 +43,10 @@ STATEFUL = ("maps", "view_sampler", "optimizer", "density")
 
 
 class IterationObserver(Protocol):
-    """Is told what an iteration does and nothing keeps. It changes nothing, and has to be cheap."""
+    """Is told what an iteration does that is stored nowhere else. It must change nothing, and be cheap."""
 
     def sampled(self, samples: PixelSamples) -> None:
-        """These pixels were drawn."""
+        """These pixels were sampled."""
 
     def changing(self, gaussians: Gaussians, update: RowUpdate, step: Step) -> None:
         """Density control is about to change the model in this way."""
@@ -95,7 +95,7 @@ class Trainer:
         self.set_length(config.train.iterations, config.train.refine_until)
         self.iteration = 0
         self.observer: IterationObserver | None = None
-        self.first_repeatable = 0
+        self.first_repeatable = 0  # the iteration after the latest change of the set of Gaussians: see `repeat_lost`
         self.initial_error = 0.0
         self.nonfinite_losses = torch.zeros((), dtype=torch.int64, device=device)
 
@@ -151,14 +151,14 @@ class Trainer:
         # 6) Sparse loss and its gradients, and 7) EMA update of the error maps
         loss = self.supervise(rendered.colors, truth, step)
 
-        # 8) Backward to the screen, carrying along the errors that step 11 needs per Gaussian
+        # 8) Backward to the screen, summing for each Gaussian what step 11 needs (errors, weights, squares)
         stats = self.density.stats
         screen = rendered.backward(loss.color_gradients, loss.pixel_errors, with_statistics=stats is not None)
 
         # 9) and 10) Backward to the parameters, solve for their updates and apply them; adds to `stats`
         self.update(screen, stats, step)
 
-        # 11) Error-driven density control
+        # 11) Density control (the paper's: error-driven)
         self.follow(self.refine(step))
 
         self.iteration += 1
@@ -195,7 +195,7 @@ class Trainer:
         return self.exchange.refine(self.density, self._gaussians, step, self.complete)
 
     def complete(self) -> None:
-        """Where several processes train, make the state whole on each. All must call it."""
+        """Gather the complete moments and statistics on every process. Every process must call this."""
         self.exchange.complete(self.optimizer.moments, self.density.stats)
 
     def compare_replicas(self) -> None:
@@ -210,8 +210,9 @@ class Trainer:
     def follow(self, update: RowUpdate | None) -> None:
         """Apply the change of the set of Gaussians that density control proposed, if any.
 
-        Model, optimizer and controller follow the change, with its rows sorted in space. Then the size of distant
-        Gaussians is limited, which is not in the paper.
+        Model, optimizer and controller follow the change, with its rows sorted in space until `refine_until`. Every
+        `RESTRAIN_EVERY` iterations, also without a change, the size of distant Gaussians is limited, which is not in
+        the paper.
         """
         if update is not None:
             if len(update.source) == 0:
@@ -227,14 +228,15 @@ class Trainer:
             restrain_distant(self.gaussians, self.extent, self.config.train.distant_size)
 
     def set_length(self, iterations: int, refine_until: int) -> None:
-        """Set T and the last iteration of density control. A run with a time budget changes them as it goes."""
+        """Set T and tau_until, the last iteration of densification. A time budget changes them during a run."""
         self.iterations, self.refine_until = iterations, refine_until
 
     def repeat_lost(self, wait: bool = False) -> None:
-        """Set the iteration back by those that did nothing because the engine had too little memory for them.
+        """Go back by the iterations that were skipped: where the engine has too little memory for an iteration, that
+        one and those after it change nothing until the engine is settled.
 
-        It never goes back past a change of the set of Gaussians, which would then be made twice: iterations lost just
-        before one are not repeated.
+        It never goes back past a change of the set of Gaussians, which would then be made twice: iterations skipped
+        just before such a change are lost.
 
         Args:
             wait: wait for the GPU, to know of all of them.
@@ -252,7 +254,7 @@ class Trainer:
 
     @property
     def gaussians(self) -> Gaussians:
-        """The model. Where several processes train, what is enqueued next comes after the latest step of all."""
+        """The model. With several processes, GPU work enqueued after this waits until every update has arrived."""
         self.exchange.finish()
         return self._gaussians
 

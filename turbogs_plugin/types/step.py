@@ -12,7 +12,7 @@ class Step:
     Args:
         iteration: t, from 0.
         total: T, iterations of the whole run.
-        refine_until: tau_until, the last iteration of density control.
+        refine_until: tau_until, the last iteration of densification.
         seed: of the run; all randomness is a function of (seed, iteration, place).
         scene_extent: radius of the camera centres about their mean, world units.
     """
@@ -25,7 +25,7 @@ class Step:
 
     @property
     def progress(self) -> float:
-        """clip(t / tau_until, 0, 1): 0 at the start, 1 once density control is over."""
+        """clip(t / tau_until, 0, 1): 0 at the start, 1 once densification is over."""
         return min(1.0, self.iteration / max(1, self.refine_until))
 
     @property
