@@ -70,10 +70,10 @@ class ErrorDrivenDensity(WindowedDensity):
             (unless they are not finite, or `max_gaussians` leaves no other choice). It protects a backdrop behind the
             scene, which few photos see. 0: none.
         choose_by: which Gaussians grow and which are removed. `difficulty`, the paper's: all grow that pass the
-            thresholds, or the most difficult of them where `max_gaussians` has no room for all; the easiest are removed first.
-            `squares` (see `priority`): as many grow as pass the threshold of the absolute gradient; which ones is drawn
-            at random among those seen, in proportion to their squares. Those with the least squares are removed first.
-            `grad_threshold`, `top_fraction`, `score` and `lambda_base` then mean nothing.
+            thresholds, or the most difficult of them where `max_gaussians` has no room for all; the easiest are removed
+            first. `squares` (see `priority`): as many grow as pass the threshold of the absolute gradient; which ones
+            is drawn at random among those seen, in proportion to their squares. Those with the least squares are
+            removed first. `grad_threshold`, `top_fraction`, `score` and `lambda_base` then mean nothing.
         final_every, final_keep: interval of the final pruning, and the share of those seen and not spared that it keeps
             (Delta_prune, eta_final). 1 keeps all.
     """

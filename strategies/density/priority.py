@@ -2,8 +2,8 @@
 
 The *squares* of a Gaussian, `GaussianStats.square_sums`, are the sum over the window's samples of (o * d loss / d o)^2,
 o its opacity. The sum stays large where some samples want a Gaussian more opaque and others less, where the gradient
-itself cancels: one Gaussian cannot serve both. It is near 0 where a Gaussian makes no difference.
-LiteGS scores growth by the variance of the same gradient.
+itself cancels: one Gaussian cannot serve both. It is near 0 where a Gaussian makes no difference. LiteGS
+scores growth by the variance of the same gradient.
 """
 
 from __future__ import annotations
