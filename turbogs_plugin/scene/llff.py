@@ -55,7 +55,6 @@ def read_llff(scene: Path, factor: int = 1) -> Capture:
         Ks=intrinsics,
         sizes=sizes,
         points=points,
-        point_colors=None,
         notes=(
             f"LLFF: {len(sizes)} photos {sizes_text(sizes)} of {folder.name}; no points, so {len(points):,} "
             f"random ones (seed 0) within the views at depths of {depths}",
