@@ -191,10 +191,8 @@ def with_default_cameras(database: Path, copy: Path) -> None:
     shutil.copyfile(database, copy)
     with pycolmap.Database.open(copy) as opened:
         for camera in opened.read_all_cameras():
-            size = camera.width, camera.height
-            plain = pycolmap.Camera.create_from_model_name(
-                camera.camera_id, DEFAULT_MODEL, camera.mean_focal_length(), *size
-            )
+            given = camera.camera_id, DEFAULT_MODEL, camera.mean_focal_length(), camera.width, camera.height
+            plain = pycolmap.Camera.create_from_model_name(*given)
             plain.has_prior_focal_length = camera.has_prior_focal_length
             opened.update_camera(plain)
 

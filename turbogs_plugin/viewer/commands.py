@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -55,11 +55,8 @@ def attached(port: int, host: str) -> Iterator[LiveViewer]:
     Raises:
         InputError: viser is not installed, or the port is not free.
     """
-    page = Page(host, port, Controls())
-    try:
+    with closing(Page(host, port, Controls())) as page:
         yield LiveViewer(page)
-    finally:
-        page.close()
 
 
 def view(path: Path, port: int, host: str, device_name: str, given: Config | None = None) -> int:
@@ -78,16 +75,11 @@ def view(path: Path, port: int, host: str, device_name: str, given: Config | Non
     require_viser()
     require_free(host, port)
     shown = open_shown(path, resolve_device(device_name), given)
-    page = Page(host, port)
-    try:
+    with suppress(KeyboardInterrupt), closing(Page(host, port)) as page:
         if shown.note:
             print(f"turbogs: {shown.note}", file=sys.stderr)
         print(f"viewer  {page.url}  (Ctrl-C ends)", flush=True)
         show(shown, page, lambda: False)
-    except KeyboardInterrupt:
-        pass
-    finally:
-        page.close()
     return 0
 
 
