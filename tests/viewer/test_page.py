@@ -169,7 +169,7 @@ def test_a_training_goes_on_while_a_client_looks(new_training, scene):
         thread.join()
     finally:
         page.close()
-    assert len(frames) == 2 and live.frames_drawn >= 2
+    assert len(frames) == 2
     assert_identical(loop.trainer.state_dict(), alone.trainer.state_dict())
 
 

@@ -16,9 +16,8 @@ from turbogs_plugin.files import require_new_file
 from turbogs_plugin.model.formats import FORMATS
 from turbogs_plugin.model.harmonics import band_energy, drop_faint_bands
 from turbogs_plugin.model.similarity import Similarity
-from turbogs_plugin.scene import Scene
-from turbogs_plugin.train.saved_model import SavedModel, load_given_model, load_model
-from turbogs_plugin.train.start import open_scene, resolve_device
+from turbogs_plugin.train.saved_model import load_with_capture
+from turbogs_plugin.train.start import resolve_device
 from turbogs_plugin.types import Gaussians
 
 PAGE = "html"
@@ -86,7 +85,8 @@ def export_run(
         raise InputError(f"'{path}' has no run's folder to export into: name a new file by --out")
     if max_gaussians is not None and out is None and file_format == "ply":
         raise InputError("--max-gaussians would take the place of the run's own model.ply: name a new file by --out")
-    model, scene, absent = _opened(path, given, needed=max_gaussians is not None or file_format == PAGE)
+    needed = max_gaussians is not None or file_format == PAGE
+    model, scene, absent = load_with_capture(path, given, resolve_device("auto"), needed)
     gaussians = whole = model.gaussians
     if max_gaussians is not None and max_gaussians < len(gaussians):
         gaussians = pruned(gaussians, contributions(gaussians, scene.train.cameras, model.config.raster), max_gaussians)
@@ -123,25 +123,9 @@ def film_run(
         device_name: where to render.
     """
     require_film(camera_path, video, seconds)
-    model, scene, _ = _opened(path, given, needed=True, device_name=device_name)
+    model, scene, _ = load_with_capture(path, given, resolve_device(device_name))
     write_film(model, film_cameras(camera_path, scene, seconds), video)
     return video
-
-
-def _opened(
-    path: Path, given: Config | None, needed: bool, device_name: str = "auto"
-) -> tuple[SavedModel, Scene | None, str]:
-    """The model on a device, its capture, and why that is None: it is not there, and not `needed`."""
-    device = resolve_device(device_name)
-    if given is not None:
-        return *load_given_model(path, given, device), ""
-    model = load_model(path, device)
-    try:
-        return model, open_scene(model.config, model.folder), ""
-    except InputError as error:
-        if needed:
-            raise
-        return model, None, str(error)
 
 
 def _notes(whole: Gaussians, kept: Gaussians, written: Gaussians, drop_bands: float | None) -> tuple[str, ...]:

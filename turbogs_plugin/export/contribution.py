@@ -30,7 +30,5 @@ def contributions(gaussians: Gaussians, cameras: Cameras, settings: RasterSettin
 
 def pruned(gaussians: Gaussians, weights: Tensor, count: int) -> Gaussians:
     """The `count` Gaussians with the largest of the `weights` [N], in their order."""
-    if count >= len(gaussians):
-        return gaussians
     kept = torch.argsort(weights, descending=True, stable=True)[:count].sort().values
     return gaussians.map(lambda value: value[kept])

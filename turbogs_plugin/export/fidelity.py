@@ -59,21 +59,16 @@ class Fidelity:
 
     Args:
         gaussians: the model, on the device where all are rendered.
-        views: the test views, on any device.
+        views: the test views, at least one, on any device.
         sh_degree: of the bands in use.
         settings: of rendering.
 
     Attributes:
         view_ids: those that are measured.
         before: mean PSNR in dB of the model.
-
-    Raises:
-        ValueError: there are no test views.
     """
 
     def __init__(self, gaussians: Gaussians, views: PosedImages, sh_degree: int, settings: RasterSettings) -> None:
-        if not len(views):
-            raise ValueError("there are no test views")
         self._views, self._device, self._degree, self._settings = views, gaussians.device, sh_degree, settings
         self.view_ids = evenly(len(views), MOST_VIEWS)
         self._model, self._before = gaussians, self.psnr(gaussians)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -56,17 +56,16 @@ class Similarity:
         their bits."""
         rotation = torch.from_numpy(self.rotation).to(gaussians.means)
         translation = torch.from_numpy(self.translation).to(gaussians.means)
-        turned = not np.array_equal(self.rotation, np.eye(3))
-        turn = torch.from_numpy(quaternions(self.rotation[None])[0]).to(gaussians.means)
-        means = gaussians.means @ rotation.T if turned else gaussians.means
-        return Gaussians(
-            means=self.scale * means + translation,
-            quats=_product(turn, gaussians.quats) if turned else gaussians.quats,
-            scales=gaussians.scales + math.log(self.scale),
-            opacities=gaussians.opacities,
-            sh0=gaussians.sh0,
-            shN=_turned_harmonics(gaussians.shN, self.rotation) if turned else gaussians.shN,
-        )
+        if not np.array_equal(self.rotation, np.eye(3)):
+            turn = torch.from_numpy(quaternions(self.rotation[None])[0]).to(gaussians.means)
+            gaussians = replace(
+                gaussians,
+                means=gaussians.means @ rotation.T,
+                quats=_product(turn, gaussians.quats),
+                shN=_turned_harmonics(gaussians.shN, self.rotation),
+            )
+        means, scales = self.scale * gaussians.means + translation, gaussians.scales + math.log(self.scale)
+        return replace(gaussians, means=means, scales=scales)
 
 
 def placed(gaussians: Gaussians, change: Similarity, source: str | Path) -> Gaussians:

@@ -148,14 +148,10 @@ def _reconstruct(photos: Sequence[PhotoFile], workspace: Workspace, others: str)
     _leave_out(best.model, best.ghosts)
     registered = {image.name for image in best.model.images.values() if image.has_pose}
     left_out = [name for name in names if name not in registered]
-    solution = Solution(
-        workspace.scene,
-        len(photos),
-        len(registered),
-        best.model.num_points3D(),
-        left_out,
-        [*([f"not used: {others}"] if others else []), *_notes(photos, matching, verified, best, repaired, left_out)],
-    )
+    notes = [f"not used: {others}"] if others else []
+    notes += _notes(photos, matching, verified, best, repaired, left_out)
+    counts = len(photos), len(registered), best.model.num_points3D()
+    solution = Solution(workspace.scene, *counts, left_out, notes)
     workspace.finish(best.model, solution)
     return solution
 
@@ -228,12 +224,7 @@ def _require_solved(solve: Solve | None, photos: int, verified: int, matching: M
 
 
 def _notes(
-    photos: Sequence[PhotoFile],
-    matching: Matching,
-    verified: int,
-    solve: Solve,
-    repaired: Sequence[str],
-    left_out: Sequence[str],
+    photos: Sequence[PhotoFile], matching: Matching, verified: int, solve: Solve, repaired: list[str], lost: list[str]
 ) -> list[str]:
     model, agreement = solve.model, solve.agreement
     lenses = len({photo.lens for photo in photos})
@@ -242,7 +233,7 @@ def _notes(
     notes = [
         f"{len(photos)} photos of {lenses} {'lens' if lenses == 1 else 'lenses'}{upright}; matched {matching.reason}: "
         f"{verified:,} pairs show the same",
-        f"{len(photos) - len(left_out)} of {len(photos)} photos registered, {model.num_points3D():,} points, "
+        f"{len(photos) - len(lost)} of {len(photos)} photos registered, {model.num_points3D():,} points, "
         f"reprojection error {model.compute_mean_reprojection_error():.2f} px",
     ]
     if repaired:
@@ -255,7 +246,7 @@ def _notes(
             f"{_photos(solve.ghosts)} left out, as more matches contradict their place than confirm it (repeated "
             f"structure): {_listed(solve.ghosts)}"
         )
-    if unplaced := [name for name in left_out if name not in set(solve.ghosts)]:
+    if unplaced := [name for name in lost if name not in set(solve.ghosts)]:
         others = f", {len(solve.sizes) - 1} smaller models besides" if len(solve.sizes) > 1 else ""
         notes.append(
             f"{_photos(unplaced)} did not register{others}: {_listed(unplaced)}; add photos between them and the others"

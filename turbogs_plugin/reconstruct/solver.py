@@ -141,8 +141,7 @@ def measure_agreement(model: pycolmap.Reconstruction, database: Path) -> Agreeme
     images = sorted((image for image in model.images.values() if image.has_pose), key=lambda image: image.name)
     index = {image.name: view for view, image in enumerate(images)}
     viewmats = np.tile(np.eye(4), (len(images), 1, 1))  # [V, 4, 4]
-    rays, limits = [], []
-    pairs, agreeing, contradicting = [], [], []
+    rays, limits, counts = [], [], []
     with pycolmap.Database.open(database) as opened:
         views = {image.image_id: index[image.name] for image in opened.read_all_images() if image.name in index}
         numbers = {view: number for number, view in views.items()}
@@ -162,15 +161,9 @@ def measure_agreement(model: pycolmap.Reconstruction, database: Path) -> Agreeme
                 rays[second][matches[:, 1]],
             )
             agree = int((distances <= max(limits[first], limits[second])).sum())
-            pairs.append((min(first, second), max(first, second)))
-            agreeing.append(agree)
-            contradicting.append(len(matches) - agree)
-    return Agreement(
-        tuple(image.name for image in images),
-        np.array(pairs, dtype=np.int64).reshape(-1, 2),
-        np.array(agreeing, dtype=np.int64),
-        np.array(contradicting, dtype=np.int64),
-    )
+            counts.append((min(first, second), max(first, second), agree, len(matches) - agree))
+    table = np.array(counts, dtype=np.int64).reshape(-1, 4)
+    return Agreement(tuple(image.name for image in images), table[:, :2], table[:, 2], table[:, 3])
 
 
 def epipolar_distances(relative: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
@@ -198,10 +191,8 @@ def with_default_cameras(database: Path, copy: Path) -> None:
     shutil.copyfile(database, copy)
     with pycolmap.Database.open(copy) as opened:
         for camera in opened.read_all_cameras():
-            size = camera.width, camera.height
-            plain = pycolmap.Camera.create_from_model_name(
-                camera.camera_id, DEFAULT_MODEL, camera.mean_focal_length(), *size
-            )
+            given = camera.camera_id, DEFAULT_MODEL, camera.mean_focal_length(), camera.width, camera.height
+            plain = pycolmap.Camera.create_from_model_name(*given)
             plain.has_prior_focal_length = camera.has_prior_focal_length
             opened.update_camera(plain)
 

@@ -8,7 +8,7 @@ import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import Future, wait
-from contextlib import nullcontext
+from contextlib import closing, nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
@@ -77,14 +77,10 @@ def row_counter(database: Path, table: str) -> Callable[[], int]:
 
     def count() -> int:
         nonlocal latest
-        try:
-            connection = sqlite3.connect(f"{database.absolute().as_uri()}?mode=ro", uri=True, timeout=0.1)
-            try:
-                (latest,) = connection.execute(f"SELECT COUNT(*) FROM {table}").fetchone()
-            finally:
-                connection.close()
-        except sqlite3.Error:  # not there yet, or locked just now
-            pass
+        place = f"{database.absolute().as_uri()}?mode=ro"
+        # It may not be there yet, or be locked just now.
+        with suppress(sqlite3.Error), closing(sqlite3.connect(place, uri=True, timeout=0.1)) as connection:
+            (latest,) = connection.execute(f"SELECT COUNT(*) FROM {table}").fetchone()
         return latest
 
     return count

@@ -19,8 +19,8 @@ from turbogs_plugin.scene.offload import place_views
 from turbogs_plugin.train.background import Background
 from turbogs_plugin.train.evaluate import evaluate, load_lpips
 from turbogs_plugin.train.flip import load_flip
-from turbogs_plugin.train.saved_model import SavedModel, load_given_model, load_model
-from turbogs_plugin.train.start import open_scene, resolve_device
+from turbogs_plugin.train.saved_model import SavedModel, load_with_capture
+from turbogs_plugin.train.start import resolve_device
 
 
 def evaluate_run(path: Path, device_name: str, given: Config | None = None) -> str:
@@ -100,10 +100,5 @@ def distinct_stems(names: Sequence[str]) -> list[str]:
 
 def _open(path: Path, device_name: str, split: str, given: Config | None) -> tuple[SavedModel, PosedImages]:
     """A run's newest model or a given one on a device, and the views of a split on the CPU."""
-    device = resolve_device(device_name)
-    if given is not None:
-        model, scene = load_given_model(path, given, device)
-    else:
-        model = load_model(path, device)
-        scene = open_scene(model.config, model.folder)
+    model, scene, _ = load_with_capture(path, given, resolve_device(device_name))
     return model, scene.test if split == "test" else scene.train

@@ -60,7 +60,6 @@ def read_blender(scene: Path) -> Capture:
         Ks=Ks,
         sizes=sizes,
         points=points,
-        point_colors=None,
         notes=(_note(scene, train, test, sizes, len(points)),),
         test=np.array([name in test for name in names]) if test else None,
     ).checked(scene / TRAIN_FILE)

@@ -47,7 +47,7 @@ class Capture:
     Ks: np.ndarray
     sizes: np.ndarray
     points: np.ndarray
-    point_colors: np.ndarray | None
+    point_colors: np.ndarray | None = None
     lenses: tuple[Lens | None, ...] = ()
     notes: tuple[str, ...] = ()
     test: np.ndarray | None = None

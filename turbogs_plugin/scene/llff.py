@@ -8,14 +8,13 @@ width and focal length of the full-size photos in pixels. The rows are those of 
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene.capture import Capture, sizes_text
-from turbogs_plugin.scene.photos import photo_size
+from turbogs_plugin.scene.photos import photo_sizes
 from turbogs_plugin.scene.poses import viewmat_of_pose
 from turbogs_plugin.scene.starting_points import NUM_RANDOM_POINTS
 from turbogs_plugin.scene.transforms import PHOTO_SUFFIXES
@@ -23,47 +22,6 @@ from turbogs_plugin.scene.transforms import PHOTO_SUFFIXES
 FILE = "poses_bounds.npy"
 COLUMNS = 17
 AGAIN = "write it again with LLFF's imgs2poses.py"
-
-
-@dataclass(frozen=True)
-class LlffTable:
-    """What the file says of V photos, checked.
-
-    Args:
-        viewmats: [V, 4, 4] float64, world to camera (x right, y down, z forward).
-        sizes: [V, 2] float64 (width, height) of the full-size photos.
-        focals: [V] float64, in pixels of the full-size photos.
-        bounds: [V, 2] float64, nearest and farthest depth along the camera's axis, 0 < near < far.
-    """
-
-    viewmats: np.ndarray
-    sizes: np.ndarray
-    focals: np.ndarray
-    bounds: np.ndarray
-
-
-@dataclass(frozen=True)
-class PhotoFolder:
-    """One of the folders with the capture's photos.
-
-    Args:
-        path: the folder.
-        reduction: by which its photos are smaller than the full-size ones.
-        names: of its photos, in order.
-    """
-
-    path: Path
-    reduction: int
-    names: tuple[str, ...]
-
-    @classmethod
-    def of(cls, path: Path, reduction: int) -> PhotoFolder:
-        files = (file for file in path.iterdir() if not file.name.startswith(".") and file.is_file())
-        return cls(path, reduction, tuple(sorted(file.name for file in files if file.suffix.lower() in PHOTO_SUFFIXES)))
-
-    def sizes(self) -> np.ndarray:
-        """[V, 2] int64 (width, height)."""
-        return np.array([photo_size(self.path / name) for name in self.names], dtype=np.int64).reshape(-1, 2)
 
 
 def read_llff(scene: Path, factor: int = 1) -> Capture:
@@ -79,29 +37,29 @@ def read_llff(scene: Path, factor: int = 1) -> Capture:
         InputError: a file of another shape, poses or bounds that make no sense, photos that do not belong to it.
     """
     source = scene / FILE
-    table = _read_table(source)
+    viewmats, full_sizes, focals, bounds = _read_table(source)
     usable = _usable_folders(scene, factor)
-    folder = next((folder for folder in usable[:-1] if _is_whole_copy(folder, table)), usable[-1])
-    sizes = _checked_sizes(folder, table, source)
-    ratios = sizes / table.sizes  # [V, 2]
+    whole = (each for each in usable[:-1] if _is_whole_copy(*each, full_sizes))
+    reduction, photos = next(whole, usable[-1])
+    sizes = _checked_sizes(photos, full_sizes, source)
     intrinsics = np.tile(np.eye(3), (len(sizes), 1, 1))
-    intrinsics[:, [0, 1], [0, 1]] = table.focals[:, None] * ratios
+    intrinsics[:, [0, 1], [0, 1]] = focals[:, None] * (sizes / full_sizes)
     intrinsics[:, :2, 2] = 0.5 * sizes
-    points = points_in_views(table.viewmats, intrinsics, sizes, table.bounds)
-    depths = f"{table.bounds[:, 0].min():.4g} to {table.bounds[:, 1].max():.4g}"
+    points = points_in_views(viewmats, intrinsics, sizes, bounds)
+    depths = f"{bounds[:, 0].min():.4g} to {bounds[:, 1].max():.4g}"
+    folder = photos[0].parent
     return Capture(
-        names=folder.names,
-        photo_folder=folder.path,
-        viewmats=table.viewmats,
+        names=tuple(photo.name for photo in photos),
+        photo_folder=folder,
+        viewmats=viewmats,
         Ks=intrinsics,
         sizes=sizes,
         points=points,
-        point_colors=None,
         notes=(
-            f"LLFF: {len(sizes)} photos {sizes_text(sizes)} of {folder.path.name}; no points, so {len(points):,} "
+            f"LLFF: {len(sizes)} photos {sizes_text(sizes)} of {folder.name}; no points, so {len(points):,} "
             f"random ones (seed 0) within the views at depths of {depths}",
         ),
-        reduction=folder.reduction,
+        reduction=reduction,
         alpha="mask",
     ).checked(source)
 
@@ -130,7 +88,14 @@ def points_in_views(viewmats: np.ndarray, Ks: np.ndarray, sizes: np.ndarray, bou
         return np.einsum("mji,mj->mi", viewmats[views, :3, :3], in_camera - viewmats[views, :3, 3])
 
 
-def _read_table(source: Path) -> LlffTable:
+def _read_table(source: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """What the file says of V photos, checked.
+
+    Returns:
+        [V, 4, 4] float64 world to camera (x right, y down, z forward); [V, 2] float64 (width, height) and [V] float64
+        focal lengths in pixels, of the full-size photos; [V, 2] float64 nearest and farthest depth along the camera's
+        axis, 0 < near < far.
+    """
     try:
         # Mapped, so that a header cannot ask for more memory than there is file.
         rows = np.lib.format.open_memmap(source, mode="r")
@@ -162,57 +127,63 @@ def _read_table(source: Path) -> LlffTable:
     ):
         if not ok.all():
             raise InputError(f"{source}: row {int(np.argmin(ok))} has {trouble} ({(~ok).sum()} such rows): {AGAIN}")
-    return LlffTable(viewmats, np.column_stack([width, height]), focal, table[:, 15:])
+    return viewmats, np.column_stack([width, height]), focal, table[:, 15:]
 
 
-def _usable_folders(scene: Path, factor: int) -> list[PhotoFolder]:
-    """The folders that a capture can be loaded from at this factor, smallest photos first; at least one."""
+def _usable_folders(scene: Path, factor: int) -> list[tuple[int, list[Path]]]:
+    """The folders that a capture can be loaded from at this factor, smallest photos first; at least one. Of each, by
+    how much its photos are smaller than the full-size ones, and the photos in order."""
     matches = ((path, re.fullmatch(r"images(?:_([1-9]\d{0,3}))?", path.name)) for path in sorted(scene.iterdir()))
-    found = (PhotoFolder.of(path, int(match[1] or 1)) for path, match in matches if match and path.is_dir())
-    folders = sorted((folder for folder in found if folder.names), key=lambda folder: -folder.reduction)
+    found = ((int(match[1] or 1), _photos_of(path)) for path, match in matches if match and path.is_dir())
+    folders = sorted((folder for folder in found if folder[1]), key=lambda folder: -folder[0])
     if not folders:
         raise InputError(f"{scene} has {FILE} but no photos ({', '.join(PHOTO_SUFFIXES)}): put them into images")
-    usable = [folder for folder in folders if factor % folder.reduction == 0]
+    usable = [folder for folder in folders if factor % folder[0] == 0]
     if not usable and factor == 1:
         usable = folders[-1:]
     if not usable:
-        largest = folders[-1]
+        reduction, photos = folders[-1]
         raise InputError(
-            f"--factor {factor}: the largest photos of {scene} are those of {largest.path.name}: use --factor "
-            f"{largest.reduction} or a multiple of it, or put the full-size photos into images"
+            f"--factor {factor}: the largest photos of {scene} are those of {photos[0].parent.name}: use --factor "
+            f"{reduction} or a multiple of it, or put the full-size photos into images"
         )
     return usable
 
 
-def _is_whole_copy(folder: PhotoFolder, table: LlffTable) -> bool:
+def _photos_of(folder: Path) -> list[Path]:
+    files = (file for file in sorted(folder.iterdir()) if file.suffix.lower() in PHOTO_SUFFIXES)
+    return [file for file in files if not file.name.startswith(".") and file.is_file()]
+
+
+def _is_whole_copy(reduction: int, photos: list[Path], full_sizes: np.ndarray) -> bool:
     """Whether all photos are there in the size that the folder's name says."""
-    if len(folder.names) != len(table.sizes):
+    if len(photos) != len(full_sizes):
         return False
-    return bool((np.abs(folder.sizes() - table.sizes / folder.reduction) <= 1.0).all())
+    return bool((np.abs(photo_sizes(photos) - full_sizes / reduction) <= 1.0).all())
 
 
-def _checked_sizes(folder: PhotoFolder, table: LlffTable, source: Path) -> np.ndarray:
-    """[V, 2] int64 sizes of the folder's photos, which are those of the table at a uniform scale."""
-    if len(folder.names) != len(table.sizes):
+def _checked_sizes(photos: list[Path], full_sizes: np.ndarray, source: Path) -> np.ndarray:
+    """[V, 2] int64 sizes of a folder's photos, which are those of the file at a uniform scale."""
+    if len(photos) != len(full_sizes):
         raise InputError(
-            f"{source} has {len(table.sizes)} poses but {folder.path} has {len(folder.names)} photos: take out the "
+            f"{source} has {len(full_sizes)} poses but {photos[0].parent} has {len(photos)} photos: take out the "
             f"photos without a pose (COLMAP leaves out what it cannot place), or {AGAIN}"
         )
-    sizes = folder.sizes()
-    other = (sizes != sizes[0]).any(axis=1) & (table.sizes == table.sizes[0]).all(axis=1)
+    sizes = photo_sizes(photos)
+    other = (sizes != sizes[0]).any(axis=1) & (full_sizes == full_sizes[0]).all(axis=1)
     if other.any():
         view = int(np.argmax(other))
         raise InputError(
-            f"photo {folder.path / folder.names[view]} is {sizes_text(sizes[[view]])} but the first one is "
+            f"photo {photos[view]} is {sizes_text(sizes[[view]])} but the first one is "
             f"{sizes_text(sizes[:1])}, and {FILE} has one size for both: use the photos that it was written for"
         )
     # Either side of a reduced photo may be rounded by up to a pixel.
-    ratios = sizes / table.sizes
-    bent = np.abs(ratios[:, 0] - ratios[:, 1]) > (1.0 / table.sizes).sum(axis=1)
+    ratios = sizes / full_sizes
+    bent = np.abs(ratios[:, 0] - ratios[:, 1]) > (1.0 / full_sizes).sum(axis=1)
     if bent.any():
         view = int(np.argmax(bent))
         raise InputError(
-            f"photo {folder.path / folder.names[view]} is {sizes_text(sizes[[view]])}, no uniform scale of the "
-            f"{sizes_text(table.sizes[[view]])} in {FILE}: use the photos that it was written for"
+            f"photo {photos[view]} is {sizes_text(sizes[[view]])}, no uniform scale of the "
+            f"{sizes_text(full_sizes[[view]])} in {FILE}: use the photos that it was written for"
         )
     return sizes

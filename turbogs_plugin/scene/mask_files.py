@@ -54,11 +54,7 @@ def _in_folders(folders: Sequence[Path], photo: str) -> Path | None:
 
 
 def load_masks(
-    files: Sequence[Path | None],
-    photos: Sequence[Path],
-    capture: Capture,
-    sizes: np.ndarray,
-    targets: np.ndarray,
+    files: Sequence[Path | None], photos: Sequence[Path], capture: Capture, sizes: np.ndarray, targets: np.ndarray
 ) -> list[ViewMask | None]:
     """Read masks in parallel, undistorted and reduced as the photos are.
 

@@ -25,7 +25,8 @@ def mean_neighbor_distances(points: Tensor, neighbors: int) -> Tensor:
     neighbors = min(neighbors, len(points) - 1)
     members, places = _buckets(points, BUCKET_SIZE)
     cloud = _Buckets(places, members < len(points))
-    nearest = torch.cat([cloud.nearest(rows, neighbors) for rows in cloud.groups()])  # [B, S, k], squared
+    groups = torch.arange(len(places), device=places.device).split(max(1, GAPS_AT_ONCE // len(places)))
+    nearest = torch.cat([cloud.nearest(rows, neighbors) for rows in groups])  # [B, S, k], squared
     result = points.new_empty(len(points))
     result[members[cloud.counts]] = nearest[cloud.counts].sqrt().mean(dim=1)
     return result
@@ -42,11 +43,6 @@ class _Buckets:
     def __init__(self, places: Tensor, counts: Tensor) -> None:
         self.places, self.counts = places, counts
         self.lows, self.highs = places.amin(dim=1), places.amax(dim=1)  # [B, 3]
-
-    def groups(self) -> tuple[Tensor, ...]:
-        """The buckets in groups that are searched at once."""
-        buckets = torch.arange(len(self.places), device=self.places.device)
-        return buckets.split(max(1, GAPS_AT_ONCE // len(buckets)))
 
     def nearest(self, rows: Tensor, neighbors: int) -> Tensor:
         """[G, S, k]: squared distances of the points of some buckets to their nearest, zero for copies."""

@@ -25,9 +25,7 @@ def find_photos(folder: Path) -> tuple[Path, list[Path]]:
         The folder that their names are relative to; the photos in the order of their names.
     """
     for place in (folder / "images", folder):
-        files = _files(place, FOLDER_DEPTH)
-        photos = [path for path in files if path.suffix.lower() in PHOTO_SUFFIXES]
-        if photos:
+        if photos := [path for path in _files(place, FOLDER_DEPTH) if path.suffix.lower() in PHOTO_SUFFIXES]:
             break
     return place, sorted(photos, key=lambda path: path.relative_to(place).as_posix())
 

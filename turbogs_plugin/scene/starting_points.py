@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 import torch
 from torch import Tensor
@@ -11,9 +9,7 @@ from torch import Tensor
 from turbogs_plugin.masks import PixelMasks
 from turbogs_plugin.scene.photos import Photos, pixel_offsets
 from turbogs_plugin.scene.poses import camera_centers, evenly
-
-if TYPE_CHECKING:
-    from turbogs_plugin.types import Cameras
+from turbogs_plugin.types import Cameras
 
 NUM_RANDOM_POINTS = 50_000
 COLOR_VIEWS = 32

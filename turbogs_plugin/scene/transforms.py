@@ -205,41 +205,33 @@ def _camera(
             "COLMAP reconstruction"
         )
     fisheye = model in FISHEYE_MODELS
-    radial = tuple(number(f"k{power}", 0.0) for power in (1, 2, 3, 4))
-    tangential = (number("p1", 0.0), number("p2", 0.0))
+    bends = tuple(number(key, 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
     if unknown := [key for key in ("k5", "k6", *(("p1", "p2") if fisheye else ())) if number(key, 0.0)]:
         raise InputError(
             f"{source}: the {model} camera of {photo.name} has {' and '.join(unknown)}, which the model does not have: "
             "use the capture's COLMAP reconstruction"
         )
-    if not (fisheye or any(radial) or any(tangential)):
+    if not (fisheye or any(bends)):
         return K, size, None
-    key = (fisheye, size, *K.ravel().tolist(), *radial, *tangential)
+    key = (fisheye, size, *K.ravel().tolist(), *bends)
     if key not in lenses:
-        owner = f"{source}: the camera of {photo.name}"
-        lenses[key] = _make_lens(fisheye, size, K, radial, tangential, owner)
+        lenses[key] = _make_lens(fisheye, size, K, bends, f"{source}: the camera of {photo.name}")
     return lenses[key].K, lenses[key].size, lenses[key]
 
 
-def _make_lens(
-    fisheye: bool,
-    size: tuple[int, int],
-    K: np.ndarray,
-    radial: tuple[float, ...],
-    tangential: tuple[float, ...],
-    owner: str,
-) -> Lens:
+def _make_lens(fisheye: bool, size: tuple[int, int], K: np.ndarray, bends: tuple[float, ...], owner: str) -> Lens:
+    """`bends`: k1, k2, k3, k4, p1, p2."""
+    radial, (k1, k2, k3, k4, p1, p2) = bends[:4], bends
     pinhole = [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]
-    if not fisheye and radial[3]:
+    if not fisheye and k4:
         # As nerfstudio has it: COLMAP's models, and OpenCV's own fourth coefficient, are other polynomials.
-        projection = brown_projection((K[0, 0], K[1, 1]), (K[0, 2], K[1, 2]), radial, *tangential)
-        return make_lens("OPENCV", size, projection, owner)
+        return make_lens("OPENCV", size, brown_projection(pinhole[:2], pinhole[2:], radial, p1, p2), owner)
     if fisheye:
         model, params = "OPENCV_FISHEYE", [*pinhole, *radial]
-    elif radial[2]:
-        model, params = "FULL_OPENCV", [*pinhole, *radial[:2], *tangential, radial[2], 0.0, 0.0, 0.0]
+    elif k3:
+        model, params = "FULL_OPENCV", [*pinhole, k1, k2, p1, p2, k3, 0.0, 0.0, 0.0]
     else:
-        model, params = "OPENCV", [*pinhole, *radial[:2], *tangential]
+        model, params = "OPENCV", [*pinhole, k1, k2, p1, p2]
     camera = load_pycolmap().Camera(model=model, width=size[0], height=size[1], params=params)
     return lens_of_camera(camera, owner)
 

@@ -129,7 +129,7 @@ def lens_of_camera(camera: pycolmap.Camera, owner: str) -> Lens:
 
 
 def brown_projection(
-    focal: tuple[float, float], center: tuple[float, float], radial: Sequence[float], p1: float, p2: float
+    focal: Sequence[float], center: Sequence[float], radial: Sequence[float], p1: float, p2: float
 ) -> Projection:
     """OpenCV's model with any number of radial coefficients, all in the numerator as Metashape and nerfstudio have it.
 
@@ -228,10 +228,6 @@ def undistortion_note(lenses: Sequence[Lens | None]) -> str:
         return ""
     different = {id(lens): lens for lens in bent}
     first = bent[0]
-    example = f"{first.model} {_size(first.photo_size)} -> PINHOLE {_size(first.size)}"
+    photo, image = ("x".join(map(str, size)) for size in (first.photo_size, first.size))
     more = f", and {len(different) - 1} more cameras" if len(different) > 1 else ""
-    return f"{len(bent)} photos undistorted: {example}{more}"
-
-
-def _size(size: tuple[int, int]) -> str:
-    return f"{size[0]}x{size[1]}"
+    return f"{len(bent)} photos undistorted: {first.model} {photo} -> PINHOLE {image}{more}"

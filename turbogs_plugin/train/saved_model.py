@@ -77,3 +77,23 @@ def load_given_model(path: Path, config: Config, device: torch.device) -> tuple[
     scene = open_scene(config)
     gaussians = load_given(path, scene, device).map(lambda value: value.to(device))
     return SavedModel(None, config, gaussians, scene.frame, None), scene
+
+
+def load_with_capture(
+    path: Path, given: Config | None, device: torch.device, needed: bool = True
+) -> tuple[SavedModel, Scene | None, str]:
+    """A run's newest model or a given one, its capture, and why that is None: it is not there, and not `needed`.
+
+    Args:
+        path: folder of the run, or the file of a model.
+        given: as `config` of `load_given_model`; None: `path` is a run.
+    """
+    if given is not None:
+        return *load_given_model(path, given, device), ""
+    model = load_model(path, device)
+    try:
+        return model, open_scene(model.config, model.folder), ""
+    except InputError as error:
+        if needed:
+            raise
+        return model, None, str(error)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,13 +13,12 @@ import torch
 
 from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.error_maps import ErrorMaps
-from turbogs_plugin.errors import InputError
 from turbogs_plugin.model.similarity import Similarity, placed
 from turbogs_plugin.scene import Frame, Scene
 from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint
 from turbogs_plugin.train.given_model import read_given
-from turbogs_plugin.train.saved_model import load_given_model, load_model
-from turbogs_plugin.train.start import open_scene, resolve_device
+from turbogs_plugin.train.saved_model import load_with_capture
+from turbogs_plugin.train.start import resolve_device
 from turbogs_plugin.types import Gaussians, Step
 from turbogs_plugin.viewer.controls import Controls
 from turbogs_plugin.viewer.frames import Frames
@@ -56,11 +55,8 @@ def attached(port: int, host: str) -> Iterator[LiveViewer]:
     Raises:
         InputError: viser is not installed, or the port is not free.
     """
-    page = Page(host, port, Controls())
-    try:
+    with closing(Page(host, port, Controls())) as page:
         yield LiveViewer(page)
-    finally:
-        page.close()
 
 
 def view(path: Path, port: int, host: str, device_name: str, given: Config | None = None) -> int:
@@ -79,16 +75,11 @@ def view(path: Path, port: int, host: str, device_name: str, given: Config | Non
     require_viser()
     require_free(host, port)
     shown = open_shown(path, resolve_device(device_name), given)
-    page = Page(host, port)
-    try:
+    with suppress(KeyboardInterrupt), closing(Page(host, port)) as page:
         if shown.note:
             print(f"turbogs: {shown.note}", file=sys.stderr)
         print(f"viewer  {page.url}  (Ctrl-C ends)", flush=True)
         show(shown, page, lambda: False)
-    except KeyboardInterrupt:
-        pass
-    finally:
-        page.close()
     return 0
 
 
@@ -114,13 +105,18 @@ def open_shown(path: Path, device: torch.device, given: Config | None = None) ->
     Raises:
         InputError: there is no usable model, or no usable capture where one was named.
     """
+    if given is None and not path.is_dir():
+        gaussians = alone(read_given(path), path).map(lambda value: value.to(device))
+        return Shown(Subject(gaussians, gaussians.sh_degree), path.name)
+    model, scene, absent = load_with_capture(path, given, device, needed=False)
+    capture = None if scene is None else CaptureViews(scene.train, scene.test)
+    subject = Subject(model.gaussians, model.sh_degree, settings=model.config.raster, capture=capture)
     if given is not None:
-        model, scene = load_given_model(path, given, device)
-        return Shown(_subject(model.gaussians, scene, device, model.sh_degree, given), path.name)
-    if path.is_dir():
-        return _open_run(path, device)
-    gaussians = alone(read_given(path), path)
-    return Shown(Subject(gaussians.map(lambda value: value.to(device)), gaussians.sh_degree), path.name)
+        return Shown(subject, path.name)
+    if scene is not None:
+        subject.maps, subject.step = _saved_maps(path, scene, model.config, model.iteration)
+    note = f"shown without its capture: {absent}" if absent else ""
+    return Shown(subject, f"{path.name}, iteration {model.iteration}", note)
 
 
 def alone(gaussians: Gaussians, path: Path) -> Gaussians:
@@ -138,24 +134,6 @@ def alone(gaussians: Gaussians, path: Path) -> Gaussians:
     middle = np.median(means, axis=0) if len(means) else np.zeros(3)
     reach = float(np.quantile(np.linalg.norm(means - middle, axis=1), MOST)) if len(means) else 1.0
     return placed(gaussians, Similarity.into(Frame(middle, reach if reach > 0 else 1.0)), path)
-
-
-def _open_run(path: Path, device: torch.device) -> Shown:
-    model = load_model(path, device)
-    note, scene = "", None
-    try:
-        scene = open_scene(model.config, model.folder)
-    except InputError as error:
-        note = f"shown without its capture: {error}"
-    subject = _subject(model.gaussians, scene, device, model.sh_degree, model.config)
-    if scene is not None:
-        subject.maps, subject.step = _saved_maps(path, scene, model.config, model.iteration)
-    return Shown(subject, f"{path.name}, iteration {model.iteration}", note)
-
-
-def _subject(gaussians: Gaussians, scene: Scene | None, device: torch.device, degree: int, config: Config) -> Subject:
-    capture = None if scene is None else CaptureViews(scene.train, scene.test)
-    return Subject(gaussians.map(lambda value: value.to(device)), degree, settings=config.raster, capture=capture)
 
 
 def _saved_maps(

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import sys
 import time
+from contextlib import suppress
 
 from turbogs_plugin.device import synchronize
 from turbogs_plugin.scene import PosedImages
@@ -34,15 +35,11 @@ class LiveViewer(Listener):
 
     Args:
         page: with controls.
-
-    Attributes:
-        frames_drawn: so far.
     """
 
     def __init__(self, page: Page) -> None:
         self.page = page
         self.frames = Frames(page.screens, page.wish)
-        self.frames_drawn = 0
         self._trainer: Trainer | None = None
         self._capture: CaptureViews | None = None
         self._samples: PixelSamples | None = None
@@ -84,14 +81,12 @@ class LiveViewer(Listener):
 
     def stay(self) -> None:
         """After the training: show its model until Ctrl-C, as is said on standard output."""
-        try:
+        with suppress(KeyboardInterrupt):
             self.page.finished()
             print(f"viewer  {self.page.url}  (Ctrl-C ends)", flush=True)
             while True:
                 if not self._serve(running=False):
                     self.page.controls.wait(0.05)
-        except KeyboardInterrupt:
-            pass
 
     def _hold(self, loop: TrainingLoop) -> None:
         """Wait until the page lets the training go on, or nobody is there who could, or it is to be stopped."""
@@ -111,7 +106,6 @@ class LiveViewer(Listener):
     def _serve(self, running: bool) -> bool:
         """Draw a frame if one is due, and keep the page's text up to date."""
         drawn = self.frames.serve(self._drawable, self._trainer.iteration, running)
-        self.frames_drawn += drawn
         now = time.perf_counter()
         if self.page.watched and now >= self._next_status:
             self._next_status = now + STATUS_SECONDS

@@ -52,9 +52,8 @@ def require_viser() -> ModuleType:
     try:
         import viser
     except ImportError as error:
-        if (error.name or "").partition(".")[0] != "viser":
-            raise InputError(f"the viewer needs {error.name}: {INSTALL}") from error
-        raise InputError(f"the viewer needs viser: {INSTALL}") from error
+        lacking = "viser" if (error.name or "").partition(".")[0] == "viser" else error.name
+        raise InputError(f"the viewer needs {lacking}: {INSTALL}") from error
     return viser
 
 
@@ -69,12 +68,12 @@ def require_free(host: str, port: int) -> None:
             probe.bind(address)
     except (OSError, UnicodeError) as error:
         reason = getattr(error, "strerror", None) or error
-        if getattr(error, "errno", None) == errno.EADDRINUSE:
-            remedy = "name another port (view --port N, train --viewer N)"
-        elif getattr(error, "errno", None) == errno.EACCES:
-            remedy = "name a port above 1023"
-        else:
-            remedy = "name an address of this machine: 127.0.0.1 for itself alone, 0.0.0.0 for the network, too"
+        remedies = {
+            errno.EADDRINUSE: "name another port (view --port N, train --viewer N)",
+            errno.EACCES: "name a port above 1023",
+        }
+        otherwise = "name an address of this machine: 127.0.0.1 for itself alone, 0.0.0.0 for the network, too"
+        remedy = remedies.get(getattr(error, "errno", None), otherwise)
         raise InputError(f"the viewer cannot listen at {host}:{port} ({reason}): {remedy}") from None
 
 

@@ -36,8 +36,7 @@ class DensityChange:
         gone = torch.ones(len(before), dtype=torch.bool, device=before.device)
         gone[update.source] = False
         removed = before.map(lambda value: value[gone])
-        counts = (update.num_cloned, update.num_split, update.num_pruned)
-        return cls(iteration, update.fresh, removed, *counts)
+        return cls(iteration, update.fresh, removed, update.num_cloned, update.num_split, update.num_pruned)
 
 
 @dataclass(frozen=True)
