@@ -16,14 +16,10 @@ from turbogs_plugin.train.evaluate import LPIPS_PACKAGES
 from turbogs_plugin.train.flip import load_flip
 from turbogs_plugin.viewer.page import INSTALL as INSTALL_VIEWER
 
-COMMAND_PACKAGES = {
-    "pycolmap": "pycolmap>=4.0",
-    "omegaconf": "omegaconf>=2.3",
-    "tyro": "tyro>=0.9",
-    "rich": "rich>=13.0",
-    "matplotlib": "matplotlib>=3.8",
-}
-"""Module -> requirement: the extra ``train`` of pyproject.toml. The strategies and the gsplat bridge need none."""
+REQUIREMENTS = ("pycolmap>=4.0", "omegaconf>=2.3", "tyro>=0.9", "rich>=13.0", "matplotlib>=3.8")
+"""The extra ``train`` of pyproject.toml. The strategies and the gsplat bridge need none of it."""
+COMMAND_PACKAGES = {requirement.partition(">=")[0]: requirement for requirement in REQUIREMENTS}
+"""Module -> requirement."""
 
 INSTALL_COMMANDS = 'pip install "turbogs-plugin[train]"'
 

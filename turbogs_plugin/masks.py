@@ -137,7 +137,9 @@ class PixelMasks:
         firsts = TileGrid(self.sizes[list(view_ids)]).offsets.tolist()
         spans = [slice(int(self.offsets[view]), int(self.offsets[view + 1])) for view in view_ids]
         tiles = torch.cat([self.tiles[span].long() + first for span, first in zip(spans, firsts, strict=False)])
-        return tiles, self._places(torch.cat([self.rows[span] for span in spans]).long())
+        words = self.bits[torch.cat([self.rows[span] for span in spans]).long()]  # [T, WORDS]
+        shifts = torch.arange(WORD_BITS, dtype=torch.int32, device=words.device)
+        return tiles, ((words[:, :, None] >> shifts) & 1).bool().reshape(-1, TILE_PIXELS)
 
     def image(self, view_id: int) -> Tensor:
         """[H, W] bool on the masks' device: the mask of one view."""
@@ -177,8 +179,3 @@ class PixelMasks:
         offsets = torch.nn.functional.pad(counts[left].cumsum(dim=0), (1, 0)).int()
         kept = (samples.pixel_ids[keep], samples.tile_ids[left], offsets, weights)
         return PixelSamples(samples.view_ids, samples.sizes, *kept, has_empty_slots=False)
-
-    def _places(self, rows: Tensor) -> Tensor:
-        """[T] rows of `bits` -> [T, 256] bool."""
-        shifts = torch.arange(WORD_BITS, dtype=torch.int32, device=rows.device)
-        return ((self.bits[rows][:, :, None] >> shifts) & 1).bool().reshape(len(rows), TILE_PIXELS)

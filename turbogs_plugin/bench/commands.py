@@ -51,9 +51,8 @@ def run_step(bench: StepBench, scene: Path | None, factor: int, device: torch.de
         capture = synthetic_scene(bench.photos, *bench.size, device)
     else:
         capture = scene_on(load_scene(scene, factor), device)
-    measured = bench.run(capture, device)
-    report = _report("step", measured, device)
-    _keep(report, step_lines(measured), out)
+    report = _report("step", bench.run(capture, device), device)
+    _keep(report, step_lines(report), out)
     _finish(report, out)
 
 
@@ -65,16 +64,14 @@ def run_raster(bench: RasterBench, scene: Path | None, factor: int, device: torc
         about = {"scene": capture.name, "model": f"trained for {bench.training} iterations"}
     # What another build trains would differ in the last bits: all measure the same models.
     job = bench, bench.models(capture, device), bench.cameras(capture), device
-    measured = bench.run(*job[1:])
-    report = _report("raster", {**about, **measured, "other_builds": {}}, device)
-    _keep(report, raster_lines(measured), out)  # a build that fails takes nothing away
+    report = _report("raster", {**about, **bench.run(*job[1:]), "other_builds": {}}, device)
+    _keep(report, raster_lines(report), out)  # a build that fails takes nothing away
     builds = {library.name: library for library in bench.libraries}
     if builds and not compiled_kernels().unavailable:
         builds = {AGAIN: compiled_kernels().path, **builds}
     for name, library in builds.items():
-        measured = other_build(library, job)
-        report["other_builds"][name] = {**about, **measured}
-        _keep(report, [f"{name}:", *raster_lines(measured)], out)
+        report["other_builds"][name] = {**about, **other_build(library, job)}
+        _keep(report, [f"{name}:", *raster_lines(report["other_builds"][name])], out)
     _finish(report, out)
 
 

@@ -158,7 +158,10 @@ def bench_solvers(out: Path, device: torch.device) -> list[SolverResult]:
     """
     results = []
     for views in VIEWS:
-        times = _nanoseconds(views, device)
+        # Branch-free solvers take the same time on every family.
+        many = [value.to(device) for value in make_problem(FAMILIES[0], views, BATCH, seed=0)]
+        measured = {name: measure(partial(solve, *many), REPEATS, device) for name, solve in SOLVERS.items()}
+        times = {name: 1e6 * took["median_ms"] / BATCH for name, took in measured.items()}
         for seed, family in enumerate(FAMILIES):
             problem = make_problem(family, views, SYSTEMS, seed)
             exact = solve_exactly(problem)
@@ -173,15 +176,6 @@ def bench_solvers(out: Path, device: torch.device) -> list[SolverResult]:
     write_text_atomically(out / "solvers.md", solvers_table(results) + "\n")
     write_atomically(out / "solvers.png", lambda file: _plot(results).savefig(file, format="png"))
     return results
-
-
-def _nanoseconds(views: int, device: torch.device) -> dict[str, float]:
-    """Time a system, by solver. Branch-free solvers take the same time on every family."""
-    problem = tuple(value.to(device) for value in make_problem(FAMILIES[0], views, BATCH, seed=0))
-    return {
-        name: 1e6 * measure(partial(solve, *problem), REPEATS, device)["median_ms"] / BATCH
-        for name, solve in SOLVERS.items()
-    }
 
 
 def solvers_table(results: list[SolverResult]) -> str:

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from turbogs_plugin.bench.clocks import back_to_back, device_times
 from turbogs_plugin.bench.models import trained_model
@@ -58,29 +59,27 @@ class RanksBench:
         Raises:
             TrainingStopped: processes ended with an error, which they have told.
         """
-        results = []
-        with tempfile.TemporaryDirectory() as name:
-            folder = Path(name)
-            scene = scene_on(load_scene(path, factor), device)
-            for count in self.step.gaussians:
-                model = trained_model(scene, count, self.step.training, device, self.step.overrides)
-                torch.save({name: value.cpu() for name, value in model.items()}, folder / f"{count}.pt")
-            scene_name = scene.name
-            del scene, model
-            job = folder / "job"
-            job.write_bytes(pickle.dumps((self, path.resolve(), factor, device.type)))
+        scene = scene_on(load_scene(path, factor), device)
+        step, name, results = self.step, scene.name, []
+        models = [trained_model(scene, count, step.training, device, step.overrides) for count in step.gaussians]
+        models = [model.map(Tensor.cpu) for model in models]
+        del scene
+        with tempfile.TemporaryDirectory() as folder:
+            job = Path(folder) / "job"
+            job.write_bytes(pickle.dumps((self, models, path.resolve(), factor, device.type)))
             for count in self.gpus:
                 if start(count, [str(job)], device.type, "turbogs_plugin.bench.ranks"):
                     raise TrainingStopped(f"bench ranks on {count} GPUs ended early")
-                results += json.loads((folder / f"result-{count}.json").read_text())
-        return {"scene": scene_name, "overrides": list(self.step.overrides), "passes": results}
+                results += json.loads(job.with_name(f"result-{count}.json").read_text())
+        return {"scene": name, "overrides": list(step.overrides), "passes": results}
 
-    def measure(self, scene: Scene, folder: Path, device: torch.device, ranks: Ranks) -> list[dict[str, Any]]:
-        """In each process: the passes with this number of GPUs."""
+    def measure(
+        self, models: Sequence[Gaussians], scene: Scene, device: torch.device, ranks: Ranks
+    ) -> list[dict[str, Any]]:
+        """In each process: the passes of models in host memory with this number of GPUs."""
         results = []
-        for count in self.step.gaussians:
-            state = torch.load(folder / f"{count}.pt", weights_only=True)
-            model = Gaussians(**{name: value.to(device) for name, value in state.items()})
+        for held in models:
+            model = held.map(lambda value: value.to(device))
             factors = sorted({1, ranks.count}) if self.grown else [1]
             for views, factor in [(views, factor) for views in self.step.views for factor in factors]:
                 for by_rows in (True, False) if ranks.count > 1 and factor == 1 else (True,):
@@ -144,13 +143,13 @@ def line_of(result: dict[str, Any]) -> str:
 def main() -> None:
     """A process that `RanksBench.run` started."""
     job = Path(sys.argv[1])
-    bench, path, factor, kind = pickle.loads(job.read_bytes())
+    bench, models, path, factor, kind = pickle.loads(job.read_bytes())
     with joined(kind) as ranks:
         device = resolve_device(kind)
         scene = scene_on(load_scene(path, factor), device)
-        results = bench.measure(scene, job.parent, device, ranks)
+        results = bench.measure(models, scene, device, ranks)
         if ranks.first:
-            (job.parent / f"result-{ranks.count}.json").write_text(json.dumps(results))
+            job.with_name(f"result-{ranks.count}.json").write_text(json.dumps(results))
 
 
 if __name__ == "__main__":

@@ -175,11 +175,8 @@ class StepBench:
         return config.changed(
             train={"iterations": 2 * NO_EVENTS, "refine_until": 2 * NO_EVENTS - 1, "sh_interval": 1},
             schedule={"type": "fixed", "views": views, "pixel_budget": self.pixel_budget},
-            density={**config.density, **dict.fromkeys(FIRST_EVENT & config.density.keys(), NO_EVENTS)},
-            optimizer={
-                **config.optimizer,
-                "learning_rates": {**rates, "batch_scale": RATE_FACTOR * rates["batch_scale"]},
-            },
+            density=dict.fromkeys(FIRST_EVENT & config.density.keys(), NO_EVENTS),
+            optimizer={"learning_rates": {**rates, "batch_scale": RATE_FACTOR * rates["batch_scale"]}},
         )
 
 

@@ -103,15 +103,13 @@ class TrainConfig:
             value = getattr(self, name)
             require(value == "auto" or 1 <= value < 2**31, name, value, "within 1 .. 2^31 - 1")
         require(math.isfinite(self.epochs) and self.epochs > 0, "epochs", self.epochs, "a finite number above 0")
-        valid = self.batch_for == "auto" or self.batch_for >= 1
-        require(valid, "batch_for", self.batch_for, "at least 1")
+        require(self.batch_for == "auto" or self.batch_for >= 1, "batch_for", self.batch_for, "at least 1")
         require(self.refine_until >= 0, "refine_until", self.refine_until, "at least 0")
         require(0 <= self.seed < 2**31, "seed", self.seed, "within 0 .. 2^31 - 1")
         require(self.device in ("auto", "cpu", "cuda"), "device", self.device, "auto, cpu or cuda")
         named = bool(self.init.strip())
         require(named, "init", self.init, "points, random, or the file of a model (.ply, .pt) or a run's folder")
-        valid = self.sh_degree == "auto" or 0 <= self.sh_degree <= 3
-        require(valid, "sh_degree", self.sh_degree, "within 0 .. 3")
+        require(self.sh_degree == "auto" or 0 <= self.sh_degree <= 3, "sh_degree", self.sh_degree, "within 0 .. 3")
         if self.background not in ("auto", "random"):
             parse_color(self.background)
         require(self.sh_interval >= 1, "sh_interval", self.sh_interval, "at least 1")

@@ -21,6 +21,7 @@ from turbogs_plugin.train.evaluate import evaluate, load_lpips
 from turbogs_plugin.train.flip import load_flip
 from turbogs_plugin.train.saved_model import SavedModel, load_with_capture
 from turbogs_plugin.train.start import resolve_device
+from turbogs_plugin.types import Color
 
 
 def evaluate_run(path: Path, device_name: str, given: Config | None = None) -> str:
@@ -31,14 +32,12 @@ def evaluate_run(path: Path, device_name: str, given: Config | None = None) -> s
         device_name: where to render.
         given: the capture of a model from a file, and how to render it; None: `path` is a run.
     """
-    model, views = _open(path, device_name, "test", given)
+    model, views, background = _open(path, device_name, "test", given)
     views = place_views(views, model.gaussians.device, model.config.train.photos_place)
     lpips, reason = load_lpips(model.config.report.lpips_weights, model.gaussians.device)
     flip, no_flip = load_flip()
-    background = Background.of(model.config.train.background, views.photos.transparent).evaluated
-    settings = model.config.raster
     options = {"flip": flip, "background": background, "aligned": True}
-    metrics = evaluate(model.gaussians, views, model.sh_degree, settings, lpips, **options)
+    metrics = evaluate(model.gaussians, views, model.sh_degree, model.config.raster, lpips, **options)
     note = f"\nLPIPS was not computed: {reason}" if reason else ""
     note += f"\nFLIP was not computed: {no_flip}" if no_flip else ""
     which = f"iteration {model.iteration}" if given is None else str(path)
@@ -71,17 +70,15 @@ def render_run(
         raise InputError(f"'{path}' has no run's folder to render into: name one by --out FOLDER")
     if out is not None:
         require_writable(out, f"--out '{out}'")
-    model, views = _open(path, device_name, split, given)
+    model, views, background = _open(path, device_name, split, given)
     target = model.folder.renders if out is None else out
     cameras = views.cameras.to(model.gaussians.device)
     folders = [target / name for name in ([split, f"{split}-depth"] if with_depth else [split])]
     for folder in folders:
         folder.mkdir(parents=True, exist_ok=True)
-    background = Background.of(model.config.train.background, views.photos.transparent).evaluated
+    options = {"sh_degree": model.sh_degree, "settings": model.config.raster, "with_depth": with_depth}
     for view_id, name in enumerate(distinct_stems(views.names)):
-        options = {"sh_degree": model.sh_degree, "settings": model.config.raster, "with_depth": with_depth}
-        options["background"] = background
-        image = render_image(model.gaussians, cameras, view_id, **options)
+        image = render_image(model.gaussians, cameras, view_id, background=background, **options)
         Image.fromarray(to_uint8(image.colors)).save(folders[0] / f"{name}.png")
         if with_depth:
             depths = (image.depths.cpu().double() * model.frame.scale).float().numpy()
@@ -98,7 +95,8 @@ def distinct_stems(names: Sequence[str]) -> list[str]:
     return list(stems)
 
 
-def _open(path: Path, device_name: str, split: str, given: Config | None) -> tuple[SavedModel, PosedImages]:
-    """A run's newest model or a given one on a device, and the views of a split on the CPU."""
+def _open(path: Path, device_name: str, split: str, given: Config | None) -> tuple[SavedModel, PosedImages, Color]:
+    """A run's newest model or a given one on a device, the views of a split on the CPU, and their background."""
     model, scene, _ = load_with_capture(path, given, resolve_device(device_name))
-    return model, scene.test if split == "test" else scene.train
+    views = scene.test if split == "test" else scene.train
+    return model, views, Background.of(model.config.train.background, views.photos.transparent).evaluated

@@ -13,6 +13,7 @@ import contextlib
 import json
 import os
 import socket
+import tempfile
 import threading
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -86,14 +87,12 @@ class Claims:
         if latest is not None and self._alive(_path(base, latest)):
             return None
         claim = Claim(base, 0 if latest is None else latest + 1)
-        try:
-            file = os.open(claim.path, os.O_CREAT | os.O_EXCL | os.O_WRONLY)
-        except FileExistsError:
-            return None
         process = os.getpid()
-        with os.fdopen(file, "w", encoding="utf-8") as opened:
-            json.dump({"host": socket.gethostname(), "process": process, "started": process_started(process)}, opened)
-        return claim
+        holder = {"host": socket.gethostname(), "process": process, "started": process_started(process)}
+        with contextlib.suppress(FileExistsError), open(claim.path, "x", encoding="utf-8") as file:
+            json.dump(holder, file)
+            return claim
+        return None
 
     def _alive(self, path: Path) -> bool:
         try:
@@ -111,11 +110,8 @@ class Claims:
 
     def _now(self) -> float:
         """The time of the file system."""
-        probe = self._folder / f".now-{socket.gethostname()}-{os.getpid()}"
-        probe.touch()
-        now = probe.stat().st_mtime
-        probe.unlink(missing_ok=True)
-        return now
+        with tempfile.NamedTemporaryFile(dir=self._folder, prefix=".now-") as probe:
+            return os.stat(probe.name).st_mtime
 
 
 def _path(base: Path, generation: int) -> Path:

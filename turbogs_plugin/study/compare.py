@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 import re
-from collections.abc import Container, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -43,7 +43,8 @@ def study_of_runs(paths: Sequence[Path]) -> Study:
             raise InputError(f"'{path}' has no evaluation yet")
         asked = folder.read_asked().to_mapping()
         shared = compared(asked, UNSHARED) | {"train.device": config.train.device}  # where it was trained
-        name = next((name for name, known in variants.items() if known == shared), None) or _new_name(path, variants)
+        folder_name = re.sub(r"[^A-Za-z0-9_+.-]", "-", path.resolve().name)[:40].lstrip("._-") or "run"
+        name = next((name for name, known in variants.items() if known == shared), unused_name(folder_name, variants))
         variants[name] = shared
         result = CellResult(
             scene=scene,
@@ -81,8 +82,3 @@ def _scene_names(scenes: Sequence[SceneConfig]) -> list[str]:
                 name += f"-{setting}-{getattr(scene, setting)}"
         names.append(name)
     return names
-
-
-def _new_name(path: Path, taken: Container[str]) -> str:
-    """The folder's name, made fit for a variant and unique."""
-    return unused_name(re.sub(r"[^A-Za-z0-9_+.-]", "-", path.resolve().name)[:40].lstrip("._-") or "run", taken)
