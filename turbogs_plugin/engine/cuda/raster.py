@@ -238,12 +238,9 @@ def rasterize_cuda(
         radii=buffers.integers("radii", views, count, 2),
         active_prefix=None if everywhere else buffers.integers("active_prefix", num_tiles + 1),
     )
-    tiles = launches.TileLists(
-        tile_cursors=buffers.integers("tile_cursors", num_active + 1),
-        tile_starts=buffers.integers("tile_starts", num_active + 1),
-        status=torch.zeros(2, dtype=torch.int32, device=device) if workspace is None else workspace.status,
-        counters=buffers.integers("counters", 2),
-    )
+    cursors, starts = (buffers.integers(name, num_active + 1) for name in ("tile_cursors", "tile_starts"))
+    status = torch.zeros(2, dtype=torch.int32, device=device) if workspace is None else workspace.status
+    tiles = launches.TileLists(cursors, starts, status, buffers.integers("counters", 2))
     # With a workspace a backward pass is likely to follow.
     records = None if workspace is None else buffers.floats("records", views * count, ScreenRecord.SIZE)
     library.launch(launches.RasterProject(scene, settings, splats, tile_ids, tiles.tile_cursors, records))
