@@ -88,14 +88,8 @@ class CharbonnierNccLoss(RuleLoss):
 
     @property
     def terms(self) -> LossTerms:
-        return LossTerms(
-            self.epsilon,
-            structure=self.structure,
-            structure_weight=self.ncc_weight,
-            variance_constant=self.variance_constant,
-            balance=True,
-            gate=self.gate,
-        )
+        structure = {"structure": self.structure, "structure_weight": self.ncc_weight, "gate": self.gate}
+        return LossTerms(self.epsilon, **structure, variance_constant=self.variance_constant, balance=True)
 
 
 @dataclass

@@ -146,10 +146,8 @@ class ProcessRanks(Ranks):
             received: (rank, contiguous tensor to overwrite) each.
         """
         distributed = self._distributed
-        operations = [distributed.P2POp(distributed.isend, tensor, rank) for rank, tensor in sent if tensor.numel()]
-        operations += [
-            distributed.P2POp(distributed.irecv, tensor, rank) for rank, tensor in received if tensor.numel()
-        ]
+        given = [(distributed.isend, *each) for each in sent] + [(distributed.irecv, *each) for each in received]
+        operations = [distributed.P2POp(act, tensor, rank) for act, rank, tensor in given if tensor.numel()]
         for work in distributed.batch_isend_irecv(operations) if operations else ():
             work.wait()
 

@@ -59,12 +59,9 @@ def rasterize_differentiable(
     Raises:
         InputError: as `Engine.render`; and at a second backward of one pass.
     """
-    rendered = rasterize(
-        gaussians.map(lambda value: value.detach().contiguous()),
-        Cameras(cameras.viewmats.detach(), cameras.Ks.detach(), cameras.sizes),
-        samples,
-        **options,
-    )
+    model = gaussians.map(lambda value: value.detach().contiguous())
+    fixed = Cameras(cameras.viewmats.detach(), cameras.Ks.detach(), cameras.sizes)
+    rendered = rasterize(model, fixed, samples, **options)
     projected = rendered.projected()
     means2d = projected.means2d.detach().requires_grad_(torch.is_grad_enabled())
     parameters = (value for _, value in gaussians.items())
@@ -90,13 +87,10 @@ class _Pass(torch.autograd.Function):
         ctx.spent = True
         errors = None if ctx.observer is None else ctx.observer.pixel_errors()
         colors, alphas, depths = (None if value is None else value.contiguous() for value in upstream)
-        screen = ctx.rendered.backward(
-            torch.zeros_like(ctx.rendered.colors) if colors is None else colors,
-            errors,
-            with_statistics=True,  # among them the absolute gradients
-            alpha_gradients=alphas,
-            depth_gradients=depths,
-        )
+        colors = torch.zeros_like(ctx.rendered.colors) if colors is None else colors
+        others = {"alpha_gradients": alphas, "depth_gradients": depths}
+        # Among the statistics are the absolute gradients.
+        screen = ctx.rendered.backward(colors, errors, with_statistics=True, **others)
         records = screen.full_records()
         stats = GaussianStats.zeros(records.shape[1], records.device)
         gradients = screen.parameter_gradients(rows=False, stats=stats)

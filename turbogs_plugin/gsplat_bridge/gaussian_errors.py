@@ -19,14 +19,7 @@ import torch
 from torch import Tensor
 
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.gsplat_bridge.host import (
-    ERROR_SUMS,
-    GROUND_TRUTH,
-    LOSS_SHARES,
-    PREDICTION,
-    STATISTICS,
-    require_keys,
-)
+from turbogs_plugin.gsplat_bridge.host import GROUND_TRUTH, LOSS_SHARES, PREDICTION, STATISTICS, require_keys
 from turbogs_plugin.types import GaussianStats
 
 WITHOUT_GRADIENT = (
@@ -34,6 +27,9 @@ WITHOUT_GRADIENT = (
     "TurboDensityStrategy and the errors for MomentLMOptimizer need it; render without these options, or keep gsplat's "
     "MCMCStrategy"
 )
+
+ERROR_SUMS = "error_sums"
+"""Key of `info` under which the sums of the zero channel, [N, 2], stay for whoever asks for them second."""
 
 _INTERSECTION = ("gaussian_ids", "conics", "opacities", "width", "height", "tile_size", "isect_offsets", "flatten_ids")
 

@@ -25,9 +25,6 @@ STATISTICS = "gaussian_stats"
 LOSS_SHARES = "loss_shares"
 """Key under which it leaves, beside them, [N] the Gaussians' shares of the loss."""
 
-ERROR_SUMS = "error_sums"
-"""Key under which the sums of the zero channel, [N, 2], stay for whoever asks for them second."""
-
 SHAPES = dict(means="[N, 3]", quats="[N, 4]", scales="[N, 3]", opacities="[N]", sh0="[N, 1, 3]", shN="[N, B, 3]")
 """gsplat's layout: N Gaussians, B harmonics above band 0."""
 

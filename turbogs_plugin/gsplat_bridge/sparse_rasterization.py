@@ -111,15 +111,11 @@ def sparse_rasterization(
     scales = scales.clamp(min=torch.finfo(scales.dtype).tiny).log()
     opacities = opacities.clamp(LOGIT_MARGIN, 1.0 - LOGIT_MARGIN).logit()
     observer = _InfoObserver(samples)
-    render = rasterize_differentiable(
-        Gaussians(means, quats, scales, opacities, sh0=colors[:, :1], shN=colors[:, 1:]),
-        Cameras(viewmats, Ks, samples.sizes),
-        samples,
-        sh_degree=sh_degree,
-        settings=RasterSettings(eps2d=eps2d, near_plane=near_plane, far_plane=far_plane),
-        with_depth=render_mode != "RGB",
-        observer=observer,
-    )
+    gaussians = Gaussians(means, quats, scales, opacities, sh0=colors[:, :1], shN=colors[:, 1:])
+    settings = RasterSettings(eps2d=eps2d, near_plane=near_plane, far_plane=far_plane)
+    options = {"sh_degree": sh_degree, "settings": settings, "with_depth": render_mode != "RGB"}
+    cameras = Cameras(viewmats, Ks, samples.sizes)
+    render = rasterize_differentiable(gaussians, cameras, samples, observer, **options)
     info = _info(render, len(viewmats), width, height)
     observer.info = weakref.ref(info)
     alphas = render.alphas[:, None]  # [P, 1]

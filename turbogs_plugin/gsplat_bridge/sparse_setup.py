@@ -74,6 +74,5 @@ def maps_of_photos(
     if all(mask is None for mask in masks):
         return ErrorMaps.from_images(errors)
     whole = (torch.ones(image.shape, dtype=torch.bool) for image in errors)
-    return ErrorMaps.from_images(
-        errors, [every if mask is None else mask for every, mask in zip(whole, masks, strict=True)]
-    )
+    masks = [every if mask is None else mask for every, mask in zip(whole, masks, strict=True)]
+    return ErrorMaps.from_images(errors, masks)

@@ -70,10 +70,8 @@ class TerminalBar(Listener):
         return {}
 
     def _show(self, trainer: Trainer, **columns: str) -> None:
-        gaussians = f"{len(trainer.gaussians):,}"
-        self._bar.update(
-            self._task, completed=trainer.iteration, total=trainer.iterations, gaussians=gaussians, **columns
-        )
+        columns["gaussians"] = f"{len(trainer.gaussians):,}"
+        self._bar.update(self._task, completed=trainer.iteration, total=trainer.iterations, **columns)
         self._bar.refresh()
 
 
@@ -109,9 +107,8 @@ class TrainingProgress(TerminalBar):
     """
 
     def __init__(self, total: int, iteration: int = 0) -> None:
-        super().__init__(
-            total=total, completed=iteration, psnr="-", gaussians="-", speed="-", memory="-", left="-", warning=""
-        )
+        unknown = dict.fromkeys(("psnr", "gaussians", "speed", "memory", "left"), "-")
+        super().__init__(total=total, completed=iteration, warning="", **unknown)
         self._first: tuple[int, float] | None = None  # iteration and seconds of training where the speed counts from
 
     def _columns(self) -> Sequence[ProgressColumn]:

@@ -46,6 +46,12 @@ FILES = "checkpoint and model, after the pictures"
 """The part of the wall time at the end in which nothing else is left to do."""
 
 
+Report = Callable[["RunSession"], object]
+"""Writes the report of a finished run."""
+Watch = Sequence[Callable[["RunSession"], Listener]]
+"""Each is called with a run before it trains, and gives one more listener of the first process's loop."""
+
+
 def plan_run(config: Config, processes: int = 1) -> Plan:
     """The plan that `train` would make now. What the capture was taken for is printed.
 
@@ -116,10 +122,10 @@ def fit(scene: Scene, *overrides: str, config: str = DEFAULT_CONFIG) -> Gaussian
 def train(
     config: Config,
     out: Path,
-    report: Callable[[RunSession], object] | None = None,
+    report: Report | None = None,
     clock: WallClock | None = None,
     ranks: Ranks = ONE,
-    watch: Sequence[Callable[[RunSession], Listener]] = (),
+    watch: Watch = (),
 ) -> RunSession:
     """Train from the start into a new folder. The plan is printed first. Photos alone are reconstructed before.
 
@@ -127,7 +133,7 @@ def train(
         report: called with the finished run; `turbogs_plugin.report.pages.write_report` writes its page.
         clock: of the wall; None: it begins now.
         ranks: the processes that train this model together; each calls this, and the first one writes and prints.
-        watch: each is called with the run before it trains, and gives one more listener of the first process's loop.
+        watch: further listeners.
 
     Raises:
         InputError: anything wrong with the input; then nothing was written.
@@ -167,11 +173,7 @@ def train(
 
 
 def resume(
-    path: Path,
-    report: Callable[[RunSession], object] | None = None,
-    clock: WallClock | None = None,
-    ranks: Ranks = ONE,
-    watch: Sequence[Callable[[RunSession], Listener]] = (),
+    path: Path, report: Report | None = None, clock: WallClock | None = None, ranks: Ranks = ONE, watch: Watch = ()
 ) -> RunSession:
     """Go on with a stopped run from its newest checkpoint, with its own configuration, in which nothing is `auto`.
 
@@ -282,9 +284,7 @@ class RunSession(Listener):
         self._threads = ThreadPoolExecutor(2, "files")
         self._written: list[Future[float]] = []
 
-    def run(
-        self, report: Callable[[RunSession], object] | None, watch: Sequence[Callable[[RunSession], Listener]] = ()
-    ) -> RunSession:
+    def run(self, report: Report | None, watch: Watch = ()) -> RunSession:
         """Train to the end, or until a signal; both end with a checkpoint."""
         loop, trainer, ranks = self.loop, self.trainer, self.loop.ranks
         self._finished_before = loop.finished

@@ -158,14 +158,9 @@ class PixelSamples:
         if len(again):
             raise InputError(f"a pixel is given twice ({place(again[0])}): expected each once")
         tile_ids, counts = torch.unique_consecutive(keys // TILE_SIZE**2, return_counts=True)  # [T] each
-        return cls(
-            view_ids=view_ids,
-            sizes=sizes,
-            pixel_ids=(y * widths + x)[order].int(),
-            tile_ids=tile_ids.int(),
-            tile_offsets=torch.nn.functional.pad(counts.cumsum(dim=0), (1, 0)).int(),
-            has_empty_slots=False,
-        )
+        pixel_ids = (y * widths + x)[order].int()
+        tile_offsets = torch.nn.functional.pad(counts.cumsum(dim=0), (1, 0)).int()
+        return cls(view_ids, sizes, pixel_ids, tile_ids.int(), tile_offsets, has_empty_slots=False)
 
     def __len__(self) -> int:
         return self.pixel_ids.shape[0]

@@ -135,13 +135,9 @@ def project_rows(
     margin_x, margin_y = 0.15 * width / fx, 0.15 * height / fy
     x = x.clamp(min=-(cx / fx + margin_x), max=(width - cx) / fx + margin_x)
     y = y.clamp(min=-(cy / fy + margin_y), max=(height - cy) / fy + margin_y)
-    to_screen = torch.stack(
-        [
-            (fx * inverse)[:, None] * (rotations[:, 0] - x[:, None] * rotations[:, 2]),
-            (fy * inverse)[:, None] * (rotations[:, 1] - y[:, None] * rotations[:, 2]),
-        ],
-        dim=1,
-    )  # [R, 2, 3], Jacobian times rotation
+    to_x = (fx * inverse)[:, None] * (rotations[:, 0] - x[:, None] * rotations[:, 2])
+    to_y = (fy * inverse)[:, None] * (rotations[:, 1] - y[:, None] * rotations[:, 2])
+    to_screen = torch.stack([to_x, to_y], dim=1)  # [R, 2, 3], Jacobian times rotation
     axes = torch.bmm(to_screen, rotation_matrices(parameters.quats)) * parameters.scales.exp()[:, None, :]  # [R, 2, 3]
     u, v = axes.unbind(dim=1)
     variance_x, variance_y, covariance = (u * u).sum(dim=-1), (v * v).sum(dim=-1), (u * v).sum(dim=-1)
