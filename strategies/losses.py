@@ -88,8 +88,14 @@ class CharbonnierNccLoss(RuleLoss):
 
     @property
     def terms(self) -> LossTerms:
-        structure = {"structure": self.structure, "structure_weight": self.ncc_weight, "gate": self.gate}
-        return LossTerms(self.epsilon, **structure, variance_constant=self.variance_constant, balance=True)
+        return LossTerms(
+            self.epsilon,
+            structure=self.structure,
+            structure_weight=self.ncc_weight,
+            variance_constant=self.variance_constant,
+            balance=True,
+            gate=self.gate,
+        )
 
 
 @dataclass

@@ -186,7 +186,8 @@ def test_a_package_of_the_same_name_is_not_taken_for_it(tmp_path, monkeypatch, c
     metadata = tmp_path / "pycolmap-0.0.1.dist-info"
     metadata.mkdir()
     (metadata / "METADATA").write_text("Metadata-Version: 2.1\nName: pycolmap\nVersion: 0.0.1\n")
-    monkeypatch.delitem(sys.modules, "pycolmap", raising=False)
+    monkeypatch.setitem(sys.modules, "pycolmap", None)  # so that what the command imports does not stay afterwards
+    monkeypatch.delitem(sys.modules, "pycolmap")
     monkeypatch.syspath_prepend(str(tmp_path))
     monkeypatch.setattr(sys, "argv", ["turbogs", "demo", str(tmp_path / "capture")])
     with pytest.raises(SystemExit) as end:

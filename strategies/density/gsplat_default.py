@@ -109,9 +109,15 @@ class GsplatDefaultDensity(WindowedDensity):
             return None
         present = torch.bincount(source, minlength=len(gaussians))
         copies = torch.bincount(source[fresh], minlength=len(gaussians))
-        cloned, split, pruned = (int(rows.sum()) for rows in (copies == 1, copies == 2, present == 0))
-        values = {name: value.data for name, value in params.items()}
-        return RowUpdate(source, fresh, values, ("opacities",) if was_reset else (), cloned, split, pruned)
+        return RowUpdate(
+            source,
+            fresh,
+            {name: value.data for name, value in params.items()},
+            reset=("opacities",) if was_reset else (),
+            num_cloned=int((copies == 1).sum()),
+            num_split=int((copies == 2).sum()),
+            num_pruned=int((present == 0).sum()),
+        )
 
 
 def run_gsplat(

@@ -88,8 +88,12 @@ class GsplatMcmcDensity(DensityController):
         copies = {name: value.clone() for name, value in gaussians.items()} | {"opacities": opacities}
         params, optimizers = self._run_gsplat(copies | {"source_row": rows.clone()}, step.refine_until, step)
         added = params.pop("source_row").data[len(rows) :]
-        fresh, values = new_rows(params, optimizers, "means"), {name: value.data for name, value in params.items()}
-        return RowUpdate(torch.cat([rows, added]), fresh, values, num_cloned=len(added))
+        return RowUpdate(
+            torch.cat([rows, added]),
+            new_rows(params, optimizers, "means"),
+            {name: value.data for name, value in params.items()},
+            num_cloned=len(added),
+        )
 
     def _add_noise(self, gaussians: Gaussians, step: Step) -> None:
         """Noise on the means, in place, where it is finite."""

@@ -22,9 +22,11 @@ class PassObserver(Protocol):
 
     def pixel_errors(self) -> Tensor | None:
         """[P] errors to carry to the Gaussians, or None. Called when the backward pass begins."""
+        ...
 
     def passed(self, stats: GaussianStats, view_losses: Tensor) -> None:
         """Receive the pass's statistics and [N] each Gaussian's share of the loss, both for the errors given before."""
+        ...
 
 
 @dataclass
@@ -59,9 +61,12 @@ def rasterize_differentiable(
     Raises:
         InputError: as `Engine.render`; and at a second backward of one pass.
     """
-    model = gaussians.map(lambda value: value.detach().contiguous())
-    fixed = Cameras(cameras.viewmats.detach(), cameras.Ks.detach(), cameras.sizes)
-    rendered = rasterize(model, fixed, samples, **options)
+    rendered = rasterize(
+        gaussians.map(lambda value: value.detach().contiguous()),
+        Cameras(cameras.viewmats.detach(), cameras.Ks.detach(), cameras.sizes),
+        samples,
+        **options,
+    )
     projected = rendered.projected()
     means2d = projected.means2d.detach().requires_grad_(torch.is_grad_enabled())
     parameters = (value for _, value in gaussians.items())
@@ -87,10 +92,13 @@ class _Pass(torch.autograd.Function):
         ctx.spent = True
         errors = None if ctx.observer is None else ctx.observer.pixel_errors()
         colors, alphas, depths = (None if value is None else value.contiguous() for value in upstream)
-        colors = torch.zeros_like(ctx.rendered.colors) if colors is None else colors
-        others = {"alpha_gradients": alphas, "depth_gradients": depths}
-        # Among the statistics are the absolute gradients.
-        screen = ctx.rendered.backward(colors, errors, with_statistics=True, **others)
+        screen = ctx.rendered.backward(
+            torch.zeros_like(ctx.rendered.colors) if colors is None else colors,
+            errors,
+            with_statistics=True,  # among them the absolute gradients
+            alpha_gradients=alphas,
+            depth_gradients=depths,
+        )
         records = screen.full_records()
         stats = GaussianStats.zeros(records.shape[1], records.device)
         gradients = screen.parameter_gradients(rows=False, stats=stats)

@@ -116,8 +116,12 @@ class Rendered(ABC):
         Raises:
             InputError: on CUDA, depth gradients for a pass without depths, or a tensor of wrong shape, dtype or device.
         """
-        upstream = {"color_gradients": color_gradients, "alpha_gradients": alpha_gradients}
-        upstream |= {"depth_gradients": depth_gradients, "pixel_errors": pixel_errors}
+        upstream = {
+            "color_gradients": color_gradients,
+            "alpha_gradients": alpha_gradients,
+            "depth_gradients": depth_gradients,
+            "pixel_errors": pixel_errors,
+        }
         return self._backward(upstream, with_statistics)
 
     @abstractmethod

@@ -11,5 +11,13 @@ from turbogs_plugin.gsplat_bridge.optimizer_swap import SharedOptimizer
 from turbogs_plugin.gsplat_bridge.sparse_rasterization import gather_pixels, sparse_loss, sparse_rasterization
 from turbogs_plugin.gsplat_bridge.sparse_setup import maps_of_photos, sparse_budget
 
-__all__ = ["SharedOptimizer", "TurboDensityStrategy", "apply_row_update", "gather_pixels", "maps_of_photos"]
-__all__ += ["sparse_budget", "sparse_loss", "sparse_rasterization"]
+__all__ = [
+    "SharedOptimizer",
+    "TurboDensityStrategy",
+    "apply_row_update",
+    "gather_pixels",
+    "maps_of_photos",
+    "sparse_budget",
+    "sparse_loss",
+    "sparse_rasterization",
+]

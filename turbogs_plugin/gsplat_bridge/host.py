@@ -25,7 +25,14 @@ STATISTICS = "gaussian_stats"
 LOSS_SHARES = "loss_shares"
 """Key under which it leaves, beside them, [N] the Gaussians' shares of the loss."""
 
-SHAPES = dict(means="[N, 3]", quats="[N, 4]", scales="[N, 3]", opacities="[N]", sh0="[N, 1, 3]", shN="[N, B, 3]")
+SHAPES = {
+    "means": "[N, 3]",
+    "quats": "[N, 4]",
+    "scales": "[N, 3]",
+    "opacities": "[N]",
+    "sh0": "[N, 1, 3]",
+    "shN": "[N, B, 3]",
+}
 """gsplat's layout: N Gaussians, B harmonics above band 0."""
 
 FLAT_SHAPES = {"opacities": "[N, 1]", "sh0": "[N, 3]"}

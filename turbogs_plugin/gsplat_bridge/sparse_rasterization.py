@@ -20,7 +20,13 @@ from turbogs_plugin.engine.rendered import RasterSettings
 from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.gsplat_bridge.gaussian_errors import residuals
-from turbogs_plugin.gsplat_bridge.host import GROUND_TRUTH, LOSS_SHARES, PREDICTION, STATISTICS, require_one_process
+from turbogs_plugin.gsplat_bridge.host import (
+    GROUND_TRUTH,
+    LOSS_SHARES,
+    PREDICTION,
+    STATISTICS,
+    require_one_process,
+)
 from turbogs_plugin.types import SH_C0, TILE_SIZE, Cameras, Gaussians, GaussianStats, LossOutput, PixelSamples, Step
 
 LOGIT_MARGIN = 2.0**-23
@@ -111,11 +117,15 @@ def sparse_rasterization(
     scales = scales.clamp(min=torch.finfo(scales.dtype).tiny).log()
     opacities = opacities.clamp(LOGIT_MARGIN, 1.0 - LOGIT_MARGIN).logit()
     observer = _InfoObserver(samples)
-    gaussians = Gaussians(means, quats, scales, opacities, sh0=colors[:, :1], shN=colors[:, 1:])
-    settings = RasterSettings(eps2d=eps2d, near_plane=near_plane, far_plane=far_plane)
-    options = {"sh_degree": sh_degree, "settings": settings, "with_depth": render_mode != "RGB"}
-    cameras = Cameras(viewmats, Ks, samples.sizes)
-    render = rasterize_differentiable(gaussians, cameras, samples, observer, **options)
+    render = rasterize_differentiable(
+        Gaussians(means, quats, scales, opacities, sh0=colors[:, :1], shN=colors[:, 1:]),
+        Cameras(viewmats, Ks, samples.sizes),
+        samples,
+        sh_degree=sh_degree,
+        settings=RasterSettings(eps2d=eps2d, near_plane=near_plane, far_plane=far_plane),
+        with_depth=render_mode != "RGB",
+        observer=observer,
+    )
     info = _info(render, len(viewmats), width, height)
     observer.info = weakref.ref(info)
     alphas = render.alphas[:, None]  # [P, 1]

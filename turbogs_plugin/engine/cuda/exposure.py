@@ -18,8 +18,15 @@ from turbogs_plugin.types import PixelSamples
 def expose_colors(exposures: Exposures, colors: Tensor, samples: PixelSamples) -> Tensor:
     """`Engine.expose`. `samples`: of at most `MAX_VIEWS` views."""
     library.require()
-    views = _exposed_views(exposures, colors, samples)
-    launch = launches.ExposeColors(**vars(views), exposed=torch.empty_like(views.colors))
+    colors = colors.detach().float().contiguous()
+    launch = launches.ExposeColors(
+        colors=colors,
+        tile_ids=samples.tile_ids,
+        tile_offsets=samples.tile_offsets,
+        views=_rows(samples),
+        offsets=exposures.offsets,
+        exposed=torch.empty_like(colors),
+    )
     library.launch(launch)
     return launch.exposed
 
@@ -34,19 +41,32 @@ def learn_exposures(
 ) -> Tensor:
     """`Engine.learn_exposures`, in two launches; `gradients`, where float32 and contiguous, is changed in place."""
     library.require()
+    rows = _rows(samples)
     backward = launches.ExposureBackward(
-        **vars(_exposed_views(exposures, colors, samples)),
+        colors=colors.detach().float().contiguous(),
+        tile_ids=samples.tile_ids,
+        tile_offsets=samples.tile_offsets,
+        views=rows,
+        offsets=exposures.offsets,
         gradients=gradients.detach().float().contiguous(),
         sums=torch.zeros(len(samples.view_ids), 3, 4, dtype=torch.float64, device=colors.device),
     )
     library.launch(backward)
-    adam = {"rate": rate, "beta1": BETA1, "beta2": BETA2, "eps": EPSILON, "pull": PULL}
-    library.launch(launches.ExposureStep(backward.sums, backward.views, exposures, overflow, **adam))
+    library.launch(
+        launches.ExposureStep(
+            sums=backward.sums,
+            views=rows,
+            exposures=exposures,
+            overflow=overflow,
+            rate=rate,
+            beta1=BETA1,
+            beta2=BETA2,
+            eps=EPSILON,
+            pull=PULL,
+        )
+    )
     return backward.gradients
 
 
-def _exposed_views(exposures: Exposures, colors: Tensor, samples: PixelSamples) -> launches.ExposedViews:
-    """What both launches have in common."""
-    rows = view_rows(np.zeros(len(samples.view_ids), dtype=np.int64), samples.sizes, samples.view_ids)
-    colors = colors.detach().float().contiguous()
-    return launches.ExposedViews(colors, samples.tile_ids, samples.tile_offsets, rows, exposures.offsets)
+def _rows(samples: PixelSamples) -> list[int]:
+    return view_rows(np.zeros(len(samples.view_ids), dtype=np.int64), samples.sizes, samples.view_ids)

@@ -109,9 +109,15 @@ class CudaScreenGradients:
         """The arguments shared by the launches that take these gradients to the parameters."""
         require_views(len(self.records))
         require_statistics(self.with_statistics, stats)
-        sums, filled = launches.NO_STATS if stats is None else stats, count_filled(self.samples)
-        slots = len(self.samples)
-        return launches.ScreenBackward(self.scene, self.records, self.radii, sums, filled, slots, self.overflow)
+        return launches.ScreenBackward(
+            scene=self.scene,
+            records=self.records,
+            radii=self.radii,
+            stats=launches.NO_STATS if stats is None else stats,
+            num_filled=count_filled(self.samples),
+            num_slots=len(self.samples),
+            overflow=self.overflow,
+        )
 
 
 def count_filled(samples: PixelSamples) -> Tensor | None:
@@ -146,8 +152,13 @@ class CudaRendered(Rendered):
     def projected(self) -> Projected:
         splats = self._forward.instances.view(*self._radii.shape[:2], InstanceRow.SIZE)
         splats = torch.where((self._radii > 0).any(dim=-1, keepdim=True), splats, 0.0)
-        columns = (InstanceRow.MEAN, InstanceRow.CONIC, InstanceRow.DEPTH, InstanceRow.OPACITY)
-        return Projected(*(splats[..., column] for column in columns), radii=self._radii.clone())
+        return Projected(
+            means2d=splats[..., InstanceRow.MEAN],
+            conics=splats[..., InstanceRow.CONIC],
+            depths=splats[..., InstanceRow.DEPTH],
+            opacities=splats[..., InstanceRow.OPACITY],
+            radii=self._radii.clone(),
+        )
 
     def _backward(self, upstream: dict[str, Tensor | None], with_statistics: bool) -> CudaScreenGradients:
         if upstream["depth_gradients"] is not None and self.depths is None:
@@ -160,8 +171,14 @@ class CudaRendered(Rendered):
         ready = {name: None if value is None else value.contiguous() for name, value in upstream.items()}
         shape = (*self._radii.shape[:2], ScreenRecord.SIZE)
         records = _Buffers(self._workspace, self.colors.device).floats("records", *shape)
-        written = {"records": records.flatten(0, 1), "with_density_sums": with_statistics, "cleared": self._cleared}
-        library.launch(launches.RasterBackward(self._forward, **ready, **written))
+        backward = launches.RasterBackward(
+            self._forward,
+            **ready,
+            records=records.flatten(0, 1),
+            with_density_sums=with_statistics,
+            cleared=self._cleared,
+        )
+        library.launch(backward)
         self._cleared = False
         overflow = None if self._workspace is None else self._workspace.overflow
         return CudaScreenGradients(self._scene, self._samples, records, self._radii, with_statistics, overflow)
@@ -183,8 +200,14 @@ def screen_gradients(
 
 
 def _scene(gaussians: Gaussians, cameras: Cameras, sh_degree: int, eps2d: float) -> launches.Scene:
-    viewmats, Ks = (value.detach().contiguous() for value in (cameras.viewmats, cameras.Ks))
-    return launches.Scene(gaussians, viewmats, Ks, cameras.sizes.reshape(-1).tolist(), sh_degree, eps2d)
+    return launches.Scene(
+        gaussians=gaussians,
+        viewmats=cameras.viewmats.detach().contiguous(),
+        Ks=cameras.Ks.detach().contiguous(),
+        sizes=cameras.sizes.reshape(-1).tolist(),
+        sh_degree=sh_degree,
+        eps2d=eps2d,
+    )
 
 
 @dataclass(frozen=True)
@@ -238,9 +261,12 @@ def rasterize_cuda(
         radii=buffers.integers("radii", views, count, 2),
         active_prefix=None if everywhere else buffers.integers("active_prefix", num_tiles + 1),
     )
-    cursors, starts = (buffers.integers(name, num_active + 1) for name in ("tile_cursors", "tile_starts"))
-    status = torch.zeros(2, dtype=torch.int32, device=device) if workspace is None else workspace.status
-    tiles = launches.TileLists(cursors, starts, status, buffers.integers("counters", 2))
+    tiles = launches.TileLists(
+        tile_cursors=buffers.integers("tile_cursors", num_active + 1),
+        tile_starts=buffers.integers("tile_starts", num_active + 1),
+        status=torch.zeros(2, dtype=torch.int32, device=device) if workspace is None else workspace.status,
+        counters=buffers.integers("counters", 2),
+    )
     # With a workspace a backward pass is likely to follow.
     records = None if workspace is None else buffers.floats("records", views * count, ScreenRecord.SIZE)
     library.launch(launches.RasterProject(scene, settings, splats, tile_ids, tiles.tile_cursors, records))
@@ -285,5 +311,15 @@ def rasterize_cuda(
         background=launches.Background(*options.background),
     )
     library.launch(forward)
-    images, cleared = (forward.colors, forward.alphas, forward.depths), workspace is not None
-    return CudaRendered(*images, tiles.status[:1], scene, samples, workspace, splats.radii, forward, cleared)
+    return CudaRendered(
+        forward.colors,
+        forward.alphas,
+        forward.depths,
+        num_intersections=tiles.status[:1],
+        _scene=scene,
+        _samples=samples,
+        _workspace=workspace,
+        _radii=splats.radii,
+        _forward=forward,
+        _cleared=workspace is not None,
+    )

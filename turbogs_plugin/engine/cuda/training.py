@@ -24,7 +24,16 @@ from turbogs_plugin.engine.protocol import MapUpdate
 from turbogs_plugin.engine.rules import DrawRule, LossTerms, UpdateRule
 from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.tiles import CELL_SIDE, TILE_PIXELS, DrawEnds, slots_of_tiles, tile_extents
-from turbogs_plugin.types import BLACK, TILE_SIZE, Color, Gaussians, GaussianStats, LossOutput, PixelSamples, Step
+from turbogs_plugin.types import (
+    BLACK,
+    TILE_SIZE,
+    Color,
+    Gaussians,
+    GaussianStats,
+    LossOutput,
+    PixelSamples,
+    Step,
+)
 
 
 def sample_pixels(rule: DrawRule, maps: ErrorMaps, view_ids: tuple[int, ...], rate: float, step: Step) -> PixelSamples:
@@ -87,10 +96,18 @@ def sample_pixels(rule: DrawRule, maps: ErrorMaps, view_ids: tuple[int, ...], ra
     has_empty_slots = rule.unit != "pixel" or maps.masks is not None
     if weights is not None:
         weights = weights * ((draw.pixel_ids >= 0).sum() / weights.sum())
-    live_tiles = None if maps.masks is None else tuple(tiles)
-    ends = DrawEnds(rule.unit, tuple(map(tuple, shapes)), tuple(wanted), live_tiles)
-    drawn = (draw.pixel_ids, draw.tile_ids, draw.tile_offsets, weights)
-    return PixelSamples(tuple(view_ids), sizes, *drawn, has_empty_slots, host_ends=ends)
+    return PixelSamples(
+        tuple(view_ids),
+        sizes,
+        draw.pixel_ids,
+        draw.tile_ids,
+        draw.tile_offsets,
+        weights,
+        has_empty_slots,
+        host_ends=DrawEnds(
+            rule.unit, tuple(map(tuple, shapes)), tuple(wanted), None if maps.masks is None else tuple(tiles)
+        ),
+    )
 
 
 @lru_cache(maxsize=4096)
@@ -185,7 +202,18 @@ def fused_step(
     library.require()
     if any(value.data_ptr() != getattr(screen.scene.gaussians, name).data_ptr() for name, value in gaussians.items()):
         raise ValueError("fused_step: these are not the Gaussians that the gradients were made of")
-    lm, given = rule.lm, screen.backward_arguments(stats)
-    kind, curvature, max_step = ("adam", 0.0, 0.0) if lm is None else (f"{lm.units}_lm", lm.curvature, lm.max_step)
-    numbers = {"beta1": rule.beta1, "beta2": rule.beta2, "eps": rule.eps, "curvature": curvature, "max_step": max_step}
-    library.launch(launches.FusedStep(given, moments, UPDATE_KINDS.index(kind), rule.per_view, rule.rates, **numbers))
+    lm = rule.lm
+    library.launch(
+        launches.FusedStep(
+            screen=screen.backward_arguments(stats),
+            moments=moments,
+            kind=UPDATE_KINDS.index("adam" if lm is None else f"{lm.units}_lm"),
+            rows_per_view=rule.per_view,
+            rates=rule.rates,
+            beta1=rule.beta1,
+            beta2=rule.beta2,
+            eps=rule.eps,
+            curvature=0.0 if lm is None else lm.curvature,
+            max_step=0.0 if lm is None else lm.max_step,
+        )
+    )

@@ -39,17 +39,33 @@ tile without another pixel is no unit either. The number of a tile within its vi
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from turbogs_plugin import tiles
-from turbogs_plugin.engine.reference import philox
+from turbogs_plugin.engine.reference.philox import (
+    PURPOSE_CELLS,
+    PURPOSE_PIXELS,
+    PURPOSE_TILES,
+    Words,
+    exponentials,
+    random_words,
+)
 from turbogs_plugin.engine.rules import DrawRule
 from turbogs_plugin.error_maps import AGE_MAX, ErrorMaps
+from turbogs_plugin.tiles import (
+    TILE_CELLS,
+    TILE_PIXELS,
+    DrawEnds,
+    cell_of_place,
+    compact,
+    pixel_table,
+    slots_of_tiles,
+    tile_extents,
+)
 from turbogs_plugin.types import PixelSamples, Step, TileGrid
 
 RANK_BITS = 20
@@ -73,7 +89,7 @@ class Units:
     errors: Tensor
     ages: Tensor
     exist: Tensor
-    words: philox.Words
+    words: Words
     wanted: int
 
 
@@ -101,7 +117,7 @@ def draw_units(units: Units, rule: DrawRule) -> tuple[Tensor, Tensor | None]:
             primary = (ages << AGE_TIE_BITS) | (words >> (32 - AGE_TIE_BITS))
         else:
             weights = weights.clamp(min=WEIGHT_FLOOR)
-            primary = (weights / philox.exponentials(words)).view(torch.int32).long()
+            primary = (weights / exponentials(words)).view(torch.int32).long()
         keys = torch.where(units.exist & ~drawn, (primary << RANK_BITS) | ranks, -1)
         largest = keys.topk(min(count + 1, keys.shape[1]), dim=1).values
         largest = torch.nn.functional.pad(largest, (0, 1), value=-1)  # a stage may take all there are
@@ -140,59 +156,59 @@ def draw_pixels(rule: DrawRule, maps: ErrorMaps, view_ids: tuple[int, ...], rate
         tiles alone, each with N, 16 N or 256 slots.
     """
     maps.fetch(view_ids)
+    device, views = maps.errors.device, np.asarray(view_ids, dtype=np.int64)
+    sizes = maps.sizes[views]
+    table = pixel_table(sizes, device)  # [T, 256]
+    exist = table >= 0
+    counts = TileGrid(sizes).shapes.prod(axis=1)  # [K]
+    tile_ids = None
+    if maps.masks is not None:
+        counts = np.array(maps.masks.live_counts(view_ids))
+        tile_ids, unmasked = maps.masks.live_tiles(view_ids)
+        table = table[tile_ids]
+        exist = unmasked & (table >= 0)
+    tile_views = np.repeat(views, counts)  # [T]
+    flat = torch.as_tensor(maps.offsets[tile_views], device=device)[:, None] + table.clamp(min=0)
+    errors = torch.where(exist, maps.errors[flat].double(), 0.0)  # [T, 256]
+    ages = torch.where(exist, (maps.now(step) - maps.stamps[flat].int()).clamp(0, AGE_MAX), 0)
+    view_numbers = torch.as_tensor(tile_views, device=device)[:, None]  # [T, 1]
+
+    def words(place: Tensor, purpose: int) -> Words:
+        return random_words(place.clamp(min=0).long(), view_numbers, purpose, step.seed, step.iteration)
+
     draw = _draw_tiles if rule.unit == "tile" else _draw_within_tiles
-    return draw(_Batch(maps, view_ids, step), rate, rule)
+    return draw(_Batch(view_ids, sizes, table, exist, counts, tile_ids, errors, ages, words), rate, rule)
 
 
+@dataclass(frozen=True)
 class _Batch:
-    """The tiles of K views, or their live tiles, with all their pixels.
+    """The tiles of K views, or their live tiles, with all their pixels; `words` gives the random words of places [T,
+    ...]."""
 
-    Attributes:
-        view_ids, sizes: of the views.
-        table: [T, 256] int32, as `pixel_table`.
-        exist: [T, 256] bool, the pixel is in the image and not masked.
-        counts: [K] tiles of each view.
-        live_tiles: [T] int64 ids of the tiles where there are masks; None: all tiles.
-        errors: [T, 256] float64.
-        ages: [T, 256] int32.
-    """
+    view_ids: tuple[int, ...]
+    sizes: np.ndarray
+    table: Tensor  # [T, 256] int32
+    exist: Tensor  # [T, 256] bool, the pixel is in the image and not masked
+    counts: np.ndarray  # [K] tiles of each view
+    live_tiles: Tensor | None  # [T] int64 ids of the tiles where there are masks; None: all tiles
+    errors: Tensor  # [T, 256] float64
+    ages: Tensor  # [T, 256] int32
+    words: Callable[[Tensor, int], Words]
 
-    def __init__(self, maps: ErrorMaps, view_ids: tuple[int, ...], step: Step) -> None:
-        device, views = maps.errors.device, np.asarray(view_ids, dtype=np.int64)
-        self.view_ids, self.sizes = view_ids, maps.sizes[views]
-        self.table = tiles.pixel_table(self.sizes, device)
-        self.exist = self.table >= 0
-        self.counts, self.live_tiles = TileGrid(self.sizes).shapes.prod(axis=1), None
-        if maps.masks is not None:
-            self.counts = np.array(maps.masks.live_counts(view_ids))
-            self.live_tiles, unmasked = maps.masks.live_tiles(view_ids)
-            self.table = self.table[self.live_tiles]
-            self.exist = unmasked & (self.table >= 0)
-        tile_views = np.repeat(views, self.counts)  # [T]
-        flat = torch.as_tensor(maps.offsets[tile_views], device=device)[:, None] + self.table.clamp(min=0)
-        self.errors = torch.where(self.exist, maps.errors[flat].double(), 0.0)
-        self.ages = torch.where(self.exist, (maps.now(step) - maps.stamps[flat].int()).clamp(0, AGE_MAX), 0)
-        self._views, self._step = torch.as_tensor(tile_views, device=device)[:, None], step  # [T, 1]
-
-    def words(self, place: Tensor, purpose: int) -> philox.Words:
-        """The random words of places [T, ...]."""
-        step = self._step
-        return philox.random_words(place.clamp(min=0).long(), self._views, purpose, step.seed, step.iteration)
-
-    def ends(self, unit: str, wanted: Sequence[int]) -> tiles.DrawEnds:
+    def ends(self, unit: str, wanted: Sequence[int]) -> DrawEnds:
         """`PixelSamples.host_ends` where so many units are drawn of each view, or of each of its tiles."""
         live = None if self.live_tiles is None else tuple(self.counts.tolist())
-        return tiles.DrawEnds(unit, tuple(map(tuple, self.sizes.tolist())), tuple(wanted), live)
+        return DrawEnds(unit, tuple(map(tuple, self.sizes.tolist())), tuple(wanted), live)
 
 
 def _draw_within_tiles(batch: _Batch, rate: float, rule: DrawRule) -> PixelSamples:
     """Pixels or cells as units, drawn from each tile."""
-    first_pixels, errors, ages, purpose = batch.table, batch.errors, batch.ages, philox.PURPOSE_PIXELS
+    first_pixels, errors, ages, purpose = batch.table, batch.errors, batch.ages, PURPOSE_PIXELS
     by_cell, exist = rule.unit == "cell", batch.exist
-    cells = tiles.cell_of_place(batch.table.device)  # [256]
+    cells = cell_of_place(batch.table.device)  # [256]
     if by_cell:
-        places = torch.argsort(cells, stable=True).view(tiles.TILE_CELLS, -1)  # [16, 16] of each cell
-        first_pixels, purpose = first_pixels[:, places[:, 0]], philox.PURPOSE_CELLS
+        places = torch.argsort(cells, stable=True).view(TILE_CELLS, -1)  # [16, 16] of each cell
+        first_pixels, purpose = first_pixels[:, places[:, 0]], PURPOSE_CELLS
         errors, ages = errors[:, places].sum(dim=2), ages[:, places].amax(dim=2)
         exist = exist[:, places].any(dim=2)
     wanted = rule.wanted(rate, errors.shape[1])
@@ -202,12 +218,12 @@ def _draw_within_tiles(batch: _Batch, rate: float, rule: DrawRule) -> PixelSampl
     if by_cell:
         drawn, weights = drawn[:, cells] & batch.exist, None if weights is None else weights[:, cells]
     if batch.live_tiles is None:
-        slots = tiles.slots_of_tiles(rule.unit, wanted, *tiles.tile_extents(batch.sizes))
+        slots = slots_of_tiles(rule.unit, wanted, *tile_extents(batch.sizes))
         tile_ids, full = torch.arange(len(batch.table), dtype=torch.int32, device=batch.table.device), not by_cell
     else:
-        slots = np.full(len(batch.table), wanted * tiles.TILE_PIXELS // errors.shape[1])
+        slots = np.full(len(batch.table), wanted * TILE_PIXELS // errors.shape[1])
         tile_ids, full = batch.live_tiles.int(), False
-    samples = tiles.compact(batch.view_ids, batch.sizes, batch.table, drawn, tile_ids, slots, weights, full=full)
+    samples = compact(batch.view_ids, batch.sizes, batch.table, drawn, tile_ids, slots, weights, full=full)
     return replace(samples, host_ends=batch.ends(rule.unit, [wanted] * len(batch.counts)))
 
 
@@ -215,9 +231,9 @@ def _draw_tiles(batch: _Batch, rate: float, rule: DrawRule) -> PixelSamples:
     """Whole tiles as units, drawn from each view."""
     device, ends = batch.table.device, np.concatenate([[0], np.cumsum(batch.counts)])
     errors, ages = batch.errors.sum(dim=1), batch.ages.amax(dim=1)  # [T]
-    numbers_in_batch = torch.arange(len(batch.table), device=device)
+    tiles = torch.arange(len(batch.table), device=device)
     firsts = torch.as_tensor(np.repeat(ends[:-1], np.diff(ends)), device=device)
-    words = batch.words((numbers_in_batch - firsts)[:, None], philox.PURPOSE_TILES)  # of the numbers within the view
+    words = batch.words((tiles - firsts)[:, None], PURPOSE_TILES)  # of the numbers within the view
     chosen, weights, numbers = [], [], []
     for first, end in itertools.pairwise(ends.tolist()):
         row = slice(first, end)
@@ -234,8 +250,8 @@ def _draw_tiles(batch: _Batch, rate: float, rule: DrawRule) -> PixelSamples:
     tile_ids = torch.cat(chosen)
     table, exist = batch.table[tile_ids], batch.exist[tile_ids]
     tile_weights = torch.cat(weights)[:, None].expand(table.shape) if rule.importance else None
-    slots = np.full(len(tile_ids), tiles.TILE_PIXELS)
+    slots = np.full(len(tile_ids), TILE_PIXELS)
     if batch.live_tiles is not None:
         tile_ids = batch.live_tiles[tile_ids]
-    samples = tiles.compact(batch.view_ids, batch.sizes, table, exist, tile_ids.int(), slots, tile_weights)
+    samples = compact(batch.view_ids, batch.sizes, table, exist, tile_ids.int(), slots, tile_weights)
     return replace(samples, host_ends=batch.ends(rule.unit, numbers))

@@ -130,5 +130,10 @@ def intersect_tiles(rows: Rows, splats: Splats, samples: PixelSamples, settings:
 
     owners, tiles = owners[kept], tiles[kept]
     slots = tiles.sort(stable=True).indices  # [M] front to back within each tile
-    tile_counts, row_counts = torch.bincount(tiles, minlength=num_tiles), torch.bincount(owners, minlength=len(order))
-    return Intersections(order[owners[slots]], tile_counts, slots, row_counts, row_order=order)
+    return Intersections(
+        rows=order[owners[slots]],
+        tile_counts=torch.bincount(tiles, minlength=num_tiles),
+        slots=slots,
+        row_counts=torch.bincount(owners, minlength=len(order)),
+        row_order=order,
+    )

@@ -12,6 +12,9 @@ Notation, per tile and channel: n samples x (prediction) and y (truth) with impo
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor
 
@@ -45,7 +48,7 @@ def sparse_loss(terms: LossTerms, colors: Tensor, targets: Tensor, samples: Pixe
     if terms.structure == "none":
         return LossOutput(loss, gradients, problem.pixel_errors)
     groups = problem.groups
-    moments = TileMoments(groups, problem.colors, problem.targets)
+    moments = TileMoments.of(groups, problem.colors, problem.targets)
     similarity, slopes = SIMILARITIES[terms.structure](moments, groups, terms.variance_constant)
     factors = torch.ones_like(similarity[:, :1])  # [T, 1]
     if terms.balance:
@@ -93,23 +96,33 @@ class TileGroups:
         return values[self.tile_of_slot]
 
 
+@dataclass
 class TileMoments:
     """First and second moments of prediction (x) and truth (y) of each tile and channel.
 
-    Attributes:
+    Args:
         mean_x, mean_y, variance_x, variance_y, covariance: [T, C].
         offset_x, offset_y: [P, C], the samples minus their tile's mean.
     """
 
-    def __init__(self, groups: TileGroups, colors: Tensor, targets: Tensor) -> None:
+    mean_x: Tensor
+    mean_y: Tensor
+    variance_x: Tensor
+    variance_y: Tensor
+    covariance: Tensor
+    offset_x: Tensor
+    offset_y: Tensor
+
+    @classmethod
+    def of(cls, groups: TileGroups, colors: Tensor, targets: Tensor) -> TileMoments:
         """Two passes, relative to the tile's first sample, so a constant tile has variance 0 exactly."""
         first_x, first_y = colors[groups.first_slots], targets[groups.first_slots]
         relative_x, relative_y = colors - groups.spread(first_x), targets - groups.spread(first_y)
         mean_x, mean_y = groups.mean(torch.cat([relative_x, relative_y], dim=1)).chunk(2, dim=1)
-        x, y = relative_x - groups.spread(mean_x), relative_y - groups.spread(mean_y)
-        products = groups.mean(torch.cat([x * x, y * y, x * y], dim=1))
-        self.variance_x, self.variance_y, self.covariance = products.chunk(3, dim=1)
-        self.mean_x, self.mean_y, self.offset_x, self.offset_y = mean_x + first_x, mean_y + first_y, x, y
+        offset_x, offset_y = relative_x - groups.spread(mean_x), relative_y - groups.spread(mean_y)
+        products = torch.cat([offset_x * offset_x, offset_y * offset_y, offset_x * offset_y], dim=1)
+        variance_x, variance_y, covariance = groups.mean(products).chunk(3, dim=1)
+        return cls(mean_x + first_x, mean_y + first_y, variance_x, variance_y, covariance, offset_x, offset_y)
 
 
 Similarity = tuple[Tensor, Tensor]
@@ -173,7 +186,12 @@ def ssim(moments: TileMoments, groups: TileGroups, constant: float) -> Similarit
     return structure * luminance, gradients
 
 
-SIMILARITIES = {"ncc": correlation, "contrast": contrast, "ssim": ssim, "printed_ncc": printed_correlation}
+SIMILARITIES: dict[str, Callable[[TileMoments, TileGroups, float], Similarity]] = {
+    "ncc": correlation,
+    "contrast": contrast,
+    "ssim": ssim,
+    "printed_ncc": printed_correlation,
+}
 """Name of a structure term -> its definition. `strategies.losses` uses the same names."""
 
 
