@@ -19,6 +19,7 @@ from turbogs_plugin.scene.colmap import MODEL_FOLDERS, find_model, incomplete_mo
 from turbogs_plugin.scene.frame import Frame
 from turbogs_plugin.scene.host_arrays import file_note
 from turbogs_plugin.scene.mask_files import find_masks, load_masks
+from turbogs_plugin.scene.nearby import POSE_FILES, capture_around, capture_near
 from turbogs_plugin.scene.photo_folder import find_photos, unread
 from turbogs_plugin.scene.photos import (
     Photos,
@@ -229,20 +230,28 @@ def _masked_note(names: tuple[str, ...], masks: list[ViewMask | None], sizes: np
 
 
 def holds_photos_alone(scene: Path) -> bool:
-    """Whether a folder has photos, and nothing that says where they were taken from: no reconstruction in parts."""
-    begun = any((scene / place.partition("/")[0]).is_dir() for place in MODEL_FOLDERS if place != ".")
-    return scene.is_dir() and not begun and _cameras(scene) == (None, []) and bool(find_photos(scene)[1])
+    """Whether a folder has photos, and nothing that says where they were taken from: no reconstruction in parts, and no
+    capture in it or around it."""
+    alone = scene.is_dir() and not _is_begun(scene) and _cameras(scene) == (None, []) and bool(find_photos(scene)[1])
+    return alone and not capture_near(scene)
+
+
+def _is_begun(scene: Path) -> bool:
+    """Whether there is a folder for a reconstruction, whatever it has."""
+    return any((scene / place.partition("/")[0]).is_dir() for place in MODEL_FOLDERS if place != ".")
 
 
 def _cameras(scene: Path) -> tuple[tuple[Path, str] | None, list[str]]:
     """What a folder has of cameras: the reconstruction, as `find_model` gives it, and the names of other files."""
-    files = [file for file in (FILE, *blender.FILES, llff.FILE) if (scene / file).is_file()]
+    files = [file for file in POSE_FILES if (scene / file).is_file()]
     return find_model(scene, anywhere=not files), files
 
 
 def _read(scene: Path, factor: int) -> Capture:
     """The capture, of the first kind in the order that `load_scene` states."""
     if not scene.is_dir():
+        if scene.is_file() and not unread(scene) and (where := capture_around(scene)):
+            raise InputError(where)
         trouble = f"{scene} is a file" if scene.is_file() else f"{scene} does not exist"
         raise InputError(f"no such scene: {unread(scene) or f'{trouble}: give the folder of a capture, or of photos'}")
     model, files = _cameras(scene)
@@ -264,6 +273,8 @@ def _read_other(scene: Path, files: list[str], factor: int) -> Capture:
         return _passing_over([file for file in files if file not in blender.FILES], blender.read_blender(scene))
     if files:
         return llff.read_llff(scene, factor)
+    if not _is_begun(scene) and (where := capture_near(scene)):
+        raise InputError(where)
     if holds_photos_alone(scene):
         raise InputError(
             f"{scene} has {len(find_photos(scene)[1])} photos and nothing that says where they were taken from: find "
@@ -297,6 +308,8 @@ def _find_photos(scene: Path, capture: Capture, factor: int) -> tuple[list[Path]
                 return paths, sizes, _undistorted_sizes(capture, sizes), ""
     paths = [capture.photo_folder / name for name in capture.names]
     missing = [name for name, path in zip(capture.names, paths, strict=True) if not path.is_file()]
+    if len(missing) == len(paths) and (where := capture_around(scene)):
+        raise InputError(where)
     if missing:
         remedy = _in_other_letters(capture.photo_folder / missing[0]) or "bring them back"
         raise InputError(
