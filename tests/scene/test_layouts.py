@@ -169,6 +169,34 @@ def test_nerfstudio(tmp_path, colmap):
     assert ("transforms.json not used" in scene.notes) == colmap
 
 
+@pytest.mark.parametrize("size", [(210, 137), (208, 139)])
+@pytest.mark.parametrize("kept", ["input images", "input", "images of the cameras' size"])
+def test_convert_py_of_gaussian_splatting(tmp_path, size, kept):
+    """Photos in input, their cameras in distorted/sparse/0, and undistorted photos of the same names in images: some
+    look like scaled copies."""
+    camera, root = [pinhole(240, 160, 200.0)], tmp_path / "bonsai"
+    write_model(root / "distorted/sparse/0", camera, NAMES)
+    write_photos(root / "input", camera, NAMES)
+    for name in NAMES if "images" in kept else []:
+        photo = Image.open(root / "input" / name)
+        photo = photo.resize(size).transpose(Image.Transpose.ROTATE_180) if kept == "input images" else photo
+        (root / "images").mkdir(exist_ok=True)
+        photo.save(root / "images" / name)
+    expected = root / ("images" if kept.startswith("images") else "input")
+    for folder in (root / "distorted", root):
+        scene = load_scene(folder)
+        require_painted(scene)
+        assert (f", photos in {expected}" in scene.notes[0]) == (expected != folder / "images")
+
+
+def test_masks_of_the_cameras_size_are_no_photos(tmp_path):
+    camera = [pinhole(240, 160, 200.0)]
+    write_model(tmp_path / "scan24/sparse/0", camera, NAMES)
+    write_photos(tmp_path / "scan24/images", camera, NAMES, 2)
+    write_photos(tmp_path / "scan24/mask", camera, NAMES)
+    assert load_scene(tmp_path / "scan24").train.cameras.sizes[0].tolist() == [120, 80]
+
+
 def test_tanks_and_temples_as_3dgs_has_them(tmp_path):
     """Photos of half the size that the cameras have, rounded as it came."""
     camera = [pinhole(241, 161, 200.0)]
