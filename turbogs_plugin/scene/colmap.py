@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 
 MODEL_FOLDERS = ("sparse", "colmap/sparse", "colmap", ".")
 """Where a scene's reconstructions may lie, in order of preference: there, or in numbered folders of it."""
+INSTANT_NGP_FOLDERS = ("colmap_sparse", "colmap_text")
+"""Further ones, of instant-ngp's ``colmap2nerf.py``."""
 
 STRAIGHT_MODELS = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 """Camera models that are a pinhole where all their parameters of distortion are 0."""
@@ -58,10 +60,10 @@ def find_model(scene: Path, anywhere: bool = False) -> tuple[Path, str] | None:
     images is taken.
 
     Args:
-        anywhere: where there is none in `MODEL_FOLDERS`, look at folders of any name, `FOLDER_DEPTH` deep.
+        anywhere: where there is none in the known folders, look at those of any name, `FOLDER_DEPTH` deep.
     """
     elsewhere = _folders(scene, FOLDER_DEPTH) if anywhere else ()
-    for place in itertools.chain((scene / name for name in MODEL_FOLDERS), elsewhere):
+    for place in itertools.chain((scene / name for name in (*MODEL_FOLDERS, *INSTANT_NGP_FOLDERS)), elsewhere):
         if numbered := _numbered_models(place):
             return max(numbered, key=lambda model: _count_images(*model))  # the first of equals
         if suffix := _suffix(place):
@@ -75,13 +77,13 @@ def _suffix(folder: Path) -> str:
     return next(complete, "")
 
 
-def incomplete_model(scene: Path) -> str:
-    """What a reconstruction in `MODEL_FOLDERS` lacks, and where; empty where there is none that lacks something."""
-    for place in (scene / name for name in MODEL_FOLDERS):
+def incomplete_model(scene: Path) -> tuple[Path, list[str]] | None:
+    """Of a reconstruction in the known folders that lacks files, where it is and which; None where there is none."""
+    for place in (scene / name for name in (*MODEL_FOLDERS, *INSTANT_NGP_FOLDERS)):
         for folder in (place, *sorted(place.glob("[0-9]"))):
             if there := {path.stem for path in folder.glob("*") if path.suffix in (".bin", ".txt")} & set(FILES):
-                return f"{folder} has no {' and no '.join(name for name in FILES if name not in there)} (.bin or .txt)"
-    return ""
+                return folder, [name for name in FILES if name not in there]
+    return None
 
 
 def _numbered_models(place: Path) -> list[tuple[Path, str]]:

@@ -15,7 +15,7 @@ from turbogs_plugin.errors import InputError
 from turbogs_plugin.masks import PixelMasks, ViewMask
 from turbogs_plugin.scene import blender, llff
 from turbogs_plugin.scene.capture import FEWEST_PHOTOS, Capture, named
-from turbogs_plugin.scene.colmap import MODEL_FOLDERS, find_model, incomplete_model, read_colmap
+from turbogs_plugin.scene.colmap import INSTANT_NGP_FOLDERS, MODEL_FOLDERS, find_model, incomplete_model, read_colmap
 from turbogs_plugin.scene.frame import Frame
 from turbogs_plugin.scene.host_arrays import file_note
 from turbogs_plugin.scene.mask_files import find_masks, load_masks
@@ -109,7 +109,7 @@ def load_scene(
 
     Args:
         path: the scene's folder. Where it could be of several kinds, the first of these is taken: a COLMAP
-            reconstruction (binary or text, in ``sparse`` or ``colmap/sparse``, there or in numbered folders), a
+            reconstruction (binary or text, in ``sparse``, ``colmap/sparse``, ... or numbered folders of these), a
             ``transforms.json``, NeRF-synthetic's ``transforms_train.json``, LLFF's ``poses_bounds.npy``.
         factor: photos and intrinsics are reduced by this. Copies in ``images_<factor>`` are used where all are there
             in the right size; otherwise ``images`` are reduced by area averaging.
@@ -256,13 +256,26 @@ def _read(scene: Path, factor: int) -> Capture:
         raise InputError(f"no such scene: {unread(scene) or f'{trouble}: give the folder of a capture, or of photos'}")
     model, files = _cameras(scene)
     if model is not None:
-        capture = read_colmap(scene, *model)
-        if not files or any((capture.photo_folder / name).is_file() for name in capture.names):
-            return _passing_over(files, capture)
-        # LLFF's poses are of the reduced copies too, which have other names than COLMAP's photos.
-        other = _read_other(scene, files, factor)
-        return replace(other, notes=(*other.notes, f"{model[0]} not used, its photos are not there"))
-    return _read_other(scene, files, factor)
+        # What instant-ngp leaves beside its transforms.json must serve as well as that.
+        whole = bool(files) and model[0].relative_to(scene).parts[:1] in [(name,) for name in INSTANT_NGP_FOLDERS]
+        try:
+            capture = read_colmap(scene, *model)
+        except InputError as error:
+            if not whole:
+                raise
+            unused = f"{model[0]} is not used: {error}"
+        else:
+            there = [(capture.photo_folder / name).is_file() for name in capture.names]
+            if not files or (all(there) if whole else any(there)):
+                return _passing_over(files, capture)
+            # LLFF's poses are of the reduced copies too, which have other names than COLMAP's photos.
+            unused = f"{model[0]} not used, its photos are not there"
+    elif (lack := incomplete_model(scene)) and lack[0] != scene:
+        unused = f"{lack[0]} is not used: it has no {' and no '.join(lack[1])} (.bin or .txt)"
+    else:
+        unused = ""
+    other = _read_other(scene, files, factor)
+    return replace(other, notes=(*other.notes, unused)) if unused else other
 
 
 def _read_other(scene: Path, files: list[str], factor: int) -> Capture:
@@ -281,7 +294,11 @@ def _read_other(scene: Path, files: list[str], factor: int) -> Capture:
             f"that by 'turbogs reconstruct {scene} --out SCENE', then use SCENE"
         )
     if lack := incomplete_model(scene):
-        raise InputError(f"{lack}: bring that file of the reconstruction back")
+        folder, absent = lack
+        files_back = "bring that file" if len(absent) == 1 else "bring these files"
+        raise InputError(
+            f"{folder} has no {' and no '.join(absent)} (.bin or .txt): {files_back} of the reconstruction back"
+        )
     raise InputError(
         f"{scene} has neither a COLMAP reconstruction (cameras, images and points3D as .bin or .txt in sparse/0) nor a "
         f"{FILE}, a {blender.TRAIN_FILE} or a {llff.FILE}, nor photos"
