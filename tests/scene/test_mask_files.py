@@ -250,6 +250,8 @@ def test_alpha_and_masks_of_one_capture_count_both(capture):
     image.putalpha(Image.fromarray(alpha))
     image.save(photo, format="PNG")
     write_masks(capture, [f"{photo.stem}.png"], half_mask())
+    shutil.copy(photo, photos_of(capture)[2])
     scene = load_scene(capture)
+    assert scene.notes[-1].startswith("2 photos have masked pixels (1 by their alpha alone), ")
     assert np.array_equal(scene.train.mask(0), (half_mask() > 0) & (alpha > 0))
     assert not scene.train.photos.transparent

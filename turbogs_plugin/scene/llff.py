@@ -194,9 +194,13 @@ def _is_whole_copy(folder: PhotoFolder, table: LlffTable) -> bool:
 def _checked_sizes(folder: PhotoFolder, table: LlffTable, source: Path) -> np.ndarray:
     """[V, 2] int64 sizes of the folder's photos, which are those of the table at a uniform scale."""
     if len(folder.names) != len(table.sizes):
+        missing = len(table.sizes) - len(folder.names)
+        remedy = "take out the photos without a pose (COLMAP leaves out what it cannot place)"
+        if missing > 0:
+            remedy = f"{missing} photos are missing there, bring them back"
         raise InputError(
-            f"{source} has {len(table.sizes)} poses but {folder.path} has {len(folder.names)} photos: take out the "
-            f"photos without a pose (COLMAP leaves out what it cannot place), or {AGAIN}"
+            f"{source} has {len(table.sizes)} poses but {folder.path} has {len(folder.names)} photos: {remedy}, or "
+            f"{AGAIN}"
         )
     sizes = folder.sizes()
     other = (sizes != sizes[0]).any(axis=1) & (table.sizes == table.sizes[0]).all(axis=1)

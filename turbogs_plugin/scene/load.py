@@ -195,7 +195,7 @@ def load_scene(
         fitted,
         undistortion_note(capture.lenses),
         mask_note,
-        _masked_note(capture.names, masks, sizes, seen),
+        _masked_note(capture.names, masks, mask_files, sizes, seen),
         "transparent photos are composited on a background (train.background)" if train.photos.transparent else "",
         file_note([train.photos.stored, tested.photos.stored], "photos"),
     )
@@ -219,14 +219,23 @@ def _pixel_masks(masks: list[ViewMask | None], sizes: np.ndarray) -> PixelMasks 
     return PixelMasks.of_views([ViewMask.whole(tuple(size)) if mask is None else mask for mask, size in pairs])
 
 
-def _masked_note(names: tuple[str, ...], masks: list[ViewMask | None], sizes: np.ndarray, seen: np.ndarray) -> str:
-    """How much is masked, and which views are left out for it, in one line; empty where nothing is masked."""
+def _masked_note(
+    names: tuple[str, ...],
+    masks: list[ViewMask | None],
+    files: list[Path | None],
+    sizes: np.ndarray,
+    seen: np.ndarray,
+) -> str:
+    """How much is masked, by the photos' alpha where no file does it, and which views are left out for it, in one line;
+    empty where nothing is masked."""
     if not (cut := [view for view, mask in enumerate(masks) if mask is not None]):
         return ""
     share = 1.0 - sum(masks[view].pixels for view in cut) / int(sizes[cut].prod(axis=1).sum())
     gone = [name for name, kept in zip(names, seen, strict=True) if not kept]
     left_out = f"; {len(gone)} masked whole are left out: {gone[0]}, ..." if gone else ""
-    return f"{len(cut)} photos have masked pixels, {share:.1%} of them{left_out}"
+    by_alpha = sum(files[view] is None for view in cut)
+    by = "" if not by_alpha else " by their alpha" if by_alpha == len(cut) else f" ({by_alpha} by their alpha alone)"
+    return f"{len(cut)} photos have masked pixels{by}, {share:.1%} of them{left_out}"
 
 
 def holds_photos_alone(scene: Path) -> bool:
@@ -296,8 +305,16 @@ def _read_other(scene: Path, files: list[str], factor: int) -> Capture:
     if lack := incomplete_model(scene):
         folder, absent = lack
         files_back = "bring that file" if len(absent) == 1 else "bring these files"
+        anew = f"take {scene / folder.relative_to(scene).parts[0]} away and find the cameras" if folder != scene else ""
         raise InputError(
             f"{folder} has no {' and no '.join(absent)} (.bin or .txt): {files_back} of the reconstruction back"
+            + (f", or {anew} by 'turbogs reconstruct {scene} --out SCENE'" if anew and find_photos(scene)[1] else "")
+        )
+    if photos := find_photos(scene)[1]:
+        begun = next(place for place in MODEL_FOLDERS if (scene / place).is_dir())
+        raise InputError(
+            f"{scene} has {len(photos)} photos and no reconstruction in {scene / begun}: bring its files back, or take "
+            f"the folder away and find the cameras by 'turbogs reconstruct {scene} --out SCENE'"
         )
     raise InputError(
         f"{scene} has neither a COLMAP reconstruction (cameras, images and points3D as .bin or .txt in sparse/0) nor a "
