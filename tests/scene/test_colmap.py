@@ -238,10 +238,16 @@ def remove_model(folder: Path) -> None:
     (folder / "sparse/0/points3D.bin").unlink()
 
 
+def remove_most_of_the_model(folder: Path) -> None:
+    remove_model(folder)
+    (folder / "sparse/0/images.bin").unlink()
+
+
 @pytest.mark.parametrize(
     ("damage", "words"),
     [
-        (remove_model, r"sparse/0 has no points3D \(\.bin or \.txt\): bring that file of the reconstruction back"),
+        (remove_model, r"has no points3D \(\.bin or \.txt\): bring that file .* back, or take .*sparse away and find"),
+        (remove_most_of_the_model, r"sparse/0 has no images and no points3D \(.*\): bring these files"),
         (capitals, r"9 of 9 photos are missing in .*; photo00\.PNG is there: give the files the letters"),
         (remove_photos, r"7 of 9 photos are missing in .*images: photo02.png, photo03.png, photo04.png, \.\.\.; bring"),
         (lambda folder: replace_photo(folder, b"\xff"), "cannot read the photo .*photo03.png"),
@@ -310,13 +316,28 @@ def test_a_model_without_images_is_refused(tmp_path):
         load_scene(tmp_path)
 
 
+def test_a_reconstruction_without_any_file_beside_photos(tmp_path):
+    folder = write_capture(tmp_path / "cup")
+    shutil.rmtree(folder / "sparse/0")
+    assert_refused("9 photos and no reconstruction in .*sparse: bring its files .*'turbogs reco", load_scene, folder)
+
+
+def test_without_photos_a_reconstruction_is_not_taken_away(tmp_path):
+    folder = write_capture(tmp_path / "cup")
+    remove_model(folder)
+    shutil.rmtree(folder / "images")
+    assert_refused("bring that file of the reconstruction back$", load_scene, folder)
+
+
 def test_the_alpha_of_a_photo_is_a_mask(tmp_path):
     """Any that is not zero keeps its pixel, in the colour that it has."""
     folder = write_capture(tmp_path / "cup")
     photo = Image.new("RGBA", (40, 24), (200, 100, 50, 51))
     photo.paste((255, 255, 255, 0), (0, 0, 40, 6))
     photo.save(folder / "images" / "photo01.png")
-    train = load_scene(folder).train
+    scene = load_scene(folder)
+    train = scene.train
+    assert scene.notes[-1] == "1 photos have masked pixels by their alpha, 25.0% of them"
     assert train.photos.image(0)[10, 0].mul(255).tolist() == [200, 100, 50]
     expected = np.zeros((24, 40), dtype=bool)
     expected[6:] = True

@@ -169,6 +169,89 @@ def test_nerfstudio(tmp_path, colmap):
     assert ("transforms.json not used" in scene.notes) == colmap
 
 
+@pytest.mark.parametrize("size", [(210, 137), (208, 139)])
+@pytest.mark.parametrize("kept", ["input images", "input", "images of the cameras' size"])
+def test_convert_py_of_gaussian_splatting(tmp_path, size, kept):
+    """Photos in input, their cameras in distorted/sparse/0, and undistorted photos of the same names in images: some
+    look like scaled copies."""
+    camera, root = [pinhole(240, 160, 200.0)], tmp_path / "bonsai"
+    write_model(root / "distorted/sparse/0", camera, NAMES)
+    write_photos(root / "input", camera, NAMES)
+    for name in NAMES if "images" in kept else []:
+        photo = Image.open(root / "input" / name)
+        photo = photo.resize(size).transpose(Image.Transpose.ROTATE_180) if kept == "input images" else photo
+        (root / "images").mkdir(exist_ok=True)
+        photo.save(root / "images" / name)
+    expected = root / ("images" if kept.startswith("images") else "input")
+    for folder in (root / "distorted", root):
+        scene = load_scene(folder)
+        require_painted(scene)
+        assert (f", photos in {expected}" in scene.notes[0]) == (expected != folder / "images")
+
+
+def test_masks_of_the_cameras_size_are_no_photos(tmp_path):
+    camera = [pinhole(240, 160, 200.0)]
+    write_model(tmp_path / "scan24/sparse/0", camera, NAMES)
+    write_photos(tmp_path / "scan24/images", camera, NAMES, 2)
+    write_photos(tmp_path / "scan24/mask", camera, NAMES)
+    assert load_scene(tmp_path / "scan24").train.cameras.sizes[0].tolist() == [120, 80]
+
+
+@pytest.mark.parametrize(("model", "suffix"), [("colmap_sparse/0", ".bin"), ("colmap_text", ".txt")])
+def test_instant_ngp(tmp_path, model, suffix):
+    """transforms.json without points, and COLMAP's model in folders of colmap2nerf.py's names."""
+    camera = [pinhole(240, 160, 200.0)]
+    write_nerfstudio(tmp_path / "fox", camera, [f"images/{name}" for name in NAMES])
+    write_photos(tmp_path / "fox/images", camera, NAMES)
+    write_model(tmp_path / "fox" / model, camera, NAMES, suffix)
+    scene = load_scene(tmp_path / "fox")
+    require_painted(scene)
+    assert f"COLMAP reconstruction {tmp_path / 'fox' / model} " in scene.notes[0] and len(scene.points) == 3
+    assert scene.notes[1:] == ("transforms.json not used",)
+
+
+@pytest.mark.parametrize("trouble", ["photos", "some photos", "damaged", "incomplete"])
+def test_instant_ngp_whose_model_cannot_be_used(tmp_path, trouble):
+    camera, names = [pinhole(240, 160, 200.0)], NAMES
+    model = tmp_path / "fox/colmap_sparse/0"
+    write_nerfstudio(tmp_path / "fox", camera, [f"images/{name}" for name in names])
+    write_photos(tmp_path / "fox/images", camera, names)
+    if trouble == "photos":
+        names = [f"raw-{name}" for name in NAMES]
+    elif trouble == "some photos":  # too few
+        names = [*NAMES[:2], *(f"raw-{name}" for name in NAMES[2:])]
+    write_model(model, camera, names)
+    if trouble == "damaged":
+        (model / "images.bin").write_bytes(b"short")
+    elif trouble == "incomplete":
+        (model / "images.bin").unlink()
+    scene = load_scene(tmp_path / "fox")
+    require_painted(scene)
+    assert "transforms.json" in scene.notes[0]
+    assert scene.notes[-1].startswith(
+        {
+            "damaged": f"{model} is not used: {model / 'images.bin'} is damaged: ",
+            "incomplete": f"{model} is not used: it has no images (.bin or .txt)",
+        }.get(trouble, f"{model} not used, its photos are not there")
+    )
+
+
+@pytest.mark.parametrize("kind", ["llff", "transforms"])
+def test_a_model_in_parts_beside_other_poses_is_said(tmp_path, kind):
+    folder, camera = tmp_path / "fern", [pinhole(240, 160, 200.0)]
+    write_photos(folder / "images", camera, NAMES)
+    if kind == "llff":
+        np.save(folder / "poses_bounds.npy", llff_table(camera[0]))
+    else:
+        write_nerfstudio(folder, camera, [f"images/{name}" for name in NAMES])
+    before = load_scene(folder).notes
+    (folder / "sparse/0").mkdir(parents=True)
+    (folder / "sparse/0/cameras.bin").write_bytes(b"")
+    (folder / "sparse/0/points3D.txt").write_bytes(b"")
+    said = f"{folder / 'sparse/0'} is not used: it has no images (.bin or .txt)"
+    assert load_scene(folder).notes == (*before, said)
+
+
 def test_tanks_and_temples_as_3dgs_has_them(tmp_path):
     """Photos of half the size that the cameras have, rounded as it came."""
     camera = [pinhole(241, 161, 200.0)]

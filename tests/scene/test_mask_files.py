@@ -12,6 +12,7 @@ from PIL import Image
 
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene import load_scene
+from turbogs_plugin.scene.mask_files import CONVENTIONS
 
 SIZE = (48, 40)
 
@@ -68,6 +69,36 @@ def test_a_nonzero_pixel_counts(capture, convention, mode):
     assert scene.notes[-1] == "8 photos have masked pixels, 49.9% of them"
 
 
+def left_half_as_jpeg(path: Path) -> None:
+    path.parent.mkdir(exist_ok=True)
+    Image.fromarray(np.where(half_mask() > 1, np.uint8(255), np.uint8(0))).save(path, format="JPEG")
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".jpeg", ".JPG", ".JPEG"])
+def test_masks_are_jpegs_too(capture, suffix):
+    for photo in photos_of(capture):
+        left_half_as_jpeg(capture / "masks" / f"{photo.stem}{suffix}")
+    assert_masked(load_scene(capture).train, half_mask() > 1)
+
+
+def test_masks_have_the_names_of_their_photos(capture, tmp_path):
+    folder = transforms_capture(capture, tmp_path)
+    content = json.loads((folder / "transforms.json").read_text())
+    for frame in content["frames"]:
+        photo = folder / frame["file_path"]
+        frame["file_path"] = f"images/{photo.stem}.Jpg"
+        Image.open(photo).convert("RGB").save(folder / frame["file_path"], format="JPEG")
+        del frame["mask_path"]
+        left_half_as_jpeg(folder / "masks" / f"{photo.stem}.Jpg")
+    (folder / "transforms.json").write_text(json.dumps(content))
+    scene = load_scene(folder)
+    assert_masked(scene.train, half_mask() > 1)
+    assert f"masks of 7 of 7 photos, as {folder}/masks/" in scene.notes[-2]
+    for mask in (folder / "masks").iterdir():  # COLMAP's name comes first
+        Image.new("L", SIZE, 255).save(mask.with_name(f"{mask.name}.png"))
+    assert load_scene(folder).train.masks is None
+
+
 def test_masks_that_are_all_there_is_nothing_masked(capture, unmasked):
     write_masks(capture, [f"{photo.stem}.png" for photo in photos_of(capture)], np.full(SIZE[::-1], 7, dtype=np.uint8))
     scene, before = load_scene(capture), load_scene(unmasked)
@@ -90,7 +121,7 @@ def test_a_folder_of_masks_of_other_names_is_named_and_not_used(capture):
     write_masks(capture, ["somebody.png"], half_mask())
     scene = load_scene(capture)
     assert scene.train.masks is None
-    assert scene.notes[-1] == f"{capture / 'masks'} is not used: it has no NAME.png or NAME.EXTENSION.png of a photo"
+    assert scene.notes[-1] == f"{capture / 'masks'} is not used: it has no {CONVENTIONS} of a photo"
 
 
 def test_views_that_are_masked_whole_are_left_out(capture):
@@ -219,6 +250,8 @@ def test_alpha_and_masks_of_one_capture_count_both(capture):
     image.putalpha(Image.fromarray(alpha))
     image.save(photo, format="PNG")
     write_masks(capture, [f"{photo.stem}.png"], half_mask())
+    shutil.copy(photo, photos_of(capture)[2])
     scene = load_scene(capture)
+    assert scene.notes[-1].startswith("2 photos have masked pixels (1 by their alpha alone), ")
     assert np.array_equal(scene.train.mask(0), (half_mask() > 0) & (alpha > 0))
     assert not scene.train.photos.transparent

@@ -25,12 +25,16 @@ if TYPE_CHECKING:
 
 MODEL_FOLDERS = ("sparse", "colmap/sparse", "colmap", ".")
 """Where a scene's reconstructions may lie, in order of preference: there, or in numbered folders of it."""
+INSTANT_NGP_FOLDERS = ("colmap_sparse", "colmap_text")
+"""Further ones, of instant-ngp's ``colmap2nerf.py``."""
 
 STRAIGHT_MODELS = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 """Camera models that are a pinhole where all their parameters of distortion are 0."""
 
 FILES = ("cameras", "images", "points3D")
 
+ORIGINALS = "input"
+"""Where gaussian-splatting's ``convert.py`` keeps the photos that it undistorts into ``images``."""
 REDUCED = re.compile(r"_\d+$")
 FOLDER_DEPTH = 2
 """Photos and models are looked for in folders of folders, no deeper."""
@@ -56,10 +60,10 @@ def find_model(scene: Path, anywhere: bool = False) -> tuple[Path, str] | None:
     images is taken.
 
     Args:
-        anywhere: where there is none in `MODEL_FOLDERS`, look at folders of any name, `FOLDER_DEPTH` deep.
+        anywhere: where there is none in the known folders, look at those of any name, `FOLDER_DEPTH` deep.
     """
     elsewhere = _folders(scene, FOLDER_DEPTH) if anywhere else ()
-    for place in itertools.chain((scene / name for name in MODEL_FOLDERS), elsewhere):
+    for place in itertools.chain((scene / name for name in (*MODEL_FOLDERS, *INSTANT_NGP_FOLDERS)), elsewhere):
         if numbered := _numbered_models(place):
             return max(numbered, key=lambda model: _count_images(*model))  # the first of equals
         if suffix := _suffix(place):
@@ -73,13 +77,13 @@ def _suffix(folder: Path) -> str:
     return next(complete, "")
 
 
-def incomplete_model(scene: Path) -> str:
-    """What a reconstruction in `MODEL_FOLDERS` lacks, and where; empty where there is none that lacks something."""
-    for place in (scene / name for name in MODEL_FOLDERS):
+def incomplete_model(scene: Path) -> tuple[Path, list[str]] | None:
+    """Of a reconstruction in the known folders that lacks files, where it is and which; None where there is none."""
+    for place in (scene / name for name in (*MODEL_FOLDERS, *INSTANT_NGP_FOLDERS)):
         for folder in (place, *sorted(place.glob("[0-9]"))):
             if there := {path.stem for path in folder.glob("*") if path.suffix in (".bin", ".txt")} & set(FILES):
-                return f"{folder} has no {' and no '.join(name for name in FILES if name not in there)} (.bin or .txt)"
-    return ""
+                return folder, [name for name in FILES if name not in there]
+    return None
 
 
 def _numbered_models(place: Path) -> list[tuple[Path, str]]:
@@ -132,7 +136,8 @@ def read_colmap(scene: Path, model: Path, suffix: str) -> Capture:
     for name, following in itertools.pairwise(names):
         if name == following:
             raise InputError(f"{model} has two images named '{name}'")
-    photo_folder, reduction = find_photo_folder(scene, names)
+    first = reconstruction.cameras[images[0].camera_id] if images else None
+    photo_folder, reduction = find_photo_folder(scene, names, first and (first.width, first.height))
     absent = [name for name in names if not (photo_folder / name).is_file()]
     absence = ()
     if absent and len(names) - len(absent) >= FEWEST_PHOTOS:
@@ -186,25 +191,39 @@ def _lens(camera: pycolmap.Camera, model: Path) -> Lens | None:
     return lens_of_camera(camera, f"camera {camera.camera_id} of {model}")
 
 
-def find_photo_folder(scene: Path, names: tuple[str, ...]) -> tuple[Path, int]:
+def find_photo_folder(scene: Path, names: tuple[str, ...], size: tuple[int, int] | None) -> tuple[Path, int]:
     """The folder that the names of the photos are relative to, and by which factor they are reduced there.
 
-    Looked at are ``images`` in the scene or beside it, the scene itself, and the folders in them; then, as not all
-    keep the full-size photos, copies of them in ``images_2``, ``images_4``, ... Where none has all the photos it is the
-    first of those that have most; not one beside the scene, whose photos may be another one's of the same names.
+    Looked at are ``images`` in the scene or beside it, the scene itself, the folders in them, and ``input`` beside it;
+    then, as not all keep the full-size photos, copies of them in ``images_2``, ``images_4``, ... Where none has all the
+    photos it is the first of those that have most; not one beside the scene, whose photos may be another one's of the
+    same names. Where the first photo has not the `size` (width, height) of its camera, and that of the same name in
+    ``input`` has, it is that folder: the others are undistorted copies.
     """
     first = scene / "images"
     if not names:
         return first, 1
-    places = (first, scene, scene.resolve().parent / "images")
+    beside = scene.resolve().parent
+    places = (first, scene, beside / "images", beside / ORIGINALS)
     whole = ((folder, 1) for place in places for folder in _folders(place, FOLDER_DEPTH))
     reduced = ((scene / f"images_{factor}", factor) for factor in REDUCTIONS)
     own = []
     for folder, reduction in itertools.chain(whole, reduced):
         if all((folder / name).is_file() for name in names):
+            originals = (scene if scene in (folder, *folder.parents) else beside) / ORIGINALS
+            undistorted = reduction == 1 and all((originals / name).is_file() for name in names)
+            if undistorted and _size_of(folder / names[0]) != size == _size_of(originals / names[0]):
+                return originals, 1
             return folder, reduction
         own += [(folder, reduction)] if scene in (folder, *folder.parents) else []
     return max(own, key=lambda place: sum((place[0] / name).is_file() for name in names))
+
+
+def _size_of(photo: Path) -> tuple[int, int] | None:
+    try:
+        return photo_size(photo)
+    except InputError:  # raised again where all photos are read
+        return None
 
 
 def _folders(place: Path, depth: int) -> Iterator[Path]:

@@ -165,9 +165,13 @@ def _is_whole_copy(reduction: int, photos: list[Path], full_sizes: np.ndarray) -
 def _checked_sizes(photos: list[Path], full_sizes: np.ndarray, source: Path) -> np.ndarray:
     """[V, 2] int64 sizes of a folder's photos, which are those of the file at a uniform scale."""
     if len(photos) != len(full_sizes):
+        missing = len(full_sizes) - len(photos)
+        remedy = "take out the photos without a pose (COLMAP leaves out what it cannot place)"
+        if missing > 0:
+            remedy = f"{missing} photos are missing there, bring them back"
         raise InputError(
-            f"{source} has {len(full_sizes)} poses but {photos[0].parent} has {len(photos)} photos: take out the "
-            f"photos without a pose (COLMAP leaves out what it cannot place), or {AGAIN}"
+            f"{source} has {len(full_sizes)} poses but {photos[0].parent} has {len(photos)} photos: {remedy}, or "
+            f"{AGAIN}"
         )
     sizes = photo_sizes(photos)
     other = (sizes != sizes[0]).any(axis=1) & (full_sizes == full_sizes[0]).all(axis=1)

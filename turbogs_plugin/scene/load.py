@@ -15,10 +15,11 @@ from turbogs_plugin.errors import InputError
 from turbogs_plugin.masks import PixelMasks, ViewMask
 from turbogs_plugin.scene import blender, llff
 from turbogs_plugin.scene.capture import FEWEST_PHOTOS, Capture, named
-from turbogs_plugin.scene.colmap import MODEL_FOLDERS, find_model, incomplete_model, read_colmap
+from turbogs_plugin.scene.colmap import INSTANT_NGP_FOLDERS, MODEL_FOLDERS, find_model, incomplete_model, read_colmap
 from turbogs_plugin.scene.frame import Frame
 from turbogs_plugin.scene.host_arrays import file_note
 from turbogs_plugin.scene.mask_files import find_masks, load_masks
+from turbogs_plugin.scene.nearby import POSE_FILES, capture_around, capture_near
 from turbogs_plugin.scene.photo_folder import find_photos, unread
 from turbogs_plugin.scene.photos import (
     Photos,
@@ -108,7 +109,7 @@ def load_scene(
 
     Args:
         path: the scene's folder. Where it could be of several kinds, the first of these is taken: a COLMAP
-            reconstruction (binary or text, in ``sparse`` or ``colmap/sparse``, there or in numbered folders), a
+            reconstruction (binary or text, in ``sparse``, ``colmap/sparse``, ... or numbered folders of these), a
             ``transforms.json``, NeRF-synthetic's ``transforms_train.json``, LLFF's ``poses_bounds.npy``.
         factor: photos and intrinsics are reduced by this. Copies in ``images_<factor>`` are used where all are there
             in the right size; otherwise ``images`` are reduced by area averaging.
@@ -194,7 +195,7 @@ def load_scene(
         fitted,
         undistortion_note(capture.lenses),
         mask_note,
-        _masked_note(capture.names, masks, sizes, seen),
+        _masked_note(capture.names, masks, mask_files, sizes, seen),
         "transparent photos are composited on a background (train.background)" if train.photos.transparent else "",
         file_note([train.photos.stored, tested.photos.stored], "photos"),
     )
@@ -218,42 +219,72 @@ def _pixel_masks(masks: list[ViewMask | None], sizes: np.ndarray) -> PixelMasks 
     return PixelMasks.of_views([ViewMask.whole(tuple(size)) if mask is None else mask for mask, size in pairs])
 
 
-def _masked_note(names: tuple[str, ...], masks: list[ViewMask | None], sizes: np.ndarray, seen: np.ndarray) -> str:
-    """How much is masked, and which views are left out for it, in one line; empty where nothing is masked."""
+def _masked_note(
+    names: tuple[str, ...],
+    masks: list[ViewMask | None],
+    files: list[Path | None],
+    sizes: np.ndarray,
+    seen: np.ndarray,
+) -> str:
+    """How much is masked, by the photos' alpha where no file does it, and which views are left out for it, in one line;
+    empty where nothing is masked."""
     if not (cut := [view for view, mask in enumerate(masks) if mask is not None]):
         return ""
     share = 1.0 - sum(masks[view].pixels for view in cut) / int(sizes[cut].prod(axis=1).sum())
     gone = [name for name, kept in zip(names, seen, strict=True) if not kept]
     left_out = f"; {len(gone)} masked whole are left out: {gone[0]}, ..." if gone else ""
-    return f"{len(cut)} photos have masked pixels, {share:.1%} of them{left_out}"
+    by_alpha = sum(files[view] is None for view in cut)
+    by = "" if not by_alpha else " by their alpha" if by_alpha == len(cut) else f" ({by_alpha} by their alpha alone)"
+    return f"{len(cut)} photos have masked pixels{by}, {share:.1%} of them{left_out}"
 
 
 def holds_photos_alone(scene: Path) -> bool:
-    """Whether a folder has photos, and nothing that says where they were taken from: no reconstruction in parts."""
-    begun = any((scene / place.partition("/")[0]).is_dir() for place in MODEL_FOLDERS if place != ".")
-    return scene.is_dir() and not begun and _cameras(scene) == (None, []) and bool(find_photos(scene)[1])
+    """Whether a folder has photos, and nothing that says where they were taken from: no reconstruction in parts, and no
+    capture in it or around it."""
+    alone = scene.is_dir() and not _is_begun(scene) and _cameras(scene) == (None, []) and bool(find_photos(scene)[1])
+    return alone and not capture_near(scene)
+
+
+def _is_begun(scene: Path) -> bool:
+    """Whether there is a folder for a reconstruction, whatever it has."""
+    return any((scene / place.partition("/")[0]).is_dir() for place in MODEL_FOLDERS if place != ".")
 
 
 def _cameras(scene: Path) -> tuple[tuple[Path, str] | None, list[str]]:
     """What a folder has of cameras: the reconstruction, as `find_model` gives it, and the names of other files."""
-    files = [file for file in (FILE, *blender.FILES, llff.FILE) if (scene / file).is_file()]
+    files = [file for file in POSE_FILES if (scene / file).is_file()]
     return find_model(scene, anywhere=not files), files
 
 
 def _read(scene: Path, factor: int) -> Capture:
     """The capture, of the first kind in the order that `load_scene` states."""
     if not scene.is_dir():
+        if scene.is_file() and not unread(scene) and (where := capture_around(scene)):
+            raise InputError(where)
         trouble = f"{scene} is a file" if scene.is_file() else f"{scene} does not exist"
         raise InputError(f"no such scene: {unread(scene) or f'{trouble}: give the folder of a capture, or of photos'}")
     model, files = _cameras(scene)
     if model is not None:
-        capture = read_colmap(scene, *model)
-        if not files or any((capture.photo_folder / name).is_file() for name in capture.names):
-            return _passing_over(files, capture)
-        # LLFF's poses are of the reduced copies too, which have other names than COLMAP's photos.
-        other = _read_other(scene, files, factor)
-        return replace(other, notes=(*other.notes, f"{model[0]} not used, its photos are not there"))
-    return _read_other(scene, files, factor)
+        # What instant-ngp leaves beside its transforms.json must serve as well as that.
+        whole = bool(files) and model[0].relative_to(scene).parts[:1] in [(name,) for name in INSTANT_NGP_FOLDERS]
+        try:
+            capture = read_colmap(scene, *model)
+        except InputError as error:
+            if not whole:
+                raise
+            unused = f"{model[0]} is not used: {error}"
+        else:
+            there = [(capture.photo_folder / name).is_file() for name in capture.names]
+            if not files or (all(there) if whole else any(there)):
+                return _passing_over(files, capture)
+            # LLFF's poses are of the reduced copies too, which have other names than COLMAP's photos.
+            unused = f"{model[0]} not used, its photos are not there"
+    elif (lack := incomplete_model(scene)) and lack[0] != scene:
+        unused = f"{lack[0]} is not used: it has no {' and no '.join(lack[1])} (.bin or .txt)"
+    else:
+        unused = ""
+    other = _read_other(scene, files, factor)
+    return replace(other, notes=(*other.notes, unused)) if unused else other
 
 
 def _read_other(scene: Path, files: list[str], factor: int) -> Capture:
@@ -264,13 +295,27 @@ def _read_other(scene: Path, files: list[str], factor: int) -> Capture:
         return _passing_over([file for file in files if file not in blender.FILES], blender.read_blender(scene))
     if files:
         return llff.read_llff(scene, factor)
+    if not _is_begun(scene) and (where := capture_near(scene)):
+        raise InputError(where)
     if holds_photos_alone(scene):
         raise InputError(
             f"{scene} has {len(find_photos(scene)[1])} photos and nothing that says where they were taken from: find "
             f"that by 'turbogs reconstruct {scene} --out SCENE', then use SCENE"
         )
     if lack := incomplete_model(scene):
-        raise InputError(f"{lack}: bring that file of the reconstruction back")
+        folder, absent = lack
+        files_back = "bring that file" if len(absent) == 1 else "bring these files"
+        anew = f"take {scene / folder.relative_to(scene).parts[0]} away and find the cameras" if folder != scene else ""
+        raise InputError(
+            f"{folder} has no {' and no '.join(absent)} (.bin or .txt): {files_back} of the reconstruction back"
+            + (f", or {anew} by 'turbogs reconstruct {scene} --out SCENE'" if anew and find_photos(scene)[1] else "")
+        )
+    if photos := find_photos(scene)[1]:
+        begun = next(place for place in MODEL_FOLDERS if (scene / place).is_dir())
+        raise InputError(
+            f"{scene} has {len(photos)} photos and no reconstruction in {scene / begun}: bring its files back, or take "
+            f"the folder away and find the cameras by 'turbogs reconstruct {scene} --out SCENE'"
+        )
     raise InputError(
         f"{scene} has neither a COLMAP reconstruction (cameras, images and points3D as .bin or .txt in sparse/0) nor a "
         f"{FILE}, a {blender.TRAIN_FILE} or a {llff.FILE}, nor photos"
@@ -297,6 +342,8 @@ def _find_photos(scene: Path, capture: Capture, factor: int) -> tuple[list[Path]
                 return paths, sizes, _undistorted_sizes(capture, sizes), ""
     paths = [capture.photo_folder / name for name in capture.names]
     missing = [name for name, path in zip(capture.names, paths, strict=True) if not path.is_file()]
+    if len(missing) == len(paths) and (where := capture_around(scene)):
+        raise InputError(where)
     if missing:
         remedy = _in_other_letters(capture.photo_folder / missing[0]) or "bring them back"
         raise InputError(

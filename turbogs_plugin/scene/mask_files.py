@@ -20,6 +20,8 @@ from turbogs_plugin.scene.photos import DECODING_BYTES, OPAQUE_SUFFIXES, decodin
 from turbogs_plugin.scene.undistort import Lens
 
 FOLDER = "masks"
+CONVENTIONS = "NAME.png, NAME.EXTENSION.png or NAME.jpg"
+JPEG_SUFFIXES = (".jpg", ".jpeg", ".JPG", ".JPEG")
 HALF = 128
 """Value from which a pixel of a JPEG counts, whose compression leaves no exact zeros."""
 
@@ -27,8 +29,9 @@ HALF = 128
 def find_masks(scene: Path, capture: Capture, photos: Sequence[Path]) -> tuple[list[Path | None], str]:
     """The file of each photo's mask, None where there is none, and what to tell the user of it.
 
-    Those that the capture names come first. Others are ``masks/NAME.png`` or COLMAP's ``masks/NAME.EXTENSION.png``, in
-    the capture or beside the folder of its photos. For photos of ``images_4`` those of ``masks_4`` come first.
+    Those that the capture names come first. Others are ``masks/NAME.png`` or COLMAP's ``masks/NAME.EXTENSION.png``,
+    else of the photo's own name or ``masks/NAME.jpg``, in the capture or beside the folder of its photos. For photos
+    of ``images_4`` those of ``masks_4`` come first.
 
     Args:
         photos: the V files.
@@ -40,7 +43,7 @@ def find_masks(scene: Path, capture: Capture, photos: Sequence[Path]) -> tuple[l
     found = [file or _in_folders(folders, name) for file, name in zip(capture.mask_files, capture.names, strict=True)]
     count, views = sum(file is not None for file in found), len(found)
     if count == 0:
-        unused = (f"{folder} is not used: it has no NAME.png or NAME.EXTENSION.png of a photo" for folder in folders)
+        unused = (f"{folder} is not used: it has no {CONVENTIONS} of a photo" for folder in folders)
         return found, next(unused, "")
     first = next(file for file in found if file is not None)
     without = [name for name, file in zip(capture.names, found, strict=True) if file is None]
@@ -49,7 +52,8 @@ def find_masks(scene: Path, capture: Capture, photos: Sequence[Path]) -> tuple[l
 
 
 def _in_folders(folders: Sequence[Path], photo: str) -> Path | None:
-    names = (str(PurePosixPath(photo).with_suffix(".png")), f"{photo}.png")
+    stem = PurePosixPath(photo).with_suffix("")
+    names = (f"{stem}.png", f"{photo}.png", photo, *(f"{stem}{suffix}" for suffix in JPEG_SUFFIXES))
     return next((folder / name for folder in folders for name in names if (folder / name).is_file()), None)
 
 
