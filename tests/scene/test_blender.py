@@ -117,6 +117,15 @@ def test_opaque_photos_and_intrinsics_of_newer_exporters(tmp_path):
     np.testing.assert_allclose(scene.train.cameras.Ks[0], [[80, 0, 31], [0, 82, 19], [0, 0, 1]])
 
 
+def test_photos_with_another_suffix(tmp_path):
+    folder = write_blender(tmp_path / "lego")
+    edit(folder, lambda content: [frame.update(file_path=f"{frame['file_path']}.jpg") for frame in content["frames"]])
+    scene = load_scene(folder)
+    assert len(scene.train) == 6 and scene.notes[1] == (
+        "6 photos have another suffix than in transforms_train.json: train/r_0.png is taken for train/r_0.jpg, ..."
+    )
+
+
 def test_photos_of_other_sizes_have_the_same_angle_of_view(tmp_path):
     folder = write_blender(tmp_path / "lego")
     Image.new("RGBA", (120, 80)).save(folder / "train/r_1.png")
@@ -179,7 +188,7 @@ def frame(**values):
         (frame(file_path="./train/r_9"), "1 of 6 photos of .*transforms_train.json are missing .train/r_9.: bring"),
         (frame(file_path="./train/r_1"), "two frames for 'train/r_1.png'"),
         (frame(file_path="./test/r_1"), "1 photos stand both in transforms_train.json and in transforms_test.json"),
-        (frame(file_path="../lego/other/r_2"), "leaves the photo folder"),
+        (frame(file_path="../lego/other/r_2"), "1 of 6 photos of .* are missing .../lego/other/r_2.: bring them back"),
         (frame(file_path=None), "a frame without a file_path"),
         (frame(transform_matrix=None), "r_2.png has no transform_matrix of 4x4"),
         (frame(transform_matrix=[[1, 2], [3]]), "r_2.png has no transform_matrix of 4x4"),

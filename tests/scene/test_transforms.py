@@ -173,8 +173,11 @@ def set_pose(value):
         (lambda content: content.update(frames=content["frames"][:2]), "has 2 images"),
         (lambda content: content["frames"].append(content["frames"][0]), "two frames for 'images/f0.png'"),
         (lambda content: content["frames"][0].pop("file_path"), "a frame without a file_path"),
-        (lambda content: content["frames"][0].update(file_path="../other/f0.png"), "leaves the photo folder"),
-        (lambda content: content["frames"][0].update(file_path="/etc/passwd"), "leaves the photo folder"),
+        (lambda content: content["frames"][0].update(file_path="/"), "leaves the photo folder"),
+        (
+            lambda content: [frame.update(file_path=f"/home/me/none{i}") for i, frame in enumerate(content["frames"])],
+            r"names 9 photos, of which 9 are missing in .* \(/home/me/none0, ...\): at least 3",
+        ),
         (
             lambda content: [frame.update(file_path=f"none{i}.png") for i, frame in enumerate(content["frames"][2:])],
             r"names 9 photos, of which 7 are missing in .* \(none0.png, ...\): at least 3",
@@ -259,6 +262,54 @@ def test_frames_without_a_photo_are_left_out_and_counted(tmp_path):
     assert scene.notes[1:] == ("2 of 9 frames are left out, their photos do not exist: images/f1.png, ...",)
 
 
+@pytest.mark.parametrize(
+    "written", ["/home/me/cup/images/f{}.png", "../cup/images/f{}.png", "D:\\cup\\images\\f{}.png"]
+)
+def test_an_absent_photo_of_another_machine_is_left_out_like_any(tmp_path, written):
+    """Nor is a file taken that its path names outside of the capture."""
+    folder = write_transforms(tmp_path / "cup")
+    (folder / "images/f5.png").unlink()
+    (tmp_path / "f7.png").write_bytes((folder / "images/f7.png").read_bytes())
+    (folder / "images/f7.png").unlink()
+
+    def change(content):
+        for view, frame in enumerate(content["frames"]):
+            frame["file_path"] = written.format(view)
+        content["frames"][7]["file_path"] = str(tmp_path / "f7.png")
+
+    edit(folder, change)
+    scene = load_scene(folder)
+    assert (*scene.test.names, *scene.train.names) == ("f0.png", *(f"f{view}.png" for view in (1, 2, 3, 4, 6, 8)))
+    assert scene.notes[1] == f"2 of 9 frames are left out, their photos do not exist: {written.format(5)}, ..."
+
+
+@pytest.mark.parametrize("written", ["images/f{}.jpeg", "/home/me/cup/images/f{}.JPG", "images\\f{}.tif"])
+def test_photos_with_another_suffix(tmp_path, written):
+    folder = write_transforms(tmp_path / "cup", test_filenames=[written.format(3)])
+    edit(folder, lambda content: [f.update(file_path=written.format(i)) for i, f in enumerate(content["frames"])])
+    scene = load_scene(folder)
+    assert scene.test.names == ("f3.png",) and len(scene.train) == 8
+    assert scene.notes[1].startswith("9 photos have another suffix than in transforms.json: images/f0.png is taken for")
+
+
+def test_neighbours_with_another_suffix_that_are_no_photos(tmp_path):
+    """Not what lies beside photos that are there, what another frame names, or one of two."""
+    folder = write_transforms(tmp_path / "cup")
+    photo = (folder / "images/f4.png").read_bytes()
+    (folder / "images/f4.png").unlink()
+    for beside in ("f3.jpg", "f4.jpg"):
+        (folder / "images" / beside).write_bytes(photo)
+    left_out = "1 of 9 frames are left out, their photos do not exist: images/f4.png, ..."
+    assert load_scene(folder).notes[1] == left_out
+    (folder / "images/f3.jpg").unlink()
+    assert load_scene(folder).notes[1].startswith("1 photos have another suffix than in transforms.json: images/f4.jpg")
+    (folder / "images/f4.JPEG").write_bytes(photo)
+    assert load_scene(folder).notes[1] == left_out
+    (folder / "images/f4.JPEG").unlink()
+    edit(folder, lambda content: content["frames"].append({**content["frames"][0], "file_path": "images/f4.jpg"}))
+    assert load_scene(folder).notes[1] == left_out.replace("of 9", "of 10")
+
+
 @pytest.mark.skipif(not (SCENES / "fox-raw").is_dir(), reason=f"no real captures in {SCENES}")
 def test_real_capture_as_published(tmp_path):
     """Its file of cameras, and every fifth of its photos."""
@@ -316,7 +367,7 @@ def test_random_points_are_about_what_the_training_cameras_see(tmp_path):
     ("content", "message"),
     [
         ({"test_filenames": ["images/f3.png", "images/g.png", "h.png"]}, "names 'images/g.png' and 1 more, which no"),
-        ({"test_filenames": ["images/f3.png", "../f1.png"]}, "leaves the photo folder"),
+        ({"test_filenames": ["images/f3.png", "../f1.png"]}, "names '../f1.png', which no frame has"),
         ({"val_filenames": "images/f3.png"}, "val_filenames is no list of file names"),
         ({"train_filenames": [1]}, "train_filenames is no list of file names"),
         ({"train_filenames": [], "test_filenames": []}, "train_filenames and test_filenames are empty"),

@@ -17,7 +17,16 @@ from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene.capture import Capture, named, sizes_text
 from turbogs_plugin.scene.photos import is_transparent, opened_image, photo_size
 from turbogs_plugin.scene.starting_points import random_points
-from turbogs_plugin.scene.transforms import number_of, opengl_viewmat, photo_name, pinhole, read_frames
+from turbogs_plugin.scene.transforms import (
+    is_there,
+    number_of,
+    opengl_viewmat,
+    other_suffixes,
+    other_suffixes_note,
+    photo_name,
+    pinhole,
+    read_frames,
+)
 
 TRAIN_FILE = "transforms_train.json"
 TEST_FILES = ("transforms_test.json", "transforms_val.json")
@@ -42,9 +51,10 @@ def read_blender(scene: Path) -> Capture:
     """
     if not (scene / TRAIN_FILE).is_file():
         raise InputError(f"{scene} has no {TRAIN_FILE}, which names the photos to train on: bring it back")
-    train = _read_views(scene, scene / TRAIN_FILE)
+    notes: list[str] = []
+    train = _read_views(scene, scene / TRAIN_FILE, notes)
     test_file = next((scene / name for name in TEST_FILES if (scene / name).is_file()), None)
-    test = {} if test_file is None else _read_views(scene, test_file)
+    test = {} if test_file is None else _read_views(scene, test_file, notes)
     if in_both := sorted(train.keys() & test.keys()):
         raise InputError(
             f"{scene}: {len(in_both)} photos stand both in {TRAIN_FILE} and in {test_file.name} ({in_both[0]}): take "
@@ -61,22 +71,24 @@ def read_blender(scene: Path) -> Capture:
         sizes=sizes,
         points=points,
         point_colors=None,
-        notes=(_note(scene, train, test, sizes, len(points)),),
+        notes=(_note(scene, train, test, sizes, len(points)), *notes),
         test=np.array([name in test for name in names]) if test else None,
     ).checked(scene / TRAIN_FILE)
 
 
-def _read_views(scene: Path, source: Path) -> dict[str, View]:
-    """The views of one file, by the photos' paths relative to the scene."""
+def _read_views(scene: Path, source: Path, notes: list[str]) -> dict[str, View]:
+    """The views of one file, by the photos' paths relative to the scene; `notes` gets lines for the user."""
     content, frames = read_frames(source)
     shared = {key: value for key, value in content.items() if key != "frames"}
     frame_of: dict[str, dict[str, Any]] = {}
-    for frame in frames:
-        name = photo_name(scene, frame.get("file_path"), source)
+    names = [photo_name(scene, frame.get("file_path"), source) for frame in frames]
+    if others := other_suffixes(scene, names, source):
+        notes.append(other_suffixes_note(others, source))
+    for name, frame in zip((others.get(name, name) for name in names), frames, strict=True):
         if name in frame_of:
             raise InputError(f"{source} has two frames for '{name}': take one of them out")
         frame_of[name] = {**shared, **frame}
-    if missing := [name for name in frame_of if not (scene / name).is_file()]:
+    if missing := [name for name in frame_of if not is_there(scene, name)]:
         raise InputError(
             f"{len(missing)} of {len(frame_of)} photos of {source} are missing ({named(missing)}): bring them back, or "
             "take their frames out of the file"

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
@@ -59,13 +60,19 @@ def read_transforms(scene: Path) -> Capture:
     absent: list[str] = []
     lenses: dict[tuple, Lens] = {}
     names_of_frames = [photo_name(scene, frame.get("file_path"), source) for frame in frames]
-    split = read_split(content, set(names_of_frames), partial(photo_name, scene, source=source), source)
+    others = other_suffixes(scene, names_of_frames, source)
+    names_of_frames = [others.get(name, name) for name in names_of_frames]
+
+    def name_of(text: str) -> str:
+        return others.get(name := photo_name(scene, text, source), name)
+
+    split = read_split(content, set(names_of_frames), name_of, source)
     for name, frame in zip(names_of_frames, frames, strict=True):
         if name in views or name in absent:
             raise InputError(f"{source} has two frames for '{name}'")
         if split is not None and name in split.unused:
             continue
-        if not (scene / name).is_file():
+        if not is_there(scene, name):
             absent.append(name)
             continue
         masks[name] = _mask_file(scene, frame, name, source)
@@ -98,6 +105,8 @@ def read_transforms(scene: Path) -> Capture:
         origin += f", so {about_cameras(len(points))}"
     parts = "" if split is None else f", {split.text(names)}"
     notes = [f"{source} (nerfstudio, instant-ngp): {len(names)} photos{parts}, {origin}"]
+    if others:
+        notes.append(other_suffixes_note(others, source))
     if absent:
         notes.append(left_out(absent, len(frames), "frames"))
     # Reduced copies lie in images_2, images_4, ... beside images.
@@ -122,10 +131,48 @@ def read_transforms(scene: Path) -> Capture:
 
 def photo_name(scene: Path, name: Any, source: Path) -> str:
     """The photo's path relative to the scene (`_file_name`), with its suffix, which Blender's names come without, if it
-    is there."""
+    is there. One that leaves the scene stays as it is: no photo `is_there`."""
     if not isinstance(name, str):
         raise InputError(f"{source} has a frame without a file_path: export it again")
-    return _file_name(scene, name, source, _photo_there)
+    return _file_name(scene, name, source, _photo_there, may_leave=True)
+
+
+def is_there(scene: Path, name: str) -> bool:
+    """Whether a name that `photo_name` gave is that of a file in the scene."""
+    path = PureWindowsPath(name)  # knows both kinds of separators, drives and roots
+    return not path.anchor and ".." not in path.parts and (scene / name).is_file()
+
+
+def other_suffixes(scene: Path, names: Sequence[str], source: Path) -> dict[str, str]:
+    """Of names without a photo, those for which there is one photo of the same stem with another suffix, and that
+    photo's name. None where photos that are there have such neighbours too: these are masks or depths."""
+    absent = [name for name in names if not is_there(scene, name)]
+    if not absent or any(_neighbours(scene, name) for name in names if is_there(scene, name)):
+        return {}
+    neighbours = {name: _file_name(scene, name, source, _one_neighbour, may_leave=True) for name in absent}
+    taken = Counter([*names, *neighbours.values()])
+    return {name: other for name, other in neighbours.items() if other != name and taken[other] == 1}
+
+
+def other_suffixes_note(others: dict[str, str], source: Path) -> str:
+    """What `other_suffixes` found, in one line."""
+    name, other = next(iter(others.items()))
+    return f"{len(others)} photos have another suffix than in {source.name}: {other} is taken for {name}, ..."
+
+
+def _neighbours(scene: Path, name: str) -> list[str]:
+    suffix = PurePosixPath(name).suffix
+    if not suffix or suffix[1:].isdigit():  # a number is part of the name
+        return []
+    stem = name.removesuffix(suffix)
+    letters = ((f"{stem}{each}", f"{stem}{each.upper()}") for each in PHOTO_SUFFIXES if each != suffix.lower())
+    there = (next((each for each in both if (scene / each).is_file()), None) for both in letters)
+    return [each for each in there if each]
+
+
+def _one_neighbour(scene: Path, name: str) -> str | None:
+    neighbours = _neighbours(scene, name)
+    return neighbours[0] if len(neighbours) == 1 else None
 
 
 def _photo_there(scene: Path, name: str) -> str | None:
@@ -141,7 +188,13 @@ def _file_there(scene: Path, name: str) -> str | None:
     return name if (scene / name).is_file() else None
 
 
-def _file_name(scene: Path, name: str, source: Path, there: Callable[[Path, str], str | None] = _file_there) -> str:
+def _file_name(
+    scene: Path,
+    name: str,
+    source: Path,
+    there: Callable[[Path, str], str | None] = _file_there,
+    may_leave: bool = False,
+) -> str:
     """A file's path relative to the scene, as it is on this machine.
 
     Separators may be those of Windows. Of a path of the machine that wrote it, absolute or with '..', the longest end
@@ -149,6 +202,7 @@ def _file_name(scene: Path, name: str, source: Path, there: Callable[[Path, str]
 
     Args:
         there: the name of the file that a path relative to the scene stands for, None where there is none.
+        may_leave: a path that leaves the scene, and of which no end is there, is given back, not refused.
 
     Raises:
         InputError: the path leaves the scene, and no end of it is there; or it cannot be printed.
@@ -160,6 +214,8 @@ def _file_name(scene: Path, name: str, source: Path, there: Callable[[Path, str]
         return there(scene, name) or there(scene, "/".join(parts)) or name
     ends = ("/".join(parts[first:]) for first in range(len(parts)) if ".." not in parts[first:])
     found = next(filter(None, (there(scene, end) for end in ends)), None)
+    if may_leave and parts:
+        return found or name
     return check_photo_name(name, source) if found is None else found
 
 
