@@ -176,7 +176,7 @@ def set_pose(value):
         (lambda content: content["frames"][0].update(file_path="/"), "leaves the photo folder"),
         (
             lambda content: [frame.update(file_path=f"/home/me/none{i}") for i, frame in enumerate(content["frames"])],
-            r"names 9 photos, of which 9 are missing in .* \(/home/me/none0, ...\): at least 3",
+            r"names 9 photos, of which 9 are missing in .*/cup/me \(/home/me/none0, ...\): at least 3",
         ),
         (
             lambda content: [frame.update(file_path=f"none{i}.png") for i, frame in enumerate(content["frames"][2:])],
@@ -290,6 +290,50 @@ def test_photos_with_another_suffix(tmp_path, written):
     scene = load_scene(folder)
     assert scene.test.names == ("f3.png",) and len(scene.train) == 8
     assert scene.notes[1].startswith("9 photos have another suffix than in transforms.json: images/f0.png is taken for")
+
+
+@pytest.mark.parametrize(
+    ("written", "lie", "folders"),
+    [
+        ("images/f{}.png", "f{}.png", "cup"),
+        ("images/f{}.png", "rgb/f{}.png", "cup/rgb"),
+        ("images/f{}.jpg", "DJI_001/f{}.PNG", "cup/DJI_001"),
+        ("/home/me/all/f{}", "out/rgb/f{}.png", "cup/out/rgb"),
+        ("..\\photos\\f{}.png", "images/f{}.png", ""),
+        ("all/cam{}/f.png", "rgb/cam{}/f.png", "cup/rgb/cam0, {}/cup/rgb/cam1, {}/cup/rgb/cam2, ..."),
+    ],
+)
+def test_photos_in_another_folder_are_found_by_their_names(tmp_path, written, lie, folders):
+    mask = "shade/f3.png"
+    folder = write_transforms(tmp_path / "cup", test_filenames=[written.format(3)])
+    for view in range(9):
+        (folder / lie.format(view)).parent.mkdir(parents=True, exist_ok=True)
+        (folder / f"images/f{view}.png").rename(folder / lie.format(view))
+    for beside in ("shade", "depth"):
+        (folder / beside).mkdir()
+        (folder / beside / "f3.png").write_bytes((folder / lie.format(3)).read_bytes())
+    edit(folder, lambda content: [f.update(file_path=written.format(i)) for i, f in enumerate(content["frames"])])
+    edit(folder, lambda content: content["frames"][3].update(mask_path=mask))
+    scene = load_scene(folder)
+    assert len(scene.train) == 8
+    np.testing.assert_allclose(scene.test.photos.image(0)[0, 0] * 255, [30, 200, 30], atol=1e-4)
+    if folders:
+        assert scene.notes[1] == f"photos in {tmp_path}/" + folders.replace("{}", str(tmp_path))
+
+
+def test_photos_in_another_folder_that_may_be_others_are_not_taken(tmp_path):
+    folder = write_transforms(tmp_path / "cup")
+    (folder / "images").rename(folder / "old")
+    (folder / "rgb").mkdir()
+    (folder / "rgb/f2.png").write_bytes((folder / "old/f2.png").read_bytes())
+    missing = r"names 9 photos, of which 9 are missing in .*/cup/images \(images/f0.png, ...\): at least 3 are needed; "
+    assert_refused(missing + r"copy the photos there \(f2.png is in .*/cup/old, .*/cup/rgb\)$", load_scene, folder)
+    (folder / "rgb/f2.png").unlink()
+    edit(folder, lambda content: content["frames"][1].update(file_path="other/f0.png"))
+    assert_refused(r" \(.*/cup/old/f0.png is of several names\)$", load_scene, folder)
+    for file in (folder / "old").iterdir():
+        file.unlink()
+    assert_refused(r"9 are missing in .*/cup \(images/f0.png.*; copy the photos there$", load_scene, folder)
 
 
 def test_neighbours_with_another_suffix_that_are_no_photos(tmp_path):

@@ -15,6 +15,7 @@ import numpy as np
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene.capture import FEWEST_PHOTOS, LARGEST_SIDE, Capture, check_photo_name, left_out
 from turbogs_plugin.scene.colmap import load_pycolmap
+from turbogs_plugin.scene.frame_photos import elsewhere_note, expected_folder, find_elsewhere
 from turbogs_plugin.scene.named_split import read_split
 from turbogs_plugin.scene.photos import photo_size
 from turbogs_plugin.scene.ply import read_vertices
@@ -60,7 +61,11 @@ def read_transforms(scene: Path) -> Capture:
     absent: list[str] = []
     lenses: dict[tuple, Lens] = {}
     names_of_frames = [photo_name(scene, frame.get("file_path"), source) for frame in frames]
-    others = other_suffixes(scene, names_of_frames, source)
+    others, unclear = other_suffixes(scene, names_of_frames, source), ""
+    others_note = other_suffixes_note(others, source) if others else ""
+    if not others and not any(is_there(scene, name) for name in names_of_frames):
+        others, unclear = find_elsewhere(scene, names_of_frames, frames)
+        others_note = elsewhere_note(scene, others)
     names_of_frames = [others.get(name, name) for name in names_of_frames]
 
     def name_of(text: str) -> str:
@@ -85,8 +90,9 @@ def read_transforms(scene: Path) -> Capture:
         views[name] = (viewmat, *_camera({**content, **frame}, scene / name, source, lenses))
     if absent and len(views) < FEWEST_PHOTOS:
         raise InputError(
-            f"{source} names {len(frames)} photos, of which {len(absent)} are missing in {scene} ({absent[0]}, ...): "
-            f"at least {FEWEST_PHOTOS} are needed; copy the photos there"
+            f"{source} names {len(frames)} photos, of which {len(absent)} are missing in "
+            f"{expected_folder(scene, absent)} ({absent[0]}, ...): at least {FEWEST_PHOTOS} are needed; copy the "
+            f"photos there{unclear}"
         )
     names, cameras = zip(*sorted(views.items()), strict=True)
     viewmats, intrinsics, sizes, lens_of_view = zip(*cameras, strict=True)
@@ -106,7 +112,7 @@ def read_transforms(scene: Path) -> Capture:
     parts = "" if split is None else f", {split.text(names)}"
     notes = [f"{source} (nerfstudio, instant-ngp): {len(names)} photos{parts}, {origin}"]
     if others:
-        notes.append(other_suffixes_note(others, source))
+        notes.append(others_note)
     if absent:
         notes.append(left_out(absent, len(frames), "frames"))
     # Reduced copies lie in images_2, images_4, ... beside images.
