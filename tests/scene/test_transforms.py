@@ -87,6 +87,42 @@ def test_a_frame_overrides_what_stands_for_all(tmp_path):
     assert scene.train.cameras.sizes[1:4].tolist() == [[20, 10], [12, 10], [20, 10]]
 
 
+@pytest.mark.parametrize("key", ["K", "intrinsic_matrix"])
+def test_intrinsics_as_a_matrix(tmp_path, key):
+    """Of each frame, 3x3 or 4x4 as NeuS2 writes it; a small skew is left by decompositions of projections."""
+    none = dict.fromkeys(["fl_x", "fl_y", "cx", "cy"])
+    folder = write_transforms(tmp_path / "cup", **none)
+
+    def change(content):
+        for view, frame in enumerate(content["frames"]):
+            K = np.eye(3 if key == "K" else 4)
+            K[:2, :3] = [[25 + view, 1e-4, 9.5], [0, 26, 5.5]]
+            frame[key] = K.tolist()
+
+    edit(folder, change)
+    scene = load_scene(folder)
+    np.testing.assert_allclose(scene.train.cameras.Ks[2], [[28, 0, 9.5], [0, 26, 5.5], [0, 0, 1]])
+    edit(folder, lambda content: content.update(fl_x=40.0))  # comes first
+    np.testing.assert_allclose(load_scene(folder).train.cameras.Ks[2], [[40, 0, 10], [0, 40, 5], [0, 0, 1]])
+
+
+@pytest.mark.parametrize(
+    ("K", "words"),
+    [
+        ("wide", r"K of ./images/f0.png is 'wide': it must be 3x3 or 4x4 finite numbers"),
+        ([[25, 0], [0, 25]], "must be 3x3 or 4x4 finite numbers"),
+        ([[25, 0, 10], [0, 25, 5], [0, 1]], "must be 3x3 or 4x4 finite numbers"),
+        ([[25, 0, 10], [0, math.nan, 5], [0, 0, 1]], "must be 3x3 or 4x4 finite numbers"),
+        ([[25, 0, 10], [0, -25, 5], [0, 0, 1]], "with positive focal lengths"),
+        ([[25, 3, 10], [0, 25, 5], [0, 0, 1]], "it must be ..fx, 0, cx., .0, fy, cy., .0, 0, 1.., with"),
+        ([[25, 0, 0], [0, 25, 0], [10, 5, 1]], "it must be ..fx, 0, cx., .0, fy, cy., .0, 0, 1.., with"),
+    ],
+)
+def test_matrices_that_are_no_intrinsics(tmp_path, K, words):
+    folder = write_transforms(tmp_path / "cup", fl_x=None, K=K)
+    assert_refused(words, load_scene, folder)
+
+
 def test_reduced_copies(tmp_path):
     folder = write_transforms(tmp_path / "cup")
     (folder / "images_2").mkdir()

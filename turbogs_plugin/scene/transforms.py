@@ -27,6 +27,10 @@ FILE = "transforms.json"
 BROWN_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL")
 """Names of one model, whose missing coefficients are 0."""
 FISHEYE_MODELS = ("OPENCV_FISHEYE",)
+MATRICES = ("K", "intrinsic_matrix")
+"""Keys of intrinsics as a matrix, of which NeuS2 writes the second."""
+LARGEST_SKEW = 0.5
+"""Of their entry [0, 1], in pixels: decompositions of projections leave a small one, which counts as none."""
 PHOTO_SUFFIXES = (".png", ".jpg", ".jpeg")
 
 
@@ -327,6 +331,8 @@ def _intrinsics(values: dict, photo: Path, source: Path) -> tuple[np.ndarray, tu
 def pinhole(values: dict, source: Path, size: tuple[float, float], angles: str = "xy") -> np.ndarray | None:
     """[3, 3] float64 intrinsics of one frame; None where nothing gives its horizontal focal length.
 
+    Of `MATRICES` where there is neither ``fl_x`` nor an angle.
+
     Args:
         values: those of the frame, before those for all frames.
         size: (width, height), in whose middle the principal point is unless it is given.
@@ -340,9 +346,28 @@ def pinhole(values: dict, source: Path, size: tuple[float, float], angles: str =
             focal = 0.5 * side / math.tan(0.5 * angle)
         focals.append(focals[0] if focal is None and focals else focal)
     if focals[0] is None:
-        return None
+        return next((_matrix(values, key, source) for key in MATRICES if key in values), None)
     x, y = (number_of(values, source, f"c{axis}", 0.5 * side) for axis, side in zip("xy", size, strict=True))
     return np.array([[focals[0], 0.0, x], [0.0, focals[1], y], [0.0, 0.0, 1.0]])
+
+
+def _matrix(values: dict, key: str, source: Path) -> np.ndarray:
+    """[3, 3] float64 of a frame's intrinsics, which are the rows of a matrix, 3x3 or 4x4."""
+    what = f"{source}: {key} of {str(values.get('file_path', 'a camera'))[:80]}"
+    try:
+        K = np.array(values[key], dtype=np.float64)
+    except (ValueError, TypeError, OverflowError):
+        K = np.empty(0)
+    if K.shape not in ((3, 3), (4, 4)) or not np.isfinite(K).all():
+        raise InputError(f"{what} is {str(values[key])[:40]!r}: it must be 3x3 or 4x4 finite numbers")
+    rest = K - np.eye(len(K))
+    rest[[0, 1], [0, 1]] = rest[:2, 2] = 0.0
+    if not (K[[0, 1], [0, 1]] > 0).all() or abs(rest[0, 1]) > LARGEST_SKEW or np.abs(np.delete(rest, 1)).max() > 1e-6:
+        raise InputError(
+            f"{what} is {str(values[key])[:80]}: it must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], with positive focal "
+            "lengths fx and fy"
+        )
+    return np.array([[K[0, 0], 0.0, K[0, 2]], [0.0, K[1, 1], K[1, 2]], [0.0, 0.0, 1.0]])
 
 
 def opengl_viewmat(matrix: Any, absent: str, wrong: str, remedy: str = "") -> np.ndarray:
