@@ -180,7 +180,7 @@ def frame(**values):
         (lambda content: content.update(camera_angle_x="wide"), "camera_angle_x is 'wide'"),
         (lambda content: content.update(camera_angle_x=math.nan), "camera_angle_x is 'nan'"),
         (lambda content: content.update(camera_angle_x=10**400), "camera_angle_x is"),
-        (lambda content: content.update(k1=0.1), "k1 of r_0.png say that its lens distorts"),
+        (lambda content: content.update(k1=-1e9), "r_0.png is OPENCV with parameters that are not those of a lens"),
         (lambda content: content.update(w=800), "w and h are 800x40 but r_0.png is 60x40: use the photos"),
         (lambda content: content.update(fl_x=-1.0), "positive focal lengths"),
         (lambda content: content.update(frames={}), "no list of frames"),

@@ -84,6 +84,7 @@ FILES = {
     "points": ("transforms.json", {**LENS, "ply_file_path": "points.ply"}),
     "matrix": ("transforms.json", {"w": 16, "h": 12, "K": [[14.0, 0.0, 8.0], [0.0, 14.0, 6.0], [0.0, 0.0, 1.0]]}),
     "blender": ("transforms_train.json", {"camera_angle_x": 1.0}),
+    "bent blender": ("transforms_train.json", {**LENS, "k1": 0.05, "p1": 0.001}),
 }
 
 

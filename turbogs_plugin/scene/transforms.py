@@ -91,7 +91,7 @@ def read_transforms(scene: Path) -> Capture:
             wrong=f"{source}: the transform_matrix of frame '{name}'",
             remedy=": export it again",
         )
-        views[name] = (viewmat, *_camera({**content, **frame}, scene / name, source, lenses))
+        views[name] = (viewmat, *read_camera({**content, **frame}, scene / name, source, lenses))
     if absent and len(views) < FEWEST_PHOTOS:
         raise InputError(
             f"{source} names {len(frames)} photos, of which {len(absent)} are missing in "
@@ -252,7 +252,7 @@ def number_of(values: dict, source: Path, key: str, default: float | None = None
     return float(value)
 
 
-def _camera(
+def read_camera(
     values: dict, photo: Path, source: Path, lenses: dict[tuple, Lens]
 ) -> tuple[np.ndarray, tuple[int, int], Lens | None]:
     """[3, 3] float64 intrinsics, (width, height), and the lens where there is distortion, of one frame.
