@@ -78,7 +78,9 @@ def read_blender(scene: Path) -> Capture:
         lenses=lens_of_view,
         test=np.array([name in test for name in names]) if test else None,
     ).checked(scene / TRAIN_FILE)
-    return replace(capture, notes=(_note(scene, train, test, capture.photo_sizes, len(points)), *notes))
+    files = f"{scene / TRAIN_FILE}{f' and {test_file.name}' if test_file else ''}"
+    note = f"{files} (NeRF-synthetic): {_note(scene, train, test, capture.photo_sizes, len(points))}"
+    return replace(capture, notes=(note, *notes))
 
 
 def _read_views(scene: Path, source: Path, notes: list[str], lenses: dict[tuple, Lens]) -> dict[str, View]:
@@ -134,11 +136,9 @@ def _read_pinhole(values: dict[str, Any], photo: Path, source: Path) -> tuple[np
 
 
 def _note(scene: Path, train: Collection[str], test: Collection[str], sizes: np.ndarray, points: int) -> str:
-    """What the capture was taken for, in one line."""
+    """What the capture has, in one line."""
     split = f"{len(train)} training and {len(test)} test photos" if test else f"{len(train)} photos, none for testing,"
     with opened_image(scene / min(train)) as photo:
         alpha = ", RGBA" if is_transparent(photo) else ""
-    return (
-        f"NeRF-synthetic: {split} {sizes_text(sizes)}{alpha}; no points, so {points:,} random ones (seed 0) about what "
-        "the cameras look at"
-    )
+    drawn = f"no points, so {points:,} random ones (seed 0) about what the cameras look at"
+    return f"{split} {sizes_text(sizes)}{alpha}; {drawn}"

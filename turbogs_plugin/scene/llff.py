@@ -98,8 +98,8 @@ def read_llff(scene: Path, factor: int = 1) -> Capture:
         points=points,
         point_colors=None,
         notes=(
-            f"LLFF: {len(sizes)} photos {sizes_text(sizes)} of {folder.path.name}; no points, so {len(points):,} "
-            f"random ones (seed 0) within the views at depths of {depths}",
+            f"{source} (LLFF): {len(sizes)} photos {sizes_text(sizes)} of {folder.path.name}; "
+            f"no points, so {len(points):,} random ones (seed 0) within the views at depths of {depths}",
         ),
         reduction=folder.reduction,
         alpha="mask",
