@@ -71,7 +71,7 @@ def test_painted_points_are_where_the_cameras_see_them(tmp_path):
     assert scene.test.names == ("IMG_000.png", "IMG_008.png") and len(scene.train) == 7
     (note,) = scene.notes
     assert note == (
-        "LLFF: 9 photos 120x80 of images; "
+        f"{tmp_path}/fern/poses_bounds.npy (LLFF): 9 photos 120x80 of images; "
         "no points, so 50,000 random ones (seed 0) within the views at depths of 2 to 10"
     )
 

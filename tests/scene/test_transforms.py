@@ -87,6 +87,42 @@ def test_a_frame_overrides_what_stands_for_all(tmp_path):
     assert scene.train.cameras.sizes[1:4].tolist() == [[20, 10], [12, 10], [20, 10]]
 
 
+@pytest.mark.parametrize("key", ["K", "intrinsic_matrix"])
+def test_intrinsics_as_a_matrix(tmp_path, key):
+    """Of each frame, 3x3 or 4x4 as NeuS2 writes it; a small skew is left by decompositions of projections."""
+    none = dict.fromkeys(["fl_x", "fl_y", "cx", "cy"])
+    folder = write_transforms(tmp_path / "cup", **none)
+
+    def change(content):
+        for view, frame in enumerate(content["frames"]):
+            K = np.eye(3 if key == "K" else 4)
+            K[:2, :3] = [[25 + view, 1e-4, 9.5], [0, 26, 5.5]]
+            frame[key] = K.tolist()
+
+    edit(folder, change)
+    scene = load_scene(folder)
+    np.testing.assert_allclose(scene.train.cameras.Ks[2], [[28, 0, 9.5], [0, 26, 5.5], [0, 0, 1]])
+    edit(folder, lambda content: content.update(fl_x=40.0))  # comes first
+    np.testing.assert_allclose(load_scene(folder).train.cameras.Ks[2], [[40, 0, 10], [0, 40, 5], [0, 0, 1]])
+
+
+@pytest.mark.parametrize(
+    ("K", "words"),
+    [
+        ("wide", r"K of ./images/f0.png is 'wide': it must be 3x3 or 4x4 finite numbers"),
+        ([[25, 0], [0, 25]], "must be 3x3 or 4x4 finite numbers"),
+        ([[25, 0, 10], [0, 25, 5], [0, 1]], "must be 3x3 or 4x4 finite numbers"),
+        ([[25, 0, 10], [0, math.nan, 5], [0, 0, 1]], "must be 3x3 or 4x4 finite numbers"),
+        ([[25, 0, 10], [0, -25, 5], [0, 0, 1]], "with positive focal lengths"),
+        ([[25, 3, 10], [0, 25, 5], [0, 0, 1]], "it must be ..fx, 0, cx., .0, fy, cy., .0, 0, 1.., with"),
+        ([[25, 0, 0], [0, 25, 0], [10, 5, 1]], "it must be ..fx, 0, cx., .0, fy, cy., .0, 0, 1.., with"),
+    ],
+)
+def test_matrices_that_are_no_intrinsics(tmp_path, K, words):
+    folder = write_transforms(tmp_path / "cup", fl_x=None, K=K)
+    assert_refused(words, load_scene, folder)
+
+
 def test_reduced_copies(tmp_path):
     folder = write_transforms(tmp_path / "cup")
     (folder / "images_2").mkdir()
@@ -173,8 +209,11 @@ def set_pose(value):
         (lambda content: content.update(frames=content["frames"][:2]), "has 2 images"),
         (lambda content: content["frames"].append(content["frames"][0]), "two frames for 'images/f0.png'"),
         (lambda content: content["frames"][0].pop("file_path"), "a frame without a file_path"),
-        (lambda content: content["frames"][0].update(file_path="../other/f0.png"), "leaves the photo folder"),
-        (lambda content: content["frames"][0].update(file_path="/etc/passwd"), "leaves the photo folder"),
+        (lambda content: content["frames"][0].update(file_path="/"), "leaves the photo folder"),
+        (
+            lambda content: [frame.update(file_path=f"/home/me/none{i}") for i, frame in enumerate(content["frames"])],
+            r"names 9 photos, of which 9 are missing in .*/cup/me \(/home/me/none0, ...\): at least 3",
+        ),
         (
             lambda content: [frame.update(file_path=f"none{i}.png") for i, frame in enumerate(content["frames"][2:])],
             r"names 9 photos, of which 7 are missing in .* \(none0.png, ...\): at least 3",
@@ -259,6 +298,98 @@ def test_frames_without_a_photo_are_left_out_and_counted(tmp_path):
     assert scene.notes[1:] == ("2 of 9 frames are left out, their photos do not exist: images/f1.png, ...",)
 
 
+@pytest.mark.parametrize(
+    "written", ["/home/me/cup/images/f{}.png", "../cup/images/f{}.png", "D:\\cup\\images\\f{}.png"]
+)
+def test_an_absent_photo_of_another_machine_is_left_out_like_any(tmp_path, written):
+    """Nor is a file taken that its path names outside of the capture."""
+    folder = write_transforms(tmp_path / "cup")
+    (folder / "images/f5.png").unlink()
+    (tmp_path / "f7.png").write_bytes((folder / "images/f7.png").read_bytes())
+    (folder / "images/f7.png").unlink()
+
+    def change(content):
+        for view, frame in enumerate(content["frames"]):
+            frame["file_path"] = written.format(view)
+        content["frames"][7]["file_path"] = str(tmp_path / "f7.png")
+
+    edit(folder, change)
+    scene = load_scene(folder)
+    assert (*scene.test.names, *scene.train.names) == ("f0.png", *(f"f{view}.png" for view in (1, 2, 3, 4, 6, 8)))
+    assert scene.notes[1] == f"2 of 9 frames are left out, their photos do not exist: {written.format(5)}, ..."
+
+
+@pytest.mark.parametrize("written", ["images/f{}.jpeg", "/home/me/cup/images/f{}.JPG", "images\\f{}.tif"])
+def test_photos_with_another_suffix(tmp_path, written):
+    folder = write_transforms(tmp_path / "cup", test_filenames=[written.format(3)])
+    edit(folder, lambda content: [f.update(file_path=written.format(i)) for i, f in enumerate(content["frames"])])
+    scene = load_scene(folder)
+    assert scene.test.names == ("f3.png",) and len(scene.train) == 8
+    assert scene.notes[1].startswith("9 photos have another suffix than in transforms.json: images/f0.png is taken for")
+
+
+@pytest.mark.parametrize(
+    ("written", "lie", "folders"),
+    [
+        ("images/f{}.png", "f{}.png", "cup"),
+        ("images/f{}.png", "rgb/f{}.png", "cup/rgb"),
+        ("images/f{}.jpg", "DJI_001/f{}.PNG", "cup/DJI_001"),
+        ("/home/me/all/f{}", "out/rgb/f{}.png", "cup/out/rgb"),
+        ("..\\photos\\f{}.png", "images/f{}.png", ""),
+        ("all/cam{}/f.png", "rgb/cam{}/f.png", "cup/rgb/cam0, {}/cup/rgb/cam1, {}/cup/rgb/cam2, ..."),
+    ],
+)
+def test_photos_in_another_folder_are_found_by_their_names(tmp_path, written, lie, folders):
+    mask = "shade/f3.png"
+    folder = write_transforms(tmp_path / "cup", test_filenames=[written.format(3)])
+    for view in range(9):
+        (folder / lie.format(view)).parent.mkdir(parents=True, exist_ok=True)
+        (folder / f"images/f{view}.png").rename(folder / lie.format(view))
+    for beside in ("shade", "depth"):
+        (folder / beside).mkdir()
+        (folder / beside / "f3.png").write_bytes((folder / lie.format(3)).read_bytes())
+    edit(folder, lambda content: [f.update(file_path=written.format(i)) for i, f in enumerate(content["frames"])])
+    edit(folder, lambda content: content["frames"][3].update(mask_path=mask))
+    scene = load_scene(folder)
+    assert len(scene.train) == 8
+    np.testing.assert_allclose(scene.test.photos.image(0)[0, 0] * 255, [30, 200, 30], atol=1e-4)
+    if folders:
+        assert scene.notes[1] == f"photos in {tmp_path}/" + folders.replace("{}", str(tmp_path))
+
+
+def test_photos_in_another_folder_that_may_be_others_are_not_taken(tmp_path):
+    folder = write_transforms(tmp_path / "cup")
+    (folder / "images").rename(folder / "old")
+    (folder / "rgb").mkdir()
+    (folder / "rgb/f2.png").write_bytes((folder / "old/f2.png").read_bytes())
+    missing = r"names 9 photos, of which 9 are missing in .*/cup/images \(images/f0.png, ...\): at least 3 are needed; "
+    assert_refused(missing + r"copy the photos there \(f2.png is in .*/cup/old, .*/cup/rgb\)$", load_scene, folder)
+    (folder / "rgb/f2.png").unlink()
+    edit(folder, lambda content: content["frames"][1].update(file_path="other/f0.png"))
+    assert_refused(r" \(.*/cup/old/f0.png is of several names\)$", load_scene, folder)
+    for file in (folder / "old").iterdir():
+        file.unlink()
+    assert_refused(r"9 are missing in .*/cup \(images/f0.png.*; copy the photos there$", load_scene, folder)
+
+
+def test_neighbours_with_another_suffix_that_are_no_photos(tmp_path):
+    """Not what lies beside photos that are there, what another frame names, or one of two."""
+    folder = write_transforms(tmp_path / "cup")
+    photo = (folder / "images/f4.png").read_bytes()
+    (folder / "images/f4.png").unlink()
+    for beside in ("f3.jpg", "f4.jpg"):
+        (folder / "images" / beside).write_bytes(photo)
+    left_out = "1 of 9 frames are left out, their photos do not exist: images/f4.png, ..."
+    assert load_scene(folder).notes[1] == left_out
+    (folder / "images/f3.jpg").unlink()
+    assert load_scene(folder).notes[1].startswith("1 photos have another suffix than in transforms.json: images/f4.jpg")
+    (folder / "images/f4.JPEG").write_bytes(photo)
+    assert load_scene(folder).notes[1] == left_out
+    (folder / "images/f4.JPEG").unlink()
+    edit(folder, lambda content: content["frames"].append({**content["frames"][0], "file_path": "images/f4.jpg"}))
+    assert load_scene(folder).notes[1] == left_out.replace("of 9", "of 10")
+
+
 @pytest.mark.skipif(not (SCENES / "fox-raw").is_dir(), reason=f"no real captures in {SCENES}")
 def test_real_capture_as_published(tmp_path):
     """Its file of cameras, and every fifth of its photos."""
@@ -316,7 +447,7 @@ def test_random_points_are_about_what_the_training_cameras_see(tmp_path):
     ("content", "message"),
     [
         ({"test_filenames": ["images/f3.png", "images/g.png", "h.png"]}, "names 'images/g.png' and 1 more, which no"),
-        ({"test_filenames": ["images/f3.png", "../f1.png"]}, "leaves the photo folder"),
+        ({"test_filenames": ["images/f3.png", "../f1.png"]}, "names '../f1.png', which no frame has"),
         ({"val_filenames": "images/f3.png"}, "val_filenames is no list of file names"),
         ({"train_filenames": [1]}, "train_filenames is no list of file names"),
         ({"train_filenames": [], "test_filenames": []}, "train_filenames and test_filenames are empty"),

@@ -7,6 +7,7 @@ Training and test photos are told apart by file, and the validation photos are n
 from __future__ import annotations
 
 from collections.abc import Collection
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,18 @@ from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene.capture import Capture, named, sizes_text
 from turbogs_plugin.scene.photos import is_transparent, opened_image, photo_size
 from turbogs_plugin.scene.starting_points import random_points
-from turbogs_plugin.scene.transforms import number_of, opengl_viewmat, photo_name, pinhole, read_frames
+from turbogs_plugin.scene.transforms import (
+    is_there,
+    number_of,
+    opengl_viewmat,
+    other_suffixes,
+    other_suffixes_note,
+    photo_name,
+    pinhole,
+    read_camera,
+    read_frames,
+)
+from turbogs_plugin.scene.undistort import Lens
 
 TRAIN_FILE = "transforms_train.json"
 TEST_FILES = ("transforms_test.json", "transforms_val.json")
@@ -26,9 +38,9 @@ FILES = (TRAIN_FILE, *TEST_FILES)
 DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 
 
-View = tuple[np.ndarray, np.ndarray, tuple[int, int]]
-"""A photo's camera: [4, 4] float64 world to camera (x right, y down, z forward), [3, 3] float64 intrinsics, (width,
-height) of the photo."""
+View = tuple[np.ndarray, np.ndarray, tuple[int, int], Lens | None]
+"""A photo's camera: [4, 4] float64 world to camera (x right, y down, z forward); [3, 3] float64 intrinsics and (width,
+height), undistorted where there is a lens; the lens."""
 
 
 def read_blender(scene: Path) -> Capture:
@@ -42,55 +54,72 @@ def read_blender(scene: Path) -> Capture:
     """
     if not (scene / TRAIN_FILE).is_file():
         raise InputError(f"{scene} has no {TRAIN_FILE}, which names the photos to train on: bring it back")
-    train = _read_views(scene, scene / TRAIN_FILE)
+    notes: list[str] = []
+    lenses: dict[tuple, Lens] = {}
+    train = _read_views(scene, scene / TRAIN_FILE, notes, lenses)
     test_file = next((scene / name for name in TEST_FILES if (scene / name).is_file()), None)
-    test = {} if test_file is None else _read_views(scene, test_file)
+    test = {} if test_file is None else _read_views(scene, test_file, notes, lenses)
     if in_both := sorted(train.keys() & test.keys()):
         raise InputError(
             f"{scene}: {len(in_both)} photos stand both in {TRAIN_FILE} and in {test_file.name} ({in_both[0]}): take "
             f"them out of one; without {' and '.join(TEST_FILES)} every 8th photo is for testing"
         )
     names, views = zip(*sorted({**train, **test}.items()), strict=True)
-    viewmats, Ks, sizes = (np.array(part) for part in zip(*views, strict=True))
-    points = random_points(np.array([viewmat for viewmat, _, _ in train.values()]))
-    return Capture(
+    viewmats, Ks, sizes, lens_of_view = zip(*views, strict=True)
+    points = random_points(np.array([viewmat for viewmat, *_ in train.values()]))
+    capture = Capture(
         names=names,
         photo_folder=scene,
-        viewmats=viewmats,
-        Ks=Ks,
-        sizes=sizes,
+        viewmats=np.array(viewmats),
+        Ks=np.array(Ks),
+        sizes=np.array(sizes),
         points=points,
-        notes=(_note(scene, train, test, sizes, len(points)),),
+        lenses=lens_of_view,
         test=np.array([name in test for name in names]) if test else None,
     ).checked(scene / TRAIN_FILE)
+    files = f"{scene / TRAIN_FILE}{f' and {test_file.name}' if test_file else ''}"
+    note = f"{files} (NeRF-synthetic): {_note(scene, train, test, capture.photo_sizes, len(points))}"
+    return replace(capture, notes=(note, *notes))
 
 
-def _read_views(scene: Path, source: Path) -> dict[str, View]:
-    """The views of one file, by the photos' paths relative to the scene."""
+def _read_views(scene: Path, source: Path, notes: list[str], lenses: dict[tuple, Lens]) -> dict[str, View]:
+    """The views of one file, by the photos' paths relative to the scene; `notes` gets lines for the user, `lenses` new
+    ones by their numbers."""
     content, frames = read_frames(source)
     shared = {key: value for key, value in content.items() if key != "frames"}
     frame_of: dict[str, dict[str, Any]] = {}
-    for frame in frames:
-        name = photo_name(scene, frame.get("file_path"), source)
+    names = [photo_name(scene, frame.get("file_path"), source) for frame in frames]
+    if others := other_suffixes(scene, names, source):
+        notes.append(other_suffixes_note(others, source))
+    for name, frame in zip((others.get(name, name) for name in names), frames, strict=True):
         if name in frame_of:
             raise InputError(f"{source} has two frames for '{name}': take one of them out")
         frame_of[name] = {**shared, **frame}
-    if missing := [name for name in frame_of if not (scene / name).is_file()]:
+    if missing := [name for name in frame_of if not is_there(scene, name)]:
         raise InputError(
             f"{len(missing)} of {len(frame_of)} photos of {source} are missing ({named(missing)}): bring them back, or "
             "take their frames out of the file"
         )
-    return {name: _read_view(values, scene / name, source) for name, values in frame_of.items()}
+    return {name: _read_view(values, scene / name, source, lenses) for name, values in frame_of.items()}
 
 
-def _read_view(values: dict[str, Any], photo: Path, source: Path) -> View:
+def _read_view(values: dict[str, Any], photo: Path, source: Path, lenses: dict[tuple, Lens]) -> View:
     """The view of one frame, whose own values go before those that the file has for all."""
+    if any([number_of(values, source, key, 0.0) for key in DISTORTION]):  # no camera of Blender's
+        camera = read_camera(values, photo, source, lenses)
+    else:
+        camera = (*_read_pinhole(values, photo, source), None)
+    viewmat = opengl_viewmat(
+        values.get("transform_matrix"),
+        absent=f"{source}: the frame of {photo.name} has no transform_matrix of 4x4 numbers: export it again",
+        wrong=f"{source}: the transform_matrix of {photo.name}",
+        remedy=": export again, from a camera of scale 1 in Blender",
+    )
+    return viewmat, *camera
+
+
+def _read_pinhole(values: dict[str, Any], photo: Path, source: Path) -> tuple[np.ndarray, tuple[int, int]]:
     number = partial(number_of, values, source)
-    if bent := [key for key in DISTORTION if number(key, 0.0)]:
-        raise InputError(
-            f"{source}: {', '.join(bent)} of {photo.name} say that its lens distorts, which Blender's cameras do not: "
-            "name the file transforms.json"
-        )
     width, height = size = photo_size(photo)
     if (number("w", width), number("h", height)) != size:
         raise InputError(
@@ -102,21 +131,13 @@ def _read_view(values: dict[str, Any], photo: Path, source: Path) -> View:
         angle = number("camera_angle_x")
         has = "has no camera_angle_x" if angle is None else f"has camera_angle_x = {angle:g}"
         raise InputError(f"{source} {has}: write the horizontal angle of view there, in radians (0 .. pi)")
-    viewmat = opengl_viewmat(
-        values.get("transform_matrix"),
-        absent=f"{source}: the frame of {photo.name} has no transform_matrix of 4x4 numbers: export it again",
-        wrong=f"{source}: the transform_matrix of {photo.name}",
-        remedy=": export again, from a camera of scale 1 in Blender",
-    )
-    return viewmat, K, size
+    return K, size
 
 
 def _note(scene: Path, train: Collection[str], test: Collection[str], sizes: np.ndarray, points: int) -> str:
-    """What the capture was taken for, in one line."""
+    """What the capture has, in one line."""
     split = f"{len(train)} training and {len(test)} test photos" if test else f"{len(train)} photos, none for testing,"
     with opened_image(scene / min(train)) as photo:
         alpha = ", RGBA" if is_transparent(photo) else ""
-    return (
-        f"NeRF-synthetic: {split} {sizes_text(sizes)}{alpha}; no points, so {points:,} random ones (seed 0) about what "
-        "the cameras look at"
-    )
+    drawn = f"no points, so {points:,} random ones (seed 0) about what the cameras look at"
+    return f"{split} {sizes_text(sizes)}{alpha}; {drawn}"

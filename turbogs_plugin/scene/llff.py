@@ -56,8 +56,8 @@ def read_llff(scene: Path, factor: int = 1) -> Capture:
         sizes=sizes,
         points=points,
         notes=(
-            f"LLFF: {len(sizes)} photos {sizes_text(sizes)} of {folder.name}; no points, so {len(points):,} "
-            f"random ones (seed 0) within the views at depths of {depths}",
+            f"{source} (LLFF): {len(sizes)} photos {sizes_text(sizes)} of {folder.name}; "
+            f"no points, so {len(points):,} random ones (seed 0) within the views at depths of {depths}",
         ),
         reduction=reduction,
         alpha="mask",

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
@@ -14,6 +15,7 @@ import numpy as np
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene.capture import FEWEST_PHOTOS, LARGEST_SIDE, Capture, check_photo_name, left_out
 from turbogs_plugin.scene.colmap import load_pycolmap
+from turbogs_plugin.scene.frame_photos import elsewhere_note, expected_folder, find_elsewhere
 from turbogs_plugin.scene.named_split import read_split
 from turbogs_plugin.scene.photos import photo_size
 from turbogs_plugin.scene.ply import read_vertices
@@ -25,6 +27,10 @@ FILE = "transforms.json"
 BROWN_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL")
 """Names of one model, whose missing coefficients are 0."""
 FISHEYE_MODELS = ("OPENCV_FISHEYE",)
+MATRICES = ("K", "intrinsic_matrix")
+"""Keys of intrinsics as a matrix, of which NeuS2 writes the second."""
+LARGEST_SKEW = 0.5
+"""Of their entry [0, 1], in pixels: decompositions of projections leave a small one, which counts as none."""
 PHOTO_SUFFIXES = (".png", ".jpg", ".jpeg")
 
 
@@ -59,13 +65,23 @@ def read_transforms(scene: Path) -> Capture:
     absent: list[str] = []
     lenses: dict[tuple, Lens] = {}
     names_of_frames = [photo_name(scene, frame.get("file_path"), source) for frame in frames]
-    split = read_split(content, set(names_of_frames), partial(photo_name, scene, source=source), source)
+    others, unclear = other_suffixes(scene, names_of_frames, source), ""
+    others_note = other_suffixes_note(others, source) if others else ""
+    if not others and not any(is_there(scene, name) for name in names_of_frames):
+        others, unclear = find_elsewhere(scene, names_of_frames, frames)
+        others_note = elsewhere_note(scene, others)
+    names_of_frames = [others.get(name, name) for name in names_of_frames]
+
+    def name_of(text: str) -> str:
+        return others.get(name := photo_name(scene, text, source), name)
+
+    split = read_split(content, set(names_of_frames), name_of, source)
     for name, frame in zip(names_of_frames, frames, strict=True):
         if name in views or name in absent:
             raise InputError(f"{source} has two frames for '{name}'")
         if split is not None and name in split.unused:
             continue
-        if not (scene / name).is_file():
+        if not is_there(scene, name):
             absent.append(name)
             continue
         masks[name] = _mask_file(scene, frame, name, source)
@@ -75,11 +91,12 @@ def read_transforms(scene: Path) -> Capture:
             wrong=f"{source}: the transform_matrix of frame '{name}'",
             remedy=": export it again",
         )
-        views[name] = (viewmat, *_camera({**content, **frame}, scene / name, source, lenses))
+        views[name] = (viewmat, *read_camera({**content, **frame}, scene / name, source, lenses))
     if absent and len(views) < FEWEST_PHOTOS:
         raise InputError(
-            f"{source} names {len(frames)} photos, of which {len(absent)} are missing in {scene} ({absent[0]}, ...): "
-            f"at least {FEWEST_PHOTOS} are needed; copy the photos there"
+            f"{source} names {len(frames)} photos, of which {len(absent)} are missing in "
+            f"{expected_folder(scene, absent)} ({absent[0]}, ...): at least {FEWEST_PHOTOS} are needed; copy the "
+            f"photos there{unclear}"
         )
     names, cameras = zip(*sorted(views.items()), strict=True)
     viewmats, intrinsics, sizes, lens_of_view = zip(*cameras, strict=True)
@@ -98,6 +115,8 @@ def read_transforms(scene: Path) -> Capture:
         origin += f", so {about_cameras(len(points))}"
     parts = "" if split is None else f", {split.text(names)}"
     notes = [f"{source} (nerfstudio, instant-ngp): {len(names)} photos{parts}, {origin}"]
+    if others:
+        notes.append(others_note)
     if absent:
         notes.append(left_out(absent, len(frames), "frames"))
     # Reduced copies lie in images_2, images_4, ... beside images.
@@ -122,10 +141,48 @@ def read_transforms(scene: Path) -> Capture:
 
 def photo_name(scene: Path, name: Any, source: Path) -> str:
     """The photo's path relative to the scene (`_file_name`), with its suffix, which Blender's names come without, if it
-    is there."""
+    is there. One that leaves the scene stays as it is: no photo `is_there`."""
     if not isinstance(name, str):
         raise InputError(f"{source} has a frame without a file_path: export it again")
-    return _file_name(scene, name, source, _photo_there)
+    return _file_name(scene, name, source, _photo_there, may_leave=True)
+
+
+def is_there(scene: Path, name: str) -> bool:
+    """Whether a name that `photo_name` gave is that of a file in the scene."""
+    path = PureWindowsPath(name)  # knows both kinds of separators, drives and roots
+    return not path.anchor and ".." not in path.parts and (scene / name).is_file()
+
+
+def other_suffixes(scene: Path, names: Sequence[str], source: Path) -> dict[str, str]:
+    """Of names without a photo, those for which there is one photo of the same stem with another suffix, and that
+    photo's name. None where photos that are there have such neighbours too: these are masks or depths."""
+    absent = [name for name in names if not is_there(scene, name)]
+    if not absent or any(_neighbours(scene, name) for name in names if is_there(scene, name)):
+        return {}
+    neighbours = {name: _file_name(scene, name, source, _one_neighbour, may_leave=True) for name in absent}
+    taken = Counter([*names, *neighbours.values()])
+    return {name: other for name, other in neighbours.items() if other != name and taken[other] == 1}
+
+
+def other_suffixes_note(others: dict[str, str], source: Path) -> str:
+    """What `other_suffixes` found, in one line."""
+    name, other = next(iter(others.items()))
+    return f"{len(others)} photos have another suffix than in {source.name}: {other} is taken for {name}, ..."
+
+
+def _neighbours(scene: Path, name: str) -> list[str]:
+    suffix = PurePosixPath(name).suffix
+    if not suffix or suffix[1:].isdigit():  # a number is part of the name
+        return []
+    stem = name.removesuffix(suffix)
+    letters = ((f"{stem}{each}", f"{stem}{each.upper()}") for each in PHOTO_SUFFIXES if each != suffix.lower())
+    there = (next((each for each in both if (scene / each).is_file()), None) for both in letters)
+    return [each for each in there if each]
+
+
+def _one_neighbour(scene: Path, name: str) -> str | None:
+    neighbours = _neighbours(scene, name)
+    return neighbours[0] if len(neighbours) == 1 else None
 
 
 def _photo_there(scene: Path, name: str) -> str | None:
@@ -141,7 +198,13 @@ def _file_there(scene: Path, name: str) -> str | None:
     return name if (scene / name).is_file() else None
 
 
-def _file_name(scene: Path, name: str, source: Path, there: Callable[[Path, str], str | None] = _file_there) -> str:
+def _file_name(
+    scene: Path,
+    name: str,
+    source: Path,
+    there: Callable[[Path, str], str | None] = _file_there,
+    may_leave: bool = False,
+) -> str:
     """A file's path relative to the scene, as it is on this machine.
 
     Separators may be those of Windows. Of a path of the machine that wrote it, absolute or with '..', the longest end
@@ -149,6 +212,7 @@ def _file_name(scene: Path, name: str, source: Path, there: Callable[[Path, str]
 
     Args:
         there: the name of the file that a path relative to the scene stands for, None where there is none.
+        may_leave: a path that leaves the scene, and of which no end is there, is given back, not refused.
 
     Raises:
         InputError: the path leaves the scene, and no end of it is there; or it cannot be printed.
@@ -160,6 +224,8 @@ def _file_name(scene: Path, name: str, source: Path, there: Callable[[Path, str]
         return there(scene, name) or there(scene, "/".join(parts)) or name
     ends = ("/".join(parts[first:]) for first in range(len(parts)) if ".." not in parts[first:])
     found = next(filter(None, (there(scene, end) for end in ends)), None)
+    if may_leave and parts:
+        return found or name
     return check_photo_name(name, source) if found is None else found
 
 
@@ -186,7 +252,7 @@ def number_of(values: dict, source: Path, key: str, default: float | None = None
     return float(value)
 
 
-def _camera(
+def read_camera(
     values: dict, photo: Path, source: Path, lenses: dict[tuple, Lens]
 ) -> tuple[np.ndarray, tuple[int, int], Lens | None]:
     """[3, 3] float64 intrinsics, (width, height), and the lens where there is distortion, of one frame.
@@ -257,6 +323,8 @@ def _intrinsics(values: dict, photo: Path, source: Path) -> tuple[np.ndarray, tu
 def pinhole(values: dict, source: Path, size: tuple[float, float], angles: str = "xy") -> np.ndarray | None:
     """[3, 3] float64 intrinsics of one frame; None where nothing gives its horizontal focal length.
 
+    Of `MATRICES` where there is neither ``fl_x`` nor an angle.
+
     Args:
         values: those of the frame, before those for all frames.
         size: (width, height), in whose middle the principal point is unless it is given.
@@ -270,9 +338,28 @@ def pinhole(values: dict, source: Path, size: tuple[float, float], angles: str =
             focal = 0.5 * side / math.tan(0.5 * angle)
         focals.append(focals[0] if focal is None and focals else focal)
     if focals[0] is None:
-        return None
+        return next((_matrix(values, key, source) for key in MATRICES if key in values), None)
     x, y = (number_of(values, source, f"c{axis}", 0.5 * side) for axis, side in zip("xy", size, strict=True))
     return np.array([[focals[0], 0.0, x], [0.0, focals[1], y], [0.0, 0.0, 1.0]])
+
+
+def _matrix(values: dict, key: str, source: Path) -> np.ndarray:
+    """[3, 3] float64 of a frame's intrinsics, which are the rows of a matrix, 3x3 or 4x4."""
+    what = f"{source}: {key} of {str(values.get('file_path', 'a camera'))[:80]}"
+    try:
+        K = np.array(values[key], dtype=np.float64)
+    except (ValueError, TypeError, OverflowError):
+        K = np.empty(0)
+    if K.shape not in ((3, 3), (4, 4)) or not np.isfinite(K).all():
+        raise InputError(f"{what} is {str(values[key])[:40]!r}: it must be 3x3 or 4x4 finite numbers")
+    rest = K - np.eye(len(K))
+    rest[[0, 1], [0, 1]] = rest[:2, 2] = 0.0
+    if not (K[[0, 1], [0, 1]] > 0).all() or abs(rest[0, 1]) > LARGEST_SKEW or np.abs(np.delete(rest, 1)).max() > 1e-6:
+        raise InputError(
+            f"{what} is {str(values[key])[:80]}: it must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], with positive focal "
+            "lengths fx and fy"
+        )
+    return np.array([[K[0, 0], 0.0, K[0, 2]], [0.0, K[1, 1], K[1, 2]], [0.0, 0.0, 1.0]])
 
 
 def opengl_viewmat(matrix: Any, absent: str, wrong: str, remedy: str = "") -> np.ndarray:
