@@ -16,7 +16,7 @@ import numpy as np
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene.capture import Capture, named, sizes_text
 from turbogs_plugin.scene.photos import is_transparent, opened_image, photo_size
-from turbogs_plugin.scene.starting_points import random_points
+from turbogs_plugin.scene.starting_points import starting_points
 from turbogs_plugin.scene.transforms import number_of, opengl_viewmat, photo_name, pinhole, read_frames
 
 TRAIN_FILE = "transforms_train.json"
@@ -35,7 +35,7 @@ def read_blender(scene: Path) -> Capture:
     """Read a capture with the split that its files say.
 
     Where there is neither a test nor a validation file, the split is left to the order of the photos. There are no
-    points: random ones are drawn (`random_points`) about what the training cameras look at.
+    points: random ones are drawn (`starting_points`) about what the training cameras look at.
 
     Raises:
         InputError: a file that is not such JSON or lacks something, missing photos, or one photo in both files.
@@ -52,7 +52,7 @@ def read_blender(scene: Path) -> Capture:
         )
     names, views = zip(*sorted({**train, **test}.items()), strict=True)
     viewmats, Ks, sizes = (np.array(part) for part in zip(*views, strict=True))
-    points = random_points(np.array([viewmat for viewmat, _, _ in train.values()]))
+    points, where = starting_points(*(np.array(part) for part in zip(*train.values(), strict=True)))
     return Capture(
         names=names,
         photo_folder=scene,
@@ -61,7 +61,7 @@ def read_blender(scene: Path) -> Capture:
         sizes=sizes,
         points=points,
         point_colors=None,
-        notes=(_note(scene, train, test, sizes, len(points)),),
+        notes=(_note(scene, train, test, sizes, f"{len(points):,} random ones (seed 0){where}"),),
         test=np.array([name in test for name in names]) if test else None,
     ).checked(scene / TRAIN_FILE)
 
@@ -112,12 +112,9 @@ def _read_view(values: dict[str, Any], photo: Path, source: Path) -> View:
     return viewmat, K, size
 
 
-def _note(scene: Path, train: Collection[str], test: Collection[str], sizes: np.ndarray, points: int) -> str:
+def _note(scene: Path, train: Collection[str], test: Collection[str], sizes: np.ndarray, points: str) -> str:
     """What the capture was taken for, in one line."""
     split = f"{len(train)} training and {len(test)} test photos" if test else f"{len(train)} photos, none for testing,"
     with opened_image(scene / min(train)) as photo:
         alpha = ", RGBA" if is_transparent(photo) else ""
-    return (
-        f"NeRF-synthetic: {split} {sizes_text(sizes)}{alpha}; no points, so {points:,} random ones (seed 0) about what "
-        "the cameras look at"
-    )
+    return f"NeRF-synthetic: {split} {sizes_text(sizes)}{alpha}; no points, so {points}"
