@@ -53,6 +53,12 @@ def facts(**changes) -> SceneFacts:
     return dataclasses.replace(FACTS, **changes)
 
 
+def test_exposures_that_could_not_be_compared_have_no_numbers():
+    compared, none = (plan_from_facts(facts(exposure_views=views), load_config("turbogs")) for views in (9, 0))
+    assert "exposures of 9 photos 0.05 stops apart and 0.05 from their neighbours'; " in compared.facts_text()
+    assert "tiles without texture, exposures could not be compared; 100 MiB of photos" in none.facts_text()
+
+
 def decision(setting: str, of: SceneFacts, *overrides: str):
     plan = plan_from_facts(of, load_config("turbogs", [f"{setting}=auto", *overrides]))
     return next(decision for decision in plan.decisions if decision.setting == setting)

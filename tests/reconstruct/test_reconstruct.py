@@ -2,6 +2,7 @@
 
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pycolmap
@@ -65,7 +66,10 @@ def test_the_solution_says_what_was_done_and_names_what_did_not_register(solved)
     assert (solution.photos, solution.registered, solution.left_out) == (COUNT + 1, COUNT, ["other.jpg"])
     text = solution.text()
     assert f"{COUNT + 1} photos of 1 lens, 2 turned upright by EXIF; matched each with each" in text
-    assert f"{COUNT} of {COUNT + 1} photos registered" in text and "1 photo did not register: other.jpg;" in text
+    assert (
+        f"{COUNT} of {COUNT + 1} photos registered" in text
+        and "1 photo did not register: other.jpg; add photos between it and" in text
+    )
     assert "ghost" not in text and "wrong place" not in text
 
 
@@ -234,6 +238,24 @@ def test_a_solve_without_ghosts_is_taken_as_it_is(attempts):
     removed, workspace = attempts(GOOD)
     best, moved = run._solve(workspace.database(1), workspace)
     assert (best.model.places, moved, removed) == (GOOD, [], [])
+
+
+def test_a_solve_that_is_not_the_first_says_why(monkeypatch, tmp_path):
+    said, workspace = [], Workspace(tmp_path)
+    monkeypatch.setattr(solver, "solve_cameras", lambda *arguments: said.append(arguments[3]))
+    first, second = (workspace.database(side) for side in run.LONG_SIDES)
+    for database, evidence in ((first, first), (tmp_path / "working.db", first), (second, second)):
+        assert run._attempt(database, evidence, workspace) is None
+    assert said == ["", " again, without the pairs that led to a ghost", " again, by COLMAP's own defaults"]
+
+
+@pytest.mark.parametrize(("out", "word"), [(["a.jpg"], "it"), (["a.jpg", "b.jpg"], "them")])
+def test_lines_about_one_photo_and_about_several(out, word):
+    model = SimpleNamespace(num_points3D=lambda: 1, compute_mean_reprojection_error=lambda: 1.0)
+    solve = run.Solve(model, (3, 3), agreement_of("ooo"), [[0, 1, 2]])
+    matching = run.choose_matching(["0.jpg", "1.jpg", "2.jpg", *out], np.full((3 + len(out), 2), np.nan))
+    (line,) = (note for note in run._notes([], matching, 3, solve, [], out) if "did not register" in note)
+    assert ", 1 smaller model besides: " in line and line.endswith(f"; add photos between {word} and the others")
 
 
 def test_photos_at_a_ghost_are_taken_out_of_the_model(solved, tmp_path):

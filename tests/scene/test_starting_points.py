@@ -1,12 +1,127 @@
-"""Colours of random points: those of the photos."""
+"""Random points: where they are drawn, and their colours, which are those of the photos."""
+
+import json
+from pathlib import Path
 
 import numpy as np
+import pytest
 import torch
+from helpers.framework_runs import tiny_config
+from PIL import Image
 
 from turbogs_plugin.masks import PixelMasks
+from turbogs_plugin.scene import load_scene
+from turbogs_plugin.scene import starting_points as module
 from turbogs_plugin.scene.photos import Photos
-from turbogs_plugin.scene.starting_points import colors_in_photos
+from turbogs_plugin.scene.starting_points import (
+    colors_in_photos,
+    points_in_views,
+    random_points,
+    shares_with_points,
+    starting_points,
+)
+from turbogs_plugin.train.evaluate import evaluate
+from turbogs_plugin.train.trainer import Trainer
 from turbogs_plugin.types import Cameras
+
+VIEWS, SIZE, FOCAL = 24, (80, 60), 60.0
+TURNS = 2 * np.pi * np.arange(VIEWS) / VIEWS
+AROUND = np.stack([np.sin(TURNS), 0 * TURNS, np.cos(TURNS)], axis=1)
+"""[V, 3], a ring of radius 1 about the origin, y up."""
+QUARTER = np.linspace(0, np.pi / 2, VIEWS)
+LINE = np.arange(VIEWS)[:, None] * np.array([1.0, 0.0, 0.0])
+
+
+def poses(centers: np.ndarray, forwards: np.ndarray) -> np.ndarray:
+    """[V, 4, 4] camera to world, in OpenGL's axes."""
+    up = np.array([0.0, 1.0, 0.0])
+    matrices = np.tile(np.eye(4), (len(centers), 1, 1))
+    matrices[:, :3] = np.stack([np.cross(forwards, up), 0 * forwards + up, -forwards, centers], axis=2)
+    return matrices
+
+
+def cameras_of(centers: np.ndarray, forwards: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """World-to-camera matrices, intrinsics and sizes."""
+    viewmats = np.linalg.inv(poses(centers, forwards) @ np.diag([1.0, -1.0, -1.0, 1.0]))
+    K = np.array([[FOCAL, 0, SIZE[0] / 2], [0, FOCAL, SIZE[1] / 2], [0, 0, 1]])
+    return viewmats, np.tile(K, (len(viewmats), 1, 1)), np.tile(SIZE, (len(viewmats), 1))
+
+
+@pytest.mark.parametrize(
+    ("cameras", "words"),
+    [
+        (cameras_of(AROUND, AROUND), " before the 24 cameras, which do not look at one thing"),
+        (
+            cameras_of(LINE, np.stack([np.sin(QUARTER), 0 * QUARTER, np.cos(QUARTER)], axis=1)),
+            " before the 24 cameras, which do not look at one thing",
+        ),
+        (
+            cameras_of(AROUND, np.where(np.arange(VIEWS)[:, None] % 2, 1, -1) * AROUND),
+            ": 25,000 about what the cameras look at, 25,000 before 12 of 24 cameras that do not see these",
+        ),
+        (cameras_of(AROUND + np.array([5e5, 100, 5e6]), AROUND), " before the 24 cameras, which do not look at one"),
+        # a rig of four cameras in each place
+        (cameras_of(np.repeat(LINE, 4, axis=0), np.tile(AROUND[::6], (VIEWS, 1))), ": 22,917 about what the cameras"),
+    ],
+    ids=["outward ring", "turning line", "inward and outward", "far from the origin", "rig"],
+)
+def test_every_view_has_points(cameras, words):
+    assert shares_with_points(random_points(cameras[0]), *cameras).min() == 0.0
+    points, said = starting_points(*cameras)
+    assert len(points) == 50_000 and said.startswith(words)
+    assert shares_with_points(points, *cameras).min() > 0.5
+    np.testing.assert_array_equal(points, starting_points(*cameras)[0])
+
+
+@pytest.mark.parametrize("centers", [AROUND, 0 * AROUND], ids=["inward ring", "on the spot"])
+def test_where_all_views_see_enough_the_points_are_those_about_it(centers):
+    cameras = cameras_of(centers, -AROUND)
+    points, said = starting_points(*cameras)
+    assert np.array_equal(points, random_points(cameras[0])) and said == " about what the cameras look at"
+
+
+def test_depths_follow_extent_and_spacing():
+    """Between half the extent of a ring of radius 1 and ten times it; nearer where cameras stand closer."""
+    for views, nearest in ((24, 0.5), (600, 0.1)):
+        turns = 2 * np.pi * np.arange(views) / views
+        ring = np.stack([np.sin(turns), 0 * turns, np.cos(turns)], axis=1)
+        points, _ = starting_points(*cameras_of(ring, ring))
+        distances = np.linalg.norm(points, axis=1)
+        assert 1 + nearest <= distances.min() < 1.05 + nearest and 9 < distances.max() < 1 + 10 / np.cos(0.7)
+
+
+def test_shares_do_not_depend_on_how_many_are_projected_at_once(monkeypatch):
+    cameras = cameras_of(LINE, AROUND)
+    points = points_in_views(*cameras, np.tile([1.0, 5.0], (VIEWS, 1)), 300)
+    shares = shares_with_points(points, *cameras)
+    monkeypatch.setattr(module, "PROJECTED_AT_ONCE", 700)
+    np.testing.assert_array_equal(shares_with_points(points, *cameras), shares)
+    one = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0], [0.01, 0.01, 1.0], [-0.5, -0.4, 1.0], [9.0, 0.0, 1.0]])
+    straight = np.eye(4)[None], cameras[1][:1], cameras[2][:1]
+    assert shares_with_points(one, *straight).tolist() == [2 / 48]  # two cells: one point twice, one is behind
+
+
+@pytest.mark.usefixtures("few_random_points")
+def test_an_outward_ring_trains(tmp_path: Path):
+    frames = []
+    for view, pose in enumerate(poses(AROUND[::6], AROUND[::6])):
+        noise = np.random.default_rng(view).integers(0, 256, (24, 32, 3), dtype=np.uint8)
+        Image.fromarray(noise).save(tmp_path / f"f{view}.png")
+        frames.append({"file_path": f"f{view}.png", "transform_matrix": pose.tolist()})
+    (tmp_path / "transforms.json").write_text(json.dumps({"fl_x": 16.0, "frames": frames}))
+    scene = load_scene(tmp_path)
+    assert "no points, so 500 random ones before the 4 cameras, which do not look at one thing" in scene.notes[0]
+    config = tiny_config(tmp_path, "optimizer.type=sparse_adam").without_plan()
+    trainer = Trainer(config, scene, torch.device("cpu"))
+
+    def psnr() -> float:
+        return evaluate(trainer.gaussians, scene.train, 0, config.raster).worst_psnr
+
+    before = psnr()
+    assert before > 8  # black: 4.8
+    for _ in range(config.train.iterations):
+        trainer.step()
+    assert psnr() > before + 0.1
 
 
 def two_views() -> tuple[Cameras, Photos]:

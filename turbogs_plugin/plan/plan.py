@@ -66,6 +66,8 @@ class Plan:
         exposures = (
             f"exposures of {facts.exposure_views} photos {facts.exposure_spread:.2f} stops apart and "
             f"{facts.exposure_jumps:.2f} from their neighbours'"
+            if facts.exposure_views
+            else "exposures could not be compared"
         )
         return (
             f"{facts.scene}: {facts.train_views} + {facts.test_views} views of "

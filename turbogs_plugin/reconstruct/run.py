@@ -186,7 +186,10 @@ def _solve(database: Path, workspace: Workspace) -> tuple[Solve | None, list[str
 
 def _attempt(database: Path, evidence: Path, workspace: Workspace) -> Solve | None:
     """A solve of a database, judged by all the matches of another."""
-    models = solver.solve_cameras(database, workspace.images, workspace.scratch)
+    again = "" if database == workspace.database(LONG_SIDES[0]) else " again, by COLMAP's own defaults"
+    if database != evidence:
+        again = " again, without the pairs that led to a ghost"
+    models = solver.solve_cameras(database, workspace.images, workspace.scratch, again)
     if not models or models[0].num_reg_images() < FEWEST_PHOTOS:
         return None
     agreement = solver.measure_agreement(models[0], evidence)
@@ -239,17 +242,19 @@ def _notes(
     if repaired:
         notes.append(
             f"{_photos(repaired)} at a ghost, as repeated structure misled the first solve; solved again without the "
-            f"pairs that put them there: {_listed(repaired)}"
+            f"pairs that put {_word(repaired, 'it', 'them')} there: {_listed(repaired)}"
         )
     if solve.ghosts:
         notes.append(
-            f"{_photos(solve.ghosts)} left out, as more matches contradict their place than confirm it (repeated "
-            f"structure): {_listed(solve.ghosts)}"
+            f"{_photos(solve.ghosts)} left out, as more matches contradict {_word(solve.ghosts, 'its', 'their')} place "
+            f"than confirm it (repeated structure): {_listed(solve.ghosts)}"
         )
     if unplaced := [name for name in lost if name not in set(solve.ghosts)]:
-        others = f", {len(solve.sizes) - 1} smaller models besides" if len(solve.sizes) > 1 else ""
+        smaller = solve.sizes[1:]
+        others = f", {len(smaller)} smaller {_word(smaller, 'model', 'models')} besides" if smaller else ""
         notes.append(
-            f"{_photos(unplaced)} did not register{others}: {_listed(unplaced)}; add photos between them and the others"
+            f"{_photos(unplaced)} did not register{others}: {_listed(unplaced)}; add photos between "
+            f"{_word(unplaced, 'it', 'them')} and the others"
         )
     if contradicting := int(agreement.contradicts.sum()):
         matches = agreement.agreeing.sum() + agreement.contradicting.sum()
@@ -259,8 +264,8 @@ def _notes(
         )
     main = {agreement.names[view] for view in solve.groups[0]}
     for groups, reason in (
-        (consistent_groups(agreement, DOUBT), "many matches contradict their place"),
-        (linked_groups(agreement), f"no pair has {fewest_links(agreement)} matches that hold them to the others"),
+        (consistent_groups(agreement, DOUBT), "which many matches contradict"),
+        (linked_groups(agreement), f"as no pair with the others has {fewest_links(agreement)} matches that agree"),
     ):
         doubtful = [name for group in groups[1:] for name in (agreement.names[view] for view in group) if name in main]
         if doubtful:
@@ -269,4 +274,8 @@ def _notes(
 
 
 def _photos(names: Sequence[str]) -> str:
-    return f"{len(names)} {'photo' if len(names) == 1 else 'photos'}"
+    return f"{len(names)} {_word(names, 'photo', 'photos')}"
+
+
+def _word(things: Sequence[object], one: str, more: str) -> str:
+    return one if len(things) == 1 else more

@@ -105,8 +105,12 @@ def match_features(database: Path, scratch: Path, names: Sequence[str], matching
     watched("pairs of photos matched", total, row_counter(database, "two_view_geometries"), step)
 
 
-def solve_cameras(database: Path, images: Path, scratch: Path) -> list[pycolmap.Reconstruction]:
-    """COLMAP's incremental mapping by its own defaults, from one seed: the models, that with most photos first."""
+def solve_cameras(database: Path, images: Path, scratch: Path, again: str = "") -> list[pycolmap.Reconstruction]:
+    """COLMAP's incremental mapping by its own defaults, from one seed: the models, that with most photos first.
+
+    Args:
+        again: for the line of progress, where it is not the first solve: what is different.
+    """
     pycolmap = _pycolmap()
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads, options.random_seed = torch.get_num_threads(), 0
@@ -131,7 +135,7 @@ def solve_cameras(database: Path, images: Path, scratch: Path) -> list[pycolmap.
         )
 
     total = row_counter(database, "images")()
-    models = watched("cameras solved", total, lambda: registered, step)
+    models = watched(f"cameras solved{again}", total, lambda: registered, step)
     return sorted(models.values(), key=lambda model: -model.num_reg_images())
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene.capture import Capture, named, sizes_text
 from turbogs_plugin.scene.photos import is_transparent, opened_image, photo_size
-from turbogs_plugin.scene.starting_points import random_points
+from turbogs_plugin.scene.starting_points import starting_points
 from turbogs_plugin.scene.transforms import (
     is_there,
     number_of,
@@ -47,7 +47,7 @@ def read_blender(scene: Path) -> Capture:
     """Read a capture with the split that its files say.
 
     Where there is neither a test nor a validation file, the split is left to the order of the photos. There are no
-    points: random ones are drawn (`random_points`) about what the training cameras look at.
+    points: random ones are drawn (`starting_points`) about what the training cameras look at.
 
     Raises:
         InputError: a file that is not such JSON or lacks something, missing photos, or one photo in both files.
@@ -66,7 +66,7 @@ def read_blender(scene: Path) -> Capture:
         )
     names, views = zip(*sorted({**train, **test}.items()), strict=True)
     viewmats, Ks, sizes, lens_of_view = zip(*views, strict=True)
-    points = random_points(np.array([viewmat for viewmat, *_ in train.values()]))
+    points, where = starting_points(*(np.array(part) for part in list(zip(*train.values(), strict=True))[:3]))
     capture = Capture(
         names=names,
         photo_folder=scene,
@@ -78,7 +78,8 @@ def read_blender(scene: Path) -> Capture:
         test=np.array([name in test for name in names]) if test else None,
     ).checked(scene / TRAIN_FILE)
     files = f"{scene / TRAIN_FILE}{f' and {test_file.name}' if test_file else ''}"
-    note = f"{files} (NeRF-synthetic): {_note(scene, train, test, capture.photo_sizes, len(points))}"
+    drawn = f"{len(points):,} random ones (seed 0){where}"
+    note = f"{files} (NeRF-synthetic): {_note(scene, train, test, capture.photo_sizes, drawn)}"
     return replace(capture, notes=(note, *notes))
 
 
@@ -134,10 +135,9 @@ def _read_pinhole(values: dict[str, Any], photo: Path, source: Path) -> tuple[np
     return K, size
 
 
-def _note(scene: Path, train: Collection[str], test: Collection[str], sizes: np.ndarray, points: int) -> str:
+def _note(scene: Path, train: Collection[str], test: Collection[str], sizes: np.ndarray, points: str) -> str:
     """What the capture has, in one line."""
     split = f"{len(train)} training and {len(test)} test photos" if test else f"{len(train)} photos, none for testing,"
     with opened_image(scene / min(train)) as photo:
         alpha = ", RGBA" if is_transparent(photo) else ""
-    drawn = f"no points, so {points:,} random ones (seed 0) about what the cameras look at"
-    return f"{split} {sizes_text(sizes)}{alpha}; {drawn}"
+    return f"{split} {sizes_text(sizes)}{alpha}; no points, so {points}"

@@ -17,7 +17,7 @@ from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene.capture import FEWEST_PHOTOS, LARGEST_SIDE, Capture, check_photo_name, left_out, named
 from turbogs_plugin.scene.colmap_check import SMALLEST_IMAGE, check_binary_model
 from turbogs_plugin.scene.photos import photo_size
-from turbogs_plugin.scene.starting_points import NUM_RANDOM_POINTS, about_cameras, random_points
+from turbogs_plugin.scene.starting_points import starting_points
 from turbogs_plugin.scene.undistort import Lens, lens_of_camera
 
 if TYPE_CHECKING:
@@ -164,8 +164,10 @@ def read_colmap(scene: Path, model: Path, suffix: str) -> Capture:
     found = [point for _, point in sorted(reconstruction.points3D.items())]
     points = np.array([point.xyz for point in found], dtype=np.float64).reshape(-1, 3)
     colors = np.array([point.color for point in found], dtype=np.uint8).reshape(-1, 3) if found else None
+    shown = f"{len(points):,} points"
     if not found and images and np.isfinite(viewmats).all():
-        points = random_points(viewmats)
+        points, where = starting_points(viewmats, intrinsics, sizes)
+        shown = f"no points, so {len(points):,} random ones{where}"
     return Capture(
         names=names,
         photo_folder=photo_folder,
@@ -175,7 +177,7 @@ def read_colmap(scene: Path, model: Path, suffix: str) -> Capture:
         points=points,
         point_colors=colors,
         lenses=tuple(lenses[image.camera_id] for image in images),
-        notes=(_kind_note(scene, model, suffix, len(images), len(found), photo_folder), *_choice_note(model), *absence),
+        notes=(_kind_note(scene, model, suffix, len(images), shown, photo_folder), *_choice_note(model), *absence),
         reduction=reduction,
         alpha="mask",
     ).checked(model)
@@ -242,11 +244,10 @@ def _may_hold_photos(entry: Path) -> bool:
     return not (REDUCED.search(entry.name) or entry.name[0] == "." or entry.name == "masks") and entry.is_dir()
 
 
-def _kind_note(scene: Path, model: Path, suffix: str, images: int, points: int, photo_folder: Path) -> str:
+def _kind_note(scene: Path, model: Path, suffix: str, images: int, points: str, photo_folder: Path) -> str:
     kind = {".bin": "binary", ".txt": "text"}[suffix]
-    shown = f"{points:,} points" if points else f"no points, so {about_cameras(NUM_RANDOM_POINTS)}"
     where = "" if photo_folder == scene / "images" else f", photos in {photo_folder}"
-    return f"COLMAP reconstruction {model} ({kind}): {images} images, {shown}{where}"
+    return f"COLMAP reconstruction {model} ({kind}): {images} images, {points}{where}"
 
 
 def _choice_note(model: Path) -> list[str]:

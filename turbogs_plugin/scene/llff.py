@@ -16,7 +16,7 @@ from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene.capture import Capture, sizes_text
 from turbogs_plugin.scene.photos import photo_sizes
 from turbogs_plugin.scene.poses import viewmat_of_pose
-from turbogs_plugin.scene.starting_points import NUM_RANDOM_POINTS
+from turbogs_plugin.scene.starting_points import NUM_RANDOM_POINTS, points_in_views
 from turbogs_plugin.scene.transforms import PHOTO_SUFFIXES
 
 FILE = "poses_bounds.npy"
@@ -45,7 +45,7 @@ def read_llff(scene: Path, factor: int = 1) -> Capture:
     intrinsics = np.tile(np.eye(3), (len(sizes), 1, 1))
     intrinsics[:, [0, 1], [0, 1]] = focals[:, None] * (sizes / full_sizes)
     intrinsics[:, :2, 2] = 0.5 * sizes
-    points = points_in_views(viewmats, intrinsics, sizes, bounds)
+    points = points_in_views(viewmats, intrinsics, sizes, bounds, NUM_RANDOM_POINTS)
     depths = f"{bounds[:, 0].min():.4g} to {bounds[:, 1].max():.4g}"
     folder = photos[0].parent
     return Capture(
@@ -62,30 +62,6 @@ def read_llff(scene: Path, factor: int = 1) -> Capture:
         reduction=reduction,
         alpha="mask",
     ).checked(source)
-
-
-def points_in_views(viewmats: np.ndarray, Ks: np.ndarray, sizes: np.ndarray, bounds: np.ndarray) -> np.ndarray:
-    """[M, 3] float64 points drawn at random, the same for the same arguments.
-
-    A view and a place in it are drawn evenly, and the inverse of the depth: so the points lie as densely in the image
-    as in depth, as far as parallax can tell depths apart.
-
-    Args:
-        viewmats: [V, 4, 4] float64, world to camera.
-        Ks: [V, 3, 3] float64 intrinsics.
-        sizes: [V, 2] (width, height).
-        bounds: [V, 2] float64, nearest and farthest depth.
-    """
-    random = np.random.default_rng(0)
-    views = random.integers(0, len(viewmats), NUM_RANDOM_POINTS)
-    pixels = random.uniform(size=(NUM_RANDOM_POINTS, 2)) * sizes[views]
-    shares = random.uniform(size=NUM_RANDOM_POINTS)
-    with np.errstate(over="ignore", invalid="ignore"):  # what overflows is refused by the capture's check
-        near, far = (1.0 / bounds[views]).T
-        depths = 1.0 / (far + shares * (near - far))
-        rays = (pixels - Ks[views, :2, 2]) / Ks[views][:, [0, 1], [0, 1]]  # [M, 2]
-        in_camera = depths[:, None] * np.column_stack([rays, np.ones(len(rays))])
-        return np.einsum("mji,mj->mi", viewmats[views, :3, :3], in_camera - viewmats[views, :3, 3])
 
 
 def _read_table(source: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

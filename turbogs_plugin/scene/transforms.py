@@ -20,7 +20,7 @@ from turbogs_plugin.scene.named_split import read_split
 from turbogs_plugin.scene.photos import photo_size
 from turbogs_plugin.scene.ply import read_vertices
 from turbogs_plugin.scene.poses import viewmat_of_pose
-from turbogs_plugin.scene.starting_points import about_cameras, random_points
+from turbogs_plugin.scene.starting_points import starting_points
 from turbogs_plugin.scene.undistort import Lens, brown_projection, lens_of_camera, make_lens
 
 FILE = "transforms.json"
@@ -52,7 +52,7 @@ def read_transforms(scene: Path) -> Capture:
     Intrinsics and distortion may stand in each frame or for all; ``camera_angle_x`` serves where there is no ``fl_x``.
     Frames whose photo does not exist are left out. A frame's ``mask_path`` is its mask. Lists of file names are the
     capture's own split (`read_split`). Points come from ``ply_file_path``; where it is not given or has none, they are
-    drawn by `random_points` about what the training cameras look at.
+    drawn by `starting_points` about what the training cameras look at.
 
     Raises:
         InputError: a file that is not such JSON, lacks something, or describes no lens; fewer than `FEWEST_PHOTOS`
@@ -111,8 +111,9 @@ def read_transforms(scene: Path) -> Capture:
     if test is not None and not test.any():
         raise InputError(f"{source}: none of its {len(split.test)} test photos is in {scene}: bring them back")
     if not len(points):
-        points, colors = random_points(viewmats if test is None or test.all() else viewmats[~test]), None
-        origin += f", so {about_cameras(len(points))}"
+        train = slice(None) if test is None or test.all() else ~test
+        points, where = starting_points(viewmats[train], intrinsics[train], sizes[train])
+        colors, origin = None, f"{origin}, so {len(points):,} random ones{where}"
     parts = "" if split is None else f", {split.text(names)}"
     notes = [f"{source} (nerfstudio, instant-ngp): {len(names)} photos{parts}, {origin}"]
     if others:

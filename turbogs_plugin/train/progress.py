@@ -79,17 +79,20 @@ class LoadingProgress:
     """Counts photos on stderr while they are decoded: in one line that is overwritten, or a line now and then."""
 
     def __init__(self) -> None:
-        self._start = time.perf_counter()
-        self._next = self._start + PATIENCE_SECONDS
+        self._start: float | None = None  # when the first photo is decoded: lenses and masks come before
+        self._next = 0.0
 
     def __call__(self, loaded: int, total: int) -> None:
         """So many photos of `total` are decoded."""
         now, terminal = time.perf_counter(), sys.stderr.isatty()
+        if self._start is None:
+            self._start, self._next = now, now + PATIENCE_SECONDS
+            return
         begun = self._next > self._start + PATIENCE_SECONDS
         if now < self._next and not (begun and terminal and loaded == total):
             return
         self._next = now + (REFRESH_SECONDS if terminal else LINE_SECONDS)
-        left = (now - self._start) / loaded * (total - loaded)
+        left = (now - self._start) / (loaded - 1) * (total - loaded)
         text = f"{loaded} of {total} photos decoded, about {left:.0f} s left"
         if not terminal:
             print(text, file=sys.stderr, flush=True)

@@ -29,7 +29,7 @@ from turbogs_plugin.plan.caps import cap_of, chosen_points, require_room
 from turbogs_plugin.scene import PosedImages, Scene
 from turbogs_plugin.scene.offload import place_maps, place_views
 from turbogs_plugin.scene.photos import PhotoSamples
-from turbogs_plugin.scene.starting_points import colors_in_photos, random_points
+from turbogs_plugin.scene.starting_points import colors_in_photos, starting_points
 from turbogs_plugin.train.background import Background
 from turbogs_plugin.train.checkpoint import gaussians_of_state
 from turbogs_plugin.train.given_model import load_given
@@ -344,7 +344,9 @@ def initial_gaussians(scene: Scene, config: Config, init: str, device: torch.dev
     if init in ("points", "random"):
         points, colors = scene.points, scene.point_colors
         if init == "random":
-            points = torch.from_numpy(random_points(scene.train.cameras.viewmats.cpu().double().numpy())).float()
+            cameras = scene.train.cameras
+            matrices = (each.cpu().double().numpy() for each in (cameras.viewmats, cameras.Ks))
+            points = torch.from_numpy(starting_points(*matrices, cameras.sizes)[0]).float()
             colors = colors_in_photos(points, scene.train.cameras, scene.train.photos, scene.train.masks)
         rows = chosen_points(len(points), cap, backdrop_count)
         settings = (train.sh_degree, scene.extent, train.initial_opacity, train.initial_size)
