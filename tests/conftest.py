@@ -1,6 +1,7 @@
 """What all tests share. Imported by the process that starts the others as well, which needs neither torch nor ours: to
 import them there would keep all cores but one waiting."""
 
+import gc
 import os
 import sys
 from collections.abc import Iterator
@@ -8,6 +9,8 @@ from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
+
+gc.set_threshold(10_000)  # of torch and the tests there are half a million objects, walked through again and again
 
 
 def pytest_collection_modifyitems() -> None:

@@ -49,8 +49,8 @@ CASES = {
 WITH_EVENTS = ("usual", "fastgs", "mcmc")
 GO_ON = (*WITH_EVENTS, "no rule", "exposures", "masked", "hosted")
 """What these have beside the model changes from step to step; of the others, the first step says all."""
-LONG = 20
-LONG_CASE = (f"train.iterations={LONG}", "train.refine_until=14", "schedule.max_views=2", "density.max_gaussians=400")
+LONG = 14
+LONG_CASE = (f"train.iterations={LONG}", "train.refine_until=10", "schedule.max_views=2", "density.max_gaussians=400")
 
 
 def masked(capture: Path) -> Path:

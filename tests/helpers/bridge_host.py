@@ -1,6 +1,7 @@
 """A gsplat trainer in small: its parameters, optimizers and order of calls, on a synthetic scene that a CPU renders."""
 
 from dataclasses import dataclass, field
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -56,6 +57,15 @@ def arguments(splats: torch.nn.ParameterDict, cameras: Cameras) -> dict[str, Any
     }
 
 
+@cache
+def looks_of_others() -> torch.Tensor:
+    """[P, 3], all pixels of three cameras: what hosts fit, the same for each. Not to be changed."""
+    cameras = make_cameras(3)
+    with torch.no_grad():
+        truth = arguments(make_splats(seed=1), cameras)
+        return sparse_rasterization(**truth, samples=dense_samples(cameras), sh_degree=1)[0]
+
+
 @dataclass
 class Host:
     """A trainer that fits what other Gaussians look like, in the order of calls of gsplat's.
@@ -74,9 +84,7 @@ class Host:
     def __post_init__(self) -> None:
         self.cameras = make_cameras(3)
         self.samples = dense_samples(self.cameras)
-        with torch.no_grad():
-            truth = arguments(make_splats(seed=1), self.cameras)
-            self.pixels, _, _ = sparse_rasterization(**truth, samples=self.samples, sh_degree=1)
+        self.pixels = looks_of_others()
         self.optimizers = {
             name: self.optimizer_class(
                 [{"params": self.splats[name], "lr": RATES[name], "name": name}],

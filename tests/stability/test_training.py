@@ -49,9 +49,23 @@ def saved_model(folder: Path) -> dict[str, torch.Tensor]:
     return load_checkpoint(latest_checkpoint(folder / "checkpoints"))["trainer"]["gaussians"]
 
 
+SHORT = (
+    "train.iterations=9",
+    "train.refine_until=7",
+    "train.sh_interval=2",
+    "density.refine_from=1",
+    "density.refine_every=2",
+    "density.final_every=1",
+    "density.max_gaussians=600",
+    "train.device=cpu",
+)
+"""On top of `TINY`: as many events and degrees in fewer iterations."""
+
+
 def small_config(capture: Path, *overrides: str) -> Config:
-    """14 iterations with densification and pruning; an override may change the type of a strategy."""
-    defaults = [*TINY, "density.max_gaussians=600", "train.device=cpu"]
+    """9 iterations with three densifications, a final pruning and three SH degrees; an override may change the type of
+    a strategy."""
+    defaults = [*TINY, *SHORT]
     replaced = tuple(override.partition("type=")[0] for override in overrides if ".type=" in override)
     config = load_config("turbogs", [*(option for option in defaults if not option.startswith(replaced)), *overrides])
     config.scene.path = str(capture)
@@ -299,9 +313,9 @@ def test_events_are_shown_while_they_happen_and_in_the_report(capture, tmp_path,
     step = Trainer.step
 
     def spoiled(trainer):
-        if 7 <= trainer.iteration < 9:
+        if 3 <= trainer.iteration < 5:
             trainer.nonfinite_losses += 1
-        if 8 <= trainer.iteration < 12:
+        if 4 <= trainer.iteration < 8:
             trainer.optimizer.moments.skipped += 1
         step(trainer)
 

@@ -131,7 +131,7 @@ def small_config(capture: Path, *overrides: str) -> Config:
 
 def first_change(capture: Path, monkeypatch) -> tuple[Tensor, int]:
     """Rows that the first event keeps and copies, and how many it removes."""
-    config = small_config(capture, *STEADY, "train.device=cpu", "density.max_gaussians=180")
+    config = small_config(capture, *STEADY, "train.device=cpu", "density.max_gaussians=110")
     trainer = Trainer(config.without_plan(), load_scene(capture), CPU)
     trainer.initialise_maps()
     found = []
@@ -156,7 +156,7 @@ def test_in_a_moved_world_the_same_rows_are_drawn(capture, tmp_path, monkeypatch
     reconstruction.write_binary(moved / "sparse/0")
     expected, pruned = first_change(capture, monkeypatch)
     source, same_pruned = first_change(moved, monkeypatch)
-    assert pruned == same_pruned > 0 and len(expected) == 180
+    assert pruned == same_pruned > 0 and len(expected) == 110
     assert torch.equal(source, expected)
 
 
