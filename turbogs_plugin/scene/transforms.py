@@ -50,10 +50,11 @@ def read_transforms(scene: Path) -> Capture:
     """Read ``scene/transforms.json``.
 
     Intrinsics and distortion may stand in each frame or for all; ``camera_angle_x`` serves where there is no ``fl_x``.
-    Frames whose photo does not exist are left out (but see `other_suffixes` and `find_elsewhere`). A frame's
-    ``mask_path`` is its mask. Lists of file names are the capture's own split (`read_split`). Points come from
-    ``ply_file_path``; where it is not given or has none, they are drawn by `random_points` about what the training
-    cameras look at.
+    Frames whose photo does not exist are left out. A frame's ``mask_path`` is its mask. Lists of file names are the
+    capture's own split (`read_split`). Points come from ``ply_file_path``; where it is not given or has none, they are
+    drawn by `random_points` about what the training cameras look at.
+
+    Photos that are not where the file says are looked for by `other_suffixes` and `find_elsewhere`.
 
     Raises:
         InputError: a file that is not such JSON, lacks something, or describes no lens; fewer than `FEWEST_PHOTOS`
