@@ -54,6 +54,8 @@ def read_transforms(scene: Path) -> Capture:
     capture's own split (`read_split`). Points come from ``ply_file_path``; where it is not given or has none, they are
     drawn by `starting_points` about what the training cameras look at.
 
+    Photos that are not where the file says are looked for by `other_suffixes` and `find_elsewhere`.
+
     Raises:
         InputError: a file that is not such JSON, lacks something, or describes no lens; fewer than `FEWEST_PHOTOS`
             photos.
