@@ -270,6 +270,10 @@ def test_another_build_measures_in_a_process_of_its_own(tmp_path):
         (["raster", "--training", "5"], "--scene"),
         (["raster", "--scene", "CAPTURE", "--training", "-1"], "--training"),
         (["raster", "--library", "absent.so"], "absent.so"),
+        (["raster", "--scene", "CAPTURE", "--ply", "model.ply"], "--ply is for bench step"),
+        (["step", "--ply", "model.ply"], "--scene"),
+        (["step", "--scene", "CAPTURE", "--training", "5", "--ply", "model.ply"], "--training"),
+        (["step", "--scene", "CAPTURE", "--ply", "absent.ply"], "absent.ply"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else None,
 )

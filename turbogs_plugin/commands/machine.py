@@ -20,6 +20,7 @@ def bench(
     /,
     *,
     scene: Scene = None,
+    ply: Annotated[Path | None, arg(metavar="MODEL.ply")] = None,
     gaussians: Annotated[tuple[int, ...], arg(metavar="M ...")] = (150_000, 600_000),
     views: Annotated[tuple[int, ...], arg(metavar="K ...")] = (10, 5, 3),
     pixel_budget: Annotated[float, arg(metavar="LAMBDA")] = 1.0,
@@ -48,6 +49,7 @@ def bench(
             with a client that moves.
         overrides: step, ranks, wall, viewer: changes of the configuration that is timed.
         scene: a capture, for its cameras and photos; where absent, all is synthetic, the models of raster as well.
+        ply: step: a trained model in place of one that is trained here, so that several builds time the same.
         gaussians: sizes of the model.
         views: views of an iteration.
         pixel_budget: pixels of an iteration in images (lambda).
@@ -81,6 +83,8 @@ def bench(
     require_positive("--pixel-budget", (pixel_budget,))
     if training is not None and training < 0:
         raise InputError(f"--training {training}: it must be at least 0")
+    if ply is not None and (what != "step" or scene is None or training is not None):
+        raise InputError("--ply is for bench step with the --scene of the model: leave --training out")
     iterations = TRAINING_ITERATIONS if training is None else training
     where = resolve_device(device)
     of_step_or_raster = library or photos or offload
@@ -105,7 +109,7 @@ def bench(
         step = StepBench(gaussians, views, pixel_budget, iterations, times, overrides)
         commands.run_ranks(RanksBench(gpus, grown, step), scene, factor, where, out)
     elif what == "step":
-        step = StepBench(gaussians, views, pixel_budget, iterations, times, overrides, offload, photos, size)
+        step = StepBench(gaussians, views, pixel_budget, iterations, times, overrides, offload, photos, size, ply)
         commands.run_step(step, scene, factor, where, out)
     else:
         if overrides:
