@@ -110,3 +110,13 @@ def test_photos_with_their_own_reconstruction_in_them_are_alone(tmp_path):
 def test_captures_more_than_two_folders_down_are_not_looked_for(tmp_path):
     with_poses(tmp_path / "x/1/2/3")
     assert "has neither a COLMAP reconstruction" in refusal(tmp_path / "x")
+
+
+def test_of_several_captures_in_a_folder_a_line_names_those_that_are_not_read(capture):
+    """Each with its own sparse/0: the first one is read."""
+    root = capture.parent
+    shutil.copytree(capture, root / "second")
+    shutil.copytree(capture, root / "third")
+    others = f"{root / 'second/sparse'}, {root / 'third/sparse'} not used: give the folder of the capture that you want"
+    assert others in load_scene(root).notes
+    assert not any("not used" in note for note in load_scene(root / "second").notes)

@@ -177,7 +177,12 @@ def read_colmap(scene: Path, model: Path, suffix: str) -> Capture:
         points=points,
         point_colors=colors,
         lenses=tuple(lenses[image.camera_id] for image in images),
-        notes=(_kind_note(scene, model, suffix, len(images), shown, photo_folder), *_choice_note(model), *absence),
+        notes=(
+            _kind_note(scene, model, suffix, len(images), shown, photo_folder),
+            *_choice_note(model),
+            *_others_note(scene, model),
+            *absence,
+        ),
         reduction=reduction,
         alpha="mask",
     ).checked(model)
@@ -257,3 +262,15 @@ def _choice_note(model: Path) -> list[str]:
         return []
     counts = named([f"{folder.name} has {_count_images(folder, suffix)}" for folder, suffix in models], most=4)
     return [f"{len(models)} reconstructions in {model.parent}: {model.name} is taken for most images ({counts})"]
+
+
+def _others_note(scene: Path, model: Path) -> list[str]:
+    """Which other reconstructions a folder has, where this one is in none of the known folders."""
+    if {model, model.parent} & {scene / name for name in (*MODEL_FOLDERS, *INSTANT_NGP_FOLDERS)}:
+        return []
+    others: list[Path] = []
+    for place in _folders(scene, FOLDER_DEPTH):
+        part = {place, place.parent} & {model, model.parent, *others}
+        if not part and (_suffix(place) or _numbered_models(place)):
+            others.append(place)
+    return [f"{named(list(map(str, others)))} not used: give the folder of the capture that you want"] if others else []
