@@ -317,13 +317,19 @@ def test_studies_are_merged_and_reported_again_without_training(turbogs, small, 
     assert code == 2 and "two different results" in err
 
 
-def test_cells_of_other_sources_are_not_shared(turbogs, small, capture, study, tmp_path, monkeypatch):
+def of_two_studies(small: Path, capture: Path, study: Path, tmp_path: Path) -> list:
+    """A call for the cell that a study has, and for the same by another name."""
     other, out = tmp_path / "other.yaml", tmp_path / "studies"
     other.write_text("title: Other\nvariants: {same: []}\n")
     small.write_text("title: Tiny\nvariants: {full: []}\n")
     shutil.copytree(study, out / "small")
     arguments = call(small, capture, out)
     arguments.insert(2, other)
+    return arguments
+
+
+def test_cells_of_other_sources_are_not_shared(turbogs, small, capture, study, tmp_path, monkeypatch):
+    arguments = of_two_studies(small, capture, study, tmp_path)
     monkeypatch.setenv("TURBOGS_COMMIT", "another")
     code, _, err = turbogs(*arguments)
     assert code == 0 and err.count("1 finished cells are kept") == 1 and "[1/1]" in err
@@ -354,13 +360,7 @@ def test_a_cell_of_an_unknown_capture_is_kept_and_merged_but_not_shared(turbogs,
     code, _, err = turbogs(*call(small, capture, old, "--only", "full"))
     assert code == 0 and "1 finished cells are kept" in err
     assert turbogs("ablate", "--merge", old, "--out", tmp_path / "merged")[0] == 0
-    other, out = tmp_path / "other.yaml", tmp_path / "studies"
-    other.write_text("title: Other\nvariants: {same: []}\n")
-    small.write_text("title: Tiny\nvariants: {full: []}\n")
-    shutil.copytree(old, out / "small")
-    arguments = call(small, capture, out)
-    arguments.insert(2, other)
-    code, _, err = turbogs(*arguments)
+    code, _, err = turbogs(*of_two_studies(small, capture, old, tmp_path))
     assert code == 0 and err.count("1 finished cells are kept") == 1 and "[1/1]" in err
 
 
