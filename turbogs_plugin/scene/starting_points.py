@@ -64,13 +64,12 @@ def starting_points(viewmats: np.ndarray, Ks: np.ndarray, sizes: np.ndarray) -> 
     points = random_points(viewmats)
     about = "about what the cameras look at"
     lacking = shares_with_points(points[:PROBES], viewmats, Ks, sizes) < ENOUGH_CELLS
-    bounds = _depth_bounds(camera_centers(viewmats))
-    if not lacking.any() or not np.isfinite(bounds).all():
+    if not lacking.any():
         return points, f" {about}"
     count = round(len(points) * lacking.mean())
-    bounds = np.tile(bounds, (int(lacking.sum()), 1))
+    bounds = np.tile(_depth_bounds(camera_centers(viewmats)), (int(lacking.sum()), 1))
     within = points_in_views(viewmats[lacking], Ks[lacking], sizes[lacking], bounds, count)
-    if not np.isfinite(within).all():  # by intrinsics that the capture's check names
+    if not np.isfinite(within).all():  # by poses or intrinsics that the capture's check names
         return points, f" {about}"
     rest = len(points) - count
     cameras = f"{len(bounds):,} of {len(lacking):,} cameras"
