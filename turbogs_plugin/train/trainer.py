@@ -250,7 +250,8 @@ class Trainer:
             InputError: an iteration has more intersections of a tile and a splat than a pass can have.
         """
         lost = self.exchange.settle(self.engine, wait)
-        self.iteration = max(self.iteration - lost, min(self.first_repeatable, self.iteration))
+        earliest = min(self.first_repeatable, self.iteration)
+        self.iteration = max(self.iteration - lost, earliest)
 
     @property
     def now(self) -> Step:
