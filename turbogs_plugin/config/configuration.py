@@ -58,7 +58,7 @@ class Config:
     def build(self, kind: str) -> Any:
         """A new strategy of this kind. RuntimeError where its type is left to a plan."""
         section = getattr(self, kind)
-        if concrete(kind, section) is not section:
+        if section.get("type") == AUTO:
             raise RuntimeError(f"{kind}.type is {AUTO}: a strategy is built from what a plan has decided")
         return registry.build(kind, section)
 
