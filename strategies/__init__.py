@@ -11,8 +11,12 @@ from turbogs_plugin import lazy_face
 
 _MODULES: dict[str, tuple[str, ...]] = {
     "protocols": (
-        *("SamplingSchedule", "ViewSampler", "PixelSampler", "SparseLoss"),
-        *("DensityController", "GaussianOptimizer"),
+        "SamplingSchedule",
+        "ViewSampler",
+        "PixelSampler",
+        "SparseLoss",
+        "DensityController",
+        "GaussianOptimizer",
     ),
     "schedule": ("SinusoidalSchedule", "LinearSchedule", "ExponentialSchedule", "FixedSchedule"),
     "view_sampling": ("GeometryAwareViewSampler", "RandomViewSampler"),

@@ -18,18 +18,13 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from turbogs_plugin.strategies.checks import require_positive, require_settings
+from turbogs_plugin.strategies.checks import require_at_least_one, require_positive, require_settings
 
 from turbogs_plugin.errors import require
 from turbogs_plugin.types import SamplingBudget, Step
 
 EPSILON = 1e-12
 """Added to the initial error, which is zero where the initial model is already exact."""
-
-
-def _check_budget(pixel_budget: float) -> None:
-    allowed = "a finite number above 0 (images per iteration)"
-    require(0 < pixel_budget < math.inf, "pixel_budget", pixel_budget, allowed)
 
 
 @dataclass
@@ -48,10 +43,10 @@ class _AdaptiveSchedule:
     alpha: float = 3.0
 
     def __post_init__(self) -> None:
-        require(self.min_views >= 1, "min_views", self.min_views, "1 or more")
+        require_at_least_one(self, "min_views")
         allowed = f"min_views ({self.min_views}) or more"
         require(self.max_views >= self.min_views, "max_views", self.max_views, allowed)
-        _check_budget(self.pixel_budget)
+        require_positive(self, "pixel_budget")
         require_settings(self)
 
     def phi(self, ratio: float) -> float:
@@ -120,8 +115,8 @@ class FixedSchedule:
     pixel_budget: float = 1.0
 
     def __post_init__(self) -> None:
-        require(self.views >= 1, "views", self.views, "1 or more")
-        _check_budget(self.pixel_budget)
+        require_at_least_one(self, "views")
+        require_positive(self, "pixel_budget")
 
     def query(self, step: Step, mean_error: float, initial_error: float, num_views: int) -> SamplingBudget:
         views = min(self.views, num_views)

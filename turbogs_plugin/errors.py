@@ -51,15 +51,12 @@ def exit_code(command: Callable[[], int]) -> int:
         code = command()
         sys.stdout.flush()
         return code
-    except (InputError, TrainingStopped) as error:
-        print(error_line(error), file=sys.stderr)
-        return 2 if isinstance(error, InputError) else 1
     except BrokenPipeError:  # whoever read the output, `head` for one, has had enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 128 + signal.SIGPIPE
-    except OSError as error:
+    except (InputError, TrainingStopped, OSError) as error:
         print(error_line(error), file=sys.stderr)
-        return 2
+        return 1 if isinstance(error, TrainingStopped) else 2
     except KeyboardInterrupt:
         print("turbogs: interrupted", file=sys.stderr)
         return 128 + signal.SIGINT

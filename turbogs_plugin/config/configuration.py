@@ -8,10 +8,8 @@ top of another. Some settings may be ``auto`` (`turbogs_plugin.config.auto`): th
 
 from __future__ import annotations
 
-import pickle
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, is_dataclass
-from functools import lru_cache
 from typing import Any, get_type_hints
 
 from omegaconf import OmegaConf
@@ -58,7 +56,7 @@ class Config:
     def build(self, kind: str) -> Any:
         """A new strategy of this kind. RuntimeError where its type is left to a plan."""
         section = getattr(self, kind)
-        if concrete(kind, section) is not section:
+        if section.get("type") == AUTO:
             raise RuntimeError(f"{kind}.type is {AUTO}: a strategy is built from what a plan has decided")
         return registry.build(kind, section)
 
@@ -93,12 +91,7 @@ class Config:
 
     def to_yaml(self) -> str:
         """Every setting; read back, it gives this very configuration."""
-        return "".join(_section_yaml(name, pickle.dumps(section)) for name, section in self.to_mapping().items())
-
-
-@lru_cache(maxsize=128)  # OmegaConf takes milliseconds for each, and most are alike from one text to the next
-def _section_yaml(name: str, section: bytes) -> str:
-    return OmegaConf.to_yaml(OmegaConf.create({name: pickle.loads(section)}))
+        return OmegaConf.to_yaml(OmegaConf.create(self.to_mapping()))
 
 
 SECTION_CLASSES = {name: hint for name, hint in get_type_hints(Config).items() if is_dataclass(hint)}

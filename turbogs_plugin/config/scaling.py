@@ -9,8 +9,12 @@ from turbogs_plugin.errors import InputError
 ITERATION_FIELDS = {
     "train": ("refine_until", "sh_interval"),
     "density": (
-        *("refine_from", "refine_every", "final_every", "prune_every"),
-        *("refine_start_iter", "refine_scale2d_stop_iter"),
+        "refine_from",
+        "refine_every",
+        "final_every",
+        "prune_every",
+        "refine_start_iter",
+        "refine_scale2d_stop_iter",
     ),
 }
 """Settings that count iterations: a run of another length scales them. Not gsplat's `reset_every`: what a reset of

@@ -44,6 +44,10 @@ LAG = 4
 """After so many iterations all processes look at the flags of an iteration, and wait for them if need be: so all know
 of them at the same place, and no host runs farther ahead of its GPU."""
 
+OVERFLOW, STOP = 0, 1
+"""Columns of a pass's flags: iterations do nothing for lack of memory; the signal to stop, 0 for none. They travel as
+one more row of the colours, whose third number means nothing."""
+
 
 class Exchange:
     """A process alone: every call goes to the engine, and nothing is exchanged."""
@@ -151,13 +155,13 @@ class RankExchange(Exchange):
         if rendered is not None:
             sent[: len(rendered.colors)] = rendered.colors
         if engine.overflow is not None:
-            sent[most, :1] = engine.overflow
+            sent[most, OVERFLOW] = engine.overflow
         if self.ranks.asked:
-            sent[most, 1] = self.ranks.asked
+            sent[most, STOP] = self.ranks.asked
         gathered = self.ranks.gather(sent)  # [ranks, most + 1, 3]
         flags = gathered[:, most].amax(dim=0)  # [3]
         if engine.overflow is not None:
-            engine.overflow.copy_(flags[:1])
+            engine.overflow.copy_(flags[OVERFLOW])
         self._flags.append(self._sent_flags(flags))
         self._passes += 1
         self.ranks.latest = time.monotonic()
@@ -290,15 +294,15 @@ class RankExchange(Exchange):
 
 @dataclass
 class _Flags:
-    """Flags of a pass on their way to the host: iterations do nothing for lack of memory; a signal to stop."""
+    """Flags of a pass on their way to the host, [3] as `OVERFLOW` and `STOP` say."""
 
     number: int
     values: Tensor
     event: torch.cuda.Event | None
 
     def read(self) -> tuple[bool, int]:
-        """Waits until they have arrived."""
+        """(whether there was too little memory, the signal to stop). Waits until they have arrived."""
         if self.event is not None:
             self.event.synchronize()
-        overflow, stop, _ = self.values.tolist()
-        return overflow != 0, int(stop)
+        values = self.values.tolist()
+        return values[OVERFLOW] != 0, int(values[STOP])

@@ -17,8 +17,17 @@ from turbogs_plugin.engine.rendered import DEFAULT_SETTINGS, RasterSettings, Ren
 from turbogs_plugin.tiles import dense_pixels
 from turbogs_plugin.types import Cameras, Gaussians, PixelSamples
 
-__all__ = ["DEFAULT_SETTINGS", "RasterSettings", "RenderOptions", "RenderedImage", "dense_samples", "rasterize"]
-__all__ += ["rasterize_reference", "render_image", "splats_per_tile"]
+__all__ = [
+    "DEFAULT_SETTINGS",
+    "RasterSettings",
+    "RenderOptions",
+    "RenderedImage",
+    "dense_samples",
+    "rasterize",
+    "rasterize_reference",
+    "render_image",
+    "splats_per_tile",
+]
 
 
 def rasterize(gaussians: Gaussians, cameras: Cameras, samples: PixelSamples, **options: Any) -> Rendered:

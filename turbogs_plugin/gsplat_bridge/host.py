@@ -25,18 +25,16 @@ STATISTICS = "gaussian_stats"
 LOSS_SHARES = "loss_shares"
 """Key under which it leaves, beside them, [N] the Gaussians' shares of the loss."""
 
-SHAPES = {
-    "means": "[N, 3]",
-    "quats": "[N, 4]",
-    "scales": "[N, 3]",
-    "opacities": "[N]",
-    "sh0": "[N, 1, 3]",
-    "shN": "[N, B, 3]",
+LAYOUTS = {
+    "means": [("N", 3)],
+    "quats": [("N", 4)],
+    "scales": [("N", 3)],
+    "opacities": [("N",), ("N", 1)],
+    "sh0": [("N", 1, 3), ("N", 3)],
+    "shN": [("N", "B", 3)],
 }
-"""gsplat's layout: N Gaussians, B harmonics above band 0."""
-
-FLAT_SHAPES = {"opacities": "[N, 1]", "sh0": "[N, 3]"}
-"""Layouts taken beside those, as nerfstudio's splatfacto has them."""
+"""gsplat's shape of each parameter: N Gaussians, B harmonics above band 0. Behind it the shape that is taken beside it,
+as nerfstudio's splatfacto has it."""
 
 GEOMETRY = ("means", "quats", "scales", "opacities")
 
@@ -80,11 +78,11 @@ def host_gaussians(params: Mapping[str, Tensor], names: Iterable[str] = PARAMETE
     count = params["means"].shape[0]
     for name in [name for name in PARAMETER_NAMES if name in params]:
         shape = tuple(params[name].shape)
-        form = SHAPES[name].replace("N", str(count)).replace("B", str(shape[1]) if len(shape) > 1 else "B")
-        flat = FLAT_SHAPES.get(name, "").replace("N", str(count))
-        if str(list(shape)) not in (form, flat):
+        sizes = {"N": count, "B": shape[1] if len(shape) > 1 else None}
+        if shape not in [tuple(sizes.get(size, size) for size in layout) for layout in LAYOUTS[name]]:
+            expected = ", ".join(map(str, LAYOUTS[name][0]))
             raise InputError(
-                f"parameter '{name}' has shape {shape}: expected {SHAPES[name]} with N = {count} as in 'means'"
+                f"parameter '{name}' has shape {shape}: expected [{expected}] with N = {count} as in 'means'"
             )
     absent = params["means"].new_zeros(count, 1, 3)
     values = {name: params[name].detach() if name in params else absent for name in PARAMETER_NAMES}

@@ -139,8 +139,9 @@ def render_view(
     background: Color = BLACK,
 ) -> Tensor:
     """[H, W, 3] float32, 0 .. 1: the model seen by one of the cameras."""
-    options = {"sh_degree": sh_degree, "settings": settings, "background": background}
-    image = render_image(gaussians, views.cameras, view_id, **options)
+    image = render_image(
+        gaussians, views.cameras, view_id, sh_degree=sh_degree, settings=settings, background=background
+    )
     return image.colors.clamp(0.0, 1.0)
 
 

@@ -45,10 +45,15 @@ class Evaluations(Listener):
             listener.evaluating(loop)
         trainer = loop.trainer
         trainer.require_finite()
-        lpips = self.lpips if loop.finished else None
-        settings, background = trainer.config.raster, trainer.background.evaluated
-        options = {"background": background, "aligned": trainer.exposures is not None}
-        metrics = evaluate(trainer.gaussians, self.test, trainer.sh_degree, settings, lpips, **options)
+        metrics = evaluate(
+            trainer.gaussians,
+            self.test,
+            trainer.sh_degree,
+            trainer.config.raster,
+            lpips=self.lpips if loop.finished else None,
+            background=trainer.background.evaluated,
+            aligned=trainer.exposures is not None,
+        )
         mean = metrics.mean
         evaluation = Evaluation(
             iteration=trainer.iteration,

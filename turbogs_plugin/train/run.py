@@ -36,7 +36,6 @@ from turbogs_plugin.train.progress import TrainingProgress
 from turbogs_plugin.train.start import open_scene, require_possible, resolve_device, starting
 from turbogs_plugin.train.trainer import Trainer
 from turbogs_plugin.train.wall import WallClock, WallRecord
-from turbogs_plugin.train.wall_marks import WallMarks
 from turbogs_plugin.types import Gaussians
 
 IMPORTS, CAMERAS = "interpreter and imports", "cameras of photos alone"
@@ -294,7 +293,8 @@ class RunSession(Listener):
         try:
             progress = TrainingProgress(trainer.iterations, trainer.iteration)
             with Interrupts(loop.stop) as interrupts, progress:
-                loop.listeners = [WallMarks(self.clock), self.evaluations, self, progress] if ranks.first else [self]
+                # First the session, so that its marks tell apart what the others do.
+                loop.listeners = [self, self.evaluations, progress] if ranks.first else [self]
                 loop.listeners += [listener_of(self) for listener_of in watch if ranks.first]
                 loop.run(self.resumed)
                 self.clock.mark("training")
@@ -328,7 +328,14 @@ class RunSession(Listener):
         seconds = 0.0 if self._finished_before else max(ends, default=self.clock.seconds)
         self.wall = WallRecord(self.loop.clock.seconds, self.earlier_wall + seconds, self.clock.parts)
 
+    def begun(self, loop: TrainingLoop) -> None:
+        self.clock.mark("initial maps")
+
+    def evaluating(self, loop: TrainingLoop) -> None:
+        self.clock.mark("training")
+
     def evaluated(self, loop: TrainingLoop, evaluation: Evaluation) -> None:
+        self.clock.mark("evaluations" if evaluation.iteration else "first evaluation")
         append_evaluation(self.folder.history, evaluation)
 
     def checkpoint_due(self, loop: TrainingLoop) -> None:

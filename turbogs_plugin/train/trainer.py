@@ -109,12 +109,17 @@ class Trainer:
     def dense_errors(self, view_id: int) -> Tensor:
         """[H * W] the errors of a dense render of one view; 0 at masked pixels."""
         background = self.background.at(self.now)
-        options = {"sh_degree": self.sh_degree, "settings": self.config.raster, "background": background}
+        gaussians, cameras = self.gaussians, self.views.cameras
+        degree, settings = self.sh_degree, self.config.raster
         if self.maps.masks is None:
-            image = render_image(self.gaussians, self.views.cameras, view_id, **options)
+            image = render_image(
+                gaussians, cameras, view_id, sh_degree=degree, settings=settings, background=background
+            )
             return (image.colors - self.views.photos.image(view_id, background)).abs().sum(dim=-1).reshape(-1)
         samples = self.maps.masks.pixels([view_id])
-        rendered = rasterize(self.gaussians, self.views.cameras.select([view_id]), samples, **options)
+        rendered = rasterize(
+            gaussians, cameras.select([view_id]), samples, sh_degree=degree, settings=settings, background=background
+        )
         truth = self.views.photos.at(samples, background).colors()  # [P, 3]
         errors = truth.new_zeros(int(self.maps.sizes[view_id].prod()))
         errors[samples.pixel_ids.long()] = (rendered.colors - truth).abs().sum(dim=-1)
@@ -245,7 +250,8 @@ class Trainer:
             InputError: an iteration has more intersections of a tile and a splat than a pass can have.
         """
         lost = self.exchange.settle(self.engine, wait)
-        self.iteration = max(self.iteration - lost, min(self.first_repeatable, self.iteration))
+        earliest = min(self.first_repeatable, self.iteration)
+        self.iteration = max(self.iteration - lost, earliest)
 
     @property
     def now(self) -> Step:

@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.files import read_text, write_text_atomically
+from turbogs_plugin.files import process_started, read_text, write_text_atomically
 
 _IMPORTED = time.perf_counter()
 
@@ -25,10 +25,9 @@ def process_age() -> float:
     """
     imported = time.perf_counter() - _IMPORTED
     try:
-        stat = Path("/proc/self/stat").read_text(encoding="ascii", errors="replace")
-        ticks = int(stat.rpartition(")")[2].split()[19])  # the name before may hold anything; field 3 comes after it
+        ticks = int(process_started(os.getpid()))
         age = time.clock_gettime(time.CLOCK_BOOTTIME) - ticks / os.sysconf("SC_CLK_TCK")
-    except (OSError, ValueError, IndexError, AttributeError):
+    except (OSError, ValueError, AttributeError):
         return imported
     return age if imported <= age <= imported + LONGEST_START else imported
 

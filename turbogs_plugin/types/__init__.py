@@ -22,6 +22,22 @@ from turbogs_plugin.types.gaussians import (
 from turbogs_plugin.types.samples import TILE_SIZE, LossOutput, PixelSamples, TileGrid, sample_order
 from turbogs_plugin.types.step import SamplingBudget, Step
 
-__all__ = ["BLACK", "PARAMETER_NAMES", "SH_C0", "TILE_SIZE", "WHITE", "Cameras", "Color", "GaussianGradients"]
-__all__ += ["GaussianStats", "Gaussians", "LossOutput", "PixelSamples", "RowUpdate"]
-__all__ += ["SamplingBudget", "Step", "TileGrid", "sample_order"]
+__all__ = [
+    "BLACK",
+    "PARAMETER_NAMES",
+    "SH_C0",
+    "TILE_SIZE",
+    "WHITE",
+    "Cameras",
+    "Color",
+    "GaussianGradients",
+    "GaussianStats",
+    "Gaussians",
+    "LossOutput",
+    "PixelSamples",
+    "RowUpdate",
+    "SamplingBudget",
+    "Step",
+    "TileGrid",
+    "sample_order",
+]

@@ -110,13 +110,15 @@ def draw_units(units: Units, rule: DrawRule) -> tuple[Tensor, Tensor | None]:
 
     drawn = torch.zeros_like(units.exist)
     missed = torch.ones_like(errors)  # probability of not being drawn
-    for count, weights, words in zip(rule.stages(units.wanted), (errors, None, mixed), units.words[:3], strict=True):
+    weights_of = {"hard": errors, "mixed": mixed}  # the stable stage goes by age alone
+    stages = ("hard", "stable", "mixed")
+    for stage, count, words in zip(stages, rule.stages(units.wanted), units.words[:3], strict=True):
         if count == 0:
             continue
-        if weights is None:
+        if stage == "stable":
             primary = (ages << AGE_TIE_BITS) | (words >> (32 - AGE_TIE_BITS))
         else:
-            weights = weights.clamp(min=WEIGHT_FLOOR)
+            weights = weights_of[stage].clamp(min=WEIGHT_FLOOR)
             primary = (weights / exponentials(words)).view(torch.int32).long()
         keys = torch.where(units.exist & ~drawn, (primary << RANK_BITS) | ranks, -1)
         largest = keys.topk(min(count + 1, keys.shape[1]), dim=1).values
@@ -126,7 +128,7 @@ def draw_units(units: Units, rule: DrawRule) -> tuple[Tensor, Tensor | None]:
         drawn |= taken
         if rule.importance:
             tau = torch.where(taken, largest_left, smallest_taken) >> RANK_BITS  # -1 for none
-            if weights is None:
+            if stage == "stable":
                 chance = (((ages + 1) << AGE_TIE_BITS) - tau).clamp(0, 1 << AGE_TIE_BITS) * 2.0**-AGE_TIE_BITS
             else:
                 threshold = tau.to(torch.int32).view(torch.float32)
