@@ -190,7 +190,7 @@ def _columns(summary: SceneSummary, against: str) -> list[tuple[str, Callable[[V
     def mean(measure: str, absent: str = "not computed", unit: int = 1) -> Callable[[VariantRow], str]:
         return lambda row: number(row.spread(measure).mean / unit, 0, absent)
 
-    def compared(text: Callable[[VariantRow], str]) -> Callable[[VariantRow], str]:
+    def unless_baseline(text: Callable[[VariantRow], str]) -> Callable[[VariantRow], str]:
         return lambda row: "" if summary.baseline in ("", row.name) else text(row)
 
     return [
@@ -199,12 +199,12 @@ def _columns(summary: SceneSummary, against: str) -> list[tuple[str, Callable[[V
         ("seeds", lambda row: str(len(row.cells))),
         ("time in s", spread("seconds", 1)),
         *((head, spread(clock, 1, "-")) for clock, head in CLOCKS.items() if _has(summary, clock)),
-        (f"time{against}", compared(lambda row: f"x {row.ratio('seconds'):.2f}")),
+        (f"time{against}", unless_baseline(lambda row: f"x {row.ratio('seconds'):.2f}")),
         ("PSNR in dB", spread("psnr", 2)),
-        (f"PSNR{against}", compared(lambda row: difference_text(row.difference("psnr"), 2))),
+        (f"PSNR{against}", unless_baseline(lambda row: difference_text(row.difference("psnr"), 2))),
         ("worst view in dB", spread("worst_psnr", 2, "not recorded")),
         ("SSIM", spread("ssim", 4)),
-        (f"SSIM{against}", compared(lambda row: difference_text(row.difference("ssim"), 4))),
+        (f"SSIM{against}", unless_baseline(lambda row: difference_text(row.difference("ssim"), 4))),
         ("LPIPS (VGG)", spread("lpips", 4)),
         *([("FLIP", spread("flip", 4))] if _has(summary, "flip") else []),
         ("Gaussians", mean("gaussians")),
