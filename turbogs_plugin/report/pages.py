@@ -30,8 +30,10 @@ def write_report(run: RunSession, process: PlotProcess | None = None) -> Path:
     lpips, lpips_reason = load_lpips(config.report.lpips_weights, trainer.device)
     metrics = None if lpips else run.evaluations.metrics_at(trainer.iteration)
     if metrics is None:
-        options = {"background": background, "aligned": trainer.exposures is not None}
-        metrics = evaluate(trainer.gaussians, run.test, trainer.sh_degree, config.raster, lpips, **options)
+        aligned = trainer.exposures is not None
+        metrics = evaluate(
+            trainer.gaussians, run.test, trainer.sh_degree, config.raster, lpips, background=background, aligned=aligned
+        )
     run.clock.mark("report")
     pictures = run.folder.path / "report"
     pictures.mkdir(exist_ok=True)
