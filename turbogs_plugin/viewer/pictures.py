@@ -172,14 +172,14 @@ def _photo(subject: Subject, request: Request) -> np.ndarray:
 
 def _errors(subject: Subject, request: Request) -> np.ndarray:
     """The map's own values: a mean over the last visits of each pixel, not the error of the present model."""
-    errors = _map_of(subject, request, lambda maps, view_id, extent: maps.errors[extent].float())
-    return _map_picture(errors / (3.0 * ERROR_FULL_SCALE), request)
+    errors = subject.maps.view_errors(shown_view(subject, request))
+    return _map_picture(errors / (3.0 * ERROR_FULL_SCALE), subject, request)
 
 
 def _ages(subject: Subject, request: Request) -> np.ndarray:
     """Black: sampled just now. The brightest: as long ago as the oldest pixel of the view, on a logarithmic scale."""
-    ages = _map_of(subject, request, lambda maps, view_id, extent: maps.ages(view_id, subject.step).float())
-    return _map_picture(torch.log1p(ages) / torch.log1p(ages.max()).clamp(min=1e-6), request)
+    ages = subject.maps.ages(shown_view(subject, request), subject.step).float()
+    return _map_picture(torch.log1p(ages) / torch.log1p(ages.max()).clamp(min=1e-6), subject, request)
 
 
 def _samples(subject: Subject, request: Request) -> np.ndarray:
@@ -242,20 +242,11 @@ def _render_of(subject: Subject, views: PosedImages, view_id: int, size: tuple[i
     return _resized(image.colors.permute(2, 0, 1), size).permute(1, 2, 0)
 
 
-def _map_of(subject: Subject, request: Request, read: Callable) -> Tensor:
-    """[H, W] float: what `read` gives of the maps of the view shown."""
-    view_id = shown_view(subject, request)
-    maps = subject.maps
-    maps.fetch([view_id])
-    width, height = maps.sizes[view_id].tolist()
-    start = int(maps.offsets[view_id])
-    return read(maps, view_id, slice(start, start + width * height)).view(height, width)
-
-
-def _map_picture(share: Tensor, request: Request) -> np.ndarray:
-    """A map [H, W], fitted into the page; what is reduced keeps its largest values."""
-    size = fitted((share.shape[1], share.shape[0]), (request.eye.width, request.eye.height))
-    return _centred(colored(_resized(share[None], size, adaptive_max_pool2d)[0]), request)
+def _map_picture(share: Tensor, subject: Subject, request: Request) -> np.ndarray:
+    """A map [H * W] of the view shown, fitted into the page; what is reduced keeps its largest values."""
+    width, height = subject.maps.sizes[shown_view(subject, request)].tolist()
+    size = fitted((width, height), (request.eye.width, request.eye.height))
+    return _centred(colored(_resized(share.view(1, height, width), size, adaptive_max_pool2d)[0]), request)
 
 
 def _resized(planes: Tensor, size: tuple[int, int], reduce: Callable | None = None) -> Tensor:
