@@ -24,7 +24,7 @@ from turbogs_plugin.study.grid import variant_config
 from turbogs_plugin.study.plots import PLOTS, write_plots
 from turbogs_plugin.study.results import Study
 from turbogs_plugin.study.statistics import Difference, Spread, crossing_gap
-from turbogs_plugin.study.summary import MEASURES, SceneSummary, VariantRow, summarise
+from turbogs_plugin.study.summary import CELL_VALUES, SceneSummary, VariantRow, summarise
 
 CLOCKS = {"wall_seconds": "wall in s", "cell_seconds": "load, train, evaluate in s"}
 """Measures of the wall's clock, each with its column, where a cell has it."""
@@ -178,7 +178,7 @@ def _scene(summary: SceneSummary) -> list[Block]:
 
 def _has(summary: SceneSummary, measure: str) -> bool:
     """Whether any cell has it: wall seconds are those of runs, and older cells lack what was recorded later."""
-    return not all(math.isnan(MEASURES[measure](cell)) for row in summary.rows for cell in row.cells)
+    return not all(math.isnan(CELL_VALUES[measure](cell)) for row in summary.rows for cell in row.cells)
 
 
 def _columns(summary: SceneSummary, against: str) -> list[tuple[str, Callable[[VariantRow], str]]]:
@@ -253,7 +253,7 @@ def table_csv(summaries: Sequence[SceneSummary]) -> str:
     """All numbers of the tables, unrounded; empty where not computed or not measured, ``inf`` where never reached."""
     lines: list[dict[str, Any]] = []
     later = {*CLOCKS, "flip"}
-    measures = [name for name in MEASURES if name not in later or any(_has(summary, name) for summary in summaries)]
+    measures = [name for name in CELL_VALUES if name not in later or any(_has(summary, name) for summary in summaries)]
     for summary in summaries:
         for row in summary.rows:
             line = {"scene": summary.scene, "variant": row.name, "seeds": len(row.cells), "pareto": row.on_front}
