@@ -50,7 +50,7 @@ from turbogs_plugin.train.trainer import Trainer
 from turbogs_plugin.train.wall import WallRecord
 
 EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
-MEASURES = ("psnr", "ssim", "aligned_psnr", "aligned_ssim")
+RAW_AND_ALIGNED = ("psnr", "ssim", "aligned_psnr", "aligned_ssim")
 VIEWS = (10, 5, 3)
 """Of the iterations that are timed."""
 BETWEEN_SAMPLES = 0.2
@@ -215,7 +215,7 @@ class Measurement:
         options = {"background": trainer.background.evaluated, "aligned": True}
         mean = evaluate(trainer.gaussians, test, trainer.sh_degree, config.raster, **options).mean
         run = {"seconds": loop.clock.seconds, "iterations": trainer.iteration, "gaussians": len(trainer.gaussians)}
-        return run | {name: getattr(mean, name) for name in MEASURES}, trainer
+        return run | {name: getattr(mean, name) for name in RAW_AND_ALIGNED}, trainer
 
 
 def published_centers(capture: Path) -> dict[str, np.ndarray]:

@@ -17,6 +17,9 @@ from statistics import mean
 
 from scaling_model import MEASURED, Case, table
 
+from turbogs_plugin.study.statistics import seconds_to_reach
+from turbogs_plugin.train.history import read_history
+
 BELOW = (0.0, 0.25, 0.5, 1.0)
 """Time to so many dB below the last PSNR of the run that ends with the lowest one."""
 
@@ -55,40 +58,21 @@ def iterations(out: Path) -> str:
     return table("an iteration", rows, ("measured", "predicted"))
 
 
-def history_of(run: Path) -> list[dict]:
-    return [json.loads(line) for line in (run / "history.jsonl").read_text().splitlines()]
-
-
-def seconds_to(history: list[dict], psnr: float) -> float:
-    """When a run first reached a PSNR, on a line between two evaluations; NaN: never."""
-    before = None
-    for line in history:
-        if line["psnr"] >= psnr:
-            if before is None:
-                return line["train_seconds"]
-            part = (psnr - before["psnr"]) / (line["psnr"] - before["psnr"])
-            return before["train_seconds"] + part * (line["train_seconds"] - before["train_seconds"])
-        before = line
-    return float("nan")
-
-
 def trainings(out: Path) -> str:
     """A table of the runs, and their means against those of one GPU with the same seeds."""
-    histories = {
-        run.name: history_of(run) for run in sorted((out / "runs").glob("*-*")) if (run / "history.jsonl").is_file()
-    }
-    histories = {name: history for name, history in histories.items() if history}
+    runs = sorted((out / "runs").glob("*-*"))
+    histories = {run.name: history for run in runs if (history := read_history(run / "history.jsonl"))}
     if not histories:
         return "no run has ended"
-    wanted = min(max(line["psnr"] for line in history) for history in histories.values())
+    wanted = min(max(line.psnr for line in history) for history in histories.values())
     levels = [wanted - below for below in BELOW]
-    times = {name: [seconds_to(history, level) for level in levels] for name, history in histories.items()}
+    times = {name: [seconds_to_reach(history, level) for level in levels] for name, history in histories.items()}
     rows = {}
     for name, history in histories.items():
         last = history[-1]
-        rows[name] = [*(f"{time:.2f} s" for time in times[name]), f"{last['train_seconds']:.2f} s"]
-        rows[name] += [f"{last['psnr']:.2f} dB", f"{last['ssim'] or 0:.4f}", str(last["num_gaussians"])]
-        rows[name].append(str(last["iteration"]))
+        rows[name] = [*(f"{time:.2f} s" for time in times[name]), f"{last.train_seconds:.2f} s"]
+        rows[name] += [f"{last.psnr:.2f} dB", f"{last.ssim:.4f}", str(last.num_gaussians)]
+        rows[name].append(str(last.iteration))
     head = (*(f"to {level:.2f} dB" for level in levels), "end", "PSNR", "SSIM", "Gaussians", "iterations")
     lines = [table("run", rows, head), ""]
     for kind in ("two", "batch"):
@@ -99,7 +83,7 @@ def trainings(out: Path) -> str:
             mean(times[f"one-{seed}"][place] / times[f"{kind}-{seed}"][place] for seed in seeds)
             for place in range(len(levels))
         ]
-        ours, theirs = ([histories[f"{which}-{seed}"][-1]["psnr"] for seed in seeds] for which in (kind, "one"))
+        ours, theirs = ([histories[f"{which}-{seed}"][-1].psnr for seed in seeds] for which in (kind, "one"))
         lines.append(
             f"{kind}, {len(seeds)} seeds: {', '.join(f'{factor:.2f}' for factor in sooner)} times as soon as one GPU; "
             f"PSNR {mean(ours):.2f} where one GPU has {mean(theirs):.2f} [{min(theirs):.2f}, {max(theirs):.2f}]"

@@ -16,7 +16,7 @@ DEARER = 1.1
 
 
 @dataclass(frozen=True)
-class Verdict:
+class PartVerdict:
     """What the comparisons say of a model with a part against one without it.
 
     Args:
@@ -30,7 +30,7 @@ class Verdict:
     decides: str
 
 
-def verdict(rows: Mapping[str, VariantRow], captures: Sequence[str]) -> Verdict:
+def verdict(rows: Mapping[str, VariantRow], captures: Sequence[str]) -> PartVerdict:
     """Better or worse where a paired difference in PSNR or SSIM is clear (Student's t) and at least `NOTICED`.
 
     Args:
@@ -39,7 +39,7 @@ def verdict(rows: Mapping[str, VariantRow], captures: Sequence[str]) -> Verdict:
     """
     seeded = {capture: row for capture, row in rows.items() if row.difference("psnr").clear is not None}
     if not seeded:
-        return Verdict("one seed", "one seed", "") if rows else Verdict("not measured", "not measured yet", "")
+        return PartVerdict("one seed", "one seed", "") if rows else PartVerdict("not measured", "not measured yet", "")
     gains: list[str] = []
     losses: list[str] = []
     for capture, row in seeded.items():
@@ -57,6 +57,6 @@ def verdict(rows: Mapping[str, VariantRow], captures: Sequence[str]) -> Verdict:
     dear = [f"x {ratio:.2f} {unit}" for unit, ratio in costs.items() if ratio > DEARER]
     text += f"; dearer: {', '.join(dear)}" if dear else ""
     if len(seeded) < len(captures):
-        return Verdict(word, f"{text} ({', '.join(seeded)} alone)", "")
+        return PartVerdict(word, f"{text} ({', '.join(seeded)} alone)", "")
     decides = {"worse": "ours", "mixed": ""}.get(word, "" if dear else "the paper's")
-    return Verdict(word, text, decides)
+    return PartVerdict(word, text, decides)

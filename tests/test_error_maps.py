@@ -32,6 +32,7 @@ def test_means_of_given_images():
     assert maps.view_means() == pytest.approx(expected, rel=1e-14)
     assert maps.mean() == pytest.approx(np.mean(expected), rel=1e-14)
     assert torch.equal(maps.errors[17 * 21 :], images[1].half().reshape(-1))
+    assert torch.equal(maps.view_errors(1), images[1].half().float().reshape(-1))
 
 
 def test_updates_follow_the_equations():

@@ -185,6 +185,11 @@ class ErrorMaps:
         batch_sums = deltas.new_zeros(len(samples.view_ids)).index_add_(0, views, tile_sums)
         self.view_sums.index_add_(0, torch.as_tensor(samples.view_ids, device=errors.device), batch_sums)
 
+    def view_errors(self, view_id: int) -> Tensor:
+        """[H * W] float32: error of each pixel of a view, 0 or more; a copy."""
+        self.fetch([view_id])
+        return self.errors[self._extent(view_id)].float()
+
     def ages(self, view_id: int, step: Step) -> Tensor:
         """[H * W] int32: iterations since each pixel of a view was last sampled, saturated at `AGE_MAX`."""
         self.fetch([view_id])

@@ -15,14 +15,7 @@ from helpers.simulated_time import OperatorTime, SimulatedTime
 from turbogs_plugin.bench import commands, floors
 from turbogs_plugin.bench.clocks import BLOCKS, Mark, back_to_back, measure, summary
 from turbogs_plugin.bench.commands import raster_lines, step_lines
-from turbogs_plugin.bench.models import (
-    resized,
-    ring_cameras,
-    spread_views,
-    surface_gaussians,
-    tile_samples,
-    trained_model,
-)
+from turbogs_plugin.bench.models import resized, ring_cameras, surface_gaussians, tile_samples, trained_model
 from turbogs_plugin.bench.precision import precision
 from turbogs_plugin.bench.raster import RasterBench
 from turbogs_plugin.bench.recorder import STEPS, Recorder, recorded
@@ -30,6 +23,7 @@ from turbogs_plugin.bench.step import tensor_bytes
 from turbogs_plugin.engine.rendering import rasterize
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene import load_scene
+from turbogs_plugin.scene.poses import evenly
 from turbogs_plugin.train.trainer import Trainer
 
 CPU = torch.device("cpu")
@@ -98,7 +92,7 @@ def test_samples_are_distinct_pixels_in_order():
 
 
 def test_views_are_spread():
-    assert spread_views(3, 43) == [0, 21, 42] and spread_views(5, 2) == [0, 1]
+    assert evenly(43, 3) == [0, 21, 42] and evenly(2, 5) == [0, 1]
 
 
 def test_cameras_look_at_the_model():
@@ -189,7 +183,7 @@ RASTER_PASSES = ("--views", 2, "--rates", 0.1, "--repeats", 1, "--device", "cpu"
 
 def visible(model, cameras) -> int:
     """Gaussians that one of two views of the capture sees."""
-    chosen = cameras.select(spread_views(2, len(cameras)))
+    chosen = cameras.select(evenly(len(cameras), 2))
     radii = rasterize(model, chosen, tile_samples(chosen.sizes, 0.1, CPU, seed=0)).projected().radii
     return int((radii > 0).all(dim=-1).any(dim=0).sum())
 

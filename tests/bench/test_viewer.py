@@ -16,8 +16,7 @@ def test_the_ways_stand_side_by_side():
     for run in runs:
         if run.way == "client":
             run.seconds, run.frames, run.frame_rate, run.width = run.seconds * 1.25, 50, 12.5, 640
-    rates = {"without": 50.0, "nobody looks": 50.0, "client": 40.0}
-    lines = viewer_lines({"runs": [vars(run) for run in runs], "rates": rates})
+    lines = viewer_lines({"runs": [vars(run) for run in runs]})
     assert [line.split("  ")[0].strip() for line in lines] == [*WAYS]
     assert "+0.0 % [+0.0, +0.0]" in lines[0] and "(100.00, 50.00, 25.00)" in lines[1]
     assert "-20.0 % [-20.0, -20.0]" in lines[2] and "12.5 frames a second, 640 pixels wide" in lines[2]

@@ -74,8 +74,8 @@ docs/*) exec PYTHON "$@" ;;
 *" train "*--gpus\\ 2*train.seed=1*) echo "turbogs: error: lost" >&2; exit 1 ;;
 *" train "*)
     mkdir -p "$6" && echo large >"$6/model.ply"
-    echo '{"iteration": 5, "train_seconds": 2.0, "psnr": 30.0, "ssim": 0.9, "l1": 0.1, "num_gaussians": 7}' \\
-        >"$6/history.jsonl" ;;
+    echo '{"iteration": 5, "train_seconds": 2.0, "psnr": 30.0, "ssim": 0.9, "l1": 0.1, "num_gaussians": 7,' \\
+        '"memory_bytes": 0}' >"$6/history.jsonl" ;;
 *" bench ranks "*) echo "1 GPU  M=600000 K=10 lambda=1 (none): 3.400 ms; draw 0.10"; exit 1 ;;
 *" ablate "*) mkdir -p "${21}/cells/scene"; touch "${21}/cells/scene/a.json" ;;
 esac

@@ -6,6 +6,7 @@ import re
 import shutil
 from dataclasses import replace
 from html import escape
+from importlib.resources import files
 
 import numpy as np
 import pytest
@@ -39,6 +40,12 @@ def test_the_page_is_one_file_that_asks_for_nothing(written):
     assert not re.search(r"""(src|href)=["'](?!data:)""", text) and "default-src 'none'" in text
     assert str(file.parents[1]) not in text and f"path: {model.config.scene.path.rpartition('/')[2]}\n" in text
     assert escape(made[1].text()) in text and abs(made[1].before - made[1].after) < 0.1
+
+
+@pytest.mark.parametrize("script", ["viewer.js", "page.js"])
+def test_scripts_of_the_page_do_not_end_their_own_element(script):
+    """They stand in the page as they are, where a browser looks for the element's end in texts and comments, too."""
+    assert "</script" not in (files("turbogs_plugin.export") / "web" / script).read_text(encoding="utf-8").lower()
 
 
 def test_a_model_that_is_too_large_is_pruned_and_the_page_says_so(written, scene, tmp_path, monkeypatch):

@@ -116,6 +116,8 @@ def test_a_file_that_is_wrong_is_refused_by_name(folder, changes, words):
         ({"pnsr": [1.0, 2.0]}, "unknown key .*did you mean 'psnr'"),
         ({"iteration": [0, 1.5]}, r"history.iteration\[1\]: expected a whole number"),
         ({"iteration": [0, None]}, r"history.iteration\[1\]: expected a whole number"),
+        ({"ssim": [0.5, "x"]}, r"history.ssim\[1\]: expected a number"),
+        ({"ssim": 0.5}, r"history.ssim: expected a list"),
     ],
 )
 def test_a_history_that_is_wrong_is_refused_by_its_place(folder, history, words):
@@ -123,6 +125,14 @@ def test_a_history_that_is_wrong_is_refused_by_its_place(folder, history, words)
     document["cells"][1]["history"] |= history
     folder.file.write_text(json.dumps(document))
     with pytest.raises(InputError, match=rf"results.json.cells\[1\].*{words}|{words}"):
+        folder.read_study()
+
+
+def test_a_history_without_a_column_that_every_one_has_is_refused(folder):
+    document = json.loads(folder.file.read_text())
+    del document["cells"][1]["history"]["psnr"]
+    folder.file.write_text(json.dumps(document))
+    with pytest.raises(InputError, match=r"cells\[1\].history: key 'psnr' is missing"):
         folder.read_study()
 
 

@@ -46,7 +46,6 @@ def run_step(bench: StepBench, scene: Path | None, factor: int, device: torch.de
         raise InputError("bench step needs cameras and photos: --scene SCENE, or --photos N for synthetic ones")
     if scene is None and bench.photos < FEWEST_PHOTOS:
         raise InputError(f"--photos {bench.photos}: at least {FEWEST_PHOTOS} are needed, as of any capture")
-    _require_new(out)
     if scene is None:
         capture = synthetic_scene(bench.photos, *bench.size, device)
     else:
@@ -57,7 +56,6 @@ def run_step(bench: StepBench, scene: Path | None, factor: int, device: torch.de
 
 
 def run_raster(bench: RasterBench, scene: Path | None, factor: int, device: torch.device, out: Path | None) -> None:
-    _require_new(out)
     capture = None if scene is None else load_scene(scene, factor)
     about = {"scene": None, "model": "synthetic"}
     if capture is not None:
@@ -90,7 +88,6 @@ def other_build(library: Path, job: tuple) -> dict[str, Any]:
 
 def run_ranks(bench: RanksBench, scene: Path, factor: int, device: torch.device, out: Path | None) -> None:
     """Prints a line a measurement, and writes the JSON where there is a file."""
-    _require_new(out)
     _keep(_report("ranks", bench.run(scene, factor, device), device), [f"json  {out}"], out)
 
 
@@ -102,7 +99,6 @@ def run_numerics(device: torch.device, out: Path) -> None:
 
 def run_wall(arguments: Sequence[str], repeats: int, device: torch.device, out: Path | None) -> None:
     """Times `turbogs train` with these arguments; prints the parts, and writes the JSON where there is a file."""
-    _require_new(out)
     measured = bench_wall(arguments, repeats)
     print("\n".join(wall_lines(measured)))
     if reason := missing_bytecode():
@@ -112,15 +108,18 @@ def run_wall(arguments: Sequence[str], repeats: int, device: torch.device, out: 
 
 def run_viewer(config: Config, repeats: int, device: torch.device, out: Path | None) -> None:
     """Times trainings with and without a viewer; prints them side by side, and writes the JSON if there is a file."""
-    _require_new(out)
     require_viser()
     measured = bench_viewer(config, open_scene(config), device, repeats)
     print("\n".join(viewer_lines(measured)))
     _keep(_report("viewer", measured, device), [f"json  {out}"], out)
 
 
-def _require_new(out: Path | None) -> None:
-    """Check the place of the result before anything is measured. An older result of the same name is replaced."""
+def require_result_file(out: Path | None) -> None:
+    """Check the place of the result before anything is measured. An older result of the same name is replaced.
+
+    Raises:
+        InputError: it is a folder, or no file can be made there.
+    """
     if out is None:
         return
     if out.is_dir() or not out.absolute().parent.is_dir():

@@ -141,8 +141,3 @@ def tile_samples(sizes: np.ndarray, rate: float, device: torch.device, seed: int
     chosen = torch.zeros_like(table, dtype=torch.bool).scatter_(1, keys.topk(count, dim=1).indices, True)
     tiles = torch.arange(len(table), dtype=torch.int32, device=device)
     return compact(range(len(sizes)), sizes, table, chosen & (table >= 0), tiles, np.full(len(table), count))
-
-
-def spread_views(count: int, of: int) -> list[int]:
-    """`count` of so many views, spread evenly."""
-    return np.linspace(0, of - 1, min(count, of)).round().astype(int).tolist()

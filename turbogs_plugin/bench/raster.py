@@ -16,7 +16,6 @@ from turbogs_plugin.bench.gsplat_dense import bench_gsplat
 from turbogs_plugin.bench.models import (
     TRAINING_ITERATIONS,
     ring_cameras,
-    spread_views,
     surface_gaussians,
     tile_samples,
     trained_model,
@@ -29,6 +28,7 @@ from turbogs_plugin.engine.cuda.raster import CudaRendered
 from turbogs_plugin.engine.rendered import Rendered
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene import Scene
+from turbogs_plugin.scene.poses import evenly
 from turbogs_plugin.study.cell import scene_on
 from turbogs_plugin.types import Cameras, Gaussians, GaussianStats
 
@@ -107,9 +107,9 @@ class RasterBench:
             settings += [(min(self.views), rate, False) for rate in self.rates]
             settings.append((*settings[0][:2], True))
             for views, rate, density in settings:
-                chosen = cameras.select(spread_views(views, len(cameras)))
+                chosen = cameras.select(evenly(len(cameras), views))
                 passes.append(self._measure(model, chosen, min(1.0, rate), density, device, bandwidth))
-            chosen = cameras.select(spread_views(min(self.views), len(cameras)))
+            chosen = cameras.select(evenly(len(cameras), min(self.views)))
             dense.append({"gaussians": len(model), "views": len(chosen), **bench_gsplat(model, chosen, self.repeats)})
         about = {"image_size": cameras.sizes.max(axis=0).tolist(), "copy_bandwidth_bytes_per_s": bandwidth}
         return about | {"precision": precision(device), "passes": passes, "gsplat": dense}

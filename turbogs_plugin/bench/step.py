@@ -22,6 +22,7 @@ from turbogs_plugin.distributed.ranks import ONE, Ranks
 from turbogs_plugin.engine.cuda.raster import CudaRendered
 from turbogs_plugin.model.ply import load_ply
 from turbogs_plugin.model.row_order import in_order_of_space
+from turbogs_plugin.model.torch_file import leaves
 from turbogs_plugin.scene import Scene
 from turbogs_plugin.train.trainer import Trainer
 from turbogs_plugin.types import Gaussians
@@ -245,8 +246,4 @@ def memory(trainer: Trainer, scene: Scene, held: int, device: torch.device) -> d
 
 def tensor_bytes(value: Any) -> int:
     """Bytes of the tensors in nested dicts and lists."""
-    if isinstance(value, dict):
-        value = list(value.values())
-    if isinstance(value, list | tuple):
-        return sum(map(tensor_bytes, value))
-    return value.nbytes if isinstance(value, Tensor) else 0
+    return sum(leaf.nbytes for _, leaf in leaves(value, "") if isinstance(leaf, Tensor))

@@ -110,14 +110,12 @@ def bench_viewer(config: Config, scene: Scene, device: torch.device, repeats: in
         scene: its photos in host memory.
 
     Returns:
-        ``scene``, its name; ``size`` of the client's page; ``runs``, in their order; and ``rates``: the median of each
-        way, in iterations a second.
+        ``scene``, its name; ``size`` of the client's page; and ``runs``, in their order.
     """
     decided = make_plan(config, scene, device).apply(config)
     _train("without", decided, scene, device)  # what happens once in a process, happens here
     runs = [_train(way, decided, scene, device) for _ in range(repeats) for way in WAYS]
-    rates = {way: statistics.median(run.rate for run in runs if run.way == way) for way in WAYS}
-    return {"scene": scene.name, "size": SIZE, "runs": [asdict(run) for run in runs], "rates": rates}
+    return {"scene": scene.name, "size": SIZE, "runs": [asdict(run) for run in runs]}
 
 
 def viewer_lines(measured: dict[str, Any]) -> list[str]:

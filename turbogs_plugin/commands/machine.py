@@ -87,6 +87,8 @@ def bench(
         raise InputError("--ply is for bench step with the --scene of the model: leave --training out")
     iterations = TRAINING_ITERATIONS if training is None else training
     where = resolve_device(device)
+    if what != "numerics":  # its --out is a folder
+        commands.require_result_file(out)
     of_step_or_raster = library or photos or offload
     if what == "numerics":
         if out is None or overrides or scene is not None or library:

@@ -27,7 +27,7 @@ from turbogs_plugin.model.row_order import spatial_order
 from turbogs_plugin.model.similarity import finite_rows
 from turbogs_plugin.report.pictures import ERROR_FULL_SCALE, error_picture, to_uint8
 from turbogs_plugin.report.plots import plot_against_seconds
-from turbogs_plugin.report.tables import ERRORS, errors, number
+from turbogs_plugin.report.tables import ERRORS, errors, history_rows, number
 from turbogs_plugin.scene import Scene
 from turbogs_plugin.study.document import CSS, Block, Heading, Paragraph, Table
 from turbogs_plugin.train.evaluate import compare
@@ -80,8 +80,6 @@ def write_page(model: SavedModel, shown: Gaussians, scene: Scene, path: Path) ->
         "views": "\n".join(_view(fidelity, model.gaussians, scene, view) for view in fidelity.view_ids),
         "tables": _tables(model, scene, history),
     }
-    for part in ("viewer", "page"):
-        assert "</script" not in parts[part]
 
     def filled(packed: PackedModel, change: Change) -> str:
         blocks = {
@@ -217,12 +215,8 @@ def _tables(model: SavedModel, scene: Scene, history: list[Evaluation]) -> str:
             data = base64.b64encode(file.read_bytes()).decode("ascii")
             curves.append(f'<img alt="{escape(label)} against seconds" src="data:image/svg+xml;base64,{data}">')
     header = ("iteration", "training in s", *ERRORS.values(), "Gaussians", "memory in MiB")
-    rows = [
-        (str(entry.iteration), f"{entry.train_seconds:.1f}", *errors(entry), str(entry.num_gaussians), f"{memory:.0f}")
-        for entry, memory in ((entry, entry.memory_bytes / 2**20) for entry in history)
-    ]
     plan = model.folder.read_plan()
-    blocks: list[Block] = [Table(header, rows)]
+    blocks: list[Block] = [Table(header, history_rows(history))]
     if plan is not None:
         decided = [(entry.setting, entry.text, entry.made, entry.reason) for entry in plan.decisions]
         blocks += [Heading("Plan"), Table(("setting", "value", "made", "reason"), decided, numeric=False)]

@@ -36,8 +36,10 @@ def evaluate_run(path: Path, device_name: str, given: Config | None = None) -> s
     views = place_views(views, model.gaussians.device, model.config.train.photos_place)
     lpips, reason = load_lpips(model.config.report.lpips_weights, model.gaussians.device)
     flip, no_flip = load_flip()
-    options = {"flip": flip, "background": background, "aligned": True}
-    metrics = evaluate(model.gaussians, views, model.sh_degree, model.config.raster, lpips, **options)
+    settings = model.config.raster
+    metrics = evaluate(
+        model.gaussians, views, model.sh_degree, settings, lpips, flip=flip, background=background, aligned=True
+    )
     note = f"\nLPIPS was not computed: {reason}" if reason else ""
     note += f"\nFLIP was not computed: {no_flip}" if no_flip else ""
     which = f"iteration {model.iteration}" if given is None else str(path)
@@ -76,9 +78,16 @@ def render_run(
     folders = [target / name for name in ([split, f"{split}-depth"] if with_depth else [split])]
     for folder in folders:
         folder.mkdir(parents=True, exist_ok=True)
-    options = {"sh_degree": model.sh_degree, "settings": model.config.raster, "with_depth": with_depth}
     for view_id, name in enumerate(distinct_stems(views.names)):
-        image = render_image(model.gaussians, cameras, view_id, background=background, **options)
+        image = render_image(
+            model.gaussians,
+            cameras,
+            view_id,
+            sh_degree=model.sh_degree,
+            settings=model.config.raster,
+            with_depth=with_depth,
+            background=background,
+        )
         Image.fromarray(to_uint8(image.colors)).save(folders[0] / f"{name}.png")
         if with_depth:
             depths = (image.depths.cpu().double() * model.frame.scale).float().numpy()

@@ -10,9 +10,8 @@ from turbogs_plugin.plan import Plan
 from turbogs_plugin.report.machine import hardware, software
 from turbogs_plugin.report.pictures import ERROR_FULL_SCALE, picture_writer, strip
 from turbogs_plugin.report.plot_process import PlotProcess, SecondsPlot
-from turbogs_plugin.report.tables import ERRORS, error_columns, errors, number, table, views_table
+from turbogs_plugin.report.tables import ERRORS, error_columns, errors, history_rows, number, table, views_table
 from turbogs_plugin.train.evaluate import Metrics, evaluate, load_lpips, render_view
-from turbogs_plugin.train.history import Evaluation
 from turbogs_plugin.train.run import RunSession
 
 
@@ -30,8 +29,10 @@ def write_report(run: RunSession, process: PlotProcess | None = None) -> Path:
     lpips, lpips_reason = load_lpips(config.report.lpips_weights, trainer.device)
     metrics = None if lpips else run.evaluations.metrics_at(trainer.iteration)
     if metrics is None:
-        options = {"background": background, "aligned": trainer.exposures is not None}
-        metrics = evaluate(trainer.gaussians, run.test, trainer.sh_degree, config.raster, lpips, **options)
+        aligned = trainer.exposures is not None
+        metrics = evaluate(
+            trainer.gaussians, run.test, trainer.sh_degree, config.raster, lpips, background=background, aligned=aligned
+        )
     run.clock.mark("report")
     pictures = run.folder.path / "report"
     pictures.mkdir(exist_ok=True)
@@ -89,13 +90,11 @@ def _page(run: RunSession, metrics: Metrics, lpips_reason: str, shown: int) -> s
     grey = "; masked pixels of photo and error are grey" if masked else ""
     heads = (*columns.values(), "training in s", "wall in s", "Gaussians", "FPS", "peak memory in MiB")
     seconds = f"{last.train_seconds:.1f}", number(run.wall.wall_seconds, 1, "not recorded")
-    cells = (*errors(metrics.mean, columns), *seconds, last.num_gaussians, f"{metrics.fps:.1f}", _mebibytes(last))
+    rows = history_rows(run.history)
+    *_, memory = rows[-1]
+    cells = (*errors(metrics.mean, columns), *seconds, last.num_gaussians, f"{metrics.fps:.1f}", memory)
     result = table(heads, [cells])
     lpips = f"\nLPIPS was not computed: {lpips_reason}.\n" if lpips_reason else ""
-    rows = [
-        (entry.iteration, f"{entry.train_seconds:.1f}", *errors(entry), entry.num_gaussians, _mebibytes(entry))
-        for entry in run.history
-    ]
     history = table(("iteration", "training in s", *ERRORS.values(), "Gaussians", "peak memory in MiB"), rows)
     strips = "\n\n".join(
         f"{view.name}: {view.psnr:.2f} dB\n\n![{view.name}](report/test-{view_id:03d}.jpg)"
@@ -152,10 +151,6 @@ finite: {last.skipped_updates}.
 {config.to_yaml().rstrip()}
 ```
 """
-
-
-def _mebibytes(evaluation: Evaluation) -> str:
-    return f"{evaluation.memory_bytes / 2**20:.0f}"
 
 
 def _plan(plan: Plan | None) -> str:

@@ -60,10 +60,10 @@ def strip(photo: Tensor, image: Tensor, mask: Tensor | None = None) -> np.ndarra
         mask: [H, W] bool; where it is False, photo and error are `MASKED`. None: nowhere.
     """
     white = torch.full((photo.shape[0], GAP, 3), 255, dtype=torch.uint8, device=photo.device)
-    truth, errors = _rounded(photo), error_picture(photo, image)
+    truth, errors = rounded(photo), error_picture(photo, image)
     if mask is not None:
         truth, errors = (torch.where(mask[:, :, None], part, MASKED) for part in (truth, errors))
-    return torch.cat((truth, white, _rounded(image), white, errors), dim=1).cpu().numpy()
+    return torch.cat((truth, white, rounded(image), white, errors), dim=1).cpu().numpy()
 
 
 def error_picture(photo: Tensor, image: Tensor) -> Tensor:
@@ -93,9 +93,10 @@ def colored(share: Tensor) -> Tensor:
 
 
 def to_uint8(image: Tensor) -> np.ndarray:
-    """[H, W, 3] uint8 of an image of floats 0 .. 1."""
-    return _rounded(image).cpu().numpy()
+    """[H, W, 3] uint8 of an image of floats 0 .. 1: `rounded`, on the CPU."""
+    return rounded(image).cpu().numpy()
 
 
-def _rounded(image: Tensor) -> Tensor:
+def rounded(image: Tensor) -> Tensor:
+    """[H, W, 3] uint8 of an image of floats 0 .. 1, on its device."""
     return (image.clamp(0.0, 1.0) * 255.0).round().byte()

@@ -55,6 +55,15 @@ def views_table(metrics: Metrics, with_means: bool = False) -> str:
     return table(["view", *columns.values()], rows)
 
 
+def history_rows(history: Iterable[Evaluation]) -> list[list[str]]:
+    """Error against run time: iteration, seconds of training, `ERRORS`, Gaussians, MiB of memory of each evaluation."""
+    rows = []
+    for entry in history:
+        cells = [str(entry.iteration), f"{entry.train_seconds:.1f}", *errors(entry), str(entry.num_gaussians)]
+        rows.append([*cells, f"{entry.memory_bytes / 2**20:.0f}"])
+    return rows
+
+
 def history_table(history: list[Evaluation]) -> str:
     """Error against seconds, for a terminal."""
     lines = [f"{'iteration':>9}  {'seconds':>8}  {'PSNR':>6}  {'SSIM':>6}  {'L1':>6}  {'Gaussians':>9}"]

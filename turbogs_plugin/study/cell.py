@@ -120,8 +120,9 @@ def train_cell(
     clock.mark("cell")
     trainer, mean_flip = loop.trainer, math.nan
     if flip is not None:  # off the clock
-        options = {"flip": flip, "background": trainer.background.evaluated}
-        mean_flip = evaluate(trainer.gaussians, test, trainer.sh_degree, trainer.config.raster, **options).mean.flip
+        settings, background = trainer.config.raster, trainer.background.evaluated
+        metrics = evaluate(trainer.gaussians, test, trainer.sh_degree, settings, flip=flip, background=background)
+        mean_flip = metrics.mean.flip
     return CellResult(
         scene=scene.name,
         variant=variant,

@@ -24,7 +24,7 @@ from turbogs_plugin.study.grid import variant_config
 from turbogs_plugin.study.plots import PLOTS, write_plots
 from turbogs_plugin.study.results import Study
 from turbogs_plugin.study.statistics import Difference, Spread, crossing_gap
-from turbogs_plugin.study.summary import MEASURES, SceneSummary, VariantRow, summarise
+from turbogs_plugin.study.summary import CELL_VALUES, SceneSummary, VariantRow, summarise
 
 CLOCKS = {"wall_seconds": "wall in s", "cell_seconds": "load, train, evaluate in s"}
 """Measures of the wall's clock, each with its column, where a cell has it."""
@@ -178,7 +178,7 @@ def _scene(summary: SceneSummary) -> list[Block]:
 
 def _has(summary: SceneSummary, measure: str) -> bool:
     """Whether any cell has it: wall seconds are those of runs, and older cells lack what was recorded later."""
-    return not all(math.isnan(MEASURES[measure](cell)) for row in summary.rows for cell in row.cells)
+    return not all(math.isnan(CELL_VALUES[measure](cell)) for row in summary.rows for cell in row.cells)
 
 
 def _columns(summary: SceneSummary, against: str) -> list[tuple[str, Callable[[VariantRow], str]]]:
@@ -190,7 +190,7 @@ def _columns(summary: SceneSummary, against: str) -> list[tuple[str, Callable[[V
     def mean(measure: str, absent: str = "not computed", unit: int = 1) -> Callable[[VariantRow], str]:
         return lambda row: number(row.spread(measure).mean / unit, 0, absent)
 
-    def compared(text: Callable[[VariantRow], str]) -> Callable[[VariantRow], str]:
+    def unless_baseline(text: Callable[[VariantRow], str]) -> Callable[[VariantRow], str]:
         return lambda row: "" if summary.baseline in ("", row.name) else text(row)
 
     return [
@@ -199,12 +199,12 @@ def _columns(summary: SceneSummary, against: str) -> list[tuple[str, Callable[[V
         ("seeds", lambda row: str(len(row.cells))),
         ("time in s", spread("seconds", 1)),
         *((head, spread(clock, 1, "-")) for clock, head in CLOCKS.items() if _has(summary, clock)),
-        (f"time{against}", compared(lambda row: f"x {row.ratio('seconds'):.2f}")),
+        (f"time{against}", unless_baseline(lambda row: f"x {row.ratio('seconds'):.2f}")),
         ("PSNR in dB", spread("psnr", 2)),
-        (f"PSNR{against}", compared(lambda row: difference_text(row.difference("psnr"), 2))),
+        (f"PSNR{against}", unless_baseline(lambda row: difference_text(row.difference("psnr"), 2))),
         ("worst view in dB", spread("worst_psnr", 2, "not recorded")),
         ("SSIM", spread("ssim", 4)),
-        (f"SSIM{against}", compared(lambda row: difference_text(row.difference("ssim"), 4))),
+        (f"SSIM{against}", unless_baseline(lambda row: difference_text(row.difference("ssim"), 4))),
         ("LPIPS (VGG)", spread("lpips", 4)),
         *([("FLIP", spread("flip", 4))] if _has(summary, "flip") else []),
         ("Gaussians", mean("gaussians")),
@@ -253,7 +253,7 @@ def table_csv(summaries: Sequence[SceneSummary]) -> str:
     """All numbers of the tables, unrounded; empty where not computed or not measured, ``inf`` where never reached."""
     lines: list[dict[str, Any]] = []
     later = {*CLOCKS, "flip"}
-    measures = [name for name in MEASURES if name not in later or any(_has(summary, name) for summary in summaries)]
+    measures = [name for name in CELL_VALUES if name not in later or any(_has(summary, name) for summary in summaries)]
     for summary in summaries:
         for row in summary.rows:
             line = {"scene": summary.scene, "variant": row.name, "seeds": len(row.cells), "pareto": row.on_front}

@@ -11,11 +11,11 @@ import json
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import MISSING, dataclass, field, fields, make_dataclass, replace
+from dataclasses import MISSING, dataclass, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 
-from turbogs_plugin.config.schema import build_dataclass, convert, dataclass_mapping
+from turbogs_plugin.config.schema import build_dataclass, convert, dataclass_mapping, nearest
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.report.provenance import Provenance
 from turbogs_plugin.study.difference import common_configuration, difference, flattened, nested, restored
@@ -34,13 +34,6 @@ DECIMALS |= {f"{of}_{name}": DECIMALS[name] for of in ("whole", "aligned") for n
 SHARED = ("provenance", "resolved", "warmup_iterations", "lpips_reason")
 """Fields of a cell that are written once, as ``common``, and in a cell only where its value is another one."""
 
-_COLUMN_FIELDS = [
-    (entry.name, list[int] if entry.type == "int" else list[float | None], field(default=entry.default))
-    for entry in fields(Evaluation)
-]
-Columns = make_dataclass("Columns", _COLUMN_FIELDS, kw_only=True)
-"""A history as the file has it: field of `Evaluation` -> its values. One that has its default all along is absent."""
-
 
 @dataclass
 class Document:
@@ -54,7 +47,8 @@ class Document:
         config: the common configuration, ``section.key`` -> value.
         cells: of each, what is not common: fields of `CellResult`, but for ``provenance``, which is a place in
             `provenances`; ``config``, the difference from `config`; ``asked``, the difference from the cell's own
-            configuration; and ``history``, `Columns`. What is absent has the default.
+            configuration; and ``history``: field of `Evaluation` -> its values, null for NaN. What is absent has the
+            default.
     """
 
     format: int
@@ -152,14 +146,22 @@ def _columns(history: Sequence[Evaluation]) -> dict[str, list[Any]]:
 
 
 def _evaluations(history: Mapping[str, Any], where: str) -> list[Evaluation]:
-    columns = vars(build_dataclass(Columns, history, where))
-    given = {name: columns[name] for name in history}
-    lengths = {len(values) for values in given.values()}
+    known, types = {entry.name: entry for entry in fields(Evaluation)}, get_type_hints(Evaluation)
+    columns: dict[str, list[Any]] = {}
+    for name, values in convert(history, dict[str, Any], where).items():
+        if name not in known:
+            raise InputError(f"unknown key '{where}.{name}': {nearest(name, known)}")
+        column = list[int] if types[name] is int else list[float | None]  # null: NaN
+        columns[name] = convert(values, column, f"{where}.{name}")
+    for name, entry in known.items():
+        if entry.default is MISSING and name not in columns:
+            raise InputError(f"{where}: key '{name}' is missing")
+    lengths = {len(values) for values in columns.values()}
     if len(lengths) != 1 or 0 in lengths:
         raise InputError(f"{where}: columns of one length are needed, with one evaluation at least")
     return [
-        Evaluation(**{name: math.nan if value is None else value for name, value in zip(given, row, strict=True)})
-        for row in zip(*given.values(), strict=True)
+        Evaluation(**{name: math.nan if value is None else value for name, value in zip(columns, row, strict=True)})
+        for row in zip(*columns.values(), strict=True)
     ]
 
 

@@ -14,7 +14,7 @@ TARGET_STEP = 0.5
 """dB between the default targets of the time to a PSNR. The highest one is what every seed of the baseline reached,
 rounded down."""
 
-MEASURES = {
+CELL_VALUES = {
     "seconds": attrgetter("final.train_seconds"),
     "wall_seconds": attrgetter("wall_seconds"),
     "cell_seconds": attrgetter("cell_seconds"),
@@ -56,16 +56,16 @@ class VariantRow:
         return self.spread("psnr")
 
     def spread(self, measure: str) -> Spread:
-        """The spread of one of `MEASURES` over the seeds; NaN if a seed lacks it."""
-        return Spread.of(map(MEASURES[measure], self.cells))
+        """The spread of one of `CELL_VALUES` over the seeds; NaN if a seed lacks it."""
+        return Spread.of(map(CELL_VALUES[measure], self.cells))
 
     def difference(self, measure: str) -> Difference:
         """From the baseline, over the seeds that both have."""
-        return Difference.of([own - base for own, base in self._pairs(MEASURES[measure])])
+        return Difference.of([own - base for own, base in self._pairs(CELL_VALUES[measure])])
 
     def ratio(self, measure: str) -> float:
         """The mean over the baseline's mean, both over the seeds that both have; NaN where there is none."""
-        own, base = self._means(MEASURES[measure])
+        own, base = self._means(CELL_VALUES[measure])
         return own / base
 
     def curve(self, name: str) -> Curve:

@@ -17,7 +17,7 @@ from torch import Tensor
 from torch.nn.functional import adaptive_max_pool2d, interpolate
 
 from turbogs_plugin.engine.rendering import render_image, splats_per_tile
-from turbogs_plugin.report.pictures import ERROR_FULL_SCALE, colored, depth_picture, error_picture
+from turbogs_plugin.report.pictures import ERROR_FULL_SCALE, colored, depth_picture, error_picture, rounded, to_uint8
 from turbogs_plugin.scene import PosedImages
 from turbogs_plugin.types import SH_C0, TILE_SIZE, Cameras, Gaussians
 from turbogs_plugin.viewer.eye import Eye
@@ -118,7 +118,7 @@ def fitted(size: tuple[int, int], box: tuple[int, int]) -> tuple[int, int]:
 def _render(subject: Subject, request: Request) -> np.ndarray:
     cameras = request.eye.cameras(subject.gaussians.device)
     image = render_image(subject.gaussians, cameras, sh_degree=subject.sh_degree, settings=subject.settings)
-    return _rounded(image.colors).cpu().numpy()
+    return to_uint8(image.colors)
 
 
 def _depth(subject: Subject, request: Request) -> np.ndarray:
@@ -147,7 +147,7 @@ def _changes(subject: Subject, request: Request) -> np.ndarray:
     both = Gaussians(**{name: torch.cat([value, getattr(removed, name)]) for name, value in model.items()})
     painted = replace(both, sh0=((colors - 0.5) / SH_C0)[:, None], shN=both.shN[:, :0])
     cameras = request.eye.cameras(model.device)
-    return _rounded(render_image(painted, cameras, sh_degree=0, settings=subject.settings).colors).cpu().numpy()
+    return to_uint8(render_image(painted, cameras, sh_degree=0, settings=subject.settings).colors)
 
 
 def _compare(subject: Subject, request: Request) -> np.ndarray:
@@ -159,7 +159,7 @@ def _compare(subject: Subject, request: Request) -> np.ndarray:
     size = wide if beside else tall
     photo = _photo_of(subject, views, view_id, size)
     image = _render_of(subject, views, view_id, size)
-    parts = [_rounded(photo), _rounded(image), error_picture(photo, image.clamp(0.0, 1.0))]
+    parts = [rounded(photo), rounded(image), error_picture(photo, image.clamp(0.0, 1.0))]
     gap_shape = (size[1], GAP, 3) if beside else (GAP, size[0], 3)
     gap = torch.full(gap_shape, BACKGROUND, dtype=torch.uint8, device=photo.device)
     strip = torch.cat([parts[0], gap, parts[1], gap, parts[2]], dim=1 if beside else 0)
@@ -167,19 +167,19 @@ def _compare(subject: Subject, request: Request) -> np.ndarray:
 
 
 def _photo(subject: Subject, request: Request) -> np.ndarray:
-    return _centred(_rounded(_photo_of(subject, *_fitted_view(subject, request))), request)
+    return _centred(rounded(_photo_of(subject, *_fitted_view(subject, request))), request)
 
 
 def _errors(subject: Subject, request: Request) -> np.ndarray:
     """The map's own values: a mean over the last visits of each pixel, not the error of the present model."""
-    errors = _map_of(subject, request, lambda maps, view_id, extent: maps.errors[extent].float())
-    return _map_picture(errors / (3.0 * ERROR_FULL_SCALE), request)
+    errors = subject.maps.view_errors(shown_view(subject, request))
+    return _map_picture(errors / (3.0 * ERROR_FULL_SCALE), subject, request)
 
 
 def _ages(subject: Subject, request: Request) -> np.ndarray:
     """Black: sampled just now. The brightest: as long ago as the oldest pixel of the view, on a logarithmic scale."""
-    ages = _map_of(subject, request, lambda maps, view_id, extent: maps.ages(view_id, subject.step).float())
-    return _map_picture(torch.log1p(ages) / torch.log1p(ages.max()).clamp(min=1e-6), request)
+    ages = subject.maps.ages(shown_view(subject, request), subject.step).float()
+    return _map_picture(torch.log1p(ages) / torch.log1p(ages.max()).clamp(min=1e-6), subject, request)
 
 
 def _samples(subject: Subject, request: Request) -> np.ndarray:
@@ -191,7 +191,7 @@ def _samples(subject: Subject, request: Request) -> np.ndarray:
     of_view = samples.view_of_slot() == samples.view_ids.index(shown_view(subject, request))
     sampled.view(-1)[samples.pixel_ids[of_view & samples.filled].long()] = 1.0
     mask = _resized(sampled, size, adaptive_max_pool2d)[0] > 0  # [H, W]
-    photo = _rounded(DIMMED * _photo_of(subject, views, view_id, size))
+    photo = rounded(DIMMED * _photo_of(subject, views, view_id, size))
     bright = torch.tensor(SAMPLED, dtype=torch.uint8, device=photo.device)
     return _centred(torch.where(mask.to(photo.device)[..., None], bright, photo), request)
 
@@ -242,20 +242,11 @@ def _render_of(subject: Subject, views: PosedImages, view_id: int, size: tuple[i
     return _resized(image.colors.permute(2, 0, 1), size).permute(1, 2, 0)
 
 
-def _map_of(subject: Subject, request: Request, read: Callable) -> Tensor:
-    """[H, W] float: what `read` gives of the maps of the view shown."""
-    view_id = shown_view(subject, request)
-    maps = subject.maps
-    maps.fetch([view_id])
-    width, height = maps.sizes[view_id].tolist()
-    start = int(maps.offsets[view_id])
-    return read(maps, view_id, slice(start, start + width * height)).view(height, width)
-
-
-def _map_picture(share: Tensor, request: Request) -> np.ndarray:
-    """A map [H, W], fitted into the page; what is reduced keeps its largest values."""
-    size = fitted((share.shape[1], share.shape[0]), (request.eye.width, request.eye.height))
-    return _centred(colored(_resized(share[None], size, adaptive_max_pool2d)[0]), request)
+def _map_picture(share: Tensor, subject: Subject, request: Request) -> np.ndarray:
+    """A map [H * W] of the view shown, fitted into the page; what is reduced keeps its largest values."""
+    width, height = subject.maps.sizes[shown_view(subject, request)].tolist()
+    size = fitted((width, height), (request.eye.width, request.eye.height))
+    return _centred(colored(_resized(share.view(1, height, width), size, adaptive_max_pool2d)[0]), request)
 
 
 def _resized(planes: Tensor, size: tuple[int, int], reduce: Callable | None = None) -> Tensor:
@@ -279,7 +270,3 @@ def _centred(pixels: Tensor, request: Request) -> np.ndarray:
     top, left = (whole.shape[0] - pixels.shape[0]) // 2, (whole.shape[1] - pixels.shape[1]) // 2
     whole[top : top + pixels.shape[0], left : left + pixels.shape[1]] = pixels.cpu().numpy()
     return whole
-
-
-def _rounded(image: Tensor) -> Tensor:
-    return (image.clamp(0.0, 1.0) * 255.0).round().byte()
