@@ -204,14 +204,14 @@ MEMORY = {
 def memory() -> str:
     """Bytes of the device at the peak, what they are, and what turbogs_plugin/plan/memory.py predicts."""
     record = measured("bench-step.json")
-    pixels, views = math.prod(record["image_size"]), record["training_views"]
+    photos = np.full((record["training_views"], 2), record["image_size"])
     lines = []
     for entry in record["passes"]:
         places = (f"train.{of}_place=device" for of in ("photos", "maps"))
         config = load_config(
             "turbogs", ["schedule.type=fixed", f"schedule.views={entry['views']}", "train.sh_degree=3", *places]
         )
-        demand = MemoryDemand.of(config, pixels * views, 0, pixels, views)
+        demand = MemoryDemand.of(config, train_sizes=photos, test_sizes=photos[:0])
         sizes = entry["memory_bytes"]
         predicted = (demand.fixed + demand.per_gaussian * entry["gaussians"]) / sizes["peak"]
         texts = (f"{sizes[part] / 1e9:.2f}" for part in (*MEMORY, "peak"))

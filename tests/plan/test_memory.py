@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from turbogs_plugin.config.configuration import load_config, resolve
@@ -45,7 +46,7 @@ def test_a_cap_that_nobody_would_keep_is_refused(turbogs, tmp_path, kind):
 
 def demand(*overrides: str) -> MemoryDemand:
     config = load_config("turbogs", ["schedule.max_views=10", "train.sh_degree=3", *overrides])
-    return MemoryDemand.of(config, pixels=200 * 8_294_400, test_pixels=25 * 8_294_400, largest=8_294_400, num_views=200)
+    return MemoryDemand.of(config, np.full((200, 2), (3840, 2160)), np.full((25, 2), (3840, 2160)))
 
 
 def test_memory_is_what_is_kept_and_what_is_done_with_it():
@@ -61,12 +62,11 @@ def test_memory_is_what_is_kept_and_what_is_done_with_it():
 def test_no_measured_peak_is_above_the_prediction():
     """Nor far below: the measured iterations have neither an event of density control nor an evaluation in them."""
     report = json.loads((Path(__file__).parents[2] / "docs/results/h200/bench-step.json").read_text())
-    width, height = report["image_size"]
     assert len(report["passes"]) >= 4
     for entry in report["passes"]:
         fixed = ("schedule.type=fixed", f"schedule.views={entry['views']}", "train.sh_degree=3")
-        pixels, views = width * height, report["training_views"]
-        memory = MemoryDemand.of(load_config("turbogs", fixed), pixels * views, 0, pixels, views)
+        sizes = np.full((report["training_views"], 2), report["image_size"])
+        memory = MemoryDemand.of(load_config("turbogs", fixed), train_sizes=sizes, test_sizes=sizes[:0])
         predicted = memory.fixed + memory.per_gaussian * entry["gaussians"]
         assert 1.0 <= predicted / entry["memory_bytes"]["peak"] <= 1.6
 

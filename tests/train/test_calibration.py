@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from helpers.framework_runs import tiny_capture, tiny_config
@@ -91,7 +92,8 @@ def test_memory_for_pixels_is_what_the_gaussians_leave():
     config = load_config("turbogs", ["train.sh_degree=3"])
 
     def demand(pixel_budget: float) -> MemoryDemand:
-        return MemoryDemand.of(with_pixel_budget(config, pixel_budget), 10**8, 10**7, 10**6, 100)
+        sizes = np.full((100, 2), 1000)
+        return MemoryDemand.of(with_pixel_budget(config, pixel_budget), sizes, sizes[:10])
 
     limit = 4 * 2**30
     more = demand(1.0).more_images(limit, 500_000)
@@ -102,8 +104,9 @@ def test_memory_for_pixels_is_what_the_gaussians_leave():
 
 def test_dense_samples_take_the_memory_of_whole_views():
     """Whatever lambda."""
+    sizes = np.full((100, 2), 1000)
     sparse, dense, clipped = (
-        MemoryDemand.of(load_config("turbogs", ["schedule.max_views=5", *overrides]), 10**8, 10**7, 10**6, 100).fixed
+        MemoryDemand.of(load_config("turbogs", ["schedule.max_views=5", *overrides]), sizes, sizes[:10]).fixed
         for overrides in (["schedule.pixel_budget=5"], ["pixel_sampler.type=dense"], ["schedule.pixel_budget=50"])
     )
     assert sparse == dense == clipped

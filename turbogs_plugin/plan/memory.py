@@ -15,6 +15,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import numpy as np
+
 from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.error_maps import MAP_BYTES
 from turbogs_plugin.errors import InputError
@@ -46,16 +48,18 @@ class MemoryDemand:
 
     @classmethod
     def of(
-        cls, config: Config, pixels: int, test_pixels: int, largest: int, num_views: int, photo_bytes: int = PHOTO_BYTES
+        cls, config: Config, train_sizes: np.ndarray, test_sizes: np.ndarray, photo_bytes: int = PHOTO_BYTES
     ) -> MemoryDemand:
         """The demand of a configuration whose places of maps and photos are decided.
 
         Args:
-            pixels, test_pixels: of all training photos, of all test photos.
-            largest: pixels of the largest photo.
-            num_views: V.
+            train_sizes, test_sizes: [V, 2] (width, height) of the training photos, and of the test photos, if any.
             photo_bytes: of a pixel of a photo.
         """
+        train, test = train_sizes.prod(axis=1), test_sizes.prod(axis=1)
+        pixels, test_pixels = int(train.sum()), int(test.sum())
+        largest = int(max(train.max(), test.max(initial=0)))
+        num_views = len(train)
         views = most_views(config, num_views)
         window = SETS * views * largest
         photos = window + SETS * largest if config.train.photos_place == "host" else pixels + test_pixels

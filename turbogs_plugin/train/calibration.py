@@ -24,7 +24,7 @@ from turbogs_plugin.plan.time import IterationCost, fit_to_time
 from turbogs_plugin.scene import Scene
 from turbogs_plugin.train.clock import TrainingClock
 from turbogs_plugin.train.loop import Listener, TrainingLoop
-from turbogs_plugin.train.start import memory_demand, require_gpu_memory
+from turbogs_plugin.train.start import require_gpu_memory
 from turbogs_plugin.train.trainer import Trainer
 
 CALIBRATION_SHARE = 0.04
@@ -125,7 +125,7 @@ def hold_to(limit: int, device: torch.device) -> None:
 
 def _memory_demand(config: Config, scene: Scene) -> MemoryDemand:
     sizes = (scene.train.cameras.sizes, scene.test.cameras.sizes)
-    return memory_demand(config, *sizes, photo_bytes=scene.train.photos.stored.shape[1])
+    return MemoryDemand.of(config, *sizes, photo_bytes=scene.train.photos.stored.shape[1])
 
 
 def _fit(config: Config, seconds: float, cost: IterationCost, gaussians: int) -> tuple[int, int]:

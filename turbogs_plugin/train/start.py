@@ -18,7 +18,7 @@ from turbogs_plugin.engine import compiled_kernels
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.model.initial import BACKDROP_COUNT
 from turbogs_plugin.plan.caps import cap_of, chosen_points, require_room
-from turbogs_plugin.plan.memory import PHOTO_BYTES, MemoryDemand
+from turbogs_plugin.plan.memory import MemoryDemand
 from turbogs_plugin.scene import Scene, load_scene
 from turbogs_plugin.train.folder import RunFolder
 from turbogs_plugin.train.given_model import read_given
@@ -74,16 +74,7 @@ def require_memory(config: Config, train_sizes: np.ndarray, test_sizes: np.ndarr
     for name, least in (("sh_degree", 0), ("maps_place", "host"), ("photos_place", "host")):
         if mapping["train"][name] == AUTO:
             mapping["train"][name] = least
-    memory_demand(resolve(mapping).without_plan(), train_sizes, test_sizes).gaussians(limit)
-
-
-def memory_demand(
-    config: Config, train_sizes: np.ndarray, test_sizes: np.ndarray, photo_bytes: int = PHOTO_BYTES
-) -> MemoryDemand:
-    """The memory that a run of this configuration takes. Sizes as in `require_memory`; `photo_bytes`: of a pixel."""
-    train, test = train_sizes.prod(axis=1), test_sizes.prod(axis=1)
-    largest = int(max(train.max(), test.max()))
-    return MemoryDemand.of(config, int(train.sum()), int(test.sum()), largest, len(train), photo_bytes)
+    MemoryDemand.of(resolve(mapping).without_plan(), train_sizes, test_sizes).gaussians(limit)
 
 
 @contextmanager
