@@ -264,27 +264,33 @@ def _read(scene: Path, factor: int) -> Capture:
         trouble = f"{scene} is a file" if scene.is_file() else f"{scene} does not exist"
         raise InputError(f"no such scene: {unread(scene) or f'{trouble}: give the folder of a capture, or of photos'}")
     model, files = _cameras(scene)
-    if model is not None:
-        # What instant-ngp leaves beside its transforms.json must serve as well as that.
-        whole = bool(files) and model[0].relative_to(scene).parts[:1] in [(name,) for name in INSTANT_NGP_FOLDERS]
-        try:
-            capture = read_colmap(scene, *model)
-        except InputError as error:
-            if not whole:
-                raise
-            unused = f"{model[0]} is not used: {error}"
-        else:
-            there = [(capture.photo_folder / name).is_file() for name in capture.names]
-            if not files or (all(there) if whole else any(there)):
-                return _passing_over(files, capture)
-            # LLFF's poses are of the reduced copies too, which have other names than COLMAP's photos.
-            unused = f"{model[0]} not used, its photos are not there"
-    elif (lack := incomplete_model(scene)) and lack[0] != scene:
-        unused = f"{lack[0]} is not used: it has no {' and no '.join(lack[1])} (.bin or .txt)"
-    else:
-        unused = ""
+    found = _read_model(scene, model, files)
+    if isinstance(found, Capture):
+        return found
     other = _read_other(scene, files, factor)
-    return replace(other, notes=(*other.notes, unused)) if unused else other
+    return replace(other, notes=(*other.notes, found)) if found else other
+
+
+def _read_model(scene: Path, model: tuple[Path, str] | None, files: list[str]) -> Capture | str:
+    """The capture of what `_cameras` gave, or why that reconstruction is not used; empty where there is none."""
+    if model is None:
+        lack = incomplete_model(scene)
+        if lack is None or lack[0] == scene:
+            return ""
+        return f"{lack[0]} is not used: it has no {' and no '.join(lack[1])} (.bin or .txt)"
+    # What instant-ngp leaves beside its transforms.json must serve as well as that.
+    whole = bool(files) and model[0].relative_to(scene).parts[:1] in [(name,) for name in INSTANT_NGP_FOLDERS]
+    try:
+        capture = read_colmap(scene, *model)
+    except InputError as error:
+        if not whole:
+            raise
+        return f"{model[0]} is not used: {error}"
+    there = [(capture.photo_folder / name).is_file() for name in capture.names]
+    if not files or (all(there) if whole else any(there)):
+        return _passing_over(files, capture)
+    # LLFF's poses are of the reduced copies too, which have other names than COLMAP's photos.
+    return f"{model[0]} not used, its photos are not there"
 
 
 def _read_other(scene: Path, files: list[str], factor: int) -> Capture:
