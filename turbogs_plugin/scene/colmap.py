@@ -166,8 +166,8 @@ def read_colmap(scene: Path, model: Path, suffix: str) -> Capture:
     colors = np.array([point.color for point in found], dtype=np.uint8).reshape(-1, 3) if found else None
     shown = f"{len(points):,} points"
     if not found and images and np.isfinite(viewmats).all():
-        points, where = starting_points(viewmats, intrinsics, sizes)
-        shown = f"no points, so {len(points):,} random ones{where}"
+        points, how = starting_points(viewmats, intrinsics, sizes)
+        shown = f"no points, so {len(points):,} random ones {how}"
     return Capture(
         names=names,
         photo_folder=photo_folder,
