@@ -66,7 +66,8 @@ def read_blender(scene: Path) -> Capture:
         )
     names, views = zip(*sorted({**train, **test}.items()), strict=True)
     viewmats, Ks, sizes, lens_of_view = zip(*views, strict=True)
-    points, how = starting_points(*(np.array(part) for part in list(zip(*train.values(), strict=True))[:3]))
+    train_viewmats, train_Ks, train_sizes, _ = zip(*train.values(), strict=True)
+    points, how = starting_points(np.array(train_viewmats), np.array(train_Ks), np.array(train_sizes))
     capture = Capture(
         names=names,
         photo_folder=scene,
