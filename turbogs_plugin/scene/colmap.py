@@ -214,7 +214,7 @@ def find_photo_folder(scene: Path, names: tuple[str, ...], size: tuple[int, int]
     places = (first, scene, beside / "images", beside / ORIGINALS)
     whole = ((folder, 1) for place in places for folder in _folders(place, FOLDER_DEPTH))
     reduced = ((scene / f"images_{factor}", factor) for factor in REDUCTIONS)
-    own = []
+    own: list[tuple[Path, int]] = []
     for folder, reduction in itertools.chain(whole, reduced):
         if all((folder / name).is_file() for name in names):
             originals = (scene if scene in (folder, *folder.parents) else beside) / ORIGINALS
@@ -222,7 +222,8 @@ def find_photo_folder(scene: Path, names: tuple[str, ...], size: tuple[int, int]
             if undistorted and _size_of(folder / names[0]) != size == _size_of(originals / names[0]):
                 return originals, 1
             return folder, reduction
-        own += [(folder, reduction)] if scene in (folder, *folder.parents) else []
+        if scene in (folder, *folder.parents):  # beside the scene, photos of the same names may be another one's
+            own.append((folder, reduction))
     return max(own, key=lambda place: sum((place[0] / name).is_file() for name in names))
 
 
