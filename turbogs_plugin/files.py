@@ -133,9 +133,7 @@ def write_text_atomically(path: Path, text: str) -> None:
 
 
 def _sync_folder(folder: Path) -> None:
-    """Bring the rename itself to the disk, where the platform can."""
-    if not hasattr(os, "O_DIRECTORY"):
-        return
+    """Bring the rename itself to the disk."""
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
         os.fsync(descriptor)

@@ -76,8 +76,7 @@ def loaded_rows(name: str, saved: dict[str, Tensor] | None, present: RowsType | 
 
 def finite_rows(gaussians: Gaussians) -> Tensor:
     """[N] bool: every parameter of the Gaussian is finite, and so are its variances, which a split needs."""
-    values = [value for _, value in gaussians.items()] + [(2 * gaussians.scales).exp()]
-    return torch.stack([torch.isfinite(value.reshape(len(value), -1)).all(dim=-1) for value in values]).all(dim=0)
+    return gaussians.finite_rows() & (2 * gaussians.scales).exp().isfinite().all(dim=1)
 
 
 def leave_one(pruned: Tensor, gaussians: Gaussians) -> Tensor:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from turbogs_plugin.engine.reference.projection import rotation_matrices
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.export.camera_path import (
     focus_and_up,
@@ -15,11 +16,16 @@ from turbogs_plugin.export.camera_path import (
     through_views,
 )
 from turbogs_plugin.scene import Frame
-from turbogs_plugin.scene.poses import camera_centers, look_at, quaternions, rotations
+from turbogs_plugin.scene.poses import camera_centers, look_at, quaternions
 from turbogs_plugin.types import Cameras
 
 K = np.array([[50.0, 0, 24], [0, 50.0, 20], [0, 0, 1]])
 UP = np.array([0.0, 0.0, 1.0])
+
+
+def rotations(quats: np.ndarray) -> np.ndarray:
+    """[..., 3, 3] of quaternions [..., 4]."""
+    return rotation_matrices(torch.from_numpy(quats)).numpy()
 
 
 def ring(angles, target=(1.0, 2.0, 0.5), radius=3.0) -> Cameras:

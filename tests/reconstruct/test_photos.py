@@ -9,7 +9,7 @@ from PIL import Image
 
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.reconstruct.photos import place_photos, read_photos
-from turbogs_plugin.scene.photos import load_photos, photo_sizes
+from turbogs_plugin.scene.photos import load_photos, photo_array, photo_sizes
 
 TURNS = {1: None, 3: Image.Transpose.ROTATE_180, 6: Image.Transpose.ROTATE_90, 8: Image.Transpose.ROTATE_270}
 """How an upright picture is stored for each orientation."""
@@ -51,7 +51,7 @@ def test_photos_are_upright_for_everybody(tmp_path):
     place_photos(photos, tmp_path / "images")
     paths = [tmp_path / "images" / photo.name for photo in photos]
     sizes = photo_sizes(paths)
-    loaded = load_photos(paths, sizes, sizes)
+    loaded = load_photos(paths, sizes, sizes, [None] * len(paths), photo_array(sizes), lambda: None)
     for view, path in enumerate(paths):
         assert Image.open(path).getexif().get(0x0112, 1) == 1
         difference = loaded.image(view).numpy() * 255 - np.asarray(shown[path.name], dtype=np.float32)

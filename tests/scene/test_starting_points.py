@@ -50,18 +50,21 @@ def cameras_of(centers: np.ndarray, forwards: np.ndarray) -> tuple[np.ndarray, n
 @pytest.mark.parametrize(
     ("cameras", "words"),
     [
-        (cameras_of(AROUND, AROUND), " before the 24 cameras, which do not look at one thing"),
+        (cameras_of(AROUND, AROUND), "before the 24 cameras, which do not look at one thing"),
         (
             cameras_of(LINE, np.stack([np.sin(QUARTER), 0 * QUARTER, np.cos(QUARTER)], axis=1)),
-            " before the 24 cameras, which do not look at one thing",
+            "before the 24 cameras, which do not look at one thing",
         ),
         (
             cameras_of(AROUND, np.where(np.arange(VIEWS)[:, None] % 2, 1, -1) * AROUND),
-            ": 25,000 about what the cameras look at, 25,000 before 12 of 24 cameras that do not see these",
+            "of which 25,000 are about what the cameras look at, 25,000 before 12 of 24 cameras that do not see these",
         ),
-        (cameras_of(AROUND + np.array([5e5, 100, 5e6]), AROUND), " before the 24 cameras, which do not look at one"),
+        (cameras_of(AROUND + np.array([5e5, 100, 5e6]), AROUND), "before the 24 cameras, which do not look at one"),
         # a rig of four cameras in each place
-        (cameras_of(np.repeat(LINE, 4, axis=0), np.tile(AROUND[::6], (VIEWS, 1))), ": 22,917 about what the cameras"),
+        (
+            cameras_of(np.repeat(LINE, 4, axis=0), np.tile(AROUND[::6], (VIEWS, 1))),
+            "of which 22,917 are about what the cameras",
+        ),
     ],
     ids=["outward ring", "turning line", "inward and outward", "far from the origin", "rig"],
 )
@@ -77,7 +80,7 @@ def test_every_view_has_points(cameras, words):
 def test_where_all_views_see_enough_the_points_are_those_about_it(centers):
     cameras = cameras_of(centers, -AROUND)
     points, said = starting_points(*cameras)
-    assert np.array_equal(points, random_points(cameras[0])) and said == " about what the cameras look at"
+    assert np.array_equal(points, random_points(cameras[0])) and said == "about what the cameras look at"
 
 
 def test_depths_follow_extent_and_spacing():

@@ -23,7 +23,7 @@ from turbogs_plugin.scene.photos import Photos
 from turbogs_plugin.tiles import compact, pixel_table
 from turbogs_plugin.train.background import Background
 from turbogs_plugin.train.evaluate import compare, evaluate, render_view
-from turbogs_plugin.train.run import train
+from turbogs_plugin.train.run import resume, train
 from turbogs_plugin.train.ssim import ssim
 from turbogs_plugin.train.trainer import Trainer
 from turbogs_plugin.types import PARAMETER_NAMES, PixelSamples, Step
@@ -197,9 +197,21 @@ def test_a_run_is_not_resumed_with_other_masks(capture, tmp_path):
     train(tiny_config(copy, "train.iterations=2"), tmp_path / "run")
     mask = sorted((copy / "masks").iterdir())[2]
     Image.new("L", SIZE, 255).save(mask)
-    from turbogs_plugin.train.run import resume
-
     with pytest.raises(InputError, match="other masks of train images"):
+        resume(tmp_path / "run")
+
+
+@pytest.mark.parametrize("masked_at_first", [True, False])
+def test_a_run_is_not_resumed_where_all_masks_went_or_came(capture, tmp_path, masked_at_first):
+    copy = shutil.copytree(capture, tmp_path / "capture")
+    if not masked_at_first:
+        (copy / "masks").rename(tmp_path / "masks")
+    train(tiny_config(copy, "train.iterations=2"), tmp_path / "run")
+    if masked_at_first:
+        (copy / "masks").rename(tmp_path / "masks")
+    else:
+        (tmp_path / "masks").rename(copy / "masks")
+    with pytest.raises(InputError, match=r"other masks of train images than .* began: bring that state of it back"):
         resume(tmp_path / "run")
 
 

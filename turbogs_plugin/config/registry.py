@@ -109,6 +109,9 @@ def strategy_class(kind: str, name: str) -> type:
 def build(kind: str, mapping: Mapping[str, Any]) -> Any:
     """A new strategy from ``{"type": name, **its init fields}``.
 
+    Args:
+        kind: one of `KINDS`.
+
     Raises:
         InputError: an unknown type or key, a wrong type of a value, one out of range, or a class without what its
             kind's protocol has.

@@ -8,12 +8,13 @@ gauge: else the model could darken and all exposures brighten).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from turbogs_plugin.engine.moments import check_state
 from turbogs_plugin.types import Step
 
 FIRST_RATE = 3e-3
@@ -50,16 +51,13 @@ class Exposures:
         return cls(*maps, torch.zeros(views, dtype=torch.int32, device=device))
 
     def state_dict(self) -> dict[str, Any]:
-        return {field.name: getattr(self, field.name) for field in fields(self)}
+        return dict(vars(self))
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Load a saved state. Raises `ValueError` if it is of another number of photos."""
-        for field in fields(self):
-            present = getattr(self, field.name)
-            if state[field.name].shape != present.shape:
-                found, expected = tuple(state[field.name].shape), tuple(present.shape)
-                raise ValueError(f"exposures.{field.name} has shape {found} where {expected} was expected")
-            present.copy_(state[field.name])
+        """Load a saved state. Raises `InputError` if it is of another number of photos."""
+        check_state(state, self.state_dict(), owner="exposures")
+        for name, present in self.state_dict().items():
+            present.copy_(state[name])
 
 
 def exposure_rate(step: Step) -> float:

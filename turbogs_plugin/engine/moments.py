@@ -77,13 +77,14 @@ class GaussianMoments:
             setattr(self, field.name, state[field.name].to(device=present.device, dtype=present.dtype, copy=True))
 
 
-def check_state(saved: dict[str, Any], present: dict[str, Tensor]) -> None:
-    """Raise `InputError` if a saved state lacks a tensor of the present one, or has one of another shape."""
+def check_state(saved: dict[str, Any], present: dict[str, Tensor], owner: str = "optimizer state") -> None:
+    """Raise `InputError`, which names the owner, if a saved state lacks a tensor of the present one, or has one of
+    another shape."""
     for name, value in present.items():
         if name not in saved or saved[name].shape != value.shape:
             found = f"shape {tuple(saved[name].shape)}" if name in saved else "nothing"
             raise InputError(
-                f"optimizer state {name}: found {found}, expected shape {tuple(value.shape)}; is it of another model?"
+                f"{owner} {name}: found {found}, expected shape {tuple(value.shape)}; is it of another model?"
             )
 
 

@@ -9,10 +9,11 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from turbogs_plugin.engine.reference.projection import rotation_matrices
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene.capture import LARGEST_SIDE
 from turbogs_plugin.scene.frame import Frame
-from turbogs_plugin.scene.poses import camera_centers, evenly, look_at, quaternions, rotations
+from turbogs_plugin.scene.poses import camera_centers, evenly, look_at, quaternions
 from turbogs_plugin.scene.transforms import number_of, opengl_viewmat, pinhole, read_frames
 from turbogs_plugin.types import Cameras
 
@@ -130,7 +131,8 @@ def interpolated(viewmats: np.ndarray, Ks: np.ndarray, size: tuple[int, int], fr
     share = (wanted - times[left]) / (times[left + 1] - times[left])  # [F]
     places = _catmull_rom(centers, left, share)
     made = np.tile(np.eye(4), (frames, 1, 1))
-    made[:, :3, :3] = rotations(_slerp(quats[left], quats[left + 1], share))
+    turned = _slerp(quats[left], quats[left + 1], share)
+    made[:, :3, :3] = rotation_matrices(torch.from_numpy(turned)).numpy()
     made[:, :3, 3] = -np.einsum("fij,fj->fi", made[:, :3, :3], places)
     between = Ks[left] + share[:, None, None] * (Ks[left + 1] - Ks[left])
     return _cameras(made, between, size)

@@ -24,7 +24,6 @@ from turbogs_plugin.export.fidelity import Change, Fidelity
 from turbogs_plugin.export.packing import PackedModel, pack, unpack
 from turbogs_plugin.files import write_text_atomically
 from turbogs_plugin.model.row_order import spatial_order
-from turbogs_plugin.model.similarity import finite_rows
 from turbogs_plugin.report.pictures import ERROR_FULL_SCALE, error_picture, to_uint8
 from turbogs_plugin.report.plots import plot_against_seconds
 from turbogs_plugin.report.tables import ERRORS, errors, history_rows, number
@@ -63,7 +62,7 @@ def write_page(model: SavedModel, shown: Gaussians, scene: Scene, path: Path) ->
     Raises:
         InputError: no Gaussian is finite, or the pictures alone are too large.
     """
-    finite = finite_rows(shown)
+    finite = shown.finite_rows()
     gaussians = shown.map(lambda value: value[finite])
     if not len(gaussians):
         raise InputError("there are no Gaussians to write")

@@ -84,7 +84,7 @@ def placed(gaussians: Gaussians, change: Similarity, source: str | Path) -> Gaus
         InputError: no Gaussian is finite.
     """
     rows = change.apply(gaussians).map(lambda value: value.float().contiguous())
-    if not finite_rows(rows).any():
+    if not rows.finite_rows().any():
         raise InputError(f"{source}: none of its {len(rows)} Gaussians is finite: export the model again")
     return _finite(rows, f"{source}: ")
 
@@ -115,16 +115,11 @@ def in_capture(gaussians: Gaussians, frame: Frame, target: Path) -> Gaussians:
 
 def _finite(gaussians: Gaussians, owner: str = "") -> Gaussians:
     """The Gaussians of which every number is finite, with a warning that counts the others."""
-    finite = finite_rows(gaussians)
+    finite = gaussians.finite_rows()
     if finite.all():
         return gaussians
     warnings.warn(f"{owner}{int((~finite).sum())} of {len(finite)} Gaussians are not finite and left out", stacklevel=4)
     return gaussians.map(lambda value: value[finite])
-
-
-def finite_rows(gaussians: Gaussians) -> Tensor:
-    """[N] bool: every number of the Gaussian is finite."""
-    return torch.stack([value[:, None].isfinite().flatten(1).all(dim=1) for _, value in gaussians.items()]).all(dim=0)
 
 
 def _product(left: Tensor, right: Tensor) -> Tensor:

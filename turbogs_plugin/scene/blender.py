@@ -66,7 +66,8 @@ def read_blender(scene: Path) -> Capture:
         )
     names, views = zip(*sorted({**train, **test}.items()), strict=True)
     viewmats, Ks, sizes, lens_of_view = zip(*views, strict=True)
-    points, where = starting_points(*(np.array(part) for part in list(zip(*train.values(), strict=True))[:3]))
+    train_viewmats, train_Ks, train_sizes, _ = zip(*train.values(), strict=True)
+    points, how = starting_points(np.array(train_viewmats), np.array(train_Ks), np.array(train_sizes))
     capture = Capture(
         names=names,
         photo_folder=scene,
@@ -78,7 +79,7 @@ def read_blender(scene: Path) -> Capture:
         test=np.array([name in test for name in names]) if test else None,
     ).checked(scene / TRAIN_FILE)
     files = f"{scene / TRAIN_FILE}{f' and {test_file.name}' if test_file else ''}"
-    drawn = f"{len(points):,} random ones (seed 0){where}"
+    drawn = f"{len(points):,} random ones (seed 0) {how}"
     note = f"{files} (NeRF-synthetic): {_note(scene, train, test, capture.photo_sizes, drawn)}"
     return replace(capture, notes=(note, *notes))
 

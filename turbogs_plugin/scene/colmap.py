@@ -166,8 +166,8 @@ def read_colmap(scene: Path, model: Path, suffix: str) -> Capture:
     colors = np.array([point.color for point in found], dtype=np.uint8).reshape(-1, 3) if found else None
     shown = f"{len(points):,} points"
     if not found and images and np.isfinite(viewmats).all():
-        points, where = starting_points(viewmats, intrinsics, sizes)
-        shown = f"no points, so {len(points):,} random ones{where}"
+        points, how = starting_points(viewmats, intrinsics, sizes)
+        shown = f"no points, so {len(points):,} random ones {how}"
     return Capture(
         names=names,
         photo_folder=photo_folder,
@@ -214,7 +214,7 @@ def find_photo_folder(scene: Path, names: tuple[str, ...], size: tuple[int, int]
     places = (first, scene, beside / "images", beside / ORIGINALS)
     whole = ((folder, 1) for place in places for folder in _folders(place, FOLDER_DEPTH))
     reduced = ((scene / f"images_{factor}", factor) for factor in REDUCTIONS)
-    own = []
+    own: list[tuple[Path, int]] = []
     for folder, reduction in itertools.chain(whole, reduced):
         if all((folder / name).is_file() for name in names):
             originals = (scene if scene in (folder, *folder.parents) else beside) / ORIGINALS
@@ -222,7 +222,8 @@ def find_photo_folder(scene: Path, names: tuple[str, ...], size: tuple[int, int]
             if undistorted and _size_of(folder / names[0]) != size == _size_of(originals / names[0]):
                 return originals, 1
             return folder, reduction
-        own += [(folder, reduction)] if scene in (folder, *folder.parents) else []
+        if scene in (folder, *folder.parents):  # beside the scene, photos of the same names may be another one's
+            own.append((folder, reduction))
     return max(own, key=lambda place: sum((place[0] / name).is_file() for name in names))
 
 

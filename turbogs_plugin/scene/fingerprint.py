@@ -10,6 +10,7 @@ import torch
 from turbogs_plugin.scene import Frame, PosedImages, Scene
 
 NO_MASKS = torch.zeros(0, dtype=torch.int64)
+"""In the place of the views' counts of unmasked pixels."""
 ROUNDING = 1e-5
 """Two readings of one reconstruction differ by less: in extents, and relative to each intrinsic."""
 
@@ -44,7 +45,7 @@ def capture_difference(saved: dict[str, Any], present: dict[str, Any]) -> str:
             return f"other {split} images"
         for same, what in (
             (torch.equal(before["sizes"], now["sizes"]), "sizes"),
-            (torch.equal(before.get("unmasked", NO_MASKS), now.get("unmasked", NO_MASKS)), "masks"),
+            (torch.equal(before["unmasked"], now["unmasked"]), "masks"),
             (_close(before["Ks"], now["Ks"], ROUNDING * now["Ks"].abs()), "intrinsics"),
             (_close(before["viewmats"], now["viewmats"], torch.tensor(ROUNDING)), "poses"),
         ):
@@ -59,9 +60,9 @@ def capture_difference(saved: dict[str, Any], present: dict[str, Any]) -> str:
 
 def _views_state(views: PosedImages) -> dict[str, Any]:
     cameras = views.cameras
-    masks = {} if views.masks is None else {"unmasked": torch.from_numpy(views.masks.pixel_counts)}  # [V] int64
+    unmasked = NO_MASKS if views.masks is None else torch.from_numpy(views.masks.pixel_counts)
     return {
-        **masks,
+        "unmasked": unmasked,  # [V] int64
         "names": list(views.names),
         "sizes": torch.from_numpy(cameras.sizes),  # [V, 2] int64
         "viewmats": cameras.viewmats,  # [V, 4, 4] float32

@@ -125,7 +125,7 @@ def load_scene(
     scene = Path(path)
     if not isinstance(factor, int) or factor < 1:
         raise InputError(f"factor is {factor}: it must be an integer of at least 1")
-    if not isinstance(test_every, int) or test_every < 1:
+    if not isinstance(test_every, int) or test_every < 2:
         raise InputError(f"test_every is {test_every}: it must be an integer of at least 2")
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # what is not finite is refused by its name
         capture = _read(scene, factor)
@@ -134,8 +134,6 @@ def load_scene(
         raise InputError(f"{scene} has {len(test)} images: at least {FEWEST_PHOTOS} are needed; add photos to it")
     if capture.test is not None and (~test).sum() < FEWEST_PHOTOS:
         raise InputError(f"{scene} has {(~test).sum()} training images: at least {FEWEST_PHOTOS} are needed")
-    if test.all():
-        raise InputError(f"test_every is {test_every}: every image of {scene} would be a test image; use 2 or more")
 
     with np.errstate(over="ignore", invalid="ignore"):
         frame = Frame.around(camera_centers(capture.viewmats[~test]), capture.points)
@@ -264,27 +262,33 @@ def _read(scene: Path, factor: int) -> Capture:
         trouble = f"{scene} is a file" if scene.is_file() else f"{scene} does not exist"
         raise InputError(f"no such scene: {unread(scene) or f'{trouble}: give the folder of a capture, or of photos'}")
     model, files = _cameras(scene)
-    if model is not None:
-        # What instant-ngp leaves beside its transforms.json must serve as well as that.
-        whole = bool(files) and model[0].relative_to(scene).parts[:1] in [(name,) for name in INSTANT_NGP_FOLDERS]
-        try:
-            capture = read_colmap(scene, *model)
-        except InputError as error:
-            if not whole:
-                raise
-            unused = f"{model[0]} is not used: {error}"
-        else:
-            there = [(capture.photo_folder / name).is_file() for name in capture.names]
-            if not files or (all(there) if whole else any(there)):
-                return _passing_over(files, capture)
-            # LLFF's poses are of the reduced copies too, which have other names than COLMAP's photos.
-            unused = f"{model[0]} not used, its photos are not there"
-    elif (lack := incomplete_model(scene)) and lack[0] != scene:
-        unused = f"{lack[0]} is not used: it has no {' and no '.join(lack[1])} (.bin or .txt)"
-    else:
-        unused = ""
+    found = _read_model(scene, model, files)
+    if isinstance(found, Capture):
+        return found
     other = _read_other(scene, files, factor)
-    return replace(other, notes=(*other.notes, unused)) if unused else other
+    return replace(other, notes=(*other.notes, found)) if found else other
+
+
+def _read_model(scene: Path, model: tuple[Path, str] | None, files: list[str]) -> Capture | str:
+    """The capture of what `_cameras` gave, or why that reconstruction is not used; empty where there is none."""
+    if model is None:
+        lack = incomplete_model(scene)
+        if lack is None or lack[0] == scene:
+            return ""
+        return f"{lack[0]} is not used: it has no {' and no '.join(lack[1])} (.bin or .txt)"
+    # What instant-ngp leaves beside its transforms.json must serve as well as that.
+    whole = bool(files) and model[0].relative_to(scene).parts[:1] in [(name,) for name in INSTANT_NGP_FOLDERS]
+    try:
+        capture = read_colmap(scene, *model)
+    except InputError as error:
+        if not whole:
+            raise
+        return f"{model[0]} is not used: {error}"
+    there = [(capture.photo_folder / name).is_file() for name in capture.names]
+    if not files or (all(there) if whole else any(there)):
+        return _passing_over(files, capture)
+    # LLFF's poses are of the reduced copies too, which have other names than COLMAP's photos.
+    return f"{model[0]} not used, its photos are not there"
 
 
 def _read_other(scene: Path, files: list[str], factor: int) -> Capture:

@@ -195,9 +195,9 @@ def load_photos(
     paths: Sequence[Path],
     sizes: np.ndarray,
     targets: np.ndarray,
-    lenses: Sequence[Lens | None] = (),
-    colors: Tensor | None = None,
-    loaded: Callable[[], object] = lambda: None,
+    lenses: Sequence[Lens | None],
+    colors: Tensor,
+    loaded: Callable[[], object],
 ) -> Photos:
     """Decode photos in parallel, undistorted, then reduced to their target sizes by area averaging.
 
@@ -207,18 +207,16 @@ def load_photos(
         paths: V files.
         sizes: [V, 2] int64 (width, height) that the files must have.
         targets: [V, 2] int64 (width, height) to give them.
-        lenses: one a photo, None for those of pinhole cameras; or empty, where all are.
-        colors: where to put them, as `photo_array` gives it; None: it is asked for it. With 3 channels, photos that
-            are transparent lose their alpha and keep their colours as stored.
+        lenses: one a photo, None for those of pinhole cameras.
+        colors: where to put them, as `photo_array` gives it. With 3 channels, photos that are transparent lose their
+            alpha and keep their colours as stored.
         loaded: called after each photo, in their order.
 
     Raises:
-        InputError: a photo that cannot be decoded, or is of another size (the first one in order is named); more
-            photos than there is room for.
+        InputError: a photo that cannot be decoded, or is of another size (the first one in order is named); no room
+            for a copy of photos that are all opaque.
     """
     offsets = pixel_offsets(targets)
-    if colors is None:
-        colors = photo_array(targets, channels_of(paths))
     channels = colors.shape[1]
     pixels = colors.numpy()
 
@@ -226,7 +224,7 @@ def load_photos(
         """Whether the photo is opaque."""
         target = tuple(targets[view].tolist())
         photo = _decode(paths[view], tuple(sizes[view].tolist()), MODES[channels])
-        lens = lenses[view] if lenses else None
+        lens = lenses[view]
         if lens is not None:
             size = lens.size_of(photo.size)
             photo = Image.frombytes(photo.mode, size, lens.undistort(np.asarray(photo), size).tobytes())

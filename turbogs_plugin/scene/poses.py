@@ -78,14 +78,3 @@ def quaternions(matrices: np.ndarray) -> np.ndarray:
         row = np.array(table[np.argmax(squares)])
         found.append(row / np.linalg.norm(row))
     return np.stack(found)
-
-
-def rotations(quats: np.ndarray) -> np.ndarray:
-    """[..., 3, 3] of unit quaternions [..., 4] wxyz."""
-    w, x, y, z = np.moveaxis(quats, -1, 0)
-    entries = [
-        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-    ]  # fmt: skip
-    return np.stack(entries, axis=-1).reshape(*quats.shape[:-1], 3, 3)

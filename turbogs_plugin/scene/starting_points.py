@@ -47,7 +47,7 @@ def random_points(viewmats: np.ndarray) -> np.ndarray:
 
 
 def starting_points(viewmats: np.ndarray, Ks: np.ndarray, sizes: np.ndarray) -> tuple[np.ndarray, str]:
-    """Points for a capture without any, the same for the same cameras, and where they are, to follow "random ones".
+    """Points for a capture without any, the same for the same cameras, and how they were drawn.
 
     They are those of `random_points`, where all views see enough of these. In proportion to the views that do not, part
     of them is drawn within these views instead: between half of the cameras' extent, or less where cameras stand
@@ -59,24 +59,24 @@ def starting_points(viewmats: np.ndarray, Ks: np.ndarray, sizes: np.ndarray) -> 
         sizes: [V, 2] (width, height).
 
     Returns:
-        [`NUM_RANDOM_POINTS`, 3] float64, and words.
+        [`NUM_RANDOM_POINTS`, 3] float64, and words that go on from "random points".
     """
     points = random_points(viewmats)
-    about = "about what the cameras look at"
+    how = "about what the cameras look at"
     lacking = shares_with_points(points[:PROBES], viewmats, Ks, sizes) < ENOUGH_CELLS
     if not lacking.any():
-        return points, f" {about}"
+        return points, how
     count = round(len(points) * lacking.mean())
     bounds = np.tile(_depth_bounds(camera_centers(viewmats)), (int(lacking.sum()), 1))
     within = points_in_views(viewmats[lacking], Ks[lacking], sizes[lacking], bounds, count)
     if not np.isfinite(within).all():  # by poses or intrinsics that the capture's check names
-        return points, f" {about}"
+        return points, how
     rest = len(points) - count
     cameras = f"{len(bounds):,} of {len(lacking):,} cameras"
     if rest == 0:
-        return within, f" before the {len(bounds):,} cameras, which do not look at one thing"
-    words = f": {rest:,} {about}, {count:,} before {cameras} that do not see these"
-    return np.concatenate([points[:rest], within]), words
+        return within, f"before the {len(bounds):,} cameras, which do not look at one thing"
+    how = f"of which {rest:,} are {how}, {count:,} before {cameras} that do not see these"
+    return np.concatenate([points[:rest], within]), how
 
 
 def shares_with_points(points: np.ndarray, viewmats: np.ndarray, Ks: np.ndarray, sizes: np.ndarray) -> np.ndarray:

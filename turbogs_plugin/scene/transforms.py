@@ -114,8 +114,8 @@ def read_transforms(scene: Path) -> Capture:
         raise InputError(f"{source}: none of its {len(split.test)} test photos is in {scene}: bring them back")
     if not len(points):
         train = slice(None) if test is None or test.all() else ~test
-        points, where = starting_points(viewmats[train], intrinsics[train], sizes[train])
-        colors, origin = None, f"{origin}, so {len(points):,} random ones{where}"
+        points, how = starting_points(viewmats[train], intrinsics[train], sizes[train])
+        colors, origin = None, f"{origin}, so {len(points):,} random ones {how}"
     parts = "" if split is None else f", {split.text(names)}"
     notes = [f"{source} (nerfstudio, instant-ngp): {len(names)} photos{parts}, {origin}"]
     if others:

@@ -140,7 +140,7 @@ def _other_ranks(file: Path) -> list[Path]:
 def _fitted(gaussians: Gaussians, into: Similarity, scene: Scene, device: torch.device, file: Path) -> Gaussians:
     """A file's model in the scene's frame, from the capture's own coordinates or from gsplat's world."""
     as_given = placed(gaussians, into, file)
-    trial = _Trial(scene, device)
+    trial = _TrialViews(scene, device)
     found, needed = trial.psnr(as_given), trial.flat_psnr
     if found >= needed:
         return as_given
@@ -178,7 +178,7 @@ def _own_viewmats(scene: Scene) -> np.ndarray:
     return viewmats
 
 
-class _Trial:
+class _TrialViews:
     """A few reduced training views.
 
     Attributes:
@@ -202,7 +202,7 @@ class _Trial:
         kept = (_kept(views.mask(view), *size) for view, size in zip(chosen, small.tolist(), strict=True))
         self._masks = [mask.to(device) for mask in kept]
         self.photos = [
-            _reduced(views.photos.image(view, self._background).to(device), *size)
+            _area_means(views.photos.image(view, self._background).to(device), *size)
             for view, size in zip(chosen, small.tolist(), strict=True)
         ]
         flat = (photo[mask].mean(dim=0) for photo, mask in zip(self.photos, self._masks, strict=True))
@@ -228,11 +228,11 @@ def _kept(mask: Tensor | None, width: int, height: int) -> Tensor:
     """[height, width] bool, the reduced pixels of which nothing is masked; all where nothing is, or none is left."""
     kept = torch.ones(height, width, dtype=torch.bool)
     if mask is not None:
-        kept = _reduced(mask[:, :, None].float(), width, height)[:, :, 0] > 0.999
+        kept = _area_means(mask[:, :, None].float(), width, height)[:, :, 0] > 0.999
     return kept if kept.any() else torch.ones_like(kept)
 
 
-def _reduced(photo: Tensor, width: int, height: int) -> Tensor:
+def _area_means(photo: Tensor, width: int, height: int) -> Tensor:
     """[height, width, 3]: the means over areas."""
     channels = photo.permute(2, 0, 1)[None]
     return torch.nn.functional.interpolate(channels, (height, width), mode="area")[0].permute(1, 2, 0)

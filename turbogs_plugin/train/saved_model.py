@@ -63,33 +63,23 @@ def load_model(path: Path, device: torch.device) -> SavedModel:
         raise InputError(f"checkpoint '{checkpoint}' is not one of a run: {error}") from None
 
 
-def load_given_model(path: Path, config: Config, device: torch.device) -> tuple[SavedModel, Scene]:
-    """A model from a file, with the capture that it belongs to.
-
-    Args:
-        path: as `require_model` takes it.
-        config: says which capture, and how to render.
-
-    Raises:
-        InputError: no such model, or no usable capture.
-    """
-    require_model(path)
-    scene = open_scene(config)
-    gaussians = load_given(path, scene, device).map(lambda value: value.to(device))
-    return SavedModel(None, config, gaussians, scene.frame, None), scene
-
-
 def load_with_capture(
     path: Path, given: Config | None, device: torch.device, needed: bool = True
 ) -> tuple[SavedModel, Scene | None, str]:
     """A run's newest model or a given one, its capture, and why that is None: it is not there, and not `needed`.
 
     Args:
-        path: folder of the run, or the file of a model.
-        given: as `config` of `load_given_model`; None: `path` is a run.
+        path: folder of the run, or a model as `require_model` takes it.
+        given: says which capture a file's model belongs to, and how to render; None: `path` is a run.
+
+    Raises:
+        InputError: no such model, or no usable capture where it is needed.
     """
     if given is not None:
-        return *load_given_model(path, given, device), ""
+        require_model(path)  # before its capture is read
+        scene = open_scene(given)
+        gaussians = load_given(path, scene, device).map(lambda value: value.to(device))
+        return SavedModel(None, given, gaussians, scene.frame, None), scene, ""
     model = load_model(path, device)
     try:
         return model, open_scene(model.config, model.folder), ""

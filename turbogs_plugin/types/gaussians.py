@@ -50,6 +50,11 @@ class Gaussians(ParameterTensors):
         """A model with `function` applied to every tensor."""
         return Gaussians(**{name: function(value) for name, value in self.items()})
 
+    def finite_rows(self) -> Tensor:
+        """[N] bool: every number of the Gaussian is finite."""
+        rows = (value[:, None].flatten(1) for _, value in self.items())  # [N, D] each, opacities too
+        return torch.stack([row.isfinite().all(dim=1) for row in rows]).all(dim=0)
+
     @property
     def device(self) -> torch.device:
         return self.means.device

@@ -9,7 +9,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from turbogs_plugin.scene.poses import quaternions, rotations
+from turbogs_plugin.engine.reference.projection import rotation_matrices
+from turbogs_plugin.scene.poses import quaternions
 from turbogs_plugin.types import Cameras
 
 SMALLEST_SIDE, LARGEST_SIDE = 16, 1920
@@ -67,6 +68,11 @@ class Eye:
         place = -rotation.T @ translation
         return cls(tuple(place.tolist()), tuple(quaternions(rotation.T[None])[0].tolist()), fov, width, height)
 
+    @property
+    def rotation(self) -> np.ndarray:
+        """[3, 3] float64, from the camera to the world."""
+        return rotation_matrices(torch.tensor(self.wxyz, dtype=torch.float64)).numpy()
+
     def with_at_most(self, pixels: float) -> Eye:
         """The same view in an image of at most so many pixels."""
         scale = min(1.0, math.sqrt(pixels / (self.width * self.height)))
@@ -75,10 +81,10 @@ class Eye:
 
     def cameras(self, device: torch.device) -> Cameras:
         """One camera, float32 on a device."""
-        rotation = rotations(np.array(self.wxyz))
+        to_camera = self.rotation.T
         viewmat = np.eye(4)
-        viewmat[:3, :3] = rotation.T
-        viewmat[:3, 3] = -rotation.T @ np.array(self.position)
+        viewmat[:3, :3] = to_camera
+        viewmat[:3, 3] = -to_camera @ np.array(self.position)
         focal = self.height / (2.0 * math.tan(self.fov / 2.0))
         K = np.array([[focal, 0.0, self.width / 2.0], [0.0, focal, self.height / 2.0], [0.0, 0.0, 1.0]])
         tensors = (torch.from_numpy(array[None]).float().to(device) for array in (viewmat, K))

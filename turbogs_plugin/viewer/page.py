@@ -21,7 +21,7 @@ from urllib.parse import urlsplit
 import numpy as np
 
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.scene.poses import evenly, rotations
+from turbogs_plugin.scene.poses import evenly
 from turbogs_plugin.types import Cameras
 from turbogs_plugin.viewer.controls import Controls
 from turbogs_plugin.viewer.eye import Eye
@@ -243,7 +243,7 @@ class Page:
 
     def _start_at(self, eye: Eye, distance: float = 1.0) -> None:
         """Where new clients stand, and those who are there already."""
-        _, down, forward = rotations(np.array(eye.wxyz)).T
+        _, down, forward = eye.rotation.T
         place = np.array(eye.position)
         start = self.server.initial_camera
         start.position, start.look_at, start.up, start.fov = place, place + distance * forward, -down, eye.fov
