@@ -36,7 +36,9 @@ class RandomViewSampler:
 
     def select(self, count: int, view_errors: np.ndarray, step: Step) -> tuple[int, ...]:
         """`count` distinct views, or all V where `count` is more."""
-        return self._take(np.arange(self._fill(count, step)))
+        count = self._fill(count, step)
+        taken, self.stack = self.stack[:count], self.stack[count:]
+        return tuple(taken.tolist())
 
     def _fill(self, count: int, step: Step) -> int:
         """Fill the stack again if it holds fewer than `count` views. Returns `count`, at most V."""
@@ -46,12 +48,6 @@ class RandomViewSampler:
         if len(self.stack) < count:
             self.stack = np.argsort(_uniforms(PURPOSE_STACK, self.num_views, step), kind="stable")
         return count
-
-    def _take(self, positions: np.ndarray) -> tuple[int, ...]:
-        """Remove and return the views at these positions of the stack, in the positions' order."""
-        taken = tuple(self.stack[positions].tolist())
-        self.stack = np.delete(self.stack, positions)
-        return taken
 
     def state_dict(self) -> dict[str, Any]:
         return {"stack": torch.from_numpy(self.stack.copy())}
@@ -111,4 +107,6 @@ class GeometryAwareViewSampler(RandomViewSampler):
         gumbel = -np.log(-np.log(_uniforms(PURPOSE_VIEWS, self.num_views, step)))
         scores = (self.log_weights(int(self.stack[anchor])) + gumbel)[self.stack]
         scores[anchor] = np.inf
-        return self._take(np.argsort(-scores, kind="stable")[:count])
+        best = np.argsort(-scores, kind="stable")[:count]
+        taken, self.stack = self.stack[best], np.delete(self.stack, best)
+        return tuple(taken.tolist())
