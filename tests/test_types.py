@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from helpers.rendering_scenes import make_cameras
 
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.tiles import dense_pixels
@@ -110,3 +111,20 @@ def test_pixels_that_do_not_fit_are_refused(arguments, words):
 def test_a_mask_that_does_not_fit_is_refused(mask, words):
     with pytest.raises(InputError, match=words):
         PixelSamples.from_mask(mask)
+
+
+def test_selected_cameras_have_the_matrices_of_now():
+    """They are sliced once, but follow what becomes of the cameras, and gradients."""
+    cameras = make_cameras([(40, 30), (20, 20), (30, 50)])
+    for change in range(3):
+        if change == 1:
+            cameras.viewmats = cameras.viewmats + 1.0
+        elif change == 2:
+            cameras.Ks.mul_(2.0)
+        chosen = cameras.select([2, 0])
+        assert torch.equal(chosen.viewmats, cameras.viewmats[[2, 0]]) and torch.equal(chosen.Ks, cameras.Ks[[2, 0]])
+        assert chosen.sizes.tolist() == [[30, 50], [40, 30]]
+    cameras.viewmats.requires_grad_()
+    for _ in range(2):
+        cameras.select([1]).viewmats.sum().backward()
+    assert torch.equal(cameras.viewmats.grad.sum(dim=(1, 2)), torch.tensor([0.0, 32.0, 0.0], dtype=torch.float64))

@@ -1,13 +1,17 @@
-"""How much room a workspace asks for, and what it does with counts of intersections, without a GPU."""
+"""How much room a workspace asks for, what it keeps for passes of the same sizes, and what it does with counts of
+intersections, without a GPU."""
 
 import math
 
 import pytest
 import torch
+from helpers.rendering_scenes import make_cameras, make_gaussians
 
+from turbogs_plugin.engine.cuda import library, raster
 from turbogs_plugin.engine.cuda.workspace import MAX_CAPACITY, Workspace, _Pending
 from turbogs_plugin.engine.layout import INTERSECTIONS_MAX
 from turbogs_plugin.errors import InputError
+from turbogs_plugin.types import PixelSamples
 
 
 class Arrived:
@@ -65,3 +69,57 @@ def test_a_pass_that_can_never_fit_is_refused(workspace, wait):
         workspace.take_lost(wait)
     assert workspace.overflowed  # what follows is refused too, until it is lowered
     assert workspace.take_lost() == 1 and workspace.capacity(1000, tiles=1) is not None
+
+
+def test_what_is_kept_is_made_anew_for_other_sizes_alone(workspace):
+    made = []
+    for sizes in ((1, 2), (1, 2), (1, 3), (1, 2)):
+        workspace.kept("buffers", sizes, lambda sizes=sizes: made.append(sizes))
+        workspace.kept("others", (5,), lambda: made.append("other"))
+    assert made == [(1, 2), "other", (1, 3), (1, 2)]
+
+
+class Passes:
+    """The shapes of the tensors of every launch of passes that do nothing, by operator."""
+
+    def __init__(self, monkeypatch) -> None:
+        self.shapes: list[dict[str, list]] = []
+        monkeypatch.setattr(library, "require", lambda: None)
+        monkeypatch.setattr(library, "launch", self.launch)
+        monkeypatch.setattr(raster, "_check", lambda *arguments: None)  # it wants a GPU
+        monkeypatch.setattr(torch.cuda, "Event", type("Event", (Arrived,), {"record": lambda event, stream: None}))
+        monkeypatch.setattr(torch.cuda, "current_stream", lambda device: None)
+
+    def launch(self, launch) -> None:
+        tensors, *_ = launch.lists()
+        names = [path.rpartition(".")[2] for path in launch.paths[0]]
+        shapes = [None if tensor is None else tuple(tensor.shape) for tensor in tensors]
+        self.shapes[-1][launch.operator] = [pair for pair in zip(names, shapes, strict=True) if pair[0] != "records"]
+
+    def draw(self, sizes: list, count: int, tiles: int, slots: int, workspace: Workspace | None) -> dict[str, list]:
+        """The launches of a pass and of its backward pass, with this many slots in this many tiles."""
+        cameras = make_cameras(sizes, dtype=torch.float32)
+        starts = torch.arange(tiles + 1, dtype=torch.int32) * (slots // tiles)
+        pixels, ids = torch.zeros(slots, dtype=torch.int32), torch.arange(tiles, dtype=torch.int32)
+        samples = PixelSamples(tuple(range(len(sizes))), cameras.sizes, pixels, ids, starts, has_empty_slots=False)
+        gaussians = make_gaussians(count, dtype=torch.float32)
+        self.shapes.append({})
+        rendered = raster.rasterize_cuda(gaussians, cameras, samples, workspace=workspace)
+        rendered.backward(torch.zeros_like(rendered.colors))
+        return self.shapes[-1]
+
+
+def test_passes_that_share_memory_have_buffers_of_their_own_sizes(workspace, monkeypatch):
+    """Views, Gaussians, tiles, tiles with samples and slots change one by one, back and forth."""
+    passes, workspace.status = Passes(monkeypatch), torch.zeros(2, dtype=torch.int32)
+    six_tiles = [(40, 30)]
+    first = (six_tiles, 30, 6, 24)
+    others = [([(40, 16), (40, 16)], 30, 6, 24), (six_tiles, 31, 6, 24), ([(64, 32)], 30, 6, 24)]
+    others += [(six_tiles, 30, 4, 24), (six_tiles, 30, 6, 30)]
+    for case in [case for other in others for case in (first, other)]:
+        expected = passes.draw(*case, workspace=None)
+        assert len(expected) == 5 and passes.draw(*case, workspace=workspace) == expected
+    passes.draw(*first, workspace=workspace)
+    workspace.learn(1_000_000, tiles=6)
+    room = (workspace.capacity(30, tiles=6),)
+    assert ("intersection_ids", room) in passes.draw(*first, workspace=workspace)["raster_sort_intersections"]

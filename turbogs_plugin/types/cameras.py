@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -29,6 +29,7 @@ class Cameras:
     viewmats: Tensor
     Ks: Tensor
     sizes: np.ndarray
+    _sliced: tuple | None = field(init=False, repr=False, compare=False, default=None)
 
     def __len__(self) -> int:
         return self.viewmats.shape[0]
@@ -36,8 +37,17 @@ class Cameras:
     def select(self, view_ids: Sequence[int]) -> Cameras:
         """The cameras of these views, in this order."""
         # Stacked, not indexed: so no index has to be copied to the device.
-        viewmats, Ks = (torch.stack([of_all[view] for view in view_ids]) for of_all in (self.viewmats, self.Ks))
+        viewmats, Ks = (torch.stack([matrices[view] for view in view_ids]) for matrices in self._matrices())
         return Cameras(viewmats, Ks, self.sizes[np.asarray(view_ids, dtype=np.int64)])
+
+    def _matrices(self) -> tuple[Sequence[Tensor], Sequence[Tensor]]:
+        """The matrices of each camera, views of `viewmats` and `Ks`. They are kept, as slicing them in each iteration
+        takes the host longer than stacking them. Where gradients flow they belong to one graph, and are not kept."""
+        if self.viewmats.requires_grad or self.Ks.requires_grad:
+            return self.viewmats, self.Ks
+        if self._sliced is None or self._sliced[0] is not self.viewmats or self._sliced[1] is not self.Ks:
+            self._sliced = self.viewmats, self.Ks, self.viewmats.unbind(), self.Ks.unbind()
+        return self._sliced[2:]
 
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Cameras:
         return Cameras(self.viewmats.to(device, dtype), self.Ks.to(device, dtype), self.sizes)

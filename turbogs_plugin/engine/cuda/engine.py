@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -56,7 +55,7 @@ class CudaEngine(Engine):
         # The kernel gathers the photos' colours itself if the photos and the maps of each view begin at the same pixel.
         # If only one of the two is in host memory, they do not.
         photos, starts = truth.photos.colors, update.maps.offsets[list(truth.samples.view_ids)]
-        aligned = len(photos) == len(update.maps.errors) and np.array_equal(truth.starts, starts)
+        aligned = len(photos) == len(update.maps.errors) and truth.starts.tolist() == starts.tolist()
         targets = photos if aligned else truth.colors()
         return training.sparse_loss(terms, colors, targets, truth.samples, update, self.overflow, truth.background)
 

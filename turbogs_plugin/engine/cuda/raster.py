@@ -8,16 +8,16 @@ tiles and splats; with one it never waits (see `workspace.py`).
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from turbogs_plugin.engine import layout
 from turbogs_plugin.engine.cuda import launches, library
-from turbogs_plugin.engine.cuda.workspace import Workspace, require_possible, round_capacity
+from turbogs_plugin.engine.cuda.workspace import Kept, Workspace, require_possible, round_capacity
 from turbogs_plugin.engine.layout import InstanceRow, ParameterRow, ScreenRecord
 from turbogs_plugin.engine.moments import COLUMNS
 from turbogs_plugin.engine.rendered import (
@@ -49,7 +49,7 @@ def _check(gaussians: Gaussians, cameras: Cameras, samples: PixelSamples) -> Non
             if tensor.dtype != dtype or tensor.device != device:
                 raise InputError(f"{name} must be {dtype} on {device}, got {tensor.dtype} on {tensor.device}")
     require_views(len(cameras))
-    if not np.array_equal(cameras.sizes, samples.sizes):
+    if cameras.sizes.tolist() != samples.sizes.tolist():
         raise InputError("cameras and samples differ in their image sizes: select the cameras of samples.view_ids")
 
 
@@ -169,18 +169,19 @@ class CudaRendered(Rendered):
                 wanted = f"float32 {list(like.shape)} on {like.device}"
                 raise InputError(f"{name} must be {wanted}, got {value.dtype} {list(value.shape)} on {value.device}")
         ready = {name: None if value is None else value.contiguous() for name, value in upstream.items()}
-        shape = (*self._radii.shape[:2], ScreenRecord.SIZE)
-        records = _Buffers(self._workspace, self.colors.device).floats("records", *shape)
+        instances = len(self._forward.instances)
+        records = _Buffers(self._workspace, self.colors.device).floats("records", instances, ScreenRecord.SIZE)
         backward = launches.RasterBackward(
             self._forward,
             **ready,
-            records=records.flatten(0, 1),
+            records=records,
             with_density_sums=with_statistics,
             cleared=self._cleared,
         )
         library.launch(backward)
         self._cleared = False
         overflow = None if self._workspace is None else self._workspace.overflow
+        records = records.view(*self._radii.shape[:2], ScreenRecord.SIZE)
         return CudaScreenGradients(self._scene, self._samples, records, self._radii, with_statistics, overflow)
 
 
@@ -225,6 +226,68 @@ class _Buffers:
     def floats(self, name: str, *shape: int) -> Tensor:
         return self.integers(name, *shape, dtype=torch.float32)
 
+    def kept(self, name: str, sizes: tuple[int, ...], make: Callable[[], Kept]) -> Kept:
+        return make() if self.workspace is None else self.workspace.kept(name, sizes, make)
+
+
+@dataclass(frozen=True)
+class _Front:
+    """Buffers of the projection and of the count of intersections."""
+
+    splats: launches.Splats
+    tiles: launches.TileLists
+    block_sums: Tensor
+    records: Tensor | None
+
+    @classmethod
+    def of(cls, buffers: _Buffers, views: int, count: int, num_active: int, num_tiles: int) -> _Front:
+        workspace = buffers.workspace
+        splats = launches.Splats(
+            cameras=buffers.floats("cameras", views, layout.CameraRow.SIZE),
+            instances=buffers.floats("instances", views * count, InstanceRow.SIZE),
+            radii=buffers.integers("radii", views, count, 2),
+            active_prefix=None if num_active == num_tiles else buffers.integers("active_prefix", num_tiles + 1),
+        )
+        tiles = launches.TileLists(
+            tile_cursors=buffers.integers("tile_cursors", num_active + 1),
+            tile_starts=buffers.integers("tile_starts", num_active + 1),
+            status=torch.zeros(2, dtype=torch.int32, device=buffers.device) if workspace is None else workspace.status,
+            counters=buffers.integers("counters", 2),
+        )
+        blocks = max(1, math.ceil(num_active / layout.SCAN_TILES))
+        block_sums = buffers.integers("block_sums", blocks, 2, dtype=torch.int64)
+        # With a workspace a backward pass is likely to follow.
+        records = None if workspace is None else buffers.floats("records", views * count, ScreenRecord.SIZE)
+        return cls(splats, tiles, block_sums, records)
+
+
+@dataclass(frozen=True)
+class _Back:
+    """Buffers of the intersections and of the forward pass."""
+
+    intersection_keys: Tensor
+    intersection_ids: Tensor
+    runs: Tensor
+    transmittances: Tensor
+    last_intersections: Tensor
+    masks: Tensor
+    bucket_counts: Tensor
+    chunks: int
+
+    @classmethod
+    def of(cls, buffers: _Buffers, capacity: int, slots: int, num_active: int) -> _Back:
+        chunks = warps_per_tile(slots, num_active)
+        return cls(
+            intersection_keys=buffers.integers("intersection_keys", capacity, dtype=torch.int64),
+            intersection_ids=buffers.integers("intersection_ids", capacity),
+            runs=buffers.integers("runs", capacity // (layout.SORT_RUN // 2), 2),
+            transmittances=buffers.floats("transmittances", slots),
+            last_intersections=buffers.integers("last_intersections", slots),
+            masks=buffers.integers("masks", (capacity // layout.BUCKET + num_active + 1) * chunks),
+            bucket_counts=buffers.integers("bucket_counts", num_active * chunks),
+            chunks=chunks,
+        )
+
 
 @torch.no_grad()
 def rasterize_cuda(
@@ -255,27 +318,14 @@ def rasterize_cuda(
     everywhere = num_active == num_tiles
     tile_ids = None if everywhere else samples.tile_ids.contiguous()
     scene = _scene(gaussians, cameras, degree, settings.eps2d)
-    splats = launches.Splats(
-        cameras=buffers.floats("cameras", views, layout.CameraRow.SIZE),
-        instances=buffers.floats("instances", views * count, InstanceRow.SIZE),
-        radii=buffers.integers("radii", views, count, 2),
-        active_prefix=None if everywhere else buffers.integers("active_prefix", num_tiles + 1),
-    )
-    tiles = launches.TileLists(
-        tile_cursors=buffers.integers("tile_cursors", num_active + 1),
-        tile_starts=buffers.integers("tile_starts", num_active + 1),
-        status=torch.zeros(2, dtype=torch.int32, device=device) if workspace is None else workspace.status,
-        counters=buffers.integers("counters", 2),
-    )
-    # With a workspace a backward pass is likely to follow.
-    records = None if workspace is None else buffers.floats("records", views * count, ScreenRecord.SIZE)
-    library.launch(launches.RasterProject(scene, settings, splats, tile_ids, tiles.tile_cursors, records))
+    sizes = (views, count, num_active, num_tiles)
+    front = buffers.kept("front", sizes, lambda: _Front.of(buffers, *sizes))
+    splats, tiles = front.splats, front.tiles
+    library.launch(launches.RasterProject(scene, settings, splats, tile_ids, tiles.tile_cursors, front.records))
 
     capacity = None if workspace is None else workspace.capacity(count, num_active)
-    blocks = max(1, math.ceil(num_active / layout.SCAN_TILES))
-    block_sums = buffers.integers("block_sums", blocks, 2, dtype=torch.int64)
     most = layout.INTERSECTIONS_MAX if capacity is None else capacity
-    library.launch(launches.RasterCountIntersections(tiles, block_sums, most))
+    library.launch(launches.RasterCountIntersections(tiles, front.block_sums, most))
     if capacity is None:
         intersections = int(tiles.status[0])
         require_possible(intersections)
@@ -283,30 +333,29 @@ def rasterize_cuda(
         if workspace is not None:
             workspace.learn(intersections, num_active)
 
-    intersection_ids = buffers.integers("intersection_ids", capacity)
-    intersection_keys = buffers.integers("intersection_keys", capacity, dtype=torch.int64)
-    runs = buffers.integers("runs", capacity // (layout.SORT_RUN // 2), 2)
-    library.launch(launches.RasterSortIntersections(splats, tiles, intersection_keys, intersection_ids, runs))
+    sizes = (capacity, slots, num_active)
+    back = buffers.kept("back", sizes, lambda: _Back.of(buffers, *sizes))
+    keys, ids = back.intersection_keys, back.intersection_ids
+    library.launch(launches.RasterSortIntersections(splats, tiles, keys, ids, back.runs))
     if workspace is not None:
         workspace.send_count(num_active)
 
-    chunks = warps_per_tile(slots, num_active)
     forward = launches.RasterForward(
         cameras=splats.cameras,
         tile_ids=tile_ids,
         tile_offsets=samples.tile_offsets.contiguous(),
         pixel_ids=samples.pixel_ids.contiguous(),
         tile_starts=tiles.tile_starts,
-        intersection_ids=intersection_ids,
+        intersection_ids=ids,
         instances=splats.instances,
         colors=torch.empty(slots, 3, device=device),
         alphas=torch.empty(slots, device=device),
-        transmittances=buffers.floats("transmittances", slots),
+        transmittances=back.transmittances,
         depths=torch.empty(slots, device=device) if options.with_depth else None,
-        last_intersections=buffers.integers("last_intersections", slots),
-        masks=buffers.integers("masks", (capacity // layout.BUCKET + num_active + 1) * chunks),
-        bucket_counts=buffers.integers("bucket_counts", num_active * chunks),
-        chunks=chunks,
+        last_intersections=back.last_intersections,
+        masks=back.masks,
+        bucket_counts=back.bucket_counts,
+        chunks=back.chunks,
         settings=settings,
         background=launches.Background(*options.background),
     )

@@ -12,13 +12,17 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
 
 from turbogs_plugin.engine.layout import INTERSECTIONS_MAX
 from turbogs_plugin.errors import InputError
+
+Kept = TypeVar("Kept")
 
 GROWTH = 1.25
 """A buffer that must grow gets this factor of the size asked for."""
@@ -83,7 +87,8 @@ class Workspace:
         self.passes = 0
         self._buffers: dict[str, Tensor] = {}
         self._views: dict[str, Tensor] = {}  # what `buffer` returned last
-        self._pinned = torch.zeros(PENDING_MAX, 2, dtype=torch.int32).pin_memory()
+        self._kept: dict[str, tuple[tuple, Any]] = {}
+        self._pinned = torch.zeros(PENDING_MAX, 2, dtype=torch.int32).pin_memory().unbind()
         self._pending: deque[_Pending] = deque()
         self._gaussians = 0
         self._intersections_per_tile = 0.0
@@ -112,6 +117,18 @@ class Workspace:
             held = self._buffers[name] = torch.empty(int(count * GROWTH) + 1, dtype=dtype, device=self.device)
         view = self._views[name] = held[:count].view(shape)
         return view
+
+    def kept(self, name: str, sizes: tuple, make: Callable[[], Kept]) -> Kept:
+        """What `make` gives; made anew only where the sizes are others than at the last call of this name.
+
+        For arguments of launches that are buffers of these sizes: they are the same for a hundred passes, and to put
+        them together anew takes the host as long as to enqueue the launches.
+        """
+        last = self._kept.get(name)
+        if last is None or last[0] != sizes:
+            self._kept.pop(name, None)  # lets go of the buffers that grow
+            last = self._kept[name] = sizes, make()
+        return last[1]
 
     def bytes_held(self) -> int:
         """Bytes of all buffers."""
