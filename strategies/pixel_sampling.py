@@ -6,13 +6,13 @@ import math
 import operator
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import ClassVar
 
 import numpy as np
 from torch import Tensor
-from turbogs_plugin.strategies.checks import require_settings
 
 from turbogs_plugin.engine import engine_of
+from turbogs_plugin.engine.layout import UNITS
 from turbogs_plugin.engine.rules import DrawRule
 from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.errors import InputError, require
@@ -21,9 +21,6 @@ from turbogs_plugin.types import PixelSamples, Step
 
 ViewIds = Sequence[int] | int | np.ndarray | Tensor
 """Views as a sampler takes them; see `view_numbers`."""
-
-Unit = Literal["pixel", "cell", "tile"]
-"""Those of `engine.layout.UNITS`."""
 
 
 def view_numbers(view_ids: ViewIds, maps: ErrorMaps) -> tuple[int, ...]:
@@ -87,16 +84,17 @@ class ErrorGuidedPixelSampler(RulePixelSampler):
 
     hard_ratio: float = 0.4
     stable_ratio: float = 0.3
-    mixed: Literal["error_age", "uniform"] = "error_age"
-    unit: Unit = "pixel"
+    mixed: str = "error_age"
+    unit: str = "pixel"
     importance: float = 0.0
 
     def __post_init__(self) -> None:
         require(0 <= self.hard_ratio <= 1, "hard_ratio", self.hard_ratio, "between 0 and 1")
         allowed = f"between 0 and 1 - hard_ratio ({1 - self.hard_ratio:g})"
         require(0 <= self.stable_ratio <= 1 - self.hard_ratio + 1e-9, "stable_ratio", self.stable_ratio, allowed)
+        require(self.mixed in ("error_age", "uniform"), "mixed", self.mixed, "error_age or uniform")
+        require(self.unit in UNITS, "unit", self.unit, f"one of {', '.join(UNITS)}")
         require(0 <= self.importance <= 1, "importance", self.importance, "between 0 and 1")
-        require_settings(self)
 
     @property
     def rule(self) -> DrawRule:
@@ -111,10 +109,10 @@ class RandomPixelSampler(RulePixelSampler):
         unit: as in `ErrorGuidedPixelSampler`.
     """
 
-    unit: Unit = "pixel"
+    unit: str = "pixel"
 
     def __post_init__(self) -> None:
-        require_settings(self)
+        require(self.unit in UNITS, "unit", self.unit, f"one of {', '.join(UNITS)}")
 
     @property
     def rule(self) -> DrawRule:

@@ -133,7 +133,9 @@ def write_text_atomically(path: Path, text: str) -> None:
 
 
 def _sync_folder(folder: Path) -> None:
-    """Bring the rename itself to the disk."""
+    """Bring the rename itself to the disk, where the platform can."""
+    if not hasattr(os, "O_DIRECTORY"):
+        return
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
         os.fsync(descriptor)
@@ -145,7 +147,7 @@ def process_started(process: int) -> str:
     """When a process of this host was started, which tells it from a later one of the same number; "gone" where there
     is none, "" where nothing is known."""
     try:
-        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[19]
+        return Path(f"/proc/{process}/stat").read_text(errors="replace").rpartition(")")[2].split()[19]
     except (OSError, IndexError):
         pass
     try:  # a system without /proc

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -14,6 +14,7 @@ from turbogs_plugin.strategies.density.priority import drawn_by_squares, squares
 from turbogs_plugin.strategies.density.rows import WindowedDensity, finite_rows, leave_one, removal
 from turbogs_plugin.strategies.density.splitting import split_in_two
 
+from turbogs_plugin.errors import InputError
 from turbogs_plugin.types import Gaussians, RowUpdate, Step
 
 EPS = 1e-12
@@ -121,6 +122,11 @@ class ErrorDrivenDensity(WindowedDensity):
         if step.iteration >= self._last_event(step):
             self._stats = None
         return update
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        if self.choose_by == "squares" and state["stats"] is not None and "square_sums" not in state["stats"]:
+            raise InputError("choose_by = squares, but the saved state has no squares: start a new run")
+        super().load_state_dict(state)
 
     def scores(self, step: Step) -> tuple[Tensor, Tensor]:
         """([N] difficulty score, [N] bool seen) of the present window. The score 0 of an unseen one has no meaning."""

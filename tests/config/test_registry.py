@@ -26,6 +26,7 @@ def test_every_name_builds_with_its_defaults(kind, name):
     [
         ("loss", {"type": "charbonier"}, "did you mean 'charbonnier'"),
         ("loss", {"type": 5}, "unknown loss.type '5'"),
+        ("losses", {}, "did you mean 'loss'"),
         ("schedule", {"type": "fixed", "view": 1}, "did you mean 'views'"),
         ("schedule", ["fixed"], "expected a mapping"),
     ],

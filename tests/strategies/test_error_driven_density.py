@@ -404,6 +404,20 @@ def test_resumed_is_bit_identical(cls):
     assert first.stats is None and second.stats is None
 
 
+def test_a_checkpoint_without_squares_goes_on_unless_they_are_needed():
+    gaussians = make_gaussians(4)
+    state = {"stats": dict(vars(controlled(gaussians, busy_stats(4)).stats))}
+    del state["stats"]["square_sums"]
+    resumed = controlled(gaussians)
+    resumed.load_state_dict(state)
+    assert not resumed.stats.square_sums.any() and resumed.stats.weight_sums.all()
+    with pytest.raises(InputError, match="choose_by = squares, but the saved state has no squares"):
+        controlled(gaussians, choose_by="squares").load_state_dict(state)
+    ended = controlled(gaussians, choose_by="squares")
+    ended.load_state_dict({"stats": None})
+    assert ended.stats is None
+
+
 @pytest.mark.parametrize("cls", [ErrorDrivenDensity, GsplatDefaultDensity, FastGsDensity])
 def test_statistics_of_another_model_are_refused(cls):
     small, large, never_set_up = cls(), cls(), cls()

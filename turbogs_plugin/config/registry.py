@@ -109,13 +109,12 @@ def strategy_class(kind: str, name: str) -> type:
 def build(kind: str, mapping: Mapping[str, Any]) -> Any:
     """A new strategy from ``{"type": name, **its init fields}``.
 
-    Args:
-        kind: one of `KINDS`.
-
     Raises:
-        InputError: an unknown type or key, a wrong type of a value, one out of range, or a class without what its
-            kind's protocol has.
+        InputError: an unknown kind, type or key, a wrong type of a value, one out of range, or a class without what
+            its kind's protocol has.
     """
+    if kind not in BUILT_IN:
+        raise InputError(f"unknown kind of strategy '{kind}': {nearest(kind, KINDS)}")
     if not isinstance(mapping, Mapping):
         raise InputError(f"{kind}: expected a mapping with a 'type', got {mapping!r}")
     options = dict(mapping)

@@ -83,7 +83,7 @@ class TrainConfig:
     batch_for: int | Auto = 1
     refine_until: int = 3500
     seed: int = 0
-    device: Literal["auto", "cpu", "cuda"] = "auto"
+    device: str = "auto"
     maps_place: Place = "auto"
     photos_place: Place = "auto"
     init: str = "points"
@@ -106,6 +106,7 @@ class TrainConfig:
         require(self.batch_for == "auto" or self.batch_for >= 1, "batch_for", self.batch_for, "at least 1")
         require(self.refine_until >= 0, "refine_until", self.refine_until, "at least 0")
         require(0 <= self.seed < 2**31, "seed", self.seed, "within 0 .. 2^31 - 1")
+        require(self.device in ("auto", "cpu", "cuda"), "device", self.device, "auto, cpu or cuda")
         named = bool(self.init.strip())
         require(named, "init", self.init, "points, random, or the file of a model (.ply, .pt) or a run's folder")
         require(self.sh_degree == "auto" or 0 <= self.sh_degree <= 3, "sh_degree", self.sh_degree, "within 0 .. 3")

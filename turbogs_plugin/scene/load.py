@@ -125,7 +125,7 @@ def load_scene(
     scene = Path(path)
     if not isinstance(factor, int) or factor < 1:
         raise InputError(f"factor is {factor}: it must be an integer of at least 1")
-    if not isinstance(test_every, int) or test_every < 2:
+    if not isinstance(test_every, int) or test_every < 1:
         raise InputError(f"test_every is {test_every}: it must be an integer of at least 2")
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # what is not finite is refused by its name
         capture = _read(scene, factor)
@@ -134,6 +134,8 @@ def load_scene(
         raise InputError(f"{scene} has {len(test)} images: at least {FEWEST_PHOTOS} are needed; add photos to it")
     if capture.test is not None and (~test).sum() < FEWEST_PHOTOS:
         raise InputError(f"{scene} has {(~test).sum()} training images: at least {FEWEST_PHOTOS} are needed")
+    if test.all():
+        raise InputError(f"test_every is {test_every}: every image of {scene} would be a test image; use 2 or more")
 
     with np.errstate(over="ignore", invalid="ignore"):
         frame = Frame.around(camera_centers(capture.viewmats[~test]), capture.points)
