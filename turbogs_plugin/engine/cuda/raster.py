@@ -226,8 +226,10 @@ class _Buffers:
     def floats(self, name: str, *shape: int) -> Tensor:
         return self.integers(name, *shape, dtype=torch.float32)
 
-    def kept(self, name: str, sizes: tuple[int, ...], make: Callable[[], Kept]) -> Kept:
-        return make() if self.workspace is None else self.workspace.kept(name, sizes, make)
+    def kept(self, name: str, make: Callable[..., Kept], *sizes: int) -> Kept:
+        """What `make` gives with these buffers and sizes; with a workspace, see `Workspace.kept`."""
+        of_sizes = partial(make, self, *sizes)
+        return of_sizes() if self.workspace is None else self.workspace.kept(name, sizes, of_sizes)
 
 
 @dataclass(frozen=True)
@@ -318,8 +320,7 @@ def rasterize_cuda(
     everywhere = num_active == num_tiles
     tile_ids = None if everywhere else samples.tile_ids.contiguous()
     scene = _scene(gaussians, cameras, degree, settings.eps2d)
-    sizes = (views, count, num_active, num_tiles)
-    front = buffers.kept("front", sizes, lambda: _Front.of(buffers, *sizes))
+    front = buffers.kept("front", _Front.of, views, count, num_active, num_tiles)
     splats, tiles = front.splats, front.tiles
     library.launch(launches.RasterProject(scene, settings, splats, tile_ids, tiles.tile_cursors, front.records))
 
@@ -333,8 +334,7 @@ def rasterize_cuda(
         if workspace is not None:
             workspace.learn(intersections, num_active)
 
-    sizes = (capacity, slots, num_active)
-    back = buffers.kept("back", sizes, lambda: _Back.of(buffers, *sizes))
+    back = buffers.kept("back", _Back.of, capacity, slots, num_active)
     keys, ids = back.intersection_keys, back.intersection_ids
     library.launch(launches.RasterSortIntersections(splats, tiles, keys, ids, back.runs))
     if workspace is not None:
