@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import statistics
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 from study_tables import CAPTURES, change, result, rows_of, stale
@@ -11,6 +11,9 @@ from verdict import verdict
 
 from turbogs_plugin.report.tables import table
 from turbogs_plugin.study.summary import VariantRow
+
+OURS = ("parts", "departures")
+"""Studies that change one thing of `turbogs` a variant."""
 
 BOUND = 0.3
 """dB by which `turbogs-paper` may be worse than 3DGS at its full length."""
@@ -21,7 +24,7 @@ class Part(NamedTuple):
 
     Args:
         name: what it is; in brackets what the full method loses without it in the paper's table of components.
-        ours: the variants of `parts` with it and without it; either is `turbogs`, or None where it has none.
+        ours: the variants with it and without it, of one of `OURS`; either is `turbogs`, or None where it has none.
         papers: the same of `paper_parts`, or None where it has none.
     """
 
@@ -52,31 +55,25 @@ PARTS = (
     Part("the error-driven score and its gates, not a draw by squares", ("by-difficulty", "turbogs")),
     Part("the score, not the gradient alone", None, ("turbogs-paper", "no-score")),
     Part("no pruning by squares at every event", ("no-turnover", "turbogs")),
-    Part("gsplat's density, not ours", ("density-gsplat", "turbogs")),
-    Part("density by votes, as FastGS's, not ours", ("density-fastgs", "turbogs")),
     Part("final pruning", ("final-pruning", "turbogs"), ("turbogs-paper", "no-final-pruning")),
     Part("NCC (+0.48 dB)", ("turbogs", "no-ncc"), ("turbogs-paper", "no-ncc")),
-    Part("NCC, not SSIM of a tile's samples (+0.36 dB)", ("turbogs", "sparse-ssim")),
-    Part("NCC at the weight of 1, not 0.4", ("turbogs", "ncc-0.4")),
     Part("the printed NCC: a flat tile scores 0", ("printed-ncc", "turbogs")),
-    Part("3DGS's learning rates", ("rates-3dgs", "turbogs"), ("turbogs-paper", "rates-turbogs")),
     Part("3DGS's splits, no opacity decay", ("plain-splits", "turbogs")),
-    Part("3DGS's splits alone", ("split-sample", "turbogs")),
-    Part("no opacity decay, alone", ("no-decay", "turbogs")),
-    Part("3DGS's percent_dense, .01", ("percent-dense-0.01", "turbogs")),
-    Part("pruning by the scene's extent, as 3DGS", ("prune-by-extent", "turbogs")),
-    Part("a band of harmonics every 1000 iterations, as 3DGS", ("sh-interval-1000", "turbogs")),
+    Part("3DGS's learning rates", ("rates-3dgs", "turbogs"), ("turbogs-paper", "rates-turbogs")),
+    Part("5,000 iterations, not 60 epochs", ("iterations-5000", "turbogs")),
     Part("no backdrop", ("no-backdrop", "turbogs")),
     Part("no bound on far sizes", ("distant-unbounded", "turbogs")),
+    Part("pruning by the scene's extent, as 3DGS", ("prune-by-extent", "turbogs")),
+    Part("a band of harmonics every 1000 iterations, as 3DGS", ("sh-interval-1000", "turbogs")),
 )
 
 
-def comparisons(study: str, variants: tuple[str, str] | None) -> dict[str, VariantRow]:
-    """Capture -> the first variant against the second, where both have a seed in common."""
+def comparisons(studies: Sequence[str], variants: tuple[str, str] | None) -> dict[str, VariantRow]:
+    """Capture -> the first variant against the second, where both have a seed in common in one of the studies."""
     if variants is None:
         return {}
     found = {}
-    for capture, rows in rows_of(study).items():
+    for capture, rows in ((capture, rows) for study in studies for capture, rows in rows_of(study).items()):
         if all(name in rows for name in variants):
             with_it, without = (rows[name].cells for name in variants)
             row = VariantRow(variants[0], with_it, without)
@@ -93,7 +90,7 @@ def paper_parts() -> str:
     """Each part of the paper: what it adds to ours and to the paper's configuration, the verdict, and the default."""
     lines = []
     for part in PARTS:
-        ours, papers = comparisons("parts", part.ours), comparisons("paper_parts", part.papers)
+        ours, papers = comparisons(OURS, part.ours), comparisons(["paper_parts"], part.papers)
         said, said_there = verdict(ours, CAPTURES), verdict(papers, CAPTURES)
         told = "<br>".join(
             f"{place}{of.text}"
@@ -105,7 +102,7 @@ def paper_parts() -> str:
             default = f"{part.default}; **should be {said.decides}**"
         lines.append((part.name, effects(ours), effects(papers), told, default))
     header = ("the paper's part", "in our default", "in the paper's configuration", "verdict", "default")
-    return "\n\n".join([table(header, lines), *stale("parts"), *stale("paper_parts")])
+    return "\n\n".join([table(header, lines), *(line for study in (*OURS, "paper_parts") for line in stale(study))])
 
 
 def paper_whole() -> str:

@@ -55,6 +55,7 @@ def test_the_tables_of_the_paper_are_there():
     assert set(packaged_names(PACKAGE)) >= {
         "baselines",
         "components",
+        "departures",
         "paper_parts",
         "parts",
         "views",
@@ -160,7 +161,9 @@ def test_a_common_length_leaves_out_what_it_makes_a_copy():
     assert alike_at(ablation, list(ablation.variants), (), 1000) == alike
     assert alike_at(ablation, ["nothing", "plan", "epochs-75"], (), 1000) == {"epochs-75": "nothing"}
     assert alike_at(load_ablation("batch"), ["x2-same-rates", "x2-longer"], (), 1000) == {"x2-longer": "x2-same-rates"}
-    for name in set(packaged_names(PACKAGE)) - {"leave_out", "batch"}:
+    departures = load_ablation("departures")
+    assert alike_at(departures, list(departures.variants), (), 1000) == {"iterations-5000": "turbogs"}
+    for name in set(packaged_names(PACKAGE)) - {"leave_out", "batch", "departures"}:
         assert alike_at(load_ablation(name), list(load_ablation(name).variants), (), 1000) == {}
     same = Ablation(
         "x", {"long": ["train.iterations=5000"], "a": [], "b": [], "last": ["train.epochs=5"]}, baseline="a"
