@@ -56,6 +56,7 @@ TABLES: dict[str, Callable[[], str | None]] = {
     "ahead": study_tables.ahead,
     "behind": study_tables.behind,
     "density_sums": machine_tables.density_sums,
+    "departures": lambda: study_tables.changes("departures"),
     "dropin": machine_tables.dropin,
     "exposure_runs": capture_tables.exposure_runs,
     "exports": viewer_tables.exports,
