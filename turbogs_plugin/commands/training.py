@@ -114,7 +114,7 @@ def plan(
 
     Args:
         scene: as in train.
-        overrides: as in train; train.sh_degree=auto leaves a setting to the plan, any other value forces it.
+        overrides: as in train; train.exposure=auto leaves a setting to the plan, any other value forces it.
         gpus: as in train; they need not be there.
     """
     if gpus is not None:

@@ -1,17 +1,10 @@
-"""Settings whose value may be ``auto``, on the plain mapping of a configuration.
-
-A run's plan decides them (`turbogs_plugin.plan`). A strategy's section with ``type: auto`` holds the fields of its
-kind's default type, and the plan names the type.
-"""
+"""Settings whose value may be ``auto``, on the plain mapping of a configuration: a run's plan decides them
+(`turbogs_plugin.plan`)."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import fields
 from typing import Any
-
-from turbogs_plugin.config import registry
-from turbogs_plugin.config.schema import dataclass_mapping
 
 AUTO = "auto"
 
@@ -19,10 +12,6 @@ AUTO_SETTINGS: dict[str, Any] = {
     "train.backdrop": False,
     "train.background": "black",
     "train.exposure": False,
-    "loss.type": registry.default_type("loss"),
-    "schedule.type": registry.default_type("schedule"),
-    "train.sh_degree": 3,
-    "optimizer.type": registry.default_type("optimizer"),
     "train.batch_for": 1,
     "train.iterations": None,
     "train.maps_place": "device",
@@ -41,25 +30,3 @@ def value_of(mapping: Mapping[str, Mapping[str, Any]], setting: str) -> Any:
     """The value of ``section.key``."""
     section, key = setting.split(".")
     return mapping[section][key]
-
-
-def concrete(kind: str, section: Any) -> Any:
-    """A strategy's section with its kind's default type instead of ``auto``; anything else is returned unchanged."""
-    if isinstance(section, Mapping) and section.get("type") == AUTO and f"{kind}.type" in AUTO_SETTINGS:
-        return {**section, "type": registry.default_type(kind)}
-    return section
-
-
-def of_type(kind: str, section: Mapping[str, Any], name: str, options: Mapping[str, Any]) -> dict[str, Any]:
-    """A section of ``type: auto`` whose type is now decided: `name`, with the values of `options`.
-
-    If that is not the kind's default type, it takes over the values that were changed from the default type's defaults,
-    where it has fields of the same names.
-    """
-    default = registry.default_type(kind)
-    if name == default:
-        return {**section, "type": name, **options}
-    unchanged = dataclass_mapping(registry.build(kind, {"type": default}))
-    known = {field.name for field in fields(registry.strategy_class(kind, name)) if field.init}
-    changed = {key: section[key] for key, value in unchanged.items() if key in known and section[key] != value}
-    return {"type": name, **changed, **options}

@@ -15,7 +15,7 @@ from typing import Any, get_type_hints
 from omegaconf import OmegaConf
 
 from turbogs_plugin.config import registry
-from turbogs_plugin.config.auto import AUTO, AUTO_SETTINGS, concrete, undecided
+from turbogs_plugin.config.auto import AUTO, AUTO_SETTINGS, undecided
 from turbogs_plugin.config.old_spellings import old_spelling
 from turbogs_plugin.config.schema import build_dataclass, dataclass_mapping, nearest
 from turbogs_plugin.config.sections import BudgetConfig, MapsConfig, ReportConfig, SceneConfig, TrainConfig
@@ -54,11 +54,8 @@ class Config:
     budget: BudgetConfig = field(default_factory=BudgetConfig)
 
     def build(self, kind: str) -> Any:
-        """A new strategy of this kind. RuntimeError where its type is left to a plan."""
-        section = getattr(self, kind)
-        if section.get("type") == AUTO:
-            raise RuntimeError(f"{kind}.type is {AUTO}: a strategy is built from what a plan has decided")
-        return registry.build(kind, section)
+        """A new strategy of this kind."""
+        return registry.build(kind, getattr(self, kind))
 
     def require_decided(self) -> None:
         """RuntimeError, for it is an error of ours, where a setting is left to a plan: no run can go by that."""
@@ -126,7 +123,7 @@ def resolve(mapping: Mapping[str, Any]) -> Config:
     }
     for kind in registry.KINDS:
         section = mapping.get(kind, {})
-        strategy = registry.build(kind, concrete(kind, section))
+        strategy = registry.build(kind, section)
         sections[kind] = {"type": section.get("type", registry.default_type(kind)), **dataclass_mapping(strategy)}
     return Config(**sections)
 
@@ -207,4 +204,4 @@ def _changes_type(kind: str, below: Mapping[str, Any], value: Mapping[str, Any])
     if kind not in registry.KINDS or "type" not in value:
         return False
     default = registry.default_type(kind)
-    return concrete(kind, value)["type"] != concrete(kind, below).get("type", default)
+    return value["type"] != below.get("type", default)

@@ -87,7 +87,7 @@ class TrainConfig:
     maps_place: Place = "auto"
     photos_place: Place = "auto"
     init: str = "points"
-    sh_degree: int | Auto = 3
+    sh_degree: int = 3
     sh_interval: int = 1000
     initial_opacity: float = 0.1
     initial_size: float = 1.0
@@ -109,7 +109,7 @@ class TrainConfig:
         require(self.device in ("auto", "cpu", "cuda"), "device", self.device, "auto, cpu or cuda")
         named = bool(self.init.strip())
         require(named, "init", self.init, "points, random, or the file of a model (.ply, .pt) or a run's folder")
-        require(self.sh_degree == "auto" or 0 <= self.sh_degree <= 3, "sh_degree", self.sh_degree, "within 0 .. 3")
+        require(0 <= self.sh_degree <= 3, "sh_degree", self.sh_degree, "within 0 .. 3")
         if self.background not in ("auto", "random"):
             parse_color(self.background)
         require(self.sh_interval >= 1, "sh_interval", self.sh_interval, "at least 1")

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
-from turbogs_plugin.config.auto import AUTO, AUTO_SETTINGS, value_of
+from turbogs_plugin.config.auto import AUTO, value_of
 from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.engine.layout import MAX_VIEWS
 from turbogs_plugin.model.initial import BACKDROP_COUNT
@@ -27,12 +27,6 @@ EXPOSURE_STOPS = 0.1
 Caliterra, whose flight lines differ, has .13; fox and snowmiku .05 (docs/plan.md). These two change by .17 and .18 in
 all, but by little from photo to photo, and what follows the view a model's harmonics take up. At .13 it pays
 only after a fit of colours (docs/captures.md)."""
-FLAT_TILES = 0.5
-"""Share of tiles without texture from which on NCC is left out. It gains SSIM at .09 (caliterra, .0055) and
-at .42 (snowmiku, .002); above, nothing has been measured yet."""
-ONE_SIDED_DEGREE = 1
-"""Degree that a one-sided capture gets: on caliterra 1 ends 0.1 dB above 3, in the same time and 18 % less
-memory."""
 DEVICE_SHARE = 0.5
 """Share of the device's memory that photos and maps may take: the rest is for the model, its optimizer, workspaces."""
 ITERATION_MS = (1.3, 3.4)
@@ -57,12 +51,10 @@ class Verdict:
     Args:
         value: what it should be.
         reason: with the number that decides.
-        options: of a strategy's type: fields of it that follow from the facts.
     """
 
     value: Value
     reason: str
-    options: dict[str, int] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -74,14 +66,12 @@ class Decision:
         value: what it is in the run.
         made: ``auto`` by the facts, or ``set`` by the configuration.
         reason: of the facts; for what is set, with the value that they would have led to.
-        options: as in `Verdict`, of what is auto.
     """
 
     setting: str
     value: Value
     made: str
     reason: str
-    options: dict[str, int] = field(default_factory=dict)
 
     @property
     def text(self) -> str:
@@ -93,7 +83,7 @@ def decide(setting: str, facts: SceneFacts, config: Config) -> Decision:
     """What a setting is in a run: what the configuration says or, where that is ``auto``, what the facts say."""
     present, verdict = value_of(config.to_mapping(), setting), RULES[setting](facts, config)
     if present == AUTO:
-        return Decision(setting, verdict.value, "auto", verdict.reason, verdict.options)
+        return Decision(setting, verdict.value, "auto", verdict.reason)
     return Decision(setting, present, "set", f"auto: {yaml_text(verdict.value)}, {verdict.reason}")
 
 
@@ -129,43 +119,6 @@ def wanted_exposure(facts: SceneFacts, config: Config) -> Verdict:
     return Verdict(
         differ, f"photos {facts.exposure_jumps:.2f} stops from their neighbours {_sign(differ)} {EXPOSURE_STOPS}"
     )
-
-
-def wanted_loss(facts: SceneFacts, config: Config) -> Verdict:
-    """The loss with a structure term, but where most tiles have no structure."""
-    flat = facts.flat_tiles >= FLAT_TILES
-    compared = f"{facts.flat_tiles:.1%} of tiles without texture {_sign(flat)} {FLAT_TILES:.0%}"
-    return Verdict("charbonnier" if flat else "charbonnier_ncc", compared)
-
-
-def wanted_schedule(facts: SceneFacts, config: Config) -> Verdict:
-    """Every view in every iteration, where the schedule may take as many anyway."""
-    most = config.schedule.get("max_views", config.schedule.get("views", 0))
-    if facts.train_views <= most:
-        compared = f"{facts.train_views} training views <= at most {most} an iteration"
-        return Verdict("fixed", compared, {"views": facts.train_views})
-    return Verdict("sinusoidal", f"{facts.train_views} training views > at most {most} an iteration")
-
-
-def wanted_sh_degree(facts: SceneFacts, config: Config) -> Verdict:
-    """No more coefficients than a Gaussian can have observations, and few for views from one side."""
-    degree, views, concentration = AUTO_SETTINGS["train.sh_degree"], facts.train_views, facts.direction_concentration
-    reason = f"{(degree + 1) ** 2} coefficients <= {views} training views"
-    while degree > 0 and (degree + 1) ** 2 > views:
-        reason = f"{(degree + 1) ** 2} coefficients of degree {degree} > {views} training views"
-        degree -= 1
-    if concentration >= ONE_SIDED and degree > ONE_SIDED_DEGREE:
-        degree, reason = ONE_SIDED_DEGREE, f"view directions concentrated to {concentration:.3f} >= {ONE_SIDED}"
-    return Verdict(degree, reason)
-
-
-def wanted_optimizer(facts: SceneFacts, config: Config) -> Verdict:
-    """The Levenberg-Marquardt part only where it pays (docs/results/leave_out and optimizer)."""
-    if facts.device == "cpu":
-        reason = "linear systems are 5 to 10 % of an iteration on a CPU, for nothing on the demo capture"
-        return Verdict("sparse_adam", reason)
-    reason = "at most 7 % more time than sparse_adam, errors within the spread of seeds, on three scenes on an H200"
-    return Verdict("moment_lm", reason)
 
 
 def wanted_batch_for(facts: SceneFacts, config: Config) -> Verdict:
@@ -252,10 +205,6 @@ RULES: dict[str, Callable[[SceneFacts, Config], Verdict]] = {
     "train.backdrop": wanted_backdrop,
     "train.background": wanted_background,
     "train.exposure": wanted_exposure,
-    "loss.type": wanted_loss,
-    "schedule.type": wanted_schedule,
-    "train.sh_degree": wanted_sh_degree,
-    "optimizer.type": wanted_optimizer,
     "train.batch_for": wanted_batch_for,
     "train.iterations": wanted_iterations,
     "train.maps_place": wanted_maps_place,

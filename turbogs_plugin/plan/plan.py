@@ -8,7 +8,6 @@ from dataclasses import asdict, dataclass
 
 import torch
 
-from turbogs_plugin.config.auto import of_type
 from turbogs_plugin.config.configuration import Config, resolve
 from turbogs_plugin.config.scaling import with_batch_for, with_iterations
 from turbogs_plugin.config.schema import build_dataclass
@@ -33,9 +32,7 @@ class Plan:
             section, key = decision.setting.split(".")
             if decision.made == "set":
                 continue
-            if key == "type":
-                mapping[section] = of_type(section, mapping[section], decision.value, decision.options)
-            elif decision.setting == "train.batch_for":
+            if decision.setting == "train.batch_for":
                 mapping = with_batch_for(resolve(mapping), decision.value).to_mapping()
             elif decision.setting == "train.iterations":
                 mapping = with_iterations(resolve(mapping), decision.value).to_mapping()
