@@ -18,7 +18,7 @@ from turbogs_plugin.engine import engine_of
 from turbogs_plugin.engine.exposures import Exposures, exposure_rate
 from turbogs_plugin.engine.protocol import MapUpdate
 from turbogs_plugin.engine.rendered import RenderOptions, ScreenGradients
-from turbogs_plugin.engine.rendering import rasterize, render_image
+from turbogs_plugin.engine.rendering import dense_samples, rasterize
 from turbogs_plugin.errors import TrainingStopped
 from turbogs_plugin.model.distant import RESTRAIN_EVERY, restrain_distant
 from turbogs_plugin.model.harmonics import with_degree
@@ -108,17 +108,15 @@ class Trainer:
 
     def dense_errors(self, view_id: int) -> Tensor:
         """[H * W] the errors of a dense render of one view; 0 at masked pixels."""
-        background = self.background.at(self.now)
-        gaussians, cameras = self.gaussians, self.views.cameras
-        degree, settings = self.sh_degree, self.config.raster
-        if self.maps.masks is None:
-            image = render_image(
-                gaussians, cameras, view_id, sh_degree=degree, settings=settings, background=background
-            )
-            return (image.colors - self.views.photos.image(view_id, background)).abs().sum(dim=-1).reshape(-1)
-        samples = self.maps.masks.pixels([view_id])
+        background, masks = self.background.at(self.now), self.maps.masks
+        samples = dense_samples(self.views.cameras, [view_id]) if masks is None else masks.pixels([view_id])
         rendered = rasterize(
-            gaussians, cameras.select([view_id]), samples, sh_degree=degree, settings=settings, background=background
+            self.gaussians,
+            self.views.cameras.select([view_id]),
+            samples,
+            sh_degree=self.sh_degree,
+            settings=self.config.raster,
+            background=background,
         )
         truth = self.views.photos.at(samples, background).colors()  # [P, 3]
         errors = truth.new_zeros(int(self.maps.sizes[view_id].prod()))
