@@ -96,7 +96,9 @@ def test_points_in_the_air_compare_nothing():
 def test_the_fact_is_of_the_training_photos():
     views = corner(RANDOM)
     colors = torch.zeros(1500, 3, dtype=torch.uint8)
-    facts = gather_facts(Scene("c", views, views, points(), colors, Frame(np.zeros(3), 1.0), 1.0), torch.device("cpu"))
+    scene = Scene("c", views, views, points(), colors, Frame(np.zeros(3), 1.0), 1.0)
+    assert gather_facts(scene, torch.device("cpu")).exposure_views is None
+    facts = gather_facts(scene, torch.device("cpu"), with_exposures=True)
     found = measured(views, points())
     assert (facts.exposure_spread, facts.exposure_jumps) == (found.spread, found.jumps)
     assert facts.exposure_views == VIEWS and found.jumps > 0.1

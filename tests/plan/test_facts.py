@@ -6,7 +6,6 @@ import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from turbogs_plugin.plan import gather_facts
-from turbogs_plugin.plan.facts import flat_tile_share
 from turbogs_plugin.scene import Frame, PosedImages, Scene
 from turbogs_plugin.scene.photos import Photos
 from turbogs_plugin.types import Cameras
@@ -77,28 +76,15 @@ def test_concentration_of_view_directions(tilt):
     assert facts.direction_concentration == pytest.approx(abs(np.cos(angle)), abs=1e-6)
 
 
-@pytest.mark.parametrize("flat_rows", [0, 1, 3])
-def test_share_of_tiles_without_texture(flat_rows):
-    image = noise(48, 64)
-    image[: 16 * flat_rows] = 100
-    image[: 16 * flat_rows, ::2] += 1  # a step of 1 of 255 is no texture
-    views = posed([image, image], nadir(LINE[:2]))
-    assert flat_tile_share(views) == pytest.approx(flat_rows / 3)
-
-
-def test_photos_smaller_than_a_tile_have_none():
-    assert flat_tile_share(posed([noise(15, 40), noise(40, 15)], nadir(LINE[:2]))) == 0.0
-
-
 def test_points_that_no_camera_sees_decide_nothing():
     behind = np.array([[0.0, 0.0, -2.0], [50.0, 0.0, 1.0]])
-    facts = gather_facts(scene_of(posed([noise()] * 4, nadir(LINE)), behind), CPU)
+    facts = gather_facts(scene_of(posed([noise()] * 4, nadir(LINE)), behind), CPU, with_exposures=True)
     assert facts.exposure_views == 0 and facts.exposure_spread == facts.exposure_jumps == 0.0
     assert facts.baseline == pytest.approx(0.1)  # of the extent instead
 
 
 def test_a_single_view_has_no_neighbour():
-    facts = gather_facts(scene_of(posed([noise()], nadir(LINE[:1]))), CPU)
+    facts = gather_facts(scene_of(posed([noise()], nadir(LINE[:1]))), CPU, with_exposures=True)
     assert (facts.baseline, facts.exposure_spread, facts.direction_concentration) == (0.0, 0.0, 1.0)
 
 

@@ -49,11 +49,11 @@ class Verdict:
     """What the facts say about a setting.
 
     Args:
-        value: what it should be.
+        value: what it should be; None where the fact was not asked for.
         reason: with the number that decides.
     """
 
-    value: Value
+    value: Value | None
     reason: str
 
 
@@ -84,7 +84,8 @@ def decide(setting: str, facts: SceneFacts, config: Config) -> Decision:
     present, verdict = value_of(config.to_mapping(), setting), RULES[setting](facts, config)
     if present == AUTO:
         return Decision(setting, verdict.value, "auto", verdict.reason)
-    return Decision(setting, present, "set", f"auto: {yaml_text(verdict.value)}, {verdict.reason}")
+    wanted = "" if verdict.value is None else f"{yaml_text(verdict.value)}, "
+    return Decision(setting, present, "set", f"auto: {wanted}{verdict.reason}")
 
 
 def yaml_text(value: Value) -> str:
@@ -113,6 +114,8 @@ def wanted_exposure(facts: SceneFacts, config: Config) -> Verdict:
     """A colour map for each photo, where neighbouring photos show the same points differently bright."""
     if facts.transparent:
         return Verdict(False, "photos are transparent: their background has no exposure")
+    if facts.exposure_views is None:
+        return Verdict(None, "compares the photos' exposures")
     if 2 * facts.exposure_views < facts.train_views:
         return Verdict(False, f"only {facts.exposure_views} of {facts.train_views} photos could be compared")
     differ = facts.exposure_jumps >= EXPOSURE_STOPS

@@ -8,19 +8,12 @@ import numpy as np
 import torch
 
 from turbogs_plugin.error_maps import MAP_BYTES
-from turbogs_plugin.plan.exposures import LUMINANCE, compare_exposures
+from turbogs_plugin.plan.exposures import compare_exposures
 from turbogs_plugin.plan.sight import Sight
 from turbogs_plugin.scene import PosedImages, Scene
 from turbogs_plugin.scene.host_arrays import free_host_bytes
 from turbogs_plugin.scene.photos import PHOTO_BYTES
-from turbogs_plugin.tiles import TILE_PIXELS
-from turbogs_plugin.types import TILE_SIZE
 
-FLAT_DEVIATION = 0.01
-"""Standard deviation of luminance (0 .. 1) below which a tile has no texture: 2.5 of 255 steps, a camera's noise."""
-TILES_AT_MOST = 6400
-"""Tiles examined, over all photos."""
-TILES_PER_PHOTO = 64
 MODEL_BYTES_PER_GAUSSIAN = 3 * 4 * 59
 """59 single-precision numbers at degree 3, with two moments each."""
 
@@ -36,9 +29,9 @@ class SceneFacts:
         points: M, of the reconstruction.
         extent: radius of the scene in the capture's own unit.
         baseline: median distance of a training camera to its nearest, over the median depth of the points it sees.
-        flat_tiles: share of the photos' 16x16 tiles without texture (`FLAT_DEVIATION`).
         exposure_spread, exposure_jumps, exposure_views: how far photos differ in brightness and white balance, in stops
-            (`compare_exposures`): all from their mean; each from its neighbours; and of how many photos this is.
+            (`compare_exposures`): all from their mean; each from its neighbours; and of how many photos this is, None
+            where no setting asks for it.
         direction_concentration: norm of the mean unit viewing direction of the training cameras; 1: all look the same
             way, 0: all around.
         photo_bytes: of all photos, training and test.
@@ -60,8 +53,6 @@ class SceneFacts:
     points: int
     extent: float
     baseline: float
-    flat_tiles: float
-    exposure_spread: float
     direction_concentration: float
     photo_bytes: int
     map_bytes: int
@@ -73,8 +64,9 @@ class SceneFacts:
     time_budget: float | None = None
     transparent: bool = False
     processes: int = 1
+    exposure_spread: float = 0.0
     exposure_jumps: float = 0.0
-    exposure_views: int = 0
+    exposure_views: int | None = None
 
 
 @torch.no_grad()
@@ -85,6 +77,7 @@ def gather_facts(
     memory_limit: int | None = None,
     time_budget: float | None = None,
     processes: int = 1,
+    with_exposures: bool = False,
 ) -> SceneFacts:
     """The facts of a scene, to be trained on a device.
 
@@ -94,12 +87,13 @@ def gather_facts(
         memory_limit: bytes of the device that must not be exceeded.
         time_budget: seconds.
         processes: that will train together.
+        with_exposures: compare those of the photos, which takes longer than all else here.
     """
     views, sizes = scene.train, scene.train.cameras.sizes
     order = np.argsort(sizes.prod(axis=1), kind="stable")
     pixels, test_pixels = int(sizes.prod(axis=1).sum()), int(scene.test.cameras.sizes.prod(axis=1).sum())
     sight = Sight.of(views, scene.points)
-    exposures = compare_exposures(views, sight)
+    exposures = compare_exposures(views, sight) if with_exposures else None
     host_free = free_host_bytes()
     return SceneFacts(
         scene=scene.name,
@@ -110,10 +104,6 @@ def gather_facts(
         points=len(scene.points),
         extent=scene.extent * scene.frame.scale,
         baseline=_baseline(views, sight, scene.extent),
-        flat_tiles=flat_tile_share(views),
-        exposure_spread=exposures.spread,
-        exposure_jumps=exposures.jumps,
-        exposure_views=int(exposures.compared.sum()),
         direction_concentration=float(views.cameras.directions.double().mean(dim=0).norm()),
         photo_bytes=(PHOTO_BYTES + views.photos.transparent) * (pixels + test_pixels),
         map_bytes=MAP_BYTES * pixels,
@@ -125,32 +115,10 @@ def gather_facts(
         time_budget=time_budget,
         transparent=views.photos.transparent,
         processes=processes,
+        exposure_spread=exposures.spread if exposures else 0.0,
+        exposure_jumps=exposures.jumps if exposures else 0.0,
+        exposure_views=int(exposures.compared.sum()) if exposures else None,
     )
-
-
-def flat_tile_share(views: PosedImages) -> float:
-    """Share of whole 16x16 tiles whose luminance deviates less than `FLAT_DEVIATION`, of tiles spread evenly. Those
-    with masked pixels are left out."""
-    colors, offsets = views.photos.stored, views.photos.offsets
-    per_photo = max(1, min(TILES_PER_PHOTO, TILES_AT_MOST // len(views)))
-    within = np.arange(TILE_SIZE)
-    places = []
-    for view, (width, height) in enumerate(views.photos.sizes.tolist()):
-        columns, rows = width // TILE_SIZE, height // TILE_SIZE
-        if columns * rows:
-            tiles = np.unique(np.linspace(0, columns * rows - 1, per_photo).astype(np.int64))
-            y = (tiles // columns * TILE_SIZE)[:, None, None] + within[:, None]
-            x = (tiles % columns * TILE_SIZE)[:, None, None] + within
-            inside = (y * width + x).reshape(len(tiles), -1)
-            if views.masks is not None:
-                inside = inside[views.masks.image(view).reshape(-1).numpy()[inside].all(axis=1)]
-            places.append(int(offsets[view]) + inside)
-    flat = torch.from_numpy(np.concatenate(places or [np.zeros((0, TILE_PIXELS), dtype=np.int64)]))  # [T, 256]
-    if not len(flat):
-        return 0.0
-    pixels = colors[flat.to(colors.device)][..., :3].float()  # [T, 256, 3], transparent colours on black
-    luminance = pixels @ (torch.from_numpy(LUMINANCE).to(colors.device) / 255.0)
-    return float((luminance.std(dim=1, correction=0) < FLAT_DEVIATION).float().mean())
 
 
 def _baseline(views: PosedImages, sight: Sight, extent: float) -> float:

@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass
 
 import torch
 
+from turbogs_plugin.config.auto import AUTO
 from turbogs_plugin.config.configuration import Config, resolve
 from turbogs_plugin.config.scaling import with_batch_for, with_iterations
 from turbogs_plugin.config.schema import build_dataclass
@@ -60,17 +61,19 @@ class Plan:
         host = "" if facts.device == "cpu" else f", {mebibytes(facts.host_free_bytes)} on the host"
         seconds = "" if facts.time_budget is None else f"; {facts.time_budget:g} s to train"
         processes = "" if facts.processes == 1 else f"; {facts.processes} processes"
-        exposures = (
-            f"exposures of {facts.exposure_views} photos {facts.exposure_spread:.2f} stops apart and "
-            f"{facts.exposure_jumps:.2f} from their neighbours'"
-            if facts.exposure_views
-            else "exposures could not be compared"
-        )
+        exposures = ""
+        if facts.exposure_views is not None:
+            exposures = (
+                f", exposures of {facts.exposure_views} photos {facts.exposure_spread:.2f} stops apart and "
+                f"{facts.exposure_jumps:.2f} from their neighbours'"
+                if facts.exposure_views
+                else ", exposures could not be compared"
+            )
         return (
             f"{facts.scene}: {facts.train_views} + {facts.test_views} views of "
             f"{small if small == large else f'{small} to {large}'} pixels, {facts.points} points; "
             f"extent {facts.extent:.4g}, baselines {facts.baseline:.3f} of depth, view directions concentrated to "
-            f"{facts.direction_concentration:.3f}, {facts.flat_tiles:.1%} of tiles without texture, {exposures}; "
+            f"{facts.direction_concentration:.3f}{exposures}; "
             f"{mebibytes(facts.photo_bytes)} of photos, "
             f"{mebibytes(facts.map_bytes)} of maps, {mebibytes(facts.model_bytes)} of model at the start; {free}{host}"
             f"{seconds}{processes}"
@@ -100,7 +103,10 @@ def make_plan(config: Config, scene: Scene, device: torch.device, processes: int
         processes: that will train one model together.
     """
     limit, seconds = config.budget.memory_bytes(), config.budget.seconds()
-    facts = gather_facts(scene, device, memory_limit=limit, time_budget=seconds, processes=processes)
+    asked = config.train.exposure == AUTO
+    facts = gather_facts(
+        scene, device, memory_limit=limit, time_budget=seconds, processes=processes, with_exposures=asked
+    )
     return plan_from_facts(facts, config)
 
 
