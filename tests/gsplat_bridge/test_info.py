@@ -45,7 +45,9 @@ def gsplat_info(splats, cameras, pixels):
     opacities = opacities.expand(depths.shape)
     radii = gsplat_radii(means2d, depths, conics, opacities)
     directions = given["means"] - torch.inverse(viewmats)[:, None, :3, 3]
-    colors = (_spherical_harmonics(1, directions, given["colors"].expand(len(viewmats), -1, -1, -1)) + 0.5).clamp(min=0)
+    # View by view: gsplat 1.6 takes one set of coefficients.
+    colors = torch.stack([_spherical_harmonics(1, one_view, given["colors"]) for one_view in directions])
+    colors = (colors + 0.5).clamp(min=0)
 
     y, x = torch.meshgrid(torch.arange(HEIGHT), torch.arange(WIDTH), indexing="ij")
     centers = torch.stack([x, y], -1).reshape(-1, 1, 2) + 0.5  # [H * W, 1, 2]

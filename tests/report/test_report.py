@@ -130,6 +130,8 @@ def test_lpips_says_why_it_is_missing(tmp_path, monkeypatch):
     assert function is None and reason
     with pytest.raises(InputError, match="no such file"):
         load_lpips(str(tmp_path / "absent.pth"), torch.device("cpu"))
+    monkeypatch.setattr(evaluate, "LPIPS_PACKAGES", ("torch", "no_such_package"))
+    assert load_lpips(None, torch.device("cpu")) == (None, "it needs no_such_package: pip install no_such_package")
 
 
 def test_lpips_is_loaded_once_a_process(tmp_path, monkeypatch):
@@ -266,9 +268,9 @@ def test_tables():
     assert number(1.23456, 2) == "1.23" and number(math.nan, 2) == "not computed"
 
 
-def training(iteration: int, gaussians: int, seconds: float = 0.0) -> SimpleNamespace:
-    """What progress reads of a loop: the iteration, of 100, the number of Gaussians, and seconds of training."""
-    fields = {"iterations": 100, "gaussians": range(gaussians), "device": torch.device("cpu")}
+def training(iteration: int, gaussians: int, seconds: float = 0.0, total: int = 100) -> SimpleNamespace:
+    """What progress reads of a loop: the iteration, of `total`, the number of Gaussians, and seconds of training."""
+    fields = {"iterations": total, "gaussians": range(gaussians), "device": torch.device("cpu")}
     clock = SimpleNamespace(now=lambda: seconds)
     return SimpleNamespace(trainer=SimpleNamespace(iteration=iteration, **fields), clock=clock)
 
@@ -294,6 +296,21 @@ def test_progress_bar_on_a_terminal(capsys, monkeypatch):
     shown = capsys.readouterr().err
     assert "50/100" in shown and "20.10" in shown and "1,234" in shown
     assert "20 it/s" in shown and "2 s left" in shown and "GiB" in shown
+
+
+def test_the_bar_of_a_long_training_fits_a_terminal_of_80_columns(capsys, monkeypatch):
+    """The bar itself gives way, not the numbers."""
+    monkeypatch.setattr("sys.stderr.isatty", lambda: True, raising=False)
+    monkeypatch.setenv("COLUMNS", "80")
+    monkeypatch.setattr("turbogs_plugin.train.progress.REFRESH_SECONDS", 0.0)
+    monkeypatch.setattr("turbogs_plugin.train.progress.memory_bytes", lambda device: 12 * 2**30)
+    with TrainingProgress(30_000) as progress:
+        progress.evaluated(training(0, 298_965, total=30_000), evaluation(0))
+        progress.advanced(training(0, 298_965, total=30_000))
+        progress.advanced(training(12_345, 298_965, 18.8, total=30_000))
+    last = [line for line in capsys.readouterr().err.splitlines() if "it/s" in line][-1]
+    for part in ("12345/30000", "PSNR 20.00 dB", "298,965 Gaussians", "657 it/s", "12.00 GiB", "27 s left"):
+        assert part in last
 
 
 @pytest.mark.parametrize("strips", [0, 1])

@@ -80,6 +80,8 @@ def test_frames_arrive_as_they_were_drawn_and_pictures_switch(browser, subject):
     thread.start()
     try:
         tab = Tab(browser, page)
+        tab.tab.get_by_text("What you see.").wait_for(state="attached", timeout=1000 * PATIENCE)
+        assert tab.tab.get_by_text("Pause the training").count() == 0  # there is none
 
         def seen_from(view: int):
             eye = Eye.of_view(subject.capture.train.cameras, view)
@@ -115,6 +117,7 @@ def test_a_training_is_paused_stepped_and_goes_on(browser, new_training, scene):
     thread.start()
     try:
         tab.tab.get_by_text("paused").wait_for(timeout=1000 * PATIENCE)
+        tab.tab.get_by_text("Pause the training").wait_for(state="attached", timeout=1000 * PATIENCE)
         assert loop.trainer.iteration == 1
         for iteration in (2, 3):
             tab.press("One step")

@@ -115,16 +115,17 @@ class TrainingProgress(TerminalBar):
         self._first: tuple[int, float] | None = None  # iteration and seconds of training where the speed counts from
 
     def _columns(self) -> Sequence[ProgressColumn]:
-        from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
+        from rich.progress import BarColumn, MofNCompleteColumn, TextColumn
+        from rich.table import Column
 
+        numbers = "PSNR {task.fields[psnr]} dB  {task.fields[gaussians]} Gaussians  {task.fields[speed]} it/s"
+        numbers += "  {task.fields[memory]}  {task.fields[left]} s left"
+        # Where the terminal is narrow, the columns that may wrap give way.
         return (
-            MofNCompleteColumn(),
+            MofNCompleteColumn(table_column=Column(no_wrap=True)),
             BarColumn(),
-            TextColumn("test PSNR {task.fields[psnr]} dB · {task.fields[gaussians]} Gaussians"),
-            TextColumn("· {task.fields[speed]} it/s · {task.fields[memory]} ·"),
-            TimeElapsedColumn(),
-            TextColumn("· {task.fields[left]} s left"),
-            TextColumn("{task.fields[warning]}", style="bold red"),
+            TextColumn(numbers),
+            TextColumn("{task.fields[warning]}", style="bold red", table_column=Column()),
         )
 
     def advanced(self, loop: TrainingLoop) -> None:

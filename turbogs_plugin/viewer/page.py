@@ -28,7 +28,7 @@ from turbogs_plugin.viewer.eye import Eye
 from turbogs_plugin.viewer.frames import Screen
 from turbogs_plugin.viewer.pictures import Picture
 from turbogs_plugin.viewer.subject import CaptureViews
-from turbogs_plugin.viewer.texts import METHOD, PICTURES
+from turbogs_plugin.viewer.texts import METHOD, PICTURES, TRY_IT
 
 JPEG_QUALITY = 85
 MOST_FRUSTA = 150
@@ -197,7 +197,7 @@ class Page:
 
     def _build_panel(self, training: bool) -> None:
         gui = self.server.gui
-        self._status = gui.add_markdown("Photos are being read.")
+        self._status = gui.add_markdown("Photos are being read, and error maps made.")
         names = [picture.value for picture in Picture]
         self._pictures = gui.add_dropdown("Picture", names, initial_value=self.picture.value)
         self._about = gui.add_markdown(PICTURES[self.picture])
@@ -264,7 +264,7 @@ class Page:
         self._looked(screen, client.camera)
         wide = screen.eye is not None and screen.eye.width > NARROW
         with client.gui.add_folder("What is this?", expand_by_default=wide):
-            client.gui.add_markdown(METHOD)
+            client.gui.add_markdown(METHOD + TRY_IT if self._training.visible else METHOD)
 
     def _disconnected(self, client: Any) -> None:
         self._screens.pop(client.client_id, None)

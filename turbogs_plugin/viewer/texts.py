@@ -37,7 +37,9 @@ each 16x16 tile only pixels with a large error or not seen for a long time (*Sam
 
 **More where it is wrong.** From time to time Gaussians are split or copied where the samples ask for more detail, and
 useless ones are removed (*Added and removed*).
+"""
 
+TRY_IT = """
 **Try it.** Pause the training, choose *Samples of this iteration*, and press *One step* a few times. Then look at the
 *Error map* of the same view.
 """
