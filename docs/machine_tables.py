@@ -140,7 +140,8 @@ def wall(file: Path = WALL) -> str:
             column.append(run.parts.get(part, 0.0))
     rows["whole command"] = [run.seconds for run in runs.values()]
     rows["training alone"] = [run.train_seconds for run in runs.values()]
-    rows["beside training"] = [run.beside_training for run in runs.values()]
+    rows["until model, report and pictures are there"] = [run.ready_seconds for run in runs.values()]
+    rows["beside training, until then"] = [run.beside_training for run in runs.values()]
     rows["from decoded photos to the first iteration"] = [run.to_first_iteration for run in runs.values()]
     made = table(("s", *runs), [(name, *(f"{value:.2f}" for value in column)) for name, column in rows.items()])
     return f"{'; '.join(dict.fromkeys(map(where, reports.values())))}.\n\n{made}"

@@ -7,7 +7,7 @@ from helpers.framework_runs import tiny_capture
 
 from turbogs_plugin.bench import wall
 from turbogs_plugin.bench.wall import REST, WallRun, bench_wall, wall_lines
-from turbogs_plugin.train.run import FILES
+from turbogs_plugin.train.run import CHECKPOINT, MODEL
 
 
 def test_the_parts_of_a_run_are_all_of_its_time(turbogs, tmp_path):
@@ -17,10 +17,13 @@ def test_the_parts_of_a_run_are_all_of_its_time(turbogs, tmp_path):
     report = json.loads((tmp_path / "w.json").read_text())
     median = report["median"]
     assert sum(median["parts"].values()) == pytest.approx(median["seconds"])
-    assert {"interpreter and imports", "photos", "training", "pictures and plots", FILES, REST} <= set(median["parts"])
+    parts = {"interpreter and imports", "photos", "training", "pictures and plots", MODEL, CHECKPOINT, REST}
+    assert parts <= set(median["parts"])
     assert 0 < median["train_seconds"] < median["model_seconds"] < median["seconds"]
+    ready = WallRun(**median).ready_seconds
+    assert median["model_seconds"] - 0.01 < ready < median["seconds"]
     assert median["parts"][REST] > 0
-    for part in (*median["parts"], "whole command", "beside training", "from photos to the first iteration"):
+    for part in (*median["parts"], "whole command", "beside training, until then", "from photos to the first iteration"):
         assert part in out
 
 
@@ -31,6 +34,7 @@ def test_the_run_in_the_middle_is_shown(monkeypatch):
     assert measured["median"]["seconds"] == 9.5 and len(measured["runs"]) == 3
     assert "4.00, 25.00, 4.50" in wall_lines(measured)[-1]
     assert WallRun(9.0, 5.0, 8.0, {"plan": 4.0, "photos": 1.0}).to_first_iteration == 4.0
+    assert WallRun(9.0, 5.0, 8.0, {CHECKPOINT: 0.5, REST: 0.25}).beside_training == 3.25
 
 
 @pytest.mark.parametrize("arguments", [(), ("--scene", "nowhere"), ("--scene", "nowhere", "--offload")])

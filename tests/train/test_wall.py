@@ -71,7 +71,7 @@ def test_a_run_records_the_wall_until_its_model_and_the_parts_of_its_report(capt
         save(*arguments)
 
     def reporting(session: run.RunSession) -> None:
-        session.finish_files()  # or the simulated seconds of two threads would mix
+        session.finish_model()  # or the simulated seconds of two threads would mix
         report_at.append(session.clock.seconds)
         clock.passes(100.0)
         write_report(session)
@@ -87,7 +87,7 @@ def test_a_run_records_the_wall_until_its_model_and_the_parts_of_its_report(capt
         "interpreter and imports": 1000.0,
         "initial maps": 0.07,
         "training": 14.0,
-        run.FILES: 10.0,
+        run.MODEL: 10.0,
         "report": 100.0,
     }
     assert {name: parts[name] for name in expected} == pytest.approx(expected, abs=2e-3)

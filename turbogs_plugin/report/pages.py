@@ -49,7 +49,7 @@ def write_report(run: RunSession, process: PlotProcess | None = None) -> Path:
             for plot in plots:  # while the strips are encoded
                 plot.draw()
     run.clock.mark("pictures and plots")
-    run.finish_files()  # the page says how long it took until they were there
+    run.finish_model()  # the page says how long it took until it was there
     write_text_atomically(run.folder.report, _page(run, metrics, lpips_reason, shown))
     run.clock.mark("report")
     return run.folder.report

@@ -41,8 +41,8 @@ from turbogs_plugin.types import Gaussians
 IMPORTS, CAMERAS = "interpreter and imports", "cameras of photos alone"
 PHOTOS, DEVICE = "photos", "CUDA and kernels, after the photos"
 """Parts of the wall time before a plan is made."""
-FILES = "checkpoint and model, after the pictures"
-"""The part of the wall time at the end in which nothing else is left to do."""
+MODEL, CHECKPOINT = "model, after the pictures", "checkpoint, after the report"
+"""Parts of the wall time at the end in which nothing else is left to do than to wait for these files."""
 
 
 Report = Callable[["RunSession"], object]
@@ -281,7 +281,8 @@ class RunSession(Listener):
         self._saved_at = -1
         self._finished_before = False
         self._threads = ThreadPoolExecutor(2, "files")
-        self._written: list[Future[float]] = []
+        self._model: Future[float] | None = None
+        self._checkpoint: Future[float] | None = None
 
     def run(self, report: Report | None, watch: Watch = ()) -> RunSession:
         """Train to the end, or until a signal; both end with a checkpoint."""
@@ -305,10 +306,14 @@ class RunSession(Listener):
             if not ranks.first:
                 return self
             if loop.finished:
-                self._in_thread(save_ply, trainer.gaussians, self.folder.model, self.scene.frame)
+                self._model = self._in_thread(save_ply, trainer.gaussians, self.folder.model, self.scene.frame)
                 if report is not None:
                     report(self)
-            self.finish_files()
+            self.finish_model()
+            if self._checkpoint is not None:
+                self._checkpoint.result()
+            self.clock.mark(CHECKPOINT)
+            self.wall.parts = self.clock.parts
             self.wall.write(self.folder.wall)
         except TrainingStopped as stop:
             raise TrainingStopped(f"{stop}; {self._last_good()}") from stop
@@ -321,11 +326,12 @@ class RunSession(Listener):
             self._threads.shutdown()
         return self
 
-    def finish_files(self) -> None:
-        """Wait until checkpoint and model are written, and set `wall`. Raises `TrainingStopped` if the disk refused."""
-        ends = [written.result() for written in self._written]
-        self.clock.mark(FILES)
-        seconds = 0.0 if self._finished_before else max(ends, default=self.clock.seconds)
+    def finish_model(self) -> None:
+        """Wait until the model is written, if the run is finished, and set `wall`. The checkpoint, which is many times
+        larger, may come later. Raises `TrainingStopped` if the disk refused."""
+        end = self.clock.seconds if self._model is None else self._model.result()
+        self.clock.mark(MODEL)
+        seconds = 0.0 if self._finished_before else end
         self.wall = WallRecord(self.loop.clock.seconds, self.earlier_wall + seconds, self.clock.parts)
 
     def begun(self, loop: TrainingLoop) -> None:
@@ -379,19 +385,22 @@ class RunSession(Listener):
         if self.loop.ranks.first:
             arguments = (self.folder.checkpoints, self.trainer.iteration, self.state_dict())
             if self.loop.finished:
-                self._in_thread(save_checkpoint, *arguments)
+                self._checkpoint = self._in_thread(save_checkpoint, *arguments)
             else:
                 with self.loop.ranks.working():
                     save_checkpoint(*arguments)
         self._saved_at = self.trainer.iteration
 
-    def _in_thread(self, write: Callable[..., object], *arguments: object) -> None:
+    def _in_thread(self, write: Callable[..., object], *arguments: object) -> Future[float]:
+        """Begin to write a file. The result is when it was written, in seconds on the wall."""
+
         def timed() -> float:
             write(*arguments)
             return self.clock.seconds
 
-        self._written.append(self._threads.submit(timed))
+        return self._threads.submit(timed)
 
     def _last_good(self) -> str:
+        self._threads.shutdown()  # it may still be on its way to the disk
         checkpoint = latest_checkpoint(self.folder.checkpoints)
         return f"the last good checkpoint is '{checkpoint}'" if checkpoint else "no checkpoint was saved before"
