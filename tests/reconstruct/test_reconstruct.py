@@ -359,6 +359,15 @@ def test_commands_that_cannot_look_for_cameras_say_what_does(solved, tmp_path, t
     assert f"{photos} has {COUNT + 1} photos and nothing" in err and "turbogs reconstruct" in err
 
 
+def test_a_command_to_copy_is_right_for_folders_with_spaces(tmp_path, turbogs):
+    photos = tmp_path / "my photos"
+    photos.mkdir()
+    for name in "abc":
+        Image.new("RGB", (64, 48)).save(photos / f"{name}.jpg")
+    code, _, err = turbogs("plan", photos, "--device", "cpu")
+    assert code == 2 and f"turbogs reconstruct '{photos}' --out SCENE" in err
+
+
 def test_the_command_refuses_in_one_line(tmp_path, turbogs):
     (tmp_path / "photos").mkdir()
     Image.new("RGB", (64, 48)).save(tmp_path / "photos/a.jpg")

@@ -135,7 +135,7 @@ def read_colmap(scene: Path, model: Path, suffix: str) -> Capture:
     names = tuple(check_photo_name(image.name, model) for image in images)
     for name, following in itertools.pairwise(names):
         if name == following:
-            raise InputError(f"{model} has two images named '{name}'")
+            raise InputError(f"{model} has two images named '{name}': rename the photos and reconstruct again")
     first = reconstruction.cameras[images[0].camera_id] if images else None
     photo_folder, reduction = find_photo_folder(scene, names, first and (first.width, first.height))
     absent = [name for name in names if not (photo_folder / name).is_file()]
