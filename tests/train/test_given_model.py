@@ -106,6 +106,21 @@ def test_a_given_model_has_the_tables_and_pictures_of_its_run(turbogs, finished,
             assert np.abs(ours - theirs).mean() < 0.1
 
 
+def test_renders_of_a_lens_with_distortion_say_that_their_cameras_are_undistorted(turbogs, finished, capture, tmp_path):
+    lensed = Path(shutil.copytree(capture, tmp_path / "lensed"))
+    model = load_pycolmap().Reconstruction(lensed / "sparse/0")
+    for camera in model.cameras.values():
+        focal, _, x, y = camera.params
+        camera.model, camera.params = load_pycolmap().CameraModelId.SIMPLE_RADIAL, [focal, x, y, 0.1]
+    model.write_binary(lensed / "sparse/0")
+    out = tmp_path / "out"
+    code, _, said = turbogs("render", finished / "model.ply", "--scene", lensed, "--out", out, "--device", "cpu")
+    assert code == 0
+    size = re.search(r"8 photos undistorted: SIMPLE_RADIAL 48x40 -> PINHOLE (\d+)x(\d+)\n", said)
+    assert size and size.groups() != ("48", "40")
+    assert {Image.open(path).size for path in (out / "test").iterdir()} == {tuple(map(int, size.groups()))}
+
+
 def test_the_settings_of_a_given_model_come_from_the_command_line(turbogs, finished, capture):
     code, out, _ = turbogs(
         "eval", finished / "model.ply", "scene.test_every=4", "--scene", capture, "--factor", "2", "--device", "cpu"

@@ -116,6 +116,6 @@ def check_photo_name(name: str, source: Path) -> str:
 
 def sizes_text(sizes: np.ndarray) -> str:
     """Of photos of `sizes` [V, 2]: ``800x600``, or the one with fewest and the one with most pixels."""
-    pixels = np.prod(sizes, axis=1)
-    ends = (f"{width:g}x{height:g}" for width, height in (sizes[pixels.argmin()], sizes[pixels.argmax()]))
+    ordered = sizes[np.lexsort((sizes[:, 0], np.prod(sizes, axis=1)))]  # of equally many pixels, the upright one first
+    ends = (f"{width:g}x{height:g}" for width, height in ordered[[0, -1]])
     return " to ".join(dict.fromkeys(ends))
