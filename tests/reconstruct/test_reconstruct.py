@@ -406,6 +406,38 @@ def test_photos_that_are_not_read_are_noted(solved, tmp_path, monkeypatch):
     )
 
 
+def test_masks_go_with_their_photos(solved, tmp_path, monkeypatch):
+    """Those of photos that are stored sideways are sideways too."""
+    photos = Path(shutil.copytree(solved[0].parent, tmp_path / "corner")) / "images"
+    scene = shutil.copytree(solved[1].scene, tmp_path / "scene")
+    monkeypatch.setattr(run, "solver", None)
+    (tmp_path / "corner/masks").mkdir()
+    upright = np.full(render_corner(camera_centers(COUNT)[0]).size[::-1], 255, np.uint8)
+    upright[:, :20] = 0
+    for view in range(COUNT):
+        turn = Image.Transpose.ROTATE_90 if view == 2 else None  # that of 5, also sideways, is upright already
+        mask = Image.fromarray(upright)
+        (mask.transpose(turn) if turn is not None else mask).save(tmp_path / f"corner/masks/view_{view:02d}.png")
+    for _ in range(2):
+        reconstruct(photos, scene)
+    for view in range(COUNT):
+        np.testing.assert_array_equal(Image.open(scene / f"masks/view_{view:02d}.png"), upright)
+    loaded = load_scene(scene, factor=2)
+    assert f"masks of {COUNT} of {COUNT} photos" in "".join(loaded.notes)
+    shares = loaded.train.masks.pixel_counts / loaded.train.cameras.sizes.prod(axis=1)
+    assert (shares < 0.95).all() and (shares > 0.5).all()
+
+
+def test_a_mask_of_another_size_is_refused_before_cameras_are_looked_for(solved, tmp_path, monkeypatch):
+    photos = Path(shutil.copytree(solved[0].parent, tmp_path / "corner")) / "images"
+    (tmp_path / "corner/masks").mkdir()
+    Image.new("L", (20, 10), 255).save(tmp_path / "corner/masks/view_00.png")
+    monkeypatch.setattr(run, "_reconstruct", lambda *_: pytest.fail("cameras were looked for"))
+    with pytest.raises(InputError, match=r"mask .*view_00.png is 20x10 but photo .* is .*: make it of"):
+        reconstruct(photos, tmp_path / "scene")
+    assert not (tmp_path / "scene").exists()
+
+
 def test_a_reconstruction_in_parts_is_not_taken_for_photos_alone(solved, tmp_path):
     scene = shutil.copytree(solved[1].scene, tmp_path / "scene")
     (scene / "sparse/0/points3D.bin").unlink()
