@@ -278,7 +278,7 @@ def _read_model(scene: Path, model: tuple[Path, str] | None, files: list[str]) -
         lack = incomplete_model(scene)
         if lack is None or lack[0] == scene:
             return ""
-        return f"{lack[0]} is not used: it has no {' and no '.join(lack[1])} (.bin or .txt)"
+        return f"{lack[0]} is not used: it has no {' and no '.join(lack[1])}"
     # What instant-ngp leaves beside its transforms.json must serve as well as that.
     whole = bool(files) and model[0].relative_to(scene).parts[:1] in [(name,) for name in INSTANT_NGP_FOLDERS]
     try:
@@ -315,7 +315,7 @@ def _read_other(scene: Path, files: list[str], factor: int) -> Capture:
         files_back = "bring that file" if len(absent) == 1 else "bring these files"
         anew = f"take {scene / folder.relative_to(scene).parts[0]} away and find the cameras" if folder != scene else ""
         raise InputError(
-            f"{folder} has no {' and no '.join(absent)} (.bin or .txt): {files_back} of the reconstruction back"
+            f"{folder} has no {' and no '.join(absent)}: {files_back} of the reconstruction back"
             + (f", or {anew} by {solve}" if anew and find_photos(scene)[1] else "")
         )
     if photos := find_photos(scene)[1]:
