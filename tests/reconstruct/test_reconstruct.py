@@ -240,6 +240,21 @@ def test_a_solve_without_ghosts_is_taken_as_it_is(attempts):
     assert (best.model.places, moved, removed) == (GOOD, [], [])
 
 
+def test_cameras_that_are_told_as_solved_are_those_of_the_largest_model(monkeypatch, tmp_path, capsys):
+    """COLMAP begins many times where photos do not connect, and registers some each time."""
+
+    def map_in_vain(*_, initial_image_pair_callback, next_image_callback, cancellation_token):
+        for _ in range(40):
+            initial_image_pair_callback()
+            next_image_callback()
+        return {0: FakeModel("ooo"), 1: FakeModel("oooo")}
+
+    monkeypatch.setattr(pycolmap, "incremental_mapping", map_in_vain)
+    models = solver.solve_cameras(tmp_path / "none.db", tmp_path, tmp_path / "scratch")
+    assert [model.num_reg_images() for model in models] == [4, 3]
+    assert capsys.readouterr().err.startswith("cameras solved: 4 in ")
+
+
 def test_a_solve_that_is_not_the_first_says_why(monkeypatch, tmp_path):
     said, workspace = [], Workspace(tmp_path)
     monkeypatch.setattr(solver, "solve_cameras", lambda *arguments: said.append(arguments[3]))
