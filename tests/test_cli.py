@@ -182,6 +182,13 @@ def test_an_output_folder_with_another_run_is_left_alone(turbogs, capture, finis
     assert tree(finished) == before
 
 
+def test_a_command_to_go_on_is_right_for_folders_with_spaces(turbogs, capture, tmp_path):
+    run = tmp_path / "my run"
+    run.mkdir()
+    (run / "config.yaml").touch()
+    assert_refused(turbogs("train", capture, "--out", run, "--device", "cpu", *QUICK), f"--resume '{run}'")
+
+
 def test_an_output_folder_with_other_files_is_left_alone(turbogs, capture, tmp_path):
     (tmp_path / "thesis.tex").write_text("mine")
     assert_refused(turbogs("train", capture, "--out", tmp_path, "--device", "cpu", *QUICK), "not empty")
@@ -200,14 +207,20 @@ def test_an_output_folder_that_cannot_be_made_is_refused_before_anything_is_comp
     assert [path.name for path in tmp_path.iterdir()] == ["dangling"]
 
 
-@pytest.mark.parametrize("error", [OSError(28, "No space left on device"), PermissionError(13, "Denied", "/place")])
-def test_what_the_system_refuses_is_one_line(turbogs, tmp_path, monkeypatch, error):
+@pytest.mark.parametrize(
+    ("error", "remedy"),
+    [
+        (OSError(28, "No space left on device"), "choose another place or make room"),
+        (PermissionError(13, "Denied", "/place"), "choose another place or give yourself leave to use it (chmod)"),
+    ],
+)
+def test_what_the_system_refuses_is_one_line(turbogs, tmp_path, monkeypatch, error, remedy):
     def refused(path, horizon):
         raise error
 
     monkeypatch.setattr(scene, "write_demo_capture", refused)
-    words = [error.strerror, *filter(None, [error.filename])]
-    assert_refused(turbogs("demo", tmp_path / "demo"), *words, "choose another place or make room")
+    words = [error.strerror, *filter(None, [error.filename]), remedy]
+    assert_refused(turbogs("demo", tmp_path / "demo"), *words)
 
 
 @pytest.mark.parametrize(

@@ -41,7 +41,8 @@ def error_line(error: Exception) -> str:
     said = str(error)
     if isinstance(error, OSError):
         place = "" if error.filename is None else f"'{error.filename}': "
-        said = f"{place}{error.strerror or error}; choose another place or make room"
+        remedy = "make room" if not isinstance(error, PermissionError) else "give yourself leave to use it (chmod)"
+        said = f"{place}{error.strerror or error}; choose another place or {remedy}"
     return f"turbogs: error: {' '.join(said.split())}"
 
 

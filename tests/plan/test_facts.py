@@ -47,6 +47,12 @@ def scene_of(train: PosedImages, points: np.ndarray | None = None) -> Scene:
 LINE = np.array([[0.0, 0, 0], [0.1, 0, 0], [0.2, 0, 0], [0.5, 0, 0]])
 
 
+def test_photos_of_as_many_pixels_upright_and_lying_have_two_sizes():
+    images = [noise(64, 48), noise(48, 64), noise(48, 64), noise(64, 48)]
+    facts = gather_facts(scene_of(posed(images, nadir(LINE))), CPU)
+    assert (facts.smallest_photo, facts.largest_photo) == ((48, 64), (64, 48))
+
+
 def test_counts_sizes_and_bytes():
     images = [noise(48, 64), noise(48, 80), noise(32, 64), noise(48, 64)]
     facts = gather_facts(scene_of(posed(images, nadir(LINE))), CPU, memory_limit=5, time_budget=20.0)

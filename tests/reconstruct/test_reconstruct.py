@@ -240,6 +240,21 @@ def test_a_solve_without_ghosts_is_taken_as_it_is(attempts):
     assert (best.model.places, moved, removed) == (GOOD, [], [])
 
 
+def test_cameras_that_are_told_as_solved_are_those_of_the_largest_model(monkeypatch, tmp_path, capsys):
+    """COLMAP begins many times where photos do not connect, and registers some each time."""
+
+    def map_in_vain(*_, initial_image_pair_callback, next_image_callback, cancellation_token):
+        for _ in range(40):
+            initial_image_pair_callback()
+            next_image_callback()
+        return {0: FakeModel("ooo"), 1: FakeModel("oooo")}
+
+    monkeypatch.setattr(pycolmap, "incremental_mapping", map_in_vain)
+    models = solver.solve_cameras(tmp_path / "none.db", tmp_path, tmp_path / "scratch")
+    assert [model.num_reg_images() for model in models] == [4, 3]
+    assert capsys.readouterr().err.startswith("cameras solved: 4 in ")
+
+
 def test_a_solve_that_is_not_the_first_says_why(monkeypatch, tmp_path):
     said, workspace = [], Workspace(tmp_path)
     monkeypatch.setattr(solver, "solve_cameras", lambda *arguments: said.append(arguments[3]))
@@ -359,6 +374,15 @@ def test_commands_that_cannot_look_for_cameras_say_what_does(solved, tmp_path, t
     assert f"{photos} has {COUNT + 1} photos and nothing" in err and "turbogs reconstruct" in err
 
 
+def test_a_command_to_copy_is_right_for_folders_with_spaces(tmp_path, turbogs):
+    photos = tmp_path / "my photos"
+    photos.mkdir()
+    for name in "abc":
+        Image.new("RGB", (64, 48)).save(photos / f"{name}.jpg")
+    code, _, err = turbogs("plan", photos, "--device", "cpu")
+    assert code == 2 and f"turbogs reconstruct '{photos}' --out SCENE" in err
+
+
 def test_the_command_refuses_in_one_line(tmp_path, turbogs):
     (tmp_path / "photos").mkdir()
     Image.new("RGB", (64, 48)).save(tmp_path / "photos/a.jpg")
@@ -395,6 +419,38 @@ def test_photos_that_are_not_read_are_noted(solved, tmp_path, monkeypatch):
     assert (
         reconstruct(photos, tmp_path / "scene") == "1 file is of a kind that is not read (IMG_1.HEIC): convert to JPEG"
     )
+
+
+def test_masks_go_with_their_photos(solved, tmp_path, monkeypatch):
+    """Those of photos that are stored sideways are sideways too."""
+    photos = Path(shutil.copytree(solved[0].parent, tmp_path / "corner")) / "images"
+    scene = shutil.copytree(solved[1].scene, tmp_path / "scene")
+    monkeypatch.setattr(run, "solver", None)
+    (tmp_path / "corner/masks").mkdir()
+    upright = np.full(render_corner(camera_centers(COUNT)[0]).size[::-1], 255, np.uint8)
+    upright[:, :20] = 0
+    for view in range(COUNT):
+        turn = Image.Transpose.ROTATE_90 if view == 2 else None  # that of 5, also sideways, is upright already
+        mask = Image.fromarray(upright)
+        (mask.transpose(turn) if turn is not None else mask).save(tmp_path / f"corner/masks/view_{view:02d}.png")
+    for _ in range(2):
+        reconstruct(photos, scene)
+    for view in range(COUNT):
+        np.testing.assert_array_equal(Image.open(scene / f"masks/view_{view:02d}.png"), upright)
+    loaded = load_scene(scene, factor=2)
+    assert f"masks of {COUNT} of {COUNT} photos" in "".join(loaded.notes)
+    shares = loaded.train.masks.pixel_counts / loaded.train.cameras.sizes.prod(axis=1)
+    assert (shares < 0.95).all() and (shares > 0.5).all()
+
+
+def test_a_mask_of_another_size_is_refused_before_cameras_are_looked_for(solved, tmp_path, monkeypatch):
+    photos = Path(shutil.copytree(solved[0].parent, tmp_path / "corner")) / "images"
+    (tmp_path / "corner/masks").mkdir()
+    Image.new("L", (20, 10), 255).save(tmp_path / "corner/masks/view_00.png")
+    monkeypatch.setattr(run, "_reconstruct", lambda *_: pytest.fail("cameras were looked for"))
+    with pytest.raises(InputError, match=r"mask .*view_00.png is 20x10 but photo .* is .*: make it of"):
+        reconstruct(photos, tmp_path / "scene")
+    assert not (tmp_path / "scene").exists()
 
 
 def test_a_reconstruction_in_parts_is_not_taken_for_photos_alone(solved, tmp_path):

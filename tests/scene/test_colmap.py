@@ -238,6 +238,13 @@ def remove_model(folder: Path) -> None:
     (folder / "sparse/0/points3D.bin").unlink()
 
 
+def parts_of_two_models(folder: Path) -> None:
+    """Of the binary one two files, of the text one the other and one of these."""
+    pycolmap.Reconstruction(folder / "sparse/0").write_text(folder / "sparse/0")
+    for file in ("points3D.bin", "cameras.txt", "images.txt"):
+        (folder / "sparse/0" / file).unlink()
+
+
 def remove_most_of_the_model(folder: Path) -> None:
     remove_model(folder)
     (folder / "sparse/0/images.bin").unlink()
@@ -246,8 +253,9 @@ def remove_most_of_the_model(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("damage", "words"),
     [
-        (remove_model, r"has no points3D \(\.bin or \.txt\): bring that file .* back, or take .*sparse away and find"),
-        (remove_most_of_the_model, r"sparse/0 has no images and no points3D \(.*\): bring these files"),
+        (remove_model, r"has no points3D\.bin: bring that file .* back, or take .*sparse away and find"),
+        (parts_of_two_models, r"sparse/0 has no points3D\.bin: bring that file"),
+        (remove_most_of_the_model, r"sparse/0 has no images\.bin and no points3D\.bin: bring these files"),
         (capitals, r"9 of 9 photos are missing in .*; photo00\.PNG is there: give the files the letters"),
         (remove_photos, r"7 of 9 photos are missing in .*images: photo02.png, photo03.png, photo04.png, \.\.\.; bring"),
         (lambda folder: replace_photo(folder, b"\xff"), "cannot read the photo .*photo03.png"),

@@ -231,7 +231,7 @@ def test_instant_ngp_whose_model_cannot_be_used(tmp_path, trouble):
     assert scene.notes[-1].startswith(
         {
             "damaged": f"{model} is not used: {model / 'images.bin'} is damaged: ",
-            "incomplete": f"{model} is not used: it has no images (.bin or .txt)",
+            "incomplete": f"{model} is not used: it has no images.bin",
         }.get(trouble, f"{model} not used, its photos are not there")
     )
 
@@ -248,7 +248,7 @@ def test_a_model_in_parts_beside_other_poses_is_said(tmp_path, kind):
     (folder / "sparse/0").mkdir(parents=True)
     (folder / "sparse/0/cameras.bin").write_bytes(b"")
     (folder / "sparse/0/points3D.txt").write_bytes(b"")
-    said = f"{folder / 'sparse/0'} is not used: it has no images (.bin or .txt)"
+    said = f"{folder / 'sparse/0'} is not used: it has no images.bin and no points3D.bin"
     assert load_scene(folder).notes == (*before, said)
 
 

@@ -215,7 +215,7 @@ def test_transforms_name_masks(capture, tmp_path):
     ("path", "words"),
     [
         ("absent.png", r"names the mask .*absent.png, which is not there: bring it back"),
-        (7, "mask_path of frame .* is not a path"),
+        (7, "mask_path of frame .* is not a path: write one"),
         ("../../secret.png", "leaves the photo folder"),
     ],
 )

@@ -106,6 +106,21 @@ def test_a_given_model_has_the_tables_and_pictures_of_its_run(turbogs, finished,
             assert np.abs(ours - theirs).mean() < 0.1
 
 
+def test_renders_of_a_lens_with_distortion_say_that_their_cameras_are_undistorted(turbogs, finished, capture, tmp_path):
+    lensed = Path(shutil.copytree(capture, tmp_path / "lensed"))
+    model = load_pycolmap().Reconstruction(lensed / "sparse/0")
+    for camera in model.cameras.values():
+        focal, _, x, y = camera.params
+        camera.model, camera.params = load_pycolmap().CameraModelId.SIMPLE_RADIAL, [focal, x, y, 0.1]
+    model.write_binary(lensed / "sparse/0")
+    out = tmp_path / "out"
+    code, _, said = turbogs("render", finished / "model.ply", "--scene", lensed, "--out", out, "--device", "cpu")
+    assert code == 0
+    size = re.search(r"8 photos undistorted: SIMPLE_RADIAL 48x40 -> PINHOLE (\d+)x(\d+)\n", said)
+    assert size and size.groups() != ("48", "40")
+    assert {Image.open(path).size for path in (out / "test").iterdir()} == {tuple(map(int, size.groups()))}
+
+
 def test_the_settings_of_a_given_model_come_from_the_command_line(turbogs, finished, capture):
     code, out, _ = turbogs(
         "eval", finished / "model.ply", "scene.test_every=4", "--scene", capture, "--factor", "2", "--device", "cpu"
@@ -298,10 +313,10 @@ def bad_files(folder: Path) -> dict[str, tuple[Path, str]]:
         "no archive": (written("text.pt", b"text"), "not a whole file of torch.save"),
         "cut": (written("cut.pt", whole[:-300]), "cannot be used"),
         "other keys": (saved("weights.pt", {"conv1": torch.zeros(3), "bias": torch.zeros(1)}), "bias, conv1"),
-        "a list": (saved("list.pt", [torch.zeros(3)]), "it has list"),
+        "a list": (saved("list.pt", [torch.zeros(3)]), "it has list): give a .ply"),
         "code": (saved("code.pt", {"splats": Path("x")}), "more than plain tensors"),
         "not finite": (save_splats(folder / "nan.pt", broken), "none of its 5 Gaussians is finite"),
-        "no rows": (save_splats(folder / "none.pt", model.map(lambda value: value[:0])), "holds no Gaussians"),
+        "no rows": (save_splats(folder / "none.pt", model.map(lambda value: value[:0])), "holds no Gaussians: export"),
         "not a ply": (written("text.ply", b"text"), "not a .ply file"),
         "not a splat": (written("text.splat", b"text"), "is not a .splat"),
         "not a spz": (written("text.spz", b"text"), "cannot read"),

@@ -283,3 +283,9 @@ def test_random_backgrounds_are_uniform_and_depend_on_seed_and_iteration():
 def test_a_background_that_is_no_colour_is_refused(setting):
     with pytest.raises(InputError, match=r"is no colour: write black, white, grey or rgb\(51, 102, 153\)"):
         tiny_config("capture", f"train.background='{setting}'")
+
+
+def test_a_background_in_hexadecimal_is_not_a_comment_of_yaml():
+    assert tiny_config("capture", "train.background=#336699").train.background == "#336699"
+    with pytest.raises(InputError, match="'#12' is no colour: write"):
+        tiny_config("capture", "train.background=#12")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import shlex
 import sys
 from contextlib import ExitStack
 from functools import partial
@@ -131,7 +132,7 @@ def _tell(session: RunSession, reported: bool) -> int:
 
     folder = session.folder
     if session.signal is not None:
-        print(f"stopped and saved: go on with  turbogs train --resume {folder.path}", file=sys.stderr)
+        print(f"stopped and saved: go on with  turbogs train --resume {shlex.quote(str(folder.path))}", file=sys.stderr)
         return 128 + session.signal
     print(history_table(session.history))
     print(f"\n{session.wall.text()}")

@@ -170,7 +170,8 @@ def apply_overrides(mapping: Mapping[str, Any], overrides: Sequence[str]) -> dic
         keys = path.strip().split(".")
         if not separator or len(keys) < 2 or not all(keys):
             raise InputError(f"override '{override}' is not of the form section.key=value")
-        parsed = parse_yaml(f"value: {text}", override)
+        # A colour as #336699 would be a comment of YAML.
+        parsed = {"value": text} if text.startswith("#") else parse_yaml(f"value: {text}", override)
         if set(parsed) != {"value"}:
             raise InputError(f"override '{override}' has more than one value")
         nested = parsed["value"]

@@ -69,8 +69,8 @@ def read_gsplat(state: Mapping[str, Any], path: str | Path) -> Gaussians:
     if bands not in [(degree + 1) ** 2 - 1 for degree in range(MAX_SH_DEGREE + 1)]:
         raise InputError(
             f"{path}: shN has {bands} bands: spherical harmonics of degree 0 .. {MAX_SH_DEGREE}, the largest here, "
-            "have 0, 3, 8 or 15"
+            "have 0, 3, 8 or 15: export a model of one of these"
         )
     if not count:
-        raise InputError(f"{path} holds no Gaussians")
+        raise InputError(f"{path} holds no Gaussians: export the model again")
     return Gaussians(**{name: splats[name].detach().double() for name in PARAMETER_NAMES})

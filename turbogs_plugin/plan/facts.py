@@ -90,7 +90,7 @@ def gather_facts(
         with_exposures: compare those of the photos, which takes longer than all else here.
     """
     views, sizes = scene.train, scene.train.cameras.sizes
-    order = np.argsort(sizes.prod(axis=1), kind="stable")
+    order = np.lexsort((sizes[:, 0], sizes.prod(axis=1)))  # of equally many pixels, upright ones first
     pixels, test_pixels = int(sizes.prod(axis=1).sum()), int(scene.test.cameras.sizes.prod(axis=1).sum())
     sight = Sight.of(views, scene.points)
     exposures = compare_exposures(views, sight) if with_exposures else None

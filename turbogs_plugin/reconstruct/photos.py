@@ -67,6 +67,11 @@ def list_photos(folder: Path) -> tuple[Path, list[Path]]:
     return place, paths
 
 
+def plain_name(path: Path) -> str:
+    """A relative path with ``/``, and with ``_`` for what COLMAP's lists take for separators."""
+    return SEPARATORS.sub("_", path.as_posix())
+
+
 def read_photos(folder: Path) -> list[PhotoFile]:
     """The photos of a folder, in the order of their names. Each is decoded once, coarsely.
 
@@ -74,7 +79,7 @@ def read_photos(folder: Path) -> list[PhotoFile]:
         InputError: as `list_photos`; or one that cannot be read (the first in order).
     """
     place, paths = list_photos(folder)
-    names = [SEPARATORS.sub("_", path.relative_to(place).as_posix()) for path in paths]
+    names = [plain_name(path.relative_to(place)) for path in paths]
     for name, number in Counter(names).items():
         if number > 1:
             raise InputError(f"{number} photos in {place} would be named '{name}' without spaces: rename them")
@@ -99,14 +104,18 @@ def place_photos(photos: Sequence[PhotoFile], folder: Path) -> None:
         if photo.turned:
             _write_upright(photo.path, part)
         else:
-            try:
-                os.link(photo.path.resolve(), part)
-            except OSError:  # another disk, a file of another user
-                shutil.copyfile(photo.path, part)
+            link_or_copy(photo.path, part)
         os.replace(part, target)
 
     with decoding_threads() as pool:
         list(pool.map(place, photos))
+
+
+def link_or_copy(source: Path, target: Path) -> None:
+    try:
+        os.link(source.resolve(), target)
+    except OSError:  # another disk, a file of another user
+        shutil.copyfile(source, target)
 
 
 def _read(path: Path, name: str) -> PhotoFile:

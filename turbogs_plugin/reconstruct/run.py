@@ -21,6 +21,7 @@ from turbogs_plugin.reconstruct.agreement import (
     ghost_pairs,
     linked_groups,
 )
+from turbogs_plugin.reconstruct.masks import find_photo_masks, place_masks
 from turbogs_plugin.reconstruct.matching import FEW, Matching, choose_matching
 from turbogs_plugin.reconstruct.photos import PhotoFile, place_photos, read_photos
 from turbogs_plugin.reconstruct.workspace import Solution, Workspace
@@ -81,7 +82,8 @@ class Solve:
 def reconstruct(photos: Path, out: Path) -> Solution:
     """Find the cameras of photos, and write a COLMAP capture: ``images`` and ``sparse/0``.
 
-    A call for the same photos goes on where an earlier one was stopped. A finished one is told again.
+    A call for the same photos goes on where an earlier one was stopped. A finished one is told again. Masks of the
+    photos go with them, as they are now.
 
     Args:
         photos: a folder of photos, or a folder whose ``images`` are.
@@ -96,9 +98,11 @@ def reconstruct(photos: Path, out: Path) -> Solution:
     place, _ = find_photos(photos)
     if place.resolve() in (out.resolve(), *out.resolve().parents):
         raise InputError(f"the scene '{out}' would lie among the photos of '{place}': choose an --out elsewhere")
+    masks = find_photo_masks(photos, place, found)
     workspace = Workspace(out)
     missing = [parent for parent in (out, *out.parents) if not parent.exists()]
     new = workspace.begin(found)
+    place_masks(masks, workspace.masks)
     if (solution := workspace.read_solution()) is not None:
         return solution
     try:
@@ -106,7 +110,8 @@ def reconstruct(photos: Path, out: Path) -> Solution:
     except InputError:
         if new:
             shutil.rmtree(missing[-1] if missing else workspace.scratch, ignore_errors=True)
-            shutil.rmtree(workspace.images, ignore_errors=True)
+            for folder in (workspace.images, workspace.masks):
+                shutil.rmtree(folder, ignore_errors=True)
         raise
 
 

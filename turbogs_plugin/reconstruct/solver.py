@@ -119,24 +119,31 @@ def solve_cameras(database: Path, images: Path, scratch: Path, again: str = "") 
     place.mkdir(parents=True)
     registered = 0
 
-    def count(images: int = 1) -> None:
+    def begin() -> None:  # a model, or another attempt at one
         nonlocal registered
-        registered += images
+        registered = 2
 
-    def step(token: pycolmap.CancellationToken) -> dict[int, pycolmap.Reconstruction]:
-        return pycolmap.incremental_mapping(
+    def count() -> None:
+        nonlocal registered
+        registered += 1
+
+    def step(token: pycolmap.CancellationToken) -> list[pycolmap.Reconstruction]:
+        nonlocal registered
+        models = pycolmap.incremental_mapping(
             database,
             images,
             place,
             options,
-            initial_image_pair_callback=lambda: count(2),
+            initial_image_pair_callback=begin,
             next_image_callback=count,
             cancellation_token=token,
         )
+        ordered = sorted(models.values(), key=lambda model: -model.num_reg_images())
+        registered = ordered[0].num_reg_images() if ordered else 0
+        return ordered
 
     total = row_counter(database, "images")()
-    models = watched(f"cameras solved{again}", total, lambda: registered, step)
-    return sorted(models.values(), key=lambda model: -model.num_reg_images())
+    return watched(f"cameras solved{again}", total, lambda: registered, step)
 
 
 def measure_agreement(model: pycolmap.Reconstruction, database: Path) -> Agreement:

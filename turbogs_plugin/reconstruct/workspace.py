@@ -43,13 +43,14 @@ class Workspace:
     """The paths of a reconstruction in a capture's folder.
 
     Attributes:
-        images, model: what a capture consists of.
+        images, masks, model: what a capture consists of.
         scratch: what only a later call needs: the list of photos, databases, the solver's output.
     """
 
     def __init__(self, scene: Path) -> None:
         self.scene = scene
         self.images = scene / "images"
+        self.masks = scene / "masks"
         self.model = scene / "sparse" / "0"
         self.scratch = scene / "reconstruction"
         self.listed = self.scratch / "photos.json"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -32,7 +33,7 @@ def evaluate_run(path: Path, device_name: str, given: Config | None = None) -> s
         device_name: where to render.
         given: the capture of a model from a file, and how to render it; None: `path` is a run.
     """
-    model, views, background = _open(path, device_name, "test", given)
+    model, views, background, _ = _open(path, device_name, "test", given)
     views = place_views(views, model.gaussians.device, model.config.train.photos_place)
     lpips, reason = load_lpips(model.config.report.lpips_weights, model.gaussians.device)
     flip, no_flip = load_flip()
@@ -55,7 +56,8 @@ def render_run(
     given: Config | None = None,
     out: Path | None = None,
 ) -> list[Path]:
-    """Write the views of a split, rendered from a run's newest model or a given one, as PNGs.
+    """Write the views of a split, rendered from a run's newest model or a given one, as PNGs, and say what was done
+    with the capture's photos: where they were undistorted, the views are those of the undistorted cameras.
 
     Args:
         path, given: as in `evaluate_run`.
@@ -72,7 +74,7 @@ def render_run(
         raise InputError(f"'{path}' has no run's folder to render into: name one by --out FOLDER")
     if out is not None:
         require_writable(out, f"--out '{out}'")
-    model, views, background = _open(path, device_name, split, given)
+    model, views, background, notes = _open(path, device_name, split, given)
     target = model.folder.renders if out is None else out
     cameras = views.cameras.to(model.gaussians.device)
     folders = [target / name for name in ([split, f"{split}-depth"] if with_depth else [split])]
@@ -93,6 +95,7 @@ def render_run(
             depths = (image.depths.cpu().double() * model.frame.scale).float().numpy()
             np.save(folders[1] / f"{name}.npy", depths)
             Image.fromarray(depth_picture(depths)).save(folders[1] / f"{name}.png")
+    print("\n".join(notes), file=sys.stderr)  # last, as an error is one line alone
     return folders
 
 
@@ -104,8 +107,12 @@ def distinct_stems(names: Sequence[str]) -> list[str]:
     return list(stems)
 
 
-def _open(path: Path, device_name: str, split: str, given: Config | None) -> tuple[SavedModel, PosedImages, Color]:
-    """A run's newest model or a given one on a device, the views of a split on the CPU, and their background."""
+def _open(
+    path: Path, device_name: str, split: str, given: Config | None
+) -> tuple[SavedModel, PosedImages, Color, tuple[str, ...]]:
+    """A run's newest model or a given one on a device, the views of a split on the CPU, their background, and the
+    capture's notes."""
     model, scene, _ = load_with_capture(path, given, resolve_device(device_name))
     views = scene.test if split == "test" else scene.train
-    return model, views, Background.of(model.config.train.background, views.photos.transparent).evaluated
+    background = Background.of(model.config.train.background, views.photos.transparent).evaluated
+    return model, views, background, scene.notes

@@ -18,6 +18,8 @@ FEWEST_PHOTOS = 3
 LARGEST_SIDE = 65535
 """Photos wider or higher than this many pixels are refused (it is JPEG's own limit)."""
 
+AGAIN = "export or reconstruct it again"
+
 
 @dataclass
 class Capture:
@@ -71,7 +73,7 @@ class Capture:
             raise InputError(f"{source} has no images with a pose: reconstruct the capture again")
         bad = ~np.isfinite(self.points).all(axis=1)
         if bad.any():
-            raise InputError(f"{source}: {bad.sum()} of {len(bad)} 3D points are not finite")
+            raise InputError(f"{source}: {bad.sum()} of {len(bad)} 3D points are not finite: {AGAIN}")
         orthogonality = self.viewmats[:, :3, :3] @ self.viewmats[:, :3, :3].transpose(0, 2, 1) - np.eye(3)
         with np.errstate(invalid="ignore"):
             posed = np.isfinite(self.viewmats).all(axis=(1, 2)) & (np.abs(orthogonality).max(axis=(1, 2)) < 1e-3)
@@ -86,7 +88,8 @@ class Capture:
         ):
             if not ok.all():
                 raise InputError(
-                    f"{source}: image '{self.names[int(np.argmin(ok))]}' has {trouble} ({(~ok).sum()} such images)"
+                    f"{source}: image '{self.names[int(np.argmin(ok))]}' has {trouble} ({(~ok).sum()} such images): "
+                    + AGAIN
                 )
         return self
 
@@ -113,6 +116,6 @@ def check_photo_name(name: str, source: Path) -> str:
 
 def sizes_text(sizes: np.ndarray) -> str:
     """Of photos of `sizes` [V, 2]: ``800x600``, or the one with fewest and the one with most pixels."""
-    pixels = np.prod(sizes, axis=1)
-    ends = (f"{width:g}x{height:g}" for width, height in (sizes[pixels.argmin()], sizes[pixels.argmax()]))
+    ordered = sizes[np.lexsort((sizes[:, 0], np.prod(sizes, axis=1)))]  # of equally many pixels, the upright one first
+    ends = (f"{width:g}x{height:g}" for width, height in ordered[[0, -1]])
     return " to ".join(dict.fromkeys(ends))

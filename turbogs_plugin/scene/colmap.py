@@ -31,7 +31,7 @@ INSTANT_NGP_FOLDERS = ("colmap_sparse", "colmap_text")
 STRAIGHT_MODELS = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 """Camera models that are a pinhole where all their parameters of distortion are 0."""
 
-FILES = ("cameras", "images", "points3D")
+FILES, SUFFIXES = ("cameras", "images", "points3D"), (".bin", ".txt")
 
 ORIGINALS = "input"
 """Where gaussian-splatting's ``convert.py`` keeps the photos that it undistorts into ``images``."""
@@ -73,16 +73,20 @@ def find_model(scene: Path, anywhere: bool = False) -> tuple[Path, str] | None:
 
 def _suffix(folder: Path) -> str:
     """That of the reconstruction in this very folder; empty where there is none."""
-    complete = (suffix for suffix in (".bin", ".txt") if all((folder / f"{file}{suffix}").is_file() for file in FILES))
+    complete = (suffix for suffix in SUFFIXES if all((folder / f"{file}{suffix}").is_file() for file in FILES))
     return next(complete, "")
 
 
 def incomplete_model(scene: Path) -> tuple[Path, list[str]] | None:
-    """Of a reconstruction in the known folders that lacks files, where it is and which; None where there is none."""
+    """Of a reconstruction in the known folders that lacks files, where it is and which: those of the suffix that most
+    have; None where there is none."""
     for place in (scene / name for name in (*MODEL_FOLDERS, *INSTANT_NGP_FOLDERS)):
         for folder in (place, *sorted(place.glob("[0-9]"))):
-            if there := {path.stem for path in folder.glob("*") if path.suffix in (".bin", ".txt")} & set(FILES):
-                return folder, [name for name in FILES if name not in there]
+            absent = [
+                [file for name in FILES if not (folder / (file := f"{name}{suffix}")).is_file()] for suffix in SUFFIXES
+            ]
+            if any(len(files) < len(FILES) for files in absent):
+                return folder, min(absent, key=len)
     return None
 
 
@@ -135,7 +139,7 @@ def read_colmap(scene: Path, model: Path, suffix: str) -> Capture:
     names = tuple(check_photo_name(image.name, model) for image in images)
     for name, following in itertools.pairwise(names):
         if name == following:
-            raise InputError(f"{model} has two images named '{name}'")
+            raise InputError(f"{model} has two images named '{name}': rename the photos and reconstruct again")
     first = reconstruction.cameras[images[0].camera_id] if images else None
     photo_folder, reduction = find_photo_folder(scene, names, first and (first.width, first.height))
     absent = [name for name in names if not (photo_folder / name).is_file()]

@@ -89,7 +89,7 @@ class _Reader:
         """Step over a quaternion of any length and a translation, both finite."""
         values = np.array(self.unpack("7d"))
         if not np.isfinite(values).all() or not 1e-6 < np.abs(values[:4]).max() < 1e6:
-            raise InputError(f"{self.path}: {owner} has a pose that is not finite, or a zero rotation")
+            raise self.fail(f"{owner} has a pose that is not finite, or a zero rotation")
 
 
 def check_binary_model(folder: Path) -> None:
@@ -102,7 +102,7 @@ def check_binary_model(folder: Path) -> None:
     _check_points(_Reader(folder / "points3D.bin"))
     rigs, frames = folder / "rigs.bin", folder / "frames.bin"
     if rigs.exists() != frames.exists():
-        raise InputError(f"{folder} has one of rigs.bin and frames.bin: it must have both or neither")
+        raise InputError(f"{folder} has one of rigs.bin and frames.bin: bring the other one back")
     if rigs.exists():
         _check_rigs(_Reader(rigs))
         _check_frames(_Reader(frames))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import shlex
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -133,7 +134,7 @@ def load_scene(
     if len(test) < FEWEST_PHOTOS:
         raise InputError(f"{scene} has {len(test)} images: at least {FEWEST_PHOTOS} are needed; add photos to it")
     if capture.test is not None and (~test).sum() < FEWEST_PHOTOS:
-        raise InputError(f"{scene} has {(~test).sum()} training images: at least {FEWEST_PHOTOS} are needed")
+        raise InputError(f"{scene} has {(~test).sum()} training images: at least {FEWEST_PHOTOS} are needed; add some")
     if test.all():
         raise InputError(f"test_every is {test_every}: every image of {scene} would be a test image; use 2 or more")
 
@@ -277,7 +278,7 @@ def _read_model(scene: Path, model: tuple[Path, str] | None, files: list[str]) -
         lack = incomplete_model(scene)
         if lack is None or lack[0] == scene:
             return ""
-        return f"{lack[0]} is not used: it has no {' and no '.join(lack[1])} (.bin or .txt)"
+        return f"{lack[0]} is not used: it has no {' and no '.join(lack[1])}"
     # What instant-ngp leaves beside its transforms.json must serve as well as that.
     whole = bool(files) and model[0].relative_to(scene).parts[:1] in [(name,) for name in INSTANT_NGP_FOLDERS]
     try:
@@ -303,24 +304,25 @@ def _read_other(scene: Path, files: list[str], factor: int) -> Capture:
         return llff.read_llff(scene, factor)
     if not _is_begun(scene) and (where := capture_near(scene)):
         raise InputError(where)
+    solve = f"'turbogs reconstruct {shlex.quote(str(scene))} --out SCENE'"
     if holds_photos_alone(scene):
         raise InputError(
             f"{scene} has {len(find_photos(scene)[1])} photos and nothing that says where they were taken from: find "
-            f"that by 'turbogs reconstruct {scene} --out SCENE', then use SCENE"
+            f"that by {solve}, then use SCENE"
         )
     if lack := incomplete_model(scene):
         folder, absent = lack
         files_back = "bring that file" if len(absent) == 1 else "bring these files"
         anew = f"take {scene / folder.relative_to(scene).parts[0]} away and find the cameras" if folder != scene else ""
         raise InputError(
-            f"{folder} has no {' and no '.join(absent)} (.bin or .txt): {files_back} of the reconstruction back"
-            + (f", or {anew} by 'turbogs reconstruct {scene} --out SCENE'" if anew and find_photos(scene)[1] else "")
+            f"{folder} has no {' and no '.join(absent)}: {files_back} of the reconstruction back"
+            + (f", or {anew} by {solve}" if anew and find_photos(scene)[1] else "")
         )
     if photos := find_photos(scene)[1]:
         begun = next(place for place in MODEL_FOLDERS if (scene / place).is_dir())
         raise InputError(
             f"{scene} has {len(photos)} photos and no reconstruction in {scene / begun}: bring its files back, or take "
-            f"the folder away and find the cameras by 'turbogs reconstruct {scene} --out SCENE'"
+            f"the folder away and find the cameras by {solve}"
         )
     raise InputError(
         f"{scene} has neither a COLMAP reconstruction (cameras, images and points3D as .bin or .txt in sparse/0) nor a "

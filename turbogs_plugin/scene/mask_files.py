@@ -40,7 +40,7 @@ def find_masks(scene: Path, capture: Capture, photos: Sequence[Path]) -> tuple[l
     names = [f"{FOLDER}{reduced[0]}", FOLDER] if reduced else [FOLDER]
     parents = dict.fromkeys((scene, capture.photo_folder.parent, capture.photo_folder))
     folders = [parent / name for name in names for parent in parents if (parent / name).is_dir()]
-    found = [file or _in_folders(folders, name) for file, name in zip(capture.mask_files, capture.names, strict=True)]
+    found = [file or in_folders(folders, name) for file, name in zip(capture.mask_files, capture.names, strict=True)]
     count, views = sum(file is not None for file in found), len(found)
     if count == 0:
         unused = (f"{folder} is not used: it has no {CONVENTIONS} of a photo" for folder in folders)
@@ -51,7 +51,8 @@ def find_masks(scene: Path, capture: Capture, photos: Sequence[Path]) -> tuple[l
     return found, f"masks of {count} of {views} photos, as {first}{rest}"
 
 
-def _in_folders(folders: Sequence[Path], photo: str) -> Path | None:
+def in_folders(folders: Sequence[Path], photo: str) -> Path | None:
+    """The mask of a photo in the first of these folders that has one; `photo` is relative to that of the photos."""
     stem = PurePosixPath(photo).with_suffix("")
     names = (f"{stem}.png", f"{photo}.png", photo, *(f"{stem}{suffix}" for suffix in JPEG_SUFFIXES))
     return next((folder / name for folder in folders for name in names if (folder / name).is_file()), None)
@@ -98,11 +99,7 @@ def load_masks(
 def _read(file: Path, photo: Path, size: tuple[int, int], full_size: tuple[int, int]) -> np.ndarray:
     """[height, width] bool: the mask, in the size of the photo."""
     with opened_image(file, "mask") as image:
-        if image.size not in (size, full_size):
-            raise InputError(
-                f"mask {file} is {image.size[0]}x{image.size[1]} but photo {photo} is {size[0]}x{size[1]}: make it of "
-                "the photo's size, nonzero where a pixel counts"
-            )
+        require_mask_size(file, image.size, photo, size, full_size)
         if image.mode == "P":
             image = image.convert("RGBA" if is_transparent(image) else "RGB")
         least = HALF if image.format == "JPEG" else 1
@@ -111,6 +108,17 @@ def _read(file: Path, photo: Path, size: tuple[int, int], full_size: tuple[int, 
             values = values[:, :, :-1] * (values[:, :, -1:] > 0)
         keep = (values.reshape(*values.shape[:2], -1) >= least).any(axis=2)
     return _reduced(keep, size)
+
+
+def require_mask_size(
+    file: Path, mask_size: tuple[int, int], photo: Path, size: tuple[int, int], other: tuple[int, int]
+) -> None:
+    """Raise `InputError` unless a mask has its photo's `size`, or the `other` one that will do; (width, height)."""
+    if mask_size not in (size, other):
+        raise InputError(
+            f"mask {file} is {mask_size[0]}x{mask_size[1]} but photo {photo} is {size[0]}x{size[1]}: make it of the "
+            "photo's size, nonzero where a pixel counts"
+        )
 
 
 def _placed(keep: np.ndarray, lens: Lens | None, target: tuple[int, int]) -> np.ndarray:

@@ -273,7 +273,7 @@ def opened_image(path: Path, what: str = "photo", remedy: str = "copy it there a
     except InputError:
         raise
     except Exception as error:  # a broken file can raise anything in its decoder
-        reason = " ".join((str(error) or type(error).__name__).split())
+        reason = " ".join((getattr(error, "strerror", None) or str(error) or type(error).__name__).split())
         if isinstance(error, UnidentifiedImageError):
             reason = "it is no image of a known kind" if path.stat().st_size else "the file is empty"
         raise InputError(f"cannot read the {what} {path}: {reason}; {remedy}") from error

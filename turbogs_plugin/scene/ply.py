@@ -62,8 +62,8 @@ def read_header(path: Path) -> tuple[list[str], int]:
 def _parse_header(path: Path, lines: list[str]) -> tuple[bool, int, np.dtype, bool]:
     """Whether the body is binary, the number of vertices, their layout, and whether nothing follows them."""
 
-    def fail(line: str, trouble: str) -> InputError:
-        return InputError(f"{path}: the line '{line[:80]}' of its header {trouble}")
+    def fail(line: str, trouble: str, remedy: str = "export it again") -> InputError:
+        return InputError(f"{path}: the line '{line[:80]}' of its header {trouble}; {remedy}")
 
     formats = {"binary_little_endian": True, "ascii": False}
     binary: bool | None = None
@@ -82,9 +82,8 @@ def _parse_header(path: Path, lines: list[str]) -> tuple[bool, int, np.dtype, bo
             if elements == ["vertex"]:
                 count = int(words[2])
             elif elements == ["chunk"]:
-                raise fail(
-                    line, "is that of SuperSplat's compressed .ply, not read here: give the .ply that it was made of"
-                )
+                compressed = "is that of SuperSplat's compressed .ply, not read here"
+                raise fail(line, compressed, "give the .ply that it was made of")
             elif len(elements) == 1:
                 raise fail(line, "comes before the vertices: they must be the first element")
         elif words[0] == "property" and elements:
@@ -98,7 +97,9 @@ def _parse_header(path: Path, lines: list[str]) -> tuple[bool, int, np.dtype, bo
         else:
             raise fail(line, "is not understood")
     if binary is None or not properties:
-        raise InputError(f"{path}: its header has no {'format' if binary is None else 'vertex properties'}")
+        raise InputError(
+            f"{path}: its header has no {'format' if binary is None else 'vertex properties'}; export it again"
+        )
     return binary, count, np.dtype(list(properties.items())).newbyteorder("<"), len(elements) == 1
 
 
@@ -111,5 +112,7 @@ def _read_ascii(path: Path, offset: int, count: int, layout: np.dtype) -> np.nda
             try:
                 vertices[row] = tuple(float(word) for word in words)
             except (ValueError, OverflowError) as error:
-                raise InputError(f"{path}: vertex {row} is not {len(layout)} numbers in their types' ranges") from error
+                raise InputError(
+                    f"{path}: vertex {row} is not {len(layout)} numbers in their types' ranges; export it again"
+                ) from error
     return vertices

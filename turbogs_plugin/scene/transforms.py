@@ -39,7 +39,8 @@ def read_frames(source: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     try:
         content = json.loads(source.read_text(encoding="utf-8-sig"))  # Windows' editors write a mark at its beginning
     except (OSError, ValueError, RecursionError) as error:
-        raise InputError(f"{source} is not readable JSON: {' '.join(str(error).split())[:200]}") from error
+        reason = " ".join((getattr(error, "strerror", None) or str(error)).split())[:200]
+        raise InputError(f"{source} is not readable JSON: {reason}; export or copy it again") from error
     frames = content.get("frames") if isinstance(content, dict) else None
     if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
         raise InputError(f"{source} has no list of frames: export it again")
@@ -80,7 +81,7 @@ def read_transforms(scene: Path) -> Capture:
     split = read_split(content, set(names_of_frames), name_of, source)
     for name, frame in zip(names_of_frames, frames, strict=True):
         if name in views or name in absent:
-            raise InputError(f"{source} has two frames for '{name}'")
+            raise InputError(f"{source} has two frames for '{name}': take one of them out")
         if split is not None and name in split.unused:
             continue
         if not is_there(scene, name):
@@ -238,7 +239,7 @@ def _mask_file(scene: Path, frame: dict, name: str, source: Path) -> Path | None
     if path is None:
         return None
     if not isinstance(path, str):
-        raise InputError(f"{source}: mask_path of frame '{name}' is not a path")
+        raise InputError(f"{source}: mask_path of frame '{name}' is not a path: write one, or take it out")
     file = scene / _file_name(scene, path, source)
     if not file.is_file():
         raise InputError(f"{source}: frame '{name}' names the mask {file}, which is not there: bring it back")
@@ -312,7 +313,10 @@ def _intrinsics(values: dict, photo: Path, source: Path) -> tuple[np.ndarray, tu
     if width is None or height is None:
         width, height = photo_size(photo)
     if not (1 <= width <= LARGEST_SIDE and 1 <= height <= LARGEST_SIDE):
-        raise InputError(f"{source}: the size of {photo.name} is {width:g}x{height:g} pixels")
+        raise InputError(
+            f"{source}: the size of {photo.name} is {width:g}x{height:g} pixels: write the photo's as w and h, or take "
+            "them out"
+        )
 
     K = pinhole(values, source, (width, height))
     if K is None:
@@ -385,7 +389,7 @@ def opengl_viewmat(matrix: Any, absent: str, wrong: str, remedy: str = "") -> np
 
 def _read_points(scene: Path, name: Any, source: Path) -> tuple[np.ndarray, np.ndarray]:
     if not isinstance(name, str):
-        raise InputError(f"{source}: ply_file_path is not a path")
+        raise InputError(f"{source}: ply_file_path is not a path: write one, or take it out")
     path = scene / _file_name(scene, name, source)
     if not path.is_file():
         raise InputError(
@@ -394,7 +398,7 @@ def _read_points(scene: Path, name: Any, source: Path) -> tuple[np.ndarray, np.n
         )
     vertices = read_vertices(path)
     if not {"x", "y", "z"} <= set(vertices.dtype.names):
-        raise InputError(f"{path} has no x, y, z")
+        raise InputError(f"{path} has no x, y, z: export it again, or take ply_file_path out of {source.name}")
     points = np.stack([vertices[axis].astype(np.float64) for axis in "xyz"], axis=1)
     channels = ("red", "green", "blue")
     if not set(channels) <= set(vertices.dtype.names):

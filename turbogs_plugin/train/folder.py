@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 
 from turbogs_plugin.config.configuration import Config, resolve_complete
@@ -37,7 +38,8 @@ class RunFolder:
     def require_new(self) -> None:
         """Raise `InputError` if the folder holds anything, or cannot be made."""
         if self.config.exists():
-            raise InputError(f"'{self.path}' holds another run: choose a new --out, or go on with --resume {self.path}")
+            quoted = shlex.quote(str(self.path))
+            raise InputError(f"'{self.path}' holds another run: choose a new --out, or go on with --resume {quoted}")
         if self.path.exists() and not self.path.is_dir():
             raise InputError(f"--out '{self.path}' is a file: choose a folder")
         if self.path.is_dir() and any(self.path.iterdir()):

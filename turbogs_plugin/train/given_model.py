@@ -116,7 +116,9 @@ def _read(file: Path) -> tuple[Gaussians, Similarity | None]:
     trainer = state.get("trainer") if isinstance(state, Mapping) else None
     if not (isinstance(trainer, Mapping) and isinstance(trainer.get("gaussians"), Mapping)):
         keys = ", ".join(sorted(map(str, state))[:6]) if isinstance(state, Mapping) else type(state).__name__
-        raise InputError(f"{file} is neither gsplat's checkpoint (step, splats) nor one of TurboGS (it has {keys})")
+        raise InputError(
+            f"{file} is neither gsplat's checkpoint (step, splats) nor one of TurboGS (it has {keys}): give {KINDS}"
+        )
     gaussians = read_gsplat({"splats": trainer["gaussians"]}, file)
     try:
         return gaussians, Similarity.into(frame_of_state(state)).inverse()

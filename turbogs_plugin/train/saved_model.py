@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import operator
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -52,7 +53,8 @@ def load_model(path: Path, device: torch.device) -> SavedModel:
     config = folder.read_config()
     checkpoint = latest_checkpoint(folder.checkpoints)
     if checkpoint is None:
-        raise InputError(f"'{path}' has no checkpoint yet: let the run go on with  turbogs train --resume {path}")
+        quoted = shlex.quote(str(path))
+        raise InputError(f"'{path}' has no checkpoint yet: let the run go on with  turbogs train --resume {quoted}")
     state = load_checkpoint(checkpoint)
     try:
         frame = frame_of_state(state)
