@@ -10,10 +10,13 @@ function of (seed, iteration, place), so all draw the same. Then
    it adds up their records, in the order of the shares;
 3. it solves for their update, and the new parameters of all rows are gathered (236 bytes a Gaussian).
 
-Every step and statistic is computed by one process, as by a process alone, and copied to the others. So the replicas
-are bit-equal, and a step differs from that of one process only by the order in which the samples of a view are added
-up. Moments and statistics are valid for a process's own rows alone, until `complete`. A density control that reads the
-statistics at every iteration (`DensityController.watched`) has them gathered, without a host that waits.
+Two processes with a small batch (`owners_pay`) do without 3: both get all records, and both make all steps.
+
+Every step and statistic is computed by one process, as by a process alone, and copied to the others; or by all, from
+the same records. So the replicas are bit-equal, and a step differs from that of one process only by the order in which
+the samples of a view are added up. Moments and statistics of owned rows are valid for a process's own rows alone, until
+`complete`. A density control that reads the statistics at every iteration (`DensityController.watched`) has them
+gathered, without a host that waits.
 """
 
 from __future__ import annotations
@@ -43,6 +46,10 @@ from turbogs_plugin.types import Cameras, Gaussians, GaussianStats, PixelSamples
 LAG = 4
 """After so many iterations all processes look at the flags of an iteration, and wait for them if need be: so all know
 of them at the same place, and no host runs farther ahead of its GPU."""
+
+OWNERS_FROM = 4_000_000
+"""Rows of a batch, views times Gaussians, from which on two processes gain by owners of rows. Measured with 1.5, 1.8, 3
+and 6 million (docs/scaling.md): below, two exchanges more cost what they save, or up to .6 ms."""
 
 OVERFLOW, STOP = 0, 1
 """Columns of a pass's flags: iterations do nothing for lack of memory; the signal to stop, 0 for none. They travel as
@@ -117,16 +124,22 @@ def exchange_of(ranks: Ranks) -> Exchange:
     return RankExchange(ranks) if isinstance(ranks, ProcessRanks) else Exchange()
 
 
+def owners_pay(processes: int, views: int, gaussians: int) -> bool:
+    """Whether owners of rows should make the steps of a batch, and not all processes all of them."""
+    return processes > 2 or views * gaussians >= OWNERS_FROM
+
+
 class RankExchange(Exchange):
     """Exchanges by torch.distributed, as the module says.
 
     Attributes:
-        by_rows: owners of rows make the steps. False: every process gets all records and makes all steps, with more
-            bytes for the records and none for parameters; optimizers without a rule always work like this.
+        by_rows: owners of rows make the steps; None: where `owners_pay`. It may change when moments are complete.
+            Optimizers without a rule always get all records, on every process.
     """
 
     def __init__(self, ranks: ProcessRanks) -> None:
-        self.ranks, self.by_rows = ranks, True
+        self.ranks = ranks
+        self.by_rows: bool | None = None
         self._passes = 0
         self._flags: deque[_Flags] = deque()
         self._incomplete = False
@@ -198,10 +211,13 @@ class RankExchange(Exchange):
         moments: GaussianMoments,
         stats: GaussianStats | None,
     ) -> None:
-        if not self.by_rows:
-            engine.update(rule, screen.whole(), gaussians, moments, stats)
-            return
         if not self._incomplete:
+            by_rows = self.by_rows
+            if by_rows is None:
+                by_rows = owners_pay(self.ranks.count, screen.views, len(gaussians))
+            if not by_rows:
+                engine.update(rule, screen.whole(), gaussians, moments, stats)
+                return
             self._incomplete, self._skipped = True, moments.skipped.clone()
         if self._owned is None or not self._owned.fits(gaussians, moments, stats):
             self._owned = OwnedRows(self.ranks, gaussians, moments, stats)

@@ -62,6 +62,11 @@ class SharedScreen:
     _plain: ScreenRecords | None
     _with_statistics: bool
 
+    @property
+    def views(self) -> int:
+        """K, of all processes."""
+        return len(self._batch.samples.view_ids)
+
     def parameter_gradients(self, rows: bool, stats: GaussianStats | None = None) -> GaussianGradients:
         """`ScreenGradients.parameter_gradients`, of all views and Gaussians, on every process."""
         return self.whole().parameter_gradients(rows, stats)
@@ -80,7 +85,7 @@ class SharedScreen:
         """
         batch, device = self._batch, own.device
         ranks, shares = batch.ranks, batch.shares
-        mine, count = rows[ranks.rank], len(batch.samples.view_ids)
+        mine, count = rows[ranks.rank], self.views
         records = torch.empty(count, mine.stop - mine.start, ScreenRecord.SIZE, device=device)
         radii = torch.empty(count, mine.stop - mine.start, 2, dtype=torch.int32, device=device)
         sent: list[tuple[int, Tensor]] = []
