@@ -16,6 +16,7 @@ import numpy as np
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene.capture import FEWEST_PHOTOS, LARGEST_SIDE, Capture, check_photo_name, left_out, named
 from turbogs_plugin.scene.colmap_check import SMALLEST_IMAGE, check_binary_model
+from turbogs_plugin.scene.photo_folder import NO_PHOTOS
 from turbogs_plugin.scene.photos import photo_size
 from turbogs_plugin.scene.starting_points import starting_points
 from turbogs_plugin.scene.undistort import Lens, lens_of_camera
@@ -259,7 +260,7 @@ def _folders(place: Path, depth: int) -> Iterator[Path]:
 
 
 def _may_hold_photos(entry: Path) -> bool:
-    return not (REDUCED.search(entry.name) or entry.name[0] == "." or entry.name == "masks") and entry.is_dir()
+    return not (REDUCED.search(entry.name) or NO_PHOTOS.fullmatch(entry.name)) and entry.is_dir()
 
 
 def _kind_note(scene: Path, model: Path, suffix: str, images: int, points: str, photo_folder: Path) -> str:
