@@ -289,7 +289,7 @@ def test_an_empty_path_is_not_the_current_folder(turbogs, copy, tmp_path, monkey
     assert_refused(turbogs("reconstruct", "", "--out", tmp_path / "cameras"), said)
     for option in (("--out", ""), ("--out=",)):
         assert_refused(turbogs("train", copy, *option, *QUICK), "--out '': write a value")
-    assert_refused(turbogs("plan", copy, "--init", ""), "--init '': write a value")
+    assert_refused(turbogs("plan", copy, "--init", ""), "--init '': write points, random, or a model's file")
     assert tree(tmp_path) == before
 
 

@@ -38,6 +38,10 @@ FLAGS = ("--report", "--no-report", "--offload", "--no-offload")
 """Options without a value, of verbs that have overrides."""
 
 
+SAY_THEMSELVES = ("--init", "--max-memory", "--time-budget")
+"""Options that say what may stand in the place of an empty value."""
+
+
 def _gathered(arguments: list[str]) -> list[str]:
     """Arguments with later overrides brought before the first option, where a word besides the verb stands there.
 
@@ -74,7 +78,7 @@ def _require_no_empty(arguments: list[str]) -> None:
     for before, text in itertools.pairwise(["", *arguments]):
         if text.startswith("--") and text.endswith("="):
             before, text = text[:-1], ""
-        if not text:
+        if not text and before not in SAY_THEMSELVES:
             which = before if before.startswith("-") else "an argument is"
             raise InputError(f"{which} '': write a value, as . for the current folder, or leave it out")
 

@@ -73,6 +73,8 @@ class RunOptions:
         if self.device is not None:
             settings.train.device = self.device
         if self.init is not None:
+            if not self.init.strip():
+                raise InputError("--init '': write points, random, or a model's file; leave it out for points")
             settings.train.init = self.init
         return settings
 
@@ -109,6 +111,9 @@ NO_SCENE = GivenOptions()
 
 def budget_overrides(max_memory: str | None, time_budget: str | None) -> tuple[str, ...]:
     """The options of a budget as overrides."""
+    for option, amount in (("--max-memory", max_memory), ("--time-budget", time_budget)):
+        if amount == "":
+            raise InputError(f"{option} '': write an amount; leave it out for no limit")
     given = {"max_memory": max_memory, "time": time_budget}
     return tuple(f"budget.{name}={value!r}" for name, value in given.items() if value is not None)
 
