@@ -37,7 +37,6 @@ OVERRIDE = re.compile(r"\w+(\.\w+)+=.*", re.DOTALL)
 FLAGS = ("--report", "--no-report", "--offload", "--no-offload")
 """Options without a value, of verbs that have overrides."""
 
-
 SAY_THEMSELVES = ("--init", "--max-memory", "--time-budget")
 """Options that say what may stand in the place of an empty value."""
 
