@@ -279,6 +279,39 @@ def test_incomplete_and_contradictory_calls(turbogs, capture, tmp_path):
     assert_refused(turbogs("train", "--resume", tmp_path, "--device", "cpu"), "nothing else")
 
 
+def test_an_empty_path_is_not_the_current_folder(turbogs, copy, tmp_path, monkeypatch):
+    monkeypatch.chdir(copy)
+    before = tree(tmp_path)
+    said = "an argument is '': write a value, as . for the current folder, or leave it out"
+    assert_refused(turbogs("train", "", "--out", tmp_path / "run", "--device", "cpu", *QUICK), said)
+    for verb in ("plan", "eval", "render", "export", "view", "demo", "compare"):
+        assert_refused(turbogs(verb, ""), said)
+    assert_refused(turbogs("reconstruct", "", "--out", tmp_path / "cameras"), said)
+    for option in (("--out", ""), ("--out=",)):
+        assert_refused(turbogs("train", copy, *option, *QUICK), "--out '': write a value")
+    assert_refused(turbogs("plan", copy, "--init", ""), "--init '': write points, random, or a model's file")
+    assert tree(tmp_path) == before
+
+
+@pytest.mark.parametrize("more", [(), QUICK])
+def test_a_viewer_takes_a_port(turbogs, copy, tmp_path, more):
+    said = "--viewer 'abc': it takes a port, which is a number, or nothing for 8080"
+    assert_refused(turbogs("train", copy, "--out", tmp_path / "run", "--viewer", "abc", *more), said)
+    assert_refused(turbogs("train", "--resume", tmp_path / "run", "--viewer", "abc"), said)
+    assert_refused(
+        turbogs("train", "--viewer", tmp_path / "absent", "--out", tmp_path / "run"), "absent does not exist"
+    )
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_run_is_no_capture(turbogs, finished, capture, tmp_path):
+    said = f"{finished} is a run's folder, not a capture: give {capture}, which it was trained on"
+    assert_refused(turbogs("train", finished, "--out", tmp_path / "run", "--device", "cpu", *QUICK), said)
+    assert_refused(turbogs("plan", finished, "--device", "cpu"), said)
+    assert_refused(turbogs("reconstruct", finished, "--out", tmp_path / "cameras"), said)
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize("verb", ["eval", "render", "export"])
 def test_verbs_without_a_run(turbogs, tmp_path, verb):
     assert_refused(turbogs(verb, tmp_path), "holds no run")

@@ -14,7 +14,7 @@ from tyro.extras import subcommand_cli_from_dict
 
 from turbogs_plugin.commands import captures, machine, models, studies, training
 from turbogs_plugin.commands.options import PORT
-from turbogs_plugin.errors import exit_code
+from turbogs_plugin.errors import InputError, exit_code
 
 COMMANDS = {
     "train": training.train,
@@ -37,6 +37,9 @@ OVERRIDE = re.compile(r"\w+(\.\w+)+=.*", re.DOTALL)
 FLAGS = ("--report", "--no-report", "--offload", "--no-offload")
 """Options without a value, of verbs that have overrides."""
 
+SAY_THEMSELVES = ("--init", "--max-memory", "--time-budget")
+"""Options that say what may stand in the place of an empty value."""
+
 
 def _gathered(arguments: list[str]) -> list[str]:
     """Arguments with later overrides brought before the first option, where a word besides the verb stands there.
@@ -54,12 +57,29 @@ def _gathered(arguments: list[str]) -> list[str]:
 
 
 def _with_port(arguments: list[str]) -> list[str]:
-    """Arguments in which --viewer without a port has the usual one."""
+    """Arguments in which --viewer without a port has the usual one.
+
+    Raises:
+        InputError: a word after it that is no port, nor the capture, which is named already.
+    """
     filled = []
+    named = "--resume" in arguments or not "".join(arguments[1:2]).startswith("-")
     for text, following in itertools.zip_longest(arguments, arguments[1:], fillvalue=""):
         portless = text == "--viewer" and not following.lstrip("-").isdecimal()
+        if portless and named and following[:1] not in ("", "-") and not OVERRIDE.fullmatch(following):
+            raise InputError(f"--viewer '{following}': it takes a port, which is a number, or nothing for {PORT}")
         filled += [text, str(PORT)] if portless else [text]
     return filled
+
+
+def _require_no_empty(arguments: list[str]) -> None:
+    """Raise `InputError` for an empty argument, which as a path would be the current folder."""
+    for before, text in itertools.pairwise(["", *arguments]):
+        if text.startswith("--") and text.endswith("="):
+            before, text = text[:-1], ""
+        if not text and before not in SAY_THEMSELVES:
+            which = before if before.startswith("-") else "an argument is"
+            raise InputError(f"{which} '': write a value, as . for the current folder, or leave it out")
 
 
 def _warning_line(message: Warning | str, *place: object) -> str:
@@ -72,9 +92,14 @@ def main() -> None:
     atexit.register(gc.freeze)  # or the collector walks through all of torch at the end, for a second
     warnings.formatwarning = _warning_line
     Image.MAX_IMAGE_PIXELS = None  # phones take 200 megapixels; photos are checked against cameras and memory
-    words = _gathered(_with_port(sys.argv[1:]))
     about = "TurboGS: train 3D Gaussian Splatting on few, well chosen pixels."
-    sys.exit(exit_code(lambda: subcommand_cli_from_dict(COMMANDS, args=words, prog="turbogs", description=about)))
+
+    def command() -> int:
+        _require_no_empty(sys.argv[1:])
+        words = _gathered(_with_port(sys.argv[1:]))
+        return subcommand_cli_from_dict(COMMANDS, args=words, prog="turbogs", description=about)
+
+    sys.exit(exit_code(command))
 
 
 if __name__ == "__main__":

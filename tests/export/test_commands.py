@@ -123,6 +123,8 @@ def test_bad_input_is_one_line(turbogs, finished, capture, tmp_path):
     ("arguments", "word"),
     [
         (("--path", "views"), "--video"),
+        (("--path", "orbit"), "--video"),
+        (("--seconds", "10"), "--video"),
         (("--video", "a.txt"), ".mp4"),
         (("--video", "a.mp4", "--path", "nowhere"), "nowhere"),
         (("--video", "a.mp4", "--seconds", "0"), "--seconds 0"),

@@ -443,6 +443,18 @@ def test_masks_go_with_their_photos(solved, tmp_path, monkeypatch):
     assert (shares < 0.95).all() and (shares > 0.5).all()
 
 
+def test_masks_in_a_folder_of_another_name_are_noted(solved, tmp_path, monkeypatch):
+    photos = Path(shutil.copytree(solved[0].parent, tmp_path / "corner")) / "images"
+    scene = shutil.copytree(solved[1].scene, tmp_path / "scene")
+    monkeypatch.setattr(run, "solver", None)
+    before = reconstruct(photos, scene).notes
+    (tmp_path / "corner/mask_images").mkdir()
+    Image.new("L", (20, 10), 255).save(tmp_path / "corner/mask_images/view_00.png")
+    said = "is not used: masks are read from masks/; rename it if it holds the photos' masks"
+    assert reconstruct(photos, scene).notes == [*before, f"{tmp_path}/corner/mask_images {said}"]
+    assert not (scene / "masks").exists()
+
+
 def test_a_mask_of_another_size_is_refused_before_cameras_are_looked_for(solved, tmp_path, monkeypatch):
     photos = Path(shutil.copytree(solved[0].parent, tmp_path / "corner")) / "images"
     (tmp_path / "corner/masks").mkdir()

@@ -93,6 +93,48 @@ def test_without_test_photos_those_for_validation_are_tested_and_without_these_e
     assert "/transforms_train.json (NeRF-synthetic): 6 photos, none for testing, 60x40, RGBA" in scene.notes[0]
 
 
+def test_frames_without_a_photo_are_left_out(tmp_path):
+    folder = write_blender(tmp_path / "lego")
+    for name in ("train/r_1", "train/r_4", "test/r_0"):
+        (folder / f"{name}.png").unlink()
+    scene = load_scene(folder)
+    assert scene.train.names == tuple(f"train/r_{view}.png" for view in (0, 2, 3, 5))
+    assert scene.test.names == tuple(f"test/r_{view}.png" for view in (1, 2, 3))
+    assert "4 training and 3 test photos" in scene.notes[0]
+    assert scene.notes[1] == "3 of 10 frames are left out, their photos do not exist: train/r_1, ..."
+
+
+@pytest.mark.parametrize("name", ["train/r_9", "../lego/other/r_2"])
+def test_a_frame_that_names_no_photo_is_left_out(tmp_path, name):
+    folder = write_blender(tmp_path / "lego")
+    edit(folder, frame(file_path=name))
+    scene = load_scene(folder)
+    assert len(scene.train) == 5
+    assert f"1 of 10 frames are left out, their photos do not exist: {name}, ..." in scene.notes
+
+
+def test_where_no_test_photo_exists_every_8th_is_for_testing(tmp_path):
+    folder = write_blender(tmp_path / "lego")
+    shutil.rmtree(folder / "test")
+    scene = load_scene(folder)
+    assert scene.test.names == ("train/r_0.png",) and len(scene.train) == 5
+    assert "6 photos, none for testing" in scene.notes[0]
+    assert scene.notes[1] == "4 of 10 frames are left out, their photos do not exist: test/r_0, ..."
+
+
+def test_three_training_photos_must_exist(tmp_path):
+    folder = write_blender(tmp_path / "lego")
+    for view in range(3):
+        (folder / f"train/r_{view}.png").unlink()
+    assert len(load_scene(folder).train) == 3
+    (folder / "train/r_3.png").unlink()
+    words = (
+        r"train.json names 6 photos, of which 4 are missing in .*/lego/train \(.*train/r_0, ...\): at least 3 "
+        "are needed; copy the photos there$"
+    )
+    assert_refused(words, load_scene, folder)
+
+
 def test_reduced_photos_mix_with_black(tmp_path):
     """The hidden white of transparent pixels does not bleed into their neighbours."""
     scene = load_scene(write_blender(tmp_path / "lego"), factor=2)
@@ -186,10 +228,8 @@ def frame(**values):
         (lambda content: content.update(fl_x=-1.0), "positive focal lengths"),
         (lambda content: content.update(frames={}), "no list of frames"),
         (lambda content: content.update(frames=content["frames"][:2]), "2 training images: at least 3"),
-        (frame(file_path="./train/r_9"), "1 of 6 photos of .*transforms_train.json are missing .train/r_9.: bring"),
         (frame(file_path="./train/r_1"), "two frames for 'train/r_1.png'"),
         (frame(file_path="./test/r_1"), "1 photos stand both in transforms_train.json and in transforms_test.json"),
-        (frame(file_path="../lego/other/r_2"), "1 of 6 photos of .* are missing .../lego/other/r_2.: bring them back"),
         (frame(file_path=None), "a frame without a file_path"),
         (frame(transform_matrix=None), "r_2.png has no transform_matrix of 4x4"),
         (frame(transform_matrix=[[1, 2], [3]]), "r_2.png has no transform_matrix of 4x4"),

@@ -124,6 +124,36 @@ def test_a_folder_of_masks_of_other_names_is_named_and_not_used(capture):
     assert scene.notes[-1] == f"{capture / 'masks'} is not used: it has no {CONVENTIONS} of a photo"
 
 
+@pytest.mark.parametrize("folder", ["mask", "Masks", "mask_images", "images/MASK"])
+def test_a_folder_of_masks_of_another_name_is_named_and_not_used(capture, folder):
+    whole = load_scene(capture).notes
+    (capture / folder).mkdir()
+    assert load_scene(capture).notes == whole  # as it holds no images
+    write_masks(capture, [f"{photo.stem}.png" for photo in photos_of(capture) if photo.is_file()], half_mask(), folder)
+    scene = load_scene(capture)
+    assert scene.train.masks is None and len(scene.train) + len(scene.test) == 8
+    assert scene.notes[-1] == (
+        f"{capture / folder} is not used: masks are read from masks/; rename it if it holds the photos' masks"
+    )
+    (capture / folder).rename(capture / "masks")
+    assert_masked(load_scene(capture).train, half_mask() > 0)
+
+
+def test_a_capture_called_mask_is_no_folder_of_masks(capture, tmp_path):
+    shutil.copytree(capture, tmp_path / "mask")
+    for photo in photos_of(capture):
+        photo.rename(capture / photo.name)
+    (capture / "images").rmdir()
+    assert not any("is not used" in note for note in load_scene(capture).notes)
+
+
+def test_masks_of_photos_in_a_folder_of_any_name_are_no_photos(capture):
+    write_masks(capture, [photo.name for photo in photos_of(capture)], half_mask(), "mask")
+    (capture / "images").rename(capture / "rgb")
+    scene = load_scene(capture)
+    assert f"photos in {capture / 'rgb'}" in scene.notes[0]
+
+
 def test_views_that_are_masked_whole_are_left_out(capture):
     photos = photos_of(capture)
     write_masks(capture, [f"{photos[1].stem}.png", f"{photos[4].stem}.png"], np.zeros(SIZE[::-1], dtype=np.uint8))

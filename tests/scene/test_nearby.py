@@ -8,6 +8,7 @@ from helpers.framework_runs import tiny_capture
 from PIL import Image
 
 from turbogs_plugin.errors import InputError
+from turbogs_plugin.reconstruct.photos import list_photos
 from turbogs_plugin.scene import load_scene
 from turbogs_plugin.scene.load import holds_photos_alone
 
@@ -120,3 +121,23 @@ def test_of_several_captures_in_a_folder_a_line_names_those_that_are_not_read(ca
     others = f"{root / 'second/sparse'}, {root / 'third/sparse'} not used: give the folder of the capture that you want"
     assert others in load_scene(root).notes
     assert not any("not used" in note for note in load_scene(root / "second").notes)
+
+
+@pytest.mark.parametrize("part", ["model.ply", "checkpoints", "report"])
+def test_a_run_is_no_folder_of_photos(tmp_path, part):
+    run = tmp_path / "run"
+    for view in range(4):
+        (run / "report").mkdir(parents=True, exist_ok=True)
+        Image.new("RGB", (8, 8)).save(run / "report" / f"test-{view:03d}.jpg")
+    if part != "report":
+        (run / "report").rename(run / "renders")
+        (run / part).mkdir()
+    assert holds_photos_alone(run)
+    (run / "config.yaml").write_text("scene: {path: /data/cup}\n")
+    said = f"{run} is a run's folder, not a capture: give /data/cup, which it was trained on"
+    assert refusal(run) == said
+    with pytest.raises(InputError) as refused:
+        list_photos(run)
+    assert str(refused.value) == said
+    (run / "config.yaml").write_text("scene: cup\n")  # another program's
+    assert holds_photos_alone(run)

@@ -10,7 +10,8 @@ import pytest
 from helpers.refusals import assert_refused
 from PIL import Image
 
-from turbogs_plugin.scene import load_scene
+from turbogs_plugin.scene import load_scene, undistort
+from turbogs_plugin.scene.colmap import read_colmap
 from turbogs_plugin.scene.undistort import brown_projection, lens_of_camera, make_lens
 
 pytestmark = pytest.mark.usefixtures("few_random_points")
@@ -279,6 +280,60 @@ def test_a_wide_fisheye_keeps_to_60_degrees_off_the_axis():
     lens = lens_of_camera(camera("OPENCV_FISHEYE", [100.0, 100.0, 160.0, 120.0, 0.0, 0.0, 0.0, 0.0]), "a camera")
     extent = np.array(lens.size) / lens.K[[0, 1], [0, 1]] / 2
     np.testing.assert_allclose(extent, np.tan(np.pi / 3), atol=0.01)
+
+
+def every_candidate(start, end, inside, upright):
+    """The search of `make_lens` with both tests of all rectangles in all rounds."""
+    for _ in range(undistort.ROUNDS):
+        rectangles = start + np.linspace(0.0, 1.0, undistort.CANDIDATES)[1:, None] * (end - start)
+        ok = inside(rectangles) & upright(rectangles)
+        if ok.all():
+            return end
+        first = int(np.argmin(ok))
+        start, end = (rectangles[first - 1] if first else start), rectangles[first]
+    return start
+
+
+@pytest.mark.parametrize("model", [*PARAMS, "folds"])
+def test_a_lens_is_found_by_few_projections(monkeypatch, model):
+    folds = ("SIMPLE_RADIAL", [190.0, 160.0, 120.0, -0.4])
+    bent = camera(*(folds if model == "folds" else (model, PARAMS[model])))
+    points = 0
+
+    def project(at):
+        nonlocal points
+        points += len(at)
+        return bent.img_from_cam(np.concatenate([at, np.ones((len(at), 1))], axis=1))
+
+    lens = make_lens(model, (WIDTH, HEIGHT), project, "a camera")
+    few, points = points, 0
+    monkeypatch.setattr(undistort, "_furthest", every_candidate)
+    same = make_lens(model, (WIDTH, HEIGHT), project, "a camera")
+    assert lens.size == same.size
+    np.testing.assert_allclose(lens.K, same.K, rtol=0, atol=1e-7)
+    np.testing.assert_allclose(lens.sources, same.sources, rtol=0, atol=1e-9)
+    lattice = undistort.LATTICE**2
+    assert model == "folds" or few - lattice < (points - lattice) / 3
+
+
+def test_cameras_with_equal_numbers_have_one_lens(tmp_path):
+    folder = write_colmap(tmp_path / "cup", "OPENCV", PARAMS["OPENCV"], np.zeros((HEIGHT, WIDTH, 3), dtype=np.uint8))
+    model = folder / "sparse" / "0"
+    pycolmap.Reconstruction(model).write_text(model)
+    for file in model.glob("*.bin"):
+        file.unlink()
+    cameras = (model / "cameras.txt").read_text().splitlines()
+    line = next(line for line in cameras if line[0] != "#")
+    (model / "cameras.txt").write_text("\n".join([*cameras, f"2{line[1:]}", f"3{line[1:]}"]) + "\n")
+    images = (model / "images.txt").read_text()
+    for rigs in ("rigs.txt", "frames.txt"):
+        (model / rigs).unlink(missing_ok=True)
+    for view, number in ((1, 2), (2, 3)):
+        images = images.replace(f" 1 {view}.png", f" {number} {view}.png")
+    (model / "images.txt").write_text(images)
+    capture = read_colmap(folder, model, ".txt")
+    assert capture.lenses[0] is not None and len({id(lens) for lens in capture.lenses}) == 1
+    assert "more cameras" not in undistort.undistortion_note(capture.lenses)
 
 
 @pytest.mark.parametrize("copies", [False, True])

@@ -57,9 +57,9 @@ def render(
     split: Literal["test", "train"] = "test",
     depth: bool = False,
     out: Annotated[Path | None, arg(metavar="FOLDER")] = None,
-    path: Annotated[str, arg(metavar="orbit|views|FILE")] = "orbit",
+    path: Annotated[str | None, arg(metavar="orbit|views|FILE")] = None,
     video: Annotated[Path | None, arg(metavar="FILE")] = None,
-    seconds: Annotated[float, arg(metavar="SECONDS")] = 10.0,
+    seconds: Annotated[float | None, arg(metavar="SECONDS")] = None,
     device: Device = "auto",
     given: Given = NO_SCENE,
 ) -> int:
@@ -72,10 +72,10 @@ def render(
         depth: also write depth images: .npy (float32, along the camera's axis, in the capture's own units; 0 where
             nothing was hit) and .png (near is bright).
         out: folder for the pictures; renders in the run's folder where absent.
-        path: of a film: orbit, about what the capture shows; views, through its training cameras; or a file of cameras
-            in the layout of transforms.json.
+        path: of a film: orbit, about what the capture shows, also where absent; views, through its training cameras;
+            or a file of cameras in the layout of transforms.json.
         video: write a film of 60 frames a second to this new file (.mp4) in the place of pictures.
-        seconds: of the film.
+        seconds: of the film; 10 where absent.
         device: where to render.
     """
     if video is not None:
@@ -83,9 +83,10 @@ def render(
 
         if depth or out is not None or split != "test":
             raise InputError("--video writes a film: it takes --path and --seconds, not --split, --depth or --out")
-        print(f"film   {film_run(run, path, video, seconds, device, given.settings(overrides))}")
+        length = 10.0 if seconds is None else seconds
+        print(f"film   {film_run(run, path or 'orbit', video, length, device, given.settings(overrides))}")
         return 0
-    if (path, seconds) != ("orbit", 10.0):
+    if path is not None or seconds is not None:
         raise InputError("--path and --seconds are those of a film: give --video FILE, too")
 
     from turbogs_plugin.report.outputs import render_run

@@ -17,6 +17,7 @@ from PIL.ExifTags import IFD, Base
 
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene.capture import FEWEST_PHOTOS
+from turbogs_plugin.scene.nearby import capture_of_run
 from turbogs_plugin.scene.photo_folder import find_photos, unread
 from turbogs_plugin.scene.photos import decoding_threads, opened_image, require_8_bits
 
@@ -52,11 +53,13 @@ def list_photos(folder: Path) -> tuple[Path, list[Path]]:
     """The folder that photos' names are relative to, and the photos in the order of their names.
 
     Raises:
-        InputError: no folder; fewer than `FEWEST_PHOTOS` photos.
+        InputError: no folder, or that of a run; fewer than `FEWEST_PHOTOS` photos.
     """
     reason = unread(folder)
     if not folder.is_dir():
         raise InputError(f"no such folder of photos: {folder}{f'; {reason}' if reason else ''}")
+    if where := capture_of_run(folder):
+        raise InputError(where)
     place, paths = find_photos(folder)
     if len(paths) < FEWEST_PHOTOS:
         there = "no photos" if not paths else "1 photo" if len(paths) == 1 else f"{len(paths)} photos"

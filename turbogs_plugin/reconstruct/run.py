@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -27,6 +27,7 @@ from turbogs_plugin.reconstruct.photos import PhotoFile, place_photos, read_phot
 from turbogs_plugin.reconstruct.workspace import Solution, Workspace
 from turbogs_plugin.scene.capture import FEWEST_PHOTOS, named
 from turbogs_plugin.scene.colmap import load_pycolmap
+from turbogs_plugin.scene.mask_files import misnamed
 from turbogs_plugin.scene.photo_folder import find_photos, unread
 
 if TYPE_CHECKING:
@@ -103,16 +104,16 @@ def reconstruct(photos: Path, out: Path) -> Solution:
     missing = [parent for parent in (out, *out.parents) if not parent.exists()]
     new = workspace.begin(found)
     place_masks(masks, workspace.masks)
-    if (solution := workspace.read_solution()) is not None:
-        return solution
+    unused = "" if masks else misnamed(dict.fromkeys((photos, place.parent, place)))
     try:
-        return _reconstruct(found, workspace, unread(photos))
+        solution = workspace.read_solution() or _reconstruct(found, workspace, unread(photos))
     except InputError:
         if new:
             shutil.rmtree(missing[-1] if missing else workspace.scratch, ignore_errors=True)
             for folder in (workspace.images, workspace.masks):
                 shutil.rmtree(folder, ignore_errors=True)
         raise
+    return replace(solution, notes=[*solution.notes, unused]) if unused else solution
 
 
 def scene_beside(photos: Path, run: Path) -> Path:

@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.scene.capture import Capture, named, sizes_text
+from turbogs_plugin.scene.capture import Capture, left_out, sizes_text
+from turbogs_plugin.scene.frame_photos import require_enough
 from turbogs_plugin.scene.photos import is_transparent, opened_image, photo_size
 from turbogs_plugin.scene.starting_points import starting_points
 from turbogs_plugin.scene.transforms import (
@@ -46,19 +47,23 @@ height), undistorted where there is a lens; the lens."""
 def read_blender(scene: Path) -> Capture:
     """Read a capture with the split that its files say.
 
-    Where there is neither a test nor a validation file, the split is left to the order of the photos. There are no
-    points: random ones are drawn (`starting_points`) about what the training cameras look at.
+    Frames whose photo does not exist are left out. Where there are no test photos, the split is left to the order of
+    the photos. There are no points: random ones are drawn (`starting_points`) about what the training cameras look at.
 
     Raises:
-        InputError: a file that is not such JSON or lacks something, missing photos, or one photo in both files.
+        InputError: a file that is not such JSON or lacks something, fewer than `FEWEST_PHOTOS` training photos, or one
+            photo in both files.
     """
     if not (scene / TRAIN_FILE).is_file():
         raise InputError(f"{scene} has no {TRAIN_FILE}, which names the photos to train on: bring it back")
     notes: list[str] = []
     lenses: dict[tuple, Lens] = {}
-    train = _read_views(scene, scene / TRAIN_FILE, notes, lenses)
+    train, absent = _read_views(scene, scene / TRAIN_FILE, notes, lenses)
+    require_enough(scene, scene / TRAIN_FILE, absent, len(train) + len(absent))
     test_file = next((scene / name for name in TEST_FILES if (scene / name).is_file()), None)
-    test = {} if test_file is None else _read_views(scene, test_file, notes, lenses)
+    test, absent_tests = ({}, []) if test_file is None else _read_views(scene, test_file, notes, lenses)
+    if absent := [*absent, *absent_tests]:
+        notes.append(left_out(absent, len(train) + len(test) + len(absent), "frames"))
     if in_both := sorted(train.keys() & test.keys()):
         raise InputError(
             f"{scene}: {len(in_both)} photos stand both in {TRAIN_FILE} and in {test_file.name} ({in_both[0]}): take "
@@ -84,9 +89,11 @@ def read_blender(scene: Path) -> Capture:
     return replace(capture, notes=(note, *notes))
 
 
-def _read_views(scene: Path, source: Path, notes: list[str], lenses: dict[tuple, Lens]) -> dict[str, View]:
-    """The views of one file, by the photos' paths relative to the scene; `notes` gets lines for the user, `lenses` new
-    ones by their numbers."""
+def _read_views(
+    scene: Path, source: Path, notes: list[str], lenses: dict[tuple, Lens]
+) -> tuple[dict[str, View], list[str]]:
+    """The views of one file, by the photos' paths relative to the scene, and such paths of photos that do not exist;
+    `notes` gets lines for the user, `lenses` new ones by their numbers."""
     content, frames = read_frames(source)
     shared = {key: value for key, value in content.items() if key != "frames"}
     frame_of: dict[str, dict[str, Any]] = {}
@@ -97,12 +104,9 @@ def _read_views(scene: Path, source: Path, notes: list[str], lenses: dict[tuple,
         if name in frame_of:
             raise InputError(f"{source} has two frames for '{name}': take one of them out")
         frame_of[name] = {**shared, **frame}
-    if missing := [name for name in frame_of if not is_there(scene, name)]:
-        raise InputError(
-            f"{len(missing)} of {len(frame_of)} photos of {source} are missing ({named(missing)}): bring them back, or "
-            "take their frames out of the file"
-        )
-    return {name: _read_view(values, scene / name, source, lenses) for name, values in frame_of.items()}
+    there = {name: values for name, values in frame_of.items() if is_there(scene, name)}
+    views = {name: _read_view(values, scene / name, source, lenses) for name, values in there.items()}
+    return views, [name for name in frame_of if name not in there]
 
 
 def _read_view(values: dict[str, Any], photo: Path, source: Path, lenses: dict[tuple, Lens]) -> View:

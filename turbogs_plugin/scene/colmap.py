@@ -16,6 +16,7 @@ import numpy as np
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene.capture import FEWEST_PHOTOS, LARGEST_SIDE, Capture, check_photo_name, left_out, named
 from turbogs_plugin.scene.colmap_check import SMALLEST_IMAGE, check_binary_model
+from turbogs_plugin.scene.photo_folder import NO_PHOTOS
 from turbogs_plugin.scene.photos import photo_size
 from turbogs_plugin.scene.starting_points import starting_points
 from turbogs_plugin.scene.undistort import Lens, lens_of_camera
@@ -152,7 +153,8 @@ def read_colmap(scene: Path, model: Path, suffix: str) -> Capture:
     viewmats = np.tile(np.eye(4), (len(images), 1, 1))
     intrinsics = np.tile(np.eye(3), (len(images), 1, 1))
     sizes = np.zeros((len(images), 2), dtype=np.int64)
-    lenses = {number: _lens(reconstruction.cameras[number], model) for number in {image.camera_id for image in images}}
+    made: dict[tuple, Lens] = {}
+    lenses = {image.camera_id: _lens(reconstruction.cameras[image.camera_id], model, made) for image in images}
     for i, image in enumerate(images):
         camera, lens = reconstruction.cameras[image.camera_id], lenses[image.camera_id]
         viewmats[i, :3] = image.cam_from_world().matrix()
@@ -192,14 +194,21 @@ def read_colmap(scene: Path, model: Path, suffix: str) -> Capture:
     ).checked(model)
 
 
-def _lens(camera: pycolmap.Camera, model: Path) -> Lens | None:
-    """None for a pinhole camera, and for one of an impossible size, which `Capture.check` refuses."""
-    name = camera.model.name
-    if name in ("PINHOLE", "SIMPLE_PINHOLE") or not 0 < max(camera.width, camera.height) <= LARGEST_SIDE:
+def _lens(camera: pycolmap.Camera, model: Path, made: dict[tuple, Lens]) -> Lens | None:
+    """None for a pinhole camera, and for one of an impossible size, which `Capture.check` refuses.
+
+    Args:
+        made: the lenses so far, by their numbers; a new one is added.
+    """
+    name, size = camera.model.name, (camera.width, camera.height)
+    if name in ("PINHOLE", "SIMPLE_PINHOLE") or not 0 < max(size) <= LARGEST_SIDE:
         return None
     if name in STRAIGHT_MODELS and not camera.params[list(camera.extra_params_idxs())].any():
         return None
-    return lens_of_camera(camera, f"camera {camera.camera_id} of {model}")
+    key = (name, size, *camera.params.tolist())
+    if key not in made:
+        made[key] = lens_of_camera(camera, f"camera {camera.camera_id} of {model}")
+    return made[key]
 
 
 def find_photo_folder(scene: Path, names: tuple[str, ...], size: tuple[int, int] | None) -> tuple[Path, int]:
@@ -251,7 +260,7 @@ def _folders(place: Path, depth: int) -> Iterator[Path]:
 
 
 def _may_hold_photos(entry: Path) -> bool:
-    return not (REDUCED.search(entry.name) or entry.name[0] == "." or entry.name == "masks") and entry.is_dir()
+    return not (REDUCED.search(entry.name) or NO_PHOTOS.fullmatch(entry.name)) and entry.is_dir()
 
 
 def _kind_note(scene: Path, model: Path, suffix: str, images: int, points: str, photo_folder: Path) -> str:

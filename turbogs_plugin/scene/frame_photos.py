@@ -11,7 +11,8 @@ from itertools import takewhile
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
 
-from turbogs_plugin.scene.capture import named
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.scene.capture import FEWEST_PHOTOS, named
 from turbogs_plugin.scene.colmap import FOLDER_DEPTH
 from turbogs_plugin.scene.photo_folder import NO_PHOTOS, PHOTO_SUFFIXES
 
@@ -82,7 +83,21 @@ def elsewhere_note(scene: Path, found: dict[str, str]) -> str:
     return f"photos in {named(sorted({str(scene / PurePosixPath(file).parent) for file in found.values()}))}"
 
 
-def expected_folder(scene: Path, names: Sequence[str]) -> Path:
+def require_enough(scene: Path, source: Path, absent: Sequence[str], count: int, unclear: str = "") -> None:
+    """Raise `InputError` where photos of a file's `count` frames do not exist and fewer than `FEWEST_PHOTOS` remain.
+
+    Args:
+        absent: the names of those.
+        unclear: what `find_elsewhere` says of them.
+    """
+    if absent and count - len(absent) < FEWEST_PHOTOS:
+        raise InputError(
+            f"{source} names {count} photos, of which {len(absent)} are missing in {_expected_folder(scene, absent)} "
+            f"({absent[0]}, ...): at least {FEWEST_PHOTOS} are needed; copy the photos there{unclear}"
+        )
+
+
+def _expected_folder(scene: Path, names: Sequence[str]) -> Path:
     """The folder of the scene in which photos are looked for that are not there."""
     folders = []
     for path in map(PureWindowsPath, names):  # knows both kinds of separators, drives and roots

@@ -7,7 +7,7 @@ undistorted or reduced counts if all pixels that it is made of do.
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -16,6 +16,7 @@ from PIL import Image
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.masks import ViewMask
 from turbogs_plugin.scene.capture import Capture
+from turbogs_plugin.scene.photo_folder import MASKS, find_photos
 from turbogs_plugin.scene.photos import DECODING_BYTES, OPAQUE_SUFFIXES, decoding_threads, is_transparent, opened_image
 from turbogs_plugin.scene.undistort import Lens
 
@@ -44,11 +45,26 @@ def find_masks(scene: Path, capture: Capture, photos: Sequence[Path]) -> tuple[l
     count, views = sum(file is not None for file in found), len(found)
     if count == 0:
         unused = (f"{folder} is not used: it has no {CONVENTIONS} of a photo" for folder in folders)
-        return found, next(unused, "")
+        return found, next(unused, "") or misnamed(parents)
     first = next(file for file in found if file is not None)
     without = [name for name, file in zip(capture.names, found, strict=True) if file is None]
     rest = f"; {len(without)} photos without one are whole: {without[0]}, ..." if without else ""
     return found, f"masks of {count} of {views} photos, as {first}{rest}"
+
+
+def misnamed(parents: Iterable[Path]) -> str:
+    """A note on the first folder of images in these that is called like one of masks, and not `FOLDER`; empty where
+    there is none."""
+    for parent in parents:
+        try:
+            folders = sorted(entry for entry in parent.iterdir() if re.fullmatch(MASKS, entry.name, re.IGNORECASE))
+        except OSError:  # may be looked into, but not listed
+            continue
+        for folder in folders:
+            place, images = find_photos(folder)
+            if folder.name != FOLDER and images and place == folder:  # not a capture of a mask
+                return f"{folder} is not used: masks are read from {FOLDER}/; rename it if it holds the photos' masks"
+    return ""
 
 
 def in_folders(folders: Sequence[Path], photo: str) -> Path | None:

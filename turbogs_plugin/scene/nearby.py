@@ -7,6 +7,7 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
+from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene import blender, llff
 from turbogs_plugin.scene.capture import named
 from turbogs_plugin.scene.colmap import find_model
@@ -16,13 +17,18 @@ from turbogs_plugin.scene.transforms import FILE
 LEVELS = 2
 """Captures are looked for so many folders up and down."""
 POSE_FILES = (FILE, *blender.FILES, llff.FILE)
+PARTS_OF_RUN = ("model.ply", "checkpoints", "report")
+"""One of them lies beside the config.yaml of a run that has begun."""
 
 
 def capture_near(folder: Path) -> str:
-    """A line that names the captures in a folder, else the one that the folder lies in; empty where there are none.
+    """A line that names the captures in a folder, else the one that the folder lies in, or that it is a run on; empty
+    where there are none.
 
     Where the folder has photos of its own, captures that were reconstructed from photos do not count.
     """
+    if where := capture_of_run(folder):
+        return where
     inner = _captures_in(folder, LEVELS)
     if find_photos(folder)[1]:
         inner = ((place, mark) for place, mark in inner if not (place / "reconstruction").is_dir())
@@ -30,6 +36,20 @@ def capture_near(folder: Path) -> str:
         return capture_around(folder)
     remedy = "give that folder" if len(found) == 1 else "give one of these folders"
     return f"{named([f'{place} has a {mark}' for place, mark in found])}: {remedy}"
+
+
+def capture_of_run(folder: Path) -> str:
+    """A line that names the capture that a run was trained on, whose folder this is; empty where it is none."""
+    config = folder / "config.yaml"
+    if not (config.is_file() and any((folder / part).exists() for part in PARTS_OF_RUN)):
+        return ""
+    from turbogs_plugin.config.yaml_text import read_yaml  # a capture is read without it
+
+    try:
+        capture = read_yaml(config)["scene"]["path"]
+    except (InputError, KeyError, TypeError):  # another program's
+        return ""
+    return f"{folder} is a run's folder, not a capture: give {capture}, which it was trained on"
 
 
 def capture_around(path: Path) -> str:

@@ -11,7 +11,9 @@ OTHER_SUFFIXES = (".heic", ".heif", ".webp", ".avif", ".jxl", ".dng", ".cr2", ".
 """Photos that at least one of them does not read."""
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".insv")
 FRAMES_OF_VIDEO = "ffmpeg -i VIDEO -vf fps=2 -q:v 2 PHOTOS/%05d.jpg"
-NO_PHOTOS = re.compile(r"\..*|images_\d+|masks?", re.IGNORECASE)
+MASKS = "masks?(_images)?"
+"""Names of folders of masks, in any letters; one of them is read (`mask_files.FOLDER`)."""
+NO_PHOTOS = re.compile(rf"\..*|images_\d+|{MASKS}", re.IGNORECASE)
 """Folders that hold none: hidden ones, copies reduced by a factor (``images_4``), masks."""
 FOLDER_DEPTH = 1
 """Photos are looked for in a folder and in the folders in it. Those of several captures beside each other lie deeper,

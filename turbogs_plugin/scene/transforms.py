@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.scene.capture import FEWEST_PHOTOS, LARGEST_SIDE, Capture, check_photo_name, left_out
+from turbogs_plugin.scene.capture import LARGEST_SIDE, Capture, check_photo_name, left_out
 from turbogs_plugin.scene.colmap import load_pycolmap
-from turbogs_plugin.scene.frame_photos import elsewhere_note, expected_folder, find_elsewhere
+from turbogs_plugin.scene.frame_photos import elsewhere_note, find_elsewhere, require_enough
 from turbogs_plugin.scene.named_split import read_split
 from turbogs_plugin.scene.photos import photo_size
 from turbogs_plugin.scene.ply import read_vertices
@@ -95,12 +95,7 @@ def read_transforms(scene: Path) -> Capture:
             remedy=": export it again",
         )
         views[name] = (viewmat, *read_camera({**content, **frame}, scene / name, source, lenses))
-    if absent and len(views) < FEWEST_PHOTOS:
-        raise InputError(
-            f"{source} names {len(frames)} photos, of which {len(absent)} are missing in "
-            f"{expected_folder(scene, absent)} ({absent[0]}, ...): at least {FEWEST_PHOTOS} are needed; copy the "
-            f"photos there{unclear}"
-        )
+    require_enough(scene, source, absent, len(views) + len(absent), unclear)
     names, cameras = zip(*sorted(views.items()), strict=True)
     viewmats, intrinsics, sizes, lens_of_view = zip(*cameras, strict=True)
     viewmats, intrinsics, sizes = np.array(viewmats), np.array(intrinsics), np.array(sizes)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial, reduce
+from functools import cache, partial, reduce
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 Projection = Callable[[np.ndarray], np.ndarray]
 """[N, 2] float64 points at depth 1 before the camera -> [N, 2] pixels of the photo (the first one's centre is at 0.5),
 NaN where there is none."""
+Test = Callable[[np.ndarray], np.ndarray]
+"""[R, 4] rectangles -> [R] bool."""
 
 WIDEST_ANGLE = math.radians(60.0)
 """No side of the pinhole image is farther off the axis: a fisheye's rim would become a smear."""
@@ -164,38 +166,55 @@ def make_lens(model: str, photo_size: tuple[int, int], project: Projection, owne
         widest = math.tan(WIDEST_ANGLE)
         seed = np.concatenate([middle, middle])
         limit = np.clip(np.concatenate([middle - reach, middle + reach]), -widest, widest)
-        seen = partial(_seen, project=project, sides=sides)
+        inside, upright = (partial(test, project=project, sides=sides) for test in (_inside, _upright))
         rectangle = seed
         for sides_grown in GROWTH:
             target = rectangle.copy()
             target[sides_grown] = limit[sides_grown]
-            rectangle = _furthest(rectangle, target, seen)
+            rectangle = _furthest(rectangle, target, inside, upright)
         width, height = np.floor(focal * (rectangle[2:] - rectangle[:2]) + 1e-3).astype(np.int64).tolist()
         if not min(width, height) >= 1:
             raise _no_lens(model, owner)
         corner = 0.5 * (rectangle[:2] + rectangle[2:] - np.array([width, height]) / focal)
         x = np.linspace(corner[0], corner[0] + width / focal[0], LATTICE)
         y = np.linspace(corner[1], corner[1] + height / focal[1], LATTICE)
-        nodes = project(np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)).reshape(LATTICE, LATTICE, 2)
-        spans = (np.ptp(nodes, axis=(0, 1)) >= SMALLEST_SHARE * sides).all()
-        inside = spans and (nodes >= -LATTICE_EDGE).all() and (nodes <= sides + LATTICE_EDGE).all()
-        if not inside or not (_turn(nodes[:-1, 1:] - nodes[:-1, :-1], nodes[1:, :-1] - nodes[:-1, :-1]) > 0).all():
+        nodes = project(np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2))
+        least, most = (np.array([end(side) for side in nodes.T]) for end in (np.min, np.max))
+        fits = (least >= -LATTICE_EDGE) & (most <= sides + LATTICE_EDGE) & (most - least >= SMALLEST_SHARE * sides)
+        nodes = nodes.reshape(LATTICE, LATTICE, 2)
+        if not fits.all() or not (_turn(nodes[:-1, 1:] - nodes[:-1, :-1], nodes[1:, :-1] - nodes[:-1, :-1]) > 0).all():
             raise _no_lens(model, owner)
     K = np.array([[focal[0], 0.0, -focal[0] * corner[0]], [0.0, focal[1], -focal[1] * corner[1]], [0.0, 0.0, 1.0]])
     return Lens(model, photo_size, (width, height), K, (2.0 * nodes / sides - 1.0).astype(np.float32))
 
 
-def _seen(rectangles: np.ndarray, project: Projection, sides: np.ndarray) -> np.ndarray:
-    """[R] bool: the outline of each of the [R, 4] rectangles (x0, y0, x1, y1) lies in the photo, and not mirrored."""
+@cache
+def _outline() -> np.ndarray:
+    """[4, 2 * B] float64: a rectangle (x0, y0, x1, y1) times this is the B points of its outline, x and y in turn."""
     share = np.linspace(0.0, 1.0, SIDE_POINTS)
     zero, one = np.zeros_like(share), np.ones_like(share)
-    outline = np.stack([np.concatenate([share, share, zero, one]), np.concatenate([zero, one, share, share])], axis=1)
-    points = rectangles[:, None, :2] + outline * (rectangles[:, None, 2:] - rectangles[:, None, :2])  # [R, B, 2]
-    steps = 1e-5 * np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
-    pixels = project((points + steps[:, None, None]).reshape(-1, 2)).reshape(3, *points.shape)
-    here = pixels[0]
-    ok = (here >= -EDGE) & (here <= sides + EDGE)
-    return ok.all(axis=(1, 2)) & (_turn(pixels[1] - here, pixels[2] - here) > 0).all(axis=1)
+    weights = np.zeros((4, 4 * SIDE_POINTS, 2))
+    for axis, ends in enumerate(((share, share, zero, one), (zero, one, share, share))):
+        weights[axis + 2, :, axis] = np.concatenate(ends)
+        weights[axis, :, axis] = 1.0 - weights[axis + 2, :, axis]
+    return weights.reshape(4, -1)
+
+
+def _inside(rectangles: np.ndarray, project: Projection, sides: np.ndarray) -> np.ndarray:
+    """[R] bool: the outline of each of the [R, 4] rectangles (x0, y0, x1, y1) lies in the photo."""
+    points = rectangles @ _outline()
+    pixels = project(points.reshape(-1, 2)).reshape(points.shape)
+    furthest = np.tile(sides + EDGE, points.shape[1] // 2)
+    return ((pixels >= -EDGE) & (pixels <= furthest)).all(axis=1)
+
+
+def _upright(rectangles: np.ndarray, project: Projection, sides: np.ndarray) -> np.ndarray:
+    """[R] bool: the outline of each of the [R, 4] rectangles is seen, and nowhere mirrored."""
+    points = rectangles @ _outline()
+    steps = np.tile(1e-5 * np.eye(2), points.shape[1] // 2)
+    moved = np.stack([points, points + steps[0], points + steps[1]])
+    here, right, down = project(moved.reshape(-1, 2)).reshape(3, len(rectangles), -1, 2)
+    return (_turn(right - here, down - here) > 0).all(axis=1)
 
 
 def _turn(x_step: np.ndarray, y_step: np.ndarray) -> np.ndarray:
@@ -203,14 +222,23 @@ def _turn(x_step: np.ndarray, y_step: np.ndarray) -> np.ndarray:
     return x_step[..., 0] * y_step[..., 1] - x_step[..., 1] * y_step[..., 0]
 
 
-def _furthest(start: np.ndarray, end: np.ndarray, seen: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+def _furthest(start: np.ndarray, end: np.ndarray, inside: Test, upright: Test) -> np.ndarray:
     """The last [4] rectangle from `start` to `end` before the first that the photo does not fill."""
+    shares = np.linspace(0.0, 1.0, CANDIDATES)[1:, None]
+    if not inside(start + shares[0] ** np.arange(1, ROUNDS + 1)[:, None] * (end - start)).any():
+        return start  # as the rounds would find: after the first growths few sides have room
+    folds = True  # between rectangles that are upright none is mirrored
     for _ in range(ROUNDS):
-        rectangles = start + np.linspace(0.0, 1.0, CANDIDATES)[1:, None] * (end - start)
-        ok = seen(rectangles)
+        rectangles = start + shares * (end - start)
+        ok = inside(rectangles)
+        if folds:
+            tried = len(ok) if ok.all() else int(np.argmin(ok)) + 1
+            straight = upright(rectangles[:tried])
+            ok[:tried] &= straight
         if ok.all():
             return end
         first = int(np.argmin(ok))
+        folds = folds and not straight[first]
         start, end = (rectangles[first - 1] if first else start), rectangles[first]
     return start
 
