@@ -9,6 +9,7 @@ import pytest
 import torch
 from helpers.framework_runs import TINY, tiny_capture, tiny_config
 
+from turbogs_plugin import device
 from turbogs_plugin.config.configuration import load_config
 from turbogs_plugin.doctor import diagnosis
 from turbogs_plugin.report.outputs import evaluate_run
@@ -67,7 +68,7 @@ def finished(tmp_path_factory) -> Path:
 def test_the_library_gets_the_photo_as_its_reference(library):
     flip, reason = load_flip()
     image, photo = torch.rand(3, 12, 14).permute(1, 2, 0), torch.zeros(12, 14, 3)
-    assert (flip(image, photo), reason) == (0.25, "")
+    assert (flip(image, photo).result(), reason) == (0.25, "")
     ((reference, test),) = library.calls
     assert not reference.any() and (test == image.numpy()).all()
 
@@ -77,7 +78,7 @@ def test_what_is_not_finite_has_no_flip(library, broken):
     photo = torch.full((12, 12, 3), 0.5)
     image = photo.clone()
     image[3, 4, 1] = broken
-    assert math.isnan(flip_module.flip(image, photo)) and math.isnan(flip_module.flip(photo, image))
+    assert all(math.isnan(flip_module.flip(*pair).result()) for pair in ((image, photo), (photo, image)))
     assert not library.calls, "the library calls such pictures equal"
 
 
@@ -115,7 +116,26 @@ def test_the_library_itself():
     torch.manual_seed(0)
     photo = torch.rand(40, 50, 3)
     noise = torch.randn(40, 50, 3)
-    values = [flip_module.flip((photo + scale * noise).clamp(0, 1), photo) for scale in (0.0, 0.01, 0.05, 0.2)]
+    scales = (0.0, 0.01, 0.05, 0.2)
+    values = [flip_module.flip((photo + scale * noise).clamp(0, 1), photo).result() for scale in scales]
     assert values[0] == 0.0 and values == sorted(values) and values[-1] < 1.0
     black, white = torch.zeros(30, 30, 3), torch.ones(30, 30, 3)
-    assert flip_module.flip(white, black) == pytest.approx(0.967, abs=0.002)  # FLIP 1.7's at 67 pixels a degree
+    assert flip_module.flip(white, black).result() == pytest.approx(
+        0.967, abs=0.002
+    )  # FLIP 1.7's at 67 pixels a degree
+
+
+@pytest.mark.skipif(importlib.util.find_spec("flip_evaluator") is None, reason="flip-evaluator is not installed")
+def test_large_pictures_are_compared_by_processes_with_the_same_result(monkeypatch):
+    torch.manual_seed(1)
+    photo, image = torch.rand(2, 40, 50, 3)
+    here = flip_module.flip(image, photo).result()
+    monkeypatch.setattr(flip_module, "SMALL_PIXELS", 1)
+    monkeypatch.setattr(device, "processor_cores", lambda: 2 * flip_module.CORES_EACH)
+    results = [flip_module.flip(image, photo) for _ in range(7)]  # more than there is room for at a time
+    assert [result.result(timeout=60.0) for result in results] == [here] * 7
+    pool, _ = flip_module._processes(2)
+    torch_there = pool.submit(eval, "'torch' in __import__('sys').modules")
+    assert not torch_there.result(), "each process would take a second more to begin"
+    pool.shutdown()
+    flip_module._processes.cache_clear()

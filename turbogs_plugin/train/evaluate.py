@@ -103,7 +103,7 @@ def evaluate(
         background: behind the model, and behind transparent photos.
         aligned: give the errors after `align_colors`, too.
     """
-    metrics, seconds = [], 0.0
+    metrics, flips, seconds = [], [], 0.0
     for view_id, name in enumerate(views.names):
         synchronize(gaussians.device)
         started = time.perf_counter()
@@ -124,8 +124,10 @@ def evaluate(
         if lpips is not None:
             measured.lpips = lpips(unmasked, photo)
         if flip is not None:
-            measured.flip = flip(unmasked, photo)
+            flips.append(flip(unmasked, photo))
         metrics.append(measured)
+    for measured, value in zip(metrics, flips, strict=False):  # no flips where it is not wanted
+        measured.flip = value.result()
     return Metrics(metrics, fps=len(metrics) / seconds)
 
 
