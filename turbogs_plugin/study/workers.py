@@ -89,7 +89,8 @@ def _work(gpus: Sequence[int], place: int, sweep: tuple) -> None:
     # Each process with as many threads as there are cores would wait for the others' at every parallel loop.
     torch.set_num_threads(max(1, processor_cores() // len(gpus)))
 
-    sys.stderr = _Lines(os.fdopen(os.dup(2), "wb", 0), write_through=True)
+    # A line at a time, with its end, or those of two workers would stand on one.
+    sys.stderr = _Lines(os.fdopen(os.dup(2), "wb"), line_buffering=True)
 
     def swept() -> int:
         try:
