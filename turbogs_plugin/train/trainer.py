@@ -5,6 +5,7 @@ The loop over iterations is in `turbogs_plugin.train.loop`.
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import replace
 from typing import Any, Protocol
 
@@ -37,6 +38,9 @@ from turbogs_plugin.types import Gaussians, GaussianStats, LossOutput, PixelSamp
 
 COLOR_STRIDE = 97
 """The mean colour of the photos is taken over every 97th pixel; coprime to usual widths."""
+
+REPEATED_AT_MOST = 32
+"""More iterations than an engine ever skips before it says so."""
 
 STATEFUL = ("maps", "view_sampler", "optimizer", "density")
 """Attributes of a trainer that have a state of their own."""
@@ -96,6 +100,7 @@ class Trainer:
         self.iteration = 0
         self.observer: IterationObserver | None = None
         self.first_repeatable = 0  # the iteration after the latest change of the set of Gaussians: see `repeat_lost`
+        self._before_views: deque[tuple[int, dict[str, Any]]] = deque(maxlen=REPEATED_AT_MOST)  # the view sampler's
         self.initial_error = 0.0
         self.nonfinite_losses = torch.zeros((), dtype=torch.int64, device=device)
 
@@ -133,6 +138,7 @@ class Trainer:
         budget = self.schedule.query(step, view_errors.mean().item(), self.initial_error, len(self.views))
 
         # 2) View selection
+        self._before_views.append((self.iteration, self.view_sampler.state_dict()))
         view_ids = self.view_sampler.select(budget.views, view_errors, step)
 
         # 3) Pixel sampling
@@ -236,7 +242,8 @@ class Trainer:
 
     def repeat_lost(self, wait: bool = False) -> None:
         """Go back by the iterations that were skipped: where the engine has too little memory for an iteration, that
-        one and those after it change nothing until the engine is settled.
+        one and those after it change nothing until the engine is settled. They are made again with the same views: or
+        views that take much memory would be looked at less often.
 
         It never goes back past a change of the set of Gaussians, which would then be made twice: iterations skipped
         just before such a change are lost.
@@ -250,6 +257,9 @@ class Trainer:
         lost = self.exchange.settle(self.engine, wait)
         earliest = min(self.first_repeatable, self.iteration)
         self.iteration = max(self.iteration - lost, earliest)
+        while lost and self._before_views and self._before_views[-1][0] >= self.iteration:
+            _, state = self._before_views.pop()
+            self.view_sampler.load_state_dict(state)
 
     @property
     def now(self) -> Step:
