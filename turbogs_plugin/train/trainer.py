@@ -327,6 +327,7 @@ class Trainer:
         if not 0 <= state["iteration"] <= self.iterations or state["nonfinite_losses"] < 0:
             raise ValueError(f"iteration {state['iteration']} with {state['nonfinite_losses']} non-finite losses")
         self.iteration = state["iteration"]
+        self._before_views.clear()
         self.initial_error = state["initial_error"]
         self.nonfinite_losses.fill_(state["nonfinite_losses"])
         self.gaussians = gaussians_of_state(state, self.device)
