@@ -12,7 +12,7 @@ from verdict import verdict
 from turbogs_plugin.report.tables import table
 from turbogs_plugin.study.summary import VariantRow
 
-OURS = ("parts", "departures")
+OURS = ("parts", "departures", "sizes")
 """Studies that change one thing of `turbogs` a variant."""
 
 BOUND = 0.3
@@ -55,13 +55,14 @@ PARTS = (
     Part("the error-driven score and its gates, not a draw by squares", ("by-difficulty", "turbogs")),
     Part("the score, not the gradient alone", None, ("turbogs-paper", "no-score")),
     Part("no pruning by squares at every event", ("no-turnover", "turbogs")),
-    Part("final pruning", ("final-pruning", "turbogs"), ("turbogs-paper", "no-final-pruning")),
+    Part("final pruning", ("turbogs", "no-final-pruning"), ("turbogs-paper", "no-final-pruning")),
     Part("NCC (+0.48 dB)", ("turbogs", "no-ncc"), ("turbogs-paper", "no-ncc")),
     Part("the printed NCC: a flat tile scores 0", ("printed-ncc", "turbogs")),
     Part("3DGS's splits, no opacity decay", ("plain-splits", "turbogs")),
     Part("3DGS's learning rates", ("rates-3dgs", "turbogs"), ("turbogs-paper", "rates-turbogs")),
     Part("5,000 iterations, not 60 epochs", ("iterations-5000", "turbogs")),
     Part("no backdrop", ("no-backdrop", "turbogs")),
+    Part("no space kept free before cameras", ("no-clearance", "turbogs")),
     Part("no bound on far sizes", ("distant-unbounded", "turbogs")),
     Part("pruning by the scene's extent, as 3DGS", ("prune-by-extent", "turbogs")),
     Part("a band of harmonics every 1000 iterations, as 3DGS", ("sh-interval-1000", "turbogs")),

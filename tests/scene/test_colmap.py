@@ -75,7 +75,7 @@ def test_reads_cameras_points_and_photos(tmp_path, model, suffix):
     assert scene.name == "cup"
     assert scene.test.names == ("photo00.png", "photo08.png")
     assert scene.train.names == tuple(f"photo{view:02d}.png" for view in range(1, 8))
-    assert scene.points.shape == (20, 3) and scene.points.dtype == torch.float32
+    assert scene.points.shape == (20, 3) and scene.points.dtype == torch.float32 and not scene.drawn_points
     assert scene.point_colors.dtype == torch.uint8 and scene.point_colors[:, 0].tolist() == list(range(20))
     centers = scene.frame.restore_points(scene.train.cameras.centers.numpy())
     np.testing.assert_allclose(centers, [[view, 0, -5] for view in range(1, 8)], atol=1e-5)
@@ -297,7 +297,7 @@ def test_bad_captures_are_refused(tmp_path, capture, arguments, words):
 
 def test_without_points_random_ones_are_drawn(tmp_path):
     scene = load_scene(write_capture(tmp_path / "cup", num_points=0))
-    assert len(scene.points) == len(scene.point_colors) == 50_000
+    assert len(scene.points) == len(scene.point_colors) == 50_000 and scene.drawn_points
     assert scene.notes[0].endswith("9 images, no points, so 50,000 random ones about what the cameras look at")
     again = load_scene(tmp_path / "cup")
     assert torch.equal(scene.points, again.points)

@@ -368,7 +368,7 @@ def test_state_statistics_and_parameters_stay_together(seed, split, cap, decay, 
         if update is not None:
             before = len(gaussians)
             order = torch.randperm(len(update.source), generator=torch.Generator().manual_seed(seed))
-            update = update.reordered(order)
+            update = update.taking(order)
             gaussians = update.apply(gaussians)
             optimizer.apply(update)
             density.apply(update)

@@ -124,7 +124,7 @@ def test_a_refinement_starts_a_new_window_and_a_reset_does_not(iteration, kept):
     density.stats.view_counts += torch.arange(10)
     gaussians.means[4] = torch.nan  # so that there is a change
     update = density.update(gaussians, Step(iteration, 1000, 800))
-    update = update.reordered(torch.arange(9).flip(0))
+    update = update.taking(torch.arange(9).flip(0))
     density.apply(update)
     assert update.source.tolist() == [9, 8, 7, 6, 5, 3, 2, 1, 0]
     assert torch.equal(density.stats.view_counts, update.source.float() if kept else torch.zeros(9))

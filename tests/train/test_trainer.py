@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -392,6 +393,20 @@ def test_what_is_far_is_kept_from_growing(capture, size, expected):
     trainer.gaussians.scales[far] = math.log(40.0 * trainer.extent)
     trainer.step()
     assert torch.allclose(trainer.gaussians.scales[far].exp(), torch.tensor(expected * trainer.extent), rtol=0.05)
+
+
+@pytest.mark.parametrize(("clears", "drawn", "remain"), [(True, False, 0), (False, False, 3), (True, True, 3)])
+def test_what_stands_before_a_camera_goes_with_the_next_change(capture, clears, drawn, remain):
+    config = tiny_config(capture, f"train.camera_clearance={clears}", "density.refine_from=1", "density.refine_every=1")
+    scene = replace(load_scene(capture), drawn_points=drawn)
+    trainer = Trainer(config.without_plan(), scene, torch.device("cpu"))
+    trainer.initialise_maps()
+    centers = scene.train.cameras.centers
+    trainer.gaussians.means[:3] = centers[:3] + 1e-3 * trainer.extent
+    trainer.follow(RowUpdate(torch.arange(len(trainer.gaussians)), torch.zeros(len(trainer.gaussians)).bool(), {}))
+    near = torch.cdist(trainer.gaussians.means, centers).amin(dim=1) < 0.01 * trainer.extent
+    assert int(near.sum()) == remain
+    assert len(trainer.optimizer.moments) == len(trainer.density.stats.grad_sums) == len(trainer.gaussians)
 
 
 def test_the_trainer_names_no_strategy():

@@ -73,6 +73,8 @@ class TrainConfig:
             after an affine fit of the render's colours. ``auto``: where the photos of neighbouring cameras differ.
         distant_size: largest standard deviation of a Gaussian beyond 2 scene extents, over its distance from the
             cameras (`restrain_distant`). 0: no bound.
+        camera_clearance: a change of the set of Gaussians also removes those that stand nearer to a training camera
+            than the capture's points do (`turbogs_plugin.model.clearance`). Nothing where it has no points of its own.
         evaluate_at: when to evaluate, as fractions of T; the start and the end are always evaluated.
         checkpoint_every: iterations between checkpoints; the end always has one. 0: only the end.
     """
@@ -95,6 +97,7 @@ class TrainConfig:
     backdrop: bool | Auto = False
     exposure: bool | Auto = False
     distant_size: float = 0.0
+    camera_clearance: bool = False
     evaluate_at: tuple[float, ...] = (0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
     checkpoint_every: int = 10_000
 

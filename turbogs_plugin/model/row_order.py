@@ -32,8 +32,7 @@ def in_order_of_space(update: RowUpdate, gaussians: Gaussians, step: Step) -> Ro
     """
     if step.iteration > step.refine_until:
         return update
-    means = update.values["means"] if "means" in update.values else gaussians.means[update.source]
-    return update.reordered(spatial_order(means, step.scene_extent))
+    return update.taking(spatial_order(update.new("means", gaussians), step.scene_extent))
 
 
 def spatial_order(means: Tensor, extent: float) -> Tensor:

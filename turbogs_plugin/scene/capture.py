@@ -33,7 +33,8 @@ class Capture:
         Ks: [V, 3, 3] float64, intrinsics of the full-size photos, undistorted where they have a lens.
         sizes: [V, 2] int64 (width, height) of the full-size photos, undistorted where they have a lens.
         points: [M, 3] float64.
-        point_colors: [M, 3] uint8; None: they are taken from the photos (`colors_in_photos`).
+        point_colors: [M, 3] uint8; None: the points were drawn at random, and their colours are taken from the photos
+            (`colors_in_photos`).
         lenses: one a view, None where the photo is that of a pinhole camera; given as empty where all are.
         notes: what the capture was taken for, and what was done with it: lines for the user.
         test: [V] bool, the test views of the capture's own split; None: views are split by their order.

@@ -82,6 +82,7 @@ class Scene:
         frame: back to the capture's own coordinates.
         extent: 1.1 times the largest distance of a training camera from their mean, as in 3DGS; 1 by the choice of
             frame, also where the cameras only turn on the spot.
+        drawn_points: the points were drawn at random, as the capture has none.
         notes: what the capture was taken for, and what was done with its photos: lines for the user.
     """
 
@@ -92,6 +93,7 @@ class Scene:
     point_colors: Tensor
     frame: Frame
     extent: float
+    drawn_points: bool = False
     notes: tuple[str, ...] = ()
 
 
@@ -208,6 +210,7 @@ def load_scene(
         point_colors=point_colors,
         frame=frame,
         extent=1.0,
+        drawn_points=capture.point_colors is None,
         notes=tuple(filter(None, (*capture.notes, *notes))),
     )
 

@@ -21,6 +21,7 @@ from turbogs_plugin.engine.protocol import MapUpdate
 from turbogs_plugin.engine.rendered import RenderOptions, ScreenGradients
 from turbogs_plugin.engine.rendering import dense_samples, rasterize
 from turbogs_plugin.errors import TrainingStopped
+from turbogs_plugin.model.clearance import Clearance
 from turbogs_plugin.model.distant import RESTRAIN_EVERY, restrain_distant
 from turbogs_plugin.model.harmonics import with_degree
 from turbogs_plugin.model.initial import BACKDROP_COUNT, backdrop_gaussians, gaussians_from_points
@@ -90,6 +91,9 @@ class Trainer:
         )
         self.background = Background.of(config.train.background, self.views.photos.transparent)
         self.exposures = Exposures.identity(len(self.views), device) if config.train.exposure else None
+        self.clearance = None
+        if config.train.camera_clearance and not scene.drawn_points:
+            self.clearance = Clearance.of(scene.points.to(device), self.views.cameras.centers)
         init = "points" if resuming else config.train.init
         self.gaussians = initial_gaussians(scene, config, init, device).map(lambda tensor: tensor.to(device))
         self.view_sampler.setup(self.views.cameras, scene.extent)
@@ -219,11 +223,13 @@ class Trainer:
     def follow(self, update: RowUpdate | None) -> None:
         """Apply the change of the set of Gaussians that density control proposed, if any.
 
-        Model, optimizer and controller follow the change, with its rows sorted in space until `refine_until`. Every
-        `RESTRAIN_EVERY` iterations, also without a change, the size of distant Gaussians is limited, which is not in
-        the paper.
+        Model, optimizer and controller follow the change, with its rows sorted in space until `refine_until`. Not in
+        the paper: what stands right before a camera goes with any change; and the size of distant Gaussians is limited,
+        every `RESTRAIN_EVERY` iterations, also without a change.
         """
         if update is not None:
+            if self.clearance is not None:
+                update = self.clearance.clear(update, self.gaussians)
             if len(update.source) == 0:
                 raise TrainingStopped(f"iteration {self.iteration}: density control removed every Gaussian")
             update = in_order_of_space(update, self.gaussians, self.now)

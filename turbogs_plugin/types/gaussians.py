@@ -154,15 +154,18 @@ class RowUpdate:
     num_split: int = 0
     num_pruned: int = 0
 
+    def new(self, name: str, gaussians: Gaussians) -> Tensor:
+        """[M, ...] a parameter after the change of `gaussians`."""
+        return self.values[name] if name in self.values else getattr(gaussians, name)[self.source]
+
     def apply(self, gaussians: Gaussians) -> Gaussians:
         """The model after the change."""
-        copies = {name: value[self.source] for name, value in gaussians.items() if name not in self.values}
-        return Gaussians(**copies, **self.values)
+        return Gaussians(**{name: self.new(name, gaussians) for name, _ in gaussians.items()})
 
-    def reordered(self, order: Tensor) -> RowUpdate:
-        """The same change with its new rows in another order [M], a permutation."""
-        values = {name: value[order] for name, value in self.values.items()}
-        return replace(self, source=self.source[order], fresh=self.fresh[order], values=values)
+    def taking(self, rows: Tensor) -> RowUpdate:
+        """The same change with these of its new rows alone, in this order."""
+        values = {name: value[rows] for name, value in self.values.items()}
+        return replace(self, source=self.source[rows], fresh=self.fresh[rows], values=values)
 
     def apply_state(self, state: Tensor) -> Tensor:
         """A state tensor [N, ...] after the change: rows follow their Gaussian, fresh ones are zero."""

@@ -1,0 +1,92 @@
+"""The space around training cameras that is kept free, against plain distances."""
+
+import pytest
+import torch
+from helpers.models import random_gaussians
+
+from turbogs_plugin.model import clearance
+from turbogs_plugin.model.clearance import POINTS, RARE, SHARE, Clearance
+from turbogs_plugin.types import RowUpdate
+
+CENTERS = torch.tensor([[0.0, 0.0, 0.0], [4.0, 0.0, 0.0]])
+
+
+def points_around(center, distance, count, seed=0):
+    directions = torch.randn(count, 3, generator=torch.Generator().manual_seed(seed))
+    return torch.tensor(center) + distance * directions / directions.norm(dim=1, keepdim=True)
+
+
+def unchanged(gaussians):
+    return RowUpdate(torch.arange(len(gaussians)), torch.zeros(len(gaussians), dtype=torch.bool), {})
+
+
+def test_a_camera_near_its_points_has_a_smaller_sphere():
+    points = torch.cat([points_around([0.0, 0.0, 0.0], 0.2, 30), points_around([4.0, 0.0, 0.0], 1.0, 3000)])
+    radii = Clearance.of(points, CENTERS).radii
+    # 30 of 3030 points lie nearer than any other: that is more than RARE, so 0.2 is what points commonly have.
+    assert radii.tolist() == pytest.approx([SHARE * 0.2, 0.2])
+
+
+def test_single_points_count_neither_for_a_camera_nor_for_all():
+    few = POINTS - 1
+    points = torch.cat([points_around([0.0, 0.0, 0.0], 0.01, few), points_around([0.0, 0.0, 0.0], 1.0, 10_000)])
+    assert few < RARE * len(points)
+    radii = Clearance.of(points, CENTERS).radii
+    assert radii[0].item() == pytest.approx(SHARE)
+    assert radii[1].item() == pytest.approx(1.0, rel=1e-5)  # farther from every point than from 0.9 of its own
+
+
+def test_no_sphere_is_larger_than_what_points_commonly_have():
+    """The second camera looks away from a wall behind it, on which no point was found."""
+    points = torch.cat([points_around([0.0, 0.0, 0.0], 0.5, 500), points_around([40.0, 0.0, 0.0], 0.1, 500)])
+    radii = Clearance.of(points, torch.tensor([[0.0, 0.0, 0.0], [20.0, 0.0, 0.0]])).radii
+    assert radii.tolist() == pytest.approx([SHARE * 0.5, 0.5])
+
+
+def test_too_few_points_say_nothing():
+    assert Clearance.of(torch.zeros(POINTS - 1, 3), CENTERS) is None
+    assert Clearance.of(torch.zeros(0, 3), CENTERS) is None
+
+
+def test_pieces_change_nothing(monkeypatch):
+    points = torch.rand(500, 3, generator=torch.Generator().manual_seed(1)) * 4
+    whole = Clearance.of(points, CENTERS)
+    monkeypatch.setattr(clearance, "DISTANCES_AT_ONCE", 14)
+    pieces = Clearance.of(points, CENTERS)
+    assert torch.equal(whole.radii, pieces.radii)
+    gaussians = random_gaussians(300)
+    assert torch.equal(
+        whole.clear(unchanged(gaussians), gaussians).source, pieces.clear(unchanged(gaussians), gaussians).source
+    )
+
+
+def test_rows_in_a_sphere_are_taken_out_of_a_change():
+    gaussians = random_gaussians(6)
+    gaussians.means[:] = torch.tensor([[0.05, 0, 0], [0.3, 0, 0], [3.7, 0, 0], [4.3, 0, 0], [9.0, 0, 0], [9.0, 1, 0]])
+    spheres = Clearance(CENTERS, torch.tensor([0.2, 0.4]))
+    moved = torch.tensor([[0.0, 0, 0], [1.0, 0, 0], [2.0, 0, 0], [4.1, 0, 0], [9.0, 0, 0], [9.0, 1, 0], [5.0, 0, 0]])
+    sizes = torch.arange(21.0).view(7, 3)
+    source, fresh = torch.tensor([0, 1, 2, 3, 4, 5, 5]), torch.tensor([0, 0, 0, 0, 0, 0, 1]).bool()
+    cleared = spheres.clear(RowUpdate(source, fresh, {"means": moved, "scales": sizes}, num_pruned=4), gaussians)
+    kept = [1, 2, 4, 5, 6]  # by where the rows are after the change
+    assert cleared.source.tolist() == [1, 2, 4, 5, 5] and cleared.fresh.tolist() == [0, 0, 0, 0, 1]
+    assert torch.equal(cleared.values["means"], moved[kept]) and torch.equal(cleared.values["scales"], sizes[kept])
+    assert cleared.num_pruned == 4 + 2
+    without_values = spheres.clear(unchanged(gaussians), gaussians)
+    assert without_values.source.tolist() == [1, 4, 5] and without_values.num_pruned == 3
+
+
+def test_a_change_without_rows_in_a_sphere_is_returned_as_it_is():
+    gaussians = random_gaussians(5)
+    gaussians.means += 100.0
+    update = unchanged(gaussians)
+    assert Clearance(CENTERS, torch.ones(2)).clear(update, gaussians) is update
+    none = RowUpdate(torch.zeros(0, dtype=torch.int64), torch.zeros(0, dtype=torch.bool), {})
+    assert Clearance(CENTERS, torch.ones(2)).clear(none, gaussians) is none
+
+
+def test_a_mean_that_is_not_finite_is_left_to_others():
+    gaussians = random_gaussians(3)
+    gaussians.means[:] = torch.tensor([[torch.nan, 0, 0], [torch.inf, 0, 0], [0.1, 0, 0]])
+    cleared = Clearance(CENTERS, torch.ones(2)).clear(unchanged(gaussians), gaussians)
+    assert cleared.source.tolist() == [0, 1]
