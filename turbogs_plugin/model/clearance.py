@@ -16,7 +16,9 @@ be wrong. So what a photo was taken of from near by stays."""
 RARE = 0.002
 """No radius is larger than the distance within which this share of the points have a camera: where a camera stands
 before a wall without points, the wall stays."""
-DISTANCES_AT_ONCE = 1 << 24
+POINTS_LOOKED_AT = 100_000
+"""Of more points so many, evenly in their order."""
+DISTANCES_AT_ONCE = 1 << 22
 """Points times cameras: it bounds memory."""
 
 
@@ -45,6 +47,7 @@ class Clearance:
         """
         if len(points) < POINTS:
             return None
+        points = points[:: -(-len(points) // POINTS_LOOKED_AT)]
         nearest = centers.new_full((POINTS, len(centers)), torch.inf)
         of_points = []
         for distances in _distances(points, centers):
@@ -60,15 +63,18 @@ class Clearance:
         Args:
             update: a change of `gaussians`.
         """
-        means = update.new("means", gaussians)
-        inside = [(distances < self.radii).any(dim=1) for distances in _distances(means, self.centers)]
-        free = (~torch.cat(inside)).nonzero()[:, 0] if inside else update.source
-        if len(free) == len(means):
+        means, reach = update.new("means", gaussians), self.radii.amax()
+        low, high = self.centers.amin(dim=0) - reach, self.centers.amax(dim=0) + reach
+        among = ((means > low) & (means < high)).all(dim=1).nonzero()[:, 0]  # the cameras: others are in no sphere
+        inside = [(distances < self.radii).any(dim=1) for distances in _distances(means[among], self.centers)]
+        free = torch.ones(len(means), dtype=torch.bool, device=means.device)
+        free[among] = ~torch.cat(inside)
+        if free.all():
             return update
-        return replace(update.taking(free), num_pruned=update.num_pruned + len(means) - len(free))
+        return replace(update.taking(free.nonzero()[:, 0]), num_pruned=update.num_pruned + int((~free).sum()))
 
 
 def _distances(points: Tensor, centers: Tensor) -> Iterator[Tensor]:
-    """[n, V] of some points after the others. Exact: cdist's way by products loses the digits of small distances."""
+    """[n, V] of some points after the others. By differences: cdist takes a block of threads for each number."""
     for part in points.split(max(1, DISTANCES_AT_ONCE // max(1, len(centers)))):
-        yield torch.cdist(part, centers, compute_mode="donot_use_mm_for_euclid_dist")
+        yield (part[:, None] - centers).norm(dim=-1)
