@@ -36,6 +36,7 @@ EVERY_ITERATION = (
     "train.sh_degree=0",
     "train.backdrop=false",
     "train.background=black",
+    "train.camera_clearance=false",
     "train.device=cpu",
     "schedule.type=fixed",
     f"schedule.views={VIEWS}",
