@@ -55,6 +55,7 @@ def round_table(name: str, table_name: str) -> str:
 TABLES: dict[str, Callable[[], str | None]] = {
     "ahead": study_tables.ahead,
     "behind": study_tables.behind,
+    "bounds": lambda: study_tables.changes("bounds"),
     "density_sums": machine_tables.density_sums,
     "departures": lambda: study_tables.changes("departures"),
     "dropin": machine_tables.dropin,

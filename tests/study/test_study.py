@@ -54,6 +54,7 @@ def test_every_packaged_ablation_resolves_and_its_variants_differ(name):
 def test_the_tables_of_the_paper_are_there():
     assert set(packaged_names(PACKAGE)) >= {
         "baselines",
+        "bounds",
         "components",
         "departures",
         "paper_parts",
