@@ -105,6 +105,7 @@ class Engine(ABC):
         Args:
             records, radii: flat float32 and int32, contiguous, aligned to 16 bytes; None: in the engine's own.
         """
+        return
 
     @abstractmethod
     def evaluate(self, terms: LossTerms, colors: Tensor, targets: Tensor, samples: PixelSamples) -> LossOutput:

@@ -84,6 +84,7 @@ class Workspace:
     def __init__(self, device: torch.device | str) -> None:
         self.device = torch.device(device)
         self.status = torch.zeros(2, dtype=torch.int32, device=self.device)
+        self._overflow = self.status[1:]
         self.passes = 0
         self._buffers: dict[str, Tensor] = {}
         self._lent: dict[str, Tensor] = {}  # of `lend`
@@ -98,7 +99,7 @@ class Workspace:
     @property
     def overflow(self) -> Tensor:
         """[1] int32 on the device, not 0 while passes do nothing. Kernels that change state must check it."""
-        return self.status[1:]
+        return self._overflow
 
     @property
     def overflowed(self) -> bool:
