@@ -1,0 +1,86 @@
+"""The kernel that collects records against its twin, and passes in memory that is lent."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from helpers.raster_cases import GPU_ONLY, make_case
+
+from turbogs_plugin.engine.cuda import raster as cuda
+from turbogs_plugin.engine.cuda.engine import CudaEngine
+from turbogs_plugin.engine.cuda.workspace import Workspace
+from turbogs_plugin.engine.layout import ScreenRecord
+from turbogs_plugin.engine.reference.records import collect_records
+from turbogs_plugin.engine.rendered import DEFAULT_OPTIONS, ScreenRecords
+
+pytestmark = GPU_ONLY
+
+GPU = torch.device("cuda")
+
+
+def records(views: int, count: int, seed: int) -> ScreenRecords:
+    """Two fifths are on screen; some of these are wide in one direction alone. The others hold NaN."""
+    generator = torch.Generator().manual_seed(seed)
+    radii = torch.randint(0, 9, (views, count, 2), generator=generator, dtype=torch.int32)
+    radii[torch.rand(views, count, generator=generator) > 0.4] = 0
+    values = torch.randn(views, count, ScreenRecord.SIZE, generator=generator)
+    values[(radii == 0).all(dim=-1)] = torch.nan
+    return ScreenRecords(values.to(GPU), radii.to(GPU), False)
+
+
+@pytest.mark.parametrize("count, rows", [(1000, (0, 1000)), (1000, (500, 1000)), (4099, (4, 517)), (37, (36, 37))])
+@pytest.mark.parametrize("adds", [False, True])
+def test_records_on_screen_are_those_of_the_twin_to_the_bit(count, rows, adds):
+    source, earlier = records(3, count, 0), records(6, rows[1] - rows[0], 1)
+    if adds:  # a view that is shared has the same radii in all processes
+        earlier.radii[2] = source.radii[0, rows[0] : rows[1]]
+    target, wanted = (ScreenRecords(earlier.records.clone(), earlier.radii.clone(), False) for _ in range(2))
+    CudaEngine().collect(source, target, rows[0], 2, adds)
+    collect_records(source, wanted, rows[0], 2, adds)
+    assert torch.equal(target.radii, wanted.radii)
+    seen = (wanted.radii > 0).any(dim=-1)
+    assert 0 < int(seen.sum()) or rows[1] - rows[0] == 1
+    assert torch.equal(target.records[seen], wanted.records[seen])
+    assert torch.equal(target.records[~seen].isnan(), earlier.records[~seen].isnan()), "left alone"
+
+
+def test_nothing_to_collect():
+    target = ScreenRecords(
+        torch.zeros(2, 0, ScreenRecord.SIZE, device=GPU), torch.zeros(2, 0, 2, device=GPU).int(), False
+    )
+    CudaEngine().collect(records(2, 8, 0), target, 8, 0, False)
+    with pytest.raises(RuntimeError, match="rows"):
+        CudaEngine().collect(records(2, 8, 0), records(2, 8, 1), 4, 0, False)
+    with pytest.raises(RuntimeError, match="views"):
+        CudaEngine().collect(records(2, 8, 0), records(2, 8, 1), 0, 1, False)
+
+
+def test_passes_in_memory_that_is_lent():
+    case = make_case([(70, 50), (33, 47)], count=200, rate=0.4, seed=11)
+    arguments = case.gpu_gaussians, case.gpu_cameras, case.gpu_samples, DEFAULT_OPTIONS
+    wanted = cuda.rasterize_cuda(*arguments)
+    wanted = wanted.backward(torch.ones_like(wanted.colors))
+    memory = Workspace(GPU)
+    floats = torch.full((500 * ScreenRecord.SIZE,), torch.nan, device=GPU)
+    integers = torch.zeros(1000, dtype=torch.int32, device=GPU)
+
+    def one_pass() -> ScreenRecords:
+        rendered = cuda.rasterize_cuda(*arguments, memory)
+        screen = rendered.backward(torch.ones_like(rendered.colors))
+        torch.testing.assert_close(screen.full_records(), wanted.full_records(), rtol=1e-4, atol=1e-5)
+        return screen.plain()
+
+    one_pass()
+    memory.lend({"records": floats, "radii": integers})
+    for _ in range(2):
+        plain = one_pass()
+        assert plain.records.data_ptr() == floats.data_ptr() and plain.radii.data_ptr() == integers.data_ptr()
+        memory.lend({"records": floats, "radii": integers})
+    memory.buffer("records", (600, ScreenRecord.SIZE), torch.float32)  # outgrown
+    memory.lend({"records": floats, "radii": integers})
+    assert one_pass().records.data_ptr() == floats.data_ptr()
+    memory.lend({"records": None, "radii": None})
+    before = floats.clone()
+    plain = one_pass()
+    assert plain.records.data_ptr() != floats.data_ptr() and plain.radii.data_ptr() != integers.data_ptr()
+    assert torch.equal(floats.nan_to_num(), before.nan_to_num())
