@@ -162,7 +162,6 @@ class RankExchange(Exchange):
     ) -> SharedRendered:
         shares = shares_of(samples, self.ranks.count)
         own = shares[self.ranks.rank]
-        self.finish()
         memory = self._prepared(engine, shares, gaussians)
         rendered = None
         if len(own):

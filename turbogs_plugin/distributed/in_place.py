@@ -7,8 +7,8 @@ the reading and the next iteration's writing. No other order is assumed than tha
 - `DRAWN`: records and radii of all are complete -> they are collected.
 - `FREE`: colours, flags, records and radii of the last iteration are read by all -> the projection clears and the
   forward pass overwrites them. Where rows have owners, the gather of parameters does the same: a process has all
-  parameters after every process's own came, which that enqueues after what it read; and `RankExchange.finish` makes
-  the stream wait for them before the next pass. So `FREE` is left out there.
+  parameters after every process's own came, which that enqueues after what it read; and nobody renders a model before
+  `Exchange.finish` made the stream wait for them. So `FREE` is left out there.
 
 `DRAWN` does not stand for `WRITTEN`, as the loss needs the colours before, nor `WRITTEN` for `FREE`: the projection
 comes before it. Barriers have their own numbers, as two processes may be at two of them. A process without samples
