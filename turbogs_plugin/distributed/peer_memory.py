@@ -81,7 +81,10 @@ def _allocate(ranks: ProcessRanks, size: int, memory: None) -> PeerMemory | None
     one_host = os.environ.get("LOCAL_WORLD_SIZE") == os.environ.get("WORLD_SIZE")
     if not one_host or os.environ.get(MESSAGES_VARIABLE) == "messages" or not _linked():
         return None
-    own = symmetric.empty(size, dtype=torch.float32, device=torch.device("cuda", torch.cuda.current_device()))
+    # As `symmetric.empty` does, but never from a pool: what one process has kept from earlier runs there, another may
+    # not, and only one of the two would then wait for the other.
+    device = torch.device("cuda", torch.cuda.current_device())
+    own = symmetric._SymmetricMemory.empty_strided_p2p((size,), (1,), torch.float32, device)
     return PeerMemory([own.zero_()], lambda channel: None)
 
 
@@ -111,11 +114,13 @@ def _linked() -> bool:
 
     Barriers need atomic operations in the other GPU's memory, which PCIe has not.
     """
-    nvml, device, state = ctypes.CDLL("libnvidia-ml.so.1"), ctypes.c_void_p(), ctypes.c_uint()
+    try:
+        nvml = ctypes.CDLL("libnvidia-ml.so.1")
+    except OSError:
+        return True
+    device, state = ctypes.c_void_p(), ctypes.c_uint()
     name = f"GPU-{torch.cuda.get_device_properties(torch.cuda.current_device()).uuid}".encode()
     if nvml.nvmlInit_v2() != 0 or nvml.nvmlDeviceGetHandleByUUID(name, ctypes.byref(device)) != 0:
         return True
-    for link in range(LINKS_MAX):
-        if nvml.nvmlDeviceGetNvLinkState(device, link, ctypes.byref(state)) == 0 and state.value:
-            return True
-    return False
+    links = range(LINKS_MAX)
+    return any(nvml.nvmlDeviceGetNvLinkState(device, link, ctypes.byref(state)) == 0 and state.value for link in links)
