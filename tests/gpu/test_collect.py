@@ -6,12 +6,18 @@ import pytest
 import torch
 from helpers.raster_cases import GPU_ONLY, make_case
 
+from turbogs_plugin.distributed.in_place import InPlace
+from turbogs_plugin.distributed.peer_memory import PeerMemory
+from turbogs_plugin.distributed.rows import rows_of
+from turbogs_plugin.distributed.shares import shares_of
 from turbogs_plugin.engine.cuda import raster as cuda
 from turbogs_plugin.engine.cuda.engine import CudaEngine
 from turbogs_plugin.engine.cuda.workspace import Workspace
 from turbogs_plugin.engine.layout import ScreenRecord
+from turbogs_plugin.engine.protocol import Engine
 from turbogs_plugin.engine.reference.records import collect_records
 from turbogs_plugin.engine.rendered import DEFAULT_OPTIONS, ScreenRecords
+from turbogs_plugin.types import Cameras, Gaussians, PixelSamples
 
 pytestmark = GPU_ONLY
 
@@ -84,3 +90,72 @@ def test_passes_in_memory_that_is_lent():
     plain = one_pass()
     assert plain.records.data_ptr() != floats.data_ptr() and plain.radii.data_ptr() != integers.data_ptr()
     assert torch.equal(floats.nan_to_num(), before.nan_to_num())
+
+
+class OneOfTwo:
+    """What `InPlace` needs to know of the processes."""
+
+    count = 2
+
+    def __init__(self, rank: int) -> None:
+        self.rank = rank
+
+
+def in_place_like_twin(engines: list[Engine], gaussians: Gaussians, cameras: Cameras, samples: PixelSamples) -> int:
+    """Two shares of a batch in one process, one after the other, so that barriers have nothing to do.
+
+    Returns:
+        How many Gaussians are on screen, in all views.
+    """
+    shares, device, parts = shares_of(samples, 2), samples.pixel_ids.device, []
+
+    def share(ranks: OneOfTwo, size: int, device: torch.device) -> PeerMemory:
+        while len(parts) < 2:
+            parts.append(torch.zeros(size, device=device))
+        assert len(parts[0]) == size
+        return PeerMemory(parts, lambda channel: None)
+
+    memories = [InPlace(OneOfTwo(rank), share) for rank in range(2)]
+    rendered = []
+    for memory, engine, own in zip(memories, engines, shares, strict=True):
+        for _ in range(3):  # the first pass of a workspace is another one
+            assert memory.prepare(engine, shares, len(gaussians), device)
+            chosen = samples.of_tiles(own.tiles, own.views, own.slots)
+            part = Cameras(cameras.viewmats[own.views], cameras.Ks[own.views], cameras.sizes[own.views])
+            last = engine.render(gaussians, part, chosen, DEFAULT_OPTIONS)
+        rendered.append(last)
+        memory.colors(shares, last.colors)
+    for memory, one in zip(memories, rendered, strict=True):
+        colors, flags = memory.colors(shares, one.colors)
+        assert torch.equal(colors, torch.cat([each.colors for each in rendered])) and flags.tolist() == [0, 0, 0]
+    plains = [one.backward(torch.ones_like(one.colors)).plain() for one in rendered]
+    seen = 0
+    for rank, rows in enumerate(rows_of(len(gaussians), 2)):
+        shape = len(cameras), rows.stop - rows.start
+        target, wanted = (
+            ScreenRecords(
+                torch.full((*shape, ScreenRecord.SIZE), torch.nan, device=device),
+                torch.full((*shape, 2), -1, dtype=torch.int32, device=device),
+                False,
+            )
+            for _ in range(2)
+        )
+        own = plains[1 - rank], memories[1 - rank]
+        own[1].collect(engines[1 - rank], shares, len(gaussians), own[0], target, rows.start)  # has copied, if it must
+        memories[rank].collect(engines[rank], shares, len(gaussians), plains[rank], target, rows.start)
+        for plain, one in zip(plains, shares, strict=True):
+            collect_records(plain, wanted, rows.start, one.views.start, one.continues)
+        assert torch.equal(target.radii, wanted.radii)
+        on_screen = (wanted.radii > 0).any(dim=-1)
+        assert torch.equal(target.records[on_screen], wanted.records[on_screen])
+        seen += int(on_screen.sum())
+    return seen
+
+
+def test_two_shares_in_memory_that_both_read():
+    """Offsets and views of the memory, with passes that write there, on one GPU."""
+    case = make_case([(70, 50), (33, 47)], count=203, rate=0.4, seed=11)
+    engines = [CudaEngine(GPU), CudaEngine(GPU)]
+    assert in_place_like_twin(engines, case.gpu_gaussians, case.gpu_cameras, case.gpu_samples) > 50
+    for engine in engines:
+        assert engine.workspace.overflow.tolist() == [0]

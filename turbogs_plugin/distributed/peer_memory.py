@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ctypes
 import os
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -66,8 +67,9 @@ def share_memory(ranks: ProcessRanks, size: int, device: torch.device) -> PeerMe
     for step in (_allocate, _map, _prove):
         try:
             memory = step(ranks, size, memory)
-        except (RuntimeError, ImportError, AttributeError, TypeError, OSError):  # drivers, other versions of torch
-            memory = None
+        except (RuntimeError, ImportError, AttributeError, TypeError, OSError) as error:  # drivers, versions of torch
+            memory, reason = None, f"{type(error).__name__}: {error}".splitlines()[0]
+            warnings.warn(f"GPUs do not read each other's memory, and send messages ({reason})", stacklevel=2)
         if not all(done for (done,) in ranks.gather_numbers([int(memory is not None)])):
             ranks.reads_peers = False
             return None
