@@ -12,8 +12,9 @@ from helpers.peer_files import KeepingEngine, PeerFiles
 from helpers.processes import ended, grouped, said, start_ranks
 
 from turbogs_plugin.config.configuration import load_config
+from turbogs_plugin.distributed import peer_memory
 from turbogs_plugin.distributed.in_place import DRAWN, FREE, WRITTEN, InPlace
-from turbogs_plugin.distributed.peer_memory import share_memory
+from turbogs_plugin.distributed.peer_memory import PeerMemory, share_memory
 from turbogs_plugin.distributed.ranks import ProcessRanks
 from turbogs_plugin.engine.layout import ScreenRecord
 from turbogs_plugin.engine.reference.engine import ReferenceEngine
@@ -118,11 +119,46 @@ def test_both_ways_give_the_same_to_the_bit(tmp_path, count):
     assert codes == [0] * count, said(tmp_path / "out")
 
 
-def test_there_is_no_such_memory_on_a_cpu():
-    class Alone:
-        reads_peers, rank, count = True, 0, 1
+class Alone:
+    """What `share_memory` needs to know of the processes, of which each does what the first one does.
 
+    Args:
+        others: whether the other process had no error, in each step.
+    """
+
+    rank, count = 0, 2
+
+    def __init__(self, *others: int) -> None:
+        self.reads_peers, self.others = True, list(others)
+
+    def gather_numbers(self, values: list[int]) -> list[list[int]]:
+        return [values, [self.others.pop(0)]]
+
+
+def test_there_is_no_such_memory_on_a_cpu():
     assert share_memory(Alone(), 10, CPU) is None
+
+
+def test_all_send_messages_if_one_cannot_share_its_memory(monkeypatch):
+    """Here or there, in any step; the next steps are not begun, and it is not tried again."""
+
+    def failing(*arguments: object) -> None:
+        raise ValueError("no peer access\nat line 3")
+
+    for name in ("_allocate", "_map", "_prove"):
+        monkeypatch.setattr(peer_memory, name, lambda ranks, size, memory: PeerMemory([], print))
+    for name in peer_memory.SETTINGS:
+        monkeypatch.setenv(name, "1")
+    device = torch.device("cuda")
+    assert share_memory(Alone(1, 1, 1), 10, device) is not None
+    there = Alone(1, 0)
+    assert share_memory(there, 10, device) is None and not there.reads_peers and not there.others
+    monkeypatch.setattr(peer_memory, "_map", failing)
+    here = Alone(1, 1)
+    with pytest.warns(UserWarning, match=r"ValueError: no peer access\)"):
+        assert share_memory(here, 10, device) is None
+    assert not here.reads_peers and not here.others
+    assert share_memory(here, 10, device) is None
 
 
 def records(views: int, count: int, seed: int) -> ScreenRecords:
