@@ -23,7 +23,7 @@ from turbogs_plugin.train.history import read_history
 BELOW = (0.0, 0.25, 0.5, 1.0)
 """Time to so many dB below the last PSNR of the run that ends with the lowest one."""
 
-LINE = re.compile(r"(\d+) GPU  M=(\d+) K=(\d+) lambda=([\d.]+) \(([\w ]+)\): ([\d.]+) ms")
+LINE = re.compile(r"(\d+) GPU  M=(\d+) K=(\d+) lambda=([\d.]+) \(([\w, ]+)\): ([\d.]+) ms")
 
 
 def passes(out: Path) -> Iterator[tuple[int, int, int, float, str, float]]:
@@ -50,7 +50,7 @@ def iterations(out: Path) -> str:
         found = f"{time:.2f} ms" + (f", {grown * base / time:.2f}x" if base else "")
         expected = "-"
         if case is not None:
-            predicted = case.grown(grown).on(gpus, exchange != "records to all")
+            predicted = case.grown(grown).on(gpus, not exchange.startswith("records to all"))
             expected = f"{predicted:.2f} ms, {grown * case.on(1) / predicted:.2f}x"
         batch = f", {grown} times the batch" if grown > 1 else ""
         machine = "1 GPU" if gpus == 1 else f"{gpus} GPUs, {exchange}"
@@ -107,9 +107,10 @@ def study(out: Path) -> str:
 
 def wanted(out: Path) -> str:
     """What issue and page ask of an iteration, so far as it is measured."""
-    found = {
-        (gpus, count, views): time for gpus, count, views, images, how, time in passes(out) if how != "records to all"
-    }
+    found: dict[tuple[int, int, int], float] = {}
+    for gpus, count, views, _, how, time in passes(out):
+        if not how.startswith("records to all"):
+            found.setdefault((gpus, count, views), time)  # the way that training takes comes first
     lines = []
     for count, views, least in ((600_000, 10, 1.3), (150_000, 10, 1.0), (150_000, 3, 1.0)):
         one, two = found.get((1, count, views)), found.get((2, count, views))

@@ -134,4 +134,28 @@ void launches::RasterBackward::run(const Arguments<RasterBackward>& in) {
     check_launched(launch_rasterize_backward(params, in.stream()), "backward");
 }
 
+void launches::CollectRecords::run(const Arguments<CollectRecords>& in) {
+    const Tensor &source = in.tensor(Tensors::source_radii), &target = in.tensor(Tensors::target_radii);
+    STD_TORCH_CHECK(source.dim() == 3 && target.dim() == 3, "turbogs: radii must be [views, Gaussians, 2]");
+    const int64_t views = source.size(0), count = source.size(1), all = target.size(0), rows = target.size(1);
+    const int64_t first_row = in.integer(Integers::first_row), first_view = in.integer(Integers::first_view);
+    STD_TORCH_CHECK(first_row >= 0 && first_row + rows <= count, "turbogs: rows ", first_row, " .. ", first_row + rows,
+                    " of ", count);
+    STD_TORCH_CHECK(first_view >= 0 && first_view + views <= all && all <= kMaxViews, "turbogs: views ", first_view,
+                    " .. ", first_view + views, " of ", all);
+    CollectParams params = {};
+    params.num_views = to_int(views, "views");
+    params.source_gaussians = to_int(count, "Gaussians");
+    params.target_gaussians = to_int(rows, "Gaussians");
+    params.first_row = to_int(first_row, "Gaussians");
+    params.first_view = to_int(first_view, "views");
+    params.adds = in.integer(Integers::adds) != 0;
+    const auto whole = ScreenRecord::kSize;
+    in.set(params.source_records, Tensors::source_records, {views, count, whole});
+    in.set(params.source_radii, Tensors::source_radii, {views, count, 2});
+    in.set(params.target_records, Tensors::target_records, {all, rows, whole});
+    in.set(params.target_radii, Tensors::target_radii, {all, rows, 2});
+    check_launched(launch_collect_records(params, in.stream()), "collection of records");
+}
+
 }  // namespace turbogs

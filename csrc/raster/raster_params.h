@@ -149,6 +149,21 @@ struct BackwardParams {
     float* records;                // [K, N, 16] out, ScreenRecord; off screen zero, or where `cleared`, left alone
 };
 
+// The records of one process's views, for rows of Gaussians that another one makes the step of. V views of the source, N
+// Gaussians there; K views of the target, and M rows.
+struct CollectParams {
+    int num_views;         // V
+    int source_gaussians;  // N
+    int target_gaussians;  // M
+    int first_row;         // of the source
+    int first_view;        // of the target
+    bool adds;             // the source's first view is added to what the target holds of it; its radii stay
+    const float4* source_records;  // [V, N, 4], ScreenRecord
+    const int2* source_radii;      // [V, N]
+    float4* target_records;        // [K, M, 4] out, where the radius is not 0
+    int2* target_radii;            // [K, M] out
+};
+
 // Every launcher returns the first CUDA error, and only enqueues work on `stream`.
 cudaError_t launch_projection(const ProjectionParams& params, cudaStream_t stream);
 cudaError_t launch_count_intersections(const CountIntersectionsParams& params, cudaStream_t stream);
@@ -156,5 +171,6 @@ cudaError_t launch_scatter_intersections(const SortIntersectionsParams& params, 
 cudaError_t launch_sort_intersections(const SortIntersectionsParams& params, cudaStream_t stream);
 cudaError_t launch_rasterize_forward(const ForwardParams& params, cudaStream_t stream);
 cudaError_t launch_rasterize_backward(const BackwardParams& params, cudaStream_t stream);
+cudaError_t launch_collect_records(const CollectParams& params, cudaStream_t stream);
 
 }  // namespace turbogs

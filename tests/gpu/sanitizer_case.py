@@ -18,6 +18,9 @@ from helpers.raster_cases import samples_to
 from helpers.rendering_scenes import make_cameras, make_gaussians, one_tile_of_a_wide_image, stacked_splats
 
 from turbogs_plugin.engine.autograd import rasterize_differentiable
+from turbogs_plugin.engine.cuda.engine import CudaEngine
+from turbogs_plugin.engine.layout import ScreenRecord
+from turbogs_plugin.engine.rendered import ScreenRecords
 from turbogs_plugin.engine.rendering import dense_samples, rasterize
 from turbogs_plugin.scene import load_scene, write_demo_capture
 from turbogs_plugin.train.loop import TrainingLoop
@@ -66,6 +69,19 @@ def draw(gaussians, cameras, samples) -> None:
     assert gradients.parameter_gradients(rows=True, stats=stats).means.isfinite().all()
 
 
+def collect() -> None:
+    """Rows of records that begin within a warp, of a view that is shared and one that is not."""
+    source, target = (
+        ScreenRecords(
+            torch.ones(2, count, ScreenRecord.SIZE, device=DEVICE),
+            torch.arange(4 * count, device=DEVICE).remainder(3).int().view(2, count, 2),
+            False,
+        )
+        for count in (517, 300)
+    )
+    CudaEngine().collect(source, target, row=4, view=0, adds=True)
+
+
 def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         nine = write_demo_capture(Path(folder, "nine"), views=11, width=48, height=40)  # every 8th is a test view
@@ -82,6 +98,7 @@ def main() -> None:
     draw(*one_tile_of_a_wide_image())  # more large splats than their list has room for
     draw(*stacked_splats(torch.full((4097,), 3.0)))  # runs of equal depths to merge, and a last one of one pair
     draw(*many_tiles())
+    collect()
     torch.cuda.synchronize()
     print(f"{len(gaussians)} Gaussians, {len(VARIANTS)} variants, done")
 

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import copy
 import json
+import os
+import time
+from contextlib import suppress
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -19,6 +22,7 @@ from turbogs_plugin.distributed.processes import start
 from turbogs_plugin.distributed.shares import shares_of
 from turbogs_plugin.engine.cuda import library as kernels
 from turbogs_plugin.engine.rendered import RenderOptions, ScreenRecords
+from turbogs_plugin.errors import TrainingStopped
 from turbogs_plugin.scene import write_demo_capture
 from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint
 from turbogs_plugin.train.trainer import Trainer
@@ -131,3 +135,26 @@ def test_a_run_on_two_gpus_keeps_its_replicas_equal(tmp_path: Path, place):
     assert len({line["num_gaussians"] for line in lines}) > 1
     state = load_checkpoint(latest_checkpoint(out / "checkpoints"))["trainer"]
     assert int(state["optimizer"]["steps"].max()) > 100
+
+
+@pytest.fixture
+def with_helpers(monkeypatch) -> None:
+    """Processes that are started find the helpers of tests."""
+    folders = [str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH", "")]
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, folders)))
+
+
+@pytest.mark.skipif(torch.cuda.device_count() < 2, reason="needs two GPUs")
+def test_what_two_gpus_read_in_place_is_what_messages_bring(tmp_path: Path, with_helpers):
+    """To the bit, in both modes, with fewer views than processes, density control and an overflow."""
+    capture = write_demo_capture(tmp_path / "capture", views=12, width=160, height=120)
+    assert start(2, ["compared", str(capture)], "cuda", "helpers.in_place_case") == 0
+
+
+@pytest.mark.skipif(torch.cuda.device_count() < 2, reason="needs two GPUs")
+def test_a_process_that_is_killed_ends_the_one_that_waits_on_its_gpu(tmp_path: Path, with_helpers):
+    capture = write_demo_capture(tmp_path / "capture", views=12, width=160, height=120)
+    told = tmp_path / "told"
+    with suppress(TrainingStopped):  # of processes that were killed before they could say a word
+        assert start(2, ["dying", str(capture), str(told)], "cuda", "helpers.in_place_case") != 0
+    assert time.time() - float(told.read_text()) < 30

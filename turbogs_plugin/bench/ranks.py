@@ -39,6 +39,14 @@ PARTS = ("draw", "arrival", "render", "colors", "loss", "backward", "records", "
 packs those of the process, which travel in the next draw; `arrival` is what is left of their way, with the copies."""
 
 
+@dataclass(frozen=True)
+class Way:
+    """Of an exchange: attributes of `RankExchange`."""
+
+    by_rows: bool = True
+    in_place: bool = True
+
+
 @dataclass
 class RanksBench:
     """What is measured.
@@ -82,22 +90,33 @@ class RanksBench:
             model = held.map(lambda value: value.to(device))
             factors = sorted({1, ranks.count}) if self.grown else [1]
             for views, factor in [(views, factor) for views in self.step.views for factor in factors]:
-                for by_rows in (True, False) if ranks.count > 1 and factor == 1 else (True,):
-                    results.append(self._measure(scene, model, views * factor, factor, by_rows, device, ranks))
+                for way in self._ways(len(model), views, ranks) if factor == 1 else (Way(),):
+                    if not way.in_place and "in place" not in results[-1]["exchange"]:
+                        continue  # it was by messages already
+                    results.append(self._measure(scene, model, views * factor, factor, way, device, ranks))
                     if ranks.first:
                         print(line_of(results[-1]), flush=True)
         return results
 
+    def _ways(self, gaussians: int, views: int, ranks: Ranks) -> list[Way]:
+        """To measure. The largest case is exchanged by messages as well, where it can be done in place."""
+        if ranks.count == 1:
+            return [Way()]
+        largest = (gaussians, views) == (max(self.step.gaussians), max(self.step.views))
+        return [Way(by_rows, in_place) for by_rows in (True, False) for in_place in (True, False)[: 1 + largest]]
+
     def _measure(
-        self, scene: Scene, model: Gaussians, views: int, factor: int, by_rows: bool, device: torch.device, ranks: Ranks
+        self, scene: Scene, model: Gaussians, views: int, factor: int, way: Way, device: torch.device, ranks: Ranks
     ) -> dict[str, Any]:
         step = replace(self.step, pixel_budget=factor * self.step.pixel_budget)
+        name = "none"
         trainer = warm_trainer(step.config_of(views), scene, model, device, ranks)
         if isinstance(trainer.exchange, RankExchange):
             trainer.complete()
-            trainer.exchange.by_rows = by_rows
+            trainer.exchange.by_rows, trainer.exchange.in_place = way.by_rows, way.in_place
             for _ in range(3):
                 trainer.step()
+            name = f"{'owners of rows' if way.by_rows else 'records to all'}, {trainer.exchange.way}"
         wall = back_to_back(trainer.step, step.repeats, device)
         parts = self._parts(trainer, device)
         trainer.repeat_lost(wait=True)
@@ -111,7 +130,7 @@ class RanksBench:
             "gaussians": len(model),
             "views": views,
             "pixel_budget": step.pixel_budget,
-            "exchange": "none" if ranks.count == 1 else "owners of rows" if by_rows else "records to all",
+            "exchange": name,
             "wall": wall,
             "parts_ms_of_ranks": everywhere,
         }

@@ -12,6 +12,10 @@ function of (seed, iteration, place), so all draw the same. Then
 
 Two processes with a small batch (`owners_pay`) do without 3: both get all records, and both make all steps.
 
+On GPUs of one host that are linked, 1 and 2 are done in place: a process reads the others' memory (`in_place`), of the
+records only those of Gaussians on screen. Elsewhere colours are gathered and records sent as messages. Both ways give
+the same, to the bit.
+
 Every step and statistic is computed by one process, as by a process alone, and copied to the others; or by all, from
 the same records. So the replicas are bit-equal, and a step differs from that of one process only by the order in which
 the samples of a view are added up. Moments and statistics of owned rows are valid for a process's own rows alone, until
@@ -31,10 +35,11 @@ import torch
 from torch import Tensor
 
 from turbogs_plugin.distributed.digest import digest
+from turbogs_plugin.distributed.in_place import InPlace
 from turbogs_plugin.distributed.ranks import ProcessRanks, Ranks
 from turbogs_plugin.distributed.rows import OwnedRows, RowGather, rows_of
 from turbogs_plugin.distributed.shared_pass import Batch, SharedRendered, SharedScreen
-from turbogs_plugin.distributed.shares import shares_of
+from turbogs_plugin.distributed.shares import Share, shares_of
 from turbogs_plugin.engine.moments import GaussianMoments
 from turbogs_plugin.engine.protocol import Engine
 from turbogs_plugin.engine.rendered import Rendered, RenderOptions, ScreenGradients
@@ -135,14 +140,19 @@ class RankExchange(Exchange):
     Attributes:
         by_rows: owners of rows make the steps; None: where `owners_pay`. It may change when moments are complete.
             Optimizers without a rule always get all records, on every process.
+        in_place: read the others' memory in place, if that is possible. It may change between two iterations, on all
+            processes alike.
     """
 
     def __init__(self, ranks: ProcessRanks) -> None:
         self.ranks = ranks
         self.by_rows: bool | None = None
+        self.in_place = True
+        self.memory = InPlace(ranks)
         self._passes = 0
         self._flags: deque[_Flags] = deque()
         self._incomplete = False
+        self._lent = False  # the engine uses `memory`
         self._owned: OwnedRows | None = None
         self._buffers: list[tuple[Tensor, torch.cuda.Event]] = []  # for flags
         self._skipped: Tensor | None = None  # [] of all processes, when last complete
@@ -152,33 +162,77 @@ class RankExchange(Exchange):
     ) -> SharedRendered:
         shares = shares_of(samples, self.ranks.count)
         own = shares[self.ranks.rank]
+        memory = self._prepared(engine, shares, gaussians)
         rendered = None
         if len(own):
-            part = Cameras(cameras.viewmats[own.views], cameras.Ks[own.views], cameras.sizes[own.views])
+            part = cameras
+            if len(own) < len(cameras):
+                part = Cameras(cameras.viewmats[own.views], cameras.Ks[own.views], cameras.sizes[own.views])
             chosen = samples.of_tiles(own.tiles, own.views, own.slots)
             rendered = engine.render(gaussians, part, chosen, options)
-        colors = self._gather_colors(engine, rendered, [share.slots for share in shares], gaussians.means)
-        return SharedRendered(colors, Batch(self.ranks, engine, gaussians, cameras, samples, options, shares), rendered)
+        colors = self._gather_colors(engine, rendered, shares, gaussians.means, memory)
+        batch = Batch(self.ranks, engine, gaussians, cameras, samples, options, shares, memory)
+        return SharedRendered(colors, batch, rendered)
 
-    def _gather_colors(self, engine: Engine, rendered: Rendered | None, slots: Sequence[slice], like: Tensor) -> Tensor:
+    @property
+    def way(self) -> str:
+        """How colours and records went in the latest pass."""
+        return "in place" if self._lent else "messages"
+
+    def _prepared(self, engine: Engine, shares: Sequence[Share], gaussians: Gaussians) -> InPlace | None:
+        """The memory that this pass is exchanged in; None: by messages."""
+        if self.in_place and self.memory.prepare(engine, shares, len(gaussians), gaussians.device):
+            self._lent = True
+            return self.memory
+        if self._lent:
+            engine.lend(None, None)
+        self._lent = False
+        return None
+
+    def _gather_colors(
+        self,
+        engine: Engine,
+        rendered: Rendered | None,
+        shares: Sequence[Share],
+        like: Tensor,
+        memory: InPlace | None,
+    ) -> Tensor:
         """[P, 3] of all samples; and all processes learn whether one had too little memory or wants to stop."""
-        counts = [part.stop - part.start for part in slots]
-        most = max(counts)
-        sent = like.new_zeros(most + 1, 3)
-        if rendered is not None:
-            sent[: len(rendered.colors)] = rendered.colors
-        if engine.overflow is not None:
-            sent[most, OVERFLOW] = engine.overflow
-        if self.ranks.asked:
-            sent[most, STOP] = self.ranks.asked
-        gathered = self.ranks.gather(sent)  # [ranks, most + 1, 3]
-        flags = gathered[:, most].amax(dim=0)  # [3]
-        if engine.overflow is not None:
-            engine.overflow.copy_(flags[OVERFLOW])
+        own = None if rendered is None else rendered.colors
+        if memory is None:
+            colors, flags = self._sent_colors(engine, own, shares, like)
+        else:
+            self._set_flags(engine, memory.flags)
+            colors, flags = memory.colors(shares, own)
+        overflow = engine.overflow
+        if overflow is not None:
+            overflow.copy_(flags[OVERFLOW])
         self._flags.append(self._sent_flags(flags))
         self._passes += 1
         self.ranks.latest = time.monotonic()
-        return torch.cat([colors[:count] for colors, count in zip(gathered, counts, strict=True)])
+        return colors
+
+    def _set_flags(self, engine: Engine, flags: Sequence[Tensor]) -> None:
+        """`flags`: three times [1], zeros or what this set before."""
+        overflow = engine.overflow
+        if overflow is not None:
+            flags[OVERFLOW].copy_(overflow)
+        if self.ranks.asked:
+            flags[STOP].fill_(self.ranks.asked)
+
+    def _sent_colors(
+        self, engine: Engine, own: Tensor | None, shares: Sequence[Share], like: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """([P, 3] the colours of all samples, [3] the largest of each flag), by a message to all."""
+        counts = [share.slots.stop - share.slots.start for share in shares]
+        most = max(counts)
+        sent = like.new_zeros(most + 1, 3)
+        if own is not None:
+            sent[: len(own)] = own
+        self._set_flags(engine, sent[most].split(1))
+        gathered = self.ranks.gather(sent)  # [ranks, most + 1, 3]
+        colors = torch.cat([colors[:count] for colors, count in zip(gathered, counts, strict=True)])
+        return colors, gathered[:, most].amax(dim=0)
 
     def _sent_flags(self, flags: Tensor) -> _Flags:
         """`flags` [3] of this pass, on their way to the host."""
@@ -226,6 +280,7 @@ class RankExchange(Exchange):
         if len(owned.gaussians):
             engine.update(rule, own_screen, owned.gaussians, owned.moments, owned.stats)
         owned.parameters.begin()
+        self.memory.ordered()
 
     def initial_errors(
         self, pixels: Sequence[int], errors_of: Callable[[int], Tensor], device: torch.device

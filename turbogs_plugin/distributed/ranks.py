@@ -85,6 +85,7 @@ class ProcessRanks(Ranks):
     Attributes:
         asked: number of the signal by which this process wants all to stop; 0: none.
         latest: `time.monotonic` of the latest sign of progress; infinite while `working`.
+        reads_peers: all processes may read each other's memory in place, as far as they have tried.
     """
 
     def __init__(self) -> None:
@@ -96,6 +97,7 @@ class ProcessRanks(Ranks):
         self.rank, self.count = distributed.get_rank(), distributed.get_world_size()
         self.stop_signal = self.asked = 0
         self.latest = time.monotonic()
+        self.reads_peers = True
 
     @_answered
     def agree(self, value: Value) -> Value:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from turbogs_plugin.distributed.in_place import InPlace
 from turbogs_plugin.distributed.ranks import ProcessRanks
 from turbogs_plugin.distributed.shares import Share
 from turbogs_plugin.engine.layout import ScreenRecord
@@ -18,7 +19,11 @@ from turbogs_plugin.types import Cameras, GaussianGradients, Gaussians, Gaussian
 
 @dataclass
 class Batch:
-    """What the processes render together in a step, and which share of the samples each has."""
+    """What the processes render together in a step, and which share of the samples each has.
+
+    Args:
+        memory: in which all read the records; None: they are sent.
+    """
 
     ranks: ProcessRanks
     engine: Engine
@@ -27,6 +32,7 @@ class Batch:
     samples: PixelSamples
     options: RenderOptions
     shares: list[Share]
+    memory: InPlace | None = None
 
 
 @dataclass
@@ -84,10 +90,23 @@ class SharedScreen:
             own: the Gaussians of this process's rows.
         """
         batch, device = self._batch, own.device
-        ranks, shares = batch.ranks, batch.shares
-        mine, count = rows[ranks.rank], self.views
-        records = torch.empty(count, mine.stop - mine.start, ScreenRecord.SIZE, device=device)
-        radii = torch.empty(count, mine.stop - mine.start, 2, dtype=torch.int32, device=device)
+        mine = rows[batch.ranks.rank]
+        target = ScreenRecords(
+            torch.empty(self.views, mine.stop - mine.start, ScreenRecord.SIZE, device=device),
+            torch.empty(self.views, mine.stop - mine.start, 2, dtype=torch.int32, device=device),
+            self._with_statistics,
+        )
+        if batch.memory is None:
+            self._send_and_receive(rows, target)
+        else:
+            count = len(batch.gaussians)
+            batch.memory.collect(batch.engine, batch.shares, count, self._plain, target, mine.start)
+        return batch.engine.screen_gradients(own, batch.cameras, batch.samples, batch.options, target)
+
+    def _send_and_receive(self, rows: Sequence[slice], target: ScreenRecords) -> None:
+        """Send every process the records of the rows that it wants. `target`: of all views and this process's rows."""
+        ranks, shares, records, radii = self._batch.ranks, self._batch.shares, target.records, target.radii
+        mine = rows[ranks.rank]
         sent: list[tuple[int, Tensor]] = []
         received: list[tuple[int, Tensor]] = []
         continued: list[tuple[int, Tensor]] = []  # (view, records of a later share), to be added in this order
@@ -111,5 +130,3 @@ class SharedScreen:
         ranks.send_and_receive(sent, received)
         for view, later in continued:
             records[view] += later
-        whole = ScreenRecords(records, radii, self._with_statistics)
-        return batch.engine.screen_gradients(own, batch.cameras, batch.samples, batch.options, whole)

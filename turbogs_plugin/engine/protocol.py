@@ -11,6 +11,7 @@ from torch import Tensor
 from turbogs_plugin.engine.exposures import Exposures
 from turbogs_plugin.engine.moments import GaussianMoments
 from turbogs_plugin.engine.reference.exposure import expose, exposure_gradients, step_exposures
+from turbogs_plugin.engine.reference.records import collect_records
 from turbogs_plugin.engine.reference.update import apply_update
 from turbogs_plugin.engine.rendered import DEFAULT_OPTIONS, Rendered, RenderOptions, ScreenGradients, ScreenRecords
 from turbogs_plugin.engine.rules import DrawRule, LossTerms, UpdateRule
@@ -85,6 +86,26 @@ class Engine(ABC):
             cameras, samples, options: of all K views, as the passes had them together.
             plain: of these views and Gaussians.
         """
+
+    def collect(self, source: ScreenRecords, target: ScreenRecords, row: int, view: int, adds: bool) -> None:
+        """Copy the records of some rows from the V views that one process rendered into those of all K views.
+
+        Args:
+            source: of V views and N Gaussians; maybe another device's memory, read in place.
+            target: of K views and M Gaussians; changed.
+            row, view: of the source's first row wanted, and of the target's first view of the source.
+            adds: the source's first view is added to what the target holds of it.
+        """
+        collect_records(source, target, row, view, adds)
+
+    def lend(self, records: Tensor | None, radii: Tensor | None) -> None:
+        """Let the following passes keep their records and radii in this memory, if the engine keeps memory from pass to
+        pass, and they fit in.
+
+        Args:
+            records, radii: flat float32 and int32, contiguous, aligned to 16 bytes; None: in the engine's own.
+        """
+        return
 
     @abstractmethod
     def evaluate(self, terms: LossTerms, colors: Tensor, targets: Tensor, samples: PixelSamples) -> LossOutput:

@@ -185,13 +185,15 @@ class PixelSamples:
             views: positions in the batch of their views.
             slots: of these tiles.
         """
+        tile_ids, tile_offsets = self.tile_ids[tiles], self.tile_offsets[tiles.start : tiles.stop + 1]
+        first = int(self.grid.offsets[views.start]) if views.start else 0
         return replace(
             self,
             view_ids=self.view_ids[views],
             sizes=self.sizes[views],
             pixel_ids=self.pixel_ids[slots],
-            tile_ids=self.tile_ids[tiles] - int(self.grid.offsets[views.start]),
-            tile_offsets=self.tile_offsets[tiles.start : tiles.stop + 1] - slots.start,
+            tile_ids=tile_ids - first if first else tile_ids,
+            tile_offsets=tile_offsets - slots.start if slots.start else tile_offsets,
             weights=None if self.weights is None else self.weights[slots],
             host_ends=None,
         )

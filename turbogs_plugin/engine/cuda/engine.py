@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from turbogs_plugin.engine.cuda import exposure, training
+from turbogs_plugin.engine.cuda import exposure, launches, library, training
 from turbogs_plugin.engine.cuda.raster import CudaRendered, CudaScreenGradients, rasterize_cuda, screen_gradients
 from turbogs_plugin.engine.cuda.workspace import Workspace
 from turbogs_plugin.engine.exposures import Exposures
@@ -50,6 +50,14 @@ class CudaEngine(Engine):
         plain: ScreenRecords,
     ) -> CudaScreenGradients:
         return screen_gradients(gaussians, cameras, samples, options, plain, self.workspace)
+
+    def collect(self, source: ScreenRecords, target: ScreenRecords, row: int, view: int, adds: bool) -> None:
+        tensors = (target.records, target.radii, source.records, source.radii)
+        library.launch(launches.CollectRecords(*tensors, first_row=row, first_view=view, adds=adds))
+
+    def lend(self, records: Tensor | None, radii: Tensor | None) -> None:
+        if self.workspace is not None:
+            self.workspace.lend({"records": records, "radii": radii})
 
     def supervise(self, terms: LossTerms, colors: Tensor, truth: PhotoSamples, update: MapUpdate) -> LossOutput:
         # The kernel gathers the photos' colours itself if the photos and the maps of each view begin at the same pixel.

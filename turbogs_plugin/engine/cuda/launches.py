@@ -235,6 +235,22 @@ class RasterBackward(Launch):
     cleared: bool  # the records on screen are zero already
 
 
+@dataclass
+class CollectRecords(Launch):
+    """Copy the records of splats on screen from one process's views to all views, for a run of rows; and the radii.
+
+    The source may be another GPU's memory, mapped here. V views, N Gaussians there; M rows.
+    """
+
+    target_records: Tensor  # [K, M, 16] float32, layout.ScreenRecord; where off screen, left alone
+    target_radii: Tensor  # [K, M, 2] int32
+    source_records: Tensor  # [V, N, 16] float32
+    source_radii: Tensor  # [V, N, 2] int32
+    first_row: int  # of the source
+    first_view: int  # of the target
+    adds: bool  # the source's first view is added to what the target holds
+
+
 # ---- Sampling and loss ----------------------------------------------------------------------------------------------
 
 

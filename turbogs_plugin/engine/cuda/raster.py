@@ -34,7 +34,7 @@ from turbogs_plugin.types import Cameras, GaussianGradients, Gaussians, Gaussian
 
 def _prepared(tensor: Tensor) -> Tensor:
     """The tensor detached, contiguous and aligned for 16-byte loads; a copy only if needed."""
-    tensor = tensor.detach().contiguous()
+    tensor = (tensor.detach() if tensor.requires_grad else tensor).contiguous()
     return tensor if tensor.data_ptr() % 16 == 0 else tensor.clone()
 
 

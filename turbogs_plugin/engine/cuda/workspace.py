@@ -84,8 +84,10 @@ class Workspace:
     def __init__(self, device: torch.device | str) -> None:
         self.device = torch.device(device)
         self.status = torch.zeros(2, dtype=torch.int32, device=self.device)
+        self._overflow = self.status[1:]
         self.passes = 0
         self._buffers: dict[str, Tensor] = {}
+        self._lent: dict[str, Tensor] = {}  # of `lend`
         self._views: dict[str, Tensor] = {}  # what `buffer` returned last
         self._kept: dict[str, tuple[tuple, Any]] = {}
         self._pinned = torch.zeros(PENDING_MAX, 2, dtype=torch.int32).pin_memory().unbind()
@@ -97,7 +99,7 @@ class Workspace:
     @property
     def overflow(self) -> Tensor:
         """[1] int32 on the device, not 0 while passes do nothing. Kernels that change state must check it."""
-        return self.status[1:]
+        return self._overflow
 
     @property
     def overflowed(self) -> bool:
@@ -117,6 +119,25 @@ class Workspace:
             held = self._buffers[name] = torch.empty(int(count * GROWTH) + 1, dtype=dtype, device=self.device)
         view = self._views[name] = held[:count].view(shape)
         return view
+
+    def lend(self, memory: dict[str, Tensor | None]) -> None:
+        """Let buffers lie in memory of the caller, until they outgrow it or this is called with other memory.
+
+        Call it before every pass that shall use the memory: a larger pass between may have replaced it.
+
+        Args:
+            memory: flat tensors, by the buffers' names; None where a buffer is to be the workspace's own again.
+        """
+        for name, tensor in memory.items():
+            held = self._buffers.get(name)
+            if held is tensor or (tensor is None and name not in self._lent):
+                continue
+            self._kept.clear()  # holds views of buffers
+            self._views.pop(name, None)
+            self._buffers.pop(name, None)
+            self._lent.pop(name, None)
+            if tensor is not None:
+                self._buffers[name] = self._lent[name] = tensor
 
     def kept(self, name: str, sizes: tuple, make: Callable[[], Kept]) -> Kept:
         """What `make` gives; made anew only where the sizes are others than at the last call of this name.

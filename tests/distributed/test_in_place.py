@@ -1,0 +1,182 @@
+"""The exchange in place: the same as by messages, to the bit, with memory that all processes read."""
+
+from __future__ import annotations
+
+import copy
+from pathlib import Path
+
+import pytest
+import torch
+from helpers.framework_runs import TINY, tiny_capture
+from helpers.peer_files import KeepingEngine, PeerFiles
+from helpers.processes import ended, grouped, said, start_ranks
+
+from turbogs_plugin.config.configuration import load_config
+from turbogs_plugin.distributed import peer_memory
+from turbogs_plugin.distributed.in_place import DRAWN, FREE, WRITTEN, InPlace
+from turbogs_plugin.distributed.peer_memory import PeerMemory, share_memory
+from turbogs_plugin.distributed.ranks import ProcessRanks
+from turbogs_plugin.engine.layout import ScreenRecord
+from turbogs_plugin.engine.reference.engine import ReferenceEngine
+from turbogs_plugin.engine.rendered import ScreenRecords
+from turbogs_plugin.model.torch_file import leaves
+from turbogs_plugin.scene import load_scene
+from turbogs_plugin.train.loop import TrainingLoop
+from turbogs_plugin.train.trainer import Trainer
+
+CPU = torch.device("cpu")
+
+CASES = {
+    "usual": (True, ()),
+    "records to all": (False, ()),
+    "one view": (True, ("schedule.type=fixed", "schedule.views=1")),
+    "one view to all": (False, ("schedule.type=fixed", "schedule.views=1")),
+    "one tile": (True, ("schedule.type=fixed", "schedule.views=1", "schedule.pixel_budget=0.1")),
+    "no rule": (False, ("optimizer.type=adam",)),
+}
+"""Name -> (whether rows have owners, overrides). The fourth iteration has an event of density control, where it is on.
+With one tile all processes but one have no samples."""
+
+STEPS = 5
+
+
+def trainer_of(capture: Path, ranks: ProcessRanks, by_rows: bool, overrides: tuple[str, ...]) -> Trainer:
+    replaced = tuple(text.partition("type=")[0] for text in overrides if ".type=" in text)
+    settings = [text for text in TINY if not (replaced and text.startswith(replaced))]
+    if "schedule.pixel_budget=0.1" in overrides:
+        settings.append("pixel_sampler.unit=tile")
+    config = load_config("turbogs", [*settings, "train.device=cpu", *overrides])
+    config.scene.path = str(capture)
+    trainer = Trainer(config.without_plan(), load_scene(capture), CPU, ranks=ranks)
+    trainer.exchange.by_rows = by_rows
+    return trainer
+
+
+def run(trainer: Trainer, in_place: list[bool]) -> dict:
+    """The state after a step for each of these, with an evaluation in the middle."""
+    trainer.initialise_maps()
+    for number, way in enumerate(in_place):
+        trainer.exchange.in_place = way
+        trainer.step()
+        assert trainer.exchange.way == ("in place" if way else "messages")
+        if number == len(in_place) // 2:
+            trainer.dense_errors(0)
+            trainer.compare_replicas()
+    trainer.compare_replicas()
+    return copy.deepcopy(dict(leaves(trainer.state_dict(), "state")))
+
+
+def same(first: dict, second: dict) -> None:
+    assert first.keys() == second.keys()
+    for name, value in first.items():
+        equal = torch.equal(value, second[name]) if isinstance(value, torch.Tensor) else value == second[name]
+        assert equal, name
+
+
+def ways(capture: Path, folder: Path) -> None:
+    """In every process: each case by messages and in place; the memory grows by an event of density control."""
+    ranks = grouped()
+    for name, (by_rows, overrides) in CASES.items():
+        wanted = run(trainer_of(capture, ranks, by_rows, overrides), [False] * STEPS)
+        for engine in (ReferenceEngine(), KeepingEngine()):
+            trainer = trainer_of(capture, ranks, by_rows, overrides)
+            trainer.engine, number = engine, len(trainer.gaussians)
+            memory = PeerFiles(folder / f"{name}-{type(engine).__name__}")
+            trainer.exchange.memory = InPlace(ranks, memory)
+            same(run(trainer, [True] * STEPS), wanted)
+            assert len(trainer.gaussians) != number
+            frees = [FREE] * (0 if by_rows else STEPS - len(memory.sizes))
+            assert sorted(memory.barriers) == sorted([WRITTEN, DRAWN] * STEPS + frees)
+    wanted = run(trainer_of(capture, ranks, True, ()), [False] * STEPS)
+    trainer = trainer_of(capture, ranks, True, ())
+    trainer.engine, trainer.exchange.memory = KeepingEngine(), InPlace(ranks, PeerFiles(folder / "turns"))
+    same(run(trainer, [True, False, True, False, True]), wanted)
+    for by_rows in (True, False):
+        lost(capture, ranks, folder / f"lost-{by_rows}", by_rows)
+
+
+def lost(capture: Path, ranks: ProcessRanks, folder: Path, by_rows: bool) -> None:
+    """One process has too little memory for one pass: all repeat it, and nothing of it stays."""
+    states = []
+    for in_place in (False, True):
+        trainer = trainer_of(capture, ranks, by_rows, ("density.type=none",))
+        trainer.engine = KeepingEngine(lose=2 if ranks.rank == ranks.count - 1 else None)
+        trainer.exchange.memory = InPlace(ranks, PeerFiles(folder))
+        trainer.exchange.in_place = in_place
+        trainer.initialise_maps()
+        TrainingLoop(trainer).advance(6)
+        trainer.compare_replicas()
+        assert trainer.engine.recovered == 1 and int(trainer.optimizer.moments.steps.max()) == 6
+        states.append(copy.deepcopy(dict(leaves(trainer.state_dict(), "state"))))
+    same(*states)
+
+
+@pytest.mark.parametrize("count", [2, 3])
+def test_both_ways_give_the_same_to_the_bit(tmp_path, count):
+    """With three processes, some views are shared by all."""
+    capture = tiny_capture(tmp_path)
+    codes = ended(start_ranks(count, ways, tmp_path / "out", capture, tmp_path / "memory"), 300)
+    assert codes == [0] * count, said(tmp_path / "out")
+
+
+class Alone:
+    """What `share_memory` needs to know of the processes, of which each does what the first one does.
+
+    Args:
+        others: whether the other process had no error, in each step.
+    """
+
+    rank, count = 0, 2
+
+    def __init__(self, *others: int) -> None:
+        self.reads_peers, self.others = True, list(others)
+
+    def gather_numbers(self, values: list[int]) -> list[list[int]]:
+        return [values, [self.others.pop(0)]]
+
+
+def test_there_is_no_such_memory_on_a_cpu():
+    assert share_memory(Alone(), 10, CPU) is None
+
+
+def test_all_send_messages_if_one_cannot_share_its_memory(monkeypatch):
+    """Here or there, in any step; the next steps are not begun, and it is not tried again."""
+
+    def failing(*arguments: object) -> None:
+        raise ValueError("no peer access\nat line 3")
+
+    for name in ("_allocate", "_map", "_prove"):
+        monkeypatch.setattr(peer_memory, name, lambda ranks, size, memory: PeerMemory([], print))
+    for name in peer_memory.SETTINGS:
+        monkeypatch.setenv(name, "1")
+    device = torch.device("cuda")
+    assert share_memory(Alone(1, 1, 1), 10, device) is not None
+    there = Alone(1, 0)
+    assert share_memory(there, 10, device) is None and not there.reads_peers and not there.others
+    monkeypatch.setattr(peer_memory, "_map", failing)
+    here = Alone(1, 1)
+    with pytest.warns(UserWarning, match=r"ValueError: no peer access\)"):
+        assert share_memory(here, 10, device) is None
+    assert not here.reads_peers and not here.others
+    assert share_memory(here, 10, device) is None
+
+
+def records(views: int, count: int, seed: int) -> ScreenRecords:
+    generator = torch.Generator().manual_seed(seed)
+    radii = torch.randint(0, 3, (views, count, 2), generator=generator, dtype=torch.int32)
+    return ScreenRecords(torch.randn(views, count, ScreenRecord.SIZE, generator=generator), radii, False)
+
+
+def test_records_of_rows_are_collected_view_after_view():
+    """Two processes share the third of four views."""
+    first, second = records(3, 9, 0), records(2, 9, 1)
+    second.radii[0] = first.radii[2]
+    target = ScreenRecords(torch.full((4, 5, ScreenRecord.SIZE), torch.nan), torch.zeros(4, 5, 2).int(), False)
+    engine = ReferenceEngine()
+    engine.collect(first, target, 2, 0, False)
+    engine.collect(second, target, 2, 2, True)
+    rows = slice(2, 7)
+    shared = (first.records[2] + second.records[0])[rows]
+    wanted = torch.cat([first.records[:2, rows], shared[None], second.records[1:, rows]])
+    assert torch.equal(target.records, wanted)
+    assert torch.equal(target.radii, torch.cat([first.radii[:, rows], second.radii[1:, rows]]))

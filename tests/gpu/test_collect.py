@@ -1,0 +1,161 @@
+"""The kernel that collects records against its twin, and passes in memory that is lent."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from helpers.raster_cases import GPU_ONLY, make_case
+
+from turbogs_plugin.distributed.in_place import InPlace
+from turbogs_plugin.distributed.peer_memory import PeerMemory
+from turbogs_plugin.distributed.rows import rows_of
+from turbogs_plugin.distributed.shares import shares_of
+from turbogs_plugin.engine.cuda import raster as cuda
+from turbogs_plugin.engine.cuda.engine import CudaEngine
+from turbogs_plugin.engine.cuda.workspace import Workspace
+from turbogs_plugin.engine.layout import ScreenRecord
+from turbogs_plugin.engine.protocol import Engine
+from turbogs_plugin.engine.reference.records import collect_records
+from turbogs_plugin.engine.rendered import DEFAULT_OPTIONS, ScreenRecords
+from turbogs_plugin.types import Cameras, Gaussians, PixelSamples
+
+pytestmark = GPU_ONLY
+
+GPU = torch.device("cuda")
+
+
+def records(views: int, count: int, seed: int) -> ScreenRecords:
+    """Two fifths are on screen; some of these are wide in one direction alone. The others hold NaN."""
+    generator = torch.Generator().manual_seed(seed)
+    radii = torch.randint(0, 9, (views, count, 2), generator=generator, dtype=torch.int32)
+    radii[torch.rand(views, count, generator=generator) > 0.4] = 0
+    values = torch.randn(views, count, ScreenRecord.SIZE, generator=generator)
+    values[(radii == 0).all(dim=-1)] = torch.nan
+    return ScreenRecords(values.to(GPU), radii.to(GPU), False)
+
+
+@pytest.mark.parametrize("count, rows", [(1000, (0, 1000)), (1000, (500, 1000)), (4099, (4, 517)), (37, (36, 37))])
+@pytest.mark.parametrize("adds", [False, True])
+def test_records_on_screen_are_those_of_the_twin_to_the_bit(count, rows, adds):
+    source, earlier = records(3, count, 0), records(6, rows[1] - rows[0], 1)
+    if adds:  # a view that is shared has the same radii in all processes
+        earlier.radii[2] = source.radii[0, rows[0] : rows[1]]
+    target, wanted = (ScreenRecords(earlier.records.clone(), earlier.radii.clone(), False) for _ in range(2))
+    CudaEngine().collect(source, target, rows[0], 2, adds)
+    collect_records(source, wanted, rows[0], 2, adds)
+    assert torch.equal(target.radii, wanted.radii)
+    seen = (wanted.radii > 0).any(dim=-1)
+    assert bool(seen.any()) or rows[1] - rows[0] == 1
+    assert torch.equal(target.records[seen], wanted.records[seen])
+    assert torch.equal(target.records[~seen].isnan(), earlier.records[~seen].isnan()), "left alone"
+
+
+def test_nothing_to_collect():
+    target = ScreenRecords(
+        torch.zeros(2, 0, ScreenRecord.SIZE, device=GPU), torch.zeros(2, 0, 2, device=GPU).int(), False
+    )
+    CudaEngine().collect(records(2, 8, 0), target, 8, 0, False)
+    with pytest.raises(RuntimeError, match="rows"):
+        CudaEngine().collect(records(2, 8, 0), records(2, 8, 1), 4, 0, False)
+    with pytest.raises(RuntimeError, match="views"):
+        CudaEngine().collect(records(2, 8, 0), records(2, 8, 1), 0, 1, False)
+
+
+def test_passes_in_memory_that_is_lent():
+    case = make_case([(70, 50), (33, 47)], count=200, rate=0.4, seed=11)
+    arguments = case.gpu_gaussians, case.gpu_cameras, case.gpu_samples, DEFAULT_OPTIONS
+    wanted = cuda.rasterize_cuda(*arguments)
+    wanted = wanted.backward(torch.ones_like(wanted.colors))
+    memory = Workspace(GPU)
+    floats = torch.full((500 * ScreenRecord.SIZE,), torch.nan, device=GPU)
+    integers = torch.zeros(1000, dtype=torch.int32, device=GPU)
+
+    def one_pass() -> ScreenRecords:
+        rendered = cuda.rasterize_cuda(*arguments, memory)
+        screen = rendered.backward(torch.ones_like(rendered.colors))
+        torch.testing.assert_close(screen.full_records(), wanted.full_records(), rtol=1e-4, atol=1e-5)
+        return screen.plain()
+
+    one_pass()
+    memory.lend({"records": floats, "radii": integers})
+    for _ in range(2):
+        plain = one_pass()
+        assert plain.records.data_ptr() == floats.data_ptr() and plain.radii.data_ptr() == integers.data_ptr()
+        memory.lend({"records": floats, "radii": integers})
+    memory.buffer("records", (600, ScreenRecord.SIZE), torch.float32)  # outgrown
+    memory.lend({"records": floats, "radii": integers})
+    assert one_pass().records.data_ptr() == floats.data_ptr()
+    memory.lend({"records": None, "radii": None})
+    before = floats.clone()
+    plain = one_pass()
+    assert plain.records.data_ptr() != floats.data_ptr() and plain.radii.data_ptr() != integers.data_ptr()
+    assert torch.equal(floats.nan_to_num(), before.nan_to_num())
+
+
+class OneOfTwo:
+    """What `InPlace` needs to know of the processes."""
+
+    count = 2
+
+    def __init__(self, rank: int) -> None:
+        self.rank = rank
+
+
+def in_place_like_twin(engines: list[Engine], gaussians: Gaussians, cameras: Cameras, samples: PixelSamples) -> int:
+    """Two shares of a batch in one process, one after the other, so that barriers have nothing to do.
+
+    Returns:
+        How many Gaussians are on screen, in all views.
+    """
+    shares, device, parts = shares_of(samples, 2), samples.pixel_ids.device, []
+
+    def share(ranks: OneOfTwo, size: int, device: torch.device) -> PeerMemory:
+        while len(parts) < 2:
+            parts.append(torch.zeros(size, device=device))
+        assert len(parts[0]) == size
+        return PeerMemory(parts, lambda channel: None)
+
+    memories = [InPlace(OneOfTwo(rank), share) for rank in range(2)]
+    rendered = []
+    for memory, engine, own in zip(memories, engines, shares, strict=True):
+        for _ in range(3):  # the first pass of a workspace is another one
+            assert memory.prepare(engine, shares, len(gaussians), device)
+            chosen = samples.of_tiles(own.tiles, own.views, own.slots)
+            part = Cameras(cameras.viewmats[own.views], cameras.Ks[own.views], cameras.sizes[own.views])
+            last = engine.render(gaussians, part, chosen, DEFAULT_OPTIONS)
+        rendered.append(last)
+        memory.colors(shares, last.colors)
+    for memory, one in zip(memories, rendered, strict=True):
+        colors, flags = memory.colors(shares, one.colors)
+        assert torch.equal(colors, torch.cat([each.colors for each in rendered])) and flags.tolist() == [0, 0, 0]
+    plains = [one.backward(torch.ones_like(one.colors)).plain() for one in rendered]
+    seen = 0
+    for rank, rows in enumerate(rows_of(len(gaussians), 2)):
+        shape = len(cameras), rows.stop - rows.start
+        target, wanted = (
+            ScreenRecords(
+                torch.full((*shape, ScreenRecord.SIZE), torch.nan, device=device),
+                torch.full((*shape, 2), -1, dtype=torch.int32, device=device),
+                False,
+            )
+            for _ in range(2)
+        )
+        own = plains[1 - rank], memories[1 - rank]
+        own[1].collect(engines[1 - rank], shares, len(gaussians), own[0], target, rows.start)  # has copied, if it must
+        memories[rank].collect(engines[rank], shares, len(gaussians), plains[rank], target, rows.start)
+        for plain, one in zip(plains, shares, strict=True):
+            collect_records(plain, wanted, rows.start, one.views.start, one.continues)
+        assert torch.equal(target.radii, wanted.radii)
+        on_screen = (wanted.radii > 0).any(dim=-1)
+        assert torch.equal(target.records[on_screen], wanted.records[on_screen])
+        seen += int(on_screen.sum())
+    return seen
+
+
+def test_two_shares_in_memory_that_both_read():
+    """Offsets and views of the memory, with passes that write there, on one GPU."""
+    case = make_case([(70, 50), (33, 47)], count=203, rate=0.4, seed=11)
+    engines = [CudaEngine(GPU), CudaEngine(GPU)]
+    assert in_place_like_twin(engines, case.gpu_gaussians, case.gpu_cameras, case.gpu_samples) > 50
+    for engine in engines:
+        assert engine.workspace.overflow.tolist() == [0]

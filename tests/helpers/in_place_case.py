@@ -1,0 +1,143 @@
+"""What each process of a test on several GPUs does: steps with the exchange in place, which keep what was read of the
+others, to be compared with what messages give of the same. Two runs of one way differ by the order of sums on a GPU."""
+
+from __future__ import annotations
+
+import signal
+import sys
+import time
+from dataclasses import replace
+from os import getpid, kill
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from turbogs_plugin.config.configuration import load_config
+from turbogs_plugin.distributed.in_place import InPlace
+from turbogs_plugin.distributed.processes import joined
+from turbogs_plugin.distributed.ranks import Ranks
+from turbogs_plugin.distributed.shared_pass import SharedScreen
+from turbogs_plugin.engine.cuda import workspace
+from turbogs_plugin.engine.rendered import ScreenRecords
+from turbogs_plugin.scene import load_scene
+from turbogs_plugin.train.loop import TrainingLoop
+from turbogs_plugin.train.trainer import Trainer
+
+CASES = {
+    "owners": (True, ("schedule.min_views=3", "schedule.max_views=5")),
+    "all": (False, ("schedule.min_views=3", "schedule.max_views=5")),
+    "one view, owners": (True, ("schedule.min_views=1", "schedule.max_views=1")),
+    "one view, all": (False, ("schedule.min_views=1", "schedule.max_views=1")),
+}
+STEPS = 60
+
+
+class Kept:
+    """What passes read in place, and what they would have sent; compared at the end, so that nothing waits before."""
+
+    def __init__(self) -> None:
+        self.colors: list[tuple] = []
+        self.screens: list[tuple] = []
+        colors, of_rows = InPlace.colors, SharedScreen.of_rows
+
+        def kept_colors(memory: InPlace, shares: list, own: Tensor | None) -> tuple[Tensor, Tensor]:
+            found = colors(memory, shares, own)
+            self.colors.append((shares, own, found[0]))
+            return found
+
+        def kept_rows(screen: SharedScreen, rows: list, own) -> object:
+            found, plain = of_rows(screen, rows, own), screen._plain
+            if plain is not None:
+                plain = ScreenRecords(plain.records.clone(), plain.radii.clone(), plain.with_statistics)
+            self.screens.append((replace(screen, _plain=plain), rows, found.records, found.radii))
+            return found
+
+        self._before = colors, of_rows
+        InPlace.colors, SharedScreen.of_rows = kept_colors, kept_rows
+
+    def compare(self) -> None:
+        InPlace.colors, SharedScreen.of_rows = self._before
+        for screen, rows, records, radii in self.screens:
+            target = ScreenRecords(torch.empty_like(records), torch.empty_like(radii), False)
+            screen._send_and_receive(rows, target)
+            assert torch.equal(radii, target.radii)
+            seen = (radii > 0).any(dim=-1)
+            assert torch.equal(records[seen], target.records[seen])
+        ranks = self.screens[0][0]._batch.ranks
+        for shares, own, found in self.colors:
+            counts = [share.slots.stop - share.slots.start for share in shares]
+            sent = found.new_zeros(max(counts), 3)
+            if own is not None:
+                sent[: len(own)] = own
+            parts = zip(ranks.gather(sent), counts, strict=True)
+            assert torch.equal(torch.cat([part[:count] for part, count in parts]), found)
+
+
+def trainer_of(capture: Path, ranks: Ranks, by_rows: bool, overrides: tuple[str, ...]) -> Trainer:
+    settings = [f"train.iterations={STEPS}", "train.refine_until=50", "density.refine_from=10"]
+    config = load_config("turbogs", [*settings, "density.refine_every=15", "train.device=cuda", *overrides])
+    config.scene.path = str(capture)
+    scene, device = load_scene(capture), torch.device("cuda")
+    trainer = Trainer(config.without_plan(), scene, device, ranks=ranks)
+    trainer.exchange.by_rows = by_rows
+    trainer.initialise_maps()
+    return trainer
+
+
+def recoveries(trainer: Trainer) -> list[int]:
+    """The iterations at which the engine recovers, as they come."""
+    found, recover = [], trainer.engine.recover
+
+    def noted() -> None:
+        found.append(trainer.iteration)
+        recover()
+
+    trainer.engine.recover = noted
+    return found
+
+
+def compared(capture: Path, ranks: Ranks) -> None:
+    """Every case, with density control, a view rendered densely by one process alone, and an overflow in one."""
+    workspace.CAPACITY_STEP = 32  # so that these few intersections can be too many
+    for name, (by_rows, overrides) in CASES.items():
+        kept = Kept()
+        trainer = trainer_of(capture, ranks, by_rows, overrides)
+        recovered = recoveries(trainer)
+        count, loop = len(trainer.gaussians), TrainingLoop(trainer)
+        loop.advance(20)
+        if trainer.exchange.way != "in place":
+            raise AssertionError("the exchange went by messages: no symmetric memory on this machine?")
+        if ranks.first:
+            trainer.dense_errors(0)
+        trainer.exchange.in_place = False  # some iterations by messages between
+        loop.advance(24)
+        trainer.exchange.in_place = True
+        loop.advance(30)
+        if ranks.rank == ranks.count - 1:
+            trainer.engine.workspace._intersections_per_tile *= 0.3
+        loop.advance(STEPS)
+        trainer.compare_replicas()
+        assert len(trainer.gaussians) != count and trainer.iteration == STEPS
+        assert recovered, "no overflow"
+        kept.compare()
+        if ranks.first:
+            print(f"{name}: {len(kept.screens)} passes, recovered at {recovered}", flush=True)
+
+
+def dying(capture: Path, ranks: Ranks, told: Path) -> None:
+    """The last process is killed between two iterations; the others wait for it at a barrier of their GPUs."""
+    trainer = trainer_of(capture, ranks, True, ())
+    for number in range(STEPS):
+        trainer.step()
+        if number == 20 and ranks.rank == ranks.count - 1:
+            told.write_text(str(time.time()))
+            kill(getpid(), signal.SIGKILL)
+
+
+if __name__ == "__main__":
+    with joined("cuda") as all_ranks:
+        if sys.argv[1] == "compared":
+            compared(Path(sys.argv[2]), all_ranks)
+        else:
+            dying(Path(sys.argv[2]), all_ranks, Path(sys.argv[3]))

@@ -1,0 +1,125 @@
+"""Memory of processes on CPUs that all of them read in place: files that all have mapped. And an engine that keeps its
+records there, as that of a GPU does."""
+
+from __future__ import annotations
+
+import random
+import time
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from turbogs_plugin.distributed.peer_memory import PeerMemory
+from turbogs_plugin.distributed.ranks import ProcessRanks
+from turbogs_plugin.engine.layout import ScreenRecord
+from turbogs_plugin.engine.reference.engine import ReferenceEngine
+from turbogs_plugin.engine.reference.raster import rasterize_reference
+from turbogs_plugin.engine.rendered import ScreenRecords
+
+
+class PeerFiles:
+    """`share_memory` by files of a folder.
+
+    Args:
+        pauses: seconds, at most, that a process waits before and after a barrier, so that a missing one shows.
+
+    Attributes:
+        sizes: of each memory that was made.
+        barriers: the numbers of all barriers.
+    """
+
+    def __init__(self, folder: Path, pauses: float = 0.004) -> None:
+        folder.mkdir(parents=True, exist_ok=True)
+        self.folder, self.pauses = folder, pauses
+        self.sizes: list[int] = []
+        self.barriers: list[int] = []
+
+    def __call__(self, ranks: ProcessRanks, size: int, device: torch.device) -> PeerMemory:
+        paths = [self.folder / f"{len(self.sizes)}-{rank}" for rank in range(ranks.count)]
+        self.sizes.append(size)
+        paths[ranks.rank].write_bytes(bytes(4 * size))
+        torch.distributed.barrier()
+        parts = [torch.from_file(str(path), shared=True, size=size, dtype=torch.float32) for path in paths]
+        unequal = random.Random(ranks.rank)
+
+        def barrier(channel: int) -> None:
+            self.barriers.append(channel)
+            time.sleep(unequal.random() * self.pauses)
+            torch.distributed.barrier()
+            time.sleep(unequal.random() * self.pauses)
+
+        return PeerMemory(parts, barrier)
+
+
+class _Forwarding:
+    """An object of which some methods are replaced."""
+
+    def __init__(self, wrapped: Any, engine: KeepingEngine) -> None:
+        self._wrapped, self._engine = wrapped, engine
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._wrapped, name)
+
+
+class _Rendered(_Forwarding):
+    def backward(self, *arguments: Any, **options: Any) -> _Screen:
+        return _Screen(self._wrapped.backward(*arguments, **options), self._engine)
+
+
+class _Screen(_Forwarding):
+    def plain(self) -> ScreenRecords:
+        plain = self._wrapped.plain()
+        if self._engine.lent is None:
+            return plain
+        kept = ScreenRecords(*self._engine.views(*plain.records.shape[:2]), plain.with_statistics)
+        kept.records.copy_(plain.records)
+        kept.radii.copy_(plain.radii)
+        return kept
+
+
+class KeepingEngine(ReferenceEngine):
+    """The projection of a pass destroys what is in the memory lent, the backward pass writes there.
+
+    Args:
+        lose: a pass that has too little memory: until `recover`, nothing changes.
+    """
+
+    def __init__(self, lose: int | None = None) -> None:
+        self.lent: tuple[Tensor, Tensor] | None = None
+        self.flag = torch.zeros(1, dtype=torch.int32)
+        self.lose, self.passes, self.recovered = lose, 0, 0
+
+    @property
+    def overflow(self) -> Tensor:
+        return self.flag
+
+    def lend(self, records: Tensor | None, radii: Tensor | None) -> None:
+        self.lent = None if records is None else (records, radii)
+
+    def views(self, views: int, count: int) -> tuple[Tensor, Tensor]:
+        records, radii = self.lent
+        size = views * count
+        return (
+            records[: ScreenRecord.SIZE * size].view(views, count, ScreenRecord.SIZE),
+            radii[: 2 * size].view(views, count, 2),
+        )
+
+    def render(self, gaussians: Any, cameras: Any, *arguments: Any) -> _Rendered:
+        self.passes += 1
+        if self.passes == self.lose:
+            self.flag.fill_(1)
+        if self.lent is not None:
+            records, radii = self.views(len(cameras), len(gaussians))
+            records.fill_(torch.nan)
+            radii.fill_(-7)
+        return _Rendered(rasterize_reference(gaussians, cameras, *arguments), self)
+
+    def update(self, *arguments: Any) -> None:
+        if not self.flag:
+            super().update(*arguments)
+
+    def recover(self) -> None:
+        self.flag.zero_()
+        self.recovered += 1

@@ -1,0 +1,128 @@
+"""Memory of GPUs of one host that all processes of a training read in place, over NVLink.
+
+By torch's symmetric memory: every process allocates as much, and maps what the others have. Nothing here uses
+multicast, and torch is told not to prepare it.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from turbogs_plugin.distributed.ranks import ProcessRanks
+
+SETTINGS = {
+    # Every process sees its own GPU alone, as number 0 (`processes.joined`). Torch would take that for one GPU of all.
+    "TORCH_SYMM_MEM_ALLOW_OVERLAPPING_DEVICES": "1",
+    "TORCH_SYMM_MEM_DISABLE_MULTICAST": "1",
+}
+"""Of torch's symmetric memory, unless the environment has others."""
+
+MESSAGES_VARIABLE = "TURBOGS_EXCHANGE"
+"""Environment variable; ``messages`` in one process keeps all from sharing memory."""
+
+LINKS_MAX = 18
+"""NVLinks of a GPU."""
+
+PROOF_MILLISECONDS = 60_000
+"""After so long without an answer from another GPU, the first barrier ends the process. Later ones wait for ever, as
+the first process may evaluate for an hour; a process that is lost is noticed by its launcher."""
+
+
+@dataclass
+class PeerMemory:
+    """As much memory of every process, for all to read.
+
+    Args:
+        parts: [size] float32 of each process, rank after rank; one's own to write to.
+        barrier: called with a small number by every process: what its stream does next comes after all that the
+            streams of all did before their calls with this number. No host waits.
+        owner: keeps the memory mapped.
+    """
+
+    parts: list[Tensor]
+    barrier: Callable[[int], None]
+    owner: Any = None
+
+
+def share_memory(ranks: ProcessRanks, size: int, device: torch.device) -> PeerMemory | None:
+    """Memory for `size` numbers of every process. Every process must call this, with one size.
+
+    Returns:
+        Zeros; or None on all of them, if one cannot have it. It is not tried again then.
+    """
+    if not ranks.reads_peers or device.type != "cuda":
+        return None
+    for name, value in SETTINGS.items():
+        os.environ.setdefault(name, value)
+    memory = None
+    # Step by step, so that none waits in one for a process that failed in the step before.
+    for step in (_allocate, _map, _prove):
+        try:
+            memory = step(ranks, size, memory)
+        except Exception as error:  # of drivers and versions of torch, whatever they raise
+            memory, reason = None, f"{type(error).__name__}: {error}".splitlines()[0]
+            warnings.warn(f"GPUs do not read each other's memory, and send messages ({reason})", stacklevel=2)
+        if not all(done for (done,) in ranks.gather_numbers([int(memory is not None)])):
+            ranks.reads_peers = False
+            return None
+    return memory
+
+
+def _allocate(ranks: ProcessRanks, size: int, memory: None) -> PeerMemory | None:
+    """This process's part."""
+    import torch.distributed._symmetric_memory as symmetric
+
+    one_host = os.environ.get("LOCAL_WORLD_SIZE") == os.environ.get("WORLD_SIZE")
+    if not one_host or os.environ.get(MESSAGES_VARIABLE) == "messages" or not _linked():
+        return None
+    # As `symmetric.empty` does, but never from a pool: what one process has kept from earlier runs there, another may
+    # not, and only one of the two would then wait for the other.
+    device = torch.device("cuda", torch.cuda.current_device())
+    own = symmetric._SymmetricMemory.empty_strided_p2p((size,), (1,), torch.float32, device)
+    return PeerMemory([own.zero_()], lambda channel: None)
+
+
+def _map(ranks: ProcessRanks, size: int, memory: PeerMemory) -> PeerMemory:
+    """All parts."""
+    import torch.distributed._symmetric_memory as symmetric
+
+    (own,) = memory.parts
+    handle = symmetric.rendezvous(own, torch.distributed.group.WORLD)
+    parts = [handle.get_buffer(rank, (size,), torch.float32) for rank in range(ranks.count)]
+    parts[ranks.rank] = own
+    return PeerMemory(parts, handle.barrier, handle)
+
+
+def _prove(ranks: ProcessRanks, size: int, memory: PeerMemory) -> PeerMemory | None:
+    """The same, if what a process writes is what the others read."""
+    memory.parts[ranks.rank][:1] = ranks.rank + 1.0
+    memory.owner.barrier(channel=0, timeout_ms=PROOF_MILLISECONDS)
+    found = torch.cat([part[:1] for part in memory.parts]).tolist()
+    memory.barrier(0)  # all have read
+    memory.parts[ranks.rank][:1] = 0.0
+    return memory if found == [rank + 1.0 for rank in range(ranks.count)] else None
+
+
+def _linked() -> bool:
+    """Whether this process's GPU has an NVLink that is up. True where the driver does not say.
+
+    Barriers need atomic operations in the other GPU's memory, which PCIe has not.
+    """
+    try:
+        nvml = ctypes.CDLL("libnvidia-ml.so.1")
+    except OSError:
+        return True
+    device, state = ctypes.c_void_p(), ctypes.c_uint()
+    name = f"GPU-{torch.cuda.get_device_properties(torch.cuda.current_device()).uuid}".encode()
+    if nvml.nvmlInit_v2() != 0 or nvml.nvmlDeviceGetHandleByUUID(name, ctypes.byref(device)) != 0:
+        return True
+    links = range(LINKS_MAX)
+    return any(nvml.nvmlDeviceGetNvLinkState(device, link, ctypes.byref(state)) == 0 and state.value for link in links)
