@@ -251,7 +251,6 @@ def test_overflow_is_noticed_and_passes_are_repeated(case, monkeypatch):
     assert (lost.colors == 0).all() and int(memory.overflow) == 1
     records = lost.backward(torch.ones_like(lost.colors)).full_records()
     assert (records == 0).all()
-    assert memory.overflowed is False  # the host has not looked yet
     assert memory.take_lost(wait=True) == 1
     assert int(memory.overflow) == 0 and memory.take_lost() == 0
     assert torch.equal(render(case, workspace=memory).colors, wanted.colors)
@@ -261,12 +260,11 @@ def test_a_pass_that_would_fit_stays_empty_while_the_flag_is_up(case):
     memory = Workspace("cuda")
     render(case, workspace=memory)
     memory.overflow.fill_(1)
-    assert (render(case, workspace=memory).colors == 0).all()
-    torch.cuda.synchronize()
-    memory.poll()
-    with pytest.raises(RuntimeError, match="take_lost"):
-        render(case, workspace=memory)
-    assert memory.take_lost() >= 1
+    for _ in range(2):
+        assert (render(case, workspace=memory).colors == 0).all()
+        torch.cuda.synchronize()
+        memory.poll()  # now the host knows
+    assert memory.take_lost() == 2
     assert (render(case, workspace=memory).colors != 0).any()
 
 

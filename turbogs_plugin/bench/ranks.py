@@ -141,8 +141,8 @@ class RanksBench:
         places = [(trainer.pixel_sampler, "sample", "draw"), (trainer, "supervise", "loss")]
         places.append((trainer.engine, "update", "solve"))
         if isinstance(trainer.exchange, RankExchange):
-            places += [(trainer.exchange, "_gather_colors", "colors"), (trainer.exchange, "finish", "arrival")]
-            places += [(RowGather, "begin", "parameters"), (SharedScreen, "of_rows", "records")]
+            places += [(trainer.exchange, "_gather_colors", "colors"), (SharedScreen, "of_rows", "records")]
+            places += [(RowGather, "begin", "parameters"), (RowGather, "finish", "arrival")]
         with recorder.passes(trainer, "render", "backward"), recorder.calls(*places):
             for _ in range(self.step.repeats):
                 trainer.step()

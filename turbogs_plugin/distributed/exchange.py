@@ -53,8 +53,9 @@ LAG = 4
 of them at the same place, and no host runs farther ahead of its GPU."""
 
 OWNERS_FROM = 4_000_000
-"""Rows of a batch, views times Gaussians, from which on two processes gain by owners of rows. Measured with 1.5, 1.8, 3
-and 6 million (docs/scaling.md): below, two exchanges more cost what they save, or up to .6 ms."""
+OWNERS_FROM_IN_PLACE = 1_000_000
+"""Rows of a batch, views times Gaussians, from which on two processes gain by owners of rows: by messages, and in
+place. Measured with .45, 1.5, 1.8 and 6 million (docs/scaling.md): below, two exchanges more cost what they save."""
 
 OVERFLOW, STOP = 0, 1
 """Columns of a pass's flags: iterations do nothing for lack of memory; the signal to stop, 0 for none. They travel as
@@ -129,9 +130,9 @@ def exchange_of(ranks: Ranks) -> Exchange:
     return RankExchange(ranks) if isinstance(ranks, ProcessRanks) else Exchange()
 
 
-def owners_pay(processes: int, views: int, gaussians: int) -> bool:
+def owners_pay(processes: int, views: int, gaussians: int, in_place: bool = False) -> bool:
     """Whether owners of rows should make the steps of a batch, and not all processes all of them."""
-    return processes > 2 or views * gaussians >= OWNERS_FROM
+    return processes > 2 or views * gaussians >= (OWNERS_FROM_IN_PLACE if in_place else OWNERS_FROM)
 
 
 class RankExchange(Exchange):
@@ -268,7 +269,7 @@ class RankExchange(Exchange):
         if not self._incomplete:
             by_rows = self.by_rows
             if by_rows is None:
-                by_rows = owners_pay(self.ranks.count, screen.views, len(gaussians))
+                by_rows = owners_pay(self.ranks.count, screen.views, len(gaussians), self._lent)
             if not by_rows:
                 engine.update(rule, screen.whole(), gaussians, moments, stats)
                 return
@@ -344,7 +345,7 @@ class RankExchange(Exchange):
         moments.skipped.fill_(before + sum(own for (own,) in skipped))
 
     def finish(self) -> None:
-        if self._owned is not None:
+        if self._owned is not None and self._owned.parameters.under_way:
             self._owned.parameters.finish()
 
     def compare(self, state: Callable[[], dict[str, Any]], iteration: int) -> None:

@@ -56,18 +56,22 @@ class RowGather:
                 self._sources.append(self._gathered[rank, first:end])
         self._wait: Callable[[], None] | None = None
 
+    @property
+    def under_way(self) -> bool:
+        """Whether rows travel, and `finish` is to come."""
+        return self._wait is not None
+
     def begin(self) -> None:
         """Pack this process's rows and let them travel, beside other work."""
         torch.cat(self._own, out=self._filled)
         self._wait = self._ranks.begin_gather(self._sent, self._gathered)
 
     def finish(self) -> None:
-        """What is enqueued next comes after the rows of all; nothing where none are on their way."""
-        if self._wait is not None:
-            self._wait()
-            self._wait = None
-            if self._targets:
-                torch._foreach_copy_(self._targets, self._sources)
+        """What is enqueued next comes after the rows of all, which must be under way."""
+        self._wait()
+        self._wait = None
+        if self._targets:
+            torch._foreach_copy_(self._targets, self._sources)
 
 
 class OwnedRows:

@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from turbogs_plugin.config.configuration import config_names
+from turbogs_plugin.config.configuration import config_names, resolve
 from turbogs_plugin.config.units import parse_seconds
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.files import write_text_atomically
@@ -122,7 +122,8 @@ def changed_since(study: Study) -> list[Paragraph]:
         present = flattened(variant_config(ablation, ablation.baseline, 0, (), None).to_mapping())
     except InputError as error:  # a setting of then, in the ablation's own words
         return [Paragraph(f"Stale: {error}.")]
-    asked = compared(measured[0].asked, OF_THE_CALL)
+    defaults = resolve({}).to_mapping()  # which settings have that are newer than the cells
+    asked = compared(defaults, OF_THE_CALL) | compared(measured[0].asked, OF_THE_CALL)
     changed = sorted(path for path in difference(present, asked) if path != ABSENT and path in present)
     if not changed:
         return []

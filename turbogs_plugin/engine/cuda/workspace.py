@@ -101,11 +101,6 @@ class Workspace:
         """[1] int32 on the device, not 0 while passes do nothing. Kernels that change state must check it."""
         return self._overflow
 
-    @property
-    def overflowed(self) -> bool:
-        """Whether the host knows of a pass that did not fit."""
-        return self._first_lost is not None
-
     def buffer(self, name: str, shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
         """The buffer of this name, uninitialised; it grows if needed."""
         view = self._views.get(name)
@@ -158,11 +153,9 @@ class Workspace:
     def capacity(self, gaussians: int, tiles: int) -> int | None:
         """How many intersections a pass gets memory for, or None if nothing is known yet.
 
-        Raises:
-            RuntimeError: an overflow is known and `take_lost` has not been called.
+        Passes may go on after a loss, and draw nothing until `take_lost`: several processes agree on it some passes
+        later.
         """
-        if self.overflowed:
-            raise RuntimeError("passes were lost to an overflow: call Workspace.take_lost() and repeat them")
         if gaussians != self._gaussians:
             self._intersections_per_tile *= gaussians / self._gaussians if self._gaussians else 0.0
             self._gaussians = gaussians
