@@ -106,13 +106,14 @@ def left_out(absent: Sequence[str], count: int, called: str) -> str:
 
 
 def check_photo_name(name: str, source: Path) -> str:
-    """The name, if it can be printed and stays within the photo folder; else `InputError`."""
+    """The name, with slashes where a Windows machine wrote backslashes, if it can be printed and stays within the photo
+    folder; else `InputError`."""
     path = PureWindowsPath(name)  # knows both kinds of separators, drives and roots
     if not name.isprintable():
         raise InputError(f"{source}: image name {name!r} has signs that cannot be printed: rename the photo")
     if not path.parts or ".." in path.parts or path.drive or path.root:
         raise InputError(f"{source}: image name {name!r} leaves the photo folder: names must be relative, without '..'")
-    return name
+    return name.replace("\\", "/")
 
 
 def sizes_text(sizes: np.ndarray) -> str:

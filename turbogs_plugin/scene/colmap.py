@@ -136,8 +136,11 @@ def read_colmap(scene: Path, model: Path, suffix: str) -> Capture:
             reason = "pycolmap cannot read a part of it"
         raise InputError(f"{model} is not a COLMAP reconstruction: {reason}; copy or reconstruct it again") from error
 
-    images = sorted((image for image in reconstruction.images.values() if image.has_pose), key=lambda image: image.name)
-    names = tuple(check_photo_name(image.name, model) for image in images)
+    images = [image for image in reconstruction.images.values() if image.has_pose]
+    for image in images:
+        image.name = check_photo_name(image.name, model)
+    images.sort(key=lambda image: image.name)
+    names = tuple(image.name for image in images)
     for name, following in itertools.pairwise(names):
         if name == following:
             raise InputError(f"{model} has two images named '{name}': rename the photos and reconstruct again")
