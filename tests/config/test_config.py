@@ -6,7 +6,6 @@ from pathlib import Path
 import pytest
 
 from turbogs_plugin.config.configuration import apply_overrides, config_names, load_config, registry, resolve
-from turbogs_plugin.config.scaling import with_iterations
 from turbogs_plugin.config.yaml_text import DEPTH_LIMIT, SIZE_LIMIT, parse_yaml
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.study.grid import load_ablation
@@ -188,12 +187,3 @@ def test_the_page_of_doubtful_settings_names_what_is_there():
         assert (ROOT / file).is_file()
         for ablation, variants in re.findall(r"`(\w+)`: ((?:`\S+`(?:, )?)+)", decided_by):
             assert set(re.findall(r"`(\S+?)`", variants)) <= set(load_ablation(ablation).variants), setting
-
-
-def test_a_longer_run_is_refused_if_its_final_prunings_would_take_most_of_the_model():
-    with pytest.raises(InputError, match=r"^52 final prunings in 30000 iterations would leave 6\.9% .*final_keep=1"):
-        load_config("turbogs", ["train.iterations=30000"])
-    for mended in ("density.final_keep=1", "density.final_every=5000", "train.refine_until=27000"):
-        load_config("turbogs", ["train.iterations=30000", mended])
-    load_config("turbogs", ["train.iterations=30000", "density.type=none"])
-    assert with_iterations(load_config("turbogs"), 30_000).train.iterations == 30_000

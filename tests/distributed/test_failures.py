@@ -39,13 +39,7 @@ from turbogs_plugin.train.wall import WallRecord
 EXCHANGES = ("agree", "gather_numbers", "broadcast", "gather", "begin_gather", "_wait", "send_and_receive")
 MOMENTS = 60
 """A tiny run has more exchanges: four of its maps, four and more of each of its 14 iterations."""
-ENDLESS = (
-    "train.iterations=100000",
-    "train.refine_until=9",
-    "train.checkpoint_every=3",
-    "train.evaluate_at=[]",
-    "density.final_keep=1",
-)
+ENDLESS = ("train.iterations=100000", "train.refine_until=9", "train.checkpoint_every=3", "train.evaluate_at=[]")
 SECONDS = 30.0
 """All processes of a training have ended so long after one of them was lost."""
 

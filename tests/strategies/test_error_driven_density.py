@@ -152,11 +152,13 @@ def test_events_are_when_the_table_says():
             events.append(iteration)
             gaussians = update.apply(gaussians)
             density.apply(update)
-    assert events == [200, 250, 300, 350, 400, 520, 620, 720, 820]
-    assert counted == list(range(821))
+    assert events == [200, 250, 300, 350, 400, 520, 620, 720]  # three final ones, though 820 would have room
+    assert counted == list(range(721))
 
 
-@pytest.mark.parametrize(("total", "final_keep", "last"), [(900, 1.0, 420), (500, 0.9, 420), (900, 0.9, 820)])
+@pytest.mark.parametrize(
+    ("total", "final_keep", "last"), [(900, 1.0, 420), (500, 0.9, 420), (700, 0.9, 620), (900, 0.9, 720)]
+)
 def test_statistics_end_with_densification_or_the_last_event(total, final_keep, last):
     gaussians = make_gaussians(5)
     density = ErrorDrivenDensity(refine_every=50, final_every=100, final_keep=final_keep)

@@ -143,13 +143,7 @@ class SyntheticTrial:
 
 def planned(scene: Scene, monkeypatch, *overrides: str):
     monkeypatch.setattr(calibration, "_Trial", SyntheticTrial)
-    settings = (
-        "schedule.pixel_budget=1",
-        "schedule.max_views=7",
-        "train.iterations=300",
-        "train.epochs=40",
-        "density.final_keep=1",
-    )
+    settings = ("schedule.pixel_budget=1", "schedule.max_views=7", "train.iterations=300", "train.epochs=40")
     config = tiny_config(Path("capture"), *settings, *overrides)
     return calibration.within_budget(config.without_plan(), scene, CPU)
 

@@ -29,9 +29,6 @@ PACKAGE = "turbogs_plugin.configs"
 DEFAULT_CONFIG = "turbogs"
 """The packaged configuration that a run without ``--config`` takes."""
 
-MANY_PRUNINGS = 8
-"""Final prunings that no run has whose settings are written for its length: the paper's has two or three."""
-
 BASE_DEPTH_LIMIT = 8
 """Configurations under one another by ``base``."""
 
@@ -128,19 +125,7 @@ def resolve(mapping: Mapping[str, Any]) -> Config:
         section = mapping.get(kind, {})
         strategy = registry.build(kind, section)
         sections[kind] = {"type": section.get("type", registry.default_type(kind)), **dataclass_mapping(strategy)}
-    _require_gaussians_left(sections["train"], sections["density"])
     return Config(**sections)
-
-
-def _require_gaussians_left(train: TrainConfig, density: Mapping[str, Any]) -> None:
-    """Refuse a run that was made longer without what counts iterations, if its final prunings would take most of it."""
-    keep, every, last = density.get("final_keep", 1.0), density.get("final_every", 0), train.iterations
-    events = (last - 1 - train.refine_until) // every if last != AUTO and every else 0
-    if events >= MANY_PRUNINGS and keep**events < 0.5:
-        raise InputError(
-            f"{events} final prunings in {last} iterations would leave {keep**events:.1%} of the Gaussians: set "
-            f"density.final_keep=1, a density.final_every above {every}, or a later train.refine_until"
-        )
 
 
 def resolve_complete(mapping: Mapping[str, Any], where: str, decided: bool = False) -> Config:

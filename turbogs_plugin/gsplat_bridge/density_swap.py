@@ -27,7 +27,7 @@ from turbogs_plugin.gsplat_bridge.host import (
 from turbogs_plugin.gsplat_bridge.tuned import TUNED_DENSITY
 from turbogs_plugin.model.row_order import in_order_of_space
 from turbogs_plugin.strategies.checks import shared_settings
-from turbogs_plugin.strategies.density.error_driven import ErrorDrivenDensity
+from turbogs_plugin.strategies.density.error_driven import FINAL_PRUNINGS, ErrorDrivenDensity
 from turbogs_plugin.strategies.density.rows import add_stats
 from turbogs_plugin.types import GaussianStats, RowUpdate, Step
 
@@ -67,7 +67,7 @@ class TurboDensityStrategy(DefaultStrategy):
             `ErrorDrivenDensity`.
         choose_by: `squares`, turbogs' own, needs the line above, and that `sparse_rasterization` renders; set
             grow_absgrad2d and prune_score_fraction to turbogs' values with it.
-        final_every, final_keep: final pruning after refine_stop_iter, off where final_keep is 1.
+        final_every, final_keep: final pruning after refine_stop_iter, three times at most; off where final_keep is 1.
         seed: of the positions of split Gaussians.
     """
 
@@ -137,7 +137,7 @@ class TurboDensityStrategy(DefaultStrategy):
                 changed between having errors and none.
         """
         require_one_process("TurboDensityStrategy")
-        if step >= self.refine_stop_iter and self.final_keep == 1:
+        if step - self.refine_stop_iter + 1 > (0 if self.final_keep == 1 else FINAL_PRUNINGS * self.final_every):
             return
         gaussians = host_gaussians(params, GEOMETRY)
         window = self._accumulate(state, info, len(gaussians))

@@ -26,8 +26,8 @@ GATES = {
     "absgrad_threshold": 2e-4,
     "final_keep": 1.0,
 }
-"""In place of turbogs' draw by squares, which gsplat's rasterization does not give; and no final pruning, for a host's
-run is of any length, which its interval does not know. docs/drop-in.md was measured so."""
+"""In place of turbogs' draw by squares, which gsplat's rasterization does not give; and no final pruning.
+docs/drop-in.md was measured so."""
 
 TUNED_DENSITY = ErrorDrivenDensity(**_settings("density") | GATES)
 """Density control with the settings of `configs/turbogs.yaml`, but for `GATES`."""
