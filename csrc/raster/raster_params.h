@@ -149,8 +149,8 @@ struct BackwardParams {
     float* records;                // [K, N, 16] out, ScreenRecord; off screen zero, or where `cleared`, left alone
 };
 
-// The records of one process's views, for rows of Gaussians that another one makes the step of. V views of the source, N
-// Gaussians there; K views of the target, and M rows.
+// The records of one process's views, for rows of Gaussians that another one makes the step of. V views of the source,
+// N Gaussians there; K views of the target, and M rows.
 struct CollectParams {
     int num_views;         // V
     int source_gaussians;  // N

@@ -18,10 +18,10 @@ from turbogs_plugin.errors import InputError
 from turbogs_plugin.types import Gaussians, RowUpdate, Step
 
 EPS = 1e-12
+"""Keeps divisions defined; the least weight a drawn splat can have in a pixel is 1e-4 / 255."""
 FINAL_PRUNINGS = 3
 """The paper's runs of 5000 and 8000 iterations have two and three. A run that was made longer without what counts
 iterations would have dozens, and lose most of its model to them."""
-"""Keeps divisions defined; the least weight a drawn splat can have in a pixel is 1e-4 / 255."""
 
 
 @dataclass

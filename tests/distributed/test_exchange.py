@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 import torch
 from gsplat.strategy import MCMCStrategy, ops
-from helpers.framework_runs import TINY, tiny_capture
+from helpers.framework_runs import tiny_capture, tiny_settings
+from helpers.losing_engine import LosingEngine
 from helpers.processes import ended, grouped, said, start_ranks
 from PIL import Image
 from torch import Tensor
@@ -21,8 +22,6 @@ from turbogs_plugin.distributed.digest import digest
 from turbogs_plugin.distributed.exchange import owners_pay
 from turbogs_plugin.distributed.ranks import ONE, ProcessRanks, Ranks
 from turbogs_plugin.distributed.rows import rows_of
-from turbogs_plugin.engine.reference.engine import ReferenceEngine
-from turbogs_plugin.engine.reference.raster import rasterize_reference
 from turbogs_plugin.errors import TrainingStopped
 from turbogs_plugin.model.torch_file import leaves
 from turbogs_plugin.scene import load_scene
@@ -86,9 +85,7 @@ def case_of(capture: Path, name: str, ranks: Ranks = ONE) -> Trainer:
 
 def trainer_of(capture: Path, *overrides: str, ranks: Ranks = ONE) -> Trainer:
     """With several processes rows have owners, which small models like these have not by themselves."""
-    replaced = tuple(text.partition("type=")[0] for text in overrides if ".type=" in text)  # sections that start afresh
-    settings = [text for text in TINY if not (replaced and text.startswith(replaced))]
-    config = load_config("turbogs", [*settings, "train.device=cpu", *overrides])
+    config = load_config("turbogs", [*tiny_settings(*overrides), "train.device=cpu", *overrides])
     config.scene.path = str(capture)
     trainer = Trainer(config.without_plan(), load_scene(capture), CPU, ranks=ranks)
     if ranks.count > 1:
@@ -145,37 +142,11 @@ def every_case(capture: Path, out: Path, cases: tuple[str, ...]) -> None:
         torch.save(results, out / "results.pt")
 
 
-class LosingEngine(ReferenceEngine):
-    """The second pass has too little memory: until `recover`, nothing changes, as on a GPU."""
-
-    def __init__(self, lose: bool) -> None:
-        self.lose, self.passes, self.recovered = lose, 0, 0
-        self.flag = torch.zeros(1, dtype=torch.int32)
-
-    @property
-    def overflow(self) -> torch.Tensor:
-        return self.flag
-
-    def render(self, *arguments):
-        self.passes += 1
-        if self.lose and self.passes == 2:
-            self.flag.fill_(1)
-        return rasterize_reference(*arguments)
-
-    def update(self, *arguments):
-        if not self.flag:
-            super().update(*arguments)
-
-    def recover(self) -> None:
-        self.flag.zero_()
-        self.recovered += 1
-
-
 def lost_iterations(capture: Path, ranks: ProcessRanks) -> dict:
     """One process has too little memory for one pass: all repeat it."""
     views = ("schedule.min_views=4", "schedule.max_views=4", "density.type=none")
     trainer = trainer_of(capture, *views, ranks=ranks)
-    trainer.engine = LosingEngine(lose=ranks.rank == ranks.count - 1)
+    trainer.engine = LosingEngine(2 if ranks.rank == ranks.count - 1 else None)
     trainer.initialise_maps()
     loop = TrainingLoop(trainer)
     loop.advance(2)  # the loss is known at this mark alone

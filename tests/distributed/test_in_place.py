@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from helpers.framework_runs import TINY, tiny_capture
+from helpers.framework_runs import tiny_capture, tiny_settings
 from helpers.peer_files import KeepingEngine, PeerFiles
 from helpers.processes import ended, grouped, said, start_ranks
 
@@ -44,8 +44,7 @@ STEPS = 5
 
 
 def trainer_of(capture: Path, ranks: ProcessRanks, by_rows: bool, overrides: tuple[str, ...]) -> Trainer:
-    replaced = tuple(text.partition("type=")[0] for text in overrides if ".type=" in text)
-    settings = [text for text in TINY if not (replaced and text.startswith(replaced))]
+    settings = tiny_settings(*overrides)
     if "schedule.pixel_budget=0.1" in overrides:
         settings.append("pixel_sampler.unit=tile")
     config = load_config("turbogs", [*settings, "train.device=cpu", *overrides])

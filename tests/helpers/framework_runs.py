@@ -34,6 +34,12 @@ TINY = (
 )
 
 
+def tiny_settings(*overrides: str) -> list[str]:
+    """`TINY` without the settings of sections whose type an override changes: these start afresh."""
+    replaced = tuple(text.partition("type=")[0] for text in overrides if ".type=" in text)
+    return [text for text in TINY if not text.startswith(replaced)]
+
+
 def tiny_capture(folder: Path) -> Path:
     """8 photos of 48x40, of which 7 train, and some 70 points: every sixteenth of the demo capture's."""
     return Path(shutil.copytree(_tiny_capture().name, folder / "capture"))

@@ -9,13 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from helpers.losing_engine import LosingEngine
 from torch import Tensor
 
 from turbogs_plugin.distributed.peer_memory import PeerMemory
 from turbogs_plugin.distributed.ranks import ProcessRanks
 from turbogs_plugin.engine.layout import ScreenRecord
-from turbogs_plugin.engine.reference.engine import ReferenceEngine
-from turbogs_plugin.engine.reference.raster import rasterize_reference
 from turbogs_plugin.engine.rendered import ScreenRecords
 
 
@@ -79,21 +78,12 @@ class _Screen(_Forwarding):
         return kept
 
 
-class KeepingEngine(ReferenceEngine):
-    """The projection of a pass destroys what is in the memory lent, the backward pass writes there.
-
-    Args:
-        lose: a pass that has too little memory: until `recover`, nothing changes.
-    """
+class KeepingEngine(LosingEngine):
+    """The projection of a pass destroys what is in the memory lent, the backward pass writes there."""
 
     def __init__(self, lose: int | None = None) -> None:
+        super().__init__(lose)
         self.lent: tuple[Tensor, Tensor] | None = None
-        self.flag = torch.zeros(1, dtype=torch.int32)
-        self.lose, self.passes, self.recovered = lose, 0, 0
-
-    @property
-    def overflow(self) -> Tensor:
-        return self.flag
 
     def lend(self, records: Tensor | None, radii: Tensor | None) -> None:
         self.lent = None if records is None else (records, radii)
@@ -107,19 +97,8 @@ class KeepingEngine(ReferenceEngine):
         )
 
     def render(self, gaussians: Any, cameras: Any, *arguments: Any) -> _Rendered:
-        self.passes += 1
-        if self.passes == self.lose:
-            self.flag.fill_(1)
         if self.lent is not None:
             records, radii = self.views(len(cameras), len(gaussians))
             records.fill_(torch.nan)
             radii.fill_(-7)
-        return _Rendered(rasterize_reference(gaussians, cameras, *arguments), self)
-
-    def update(self, *arguments: Any) -> None:
-        if not self.flag:
-            super().update(*arguments)
-
-    def recover(self) -> None:
-        self.flag.zero_()
-        self.recovered += 1
+        return _Rendered(super().render(gaussians, cameras, *arguments), self)

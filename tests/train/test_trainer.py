@@ -16,7 +16,7 @@ import numpy as np
 import pycolmap
 import pytest
 import torch
-from helpers.framework_runs import TINY, assert_identical, stop_after, tiny_capture, tiny_config
+from helpers.framework_runs import TINY, assert_identical, stop_after, tiny_capture, tiny_config, tiny_settings
 from helpers.processes import PRELOADED, ended
 from PIL import Image
 
@@ -430,9 +430,7 @@ def test_the_trainer_names_no_strategy():
     ids=lambda overrides: overrides[0],
 )
 def test_every_alternative_trains(capture, tmp_path, overrides):
-    kinds = [override.partition(".")[0] for override in overrides if ".type=" in override]
-    kept = [option for option in TINY if option.partition(".")[0] not in kinds]
-    config = load_config("turbogs", [*kept, "train.device=cpu", "train.iterations=5", *overrides])
+    config = load_config("turbogs", [*tiny_settings(*overrides), "train.device=cpu", "train.iterations=5", *overrides])
     config.scene.path = str(capture)
     outcome = run.train(config, tmp_path / "run")
     assert outcome.history[-1].psnr > outcome.history[0].psnr

@@ -87,7 +87,7 @@ class Workspace:
         self._overflow = self.status[1:]
         self.passes = 0
         self._buffers: dict[str, Tensor] = {}
-        self._lent: dict[str, Tensor] = {}  # of `lend`
+        self._lent: set[str] = set()  # names of buffers, by `lend`
         self._views: dict[str, Tensor] = {}  # what `buffer` returned last
         self._kept: dict[str, tuple[tuple, Any]] = {}
         self._pinned = torch.zeros(PENDING_MAX, 2, dtype=torch.int32).pin_memory().unbind()
@@ -130,9 +130,10 @@ class Workspace:
             self._kept.clear()  # holds views of buffers
             self._views.pop(name, None)
             self._buffers.pop(name, None)
-            self._lent.pop(name, None)
+            self._lent.discard(name)
             if tensor is not None:
-                self._buffers[name] = self._lent[name] = tensor
+                self._buffers[name] = tensor
+                self._lent.add(name)
 
     def kept(self, name: str, sizes: tuple, make: Callable[[], Kept]) -> Kept:
         """What `make` gives; made anew only where the sizes are others than at the last call of this name.
