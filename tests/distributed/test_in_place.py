@@ -8,14 +8,16 @@ from pathlib import Path
 import pytest
 import torch
 from helpers.framework_runs import tiny_capture, tiny_settings
-from helpers.peer_files import KeepingEngine, PeerFiles
+from helpers.peer_files import KeepingEngine, LateSide, PeerFiles
 from helpers.processes import ended, grouped, said, start_ranks
 
 from turbogs_plugin.config.configuration import load_config
-from turbogs_plugin.distributed import peer_memory
-from turbogs_plugin.distributed.in_place import DRAWN, FREE, WRITTEN, InPlace
+from turbogs_plugin.distributed import in_place, peer_memory
+from turbogs_plugin.distributed.in_place import DRAWN, FREE, PACKED, WRITTEN, InPlace
 from turbogs_plugin.distributed.peer_memory import PeerMemory, share_memory
 from turbogs_plugin.distributed.ranks import ProcessRanks
+from turbogs_plugin.distributed.rows import rows_of
+from turbogs_plugin.distributed.side_stream import SideStream
 from turbogs_plugin.engine.layout import ScreenRecord
 from turbogs_plugin.engine.reference.engine import ReferenceEngine
 from turbogs_plugin.engine.rendered import ScreenRecords
@@ -54,14 +56,14 @@ def trainer_of(capture: Path, ranks: ProcessRanks, by_rows: bool, overrides: tup
     return trainer
 
 
-def run(trainer: Trainer, in_place: list[bool]) -> dict:
-    """The state after a step for each of these, with an evaluation in the middle."""
+def run(trainer: Trainer, ways: list[bool]) -> dict:
+    """The state after a step for each of these, which say whether in place, with an evaluation in the middle."""
     trainer.initialise_maps()
-    for number, way in enumerate(in_place):
+    for number, way in enumerate(ways):
         trainer.exchange.in_place = way
         trainer.step()
         assert trainer.exchange.way == ("in place" if way else "messages")
-        if number == len(in_place) // 2:
+        if number == len(ways) // 2:
             trainer.dense_errors(0)
             trainer.compare_replicas()
     trainer.compare_replicas()
@@ -75,37 +77,97 @@ def same(first: dict, second: dict) -> None:
         assert equal, name
 
 
-def ways(capture: Path, folder: Path) -> None:
+def every_case(capture: Path, folder: Path) -> None:
     """In every process: each case by messages and in place; the memory grows by an event of density control."""
     ranks = grouped()
     for name in CASES if ranks.count == 2 else OF_THREE:
         by_rows, overrides = CASES[name]
         wanted = run(trainer_of(capture, ranks, by_rows, overrides), [False] * STEPS)
-        for engine in (ReferenceEngine(), KeepingEngine()):
+        for engine, beside in ((ReferenceEngine(), SideStream), (KeepingEngine(), LateSide)):
             trainer = trainer_of(capture, ranks, by_rows, overrides)
             trainer.engine, number = engine, len(trainer.gaussians)
             memory = PeerFiles(folder / f"{name}-{type(engine).__name__}")
-            trainer.exchange.memory = InPlace(ranks, memory)
+            trainer.exchange.memory = InPlace(ranks, memory, beside)
             same(run(trainer, [True] * STEPS), wanted)
             assert len(trainer.gaussians) != number
-            frees = [FREE] * (0 if by_rows else STEPS - len(memory.sizes))
-            assert sorted(memory.barriers) == sorted([WRITTEN, DRAWN] * STEPS + frees)
+            others = [PACKED] * STEPS if by_rows else [FREE] * (STEPS - len(memory.sizes))
+            assert sorted(memory.barriers) == sorted([WRITTEN, DRAWN] * STEPS + others)
     wanted = run(trainer_of(capture, ranks, True, ()), [False] * STEPS)
-    trainer = trainer_of(capture, ranks, True, ())
-    trainer.engine, trainer.exchange.memory = KeepingEngine(), InPlace(ranks, PeerFiles(folder / "turns"))
-    same(run(trainer, [True, False, True, False, True]), wanted)
+    turns = [True, False, True, False, True]
+    for beside in (SideStream, LateSide):
+        files = PeerFiles(folder / f"turns-{beside.__name__}")
+        trainer = keeping(trainer_of(capture, ranks, True, ()), files, beside)
+        same(run(trainer, turns), wanted)
+        assert files.barriers.count(PACKED) == sum(turns)
+    without_some_memory(capture, ranks, folder, wanted)
+    growing(capture, ranks, folder, wanted)
+    few(capture, ranks, folder)
     for by_rows in (True, False):
         lost(capture, ranks, folder / f"lost-{by_rows}", by_rows)
+
+
+def keeping(trainer: Trainer, files: PeerFiles, beside: type = LateSide) -> Trainer:
+    trainer.engine, trainer.exchange.memory = KeepingEngine(), InPlace(trainer.ranks, files, beside)
+    return trainer
+
+
+def without_some_memory(capture: Path, ranks: ProcessRanks, folder: Path, wanted: dict) -> None:
+    """Where there is memory for passes alone, parameters go by messages; where there is none, all does. Nobody asks
+    again."""
+    files = PeerFiles(folder / "of passes", most=1)
+    trainer = keeping(trainer_of(capture, ranks, True, ()), files)
+    same(run(trainer, [True] * 2), run(trainer_of(capture, ranks, True, ()), [False] * 2))
+    assert files.barriers == [WRITTEN, DRAWN] * 2 and files.refused == 1
+    files = PeerFiles(folder / "none", most=0)
+    trainer = keeping(trainer_of(capture, ranks, True, ()), files)
+    trainer.initialise_maps()
+    for _ in range(STEPS):
+        trainer.step()
+        assert trainer.exchange.way == "messages"
+    trainer.compare_replicas()
+    same(dict(leaves(trainer.state_dict(), "state")), wanted)
+    assert files.refused == 1 and not files.barriers
+
+
+def growing(capture: Path, ranks: ProcessRanks, folder: Path, wanted: dict) -> None:
+    """Without room to spare, the event before the last iteration makes both memories grow."""
+    before, in_place.GROWTH = in_place.GROWTH, 1.0
+    files = PeerFiles(folder / "growing")
+    trainer = keeping(trainer_of(capture, ranks, True, ()), files)
+    counts = [len(trainer.gaussians)]
+    same(run(trainer, [True] * STEPS), wanted)
+    counts.append(len(trainer.gaussians))
+    width = sum(value[0].numel() for _, value in trainer.gaussians.items())
+    wanted_sizes = [width * rows_of(count, ranks.count)[0].stop for count in counts]
+    assert [size for size in files.sizes if size in wanted_sizes] == wanted_sizes and wanted_sizes[0] < wanted_sizes[1]
+    in_place.GROWTH = before
+
+
+def few(capture: Path, ranks: ProcessRanks, folder: Path) -> None:
+    """The last process has no rows."""
+    count, states = 4 * (ranks.count - 1), []
+    assert rows_of(count, ranks.count)[-1] == slice(count, count)
+    for way, beside in ((False, LateSide), (True, SideStream), (True, LateSide)):
+        files = PeerFiles(folder / f"few-{way}-{beside.__name__}")
+        trainer = keeping(trainer_of(capture, ranks, True, ("density.type=none",)), files, beside)
+        first = trainer.gaussians.map(torch.clone)
+        trainer.gaussians = first.map(lambda value: value[:count].clone())
+        trainer.optimizer.setup(trainer.gaussians)
+        trainer.density.setup(trainer.gaussians)
+        states.append(run(trainer, [way] * STEPS))
+        assert not torch.equal(trainer.gaussians.means, first.means[:count])
+        assert files.barriers.count(PACKED) == way * STEPS
+    same(states[0], states[1])
+    same(states[0], states[2])
 
 
 def lost(capture: Path, ranks: ProcessRanks, folder: Path, by_rows: bool) -> None:
     """One process has too little memory for one pass: all repeat it, and nothing of it stays."""
     states = []
-    for in_place in (False, True):
-        trainer = trainer_of(capture, ranks, by_rows, ("density.type=none",))
+    for way in (False, True):
+        trainer = keeping(trainer_of(capture, ranks, by_rows, ("density.type=none",)), PeerFiles(folder))
         trainer.engine = KeepingEngine(lose=2 if ranks.rank == ranks.count - 1 else None)
-        trainer.exchange.memory = InPlace(ranks, PeerFiles(folder))
-        trainer.exchange.in_place = in_place
+        trainer.exchange.in_place = way
         trainer.initialise_maps()
         TrainingLoop(trainer).advance(6)
         trainer.compare_replicas()
@@ -117,7 +179,7 @@ def lost(capture: Path, ranks: ProcessRanks, folder: Path, by_rows: bool) -> Non
 @pytest.mark.parametrize("count", [2, 3])
 def test_both_ways_give_the_same_to_the_bit(tmp_path, count):
     capture = tiny_capture(tmp_path)
-    codes = ended(start_ranks(count, ways, tmp_path / "out", capture, tmp_path / "memory"), 300)
+    codes = ended(start_ranks(count, every_case, tmp_path / "out", capture, tmp_path / "memory"), 300)
     assert codes == [0] * count, said(tmp_path / "out")
 
 

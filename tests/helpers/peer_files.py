@@ -1,10 +1,11 @@
 """Memory of processes on CPUs that all of them read in place: files that all have mapped. And an engine that keeps its
-records there, as that of a GPU does."""
+records there, as that of a GPU does; and work beside that of a stream, done late."""
 
 from __future__ import annotations
 
 import random
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -23,19 +24,25 @@ class PeerFiles:
 
     Args:
         pauses: seconds, at most, that a process waits before and after a barrier, so that a missing one shows.
+        most: memories that can be had; then there are none. None: as many as wanted.
 
     Attributes:
         sizes: of each memory that was made.
+        refused: how often there was none.
         barriers: the numbers of all barriers.
     """
 
-    def __init__(self, folder: Path, pauses: float = 0.004) -> None:
+    def __init__(self, folder: Path, pauses: float = 0.004, most: int | None = None) -> None:
         folder.mkdir(parents=True, exist_ok=True)
-        self.folder, self.pauses = folder, pauses
+        self.folder, self.pauses, self.most = folder, pauses, most
         self.sizes: list[int] = []
+        self.refused = 0
         self.barriers: list[int] = []
 
-    def __call__(self, ranks: ProcessRanks, size: int, device: torch.device) -> PeerMemory:
+    def __call__(self, ranks: ProcessRanks, size: int, device: torch.device) -> PeerMemory | None:
+        if len(self.sizes) == self.most:
+            self.refused += 1
+            return None
         paths = [self.folder / f"{len(self.sizes)}-{rank}" for rank in range(ranks.count)]
         self.sizes.append(size)
         paths[ranks.rank].write_bytes(bytes(4 * size))
@@ -102,3 +109,19 @@ class KeepingEngine(LosingEngine):
             records.fill_(torch.nan)
             radii.fill_(-7)
         return _Rendered(super().render(gaussians, cameras, *arguments), self)
+
+
+class LateSide:
+    """A `SideStream` whose work is done at the last moment. A GPU may do it then, or at the first, as the true one does
+    on a CPU."""
+
+    def __init__(self, device: torch.device) -> None:
+        self._work: Callable[[], None] | None = None
+
+    def begin(self, work: Callable[[], None]) -> None:
+        assert self._work is None, "others are under way"
+        self._work = work
+
+    def finish(self) -> None:
+        work, self._work = self._work, None
+        work()

@@ -25,7 +25,7 @@ from turbogs_plugin.device import synchronize
 from turbogs_plugin.distributed.exchange import RankExchange
 from turbogs_plugin.distributed.processes import joined, start
 from turbogs_plugin.distributed.ranks import ProcessRanks, Ranks
-from turbogs_plugin.distributed.rows import RowGather
+from turbogs_plugin.distributed.rows import OwnedRows
 from turbogs_plugin.distributed.shared_pass import SharedScreen
 from turbogs_plugin.errors import TrainingStopped
 from turbogs_plugin.scene import Scene, load_scene
@@ -36,7 +36,8 @@ from turbogs_plugin.types import Gaussians
 
 PARTS = ("draw", "arrival", "render", "colors", "loss", "backward", "records", "solve", "parameters")
 """Parts of an iteration. `colors` and `records` are exchanges, with the wait for the slowest process. `parameters`
-packs those of the process, which travel in the next draw; `arrival` is what is left of their way, with the copies."""
+packs those of the process, which travel in the next draw; `arrival` is what is left of their way then: of the gather,
+with the copies after it, or of the copies that read them in place, with the wait for the slowest process's pack."""
 
 
 @dataclass(frozen=True)
@@ -142,7 +143,7 @@ class RanksBench:
         places.append((trainer.engine, "update", "solve"))
         if isinstance(trainer.exchange, RankExchange):
             places += [(trainer.exchange, "_gather_colors", "colors"), (SharedScreen, "of_rows", "records")]
-            places += [(RowGather, "begin", "parameters"), (RowGather, "finish", "arrival")]
+            places += [(OwnedRows, "begin", "parameters"), (OwnedRows, "finish", "arrival")]
         with recorder.passes(trainer, "render", "backward"), recorder.calls(*places):
             for _ in range(self.step.repeats):
                 trainer.step()

@@ -12,9 +12,9 @@ function of (seed, iteration, place), so all draw the same. Then
 
 Two processes with a small batch (`owners_pay`) do without 3: both get all records, and both make all steps.
 
-On GPUs of one host that are linked, 1 and 2 are done in place: a process reads the others' memory (`in_place`), of the
-records only those of Gaussians on screen. Elsewhere colours are gathered and records sent as messages. Both ways give
-the same, to the bit.
+On GPUs of one host that are linked, all three are done in place: a process reads the others' memory (`in_place`), of
+the records only those of Gaussians on screen. Elsewhere colours and parameters are gathered and records sent as
+messages. Both ways give the same, to the bit.
 
 Every step and statistic is computed by one process, as by a process alone, and copied to the others; or by all, from
 the same records. So the replicas are bit-equal, and a step differs from that of one process only by the order in which
@@ -37,7 +37,7 @@ from torch import Tensor
 from turbogs_plugin.distributed.digest import digest
 from turbogs_plugin.distributed.in_place import InPlace
 from turbogs_plugin.distributed.ranks import ProcessRanks, Ranks
-from turbogs_plugin.distributed.rows import OwnedRows, RowGather, rows_of
+from turbogs_plugin.distributed.rows import OwnedRows, Packing, RowGather, rows_of
 from turbogs_plugin.distributed.shared_pass import Batch, SharedRendered, SharedScreen
 from turbogs_plugin.distributed.shares import Share, shares_of
 from turbogs_plugin.engine.moments import GaussianMoments
@@ -177,7 +177,7 @@ class RankExchange(Exchange):
 
     @property
     def way(self) -> str:
-        """How colours and records went in the latest pass."""
+        """How colours and records went in the latest pass; `OwnedRows.way` says it of parameters."""
         return "in place" if self._lent else "messages"
 
     def _prepared(self, engine: Engine, shares: Sequence[Share], gaussians: Gaussians) -> InPlace | None:
@@ -275,12 +275,13 @@ class RankExchange(Exchange):
                 return
             self._incomplete, self._skipped = True, moments.skipped.clone()
         if self._owned is None or not self._owned.fits(gaussians, moments, stats):
+            self._owned = None  # nothing keeps memory of rows, which may have to grow
             self._owned = OwnedRows(self.ranks, gaussians, moments, stats)
         owned = self._owned
         own_screen = screen.of_rows(owned.rows, owned.gaussians)
         if len(owned.gaussians):
             engine.update(rule, own_screen, owned.gaussians, owned.moments, owned.stats)
-        owned.parameters.begin()
+        owned.begin(self.memory if self._lent else None)
         self.memory.ordered()
 
     def initial_errors(
@@ -337,7 +338,7 @@ class RankExchange(Exchange):
         self._owned = None  # an event makes new tensors, beside which the old ones have no room
         tensors = [moments.exp_avg, moments.exp_avg_sq, moments.exp_avg_shN, moments.exp_avg_sq_shN, moments.steps]
         tensors += [] if stats is None else list(vars(stats).values())
-        gather = RowGather(self.ranks, tensors, rows_of(len(moments), self.ranks.count))
+        gather = RowGather(self.ranks, Packing(tensors, rows_of(len(moments), self.ranks.count)))
         gather.begin()
         gather.finish()
         before = int(self._skipped)
@@ -345,8 +346,8 @@ class RankExchange(Exchange):
         moments.skipped.fill_(before + sum(own for (own,) in skipped))
 
     def finish(self) -> None:
-        if self._owned is not None and self._owned.parameters.under_way:
-            self._owned.parameters.finish()
+        if self._owned is not None and self._owned.under_way:
+            self._owned.finish()
 
     def compare(self, state: Callable[[], dict[str, Any]], iteration: int) -> None:
         plain = {name: value for name, value in state().items() if isinstance(value, (Tensor, int, float))}

@@ -1,18 +1,52 @@
-"""The exchanges of colours and records in place: every process reads the others' memory (`peer_memory`).
+"""The exchanges of colours, records and parameters in place: processes read each other's memory (`peer_memory`).
 
-Between an iteration's writing and another process's reading lies a barrier of the GPUs' streams, and so does between
-the reading and the next iteration's writing. No other order is assumed than that of each process's one stream:
+Between a process's writing and another's reading lies a barrier of the GPUs' streams, and so does between the reading
+and the next iteration's writing. Barriers have their own numbers, as two processes may be at two of them:
 
 - `WRITTEN`: colours and flags of all are written -> they are read.
 - `DRAWN`: records and radii of all are complete -> they are collected.
+- `PACKED`: all owners have packed the parameters of their rows, after their step -> they are copied into the models.
 - `FREE`: colours, flags, records and radii of the last iteration are read by all -> the projection clears and the
-  forward pass overwrites them. Where rows have owners, the gather of parameters does the same: a process has all
-  parameters after every process's own came, which that enqueues after what it read; and nobody renders a model before
-  `Exchange.finish` made the stream wait for them. So `FREE` is left out there.
+  forward pass overwrites them. Only where rows have no owners.
 
 `DRAWN` does not stand for `WRITTEN`, as the loss needs the colours before, nor `WRITTEN` for `FREE`: the projection
-comes before it. Barriers have their own numbers, as two processes may be at two of them. A process without samples
-comes to all of them. When the memory grows, processes let go of the old one; it lives on until none has it mapped.
+comes before it. A process without samples, or without rows, comes to all barriers. All processes enqueue the same
+barriers and messages in the same order, and none needs one that was enqueued later. So none waits for ever, even if a
+GPU should do its two streams' work in the order in which it was enqueued.
+
+**Parameters** travel beside the next draw of pixels. Per iteration, a process's main stream has
+
+    render, WRITTEN, loss, backward, DRAWN, collect, step, pack | next draw | wait for the copies, render, ...
+
+and its side stream has `PACKED` and the copies, after what the main stream was given up to the pack (`OwnedRows.begin`,
+by an event), and before what it is given from `OwnedRows.finish` on (by another). Nobody reads or renders a model
+before `Exchange.finish`. From this follows:
+
+- *Copies read what is packed:* pack, event, `PACKED` of all, copies. They overwrite rows of others in this process's
+  model, which its main stream may have read until the pack; the same event keeps them behind that.
+- *The next pack overwrites nothing that is still read.* A process's copies end before it renders the next pass, by
+  `finish`; so before its `WRITTEN` and `DRAWN` of that pass. Every process packs behind those barriers. A pass by
+  messages has no such barriers, but then parameters go by messages, too: a pack into this memory always comes after a
+  pass in place, and that after the last copies.
+- *`FREE` can be left out* (`ordered`). A process that renders the next pass has its copies behind it, so `PACKED` of
+  all; each comes, by the event, after what that process read of others in `colors` and `collect`. Where parameters go
+  by messages the gather does the same: it is enqueued after what was read, and a process has all rows after every
+  process's own came.
+- *Lost iterations* go through all of this, and copy what did not change. A process that has settled repeats the
+  iteration like any other.
+- *Memory.* What is written (the tensors of the model) was allocated for the main stream. Who replaces the model, by an
+  event of density control or a state that is loaded, calls `finish` before; memory that is used again after that is
+  used behind the copies. Nothing is allocated on the side stream.
+
+**Growth.** All processes grow a memory in the same iteration, as its size is known to all, and let go of the old one,
+after a device synchronization. It lives on until none has it mapped.
+
+- That of passes grows in `prepare`. `finish` came before, and the device waits for the copies as well; they are of
+  another memory, anyway.
+- That of rows is asked for when an iteration packs for the first time with a new set of Gaussians, when none are under
+  way. This iteration's `DRAWN` is past on this device, so all others have read what was packed last.
+
+If the memory of rows cannot be had, where that of passes can, parameters go by messages from then on.
 """
 
 from __future__ import annotations
@@ -26,11 +60,12 @@ from turbogs_plugin.device import synchronize
 from turbogs_plugin.distributed.peer_memory import PeerMemory, share_memory
 from turbogs_plugin.distributed.ranks import ProcessRanks
 from turbogs_plugin.distributed.shares import Share
+from turbogs_plugin.distributed.side_stream import SideStream
 from turbogs_plugin.engine.layout import ScreenRecord
 from turbogs_plugin.engine.protocol import Engine
 from turbogs_plugin.engine.rendered import ScreenRecords
 
-FREE, WRITTEN, DRAWN = 0, 1, 2
+FREE, WRITTEN, DRAWN, PACKED = 0, 1, 2, 3
 """Numbers of the barriers."""
 
 GROWTH = 1.25
@@ -47,11 +82,12 @@ SIZES_KEPT = 256
 
 
 class InPlace:
-    """This process's memory for colours and records, and the views of that of all.
+    """This process's memory for colours and records and that for parameters, and the views of those of all.
 
     Args:
         ranks: of all.
         share: gives memory that all read, or None.
+        beside: gives what lets parameters travel beside other work.
 
     Attributes:
         flags: three times [1] float32, this process's flags of a pass.
@@ -63,13 +99,18 @@ class InPlace:
         self,
         ranks: ProcessRanks,
         share: Callable[[ProcessRanks, int, torch.device], PeerMemory | None] = share_memory,
+        beside: Callable[[torch.device], SideStream] = SideStream,
     ) -> None:
-        self._ranks, self._share = ranks, share
+        self._ranks, self._share, self._beside = ranks, share, beside
         self._memory: PeerMemory | None = None
         self._possible = True
         self._slots = self._instances = 0  # there is room for
         self._read = False  # others may be reading this process's memory
         self._views: dict[tuple, list[Tensor] | ScreenRecords] = {}
+        self._rows: PeerMemory | None = None
+        self._rows_possible = True
+        self._row_numbers = 0  # there is room for
+        self._side: SideStream | None = None
 
     def prepare(self, engine: Engine, shares: Sequence[Share], gaussians: int, device: torch.device) -> bool:
         """Make room for a pass, in which the engine keeps its records in this memory. Every process must call this.
@@ -98,6 +139,31 @@ class InPlace:
     def ordered(self) -> None:
         """What this process writes next comes after all that the others read, without a barrier."""
         self._read = False
+
+    def rows(self, size: int, device: torch.device) -> tuple[PeerMemory, SideStream] | None:
+        """Memory for the rows of each process, and the stream to copy them on. Every process must call this, with none
+        of them under way and no view of an earlier such memory kept.
+
+        Args:
+            size: numbers that a process has at most.
+
+        Returns:
+            None: there is no such memory, for none of the processes.
+        """
+        if not self._rows_possible:
+            return None
+        if self._rows is None or size > self._row_numbers:
+            if self._rows is not None:
+                synchronize(device)  # as in `_grow`
+                self._rows = None
+            self._row_numbers = int(GROWTH * size)
+            self._rows = self._share(self._ranks, self._row_numbers, device)
+            if self._rows is None:
+                self._rows_possible = False
+                return None
+        if self._side is None:
+            self._side = self._beside(device)
+        return self._rows, self._side
 
     def _grow(self, engine: Engine, slots: int, instances: int, device: torch.device) -> None:
         """Replace the memory. All processes come here in the same iteration, as their shares are known to all."""

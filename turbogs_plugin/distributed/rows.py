@@ -13,7 +13,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from turbogs_plugin.distributed.in_place import PACKED, InPlace
+from turbogs_plugin.distributed.peer_memory import PeerMemory
 from turbogs_plugin.distributed.ranks import ProcessRanks
+from turbogs_plugin.distributed.side_stream import SideStream
 from turbogs_plugin.engine.moments import GaussianMoments
 from turbogs_plugin.types import Gaussians, GaussianStats
 
@@ -27,39 +30,68 @@ def rows_of(count: int, processes: int) -> list[slice]:
     return [slice(min(count, rank * size), min(count, (rank + 1) * size)) for rank in range(processes)]
 
 
+class Packing:
+    """How the rows of some tensors lie in a part of memory for each process: one tensor after the other.
+
+    Args:
+        tensors: [N, ...] each, contiguous, of four bytes an element.
+        rows: of each process.
+
+    Attributes:
+        size: numbers of the largest part, the first process's.
+    """
+
+    def __init__(self, tensors: Sequence[Tensor], rows: Sequence[slice]) -> None:
+        self._flat = [value.view(torch.float32).view(len(value), -1) for value in tensors if value.numel()]
+        self._rows = rows
+        self._ends = np.cumsum([0, *(value.shape[1] for value in self._flat)])  # of a row of each tensor
+        self.size = self.filled(0)
+
+    def filled(self, rank: int) -> int:
+        """Numbers of a process's part that mean something."""
+        return (self._rows[rank].stop - self._rows[rank].start) * int(self._ends[-1])
+
+    def own(self, rank: int) -> list[Tensor]:
+        """A process's rows of each tensor, [.] each."""
+        return [value[self._rows[rank]].view(-1) for value in self._flat]
+
+    def of_others(self, rank: int, parts: Sequence[Tensor]) -> tuple[list[Tensor], list[Tensor]]:
+        """The rows of all processes but one.
+
+        Args:
+            rank: that one.
+            parts: [size] or more, of each process.
+
+        Returns:
+            ([.] each in the tensors, [.] each where it lies in the parts).
+        """
+        targets, sources = [], []
+        for other, rows in enumerate(self._rows):
+            if other == rank or rows.start == rows.stop:
+                continue
+            ends = ((rows.stop - rows.start) * self._ends).tolist()
+            for value, first, end in zip(self._flat, ends[:-1], ends[1:], strict=True):
+                targets.append(value[rows].view(-1))
+                sources.append(parts[other][first:end])
+        return targets, sources
+
+
 class RowGather:
-    """Overwrites all rows of some tensors by their owners' rows.
+    """Overwrites all rows of some tensors by their owners' rows, which are sent as messages.
 
     Args:
         ranks: of the owners.
-        tensors: [N, ...] each, contiguous, of four bytes an element.
-        rows: of each process.
+        packing: of the rows.
     """
 
-    def __init__(self, ranks: ProcessRanks, tensors: Sequence[Tensor], rows: Sequence[slice]) -> None:
+    def __init__(self, ranks: ProcessRanks, packing: Packing) -> None:
         self._ranks = ranks
-        flat = [value.view(torch.float32).view(len(value), -1) for value in tensors if value.numel()]
-        widths = [value.shape[1] for value in flat]
-        own = rows[ranks.rank]
-        self._own = [value[own].view(-1) for value in flat]
-        self._sent = flat[0].new_zeros((rows[0].stop - rows[0].start) * sum(widths))
-        self._filled = self._sent[: (own.stop - own.start) * sum(widths)]
+        self._own = packing.own(ranks.rank)
+        self._sent = self._own[0].new_zeros(packing.size)
+        self._filled = self._sent[: packing.filled(ranks.rank)]
         self._gathered = self._sent.new_empty(ranks.count, len(self._sent))
-        self._targets: list[Tensor] = []
-        self._sources: list[Tensor] = []
-        for rank, part in enumerate(rows):
-            if rank == ranks.rank or part.start == part.stop:
-                continue
-            ends = (part.stop - part.start) * np.cumsum([0, *widths])
-            for value, first, end in zip(flat, ends[:-1].tolist(), ends[1:].tolist(), strict=True):
-                self._targets.append(value[part].view(-1))
-                self._sources.append(self._gathered[rank, first:end])
+        self._targets, self._sources = packing.of_others(ranks.rank, self._gathered)
         self._wait: Callable[[], None] | None = None
-
-    @property
-    def under_way(self) -> bool:
-        """Whether rows travel, and `finish` is to come."""
-        return self._wait is not None
 
     def begin(self) -> None:
         """Pack this process's rows and let them travel, beside other work."""
@@ -74,13 +106,46 @@ class RowGather:
             torch._foreach_copy_(self._targets, self._sources)
 
 
+class RowsInPlace:
+    """Overwrites all rows of some tensors by their owners' rows, which are read where the owners pack them.
+
+    The order of all this is that of `in_place`.
+
+    Args:
+        ranks: of the owners.
+        packing: of the rows.
+        memory: [packing.size] or more, of each process.
+        side: lets them travel beside other work.
+    """
+
+    def __init__(self, ranks: ProcessRanks, packing: Packing, memory: PeerMemory, side: SideStream) -> None:
+        self._memory, self._side = memory, side
+        self._own = packing.own(ranks.rank)
+        self._filled = memory.parts[ranks.rank][: packing.filled(ranks.rank)]
+        self._targets, self._sources = packing.of_others(ranks.rank, memory.parts)
+
+    def begin(self) -> None:
+        """Pack this process's rows and copy those of the others, beside other work."""
+        torch.cat(self._own, out=self._filled)
+        self._side.begin(self._copy)
+
+    def _copy(self) -> None:
+        self._memory.barrier(PACKED)
+        if self._targets:
+            torch._foreach_copy_(self._targets, self._sources)
+
+    def finish(self) -> None:
+        """What is enqueued next comes after the rows of all, which must be under way."""
+        self._side.finish()
+
+
 class OwnedRows:
     """What one process needs to make the step of its rows, as long as the tensors are the same.
 
     Attributes:
         rows: of each process.
         gaussians, moments, stats: this process's rows, views of the tensors.
-        parameters: gathers the parameters of all.
+        under_way: parameters travel, and `finish` is to come.
     """
 
     def __init__(
@@ -93,14 +158,52 @@ class OwnedRows:
         states = vars(moments).items()
         self.moments = replace(moments, **{name: value[own] if value.dim() else value for name, value in states})
         self.stats = None if stats is None else stats.map(lambda value: value[own])
-        self.parameters = RowGather(ranks, [value for _, value in gaussians.items()], self.rows)
         self._ranks, self._all_stats = ranks, stats
+        self._packing = Packing([value for _, value in gaussians.items()], self.rows)
+        self._messages: RowGather | None = None
+        self._in_place: RowsInPlace | None = None
+        self._latest: RowGather | RowsInPlace | None = None
         self._statistics: RowGather | None = None
+        self.under_way = False
+
+    @property
+    def way(self) -> str:
+        """How parameters went last."""
+        return "in place" if isinstance(self._latest, RowsInPlace) else "messages"
+
+    def begin(self, memory: InPlace | None) -> None:
+        """Let the parameters of this process's rows travel to all, beside other work. Every process must call this.
+
+        Args:
+            memory: to read them in place, if it has room for them; None: by messages.
+        """
+        self._latest = self._gather_by(memory)
+        self._latest.begin()
+        self.under_way = True
+
+    def finish(self) -> None:
+        """What is enqueued next comes after the parameters of all, which must be under way."""
+        self._latest.finish()
+        self.under_way = False
+
+    def _gather_by(self, memory: InPlace | None) -> RowGather | RowsInPlace:
+        """Made when first asked for: either takes memory."""
+        if memory is not None:
+            if self._in_place is None:
+                found = memory.rows(self._packing.size, self.gaussians.device)
+                if found is not None:
+                    self._in_place = RowsInPlace(self._ranks, self._packing, *found)
+            if self._in_place is not None:
+                return self._in_place
+        if self._messages is None:
+            self._messages = RowGather(self._ranks, self._packing)
+        return self._messages
 
     def gather_statistics(self) -> None:
         """What is enqueued next comes after the statistics of all rows: 32 bytes a Gaussian, and no host waits."""
         if self._statistics is None:
-            self._statistics = RowGather(self._ranks, list(vars(self._all_stats).values()), self.rows)
+            packing = Packing(list(vars(self._all_stats).values()), self.rows)
+            self._statistics = RowGather(self._ranks, packing)
         self._statistics.begin()
         self._statistics.finish()
 
