@@ -173,8 +173,11 @@ def where(record: dict[str, Any]) -> str:
 
 
 def ranks() -> str:
-    """Milliseconds of an iteration on one GPU and on two, beside the predictions."""
-    return f"{where(measured('ranks.json'))}.\n\n{scaling_results.iterations(H200)}"
+    """Milliseconds of an iteration on one GPU and on two, beside the predictions: on two hosts."""
+    places = ("", "other-host/")
+    return "\n\n".join(
+        f"{where(measured(f'{place}ranks.json'))}.\n\n{scaling_results.iterations(H200 / place)}" for place in places
+    )
 
 
 def steps() -> str:
