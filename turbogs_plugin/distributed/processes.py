@@ -2,13 +2,16 @@
 
 torchrun, or `start` here by the same means, starts a process for each GPU and watches them: when one ends with an
 error, it ends the others, and starts all again if asked to (`--max-restarts`). A process that waits for a lost one
-inside a collective cannot be told so by Python; `_Watch` ends it.
+inside a collective cannot be told so by Python; `_Watch` ends it. Where the launcher itself is lost, the kernel ends
+all (`end_with_parent`).
 """
 
 from __future__ import annotations
 
+import ctypes
 import logging
 import os
+import re
 import signal
 import socket
 import sys
@@ -35,6 +38,12 @@ MEETING = timedelta(minutes=5)
 
 GRACE_SECONDS = 15.0
 """A process that was asked to end and makes no iteration for so long is ended: another one is lost."""
+
+RUN_ID = "TORCHELASTIC_RUN_ID"
+"""The variable that a launcher gives each of its processes, and none has without one, as under Slurm."""
+
+PR_SET_PDEATHSIG = 1
+"""Of Linux' prctl."""
 
 
 def launched() -> bool:
@@ -77,7 +86,7 @@ def start(count: int, arguments: Sequence[str], device: str = "auto", module: st
         min_nodes=1,
         max_nodes=1,
         nproc_per_node=count,
-        run_id=uuid.uuid4().hex,
+        run_id=f"turbogs-{os.getpid()}-{uuid.uuid4().hex}",  # see `_end_with_launcher`
         rdzv_backend="c10d",
         rdzv_endpoint="localhost:0",
         max_restarts=0,
@@ -117,6 +126,7 @@ def joined(device: str) -> Iterator[Ranks]:
     Raises:
         InputError: there are fewer GPUs than processes on this machine, or the processes do not find each other.
     """
+    _end_with_launcher()
     if not launched():
         yield ONE
         return
@@ -161,6 +171,38 @@ def joined(device: str) -> Iterator[Ranks]:
     except Exception:  # a fault of the program
         traceback.print_exc()
         os._exit(1)
+
+
+def end_with_parent(alive: Callable[[], bool]) -> None:
+    """From now on this process is killed when its parent is gone, however that went. Linux only.
+
+    The kernel does it, so it works where the main thread waits for a GPU or for another process, and holds Python's
+    lock. The signal is SIGKILL. SIGTERM would mean to save first: that waits for processes which may be gone, holds the
+    GPU meanwhile, and writes into a folder that its user may have started on anew. Nothing is lost but the iterations
+    since the last checkpoint: files are written beside their place and renamed.
+
+    To be called in a thread that stays, as the kernel keeps the wish with the thread. It also takes the end of the
+    *thread* that started this process for the parent's; torchrun, `start` and a study wait there for their processes.
+
+    Args:
+        alive: whether the parent was still there after the wish. It may have gone before.
+    """
+    if sys.platform != "linux":
+        return
+    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, *(ctypes.c_ulong(value) for value in (signal.SIGKILL, 0, 0, 0)))
+    if not alive():
+        os.kill(os.getpid(), signal.SIGKILL)
+
+
+def _end_with_launcher() -> None:
+    """Under torchrun or `start`. Without one nothing is done: the parent, a shell say, may go before its time.
+
+    The run's id of `start` tells who its launcher is, should it have gone in the seconds before this call. Where
+    torchrun has, its processes wait for `MEETING` without a GPU, as it kept the store, and end with a line.
+    """
+    if RUN_ID in os.environ:
+        own = re.match(r"turbogs-(\d+)-", os.environ[RUN_ID])
+        end_with_parent(lambda: own is None or os.getppid() == int(own[1]))
 
 
 def _see_own_gpu() -> None:

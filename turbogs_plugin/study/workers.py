@@ -14,6 +14,7 @@ from multiprocessing.process import BaseProcess
 import torch
 
 from turbogs_plugin.device import processor_cores
+from turbogs_plugin.distributed.processes import end_with_parent
 from turbogs_plugin.errors import InputError, TrainingStopped, exit_code
 from turbogs_plugin.study.sweep import SweepOptions, run_sweep
 
@@ -81,7 +82,8 @@ def _wait_for(workers: Sequence[BaseProcess]) -> None:
 
 
 def _work(gpus: Sequence[int], place: int, sweep: tuple) -> None:
-    """In a process of its own, before CUDA starts."""
+    """In a process of its own, before CUDA starts. It ends with the one that started it."""
+    end_with_parent(multiprocessing.parent_process().is_alive)
     gpu = gpus[place]
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     visible = [name for name in os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",") if name]

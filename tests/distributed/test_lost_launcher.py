@@ -1,0 +1,145 @@
+"""A launcher that is killed outright, as by the kernel when memory is short: nothing that it started goes on."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from multiprocessing.connection import Connection
+from pathlib import Path
+
+import pytest
+from helpers.framework_runs import TINY
+from helpers.processes import PRELOADED
+
+from turbogs_plugin.distributed.processes import RUN_ID, joined
+from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="by a call of Linux")
+
+ENDLESS = ("train.iterations=1000000", "train.refine_until=9", "train.checkpoint_every=3", "train.evaluate_at=[]")
+SECONDS = 60.0
+"""Far more than anything here takes."""
+ABLATION = """
+title: Endless
+base: turbogs
+baseline: full
+variants:
+  full: []
+"""
+
+
+def state(process: int) -> tuple[str, int]:
+    """(letter, parent) of a process; X where there is none. One that ended and was not yet waited for is a Z."""
+    try:
+        words = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
+    except (FileNotFoundError, ProcessLookupError):
+        return "X", 0
+    return words[0], int(words[1])
+
+
+def running(processes: list[int]) -> list[int]:
+    return [process for process in processes if state(process)[0] not in "XZ"]
+
+
+def started_by(process: int) -> list[int]:
+    return sorted(int(path.name) for path in Path("/proc").glob("[0-9]*") if state(int(path.name))[1] == process)
+
+
+def comes_true(condition: Callable[[], bool]) -> bool:
+    give_up = time.monotonic() + SECONDS
+    while not condition() and time.monotonic() < give_up:
+        time.sleep(0.02)
+    return condition()
+
+
+def left_after_its_kill(words: list[str], folder: Path, working: Callable[[], bool]) -> list[int]:
+    """Start a command, and kill it alone as soon as its processes are `working`: which of them stay.
+
+    One of them hangs then, as in a call of a GPU, and hears nothing but SIGKILL; in a training the other waits for it.
+    """
+    with (folder / "told").open("w") as told:
+        command = [sys.executable, "-m", "turbogs_plugin", *words]
+        launcher = subprocess.Popen(command, stdout=told, stderr=told, start_new_session=True)
+    processes: list[int] = []
+    try:
+        assert comes_true(lambda: working() or launcher.poll() is not None), "it does not begin"
+        processes = started_by(launcher.pid)
+        assert launcher.poll() is None and len(processes) >= 2, (folder / "told").read_text()
+        os.kill(processes[-1], signal.SIGSTOP)
+        launcher.kill()
+        launcher.wait()
+        comes_true(lambda: not running(processes))
+        return running(processes)
+    finally:
+        launcher.kill()
+        launcher.wait()
+        for process in running(processes):
+            os.kill(process, signal.SIGKILL)
+
+
+def test_processes_of_a_training_end_with_their_launcher(capture, tmp_path):
+    checkpoints = tmp_path / "run/checkpoints"
+    words = ["train", str(capture), "--out", str(tmp_path / "run"), "--gpus", "2", "--device", "cpu", "--no-report"]
+    words += [*TINY, *ENDLESS]
+    assert not left_after_its_kill(words, tmp_path, (checkpoints / "latest").is_file)
+    newest = latest_checkpoint(checkpoints)
+    iteration = load_checkpoint(newest)["trainer"]["iteration"]
+    assert iteration >= 3 and newest.name == f"iteration-{iteration:06d}.pt"
+
+
+def test_processes_of_a_study_end_with_their_launcher(capture, tmp_path):
+    (tmp_path / "endless.yaml").write_text(ABLATION)
+    words = ["ablate", str(tmp_path / "endless.yaml"), "--scene", str(capture), "--out", str(tmp_path / "study")]
+    words += ["--seeds", "0", "1", "--gpus", "0,1", "--device", "cpu", "--steps", "1000000"]
+    claims = tmp_path / "study/claims"
+    assert not left_after_its_kill(words, tmp_path, lambda: sum(path.is_file() for path in claims.rglob("*")) == 2)
+
+
+def joining(launcher: str, tells: Connection) -> None:
+    """Start a process that joins a training, and wait to be killed."""
+    here = os.getpid()
+    if os.fork() == 0:
+        if launcher:
+            os.environ[RUN_ID] = launcher.format(here)
+        with joined("cpu"):
+            tells.send("joined")
+            while os.getppid() == here:
+                time.sleep(0.01)
+            time.sleep(0.1)  # whoever is to be killed is
+            tells.send("goes on")
+        os._exit(0)
+    signal.pause()
+
+
+@pytest.mark.parametrize(
+    ("launcher", "told"),
+    [("", ["joined", "goes on"]), ("a-job", ["joined"]), ("turbogs-{}-0", ["joined"]), ("turbogs-1-0", [])],
+    ids=["none", "torchrun", "ours", "gone before"],
+)
+def test_only_a_launcher_takes_its_processes_along(launcher, told, tmp_path):
+    """Without one, as under Slurm, the parent may go. `start` says who it is, should it go before they join."""
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(PRELOADED)
+    reads, tells = context.Pipe(duplex=False)
+    parent = context.Process(target=joining, args=(launcher, tells))
+    parent.start()
+    tells.close()
+    heard = []
+    try:
+        if not told:
+            assert comes_true(lambda: any(state(child)[0] == "Z" for child in started_by(parent.pid)))
+            parent.kill()
+        while reads.poll(SECONDS):
+            heard.append(reads.recv())
+            parent.kill()
+    except EOFError:  # no process is left that could tell
+        pass
+    finally:
+        parent.kill()
+        parent.join()
+    assert heard == told
