@@ -18,8 +18,8 @@ from typing import BinaryIO
 
 import pytest
 import torch
-from helpers.framework_runs import TINY, assert_identical, tiny_config
-from helpers.processes import PRELOADED, ended, said, start_ranks
+from helpers.framework_runs import ENDLESS, TINY, assert_identical, tiny_config
+from helpers.processes import PRELOADED, comes_true, ended, said, start_ranks
 from torch.distributed.launcher.api import LaunchConfig, elastic_launch
 
 from turbogs_plugin import cli, files
@@ -39,7 +39,6 @@ from turbogs_plugin.train.wall import WallRecord
 EXCHANGES = ("agree", "gather_numbers", "broadcast", "gather", "begin_gather", "_wait", "send_and_receive")
 MOMENTS = 60
 """A tiny run has more exchanges: four of its maps, four and more of each of its 14 iterations."""
-ENDLESS = ("train.iterations=100000", "train.refine_until=9", "train.checkpoint_every=3", "train.evaluate_at=[]")
 SECONDS = 30.0
 """All processes of a training have ended so long after one of them was lost."""
 
@@ -255,9 +254,7 @@ def test_a_process_that_waits_for_one_that_hangs_ends_when_it_is_asked_to(captur
     """As on GPUs, where nothing tells a waiting process that another one is gone: the launcher asks it to end."""
     processes = start_ranks(2, training, tmp_path, capture, tmp_path / "run", "short grace", ENDLESS)
     newest = tmp_path / "run/checkpoints/iteration-000006.pt"
-    give_up = time.monotonic() + 120
-    while not newest.exists() and time.monotonic() < give_up:
-        time.sleep(0.01)
+    comes_true(newest.exists, 120.0)
     os.kill(processes[1].pid, signal.SIGSTOP)
     time.sleep(0.5)
     processes[0].terminate()

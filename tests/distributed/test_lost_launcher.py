@@ -13,15 +13,14 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 
 import pytest
-from helpers.framework_runs import TINY
-from helpers.processes import PRELOADED
+from helpers.framework_runs import ENDLESS, TINY
+from helpers.processes import PRELOADED, comes_true
 
 from turbogs_plugin.distributed.processes import RUN_ID, joined
 from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="by a call of Linux")
 
-ENDLESS = ("train.iterations=1000000", "train.refine_until=9", "train.checkpoint_every=3", "train.evaluate_at=[]")
 SECONDS = 60.0
 """Far more than anything here takes."""
 ABLATION = """
@@ -50,13 +49,6 @@ def started_by(process: int) -> list[int]:
     return sorted(int(path.name) for path in Path("/proc").glob("[0-9]*") if state(int(path.name))[1] == process)
 
 
-def comes_true(condition: Callable[[], bool]) -> bool:
-    give_up = time.monotonic() + SECONDS
-    while not condition() and time.monotonic() < give_up:
-        time.sleep(0.02)
-    return condition()
-
-
 def left_after_its_kill(words: list[str], folder: Path, working: Callable[[], bool]) -> list[int]:
     """Start a command, and kill it alone as soon as its processes are `working`: which of them stay.
 
@@ -67,13 +59,13 @@ def left_after_its_kill(words: list[str], folder: Path, working: Callable[[], bo
         launcher = subprocess.Popen(command, stdout=told, stderr=told, start_new_session=True)
     processes: list[int] = []
     try:
-        assert comes_true(lambda: working() or launcher.poll() is not None), "it does not begin"
+        assert comes_true(lambda: working() or launcher.poll() is not None, SECONDS), "it does not begin"
         processes = started_by(launcher.pid)
         assert launcher.poll() is None and len(processes) >= 2, (folder / "told").read_text()
         os.kill(processes[-1], signal.SIGSTOP)
         launcher.kill()
         launcher.wait()
-        comes_true(lambda: not running(processes))
+        comes_true(lambda: not running(processes), SECONDS)
         return running(processes)
     finally:
         launcher.kill()
@@ -132,7 +124,7 @@ def test_only_a_launcher_takes_its_processes_along(launcher, told, tmp_path):
     heard = []
     try:
         if not told:
-            assert comes_true(lambda: any(state(child)[0] == "Z" for child in started_by(parent.pid)))
+            assert comes_true(lambda: any(state(child)[0] == "Z" for child in started_by(parent.pid)), SECONDS)
             parent.kill()
         while reads.poll(SECONDS):
             heard.append(reads.recv())

@@ -33,6 +33,9 @@ TINY = (
     "density.opacity_decay=0.2",
 )
 
+ENDLESS = ("train.iterations=100000", "train.refine_until=9", "train.checkpoint_every=3", "train.evaluate_at=[]")
+"""After `TINY`: a run that no test waits for."""
+
 
 def tiny_settings(*overrides: str) -> list[str]:
     """`TINY` without the settings of sections whose type an override changes: these start afresh."""

@@ -65,7 +65,7 @@ class Kept:
 
         def kept_finish(owned: OwnedRows) -> None:
             finish(owned)
-            self.arrived_in_place += owned.way == "in place"
+            self.arrived_in_place += owned._latest is owned._in_place
             model = [value.clone() for value in owned._tensors[: len(PARAMETER_NAMES)]]
             self.parameters.append((owned.rows, self._own, Gaussians(*model)))
 

@@ -68,6 +68,14 @@ def ended(processes: list[Any], seconds: float = 120.0) -> list[int]:
     return [process.exitcode for process in processes]
 
 
+def comes_true(condition: Callable[[], bool], seconds: float) -> bool:
+    """Wait for a condition; whether it came true in time."""
+    give_up = time.monotonic() + seconds
+    while not condition() and time.monotonic() < give_up:
+        time.sleep(0.01)
+    return condition()
+
+
 def said(folder: Path) -> str:
     """All that the processes wrote to stderr."""
     return "".join(path.read_text() for path in sorted(folder.glob("err-*")))

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 from helpers.framework_runs import TINY, tiny_capture
-from helpers.processes import PRELOADED
+from helpers.processes import PRELOADED, comes_true
 
 from turbogs_plugin import cli
 from turbogs_plugin.commands import studies
@@ -93,10 +93,7 @@ def test_a_kept_claim_stays_alive(tmp_path, monkeypatch):
     claim = Claims(tmp_path).take(KEY)
     os.utime(claim.path, (0, 0))
     with claim.kept():
-        give_up = time.monotonic() + 30
-        while claim.path.stat().st_mtime == 0 and time.monotonic() < give_up:
-            time.sleep(0.01)
-        assert claim.path.stat().st_mtime > 0
+        assert comes_true(lambda: claim.path.stat().st_mtime > 0, 30.0)
 
 
 ABLATION = """

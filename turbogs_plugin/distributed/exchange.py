@@ -177,7 +177,7 @@ class RankExchange(Exchange):
 
     @property
     def way(self) -> str:
-        """How colours and records went in the latest pass; `OwnedRows.way` says it of parameters."""
+        """How colours and records went in the latest pass."""
         return "in place" if self._lent else "messages"
 
     def _prepared(self, engine: Engine, shares: Sequence[Share], gaussians: Gaussians) -> InPlace | None:

@@ -166,11 +166,6 @@ class OwnedRows:
         self._statistics: RowGather | None = None
         self.under_way = False
 
-    @property
-    def way(self) -> str:
-        """How parameters went last."""
-        return "in place" if isinstance(self._latest, RowsInPlace) else "messages"
-
     def begin(self, memory: InPlace | None) -> None:
         """Let the parameters of this process's rows travel to all, beside other work. Every process must call this.
 
@@ -202,8 +197,7 @@ class OwnedRows:
     def gather_statistics(self) -> None:
         """What is enqueued next comes after the statistics of all rows: 32 bytes a Gaussian, and no host waits."""
         if self._statistics is None:
-            packing = Packing(list(vars(self._all_stats).values()), self.rows)
-            self._statistics = RowGather(self._ranks, packing)
+            self._statistics = RowGather(self._ranks, Packing(list(vars(self._all_stats).values()), self.rows))
         self._statistics.begin()
         self._statistics.finish()
 
