@@ -118,11 +118,18 @@ def test_two_workers_train_each_cell_once(tmp_path, monkeypatch, capfd):
     capture, server = tiny_capture(tmp_path), multiprocessing.get_context("forkserver")
     server.set_forkserver_preload(PRELOADED)
     monkeypatch.setattr(multiprocessing, "get_context", {"spawn": server}.__getitem__)
-    monkeypatch.setattr(sys, "argv", ["turbogs", *call(tmp_path, capture, "--gpus", "0,1")])
-    with pytest.raises(SystemExit) as end:
-        cli.main()
-    told = capfd.readouterr().err
-    assert not end.value.code, told
+    arguments = ["turbogs", *call(tmp_path, capture, "--gpus", "0,1")]
+
+    def told_by(code: int, *more: str) -> tuple[str, str]:
+        monkeypatch.setattr(sys, "argv", [*arguments, *more])
+        with pytest.raises(SystemExit) as end:
+            cli.main()
+        told = capfd.readouterr()
+        assert (end.value.code or 0) == code, told.err
+        return told.out, told.err
+
+    assert "with 4 cells left" in told_by(3, "--within", "0.001s")[0]
+    told = told_by(0)[1]
     study = StudyFolder(tmp_path / "study").read_study()
     assert len(study.results) == 4 and not study.failures
     trained = [line for line in told.splitlines() if " dB in " in line]

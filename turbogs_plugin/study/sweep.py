@@ -173,6 +173,14 @@ def run_sweep(
     return len(left)
 
 
+def cells_left(options: SweepOptions, variants: Sequence[str], folder: StudyFolder) -> int:
+    """How many of the cells asked for have neither a result nor a failure."""
+    study = folder.read_study()
+    there = {each.key for each in (*study.results, *study.failures)}
+    names = [path.resolve().name for path in options.scenes]
+    return sum(CellKey(*key) not in there for key in itertools.product(names, variants, options.seeds))
+
+
 def _scene_configs(
     ablation: Ablation, variants: Sequence[str], options: SweepOptions, scene: Path, device: torch.device
 ) -> dict[CellKey, Config]:

@@ -16,7 +16,7 @@ import torch
 from turbogs_plugin.device import processor_cores
 from turbogs_plugin.distributed.processes import end_with_parent
 from turbogs_plugin.errors import InputError, TrainingStopped, exit_code
-from turbogs_plugin.study.sweep import SweepOptions, run_sweep
+from turbogs_plugin.study.sweep import SweepOptions, cells_left, run_sweep
 
 UNFINISHED = 3
 """Exit code of a sweep that `--within` ended, so that a script can call again; and of its workers."""
@@ -38,7 +38,7 @@ def run_on_gpus(options: SweepOptions, sweep: tuple) -> int:
         sweep: arguments of `run_sweep`, with these options.
 
     Returns:
-        1 if `options.within` left cells for another call; else 0.
+        How many cells are left, for another call, because `options.within` was over.
 
     Raises:
         InputError: a GPU is not there, or what `run_sweep` raises.
@@ -65,7 +65,10 @@ def run_on_gpus(options: SweepOptions, sweep: tuple) -> int:
         raise SystemExit(2)
     if not {0, UNFINISHED} & set(codes):
         raise TrainingStopped("no process of this study lived to its end: the same command goes on")
-    return int(0 not in codes)
+    if 0 in codes:
+        return 0
+    _, variants, _, _, folder, *_ = sweep
+    return cells_left(options, variants, folder)
 
 
 def _wait_for(workers: Sequence[BaseProcess]) -> None:
