@@ -26,7 +26,7 @@ from torch import Tensor
 from turbogs_plugin.report.pictures import GAP
 from turbogs_plugin.report.provenance import provenance
 from turbogs_plugin.scene import Scene
-from turbogs_plugin.train.evaluate import render_view
+from turbogs_plugin.train.evaluate import Look, render_view
 from turbogs_plugin.train.history import read_history
 from turbogs_plugin.train.loop import Listener, TrainingLoop
 from turbogs_plugin.train.run import new_loop
@@ -76,7 +76,8 @@ class Renders:
     def image(self, view_id: int) -> Tensor:
         """[H, W, 3] float32, 0 .. 1."""
         trainer = self.trainer
-        return render_view(trainer.gaussians, trainer.views, view_id, trainer.sh_degree, trainer.config.raster)
+        look = Look(trainer.sh_degree, trainer.config.raster)
+        return render_view(trainer.gaussians, trainer.views, view_id, look)
 
 
 def main() -> None:

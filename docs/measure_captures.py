@@ -212,8 +212,7 @@ class Measurement:
         loop.run()
         trainer = loop.trainer
         trainer.require_finite()
-        options = {"background": trainer.background.evaluated, "aligned": True}
-        mean = evaluate(trainer.gaussians, test, trainer.sh_degree, config.raster, **options).mean
+        mean = evaluate(trainer.gaussians, test, trainer.look(test.names), aligned=True).mean
         run = {"seconds": loop.clock.seconds, "iterations": trainer.iteration, "gaussians": len(trainer.gaussians)}
         return run | {name: getattr(mean, name) for name in RAW_AND_ALIGNED}, trainer
 

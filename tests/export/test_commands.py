@@ -14,7 +14,7 @@ from turbogs_plugin.export.contribution import contributions, pruned
 from turbogs_plugin.export.fidelity import Fidelity
 from turbogs_plugin.model.formats import FORMATS
 from turbogs_plugin.model.ply import load_ply
-from turbogs_plugin.train.evaluate import psnr, render_view
+from turbogs_plugin.train.evaluate import Look, psnr, render_view
 
 
 def refused(result: tuple[int, str, str], *words: object) -> None:
@@ -55,8 +55,9 @@ def test_the_view_that_lost_most_is_named(model, scene):
     fidelity = Fidelity(model.gaussians, views, model.sh_degree, raster)
     kept = model.gaussians.map(lambda value: value[::2])
     change = fidelity.change(kept)
+    look = Look(model.sh_degree, raster)
     before, after = (
-        [psnr(render_view(part, views, view, model.sh_degree, raster), views.photos.image(view)) for view in range(7)]
+        [psnr(render_view(part, views, view, look), views.photos.image(view)) for view in range(7)]
         for part in (model.gaussians, kept)
     )
     losses = np.array(before) - np.array(after)

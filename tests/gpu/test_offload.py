@@ -136,7 +136,8 @@ def test_a_capture_larger_than_the_limit_trains_within_it():
         trainer.initialise_maps()
         first = trainer.maps.mean()
         run(trainer, 30)
-        metrics = evaluate(trainer.gaussians, place_views(scene.test, GPU, "host"), trainer.sh_degree, config.raster)
+        test = place_views(scene.test, GPU, "host")
+        metrics = evaluate(trainer.gaussians, test, trainer.look(test.names))
         assert torch.cuda.max_memory_reserved() <= limit
         assert len(trainer.gaussians) <= config.density["max_gaussians"]
         trainer.maps._means.restart()

@@ -11,6 +11,7 @@ from turbogs_plugin.plan.exposures import compare_exposures, fit_gains
 from turbogs_plugin.plan.sight import Sight
 from turbogs_plugin.scene import Frame, PosedImages, Scene
 from turbogs_plugin.scene.photos import Photos
+from turbogs_plugin.train.initial_state import first_exposures
 from turbogs_plugin.types import Cameras
 
 VIEWS = 14
@@ -67,17 +68,16 @@ def test_gains_are_recovered_to_a_few_percent(turned, hidden):
 
 def test_equal_photos_have_no_spread():
     found = measured(corner(np.ones((VIEWS, 3))), points())
-    assert found.spread < 0.01 and found.jumps < 0.01
+    assert found.spread < 0.01 and found.rest < 0.01
 
 
-def test_a_drift_is_no_jump_and_lines_of_photos_are():
-    """Both with the same spread; the nearest camera always has nearly the same exposure in the first."""
+def test_a_drift_is_told_by_the_photos_before_and_after_and_turns_are_not():
     drift = 2.0 ** np.linspace(-0.4, 0.4, VIEWS)
-    lines = 2.0 ** np.where(np.arange(VIEWS) % 2, 0.25, -0.25)  # one line above the other
-    smooth, rough = (measured(corner(np.tile(gains[:, None], 3)), points()) for gains in (drift, lines))
+    turns = 2.0 ** np.where(np.arange(VIEWS) % 2, 0.25, -0.25)
+    smooth, rough = (measured(corner(np.tile(gains[:, None], 3)), points()) for gains in (drift, turns))
     assert smooth.spread == pytest.approx(np.log2(drift).std(), rel=0.05)
     assert rough.spread == pytest.approx(0.25, rel=0.05)
-    assert smooth.jumps < 0.7 * smooth.spread and rough.jumps > 0.9 * rough.spread
+    assert smooth.rest < 0.2 * smooth.spread and rough.rest > 1.9 * rough.spread
 
 
 def test_photos_of_something_else_are_not_compared():
@@ -100,8 +100,20 @@ def test_the_fact_is_of_the_training_photos():
     assert gather_facts(scene, torch.device("cpu")).exposure_views is None
     facts = gather_facts(scene, torch.device("cpu"), with_exposures=True)
     found = measured(views, points())
-    assert (facts.exposure_spread, facts.exposure_jumps) == (found.spread, found.jumps)
-    assert facts.exposure_views == VIEWS and found.jumps > 0.1
+    assert (facts.exposure_spread, facts.exposure_rest) == (found.spread, found.rest)
+    assert facts.exposure_views == VIEWS and found.rest > 0.1
+
+
+def test_training_starts_from_the_gains():
+    """Known to a few percent before the first iteration, with the identity as their mean."""
+    views = corner(RANDOM)
+    scene = Scene("c", views, views, points(), torch.zeros(1500, 3, dtype=torch.uint8), Frame(np.zeros(3), 1.0), 1.0)
+    offsets = first_exposures(scene, False, torch.device("cpu")).offsets
+    wanted = torch.from_numpy(RANDOM / RANDOM.mean(axis=0) - 1.0).float()
+    torch.testing.assert_close(offsets.diagonal(dim1=1, dim2=2), wanted, rtol=0, atol=0.06)
+    assert offsets.mean(dim=0).abs().max() < 1e-6
+    assert (offsets - torch.diag_embed(offsets.diagonal(dim1=1, dim2=2)) @ torch.eye(3, 4) == 0).all()
+    assert not first_exposures(scene, True, torch.device("cpu")).offsets.any()
 
 
 def test_the_fit_passes_over_pairs_that_are_wrong():

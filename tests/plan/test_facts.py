@@ -85,7 +85,7 @@ def test_concentration_of_view_directions(tilt):
 def test_points_that_no_camera_sees_decide_nothing():
     behind = np.array([[0.0, 0.0, -2.0], [50.0, 0.0, 1.0]])
     facts = gather_facts(scene_of(posed([noise()] * 4, nadir(LINE)), behind), CPU, with_exposures=True)
-    assert facts.exposure_views == 0 and facts.exposure_spread == facts.exposure_jumps == 0.0
+    assert facts.exposure_views == 0 and facts.exposure_spread == facts.exposure_rest == 0.0
     assert facts.baseline == pytest.approx(0.1)  # of the extent instead
 
 

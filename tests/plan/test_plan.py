@@ -35,7 +35,7 @@ FACTS = SceneFacts(
     extent=3.0,
     baseline=0.1,
     exposure_spread=0.05,
-    exposure_jumps=0.05,
+    exposure_rest=0.05,
     exposure_views=100,
     direction_concentration=0.5,
     photo_bytes=100 * MIB,
@@ -54,7 +54,7 @@ def facts(**changes) -> SceneFacts:
 
 def test_exposures_that_could_not_be_compared_have_no_numbers():
     compared, none = (plan_from_facts(facts(exposure_views=views), load_config("turbogs")) for views in (9, 0))
-    assert "exposures of 9 photos 0.05 stops apart and 0.05 from their neighbours'; " in compared.facts_text()
+    assert "exposures of 9 photos 0.05 stops apart and 0.05 from those before and after; " in compared.facts_text()
     assert ", exposures could not be compared; 100 MiB of photos" in none.facts_text()
     assert "exposures" not in plan_from_facts(facts(exposure_views=None), load_config("turbogs")).facts_text()
 
@@ -79,22 +79,23 @@ BOTH_SIDES = [
     ("train.backdrop", {"direction_concentration": 0.95}, ("density.max_gaussians=3001",), True, "0.950 >= 0.95"),
     ("train.background", {"transparent": False}, (), "black", "opaque"),
     ("train.background", {"transparent": True}, (), "random", "transparent"),
-    ("train.exposure", {"exposure_jumps": 0.1}, (), True, "0.10 stops from their neighbours >= 0.1"),
     (
         "train.exposure",
-        {"exposure_jumps": 0.05, "exposure_spread": 1.0},
+        {"exposure_spread": 0.1, "exposure_rest": 0.05},
         (),
-        False,
-        "0.05 stops from their neighbours < 0.1",
+        True,
+        "photos 0.10 stops apart >= 0.05, and 0.05 from those before and after <= 0.5 of that",
     ),
+    ("train.exposure", {"exposure_spread": 0.1, "exposure_rest": 0.06}, (), False, "before and after > 0.5 of that"),
+    ("train.exposure", {"exposure_spread": 0.04, "exposure_rest": 0.0}, (), False, "0.04 stops apart < 0.05"),
     (
         "train.exposure",
-        {"exposure_jumps": 1.0, "exposure_views": 9},
+        {"exposure_spread": 1.0, "exposure_views": 9},
         (),
         False,
         "only 9 of 100 photos could be compared",
     ),
-    ("train.exposure", {"exposure_jumps": 1.0, "transparent": True}, (), False, "transparent"),
+    ("train.exposure", {"exposure_spread": 1.0, "transparent": True}, (), False, "transparent"),
     ("train.batch_for", {}, (), 1, "one process"),
     ("train.batch_for", {"processes": 2}, (), 2, "2 processes"),
     ("train.batch_for", {"processes": 4, "train_views": 39}, (), 3, "but 4 times 10 views > 39 training views"),
@@ -149,7 +150,7 @@ SET = [
     ("train.background", "white", {}, lambda config: config.train.background == "white"),
     ("train.background", "black", {"transparent": True}, lambda config: config.train.background == "black"),
     ("train.exposure", "true", {}, lambda config: config.train.exposure is True),
-    ("train.exposure", "false", {"exposure_jumps": 1.0}, lambda config: config.train.exposure is False),
+    ("train.exposure", "false", {"exposure_spread": 1.0}, lambda config: config.train.exposure is False),
     ("train.batch_for", "2", {"processes": 2}, lambda config: config.schedule["pixel_budget"] == 1.0),
     ("train.iterations", "700", {"train_views": 250}, lambda config: config.train.refine_until == 3500),
     ("train.maps_place", "host", {}, lambda config: config.train.maps_place == "host"),

@@ -12,7 +12,7 @@ from PIL import Image
 from turbogs_plugin.config.configuration import load_config
 from turbogs_plugin.scene import Scene, load_scene, write_demo_capture
 from turbogs_plugin.scene.demo import FOCAL
-from turbogs_plugin.train.evaluate import evaluate
+from turbogs_plugin.train.evaluate import Look, evaluate
 from turbogs_plugin.train.trainer import Trainer
 
 CPU = torch.device("cpu")
@@ -131,7 +131,7 @@ def test_a_distorted_capture_trains_to_the_error_of_the_undistorted(source, tmp_
     assert not any("undistorted" in note for note in straight.notes)
     # All against the photos that no lens has bent.
     untrained, expected, reached = (
-        evaluate(trainer.gaussians, straight.test, 0, trainer.config.raster).mean.psnr
+        evaluate(trainer.gaussians, straight.test, Look(0, trainer.config.raster)).mean.psnr
         for trainer in (trainer_of(straight), train(straight), train(bent))
     )
     assert expected > untrained + 2.0

@@ -11,7 +11,7 @@ from turbogs_plugin.config.configuration import load_config
 from turbogs_plugin.plan import make_plan
 from turbogs_plugin.scene import Scene
 from turbogs_plugin.scene.offload import place_views
-from turbogs_plugin.train.evaluate import evaluate
+from turbogs_plugin.train.evaluate import Look, evaluate
 from turbogs_plugin.train.trainer import Trainer
 
 CPU = torch.device("cpu")
@@ -46,11 +46,11 @@ def test_it_trains_from_host_memory(scene):
     trainer.initialise_maps()
     first = trainer.maps.mean()
     test = place_views(scene.test, CPU, config.train.photos_place)
-    before = evaluate(trainer.gaussians, test, 0, config.raster).mean.psnr
+    before = evaluate(trainer.gaussians, test, Look(0, config.raster)).mean.psnr
     for _ in range(12):
         trainer.step()
     assert trainer.maps.mean() < first
-    assert evaluate(trainer.gaussians, test, 0, config.raster).mean.psnr > before
+    assert evaluate(trainer.gaussians, test, Look(0, config.raster)).mean.psnr > before
     assert trainer.maps.window_bytes == 4 * (4 * 48 * 32 + 1)
     assert trainer.views.photos.window_bytes == 3 * (4 * 48 * 32 + 1)
     assert np.array_equal(trainer.maps.offsets, trainer.views.photos.offsets)

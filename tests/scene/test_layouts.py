@@ -18,7 +18,7 @@ from turbogs_plugin.config.configuration import load_config
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.plan import make_plan
 from turbogs_plugin.scene import Scene, load_scene
-from turbogs_plugin.train.evaluate import evaluate
+from turbogs_plugin.train.evaluate import Look, evaluate
 from turbogs_plugin.train.trainer import Trainer
 
 POINTS = np.array([[0.3, 0.0, 0.1], [-0.2, 0.25, -0.3], [0.0, -0.4, 0.35]])
@@ -308,4 +308,4 @@ def test_one_camera_a_photo_upright_and_lying(tmp_path, kind):
     for _ in range(6):
         trainer.step()
     assert trainer.maps.mean() < before
-    assert np.isfinite(evaluate(trainer.gaussians, scene.test, 0, config.raster).mean.psnr)
+    assert np.isfinite(evaluate(trainer.gaussians, scene.test, Look(0, config.raster)).mean.psnr)

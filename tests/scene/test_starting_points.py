@@ -20,7 +20,7 @@ from turbogs_plugin.scene.starting_points import (
     shares_with_points,
     starting_points,
 )
-from turbogs_plugin.train.evaluate import evaluate
+from turbogs_plugin.train.evaluate import Look, evaluate
 from turbogs_plugin.train.trainer import Trainer
 from turbogs_plugin.types import Cameras
 
@@ -118,7 +118,7 @@ def test_an_outward_ring_trains(tmp_path: Path):
     trainer = Trainer(config, scene, torch.device("cpu"))
 
     def psnr() -> float:
-        return evaluate(trainer.gaussians, scene.train, 0, config.raster).worst_psnr
+        return evaluate(trainer.gaussians, scene.train, Look(0, config.raster)).worst_psnr
 
     before = psnr()
     assert before > 8  # black: 4.8

@@ -24,7 +24,7 @@ from turbogs_plugin.model.gsplat_file import save_gsplat
 from turbogs_plugin.model.ply import save_ply
 from turbogs_plugin.scene import Frame, Scene, load_scene
 from turbogs_plugin.train import given_model
-from turbogs_plugin.train.trainer import initial_gaussians
+from turbogs_plugin.train.initial_state import initial_gaussians
 from turbogs_plugin.types import Gaussians
 
 MEMORY = 64 * 2**20

@@ -1,6 +1,8 @@
 """Training with an exposure for each photo, and errors after a colour alignment."""
 
 import math
+import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,10 +10,12 @@ import torch
 from helpers.framework_runs import assert_identical, stop_after, tiny_capture, tiny_config
 from PIL import Image
 
-from turbogs_plugin.report.outputs import evaluate_run
+from turbogs_plugin.engine.rendering import render_image
+from turbogs_plugin.report.outputs import evaluate_run, render_run
 from turbogs_plugin.report.pages import write_report
 from turbogs_plugin.scene import load_scene
-from turbogs_plugin.train.evaluate import align_colors, compare, evaluate
+from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint, save_checkpoint
+from turbogs_plugin.train.evaluate import align_colors, compare, evaluate, render_view
 from turbogs_plugin.train.history import read_history
 from turbogs_plugin.train.run import resume, train
 from turbogs_plugin.train.trainer import Trainer
@@ -97,27 +101,61 @@ def test_a_stopped_run_resumes_to_the_same_model(capture, tmp_path, monkeypatch)
     assert_identical(whole.trainer.state_dict(), resumed.trainer.state_dict())
 
 
-def test_raw_and_aligned_errors_stand_side_by_side(capture, tmp_path):
+def test_errors_shown_own_and_aligned_stand_side_by_side(capture, tmp_path):
     outcome = train(tiny_config(capture, "train.exposure=true"), tmp_path / "on")
     last = read_history(outcome.folder.history)[-1]
-    assert last.aligned_psnr > last.psnr and last.aligned_l1 > 0 and 0 < last.aligned_ssim < 1
+    assert last.aligned_psnr > max(last.psnr, last.own_psnr) and last.aligned_l1 > 0 and 0 < last.aligned_ssim < 1
     page = write_report(outcome).read_text()
-    assert "PSNR in dB after colour alignment" in page and "errors are raw" in page
+    assert "PSNR in dB after colour alignment" in page and "PSNR in dB of the model's own colours" in page
     off = train(tiny_config(capture), tmp_path / "off")
     assert math.isnan(read_history(off.folder.history)[-1].aligned_psnr)
-    assert "aligned" not in off.folder.history.read_text() and "alignment" not in write_report(off).read_text()
+    assert not re.search("aligned|own_", off.folder.history.read_text())
+    assert "alignment" not in write_report(off).read_text()
     for folder in ("on", "off"):  # so that both can be compared
         assert "SSIM after colour alignment" in evaluate_run(tmp_path / folder, "cpu")
 
 
-def test_test_views_are_rendered_without_an_exposure(scene):
-    """Raw errors are those of the model's own colours, whatever the training photos' exposures are."""
+def test_a_saved_run_is_shown_as_its_trainer_is(capture, tmp_path):
+    """Test views with the exposures of their neighbours, training views with their own; a file has none."""
+    run, scene = tmp_path / "run", load_scene(capture)
+    outcome = train(tiny_config(capture, "train.exposure=true"), run)
+    trainer = outcome.trainer
+    state = load_checkpoint(latest_checkpoint(outcome.folder.checkpoints))
+    state["trainer"]["exposures"]["offsets"] = torch.linspace(-0.3, 0.2, 7)[:, None, None].expand(7, 3, 4).clone()
+    save_checkpoint(outcome.folder.checkpoints, trainer.iteration, state)
+    trainer.load_state_dict(state["trainer"])
+    look = trainer.look(scene.test.names)
+    metrics = evaluate(trainer.gaussians, scene.test, look).mean
+    table = evaluate_run(run, "cpu")
+    for column, value in (("PSNR in dB", metrics.psnr), ("PSNR in dB of the model's own colours", metrics.own_psnr)):
+        assert metrics.psnr != metrics.own_psnr and mean_of(table, column) == pytest.approx(value, abs=1e-4)
+    of_training = replace(look, exposures=trainer.exposures.offsets)
+    for split, views, shown in (("test", scene.test, look), ("train", scene.train, of_training)):
+        (folder,) = render_run(run, split, "cpu")
+        picture = np.asarray(Image.open(sorted(folder.iterdir())[0]), dtype=np.float32) / 255
+        wanted = render_view(trainer.gaussians, views, 0, shown)
+        assert np.abs(picture - wanted.numpy()).max() <= 1 / 255
+    assert "own colours" not in evaluate_run(run / "model.ply", "cpu", trainer.config)
+
+
+def mean_of(table: str, column: str) -> float:
+    """That of the last line of a Markdown table."""
+    lines = [line.split(" | ") for line in table.splitlines() if line.startswith("| ")]
+    return float(lines[-1][[head.strip("| ") for head in lines[0]].index(column)])
+
+
+def test_test_views_are_shown_with_what_their_neighbours_have(scene):
+    """Nothing but exposures changes: the model's own colours have the errors that they had."""
     trainer = trainer_of(scene, "train.exposure=true")
-    settings = (trainer.gaussians, scene.test, trainer.sh_degree, trainer.config.raster)
-    before = evaluate(*settings, aligned=True).mean
+    views = (trainer.gaussians, scene.test)
+    before = evaluate(*views, trainer.look(scene.test.names)).mean
+    assert before.psnr == before.own_psnr  # every exposure is the identity
     trainer.exposures.offsets += 0.3
-    after = evaluate(*settings, aligned=True).mean
-    assert (before.psnr, before.aligned_psnr) == (after.psnr, after.aligned_psnr)
+    after = evaluate(*views, trainer.look(scene.test.names)).mean
+    assert (after.own_psnr, after.own_ssim, after.own_l1) == (before.psnr, before.ssim, before.l1)
+    own = render_image(trainer.gaussians, scene.test.cameras, 0, sh_degree=0, settings=trainer.config.raster).colors
+    shown = (own + 0.3 * own.sum(dim=2, keepdim=True) + 0.3).clamp(0.0, 1.0)
+    assert after.l1 == pytest.approx(float((shown - scene.test.photos.image(0)).abs().mean()), abs=1e-6)
 
 
 def test_alignment_finds_an_affine_map_of_colours():

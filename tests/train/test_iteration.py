@@ -11,7 +11,7 @@ from torch import Tensor
 
 from turbogs_plugin.engine.rendering import render_image
 from turbogs_plugin.scene import load_scene
-from turbogs_plugin.train.evaluate import evaluate, render_view
+from turbogs_plugin.train.evaluate import Look, evaluate, render_view
 from turbogs_plugin.train.trainer import Trainer
 from turbogs_plugin.types import RowUpdate
 
@@ -117,6 +117,6 @@ def test_an_evaluation_measures_what_a_screen_shows(scene):
     settings = trainer.config.raster
     image = render_image(trainer.gaussians, scene.test.cameras, 0, sh_degree=0, settings=settings)
     assert float(image.colors.max()) > 9
-    assert float(render_view(trainer.gaussians, scene.test, 0, 0, settings).max()) == 1.0
-    metrics = evaluate(trainer.gaussians, scene.test, 0, settings)
+    assert float(render_view(trainer.gaussians, scene.test, 0, Look(0, settings)).max()) == 1.0
+    metrics = evaluate(trainer.gaussians, scene.test, Look(0, settings))
     assert metrics.mean.l1 <= 1.0 and metrics.mean.psnr >= 0.0

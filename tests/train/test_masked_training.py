@@ -22,7 +22,7 @@ from turbogs_plugin.scene import load_scene
 from turbogs_plugin.scene.photos import Photos
 from turbogs_plugin.tiles import compact, pixel_table
 from turbogs_plugin.train.background import Background
-from turbogs_plugin.train.evaluate import compare, evaluate, render_view
+from turbogs_plugin.train.evaluate import Look, compare, evaluate, render_view
 from turbogs_plugin.train.run import resume, train
 from turbogs_plugin.train.ssim import ssim
 from turbogs_plugin.train.trainer import Trainer
@@ -162,8 +162,8 @@ def test_only_live_tiles_are_drawn_from(scene):
 
 def test_errors_are_those_of_unmasked_pixels_and_of_whole_photos(scene):
     trainer = Trainer(tiny_config("capture").without_plan(), scene, CPU)
-    metrics = evaluate(trainer.gaussians, scene.test, 0, trainer.config.raster)
-    image = render_view(trainer.gaussians, scene.test, 0, 0, trainer.config.raster)
+    metrics = evaluate(trainer.gaussians, scene.test, Look(0, trainer.config.raster))
+    image = render_view(trainer.gaussians, scene.test, 0, Look(0, trainer.config.raster))
     photo, mask = scene.test.photos.image(0), torch.from_numpy(disc_mask(0))
     difference = (image - photo).double()
     assert metrics.mean.psnr == pytest.approx(-10 * math.log10(difference[mask].square().mean()), abs=1e-4)
@@ -261,7 +261,7 @@ def test_an_opaque_model_in_front_of_nothing_is_an_error_on_another_background(s
     assert (errors.max() > 0.3) == (setting != "black")
     shown = trainer.background.evaluated
     assert shown == {"random": (1, 1, 1), "white": (1, 1, 1), "black": (0, 0, 0)}.get(setting, (0.2, 0.4, 0.6))
-    metrics = evaluate(trainer.gaussians, given.test, 0, trainer.config.raster, background=shown)
+    metrics = evaluate(trainer.gaussians, given.test, Look(0, trainer.config.raster, shown))
     image = render_image(trainer.gaussians, given.test.cameras, 0, sh_degree=0, background=shown).colors.clamp(0, 1)
     pixels = given.test.photos.colors.view(40, 48, 4).float() / 255
     photo = pixels[..., :3] + (1 - pixels[..., 3:]) * torch.tensor([float(c) for c in shown])

@@ -30,7 +30,7 @@ from turbogs_plugin.scene import load_scene
 from turbogs_plugin.scene.fingerprint import capture_difference, capture_state
 from turbogs_plugin.train import run
 from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint
-from turbogs_plugin.train.evaluate import render_view
+from turbogs_plugin.train.evaluate import Look, render_view
 from turbogs_plugin.train.history import read_history
 from turbogs_plugin.train.saved_model import load_model
 from turbogs_plugin.train.trainer import Trainer
@@ -111,7 +111,7 @@ def test_the_exported_model_is_the_trained_one_in_the_capture_frame(whole, captu
 def test_the_saved_model_renders_what_the_last_evaluation_saw(whole, capture):
     model = load_model(whole.folder.path, torch.device("cpu"))
     test = load_scene(capture).test
-    image = render_view(model.gaussians, test, 0, model.sh_degree, model.config.raster)
+    image = render_view(model.gaussians, test, 0, Look(model.sh_degree, model.config.raster))
     mse = (image - test.photos.image(0)).square().mean().item()
     assert -10 * np.log10(mse) == pytest.approx(whole.history[-1].psnr, abs=1e-4)
 

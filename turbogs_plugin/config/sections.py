@@ -69,8 +69,9 @@ class TrainConfig:
             ``auto``: random where photos are transparent, else black. Transparent photos are composited on it.
         backdrop: start with a far sphere of Gaussians in the photos' mean colour behind the scene.
         exposure: learn an affine colour for each training photo, for captures whose exposure or white balance changes
-            from photo to photo (`turbogs_plugin.engine.exposures`). Test photos are compared without one, and once more
-            after an affine fit of the render's colours. ``auto``: where the photos of neighbouring cameras differ.
+            from photo to photo (`turbogs_plugin.engine.exposures`). Test photos are compared with that of the training
+            photos before and after them (`turbogs_plugin.train.interpolated_exposures`). ``auto``: where photos differ,
+            but little from those before and after them.
         distant_size: largest standard deviation of a Gaussian beyond 2 scene extents, over its distance from the
             cameras (`restrain_distant`). 0: no bound.
         camera_clearance: a change of the set of Gaussians also removes those that stand nearer to a training camera

@@ -12,7 +12,7 @@ import torch
 from turbogs_plugin.engine.rendering import RasterSettings
 from turbogs_plugin.scene import PosedImages
 from turbogs_plugin.scene.poses import evenly
-from turbogs_plugin.train.evaluate import psnr, render_view
+from turbogs_plugin.train.evaluate import Look, psnr, render_view
 from turbogs_plugin.types import Gaussians
 
 MOST_VIEWS = 8
@@ -82,7 +82,7 @@ class Fidelity:
         """[H, W, 3] float32, 0 .. 1, on the device: a model seen by one of the test cameras."""
         model = gaussians.map(lambda value: value.to(self._device))
         views = replace(self._views, cameras=self._views.cameras.to(self._device), masks=None)
-        return render_view(model, views, view_id, min(self._degree, model.sh_degree), self._settings)
+        return render_view(model, views, view_id, Look(min(self._degree, model.sh_degree), self._settings))
 
     def photo(self, view_id: int) -> torch.Tensor:
         """[H, W, 3] float32, 0 .. 1, on the device."""

@@ -22,11 +22,12 @@ from turbogs_plugin.scene.host_arrays import MEMORY_SHARE as HOST_SHARE
 ONE_SIDED = 0.95
 """Direction concentration above which a capture is seen from one side. Nadir grids of aircraft have .99; walks around
 something have .68 (snowmiku) and .83 (fox)."""
-EXPOSURE_STOPS = 0.1
-"""Standard deviation of photos from their neighbours' exposures, in stops, from which on each photo gets one.
-Caliterra, whose flight lines differ, has .13; fox and snowmiku .05 (docs/plan.md). These two change by .17 and .18 in
-all, but by little from photo to photo, and what follows the view a model's harmonics take up. At .13 it pays
-only after a fit of colours (docs/captures.md)."""
+EXPOSURE_STOPS = 0.05
+"""Standard deviation of the photos' exposures, in stops, from which on each photo gets one. fox, caliterra and snowmiku
+have .17 to .19 (docs/plan.md)."""
+EXPOSURE_SHARE = 0.5
+"""Share of that deviation which photos may keep from those before and after them: else nothing says what exposure a
+photo has that is not trained. The three captures have .17 to .35."""
 DEVICE_SHARE = 0.5
 """Share of the device's memory that photos and maps may take: the rest is for the model, its optimizer, workspaces."""
 ITERATION_MS = (1.3, 3.4)
@@ -111,17 +112,21 @@ def wanted_backdrop(facts: SceneFacts, config: Config) -> Verdict:
 
 
 def wanted_exposure(facts: SceneFacts, config: Config) -> Verdict:
-    """A colour map for each photo, where neighbouring photos show the same points differently bright."""
+    """A colour map for each photo, where photos show the same points differently bright, but much as those before and
+    after them."""
     if facts.transparent:
         return Verdict(False, "photos are transparent: their background has no exposure")
     if facts.exposure_views is None:
         return Verdict(None, "compares the photos' exposures")
     if 2 * facts.exposure_views < facts.train_views:
         return Verdict(False, f"only {facts.exposure_views} of {facts.train_views} photos could be compared")
-    differ = facts.exposure_jumps >= EXPOSURE_STOPS
-    return Verdict(
-        differ, f"photos {facts.exposure_jumps:.2f} stops from their neighbours {_sign(differ)} {EXPOSURE_STOPS}"
-    )
+    spread, rest = facts.exposure_spread, facts.exposure_rest
+    differ, told = spread >= EXPOSURE_STOPS, rest <= EXPOSURE_SHARE * spread
+    reason = f"photos {spread:.2f} stops apart {_sign(differ)} {EXPOSURE_STOPS}"
+    if differ:
+        sign = "<=" if told else ">"
+        reason += f", and {rest:.2f} from those before and after {sign} {EXPOSURE_SHARE} of that"
+    return Verdict(differ and told, reason)
 
 
 def wanted_batch_for(facts: SceneFacts, config: Config) -> Verdict:

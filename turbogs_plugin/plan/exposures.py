@@ -18,6 +18,7 @@ from torch import Tensor
 
 from turbogs_plugin.plan.sight import Sight
 from turbogs_plugin.scene import PosedImages
+from turbogs_plugin.scene.sequence import neighbours
 
 NEIGHBOURS, CANDIDATES = 8, 24
 """A photo is compared with so many of the cameras nearest to it, of so many that are tried."""
@@ -52,12 +53,12 @@ class Exposures:
 
     Args:
         gains: [V, 3] float64 of the channels; their mean over what is compared is 0.
-        local: [V, 3] float64, the gains less the mean gain of the photos with which one is compared.
+        left: [V, 3] float64, the gains less what the photos before and after tell (`turbogs_plugin.scene.sequence`).
         compared: [V] bool, photos that share enough with another one; the others' gains are 0.
     """
 
     gains: Floats
-    local: Floats
+    left: Floats
     compared: NDArray[np.bool_]
 
     @property
@@ -66,10 +67,10 @@ class Exposures:
         return _deviation(self.gains[self.compared])
 
     @property
-    def jumps(self) -> float:
-        """Standard deviation of the gains from those of their neighbours. A camera's automatic that follows the light
-        gives little; another exposure in the next flight line, or at random, much."""
-        return _deviation(self.local[self.compared])
+    def rest(self) -> float:
+        """Standard deviation of the gains from those of the photos before and after. A camera's automatic that follows
+        the light leaves little; exposures at random leave more than there was."""
+        return _deviation(self.left[self.compared])
 
 
 @dataclass(frozen=True)
@@ -110,11 +111,11 @@ def compare_exposures(views: PosedImages, sight: Sight) -> Exposures:
     pairs = np.array(list(kept), dtype=np.int64).reshape(-1, 2)
     weights = np.sqrt(np.array([ratios[pair][1] for pair in kept], dtype=np.float64))
     gains = fit_gains(pairs, np.array(list(kept.values()), dtype=np.float64).reshape(-1, 3), weights, count)
-    neighbours = np.bincount(pairs.reshape(-1), minlength=count)  # [V]
-    sums = _summed(pairs, gains[pairs[:, ::-1]], count)
-    compared = neighbours > 0
-    local = np.where(compared[:, None], gains - sums / np.maximum(1, neighbours)[:, None], 0.0)
-    return Exposures(gains, local, compared)
+    compared = np.bincount(pairs.reshape(-1), minlength=count) > 0  # [V]
+    names = [name for name, told in zip(views.names, compared, strict=True) if told]
+    left = gains.copy()
+    left[compared] -= neighbours(names, names).mean(torch.from_numpy(gains[compared])).numpy()
+    return Exposures(gains, left, compared)
 
 
 def fit_gains(pairs: Integers, ratios: Floats, weights: Floats, count: int) -> Floats:

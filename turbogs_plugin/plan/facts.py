@@ -29,9 +29,9 @@ class SceneFacts:
         points: M, of the reconstruction.
         extent: radius of the scene in the capture's own unit.
         baseline: median distance of a training camera to its nearest, over the median depth of the points it sees.
-        exposure_spread, exposure_jumps, exposure_views: how far photos differ in brightness and white balance, in stops
-            (`compare_exposures`): all from their mean; each from its neighbours; and of how many photos this is, None
-            where no setting asks for it.
+        exposure_spread, exposure_rest, exposure_views: how far photos differ in brightness and white balance, in stops
+            (`compare_exposures`): all from their mean; each from the photos before and after; and of how many photos
+            this is, None where no setting asks for it.
         direction_concentration: norm of the mean unit viewing direction of the training cameras; 1: all look the same
             way, 0: all around.
         photo_bytes: of all photos, training and test.
@@ -65,7 +65,7 @@ class SceneFacts:
     transparent: bool = False
     processes: int = 1
     exposure_spread: float = 0.0
-    exposure_jumps: float = 0.0
+    exposure_rest: float = 0.0
     exposure_views: int | None = None
 
 
@@ -116,7 +116,7 @@ def gather_facts(
         transparent=views.photos.transparent,
         processes=processes,
         exposure_spread=exposures.spread if exposures else 0.0,
-        exposure_jumps=exposures.jumps if exposures else 0.0,
+        exposure_rest=exposures.rest if exposures else 0.0,
         exposure_views=int(exposures.compared.sum()) if exposures else None,
     )
 

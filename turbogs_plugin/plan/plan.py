@@ -65,7 +65,7 @@ class Plan:
         if facts.exposure_views is not None:
             exposures = (
                 f", exposures of {facts.exposure_views} photos {facts.exposure_spread:.2f} stops apart and "
-                f"{facts.exposure_jumps:.2f} from their neighbours'"
+                f"{facts.exposure_rest:.2f} from those before and after"
                 if facts.exposure_views
                 else ", exposures could not be compared"
             )

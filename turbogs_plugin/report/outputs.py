@@ -18,11 +18,11 @@ from turbogs_plugin.report.tables import views_table
 from turbogs_plugin.scene import PosedImages
 from turbogs_plugin.scene.offload import place_views
 from turbogs_plugin.train.background import Background
-from turbogs_plugin.train.evaluate import evaluate, load_lpips
+from turbogs_plugin.train.evaluate import Look, evaluate, load_lpips
 from turbogs_plugin.train.flip import load_flip
+from turbogs_plugin.train.interpolated_exposures import interpolated_exposures
 from turbogs_plugin.train.saved_model import SavedModel, load_with_capture
 from turbogs_plugin.train.start import resolve_device
-from turbogs_plugin.types import Color
 
 
 def evaluate_run(path: Path, device_name: str, given: Config | None = None) -> str:
@@ -33,14 +33,11 @@ def evaluate_run(path: Path, device_name: str, given: Config | None = None) -> s
         device_name: where to render.
         given: the capture of a model from a file, and how to render it; None: `path` is a run.
     """
-    model, views, background, _ = _open(path, device_name, "test", given)
+    model, views, look, _ = _open(path, device_name, "test", given)
     views = place_views(views, model.gaussians.device, model.config.train.photos_place)
     lpips, reason = load_lpips(model.config.report.lpips_weights, model.gaussians.device)
     flip, no_flip = load_flip()
-    settings = model.config.raster
-    metrics = evaluate(
-        model.gaussians, views, model.sh_degree, settings, lpips, flip=flip, background=background, aligned=True
-    )
+    metrics = evaluate(model.gaussians, views, look, lpips, flip, aligned=True)
     note = f"\nLPIPS was not computed: {reason}" if reason else ""
     note += f"\nFLIP was not computed: {no_flip}" if no_flip else ""
     which = f"iteration {model.iteration}" if given is None else str(path)
@@ -74,7 +71,7 @@ def render_run(
         raise InputError(f"'{path}' has no run's folder to render into: name one by --out FOLDER")
     if out is not None:
         require_writable(out, f"--out '{out}'")
-    model, views, background, notes = _open(path, device_name, split, given)
+    model, views, look, notes = _open(path, device_name, split, given)
     target = model.folder.renders if out is None else out
     cameras = views.cameras.to(model.gaussians.device)
     folders = [target / name for name in ([split, f"{split}-depth"] if with_depth else [split])]
@@ -85,12 +82,12 @@ def render_run(
             model.gaussians,
             cameras,
             view_id,
-            sh_degree=model.sh_degree,
-            settings=model.config.raster,
+            sh_degree=look.sh_degree,
+            settings=look.settings,
             with_depth=with_depth,
-            background=background,
+            background=look.background,
         )
-        Image.fromarray(to_uint8(image.colors)).save(folders[0] / f"{name}.png")
+        Image.fromarray(to_uint8(look.colors(image.colors, view_id))).save(folders[0] / f"{name}.png")
         if with_depth:
             depths = (image.depths.cpu().double() * model.frame.scale).float().numpy()
             np.save(folders[1] / f"{name}.npy", depths)
@@ -109,10 +106,14 @@ def distinct_stems(names: Sequence[str]) -> list[str]:
 
 def _open(
     path: Path, device_name: str, split: str, given: Config | None
-) -> tuple[SavedModel, PosedImages, Color, tuple[str, ...]]:
-    """A run's newest model or a given one on a device, the views of a split on the CPU, their background, and the
-    capture's notes."""
+) -> tuple[SavedModel, PosedImages, Look, tuple[str, ...]]:
+    """A run's newest model or a given one on a device, the views of a split on the CPU, how it is shown beside them,
+    and the capture's notes. Training views have their own exposures, where the run learnt them."""
     model, scene, _ = load_with_capture(path, given, resolve_device(device_name))
     views = scene.test if split == "test" else scene.train
     background = Background.of(model.config.train.background, views.photos.transparent).evaluated
-    return model, views, background, scene.notes
+    exposures = model.exposures
+    if exposures is not None and split == "test":
+        exposures = interpolated_exposures(exposures, scene.train.names, scene.test.names)
+    look = Look(model.sh_degree, model.config.raster, background, exposures)
+    return model, views, look, scene.notes

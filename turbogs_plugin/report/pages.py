@@ -25,32 +25,29 @@ def write_report(run: RunSession, process: PlotProcess | None = None) -> Path:
         The page.
     """
     trainer, config = run.trainer, run.trainer.config
-    background = trainer.background.evaluated
+    look = trainer.look(run.test.names)
     lpips, lpips_reason = load_lpips(config.report.lpips_weights, trainer.device)
     metrics = None if lpips else run.evaluations.metrics_at(trainer.iteration)
     if metrics is None:
-        aligned = trainer.exposures is not None
-        metrics = evaluate(
-            trainer.gaussians, run.test, trainer.sh_degree, config.raster, lpips, background=background, aligned=aligned
-        )
+        metrics = evaluate(trainer.gaussians, run.test, look, lpips, aligned=trainer.exposures is not None)
     run.clock.mark("report")
     pictures = run.folder.path / "report"
     pictures.mkdir(exist_ok=True)
-    shown = min(len(run.test), config.report.strips)
+    strips = min(len(run.test), config.report.strips)
     plots = _plots(run, pictures)
     if process is not None:
         process.begin(plots)
     with picture_writer() as write:
-        for view_id in range(shown):
-            image = render_view(trainer.gaussians, run.test, view_id, trainer.sh_degree, config.raster, background)
-            photo = run.test.photos.image(view_id, background)
+        for view_id in range(strips):
+            image = render_view(trainer.gaussians, run.test, view_id, look)
+            photo = run.test.photos.image(view_id, look.background)
             write(pictures / f"test-{view_id:03d}.jpg", strip(photo, image, run.test.mask(view_id)))
         if process is None or not process.end():
             for plot in plots:  # while the strips are encoded
                 plot.draw()
     run.clock.mark("pictures and plots")
     run.finish_model()  # the page says how long it took until it was there
-    write_text_atomically(run.folder.report, _page(run, metrics, lpips_reason, shown))
+    write_text_atomically(run.folder.report, _page(run, metrics, lpips_reason, strips))
     run.clock.mark("report")
     return run.folder.report
 
@@ -84,8 +81,9 @@ def _page(run: RunSession, metrics: Metrics, lpips_reason: str, shown: int) -> s
         on = f" Photos are transparent; they and the model are compared on rgb({red}, {green}, {blue})."
     if "aligned_l1" in columns:
         on += (
-            " Training photos have exposures of their own, test photos none: errors are raw, and beside them stand"
-            " those after the affine map of the render's colours that fits each test photo best."
+            " Training photos have exposures of their own. A test photo is compared with the render in the exposure of"
+            " the training photos before and after it; beside that stand errors of the model's own colours, and those"
+            " after the affine map of these that fits the photo best."
         )
     grey = "; masked pixels of photo and error are grey" if masked else ""
     heads = (*columns.values(), "training in s", "wall in s", "Gaussians", "FPS", "peak memory in MiB")

@@ -11,11 +11,13 @@ from turbogs_plugin.train.history import Evaluation
 ERRORS = {"psnr": "PSNR in dB", "ssim": "SSIM", "l1": "mean absolute error"}
 """Measure -> head of its column, in every table of errors. Masked pixels do not count in them."""
 
-FURTHER = {
-    f"{kind}_{name}": f"{head} {said}"
-    for kind, said in {"whole": "with masked pixels", "aligned": "after colour alignment"}.items()
-    for name, head in ERRORS.items()
+FURTHER_KINDS = {
+    "whole": "with masked pixels",
+    "own": "of the model's own colours",
+    "aligned": "after colour alignment",
 }
+
+FURTHER = {f"{kind}_{name}": f"{head} {said}" for kind, said in FURTHER_KINDS.items() for name, head in ERRORS.items()}
 """The same of `FurtherErrors`."""
 
 

@@ -90,10 +90,10 @@ class EventWriter(Listener):
 
     def _strip(self, loop: TrainingLoop, view: int) -> np.ndarray:
         """[H, W, 3] uint8, at most `WIDEST_STRIP` wide: photo, render and error of a test view."""
-        trainer, background = loop.trainer, loop.trainer.background.evaluated
+        trainer, look = loop.trainer, loop.trainer.look(self._test.names)
         views = replace(self._test, cameras=self._test.cameras.to(trainer.device))
-        image = render_view(trainer.gaussians, views, view, trainer.sh_degree, trainer.config.raster, background)
-        photo = views.photos.image(view, background).to(trainer.device)
+        image = render_view(trainer.gaussians, views, view, look)
+        photo = views.photos.image(view, look.background).to(trainer.device)
         picture = Image.fromarray(strip(photo, image, views.mask(view)))
         picture.thumbnail((WIDEST_STRIP, WIDEST_STRIP), Image.Resampling.LANCZOS)
         return np.asarray(picture)

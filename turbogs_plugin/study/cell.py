@@ -120,8 +120,7 @@ def train_cell(
     clock.mark("cell")
     trainer, mean_flip = loop.trainer, math.nan
     if flip is not None:  # off the clock
-        settings, background = trainer.config.raster, trainer.background.evaluated
-        metrics = evaluate(trainer.gaussians, test, trainer.sh_degree, settings, flip=flip, background=background)
+        metrics = evaluate(trainer.gaussians, test, trainer.look(test.names), flip=flip)
         mean_flip = metrics.mean.flip
     return CellResult(
         scene=scene.name,
@@ -146,6 +145,6 @@ def warm_up(config: Config, scene: Scene, test: PosedImages, device: torch.devic
     """Train and evaluate a model that is thrown away, with every kind of event that the configuration has."""
     trainer = Trainer(with_iterations(config, iterations), scene, device)
     TrainingLoop(trainer).run()
-    evaluate(trainer.gaussians, test, trainer.sh_degree, config.raster, background=trainer.background.evaluated)
+    evaluate(trainer.gaussians, test, trainer.look(test.names))
     del trainer
     free_device_memory(device)

@@ -1,8 +1,8 @@
 """Test error of a model: PSNR, SSIM, mean absolute error, LPIPS and FLIP if wanted and there; and rendering speed.
 
 Where views have masks, errors are of the pixels that are not masked, and those of whole photos are given beside them.
-Where photos have exposures of their own, errors after a colour alignment are given beside the raw ones: no model can
-know the exposure of a test photo.
+Where photos have exposures of their own, a test view is shown with the exposure that is known of it, and errors of the
+model's own colours, and those after a colour alignment, are given beside.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene import PosedImages
 from turbogs_plugin.train.flip import Flip
 from turbogs_plugin.train.history import MEASURES, FurtherErrors
+from turbogs_plugin.train.interpolated_exposures import exposed
 from turbogs_plugin.train.ssim import SSIM_SIDE, ssim
 from turbogs_plugin.types import BLACK, Color, Gaussians
 
@@ -80,43 +81,65 @@ class Metrics:
         return math.nan if any(map(math.isnan, values)) else min(values)
 
 
+@dataclass(frozen=True)
+class Look:
+    """How a model is shown beside the photos of V views.
+
+    Args:
+        sh_degree: highest degree in use.
+        settings: those of the rasterizer.
+        background: behind the model, and behind transparent photos.
+        exposures: [V, 3, 4] of the views (`interpolated_exposures`); None: the model's own colours.
+    """
+
+    sh_degree: int
+    settings: RasterSettings
+    background: Color = BLACK
+    exposures: Tensor | None = None
+
+    def colors(self, colors: Tensor, view_id: int) -> Tensor:
+        """[H, W, 3], 0 .. 1: the model's own colours [H, W, 3], seen by a view, with its exposure."""
+        return (colors if self.exposures is None else exposed(colors, self.exposures[view_id])).clamp(0.0, 1.0)
+
+
 @torch.no_grad()
 def evaluate(
     gaussians: Gaussians,
     views: PosedImages,
-    sh_degree: int,
-    settings: RasterSettings,
+    look: Look,
     lpips: Lpips | None = None,
     flip: Flip | None = None,
-    background: Color = BLACK,
     aligned: bool = False,
 ) -> Metrics:
-    """Render every view, one at a time, and compare it with its photo.
+    """Render every view, one at a time, and compare it with its photo. Where views have exposures, errors of the
+    model's own colours are given beside.
 
     Args:
         gaussians: the model, on the views' device.
         views: cameras and photos.
-        sh_degree: highest degree in use.
-        settings: those of the rasterizer.
+        look: how it is shown.
         lpips: from `load_lpips`, if wanted.
         flip: from `load_flip`, if wanted. Masked pixels are the photo's in both images that these two get.
-        background: behind the model, and behind transparent photos.
-        aligned: give the errors after `align_colors`, too.
+        aligned: give the errors of its own colours after `align_colors`, too.
     """
     metrics, flips, seconds = [], [], 0.0
     for view_id, name in enumerate(views.names):
         synchronize(gaussians.device)
         started = time.perf_counter()
-        image = render_view(gaussians, views, view_id, sh_degree, settings, background)
+        own = _render(gaussians, views, view_id, look)
+        image = look.colors(own, view_id)
         synchronize(gaussians.device)
         seconds += time.perf_counter() - started
-        photo, mask = views.photos.image(view_id, background), views.mask(view_id)
+        photo, mask = views.photos.image(view_id, look.background), views.mask(view_id)
         measured = compare(name, image, photo, mask)
         further = {}
+        own = own.clamp(0.0, 1.0)
+        if look.exposures is not None:
+            further["own"] = compare(name, own, photo, mask)
         if views.masks is not None:
             further["whole"] = compare(name, image, photo)
         if aligned:
-            further["aligned"] = compare(name, align_colors(image, photo, mask), photo, mask)
+            further["aligned"] = compare(name, align_colors(own, photo, mask), photo, mask)
         for kind, other in further.items():
             for measure in MEASURES:
                 setattr(measured, f"{kind}_{measure}", getattr(other, measure))
@@ -132,19 +155,15 @@ def evaluate(
 
 
 @torch.no_grad()
-def render_view(
-    gaussians: Gaussians,
-    views: PosedImages,
-    view_id: int,
-    sh_degree: int,
-    settings: RasterSettings,
-    background: Color = BLACK,
-) -> Tensor:
+def render_view(gaussians: Gaussians, views: PosedImages, view_id: int, look: Look) -> Tensor:
     """[H, W, 3] float32, 0 .. 1: the model seen by one of the cameras."""
-    image = render_image(
-        gaussians, views.cameras, view_id, sh_degree=sh_degree, settings=settings, background=background
-    )
-    return image.colors.clamp(0.0, 1.0)
+    return look.colors(_render(gaussians, views, view_id, look), view_id)
+
+
+def _render(gaussians: Gaussians, views: PosedImages, view_id: int, look: Look) -> Tensor:
+    """[H, W, 3] float32, the model's own colours, which may be above 1."""
+    settings = {"sh_degree": look.sh_degree, "settings": look.settings, "background": look.background}
+    return render_image(gaussians, views.cameras, view_id, **settings).colors
 
 
 def psnr(image: Tensor, photo: Tensor) -> float:

@@ -48,10 +48,8 @@ class Evaluations(Listener):
         metrics = evaluate(
             trainer.gaussians,
             self.test,
-            trainer.sh_degree,
-            trainer.config.raster,
+            trainer.look(self.test.names),
             lpips=self.lpips if loop.finished else None,
-            background=trainer.background.evaluated,
             aligned=trainer.exposures is not None,
         )
         mean = metrics.mean

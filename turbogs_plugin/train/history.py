@@ -21,13 +21,18 @@ class FurtherErrors:
     Args:
         whole_psnr, whole_ssim, whole_l1: with masked pixels, which have no part in the plain ones; NaN where no test
             view has a mask.
-        aligned_psnr, aligned_ssim, aligned_l1: of renders after a colour alignment (`align_colors`), in runs that learn
-            exposures.
+        own_psnr, own_ssim, own_l1: of the model's own colours, in runs that learn exposures; the plain ones there are
+            of test views with the exposures of their neighbours (`interpolated_exposures`).
+        aligned_psnr, aligned_ssim, aligned_l1: of the model's own colours after a colour alignment (`align_colors`), in
+            runs that learn exposures.
     """
 
     whole_psnr: float = math.nan
     whole_ssim: float = math.nan
     whole_l1: float = math.nan
+    own_psnr: float = math.nan
+    own_ssim: float = math.nan
+    own_l1: float = math.nan
     aligned_psnr: float = math.nan
     aligned_ssim: float = math.nan
     aligned_l1: float = math.nan

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
+from torch import Tensor
 
 from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.errors import InputError
@@ -26,6 +27,7 @@ class SavedModel:
 
     Args:
         folder, iteration: of the run; None of a model from a file.
+        exposures: [V, 3, 4], those of the training photos; None where none were learnt, and of a model from a file.
     """
 
     folder: RunFolder | None
@@ -33,6 +35,7 @@ class SavedModel:
     gaussians: Gaussians
     frame: Frame
     iteration: int | None
+    exposures: Tensor | None = None
 
     @property
     def sh_degree(self) -> int:
@@ -60,7 +63,8 @@ def load_model(path: Path, device: torch.device) -> SavedModel:
         frame = frame_of_state(state)
         trained = state["trainer"]
         iteration = operator.index(trained["iteration"])
-        return SavedModel(folder, config, gaussians_of_state(trained, device), frame, iteration)
+        exposures = trained["exposures"]["offsets"].to(device) if config.train.exposure is True else None
+        return SavedModel(folder, config, gaussians_of_state(trained, device), frame, iteration, exposures)
     except (KeyError, TypeError, AttributeError, IndexError, ValueError, RuntimeError) as error:
         raise InputError(f"checkpoint '{checkpoint}' is not one of a run: {error}") from None
 

@@ -6,6 +6,7 @@ The loop over iterations is in `turbogs_plugin.train.loop`.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, Protocol
 
@@ -16,29 +17,24 @@ from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.distributed.exchange import exchange_of
 from turbogs_plugin.distributed.ranks import ONE, Ranks
 from turbogs_plugin.engine import engine_of
-from turbogs_plugin.engine.exposures import Exposures, exposure_rate
+from turbogs_plugin.engine.exposures import exposure_rate
 from turbogs_plugin.engine.protocol import MapUpdate
 from turbogs_plugin.engine.rendered import RenderOptions, ScreenGradients
 from turbogs_plugin.engine.rendering import dense_samples, rasterize
 from turbogs_plugin.errors import TrainingStopped
 from turbogs_plugin.model.clearance import Clearance
 from turbogs_plugin.model.distant import RESTRAIN_EVERY, restrain_distant
-from turbogs_plugin.model.harmonics import with_degree
-from turbogs_plugin.model.initial import BACKDROP_COUNT, backdrop_gaussians, gaussians_from_points
 from turbogs_plugin.model.row_order import in_order_of_space
 from turbogs_plugin.model.torch_file import leaves
-from turbogs_plugin.plan.caps import cap_of, chosen_points, require_room
-from turbogs_plugin.scene import PosedImages, Scene
+from turbogs_plugin.scene import Scene
 from turbogs_plugin.scene.offload import place_maps, place_views
 from turbogs_plugin.scene.photos import PhotoSamples
-from turbogs_plugin.scene.starting_points import colors_in_photos, starting_points
 from turbogs_plugin.train.background import Background
 from turbogs_plugin.train.checkpoint import gaussians_of_state
-from turbogs_plugin.train.given_model import load_given
+from turbogs_plugin.train.evaluate import Look
+from turbogs_plugin.train.initial_state import first_exposures, initial_gaussians
+from turbogs_plugin.train.interpolated_exposures import interpolated_exposures
 from turbogs_plugin.types import Gaussians, GaussianStats, LossOutput, PixelSamples, RowUpdate, Step
-
-COLOR_STRIDE = 97
-"""The mean colour of the photos is taken over every 97th pixel; coprime to usual widths."""
 
 REPEATED_AT_MOST = 32
 """More iterations than an engine ever skips before it says so."""
@@ -90,7 +86,7 @@ class Trainer:
             self.views.cameras.sizes, device, config.train.maps_place, config.maps.beta, self.views.masks
         )
         self.background = Background.of(config.train.background, self.views.photos.transparent)
-        self.exposures = Exposures.identity(len(self.views), device) if config.train.exposure else None
+        self.exposures = first_exposures(scene, resuming, device) if config.train.exposure else None
         self.clearance = None
         if config.train.camera_clearance and not scene.drawn_points:
             self.clearance = Clearance.of(scene.points.to(device), self.views.cameras.centers)
@@ -129,7 +125,7 @@ class Trainer:
         )
         truth = self.views.photos.at(samples, background).colors()  # [P, 3]
         errors = truth.new_zeros(int(self.maps.sizes[view_id].prod()))
-        errors[samples.pixel_ids.long()] = (rendered.colors - truth).abs().sum(dim=-1)
+        errors[samples.pixel_ids.long()] = (self.shown(rendered.colors, samples) - truth).abs().sum(dim=-1)
         return errors
 
     def step(self) -> None:
@@ -182,7 +178,7 @@ class Trainer:
         Loss and maps are one step if the loss is a rule, else the loss's own code comes first.
         """
         samples, update = truth.samples, MapUpdate(self.maps, step, self.nonfinite_losses)
-        shown = colors if self.exposures is None else self.engine.expose(self.exposures, colors, samples)
+        shown = self.shown(colors, samples)
         if self.loss.terms is not None:
             loss = self.engine.supervise(self.loss.terms, shown, truth, update)
         else:
@@ -193,6 +189,10 @@ class Trainer:
         rate, gradients = exposure_rate(step), loss.color_gradients
         gradients = self.engine.learn_exposures(self.exposures, colors, gradients, samples=samples, rate=rate)
         return replace(loss, color_gradients=gradients)
+
+    def shown(self, colors: Tensor, samples: PixelSamples) -> Tensor:
+        """[P, 3]: the model's colours at samples [P, 3], with the exposures of their photos where there are any."""
+        return colors if self.exposures is None else self.engine.expose(self.exposures, colors, samples)
 
     def update(self, screen: ScreenGradients, stats: GaussianStats | None, step: Step) -> None:
         """Gradients, statistics and update: in one step if the optimizer has a rule, else by its own code."""
@@ -293,6 +293,13 @@ class Trainer:
         """Highest degree of spherical harmonics in use."""
         return self.config.train.sh_degree_at(self.iteration)
 
+    def look(self, photos: Sequence[str]) -> Look:
+        """How the present model is shown beside photos that are not trained, by their names."""
+        exposures = None
+        if self.exposures is not None:
+            exposures = interpolated_exposures(self.exposures.offsets, self.views.names, photos)
+        return Look(self.sh_degree, self.config.raster, self.background.evaluated, exposures)
+
     def require_finite(self) -> None:
         """Stop a run whose model is lost.
 
@@ -343,50 +350,3 @@ class Trainer:
         self.density.setup(self.gaussians)
         for name in STATEFUL:
             getattr(self, name).load_state_dict(state[name])
-
-
-def initial_gaussians(scene: Scene, config: Config, init: str, device: torch.device) -> Gaussians:
-    """The model that training starts from: a given one, or one of points; and a backdrop if one is wanted.
-
-    If there are more points than `density.max_gaussians` allows, as many as it allows are taken, evenly in their order.
-
-    Args:
-        init: as `train.init`.
-        device: where a given model is tried on training views.
-
-    Returns:
-        On the CPU.
-
-    Raises:
-        InputError: the given model cannot be read, or has more Gaussians than are allowed.
-    """
-    train, cap = config.train, cap_of(config)
-    backdrop_count = BACKDROP_COUNT if train.backdrop else 0
-    if init in ("points", "random"):
-        points, colors = scene.points, scene.point_colors
-        if init == "random":
-            cameras = scene.train.cameras
-            matrices = (each.cpu().double().numpy() for each in (cameras.viewmats, cameras.Ks))
-            points = torch.from_numpy(starting_points(*matrices, cameras.sizes)[0]).float()
-            colors = colors_in_photos(points, scene.train.cameras, scene.train.photos, scene.train.masks)
-        rows = chosen_points(len(points), cap, backdrop_count)
-        settings = (train.sh_degree, scene.extent, train.initial_opacity, train.initial_size)
-        gaussians = gaussians_from_points(points[rows], colors[rows], *settings)
-    else:
-        gaussians = with_degree(load_given(init, scene, device), train.sh_degree)
-        require_room(init, len(gaussians), cap, backdrop_count)
-    if not train.backdrop:
-        return gaussians
-    color = _mean_color(scene.train)
-    backdrop = backdrop_gaussians(color, train.sh_degree, scene.extent)
-    return Gaussians(**{name: torch.cat([tensor, getattr(backdrop, name)]) for name, tensor in gaussians.items()})
-
-
-def _mean_color(views: PosedImages) -> Tensor:
-    """[3] float32, 0 .. 1: the mean of every `COLOR_STRIDE`-th pixel that is not masked; transparent ones on black."""
-    pixels = views.photos.stored[::COLOR_STRIDE, :3].float().cpu()
-    if views.masks is not None:
-        keep = [views.masks.image(view).reshape(-1) for view in range(len(views))]
-        kept = torch.cat(keep)[::COLOR_STRIDE]
-        pixels = pixels[kept] if kept.any() else pixels
-    return pixels.mean(dim=0) / 255.0
