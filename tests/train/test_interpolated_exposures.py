@@ -37,6 +37,17 @@ def test_exposures_at_random_tell_nothing():
     assert told.norm() < 0.3 * noise[rows(TEST)].norm()
 
 
+def test_a_part_of_the_sequence_that_is_missing_is_told_as_far_as_such_parts_are():
+    """Waves of 38 photos: the next photo tells, and what is half a wave away says the opposite."""
+    names = [f"{number}.jpg" for number in range(200)]
+    wave = of(0.4 * torch.sin(torch.arange(200) / 6))
+    missing = range(80, 118)
+    trained = [number for number in range(200) if number not in missing]
+    told = interpolated_exposures(wave[trained], [names[number] for number in trained], [names[n] for n in missing])
+    assert (told[[0, -1]] - wave[[80, 117]]).abs().max() < 0.06 < 0.2 < wave[[80, 117]].abs().amax(dim=(1, 2)).min()
+    assert not told[18:20].any()
+
+
 def test_the_order_of_photos_in_memory_does_not_matter():
     wave, mixed = of(torch.sin(torch.arange(40) / 6)), torch.randperm(35, generator=torch.Generator().manual_seed(1))
     shuffled = [TRAINED[row] for row in mixed]

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from turbogs_plugin.plan.sight import Sight
 from turbogs_plugin.scene import PosedImages
-from turbogs_plugin.scene.sequence import neighbours
+from turbogs_plugin.scene.sequence import PhotoOrder
 
 NEIGHBOURS, CANDIDATES = 8, 24
 """A photo is compared with so many of the cameras nearest to it, of so many that are tried."""
@@ -114,7 +114,8 @@ def compare_exposures(views: PosedImages, sight: Sight) -> Exposures:
     compared = np.bincount(pairs.reshape(-1), minlength=count) > 0  # [V]
     names = [name for name, told in zip(views.names, compared, strict=True) if told]
     left = gains.copy()
-    left[compared] -= neighbours(names, names).mean(torch.from_numpy(gains[compared])).numpy()
+    near = PhotoOrder(views.names).neighbours(names, names)
+    left[compared] -= near.mean(torch.from_numpy(gains[compared])).numpy()
     return Exposures(gains, left, compared)
 
 

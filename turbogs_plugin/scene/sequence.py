@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import re
-from bisect import bisect_left
-from collections.abc import Sequence
+from bisect import bisect_left, bisect_right
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -19,10 +19,12 @@ class Neighbours:
         rows: [W, 2] int64, which of the known photos.
         weights: [W, 2] float32: of two neighbours, the nearer one weighs more, and both sum to 1; an only one has 1;
             where there is none, both are 0.
+        distances: [W] int64, to the nearer one, in photos; 0 where there is none.
     """
 
     rows: Tensor
     weights: Tensor
+    distances: Tensor
 
     def mean(self, values: Tensor) -> Tensor:
         """[W, ...]: the weighted mean of the neighbours' values [known, ...]; 0 where there is none."""
@@ -30,34 +32,43 @@ class Neighbours:
         return (values[rows] * weights.view(*weights.shape, *[1] * (values.dim() - 1))).sum(dim=1)
 
 
-def neighbours(known: Sequence[str], photos: Sequence[str]) -> Neighbours:
-    """The neighbours of photos in their folder's order of names, in which numbers count as numbers.
+class PhotoOrder:
+    """The photos of each folder in the order of their names, in which numbers count as numbers.
 
-    A photo is no neighbour of itself. Distances count all photos named here. Photos of one folder are taken for one
-    sequence: cameras and programs that cut videos number what they write.
+    Those of one folder are taken for one sequence: cameras, and programs that cut videos, number what they write.
 
     Args:
-        known: names of the photos of which something is known, with their folders.
-        photos: names of those whose neighbours are wanted.
+        names: of all photos, with their folders.
     """
-    ordered = sorted({*known, *photos}, key=_key)
-    places = {name: place for place, name in enumerate(ordered)}
-    sequences: dict[str, list[int]] = {}  # folder -> rows of known photos, in their order
-    for row in sorted(range(len(known)), key=lambda row: places[known[row]]):
-        sequences.setdefault(_folder(known[row]), []).append(row)
-    rows, weights = torch.zeros(len(photos), 2, dtype=torch.int64), torch.zeros(len(photos), 2)
-    for photo, name in enumerate(photos):
-        sequence = sequences.get(_folder(name), [])
-        after = bisect_left(sequence, places[name], key=lambda row: places[known[row]])
-        behind = after + (after < len(sequence) and known[sequence[after]] == name)
-        found = [sequence[at] for at in (after - 1, behind) if 0 <= at < len(sequence)]
-        if not found:
-            continue
-        distances = [abs(places[known[row]] - places[name]) for row in found]
-        rows[photo] = torch.tensor([found[0], found[-1]])
-        weights[photo, 0] = distances[-1] / sum(distances) if len(found) == 2 else 1.0
-        weights[photo, 1] = 1.0 - weights[photo, 0]
-    return Neighbours(rows, weights)
+
+    def __init__(self, names: Iterable[str]) -> None:
+        self._places = {name: place for place, name in enumerate(sorted(set(names), key=_key))}
+
+    def neighbours(self, known: Sequence[str], photos: Sequence[str], apart: int = 1) -> Neighbours:
+        """The nearest known photos at least so many photos before and after each photo, which is none of its own.
+
+        Args:
+            known: names of the photos of which something is known.
+            photos: names of those whose neighbours are wanted.
+            apart: 1 or more.
+        """
+        sequences: dict[str, list[int]] = {}  # folder -> rows of known photos, in their order
+        for row in sorted(range(len(known)), key=lambda row: self._places[known[row]]):
+            sequences.setdefault(_folder(known[row]), []).append(row)
+        places = {folder: [self._places[known[row]] for row in rows] for folder, rows in sequences.items()}
+        rows, weights = torch.zeros(len(photos), 2, dtype=torch.int64), torch.zeros(len(photos), 2)
+        distances = torch.zeros(len(photos), dtype=torch.int64)
+        for photo, name in enumerate(photos):
+            there, place = places.get(_folder(name), []), self._places[name]
+            before, after = bisect_right(there, place - apart) - 1, bisect_left(there, place + apart)
+            found = [at for at in (before, after) if 0 <= at < len(there)]
+            if not found:
+                continue
+            lengths = [abs(there[at] - place) for at in found]
+            first = lengths[-1] / sum(lengths) if len(found) == 2 else 1.0
+            rows[photo] = torch.tensor([sequences[_folder(name)][at] for at in (found[0], found[-1])])
+            weights[photo], distances[photo] = torch.tensor([first, 1.0 - first]), min(lengths)
+        return Neighbours(rows, weights, distances)
 
 
 def _folder(name: str) -> str:

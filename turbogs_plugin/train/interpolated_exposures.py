@@ -11,28 +11,38 @@ from collections.abc import Sequence
 
 from torch import Tensor
 
-from turbogs_plugin.scene.sequence import neighbours
+from turbogs_plugin.scene.sequence import Neighbours, PhotoOrder
 
 
 def interpolated_exposures(offsets: Tensor, trained: Sequence[str], photos: Sequence[str]) -> Tensor:
-    """[W, 3, 4] float32, ``A | b`` of photos: the mean of their neighbours', times how well that would have told the
-    exposures of the training photos themselves.
+    """[W, 3, 4] float32, ``A | b`` of photos: the mean of their neighbours', times how well that tells exposures.
 
-    That factor is the slope of the least squares of the training photos' exposures against their neighbours' mean,
-    within 0 .. 1: nearly 1 where exposures follow the sequence, and 0, so that all photos have the identity, where they
-    differ at random, as in a collection of many people's photos. A photo without a neighbour has the identity, too.
+    How well is measured on the training photos themselves, as if each were left out together with all that are nearer
+    than the photo's neighbour is: the slope of the least squares of their exposures against their neighbours' mean,
+    within 0 .. 1. It is nearly 1 where exposures follow the sequence, and 0, which gives the identity, where they
+    differ at random, as in a collection of many people's photos, or where a long part of the sequence is missing. A
+    photo without a neighbour has the identity, too.
 
     Args:
         offsets: [V, 3, 4], those of the training photos (`turbogs_plugin.engine.exposures.Exposures`).
         trained: [V] the training photos' names.
         photos: [W] names; a training photo gets its neighbours' exposure, not its own.
     """
-    among = neighbours(trained, trained)
-    between = (among.weights > 0).all(dim=1).to(offsets.device)  # [V]: not those at an end of their sequence
+    order = PhotoOrder([*trained, *photos])
+    found = order.neighbours(trained, photos)
+    told = found.mean(offsets)
+    for apart in found.distances.unique().tolist():
+        there = (found.distances == apart).to(offsets.device)
+        told[there] *= _slope(offsets, order.neighbours(trained, trained, max(1, apart)))
+    return told
+
+
+def _slope(offsets: Tensor, among: Neighbours) -> float:
+    """That of photos' exposures [V, 3, 4] against their neighbours' mean; 0 where no photo has one on either side."""
+    between = (among.weights > 0).all(dim=1).to(offsets.device)  # [V]
     own, told = offsets[between].double(), among.mean(offsets)[between].double()
-    length = told.square().sum()
-    slope = ((own * told).sum() / length).clamp(0.0, 1.0) if length > 0 else length
-    return slope.float() * neighbours(trained, photos).mean(offsets)
+    length = float(told.square().sum())
+    return min(1.0, max(0.0, float((own * told).sum()) / length)) if length > 0 else 0.0
 
 
 def exposed(colors: Tensor, exposure: Tensor) -> Tensor:
