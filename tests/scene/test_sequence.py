@@ -19,25 +19,20 @@ def test_the_nearer_neighbour_weighs_more_and_all_photos_count():
 
 def test_a_photo_is_no_neighbour_of_itself():
     near = neighbours(["1.png", "2.png", "3.png"], ["1.png", "2.png", "3.png"])
-    assert near.rows.tolist() == [[1, 1], [0, 2], [1, 1]]
-    assert near.weights.tolist() == [[1.0, 0.0], [0.5, 0.5], [1.0, 0.0]]
+    assert near.rows.tolist() == [[0, 1], [0, 2], [1, 0]]
+    assert near.weights.tolist() == [[0.0, 1.0], [0.5, 0.5], [1.0, 0.0]]
 
 
 def test_each_folder_is_a_sequence_of_its_own():
     near = neighbours(["left/1.jpg", "left/3.jpg", "right/2.jpg"], ["left/2.jpg", "right/1.jpg", "up/1.jpg"])
-    assert near.rows[:2].tolist() == [[0, 1], [2, 2]]
-    assert near.weights.tolist() == [[0.5, 0.5], [1.0, 0.0], [0.0, 0.0]]
+    assert near.rows.tolist() == [[0, 1], [0, 2], [0, 0]]
+    assert near.weights.tolist() == [[0.5, 0.5], [0.0, 1.0], [0.0, 0.0]]
     assert near.mean(torch.ones(3, 2)).tolist() == [[1.0, 1.0], [1.0, 1.0], [0.0, 0.0]]
 
 
 def test_neighbours_some_photos_apart():
     names = [f"{number}.png" for number in range(9)]
     near = neighbours(names, names, 3)
-    assert near.rows.tolist()[2:5] == [[5, 5], [0, 6], [1, 7]] and near.distances.tolist() == [3] * 9
+    assert near.rows.tolist()[2:5] == [[0, 5], [0, 6], [1, 7]] and near.distances.tolist() == [3] * 9
     few = neighbours(names[::4], names, 2)
     assert few.rows.tolist()[3:6] == [[0, 2], [0, 2], [0, 2]] and few.distances.tolist()[3:6] == [3, 4, 3]
-
-
-def test_nothing_known():
-    near = neighbours([], ["1.jpg"])
-    assert near.weights.tolist() == [[0.0, 0.0]] and near.distances.tolist() == [0]

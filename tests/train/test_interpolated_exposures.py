@@ -38,14 +38,17 @@ def test_exposures_at_random_tell_nothing():
 
 
 def test_a_part_of_the_sequence_that_is_missing_is_told_as_far_as_such_parts_are():
-    """Waves of 38 photos: the next photo tells, and what is half a wave away says the opposite."""
-    names = [f"{number}.jpg" for number in range(200)]
-    wave = of(0.4 * torch.sin(torch.arange(200) / 6))
-    missing = range(80, 118)
-    trained = [number for number in range(200) if number not in missing]
-    told = interpolated_exposures(wave[trained], [names[number] for number in trained], [names[n] for n in missing])
-    assert (told[[0, -1]] - wave[[80, 117]]).abs().max() < 0.06 < 0.2 < wave[[80, 117]].abs().amax(dim=(1, 2)).min()
-    assert not told[18:20].any()
+    """Each photo has .95 of the exposure before it: the next one tells it, and one that is 64 away does not."""
+    random, names = torch.Generator().manual_seed(0), [f"{number}.jpg" for number in range(1000)]
+    gains = torch.randn(1000, generator=random)
+    for number in range(1, 1000):
+        gains[number] = 0.95 * gains[number - 1] + 0.3 * gains[number]
+    exposures, missing = of(gains), range(400, 528)
+    trained = [number for number in range(1000) if number not in missing]
+    told = interpolated_exposures(exposures[trained], [names[n] for n in trained], [names[n] for n in missing])
+    lengths, wanted = told.flatten(1).norm(dim=1), exposures[trained].flatten(1).norm(dim=1)
+    assert (told[[0, -1]] - exposures[[400, 527]]).norm() < 0.5 * exposures[[400, 527]].norm()
+    assert lengths[[0, -1]].min() > 0.5 * wanted.mean() and lengths[56:72].max() < 0.1 * wanted.mean()
 
 
 def test_the_order_of_photos_in_memory_does_not_matter():

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import re
-from bisect import bisect_left, bisect_right
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 
@@ -42,33 +43,35 @@ class PhotoOrder:
     """
 
     def __init__(self, names: Iterable[str]) -> None:
-        self._places = {name: place for place, name in enumerate(sorted(set(names), key=_key))}
+        ordered = sorted(set(names), key=_key)
+        self._places = {name: place for place, name in enumerate(ordered)}
+        self._folders = np.unique([_folder(name) for name in ordered], return_inverse=True)[1]  # of each place
 
     def neighbours(self, known: Sequence[str], photos: Sequence[str], apart: int = 1) -> Neighbours:
         """The nearest known photos at least so many photos before and after each photo, which is none of its own.
 
         Args:
-            known: names of the photos of which something is known.
+            known: names of the photos of which something is known, at least one.
             photos: names of those whose neighbours are wanted.
             apart: 1 or more.
         """
-        sequences: dict[str, list[int]] = {}  # folder -> rows of known photos, in their order
-        for row in sorted(range(len(known)), key=lambda row: self._places[known[row]]):
-            sequences.setdefault(_folder(known[row]), []).append(row)
-        places = {folder: [self._places[known[row]] for row in rows] for folder, rows in sequences.items()}
-        rows, weights = torch.zeros(len(photos), 2, dtype=torch.int64), torch.zeros(len(photos), 2)
-        distances = torch.zeros(len(photos), dtype=torch.int64)
-        for photo, name in enumerate(photos):
-            there, place = places.get(_folder(name), []), self._places[name]
-            before, after = bisect_right(there, place - apart) - 1, bisect_left(there, place + apart)
-            found = [at for at in (before, after) if 0 <= at < len(there)]
-            if not found:
-                continue
-            lengths = [abs(there[at] - place) for at in found]
-            first = lengths[-1] / sum(lengths) if len(found) == 2 else 1.0
-            rows[photo] = torch.tensor([sequences[_folder(name)][at] for at in (found[0], found[-1])])
-            weights[photo], distances[photo] = torch.tensor([first, 1.0 - first]), min(lengths)
-        return Neighbours(rows, weights, distances)
+        there, here = self._places_of(known), self._places_of(photos)[:, None]  # [known], [W, 1]
+        order = there.argsort()
+        there = there[order]
+        before = np.searchsorted(there, here - apart, side="right") - 1
+        found = np.concatenate([before, np.searchsorted(there, here + apart)], axis=1)  # [W, 2]
+        inside = (found >= 0) & (found < len(there))
+        found[~inside] = 0
+        inside &= self._folders[there[found]] == self._folders[here]
+        lengths = np.where(inside, np.abs(there[found] - here), 0)
+        both = inside.all(axis=1, keepdims=True)
+        weights = np.where(both, lengths[:, ::-1] / np.maximum(1, lengths.sum(axis=1, keepdims=True)), inside)
+        rows = np.where(inside, order[found], 0)
+        nearer = np.where(both[:, 0], lengths.min(axis=1), lengths.max(axis=1))
+        return Neighbours(torch.from_numpy(rows), torch.from_numpy(weights).float(), torch.from_numpy(nearer))
+
+    def _places_of(self, names: Sequence[str]) -> NDArray[np.int64]:
+        return np.array([self._places[name] for name in names], dtype=np.int64)
 
 
 def _folder(name: str) -> str:

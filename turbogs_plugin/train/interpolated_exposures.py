@@ -18,10 +18,10 @@ def interpolated_exposures(offsets: Tensor, trained: Sequence[str], photos: Sequ
     """[W, 3, 4] float32, ``A | b`` of photos: the mean of their neighbours', times how well that tells exposures.
 
     How well is measured on the training photos themselves, as if each were left out together with all that are nearer
-    than the photo's neighbour is: the slope of the least squares of their exposures against their neighbours' mean,
-    within 0 .. 1. It is nearly 1 where exposures follow the sequence, and 0, which gives the identity, where they
-    differ at random, as in a collection of many people's photos, or where a long part of the sequence is missing. A
-    photo without a neighbour has the identity, too.
+    than the photo's neighbour is (rounded up to a power of two): the slope of the least squares of their exposures
+    against their neighbours' mean, within 0 .. 1. It is nearly 1 where exposures follow the sequence, and 0, which
+    gives the identity, where they differ at random, as in a collection of many people's photos, or where a long part of
+    the sequence is missing. A photo without a neighbour has the identity, too.
 
     Args:
         offsets: [V, 3, 4], those of the training photos (`turbogs_plugin.engine.exposures.Exposures`).
@@ -31,9 +31,10 @@ def interpolated_exposures(offsets: Tensor, trained: Sequence[str], photos: Sequ
     order = PhotoOrder([*trained, *photos])
     found = order.neighbours(trained, photos)
     told = found.mean(offsets)
-    for apart in found.distances.unique().tolist():
-        there = (found.distances == apart).to(offsets.device)
-        told[there] *= _slope(offsets, order.neighbours(trained, trained, max(1, apart)))
+    steps = 2 ** found.distances.clamp(min=1).log2().ceil().long()  # [W]
+    for apart in steps.unique().tolist():
+        there = (steps == apart).to(offsets.device)
+        told[there] *= _slope(offsets, order.neighbours(trained, trained, apart))
     return told
 
 
