@@ -27,7 +27,7 @@ EXPOSURE_STOPS = 0.05
 have .17 to .19 (docs/plan.md)."""
 EXPOSURE_SHARE = 0.5
 """Share of that deviation which photos may keep from those before and after them: else nothing says what exposure a
-photo has that is not trained. The three captures have .17 to .35."""
+photo has that is not trained. The three captures have .17 to .34."""
 DEVICE_SHARE = 0.5
 """Share of the device's memory that photos and maps may take: the rest is for the model, its optimizer, workspaces."""
 ITERATION_MS = (1.3, 3.4)
