@@ -28,6 +28,8 @@ from turbogs_plugin.study.statistics import Difference, Spread
 
 RESULTS = Path(__file__).resolve().parent / "results"
 FOLDER = RESULTS / "sweeps"
+EXTRA = ("own_psnr", "aligned_psnr")
+"""Further measures of the end that are gathered where a run has them."""
 
 
 @dataclass(frozen=True)
@@ -202,6 +204,9 @@ def gather(name: str, studies: Mapping[str, Path], folder: Path = FOLDER) -> Pat
             for measure, digits in (("psnr", 3), ("ssim", 5), ("num_gaussians", 0), ("train_seconds", 2)):
                 values = [round(getattr(entry, measure), digits) for entry in result.history]
                 cell[measure] = [int(value) for value in values] if measure == "num_gaussians" else values
+            ends = {measure: round(getattr(result.history[-1], measure), 3) for measure in EXTRA}
+            if known := {measure: value for measure, value in ends.items() if not math.isnan(value)}:
+                cell["extra"] = known
             cells.append(cell)
     file = folder / f"{name}.json"
     file.write_text("[\n" + ",\n".join(map(json.dumps, cells)) + "\n]\n")

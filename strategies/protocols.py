@@ -110,6 +110,11 @@ class DensityController(Protocol):
         """
         return True
 
+    def growth_room(self, step: Step) -> float:
+        """How many times its cap a model may have after an event at this iteration, since later events remove the rest;
+        for a memory budget, which limits the largest number of a run."""
+        return 1.0
+
     def apply(self, update: RowUpdate) -> None:
         """Apply the change to the controller's own state, row by row. Called after model and optimizer have followed;
         the rows may be in another order than `update` proposed."""

@@ -20,8 +20,10 @@ from turbogs_plugin.types import Gaussians, RowUpdate, Step
 EPS = 1e-12
 """Keeps divisions defined; the least weight a drawn splat can have in a pixel is 1e-4 / 255."""
 FINAL_PRUNINGS = 3
-"""The paper's runs of 5000 and 8000 iterations have two and three. A run that was made longer without what counts
-iterations would have dozens, and lose most of its model to them."""
+"""Final prunings at most. The paper's runs of 5000 and 8000 iterations have two and three. A run that was made longer
+without what counts iterations would have dozens, and lose most of its model to them."""
+MOST_ROOM = 2.0
+"""Times its cap that a model may have while it grows, however much the final prunings remove."""
 
 
 @dataclass
@@ -55,8 +57,9 @@ class ErrorDrivenDensity(WindowedDensity):
         split: two draws from the Gaussian, all axes divided by 1.6 as in 3DGS (`sample`); or two halves along its
             longest axis, which is divided by 1.6, placed so that the pair has the parent's mean and covariance
             (`long_axis`).
-        max_gaussians: never more than this. An initial model that has more is reduced to it at the first event:
-            those of least worth (`choose_by`) are removed first, those beyond `spare_beyond` last. 0: no cap.
+        max_gaussians: never more than this once the last event is over; before, as many more as the final prunings that
+            are to come take away (`bound`). A model that has more is reduced at the next event: those of least worth
+            (`choose_by`) are removed first, those beyond `spare_beyond` last. 0: no cap.
         prune_opacity: less opaque Gaussians are pruned.
         prune_world_size: pruned where the largest standard deviation exceeds this * `prune_world_reference`. 0: off.
         prune_world_reference: the scene extent, as in 3DGS (`extent`). With `distance`, a Gaussian farther than that
@@ -155,14 +158,31 @@ class ErrorDrivenDensity(WindowedDensity):
     def event_due(self, step: Step) -> bool:
         return any(self.due(step))
 
+    def growth_room(self, step: Step) -> float:
+        return min(MOST_ROOM, self.final_keep ** -self._final_prunings_left(step))
+
+    def bound(self, step: Step) -> int:
+        """Most Gaussians after an event at this iteration; 0: any number. What is grown beyond the cap and then removed
+        by worth makes a better model of as many Gaussians than what never was beyond it (sweeps, eighteenth round)."""
+        return math.floor(self.max_gaussians * self.growth_room(step) + 1e-6)
+
     def _last_event(self, step: Step) -> int:
         """Iteration after which no statistics are needed: that of the last event, or where densification ends.
 
         Not the iteration of the last densification: a time budget may still move `refine_until` and make room for
         another one.
         """
-        events = min(FINAL_PRUNINGS, max(0, step.total - 1 - step.refine_until) // self.final_every)
-        return step.refine_until + (events * self.final_every if self.final_keep < 1 else 0)
+        return step.refine_until + self._final_prunings(step) * self.final_every
+
+    def _final_prunings(self, step: Step) -> int:
+        """How many the run has."""
+        fitting = max(0, step.total - 1 - step.refine_until) // self.final_every
+        return min(FINAL_PRUNINGS, fitting) if self.final_keep < 1 else 0
+
+    def _final_prunings_left(self, step: Step) -> int:
+        """How many come after this iteration."""
+        over = max(0, step.iteration - step.refine_until) // self.final_every
+        return max(0, self._final_prunings(step) - over)
 
     def _refine(self, gaussians: Gaussians, step: Step) -> RowUpdate | None:
         extent = step.scene_extent
@@ -191,13 +211,11 @@ class ErrorDrivenDensity(WindowedDensity):
         pruned = leave_one((hopeless | (big & ~(candidates & ~small))) & ~spared, gaussians)
         candidates &= ~pruned
         if self.max_gaussians > 0:
-            chosen = _first(priority, candidates, max(0, self.max_gaussians - int((~pruned).sum())))
+            chosen = _first(priority, candidates, max(0, self.bound(step) - int((~pruned).sum())))
             denied = candidates & ~chosen
             candidates = chosen
             pruned = leave_one(pruned | (big & denied & ~spared), gaussians)  # too large, but no room to split them
-            excess = int((~pruned).sum()) - self.max_gaussians
-            if excess > 0:  # the model began above the cap; nothing was chosen
-                pruned = pruned | _least(worth, known, ~pruned, spared, excess)
+            pruned = self._within_bound(pruned, worth, known, spared, step)  # if it removes any, nothing was chosen
         return self._compose(gaussians, candidates & small, candidates & ~small, pruned, spared, step)
 
     def _passing(self, score: Tensor, seen: Tensor) -> Tensor:
@@ -228,7 +246,15 @@ class ErrorDrivenDensity(WindowedDensity):
         worth, known = self._worth(score, seen)
         spared = self._spared(gaussians, finite, step.scene_extent)
         pruned = ~finite | _lowest(worth, known & seen & ~spared, 1 - self.final_keep)
-        return removal(leave_one(pruned, gaussians))
+        pruned = leave_one(pruned, gaussians)
+        if self.max_gaussians > 0:
+            pruned = self._within_bound(pruned, worth, known, spared, step)
+        return removal(pruned)
+
+    def _within_bound(self, pruned: Tensor, worth: Tensor, known: Tensor, spared: Tensor, step: Step) -> Tensor:
+        """[N] bool, what is pruned: those of least worth, too, if more would be left than the cap allows."""
+        excess = int((~pruned).sum()) - self.bound(step)
+        return pruned | _least(worth, known, ~pruned, spared, excess) if excess > 0 else pruned
 
     def _compose(
         self, gaussians: Gaussians, cloned: Tensor, split: Tensor, pruned: Tensor, spared: Tensor, step: Step

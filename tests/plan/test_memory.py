@@ -9,7 +9,7 @@ import pytest
 from turbogs_plugin.config.configuration import load_config, resolve
 from turbogs_plugin.config.units import parse_bytes
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.plan.caps import FEWEST_GAUSSIANS, cap_of, lowered_cap, with_cap, without_growth
+from turbogs_plugin.plan.caps import FEWEST_GAUSSIANS, cap_of, growth_room, lowered_cap, with_cap, without_growth
 from turbogs_plugin.plan.memory import MemoryDemand
 
 
@@ -30,6 +30,23 @@ def test_no_cap_is_lowered_to_any():
     free = load_config("turbogs")
     assert cap_of(free) == cap_of(without_growth(free)) == 0
     assert lowered_cap(free, 700).density["max_gaussians"] == 700
+
+
+@pytest.mark.parametrize(
+    ("settings", "times"),
+    [
+        (["density.final_every=500"], 0.95**-2),
+        (["density.final_every=200"], 0.95**-3),
+        (["density.final_every=2000"], 1.0),
+        (["density.final_keep=1"], 1.0),
+        (["density.final_keep=0.1"], 2.0),
+        (["density.type=mcmc"], 1.0),
+        (["density.type=none"], 1.0),
+    ],
+)
+def test_a_memory_budget_leaves_room_for_what_is_grown_beyond_the_cap(settings, times):
+    config = load_config("turbogs", ["train.iterations=5000", "train.refine_until=3500", *settings])
+    assert growth_room(config) == pytest.approx(times)
 
 
 @pytest.mark.parametrize("kind", ["gsplat_default", "fastgs"])

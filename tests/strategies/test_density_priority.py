@@ -13,7 +13,7 @@ from turbogs_plugin.strategies.density.priority import drawn_by_squares, squares
 from turbogs_plugin.types import GaussianStats, Step
 
 COUNT = 40
-FULL = Step(1200, 5000, 3500, seed=3, scene_extent=2.0)
+FULL = Step(1200, 3500, 3500, seed=3, scene_extent=2.0)  # no final pruning follows
 FINAL = Step(4000, 5000, 3500)
 GROWS = {
     "grad_threshold": 0.0,
@@ -62,7 +62,7 @@ def test_a_draw_is_a_function_of_seed_and_iteration():
     stats = random_stats(COUNT, seed=1)
     one, same, later, other = (
         drawn_by_squares(stats, step)
-        for step in (FULL, FULL, Step(1300, 5000, 3500, seed=3), Step(1200, 5000, 3500, seed=4))
+        for step in (FULL, FULL, Step(1300, 3500, 3500, seed=3), Step(1200, 3500, 3500, seed=4))
     )
     assert torch.equal(one, same) and not torch.equal(one, later) and not torch.equal(one, other)
 

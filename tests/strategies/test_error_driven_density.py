@@ -19,7 +19,7 @@ from turbogs_plugin.strategies.optimizers.moment_lm import MomentLMOptimizer
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.types import GaussianStats, Step
 
-FULL = Step(1200, 5000, 3500, seed=3, scene_extent=2.0)  # past `prune_size_from`
+FULL = Step(1200, 3500, 3500, seed=3, scene_extent=2.0)  # past `prune_size_from`; no final pruning follows
 QUIET = {"prune_world_size": 0.0, "prune_opacity": 0.0}
 
 
@@ -366,7 +366,8 @@ def test_state_statistics_and_parameters_stay_together(seed, split, cap, decay, 
         moments.steps[:] = tags.int() + 1
         if density.stats is not None:
             fill(density.stats, random_stats(len(gaussians), seed + iteration))
-        update = density.update(gaussians, Step(iteration, 1600, 500, seed, scene_extent=1.0))
+        step = Step(iteration, 1600, 500, seed, scene_extent=1.0)
+        update = density.update(gaussians, step)
         if update is not None:
             before = len(gaussians)
             order = torch.randperm(len(update.source), generator=torch.Generator().manual_seed(seed))
@@ -376,7 +377,7 @@ def test_state_statistics_and_parameters_stay_together(seed, split, cap, decay, 
             density.apply(update)
             assert int(update.source.max()) < before and len(gaussians) >= 1
             if not gsplat and cap:
-                assert len(gaussians) <= max(cap, 0)
+                assert len(gaussians) <= density.bound(step)
             moments, tags = optimizer.moments, gaussians.sh0[:, 0, 0]
             expected = torch.where(update.fresh, 0.0, tags)
             assert torch.equal(moments.exp_avg[:, 0], expected) and torch.equal(moments.exp_avg_shN[:, 0], expected)
@@ -492,3 +493,49 @@ def test_the_cap_takes_the_backdrop_last(cap, kept):
     stats.error_sums[:] = torch.tensor([0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 0.1, 0.2, 0.3, 0.4])  # the backdrop is easiest
     density = controlled(gaussians, stats, max_gaussians=cap, spare_beyond=10.0, **QUIET)
     assert density.update(gaussians, FULL).source.tolist() == kept
+
+
+@given(
+    cap=st.integers(1, 60),
+    keep=st.sampled_from([0.1, 0.5, 0.8, 0.95, 1.0]),
+    every=st.sampled_from([100, 150, 400, 1100]),
+    choose_by=st.sampled_from(["difficulty", "squares"]),
+    seen=st.sampled_from([0.0, 0.5, 1.0]),
+    far=st.booleans(),
+)
+@settings(max_examples=60, deadline=None)
+def test_the_cap_holds_at_the_end(cap, keep, every, choose_by, seen, far):
+    """Whatever was seen, and whatever is spared: never more than the bound, and at the end never more than the cap."""
+    settings_of = {"max_gaussians": cap, "final_keep": keep, "final_every": every, "choose_by": choose_by}
+    gaussians = make_gaussians(40, dtype=torch.float32)
+    gaussians.means[:20] *= 1e3 if far else 1.0
+    density = controlled(gaussians, **settings_of, spare_beyond=10.0, **QUIET, split="long_axis")
+    total, seed = 1500, 0
+    for iteration in range(100, total, 50):
+        step = Step(iteration, total, 800, seed)
+        if density.stats is not None:
+            fill(density.stats, random_stats(len(gaussians), iteration, seen))
+        update = density.update(gaussians, step)
+        if update is not None:
+            gaussians = update.apply(gaussians)
+            density.apply(update)
+            assert len(gaussians) <= density.bound(step) <= 2 * cap
+    assert len(gaussians) <= density.bound(step) == cap
+
+
+def test_growth_goes_beyond_the_cap_by_what_final_prunings_remove():
+    """To the room that they leave, and down again by worth, to the cap itself."""
+    gaussians = make_gaussians(40, dtype=torch.float32)
+    density, counts = controlled(gaussians, max_gaussians=100, percent_dense=0.0, **QUIET), {}
+    for iteration in (200, 300, 3500, 4000, 4500):
+        if density.stats is not None:
+            fill(density.stats, random_stats(len(gaussians), iteration, seen=1.0))
+            density.stats.grad_sums += 1.0
+        least = set(density.scores(Step(iteration, 5000, 3500))[0].argsort()[:4].tolist())
+        update = density.update(gaussians, Step(iteration, 5000, 3500))
+        gaussians = update.apply(gaussians)
+        density.apply(update)
+        counts[iteration] = len(gaussians)
+        if iteration > 3500:
+            assert least.isdisjoint(update.source.tolist())
+    assert counts == {200: 60, 300: 90, 3500: 110, 4000: 105, 4500: 100}

@@ -10,7 +10,7 @@ from helpers.simulated_time import SimulatedTime
 from turbogs_plugin.strategies.pixel_sampling import ErrorGuidedPixelSampler
 
 from turbogs_plugin.config.configuration import load_config
-from turbogs_plugin.plan.caps import EXPECTED_GROWTH, growth_cap
+from turbogs_plugin.plan.caps import EXPECTED_GROWTH, growth_cap, growth_room
 from turbogs_plugin.plan.memory import MemoryDemand
 from turbogs_plugin.plan.pixels import TOLERANCE, pixel_budget_range, pixels_for_time, with_pixel_budget
 from turbogs_plugin.plan.time import IterationCost
@@ -180,14 +180,15 @@ def test_pixels_and_gaussians_share_the_memory(scene, monkeypatch):
     config, _ = planned(scene, monkeypatch)
     demand = calibration._memory_demand(config, scene)
     expected = int(EXPECTED_GROWTH * SyntheticTrial.gaussians)
+    most = growth_room(config) * expected  # what it has while it grows
     rounding = 1e-3 + demand.per_gaussian / demand.per_image  # the cap is whole Gaussians: lambda gets what is left
     for room, raised in ((1.5, 2.5), (-0.5, 1.0)):
-        limit = int(demand.fixed + expected * demand.per_gaussian + room * demand.per_image)
+        limit = int(demand.fixed + most * demand.per_gaussian + room * demand.per_image)
         config, _ = planned(scene, monkeypatch, f"budget.max_memory='{limit}'", "budget.time=30s")
         assert config.schedule["pixel_budget"] == pytest.approx(raised, abs=rounding)
         needed = calibration._memory_demand(config, scene)
         cap = config.density["max_gaussians"]
-        assert cap == (limit - needed.fixed) // needed.per_gaussian
+        assert cap == int((limit - needed.fixed) // needed.per_gaussian / growth_room(config))
         assert room < 0 or cap == pytest.approx(expected, rel=0.01)
 
 

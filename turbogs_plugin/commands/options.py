@@ -37,7 +37,7 @@ class RunOptions:
         config: name of a packaged configuration or a .yaml file; turbogs where absent.
         factor: scale photos down by this.
         device: where to train; auto takes a GPU where there is one.
-        max_gaussians: never more than this (density.max_gaussians).
+        max_gaussians: of the finished model (density.max_gaussians). While it grows it may have some more.
         max_memory: of the GPU, never more than this for tensors: 2GiB, 1500MB (budget.max_memory). Photos and error
             maps move to the host if need be, then the number of Gaussians is limited.
         time_budget: seconds of training to end after: 20s, 2m (budget.time). The schedule is fitted to it, and

@@ -8,6 +8,7 @@ import numpy as np
 
 from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.errors import InputError
+from turbogs_plugin.types import Step
 
 FEWEST_GAUSSIANS = 1000
 """Fewer are no model of a capture."""
@@ -22,7 +23,7 @@ def keeps_cap(config: Config) -> bool:
 
 
 def cap_of(config: Config) -> int:
-    """Never more Gaussians than this; 0: no cap."""
+    """Most Gaussians of the finished model; 0: no cap."""
     return config.density.get("max_gaussians", 0)
 
 
@@ -39,8 +40,18 @@ def with_cap(config: Config, cap: int) -> Config:
 
 
 def lowered_cap(config: Config, cap: int) -> Config:
-    """The configuration with never more Gaussians than `cap`, or its own cap if that is less. Raises as `with_cap`."""
+    """The configuration with this cap, or its own if that is less. Raises as `with_cap`."""
     return with_cap(config, min(cap, cap_of(config) or cap))
+
+
+def growth_room(config: Config) -> float:
+    """How many times its cap a run may have while it grows.
+
+    Args:
+        config: with the run's iterations decided.
+    """
+    train = config.train
+    return config.build("density").growth_room(Step(0, train.iterations, train.refine_until))
 
 
 def without_growth(config: Config) -> Config:
@@ -49,7 +60,7 @@ def without_growth(config: Config) -> Config:
 
 
 def growth_cap(config: Config, initial: int) -> int:
-    """How many Gaussians there can be at most; 0: any number. A model that does not grow has its initial number."""
+    """How many Gaussians there can be at the end; 0: any number. A model that does not grow has its initial number."""
     return initial if config.density["type"] == "none" else cap_of(config)
 
 
@@ -71,7 +82,7 @@ def chosen_points(count: int, cap: int, others: int) -> slice | np.ndarray:
     """Which of `count` points a model begins with: all, or as many as leave room for `others` under a cap, evenly.
 
     Args:
-        cap: never more Gaussians; 0: no cap.
+        cap: most Gaussians; 0: no cap.
         others: Gaussians that are no points of the capture.
 
     Raises:

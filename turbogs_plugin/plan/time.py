@@ -53,7 +53,7 @@ def fit_to_time(
         seconds: left for iterations.
         initial: Gaussians at the start; their number is expected to rise along a line until the end of density control,
             to `expected_gaussians`.
-        cap: never more Gaussians; 0: none.
+        cap: most Gaussians at the end; 0: none.
         iterations: configured.
         refine_share: of the iterations, those with density control.
         keeps_cap: whether the density control would keep a smaller cap.

@@ -75,14 +75,14 @@ def within_budget(
     limit, seconds = config.budget.memory_bytes(), config.budget.seconds()
     if limit is not None:
         hold_to(limit, device)
-        config = caps.lowered_cap(config, _memory_demand(config, scene).gaussians(limit))
+        config = _within_memory(config, scene, limit)
     if seconds is None:
         return config, None
     measured = calibrate(config, scene, device, seconds, ranks)
     if measured.pixel_budget > measured.configured_pixel_budget:
         config = pixels.with_pixel_budget(config, measured.pixel_budget)
         if limit is not None:
-            config = caps.lowered_cap(config, _memory_demand(config, scene).gaussians(limit))
+            config = _within_memory(config, scene, limit)
     left = seconds - (measured.seconds + measured.initialisation)
     iterations, cap = _fit(config, left, measured.cost, measured.gaussians)
     if cap != caps.growth_cap(config, measured.gaussians):
@@ -121,6 +121,12 @@ def hold_to(limit: int, device: torch.device) -> None:
     require_gpu_memory(device)
     total = torch.cuda.get_device_properties(device).total_memory
     torch.cuda.set_per_process_memory_fraction(min(1.0, limit / total))
+
+
+def _within_memory(config: Config, scene: Scene, limit: int) -> Config:
+    """The configuration whose largest number of Gaussians fits into the memory."""
+    most = _memory_demand(config, scene).gaussians(limit)
+    return caps.lowered_cap(config, max(1, int(most / caps.growth_room(config))))
 
 
 def _memory_demand(config: Config, scene: Scene) -> MemoryDemand:
@@ -198,7 +204,7 @@ def _room_for_images(config: Config, scene: Scene, device: torch.device, gaussia
     if limit is None:
         limit = int(MEMORY_SHARE * (torch.cuda.mem_get_info(device)[0] + torch.cuda.memory_reserved(device)))
     expected = max(caps.FEWEST_GAUSSIANS, caps.expected_gaussians(gaussians, caps.growth_cap(config, gaussians)))
-    return _memory_demand(config, scene).more_images(limit, expected)
+    return _memory_demand(config, scene).more_images(limit, caps.growth_room(config) * expected)
 
 
 class _Trial:
