@@ -69,4 +69,4 @@ def learn_exposures(
 
 
 def _rows(samples: PixelSamples) -> list[int]:
-    return view_rows(np.zeros(len(samples.view_ids), dtype=np.int64), samples.sizes, samples.view_ids)
+    return view_rows(np.zeros(len(samples.view_ids), dtype=np.int64), samples.sizes.tolist(), samples.view_ids)

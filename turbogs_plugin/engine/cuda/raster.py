@@ -48,9 +48,6 @@ def _check(gaussians: Gaussians, cameras: Cameras, samples: PixelSamples) -> Non
         for name, tensor in tensors:
             if tensor.dtype != dtype or tensor.device != device:
                 raise InputError(f"{name} must be {dtype} on {device}, got {tensor.dtype} on {tensor.device}")
-    require_views(len(cameras))
-    if cameras.sizes.tolist() != samples.sizes.tolist():
-        raise InputError("cameras and samples differ in their image sizes: select the cameras of samples.view_ids")
 
 
 def warps_per_tile(slots: int, tiles: int) -> int:
@@ -309,8 +306,14 @@ def rasterize_cuda(
     """
     library.require()
     degree, settings = options.used_degree(gaussians), options.settings
-    _check(gaussians, cameras, samples)
-    gaussians = gaussians.map(_prepared)
+    require_views(len(cameras))
+    if cameras.sizes.tolist() != samples.sizes.tolist():
+        raise InputError("cameras and samples differ in their image sizes: select the cameras of samples.view_ids")
+    if workspace is None or not workspace.knows(gaussians):
+        _check(gaussians, cameras, samples)
+        given, gaussians = gaussians, gaussians.map(_prepared)
+        if workspace is not None and all(value is getattr(given, name) for name, value in gaussians.items()):
+            workspace.know(given)
     device = gaussians.device
     buffers = _Buffers(workspace, device)
     views, count, slots = len(cameras), len(gaussians), len(samples)

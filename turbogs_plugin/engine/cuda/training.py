@@ -9,6 +9,7 @@ torch's current stream and does not wait. Tensors must be contiguous. A wrong de
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 from itertools import accumulate
 
@@ -42,41 +43,25 @@ def sample_pixels(rule: DrawRule, maps: ErrorMaps, view_ids: tuple[int, ...], ra
     maps.fetch(view_ids)
     views = np.asarray(view_ids, dtype=np.int64)
     device, sizes = maps.errors.device, maps.sizes[views]
-    shapes = sizes.tolist()
-    masks, live_starts = maps.masks or launches.NO_MASKS, [0] * len(shapes)
-    tiles = [-(-width // TILE_SIZE) * -(-height // TILE_SIZE) for width, height in shapes]  # [K]
-    if maps.masks is not None:
-        live_starts, tiles = maps.masks.offsets[views].tolist(), maps.masks.live_counts(view_ids)
-    scratch, by_tile = launches.NO_SCRATCH, rule.unit == "tile"
-    if by_tile:
-        wanted, slots_per_tile = [rule.wanted(rate, count) for count in tiles], 0
-        ends = list(accumulate(wanted))  # of each view's chosen tiles
-        chosen, slots = ends[-1], ends[-1] * TILE_PIXELS
+    shapes, masks = tuple(map(tuple, sizes.tolist())), launches.NO_MASKS
+    if maps.masks is None:
+        tiles, live_starts = _tiles(shapes), None
+    else:
+        masks = maps.masks
+        tiles, live_starts = tuple(masks.live_counts(view_ids)), tuple(masks.offsets[views].tolist())
+    places = _places(rule, _wanted(rule, rate, tiles), shapes, tiles, live_starts)
+    scratch = launches.NO_SCRATCH
+    if rule.unit == "tile":
         dtypes = (torch.float64, torch.int32, torch.int64, torch.float32)
         scratch = launches.TileScratch(*(torch.empty(sum(tiles), dtype=dtype, device=device) for dtype in dtypes))
-    else:
-        unit_pixels = CELL_SIDE**2 if rule.unit == "cell" else 1
-        wanted = [rule.wanted(rate, TILE_PIXELS // unit_pixels)] * len(tiles)  # of each tile
-        slots_per_tile = wanted[0] * unit_pixels
-        if maps.masks is None:
-            ends = list(accumulate(_view_slots(*size, rule.unit, wanted[0]) for size in shapes))
-        else:
-            ends = list(accumulate(slots_per_tile * count for count in tiles))
-        chosen, slots = sum(tiles), ends[-1]
-    stages = {count: rule.stages(count) for count in set(wanted)}
-    firsts = zip([0, *ends[:-1]], wanted, strict=True)
-    live = zip(live_starts, tiles, strict=True)
-    draws = [
-        (first, count if by_tile else 0, *stages[count], *of_view)
-        for (first, count), of_view in zip(firsts, live, strict=True)
-    ]
+    slots, chosen = places.slots, places.chosen
     draw = launches.SamplePixels(
         errors=maps.errors,
         stamps=maps.stamps,
-        views=view_rows(maps.offsets[views], sizes, view_ids, draws),
+        views=view_rows(maps.offsets[views], shapes, view_ids, places.draws),
         unit=UNITS.index(rule.unit),
         masks=masks,
-        slots_per_tile=slots_per_tile,
+        slots_per_tile=places.slots_per_tile,
         mixed_uniform=rule.mixed_uniform,
         importance=rule.importance,
         seed=step.seed,
@@ -93,7 +78,6 @@ def sample_pixels(rule: DrawRule, maps: ErrorMaps, view_ids: tuple[int, ...], ra
     else:
         draw.tile_offsets.zero_()
     weights = draw.weights
-    has_empty_slots = rule.unit != "pixel" or maps.masks is not None
     if weights is not None:
         weights = weights * ((draw.pixel_ids >= 0).sum() / weights.sum())
     return PixelSamples(
@@ -103,11 +87,78 @@ def sample_pixels(rule: DrawRule, maps: ErrorMaps, view_ids: tuple[int, ...], ra
         draw.tile_ids,
         draw.tile_offsets,
         weights,
-        has_empty_slots,
-        host_ends=DrawEnds(
-            rule.unit, tuple(map(tuple, shapes)), tuple(wanted), None if maps.masks is None else tuple(tiles)
-        ),
+        has_empty_slots=rule.unit != "pixel" or maps.masks is not None,
+        host_ends=places.ends,
     )
+
+
+@dataclass(frozen=True)
+class _Places:
+    """What a draw takes from views of given sizes.
+
+    Args:
+        chosen: tiles of all views that get samples.
+        slots: of all views.
+        slots_per_tile: 0 where tiles are drawn.
+        draws: for each view the last five numbers of its `layout.DrawRow`.
+        ends: see `PixelSamples.host_ends`.
+    """
+
+    chosen: int
+    slots: int
+    slots_per_tile: int
+    draws: tuple[tuple[int, ...], ...]
+    ends: DrawEnds
+
+
+def _wanted(rule: DrawRule, rate: float, tiles: Sequence[int]) -> tuple[int, ...]:
+    """For each view, how many of its tiles are drawn, or how many units of each of its tiles."""
+    if rule.unit == "tile":
+        return tuple(rule.wanted(rate, count) for count in tiles)
+    units = TILE_PIXELS // (CELL_SIDE**2 if rule.unit == "cell" else 1)
+    return (rule.wanted(rate, units),) * len(tiles)
+
+
+@lru_cache(maxsize=4096)
+def _tiles(shapes: tuple[tuple[int, int], ...]) -> tuple[int, ...]:
+    """Number of tiles of views with these (width, height)."""
+    return tuple(-(-width // TILE_SIZE) * -(-height // TILE_SIZE) for width, height in shapes)
+
+
+@lru_cache(maxsize=4096)
+def _places(
+    rule: DrawRule,
+    wanted: tuple[int, ...],
+    shapes: tuple[tuple[int, int], ...],
+    tiles: tuple[int, ...],
+    live_starts: tuple[int, ...] | None,
+) -> _Places:
+    """Kept, as a hundred iterations ask for the same: to make them takes the host longer than to enqueue the draw.
+
+    Args:
+        wanted: of each view, from `_wanted`.
+        shapes: of each view.
+        tiles: of each view, those that are not masked whole.
+        live_starts: where each view's tiles stand among the unmasked ones; None without masks.
+    """
+    by_tile, slots_per_tile = rule.unit == "tile", 0
+    if by_tile:
+        ends = list(accumulate(wanted))  # of each view's chosen tiles
+        chosen, slots = ends[-1], ends[-1] * TILE_PIXELS
+    else:
+        slots_per_tile = wanted[0] * (CELL_SIDE**2 if rule.unit == "cell" else 1)
+        if live_starts is None:
+            ends = list(accumulate(_view_slots(*shape, rule.unit, wanted[0]) for shape in shapes))
+        else:
+            ends = list(accumulate(slots_per_tile * count for count in tiles))
+        chosen, slots = sum(tiles), ends[-1]
+    starts = live_starts or (0,) * len(tiles)
+    draws = tuple(
+        (first, count if by_tile else 0, *rule.stages(count), start, live)
+        for first, count, start, live in zip([0, *ends[:-1]], wanted, starts, tiles, strict=True)
+    )
+    host_ends = DrawEnds(rule.unit, shapes, wanted, None if live_starts is None else tiles)
+    return _Places(chosen, slots, slots_per_tile, draws, host_ends)
 
 
 @lru_cache(maxsize=4096)
@@ -117,11 +168,14 @@ def _view_slots(width: int, height: int, unit: str, wanted: int) -> int:
 
 
 def view_rows(
-    starts: np.ndarray, sizes: np.ndarray, view_ids: Sequence[int], draws: Sequence[tuple[int, ...]] | None = None
+    starts: np.ndarray,
+    shapes: Sequence[Sequence[int]],
+    view_ids: Sequence[int],
+    draws: Sequence[tuple[int, ...]] | None = None,
 ) -> list[int]:
-    """A `layout.ViewRow` for each view (with `draws` a `layout.DrawRow`), end to end."""
+    """A `layout.ViewRow` for each view (with `draws` a `layout.DrawRow`), end to end. `shapes`: (width, height)."""
     require_views(len(view_ids))
-    columns = zip(starts.tolist(), sizes.tolist(), view_ids, draws or [()] * len(view_ids), strict=True)
+    columns = zip(starts.tolist(), shapes, view_ids, draws or [()] * len(view_ids), strict=True)
     return [number for start, size, view_id, draw in columns for number in (start, *size, view_id, *draw)]
 
 
@@ -166,7 +220,7 @@ def sparse_loss(
         targets=None if photos is not None else targets.detach().float().contiguous(),
         photos=photos,
         samples=samples,
-        views=view_rows(starts, samples.sizes, samples.view_ids),
+        views=view_rows(starts, samples.sizes.tolist(), samples.view_ids),
         structure=STRUCTURES.index(terms.structure),
         terms=terms,
         maps=maps,

@@ -15,12 +15,14 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, TypeVar
+from weakref import ref
 
 import torch
 from torch import Tensor
 
 from turbogs_plugin.engine.layout import INTERSECTIONS_MAX
 from turbogs_plugin.errors import InputError
+from turbogs_plugin.types import Gaussians
 
 Kept = TypeVar("Kept")
 
@@ -95,6 +97,7 @@ class Workspace:
         self._gaussians = 0
         self._intersections_per_tile = 0.0
         self._first_lost: int | None = None
+        self._known: Callable[[], Gaussians | None] = lambda: None
 
     @property
     def overflow(self) -> Tensor:
@@ -134,6 +137,14 @@ class Workspace:
             if tensor is not None:
                 self._buffers[name] = tensor
                 self._lent.add(name)
+
+    def know(self, gaussians: Gaussians) -> None:
+        """Remember this model, until another one: its tensors are as kernels take them."""
+        self._known = ref(gaussians)
+
+    def knows(self, gaussians: Gaussians) -> bool:
+        """Whether it is the model remembered, whose tensors need no look at each pass; operators look at them, too."""
+        return self._known() is gaussians
 
     def kept(self, name: str, sizes: tuple, make: Callable[[], Kept]) -> Kept:
         """What `make` gives; made anew only where the sizes are others than at the last call of this name.
