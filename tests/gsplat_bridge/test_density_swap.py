@@ -250,6 +250,18 @@ def test_an_event_is_the_controllers_with_these_values(name, tells_errors):
         assert differ(after, controlled(BASE_OF_CONTROLLER, before, window, 0, 1.0, 14_999))
 
 
+def test_a_cap_holds_at_any_step():
+    """A trainer may end at any step, so growth counts on no final pruning."""
+    fields = {"refine_start_iter": 1, "refine_every": 2, "refine_stop_iter": 9, "final_every": 3, "final_keep": 0.8}
+    grows = {"grow_grad2d": 0.0, "grow_absgrad2d": 0.0, "top_fraction": 1.0, "prune_opa": 0.0, "prune_scale3d": 0.0}
+    strategy = TurboDensityStrategy(**{**BASE, **fields, **grows, "max_gaussians": 50})
+    host, counts = Host(strategy), []
+    for step in range(16):
+        host.step(step)
+        counts.append(len(host.splats["means"]))
+    assert counts[8] == max(counts) == 50 and counts[-1] < 50, counts
+
+
 def test_no_opacity_is_reset():
     """gsplat resets where step % reset_every == 0; here, the optimizers apart, no step changes an opacity."""
     fields = {"refine_start_iter": 1, "refine_every": 2, "reset_every": 2, "grow_grad2d": 1.0}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -67,6 +66,7 @@ class TurboDensityStrategy(DefaultStrategy):
             `ErrorDrivenDensity`.
         choose_by: `squares`, turbogs' own, needs the line above, and that `sparse_rasterization` renders; set
             grow_absgrad2d and prune_score_fraction to turbogs' values with it.
+        max_gaussians: never more, at any step, as the end of the run is not known.
         final_every, final_keep: final pruning after refine_stop_iter, three times at most; off where final_keep is 1.
         seed: of the positions of split Gaussians.
     """
@@ -146,8 +146,8 @@ class TurboDensityStrategy(DefaultStrategy):
         controller = self._controller(step)
         controller.setup(gaussians)
         controller.load_state_dict({"stats": vars(window)})
-        # The end of the run is not known here; the controller needs it only to stop taking statistics.
-        now = Step(step, sys.maxsize, self.refine_stop_iter - 1, self.seed, state["scene_scale"])
+        # The end of the run is not known here, so no final pruning is counted on: `max_gaussians` holds at any step.
+        now = Step(step, step + 1, self.refine_stop_iter - 1, self.seed, state["scene_scale"])
         update = controller.update(gaussians, now)
         window.zero_()
         if update is None:
