@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.config.sections import TrainConfig
-from turbogs_plugin.plan.caps import cap_of
+from turbogs_plugin.plan.caps import cap_of, growth_room
 from turbogs_plugin.plan.time import IterationCost
 
 MARK_SHARE = 0.03
@@ -66,7 +66,7 @@ class TimePace:
         seconds: when to end, on the clock of training; the time before the first iteration counts.
         cost: how the cost of an iteration depends on the number of Gaussians, from the calibration. Only its ratios
             count. None: growth is not foreseen.
-        cap: most Gaussians; 0: no cap.
+        cap: most Gaussians at any time; 0: no cap.
     """
 
     def __init__(self, train: TrainConfig, seconds: float, cost: IterationCost | None = None, cap: int = 0) -> None:
@@ -152,4 +152,4 @@ def pace_of(config: Config, cost: IterationCost | None = None) -> Pace:
     seconds = config.budget.seconds()
     if seconds is None:
         return IterationPace(config.train)
-    return TimePace(config.train, seconds, cost, cap_of(config))
+    return TimePace(config.train, seconds, cost, int(growth_room(config) * cap_of(config)))
