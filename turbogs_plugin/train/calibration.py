@@ -98,7 +98,7 @@ def budget_text(config: Config, measured: Calibration | None) -> str:
     """
     parts = []
     if caps.cap_of(config):
-        parts.append(f"at most {caps.cap_of(config)} Gaussians")
+        parts.append(f"at most {caps.cap_of(config)} Gaussians at the end")
     if config.budget.max_memory:
         parts.append(f"{config.budget.max_memory} of device memory")
     if measured is not None:
