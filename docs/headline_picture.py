@@ -66,10 +66,9 @@ def draw(data: dict[str, Any]) -> Figure:
             style = {"color": PICTURE_COLORS[name], "marker": "*" if name == "turbogs" else "o", "linestyle": ""}
             size = 13 if name == "turbogs" else 6
             axes[0, column].plot(seconds, psnr, markersize=size, label=name, **style)
-            if gaussians is not None:
-                axes[1, column].plot(gaussians, psnr, markersize=size, label=name, **style)
-            if gaussians is not None and ssim is not None:
-                axes[2, column].plot(gaussians, ssim, markersize=size, label=name, **style)
+            for axis, error in zip(axes[1:, column], (psnr, ssim), strict=True):
+                if gaussians is not None and error is not None:
+                    axis.plot(gaussians, error, markersize=size, label=name, **style)
         best, worst = (pick(point[2] for point in shown["points"]) for pick in (max, min))
         longest = max(250.0, *(1.2 * point[1] for point in shown["points"]))
         axes[0, column].set(title=capture, xlabel="training seconds", xlim=(0.3, longest))

@@ -151,15 +151,14 @@ class ErrorDrivenDensity(WindowedDensity):
         """Whether this iteration densifies, and whether it makes a final pruning."""
         iteration, after = step.iteration, step.iteration - step.refine_until
         densify = after <= 0 and iteration >= self.refine_from and iteration % self.refine_every == 0
-        final = 0 < after <= FINAL_PRUNINGS * self.final_every and iteration < step.total
-        final = final and after % self.final_every == 0
-        return densify, self.final_keep < 1 and final
+        final = 0 < after <= self._final_prunings(step) * self.final_every and after % self.final_every == 0
+        return densify, final
 
     def event_due(self, step: Step) -> bool:
         return any(self.due(step))
 
     def growth_room(self, step: Step) -> float:
-        return min(MOST_ROOM, self.final_keep ** -self._final_prunings_left(step))
+        return 1 / max(1 / MOST_ROOM, self.final_keep ** self._final_prunings_left(step))
 
     def bound(self, step: Step) -> int:
         """Most Gaussians after an event at this iteration; 0: any number. What is grown beyond the cap and then removed
@@ -246,14 +245,11 @@ class ErrorDrivenDensity(WindowedDensity):
         worth, known = self._worth(score, seen)
         spared = self._spared(gaussians, finite, step.scene_extent)
         pruned = ~finite | _lowest(worth, known & seen & ~spared, 1 - self.final_keep)
-        pruned = leave_one(pruned, gaussians)
-        if self.max_gaussians > 0:
-            pruned = self._within_bound(pruned, worth, known, spared, step)
-        return removal(pruned)
+        return removal(self._within_bound(leave_one(pruned, gaussians), worth, known, spared, step))
 
     def _within_bound(self, pruned: Tensor, worth: Tensor, known: Tensor, spared: Tensor, step: Step) -> Tensor:
         """[N] bool, what is pruned: those of least worth, too, if more would be left than the cap allows."""
-        excess = int((~pruned).sum()) - self.bound(step)
+        excess = int((~pruned).sum()) - self.bound(step) if self.max_gaussians > 0 else 0
         return pruned | _least(worth, known, ~pruned, spared, excess) if excess > 0 else pruned
 
     def _compose(

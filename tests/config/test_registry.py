@@ -130,7 +130,8 @@ def test_what_is_no_sampler_is_refused(monkeypatch, attribute, options, words):
 
 def test_all_that_a_class_lacks_is_named(monkeypatch):
     _plug_in(monkeypatch, "half", "third_party_samplers:Half")
-    lacking = "is no DensityController: it lacks watched, stats, event_due, growth_room, apply, state_dict"
+    lacking = "is no DensityController: it lacks watched, stats, event_due, growth_room, apply, "
+    lacking += "state_dict, load_state_dict"
     with pytest.raises(InputError, match=lacking):
         registry.build("density", {"type": "half"})
 

@@ -40,6 +40,7 @@ def test_no_cap_is_lowered_to_any():
         (["density.final_every=2000"], 1.0),
         (["density.final_keep=1"], 1.0),
         (["density.final_keep=0.1"], 2.0),
+        (["density.final_keep=1e-300"], 2.0),
         (["density.type=mcmc"], 1.0),
         (["density.type=none"], 1.0),
     ],

@@ -30,6 +30,11 @@ def test_each_folder_is_a_sequence_of_its_own():
     assert near.mean(torch.ones(3, 2)).tolist() == [[1.0, 1.0], [1.0, 1.0], [0.0, 0.0]]
 
 
+def test_nothing_known():
+    near = neighbours([], ["1.jpg"])
+    assert near.weights.tolist() == [[0.0, 0.0]]
+
+
 def test_neighbours_some_photos_apart():
     names = [f"{number}.png" for number in range(9)]
     near = neighbours(names, names, 3)

@@ -51,7 +51,7 @@ class PhotoOrder:
         """The nearest known photos at least so many photos before and after each photo, which is none of its own.
 
         Args:
-            known: names of the photos of which something is known, at least one.
+            known: names of the photos of which something is known.
             photos: names of those whose neighbours are wanted.
             apart: 1 or more.
         """
@@ -61,7 +61,7 @@ class PhotoOrder:
         before = np.searchsorted(there, here - apart, side="right") - 1
         found = np.concatenate([before, np.searchsorted(there, here + apart)], axis=1)  # [W, 2]
         inside = (found >= 0) & (found < len(there))
-        found[~inside] = 0
+        there, order, found[~inside] = np.append(there, 0), np.append(order, 0), -1  # -1: the one appended
         inside &= self._folders[there[found]] == self._folders[here]
         lengths = np.where(inside, np.abs(there[found] - here), 0)
         both = inside.all(axis=1, keepdims=True)

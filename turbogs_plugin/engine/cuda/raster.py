@@ -8,7 +8,7 @@ tiles and splats; with one it never waits (see `workspace.py`).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from functools import partial
 
@@ -38,16 +38,36 @@ def _prepared(tensor: Tensor) -> Tensor:
     return tensor if tensor.data_ptr() % 16 == 0 else tensor.clone()
 
 
-def _check(gaussians: Gaussians, cameras: Cameras, samples: PixelSamples) -> None:
-    device = gaussians.device
-    if device.type != "cuda":
-        raise InputError(f"rasterize_cuda: the Gaussians are on {device}; move them to a CUDA device")
-    floats = [*gaussians.items(), ("cameras.viewmats", cameras.viewmats), ("cameras.Ks", cameras.Ks)]
-    integers = [(f"samples.{name}", getattr(samples, name)) for name in ("pixel_ids", "tile_ids", "tile_offsets")]
-    for dtype, tensors in ((torch.float32, floats), (torch.int32, integers)):
-        for name, tensor in tensors:
-            if tensor.dtype != dtype or tensor.device != device:
-                raise InputError(f"{name} must be {dtype} on {device}, got {tensor.dtype} on {tensor.device}")
+def _check(gaussians: Gaussians) -> None:
+    if gaussians.device.type != "cuda":
+        raise InputError(f"rasterize_cuda: the Gaussians are on {gaussians.device}; move them to a CUDA device")
+    _require(gaussians.items(), torch.float32, gaussians.device)
+
+
+def _check_batch(cameras: Cameras, samples: PixelSamples, device: torch.device) -> None:
+    _require((("cameras.viewmats", cameras.viewmats), ("cameras.Ks", cameras.Ks)), torch.float32, device)
+    integers = ((f"samples.{name}", getattr(samples, name)) for name in ("pixel_ids", "tile_ids", "tile_offsets"))
+    _require(integers, torch.int32, device)
+    require_views(len(cameras))
+    if cameras.sizes.tolist() != samples.sizes.tolist():
+        raise InputError("cameras and samples differ in their image sizes: select the cameras of samples.view_ids")
+
+
+def _require(tensors: Iterable[tuple[str, Tensor]], dtype: torch.dtype, device: torch.device) -> None:
+    for name, tensor in tensors:
+        if tensor.dtype != dtype or tensor.device != device:
+            raise InputError(f"{name} must be {dtype} on {device}, got {tensor.dtype} on {tensor.device}")
+
+
+def _ready(gaussians: Gaussians, workspace: Workspace | None) -> Gaussians:
+    """The model as kernels take it. With a workspace a model is looked at once, not at each pass."""
+    if workspace is not None and workspace.knows(gaussians):
+        return gaussians
+    _check(gaussians)
+    ready = gaussians.map(_prepared)
+    if workspace is not None and all(value is getattr(gaussians, name) for name, value in ready.items()):
+        workspace.know(gaussians)
+    return ready
 
 
 def warps_per_tile(slots: int, tiles: int) -> int:
@@ -306,15 +326,9 @@ def rasterize_cuda(
     """
     library.require()
     degree, settings = options.used_degree(gaussians), options.settings
-    require_views(len(cameras))
-    if cameras.sizes.tolist() != samples.sizes.tolist():
-        raise InputError("cameras and samples differ in their image sizes: select the cameras of samples.view_ids")
-    if workspace is None or not workspace.knows(gaussians):
-        _check(gaussians, cameras, samples)
-        given, gaussians = gaussians, gaussians.map(_prepared)
-        if workspace is not None and all(value is getattr(given, name) for name, value in gaussians.items()):
-            workspace.know(given)
+    gaussians = _ready(gaussians, workspace)
     device = gaussians.device
+    _check_batch(cameras, samples, device)
     buffers = _Buffers(workspace, device)
     views, count, slots = len(cameras), len(gaussians), len(samples)
     num_tiles, num_active = len(samples.grid), len(samples.tile_ids)
