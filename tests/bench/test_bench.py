@@ -4,6 +4,7 @@ import itertools
 import json
 import math
 import sys
+from contextlib import nullcontext
 from types import SimpleNamespace
 
 import numpy as np
@@ -17,9 +18,10 @@ from turbogs_plugin.bench.clocks import BLOCKS, Mark, back_to_back, measure, sum
 from turbogs_plugin.bench.commands import raster_lines, step_lines
 from turbogs_plugin.bench.models import resized, ring_cameras, surface_gaussians, tile_samples, trained_model
 from turbogs_plugin.bench.precision import precision
-from turbogs_plugin.bench.raster import RasterBench
+from turbogs_plugin.bench.raster import STAGES, RasterBench, stages_recorded
 from turbogs_plugin.bench.recorder import STEPS, Recorder, recorded
 from turbogs_plugin.bench.step import tensor_bytes
+from turbogs_plugin.engine.cuda import library
 from turbogs_plugin.engine.rendering import rasterize
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene import load_scene
@@ -68,6 +70,18 @@ def test_the_recorder_marks_the_trainers_own_steps_and_leaves_no_trace(capture, 
         marks = [start, *itertools.chain.from_iterable(sorted(spans.values())), end]
         assert marks == sorted(marks)
         assert sum(last - first for first, last in spans.values()) > 0.9 * (end - start) > 100
+
+
+def test_launches_are_recorded_also_of_operators_that_were_called_before(monkeypatch):
+    for operator in STAGES:
+        monkeypatch.setattr(library.operators, operator, lambda *lists: None, raising=False)
+    launches = [SimpleNamespace(operator=operator, lists=lambda: ([], [], [], [])) for operator in STAGES]
+    recorder = Recorder(CPU)
+    for entered in (nullcontext(), stages_recorded(recorder), nullcontext()):
+        with entered:
+            for launch in launches:
+                library.launch(launch)
+    assert {stage: len(spans) for stage, spans in recorder.spans.items()} == dict.fromkeys(STAGES.values(), 1)
 
 
 @pytest.mark.parametrize("count", [150, 300, 1000])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,7 @@ from turbogs_plugin.bench.precision import precision
 from turbogs_plugin.bench.recorder import Recorder
 from turbogs_plugin.device import free_device_memory
 from turbogs_plugin.engine import engine_of
+from turbogs_plugin.engine.cuda import library
 from turbogs_plugin.engine.cuda.raster import CudaRendered
 from turbogs_plugin.engine.rendered import Rendered
 from turbogs_plugin.errors import InputError
@@ -41,6 +43,11 @@ STAGES = {
     "projection_backward": "projection backward",
 }
 """Operators of the library, and the stage that each of them is."""
+
+
+def stages_recorded(recorder: Recorder) -> AbstractContextManager[None]:
+    """While entered, each launch of a stage is recorded under the stage's name."""
+    return recorder.calls(*((library.operators, operator, stage) for operator, stage in STAGES.items()))
 
 
 @dataclass
@@ -71,9 +78,9 @@ class RasterBench:
     libraries: Sequence[Path] = ()
 
     def __post_init__(self) -> None:
-        for library in self.libraries:
-            if not library.is_file():
-                raise InputError(f"no such library: '{library}'")
+        for path in self.libraries:
+            if not path.is_file():
+                raise InputError(f"no such library: '{path}'")
 
     def models(self, scene: Scene | None, device: torch.device) -> list[Gaussians]:
         """The models in host memory, so that the device holds the one that is timed.
@@ -138,7 +145,7 @@ class RasterBench:
             torch.cuda.reset_peak_memory_stats(device)
             whole()
             recorder = Recorder(device)
-            with recorder.calls(*((torch.ops.turbogs, operator, stage) for operator, stage in STAGES.items())):
+            with stages_recorded(recorder):
                 measure(whole, self.repeats, device)
             spans = recorder.spans.items()
             measured["stages"] = {stage: device_times(calls[-self.repeats :]) for stage, calls in spans}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Callable
-from functools import cache, lru_cache
+from functools import lru_cache
 from pathlib import Path
 
 import torch
@@ -101,19 +101,26 @@ def require() -> None:
         raise InputError(f"CUDA kernels: {reason}")
 
 
+class _Operators:
+    """The library's operators as attributes, each kept: to look one up for each launch takes a third of the call."""
+
+    def __getattr__(self, name: str) -> Callable[..., None]:
+        operator = getattr(torch.ops.turbogs, name).default  # the only overload
+        setattr(self, name, operator)
+        return operator
+
+
+operators = _Operators()
+"""What `launch` calls. A recorder of launches puts its own functions here."""
+
+
 def launch(arguments: launches.Launch) -> None:
     """Call the operator of a launch. It is enqueued on torch's current stream of its tensors' device.
 
     Raises:
         RuntimeError: the operator does not accept a tensor; the message names it.
     """
-    _operator(arguments.operator)(*arguments.lists())
-
-
-@cache
-def _operator(name: str) -> Callable[..., None]:
-    """An operator's only overload, kept: to look it up for each launch takes a third of the call."""
-    return getattr(torch.ops.turbogs, name).default
+    getattr(operators, arguments.operator)(*arguments.lists())
 
 
 def architectures() -> tuple[str, ...]:
