@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from helpers.rendering_scenes import make_cameras
+from helpers.rendering_scenes import dense_on_grid, make_cameras
 
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.tiles import dense_pixels
@@ -54,6 +54,21 @@ def test_all_pixels_are_the_dense_samples():
     samples = PixelSamples.from_coordinates(*some_pixels(37 * 21 + 16 * 50), SIZES)
     for name in ("pixel_ids", "tile_ids", "tile_offsets"):
         assert torch.equal(getattr(samples, name), getattr(expected, name))
+
+
+@pytest.mark.parametrize("origin", [(0, 0), (15, 1), (7, 8)])
+def test_a_grid_may_begin_before_its_images(origin):
+    grid = TileGrid(SIZES, origin)
+    samples = dense_on_grid(SIZES, origin)
+    assert samples.origin == origin and len(samples.grid) == len(grid) == grid.offsets[-1]
+    x, y = samples.coordinates().unbind(dim=-1)
+    column, line = (x + origin[0]) // 16, (y + origin[1]) // 16
+    assert grid.shapes.tolist() == [[(w + origin[0] + 15) // 16, (h + origin[1] + 15) // 16] for w, h in SIZES.tolist()]
+    views = samples.view_of_slot()
+    places = torch.as_tensor(grid.offsets)[views] + line * torch.as_tensor(grid.shapes)[views, 0] + column
+    assert torch.equal(samples.tile_ids[samples.tile_of_slot()].long(), places)
+    second = samples.of_tiles(slice(int(grid.offsets[1]), len(grid)), slice(1, 2), slice(37 * 21, 37 * 21 + 16 * 50))
+    assert second.tile_ids[0] == 0 and second.origin == origin and (second.view_of_slot() == 0).all()
 
 
 @pytest.mark.parametrize("views", [None, 1, 3])

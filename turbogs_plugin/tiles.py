@@ -63,14 +63,19 @@ class DrawEnds:
         return TileGrid(sizes).offsets[1:], np.cumsum(slots_of_tiles(self.unit, self.wanted[0], *tile_extents(sizes)))
 
 
-def pixel_table(sizes: np.ndarray, device: torch.device | str) -> Tensor:
-    """[T, 256] int32: the pixel id of each place of each tile of ``TileGrid(sizes)``, in `sample_order`; -1 outside."""
+def pixel_table(sizes: np.ndarray, device: torch.device | str, origin: tuple[int, int] = (0, 0)) -> Tensor:
+    """[T, 256] int32: the pixel id of each place of each tile of ``TileGrid(sizes, origin)``, in `sample_order`; -1
+    outside."""
     x, y = _places(device)
     tables = []
     for width, height in sizes.tolist():
-        xs = torch.arange(0, width, TILE_SIZE, dtype=torch.int32, device=device)[:, None] + x  # [tiles in x, 256]
-        ys = torch.arange(0, height, TILE_SIZE, dtype=torch.int32, device=device)[:, None, None] + y  # [in y, 1, 256]
-        ids = (ys * width + xs).masked_fill_((ys >= height) | (xs >= width), -1)
+        starts_x, starts_y = (
+            torch.arange(-start, side, TILE_SIZE, dtype=torch.int32, device=device)
+            for start, side in zip(origin, (width, height), strict=True)
+        )
+        xs, ys = starts_x[:, None] + x, starts_y[:, None, None] + y  # [tiles in x, 256], [tiles in y, 1, 256]
+        outside = (ys < 0) | (ys >= height) | (xs < 0) | (xs >= width)
+        ids = (ys * width + xs).masked_fill_(outside, -1)
         tables.append(ids.reshape(-1, TILE_PIXELS))
     return torch.cat(tables)
 
@@ -93,11 +98,12 @@ def compact(
     slot_counts: np.ndarray,
     weights: Tensor | None = None,
     full: bool = False,
+    origin: tuple[int, int] = (0, 0),
 ) -> PixelSamples:
     """Samples of the masked places of tiles, in the table's order, without counting on the device.
 
     Args:
-        view_ids, sizes: of the batch, as in `PixelSamples`.
+        view_ids, sizes, origin: of the batch, as in `PixelSamples`.
         table: [T, 256] int32 pixel ids.
         mask: [T, 256] bool, the places to keep: in each tile at most its count of slots; the others stay empty.
         tile_ids: [T] int32.
@@ -118,7 +124,9 @@ def compact(
         kept = torch.zeros(slots + 1, device=device)
         kept[positions] = torch.where(mask, weights, 0.0).reshape(-1)
         weights = kept[:-1] * ((pixel_ids >= 0).sum() / kept[:-1].sum())
-    return PixelSamples(tuple(view_ids), sizes, pixel_ids, tile_ids, tile_offsets, weights, has_empty_slots=not full)
+    return PixelSamples(
+        tuple(view_ids), sizes, pixel_ids, tile_ids, tile_offsets, weights, has_empty_slots=not full, origin=origin
+    )
 
 
 def dense_pixels(view_ids: Sequence[int], sizes: np.ndarray, device: torch.device | str) -> PixelSamples:

@@ -204,4 +204,15 @@ private:
     int previous_ = 0;
 };
 
+// Pixels by which the grid of tiles begins before the images of a batch. `Launch` has the fields of launches.py's
+// `GridOrigin`.
+template <class Launch>
+void read_origin(const Arguments<Launch>& in, int& x, int& y) {
+    const int64_t origin_x = in.integer(Launch::Integers::origin_x), origin_y = in.integer(Launch::Integers::origin_y);
+    STD_TORCH_CHECK(origin_x >= 0 && origin_x < kTileSize && origin_y >= 0 && origin_y < kTileSize,
+                    "turbogs: the grid's origin must be 0 .. ", kTileSize - 1, ", got ", origin_x, ", ", origin_y);
+    x = static_cast<int>(origin_x);
+    y = static_cast<int>(origin_y);
+}
+
 }  // namespace turbogs

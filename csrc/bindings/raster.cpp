@@ -51,9 +51,11 @@ void launches::RasterProject::run(const Arguments<RasterProject>& in) {
     const bool everywhere = !in.has(Tensors::tile_ids);
     STD_TORCH_CHECK(everywhere == !in.has(Tensors::active_prefix), "turbogs: tile_ids and active_prefix go together");
     const int64_t views = params.num_views, count = params.num_gaussians, total = views * count;
+    read_origin(in, params.origin_x, params.origin_y);
     int64_t tiles = 0;
     for (int view = 0; view < params.num_views; ++view) {
-        tiles += int64_t{1} * tiles_along(params.widths[view]) * tiles_along(params.heights[view]);
+        tiles += int64_t{1} * tiles_along(params.origin_x + params.widths[view]) *
+                 tiles_along(params.origin_y + params.heights[view]);
     }
     params.num_tiles = to_int(tiles, "tiles");
     params.num_active = to_int(everywhere ? tiles : in.tensor(Tensors::tile_ids).size(0), "active tiles");

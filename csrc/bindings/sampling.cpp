@@ -32,6 +32,9 @@ void launches::SamplePixels::run(const Arguments<SamplePixels>& in) {
                                              "unit must be 0 (pixel), 1 (cell) or 2 (tile)");
     STD_TORCH_CHECK(params.unit == SampleUnit::kTile || chosen == tiles,
                     "turbogs: tile_ids must have an entry for each tile");
+    const bool at_origin = params.views[0].origin_x == 0 && params.views[0].origin_y == 0;
+    STD_TORCH_CHECK(at_origin || (params.unit == SampleUnit::kTile && !masked),
+                    "turbogs: another origin of the grid is for whole tiles without masks");
     params.num_chosen = to_int(chosen, "tiles");
     for (int i = 0; i < params.num_views; ++i) {
         const int64_t* row = in.row(i, DrawRow::kSize);

@@ -41,9 +41,9 @@ __device__ __forceinline__ Emission make_emission(const SortIntersectionsParams&
     const float4 first = splat[0], second = splat[1];
     out.key = static_cast<uint64_t>(__float_as_uint(second.z)) << 32 | instance;
     out.reach = make_reach(first.x, first.y, first.z, first.w, second.x, second.w);
-    out.rows = tile_rows(out.reach, out.camera->tiles_y);
-    const int2 columns =
-        tile_span(out.reach.x - out.reach.half_x, out.reach.x + out.reach.half_x, out.camera->tiles_x);
+    out.rows = tile_rows(out.reach, *out.camera);
+    const int2 columns = tile_span(out.reach.x - out.reach.half_x, out.reach.x + out.reach.half_x,
+                                   out.camera->origin_x, out.camera->tiles_x);
     box_tiles = (out.rows.y - out.rows.x) * (columns.y - columns.x);
     return out;
 }
@@ -51,7 +51,7 @@ __device__ __forceinline__ Emission make_emission(const SortIntersectionsParams&
 __device__ __forceinline__ int2 tiles_of_row(const SortIntersectionsParams& params, const Emission& emission,
                                              int row) {
     const RasterCamera& camera = *emission.camera;
-    return active_tiles(camera, params.active_prefix, row, tile_columns(emission.reach, row, camera.tiles_x));
+    return active_tiles(camera, params.active_prefix, row, tile_columns(emission.reach, row, camera));
 }
 
 // The lane that item `number` belongs to, if each lane has some items; `sum`: those of the lanes up to this one.

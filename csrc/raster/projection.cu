@@ -34,11 +34,13 @@ __global__ void prepare_kernel(const __grid_constant__ ProjectionParams params) 
         RasterCamera camera;
         static_cast<Pinhole&>(camera) = load_pinhole(params.viewmats + 16 * i, params.intrinsics + 9 * i);
         camera.tile_base = 0;
+        camera.origin_x = params.origin_x;
+        camera.origin_y = params.origin_y;
         for (int view = 0; view <= i; ++view) {
             camera.width = params.widths[view];
             camera.height = params.heights[view];
-            camera.tiles_x = tiles_along(camera.width);
-            camera.tiles_y = tiles_along(camera.height);
+            camera.tiles_x = tiles_along(camera.origin_x + camera.width);
+            camera.tiles_y = tiles_along(camera.origin_y + camera.height);
             if (view < i) camera.tile_base += camera.tiles_x * camera.tiles_y;
         }
         camera.slopes = slope_bounds(camera, camera.width, camera.height);
@@ -102,9 +104,9 @@ struct alignas(16) Queued {
 __device__ __forceinline__ void count_tiles(const RasterCamera& camera, const int32_t* active_prefix,
                                             const Queued& splat, int32_t* tile_differences) {
     const Reach reach = make_reach(splat.x, splat.y, splat.conic_a, splat.conic_b, splat.conic_c, splat.log_reach);
-    const int2 rows = tile_rows(reach, camera.tiles_y);
+    const int2 rows = tile_rows(reach, camera);
     for (int row = rows.x; row < rows.y; ++row) {
-        const int2 tiles = active_tiles(camera, active_prefix, row, tile_columns(reach, row, camera.tiles_x));
+        const int2 tiles = active_tiles(camera, active_prefix, row, tile_columns(reach, row, camera));
         if (tiles.x == tiles.y) continue;
         atomicAdd(tile_differences + tiles.x, 1);
         atomicAdd(tile_differences + tiles.y, -1);

@@ -27,6 +27,7 @@ struct alignas(16) RasterCamera : Pinhole {
     int width, height;   // pixels
     int tiles_x;
     int tile_base;       // id of the view's first tile
+    int origin_x, origin_y;  // pixels by which the grid of tiles begins before the image
     SlopeBounds slopes;  // where the Jacobian is taken
 };
 static_assert(sizeof(RasterCamera) == CameraRow::kSize * sizeof(float), "as layout.py has it");
@@ -58,6 +59,7 @@ static_assert(sizeof(Instance) == InstanceRow::kSize * sizeof(float), "as layout
 struct ProjectionParams : SceneParams {
     int num_tiles;   // tiles of all views
     int num_active;  // T
+    int origin_x, origin_y;
     float near_plane, far_plane, alpha_min;
     const int32_t* tile_ids;  // [T] ascending, or null where every tile is active
 

@@ -75,7 +75,8 @@ __device__ __forceinline__ TileFrame tile_frame(const ForwardParams& params, int
     const RasterCamera& camera = params.cameras[view_of_tile(params.cameras, params.num_views, tile_id)];
     const int place = tile_id - camera.tile_base, row = place / camera.tiles_x, column = place - row * camera.tiles_x;
     const float half = 0.5f * kTileSize;
-    return {camera.width, static_cast<float>(column * kTileSize) + half, static_cast<float>(row * kTileSize) + half};
+    return {camera.width, static_cast<float>(column * kTileSize - camera.origin_x) + half,
+            static_cast<float>(row * kTileSize - camera.origin_y) + half};
 }
 
 // A work item's mask of the first bucket. That of the next one lies params.chunks further on.

@@ -47,25 +47,28 @@ __device__ __forceinline__ Reach make_reach(float x, float y, float a, float b, 
     return reach;
 }
 
-// First and last + 1 of the tiles whose pixel centres an interval of pixel coordinates reaches, within [0, count).
-__device__ __forceinline__ int2 tile_span(float low, float high, int count) {
+// First and last + 1 of the tiles whose pixel centres an interval of pixel coordinates reaches, within [0, count), if
+// the first tile begins `origin` pixels before the image.
+__device__ __forceinline__ int2 tile_span(float low, float high, int origin, int count) {
     const float inverse = 1.0f / kTileSize;  // a power of two: exact
-    const float first = ceilf(__fmul_rn(__fadd_rn(low, 0.5f - kTileSize), inverse));
-    const float last = floorf(__fmul_rn(__fadd_rn(high, -0.5f), inverse));
+    const float start = static_cast<float>(origin);
+    const float first = ceilf(__fmul_rn(__fadd_rn(low, start + 0.5f - kTileSize), inverse));
+    const float last = floorf(__fmul_rn(__fadd_rn(high, start - 0.5f), inverse));
     const int begin = static_cast<int>(fminf(fmaxf(first, 0.0f), static_cast<float>(count)));
     const int end = static_cast<int>(fminf(fmaxf(last, -1.0f), static_cast<float>(count - 1))) + 1;
     return make_int2(begin, max(begin, end));
 }
 
 // Tile rows that the splat reaches.
-__device__ __forceinline__ int2 tile_rows(const Reach& reach, int tiles_y) {
-    return tile_span(__fsub_rn(reach.y, reach.half_y), __fadd_rn(reach.y, reach.half_y), tiles_y);
+__device__ __forceinline__ int2 tile_rows(const Reach& reach, const RasterCamera& camera) {
+    return tile_span(__fsub_rn(reach.y, reach.half_y), __fadd_rn(reach.y, reach.half_y), camera.origin_y,
+                     camera.tiles_y);
 }
 
 // Tile columns that the splat reaches within a tile row. The ellipse cut by the row's band of pixel centres is
 // convex, so the columns that it reaches are those between its leftmost and its rightmost point.
-__device__ __forceinline__ int2 tile_columns(const Reach& reach, int row, int tiles_x) {
-    const float top = __fsub_rn(static_cast<float>(row * kTileSize) + 0.5f, reach.y);
+__device__ __forceinline__ int2 tile_columns(const Reach& reach, int row, const RasterCamera& camera) {
+    const float top = __fsub_rn(static_cast<float>(row * kTileSize - camera.origin_y) + 0.5f, reach.y);
     const float bottom = __fadd_rn(top, static_cast<float>(kTileSize - 1));
     const float dy_right = fminf(fmaxf(reach.extreme_y, top), bottom);
     const float dy_left = fminf(fmaxf(-reach.extreme_y, top), bottom);
@@ -74,7 +77,7 @@ __device__ __forceinline__ int2 tile_columns(const Reach& reach, int row, int ti
     const float chord_left = approximate_sqrt_flushed(fmaxf(0.0f, __fmaf_rn(-v_left, v_left, 1.0f)));
     const float right = __fmaf_rn(reach.slope, dy_right, __fmul_rn(reach.half_chord, chord_right));
     const float left = __fmaf_rn(reach.slope, dy_left, -__fmul_rn(reach.half_chord, chord_left));
-    return tile_span(__fadd_rn(reach.x, left), __fadd_rn(reach.x, right), tiles_x);
+    return tile_span(__fadd_rn(reach.x, left), __fadd_rn(reach.x, right), camera.origin_x, camera.tiles_x);
 }
 
 // Positions of the active tiles among the columns of a row: they are consecutive, as active tiles are numbered by id.

@@ -24,16 +24,16 @@ struct TilePixels {
     int view;                  // in the batch
     int id_of_tile;            // in the numbering of the batch
     int column, row;           // of the tile
-    int width, height;         // of the part inside the image
+    int width, height;         // of the part inside the image, where the grid begins with it
     uint32_t inside;           // bit j: pixel (j, lane) exists and is not masked
-    uint32_t first;            // id of pixel (0, lane), y * width + x
+    int first;                 // id of pixel (0, lane), y * width + x, also where that lies before the image
     int image_width;
 
     // From pixel (0, lane) to pixel (j, lane).
     __device__ __forceinline__ int offset(int j) const {
         return j / kRowPatches * kPatchHeight * image_width + j % kRowPatches * kPatchWidth;
     }
-    __device__ __forceinline__ uint32_t id(int j) const { return first + static_cast<uint32_t>(offset(j)); }
+    __device__ __forceinline__ uint32_t id(int j) const { return static_cast<uint32_t>(first + offset(j)); }
 };
 
 // The tile at a place of the list of tiles to draw from.
@@ -56,11 +56,13 @@ __device__ __forceinline__ TilePixels locate_tile(const SamplePixelsParams& para
     pixels.inside = 0;
     const int lane = this_lane(), x = lane % kPatchWidth, y = lane / kPatchWidth;
     pixels.image_width = view.width;
-    pixels.first = static_cast<uint32_t>((kTileSize * pixels.row + y) * view.width + kTileSize * pixels.column + x);
+    const int first_x = kTileSize * pixels.column - view.origin_x + x;
+    const int first_y = kTileSize * pixels.row - view.origin_y + y;
+    pixels.first = first_y * view.width + first_x;
 #pragma unroll
     for (int j = 0; j < kPerLane; ++j) {
-        const bool exists = x + j % kRowPatches * kPatchWidth < pixels.width &&
-                            y + j / kRowPatches * kPatchHeight < pixels.height;
+        const int image_x = first_x + j % kRowPatches * kPatchWidth, image_y = first_y + j / kRowPatches * kPatchHeight;
+        const bool exists = image_x >= 0 && image_x < view.width && image_y >= 0 && image_y < view.height;
         pixels.inside |= static_cast<uint32_t>(exists) << j;
     }
     if (kMasked) {

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from helpers.rendering_scenes import make_cameras, make_gaussians, thin_out
+from helpers.rendering_scenes import dense_on_grid, make_cameras, make_gaussians, thin_out
 
 from turbogs_plugin.engine.reference.intersection import intersect_tiles, smallest_exponents, spread
 from turbogs_plugin.engine.reference.projection import drawable_rows, project_rows
@@ -24,9 +24,10 @@ def contributing(rows, splats, samples, tile: int) -> torch.Tensor:
     view = int(np.searchsorted(grid.offsets, tile_id, side="right")) - 1
     line, column = divmod(tile_id - int(grid.offsets[view]), int(grid.shapes[view, 0]))
     width, height = samples.sizes[view]
+    left, top = 16 * column - samples.origin[0], 16 * line - samples.origin[1]
     y, x = torch.meshgrid(
-        torch.arange(16 * line, min(16 * line + 16, height)),
-        torch.arange(16 * column, min(16 * column + 16, width)),
+        torch.arange(max(top, 0), min(top + 16, height)),
+        torch.arange(max(left, 0), min(left + 16, width)),
         indexing="ij",
     )
     centers = torch.stack([x, y], dim=-1).reshape(-1, 2) + 0.5
@@ -38,14 +39,14 @@ def contributing(rows, splats, samples, tile: int) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("shape", ["round", "needles"])
-def test_no_contribution_is_lost_and_order_is_by_depth(dtype, shape):
+@pytest.mark.parametrize(("shape", "origin"), [("round", (0, 0)), ("needles", (0, 0)), ("needles", (15, 6))])
+def test_no_contribution_is_lost_and_order_is_by_depth(dtype, shape, origin):
     gaussians = make_gaussians(300, dtype=dtype, degree=0, spread=1.5)
     if shape == "needles":
         gaussians.scales[:, 0] += 6
         gaussians.scales[:, 1:] -= 5
     cameras = make_cameras([(70, 45), (33, 64)], dtype)
-    samples = thin_out(dense_samples(cameras), 0.2)
+    samples = thin_out(dense_on_grid(cameras.sizes, origin), 0.2)
     rows, splats, intersections = intersections_of(gaussians, cameras, samples)
     assert len(samples.tile_ids) < len(samples.grid)
     found, needed = 0, 0

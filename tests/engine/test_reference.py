@@ -5,7 +5,7 @@ import pytest
 import torch
 from gsplat.cuda._torch_impl import _spherical_harmonics
 from helpers.gsplat_torch import gsplat_torch_render
-from helpers.rendering_scenes import loop_render, make_cameras, make_gaussians, thin_out
+from helpers.rendering_scenes import dense_on_grid, loop_render, make_cameras, make_gaussians, thin_out
 from torch.autograd.function import once_differentiable
 
 from turbogs_plugin.engine.autograd import rasterize_differentiable
@@ -280,6 +280,23 @@ def test_sparse_equals_dense_at_the_same_pixels(dtype):
         for name in ("colors", "alphas", "depths"):
             assert getattr(image, name).dtype == dtype
             torch.testing.assert_close(getattr(rendered, name)[slot], getattr(image, name)[y[slot], x[slot]])
+
+
+@pytest.mark.parametrize("origin", [(1, 0), (15, 15), (6, 11)])
+def test_where_the_grid_of_tiles_begins_does_not_matter(origin):
+    gaussians, cameras = make_gaussians(80), make_cameras(SIZES)
+    by_grid = [dense_on_grid(cameras.sizes, place) for place in ((0, 0), origin)]
+    assert len(by_grid[0]) == len(by_grid[1]) == cameras.sizes.prod(axis=1).sum()
+    flat = [samples.flat_pixels(np.concatenate([[0], np.cumsum(samples.sizes.prod(axis=1))])) for samples in by_grid]
+    values, found = upstream(by_grid[0])[::3], []
+    for samples, pixels in zip(by_grid, flat, strict=True):
+        colors, errors = (value[flat[0].argsort()][pixels] for value in values)
+        rendered = rasterize(gaussians, cameras, samples, with_depth=True)
+        gradients = rendered.backward(colors, errors).parameter_gradients(rows=False)
+        images = [value[pixels.argsort()] for value in (rendered.colors, rendered.alphas, rendered.depths)]
+        found.append([*images, *(gradients.summed(name) for name in PARAMETER_NAMES), gradients.view_losses])
+    for one, other in zip(*found, strict=True):
+        torch.testing.assert_close(other, one, rtol=1e-9, atol=1e-12)
 
 
 def test_float32_is_close_to_float64():

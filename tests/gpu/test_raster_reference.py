@@ -26,6 +26,9 @@ CASES = {
     "rate 0.1 with empty slots": dict(
         sizes=[(130, 90), (65, 97), (48, 48)], count=300, rate=0.1, seed=4, empty_slots=3
     ),
+    "another grid": dict(sizes=[(130, 90), (33, 47), (16, 16)], count=400, seed=9, origin=(5, 14)),
+    "rate 0.33 of another grid": dict(sizes=[(130, 90)], count=400, rate=0.33, seed=3, origin=(15, 1), empty_slots=2),
+    "large splats of another grid": dict(sizes=[(200, 140)], count=60, rate=0.5, seed=5, log_scale=1.2, origin=(8, 8)),
     "large splats": dict(sizes=[(200, 140)], count=60, rate=0.5, seed=5, log_scale=1.2),
     "small splats": dict(sizes=[(160, 120), (90, 90)], count=3000, rate=0.2, seed=6, log_scale=-2.0),
     "deep": dict(sizes=[(48, 48)], count=4000, rate=0.4, seed=7, log_scale=-0.5),

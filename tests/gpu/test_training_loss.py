@@ -1,5 +1,7 @@
 """The CUDA loss equals its torch twins, updates the maps as `ErrorMaps.update` does, and keeps bad colours out."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -12,7 +14,7 @@ from turbogs_plugin.engine.reference.draws import draw_pixels
 from turbogs_plugin.engine.reference.losses import sparse_loss
 from turbogs_plugin.engine.rules import DrawRule
 from turbogs_plugin.error_maps import ErrorMaps
-from turbogs_plugin.types import PixelSamples, Step
+from turbogs_plugin.types import Step
 
 pytestmark = [
     pytest.mark.gpu,
@@ -40,13 +42,13 @@ def make_maps(device, seed=0):
 
 def make_samples(rate, unit="cell", importance=0.0, views=(2, 0)):
     maps = make_maps("cpu")
-    return draw_pixels(DrawRule(unit, 0.4, 0.3, False, importance), maps, views, rate, Step(0, 1, 1))
+    return draw_pixels(DrawRule(unit, 0.4, 0.3, False, importance), maps, views, rate, Step(3, 4, 4))
 
 
 def to_device(samples):
     moved = {name: getattr(samples, name).to(DEVICE) for name in ("pixel_ids", "tile_ids", "tile_offsets")}
     weights = None if samples.weights is None else samples.weights.to(DEVICE)
-    return PixelSamples(samples.view_ids, samples.sizes, **moved, weights=weights)
+    return replace(samples, **moved, weights=weights)
 
 
 def make_colors(samples, seed=0):

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import pytest
 import torch
-from helpers.rendering_scenes import make_cameras, make_gaussians, thin_out
+from helpers.rendering_scenes import dense_on_grid, make_cameras, make_gaussians, thin_out
 from torch import Tensor
 
 from turbogs_plugin.engine.cuda import library as kernels
@@ -51,6 +51,7 @@ def make_case(
     seed: int = 0,
     empty_slots: int = 0,
     log_scale: float = 0.0,
+    origin: tuple[int, int] = (0, 0),
     device: str = "cuda",
 ) -> Case:
     """Random Gaussians seen by cameras of these image sizes.
@@ -58,11 +59,12 @@ def make_case(
     Args:
         rate: share of each tile's pixels; below 1 some tiles have no samples at all.
         log_scale: added to the logarithms of the scales.
+        origin: of the grid of tiles.
     """
     gaussians = make_gaussians(count, seed, torch.float32)
     gaussians.scales += log_scale
     cameras = make_cameras(sizes, torch.float32)
-    samples = dense_samples(cameras)
+    samples = dense_samples(cameras) if origin == (0, 0) else dense_on_grid(cameras.sizes, origin)
     if rate < 1:
         samples = thin_out(samples, rate, seed, empty_slots)
     return Case(

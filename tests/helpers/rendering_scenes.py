@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from turbogs_plugin.engine.rendering import DEFAULT_SETTINGS, RasterSettings, dense_samples
+from turbogs_plugin.tiles import compact, pixel_table
 from turbogs_plugin.types import Cameras, Gaussians, PixelSamples
 
 
@@ -53,6 +54,15 @@ def make_gaussians(count: int, seed: int = 0, dtype=torch.float64, degree: int =
     return gaussians.map(lambda value: value.to(dtype))
 
 
+def dense_on_grid(sizes: np.ndarray, origin: tuple[int, int]) -> PixelSamples:
+    """Every pixel of images of these sizes, by the tiles of a grid that begins elsewhere."""
+    table = pixel_table(sizes, "cpu", origin)
+    exist = table >= 0
+    tile_ids = torch.arange(len(table), dtype=torch.int32)
+    counts = exist.sum(dim=1).numpy()
+    return compact(tuple(range(len(sizes))), sizes, table, exist, tile_ids, counts, full=True, origin=origin)
+
+
 def thin_out(samples: PixelSamples, rate: float, seed: int = 0, empty_slots: int = 0) -> PixelSamples:
     """Keep a share of each tile's samples, in order; leave some tiles out altogether; add empty slots at tile ends."""
     generator = np.random.default_rng(seed)
@@ -71,6 +81,7 @@ def thin_out(samples: PixelSamples, rate: float, seed: int = 0, empty_slots: int
         torch.from_numpy(np.concatenate(pixels).astype(np.int32)),
         torch.tensor(tiles, dtype=torch.int32),
         torch.tensor([0, *np.cumsum(counts)], dtype=torch.int32),
+        origin=samples.origin,
     )
 
 

@@ -53,12 +53,13 @@ def exact_sets(errors, ages, stages, uniform=False):
 
 
 def drawn_units(sampler, rate, views, size, errors, ages, units):
-    """[views, units] bool: what is drawn in as many equal views; `units` gives the unit of each pixel of a view."""
+    """[views, units] bool: what is drawn in as many equal views; `units` gives the unit of each pixel of a view. In
+    iteration 0, where the grid of tiles begins with the image."""
     maps = ErrorMaps(np.tile(size, (views, 1)))
     for view in range(views):
         maps.initialise(view, torch.as_tensor(errors, dtype=torch.float32)[units])
-    maps.stamps.copy_((50 - torch.as_tensor(ages)[units]).repeat(views))
-    samples = sampler.sample(maps, tuple(range(views)), rate, step(50))
+    maps.stamps.copy_((-torch.as_tensor(ages)[units]).repeat(views))
+    samples = sampler.sample(maps, tuple(range(views)), rate, step(0))
     filled = samples.filled
     drawn = torch.zeros(views, len(errors), dtype=torch.bool)
     drawn[samples.view_of_slot()[filled], units[samples.pixel_ids[filled].long()]] = True

@@ -39,6 +39,8 @@ def test_layout(sampler, unit, rate):
     width, height = torch.as_tensor(samples.sizes)[view_of_slot].unbind(dim=1)
     assert (samples.pixel_ids < width * height).all()
     x, y = coordinates.unbind(dim=1)
+    assert grid.origin == samples.origin == ((7, 15) if unit == "tile" else (0, 0))
+    x, y = x + samples.origin[0], y + samples.origin[1]  # in the grid
     columns = torch.as_tensor(grid.shapes[:, 0])[view_of_slot]
     tiles = torch.as_tensor(grid.offsets[:-1])[view_of_slot] + (y // TILE_SIZE) * columns + x // TILE_SIZE
     assert (tiles == samples.tile_ids[tile_of_slot])[filled].all()
@@ -108,7 +110,7 @@ def test_counts_of_cells(rate, wanted):
 
 @pytest.mark.parametrize(("rate", "tiles"), [(1e-6, (1, 1)), (0.34, (4, 2)), (1.0, (12, 6))])
 def test_counts_of_tiles(rate, tiles):
-    samples = ErrorGuidedPixelSampler(unit="tile").sample(random_maps(), (4, 0), rate, step(1))
+    samples = ErrorGuidedPixelSampler(unit="tile").sample(random_maps(), (4, 0), rate, step(0))
     ids = samples.tile_ids
     assert ((ids < 12).sum(), (ids >= 12).sum()) == tiles
     extents = [256] * 12 + [256, 256, 80, 80, 80, 25]
@@ -116,6 +118,24 @@ def test_counts_of_tiles(rate, tiles):
         tile: extents[tile] for tile in ids.tolist()
     }
     assert len(samples) == 256 * len(ids)
+
+
+def test_whole_tiles_begin_elsewhere_in_each_iteration():
+    """Tiles of another grid hold all their pixels, and at a rate of 1 every pixel of the views."""
+    maps, views = random_maps(), (4, 0, 2)
+    sampler, origins = ErrorGuidedPixelSampler(unit="tile"), []
+    for t in range(256):
+        samples = sampler.sample(maps, views, 1.0, step(t))
+        origins.append(samples.origin)
+        assert samples.filled.sum() == sum(int(np.prod(SIZES[view])) for view in views)
+        widths = [min(16 * n + 16 - samples.origin[0], 64) - max(16 * n - samples.origin[0], 0) for n in range(4)]
+        heights = [min(16 * n + 16 - samples.origin[1], 48) - max(16 * n - samples.origin[1], 0) for n in range(3)]
+        assert [len(pixels) for pixels in pixels_by_tile(samples).values()][:4] == [w * heights[0] for w in widths]
+        assert len(pixels_by_tile(samples)[samples.grid.shapes[0, 0]]) == widths[0] * heights[1]
+    assert origins[0] == (0, 0) and min(map(min, origins)) == 0 and max(map(max, origins)) == 15
+    by_column = np.bincount([x for x, _ in origins])
+    assert by_column.min() >= 15 and by_column.max() <= 17 and len(set(origins)) > 200  # evenly spread
+    assert sampler.sample(maps, views, 0.1, step(70)).origin == sampler.sample(maps, (1,), 0.9, step(70, 5)).origin
 
 
 def test_dense_is_every_pixel_as_the_rasterizer_orders_them():
@@ -262,13 +282,14 @@ def test_ages_past_sixteen_bits_still_rank():
 
 @pytest.mark.parametrize("unit", UNITS)
 def test_every_pixel_is_revisited(unit):
-    """The stable share alone reaches every unit within ceil(units / stable) iterations, whatever the errors."""
+    """The stable share alone reaches every unit within ceil(units / stable) iterations, whatever the errors. Of whole
+    tiles, whose grid moves, a view of 4x4 has up to 5x5."""
     maps = ErrorMaps(np.array([[64, 64]]))
     errors = torch.zeros(64 * 64)
     errors[:300] = 3.0
     maps.initialise(0, errors)
     rate = {"pixel": 0.1, "cell": 0.2, "tile": 0.2}[unit]  # 25 of 256, or 3 of 16: stable 8, or 1
-    iterations = {"pixel": 256 // 8, "cell": 16, "tile": 16}[unit]
+    iterations = {"pixel": 256 // 8, "cell": 16, "tile": 25}[unit]
     for t in range(iterations):
         samples = ErrorGuidedPixelSampler(unit=unit).sample(maps, (0,), rate, step(t))
         maps.update(samples, maps.errors[maps.flat_pixels(samples)], step(t))

@@ -86,7 +86,7 @@ class InstanceRow:
 class CameraRow:
     """A view inside the raster kernels: a row of 4-byte numbers that only they read."""
 
-    SIZE = 28
+    SIZE = 32
 
 
 class ImageRow:

@@ -10,9 +10,14 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
+from turbogs_plugin.types import TILE_SIZE
+
 LUMINANCE_CONSTANT = 0.01**2
 STRUCTURE_CONSTANT = 0.03**2
 """SSIM's two constants, for colours of 0 .. 1."""
+
+GRID_STEPS = (0.7548776662466927, 0.5698402909980532)
+"""1 / g and 1 / g^2, with g^3 = g + 1."""
 
 
 @dataclass(frozen=True)
@@ -39,6 +44,17 @@ class DrawRule:
         """
         slack = 0.5 if self.unit == "cell" else 0.0
         return min(units, max(1, math.floor(rate * units + slack)))
+
+    def origin(self, iteration: int) -> tuple[int, int]:
+        """Of the grid of tiles in an iteration, see `TileGrid`.
+
+        Whole tiles begin elsewhere in each iteration, so that no pixel is always at the edge of the window that a loss
+        compares: at the points of a sequence that fills the square evenly (Roberts 2018, R2). Not with masks.
+        """
+        if self.unit != "tile":
+            return 0, 0
+        x, y = (int(TILE_SIZE * math.fmod(iteration * step, 1.0)) for step in GRID_STEPS)
+        return x, y
 
     def stages(self, wanted: int) -> tuple[int, int, int]:
         """Number of units of the hard, stable and mixed stage; halves round up."""

@@ -37,14 +37,16 @@ class TileGrid:
 
     Args:
         sizes: [K, 2] int64 numpy array (width, height).
+        origin: (x, y), 0 .. TILE_SIZE - 1, pixels by which the first tile of each image begins left of it and above.
     """
 
     sizes: np.ndarray
+    origin: tuple[int, int] = (0, 0)
 
     @property
     def shapes(self) -> np.ndarray:
         """[K, 2] int64: tiles in x and in y of each image."""
-        return -(-self.sizes // TILE_SIZE)
+        return -(-(self.sizes + self.origin) // TILE_SIZE)
 
     @property
     def offsets(self) -> np.ndarray:
@@ -52,7 +54,10 @@ class TileGrid:
         return np.concatenate([[0], np.cumsum(self.shapes.prod(axis=1))])
 
     def __len__(self) -> int:
-        return sum(-(-width // TILE_SIZE) * -(-height // TILE_SIZE) for width, height in self.sizes.tolist())
+        x, y = self.origin
+        return sum(
+            -(-(width + x) // TILE_SIZE) * -(-(height + y) // TILE_SIZE) for width, height in self.sizes.tolist()
+        )
 
 
 @dataclass
@@ -67,12 +72,13 @@ class PixelSamples:
         sizes: [K, 2] int64 numpy array (width, height) of those views.
         pixel_ids: [P] int32, ``y * width + x`` in its own view, or -1 for an empty slot. Within a tile, ascending
             in `sample_order`, empty slots last.
-        tile_ids: [T] int32, ascending, in the numbering of ``TileGrid(sizes)``.
+        tile_ids: [T] int32, ascending, in the numbering of ``TileGrid(sizes, origin)``.
         tile_offsets: [T + 1] int32, the first slot of each tile; the last entry is P.
         weights: [P] float32 importance weights with mean 1 over the filled slots, or None where all are 1.
         has_empty_slots: False promises that every slot is filled, so that none has to be counted.
         host_ends: gives ([K], [T]) int64 numpy arrays, the end of each view's tiles (in `tile_ids`) and of each tile's
             slots, where the host knows them without asking the device; None: it has to ask.
+        origin: of the grid of tiles, see `TileGrid`.
     """
 
     view_ids: tuple[int, ...]
@@ -83,6 +89,7 @@ class PixelSamples:
     weights: Tensor | None = None
     has_empty_slots: bool = True
     host_ends: Callable[[], tuple[np.ndarray, np.ndarray]] | None = None
+    origin: tuple[int, int] = (0, 0)
 
     @classmethod
     def from_mask(cls, mask: Tensor, view_ids: Sequence[int] | None = None) -> PixelSamples:
@@ -167,7 +174,7 @@ class PixelSamples:
 
     @property
     def grid(self) -> TileGrid:
-        return TileGrid(self.sizes)
+        return TileGrid(self.sizes, self.origin)
 
     def ends(self) -> tuple[np.ndarray, np.ndarray]:
         """([K], [T]) int64: the end of each view's tiles (in `tile_ids`) and of each tile's slots. Without `host_ends`

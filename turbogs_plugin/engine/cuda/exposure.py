@@ -24,6 +24,7 @@ def expose_colors(exposures: Exposures, colors: Tensor, samples: PixelSamples) -
         tile_ids=samples.tile_ids,
         tile_offsets=samples.tile_offsets,
         views=_rows(samples),
+        grid=launches.GridOrigin(*samples.origin),
         offsets=exposures.offsets,
         exposed=torch.empty_like(colors),
     )
@@ -41,12 +42,13 @@ def learn_exposures(
 ) -> Tensor:
     """`Engine.learn_exposures`, in two launches; `gradients`, where float32 and contiguous, is changed in place."""
     library.require()
-    rows = _rows(samples)
+    rows, grid = _rows(samples), launches.GridOrigin(*samples.origin)
     backward = launches.ExposureBackward(
         colors=colors.detach().float().contiguous(),
         tile_ids=samples.tile_ids,
         tile_offsets=samples.tile_offsets,
         views=rows,
+        grid=grid,
         offsets=exposures.offsets,
         gradients=gradients.detach().float().contiguous(),
         sums=torch.zeros(len(samples.view_ids), 3, 4, dtype=torch.float64, device=colors.device),
@@ -56,6 +58,7 @@ def learn_exposures(
         launches.ExposureStep(
             sums=backward.sums,
             views=rows,
+            grid=grid,
             exposures=exposures,
             overflow=overflow,
             rate=rate,

@@ -95,10 +95,18 @@ class Scene:
 
 
 @dataclass
+class GridOrigin:
+    """`PixelSamples.origin`."""
+
+    origin_x: int
+    origin_y: int
+
+
+@dataclass
 class Splats:
     """The results of the projection, for the later stages."""
 
-    cameras: Tensor  # [K, 28] float32, layout.CameraRow
+    cameras: Tensor  # [K, 32] float32, layout.CameraRow
     instances: Tensor  # [K * N, 12] float32, layout.InstanceRow; nothing where off screen
     radii: Tensor  # [K, N, 2] int32, zero where off screen
     active_prefix: Tensor | None  # [tiles + 1] int32, number of tiles with samples of a smaller id; None: all have some
@@ -158,6 +166,7 @@ class RasterProject(Launch):
     """Stage 1: project `scene`. Writes `splats` and `tile_cursors`, and clears the records of splats on screen."""
 
     scene: Scene
+    grid: GridOrigin
     settings: ProjectionSettings
     splats: Splats
     tile_ids: Tensor | None  # [T] int32; None where all tiles have samples
@@ -283,6 +292,7 @@ class SamplePixels(Launch):
     errors: Tensor  # [X] float16
     stamps: Tensor  # [X] int16
     views: list[int]  # [K] layout.DrawRow
+    grid: GridOrigin
     unit: int  # of layout.UNITS
     masks: MaskArrays
     slots_per_tile: int  # slots of a tile that the image's edge does not cut; with masks, of every tile
@@ -334,6 +344,7 @@ class SparseLoss(Launch):
     photos: Tensor | None  # [X, 3 or 4] uint8, from which to gather the colours; instead of `targets`
     samples: SampleArrays
     views: list[int]  # [K] layout.ViewRow
+    grid: GridOrigin
     structure: int  # of layout.STRUCTURES
     terms: LossSettings
     maps: MapArrays
@@ -359,6 +370,7 @@ class ExposedViews:
     tile_ids: Tensor  # [T] int32
     tile_offsets: Tensor  # [T + 1] int32
     views: list[int]  # [K] layout.ViewRow
+    grid: GridOrigin
     offsets: Tensor  # [V, 3, 4] float32
 
 
@@ -387,6 +399,7 @@ class ExposureStep(Launch):
 
     sums: Tensor  # [K, 3, 4] float64
     views: list[int]  # [K] layout.ViewRow
+    grid: GridOrigin
     exposures: ExposureArrays
     overflow: Tensor | None  # [1] int32; if not 0, the launch does nothing
     rate: float

@@ -339,7 +339,8 @@ def rasterize_cuda(
     scene = _scene(gaussians, cameras, degree, settings.eps2d)
     front = buffers.kept("front", _Front.of, views, count, num_active, num_tiles)
     splats, tiles = front.splats, front.tiles
-    library.launch(launches.RasterProject(scene, settings, splats, tile_ids, tiles.tile_cursors, front.records))
+    grid = launches.GridOrigin(*samples.origin)
+    library.launch(launches.RasterProject(scene, grid, settings, splats, tile_ids, tiles.tile_cursors, front.records))
 
     capacity = None if workspace is None else workspace.capacity(count, num_active)
     most = layout.INTERSECTIONS_MAX if capacity is None else capacity

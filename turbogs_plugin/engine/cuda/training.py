@@ -27,13 +27,13 @@ from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.tiles import CELL_SIDE, TILE_PIXELS, DrawEnds, slots_of_tiles, tile_extents
 from turbogs_plugin.types import (
     BLACK,
-    TILE_SIZE,
     Color,
     Gaussians,
     GaussianStats,
     LossOutput,
     PixelSamples,
     Step,
+    TileGrid,
 )
 
 
@@ -44,8 +44,9 @@ def sample_pixels(rule: DrawRule, maps: ErrorMaps, view_ids: tuple[int, ...], ra
     views = np.asarray(view_ids, dtype=np.int64)
     device, sizes = maps.errors.device, maps.sizes[views]
     shapes, masks = tuple(map(tuple, sizes.tolist())), launches.NO_MASKS
+    origin = rule.origin(step.iteration) if maps.masks is None else (0, 0)
     if maps.masks is None:
-        tiles, live_starts = _tiles(shapes), None
+        tiles, live_starts = _tiles(shapes, origin), None
     else:
         masks = maps.masks
         tiles, live_starts = tuple(masks.live_counts(view_ids)), tuple(masks.offsets[views].tolist())
@@ -59,6 +60,7 @@ def sample_pixels(rule: DrawRule, maps: ErrorMaps, view_ids: tuple[int, ...], ra
         errors=maps.errors,
         stamps=maps.stamps,
         views=view_rows(maps.offsets[views], shapes, view_ids, places.draws),
+        grid=launches.GridOrigin(*origin),
         unit=UNITS.index(rule.unit),
         masks=masks,
         slots_per_tile=places.slots_per_tile,
@@ -89,6 +91,7 @@ def sample_pixels(rule: DrawRule, maps: ErrorMaps, view_ids: tuple[int, ...], ra
         weights,
         has_empty_slots=rule.unit != "pixel" or maps.masks is not None,
         host_ends=places.ends,
+        origin=origin,
     )
 
 
@@ -120,9 +123,9 @@ def _wanted(rule: DrawRule, rate: float, tiles: Sequence[int]) -> tuple[int, ...
 
 
 @lru_cache(maxsize=4096)
-def _tiles(shapes: tuple[tuple[int, int], ...]) -> tuple[int, ...]:
+def _tiles(shapes: tuple[tuple[int, int], ...], origin: tuple[int, int]) -> tuple[int, ...]:
     """Number of tiles of views with these (width, height)."""
-    return tuple(-(-width // TILE_SIZE) * -(-height // TILE_SIZE) for width, height in shapes)
+    return tuple(TileGrid(np.array(shapes), origin).shapes.prod(axis=1).tolist())
 
 
 @lru_cache(maxsize=4096)
@@ -221,6 +224,7 @@ def sparse_loss(
         photos=photos,
         samples=samples,
         views=view_rows(starts, samples.sizes.tolist(), samples.view_ids),
+        grid=launches.GridOrigin(*samples.origin),
         structure=STRUCTURES.index(terms.structure),
         terms=terms,
         maps=maps,

@@ -160,9 +160,10 @@ def draw_pixels(rule: DrawRule, maps: ErrorMaps, view_ids: tuple[int, ...], rate
     maps.fetch(view_ids)
     device, views = maps.errors.device, np.asarray(view_ids, dtype=np.int64)
     sizes = maps.sizes[views]
-    table = pixel_table(sizes, device)  # [T, 256]
+    origin = (0, 0) if maps.masks is not None else rule.origin(step.iteration)
+    table = pixel_table(sizes, device, origin)  # [T, 256]
     exist = table >= 0
-    counts = TileGrid(sizes).shapes.prod(axis=1)  # [K]
+    counts = TileGrid(sizes, origin).shapes.prod(axis=1)  # [K]
     tile_ids = None
     if maps.masks is not None:
         counts = np.array(maps.masks.live_counts(view_ids))
@@ -179,7 +180,7 @@ def draw_pixels(rule: DrawRule, maps: ErrorMaps, view_ids: tuple[int, ...], rate
         return random_words(place.clamp(min=0).long(), view_numbers, purpose, step.seed, step.iteration)
 
     draw = _draw_tiles if rule.unit == "tile" else _draw_within_tiles
-    return draw(_Batch(view_ids, sizes, table, exist, counts, tile_ids, errors, ages, words), rate, rule)
+    return draw(_Batch(view_ids, sizes, origin, table, exist, counts, tile_ids, errors, ages, words), rate, rule)
 
 
 @dataclass(frozen=True)
@@ -189,6 +190,7 @@ class _Batch:
 
     view_ids: tuple[int, ...]
     sizes: np.ndarray
+    origin: tuple[int, int]
     table: Tensor  # [T, 256] int32
     exist: Tensor  # [T, 256] bool, the pixel is in the image and not masked
     counts: np.ndarray  # [K] tiles of each view
@@ -255,5 +257,7 @@ def _draw_tiles(batch: _Batch, rate: float, rule: DrawRule) -> PixelSamples:
     slots = np.full(len(tile_ids), TILE_PIXELS)
     if batch.live_tiles is not None:
         tile_ids = batch.live_tiles[tile_ids]
-    samples = compact(batch.view_ids, batch.sizes, table, exist, tile_ids.int(), slots, tile_weights)
+    samples = compact(
+        batch.view_ids, batch.sizes, table, exist, tile_ids.int(), slots, tile_weights, origin=batch.origin
+    )
     return replace(samples, host_ends=batch.ends(rule.unit, numbers))

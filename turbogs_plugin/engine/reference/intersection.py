@@ -107,13 +107,14 @@ def intersect_tiles(rows: Rows, splats: Splats, samples: PixelSamples, settings:
     on_screen = (splats.radii > 0).any(dim=-1)
     order = torch.where(on_screen, splats.depths, torch.inf).sort(stable=True).indices  # [R]
     image = sizes[rows.views[order]]  # [R, 2]
+    origin = torch.as_tensor(samples.origin, device=device)  # [2]
     means2d, radii = splats.means2d[order], splats.radii[order]
     # Pixel centres within the box of the radii, widened against rounding, as tiles [first, last].
     slack = 1 + ROUNDING * torch.finfo(means2d.dtype).eps * (means2d.abs() + radii)
     first = (means2d - radii - 0.5 - slack).clamp(min=0)
     last = (means2d + radii - 0.5 + slack).clamp(min=-1)
-    first = torch.minimum(first, image.to(first.dtype)).long() // TILE_SIZE
-    last = torch.minimum(last, (image - 1).to(last.dtype)).floor().long() // TILE_SIZE
+    first = (torch.minimum(first, image.to(first.dtype)).long() + origin) // TILE_SIZE
+    last = (torch.minimum(last, (image - 1).to(last.dtype)).floor().long() + origin) // TILE_SIZE
     spans = (last - first + 1).clamp(min=0) * on_screen[order, None]  # [R, 2] tiles in x and y
 
     owners, number = spread(spans.prod(dim=-1))  # [C] candidates
@@ -121,8 +122,8 @@ def intersect_tiles(rows: Rows, splats: Splats, samples: PixelSamples, settings:
     line = number // spans[owners, 0] + first[owners, 1]
     tiles = position[offsets[rows.views[order]][owners] + line * shapes[rows.views[order]][owners, 0] + column]
 
-    low = torch.stack([column, line], dim=-1) * TILE_SIZE
-    high = torch.minimum(low + TILE_SIZE, image[owners]) - 1
+    start = torch.stack([column, line], dim=-1) * TILE_SIZE - origin
+    low, high = start.clamp(min=0), torch.minimum(start + TILE_SIZE, image[owners]) - 1
     centers = means2d[owners]
     smallest = smallest_exponents(splats.conics[order][owners], low + 0.5 - centers, high + 0.5 - centers)
     limits = torch.log(splats.opacities[order] / settings.alpha_min)[owners]
