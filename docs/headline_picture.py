@@ -8,7 +8,7 @@ from typing import Any
 
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
-from study_tables import CAPTURES, OURS, ROOT, read_peers, rows_of
+from study_tables import CAPS, CAPTURES, OURS, ROOT, read_peers, rows_of
 
 PICTURE = ROOT / "docs/results/headline.png"
 DRAWING = 4
@@ -16,7 +16,7 @@ DRAWING = 4
 
 PICTURE_COLORS = {
     "turbogs": "#d1495b",
-    "turbogs with a cap": "#e8a0a8",
+    "turbogs-small with a cap": "#e8a0a8",
     "turbogs-ssim": "#8a1c3a",
     "turbogs-paper": "#17919e",
     "3dgs": "black",
@@ -29,7 +29,7 @@ PICTURE_COLORS = {
     "Faster-GS": "#2e8b57",
 }
 PICTURE_LABELS = {"3dgs": "3DGS, ours", "mcmc": "MCMC, ours", "fastgs": "votes as FastGS's, ours"}
-PICTURE_NAMES = {"ssim": "turbogs-ssim", **dict.fromkeys(("cap-57k", "cap-67k", "cap-157k"), "turbogs with a cap")}
+PICTURE_NAMES = {"ssim": "turbogs-ssim", **dict.fromkeys(CAPS, "turbogs-small with a cap")}
 PICTURE_TICKS = (
     {"0.3": 0.3, "1": 1, "3": 3, "10": 10, "30": 30, "100": 100},
     *({"50k": 5e4, "100k": 1e5, "200k": 2e5, "500k": 5e5, "1M": 1e6, "2M": 2e6},) * 2,
@@ -44,8 +44,9 @@ def picture_data() -> dict[str, Any]:
         name = PICTURE_NAMES.get(variant, variant)
         for capture, rows in rows_of(study).items():
             if row := rows.get(variant):
-                curve = row.curve("psnr")
-                data[capture]["curves"][name] = [curve.seconds.round(4).tolist(), curve.mean.round(4).tolist()]
+                if CAPS.get(variant, capture) == capture:
+                    curve = row.curve("psnr")
+                    data[capture]["curves"][name] = [curve.seconds.round(4).tolist(), curve.mean.round(4).tolist()]
                 means = [row.spread(measure).mean for measure in ("seconds", "psnr", "gaussians", "ssim")]
                 data[capture]["points"].append([name, *(round(value, 4) for value in means)])
     for entry in read_peers()["rows"]:

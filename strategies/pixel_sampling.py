@@ -77,7 +77,8 @@ class ErrorGuidedPixelSampler(RulePixelSampler):
         hard_ratio, stable_ratio: r_hard and r_stable, shares of the units drawn in each tile.
         mixed: how the remaining share is drawn, which the paper names but does not define: by `error_age`, the mean of
             the two normalised distributions, or `uniform`.
-        unit: `pixel` (the paper), `cell` (4x4 pixels of a tile), or `tile` (whole tiles of a view).
+        unit: `pixel` (the paper), `cell` (4x4 pixels of a tile), or `tile` (whole tiles of a view, which begin
+            elsewhere in each iteration: `DrawRule.origin`).
         importance: exponent a of the importance weights p^-a, p the probability that a unit is drawn: 0 none, as in the
             paper's runs; 1 unbiased (exactly so for a draw of a single stage).
     """

@@ -2,7 +2,8 @@
 
 Within every 16x16 tile of the K views, N units are drawn without replacement in three stages, each from the units that
 the stages before it left: the *hard* share by error, the *stable* share by age, the *mixed* rest by both. A unit is a
-pixel (the paper's), a 4x4 cell, or a whole tile; whole tiles are drawn among the tiles of a view.
+pixel (the paper's), a 4x4 cell, or a whole tile; whole tiles are drawn among the tiles of a view. Their grid begins
+elsewhere in each iteration (`DrawRule.origin`), but for maps with masks.
 
 The draw is defined down to the bit, so that `draw_pixels` here and its CUDA twin return equal sets:
 
