@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import statistics
 from collections.abc import Callable
 from pathlib import Path
@@ -168,8 +169,14 @@ def on(name: str, made: Callable[[], str]) -> str:
 def where(record: dict[str, Any]) -> str:
     """Machine, commit and torch of a file of `turbogs bench`."""
     provenance = record["provenance"]
-    machine = provenance["machine"].partition(" (")[0]
-    return f"{machine}, commit {provenance['commit'][:7]}, torch {provenance['software']['torch']}"
+    commit, torch = provenance["commit"][:7], provenance["software"]["torch"]
+    return f"{short(provenance['machine'])}, commit {commit}, torch {torch}"
+
+
+def short(machine: str) -> str:
+    """The GPU, and how many cores the host has, which makes the seconds differ."""
+    gpu, cores = machine.partition(" (")[0], re.search(r"\d+ cores", machine)
+    return f"{gpu}, {cores[0]}" if cores else gpu
 
 
 def ranks() -> str:

@@ -108,11 +108,11 @@ def ahead() -> str:
     for entry in read_peers()["rows"]:
         row = ours[entry["capture"]]
         times = [time for time in row.seconds_to(entry["psnr"]) if math.isfinite(time)]
-        parts = ["never"]
-        if times:
+        if len(times) == len(row.cells):
             mean = math.fsum(times) / len(times)
             parts = [f"{mean:.1f} s, {entry['seconds'] / mean:.0f} times sooner"]
-        parts += [] if len(times) == len(row.cells) else [f"{len(times)} of {len(row.cells)} seeds"]
+        else:  # a mean over those that came so far would leave out the slow ones
+            parts = [f"reached by {len(times)} of {len(row.cells)} seeds"]
         if entry["gaussians"]:
             parts.append(f"x {row.spread('gaussians').mean / entry['gaussians']:.1f} N")
         lines.setdefault(entry["method"], {})[entry["capture"]] = ", ".join(parts)
@@ -150,7 +150,7 @@ def headline_sources() -> str:
         rows = [found[variant] for found in rows_of(study).values() if variant in found]
         places = [place for row in rows for cell in row.cells if (place := cell.provenance)]
         if rows:
-            where = {f"{place.machine.partition(' (')[0]}, commit {place.commit[:7]}" for place in places}
+            where = {f"{machine_tables.short(place.machine)}, commit {place.commit[:7]}" for place in places}
             said.setdefault(name, set()).update(where)
             changed += stale(study)
     lines = [(name, "; ".join(sorted(where)) or "not recorded") for name, where in said.items()]

@@ -101,8 +101,8 @@ def overlays_caption(file: Path = PICTURES) -> str | None:
     return wrapped(
         f"*The {width}x{height} pixels in the middle of that view, after {early['iteration']} iterations. Left: its "
         f"error map. Right: the {100 * early['share']:.0f} % of the view's pixels that this iteration samples, over "
-        "the render: as many in each 16x16 tile, and in a tile mostly those with large errors, or that were not "
-        "sampled for a long time.*"
+        "the render: the same number in each 16x16 tile, and in a tile mostly those with large errors, or that were "
+        "not sampled for a long time.*"
     )
 
 
