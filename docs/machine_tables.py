@@ -167,16 +167,16 @@ def on(name: str, made: Callable[[], str]) -> str:
 
 
 def where(record: dict[str, Any]) -> str:
-    """Machine, commit and torch of a file of `turbogs bench`."""
+    """Machine, commit, day and torch of a file of `turbogs bench`."""
     provenance = record["provenance"]
-    commit, torch = provenance["commit"][:7], provenance["software"]["torch"]
-    return f"{short(provenance['machine'])}, commit {commit}, torch {torch}"
+    found = place(provenance["machine"], provenance["commit"], provenance.get("day", ""))
+    return f"{found}, torch {provenance['software']['torch']}"
 
 
-def short(machine: str) -> str:
-    """The GPU, and how many cores the host has, which makes the seconds differ."""
-    gpu, cores = machine.partition(" (")[0], re.search(r"\d+ cores", machine)
-    return f"{gpu}, {cores[0]}" if cores else gpu
+def place(machine: str, commit: str, day: str) -> str:
+    """The GPU; how many cores the host has, which makes the seconds differ; commit; and day, where it was recorded."""
+    cores = re.findall(r"\d+ cores", machine)
+    return ", ".join([machine.partition(" (")[0], *cores, f"commit {commit[:7]}", *([day] if day else [])])
 
 
 def ranks() -> str:

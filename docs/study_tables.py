@@ -143,14 +143,14 @@ def behind() -> str:
 
 
 def headline_sources() -> str:
-    """Machine and commit of each row of ours; a line for what a packaged configuration no longer gives."""
+    """Machine, commit and day of each row of ours; a line for what a packaged configuration no longer gives."""
     said: dict[str, set[str]] = {}
     changed: list[str] = []
     for study, variant, name in OURS:
         rows = [found[variant] for found in rows_of(study).values() if variant in found]
         places = [place for row in rows for cell in row.cells if (place := cell.provenance)]
         if rows:
-            where = {f"{machine_tables.short(place.machine)}, commit {place.commit[:7]}" for place in places}
+            where = {machine_tables.place(place.machine, place.commit, place.day) for place in places}
             said.setdefault(name, set()).update(where)
             changed += stale(study)
     lines = [(name, "; ".join(sorted(where)) or "not recorded") for name, where in said.items()]

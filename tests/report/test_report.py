@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -261,6 +262,7 @@ def test_the_commit_of_the_sources(tmp_path, monkeypatch):
     assert provenance.source_commit() == commit + provenance.MODIFIED
     monkeypatch.setenv(provenance.COMMIT_VARIABLE, "named")
     assert provenance.source_commit() == "named"
+    assert re.fullmatch(r"20\d\d-[01]\d-[0-3]\d", provenance.provenance("cpu").day)
 
 
 def test_tables():

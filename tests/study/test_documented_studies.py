@@ -109,6 +109,12 @@ def test_what_is_not_measured_yet_says_so_until_it_is(tmp_path, monkeypatch):
     assert paper_tables.within_bound(row, row, end=True) == "+0.00 ± 0.05 dB, within the bound"
 
 
+def test_a_place_says_what_is_known():
+    host = "NVIDIA H200 (140 GiB), Intel(R) Xeon(R) Processor, 32 cores"
+    assert machine_tables.place(host, "0123456789", "2026-11-25") == "NVIDIA H200, 32 cores, commit 0123456, 2026-11-25"
+    assert machine_tables.where({"provenance": PLACE}) == "NVIDIA H200, commit 0123456, torch 2.11.0"
+
+
 def test_the_headline_has_the_wall_beside_the_training():
     assert (
         study_tables.result(4.12, 32.2, 0.893, 209e3, study_tables.duration(9.54))

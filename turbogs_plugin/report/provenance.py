@@ -1,10 +1,11 @@
-"""What a measurement depends on besides its inputs: machine, versions, kernels, commit."""
+"""What a measurement depends on besides its inputs: machine, versions, kernels, commit; and its day."""
 
 from __future__ import annotations
 
 import os
 import subprocess
 from dataclasses import dataclass
+from datetime import datetime, timezone
 from pathlib import Path
 
 from turbogs_plugin.engine import compiled_kernels
@@ -26,12 +27,14 @@ class Provenance:
         software: name -> version.
         kernels: the CUDA library that ran, or why the torch reference did.
         commit: of the sources, or "" where unknown.
+        day: ``2026-11-25``, in UTC, when the process began to measure; "" where it was not recorded.
     """
 
     machine: str
     software: dict[str, str]
     kernels: str
     commit: str
+    day: str = ""
 
 
 def provenance(device_type: str) -> Provenance:
@@ -41,7 +44,8 @@ def provenance(device_type: str) -> Provenance:
     engine = f"{kernels.path.name} for {', '.join(kernels.architectures)}"
     if reason:
         engine = f"none, the torch reference ran: {reason}"
-    return Provenance(hardware(device_type), dict(software()), engine, source_commit())
+    day = datetime.now(timezone.utc).date().isoformat()
+    return Provenance(hardware(device_type), dict(software()), engine, source_commit(), day)
 
 
 def source_commit() -> str:

@@ -134,10 +134,17 @@ def changed_since(study: Study) -> list[Paragraph]:
 def _machines(provenances: Sequence[Provenance | None]) -> list[Block]:
     recorded = [entry for entry in provenances if entry is not None]
     rows = [
-        (entry.machine, entry.kernels, entry.commit or "unknown", ", ".join(map(" ".join, entry.software.items())))
+        (
+            entry.machine,
+            entry.kernels,
+            entry.commit or "unknown",
+            entry.day or "not recorded",
+            ", ".join(map(" ".join, entry.software.items())),
+        )
         for entry in recorded
     ]
-    blocks: list[Block] = [Table(("machine", "kernels", "commit", "software"), rows, numeric=False)] if rows else []
+    header = ("machine", "kernels", "commit", "day", "software")
+    blocks: list[Block] = [Table(header, rows, numeric=False)] if rows else []
     if None in provenances:
         blocks.append(Paragraph("The machine is not recorded for every run; seconds compare only within one machine."))
     if len({entry.machine for entry in recorded}) > 1:
