@@ -45,13 +45,14 @@ class DrawRule:
         slack = 0.5 if self.unit == "cell" else 0.0
         return min(units, max(1, math.floor(rate * units + slack)))
 
-    def origin(self, iteration: int) -> tuple[int, int]:
+    def origin(self, iteration: int, masked: bool) -> tuple[int, int]:
         """Of the grid of tiles in an iteration, see `TileGrid`.
 
         Whole tiles begin elsewhere in each iteration, so that no pixel is always at the edge of the window that a loss
-        compares: at the points of a sequence that fills the square evenly (Roberts 2018, R2). Not with masks.
+        compares: at the points of a sequence that fills the square evenly (Roberts 2018, R2). Not where maps
+        have masks, whose tables are of one grid.
         """
-        if self.unit != "tile":
+        if self.unit != "tile" or masked:
             return 0, 0
         x, y = (int(TILE_SIZE * math.fmod(iteration * step, 1.0)) for step in GRID_STEPS)
         return x, y

@@ -44,7 +44,7 @@ def sample_pixels(rule: DrawRule, maps: ErrorMaps, view_ids: tuple[int, ...], ra
     views = np.asarray(view_ids, dtype=np.int64)
     device, sizes = maps.errors.device, maps.sizes[views]
     shapes, masks = tuple(map(tuple, sizes.tolist())), launches.NO_MASKS
-    origin = rule.origin(step.iteration) if maps.masks is None else (0, 0)
+    origin = rule.origin(step.iteration, masked=maps.masks is not None)
     if maps.masks is None:
         tiles, live_starts = _tiles(shapes, origin), None
     else:

@@ -161,7 +161,7 @@ def draw_pixels(rule: DrawRule, maps: ErrorMaps, view_ids: tuple[int, ...], rate
     maps.fetch(view_ids)
     device, views = maps.errors.device, np.asarray(view_ids, dtype=np.int64)
     sizes = maps.sizes[views]
-    origin = (0, 0) if maps.masks is not None else rule.origin(step.iteration)
+    origin = rule.origin(step.iteration, masked=maps.masks is not None)
     table = pixel_table(sizes, device, origin)  # [T, 256]
     exist = table >= 0
     counts = TileGrid(sizes, origin).shapes.prod(axis=1)  # [K]
