@@ -12,8 +12,9 @@ import machine_tables
 
 from turbogs_plugin.report.tables import table
 from turbogs_plugin.study.folder import StudyFolder
-from turbogs_plugin.study.pages import changed_since, difference_text
+from turbogs_plugin.study.pages import changed_since, difference_text, spread_text
 from turbogs_plugin.study.results import Study
+from turbogs_plugin.study.statistics import Spread
 from turbogs_plugin.study.summary import VariantRow, summarise
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -55,13 +56,23 @@ def rows_of(study: str) -> dict[str, dict[str, VariantRow]]:
     return {summary.scene: {row.name: row for row in summary.rows} for summary in summaries}
 
 
-def result(seconds: float, psnr: float, ssim: float | None, gaussians: float | None, wall: str | None = None) -> str:
-    """``4.1 s, 32.20 dB, .893, 209k``; what was not recorded is left out. With `wall`, ``4.1 / 9.5 s``."""
+def shown(study: str, variant: str) -> dict[str, VariantRow]:
+    """Capture -> a variant's row, for the cells that the headline table has of it."""
+    found = {capture: rows[variant] for capture, rows in rows_of(study).items() if variant in rows}
+    return {capture: row for capture, row in found.items() if CAPS.get(variant, capture) == capture}
+
+
+def result(
+    seconds: float, psnr: float | Spread, ssim: float | None, gaussians: float | None, wall: str | None = None
+) -> str:
+    """``4.1 s, 32.20 dB, .893, 209k``; what was not recorded is left out. With `wall`, ``4.1 / 9.5 s``; with the PSNR's
+    spread over several seeds, ``32.20 [32.05, 32.31] dB``."""
     size = (
         gaussians if gaussians is None else f"{gaussians / 1e6:.2f}M" if gaussians >= 1e6 else f"{gaussians / 1e3:.0f}k"
     )
     clocks = duration(seconds) if wall is None else f"{duration(seconds)} / {wall}"
-    parts = [f"{clocks} s", f"{psnr:.2f} dB"]
+    error = spread_text(psnr, 2) if isinstance(psnr, Spread) else f"{psnr:.2f}"
+    parts = [f"{clocks} s", f"{error} dB"]
     parts += [] if ssim is None else [f"{ssim:.3f}".lstrip("0")]
     return ", ".join(parts if size is None else [*parts, size])
 
@@ -80,12 +91,11 @@ def headline() -> str:
         cell = result(entry["seconds"], entry["psnr"], entry["ssim"], entry["gaussians"], wall)
         lines.setdefault(entry["method"], {})[entry["capture"]] = cell
     for study, variant, name in OURS:
-        for capture, rows in rows_of(study).items():
-            if (row := rows.get(variant)) and CAPS.get(variant, capture) == capture:
-                means = [row.spread(measure).mean for measure in ("seconds", "psnr", "ssim", "gaussians")]
-                wall = duration(wall_seconds(variant, capture))
-                seeds = f" ({len(row.cells)})" if len(row.cells) > 1 else ""
-                lines.setdefault(name, {})[capture] = f"{result(*means, wall)}{seeds}"
+        for capture, row in shown(study, variant).items():
+            seconds, ssim, gaussians = (row.spread(measure).mean for measure in ("seconds", "ssim", "gaussians"))
+            wall = duration(wall_seconds(variant, capture))
+            seeds = f" ({len(row.cells)})" if len(row.cells) > 1 else ""
+            lines.setdefault(name, {})[capture] = f"{result(seconds, row.psnr, ssim, gaussians, wall)}{seeds}"
     return by_capture("", lines)
 
 
