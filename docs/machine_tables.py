@@ -18,6 +18,7 @@ from turbogs_plugin.bench.statistics import StatisticsResult, statistics_table
 from turbogs_plugin.bench.wall import WallRun
 from turbogs_plugin.config.configuration import load_config
 from turbogs_plugin.plan.memory import MemoryDemand
+from turbogs_plugin.report.provenance import MODIFIED
 from turbogs_plugin.report.tables import table
 
 ABSENT = "Not measured yet."
@@ -176,7 +177,12 @@ def where(record: dict[str, Any]) -> str:
 def place(machine: str, commit: str, day: str) -> str:
     """The GPU; how many cores the host has, which makes the seconds differ; commit; and day, where it was recorded."""
     cores = re.findall(r"\d+ cores", machine)
-    return ", ".join([machine.partition(" (")[0], *cores, f"commit {commit[:7]}", *([day] if day else [])])
+    return ", ".join([machine.partition(" (")[0], *cores, f"commit {short(commit)}", *([day] if day else [])])
+
+
+def short(commit: str) -> str:
+    """As pages name it; sources that differ from it say so."""
+    return commit[:7] + (MODIFIED if commit.endswith(MODIFIED) else "")
 
 
 def ranks() -> str:

@@ -1,4 +1,5 @@
-"""Fills the tables of README.md and of pages in docs/ from results; `make pages` runs it.
+"""Fills the tables of README.md and of pages in docs/ from results, and marks the pages of studies that are of another
+commit than README's numbers; `make pages` runs it.
 
 A table stands between ``<!-- made: NAME -->`` and ``<!-- end -->``, where NAME is a key of `TABLES`; what is between
 them is replaced, unless there is nothing yet to make it of. A second run changes nothing.
@@ -105,4 +106,6 @@ def _made(block: re.Match[str]) -> str:
 if __name__ == "__main__":
     for page in PAGES:
         page.write_text(filled(page.read_text()))
+    for results in ROOT.glob("docs/results/*/results.json"):
+        results.with_name("report.md").write_text(study_tables.study_page(results.parent.name))
     save_plot(PICTURE, lambda: draw(picture_data()), picture_digest())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections import Counter
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -11,9 +12,10 @@ from typing import Any
 import machine_tables
 
 from turbogs_plugin.report.tables import table
+from turbogs_plugin.study.document import Heading, Paragraph, to_markdown
 from turbogs_plugin.study.folder import StudyFolder
-from turbogs_plugin.study.pages import changed_since, difference_text, spread_text
-from turbogs_plugin.study.results import Study
+from turbogs_plugin.study.pages import changed_since, difference_text, report_blocks, spread_text
+from turbogs_plugin.study.results import CellResult, Study
 from turbogs_plugin.study.statistics import Spread
 from turbogs_plugin.study.summary import VariantRow, summarise
 
@@ -153,21 +155,43 @@ def behind() -> str:
 
 
 def headline_sources() -> str:
-    """Machine, commit and day of each row of ours; a line for what a packaged configuration no longer gives."""
+    """Machine, commit and day of each row of ours, stale where that is not the commit of **turbogs**; a line for what a
+    packaged configuration no longer gives."""
     said: dict[str, set[str]] = {}
     changed: list[str] = []
     for study, variant, name in OURS:
-        rows = [found[variant] for found in rows_of(study).values() if variant in found]
+        rows = shown(study, variant).values()
         places = [place for row in rows for cell in row.cells if (place := cell.provenance)]
         if rows:
-            where = {machine_tables.place(place.machine, place.commit, place.day) for place in places}
+            where = {
+                machine_tables.place(place.machine, place.commit, place.day) + mark(place.commit) for place in places
+            }
             said.setdefault(name, set()).update(where)
-            changed += stale(study)
+            changed += other_settings(study)
     lines = [(name, "; ".join(sorted(where)) or "not recorded") for name, where in said.items()]
-    reports = json.loads(machine_tables.WALL.read_text())
-    lines.append(("turbogs, on the wall", "; ".join(dict.fromkeys(map(machine_tables.where, reports.values())))))
+    reports = json.loads(machine_tables.WALL.read_text()).values()
+    walls = dict.fromkeys(machine_tables.where(report) + mark(report["provenance"]["commit"]) for report in reports)
+    lines.append(("turbogs, on the wall", "; ".join(walls)))
     lines.append(("the others", read_peers()["measured"]))
     return "\n\n".join([table(("row", "measured on"), lines), *dict.fromkeys(changed)])
+
+
+def commit_of(cell: CellResult) -> str:
+    """As pages name it; "" where it was not recorded."""
+    return machine_tables.short(cell.provenance.commit) if cell.provenance else ""
+
+
+def readme_commit() -> str:
+    """That of most runs of README's **turbogs**; "" where none is recorded. What has another one is stale."""
+    runs = (cell for row in shown("sizes", "turbogs").values() for cell in row.cells)
+    commits = Counter(filter(None, map(commit_of, runs)))
+    return max(commits, key=commits.__getitem__, default="")
+
+
+def mark(commit: str) -> str:
+    """What stands behind a commit that is not README's."""
+    readme = readme_commit()
+    return " (stale)" if readme and commit and machine_tables.short(commit) != readme else ""
 
 
 def changes(study: str) -> str:
@@ -186,10 +210,36 @@ def changes(study: str) -> str:
 
 
 def stale(study: str) -> list[str]:
+    """Lines that say what was measured where a study's baseline is not today's or its commit not README's."""
+    return [*other_settings(study), *(block.markdown() for block in other_commit(study))]
+
+
+def other_settings(study: str) -> list[str]:
     """A line that says what was measured where a study's baseline is not today's; none where it is."""
     folder = ROOT / "docs/results" / study
     measured = (folder / "results.json").is_file()
     return [block.markdown() for block in changed_since(read_study(folder))] if measured else []
+
+
+def other_commit(study: str) -> list[Paragraph]:
+    """A line that says how many cells of a study are of another commit than README's; none where all are of that."""
+    folder, readme = ROOT / "docs/results" / study, readme_commit()
+    cells = read_study(folder).results if (folder / "results.json").is_file() else []
+    others = Counter(commit for cell in cells if (commit := commit_of(cell)) not in ("", readme))
+    if not readme or not others:
+        return []
+    which = f"commit{'s' if len(others) > 1 else ''} {', '.join(others)}"
+    count = f"{others.total()} of {len(cells)} cells of `{study}`"
+    return [Paragraph(f"Stale: {count} were measured at {which}; README's `turbogs` at {readme}.")]
+
+
+def study_page(study: str) -> str:
+    """``report.md`` of a study: what `turbogs report` writes, and above its first capture the line of `other_commit`,
+    of which only README's results know."""
+    measured = read_study(ROOT / "docs/results" / study)
+    blocks = report_blocks(measured, summarise(measured))
+    first = next(place for place, block in enumerate(blocks) if isinstance(block, Heading))
+    return to_markdown(measured.ablation.title, [*blocks[:first], *other_commit(study), *blocks[first:]])
 
 
 def change(row: VariantRow) -> str:

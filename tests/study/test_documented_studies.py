@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from turbogs_plugin.bench.viewer import ViewerRun
+from turbogs_plugin.report.provenance import Provenance
 from turbogs_plugin.study.document import to_markdown
 from turbogs_plugin.study.folder import StudyFolder
 from turbogs_plugin.study.grid import load_ablation, variant_config
@@ -39,8 +40,10 @@ def test_a_study_in_the_documentation_is_what_its_results_say(folder):
     study = StudyFolder(folder).read_study()
     summaries = summarise(study)
     assert (folder / "results.json").read_text() == study_to_json(study)
-    page = to_markdown(study.ablation.title, report_blocks(study, summaries))
-    assert (folder / "report.md").read_text() == page, "the page is not that of these results: make pages"
+    page = (folder / "report.md").read_text()
+    assert page == study_tables.study_page(folder.name), "the page is not that of these results: make pages"
+    line = "".join(f"{block.markdown()}\n\n" for block in study_tables.other_commit(folder.name))
+    assert page.replace(line, "") == to_markdown(study.ablation.title, report_blocks(study, summaries))
     shown = {f"{summary.scene}-{plot.name}.png": plot_digest(summary) for summary in summaries for plot in PLOTS}
     for name, digest in shown.items():
         assert shown_digest(folder / name) == digest, f"{name} does not show these results: make pages"
@@ -68,8 +71,8 @@ def test_every_part_of_the_paper_has_its_row():
     assert {part.default for part in paper_tables.PARTS} == {"the paper's", "ours", ""}
 
 
-def a_study(folder: Path, name: str, results: dict[str, tuple[float, ...]]) -> None:
-    """Results of a packaged ablation on every capture, variant -> final PSNRs of its seeds."""
+def a_study(folder: Path, name: str, results: dict[str, tuple[float, ...]], commits: tuple[str, ...] = ()) -> None:
+    """Results of a packaged ablation on every capture, variant -> final PSNRs of its seeds; seed -> its commit."""
     ablation, cells = load_ablation(name), []
     for capture in study_tables.CAPTURES:
         for variant, psnrs in results.items():
@@ -78,6 +81,8 @@ def a_study(folder: Path, name: str, results: dict[str, tuple[float, ...]]) -> N
                 history = [Evaluation(0, 0.1, 9.0, 0.2, 0.4, 90, 9), Evaluation(5, 3.0, 33.0, 0.9, 0.1, 900, 9)]
                 history.append(Evaluation(9, 7.0, psnr, 0.9, 0.1, 1000, 9))
                 where = {"scene": capture, "variant": variant, "seed": seed}
+                if commits:
+                    where["provenance"] = Provenance(**PLACE | {"commit": commits[seed]}, kernels="", day="2026-11-25")
                 cells.append(CellResult(**where, config=config, asked=config, cell_seconds=12.0, history=history))
     study = StudyFolder(folder / "docs/results" / name)
     study.path.mkdir(parents=True)
@@ -153,6 +158,40 @@ def test_the_headline_says_how_many_seeds_and_where_and_when_ours_had_the_others
     sources = study_tables.headline_sources()
     assert "| **turbogs** | not recorded |" in sources and "| the others | another day |" in sources
     assert "| turbogs, on the wall | NVIDIA H200, commit 0123456, torch 2.11.0 |" in sources
+
+
+def test_what_is_of_another_commit_than_ours_is_stale(tmp_path, monkeypatch):
+    monkeypatch.setattr(study_tables, "ROOT", tmp_path)
+    monkeypatch.setattr(machine_tables, "WALL", tmp_path / "wall.json")
+    a_study(tmp_path, "baselines", {"3dgs": (30.3,)}, ("aaaaaaa",))
+    (tmp_path / "docs/results/peers.json").write_text(json.dumps({"measured": "another day"}))
+    walls = ({"provenance": PLACE | {"commit": commit}} for commit in ("aaaaaaabbb", "0123456789ab"))
+    (tmp_path / "wall.json").write_text(json.dumps(dict(zip(study_tables.CAPTURES, walls, strict=False))))
+    # Without a commit of ours there is none to compare with.
+    assert "stale" not in study_tables.headline_sources() and study_tables.other_commit("baselines") == []
+    a_study(tmp_path, "sizes", {"turbogs": (31.0,) * 3, "ssim": (31.0,)}, ("0123456789", "0123456-modified", "0123456"))
+    a_study(tmp_path, "parts", {"turbogs": (31.0, 31.1)}, ("0123456aaa", ""))
+    a_study(tmp_path, "departures", {"turbogs": (31.0,)}, ("aaaaaaa",))
+    study_tables.read_study.cache_clear()
+    lines = dict(line.strip("| ").split(" | ") for line in study_tables.headline_sources().splitlines() if "|" in line)
+    ours = "NVIDIA H200, commit 0123456, 2026-11-25"
+    assert lines["turbogs-ssim"] == ours
+    assert lines["**turbogs**"] == f"{ours}; NVIDIA H200, commit 0123456-modified, 2026-11-25 (stale)"
+    (full,) = (where for name, where in lines.items() if name.startswith("3DGS"))
+    assert full == "NVIDIA H200, commit aaaaaaa, 2026-11-25 (stale)"
+    wall = "NVIDIA H200, commit aaaaaaa, torch 2.11.0 (stale); NVIDIA H200, commit 0123456, torch 2.11.0"
+    assert lines["turbogs, on the wall"] == wall and lines["the others"] == "another day"
+    line = "Stale: 3 of 3 cells of `baselines` were measured at commit aaaaaaa; README's `turbogs` at 0123456."
+    assert study_tables.stale("baselines") == [*study_tables.other_settings("baselines"), line]
+    assert study_tables.stale("parts") == study_tables.other_settings("parts")
+    assert study_tables.changes("baselines").endswith(f"\n\n{line}")
+    (told,) = (found for found in paper_tables.paper_parts().split("\n\n") if "measured at" in found)
+    assert told.startswith("Stale: 3 of 3 cells of `departures` were measured at commit aaaaaaa; ")
+    head = study_tables.study_page("baselines").partition("\n## ")[0]
+    assert head.endswith(f"\n\n{line}\n")
+    assert "were measured at" not in study_tables.study_page("parts") and study_tables.mark("") == ""
+    part = "Stale: 3 of 12 cells of `sizes` were measured at commit 0123456-modified; README's"
+    assert part in study_tables.study_page("sizes")
 
 
 NUMBER = re.compile(r"\d\.\d+ dB\b|\d (?:ms|us)\b|(?<![\d.])0?\.\d{4}\b")
