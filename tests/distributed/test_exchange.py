@@ -31,7 +31,7 @@ from turbogs_plugin.train.trainer import Trainer
 CPU = torch.device("cpu")
 
 CASES = {
-    "usual": (),
+    "usual": ("train.average_last=1.0",),
     "one view": ("schedule.type=fixed", "schedule.views=1"),
     "one tile": ("schedule.type=fixed", "schedule.views=1", "schedule.pixel_budget=0.1", "pixel_sampler.unit=tile"),
     "cells": ("pixel_sampler.unit=cell",),
@@ -40,7 +40,7 @@ CASES = {
     "no rule": ("optimizer.type=adam",),
     "fastgs": ("density.type=fastgs", "density.refine_from=2", "density.refine_every=3", "density.grad_threshold=0"),
     "mcmc": ("density.type=mcmc", "density.refine_start_iter=1", "density.refine_every=3"),
-    "exposures": ("train.exposure=true", "train.background=random"),
+    "exposures": ("train.exposure=true", "train.background=random", "train.average_last=1.0"),
     "masked": ("schedule.min_views=7", "schedule.max_views=7"),
     "masked tiles": ("pixel_sampler.unit=tile", "schedule.type=fixed", "schedule.views=2"),
     "hosted": ("train.maps_place=host", "train.photos_place=host"),

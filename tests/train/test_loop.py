@@ -26,7 +26,7 @@ class CountingTrainer:
         self.iteration = 0
         self.steps: list[int] = []
         self.gaussians = range(10)
-        self.initialised = False
+        self.initialised = self.concluded = False
         self._lost = set(lost)
         self._unnoticed = 0
 
@@ -51,6 +51,10 @@ class CountingTrainer:
     def set_length(self, iterations: int, refine_until: int) -> None:
         self.length = (iterations, refine_until)
 
+    def conclude(self) -> None:
+        assert self.iteration == self.length[0]
+        self.concluded = True
+
 
 class Diary(Listener):
     def __init__(self) -> None:
@@ -61,6 +65,7 @@ class Diary(Listener):
         self.lines.append(("begun", loop.trainer.iteration))
 
     def evaluation_due(self, loop: TrainingLoop) -> None:
+        assert loop.trainer.concluded == loop.finished
         self.lines.append(("evaluation", loop.trainer.iteration))
 
     def checkpoint_due(self, loop: TrainingLoop) -> None:
@@ -82,6 +87,7 @@ def test_an_evaluation_comes_before_the_checkpoint_of_the_same_place():
     loop.run()
     assert diary.lines == [("begun", 0), *(("evaluation", 3), ("checkpoint", 3)), ("evaluation", 6), ("checkpoint", 6)]
     assert loop.finished and not loop.stopped and trainer.steps == [1, 2, 3, 4, 5, 6]
+    assert trainer.concluded
     assert trainer.length == (6, 6)
 
 
@@ -101,7 +107,7 @@ def test_no_iteration_is_missing_at_a_stop():
     trainer, diary = CountingTrainer(9, lost=(4,), evaluate_at=(1 / 3,), checkpoint_every=3), Diary()
     loop = TrainingLoop(trainer, listeners=[diary, StopAt(5)])
     loop.run()
-    assert loop.stopped and not loop.finished and trainer.iteration == 3
+    assert loop.stopped and not loop.finished and trainer.iteration == 3 and not trainer.concluded
     assert diary.lines == [("begun", 0), ("evaluation", 3), ("checkpoint", 3)]
 
 

@@ -76,6 +76,8 @@ class TrainConfig:
             cameras (`restrain_distant`). 0: no bound.
         camera_clearance: a change of the set of Gaussians also removes those that stand nearer to a training camera
             than the capture's points do (`turbogs_plugin.model.clearance`). Nothing where it has no points of its own.
+        average_last: share of the iterations, at the end of the run and since the last change of the set of Gaussians,
+            whose mean the model becomes (`turbogs_plugin.train.parameter_mean`). 0: it stays that of the last one.
         evaluate_at: when to evaluate, as fractions of T; the start and the end are always evaluated.
         checkpoint_every: iterations between checkpoints; the end always has one. 0: only the end.
     """
@@ -99,6 +101,7 @@ class TrainConfig:
     exposure: bool | Auto = False
     distant_size: float = 0.0
     camera_clearance: bool = False
+    average_last: float = 0.0
     evaluate_at: tuple[float, ...] = (0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
     checkpoint_every: int = 10_000
 
@@ -120,6 +123,7 @@ class TrainConfig:
         require(0 < self.initial_opacity < 1, "initial_opacity", self.initial_opacity, "more than 0 and less than 1")
         require(0 < self.initial_size <= 100, "initial_size", self.initial_size, "more than 0 and at most 100")
         require_not_negative(self, "distant_size")
+        require(0 <= self.average_last <= 1, "average_last", self.average_last, "within 0 .. 1")
         for value in self.evaluate_at:
             require(0 < value <= 1, "evaluate_at", value, "fractions within (0, 1]")
         require(self.checkpoint_every >= 0, "checkpoint_every", self.checkpoint_every, "at least 0")

@@ -83,6 +83,8 @@ class TrainingLoop:
                 break
             due = pace.reached(trainer.iteration, clock.seconds, len(trainer.gaussians))
             trainer.set_length(pace.iterations, pace.refine_until)
+            if self.finished:
+                trainer.conclude()
             if due.evaluate or due.save:
                 trainer.compare_replicas()
             if due.evaluate:

@@ -34,6 +34,7 @@ from turbogs_plugin.train.checkpoint import gaussians_of_state
 from turbogs_plugin.train.evaluate import Look
 from turbogs_plugin.train.initial_state import first_exposures, initial_gaussians
 from turbogs_plugin.train.interpolated_exposures import interpolated_exposures
+from turbogs_plugin.train.parameter_mean import ParameterMean
 from turbogs_plugin.types import Gaussians, GaussianStats, LossOutput, PixelSamples, RowUpdate, Step
 
 REPEATED_AT_MOST = 32
@@ -95,6 +96,8 @@ class Trainer:
         self.view_sampler.setup(self.views.cameras, scene.extent)
         self.optimizer.setup(self.gaussians)
         self.density.setup(self.gaussians)
+        share = config.train.average_last
+        self.parameter_mean = ParameterMean(share, self.learnt()) if share else None
         self.engine = engine_of(device, for_training=True)
         self.set_length(config.train.iterations, config.train.refine_until)
         self.iteration = 0
@@ -171,6 +174,8 @@ class Trainer:
         self.follow(self.refine(step))
 
         self.iteration += 1
+        if self.parameter_mean is not None and self.parameter_mean.due(self.iteration, self.iterations):
+            self.parameter_mean.add(self.learnt())
 
     def supervise(self, colors: Tensor, truth: PhotoSamples, step: Step) -> LossOutput:
         """Loss and error maps, and the exposures of the photos where they are learnt.
@@ -235,12 +240,28 @@ class Trainer:
             update = in_order_of_space(update, self.gaussians, self.now)
             if self.observer is not None:
                 self.observer.changing(self.gaussians, update, self.now)
+            if self.parameter_mean is not None:
+                self.parameter_mean.restart()
             self.gaussians = update.apply(self.gaussians)
             self.optimizer.apply(update)
             self.density.apply(update)
             self.first_repeatable = self.iteration + 1
         if self.config.train.distant_size > 0 and self.iteration % RESTRAIN_EVERY == 0:
             restrain_distant(self.gaussians, self.extent, self.config.train.distant_size)
+
+    def learnt(self) -> dict[str, Tensor]:
+        """All tensors that iterations learn, by name: the model's, and the exposures of the photos."""
+        exposures = {} if self.exposures is None else {"exposures": self.exposures.offsets}
+        return {**dict(self.gaussians.items()), **exposures}
+
+    def conclude(self) -> None:
+        """At the end of a run: the model becomes the mean of the last iterations, if there is one."""
+        if self.parameter_mean is not None and self.parameter_mean.count:
+            mean = dict(self.parameter_mean.tensors)
+            if self.exposures is not None:
+                self.exposures.offsets.copy_(mean.pop("exposures"))
+            self.gaussians = Gaussians(**mean)
+            self.parameter_mean.restart()
 
     def set_length(self, iterations: int, refine_until: int) -> None:
         """Set T and tau_until, the last iteration of densification. A time budget changes them during a run."""
@@ -325,6 +346,7 @@ class Trainer:
             "nonfinite_losses": int(self.nonfinite_losses),
             "gaussians": dict(self.gaussians.items()),
             **({} if self.exposures is None else {"exposures": self.exposures.state_dict()}),
+            **({} if self.parameter_mean is None else {"parameter_mean": self.parameter_mean.state_dict()}),
             **{name: getattr(self, name).state_dict() for name in STATEFUL},
         }
 
@@ -346,6 +368,8 @@ class Trainer:
         self.gaussians = gaussians_of_state(state, self.device)
         if self.exposures is not None:
             self.exposures.load_state_dict(state["exposures"])
+        if self.parameter_mean is not None:
+            self.parameter_mean.load_state_dict(state["parameter_mean"], self.learnt())
         self.optimizer.setup(self.gaussians)
         self.density.setup(self.gaussians)
         for name in STATEFUL:

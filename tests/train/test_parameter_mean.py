@@ -1,0 +1,154 @@
+"""The mean of the last iterations, which becomes the model: what counts, restarts, resumes."""
+
+import pytest
+import torch
+from helpers.framework_runs import assert_identical, stop_after, tiny_capture, tiny_config
+
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.scene import load_scene
+from turbogs_plugin.train.loop import Listener, TrainingLoop
+from turbogs_plugin.train.parameter_mean import AVERAGE_EVERY, ParameterMean
+from turbogs_plugin.train.run import fit, resume, train
+from turbogs_plugin.train.trainer import Trainer
+
+CPU = torch.device("cpu")
+AVERAGED = ("train.iterations=22", "train.average_last=0.6", "density.final_keep=1.0")
+"""After the last change of the set, at iteration 9, these count: 12, 16, 20, and the end, 22."""
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory):
+    return tiny_capture(tmp_path_factory.mktemp("captures"))
+
+
+class Kept(Listener):
+    """Every iteration's parameters, and the size of the mean after it."""
+
+    def __init__(self) -> None:
+        self.learnt, self.counts = {}, {}
+
+    def advanced(self, loop: TrainingLoop) -> None:
+        trainer = loop.trainer
+        self.learnt[trainer.iteration] = {name: value.clone() for name, value in trainer.learnt().items()}
+        self.counts[trainer.iteration] = trainer.parameter_mean.count
+
+
+def trained(capture, *overrides: str) -> tuple[Trainer, Kept]:
+    kept = Kept()
+    loop = TrainingLoop(
+        Trainer(tiny_config(capture, *overrides).without_plan(), load_scene(capture), CPU), None, [kept]
+    )
+    loop.run()
+    return loop.trainer, kept
+
+
+def tensors(value: float, rows: int = 2) -> dict[str, torch.Tensor]:
+    return {"means": torch.full((rows, 3), value), "opacities": torch.full((rows,), -value)}
+
+
+def test_it_is_the_mean_of_what_was_added():
+    mean = ParameterMean(0.5, tensors(0.0))
+    assert mean.count == 0 and all(len(value) == 0 for value in mean.tensors.values())
+    present = tensors(1.0)
+    mean.add(present)
+    present["means"] += 100.0  # a copy was kept
+    for value in (2.0, 6.0):
+        mean.add(tensors(value))
+    assert mean.count == 3
+    torch.testing.assert_close(mean.tensors, tensors(3.0))
+    mean.restart()
+    mean.add(tensors(5.0, rows=7))
+    torch.testing.assert_close(mean.tensors, tensors(5.0, rows=7))
+
+
+def test_the_last_share_of_a_run_counts_and_its_end_always_does():
+    mean = ParameterMean(0.1, tensors(0.0))
+    assert [i for i in range(1, 104) if mean.due(i, 103)] == [96, 100, 103]
+    assert mean.due(3, 3) and ParameterMean(1.0, tensors(0.0)).due(AVERAGE_EVERY, 1000)
+
+
+def test_a_run_that_became_longer_begins_its_mean_anew():
+    mean = ParameterMean(0.1, tensors(0.0))
+    assert mean.due(96, 100)
+    mean.add(tensors(1.0))
+    assert not mean.due(97, 200) and mean.count == 0
+
+
+def test_thousands_of_equal_models_have_themselves_as_mean():
+    mean, model = ParameterMean(1.0, tensors(0.0)), {"means": torch.randn(50, 3) * torch.logspace(-30, 30, 50)[:, None]}
+    for _ in range(3000):
+        mean.add(model)
+    assert torch.equal(mean.tensors["means"], model["means"])
+    # Rounding of sums would be 3000 times half a unit in the last place, and sums of the largest numbers infinite.
+    huge = ParameterMean(1.0, tensors(0.0))
+    for sign in (1.0, -1.0) * 1500:
+        huge.add({"means": torch.full((2, 3), sign * 1.5e38)})
+    assert bool((huge.tensors["means"].abs() <= 1e33).all())
+
+
+def test_the_model_at_the_end_is_the_mean(capture):
+    trainer, kept = trained(capture, *AVERAGED)
+    assert [i for i in range(10, 23) if kept.counts[i] != kept.counts[i - 1]] == [12, 16, 20, 22]
+    for name, value in trainer.gaussians.items():
+        expected = torch.stack([kept.learnt[i][name].double() for i in (12, 16, 20, 22)]).mean(dim=0)
+        torch.testing.assert_close(value.double(), expected, rtol=1e-6, atol=1e-6)
+        assert not torch.equal(value, kept.learnt[22][name])
+
+
+def test_training_itself_is_the_same(capture):
+    """Until the end, where the model alone becomes another."""
+    averaged, kept = trained(capture, *AVERAGED)
+    plain = Trainer(tiny_config(capture, *AVERAGED, "train.average_last=0").without_plan(), load_scene(capture), CPU)
+    TrainingLoop(plain).run()
+    assert_identical(kept.learnt[22], plain.learnt())
+    for name in ("optimizer", "density", "maps"):
+        assert_identical(getattr(averaged, name).state_dict(), getattr(plain, name).state_dict())
+    assert "parameter_mean" not in plain.state_dict()
+
+
+def test_a_change_of_the_set_begins_it_anew(capture):
+    _, kept = trained(capture, "train.iterations=24", "train.average_last=1.0", "density.final_every=10")
+    sizes = {i: len(kept.learnt[i]["means"]) for i in kept.learnt}
+    changed = [i for i in range(2, 25) if sizes[i] != sizes[i - 1]]
+    assert changed[-1] in range(12, 24) and kept.counts[changed[-1]] <= 1
+    last = [i for i in range(changed[-1], 25) if i % AVERAGE_EVERY == 0]
+    assert kept.counts[24] == len(last) > 1
+
+
+def test_exposures_are_averaged_with_the_model(capture):
+    trainer, kept = trained(capture, *AVERAGED, "train.exposure=true")
+    expected = torch.stack([kept.learnt[i]["exposures"].double() for i in (12, 16, 20, 22)]).mean(dim=0)
+    torch.testing.assert_close(trainer.exposures.offsets.double(), expected, rtol=1e-6, atol=1e-7)
+    assert trainer.exposures.offsets.any()
+
+
+@pytest.mark.parametrize("left_at", [11, 13, 20])
+def test_a_resume_within_the_mean_gives_the_same_bits(capture, tmp_path, monkeypatch, left_at):
+    whole = train(tiny_config(capture, *AVERAGED), tmp_path / "whole")
+    with monkeypatch.context() as context:
+        stop_after(context, left_at)
+        train(tiny_config(capture, *AVERAGED), tmp_path / "stopped")
+    resumed = resume(tmp_path / "stopped")
+    assert resumed.resumed and whole.trainer.iteration == 22
+    assert_identical(whole.trainer.state_dict(), resumed.trainer.state_dict())
+    again = resume(tmp_path / "stopped")  # a run at its end stays as it is
+    assert_identical(whole.trainer.state_dict(), again.trainer.state_dict())
+
+
+def test_a_mean_of_another_model_is_refused(capture):
+    trainer, _ = trained(capture, *AVERAGED)
+    state = trainer.state_dict()
+    state["parameter_mean"] = {"count": 2, "tensors": {name: value[1:] for name, value in trainer.learnt().items()}}
+    with pytest.raises(ValueError, match=r"the mean of means over 2 iterations has shape \(\d+, 3\)"):
+        trainer.load_state_dict(state)
+
+
+def test_a_model_of_one_iteration_is_that_iterations(capture):
+    gaussians = fit(load_scene(capture), "train.iterations=1", "train.refine_until=1", "train.device=cpu")
+    assert all(bool(value.isfinite().all()) for _, value in gaussians.items())
+
+
+@pytest.mark.parametrize("share", [-0.1, 1.5])
+def test_a_share_is_within_0_and_1(capture, share):
+    with pytest.raises(InputError, match="average_last"):
+        tiny_config(capture, f"train.average_last={share}")

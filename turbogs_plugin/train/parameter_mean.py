@@ -1,0 +1,80 @@
+"""The mean of the parameters over the last iterations of a run, which becomes the model.
+
+With a learning rate that does not fall to zero, parameters go on wandering about the place that they have come to, each
+iteration after other views and pixels. Their mean over some iterations is nearer to that place (Polyak and Juditsky,
+1992; for networks Izmailov et al., 2018). Not in the paper.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from torch import Tensor
+
+AVERAGE_EVERY = 4
+"""Iterations from one that counts to the next: one after another are too alike to tell more."""
+
+
+class ParameterMean:
+    """The mean of tensors, by name, over the iterations that were added since it began.
+
+    Args:
+        share: of a run's iterations, at its end, that count.
+        tensors: those of the present iteration, for their layout alone.
+
+    Attributes:
+        count: iterations that were added.
+        tensors: their mean; without rows where there is none.
+    """
+
+    def __init__(self, share: float, tensors: Mapping[str, Tensor]) -> None:
+        self.share = share
+        self._begin(tensors)
+
+    def due(self, iteration: int, total: int) -> bool:
+        """Whether the parameters after so many iterations of `total` count.
+
+        Where none are to count yet, it begins anew: a time budget has made the run longer.
+        """
+        if iteration < (1.0 - self.share) * total:
+            self.restart()
+            return False
+        return iteration % AVERAGE_EVERY == 0 or iteration == total
+
+    def add(self, tensors: Mapping[str, Tensor]) -> None:
+        """Add those of one more iteration. They are copied."""
+        if self.count == 0:
+            self.tensors = {name: value.detach().clone() for name, value in tensors.items()}
+        else:
+            for name, mean in self.tensors.items():
+                mean.lerp_(tensors[name].detach(), 1.0 / (self.count + 1))
+        self.count += 1
+
+    def restart(self) -> None:
+        """Begin anew: from here on the parameters are of other Gaussians."""
+        if self.count:
+            self._begin(self.tensors)
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"count": self.count, "tensors": dict(self.tensors)}
+
+    def load_state_dict(self, state: Mapping[str, Any], present: Mapping[str, Tensor]) -> None:
+        """Load a saved state.
+
+        Args:
+            present: the tensors whose mean it is, for their layout and device.
+
+        Raises:
+            ValueError: it is the mean of other tensors.
+        """
+        count, tensors = state["count"], {}
+        for name, value in present.items():
+            mean = tensors[name] = state["tensors"][name].to(value.device)
+            if mean.shape != (value if count else value[:0]).shape:
+                raise ValueError(f"the mean of {name} over {count} iterations has shape {tuple(mean.shape)}")
+        self.count, self.tensors = count, tensors
+
+    def _begin(self, tensors: Mapping[str, Tensor]) -> None:
+        self.count = 0
+        self.tensors = {name: value.detach()[:0].clone() for name, value in tensors.items()}
