@@ -26,7 +26,7 @@ demo/capture: | $(INSTALLED)
 # README's tables anew, from nothing, on a GPU machine: make results SCENES="PATH/fox PATH/caliterra PATH/snowmiku".
 # Begins no training after WITHIN and then ends with an error: call it again until it ends without.
 WITHIN ?= 9m
-RECORD := sizes parts departures bounds paper_parts components views hard_ratio schedule
+RECORD := sizes average parts departures bounds paper_parts components views hard_ratio schedule
 results: $(INSTALLED)
 	test -n "$(SCENES)" || { echo 'make results SCENES="CAPTURE CAPTURE ..."'; exit 2; }
 	$(BIN)/turbogs ablate $(RECORD) $(addprefix --scene ,$(SCENES)) --seeds 0 1 2 3 4 --within $(WITHIN) --out results

@@ -56,6 +56,7 @@ def round_table(name: str, table_name: str) -> str:
 TABLES: dict[str, Callable[[], str | None]] = {
     "ahead": study_tables.ahead,
     "behind": study_tables.behind,
+    "average": lambda: study_tables.changes("average"),
     "bounds": lambda: study_tables.changes("bounds"),
     "density_sums": machine_tables.density_sums,
     "departures": lambda: study_tables.changes("departures"),

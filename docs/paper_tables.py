@@ -13,7 +13,7 @@ from verdict import verdict
 from turbogs_plugin.report.tables import table
 from turbogs_plugin.study.summary import VariantRow
 
-OURS = ("parts", "departures", "bounds")
+OURS = ("parts", "departures", "bounds", "average")
 """Studies that change one thing of `turbogs` a variant."""
 
 BOUND = 0.3
@@ -66,6 +66,7 @@ PARTS = (
     Part("no space kept free before cameras", ("no-clearance", "turbogs")),
     Part("no bound on far sizes", ("distant-unbounded", "turbogs")),
     Part("pruning by the scene's extent, as 3DGS", ("prune-by-extent", "turbogs")),
+    Part("the last iteration's model, not the mean of the last tenth", ("no-average", "turbogs")),
     Part("a band of harmonics every 1000 iterations, as 3DGS", ("sh-interval-1000", "turbogs")),
 )
 

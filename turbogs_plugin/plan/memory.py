@@ -5,7 +5,8 @@ context comes on top, with its 0.3 to 0.6 GiB). With K views an iteration, degre
 lambda images of S pixels an iteration:
 
 - per Gaussian: 14 + 3 B parameters, two moments of each, a step count and 8 statistics, all of it twice, for an event
-  of density control makes the new arrays beside the old; and for each of the K views `VIEW_BYTES`;
+  of density control makes the new arrays beside the old (the mean of the last iterations is 14 + 3 B,
+  and goes before an event); and for each of the K views `VIEW_BYTES`;
 - fixed: photos and maps, or their windows of 2 K views; `SAMPLE_BYTES` for each of lambda S samples; `IMAGE_BYTES` for
   each pixel of the largest photo, which is rendered whole at the start and in evaluations.
 """
