@@ -1,5 +1,8 @@
 """The mean of the last iterations, which becomes the model: what counts, restarts, resumes."""
 
+import re
+from pathlib import Path
+
 import pytest
 import torch
 from helpers.framework_runs import assert_identical, stop_after, tiny_capture, tiny_config
@@ -59,6 +62,43 @@ def test_it_is_the_mean_of_what_was_added():
     mean.restart()
     mean.add(tensors(5.0, rows=7))
     torch.testing.assert_close(mean.tensors, tensors(5.0, rows=7))
+
+
+def test_it_goes_into_another_trainers_parameters():
+    """Of gsplat's splats: a dictionary of parameters, whose rows its strategies change."""
+    splats = torch.nn.ParameterDict(tensors(1.0))
+    mean = ParameterMean(0.5, splats)
+    mean.add(splats)
+    splats = torch.nn.ParameterDict(tensors(4.0, rows=3))
+    for value in (4.0, 8.0):
+        for parameter in splats.values():
+            parameter.data = parameter.data.sign() * value
+        mean.add(splats)
+    parameter = splats["means"]
+    mean.overwrite(splats)
+    assert splats["means"] is parameter and parameter.requires_grad and mean.count == 0
+    torch.testing.assert_close(dict(splats), tensors(6.0, rows=3), check_stride=False)
+    mean.overwrite(splats)  # none is there
+    torch.testing.assert_close(dict(splats), tensors(6.0, rows=3))
+    mean.add(splats)
+    with pytest.raises(ValueError, match=r"the mean of means has shape \(3, 3\), not \(7, 3\): restart it"):
+        mean.overwrite(tensors(0.0, rows=7))
+
+
+def test_the_lines_of_the_documentation():
+    """docs/drop-in.md, in a loop as gsplat's."""
+    page = (Path(__file__).parents[2] / "docs/drop-in.md").read_text()
+    (code,) = re.findall(r"```python\n(from turbogs_plugin\.train\.parameter_mean .*?)```", page, re.DOTALL)
+    start, each_step, end = (compile(part, "drop-in.md", "exec") for part in re.split(r"\n\n(?=if |mean\.)", code))
+    names = {"splats": torch.nn.ParameterDict(tensors(0.0)), "max_steps": 100}
+    exec(start, names)
+    for step in range(100):
+        for parameter in names["splats"].values():
+            parameter.data.fill_(step)
+        exec(each_step, names | {"step": step})
+    exec(end, names)
+    after = [iteration - 1 for iteration in range(90, 101) if iteration % AVERAGE_EVERY == 0]
+    assert names["splats"]["means"][0, 0].item() == pytest.approx(sum(after) / len(after))
 
 
 def test_the_last_share_of_a_run_counts_and_its_end_always_does():

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+import torch
 from torch import Tensor
 
 AVERAGE_EVERY = 4
@@ -19,9 +20,12 @@ AVERAGE_EVERY = 4
 class ParameterMean:
     """The mean of tensors, by name, over the iterations that were added since it began.
 
+    For any trainer: ask `due` after each iteration, `add` where it is; `restart` where rows are of other Gaussians; and
+    `overwrite` at the end.
+
     Args:
         share: of a run's iterations, at its end, that count.
-        tensors: those of the present iteration, for their layout alone.
+        tensors: those of the present iteration, for their layout alone. A mapping, such as gsplat's splats.
 
     Attributes:
         count: iterations that were added.
@@ -43,7 +47,9 @@ class ParameterMean:
         return iteration % AVERAGE_EVERY == 0 or iteration == total
 
     def add(self, tensors: Mapping[str, Tensor]) -> None:
-        """Add those of one more iteration. They are copied."""
+        """Add those of one more iteration. They are copied. Where there are more or fewer rows, it begins anew."""
+        if any(mean.shape != tensors[name].shape for name, mean in self.tensors.items()):
+            self.restart()
         if self.count == 0:
             self.tensors = {name: value.detach().clone() for name, value in tensors.items()}
         else:
@@ -55,6 +61,21 @@ class ParameterMean:
         """Begin anew: from here on the parameters are of other Gaussians."""
         if self.count:
             self._begin(self.tensors)
+
+    @torch.no_grad()
+    def overwrite(self, tensors: Mapping[str, Tensor]) -> None:
+        """Write the mean, if there is one, into the tensors whose mean it is, and begin anew.
+
+        Raises:
+            ValueError: they have other rows.
+        """
+        if self.count:
+            for name, mean in self.tensors.items():
+                if mean.shape != tensors[name].shape:
+                    shapes = f"{tuple(mean.shape)}, not {tuple(tensors[name].shape)}"
+                    raise ValueError(f"the mean of {name} has shape {shapes}: restart it where rows change")
+                tensors[name].copy_(mean)
+        self.restart()
 
     def state_dict(self) -> dict[str, Any]:
         return {"count": self.count, "tensors": dict(self.tensors)}

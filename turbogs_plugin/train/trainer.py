@@ -256,12 +256,8 @@ class Trainer:
 
     def conclude(self) -> None:
         """At the end of a run: the model becomes the mean of the last iterations, if there is one."""
-        if self.parameter_mean is not None and self.parameter_mean.count:
-            mean = dict(self.parameter_mean.tensors)
-            if self.exposures is not None:
-                self.exposures.offsets.copy_(mean.pop("exposures"))
-            self.gaussians = Gaussians(**mean)
-            self.parameter_mean.restart()
+        if self.parameter_mean is not None:
+            self.parameter_mean.overwrite(self.learnt())
 
     def set_length(self, iterations: int, refine_until: int) -> None:
         """Set T and tau_until, the last iteration of densification. A time budget changes them during a run."""
