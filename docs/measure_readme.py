@@ -211,7 +211,7 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument("captures", type=Path, nargs=3)
     parser.add_argument("stages", nargs="*", metavar="stage", help="all where absent")
     parser.add_argument("--within", type=parse_seconds, default="9m")
-    options = parser.parse_intermixed_args(words)
+    options = parser.parse_args(words)
     scenes = {path.resolve().name: path.resolve() for path in options.captures}
     stages, commit = options.stages or list(STAGES), source_commit()
     if scenes.keys() != set(CAPTURES):
