@@ -23,15 +23,13 @@ ablation: demo/capture
 demo/capture: | $(INSTALLED)
 	$(BIN)/turbogs demo $@
 
-# README's tables anew, from nothing, on a GPU machine: make results SCENES="PATH/fox PATH/caliterra PATH/snowmiku".
-# Begins no training after WITHIN and then ends with an error: call it again until it ends without.
+# All tables and pictures of README that come from runs of ours, and the tables of docs/results/README.md, anew, from
+# nothing, on a GPU machine: make results SCENES="PATH/fox PATH/caliterra PATH/snowmiku".
+# Begins nothing that would end after WITHIN and then ends with an error: call it again until it ends without. What is
+# measured is in results/COMMIT. STAGES="sizes wall": these alone; docs/measure_readme.py says what there is.
 WITHIN ?= 9m
-RECORD := sizes average parts departures bounds paper_parts components views hard_ratio schedule
 results: $(INSTALLED)
-	test -n "$(SCENES)" || { echo 'make results SCENES="CAPTURE CAPTURE ..."'; exit 2; }
-	$(BIN)/turbogs ablate $(RECORD) $(addprefix --scene ,$(SCENES)) --seeds 0 1 2 3 4 --within $(WITHIN) --out results
-	$(BIN)/turbogs ablate baselines $(addprefix --scene ,$(SCENES)) --within $(WITHIN) --out results/baselines
-	for study in $(RECORD) baselines; do cp results/$$study/results.json docs/results/$$study/; done
+	$(BIN)/python docs/measure_readme.py results $(SCENES) $(STAGES) --within $(WITHIN)
 	$(MAKE) pages
 
 # The page and the plots of every study in docs/, and the tables of README, from results.json; a second run changes

@@ -84,6 +84,7 @@ def main() -> None:
     run, view = Path(sys.argv[1]), int(sys.argv[2])
     pictures = facts = Path(sys.argv[3]) if len(sys.argv) > 3 else DOCS
     facts = facts / "results" if len(sys.argv) <= 3 else facts
+    facts.mkdir(exist_ok=True)
     model = load_model(run, resolve_device("auto"))
     device, scene = model.gaussians.device, open_scene(model.config, model.folder)
     last = read_history(model.folder.history)[-1]
