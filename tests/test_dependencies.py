@@ -75,11 +75,51 @@ print("used")
 """
 
 
+AFTER_TORCH = """
+import os, sys, traceback
+import torch
+
+places, codes = sys.argv[1::2], sys.argv[2::2]
+assert not set({absent}) & set(sys.modules)
+for place, code in zip(places, codes):
+    if os.fork() == 0:
+        for name, stream in (("out", 1), ("err", 2)):
+            os.dup2(os.open(f"{{place}}.{{name}}", os.O_WRONLY | os.O_CREAT), stream)
+        os.chdir(place)
+        ended = 1
+        try:
+            exec(code, {{"__name__": "__main__"}})
+            ended = 0
+        except BaseException:
+            traceback.print_exc()
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(ended)
+    print(os.waitstatus_to_exitcode(os.wait()[1]))
+"""
+"""Runs each of several codes in a process that has nothing but torch, whose import takes longest, and in a folder of
+its own. What it says goes beside that; the exit codes are printed."""
+
+
 def run(code: str, absent: set[str], *arguments, folder: Path) -> subprocess.CompletedProcess:
     script = BLOCKED.format(absent=sorted(absent)) + code
     command = [sys.executable, "-c", script, *map(str, arguments)]
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "TURBOGS_LIBRARY": str(folder / "no kernels")}
     return subprocess.run(command, capture_output=True, text=True, cwd=folder, env=environment, check=False)
+
+
+def run_after_torch(codes: dict[Path, tuple[str, set[str]]], folder: Path) -> list[subprocess.CompletedProcess]:
+    """Of `run`, for (code, what is absent) in folders."""
+    arguments = []
+    for place, (code, absent) in codes.items():
+        arguments += [place, BLOCKED.format(absent=sorted(absent)) + code]
+    done = run(AFTER_TORCH.format(absent=sorted(COMMAND_PACKAGES)), set(), *arguments, folder=folder)
+    assert done.returncode == 0, done.stderr
+    said = [[place.with_name(f"{place.name}.{stream}").read_text() for stream in ("out", "err")] for place in codes]
+    return [
+        subprocess.CompletedProcess(place, int(ended), *texts)
+        for place, ended, texts in zip(codes, done.stdout.split(), said, strict=True)
+    ]
 
 
 @pytest.fixture(scope="module")
@@ -123,8 +163,8 @@ ALL_COMMANDS = """
 import contextlib, io, json
 from turbogs_plugin.__main__ import main
 
-answers = {}
-for line in json.loads(sys.argv[1]):
+answers = {{}}
+for line in {lines}:
     sys.argv = ["turbogs", *line]
     out, err = io.StringIO(), io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
@@ -142,14 +182,13 @@ def answers(tmp_path_factory) -> dict[bool, subprocess.CompletedProcess]:
 
     Without a parser nothing can be read; with it, each command comes to the first package that it lacks itself.
     """
-    lines = json.dumps([["doctor"], *([command, *arguments] for command, arguments in COMMANDS.items())])
+    lines = [["doctor"], *([command, *arguments] for command, arguments in COMMANDS.items())]
+    code = ALL_COMMANDS.format(lines=lines)
     folders = {parser: tmp_path_factory.mktemp("lacking") for parser in (False, True)}
-    found = {
-        parser: run(ALL_COMMANDS + ("" if parser else USE), lacking(parser), lines, folder=folder)
-        for parser, folder in folders.items()
-    }
+    codes = {folder: (code + ("" if parser else USE), lacking(parser)) for parser, folder in folders.items()}
+    found = run_after_torch(codes, tmp_path_factory.mktemp("beside"))
     assert all(list(folder.iterdir()) == [] for folder in folders.values())
-    return found
+    return dict(zip(folders, found, strict=True))
 
 
 def lacking(parser: bool) -> set[str]:

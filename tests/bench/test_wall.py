@@ -1,10 +1,16 @@
 """`turbogs bench wall`: the command in a process of its own, part by part."""
 
+import io
 import json
+import subprocess
+import sys
+from contextlib import redirect_stderr
+from types import SimpleNamespace
 
 import pytest
 from helpers.framework_runs import tiny_capture
 
+from turbogs_plugin import cli
 from turbogs_plugin.bench import wall
 from turbogs_plugin.bench.wall import REST, WallRun, bench_wall, wall_lines
 from turbogs_plugin.train.run import CHECKPOINT, MODEL
@@ -39,7 +45,15 @@ def test_the_run_in_the_middle_is_shown(monkeypatch):
 
 
 @pytest.mark.parametrize("arguments", [(), ("--scene", "nowhere"), ("--scene", "nowhere", "--offload")])
-def test_bad_input_is_one_line(turbogs, arguments):
+def test_bad_input_is_one_line(turbogs, monkeypatch, arguments):
+    def run_here(command: list[str], stderr: int, **options: object) -> SimpleNamespace:
+        assert command[:4] == [sys.executable, "-m", cli.__name__, "train"] and stderr == subprocess.PIPE
+        monkeypatch.setattr(sys, "argv", command[2:])
+        with redirect_stderr(io.StringIO()) as told, pytest.raises(SystemExit) as end:
+            cli.main()
+        return SimpleNamespace(returncode=end.value.code, stderr=told.getvalue())
+
+    monkeypatch.setattr(wall.subprocess, "run", run_here)
     code, out, err = turbogs("bench", "wall", *arguments, "--device", "cpu")
     assert (code, out) == (2, "") and err.count("\n") == 1
     assert "bench wall needs --scene" in err or "no such scene: nowhere" in err

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import shutil
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -76,6 +77,12 @@ def without_gsplats_kernels() -> None:
     ops.quat_scale_to_covar_preci = covariances
     MCMCStrategy.initialize_state = lambda self: {"binoms": torch.empty(0)}  # of relocation; takes two seconds
     GsplatMcmcDensity.setup = lambda self, gaussians: None
+    # Making torch's optimizers, which take no step here, imports its compiler to keep that away: two seconds a process.
+    add = torch.optim.Optimizer.add_param_group.__wrapped__
+    vars(add).setdefault("__dynamo_disable", add)
+
+
+scene_of = cache(load_scene)  # a trainer only reads it
 
 
 def case_of(capture: Path, name: str, ranks: Ranks = ONE) -> Trainer:
@@ -87,7 +94,7 @@ def trainer_of(capture: Path, *overrides: str, ranks: Ranks = ONE) -> Trainer:
     """With several processes rows have owners, which small models like these have not by themselves."""
     config = load_config("turbogs", [*tiny_settings(*overrides), "train.device=cpu", *overrides])
     config.scene.path = str(capture)
-    trainer = Trainer(config.without_plan(), load_scene(capture), CPU, ranks=ranks)
+    trainer = Trainer(config.without_plan(), scene_of(capture), CPU, ranks=ranks)
     if ranks.count > 1:
         trainer.exchange.by_rows = True
     return trainer

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -11,7 +12,7 @@ from helpers.framework_runs import tiny_capture, tiny_settings
 from helpers.peer_files import KeepingEngine, LateSide, PeerFiles
 from helpers.processes import ended, grouped, said, start_ranks
 
-from turbogs_plugin.config.configuration import load_config
+from turbogs_plugin.config.configuration import Config, load_config
 from turbogs_plugin.distributed import in_place, peer_memory
 from turbogs_plugin.distributed.in_place import DRAWN, FREE, PACKED, WRITTEN, InPlace
 from turbogs_plugin.distributed.peer_memory import PeerMemory, share_memory
@@ -44,21 +45,46 @@ OF_THREE = ("usual", "records to all", "one tile")
 
 STEPS = 5
 
+FIRST_ERRORS: dict[tuple[int, int], torch.Tensor] = {}
+"""(Gaussians, view) -> errors before the first step, which are the same in all cases."""
 
-def trainer_of(capture: Path, ranks: ProcessRanks, by_rows: bool, overrides: tuple[str, ...]) -> Trainer:
+
+scene_of = cache(load_scene)  # a trainer only reads it
+
+
+@cache
+def config_of(capture: Path, overrides: tuple[str, ...]) -> Config:
     settings = tiny_settings(*overrides)
     if "schedule.pixel_budget=0.1" in overrides:
         settings.append("pixel_sampler.unit=tile")
     config = load_config("turbogs", [*settings, "train.device=cpu", *overrides])
     config.scene.path = str(capture)
-    trainer = Trainer(config.without_plan(), load_scene(capture), CPU, ranks=ranks)
+    return config.without_plan()
+
+
+def trainer_of(capture: Path, ranks: ProcessRanks, by_rows: bool, overrides: tuple[str, ...]) -> Trainer:
+    trainer = Trainer(copy.deepcopy(config_of(capture, overrides)), scene_of(capture), CPU, ranks=ranks)
     trainer.exchange.by_rows = by_rows
     return trainer
 
 
+def initialise_maps(trainer: Trainer) -> None:
+    """Every trainer exchanges the errors of its model, which are those of the first one: that alone renders them."""
+    render, count = trainer.dense_errors, len(trainer.gaussians)
+
+    def errors(view: int) -> torch.Tensor:
+        if (count, view) not in FIRST_ERRORS:
+            FIRST_ERRORS[count, view] = render(view)
+        return FIRST_ERRORS[count, view].clone()
+
+    trainer.dense_errors = errors
+    trainer.initialise_maps()
+    del trainer.dense_errors
+
+
 def run(trainer: Trainer, ways: list[bool]) -> dict:
     """The state after a step for each of these, which say whether in place, with an evaluation in the middle."""
-    trainer.initialise_maps()
+    initialise_maps(trainer)
     for number, way in enumerate(ways):
         trainer.exchange.in_place = way
         trainer.step()
@@ -120,7 +146,7 @@ def without_some_memory(capture: Path, ranks: ProcessRanks, folder: Path, wanted
     assert files.barriers == [WRITTEN, DRAWN] * 2 and files.refused == 1
     files = PeerFiles(folder / "none", most=0)
     trainer = keeping(trainer_of(capture, ranks, True, ()), files)
-    trainer.initialise_maps()
+    initialise_maps(trainer)
     for _ in range(STEPS):
         trainer.step()
         assert trainer.exchange.way == "messages"
@@ -168,7 +194,7 @@ def lost(capture: Path, ranks: ProcessRanks, folder: Path, by_rows: bool) -> Non
         trainer = keeping(trainer_of(capture, ranks, by_rows, ("density.type=none",)), PeerFiles(folder))
         trainer.engine = KeepingEngine(lose=2 if ranks.rank == ranks.count - 1 else None)
         trainer.exchange.in_place = way
-        trainer.initialise_maps()
+        initialise_maps(trainer)
         TrainingLoop(trainer).advance(6)
         trainer.compare_replicas()
         assert trainer.engine.recovered == 1 and int(trainer.optimizer.moments.steps.max()) == 6

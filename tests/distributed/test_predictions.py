@@ -68,9 +68,10 @@ def test_results_are_printed_as_they_come(tmp_path):
 
 
 STAND_IN = """#!/bin/sh
-# In the place of Python: runs, a bench and studies that take no time. The second seed's runs on two GPUs fail.
+# In the place of Python: runs, a bench and studies that take no time. The second seed's runs on two GPUs fail. Results
+# are printed as the last run is there, and named before.
 case "$*" in
-docs/*) exec PYTHON "$@" ;;
+docs/*) [ -d "$2/runs/batch-2" ] && exec PYTHON "$@"; echo "$@ with $(ls "$2/runs")" ;;
 *" train "*--gpus\\ 2*train.seed=1*) echo "turbogs: error: lost" >&2; exit 1 ;;
 *" train "*)
     mkdir -p "$6" && echo large >"$6/model.ply"

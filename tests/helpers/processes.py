@@ -24,7 +24,13 @@ PRELOADED = [
     "torch.fx.experimental.symbolic_shapes",  # and sympy: the first gradient of each process would import them
     "turbogs_plugin.train.run",
     "turbogs_plugin.report.pages",
+    "turbogs_plugin.cli",
+    "turbogs_plugin.strategies.density.error_driven",
     "pycolmap",
+    "numpy.ma",
+    "numpy.random",
+    "torch.distributed.launcher.api",
+    "pytest",  # which the module of a test imports
 ]
 
 

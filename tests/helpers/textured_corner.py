@@ -32,7 +32,13 @@ def viewmat(center: np.ndarray, target: tuple[float, float, float] = (0.6, 0.6, 
 
 
 def render_corner(center: np.ndarray, seed: int = 0) -> Image.Image:
-    """The corner as a pinhole camera sees it."""
+    """The corner as a pinhole camera sees it. Not to be changed."""
+    return _render(tuple(center.tolist()), seed)
+
+
+@cache
+def _render(place: tuple[float, float, float], seed: int) -> Image.Image:
+    center = np.array(place)
     width, height = SIZE
     x, y = np.meshgrid(np.arange(width) + 0.5 - width / 2, np.arange(height) + 0.5 - height / 2)
     rays = np.stack([x / FOCAL, y / FOCAL, np.ones_like(x)], axis=-1) @ viewmat(center)[:, :3]  # [H, W, 3]

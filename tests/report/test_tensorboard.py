@@ -18,6 +18,8 @@ from turbogs_plugin.train.trainer import Trainer
 pytestmark = pytest.mark.usefixtures("plotted")
 
 ASKED = "report.tensorboard=true"
+SHORT = ("train.iterations=2", "train.refine_until=1", "train.evaluate_at=[]")
+"""For tests of what is written, whatever was learnt."""
 
 
 class Recorder:
@@ -100,7 +102,7 @@ def test_a_resumed_run_takes_the_place_of_what_it_does_again(writers, capture, t
 
 
 def test_nothing_is_written_unless_asked_for(writers, capture, tmp_path):
-    config = tiny_config(capture)
+    config = tiny_config(capture, *SHORT)
     assert event_writers(config) == []
     run.train(config, tmp_path / "run", watch=event_writers(config))
     assert not writers and not (tmp_path / "run/tensorboard").exists()
@@ -108,9 +110,9 @@ def test_nothing_is_written_unless_asked_for(writers, capture, tmp_path):
 
 def test_strips_are_small_and_may_be_none(writers, capture, tmp_path, monkeypatch):
     monkeypatch.setattr("turbogs_plugin.report.tensorboard.WIDEST_STRIP", 60)
-    config = tiny_config(capture, ASKED, "report.strips=0")
+    config = tiny_config(capture, *SHORT, ASKED, "report.strips=0")
     run.train(config, tmp_path / "none", watch=event_writers(config))
-    config = tiny_config(capture, ASKED)
+    config = tiny_config(capture, *SHORT, ASKED)
     run.train(config, tmp_path / "run", watch=event_writers(config))
     none, some = writers
     assert not none.images and none.scalars

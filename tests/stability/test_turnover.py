@@ -161,19 +161,29 @@ def test_in_a_moved_world_the_same_rows_are_drawn(capture, tmp_path, monkeypatch
     assert torch.equal(source, expected)
 
 
+def small_trainer(capture: Path) -> Trainer:
+    return Trainer(small_config(capture, "train.device=cpu").without_plan(), load_scene(capture), CPU)
+
+
+@pytest.fixture(scope="module")
+def states(capture) -> list[dict]:
+    """After so many iterations, up to 10."""
+    trainer = small_trainer(capture)
+    trainer.initialise_maps()
+    found = [copy.deepcopy(trainer.state_dict())]
+    for _ in range(10):
+        trainer.step()
+        found.append(copy.deepcopy(trainer.state_dict()))
+    return found
+
+
 @pytest.mark.parametrize("left_at", [5, 6, 8])
-def test_a_resume_within_a_window_gives_the_same_bits(capture, left_at):
+def test_a_resume_within_a_window_gives_the_same_bits(capture, states, left_at):
     """Its sums are in the state, and the draws are functions of seed and iteration."""
-    config = small_config(capture, "train.device=cpu")
-    whole, resumed = (Trainer(config.without_plan(), load_scene(capture), CPU) for _ in range(2))
-    whole.initialise_maps()
-    for _ in range(left_at):
-        whole.step()
-    state = copy.deepcopy(whole.state_dict())
+    resumed, state = small_trainer(capture), states[left_at]
     assert state["density"]["stats"]["square_sums"].max() > 0, "not within a window"
-    resumed.load_state_dict(state)
-    for trainer in (whole, resumed):
-        for _ in range(10 - left_at):
-            trainer.step()
-    assert_identical(whole.state_dict(), resumed.state_dict())
-    assert len(whole.gaussians) != len(state["gaussians"]["means"]), "no event came after"
+    resumed.load_state_dict(copy.deepcopy(state))
+    for _ in range(10 - left_at):
+        resumed.step()
+    assert_identical(states[10], resumed.state_dict())
+    assert len(resumed.gaussians) != len(state["gaussians"]["means"]), "no event came after"

@@ -133,8 +133,8 @@ def test_large_pictures_are_compared_by_processes_with_the_same_result(monkeypat
     here = flip_module.flip(image, photo).result()
     monkeypatch.setattr(flip_module, "SMALL_PIXELS", 1)
     monkeypatch.setattr(device, "processor_cores", lambda: 2 * flip_module.CORES_EACH)
-    results = [flip_module.flip(image, photo) for _ in range(7)]  # more than there is room for at a time
-    assert [result.result(timeout=60.0) for result in results] == [here] * 7
+    results = [flip_module.flip(image, photo) for _ in range(5)]  # more than there is room for at a time
+    assert [result.result(timeout=60.0) for result in results] == [here] * 5
 
 
 def test_a_process_that_compares_begins_without_torch():

@@ -1,5 +1,6 @@
 """The mean of the last iterations, which becomes the model: what counts, restarts, resumes."""
 
+import copy
 import re
 from pathlib import Path
 
@@ -11,7 +12,7 @@ from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene import load_scene
 from turbogs_plugin.train.loop import Listener, TrainingLoop
 from turbogs_plugin.train.parameter_mean import AVERAGE_EVERY, ParameterMean
-from turbogs_plugin.train.run import fit, resume, train
+from turbogs_plugin.train.run import RunSession, fit, resume, train
 from turbogs_plugin.train.trainer import Trainer
 
 CPU = torch.device("cpu")
@@ -43,6 +44,18 @@ def trained(capture, *overrides: str) -> tuple[Trainer, Kept]:
     )
     loop.run()
     return loop.trainer, kept
+
+
+@pytest.fixture(scope="module")
+def averaged(capture) -> tuple[Trainer, Kept]:
+    """Not to be changed."""
+    return trained(capture, *AVERAGED)
+
+
+@pytest.fixture(scope="module")
+def whole(capture, tmp_path_factory) -> RunSession:
+    """The same training as a run."""
+    return train(tiny_config(capture, *AVERAGED), tmp_path_factory.mktemp("runs") / "whole")
 
 
 def tensors(value: float, rows: int = 2) -> dict[str, torch.Tensor]:
@@ -126,8 +139,8 @@ def test_thousands_of_equal_models_have_themselves_as_mean():
     assert bool((huge.tensors["means"].abs() <= 1e33).all())
 
 
-def test_the_model_at_the_end_is_the_mean(capture):
-    trainer, kept = trained(capture, *AVERAGED)
+def test_the_model_at_the_end_is_the_mean(averaged):
+    trainer, kept = averaged
     assert [i for i in range(10, 23) if kept.counts[i] != kept.counts[i - 1]] == [12, 16, 20, 22]
     for name, value in trainer.gaussians.items():
         expected = torch.stack([kept.learnt[i][name].double() for i in (12, 16, 20, 22)]).mean(dim=0)
@@ -135,14 +148,14 @@ def test_the_model_at_the_end_is_the_mean(capture):
         assert not torch.equal(value, kept.learnt[22][name])
 
 
-def test_training_itself_is_the_same(capture):
+def test_training_itself_is_the_same(averaged, capture):
     """Until the end, where the model alone becomes another."""
-    averaged, kept = trained(capture, *AVERAGED)
+    trainer, kept = averaged
     plain = Trainer(tiny_config(capture, *AVERAGED, "train.average_last=0").without_plan(), load_scene(capture), CPU)
     TrainingLoop(plain).run()
     assert_identical(kept.learnt[22], plain.learnt())
     for name in ("optimizer", "density", "maps"):
-        assert_identical(getattr(averaged, name).state_dict(), getattr(plain, name).state_dict())
+        assert_identical(getattr(trainer, name).state_dict(), getattr(plain, name).state_dict())
     assert "parameter_mean" not in plain.state_dict()
 
 
@@ -163,8 +176,7 @@ def test_exposures_are_averaged_with_the_model(capture):
 
 
 @pytest.mark.parametrize("left_at", [11, 13, 20])
-def test_a_resume_within_the_mean_gives_the_same_bits(capture, tmp_path, monkeypatch, left_at):
-    whole = train(tiny_config(capture, *AVERAGED), tmp_path / "whole")
+def test_a_resume_within_the_mean_gives_the_same_bits(capture, whole, tmp_path, monkeypatch, left_at):
     with monkeypatch.context() as context:
         stop_after(context, left_at)
         train(tiny_config(capture, *AVERAGED), tmp_path / "stopped")
@@ -175,9 +187,10 @@ def test_a_resume_within_the_mean_gives_the_same_bits(capture, tmp_path, monkeyp
     assert_identical(whole.trainer.state_dict(), again.trainer.state_dict())
 
 
-def test_a_mean_of_another_model_is_refused(capture):
-    trainer, _ = trained(capture, *AVERAGED)
-    state = trainer.state_dict()
+def test_a_mean_of_another_model_is_refused(averaged, capture):
+    trainer = Trainer(tiny_config(capture, *AVERAGED).without_plan(), load_scene(capture), CPU)
+    state = copy.deepcopy(averaged[0].state_dict())
+    trainer.load_state_dict(state)
     state["parameter_mean"] = {"count": 2, "tensors": {name: value[1:] for name, value in trainer.learnt().items()}}
     with pytest.raises(ValueError, match=r"the mean of means over 2 iterations has shape \(\d+, 3\)"):
         trainer.load_state_dict(state)

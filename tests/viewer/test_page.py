@@ -215,6 +215,7 @@ def test_a_command_with_a_viewer_shows_the_model_until_ctrl_c(capture, tmp_path)
     pytest.importorskip("viser")
     out = tmp_path / "run"
     command = ["train", capture, "--out", out, "--no-report", "--device", "cpu", "--viewer", "0", *TINY]
+    command += ["train.iterations=2", "train.refine_until=1", "train.evaluate_at=[]"]
     # A shell starts what it puts into the background with SIGINT ignored, and children inherit that.
     heeding = "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); "
     process = subprocess.Popen(
