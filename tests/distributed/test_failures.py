@@ -20,7 +20,6 @@ import pytest
 import torch
 from helpers.framework_runs import ENDLESS, TINY, assert_identical, tiny_config
 from helpers.processes import PRELOADED, comes_true, ended, said, start_ranks
-from torch.distributed.elastic.rendezvous import dynamic_rendezvous
 from torch.distributed.launcher.api import LaunchConfig, elastic_launch
 
 from turbogs_plugin import cli, files
@@ -282,12 +281,6 @@ def test_a_time_budget_is_kept_by_the_first_clock(capture, tmp_path):
     assert final.train_seconds == pytest.approx(0.6, abs=0.05) and final.iteration > 15
 
 
-@pytest.fixture
-def agent(monkeypatch) -> None:
-    """Torchrun's, whose every message names its caller, found among the sources of all modules: a second in all."""
-    monkeypatch.setattr(dynamic_rendezvous, "get_method_name", lambda depth=2: "", raising=False)
-
-
 def lost_once(words: list[str]) -> None:
     """In every process that torchrun's agent starts: the command, which at first one of them does not survive."""
     step = Trainer.step
@@ -305,7 +298,7 @@ def lost_once(words: list[str]) -> None:
     assert not end.value.code, end.value.code
 
 
-def test_torchrun_starts_a_lost_run_again_from_its_checkpoint(capture, tmp_path, agent):
+def test_torchrun_starts_a_lost_run_again_from_its_checkpoint(capture, tmp_path):
     """By the agent of torchrun, in this process; its processes are forked, where torchrun's begin with Python."""
     multiprocessing.get_context("forkserver").set_forkserver_preload(PRELOADED)
     endpoint = {"rdzv_backend": "c10d", "rdzv_endpoint": "localhost:0", "local_addr": "localhost"}
@@ -325,7 +318,7 @@ def test_torchrun_starts_a_lost_run_again_from_its_checkpoint(capture, tmp_path,
     assert math.isnan(WallRecord.read(run_folder / "wall.json").wall_seconds), "no process was lost"
 
 
-def test_the_command_starts_processes_itself(capture, tmp_path, turbogs, monkeypatch, agent):
+def test_the_command_starts_processes_itself(capture, tmp_path, turbogs, monkeypatch):
     settings = ("train.iterations=3", "train.refine_until=2", "train.evaluate_at=[]")
     settings += ("schedule.min_views=1", "schedule.max_views=2", "train.batch_for=auto")
     folder = tmp_path / "run"
