@@ -12,12 +12,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, is_dataclass
 from typing import Any, get_type_hints
 
+from omegaconf import OmegaConf
+
 from turbogs_plugin.config import registry
 from turbogs_plugin.config.auto import AUTO, AUTO_SETTINGS, undecided
 from turbogs_plugin.config.old_spellings import old_spelling
 from turbogs_plugin.config.schema import build_dataclass, dataclass_mapping, nearest
 from turbogs_plugin.config.sections import BudgetConfig, MapsConfig, ReportConfig, SceneConfig, TrainConfig
-from turbogs_plugin.config.yaml_text import packaged_names, parse_yaml, read_named_yaml, yaml_text
+from turbogs_plugin.config.yaml_text import packaged_names, parse_yaml, read_named_yaml
 from turbogs_plugin.engine.rendered import RasterSettings
 from turbogs_plugin.errors import InputError
 
@@ -86,7 +88,7 @@ class Config:
 
     def to_yaml(self) -> str:
         """Every setting; read back, it gives this very configuration."""
-        return yaml_text(self.to_mapping())
+        return OmegaConf.to_yaml(OmegaConf.create(self.to_mapping()))
 
 
 SECTION_CLASSES = {name: hint for name, hint in get_type_hints(Config).items() if is_dataclass(hint)}

@@ -1,4 +1,4 @@
-"""Reading YAML from untrusted sources: plain values only, in bounded memory. And writing it."""
+"""Reading YAML from untrusted sources: plain values only, in bounded memory."""
 
 from __future__ import annotations
 
@@ -109,28 +109,3 @@ def _refuse_unsafe(text: str, where: str) -> None:
     if not isinstance(roots[0], yaml.MappingStartEvent):
         found = f"the text '{roots[0].value[:40]}'" if isinstance(roots[0], yaml.ScalarEvent) else "a list"
         raise InputError(f"config '{where}': expected a mapping of sections, got {found}")
-
-
-def yaml_text(mapping: dict[str, Any]) -> str:
-    """A mapping of plain values as text that `parse_yaml` reads back.
-
-    The text is that of ``OmegaConf.to_yaml``, which first wraps every value, for ten times as long.
-    """
-    return yaml.dump(mapping, Dumper=_Dumper, default_flow_style=False, allow_unicode=True, sort_keys=False)
-
-
-class _Dumper(getattr(yaml, "CSafeDumper", yaml.SafeDumper)):  # in C where PyYAML was built with it
-    def ignore_aliases(self, data: Any) -> bool:
-        return True  # a value that stands twice is written twice, as aliases are refused
-
-
-def _quoted_where_a_number(dumper: _Dumper, text: str) -> yaml.ScalarNode:
-    """YAML 1.1, by which the dumper goes, reads ``1e-4`` as text, YAML 1.2 as a number."""
-    try:
-        float(text)
-    except ValueError:
-        return dumper.represent_str(text)
-    return dumper.represent_scalar("tag:yaml.org,2002:str", text, style="'")
-
-
-_Dumper.add_representer(str, _quoted_where_a_number)
