@@ -63,4 +63,7 @@ struct CountFilledParams {
 cudaError_t launch_count_filled(const CountFilledParams& params, cudaStream_t stream);
 cudaError_t launch_sparse_loss(const SparseLossParams& params, cudaStream_t stream);
 
+// For launch_sparse_loss: SSIM's part, where T is not 0, after the rest is enqueued.
+cudaError_t launch_window_similarity(const SparseLossParams& params, cudaStream_t stream);
+
 }  // namespace turbogs

@@ -4,7 +4,8 @@
 // A lane keeps up to 4 of its tile's samples in registers, so that colour and truth are read once; larger tiles are
 // read again in each pass. The first pass makes the means, relative to the tile's first sample, so that a constant tile
 // has variance 0 exactly. The second makes the variances, a third the norms that the balance needs, and the last writes
-// the gradient. The sums of the views add half-precision numbers in double, which is exact in any order.
+// the gradient. The sums of the views add half-precision numbers in double, which is exact in any order. SSIM has many
+// windows in a tile, and a kernel of its own after this one, window_similarity.cu.
 #include <cfloat>
 
 #include <cuda_fp16.h>
@@ -12,7 +13,7 @@
 #include "common/approximate_math.cuh"
 #include "common/tiles.cuh"
 #include "common/warp.cuh"
-#include "loss/loss_params.h"
+#include "loss/sample_truth.cuh"
 #include "loss/tile_similarity.cuh"
 
 namespace turbogs {
@@ -23,12 +24,6 @@ constexpr int kLossBlocks = 7;     // of an SM: 72 registers. With 64 it spills,
 constexpr int kLossWarps = kLossThreads / kWarpSize;
 constexpr float kBalanceEpsilon = 1e-8f;  // BALANCE_EPSILON of reference/losses.py
 constexpr float kErrorMax = 65504.0f;     // largest finite half
-
-// byte / 255, correctly rounded.
-__device__ __forceinline__ float unit_color(uint8_t byte) {
-    const float value = static_cast<float>(byte), quotient = value * (1.0f / 255.0f);
-    return __fmaf_rn(__fmaf_rn(-quotient, 255.0f, value), 1.0f / 255.0f, quotient);
-}
 
 // What a lane holds of a tile: of each kWarpSize slots one. An empty slot has weight 0 and pixel -1.
 template <int kSlots>
@@ -57,20 +52,7 @@ __device__ __forceinline__ void load_samples(const SparseLossParams& params, con
         }
         samples.weight[j] = filled ? (params.weights != nullptr ? params.weights[slot] : 1.0f) : 0.0f;
         if (!filled) continue;
-        if (params.targets != nullptr) {
-#pragma unroll
-            for (int c = 0; c < 3; ++c) samples.y[j][c] = params.targets[3 * slot + c];
-        } else {
-            const uint8_t* photo = params.photos + (kAlpha ? 4 : 3) * (view.pixel_base + samples.pixel[j]);
-            const float through = kAlpha ? __fsub_rn(1.0f, unit_color(photo[3])) : 0.0f;
-#pragma unroll
-            for (int c = 0; c < 3; ++c) {
-                samples.y[j][c] = unit_color(photo[c]);
-                if (kAlpha) {
-                    samples.y[j][c] = __fadd_rn(samples.y[j][c], __fmul_rn(through, params.background[c]));
-                }
-            }
-        }
+        load_truth<kAlpha>(params, view, slot, samples.pixel[j], samples.y[j]);
     }
 #pragma unroll
     for (int j = 0; j < kSlots; ++j) {
@@ -94,7 +76,7 @@ __device__ __forceinline__ TileTotals tile_loss(const SparseLossParams& params, 
     constexpr int kRound = kWarpSize * kSlots;
     const int lane = this_lane();
     const bool resident = end - first <= kRound;
-    const bool structured = params.structure != Structure::kNone;
+    const bool structured = params.structure != Structure::kNone && params.structure != Structure::kSsim;
     const float l1_scale = params.l1_weight / (3.0f * filled), epsilon2 = params.epsilon * params.epsilon;
     TileTotals totals;
     LaneSamples<kSlots> samples;
@@ -205,10 +187,8 @@ __device__ __forceinline__ TileTotals tile_loss(const SparseLossParams& params, 
                 similarity = correlation(xx, yy, xy, params.variance_constant);
             } else if (params.structure == Structure::kContrast) {
                 similarity = contrast(xx, yy, xy, params.variance_constant);
-            } else if (params.structure == Structure::kPrintedNcc) {
-                similarity = printed_correlation(xx, yy, xy, params.variance_constant);
             } else {
-                similarity = ssim(mean_x[c] + first_x[c], mean_y[c] + first_y[c], xx, yy, xy);
+                similarity = printed_correlation(xx, yy, xy, params.variance_constant);
             }
             variance_y[c] = yy;
             at_y[c] = similarity.at_y;
@@ -292,13 +272,7 @@ __global__ void __launch_bounds__(kLossThreads, kLossBlocks)
                 delta = 0.0;
             }
         }
-        if (loss != 0.0) {
-            const double before = atomicAdd(params.loss, loss);
-            // Once lost, the sum stays so: one block sees it happen.
-            if (params.nonfinite_losses != nullptr && is_finite(before) && !is_finite(before + loss)) {
-                atomicAdd(params.nonfinite_losses, 1ull);
-            }
-        }
+        add_loss(params, loss);
     }
 }
 
@@ -320,7 +294,9 @@ cudaError_t launch_sparse_loss(const SparseLossParams& params, cudaStream_t stre
     if (params.num_slots == 0 || params.num_tiles == 0) return cudaSuccess;
     if (params.photos != nullptr && params.channels == 4) launch<true>(params, stream);
     else launch<false>(params, stream);
-    return cudaGetLastError();
+    const cudaError_t error = cudaGetLastError();
+    if (error != cudaSuccess || params.structure != Structure::kSsim) return error;
+    return launch_window_similarity(params, stream);
 }
 
 }  // namespace turbogs

@@ -1,5 +1,5 @@
-// How alike prediction and truth are over the samples of a tile, in one channel: the structure terms of
-// turbogs_plugin/engine/reference/losses.py with their gradients, as functions of the tile's moments.
+// How alike prediction and truth are over the samples of a tile or a window, in one channel: the structure terms of
+// turbogs_plugin/engine/reference/losses.py with their gradients, as functions of the moments.
 #pragma once
 
 #include <cuda_runtime.h>
@@ -10,7 +10,7 @@ namespace turbogs {
 constexpr float kLuminanceConstant = 1e-4f;  // 0.01^2
 constexpr float kSsimConstant = 9e-4f;       // 0.03^2
 
-// Similarity S of a tile in one channel, and its gradient dS/dx = share * (at_y * dy - at_x * dx + constant), with
+// Similarity S in one channel, and its gradient dS/dx = share * (at_y * dy - at_x * dx + constant), with
 // dx, dy the offsets of prediction and truth from their means.
 struct Similarity {
     float value, at_y, at_x, constant;

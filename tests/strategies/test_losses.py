@@ -7,7 +7,11 @@ import pytest
 import torch
 from turbogs_plugin.strategies.losses import CharbonnierLoss, CharbonnierNccLoss, SparseSsimLoss
 
+from turbogs_plugin.engine.reference.window_similarity import window_similarity
+from turbogs_plugin.engine.rules import LossTerms
 from turbogs_plugin.errors import InputError
+from turbogs_plugin.tiles import pixel_table
+from turbogs_plugin.train.ssim import ssim
 from turbogs_plugin.types import PixelSamples
 
 EVERY = [
@@ -20,13 +24,18 @@ EVERY = [
     SparseSsimLoss(),
     SparseSsimLoss(ssim_weight=1.0),
 ]
+SSIM_SLOPE = 8 * 2 / 0.03 + 1 / 0.01
+"""The most that h of `window_similarity` can be in exact arithmetic. A window gives a pixel at most 2 sqrt(share / c2) of
+its contrast-structure term, and the sum of the roots of a pixel's shares in all whole windows is 7.5; the luminance
+term's slope is at most 1 / sqrt(c1)."""
 STRUCTURED = [loss for loss in EVERY if isinstance(loss, CharbonnierNccLoss)]
 
 
 def make_samples(counts, empty=(), weights=None):
     """Tiles of a 16-pixel-high strip with so many slots each; the last `empty[tile]` of a tile are empty."""
     counts = np.asarray(counts)
-    ids = np.concatenate([np.arange(count) + 16 * tile for tile, count in enumerate(counts)])
+    places = pixel_table(np.array([[16 * len(counts), 16]]), "cpu").numpy()
+    ids = np.concatenate([places[tile, :count] for tile, count in enumerate(counts)])
     offsets = np.concatenate([[0], np.cumsum(counts)])
     for tile, number in enumerate(empty):
         ids[offsets[tile + 1] - number : offsets[tile + 1]] = -1
@@ -57,15 +66,30 @@ def tiles_of(samples):
     return [[p for p in range(a, b) if ids[p] >= 0] for a, b in itertools.pairwise(offsets)]
 
 
-def expected_similarity(loss, x, y, w):
-    """S of one tile and channel, from numpy's weighted moments."""
+def weighted_moments(x, y, w):
     omega = w / w.sum()
     mean_x, mean_y = omega @ x, omega @ y
-    var_x, var_y, cov = omega @ (x - mean_x) ** 2, omega @ (y - mean_y) ** 2, omega @ ((x - mean_x) * (y - mean_y))
-    if isinstance(loss, SparseSsimLoss):
+    return mean_x, mean_y, omega @ (x - mean_x) ** 2, omega @ (y - mean_y) ** 2, omega @ ((x - mean_x) * (y - mean_y))
+
+
+def expected_ssim(x, y, w, coordinates):
+    """The mean of the SSIM of each sample's own Gaussian window, one window after the other."""
+    values = []
+    for center in coordinates:
+        apart = coordinates - center
+        window = np.exp(-((apart / 1.5) ** 2).sum(axis=1) / 2) * (np.abs(apart).max(axis=1) <= 5)
+        mean_x, mean_y, var_x, var_y, cov = weighted_moments(x, y, w * window)
         c1, c2 = 0.01**2, 0.03**2
         luminance = (2 * mean_x * mean_y + c1) / (mean_x**2 + mean_y**2 + c1)
-        return luminance * (2 * cov + c2) / (var_x + var_y + c2), 1.0
+        values.append(luminance * (2 * cov + c2) / (var_x + var_y + c2))
+    return np.average(values, weights=w)
+
+
+def expected_similarity(loss, x, y, w, coordinates):
+    """S of one tile and channel, from numpy's weighted moments; and its gate."""
+    if isinstance(loss, SparseSsimLoss):
+        return expected_ssim(x, y, w, coordinates), 1.0
+    _, _, var_x, var_y, cov = weighted_moments(x, y, w)
     c = loss.variance_constant
     gate = var_y / (var_y + c) if loss.gate else 1.0
     if loss.structure == "contrast":
@@ -88,7 +112,7 @@ def expected_balance(loss, colors, targets, samples):
             for i in range(len(slots)):
                 step = np.zeros(len(slots))
                 step[i] = 1e-6
-                up, down = (expected_similarity(loss, x + s, y, w[slots])[0] for s in (step, -step))
+                up, down = (expected_similarity(loss, x + s, y, w[slots], None)[0] for s in (step, -step))
                 norm_structure += abs(up - down) / 2e-6  # = omega_i |g_i|
         factors.append(min(1.0, norm_l1 / (norm_structure + 1e-8)))
     return factors
@@ -105,10 +129,11 @@ def expected_loss(loss, colors, targets, samples, balance):
     weight, base = (
         (loss.ssim_weight, 1 - loss.ssim_weight) if isinstance(loss, SparseSsimLoss) else (loss.ncc_weight, 1)
     )
-    structure = 0.0
+    structure, coordinates = 0.0, samples.coordinates().numpy()
     for slots, factor in zip(tiles_of(samples), balance, strict=True):
         for channel in range(3):
-            similarity, gate = expected_similarity(loss, colors[slots, channel], targets[slots, channel], w[slots])
+            x, y = colors[slots, channel], targets[slots, channel]
+            similarity, gate = expected_similarity(loss, x, y, w[slots], coordinates[slots])
             structure += factor * gate * (1 - similarity) / 3
     return base * l1 + weight * structure / len(samples.tile_ids)
 
@@ -132,6 +157,50 @@ def test_value_and_gradient_are_the_equations(loss, weighted):
         numeric[place] = (up - down) / 2e-6
     assert result.color_gradients.numpy() == pytest.approx(numeric, rel=1e-4, abs=1e-8)
     assert np.abs(numeric).max() > 1e-3
+
+
+@pytest.mark.parametrize("origin", [(0, 0), (5, 11)])
+def test_windows_within_a_tile_are_those_of_the_evaluation(origin):
+    """Six by six pixels of a tile have their whole window in it."""
+    generator = torch.Generator().manual_seed(1)
+    photo, image = torch.rand(2, 32, 40, 3, generator=generator, dtype=torch.float64)
+    table = pixel_table(np.array([[40, 32]]), "cpu", origin)  # [T, 256]
+    tile = int((table >= 0).all(dim=1).nonzero()[0])
+    ids = table[tile]
+    samples = PixelSamples(
+        (0,),
+        np.array([[40, 32]]),
+        ids,
+        torch.tensor([tile], dtype=torch.int32),
+        torch.tensor([0, 256], dtype=torch.int32),
+        origin=origin,
+    )
+    colors, targets = image.view(-1, 3)[ids.long()], photo.view(-1, 3)[ids.long()]
+    found, _ = window_similarity(colors, targets, torch.ones(256, 1, dtype=torch.float64), samples)
+    inside = (samples.coordinates() + torch.tensor(origin)) % 16
+    whole = ((inside >= 5) & (inside <= 10)).all(dim=1)
+    mask = torch.zeros(32 * 40, dtype=torch.bool)
+    mask[ids[whole].long()] = True
+    assert whole.sum() == 36
+    assert found[whole].mean().item() == pytest.approx(ssim(image, photo, mask.view(32, 40)).item(), rel=1e-9)
+
+
+def test_ssim_has_neither_balance_nor_gate():
+    for option in ({"balance": True}, {"gate": True}):
+        with pytest.raises(ValueError, match="ssim has neither balance nor gate"):
+            LossTerms(1e-3, structure="ssim", structure_weight=0.2, **option)
+
+
+@pytest.mark.parametrize("level", [1.0, 1e4, 1e8])
+def test_windows_stay_bounded_where_their_variance_is_lost(level):
+    """In single precision, flat windows of a tile that elsewhere has a contrast of `level`."""
+    samples = make_samples([256])
+    x, y = samples.coordinates().float().unbind(dim=1)
+    targets = torch.where(x < 8, level, 0.1)[:, None].repeat(1, 3)
+    for colors in (targets + 0.01 * torch.sin(9.0 * x + 5.0 * y)[:, None], targets.flip(0)):
+        similarity, slopes = window_similarity(colors, targets, torch.ones(256, 1), samples)
+        assert similarity.abs().max() <= 1 + 1e-6
+        assert slopes.abs().max() <= SSIM_SLOPE
 
 
 @pytest.mark.parametrize("loss", EVERY, ids=repr)

@@ -31,6 +31,9 @@ UNITS = ("pixel", "cell", "tile")
 STRUCTURES = ("none", "ncc", "contrast", "ssim", "printed_ncc")
 """Similarities of a tile's samples that a loss may use beside its l1 term. The kernels number them in this order."""
 
+WINDOW_RADIUS = 5
+"""Pixels from the middle of a window of SSIM to its edge, along each axis."""
+
 UPDATE_KINDS = ("adam", "balanced_lm", "paper_lm")
 """Kinds of a step of the parameters. The kernels number them in this order."""
 

@@ -16,6 +16,9 @@ LUMINANCE_CONSTANT = 0.01**2
 STRUCTURE_CONSTANT = 0.03**2
 """SSIM's two constants, for colours of 0 .. 1."""
 
+WINDOW_SIGMA = 1.5
+"""Standard deviation of SSIM's Gaussian windows, in pixels; they end after `layout.WINDOW_RADIUS` of them."""
+
 GRID_STEPS = (0.7548776662466927, 0.5698402909980532)
 """1 / g and 1 / g^2, with g^3 = g + 1."""
 
@@ -74,8 +77,11 @@ class LossTerms:
         structure: one of `layout.STRUCTURES`.
         structure_weight: factor of the mean over tiles and channels of 1 - S, S the similarity.
         variance_constant: c of `ncc` and `contrast`, epsilon of `printed_ncc`.
-        balance: scale the structure term by the paper's lambda, the gradient-balanced weight.
-        gate: scale it by the truth's variance.
+        balance: scale the structure term by the paper's lambda, the gradient-balanced weight. Not with `ssim`.
+        gate: scale it by the truth's variance. Not with `ssim`.
+
+    Raises:
+        ValueError: `balance` or `gate` with `ssim`, which has many windows in a tile.
     """
 
     epsilon: float
@@ -85,6 +91,10 @@ class LossTerms:
     variance_constant: float = STRUCTURE_CONSTANT
     balance: bool = False
     gate: bool = False
+
+    def __post_init__(self) -> None:
+        if self.structure == "ssim" and (self.balance or self.gate):
+            raise ValueError("the structure ssim has neither balance nor gate: use ncc or contrast")
 
 
 @dataclass(frozen=True)

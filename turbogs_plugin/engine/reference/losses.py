@@ -14,11 +14,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
 
-from turbogs_plugin.engine.rules import LUMINANCE_CONSTANT, STRUCTURE_CONSTANT, LossTerms
+from turbogs_plugin.engine.reference.window_similarity import window_similarity
+from turbogs_plugin.engine.rules import LossTerms
 from turbogs_plugin.types import LossOutput, PixelSamples
 
 BALANCE_EPSILON = 1e-8
@@ -48,15 +50,15 @@ def sparse_loss(terms: LossTerms, colors: Tensor, targets: Tensor, samples: Pixe
     if terms.structure == "none":
         return LossOutput(loss, gradients, problem.pixel_errors)
     groups = problem.groups
-    moments = TileMoments.of(groups, problem.colors, problem.targets)
-    similarity, slopes = SIMILARITIES[terms.structure](moments, groups, terms.variance_constant)
+    similarity, slopes = SIMILARITIES[terms.structure](problem, terms.variance_constant)
     factors = torch.ones_like(similarity[:, :1])  # [T, 1]
     if terms.balance:
         norms = torch.stack([problem.slopes.abs().sum(dim=1), slopes.abs().sum(dim=1)], dim=1)
         norm_l1, norm_structure = groups.mean(norms).unbind(dim=1)
         factors = (norm_l1 / (norm_structure + BALANCE_EPSILON)).clamp(max=1.0)[:, None]
     if terms.gate:
-        factors = factors * (moments.variance_y / (moments.variance_y + terms.variance_constant))
+        variance = problem.moments.variance_y
+        factors = factors * (variance / (variance + terms.variance_constant))
     factors = factors * (terms.structure_weight / (3 * max(1, groups.tiles)))
     loss = loss + (factors * (1.0 - similarity)).sum()
     gradients = gradients - groups.spread(factors.expand_as(similarity)) * groups.shares * slopes
@@ -129,7 +131,7 @@ Similarity = tuple[Tensor, Tensor]
 """Similarity S of each tile and channel, [T, C], at most 1; and g, [P, C], with d S / d x = omega * g."""
 
 
-def correlation(moments: TileMoments, groups: TileGroups, constant: float) -> Similarity:
+def correlation(problem: _Problem, constant: float) -> Similarity:
     """NCC with a variance floor f = constant / 2, the structure term of SSIM::
 
         S = (s_xy + f) / sqrt((s_x^2 + f) (s_y^2 + f))
@@ -138,14 +140,14 @@ def correlation(moments: TileMoments, groups: TileGroups, constant: float) -> Si
     Where variances exceed f this is the paper's NCC. As the floor is in numerator and denominator, S = 1 and g = 0
     where x = y, in tiles of one sample, and in tiles constant in both x and y. ``|omega g| <= 1.5 sqrt(omega / f)``.
     """
-    floor = 0.5 * constant
+    moments, groups, floor = problem.moments, problem.groups, 0.5 * constant
     scale_x, scale_y = (moments.variance_x + floor).sqrt(), (moments.variance_y + floor).sqrt()
     similarity = (moments.covariance + floor) / scale_x / scale_y
     slope_y, slope_x = 1.0 / scale_x / scale_y, similarity / scale_x / scale_x
     return similarity, moments.offset_y * groups.spread(slope_y) - moments.offset_x * groups.spread(slope_x)
 
 
-def printed_correlation(moments: TileMoments, groups: TileGroups, constant: float) -> Similarity:
+def printed_correlation(problem: _Problem, constant: float) -> Similarity:
     """NCC and its gradient as the appendix prints them, with epsilon = constant::
 
         S = s_xy / sqrt(s_x^2 s_y^2 + epsilon)
@@ -154,13 +156,14 @@ def printed_correlation(moments: TileMoments, groups: TileGroups, constant: floa
     A flat tile scores 0, and a faint texture scores near 0, as epsilon is added to a product of two variances. There g
     is not quite the derivative of S, which has s_y^2 / (s_x^2 s_y^2 + epsilon) in the place of 1 / (s_x^2 + epsilon).
     """
+    moments, groups = problem.moments, problem.groups
     scale = (moments.variance_x * moments.variance_y + constant).sqrt()
     similarity = moments.covariance / scale
     slope_x = similarity / (moments.variance_x + constant)
     return similarity, moments.offset_y * groups.spread(1.0 / scale) - moments.offset_x * groups.spread(slope_x)
 
 
-def contrast(moments: TileMoments, groups: TileGroups, constant: float) -> Similarity:
+def contrast(problem: _Problem, constant: float) -> Similarity:
     """The contrast-structure term of SSIM, with c = constant::
 
         S = (2 s_xy + c) / (s_x^2 + s_y^2 + c)
@@ -168,25 +171,22 @@ def contrast(moments: TileMoments, groups: TileGroups, constant: float) -> Simil
 
     Unlike a correlation it also sees the scale of the contrast. ``|omega g| <= 2 sqrt(omega / c)``.
     """
+    moments, groups = problem.moments, problem.groups
     denominator = moments.variance_x + moments.variance_y + constant
     similarity = (2.0 * moments.covariance + constant) / denominator
     slope_y, slope_x = 2.0 / denominator, 2.0 * similarity / denominator
     return similarity, moments.offset_y * groups.spread(slope_y) - moments.offset_x * groups.spread(slope_x)
 
 
-def ssim(moments: TileMoments, groups: TileGroups, constant: float) -> Similarity:
-    """SSIM with a tile's samples as one window: the luminance term times `contrast`, both with SSIM's own constants,
-    whatever `constant` is."""
-    structure, structure_gradients = contrast(moments, groups, STRUCTURE_CONSTANT)
-    mean_x, mean_y = moments.mean_x, moments.mean_y
-    denominator = mean_x * mean_x + mean_y * mean_y + LUMINANCE_CONSTANT
-    luminance = (2.0 * mean_x * mean_y + LUMINANCE_CONSTANT) / denominator
-    luminance_slope = 2.0 * (mean_y - luminance * mean_x) / denominator
-    gradients = structure_gradients * groups.spread(luminance) + groups.spread(structure * luminance_slope)
-    return structure * luminance, gradients
+def ssim(problem: _Problem, constant: float) -> Similarity:
+    """The mean SSIM of the samples of a tile, in windows, with SSIM's own constants, whatever `constant` is; see
+    `window_similarity`."""
+    groups = problem.groups
+    similarity, slopes = window_similarity(problem.colors, problem.targets, groups.weights, problem.samples)
+    return 1.0 - groups.mean(1.0 - similarity), slopes
 
 
-SIMILARITIES: dict[str, Callable[[TileMoments, TileGroups, float], Similarity]] = {
+SIMILARITIES: dict[str, Callable[[_Problem, float], Similarity]] = {
     "ncc": correlation,
     "contrast": contrast,
     "ssim": ssim,
@@ -208,6 +208,7 @@ class _Problem:
             shapes = f"{tuple(colors.shape)} and {tuple(targets.shape)}"
             raise ValueError(f"colors and targets have shapes {shapes}, expected {expected} as there are slots")
         dtype = torch.promote_types(torch.promote_types(colors.dtype, targets.dtype), torch.float32)
+        self.samples = samples
         used = samples.filled & torch.isfinite(colors).all(dim=1)
         self.colors = torch.where(used[:, None], colors.detach().to(dtype), 0.0)
         self.targets = torch.where(used[:, None], targets.detach().to(dtype), 0.0)
@@ -219,3 +220,7 @@ class _Problem:
         values = differences * self.slopes * (roots / (roots + epsilon))  # d^2 / (root + eps) = root - eps
         self.loss = (groups.weights * values).sum() / (3.0 * groups.filled)
         self.gradients = self.slopes * (groups.weights / (3.0 * groups.filled))
+
+    @cached_property
+    def moments(self) -> TileMoments:
+        return TileMoments.of(self.groups, self.colors, self.targets)
