@@ -102,7 +102,8 @@ class CharbonnierNccLoss(RuleLoss):
 class SparseSsimLoss(RuleLoss):
     """``(1 - ssim_weight) * l1 + ssim_weight * mean over tiles and channels of (1 - SSIM)``, 3DGS' mixture.
 
-    SSIM's statistics are those of a tile's samples, taken as one window.
+    A tile's SSIM is the mean over its samples, each in a Gaussian window of 11x11 pixels (Wang et al. 2004) that ends
+    at the tile's edge. It is of use where whole tiles are sampled.
 
     Args:
         epsilon: of the Charbonnier term.

@@ -25,7 +25,7 @@ from turbogs_plugin.types import SH_C0, RowUpdate
 
 CPU = torch.device("cpu")
 WIDTH, HEIGHT, VIEWS = 12, 10, 3
-EVENTS = 45
+EVENTS = 60
 FREE_EVENTS = 25
 CAP = 120
 THRESHOLD = SQUARES["absgrad_threshold"]
