@@ -25,7 +25,8 @@ class Part(NamedTuple):
 
     Args:
         name: what it is; in brackets what the full method loses without it in the paper's table of components.
-        ours: the variants with it and without it, of one of `OURS`; either is `turbogs`, or None where it has none.
+        ours: the variants with it and without it, of one of `OURS`, or None where it has none. Where neither is
+            `turbogs`, the row does not decide the default.
         papers: the same of `paper_parts`, or None where it has none.
     """
 
@@ -35,8 +36,8 @@ class Part(NamedTuple):
 
     @property
     def default(self) -> str:
-        """Whose way today's `turbogs` has."""
-        if self.ours is None:
+        """Whose way today's `turbogs` has, where it is one of the two."""
+        if self.ours is None or "turbogs" not in self.ours:
             return ""
         return "the paper's" if self.ours[0] == "turbogs" else "ours"
 
@@ -54,7 +55,7 @@ PARTS = (
     ),
     Part("Moment-LM, not sparse Adam", ("turbogs", "sparse-adam"), ("turbogs-paper", "sparse-adam")),
     Part("the error-driven score and its gates, not a draw by squares", ("by-difficulty", "turbogs")),
-    Part("the score, not the gradient alone", None, ("turbogs-paper", "no-score")),
+    Part("the score, not the gradient alone", ("by-difficulty", "by-gradient"), ("turbogs-paper", "no-score")),
     Part("no pruning by squares at every event", ("no-turnover", "turbogs")),
     Part("final pruning", ("turbogs", "no-final-pruning"), ("turbogs-paper", "no-final-pruning")),
     Part("NCC (+0.48 dB)", ("turbogs", "no-ncc"), ("turbogs-paper", "no-ncc")),
