@@ -128,13 +128,13 @@ def pixels_on_an_mlp(file: Path = H200.parent / "pixels_on_an_mlp.json") -> str:
 
 
 WALL = H200 / "wall.json"
-"""Capture -> what `turbogs bench wall` wrote."""
+"""Variant of the ablation `sizes` -> capture -> what `turbogs bench wall` wrote."""
 
 
 def wall(file: Path = WALL) -> str:
-    """Where each second of `turbogs train` goes: of each capture the run in the middle, by what it took beside
-    training."""
-    reports = json.loads(file.read_text())
+    """Where each second of `turbogs train` goes, with the configuration `turbogs`: of each capture the run in the
+    middle, by what it took beside training."""
+    reports = json.loads(file.read_text())["turbogs"]
     runs = {capture: WallRun(**report["median"]) for capture, report in reports.items()}
     rows: dict[str, list[float]] = {part: [] for run in runs.values() for part in run.parts}
     for run in runs.values():

@@ -9,7 +9,7 @@ call goes on. Where nothing is missing, the call copies what the stages made int
 and plots of it. It changes no file of the repository before, so that all is of one commit. The stages:
 
     sizes         README's rows of `turbogs`, `turbogs-ssim` and `turbogs-small`
-    wall          `turbogs bench wall`, capture by capture
+    wall          `turbogs bench wall` of the same three, capture by capture
     pictures      README's first two pictures, of a run on caliterra
     pixels        a network without Gaussians, by examples/pixels_on_an_mlp.py; wants no GPU
     paper_parts   README's row of `turbogs-paper`, and each part changed alone in it
@@ -32,11 +32,12 @@ from functools import partial
 from pathlib import Path
 from time import monotonic
 
-from study_tables import CAPTURES, ROOT
+from study_tables import CAPS, CAPTURES, OURS, ROOT
 
 from turbogs_plugin.config.units import parse_seconds
 from turbogs_plugin.files import write_atomically
 from turbogs_plugin.report.provenance import COMMIT_VARIABLE, MODIFIED, source_commit
+from turbogs_plugin.study.grid import load_ablation
 from turbogs_plugin.study.workers import UNFINISHED
 
 PAGES_SECONDS = 60
@@ -114,8 +115,11 @@ def run(words: Words) -> int:
     return subprocess.run([sys.executable, *words], cwd=ROOT).returncode
 
 
-def time_wall(capture: str, scenes: Scenes, file: Path, scratch: Path) -> list[Words]:
-    return [[*TURBOGS, "bench", "wall", "--scene", scenes[capture], "--out", file]]
+def time_wall(variant: str, capture: str, scenes: Scenes, file: Path, scratch: Path) -> list[Words]:
+    """`variant`: of the ablation `sizes`. `turbogs`, whose seconds have a table of their own, runs three times."""
+    runs = ["--repeats", "3" if variant == "turbogs" else "1"]
+    changes = load_ablation("sizes").variants[variant]
+    return [[*TURBOGS, "bench", "wall", *changes, "--scene", scenes[capture], *runs, "--out", file]]
 
 
 def make_pictures(capture: str, view: int, scenes: Scenes, folder: Path, scratch: Path) -> list[Words]:
@@ -137,9 +141,20 @@ PHOTOS: dict[str, Callable[[Scenes], Words]] = {
 }
 """What a network learns."""
 
+WALLS = {
+    variant: [capture for capture in CAPTURES if CAPS.get(variant, capture) == capture]
+    for study, variant, _ in OURS
+    if study == "sizes"
+}
+"""Variant of the ablation `sizes` -> the captures that README has it of."""
+
 STAGES: dict[str, Sequence[Piece | Sweep]] = {
     "sizes": [Sweep(60, ["sizes"])],
-    "wall": [Piece(60, f"wall/{capture}.json", partial(time_wall, capture)) for capture in CAPTURES],
+    "wall": [
+        Piece(60, f"wall/{variant}-{capture}.json", partial(time_wall, variant, capture))
+        for variant, captures in WALLS.items()
+        for capture in captures
+    ],
     "pictures": [Piece(60, "pictures", partial(make_pictures, "caliterra", 44))],
     "pixels": [Piece(120, f"pixels/{name}", partial(learn_photo, chosen)) for name, chosen in PHOTOS.items()],
     "paper_parts": [Sweep(150, ["paper_parts"])],
@@ -154,7 +169,11 @@ STAGES: dict[str, Sequence[Piece | Sweep]] = {
 def files_of(stage: str, folder: Path) -> dict[str, bytes]:
     """File in docs/ -> its content, of a stage that is done in `folder`, OUT/COMMIT."""
     if stage == "wall":
-        return {"results/h200/wall.json": as_json({name: read(folder / f"wall/{name}.json") for name in CAPTURES})}
+        walls = {
+            variant: {capture: read(folder / f"wall/{variant}-{capture}.json") for capture in captures}
+            for variant, captures in WALLS.items()
+        }
+        return {"results/h200/wall.json": as_json(walls)}
     if stage == "pictures":
         places = ("render.jpg", "overlays.jpg", "results/pictures.json")
         return {place: (folder / "pictures" / Path(place).name).read_bytes() for place in places}

@@ -109,8 +109,8 @@ def by_capture(head: str, lines: dict[str, dict[str, str]]) -> str:
 
 def wall_seconds(variant: str, capture: str) -> float:
     """Of a whole `turbogs train`, the run in the middle of `turbogs bench wall`; NaN where that is not measured."""
-    report = json.loads(machine_tables.WALL.read_text()).get(capture)
-    return report["median"]["seconds"] if report and variant == "turbogs" else math.nan
+    report = json.loads(machine_tables.WALL.read_text()).get(variant, {}).get(capture)
+    return report["median"]["seconds"] if report else math.nan
 
 
 def ahead() -> str:
@@ -169,9 +169,9 @@ def headline_sources() -> str:
             said.setdefault(name, set()).update(where)
             changed += other_settings(study)
     lines = [(name, "; ".join(sorted(where)) or "not recorded") for name, where in said.items()]
-    reports = json.loads(machine_tables.WALL.read_text()).values()
+    reports = [report for of in json.loads(machine_tables.WALL.read_text()).values() for report in of.values()]
     walls = dict.fromkeys(machine_tables.where(report) + mark(report["provenance"]["commit"]) for report in reports)
-    lines.append(("turbogs, on the wall", "; ".join(walls)))
+    lines.append(("whole commands of ours", "; ".join(walls)))
     lines.append(("the others", read_peers()["measured"]))
     return "\n\n".join([table(("row", "measured on"), lines), *dict.fromkeys(changed)])
 

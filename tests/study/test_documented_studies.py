@@ -133,7 +133,9 @@ def test_the_headline_says_how_many_seeds_and_where_and_when_ours_had_the_others
     monkeypatch.setattr(machine_tables, "WALL", tmp_path / "wall.json")
     a_study(tmp_path, "sizes", {"turbogs": (31.0, 32.0)})
     a_study(tmp_path, "baselines", {"3dgs": (30.3,)})
-    (tmp_path / "wall.json").write_text(json.dumps({"fox": {"provenance": PLACE, "median": {"seconds": 12.3}}}))
+    (tmp_path / "wall.json").write_text(
+        json.dumps({"turbogs": {"fox": {"provenance": PLACE, "median": {"seconds": 12.3}}}})
+    )
     rows = [
         {"method": "Slow", "capture": "fox", "seconds": 50, "psnr": 21.0, "ssim": 0.9, "gaussians": 500},
         {"method": "Slow", "capture": "caliterra", "seconds": 50, "psnr": 33.0, "ssim": None, "gaussians": None},
@@ -157,7 +159,7 @@ def test_the_headline_says_how_many_seeds_and_where_and_when_ours_had_the_others
     ]
     sources = study_tables.headline_sources()
     assert "| **turbogs** | not recorded |" in sources and "| the others | another day |" in sources
-    assert "| turbogs, on the wall | NVIDIA H200, commit 0123456, torch 2.11.0 |" in sources
+    assert "| whole commands of ours | NVIDIA H200, commit 0123456, torch 2.11.0 |" in sources
 
 
 def test_what_is_of_another_commit_than_ours_is_stale(tmp_path, monkeypatch):
@@ -166,7 +168,8 @@ def test_what_is_of_another_commit_than_ours_is_stale(tmp_path, monkeypatch):
     a_study(tmp_path, "baselines", {"3dgs": (30.3,)}, ("aaaaaaa",))
     (tmp_path / "docs/results/peers.json").write_text(json.dumps({"measured": "another day"}))
     walls = ({"provenance": PLACE | {"commit": commit}} for commit in ("aaaaaaabbb", "0123456789ab"))
-    (tmp_path / "wall.json").write_text(json.dumps(dict(zip(study_tables.CAPTURES, walls, strict=False))))
+    by_capture = dict(zip(study_tables.CAPTURES, walls, strict=False))
+    (tmp_path / "wall.json").write_text(json.dumps({"turbogs": by_capture}))
     # Without a commit of ours there is none to compare with.
     assert "stale" not in study_tables.headline_sources() and study_tables.other_commit("baselines") == []
     a_study(tmp_path, "sizes", {"turbogs": (31.0,) * 3, "ssim": (31.0,)}, ("0123456789", "0123456-modified", "0123456"))
@@ -180,7 +183,7 @@ def test_what_is_of_another_commit_than_ours_is_stale(tmp_path, monkeypatch):
     (full,) = (where for name, where in lines.items() if name.startswith("3DGS"))
     assert full == "NVIDIA H200, commit aaaaaaa, 2026-11-25 (stale)"
     wall = "NVIDIA H200, commit aaaaaaa, torch 2.11.0 (stale); NVIDIA H200, commit 0123456, torch 2.11.0"
-    assert lines["turbogs, on the wall"] == wall and lines["the others"] == "another day"
+    assert lines["whole commands of ours"] == wall and lines["the others"] == "another day"
     line = "Stale: 3 of 3 cells of `baselines` were measured at commit aaaaaaa; README's `turbogs` at 0123456."
     assert study_tables.stale("baselines") == [*study_tables.other_settings("baselines"), line]
     assert study_tables.stale("parts") == study_tables.other_settings("parts")
