@@ -28,7 +28,7 @@ from turbogs_plugin.train.wall import WallClock
 
 WARMUP_ITERATIONS = {"cuda": 20, "cpu": 2}
 """Iterations of warm-up: the configuration is scaled to this length and trained once before the clock starts, so that
-the code of every kind of step is loaded."""
+the code of every kind of step is loaded. Once a variant in each process: what is loaded stays."""
 
 
 class PeakMemory(Listener):
@@ -87,6 +87,7 @@ def train_cell(
     made_by: Provenance,
     listeners: Sequence[Listener] = (),
     loading: float = math.nan,
+    warm: bool = False,
 ) -> CellResult:
     """Train one variant, as `turbogs train` would: by a plan for the scene, within the budgets of the configuration.
 
@@ -98,6 +99,7 @@ def train_cell(
         made_by: machine and sources, as they were when the process began.
         listeners: to the training.
         loading: seconds that the scene took to load; NaN: the cell's own seconds are not known.
+        warm: this process has trained a cell of this variant.
 
     Raises:
         InputError: a budget is too small.
@@ -110,7 +112,8 @@ def train_cell(
     test = place_views(scene.test, device, planned.train.photos_place)
     clock.mark("cell")
     warmup = min(WARMUP_ITERATIONS[device.type], planned.train.iterations)
-    warm_up(planned, scene, test, device, warmup)
+    if not warm:
+        warm_up(planned, scene, test, device, warmup)
     clock.mark("warm-up")
     memory = PeakMemory(device)
     loop, _ = new_loop(planned, scene, device)

@@ -20,7 +20,8 @@ class CellResult:
         capture: `capture_digest` of the scene, or "" where it was not recorded.
         provenance: machine, versions and commit, or None where they were not recorded.
         resolved: False in a record that has only the configuration asked for, which is then `config`.
-        warmup_iterations: iterations of the same configuration before the clock started, on a model thrown away.
+        warmup_iterations: iterations of the same configuration, but for the seed, that the process had trained before
+            the clock started, on a model thrown away.
         lpips_reason: why LPIPS was not computed; empty where it was.
         config: its configuration, as plan and budgets resolved it.
         asked: the configuration that was asked for: by it a finished cell is recognised.
