@@ -52,6 +52,13 @@ def facts(**changes) -> SceneFacts:
     return dataclasses.replace(FACTS, **changes)
 
 
+def test_the_accuracy_of_cameras_is_told_where_it_is_known():
+    known, none = (plan_from_facts(facts(reprojection_error=error), load_config("turbogs")) for error in (0.358, None))
+    assert " 10000 points, 0.36 pixels from where photos show them; extent 3" in known.facts_text()
+    assert " 10000 points; extent 3" in none.facts_text()
+    assert Plan.from_json(known.to_json()) == known and Plan.from_json(none.to_json()) == none
+
+
 def test_exposures_that_could_not_be_compared_have_no_numbers():
     compared, none = (plan_from_facts(facts(exposure_views=views), load_config("turbogs")) for views in (9, 0))
     assert "exposures of 9 photos 0.05 stops apart and 0.05 from those before and after; " in compared.facts_text()

@@ -27,6 +27,7 @@ class SceneFacts:
         train_views, test_views: V and the number of test views.
         smallest_photo, largest_photo: (width, height) of the training photos with the fewest and most pixels.
         points: M, of the reconstruction.
+        reprojection_error: a mean in pixels, see `Scene`; None: not known.
         extent: radius of the scene in the capture's own unit.
         baseline: median distance of a training camera to its nearest, over the median depth of the points it sees.
         exposure_spread, exposure_rest, exposure_views: how far photos differ in brightness and white balance, in stops
@@ -67,6 +68,7 @@ class SceneFacts:
     exposure_spread: float = 0.0
     exposure_rest: float = 0.0
     exposure_views: int | None = None
+    reprojection_error: float | None = None
 
 
 @torch.no_grad()
@@ -118,6 +120,7 @@ def gather_facts(
         exposure_spread=exposures.spread if exposures else 0.0,
         exposure_rest=exposures.rest if exposures else 0.0,
         exposure_views=int(exposures.compared.sum()) if exposures else None,
+        reprojection_error=scene.reprojection_error,
     )
 
 

@@ -69,9 +69,12 @@ class Plan:
                 if facts.exposure_views
                 else ", exposures could not be compared"
             )
+        points = f"{facts.points} points"
+        if facts.reprojection_error is not None:
+            points += f", {facts.reprojection_error:.2f} pixels from where photos show them"
         return (
             f"{facts.scene}: {facts.train_views} + {facts.test_views} views of "
-            f"{small if small == large else f'{small} to {large}'} pixels, {facts.points} points; "
+            f"{small if small == large else f'{small} to {large}'} pixels, {points}; "
             f"extent {facts.extent:.4g}, baselines {facts.baseline:.3f} of depth, view directions concentrated to "
             f"{facts.direction_concentration:.3f}{exposures}; "
             f"{mebibytes(facts.photo_bytes)} of photos, "

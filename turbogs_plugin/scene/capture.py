@@ -42,6 +42,8 @@ class Capture:
         alpha: what the alpha of a transparent photo is: the object's ``opacity``, so that the background shows through
             and training makes the model as transparent; or a ``mask``, whose zero pixels are ignored.
         mask_files: files of masks that the capture names, one a view or None; given as empty where it names none.
+        reprojection_error: how far points are from where photos show them, a mean in pixels of the full-size photos;
+            None: the capture does not say.
     """
 
     names: tuple[str, ...]
@@ -57,6 +59,7 @@ class Capture:
     reduction: int = 1
     alpha: Literal["opacity", "mask"] = "opacity"
     mask_files: tuple[Path | None, ...] = ()
+    reprojection_error: float | None = None
 
     def __post_init__(self) -> None:
         self.lenses = self.lenses or (None,) * len(self.names)
