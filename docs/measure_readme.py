@@ -12,7 +12,7 @@ and plots of it. It changes no file of the repository before, so that all is of 
     wall          `turbogs bench wall` of the same three, capture by capture
     pictures      README's first two pictures, of a run on caliterra
     pixels        a network without Gaussians, by examples/pixels_on_an_mlp.py; wants no GPU
-    paper_parts   README's row of `turbogs-paper`, and each part changed alone in it
+    paper_parts   README's row of `turbogs-paper`, and each part changed alone in it; the printed update, two seeds
     baselines     3DGS, MCMC and the votes of many views at full length
     studies       the tables of docs/results/README.md, which docs/paper.md has, too
     paper_tables  the paper's tables
@@ -32,6 +32,7 @@ from functools import partial
 from pathlib import Path
 from time import monotonic
 
+import torch
 from study_tables import CAPS, CAPTURES, OURS, ROOT
 
 from turbogs_plugin.config.units import parse_seconds
@@ -90,21 +91,26 @@ class Sweep:
         names: of the ablations. Of several, each takes from those before it what they have in common.
         seeds: of each variant.
         captures: on which all are trained.
+        only: of the one ablation, these variants and the baseline; all where absent.
     """
 
     seconds: int
     names: Sequence[str]
     seeds: int = 5
     captures: Sequence[str] = CAPTURES
+    only: Sequence[str] = ()
 
     def measure(self, scenes: Scenes, folder: Path, left: float) -> int:
         """As `Piece.measure`."""
         if left < self.seconds + 1:
             return UNFINISHED
-        print(f"{', '.join(self.names)}, {left:.0f} s are left", flush=True)
+        print(f"{', '.join((*self.names, *self.only))}, {left:.0f} s are left", flush=True)
         words = [*TURBOGS, "ablate", *self.names, "--seeds", *map(str, range(self.seeds))]
         for capture in self.captures:
             words += ["--scene", scenes[capture]]
+        words += ["--only", *self.only] if self.only else []
+        gpus = torch.cuda.device_count()
+        words += ["--gpus", ",".join(map(str, range(gpus)))] if gpus > 1 else []
         out = folder / "studies"
         out = out if len(self.names) > 1 else out / self.names[0]  # of several, each has a folder in it
         return run([*words, "--within", f"{left - self.seconds:.0f}s", "--out", out])
@@ -141,7 +147,9 @@ PHOTOS: dict[str, Callable[[Scenes], Words]] = {
 }
 """What a network learns."""
 
-WALLS = {
+LITERAL = "paper-literal"
+
+SHOWN = {
     variant: [capture for capture in CAPTURES if CAPS.get(variant, capture) == capture]
     for study, variant, _ in OURS
     if study == "sizes"
@@ -149,15 +157,21 @@ WALLS = {
 """Variant of the ablation `sizes` -> the captures that README has it of."""
 
 STAGES: dict[str, Sequence[Piece | Sweep]] = {
-    "sizes": [Sweep(60, ["sizes"])],
+    "sizes": [
+        Sweep(60, ["sizes"], captures=[capture], only=[name for name, captures in SHOWN.items() if capture in captures])
+        for capture in CAPTURES
+    ],
     "wall": [
         Piece(60, f"wall/{variant}-{capture}.json", partial(time_wall, variant, capture))
-        for variant, captures in WALLS.items()
+        for variant, captures in SHOWN.items()
         for capture in captures
     ],
     "pictures": [Piece(60, "pictures", partial(make_pictures, "caliterra", 44))],
     "pixels": [Piece(120, f"pixels/{name}", partial(learn_photo, chosen)) for name, chosen in PHOTOS.items()],
-    "paper_parts": [Sweep(150, ["paper_parts"])],
+    "paper_parts": [
+        Sweep(150, ["paper_parts"], only=[name for name in load_ablation("paper_parts").variants if name != LITERAL]),
+        Sweep(150, ["paper_parts"], only=[LITERAL], seeds=2),  # it diverges, and is slow
+    ],
     "baselines": [Sweep(210, ["baselines"], seeds=1)],
     "studies": [Sweep(60, ["sizes", "average", "parts", "departures", "bounds"])],
     "paper_tables": [
@@ -171,7 +185,7 @@ def files_of(stage: str, folder: Path) -> dict[str, bytes]:
     if stage == "wall":
         walls = {
             variant: {capture: read(folder / f"wall/{variant}-{capture}.json") for capture in captures}
-            for variant, captures in WALLS.items()
+            for variant, captures in SHOWN.items()
         }
         return {"results/h200/wall.json": as_json(walls)}
     if stage == "pictures":
@@ -181,8 +195,8 @@ def files_of(stage: str, folder: Path) -> dict[str, bytes]:
         known = {photo: ways for name in PHOTOS for photo, ways in read(folder / f"pixels/{name}/psnr.json").items()}
         figure = (folder / "pixels/synthetic/figure.png").read_bytes()
         return {"results/pixels_on_an_mlp.json": as_json(known), "pixels_on_an_mlp.png": figure}
-    places = [f"{name}/results.json" for sweep in STAGES[stage] for name in sweep.names]
-    return {f"results/{place}": (folder / "studies" / place).read_bytes() for place in places}
+    places = {f"{name}/results.json" for sweep in STAGES[stage] for name in sweep.names}
+    return {f"results/{place}": (folder / "studies" / place).read_bytes() for place in sorted(places)}
 
 
 def read(file: Path) -> dict:

@@ -92,7 +92,7 @@ class Machine:
             there = {line for line in (folder / "cells").read_text().split()} if (folder / "cells").exists() else set()
             wanted = {
                 f"{scene.name}-{variant}-{seed}"
-                for variant in load_ablation(name).variants
+                for variant in load_ablation(name).only(only)
                 for scene in options.scenes
                 for seed in options.seeds
             }
@@ -151,9 +151,9 @@ def test_parts_of_nine_minutes_make_all_and_none_of_it_twice(machine, call, tmp_
         assert not code or files_below(tmp_path / "docs") == set(), "the sources stay those of the commit"
     assert set(codes[:-1]) == {UNFINISHED} and len(codes) > 5
     assert max(ends) <= 540 and min(ends[:-1]) > 540 - 210 - SECONDS["ablate"]
-    first = machine.begun.index("sizes 69")
-    assert machine.begun[first : first + 16] == [
-        *("sizes 69", "sizes 6", *WALLS, "train", "make_pictures.py", *["pixels_on_an_mlp.py"] * 3),
+    first = machine.begun.index("sizes 15")
+    assert machine.begun[first : first + 17] == [
+        *(*["sizes 15"] * 3, *WALLS, "train", "make_pictures.py", *["pixels_on_an_mlp.py"] * 3),
     ]
     cells = {}
     for name, count in (line.split() for line in machine.begun if line[-1].isdigit()):
@@ -163,6 +163,7 @@ def test_parts_of_nine_minutes_make_all_and_none_of_it_twice(machine, call, tmp_
         *("components", "views", "hard_ratio", "schedule"),
     ]
     assert cells["sizes"] == 5 * 3 * 5 and cells["baselines"] == 4 * 3 and cells["components"] == 6 * 2
+    assert cells["paper_parts"] == (8 * 5 + 2) * 3
     docs = tmp_path / "docs"
     assert (docs / "results/sizes/results.json").read_bytes() == (ROOT / "docs/results/sizes/results.json").read_bytes()
     walls = json.loads((docs / "results/h200/wall.json").read_text())
@@ -175,6 +176,16 @@ def test_parts_of_nine_minutes_make_all_and_none_of_it_twice(machine, call, tmp_
     # A further call finds all there; another commit has nothing.
     done = len(machine.begun)
     assert call()[0] == 0 and len(machine.begun) == done
+
+
+@pytest.mark.parametrize(("gpus", "told"), [(1, []), (2, ["--gpus", "0,1"])])
+def test_the_gpus_of_a_machine_share_the_trainings(monkeypatch, tmp_path, gpus, told):
+    called: list[list[str]] = []
+    monkeypatch.setattr(measure_readme, "run", lambda words: called.append(words) or 0)
+    monkeypatch.setattr(measure_readme.torch.cuda, "device_count", lambda: gpus)
+    scenes = {name: tmp_path / name for name in measure_readme.CAPTURES}
+    assert measure_readme.Sweep(60, ["parts"]).measure(scenes, tmp_path, 500.0) == 0
+    assert called[0][-6:-4] == told if told else "--gpus" not in called[0]
 
 
 def test_a_stage_alone_and_another_commit(machine, call, tmp_path, monkeypatch):
