@@ -85,6 +85,22 @@ def test_equals_the_twin(name, rate, unit, importance):
         torch.testing.assert_close(found.pixel_errors.cpu(), expected.pixel_errors, rtol=1e-5, atol=2e-7)
 
 
+@pytest.mark.parametrize("level", [1.0, 1e4, 1e8])
+def test_windows_stay_bounded_where_their_variance_is_lost(level):
+    """As the twin's (`strategies/test_losses.py`): flat windows of tiles that elsewhere have a contrast of `level`."""
+    samples = make_samples(1.0, "tile")
+    x, y = samples.coordinates().float().unbind(dim=1)
+    targets = torch.where((x % 16 < 8)[:, None], level, 0.1).repeat(1, 3) * samples.filled[:, None]
+    terms, tiles = SparseSsimLoss(ssim_weight=1.0).terms, len(samples.tile_ids)
+    for colors in (targets + 0.01 * torch.sin(9.0 * x + 5.0 * y)[:, None], targets.roll(1, dims=0)):
+        colors = colors * samples.filled[:, None]
+        found = training_kernels.sparse_loss(terms, colors.to(DEVICE), targets.to(DEVICE), to_device(samples))
+        assert 0 <= float(found.loss) <= 2
+        # A tile has its share of the mean, and a sample its share of a tile that holds a row of pixels at least.
+        assert float(found.color_gradients.abs().max()) <= (8 * 2 / 0.03 + 1 / 0.01) / (3 * tiles)
+        assert torch.isfinite(found.color_gradients).all()
+
+
 @pytest.mark.parametrize("rate", [0.1, 1.0])
 def test_maps_follow(rate):
     """Bit for bit: sums of three absolute values in one order, then single-precision products rounded one by one."""
