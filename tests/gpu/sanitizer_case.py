@@ -32,7 +32,7 @@ DEVICE = "cuda"
 VARIANTS = (
     (),
     ("optimizer.type=sparse_adam", "pixel_sampler.unit=cell", "loss.ncc_weight=1.0"),
-    ("optimizer.rows=summed", "pixel_sampler.unit=tile", "pixel_sampler.importance=0.5"),
+    ("optimizer.rows=summed", "pixel_sampler.unit=tile", "pixel_sampler.importance=0.5", "loss.type=sparse_ssim"),
 )
 """Overrides that lead through the kernels' other branches."""
 
