@@ -118,13 +118,14 @@ def dropin_table(runs: list[dict[str, Any]]) -> str:
 
 def pixels_on_an_mlp(file: Path = H200.parent / "pixels_on_an_mlp.json") -> str:
     """PSNR of a network without Gaussians by both ways, means of seeds: what examples/pixels_on_an_mlp.py wrote."""
-    lines = []
-    for photo, (plain, ours) in ((name, ways.values()) for name, ways in json.loads(file.read_text()).items()):
+    lines, photos = [], json.loads(file.read_text())
+    for photo, (plain, ours) in ((name, found["psnr"].values()) for name, found in photos.items()):
         gains = [after - before for before, after in zip(plain, ours, strict=True)]
         means = (f"{statistics.mean(values):.2f}" for values in (plain, ours))
         spread = f"{statistics.mean(gains):+.2f} [{min(gains):+.2f}, {max(gains):+.2f}]"
         lines.append((photo, *means, spread))
-    return table(("photo", "random pixels, Charbonnier", "error-guided pixels, NCC", "gain in dB"), lines)
+    made = table(("photo", "random pixels, Charbonnier", "error-guided pixels, NCC", "gain in dB"), lines)
+    return f"{'; '.join(dict.fromkeys(map(where, photos.values())))}.\n\n{made}"
 
 
 WALL = H200 / "wall.json"

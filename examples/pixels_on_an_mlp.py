@@ -4,7 +4,7 @@ comparison, from as many random pixels with a Charbonnier loss."""
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +19,7 @@ from turbogs_plugin.strategies.pixel_sampling import DensePixelSampler, ErrorGui
 
 from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.gsplat_bridge import gather_pixels
+from turbogs_plugin.report.provenance import provenance
 from turbogs_plugin.types import PixelSamples, Step
 
 
@@ -141,9 +142,11 @@ def draw_figure(path: Path, photo: Tensor, learnt: list[Tensor]) -> None:
 
 
 def record(path: Path, name: str, values: list[list[float]]) -> None:
-    """Write the PSNR of a photo into a file that has those of others: photo -> variant -> a value a seed."""
+    """Write the PSNR of a photo into a file that has those of others: photo -> where it was measured, and variant -> a
+    value a seed."""
     known = json.loads(path.read_text()) if path.exists() else {}
-    known[name] = {variant.name: [row[place] for row in values] for place, variant in enumerate(VARIANTS)}
+    of_variants = {variant.name: [row[place] for row in values] for place, variant in enumerate(VARIANTS)}
+    known[name] = {"provenance": asdict(provenance("cpu")), "psnr": of_variants}
     path.write_text(json.dumps(known, indent=1) + "\n")
 
 
