@@ -176,9 +176,11 @@ def where(record: dict[str, Any]) -> str:
 
 
 def place(machine: str, commit: str, day: str) -> str:
-    """The GPU; how many cores the host has, which makes the seconds differ; commit; and day, where it was recorded."""
-    cores = re.findall(r"\d+ cores", machine)
-    return ", ".join([machine.partition(" (")[0], *cores, f"commit {short(commit)}", *([day] if day else [])])
+    """The GPU, or the CPU where none was used; how many cores the host has, which makes the seconds differ; commit; and
+    day, where it was recorded."""
+    device, cores = machine.partition(" (")[0], re.findall(r"\d+ cores", machine)
+    cores = [] if device.endswith(" cores") else cores
+    return ", ".join([device, *cores, f"commit {short(commit)}", *([day] if day else [])])
 
 
 def short(commit: str) -> str:

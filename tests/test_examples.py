@@ -112,8 +112,9 @@ def test_pixels_on_an_mlp(example, tmp_path, capsys):
         assert drawn.size == (3 * 2 * 48, 2 * 2 * 32 + 14)
     script.record(results, "another", [[20.0, 21.0], [22.0, 24.0]])
     first, second = json.loads(results.read_text()).items()
-    assert first[0].endswith("/photo.png") and [len(column) for column in first[1].values()] == [1, 1]
-    assert second == ("another", dict(zip(first[1], [[20.0, 22.0], [21.0, 24.0]], strict=True)))
+    assert first[0].endswith("/photo.png") and [len(column) for column in first[1]["psnr"].values()] == [1, 1]
+    psnr = dict(zip(first[1]["psnr"], [[20.0, 22.0], [21.0, 24.0]], strict=True))
+    assert second[0] == "another" and second[1]["psnr"] == psnr and second[1]["provenance"]["machine"]
 
 
 def test_the_variants_of_pixels_on_an_mlp_draw_equally_many(example):
