@@ -11,6 +11,7 @@ and plots of it. It changes no file of the repository before, so that all is of 
     sizes         README's rows of `turbogs`, `turbogs-ssim` and `turbogs-small`
     wall          `turbogs bench wall` of the same three, capture by capture
     pictures      README's first two pictures, of a run on caliterra
+    demo          README's picture of `make demo`, on the CPU
     pixels        a network without Gaussians, by examples/pixels_on_an_mlp.py; wants no GPU
     paper_parts   README's row of `turbogs-paper`, and each part changed alone in it; the printed update, two seeds
     baselines     3DGS, MCMC and the votes of many views at full length
@@ -135,6 +136,13 @@ def make_pictures(capture: str, view: int, scenes: Scenes, folder: Path, scratch
     return [train, ["docs/make_pictures.py", trained, str(view), folder]]
 
 
+def draw_demo(scenes: Scenes, file: Path, scratch: Path) -> list[Words]:
+    """As `make demo` does."""
+    capture, trained = scratch / "capture", scratch / "run"
+    train = [*TURBOGS, "train", capture, "--out", trained, "--config", "demo", "--device", "cpu"]
+    return [[*TURBOGS, "demo", capture], train, ["docs/demo_picture.py", trained, file]]
+
+
 def learn_photo(chosen: Callable[[Scenes], Words], scenes: Scenes, folder: Path, scratch: Path) -> list[Words]:
     files = ["--figure", folder / "figure.png", "--results", folder / "psnr.json"]
     return [["examples/pixels_on_an_mlp.py", *chosen(scenes), *files]]
@@ -167,6 +175,7 @@ STAGES: dict[str, Sequence[Piece | Sweep]] = {
         for capture in captures
     ],
     "pictures": [Piece(60, "pictures", partial(make_pictures, "caliterra", 44))],
+    "demo": [Piece(120, "demo.png", draw_demo)],
     "pixels": [Piece(120, f"pixels/{name}", partial(learn_photo, chosen)) for name, chosen in PHOTOS.items()],
     "paper_parts": [
         Sweep(150, ["paper_parts"], only=[name for name in load_ablation("paper_parts").variants if name != LITERAL]),
@@ -191,6 +200,8 @@ def files_of(stage: str, folder: Path) -> dict[str, bytes]:
     if stage == "pictures":
         places = ("render.jpg", "overlays.jpg", "results/pictures.json")
         return {place: (folder / "pictures" / Path(place).name).read_bytes() for place in places}
+    if stage == "demo":
+        return {"demo.png": (folder / "demo.png").read_bytes()}
     if stage == "pixels":
         known = {photo: ways for name in PHOTOS for photo, ways in read(folder / f"pixels/{name}/psnr.json").items()}
         figure = (folder / "pixels/synthetic/figure.png").read_bytes()
