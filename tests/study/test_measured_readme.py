@@ -28,8 +28,12 @@ demo_picture, make_pages, make_pictures, measure_readme, pixels_on_an_mlp, study
 OTHERS = {"docs/results/peers.json"}
 """What README's tables have of the others' own code."""
 SECONDS = {
-    **{"ablate": 7, "wall": 40, "train": 15},
-    **{"make_pictures.py": 15, "demo_picture.py": 1, "pixels_on_an_mlp.py": 50},
+    "ablate": 7,
+    "wall": 40,
+    "train": 15,
+    "make_pictures.py": 15,
+    "demo_picture.py": 1,
+    "pixels_on_an_mlp.py": 50,
 }
 """What commands take by the clock of `Machine`; an ablation, for each cell."""
 WALLS = 3 * ["wall fox", "wall caliterra", "wall snowmiku"]
