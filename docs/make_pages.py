@@ -41,7 +41,7 @@ PAGES = tuple(
         *(f"docs/results/sweeps/{name}.md" for name in sweep_tables.rounds()),
     )
 )
-BLOCK = re.compile(r"(<!-- made: (.+?) -->\n).*?(<!-- end -->)", re.DOTALL)
+BLOCK = re.compile(r"(<!-- made: ([\w -]+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
 @cache

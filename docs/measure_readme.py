@@ -56,7 +56,7 @@ class Piece:
     """Work that is done as a whole.
 
     Args:
-        seconds: the most that it takes on an H200.
+        seconds: the most that it takes on an H100 or H200.
         made: the file or the folder that it makes, in OUT/COMMIT; where that is there, the work is done.
         commands: (captures, where to write, a folder that is thrown away) -> what is called.
     """
@@ -88,7 +88,7 @@ class Sweep:
     """One or more ablations in OUT/COMMIT/studies; `turbogs ablate` trains the cells that are missing.
 
     Args:
-        seconds: the most that a cell takes on an H200.
+        seconds: the most that a cell takes on an H100 or H200.
         names: of the ablations. Of several, each takes from those before it what they have in common.
         seeds: of each variant.
         captures: on which all are trained.

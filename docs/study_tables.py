@@ -171,7 +171,7 @@ def headline_sources() -> str:
     lines = [(name, "; ".join(sorted(where)) or "not recorded") for name, where in said.items()]
     reports = [report for of in json.loads(machine_tables.WALL.read_text()).values() for report in of.values()]
     walls = dict.fromkeys(machine_tables.where(report) + mark(report["provenance"]["commit"]) for report in reports)
-    lines.append(("whole commands of ours", "; ".join(walls)))
+    lines.append(("whole command of **turbogs**", "; ".join(walls)))
     lines.append(("the others", read_peers()["measured"]))
     return "\n\n".join([table(("row", "measured on"), lines), *dict.fromkeys(changed)])
 

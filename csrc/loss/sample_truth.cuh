@@ -1,4 +1,4 @@
-// The truth of a sample, and the sum of a loss that is told once when it is lost.
+// The true colour of a sample; and adding to a loss, which counts once a sum that is no longer finite.
 #pragma once
 
 #include "common/approximate_math.cuh"

@@ -5,7 +5,7 @@
 // windows are two passes of eleven products, along the rows and along the columns. Five moments of each channel go
 // through them, and from these three terms of the gradient, which a window gives to its pixels as it took theirs: the
 // Gaussian is symmetric. Means are relative to the tile's first sample. A place without a sample has weight 0. All of a
-// tile stays in shared memory: of the device's, a sample costs its colour, its truth and its gradient once.
+// tile stays in shared memory: a sample's colour and truth are read once, its gradient is read and written once.
 #include "common/tiles.cuh"
 #include "common/warp.cuh"
 #include "loss/sample_truth.cuh"

@@ -54,7 +54,7 @@ def facts(**changes) -> SceneFacts:
 
 def test_the_accuracy_of_cameras_is_told_where_it_is_known():
     known, none = (plan_from_facts(facts(reprojection_error=error), load_config("turbogs")) for error in (0.358, None))
-    assert " 10000 points, 0.36 pixels from where photos show them; extent 3" in known.facts_text()
+    assert " 10000 points with a reprojection error of 0.36 pixels; extent 3" in known.facts_text()
     assert " 10000 points; extent 3" in none.facts_text()
     assert Plan.from_json(known.to_json()) == known and Plan.from_json(none.to_json()) == none
 

@@ -100,14 +100,18 @@ def study(trained, tmp_path, monkeypatch) -> Path:
     return Path(shutil.copytree(trained, tmp_path / "study"))
 
 
+def test_a_process_warms_up_once_for_a_variant_and_capture(turbogs, small, capture, tmp_path, monkeypatch):
+    other, warmed = shutil.copytree(capture, tmp_path / "other"), []
+    monkeypatch.setattr(cell_module, "warm_up", lambda config, scene, *rest: warmed.append(scene.name))
+    code, _, err = turbogs(*call(small, capture, tmp_path / "study", "--scene", other, "--seeds", "0", "1"))
+    assert code == 0 and "[8/8]" in err
+    assert warmed == ["capture", "capture", "other", "other"]
+
+
 def test_a_sweep_is_complete_and_goes_on_where_it_stopped(turbogs, small, capture, tmp_path, monkeypatch, warm):
-    out, warmed, warm_up = tmp_path / "study", [], cell_module.warm_up
-    monkeypatch.setattr(
-        cell_module, "warm_up", lambda config, *rest: (warmed.append(config.train.seed), warm_up(config, *rest))
-    )
+    out = tmp_path / "study"
     code, printed, err = turbogs(*call(small, capture, out, "--seeds", "0", "1"))
     assert code == 0 and str(out / "report.html") in printed
-    assert warmed == [0, 0], "once a variant"
     assert "[4/4]" in err and "left" in err
     cells = sorted(out.glob("cells/capture/*.json"))
     assert [path.name for path in cells] == [f"{name}--seed{n}.json" for name in ("full", "random") for n in (0, 1)]

@@ -159,7 +159,7 @@ def test_the_headline_says_how_many_seeds_and_where_and_when_ours_had_the_others
     ]
     sources = study_tables.headline_sources()
     assert "| **turbogs** | not recorded |" in sources and "| the others | another day |" in sources
-    assert "| whole commands of ours | NVIDIA H200, commit 0123456, torch 2.11.0 |" in sources
+    assert "| whole command of **turbogs** | NVIDIA H200, commit 0123456, torch 2.11.0 |" in sources
 
 
 def test_what_is_of_another_commit_than_ours_is_stale(tmp_path, monkeypatch):
@@ -183,7 +183,7 @@ def test_what_is_of_another_commit_than_ours_is_stale(tmp_path, monkeypatch):
     (full,) = (where for name, where in lines.items() if name.startswith("3DGS"))
     assert full == "NVIDIA H200, commit aaaaaaa, 2026-11-25 (stale)"
     wall = "NVIDIA H200, commit aaaaaaa, torch 2.11.0 (stale); NVIDIA H200, commit 0123456, torch 2.11.0"
-    assert lines["whole commands of ours"] == wall and lines["the others"] == "another day"
+    assert lines["whole command of **turbogs**"] == wall and lines["the others"] == "another day"
     line = "Stale: 3 of 3 cells of `baselines` were measured at commit aaaaaaa; README's `turbogs` at 0123456."
     assert study_tables.stale("baselines") == [*study_tables.other_settings("baselines"), line]
     assert study_tables.stale("parts") == study_tables.other_settings("parts")

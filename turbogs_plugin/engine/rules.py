@@ -51,9 +51,9 @@ class DrawRule:
     def origin(self, iteration: int, masked: bool) -> tuple[int, int]:
         """Of the grid of tiles in an iteration, see `TileGrid`.
 
-        Whole tiles begin elsewhere in each iteration, so that no pixel is always at the edge of the window that a loss
-        compares: at the points of a sequence that fills the square evenly (Roberts 2018, R2). Not where maps
-        have masks, whose tables are of one grid.
+        Whole tiles begin elsewhere in each iteration, so that no pixel is always at the edge of its tile, where the
+        windows that a loss compares are cut: at the points of a sequence that fills the square evenly (Roberts 2018,
+        R2). Not where maps have masks, whose tables are of one grid.
         """
         if self.unit != "tile" or masked:
             return 0, 0

@@ -28,7 +28,7 @@ from turbogs_plugin.train.wall import WallClock
 
 WARMUP_ITERATIONS = {"cuda": 20, "cpu": 2}
 """Iterations of warm-up: the configuration is scaled to this length and trained once before the clock starts, so that
-the code of every kind of step is loaded. Once a variant in each process: what is loaded stays."""
+the code of every kind of step is loaded. Once for a variant and capture in each process: what is loaded stays."""
 
 
 class PeakMemory(Listener):
@@ -99,7 +99,7 @@ def train_cell(
         made_by: machine and sources, as they were when the process began.
         listeners: to the training.
         loading: seconds that the scene took to load; NaN: the cell's own seconds are not known.
-        warm: this process has trained a cell of this variant.
+        warm: this process has trained a cell of this variant on this capture.
 
     Raises:
         InputError: a budget is too small.

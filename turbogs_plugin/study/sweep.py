@@ -140,7 +140,7 @@ def run_sweep(
     wanted = len(options.scenes) * len(options.seeds) * len(variants)
     claims = Claims(folder.claims)
     before = {key: folder.written(key) for _, key, _ in left}
-    warm: set[str] = set()  # variants
+    warm: set[tuple[str, str]] = set()  # variants and captures: a plan is of a capture
     with SweepProgress(len(left), wanted - len(left)) as progress:
         while left and not (options.within is not None and time.monotonic() - begun > options.within):
             taken = next(((place, claim) for place, cell in enumerate(left) if (claim := claims.take(cell[1]))), None)
@@ -158,9 +158,9 @@ def run_sweep(
                 events = [EventWriter(path, scene.test, config.report.strips)] if config.report.tensorboard else []
                 listeners = [progress, *events]
                 try:
-                    seconds, known = loading[key.scene], key.variant in warm
+                    seconds, known = loading[key.scene], (key.variant, key.scene) in warm
                     outcome = train_cell(key.variant, config, scene, device, here, listeners, seconds, known)
-                    warm.add(key.variant)
+                    warm.add((key.variant, key.scene))
                 except Exception as error:  # whatever a variant breaks by, the other cells go on
                     outcome = Failure(key, _reason(error))
                 finally:

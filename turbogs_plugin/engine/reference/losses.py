@@ -100,15 +100,13 @@ class TileGroups:
 
 @dataclass
 class TileMoments:
-    """First and second moments of prediction (x) and truth (y) of each tile and channel.
+    """Second moments of prediction (x) and truth (y) of each tile and channel.
 
     Args:
-        mean_x, mean_y, variance_x, variance_y, covariance: [T, C].
+        variance_x, variance_y, covariance: [T, C].
         offset_x, offset_y: [P, C], the samples minus their tile's mean.
     """
 
-    mean_x: Tensor
-    mean_y: Tensor
     variance_x: Tensor
     variance_y: Tensor
     covariance: Tensor
@@ -124,7 +122,7 @@ class TileMoments:
         offset_x, offset_y = relative_x - groups.spread(mean_x), relative_y - groups.spread(mean_y)
         products = torch.cat([offset_x * offset_x, offset_y * offset_y, offset_x * offset_y], dim=1)
         variance_x, variance_y, covariance = groups.mean(products).chunk(3, dim=1)
-        return cls(mean_x + first_x, mean_y + first_y, variance_x, variance_y, covariance, offset_x, offset_y)
+        return cls(variance_x, variance_y, covariance, offset_x, offset_y)
 
 
 Similarity = tuple[Tensor, Tensor]

@@ -25,7 +25,8 @@ def window_similarity(colors: Tensor, targets: Tensor, weights: Tensor, samples:
     ``sum of omega_i S_i`` and its derivative with x_j is ``omega_j h_j``.
 
     The moments are taken relative to the tile's first sample. They are differences of sums, so that of colours of
-    thousands a flat window's variance is lost; the covariance is then held to what the variances allow, and S to 1.
+    thousands a flat window's variance is lost; the covariance is then held to what the variances allow, and S to 1. The
+    gradient ignores that.
 
     Args:
         colors, targets: [P, 3], 0 where the weight is 0.
