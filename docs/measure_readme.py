@@ -34,7 +34,7 @@ from pathlib import Path
 from time import monotonic
 
 import torch
-from study_tables import CAPS, CAPTURES, OURS, ROOT
+from study_tables import CAPTURES, OURS, ROOT, captures_of
 
 from turbogs_plugin.config.units import parse_seconds
 from turbogs_plugin.files import write_atomically
@@ -157,11 +157,7 @@ PHOTOS: dict[str, Callable[[Scenes], Words]] = {
 
 LITERAL = "paper-literal"
 
-SHOWN = {
-    variant: [capture for capture in CAPTURES if CAPS.get(variant, capture) == capture]
-    for study, variant, _ in OURS
-    if study == "sizes"
-}
+SHOWN = {variant: captures_of(variant) for study, variant, _ in OURS if study == "sizes"}
 """Variant of the ablation `sizes` -> the captures that README has it of."""
 
 STAGES: dict[str, Sequence[Piece | Sweep]] = {

@@ -61,7 +61,12 @@ def rows_of(study: str) -> dict[str, dict[str, VariantRow]]:
 def shown(study: str, variant: str) -> dict[str, VariantRow]:
     """Capture -> a variant's row, for the cells that the headline table has of it."""
     found = {capture: rows[variant] for capture, rows in rows_of(study).items() if variant in rows}
-    return {capture: row for capture, row in found.items() if CAPS.get(variant, capture) == capture}
+    return {capture: found[capture] for capture in captures_of(variant) if capture in found}
+
+
+def captures_of(variant: str) -> list[str]:
+    """The captures that the headline table has a variant of."""
+    return [capture for capture in CAPTURES if CAPS.get(variant, capture) == capture]
 
 
 def result(
@@ -169,9 +174,12 @@ def headline_sources() -> str:
             said.setdefault(name, set()).update(where)
             changed += other_settings(study)
     lines = [(name, "; ".join(sorted(where)) or "not recorded") for name, where in said.items()]
-    reports = [report for of in json.loads(machine_tables.WALL.read_text()).values() for report in of.values()]
-    walls = dict.fromkeys(machine_tables.where(report) + mark(report["provenance"]["commit"]) for report in reports)
-    lines.append(("whole command of **turbogs**", "; ".join(walls)))
+    walls: dict[str, dict[str, None]] = {}
+    reports = json.loads(machine_tables.WALL.read_text())
+    for variant, name in [(variant, name) for study, variant, name in OURS if study == "sizes" and variant in reports]:
+        places = (machine_tables.where(of) + mark(of["provenance"]["commit"]) for of in reports[variant].values())
+        walls.setdefault(f"whole command of {name}", {}).update(dict.fromkeys(places))
+    lines += [(name, "; ".join(where)) for name, where in walls.items()]
     lines.append(("the others", read_peers()["measured"]))
     return "\n\n".join([table(("row", "measured on"), lines), *dict.fromkeys(changed)])
 

@@ -7,6 +7,7 @@ import pytest
 import torch
 from turbogs_plugin.strategies.losses import CharbonnierLoss, CharbonnierNccLoss, SparseSsimLoss
 
+from turbogs_plugin.engine.reference.tile_groups import TileGroups
 from turbogs_plugin.engine.reference.window_similarity import window_similarity
 from turbogs_plugin.engine.rules import LossTerms
 from turbogs_plugin.errors import InputError
@@ -176,7 +177,7 @@ def test_windows_within_a_tile_are_those_of_the_evaluation(origin):
         origin=origin,
     )
     colors, targets = image.view(-1, 3)[ids.long()], photo.view(-1, 3)[ids.long()]
-    found, _ = window_similarity(colors, targets, torch.ones(256, 1, dtype=torch.float64), samples)
+    found, _ = window_similarity(colors, targets, samples, TileGroups(samples, torch.ones(256, dtype=torch.float64)))
     inside = (samples.coordinates() + torch.tensor(origin)) % 16
     whole = ((inside >= 5) & (inside <= 10)).all(dim=1)
     mask = torch.zeros(32 * 40, dtype=torch.bool)
@@ -198,7 +199,7 @@ def test_windows_stay_bounded_where_their_variance_is_lost(level):
     x, y = samples.coordinates().float().unbind(dim=1)
     targets = torch.where(x < 8, level, 0.1)[:, None].repeat(1, 3)
     for colors in (targets + 0.01 * torch.sin(9.0 * x + 5.0 * y)[:, None], targets.flip(0)):
-        similarity, slopes = window_similarity(colors, targets, torch.ones(256, 1), samples)
+        similarity, slopes = window_similarity(colors, targets, samples, TileGroups(samples, torch.ones(256)))
         assert similarity.abs().max() <= 1 + 1e-6
         assert slopes.abs().max() <= SSIM_SLOPE
 

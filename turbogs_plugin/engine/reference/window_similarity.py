@@ -6,11 +6,14 @@ import torch
 from torch import Tensor
 
 from turbogs_plugin.engine.layout import WINDOW_RADIUS
+from turbogs_plugin.engine.reference.tile_groups import TileGroups
 from turbogs_plugin.engine.rules import LUMINANCE_CONSTANT, STRUCTURE_CONSTANT, WINDOW_SIGMA
 from turbogs_plugin.types import TILE_SIZE, PixelSamples
 
 
-def window_similarity(colors: Tensor, targets: Tensor, weights: Tensor, samples: PixelSamples) -> tuple[Tensor, Tensor]:
+def window_similarity(
+    colors: Tensor, targets: Tensor, samples: PixelSamples, groups: TileGroups
+) -> tuple[Tensor, Tensor]:
     """SSIM of every sample, and what it gives to the gradient.
 
     The window of sample i has the weights ``w_j g(i - j)`` over the samples j of its tile, over their sum n_i, with g a
@@ -30,22 +33,21 @@ def window_similarity(colors: Tensor, targets: Tensor, weights: Tensor, samples:
 
     Args:
         colors, targets: [P, 3], 0 where the weight is 0.
-        weights: [P, 1], w, 0 in unused slots.
         samples: the P slots. In a tile, each pixel at most once.
+        groups: of these samples, with w.
 
     Returns:
         S and h, [P, 3] each.
     """
-    places, tiles = _places(samples), len(samples.tile_ids)
-    tile_of_slot = samples.tile_of_slot()
-    first = samples.tile_offsets[:-1].long().clamp(max=max(0, len(samples) - 1))[tile_of_slot]  # [P]
-    x, y = colors - colors[first], targets - targets[first]
+    places = _places(samples, groups.tile_of_slot)
+    first_x, first_y = groups.spread(colors[groups.first_slots]), groups.spread(targets[groups.first_slots])  # [P, 3]
+    x, y = colors - first_x, targets - first_y
 
     def windows(values: Tensor) -> Tensor:
         """[P, C] -> [P, C]: sums of w times the values under each sample's window."""
-        return _sum_windows(weights * values, places, tiles)
+        return _sum_windows(groups.weights * values, places, groups.tiles)
 
-    totals = windows(torch.ones_like(weights))  # n
+    totals = windows(torch.ones_like(groups.weights))  # n
     inverse_totals = 1.0 / torch.where(totals > 0, totals, 1.0)
     moments = windows(torch.cat([x, y, x * x, y * y, x * y], dim=1)) * inverse_totals
     mean_x, mean_y, xx, yy, xy = moments.chunk(5, dim=1)
@@ -56,7 +58,7 @@ def window_similarity(colors: Tensor, targets: Tensor, weights: Tensor, samples:
 
     spread = variance_x + variance_y + STRUCTURE_CONSTANT
     structure = (2.0 * covariance + STRUCTURE_CONSTANT) / spread
-    true_x, true_y = mean_x + colors[first], mean_y + targets[first]
+    true_x, true_y = mean_x + first_x, mean_y + first_y
     level = true_x * true_x + true_y * true_y + LUMINANCE_CONSTANT
     luminance = (2.0 * true_x * true_y + LUMINANCE_CONSTANT) / level
     at_y = 2.0 * luminance / spread
@@ -67,10 +69,10 @@ def window_similarity(colors: Tensor, targets: Tensor, weights: Tensor, samples:
     return structure * luminance, sum_y * y - sum_x * x + rest
 
 
-def _places(samples: PixelSamples) -> Tensor:
+def _places(samples: PixelSamples, tile_of_slot: Tensor) -> Tensor:
     """[P] int64: the place of each slot among the pixels of all T tiles, row by row in a tile; in empty slots any."""
     inside = (samples.coordinates() + torch.tensor(samples.origin, device=samples.pixel_ids.device)) % TILE_SIZE
-    return (samples.tile_of_slot() * TILE_SIZE + inside[:, 1]) * TILE_SIZE + inside[:, 0]
+    return (tile_of_slot * TILE_SIZE + inside[:, 1]) * TILE_SIZE + inside[:, 0]
 
 
 def _sum_windows(values: Tensor, places: Tensor, tiles: int) -> Tensor:
