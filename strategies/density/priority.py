@@ -8,10 +8,10 @@ scores growth by the variance of the same gradient.
 
 from __future__ import annotations
 
-import numpy as np
 import torch
 from torch import Tensor
 
+from turbogs_plugin.engine.reference.philox import PURPOSE_GROWTH, exponentials, random_words
 from turbogs_plugin.types import GaussianStats, Step
 
 TINY = 1e-30
@@ -21,17 +21,17 @@ TINY = 1e-30
 def drawn_by_squares(stats: GaussianStats, step: Step) -> Tensor:
     """[N] keys, of which the largest k are a draw of k without replacement, with chances in proportion to squares.
 
-    That is Gumbel's trick: the logarithm of a weight plus noise. The noise is drawn on the host, so it is the same on
-    every device. A sum that is not finite counts as 0.
+    That is Gumbel's trick: the logarithm of a weight plus noise, which is minus the logarithm of an exponential variate
+    of the row. The variates are the same on every device. A sum that is not finite counts as 0.
 
     Args:
         stats: of the window.
         step: its seed and iteration are those of the draw.
     """
     squares, _ = squares_of(stats)
-    generator = np.random.Generator(np.random.Philox(np.random.SeedSequence([step.seed, step.iteration, 1])))
-    noise = torch.from_numpy(generator.gumbel(size=len(squares))).to(squares)
-    return squares.clamp(min=TINY).log() + noise
+    rows = torch.arange(len(squares), device=squares.device)
+    words = random_words(rows, 0, PURPOSE_GROWTH, step.seed, step.iteration)
+    return squares.clamp(min=TINY).log() - exponentials(words[0]).log()
 
 
 def squares_of(stats: GaussianStats) -> tuple[Tensor, Tensor]:

@@ -146,7 +146,8 @@ def first_change(capture: Path, monkeypatch) -> tuple[Tensor, int]:
     return changes[0].source, changes[0].num_pruned
 
 
-STEADY = ("view_sampler.type=random", "pixel_sampler.type=random", "train.backdrop=false")
+STEADY = ("view_sampler.type=random", "pixel_sampler.type=random", "train.backdrop=false", "train.seed=1")
+"""With seed 0 the first event grows a Gaussian into a camera's clearance."""
 
 
 @pytest.mark.parametrize(

@@ -108,15 +108,15 @@ def test_a_run_by_time_goes_on_after_a_stop(capture, tmp_path, monkeypatch):
     assert [entry.iteration for entry in second.history] == sorted({entry.iteration for entry in second.history})
 
 
-@pytest.mark.parametrize(("cap", "most"), [(50, 50), (120, int(120 / 0.95**2))])
-def test_a_cap_holds_for_the_finished_model(capture, tmp_path, counts, cap, most):
+@pytest.mark.parametrize("cap", [50, 120])
+def test_a_cap_holds_for_the_finished_model(capture, tmp_path, counts, cap):
     """By the initial model, too, where the capture has more points than that; and what stops growth is the room that
-    the cap and the final prunings leave."""
-    points = len(load_scene(capture).points)
+    the cap and the final prunings leave, which the larger cap's run fills."""
+    points, most = len(load_scene(capture).points), int(cap / 0.95**2)
     config = tiny_config(capture, f"density.max_gaussians={cap}", "train.camera_clearance=false")
     outcome = run.train(config, tmp_path / "run")
     assert counts[0] == min(points, cap)
-    assert max(counts) == most != points
+    assert max(counts) <= most != points and (max(counts) == most or cap < points)
     assert outcome.history[-1].num_gaussians == counts[-1] <= cap
     assert load_model(tmp_path / "run", torch.device("cpu")).config.density["max_gaussians"] == cap
 
