@@ -62,6 +62,10 @@ void launches::RasterProject::run(const Arguments<RasterProject>& in) {
     params.near_plane = in.number(Reals::near_plane);
     params.far_plane = in.number(Reals::far_plane);
     params.alpha_min = in.number(Reals::alpha_min);
+    const int64_t threshold = in.integer(Integers::threshold);
+    STD_TORCH_CHECK(threshold >= 0 && threshold < int64_t{1} << 32, "turbogs: dropout must be below 1");
+    params.dropout_threshold = static_cast<uint32_t>(threshold);
+    params.dropout_keys = philox_keys(in.integer(Integers::seed), in.integer(Integers::iteration));
     in.set_optional(params.tile_ids, Tensors::tile_ids, {params.num_active});
     in.set_structs(params.cameras, Tensors::cameras, views);
     in.set_optional(params.active_prefix, Tensors::active_prefix, {tiles + 1});

@@ -4,13 +4,6 @@
 #include "sampling/sampling_params.h"
 
 namespace turbogs {
-namespace {
-
-// What Philox adds to its two keys from round to round (Salmon et al., SC 2011).
-constexpr uint32_t kPhiloxStep0 = 0x9E3779B9u, kPhiloxStep1 = 0xBB67AE85u;
-
-}  // namespace
-
 void launches::SamplePixels::run(const Arguments<SamplePixels>& in) {
     const int64_t pixels = in.tensor(Tensors::errors).numel(), slots = in.tensor(Tensors::pixel_ids).numel();
     const int64_t chosen = in.tensor(Tensors::tile_ids).numel();
@@ -45,12 +38,7 @@ void launches::SamplePixels::run(const Arguments<SamplePixels>& in) {
     params.slots_per_tile = static_cast<int>(in.integer(Integers::slots_per_tile));
     params.mixed_uniform = in.integer(Integers::mixed_uniform) != 0;
     params.importance = in.number(Reals::importance);
-    const int64_t seed = in.integer(Integers::seed), iteration = in.integer(Integers::iteration);
-    params.seed_high = static_cast<uint32_t>(static_cast<uint64_t>(seed) >> 32);
-    for (uint32_t round = 0; round < kPhiloxRounds; ++round) {
-        params.round_keys[round][0] = static_cast<uint32_t>(seed) + round * kPhiloxStep0;
-        params.round_keys[round][1] = static_cast<uint32_t>(iteration) + round * kPhiloxStep1;
-    }
+    params.keys = philox_keys(in.integer(Integers::seed), in.integer(Integers::iteration));
     params.now = static_cast<int>(in.integer(Integers::now));
     in.set(params.errors, Tensors::errors, {pixels});
     in.set(params.stamps, Tensors::stamps, {pixels});

@@ -7,6 +7,7 @@
 // queue, from which all threads together take them to find their colours and tiles, and to clear their records where
 // a backward pass will add to them: what is off screen has no record. Active tiles of a row of tiles have consecutive
 // positions, found by their prefix counts, so a splat is counted by two additions a row, whatever its length.
+#include "common/philox.cuh"
 #include "common/spherical_harmonics.cuh"
 #include "common/splat_geometry.cuh"
 #include "common/tiles.cuh"
@@ -126,6 +127,11 @@ struct ProjectionShared {
     int num_queued;                     // so far
 };
 
+__device__ __forceinline__ bool left_out(const ProjectionParams& params, int gaussian) {
+    if (params.dropout_threshold == 0) return false;
+    return random_words(params.dropout_keys, gaussian, 0, kPurposeDropout).x < params.dropout_threshold;
+}
+
 __device__ __forceinline__ size_t instance_of(const ProjectionParams& params, int first, int source) {
     return static_cast<size_t>(source / kProjectionGaussians) * params.num_gaussians + first +
            source % kProjectionGaussians;
@@ -205,7 +211,7 @@ __global__ void __launch_bounds__(kProjectionGaussians* kProjectionSlices, kProj
     __syncthreads();
 
     const int local = threadIdx.x, gaussian = first + local;
-    bool usable = local < block_gaussians && !shared.broken[local];
+    bool usable = local < block_gaussians && !shared.broken[local] && !left_out(params, gaussian);
     float mean[3], axes[9], span = 0.0f, extent = 0.0f;
     Instance splat = {};
     if (usable) {

@@ -13,6 +13,7 @@
 #include <cstdint>
 
 #include "common/camera.cuh"
+#include "common/philox.h"
 #include "common/scene_params.h"
 #include "common/sizes.h"
 
@@ -61,6 +62,8 @@ struct ProjectionParams : SceneParams {
     int num_active;  // T
     int origin_x, origin_y;
     float near_plane, far_plane, alpha_min;
+    uint32_t dropout_threshold;  // a Gaussian is left out whose word is below this; 0: none
+    PhiloxKeys dropout_keys;
     const int32_t* tile_ids;  // [T] ascending, or null where every tile is active
 
     RasterCamera* cameras;      // [K] out

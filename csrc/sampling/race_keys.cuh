@@ -1,40 +1,21 @@
-// Random words and the keys of the pixel sampler, to the bit as turbogs_plugin/engine/reference/philox.py and
-// draws.py define them: single-precision operations that are rounded one by one.
+// The keys of the pixel sampler, to the bit as turbogs_plugin/engine/reference/philox.py and draws.py define them:
+// single-precision operations that are rounded one by one.
 //
-// A unit's random words depend on the seed, the iteration and its place alone. In a race its key is weight over an
+// In a race its key is weight over an
 // exponential number, and the largest keys win with the probabilities of drawing one by one without replacement. By
 // age, the key is the age with random bits below it. Keys are integers, so that a threshold can be searched.
 #pragma once
 
 #include "common/approximate_math.cuh"
+#include "common/philox.cuh"
 #include "sampling/sampling_params.h"
 
 namespace turbogs {
 
-// As in draws.py and philox.py.
+// As in draws.py.
 constexpr int kAgeTieBits = 24;                         // random bits below an age
 constexpr float kWeightFloor = 7.888609052210118e-31f;  // 2^-100, the least weight of a race
-constexpr uint32_t kPurposePixels = 0, kPurposeCells = 1, kPurposeTiles = 2;
 constexpr float kRandomUnit = 5.9604644775390625e-8f;  // 2^-24, the least chance
-
-// The multipliers of Philox4x32 (Salmon et al., SC 2011).
-constexpr uint32_t kPhiloxMultiplier0 = 0xD2511F53u, kPhiloxMultiplier1 = 0xCD9E8D57u;
-
-// The first three of the four words of Philox4x32-10, in the layout of philox.py.
-__device__ __forceinline__ uint3 random_words(const SamplePixelsParams& params, uint32_t place, uint32_t view,
-                                              uint32_t purpose) {
-    uint32_t c0 = place, c1 = view, c2 = purpose, c3 = params.seed_high;
-#pragma unroll
-    for (int round = 0; round < kPhiloxRounds; ++round) {
-        const uint32_t high0 = __umulhi(c0, kPhiloxMultiplier0), low0 = c0 * kPhiloxMultiplier0;
-        const uint32_t high1 = __umulhi(c2, kPhiloxMultiplier1), low1 = c2 * kPhiloxMultiplier1;
-        c0 = high1 ^ c1 ^ params.round_keys[round][0];
-        c1 = low1;
-        c2 = high0 ^ c3 ^ params.round_keys[round][1];
-        c3 = low0;
-    }
-    return make_uint3(c0, c1, c2);
-}
 
 // a / b, correctly rounded: the steps of __fdiv_rn without its test for extreme exponents. What is divided here lies
 // within 2^-100 .. 2^24, by 2^-24 .. 2^24.

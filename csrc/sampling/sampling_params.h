@@ -6,12 +6,11 @@
 
 #include <cstdint>
 
+#include "common/philox.h"
 #include "common/sample_view.h"
 #include "common/sizes.h"
 
 namespace turbogs {
-
-constexpr int kPhiloxRounds = 10;  // Philox4x32-10
 
 // The tiles of a view that are drawn from, as a list. Without masks it is all tiles of the view.
 struct LiveTiles {
@@ -33,9 +32,8 @@ struct SamplePixelsParams {
                                // masks, of every tile
     bool mixed_uniform;
     float importance;  // a of the weights p^-a, 0 for none
-    uint32_t seed_high;
-    uint32_t round_keys[kPhiloxRounds][2];  // from the low half of the seed and the iteration
-    int now;                                // a pixel's age is now - stamp, within 0 .. 32767
+    PhiloxKeys keys;
+    int now;  // a pixel's age is now - stamp, within 0 .. 32767
 
     const uint16_t* errors;  // [X] halves
     const int16_t* stamps;   // [X]

@@ -94,8 +94,8 @@ __global__ void __launch_bounds__(kChooseThreads) choose_tiles_kernel(
         for (int i = threadIdx.x; i < count; i += kChooseThreads) {
             if (keys[i] < 0) continue;
             ++open;
-            const uint3 words = random_words(params, static_cast<uint32_t>(i), static_cast<uint32_t>(view.view_number),
-                                             kPurposeTiles);
+            const uint3 words = random_words(params.keys, static_cast<uint32_t>(i),
+                                             static_cast<uint32_t>(view.view_number), kPurposeTiles);
             const uint64_t primary = stage == 1 ? age_key(ages[i], words.y)
                                                 : race_key(weight_of(i), stage == 0 ? words.x : words.z);
             keys[i] = static_cast<int64_t>(primary << kRankBits | ((1u << kRankBits) - 1u - static_cast<uint32_t>(i)));

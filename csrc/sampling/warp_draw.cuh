@@ -171,7 +171,7 @@ __device__ __forceinline__ uint32_t draw(const SamplePixelsParams& params, const
     uint32_t keys[kUnits], hard_words[kUnits], stable_words[kUnits], mixed_words[kUnits];
 #pragma unroll
     for (int j = 0; j < kUnits; ++j) {
-        const uint3 words = random_words(params, units.place(j), view, purpose);
+        const uint3 words = random_words(params.keys, units.place(j), view, purpose);
         hard_words[j] = words.x;
         stable_words[j] = words.y;
         mixed_words[j] = words.z;

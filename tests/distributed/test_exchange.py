@@ -42,6 +42,7 @@ CASES = {
     "fastgs": ("density.type=fastgs", "density.refine_from=2", "density.refine_every=3", "density.grad_threshold=0"),
     "mcmc": ("density.type=mcmc", "density.refine_start_iter=1", "density.refine_every=3"),
     "exposures": ("train.exposure=true", "train.background=random", "train.average_last=1.0"),
+    "dropout": ("train.dropout=0.3",),
     "masked": ("schedule.min_views=7", "schedule.max_views=7"),
     "masked tiles": ("pixel_sampler.unit=tile", "schedule.type=fixed", "schedule.views=2"),
     "hosted": ("train.maps_place=host", "train.photos_place=host"),

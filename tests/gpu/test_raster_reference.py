@@ -14,7 +14,9 @@ from helpers.raster_cases import (
 
 from turbogs_plugin.engine.autograd import rasterize_differentiable
 from turbogs_plugin.engine.cuda import raster as cuda
+from turbogs_plugin.engine.reference.dropout import kept
 from turbogs_plugin.engine.rendering import RenderOptions, rasterize_reference
+from turbogs_plugin.engine.rules import NO_DROPOUT, Dropout
 from turbogs_plugin.types import GaussianStats
 
 pytestmark = GPU_ONLY
@@ -46,8 +48,8 @@ def with_depth(request):
     return request.param
 
 
-def render_both(case, with_depth=False):
-    options = RenderOptions(with_depth=with_depth)
+def render_both(case, with_depth=False, dropout=NO_DROPOUT):
+    options = RenderOptions(with_depth=with_depth, dropout=dropout)
     got = cuda.rasterize_cuda(case.gpu_gaussians, case.gpu_cameras, case.gpu_samples, options)
     return got, rasterize_reference(case.gaussians, case.cameras, case.samples, options)
 
@@ -70,6 +72,23 @@ def test_projection(case):
         torch.testing.assert_close(
             getattr(got, name).cpu().double()[both], getattr(wanted, name)[both], rtol=2e-4, atol=2e-4
         )
+
+
+@pytest.mark.parametrize("dropout", [Dropout(0.3, 5, 11), Dropout(0.6, 2**31 - 1, 29_999)])
+def test_the_same_gaussians_are_left_out(case, dropout):
+    got, wanted = render_both(case, dropout=dropout)
+    assert_forward_close(got.colors, wanted.colors, "colors")
+    stay = kept(dropout, len(case.gaussians), case.gaussians.device)
+    shown, wanted_shown = ((each.projected().radii.cpu() > 0).any(-1) for each in (got, wanted))
+    assert not shown[:, ~stay].any() and not wanted_shown[:, ~stay].any()
+    assert (shown != wanted_shown).double().mean() <= 1e-3  # a rounding to the next pixel
+    gradients = upstream(case)
+    given = {name: gradients[name] for name in ("color_gradients", "pixel_errors")}
+    screen = got.backward(**on_gpu(given))
+    assert not screen.full_records().cpu()[:, ~stay].any()
+    records, expected = screen.full_records(), wanted.backward(**given).full_records()
+    for name, column in RECORD_COLUMNS.items():
+        assert_gradients_close(records[..., column], expected[..., column], name)
 
 
 def test_screen_records(case, with_depth):

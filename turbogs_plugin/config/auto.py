@@ -12,6 +12,7 @@ AUTO_SETTINGS: dict[str, Any] = {
     "train.backdrop": False,
     "train.background": "black",
     "train.exposure": False,
+    "train.dropout": 0.0,
     "train.batch_for": 1,
     "train.iterations": None,
     "train.maps_place": "device",

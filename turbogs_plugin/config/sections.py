@@ -72,6 +72,8 @@ class TrainConfig:
             from photo to photo (`turbogs_plugin.engine.exposures`). Test photos are compared with that of the training
             photos before and after them (`turbogs_plugin.train.interpolated_exposures`). ``auto``: where photos differ,
             but little from those before and after them.
+        dropout: share of the Gaussians that each iteration leaves out, drawn anew each time, until
+            `trainer.DROPOUT_UNTIL` of the run. ``auto``: where cameras are less accurate than half a pixel.
         distant_size: largest standard deviation of a Gaussian beyond 2 scene extents, over its distance from the
             cameras (`restrain_distant`). 0: no bound.
         camera_clearance: a change of the set of Gaussians also removes those that stand nearer to a training camera
@@ -99,6 +101,7 @@ class TrainConfig:
     background: str = "black"
     backdrop: bool | Auto = False
     exposure: bool | Auto = False
+    dropout: float | Auto = 0.0
     distant_size: float = 0.0
     camera_clearance: bool = False
     average_last: float = 0.0
@@ -122,6 +125,7 @@ class TrainConfig:
         require(self.sh_interval >= 1, "sh_interval", self.sh_interval, "at least 1")
         require(0 < self.initial_opacity < 1, "initial_opacity", self.initial_opacity, "more than 0 and less than 1")
         require(0 < self.initial_size <= 100, "initial_size", self.initial_size, "more than 0 and at most 100")
+        require(self.dropout == "auto" or 0 <= self.dropout < 1, "dropout", self.dropout, "at least 0, less than 1")
         require_not_negative(self, "distant_size")
         require(0 <= self.average_last <= 1, "average_last", self.average_last, "within 0 .. 1")
         for value in self.evaluate_at:

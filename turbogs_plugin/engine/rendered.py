@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from turbogs_plugin.engine.layout import MAX_SH_DEGREE
+from turbogs_plugin.engine.rules import NO_DROPOUT, Dropout
 from turbogs_plugin.errors import InputError, require
 from turbogs_plugin.types import BLACK, Color, GaussianGradients, Gaussians, GaussianStats
 
@@ -186,12 +187,14 @@ class RenderOptions:
         settings: thresholds and planes.
         with_depth: also render expected depths.
         background: colour that shows through: a sample's is ``colour + (1 - alpha) * background``.
+        dropout: Gaussians that are left out.
     """
 
     sh_degree: int | None = None
     settings: RasterSettings = DEFAULT_SETTINGS
     with_depth: bool = False
     background: Color = BLACK
+    dropout: Dropout = NO_DROPOUT
 
     def used_degree(self, gaussians: Gaussians) -> int:
         """The degree of spherical harmonics to evaluate.

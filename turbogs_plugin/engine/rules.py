@@ -68,6 +68,30 @@ class DrawRule:
 
 
 @dataclass(frozen=True)
+class Dropout:
+    """The Gaussians that a pass leaves out, as if they were not there; `engine.reference.dropout` defines which.
+
+    After DropGaussian (Park et al., CVPR 2025), but opacities of the others stay as they are.
+
+    Args:
+        share: chance of each Gaussian to be left out, 0 .. 1.
+        seed, iteration: with the row they decide.
+    """
+
+    share: float = 0.0
+    seed: int = 0
+    iteration: int = 0
+
+    @property
+    def threshold(self) -> int:
+        """A Gaussian is left out whose random word is below this; 0: none."""
+        return min(round(self.share * 2**32), 2**32 - 1)
+
+
+NO_DROPOUT = Dropout()
+
+
+@dataclass(frozen=True)
 class LossTerms:
     """A loss on samples (paper section 3.7); `engine.reference.losses` defines its value and gradient.
 

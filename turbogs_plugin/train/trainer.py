@@ -21,6 +21,7 @@ from turbogs_plugin.engine.exposures import exposure_rate
 from turbogs_plugin.engine.protocol import MapUpdate
 from turbogs_plugin.engine.rendered import RenderOptions, ScreenGradients
 from turbogs_plugin.engine.rendering import dense_samples, rasterize
+from turbogs_plugin.engine.rules import Dropout
 from turbogs_plugin.errors import TrainingStopped
 from turbogs_plugin.model.clearance import Clearance
 from turbogs_plugin.model.distant import RESTRAIN_EVERY, restrain_distant
@@ -39,6 +40,9 @@ from turbogs_plugin.types import Gaussians, GaussianStats, LossOutput, PixelSamp
 
 REPEATED_AT_MOST = 32
 """More iterations than an engine ever skips before it says so."""
+
+DROPOUT_UNTIL = 0.95
+"""Share of a run after which no Gaussian is left out any more, so that the model is fitted as it is drawn."""
 
 STATEFUL = ("maps", "view_sampler", "optimizer", "density")
 """Attributes of a trainer that have a state of their own."""
@@ -157,7 +161,7 @@ class Trainer:
 
         # 5) Sparse forward rendering
         cameras = self.views.cameras.select(view_ids)
-        options = RenderOptions(self.sh_degree, self.config.raster, background=background)
+        options = RenderOptions(self.sh_degree, self.config.raster, background=background, dropout=self.dropout)
         rendered = self.exchange.render(self.engine, self.gaussians, cameras, samples, options)
 
         # 6) Sparse loss and its gradients, and 7) EMA update of the error maps
@@ -288,6 +292,12 @@ class Trainer:
     def now(self) -> Step:
         """The present state of training, as strategies see it."""
         return Step(self.iteration, self.iterations, self.refine_until, self.config.train.seed, self.extent)
+
+    @property
+    def dropout(self) -> Dropout:
+        """What this iteration leaves out of the model."""
+        share = self.config.train.dropout if self.iteration < DROPOUT_UNTIL * self.iterations else 0.0
+        return Dropout(share, self.config.train.seed, self.iteration)
 
     @property
     def gaussians(self) -> Gaussians:

@@ -161,6 +161,10 @@ ProjectionSettings = fields_of("float", "near_plane far_plane alpha_min")
 """Fields of `RasterSettings`."""
 
 
+DropoutWords = fields_of("int", "threshold seed iteration")
+"""Fields of `rules.Dropout`."""
+
+
 @dataclass
 class RasterProject(Launch):
     """Stage 1: project `scene`. Writes `splats` and `tile_cursors`, and clears the records of splats on screen."""
@@ -168,6 +172,7 @@ class RasterProject(Launch):
     scene: Scene
     grid: GridOrigin
     settings: ProjectionSettings
+    dropout: DropoutWords
     splats: Splats
     tile_ids: Tensor | None  # [T] int32; None where all tiles have samples
     tile_cursors: Tensor  # [T + 1] int32

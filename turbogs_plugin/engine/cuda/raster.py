@@ -340,7 +340,8 @@ def rasterize_cuda(
     front = buffers.kept("front", _Front.of, views, count, num_active, num_tiles)
     splats, tiles = front.splats, front.tiles
     grid = launches.GridOrigin(*samples.origin)
-    library.launch(launches.RasterProject(scene, grid, settings, splats, tile_ids, tiles.tile_cursors, front.records))
+    arrays = (splats, tile_ids, tiles.tile_cursors, front.records)
+    library.launch(launches.RasterProject(scene, grid, settings, options.dropout, *arrays))
 
     capacity = None if workspace is None else workspace.capacity(count, num_active)
     most = layout.INTERSECTIONS_MAX if capacity is None else capacity

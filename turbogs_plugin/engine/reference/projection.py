@@ -71,8 +71,14 @@ class Splats(Projected):
 
 
 @torch.no_grad()
-def drawable_rows(gaussians: Gaussians, cameras: Cameras, settings: RasterSettings) -> Rows:
-    """The rows between the depth planes and opaque enough, of Gaussians that are finite and of bounded size."""
+def drawable_rows(
+    gaussians: Gaussians, cameras: Cameras, settings: RasterSettings, among: Tensor | None = None
+) -> Rows:
+    """The rows between the depth planes and opaque enough, of Gaussians that are finite and of bounded size.
+
+    Args:
+        among: [N, K] or [N, 1] bool; no other rows are drawable.
+    """
     usable = torch.sigmoid(gaussians.opacities) >= settings.alpha_min  # [N]; False for NaN
     usable &= gaussians.means.abs().amax(dim=1) <= DISTANCE_MAX
     for name, value in gaussians.items():
@@ -82,6 +88,8 @@ def drawable_rows(gaussians: Gaussians, cameras: Cameras, settings: RasterSettin
     drawable = usable[:, None] & (depths >= settings.near_plane) & (depths <= settings.far_plane)
     focal = cameras.Ks[:, [0, 1], [0, 1]].amax(dim=1)  # [K]
     drawable &= gaussians.scales.amax(dim=1).exp()[:, None] * focal <= SPAN_MAX * depths
+    if among is not None:
+        drawable &= among
     views, indices = drawable.T.nonzero(as_tuple=True)
     return Rows(views, indices, (len(cameras), len(gaussians)))
 

@@ -10,6 +10,7 @@ from torch import Tensor
 from turbogs_plugin.engine.layout import ScreenRecord
 from turbogs_plugin.engine.reference import compositing
 from turbogs_plugin.engine.reference.compositing import ALPHA_TINY, Compositor
+from turbogs_plugin.engine.reference.dropout import kept
 from turbogs_plugin.engine.reference.intersection import intersect_tiles
 from turbogs_plugin.engine.reference.projection import Rows, Splats, drawable_rows, project_rows
 from turbogs_plugin.engine.rendered import (
@@ -142,7 +143,8 @@ def rasterize_reference(
 ) -> ReferenceRendered:
     """`Engine.render`; float32 or float64, CPU or CUDA."""
     settings = options.settings
-    rows, leaves, splats = _projected(gaussians, cameras, options)
+    stay = kept(options.dropout, len(gaussians), gaussians.device)
+    rows, leaves, splats = _projected(gaussians, cameras, options, None if stay is None else stay[:, None])
     with torch.no_grad():
         compositor = Compositor(intersect_tiles(rows, splats, samples, settings), samples, settings)
         table = compositing.splat_table(splats.means2d, splats.conics, splats.colors, splats.opacities, splats.depths)
@@ -158,16 +160,22 @@ def rasterize_reference(
 def screen_gradients(
     gaussians: Gaussians, cameras: Cameras, samples: PixelSamples, options: RenderOptions, plain: ScreenRecords
 ) -> ReferenceScreenGradients:
-    """`Engine.screen_gradients`: projects the Gaussians again, so the radii are not needed."""
-    rows, leaves, splats = _projected(gaussians, cameras, options)
+    """`Engine.screen_gradients`: projects those Gaussians again that were drawn."""
+    rows, leaves, splats = _projected(gaussians, cameras, options, (plain.radii > 0).any(dim=-1).T)
     records = plain.records.flatten(0, 1)[rows.flat]  # [R, 16]
     return ReferenceScreenGradients(rows, splats, leaves, records, samples, plain.with_statistics)
 
 
-def _projected(gaussians: Gaussians, cameras: Cameras, options: RenderOptions) -> tuple[Rows, Gaussians, Splats]:
-    """The rows that can be drawn, their parameters, and their projection, connected to these by autograd."""
+def _projected(
+    gaussians: Gaussians, cameras: Cameras, options: RenderOptions, among: Tensor | None
+) -> tuple[Rows, Gaussians, Splats]:
+    """The rows that can be drawn, their parameters, and their projection, connected to these by autograd.
+
+    Args:
+        among: as in `drawable_rows`.
+    """
     degree, settings = options.used_degree(gaussians), options.settings
     with torch.enable_grad():
-        rows = drawable_rows(gaussians, cameras, settings)
+        rows = drawable_rows(gaussians, cameras, settings, among)
         leaves = rows.take(gaussians).map(lambda value: value.detach().requires_grad_())
         return rows, leaves, project_rows(rows, leaves, cameras, degree, settings)
