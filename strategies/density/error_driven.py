@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn.functional import logsigmoid
 from turbogs_plugin.strategies.checks import require_at_least_one, require_each, require_settings, require_share
 from turbogs_plugin.strategies.density.priority import drawn_by_squares, squares_of
-from turbogs_plugin.strategies.density.rows import WindowedDensity, finite_rows, leave_one, removal
+from turbogs_plugin.strategies.density.rows import WindowedDensity, finite_rows, keep_one, removal
 from turbogs_plugin.strategies.density.splitting import split_in_two
 
 from turbogs_plugin.errors import InputError
@@ -136,11 +136,9 @@ class ErrorDrivenDensity(WindowedDensity):
 
     def scores(self, step: Step) -> tuple[Tensor, Tensor]:
         """([N] difficulty score, [N] bool seen) of the present window. The score 0 of an unseen one has no meaning."""
-        stats = self._stats
-        weights = stats.weight_sums
-        seen = (weights > 0) & torch.isfinite(weights + stats.error_sums + stats.distance_sums)
+        stats, seen = self._stats, self._seen()
         errors, distances = (
-            torch.where(seen, sums / (weights + EPS), 0.0) for sums in (stats.error_sums, stats.distance_sums)
+            torch.where(seen, sums / (stats.weight_sums + EPS), 0.0) for sums in (stats.error_sums, stats.distance_sums)
         )
         if self.score == "balanced":
             count = seen.sum().clamp(min=1)
@@ -183,41 +181,38 @@ class ErrorDrivenDensity(WindowedDensity):
         over = max(0, step.iteration - step.refine_until) // self.final_every
         return max(0, self._final_prunings(step) - over)
 
+    def _seen(self) -> Tensor:
+        """[N] bool: with a weight in the present window, and finite sums."""
+        stats = self._stats
+        weights = stats.weight_sums
+        return (weights > 0) & torch.isfinite(weights + stats.error_sums + stats.distance_sums)
+
     def _refine(self, gaussians: Gaussians, step: Step) -> RowUpdate | None:
         extent = step.scene_extent
-        score, seen = self.scores(step)
-        worth, known = self._worth(score, seen)
+        worth, known, seen = self._worth(step)
         finite = finite_rows(gaussians)
         spared = self._spared(gaussians, finite, extent)
-        hopeless = ~finite | (torch.sigmoid(gaussians.opacities) < self.prune_opacity)
+        sound = finite & (torch.sigmoid(gaussians.opacities) >= self.prune_opacity)
         if self.prune_score_fraction > 0:
-            hopeless |= _lowest(worth, known & seen & ~spared, self.prune_score_fraction)
-        candidates, priority = self._passing(score, seen) & ~hopeless, score
+            sound &= ~_lowest(worth, known & seen & ~spared, self.prune_score_fraction)
+        keys = drawn_by_squares(self._stats, step) if self.choose_by == "squares" else worth
+        order = _descending(keys)  # who grows first
+        candidates = self._passing(worth, seen) & sound
         if self.choose_by == "squares":
-            priority = drawn_by_squares(self._stats, step)
-            candidates = _first(priority, seen & ~hopeless, int(candidates.sum()))
+            candidates = _first(order, seen & sound, candidates.sum())
         largest = gaussians.scales.amax(dim=-1).exp()  # [N]
-        small = largest <= self.percent_dense * extent
-        big = torch.zeros_like(seen)
-        if step.progress >= self.prune_size_from:
-            if self.prune_world_size > 0:
-                reference = extent
-                if self.prune_world_reference == "distance":
-                    reference = gaussians.means.norm(dim=-1).clamp(min=extent)
-                big |= largest > self.prune_world_size * reference
-            if self.prune_screen_size > 0:
-                big |= self._stats.max_radii > self.prune_screen_size
-        pruned = leave_one((hopeless | (big & ~(candidates & ~small))) & ~spared, gaussians)
-        candidates &= ~pruned
+        large = largest > self.percent_dense * extent
+        fitting = ~self._oversized(gaussians, largest, step)
+        kept, count = keep_one(spared | (sound & (fitting | (candidates & large))), gaussians)
+        candidates &= kept
         if self.max_gaussians > 0:
-            chosen = _first(priority, candidates, max(0, self.bound(step) - int((~pruned).sum())))
-            denied = candidates & ~chosen
-            candidates = chosen
-            pruned = leave_one(pruned | (big & denied & ~spared), gaussians)  # too large, but no room to split them
-            pruned = self._within_bound(pruned, worth, known, spared, step)  # if it removes any, nothing was chosen
-        return self._compose(gaussians, candidates & small, candidates & ~small, pruned, spared, step)
+            candidates = _first(order, candidates, max(0, self.bound(step) - count))
+            # Those that are too large leave where there is no room to split them.
+            kept, count = keep_one(kept & (fitting | spared | candidates), gaussians)
+            kept = self._within_bound(kept, count, worth, known, spared, step)  # if it removes any, nothing was chosen
+        return self._compose(gaussians, candidates & ~large, candidates & large, kept, spared, step)
 
-    def _passing(self, score: Tensor, seen: Tensor) -> Tensor:
+    def _passing(self, worth: Tensor, seen: Tensor) -> Tensor:
         """[N] bool, which pass the gates: a high screen gradient and, by difficulty, a high score."""
         stats = self._stats
         views = stats.view_counts.clamp(min=1)
@@ -225,38 +220,65 @@ class ErrorDrivenDensity(WindowedDensity):
         if self.choose_by == "squares":
             return absolute
         passes = absolute | (stats.grad_sums / views > self.grad_threshold)
-        return passes & seen & (score >= _quantile(score, seen, 1 - self.top_fraction))
+        return passes & seen & (worth >= _quantile(worth, seen, 1 - self.top_fraction))
 
-    def _worth(self, score: Tensor, seen: Tensor) -> tuple[Tensor, Tensor]:
-        """([N] worth: the less, the sooner removed; [N] bool, where it is known): the score, or the squares.
+    def _oversized(self, gaussians: Gaussians, largest: Tensor, step: Step) -> Tensor:
+        """[N] bool, which are too large by the size rules, if those have begun.
 
-        A Gaussian that was not seen has no known score; its squares are 0, so by squares it is worth least.
+        Args:
+            largest: [N], the largest standard deviation of each.
         """
-        return (score, seen) if self.choose_by == "difficulty" else squares_of(self._stats)
+        begun, limit = step.progress >= self.prune_size_from, math.inf
+        if begun and self.prune_world_size > 0:
+            reference = step.scene_extent
+            if self.prune_world_reference == "distance":
+                reference = gaussians.means.norm(dim=-1).clamp(min=reference)
+            limit = self.prune_world_size * reference
+        oversized = largest > limit
+        if begun and self.prune_screen_size > 0:
+            oversized |= self._stats.max_radii > self.prune_screen_size
+        return oversized
+
+    def _worth(self, step: Step) -> tuple[Tensor, Tensor, Tensor]:
+        """([N] worth, [N] bool where it is known, [N] bool seen). What is worth less is removed sooner.
+
+        Worth is the score, or the squares. A Gaussian that was not seen has no known score; its squares are 0, so by
+        squares it is worth least.
+        """
+        if self.choose_by == "squares":
+            return *squares_of(self._stats), self._seen()
+        score, seen = self.scores(step)
+        return score, seen, seen
 
     def _spared(self, gaussians: Gaussians, finite: Tensor, extent: float) -> Tensor:
         """[N] bool: the finite ones that lie beyond `spare_beyond`."""
-        beyond = self.spare_beyond * extent if self.spare_beyond > 0 else math.inf
-        return finite & (gaussians.means.norm(dim=-1) > beyond)
+        if self.spare_beyond == 0:
+            return torch.zeros_like(finite)
+        return finite & (gaussians.means.norm(dim=-1) > self.spare_beyond * extent)
 
     def _final_prune(self, gaussians: Gaussians, step: Step) -> RowUpdate | None:
         finite = finite_rows(gaussians)
-        score, seen = self.scores(step)
-        worth, known = self._worth(score, seen)
+        worth, known, seen = self._worth(step)
         spared = self._spared(gaussians, finite, step.scene_extent)
-        pruned = ~finite | _lowest(worth, known & seen & ~spared, 1 - self.final_keep)
-        return removal(self._within_bound(leave_one(pruned, gaussians), worth, known, spared, step))
+        kept = finite & ~_lowest(worth, known & seen & ~spared, 1 - self.final_keep)
+        kept, count = keep_one(kept, gaussians)
+        return removal(~self._within_bound(kept, count, worth, known, spared, step))
 
-    def _within_bound(self, pruned: Tensor, worth: Tensor, known: Tensor, spared: Tensor, step: Step) -> Tensor:
-        """[N] bool, what is pruned: those of least worth, too, if more would be left than the cap allows."""
-        excess = int((~pruned).sum()) - self.bound(step) if self.max_gaussians > 0 else 0
-        return pruned | _least(worth, known, ~pruned, spared, excess) if excess > 0 else pruned
+    def _within_bound(
+        self, kept: Tensor, count: int, worth: Tensor, known: Tensor, spared: Tensor, step: Step
+    ) -> Tensor:
+        """[N] bool, which of the `count` that would be kept are: not those of least worth, if the cap allows fewer."""
+        excess = count - self.bound(step) if self.max_gaussians > 0 else 0
+        return kept & ~_least(worth, known, kept, spared, excess) if excess > 0 else kept
 
     def _compose(
-        self, gaussians: Gaussians, cloned: Tensor, split: Tensor, pruned: Tensor, spared: Tensor, step: Step
+        self, gaussians: Gaussians, cloned: Tensor, split: Tensor, kept: Tensor, spared: Tensor, step: Step
     ) -> RowUpdate | None:
-        """One change from masks [N]. New rows: the Gaussians that stay, the clones, then both halves of the split."""
-        rest, copies, halves = (torch.nonzero(mask).squeeze(-1) for mask in (~(pruned | split), cloned, split))
+        """One change from masks [N]; whoever is cloned or split is kept.
+
+        New rows: the Gaussians that stay, the clones, then both halves of the split.
+        """
+        rest, copies, halves = (torch.nonzero(mask).squeeze(-1) for mask in (kept & ~split, cloned, split))
         if len(rest) == len(gaussians) and len(copies) == 0 and self.opacity_decay == 0:
             return None
         source = torch.cat([rest, copies, halves, halves])
@@ -269,8 +291,8 @@ class ErrorDrivenDensity(WindowedDensity):
         if self.opacity_decay > 0:
             opacities = torch.where(spared, gaussians.opacities, _decayed(gaussians.opacities, self.opacity_decay))
             values["opacities"] = opacities[source]
-        counts = {"num_cloned": len(copies), "num_split": len(halves), "num_pruned": int(pruned.sum())}
-        return RowUpdate(source, fresh, values, **counts)
+        num_pruned = len(gaussians) - len(rest) - len(halves)
+        return RowUpdate(source, fresh, values, num_cloned=len(copies), num_split=len(halves), num_pruned=num_pruned)
 
 
 def _quantile(values: Tensor, mask: Tensor, fraction: float) -> Tensor:
@@ -290,12 +312,18 @@ def _lowest(values: Tensor, mask: Tensor, share: float) -> Tensor:
     return mask & (values < _quantile(values, mask, share))
 
 
-def _first(keys: Tensor, mask: Tensor, count: int) -> Tensor:
-    """[N] bool: the `count` rows of the mask (or all, if fewer) with the largest keys; of equal keys the lower rows."""
-    order = torch.argsort(keys, descending=True, stable=True)
-    chosen = torch.zeros_like(mask)
-    chosen[order[mask[order]][:count]] = True
-    return chosen
+def _descending(keys: Tensor) -> Tensor:
+    """[N] int64, the rows by their keys, the largest first; of equal keys the lower rows first."""
+    return torch.argsort(keys, descending=True, stable=True)
+
+
+def _first(order: Tensor, mask: Tensor, count: int | Tensor) -> Tensor:
+    """[N] bool: the `count` rows of the mask (or all, if fewer) that come first in an order of all rows [N].
+
+    The count may lie on the GPU, which nothing here waits for.
+    """
+    ordered = mask[order]
+    return torch.empty_like(mask).scatter_(0, order, ordered & (ordered.cumsum(0) <= count))
 
 
 def _least(worth: Tensor, known: Tensor, present: Tensor, spared: Tensor, count: int) -> Tensor:
@@ -304,9 +332,9 @@ def _least(worth: Tensor, known: Tensor, present: Tensor, spared: Tensor, count:
     A Gaussian whose worth is not known counts as average, as nothing says that it is worth little.
     """
     average = torch.where(known, worth, 0.0).double().sum() / known.sum().clamp(min=1)  # the sum may overflow float32
-    keys = -torch.where(known, worth, average.to(worth))
-    taken = _first(keys, present & ~spared, count)
-    return taken | _first(keys, present & spared, count - int(taken.sum()))
+    order = _descending(-torch.where(known, worth, average.to(worth)))
+    taken = _first(order, present & ~spared, count)
+    return taken | _first(order, present & spared, count - taken.sum())
 
 
 def _decayed(logits: Tensor, decay: float) -> Tensor:

@@ -28,7 +28,7 @@ def drawn_by_squares(stats: GaussianStats, step: Step) -> Tensor:
         stats: of the window.
         step: its seed and iteration are those of the draw.
     """
-    squares, _ = squares_of(stats)
+    squares = _finite_squares(stats)
     rows = torch.arange(len(squares), device=squares.device)
     words = random_words(rows, 0, PURPOSE_GROWTH, step.seed, step.iteration)
     return squares.clamp(min=TINY).log() - exponentials(words[0]).log()
@@ -36,5 +36,9 @@ def drawn_by_squares(stats: GaussianStats, step: Step) -> Tensor:
 
 def squares_of(stats: GaussianStats) -> tuple[Tensor, Tensor]:
     """([N] sums of squares, 0 where not finite; [N] bool, which are finite). What was not seen has 0."""
-    known = torch.isfinite(stats.square_sums)
-    return torch.where(known, stats.square_sums, 0.0), known
+    return _finite_squares(stats), torch.isfinite(stats.square_sums)
+
+
+def _finite_squares(stats: GaussianStats) -> Tensor:
+    """[N] sums of squares, 0 where not finite."""
+    return stats.square_sums.nan_to_num(0.0, 0.0, 0.0)

@@ -82,16 +82,24 @@ def loaded_rows(name: str, saved: dict[str, Tensor] | None, present: RowsType | 
 
 def finite_rows(gaussians: Gaussians) -> Tensor:
     """[N] bool: every parameter of the Gaussian is finite, and so are its variances, which a split needs."""
-    return gaussians.finite_rows() & (2 * gaussians.scales).exp().isfinite().all(dim=1)
+    parts = [*(value for _, value in gaussians.items()), (2 * gaussians.scales).exp()]
+    numbers = torch.cat([part[:, None].flatten(1) for part in parts], dim=1)  # [N, D]
+    return numbers.abs_().amax(dim=1) < torch.inf  # the largest is NaN if one is
+
+
+def keep_one(kept: Tensor, gaussians: Gaussians) -> tuple[Tensor, int]:
+    """The mask [N] and how many it keeps. If it would keep none, the most opaque (finite) Gaussian is added to it."""
+    count = int(kept.sum())
+    if count > 0:
+        return kept, count
+    kept = kept.clone()
+    kept[torch.where(finite_rows(gaussians), gaussians.opacities, -torch.inf).argmax()] = True
+    return kept, 1
 
 
 def leave_one(pruned: Tensor, gaussians: Gaussians) -> Tensor:
     """The mask [N]. If it would prune every Gaussian, the most opaque (finite) one is taken out of it."""
-    if not bool(pruned.all()):
-        return pruned
-    pruned = pruned.clone()
-    pruned[torch.where(finite_rows(gaussians), gaussians.opacities, -torch.inf).argmax()] = False
-    return pruned
+    return ~keep_one(~pruned, gaussians)[0]
 
 
 def removal(pruned: Tensor) -> RowUpdate | None:

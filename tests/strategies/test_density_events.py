@@ -95,3 +95,18 @@ def test_the_noise_of_mcmc_is_why_it_watches_the_model(monkeypatch):
     before, step = gaussians.means.clone(), Step(1, TOTAL, REFINE_UNTIL)
     assert not density.event_due(step) and density.update(gaussians, step) is None
     assert not torch.equal(gaussians.means, before) and density.watched == ("model",)
+
+
+def test_an_event_ends_a_window_whether_it_changes_anything_or_not():
+    """The next one begins with zeros, for the rows of the change as it was followed."""
+    gaussians, due = make_gaussians(COUNT), Step(8, TOTAL, REFINE_UNTIL)
+    density = error_driven(prune_opacity=0.0, prune_world_size=0.0, absgrad_threshold=1e3, grad_threshold=1e3)
+    density.setup(gaussians)
+    fill(density.stats, random_stats(COUNT, seed=1))
+    assert density.update(gaussians, due) is None
+    assert not any(value.any() for value in vars(density.stats).values())
+    gaussians.opacities[::5] = torch.nan
+    fill(density.stats, random_stats(COUNT, seed=1))
+    change = density.update(gaussians, due)
+    density.apply(change.taking(torch.arange(3, 20)))
+    assert all(len(value) == 17 and not value.any() for value in vars(density.stats).values())

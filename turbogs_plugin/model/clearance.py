@@ -67,11 +67,11 @@ class Clearance:
         low, high = self.centers.amin(dim=0) - reach, self.centers.amax(dim=0) + reach
         among = ((means > low) & (means < high)).all(dim=1).nonzero()[:, 0]  # the cameras: others are in no sphere
         inside = [(distances < self.radii).any(dim=1) for distances in _distances(means[among], self.centers)]
-        free = torch.ones(len(means), dtype=torch.bool, device=means.device)
-        free[among] = ~torch.cat(inside)
-        if free.all():
+        cleared = among[torch.cat(inside)]
+        if len(cleared) == 0:
             return update
-        return replace(update.taking(free.nonzero()[:, 0]), num_pruned=update.num_pruned + int((~free).sum()))
+        free = torch.ones(len(means), dtype=torch.bool, device=means.device).index_fill_(0, cleared, False)
+        return replace(update.taking(free.nonzero()[:, 0]), num_pruned=update.num_pruned + len(cleared))
 
 
 def _distances(points: Tensor, centers: Tensor) -> Iterator[Tensor]:

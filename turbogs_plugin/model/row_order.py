@@ -52,6 +52,6 @@ def spatial_order(means: Tensor, extent: float) -> Tensor:
     cells = ((contracted.double() + 1.0) * 2.0 ** (BITS - 1)).nan_to_num(2.0**BITS, 2.0**BITS)
     spread = cells.long().clamp(0, 2**BITS - 1)
     for shift, mask in SPREADS:
-        spread = (spread | spread << shift) & mask
-    keys = spread[:, 0] | spread[:, 1] << 1 | spread[:, 2] << 2
+        spread = spread * (1 + (1 << shift)) & mask  # x | x << shift, as no bits of these meet
+    keys = (spread << torch.arange(3, device=spread.device)).sum(dim=1)
     return torch.argsort(keys, stable=True)

@@ -51,13 +51,13 @@ Array = TypeVar("Array", Tensor, np.ndarray)
 
 
 def philox4x32(
-    counter: tuple[Array, Array, Array, Array], key: tuple[int | Array, int | Array]
+    counter: tuple[Array, int | Array, int | Array, int | Array], key: tuple[int | Array, int | Array]
 ) -> tuple[Array, Array, Array, Array]:
     """Philox4x32-10.
 
     Args:
         counter: four int64 tensors (or numpy arrays), each holding values 0 .. 2^32 - 1; the first has the shape of the
-            result, the others broadcast to it.
+            result, the others broadcast to it, or are numbers.
         key: two such numbers, or arrays of them that broadcast to the first counter.
 
     Returns:
@@ -88,8 +88,7 @@ def random_words(place: Tensor, view: Tensor | int, purpose: int, seed: int, ite
         place: int64, any shape, values 0 .. 2^32 - 1.
         view: int64 tensor that broadcasts to `place`, or a number.
     """
-    constant = [torch.as_tensor(value, dtype=torch.int64, device=place.device) for value in (view, purpose, seed >> 32)]
-    return philox4x32((place, constant[0], constant[1], constant[2] & MASK), (seed & MASK, iteration & MASK))
+    return philox4x32((place, view, purpose, seed >> 32 & MASK), (seed & MASK, iteration & MASK))
 
 
 def host_words(purpose: int, places: int, step: Step) -> tuple[np.ndarray, ...]:
