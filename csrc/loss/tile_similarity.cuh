@@ -9,6 +9,7 @@ namespace turbogs {
 // SSIM's, as in turbogs_plugin/engine/rules.py.
 constexpr float kLuminanceConstant = 1e-4f;  // 0.01^2
 constexpr float kSsimConstant = 9e-4f;       // 0.03^2
+constexpr float kRounding = 0x1p-23f;        // of float32
 
 // Similarity S in one channel, and its gradient dS/dx = share * (at_y * dy - at_x * dx + constant), with
 // dx, dy the offsets of prediction and truth from their means.
@@ -37,8 +38,8 @@ __device__ __forceinline__ Similarity contrast(float variance_x, float variance_
 }
 
 __device__ __forceinline__ Similarity ssim(float mean_x, float mean_y, float variance_x, float variance_y,
-                                           float covariance) {
-    const Similarity structure = contrast(variance_x, variance_y, covariance, kSsimConstant);
+                                           float covariance, float c) {
+    const Similarity structure = contrast(variance_x, variance_y, covariance, c);
     const float denominator = mean_x * mean_x + mean_y * mean_y + kLuminanceConstant;
     const float luminance = (2.0f * mean_x * mean_y + kLuminanceConstant) / denominator;
     const float slope = 2.0f * (mean_y - luminance * mean_x) / denominator;

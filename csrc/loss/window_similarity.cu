@@ -160,7 +160,9 @@ __global__ void __launch_bounds__(kWindowThreads)
         const float variance_y = fmaxf(moments[3] - mean_y * mean_y, 0.0f);
         const float largest = sqrtf(variance_x) * sqrtf(variance_y);
         const float covariance = fminf(fmaxf(moments[4] - mean_x * mean_y, -largest), largest);
-        const Similarity similarity = ssim(mean_x + first_x, mean_y + first_y, variance_x, variance_y, covariance);
+        const float steady = kSsimConstant + kRounding * (moments[2] + moments[3]);
+        const Similarity similarity =
+            ssim(mean_x + first_x, mean_y + first_y, variance_x, variance_y, covariance, steady);
         if (weight > 0.0f) missing += 1.0f - similarity.value;
 
         // What the window gives to its pixels.

@@ -85,7 +85,7 @@ def test_equals_the_twin(name, rate, unit, importance):
         torch.testing.assert_close(found.pixel_errors.cpu(), expected.pixel_errors, rtol=1e-5, atol=2e-7)
 
 
-@pytest.mark.parametrize("level", [1.0, 1e4, 1e8])
+@pytest.mark.parametrize("level", [1.0, 1e4, 1e6, 1e8])
 def test_windows_stay_bounded_where_their_variance_is_lost(level):
     """As the twin's (`strategies/test_losses.py`): flat windows of tiles that elsewhere have a contrast of `level`."""
     samples = make_samples(1.0, "tile")

@@ -20,16 +20,18 @@ def window_similarity(
     Gaussian of `WINDOW_SIGMA` pixels that ends after `WINDOW_RADIUS` pixels along each axis. Means, variances and
     covariance under the window give the luminance term times the contrast-structure term::
 
-        S_i = (2 m_x m_y + c1) / (m_x^2 + m_y^2 + c1) * (2 s_xy + c2) / (s_x^2 + s_y^2 + c2)
+        S_i = (2 m_x m_y + c1) / (m_x^2 + m_y^2 + c1) * (2 s_xy + c) / (s_x^2 + s_y^2 + c)
         h_j = sum over i of w_i g(i - j) / n_i * (a_i (y_j - m_y,i) - b_i (x_j - m_x,i) + l_i)
 
-    a, b and l are those of the sample's window: ``2 L / (s_x^2 + s_y^2 + c2)``, ``S a / L`` and the slope of the
+    a, b and l are those of the sample's window: ``2 L / (s_x^2 + s_y^2 + c)``, ``S a / L`` and the slope of the
     luminance term L with m_x, times the other. With ``omega_j = w_j / sum(w)`` over the tile, the tile's similarity is
     ``sum of omega_i S_i`` and its derivative with x_j is ``omega_j h_j``.
 
     The moments are taken relative to the tile's first sample. They are differences of sums, so that of colours of
-    thousands a flat window's variance is lost; the covariance is then held to what the variances allow, and S to 1. The
-    gradient ignores that.
+    thousands a flat window's variance is lost; the covariance is then held to what the variances allow, and S to 1.
+    And c is SSIM's c2 plus the mean squares' rounding: where that is larger, a window that seems to have no variance
+    would else have the slope of a flat one, times what rounding makes of colours of thousands. The gradient ignores
+    both.
 
     Args:
         colors, targets: [P, 3], 0 where the weight is 0.
@@ -56,8 +58,9 @@ def window_similarity(
     largest = variance_x.sqrt() * variance_y.sqrt()
     covariance = torch.minimum(torch.maximum(xy - mean_x * mean_y, -largest), largest)
 
-    spread = variance_x + variance_y + STRUCTURE_CONSTANT
-    structure = (2.0 * covariance + STRUCTURE_CONSTANT) / spread
+    steady = STRUCTURE_CONSTANT + torch.finfo(xx.dtype).eps * (xx + yy)  # c
+    spread = variance_x + variance_y + steady
+    structure = (2.0 * covariance + steady) / spread
     true_x, true_y = mean_x + first_x, mean_y + first_y
     level = true_x * true_x + true_y * true_y + LUMINANCE_CONSTANT
     luminance = (2.0 * true_x * true_y + LUMINANCE_CONSTANT) / level
