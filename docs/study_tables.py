@@ -14,7 +14,8 @@ import machine_tables
 from turbogs_plugin.report.tables import table
 from turbogs_plugin.study.document import Heading, Paragraph, to_markdown
 from turbogs_plugin.study.folder import StudyFolder
-from turbogs_plugin.study.pages import changed_since, difference_text, report_blocks, spread_text
+from turbogs_plugin.study.grid import load_ablation
+from turbogs_plugin.study.pages import changed_settings, changed_since, difference_text, report_blocks, spread_text
 from turbogs_plugin.study.results import CellResult, Study
 from turbogs_plugin.study.statistics import Spread
 from turbogs_plugin.study.summary import VariantRow, summarise
@@ -172,7 +173,7 @@ def headline_sources() -> str:
                 machine_tables.place(place.machine, place.commit, place.day) + mark(place.commit) for place in places
             }
             said.setdefault(name, set()).update(where)
-            changed += other_settings(study)
+            changed += [*other_settings(study), *other_variant(study, variant, name)]
     lines = [(name, "; ".join(sorted(where)) or "not recorded") for name, where in said.items()]
     walls: dict[str, dict[str, None]] = {}
     reports = json.loads(machine_tables.WALL.read_text())
@@ -227,6 +228,15 @@ def other_settings(study: str) -> list[str]:
     folder = ROOT / "docs/results" / study
     measured = (folder / "results.json").is_file()
     return [block.markdown() for block in changed_since(read_study(folder))] if measured else []
+
+
+def other_variant(study: str, variant: str, name: str) -> list[str]:
+    """A line that says with what settings a variant was measured where its packaged ablation has others today."""
+    folder, packaged = ROOT / "docs/results" / study, load_ablation(study)
+    if variant == packaged.baseline or variant not in packaged.variants:
+        return []
+    then = changed_settings(read_study(folder), variant, packaged)
+    return [Paragraph(f"Stale: {name} has other settings now. {then}").markdown()] if then else []
 
 
 def other_commit(study: str) -> list[Paragraph]:

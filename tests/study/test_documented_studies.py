@@ -76,14 +76,17 @@ def a_study(folder: Path, name: str, results: dict[str, tuple[float, ...]], comm
     ablation, cells = load_ablation(name), []
     for capture in study_tables.CAPTURES:
         for variant, psnrs in results.items():
-            config = variant_config(ablation, variant, 0, (), None).without_plan().to_mapping()
+            asked = variant_config(ablation, variant, 0, (), None)
+            config = asked.without_plan().to_mapping()
             for seed, psnr in enumerate(psnrs):
                 history = [Evaluation(0, 0.1, 9.0, 0.2, 0.4, 90, 9), Evaluation(5, 3.0, 33.0, 0.9, 0.1, 900, 9)]
                 history.append(Evaluation(9, 7.0, psnr, 0.9, 0.1, 1000, 9))
                 where = {"scene": capture, "variant": variant, "seed": seed}
                 if commits:
                     where["provenance"] = Provenance(**PLACE | {"commit": commits[seed]}, kernels="", day="2026-11-25")
-                cells.append(CellResult(**where, config=config, asked=config, cell_seconds=12.0, history=history))
+                cells.append(
+                    CellResult(**where, config=config, asked=asked.to_mapping(), cell_seconds=12.0, history=history)
+                )
     study = StudyFolder(folder / "docs/results" / name)
     study.path.mkdir(parents=True)
     study.write_study(Study(ablation, cells))
@@ -353,3 +356,18 @@ def test_runs_of_another_day_are_compared_with_its_own_stock(tmp_path):
         (tmp_path / f"dropin-{day}.json").write_text(json.dumps(record))
     page = machine_tables.dropin(tmp_path)
     assert page.index("2026-11-01:") < page.index("+1.00 dB") < page.index("2026-11-02:") < page.index("+3.00 dB")
+
+
+def test_a_variant_whose_ablation_has_other_settings_today_is_stale(tmp_path, monkeypatch):
+    monkeypatch.setattr(study_tables, "ROOT", tmp_path)
+    a_study(tmp_path, "sizes", {"turbogs": (31.0,), "ssim": (31.0,)}, ("0123456",))
+    study_tables.read_study.cache_clear()
+    today = load_ablation("sizes")
+    monkeypatch.setattr(study_tables, "load_ablation", lambda name: today)
+    assert study_tables.other_variant("sizes", "ssim", "turbogs-ssim") == []
+    for overrides in today.variants.values():
+        overrides.append("loss.epsilon=0.5")
+    (line,) = study_tables.other_variant("sizes", "ssim", "turbogs-ssim")
+    assert line == "Stale: turbogs-ssim has other settings now. Then: loss.epsilon 0.001 (now 0.5)."
+    assert study_tables.other_variant("sizes", "cap-67k", "not measured") == []
+    assert study_tables.other_variant("sizes", "turbogs", "the baseline, of which `other_settings` tells") == []

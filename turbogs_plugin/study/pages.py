@@ -20,7 +20,7 @@ from turbogs_plugin.study.compare import UNSHARED
 from turbogs_plugin.study.difference import ABSENT, compared, difference, flattened
 from turbogs_plugin.study.document import Block, Heading, Paragraph, Picture, Table, to_html, to_markdown
 from turbogs_plugin.study.folder import StudyFolder
-from turbogs_plugin.study.grid import variant_config
+from turbogs_plugin.study.grid import Ablation, variant_config
 from turbogs_plugin.study.plots import PLOTS, write_plots
 from turbogs_plugin.study.results import Study
 from turbogs_plugin.study.statistics import Difference, Spread, crossing_gap
@@ -115,20 +115,31 @@ def _header(study: Study) -> list[Block]:
 def changed_since(study: Study) -> list[Paragraph]:
     """A line that marks a page whose baseline a packaged configuration no longer gives."""
     ablation = study.ablation
-    measured = [result for result in study.results if result.variant == ablation.baseline]
-    if ablation.base not in config_names() or not measured:
+    if ablation.base not in config_names():
         return []
     try:
-        present = flattened(variant_config(ablation, ablation.baseline, 0, (), None).to_mapping())
+        changed = changed_settings(study, ablation.baseline, ablation)
     except InputError as error:  # a setting of then, in the ablation's own words
         return [Paragraph(f"Stale: {error}.")]
+    return [Paragraph(f"Stale: '{ablation.base}' is no longer what was measured here. {changed}")] if changed else []
+
+
+def changed_settings(study: Study, variant: str, ablation: Ablation) -> str:
+    """``Then: KEY VALUE (now VALUE).``: what a study's cells of a variant have other than an ablation gives it today.
+
+    Empty where nothing has changed, or the study has no such cells.
+
+    Raises:
+        InputError: the ablation has a setting that there is no more.
+    """
+    measured = next((result for result in study.results if result.variant == variant), None)
+    if measured is None:
+        return ""
+    present = flattened(variant_config(ablation, variant, 0, (), None).to_mapping())
     defaults = resolve({}).to_mapping()  # which settings have that are newer than the cells
-    asked = compared(defaults, OF_THE_CALL) | compared(measured[0].asked, OF_THE_CALL)
+    asked = compared(defaults, OF_THE_CALL) | compared(measured.asked, OF_THE_CALL)
     changed = sorted(path for path in difference(present, asked) if path != ABSENT and path in present)
-    if not changed:
-        return []
-    listed = ", ".join(f"{path} {asked[path]} (now {present[path]})" for path in changed)
-    return [Paragraph(f"Stale: '{ablation.base}' is no longer what was measured here. Then: {listed}.")]
+    return f"Then: {', '.join(f'{path} {asked[path]} (now {present[path]})' for path in changed)}." if changed else ""
 
 
 def _machines(provenances: Sequence[Provenance | None]) -> list[Block]:
