@@ -4,6 +4,7 @@
 #include "sampling/sampling_params.h"
 
 namespace turbogs {
+
 void launches::SamplePixels::run(const Arguments<SamplePixels>& in) {
     const int64_t pixels = in.tensor(Tensors::errors).numel(), slots = in.tensor(Tensors::pixel_ids).numel();
     const int64_t chosen = in.tensor(Tensors::tile_ids).numel();

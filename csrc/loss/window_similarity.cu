@@ -160,6 +160,7 @@ __global__ void __launch_bounds__(kWindowThreads)
         const float variance_y = fmaxf(moments[3] - mean_y * mean_y, 0.0f);
         const float largest = sqrtf(variance_x) * sqrtf(variance_y);
         const float covariance = fminf(fmaxf(moments[4] - mean_x * mean_y, -largest), largest);
+        // So that a window which seems to have no variance beside colours of thousands has no slope of rounding.
         const float steady = kSsimConstant + kRounding * (moments[2] + moments[3]);
         const Similarity similarity =
             ssim(mean_x + first_x, mean_y + first_y, variance_x, variance_y, covariance, steady);

@@ -82,9 +82,7 @@ def loaded_rows(name: str, saved: dict[str, Tensor] | None, present: RowsType | 
 
 def finite_rows(gaussians: Gaussians) -> Tensor:
     """[N] bool: every parameter of the Gaussian is finite, and so are its variances, which a split needs."""
-    parts = [*(value for _, value in gaussians.items()), (2 * gaussians.scales).exp()]
-    numbers = torch.cat([part[:, None].flatten(1) for part in parts], dim=1)  # [N, D]
-    return numbers.abs_().amax(dim=1) < torch.inf  # the largest is NaN if one is
+    return gaussians.finite_rows() & ((2 * gaussians.scales.amax(dim=1)).exp() < torch.inf)
 
 
 def keep_one(kept: Tensor, gaussians: Gaussians) -> tuple[Tensor, int]:

@@ -116,7 +116,7 @@ def test_a_cap_holds_for_the_finished_model(capture, tmp_path, counts, cap):
     config = tiny_config(capture, f"density.max_gaussians={cap}", "train.camera_clearance=false")
     outcome = run.train(config, tmp_path / "run")
     assert counts[0] == min(points, cap)
-    assert max(counts) <= most != points and (max(counts) == most or cap < points)
+    assert cap <= max(counts) <= most != points and (max(counts) == most or cap < points)
     assert outcome.history[-1].num_gaussians == counts[-1] <= cap
     assert load_model(tmp_path / "run", torch.device("cpu")).config.density["max_gaussians"] == cap
 

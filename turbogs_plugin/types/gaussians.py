@@ -52,8 +52,8 @@ class Gaussians(ParameterTensors):
 
     def finite_rows(self) -> Tensor:
         """[N] bool: every number of the Gaussian is finite."""
-        rows = (value[:, None].flatten(1) for _, value in self.items())  # [N, D] each, opacities too
-        return torch.stack([row.isfinite().all(dim=1) for row in rows]).all(dim=0)
+        numbers = torch.cat([value.detach()[:, None].flatten(1) for _, value in self.items()], dim=1)  # [N, D]
+        return numbers.abs_().amax(dim=1) < torch.inf  # the largest is NaN if one is
 
     @property
     def device(self) -> torch.device:
