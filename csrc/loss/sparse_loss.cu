@@ -149,7 +149,7 @@ __device__ __forceinline__ TileTotals tile_loss(const SparseLossParams& params, 
     }
     totals.loss = static_cast<double>(l1_sum) * static_cast<double>(l1_scale);
 
-    float factor[3] = {}, at_y[3] = {}, at_x[3] = {}, constant[3] = {};
+    float factor[3] = {}, at_y[3] = {}, at_x[3] = {};
     const auto offset_x = [&](int j, int c) { return (samples.x[j][c] - first_x[c]) - mean_x[c]; };
     const auto offset_y = [&](int j, int c) { return (samples.y[j][c] - first_y[c]) - mean_y[c]; };
     // Of each sample again, the lane's j-th of a round.
@@ -160,9 +160,7 @@ __device__ __forceinline__ TileTotals tile_loss(const SparseLossParams& params, 
             for (int j = 0; j < kSlots; ++j) visit(j, start + kWarpSize * j + lane);
         }
     };
-    const auto structure_slope = [&](int j, int c) {
-        return offset_y(j, c) * at_y[c] - offset_x(j, c) * at_x[c] + constant[c];
-    };
+    const auto structure_slope = [&](int j, int c) { return offset_y(j, c) * at_y[c] - offset_x(j, c) * at_x[c]; };
     if (structured) {
         // Pass 2: variances and covariances.
         float sums[8] = {}, last = 0.0f;  // xx 0-2, yy 3-5, xy 6, 7 and `last`
@@ -193,7 +191,6 @@ __device__ __forceinline__ TileTotals tile_loss(const SparseLossParams& params, 
             variance_y[c] = yy;
             at_y[c] = similarity.at_y;
             at_x[c] = similarity.at_x;
-            constant[c] = similarity.constant;
             factor[c] = 1.0f - similarity.value;
         }
         float balance = 1.0f;

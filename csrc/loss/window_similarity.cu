@@ -162,7 +162,7 @@ __global__ void __launch_bounds__(kWindowThreads)
         const float covariance = fminf(fmaxf(moments[4] - mean_x * mean_y, -largest), largest);
         // So that a window which seems to have no variance beside colours of thousands has no slope of rounding.
         const float steady = kSsimConstant + kRounding * (moments[2] + moments[3]);
-        const Similarity similarity =
+        const LuminanceSimilarity similarity =
             ssim(mean_x + first_x, mean_y + first_y, variance_x, variance_y, covariance, steady);
         if (weight > 0.0f) missing += 1.0f - similarity.value;
 

@@ -33,6 +33,7 @@ VARIANTS = (
     (),
     ("optimizer.type=sparse_adam", "pixel_sampler.unit=cell", "loss.ncc_weight=1.0"),
     ("optimizer.rows=summed", "pixel_sampler.unit=tile", "pixel_sampler.importance=0.5", "loss.type=sparse_ssim"),
+    ("train.dropout=0.3",),
 )
 """Overrides that lead through the kernels' other branches."""
 

@@ -16,7 +16,7 @@ from helpers.raster_cases import (
     upstream,
 )
 from PIL import Image
-from turbogs_plugin.strategies.losses import CharbonnierNccLoss
+from turbogs_plugin.strategies.losses import CharbonnierNccLoss, SparseSsimLoss
 
 from turbogs_plugin.distributed.shares import shares_of
 from turbogs_plugin.engine.cuda import raster as cuda
@@ -31,7 +31,7 @@ from turbogs_plugin.scene import load_scene
 from turbogs_plugin.scene.photos import Photos
 from turbogs_plugin.train.loop import TrainingLoop
 from turbogs_plugin.train.trainer import Trainer
-from turbogs_plugin.types import BLACK, PixelSamples, Step
+from turbogs_plugin.types import BLACK, Step
 
 pytestmark = GPU_ONLY
 
@@ -142,8 +142,10 @@ def test_black_is_as_without_a_background():
     assert torch.equal(plain.colors, black.colors)
 
 
-@pytest.mark.parametrize("unit", ["pixel", "tile"])
-def test_the_loss_composites_transparent_photos(unit):
+@pytest.mark.parametrize(
+    ("unit", "loss"), [("pixel", CharbonnierNccLoss()), ("tile", CharbonnierNccLoss()), ("tile", SparseSsimLoss())]
+)
+def test_the_loss_composites_transparent_photos(unit, loss):
     """The kernel gathers them as torch does, and learns the same errors.
 
     It composites by one fused multiply-add, torch by two roundings: a colour differs by 6e-8, and the Charbonnier
@@ -157,15 +159,15 @@ def test_the_loss_composites_transparent_photos(unit):
     samples = training_kernels.sample_pixels(DrawRule(unit, 0.4, 0.3, False, 0.0), maps, (3, 0, 2), 0.4, step)
     truth = photos.to(DEVICE).at(samples, COLOR).colors()
     rendered = torch.rand(truth.shape, generator=generator).to(DEVICE)
-    terms = CharbonnierNccLoss().terms
+    terms = loss.terms
     expected = training_kernels.sparse_loss(terms, rendered, truth, samples)
     update = MapUpdate(maps, step)
     found = training_kernels.sparse_loss(terms, rendered, photos.colors.to(DEVICE), samples, update, None, COLOR)
     largest = float(expected.color_gradients.abs().max())
     torch.testing.assert_close(found.color_gradients, expected.color_gradients, rtol=1e-5, atol=1e-4 * largest)
     torch.testing.assert_close(found.pixel_errors, expected.pixel_errors, rtol=1e-6, atol=5e-7)
-    moved = PixelSamples(
-        samples.view_ids, samples.sizes, samples.pixel_ids.cpu(), samples.tile_ids.cpu(), samples.tile_offsets.cpu()
+    moved = replace(
+        samples, **{name: getattr(samples, name).cpu() for name in ("pixel_ids", "tile_ids", "tile_offsets")}
     )
     twin = sparse_loss(terms, rendered.cpu().double(), photos.at(moved, COLOR).colors().double(), moved)
     assert float(found.loss) == pytest.approx(float(twin.loss), rel=1e-5)

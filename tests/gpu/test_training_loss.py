@@ -85,6 +85,21 @@ def test_equals_the_twin(name, rate, unit, importance):
         torch.testing.assert_close(found.pixel_errors.cpu(), expected.pixel_errors, rtol=1e-5, atol=2e-7)
 
 
+def test_windows_of_tiles_with_one_sample_or_none():
+    samples = make_samples(1.0, "tile")
+    pixel_ids = samples.pixel_ids.clone()
+    pixel_ids[: samples.tile_offsets[1]] = -1  # a tile without a sample
+    pixel_ids[samples.tile_offsets[1] + 1 : samples.tile_offsets[2]] = -1  # and one with one
+    samples = replace(samples, pixel_ids=pixel_ids, has_empty_slots=True)
+    colors, targets, _ = make_colors(samples)
+    terms = CASES["ssim"].terms
+    expected = sparse_loss(terms, colors.double(), targets.double(), samples)
+    found = training_kernels.sparse_loss(terms, colors.to(DEVICE), targets.to(DEVICE), to_device(samples))
+    assert float(found.loss) == pytest.approx(float(expected.loss), rel=1e-5)
+    assert relative(found.color_gradients, expected.color_gradients) < 1e-5
+    assert not found.color_gradients.cpu()[~samples.filled].any()
+
+
 @pytest.mark.parametrize("level", [1.0, 1e4, 1e6, 1e8])
 def test_windows_stay_bounded_where_their_variance_is_lost(level):
     """As the twin's (`strategies/test_losses.py`): flat windows of tiles that elsewhere have a contrast of `level`."""
