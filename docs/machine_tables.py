@@ -196,10 +196,15 @@ def ranks() -> str:
     )
 
 
-def steps() -> str:
-    """Milliseconds of a whole iteration [10 %, 90 %], of its steps [floor], and of all with events around each."""
+def steps(name: str) -> str:
+    """Milliseconds of a whole iteration [10 %, 90 %], of its steps [floor], and of all with events around each, from a
+    file of `turbogs bench step`."""
+    return on(name, lambda: _steps(name))
+
+
+def _steps(name: str) -> str:
     lines = []
-    for entry in measured("bench-step.json")["passes"]:
+    for entry in measured(name)["passes"]:
         whole, parts, floors = entry["free_running"], entry["steps"], entry["floors_ms"]
         texts = (f"{parts[step]['device']['median_ms']:.3f} [{floors[step]:.3f}]" for step in STEPS)
         spread = f"{whole['median_ms']:.2f} [{whole['p10_ms']:.2f}, {whole['p90_ms']:.2f}]"

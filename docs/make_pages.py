@@ -88,7 +88,8 @@ TABLES: dict[str, Callable[[], str | None]] = {
     "pixels_on_an_mlp": machine_tables.pixels_on_an_mlp,
     "raster": lambda: machine_tables.on("bench-raster.json", machine_tables.raster),
     "solvers": machine_tables.solvers,
-    "steps": lambda: machine_tables.on("bench-step.json", machine_tables.steps),
+    "steps": lambda: machine_tables.steps("bench-step.json"),
+    "steps_ssim": lambda: machine_tables.steps("bench-step-ssim.json"),
     "wall": machine_tables.wall,
 }
 TABLES |= {name: lambda name=name: round_table(*name.split()) for name in sweep_tables.names()}
