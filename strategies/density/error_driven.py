@@ -81,7 +81,8 @@ class ErrorDrivenDensity(WindowedDensity):
             is drawn at random among those seen, in proportion to their squares. Those with the least squares are
             removed first. `grad_threshold`, `top_fraction`, `score` and `lambda_base` then mean nothing.
         final_every, final_keep: interval of the final pruning, and the share of those seen and not spared that it keeps
-            (Delta_prune, eta_final). 1 keeps all. There are `FINAL_PRUNINGS` at most.
+            (Delta_prune, eta_final). 1 keeps all. There are `FINAL_PRUNINGS` at most, the last one half an interval or
+            more before the end.
     """
 
     lambda_base: float = 0.8
@@ -173,8 +174,9 @@ class ErrorDrivenDensity(WindowedDensity):
 
     def _final_prunings(self, step: Step) -> int:
         """How many the run has."""
-        fitting = max(0, step.total - 1 - step.refine_until) // self.final_every
-        return min(FINAL_PRUNINGS, fitting) if self.final_keep < 1 else 0
+        # Half an interval at least is left after the last, so that a length which is off by a few has as many.
+        fitting = math.floor((step.total - step.refine_until) / self.final_every - 0.5)
+        return min(FINAL_PRUNINGS, max(0, fitting)) if self.final_keep < 1 else 0
 
     def _final_prunings_left(self, step: Step) -> int:
         """How many come after this iteration."""

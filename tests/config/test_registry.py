@@ -7,9 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+from turbogs_plugin.strategies.protocols import DensityController
 
 from turbogs_plugin.config import registry
 from turbogs_plugin.config.configuration import load_config
+from turbogs_plugin.config.scaling import with_iterations
 from turbogs_plugin.errors import InputError
 
 ALL_TYPES = [(kind, name) for kind, types_of_kind in registry.BUILT_IN.items() for name in types_of_kind]
@@ -57,7 +59,7 @@ class Unresolved:
 
 def _plug_in(monkeypatch, name: str, value: str) -> None:
     module = types.ModuleType("third_party_samplers")
-    module.FewPixels, module.Unresolved = FewPixels, Unresolved
+    module.FewPixels, module.Unresolved, module.Fading = FewPixels, Unresolved, Fading
     module.Outer = type("Outer", (), {"Inner": FewPixels})
     module.NoSampler = dataclass(type("NoSampler", (), {}))
     module.Half = dataclass(type("Half", (), {"setup": FewPixels.sample, "update": FewPixels.sample}))
@@ -126,6 +128,22 @@ def test_what_is_no_sampler_is_refused(monkeypatch, attribute, options, words):
     _plug_in(monkeypatch, "few", f"third_party_samplers:{attribute}")
     with pytest.raises(InputError, match=words):
         registry.build("pixel_sampler", {"type": "few", **options})
+
+
+@dataclass
+class Fading(DensityController):
+    """A third party's density control, which counts no iterations."""
+
+    opacity_decay: float = 0.2
+
+    def update(self, gaussians, step):
+        return None
+
+
+def test_a_decay_without_an_interval_may_be_scaled(monkeypatch):
+    _plug_in(monkeypatch, "fading", "third_party_samplers:Fading")
+    config = load_config("turbogs", ["density.type=fading"])
+    assert with_iterations(config, 500).density == {"type": "fading", "opacity_decay": 0.2}
 
 
 def test_all_that_a_class_lacks_is_named(monkeypatch):

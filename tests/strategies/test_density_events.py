@@ -31,6 +31,8 @@ MAKERS = {
 }
 EXACT = ("error_driven", "no final", "fastgs", "mcmc", "none")
 """Every event of theirs changes something here."""
+WITHOUT_LATER_EVENTS = ("no final", "mcmc", "gsplat_default", "none")
+"""None of theirs comes after densification has ended."""
 
 
 class Untouchable:
@@ -86,6 +88,8 @@ def test_events_are_where_it_says(name):
     if name in EXACT:
         assert changed == said
     assert len(said) < TOTAL / 3 and (len(changed) > 3 or name == "none")
+    if name in WITHOUT_LATER_EVENTS:
+        assert max(said, default=0) <= REFINE_UNTIL
 
 
 def test_the_noise_of_mcmc_is_why_it_watches_the_model(monkeypatch):

@@ -523,6 +523,18 @@ def test_the_cap_holds_at_the_end(cap, keep, every, choose_by, seen, far):
     assert len(gaussians) <= density.bound(step) == cap
 
 
+@pytest.mark.parametrize(
+    ("base", "refine_until", "every", "prunings"), [(5000, 3500, 500, 2), (8000, 6000, 500, 3), (30_000, 3500, 500, 3)]
+)
+def test_runs_of_any_length_have_as_many_final_prunings(base, refine_until, every, prunings):
+    """And the last leaves half an interval, however the length and what is scaled with it were rounded."""
+    for total in range(200, 12_000, 7):
+        until, interval = round(refine_until * total / base), round(every * total / base)
+        density = ErrorDrivenDensity(final_every=interval)
+        at = [it for it in range(until + 1, total) if density.due(Step(it, total, until))[1]]
+        assert len(at) == prunings and total - at[-1] >= interval / 2, total
+
+
 def test_growth_goes_beyond_the_cap_by_what_final_prunings_remove():
     """To the room that they leave, and down again by worth, to the cap itself."""
     gaussians = make_gaussians(40, dtype=torch.float32)

@@ -219,6 +219,16 @@ def test_empty_slots_have_no_part(loss):
     assert result.loss == again.loss
 
 
+@pytest.mark.parametrize("loss", EVERY, ids=repr)
+def test_no_tile_is_no_loss(loss):
+    """As where masks hide all of a batch."""
+    samples = make_samples([4])
+    nothing = torch.zeros(0, dtype=torch.int32)
+    samples = PixelSamples(samples.view_ids, samples.sizes, nothing, nothing, torch.zeros(1, dtype=torch.int32))
+    result = loss(torch.zeros(0, 3), torch.zeros(0, 3), samples)
+    assert result.loss == 0 and result.color_gradients.shape == (0, 3) and len(result.pixel_errors) == 0
+
+
 def test_pixel_errors_are_l1_norms():
     colors, targets, samples = random_case()
     result = CharbonnierNccLoss()(colors, targets, samples)

@@ -48,7 +48,7 @@ def with_iterations(config: Config, iterations: int) -> Config:
                 mapping[section][name] = max(least, round(value * factor))
     mapping["train"]["iterations"] = mapping["train"]["base_iterations"] = iterations
     if density.get("opacity_decay", 0.0):
-        density["opacity_decay"] = decay_at(density["opacity_decay"], interval, density["refine_every"])
+        density["opacity_decay"] = decay_at(density["opacity_decay"], interval, density.get("refine_every", REGROWTH))
     return resolve(mapping)
 
 

@@ -146,8 +146,9 @@ class TurboDensityStrategy(DefaultStrategy):
         controller = self._controller(step)
         controller.setup(gaussians)
         controller.load_state_dict({"stats": vars(window)})
-        # The end of the run is not known here, so no final pruning is counted on: `max_gaussians` holds at any step.
-        now = Step(step, step + 1, self.refine_stop_iter - 1, self.seed, state["scene_scale"])
+        # The end of the run is not known here: another interval is taken to be left, so that this step may prune, but
+        # no later pruning is counted on. `max_gaussians` holds at any step.
+        now = Step(step, step + self.final_every, self.refine_stop_iter - 1, self.seed, state["scene_scale"])
         update = controller.update(gaussians, now)
         window.zero_()
         if update is None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 import shlex
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -36,6 +37,10 @@ from turbogs_plugin.scene.starting_points import colors_in_photos
 from turbogs_plugin.scene.transforms import FILE, read_transforms
 from turbogs_plugin.scene.undistort import undistortion_note
 from turbogs_plugin.types import Cameras
+
+MOST_PIXELS = 1 << 28
+"""Of a photo as it is trained on. Where tiles are drawn whole, a draw tells 2^20 of a view apart (`RANK_BITS` of
+engine/reference/draws.py)."""
 
 FARTHEST = 1e15
 """Distance of a point in extents, from which on squares, and squares of these, do not fit into float32."""
@@ -159,6 +164,12 @@ def load_scene(
         )
     remaining = max(1, factor // capture.reduction)
     paths, file_sizes, sizes, fitted = _find_photos(scene, capture, remaining)
+    largest = sizes[np.argmax(sizes.prod(axis=1))]
+    if largest.prod() > MOST_PIXELS:
+        raise InputError(
+            f"{scene}: a photo would have {largest[0]}x{largest[1]} pixels, more than {MOST_PIXELS}: use --factor "
+            f"{factor * math.ceil(math.sqrt(largest.prod() / MOST_PIXELS))}"
+        )
     ratios = sizes / capture.sizes  # [V, 2]
     intrinsics = capture.Ks.copy()
     intrinsics[:, :2] *= ratios[:, :, None]

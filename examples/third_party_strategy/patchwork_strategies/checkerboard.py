@@ -32,4 +32,4 @@ class CheckerboardPixelSampler:
         chosen = (x + y) % 2 == step.iteration % 2
         # Empty slots come last within their tile.
         order = torch.argsort(dense.tile_of_slot() * 2 + ~chosen, stable=True)
-        return replace(dense, pixel_ids=torch.where(chosen, dense.pixel_ids, -1)[order])
+        return replace(dense, pixel_ids=torch.where(chosen, dense.pixel_ids, -1)[order], has_empty_slots=True)

@@ -81,10 +81,10 @@ def _places(samples: PixelSamples, tile_of_slot: Tensor) -> Tensor:
 def _sum_windows(values: Tensor, places: Tensor, tiles: int) -> Tensor:
     """[P, C] -> [P, C]: for each slot the sum of its tile's values times g of their distance from it."""
     planes = values.new_zeros(tiles * TILE_SIZE**2, values.shape[1]).index_add_(0, places, values)
-    planes = planes.view(tiles, TILE_SIZE, TILE_SIZE, -1)  # [T, S, S, C]
+    planes = planes.view(tiles, TILE_SIZE, TILE_SIZE, values.shape[1])  # [T, S, S, C]
     along = torch.arange(TILE_SIZE, device=values.device, dtype=values.dtype)
     distances = (along[:, None] - along).abs()
     gaussian = torch.exp(-0.5 * (distances / WINDOW_SIGMA) ** 2) * (distances <= WINDOW_RADIUS)  # [S, S]
     sums = torch.einsum("ij,tjkc->tikc", gaussian, planes)
     sums = torch.einsum("ij,tkjc->tkic", gaussian, sums)
-    return sums.reshape(tiles * TILE_SIZE**2, -1)[places]
+    return sums.reshape(tiles * TILE_SIZE**2, values.shape[1])[places]
