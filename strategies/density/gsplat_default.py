@@ -64,9 +64,7 @@ class GsplatDefaultDensity(WindowedDensity):
         require_settings(self)
 
     def event_due(self, step: Step) -> bool:
-        return step.iteration < step.refine_until and (
-            step.iteration % self.refine_every == 0 or self._reset_due(step)
-        )
+        return step.iteration < step.refine_until and (step.iteration % self.refine_every == 0 or self._reset_due(step))
 
     def _reset_due(self, step: Step) -> bool:
         return step.iteration > 0 and step.iteration % self.reset_every == 0

@@ -3,6 +3,7 @@
 import json
 import re
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,9 +13,12 @@ from turbogs_plugin.engine.rendering import render_image
 from turbogs_plugin.export import film
 from turbogs_plugin.export.contribution import contributions, pruned
 from turbogs_plugin.export.fidelity import Fidelity
+from turbogs_plugin.masks import PixelMasks
 from turbogs_plugin.model.formats import FORMATS
 from turbogs_plugin.model.ply import load_ply
-from turbogs_plugin.train.evaluate import Look, psnr, render_view
+from turbogs_plugin.scene.photos import Photos
+from turbogs_plugin.train.evaluate import evaluate, psnr, render_view
+from turbogs_plugin.types import BLACK, WHITE
 
 
 def refused(result: tuple[int, str, str], *words: object) -> None:
@@ -40,7 +44,7 @@ def test_an_export_says_bytes_and_what_was_lost(turbogs, finished, tmp_path, nam
 
 
 def test_nothing_is_lost_only_where_all_numbers_are_equal(model, scene):
-    fidelity = Fidelity(model.gaussians, scene.test, model.sh_degree, model.config.raster)
+    fidelity = Fidelity(model.gaussians, scene.test, model.own_look(scene.test))
     same = model.gaussians.map(torch.clone)
     assert fidelity.change(same).text().endswith(": nothing lost, all numbers are equal")
     same.means[0, 0] += 1e-6
@@ -51,11 +55,10 @@ def test_nothing_is_lost_only_where_all_numbers_are_equal(model, scene):
 
 
 def test_the_view_that_lost_most_is_named(model, scene):
-    views, raster = scene.train, model.config.raster
-    fidelity = Fidelity(model.gaussians, views, model.sh_degree, raster)
+    views, look = scene.train, model.own_look(scene.train)
+    fidelity = Fidelity(model.gaussians, views, look)
     kept = model.gaussians.map(lambda value: value[::2])
     change = fidelity.change(kept)
-    look = Look(model.sh_degree, raster)
     before, after = (
         [psnr(render_view(part, views, view, look), views.photos.image(view)) for view in range(7)]
         for part in (model.gaussians, kept)
@@ -64,6 +67,28 @@ def test_the_view_that_lost_most_is_named(model, scene):
     assert change.worst_view == views.names[int(losses.argmax())] and change.worst_loss == pytest.approx(losses.max())
     assert change.before - change.after == pytest.approx(losses.mean()) and change.worst_loss > losses.mean() + 0.01
     assert f"worst in {change.worst_view}: {losses.max():.3f} dB lost" in change.text()
+
+
+@pytest.mark.parametrize("transparent", [False, True])
+def test_a_model_is_measured_as_an_evaluation_does(model, scene, transparent):
+    """On the run's background, without masked pixels."""
+    views = scene.train
+    if transparent:
+        photos = views.photos
+        alpha = torch.arange(len(photos.colors)).remainder(256).to(torch.uint8)[:, None]
+        colors = torch.cat([torch.minimum(photos.colors, alpha), alpha], dim=1)
+        views = replace(views, photos=Photos(colors, photos.sizes))
+    keep = [torch.arange(40)[:, None] + torch.arange(48) > 30 for _ in views.names]
+    views = replace(views, masks=PixelMasks.from_images(keep))
+    model.config.train.background = "auto" if transparent else "#ffffff"
+    look = model.own_look(views)
+    assert look.background == WHITE
+    faint = model.gaussians.map(torch.clone)
+    faint.opacities -= 3.0
+    found = Fidelity(faint, views, look).psnr(faint)
+    assert found == pytest.approx([view.psnr for view in evaluate(faint, views, look).views], abs=1e-4)
+    black = Fidelity(faint, views, replace(look, background=BLACK)).psnr(faint)
+    assert min(abs(a - b) for a, b in zip(found, black, strict=True)) > 0.1
 
 
 def test_a_run_whose_capture_is_gone_is_exported_unmeasured(turbogs, finished, capture, tmp_path):
@@ -143,6 +168,15 @@ def test_a_film_that_cannot_be_made(turbogs, finished, tmp_path, monkeypatch, ar
 def test_a_film_without_its_package(turbogs, finished, tmp_path, monkeypatch):
     monkeypatch.setattr(film.importlib.util, "find_spec", lambda name: None)
     refused(turbogs("render", finished, "--video", tmp_path / "a.mp4"), "imageio-ffmpeg", "turbogs-plugin[video]")
+
+
+def test_a_film_has_the_background(model, scene, tmp_path):
+    ffmpeg = pytest.importorskip("imageio_ffmpeg")
+    look = replace(model.own_look(), background=WHITE)
+    empty = model.gaussians.map(lambda value: value[:0])
+    film.write_film(empty, look, film.film_cameras("views", scene, 0.05), tmp_path / "a.mp4")
+    _, frame, *_ = ffmpeg.read_frames(str(tmp_path / "a.mp4"))
+    assert np.frombuffer(frame, dtype=np.uint8).min() > 250
 
 
 @pytest.mark.parametrize("path", ["orbit", "views", "file"])

@@ -1,6 +1,7 @@
 """The page: one file, small enough, and in a real browser without a network it shows what our renderer draws."""
 
 import base64
+import copy
 import io
 import re
 import shutil
@@ -40,6 +41,17 @@ def test_the_page_is_one_file_that_asks_for_nothing(written):
     assert not re.search(r"""(src|href)=["'](?!data:)""", text) and "default-src 'none'" in text
     assert str(file.parents[1]) not in text and f"path: {model.config.scene.path.rpartition('/')[2]}\n" in text
     assert escape(made[1].text()) in text and abs(made[1].before - made[1].after) < 0.1
+
+
+def test_the_page_has_the_background_and_says_whose_colours_it_shows(written, scene, tmp_path):
+    _, _, model = written
+    config = copy.deepcopy(model.config)
+    config.train.background = "#3366ff"
+    exposures = torch.eye(3, 4).repeat(len(scene.train), 1, 1)
+    write_page(replace(model, config=config, exposures=exposures), model.gaussians, scene, tmp_path / "a.html")
+    text = (tmp_path / "a.html").read_text(encoding="utf-8")
+    assert "background: rgb(51, 102, 255)" in text and "in the model&#x27;s own colours" in text
+    assert "background: rgb(0, 0, 0)" in written[0].read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize("script", ["viewer.js", "page.js"])

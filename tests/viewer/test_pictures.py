@@ -50,6 +50,12 @@ def spots(*places: tuple[float, float, float], color: float = 0.5) -> Gaussians:
     )
 
 
+def test_model_and_photo_stand_on_the_background():
+    nothing = spots((0.0, 0.0, -5.0))
+    assert (draw(Subject(nothing, 0, background=(1.0, 0.0, 0.5)), Request(Picture.RENDER, FLAT)) == (255, 0, 128)).all()
+    assert not draw(Subject(nothing, 0), Request(Picture.RENDER, FLAT)).any()
+
+
 @pytest.mark.parametrize("view", [0, 3, 6])
 def test_the_render_is_that_of_the_engine(subject, view):
     cameras = subject.capture.train.cameras

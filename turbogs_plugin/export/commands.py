@@ -105,7 +105,7 @@ def export_run(
         read = Similarity.into(model.frame).apply(FORMATS[file_format].read(file)).map(torch.Tensor.float)
         count = len(read)
         reason = absent or ("" if len(scene.test) else "the capture has no test views")
-        change = None if reason else Fidelity(whole, scene.test, model.sh_degree, model.config.raster).change(read)
+        change = None if reason else Fidelity(whole, scene.test, model.own_look(scene.test)).change(read)
     held = sum(value.numel() * 4 for _, value in whole.items())
     return Exported(file, file.stat().st_size, count, held, len(whole), change, reason, notes)
 
@@ -124,7 +124,7 @@ def film_run(
     """
     require_film(camera_path, video, seconds)
     model, scene, _ = load_with_capture(path, given, resolve_device(device_name))
-    write_film(model, film_cameras(camera_path, scene, seconds), video)
+    write_film(model.gaussians, model.own_look(scene.train), film_cameras(camera_path, scene, seconds), video)
     return video
 
 

@@ -9,7 +9,6 @@ from statistics import fmean
 import numpy as np
 import torch
 
-from turbogs_plugin.engine.rendering import RasterSettings
 from turbogs_plugin.scene import PosedImages
 from turbogs_plugin.scene.poses import evenly
 from turbogs_plugin.train.evaluate import Look, psnr, render_view
@@ -59,34 +58,43 @@ class Fidelity:
 
     Args:
         gaussians: the model, on the device where all are rendered.
-        views: the test views, at least one, on any device.
-        sh_degree: of the bands in use.
-        settings: of rendering.
+        views: the test views, at least one, on any device. Masked pixels do not count.
+        look: how it is shown; without exposures, as a file of a model holds none.
 
     Attributes:
         view_ids: those that are measured.
         before: mean PSNR in dB of the model.
     """
 
-    def __init__(self, gaussians: Gaussians, views: PosedImages, sh_degree: int, settings: RasterSettings) -> None:
-        self._views, self._device, self._degree, self._settings = views, gaussians.device, sh_degree, settings
+    def __init__(self, gaussians: Gaussians, views: PosedImages, look: Look) -> None:
+        self._views, self._device, self._look = views, gaussians.device, look
         self.view_ids = evenly(len(views), MOST_VIEWS)
         self._model, self._before = gaussians, self.psnr(gaussians)
         self.before = fmean(self._before)
 
     def psnr(self, gaussians: Gaussians) -> list[float]:
         """[`view_ids`] PSNR in dB of a model in the scene's frame, on any device."""
-        return [psnr(self.image(gaussians, view), self.photo(view)) for view in self.view_ids]
+        return [self._psnr(self.image(gaussians, view), view) for view in self.view_ids]
+
+    def _psnr(self, image: torch.Tensor, view_id: int) -> float:
+        photo, mask = self.photo(view_id), self.mask(view_id)
+        return psnr(image, photo) if mask is None else psnr(image[mask], photo[mask])
 
     def image(self, gaussians: Gaussians, view_id: int) -> torch.Tensor:
         """[H, W, 3] float32, 0 .. 1, on the device: a model seen by one of the test cameras."""
         model = gaussians.map(lambda value: value.to(self._device))
         views = replace(self._views, cameras=self._views.cameras.to(self._device), masks=None)
-        return render_view(model, views, view_id, Look(min(self._degree, model.sh_degree), self._settings))
+        look = replace(self._look, sh_degree=min(self._look.sh_degree, model.sh_degree))
+        return render_view(model, views, view_id, look)
 
     def photo(self, view_id: int) -> torch.Tensor:
-        """[H, W, 3] float32, 0 .. 1, on the device."""
-        return self._views.photos.image(view_id).to(self._device)
+        """[H, W, 3] float32, 0 .. 1, on the device: a transparent one on the background that the model has."""
+        return self._views.photos.image(view_id, self._look.background).to(self._device)
+
+    def mask(self, view_id: int) -> torch.Tensor | None:
+        """[H, W] bool on the device, True where a pixel counts; None where all do."""
+        mask = self._views.mask(view_id)
+        return None if mask is None else mask.to(self._device)
 
     def change(self, gaussians: Gaussians) -> Change:
         """What became of the model."""

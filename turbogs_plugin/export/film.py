@@ -15,8 +15,8 @@ from turbogs_plugin.export.camera_path import from_file, orbit, through_views
 from turbogs_plugin.files import require_new_file, require_writable
 from turbogs_plugin.report.pictures import to_uint8
 from turbogs_plugin.scene import Scene
-from turbogs_plugin.train.saved_model import SavedModel
-from turbogs_plugin.types import Cameras
+from turbogs_plugin.train.evaluate import Look
+from turbogs_plugin.types import Cameras, Gaussians
 
 RATE = 60
 """Frames a second."""
@@ -51,10 +51,12 @@ def film_cameras(path: str, scene: Scene, seconds: float) -> Cameras:
     return (orbit if path == "orbit" else through_views)(scene.train.cameras, frames)
 
 
-def write_film(model: SavedModel, cameras: Cameras, video: Path) -> None:
+def write_film(gaussians: Gaussians, look: Look, cameras: Cameras, video: Path) -> None:
     """Render and encode a film. Nothing is left behind where this fails.
 
     Args:
+        gaussians: the model, on the device that renders.
+        look: how it is shown, without exposures.
         cameras: of the frames, all of one size; an odd side loses a pixel, which the encoder needs.
         video: a new file, whose suffix says which container.
 
@@ -64,7 +66,7 @@ def write_film(model: SavedModel, cameras: Cameras, video: Path) -> None:
     import imageio_ffmpeg
 
     width, height = (cameras.sizes[0] // 2 * 2).tolist()
-    cameras = cameras.to(model.gaussians.device)
+    cameras = cameras.to(gaussians.device)
     # Its own suffix last, by which ffmpeg knows the container.
     temporary = video.with_name(f".{video.stem}.part{video.suffix}")
     options = {"fps": RATE, "codec": CODEC, "quality": QUALITY, "macro_block_size": 1, "ffmpeg_log_level": "error"}
@@ -72,8 +74,8 @@ def write_film(model: SavedModel, cameras: Cameras, video: Path) -> None:
     try:
         writer.send(None)
         for frame in _told(len(cameras)):
-            settings = model.config.raster
-            image = render_image(model.gaussians, cameras, frame, sh_degree=model.sh_degree, settings=settings)
+            options = {"sh_degree": look.sh_degree, "settings": look.settings, "background": look.background}
+            image = render_image(gaussians, cameras, frame, **options)
             writer.send(np.ascontiguousarray(to_uint8(image.colors)[:height, :width]))
         writer.close()
         temporary.replace(video)

@@ -68,7 +68,8 @@ def write_page(model: SavedModel, shown: Gaussians, scene: Scene, path: Path) ->
         raise InputError("there are no Gaussians to write")
     order = spatial_order(gaussians.means, scene.extent)
     gaussians = gaussians.map(lambda value: value[order])
-    fidelity = Fidelity(model.gaussians, scene.test, model.sh_degree, model.config.raster)
+    look = model.own_look(scene.test)
+    fidelity = Fidelity(model.gaussians, scene.test, look)
     history = read_history(model.folder.history) if model.folder is not None else []
     parts = {
         "title": escape(scene.name),
@@ -76,6 +77,7 @@ def write_page(model: SavedModel, shown: Gaussians, scene: Scene, path: Path) ->
         "viewer": _web("viewer.js"),
         "page": _web("page.js"),
         "full_scale": f"{ERROR_FULL_SCALE:g}",
+        "background": "rgb({}, {}, {})".format(*(round(255 * value) for value in look.background)),
         "views": "\n".join(_view(fidelity, model.gaussians, scene, view) for view in fidelity.view_ids),
         "tables": _tables(model, scene, history),
     }
@@ -126,6 +128,8 @@ def _summary(model: SavedModel, scene: Scene, fidelity: Fidelity, history: list[
     header = (*ERRORS.values(), "training in s", "iterations", "Gaussians")
     row = (*errors(last), f"{last.train_seconds:.1f}", str(last.iteration), str(last.num_gaussians))
     said = f"{views}; seed {model.config.train.seed}. Errors are means over the test views."
+    if model.exposures is not None:
+        said += " They are of the model with each photo's exposure; below, all is in the model's own colours."
     return _html([Table(header, [row]), Paragraph(said)])
 
 
@@ -140,7 +144,7 @@ def _cost(count: int, packed: PackedModel, change: Change) -> str:
 def _view(fidelity: Fidelity, gaussians: Gaussians, scene: Scene, view: int) -> str:
     photo, image = fidelity.photo(view), fidelity.image(gaussians, view)
     name = scene.test.names[view]
-    measured = compare(name, image, photo)
+    measured = compare(name, image, photo, fidelity.mask(view))
     error = error_picture(photo, image).cpu().numpy()
     pictures = (("photo", to_uint8(photo)), ("render", to_uint8(image)), ("error", error))
     images = "".join(f'<img alt="{kind} of {escape(name)}" src="{_jpeg(pixels)}">' for kind, pixels in pictures)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,6 @@ from turbogs_plugin.report.pictures import depth_picture, to_uint8
 from turbogs_plugin.report.tables import views_table
 from turbogs_plugin.scene import PosedImages
 from turbogs_plugin.scene.offload import place_views
-from turbogs_plugin.train.background import Background
 from turbogs_plugin.train.evaluate import Look, evaluate, load_lpips
 from turbogs_plugin.train.flip import load_flip
 from turbogs_plugin.train.interpolated_exposures import interpolated_exposures
@@ -111,9 +111,7 @@ def _open(
     and the capture's notes. Training views have their own exposures, where the run learnt them."""
     model, scene, _ = load_with_capture(path, given, resolve_device(device_name))
     views = scene.test if split == "test" else scene.train
-    background = Background.of(model.config.train.background, views.photos.transparent).evaluated
     exposures = model.exposures
     if exposures is not None and split == "test":
         exposures = interpolated_exposures(exposures, scene.train.names, scene.test.names)
-    look = Look(model.sh_degree, model.config.raster, background, exposures)
-    return model, views, look, scene.notes
+    return model, views, replace(model.own_look(views), exposures=exposures), scene.notes

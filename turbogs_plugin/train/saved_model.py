@@ -12,9 +12,11 @@ from torch import Tensor
 
 from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.scene import Frame, Scene
+from turbogs_plugin.scene import Frame, PosedImages, Scene
 from turbogs_plugin.scene.fingerprint import frame_of_state
+from turbogs_plugin.train.background import Background
 from turbogs_plugin.train.checkpoint import gaussians_of_state, latest_checkpoint, load_checkpoint
+from turbogs_plugin.train.evaluate import Look
 from turbogs_plugin.train.folder import RunFolder
 from turbogs_plugin.train.given_model import load_given, require_model
 from turbogs_plugin.train.start import open_scene
@@ -42,6 +44,13 @@ class SavedModel:
         """Degree of the bands in use; a file does not say, so it is all that there are."""
         given = self.iteration is None
         return self.gaussians.sh_degree if given else self.config.train.sh_degree_at(self.iteration)
+
+    def own_look(self, views: PosedImages | None = None) -> Look:
+        """How the model's own colours are shown, beside views of its capture if there is one: on the background of
+        evaluations, without exposures."""
+        transparent = views is not None and views.photos.transparent
+        background = Background.of(self.config.train.background, transparent).evaluated
+        return Look(self.sh_degree, self.config.raster, background)
 
 
 def load_model(path: Path, device: torch.device) -> SavedModel:

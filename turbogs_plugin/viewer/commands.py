@@ -110,7 +110,8 @@ def open_shown(path: Path, device: torch.device, given: Config | None = None) ->
         return Shown(Subject(gaussians, gaussians.sh_degree), path.name)
     model, scene, absent = load_with_capture(path, given, device, needed=False)
     capture = None if scene is None else CaptureViews(scene.train, scene.test)
-    subject = Subject(model.gaussians, model.sh_degree, settings=model.config.raster, capture=capture)
+    look = model.own_look(None if scene is None else scene.train)
+    subject = Subject(model.gaussians, look.sh_degree, look.settings, look.background, capture)
     if given is not None:
         return Shown(subject, path.name)
     if scene is not None:

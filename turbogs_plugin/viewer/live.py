@@ -123,6 +123,7 @@ class LiveViewer(Listener):
             gaussians=trainer.gaussians,
             sh_degree=trainer.sh_degree,
             settings=trainer.config.raster,
+            background=trainer.background.evaluated,
             capture=self._capture,
             maps=trainer.maps,
             step=trainer.now,

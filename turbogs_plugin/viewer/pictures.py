@@ -117,8 +117,7 @@ def fitted(size: tuple[int, int], box: tuple[int, int]) -> tuple[int, int]:
 
 def _render(subject: Subject, request: Request) -> np.ndarray:
     cameras = request.eye.cameras(subject.gaussians.device)
-    image = render_image(subject.gaussians, cameras, sh_degree=subject.sh_degree, settings=subject.settings)
-    return to_uint8(image.colors)
+    return to_uint8(render_image(subject.gaussians, cameras, **subject.options).colors)
 
 
 def _depth(subject: Subject, request: Request) -> np.ndarray:
@@ -222,7 +221,7 @@ def _fitted_view(
 def _photo_of(subject: Subject, views: PosedImages, view_id: int, size: tuple[int, int]) -> Tensor:
     """[height, width, 3] float on the model's device: a photo, reduced by means over areas or enlarged pixel by
     pixel."""
-    photo = views.photos.image(view_id).to(subject.gaussians.device)
+    photo = views.photos.image(view_id, subject.background).to(subject.gaussians.device)
     return _resized(photo.permute(2, 0, 1), size).permute(1, 2, 0)
 
 
@@ -238,7 +237,7 @@ def _render_of(subject: Subject, views: PosedImages, view_id: int, size: tuple[i
     ratios = cameras.Ks.new_tensor([drawn[0] / own[0], drawn[1] / own[1], 1.0])
     small = Cameras(cameras.viewmats, cameras.Ks * ratios[None, :, None], np.array([drawn], dtype=np.int64))
     settings = replace(subject.settings, eps2d=subject.settings.eps2d / by**2)
-    image = render_image(subject.gaussians, small, sh_degree=subject.sh_degree, settings=settings)
+    image = render_image(subject.gaussians, small, **(subject.options | {"settings": settings}))
     return _resized(image.colors.permute(2, 0, 1), size).permute(1, 2, 0)
 
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 
 from turbogs_plugin.engine.rendering import DEFAULT_SETTINGS, RasterSettings
 from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.scene import PosedImages
-from turbogs_plugin.types import Gaussians, PixelSamples, RowUpdate, Step
+from turbogs_plugin.types import BLACK, Color, Gaussians, PixelSamples, RowUpdate, Step
 
 
 @dataclass
@@ -72,6 +73,7 @@ class Subject:
         gaussians: the model, on the device that renders.
         sh_degree: highest degree of spherical harmonics in use.
         settings: those of the rasterizer.
+        background: behind the model, and behind transparent photos.
         capture: its views, for training and for testing.
         maps: errors and ages of the training views.
         step: the time from which ages count.
@@ -82,8 +84,14 @@ class Subject:
     gaussians: Gaussians
     sh_degree: int
     settings: RasterSettings = DEFAULT_SETTINGS
+    background: Color = BLACK
     capture: CaptureViews | None = None
     maps: ErrorMaps | None = None
     step: Step | None = None
     samples: PixelSamples | None = None
     change: DensityChange | None = None
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """Of rendering."""
+        return {"sh_degree": self.sh_degree, "settings": self.settings, "background": self.background}
