@@ -33,7 +33,7 @@ from turbogs_plugin.train.run import new_loop
 from turbogs_plugin.train.saved_model import SavedModel, load_model
 from turbogs_plugin.train.start import open_scene, resolve_device
 from turbogs_plugin.train.trainer import Trainer
-from turbogs_plugin.types import Gaussians, PixelSamples, RowUpdate, Step
+from turbogs_plugin.types import Color, Gaussians, PixelSamples, RowUpdate, Step
 from turbogs_plugin.viewer.eye import Eye
 from turbogs_plugin.viewer.pictures import Picture, Request, draw
 from turbogs_plugin.viewer.subject import CaptureViews, Subject
@@ -73,10 +73,10 @@ class Renders:
 
     trainer: Trainer
 
-    def image(self, view_id: int) -> Tensor:
+    def image(self, view_id: int, background: Color) -> Tensor:
         """[H, W, 3] float32, 0 .. 1."""
         trainer = self.trainer
-        look = Look(trainer.sh_degree, trainer.config.raster)
+        look = Look(trainer.sh_degree, trainer.config.raster, background)
         return render_view(trainer.gaussians, trainer.views, view_id, look)
 
 
