@@ -145,7 +145,7 @@ struct ForwardParams {
 struct BackwardParams {
     ForwardParams forward;         // as given to stage 5; its outputs are inputs here
     int num_instances;
-    bool with_density_sums;        // fill what only densification asks for: distance and absolute sums; else zeros
+    bool with_density_sums;        // fill what density control asks for: absolute, distance and square sums; else zeros
     bool cleared;                  // `records` are zero where the radius is not 0
     const float* color_gradients;  // [P, 3]
     const float* alpha_gradients;  // [P] or null

@@ -1,9 +1,9 @@
 // The keys of the pixel sampler, to the bit as turbogs_plugin/engine/reference/philox.py and draws.py define them:
 // single-precision operations that are rounded one by one.
 //
-// In a race its key is weight over an
-// exponential number, and the largest keys win with the probabilities of drawing one by one without replacement. By
-// age, the key is the age with random bits below it. Keys are integers, so that a threshold can be searched.
+// In a race the key of a unit is its weight over an exponential number, and the largest keys win with the
+// probabilities of drawing one by one without replacement. By age, the key is the age with random bits below it. Keys
+// are integers, so that a threshold can be searched.
 #pragma once
 
 #include "common/approximate_math.cuh"

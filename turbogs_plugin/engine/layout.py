@@ -1,4 +1,5 @@
-"""Sizes and layouts that Python and the kernels of csrc/ share. They are defined here and nowhere else.
+"""Sizes and layouts that Python and the kernels of csrc/ share, defined here and nowhere else. Constants of a formula
+stand beside it, in engine/reference and in the kernel.
 
 The build makes a C++ header from this file (csrc/generate_headers.py), so it must not import torch. In C++ a number
 ``NAME`` is ``kName``, a class is a struct of such constants, and a slice of columns is the number of its first column.
@@ -42,8 +43,8 @@ class ScreenRecord:
     """Gradients and sums of one Gaussian in one view: a row of float32.
 
     w is the weight of a sample (transmittance times alpha), e its error, D its distance from the mean in standard
-    deviations (Mahalanobis). Sums run over the samples. `ABSOLUTE`, `DISTANCE_SUM` and `SQUARE_SUM` are filled only if
-    density control asks for them, and are zero otherwise.
+    deviations (Mahalanobis). Sums run over the samples. `ABSOLUTE`, `DISTANCE_SUM` and `SQUARE_SUM` are for density
+    control alone: the kernels leave them zero where it does not ask for them.
     """
 
     MEAN = slice(0, 2)  # d loss / d projected mean, in pixels

@@ -108,7 +108,7 @@ def run_sweep(
             raise InputError(f"'{folder.path}' has a cell of another ablation ({result.key}): choose a new --out")
     device = resolve_device(options.device)
     reusable = _reusable_cells(here, siblings)
-    taken: list[CellResult] = []
+    repeated: list[CellResult] = []
     left: list[tuple[Scene, CellKey, Config]] = []
     loading: dict[str, float] = {}  # capture -> seconds
     # All scenes are read before anything is trained, so that a wrong one is known at once.
@@ -125,7 +125,7 @@ def run_sweep(
             if key in finished:
                 _require_same(finished[key], config)
             elif known is not None:
-                taken.append(replace(known, variant=key.variant))
+                repeated.append(replace(known, variant=key.variant))
             else:
                 left.append((scene, key, config))
         for key, result in finished.items():
@@ -135,7 +135,7 @@ def run_sweep(
                 )
         del scene  # where no cell needs it: photos take room
     folder.write_study(replace(study, ablation=ablation))
-    for result in taken:
+    for result in repeated:
         folder.write(result)
     wanted = len(options.scenes) * len(options.seeds) * len(variants)
     claims = Claims(folder.claims)

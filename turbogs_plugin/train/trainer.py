@@ -240,7 +240,7 @@ class Trainer:
             if self.clearance is not None:
                 update = self.clearance.clear(update, self.gaussians)
             if len(update.source) == 0:
-                raise TrainingStopped(f"iteration {self.iteration}: density control removed every Gaussian")
+                raise TrainingStopped(f"iteration {self.iteration}: every Gaussian was removed")
             update = in_order_of_space(update, self.gaussians, self.now)
             if self.observer is not None:
                 self.observer.changing(self.gaussians, update, self.now)
