@@ -55,7 +55,9 @@ of them at the same place, and no host runs farther ahead of its GPU."""
 OWNERS_FROM = 4_000_000
 OWNERS_FROM_IN_PLACE = 1_000_000
 """Rows of a batch, views times Gaussians, from which on two processes gain by owners of rows: by messages, and in
-place. Measured with .45, 1.5, 1.8 and 6 million (docs/scaling.md): below, two exchanges more cost what they save."""
+place. Measured with .45, 1.5, 1.8 and 6 million (docs/scaling.md): below, two exchanges more cost what they save. In
+place, three hosts do not agree at .45 million: owners are the faster way on the newest, the slower one on the others.
+To be decided when two GPUs can be measured again."""
 
 OVERFLOW, STOP = 0, 1
 """Columns of a pass's flags: iterations do nothing for lack of memory; the signal to stop, 0 for none. They travel as
