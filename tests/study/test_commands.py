@@ -30,6 +30,7 @@ from turbogs_plugin.study.cell import capture_digest, train_cell
 from turbogs_plugin.study.compare import study_of_runs
 from turbogs_plugin.study.folder import StudyFolder
 from turbogs_plugin.study.grid import load_ablation, variant_config
+from turbogs_plugin.study.pages import changed_since
 from turbogs_plugin.study.results import CellResult, Study
 from turbogs_plugin.study.results_file import DECIMALS
 from turbogs_plugin.train.folder import RunFolder
@@ -98,6 +99,15 @@ def study(trained, tmp_path, monkeypatch) -> Path:
     """A copy of `trained`, to go on with at the same commit."""
     monkeypatch.setenv("TURBOGS_COMMIT", "one")
     return Path(shutil.copytree(trained, tmp_path / "study"))
+
+
+def test_what_a_call_asked_for_makes_no_study_stale_but_a_change_of_its_ablation_does(study):
+    assert "Stale" not in (study / "report.md").read_text()
+    made = StudyFolder(study).read_study()
+    assert (made.results[0].overrides, made.results[0].steps) == ([*SETTINGS], 4)
+    made.ablation.variants["full"] = ["loss.epsilon=0.5"]
+    (line,) = changed_since(made)
+    assert line.markdown().endswith("Then: loss.epsilon 0.001 (now 0.5).")
 
 
 def test_a_process_warms_up_once_for_a_variant_and_capture(turbogs, small, capture, tmp_path, monkeypatch):

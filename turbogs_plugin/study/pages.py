@@ -127,7 +127,8 @@ def changed_since(study: Study) -> list[Paragraph]:
 def changed_settings(study: Study, variant: str, ablation: Ablation) -> str:
     """``Then: KEY VALUE (now VALUE).``: what a study's cells of a variant have other than an ablation gives it today.
 
-    Empty where nothing has changed, or the study has no such cells.
+    What the study's call asked for itself is no change. Empty where nothing has changed, or the study has no such
+    cells.
 
     Raises:
         InputError: the ablation has a setting that there is no more.
@@ -135,7 +136,7 @@ def changed_settings(study: Study, variant: str, ablation: Ablation) -> str:
     measured = next((result for result in study.results if result.variant == variant), None)
     if measured is None:
         return ""
-    present = flattened(variant_config(ablation, variant, 0, (), None).to_mapping())
+    present = flattened(variant_config(ablation, variant, 0, measured.overrides, measured.steps).to_mapping())
     defaults = resolve({}).to_mapping()  # which settings have that are newer than the cells
     asked = compared(defaults, OF_THE_CALL) | compared(measured.asked, OF_THE_CALL)
     changed = sorted(path for path in difference(present, asked) if path != ABSENT and path in present)

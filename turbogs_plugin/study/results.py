@@ -25,6 +25,8 @@ class CellResult:
         lpips_reason: why LPIPS was not computed; empty where it was.
         config: its configuration, as plan and budgets resolved it.
         asked: the configuration that was asked for: by it a finished cell is recognised.
+        overrides, steps: what the call of the study asked for beside its variant (`variant_config`); empty and None
+            where it asked for nothing, or where that was not recorded.
         lpips, flip: of the final model; NaN where they were not computed.
         fps: test views rendered a second, one after the other; NaN where it was not recorded.
         wall_seconds: of a run, from its process's start until its model was written; NaN where a process has many.
@@ -44,6 +46,8 @@ class CellResult:
     lpips_reason: str = ""
     config: dict[str, Any]
     asked: dict[str, Any]
+    overrides: list[str] = field(default_factory=list)
+    steps: int | None = None
     lpips: float = math.nan
     flip: float = math.nan
     fps: float = math.nan

@@ -115,7 +115,7 @@ def _reduced(cell: dict[str, Any], common: Mapping[str, Any], config: Mapping[st
     """What a cell's line says."""
     cell = cell | {"config": difference(config, cell["config"])}
     own = {name: value for name, value in cell.items() if name not in common or value != common[name]}
-    return {name: value for name, value in own.items() if value not in (None, {})}
+    return {name: value for name, value in own.items() if value not in (None, {}, [])}
 
 
 def _result(document: Document, cell: dict[str, Any], where: str) -> CellResult:

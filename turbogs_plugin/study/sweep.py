@@ -100,6 +100,7 @@ def run_sweep(
         TrainingStopped: the GPU can no longer be used by this process.
     """
     begun = time.monotonic() if begun is None else begun
+    call = {"overrides": list(options.overrides), "steps": options.steps}
     folder.require_usable()
     study = folder.read_study() if folder.file.is_file() else Study(ablation, [])
     finished = {result.key: result for result in study.results}
@@ -125,7 +126,7 @@ def run_sweep(
             if key in finished:
                 _require_same(finished[key], config)
             elif known is not None:
-                repeated.append(replace(known, variant=key.variant))
+                repeated.append(replace(known, variant=key.variant, **call))
             else:
                 left.append((scene, key, config))
         for key, result in finished.items():
@@ -160,6 +161,7 @@ def run_sweep(
                 try:
                     seconds, known = loading[key.scene], (key.variant, key.scene) in warm
                     outcome = train_cell(key.variant, config, scene, device, here, listeners, seconds, known)
+                    outcome = replace(outcome, **call)
                     warm.add((key.variant, key.scene))
                 except Exception as error:  # whatever a variant breaks by, the other cells go on
                     outcome = Failure(key, _reason(error))
