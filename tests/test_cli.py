@@ -156,6 +156,7 @@ def test_a_broken_capture_is_refused(turbogs, copy, tmp_path, damage, words):
         (["--max-memory", ""], ["--max-memory ''", "leave it out"]),
         (["--time-budget", ""], ["--time-budget ''", "leave it out"]),
         (["scene.path=elsewhere"], ["scene.path", "leave the override out"]),
+        (["train.iterations=2", "--time-budget", "9s"], ["train.iterations=2 and the time budget 9s exclude"]),
     ],
     ids=lambda value: value[-1] if isinstance(value, list) else None,
 )

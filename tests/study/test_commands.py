@@ -27,15 +27,18 @@ from turbogs_plugin.scene import load_scene, write_demo_capture
 from turbogs_plugin.study import cell as cell_module
 from turbogs_plugin.study import sweep
 from turbogs_plugin.study.cell import capture_digest, train_cell
+from turbogs_plugin.study.commands import ablate
 from turbogs_plugin.study.compare import study_of_runs
 from turbogs_plugin.study.folder import StudyFolder
 from turbogs_plugin.study.grid import load_ablation, variant_config
 from turbogs_plugin.study.pages import changed_since
 from turbogs_plugin.study.results import CellResult, Study
 from turbogs_plugin.study.results_file import DECIMALS
+from turbogs_plugin.study.sweep import SweepOptions
 from turbogs_plugin.train.folder import RunFolder
 from turbogs_plugin.train.history import Evaluation, append_evaluation, read_history
 from turbogs_plugin.train.loop import Listener, TrainingLoop
+from turbogs_plugin.train.run import train
 from turbogs_plugin.train.trainer import Trainer
 from turbogs_plugin.train.wall import WallRecord
 
@@ -179,8 +182,11 @@ def test_a_cell_of_other_settings_is_not_mixed_in(turbogs, small, capture, study
     changed.insert(2, "loss.ncc_weight=0.1")
     code, _, err = turbogs(*changed)
     assert code == 2 and "other settings (loss)" in err
-    code, _, err = turbogs(*call(small, capture, study, "--only", "full", "--time-budget", "1s"))
+    changed[2] = "budget.time=1s"
+    code, _, err = turbogs(*changed)
     assert code == 2 and "other settings (budget)" in err
+    code, _, err = turbogs(*changed, "--time-budget", "1s")
+    assert code == 2 and "--steps 4 and --time-budget 1s exclude each other: leave one out" in err
     assert {path: path.read_bytes() for path in study.rglob("*") if path.is_file()} == before
 
 
@@ -218,16 +224,13 @@ def machine(monkeypatch) -> None:
     "length", [("train.iterations=30",), ("train.iterations=8", "train.epochs=2")], ids=["short", "long"]
 )
 def test_a_cell_with_a_time_budget_is_trained_as_a_run_with_one(
-    turbogs, machine, small, capture, tmp_path, length, warm
+    machine, small, capture, tmp_path, length, warm, capsys
 ):
     """Fewer iterations than configured, or more pixels: the same numbers, and the same resolved configuration."""
-    budget = ("--time-budget", "3s", "--device", "cpu")
-    settings = (*TINY, *length)
-    code, _, err = turbogs("train", capture, *settings, "--out", tmp_path / "run", *budget)
-    assert code == 0, err
-    out = tmp_path / "study"
-    code, _, err = turbogs("ablate", small, *settings, "--scene", capture, "--out", out, "--only", "full", *budget)
-    assert code == 0, err
+    settings = (*TINY, *length, "budget.time=3s")  # on the command line the two would be refused
+    train(load_config("turbogs", [*settings, f"scene.path={capture}"]), tmp_path / "run")
+    out, options = tmp_path / "study", SweepOptions([capture], overrides=settings, device="cpu")
+    assert ablate([str(small)], options, out, ["full"], ()) == 0
     (cell,) = StudyFolder(out).read_study().results
     assert cell.time_budget == "3s" and 2.5 < cell.final.train_seconds < 3.5
     errors = ("iteration", "train_seconds", "psnr", "ssim", "l1", "num_gaussians")
@@ -242,8 +245,9 @@ def test_a_cell_with_a_time_budget_is_trained_as_a_run_with_one(
     assert cell.config == config.to_mapping()
     assert cell.config["train"]["iterations"] != cell.asked["train"]["iterations"] == int(length[0].partition("=")[2])
     assert "s many iterations as fit into 3s of training" in (out / "report.md").read_text()
-    code, _, err = turbogs("ablate", small, *settings, "--scene", capture, "--out", out, "--only", "full", *budget)
-    assert code == 0 and "1 finished cells are kept" in err
+    capsys.readouterr()
+    assert ablate([str(small)], options, out, ["full"], ()) == 0
+    assert "1 finished cells are kept" in capsys.readouterr().err
 
 
 def test_an_interrupted_sweep_reports_what_is_there(turbogs, small, capture, tmp_path, monkeypatch):

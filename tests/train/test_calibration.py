@@ -166,6 +166,13 @@ def test_a_configuration_for_its_time(scene, monkeypatch, seconds, overrides, pi
     assert (told in calibration.budget_text(config, measured)) == (pixel_budget > 1.0)
 
 
+@pytest.mark.parametrize(("seconds", "told"), [(1.0234, "1020 ms"), (0.0013, "1.3 ms"), (0.0156789, "15.7 ms")])
+def test_milliseconds_are_told_as_plain_numbers(seconds, told):
+    measured = calibration.Calibration(1.0, 0.1, IterationCost(seconds, 0.0), 100, 1.0, 1.0)
+    config = load_config("turbogs", ["budget.time=9s"])
+    assert f"for one takes {told} with 100 Gaussians" in calibration.budget_text(config, measured)
+
+
 @pytest.mark.parametrize(("seconds", "longest"), [(30, 1.2), (3600, 5.0), (360_000, 5.0)])
 def test_a_long_time_is_not_spent_on_calibration(scene, monkeypatch, seconds, longest):
     asked, cost = [], SyntheticTrial.cost

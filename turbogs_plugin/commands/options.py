@@ -56,7 +56,7 @@ class RunOptions:
 
     def settings(self, scene: Path, overrides: tuple[str, ...]) -> Config:
         """The configuration that a command line asks for."""
-        from turbogs_plugin.config.configuration import DEFAULT_CONFIG, load_config
+        from turbogs_plugin.config.configuration import DEFAULT_CONFIG, load_config, require_one_length
         from turbogs_plugin.plan.caps import with_cap
 
         budget = budget_overrides(self.max_memory, self.time_budget)
@@ -64,7 +64,9 @@ class RunOptions:
             raise InputError(f"--max-gaussians {self.max_gaussians}: it must be at least 1; leave it out for no limit")
         if any(override.partition("=")[0].strip() == "scene.path" for override in overrides):
             raise InputError(f"scene.path is '{scene}', as SCENE says: leave the override out")
-        settings = load_config(DEFAULT_CONFIG if self.config is None else self.config, (*overrides, *budget))
+        asked = DEFAULT_CONFIG if self.config is None else self.config, (*overrides, *budget)
+        settings = load_config(*asked)
+        require_one_length(*asked)
         if self.max_gaussians is not None:
             settings = with_cap(settings, self.max_gaussians)
         settings.scene.path = str(scene)

@@ -45,6 +45,7 @@ def ablate(
         gpus: numbers of GPUs, a process each, which share the cells.
         device: where to train.
     """
+    from turbogs_plugin.config.configuration import DEFAULT_CONFIG, require_one_length
     from turbogs_plugin.config.units import parse_seconds
     from turbogs_plugin.study import commands
     from turbogs_plugin.study.sweep import SweepOptions
@@ -61,6 +62,9 @@ def ablate(
         raise InputError("ablate needs NAME_OR_FILE and --scene SCENE, or --merge STUDY ...")
     if only and len(ablations) > 1:
         raise InputError("--only names variants of one ablation: give it one NAME_OR_FILE")
+    if steps is not None and time_budget is not None:
+        raise InputError(f"--steps {steps} and --time-budget {time_budget} exclude each other: leave one out")
+    require_one_length(DEFAULT_CONFIG, overrides)
     limit = None if within is None else parse_seconds(within)
     options = SweepOptions(scene, seeds, overrides, steps, device, limit, numbers("--gpus", gpus))
     return commands.ablate(ablations, options, out, only, psnr)

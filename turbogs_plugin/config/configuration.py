@@ -110,6 +110,30 @@ def load_config(name_or_file: str = DEFAULT_CONFIG, overrides: Sequence[str] = (
     return resolve(apply_overrides(_load_mapping(name_or_file), overrides))
 
 
+def require_one_length(name_or_file: str, overrides: Sequence[str]) -> None:
+    """Raise `InputError` where overrides ask for a time budget and a number of iterations, or for one of them beside a
+    file of the user's that has the other. A number of a packaged configuration is no request.
+
+    A file that has both is no contradiction: the configuration of a run with a time budget is such a one.
+
+    Args:
+        name_or_file, overrides: which `load_config` takes.
+    """
+    told, filed = apply_overrides({}, overrides), _load_mapping(name_or_file, packaged=False)
+
+    def said(mapping: Mapping[str, Any], section: str, key: str) -> Any:
+        return mapping.get(section, {}).get(key)
+
+    asked = _merge(filed, told)
+    iterations, seconds = said(asked, "train", "iterations"), said(asked, "budget", "time")
+    by_override = said(told, "train", "iterations") is not None or said(told, "budget", "time") is not None
+    if by_override and seconds and iterations not in (None, AUTO):
+        of = "" if said(told, "train", "iterations") is not None else f" of '{name_or_file}'"
+        raise InputError(
+            f"train.iterations={iterations}{of} and the time budget {seconds} exclude each other: leave one out"
+        )
+
+
 def resolve(mapping: Mapping[str, Any]) -> Config:
     """The complete, checked configuration of a mapping of sections; absent sections have their defaults."""
     old = old_spelling(mapping)
@@ -181,12 +205,15 @@ def apply_overrides(mapping: Mapping[str, Any], overrides: Sequence[str]) -> dic
     return result
 
 
-def _load_mapping(name_or_file: str, depth: int = 0) -> dict[str, Any]:
+def _load_mapping(name_or_file: str, depth: int = 0, packaged: bool = True) -> dict[str, Any]:
+    """The mapping of a configuration on top of its bases, or without what comes from packaged ones."""
+    if not packaged and name_or_file in config_names():
+        return {}
     if depth > BASE_DEPTH_LIMIT:
         raise InputError(f"config '{name_or_file}': its bases form a circle")
     mapping = read_named_yaml(name_or_file, PACKAGE, "config")
     base = mapping.pop("base", None)
-    return mapping if base is None else _merge(_load_mapping(str(base), depth + 1), mapping)
+    return mapping if base is None else _merge(_load_mapping(str(base), depth + 1, packaged), mapping)
 
 
 def _merge(under: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:

@@ -102,12 +102,13 @@ def budget_text(config: Config, measured: Calibration | None) -> str:
     if config.budget.max_memory:
         parts.append(f"{config.budget.max_memory} of device memory")
     if measured is not None:
-        cost = 1e3 * measured.cost.at(measured.gaussians)
+        # Three digits, and never as 1.02e+03.
+        cost = float(f"{1e3 * measured.cost.at(measured.gaussians):.3g}")
         configured, chosen = measured.configured_pixel_budget, measured.pixel_budget
         raised = f" with schedule.pixel_budget {chosen:g} instead of {configured:g}" if chosen > configured else ""
         parts.append(
             f"{config.budget.time} of training: about {config.train.iterations} iterations{raised}, for one "
-            f"takes {cost:.3g} ms with {measured.gaussians} Gaussians (measured in {measured.seconds:.1f} s)"
+            f"takes {cost:.10g} ms with {measured.gaussians} Gaussians (measured in {measured.seconds:.1f} s)"
         )
     return f"budget: {'; '.join(parts)}" if parts else ""
 
