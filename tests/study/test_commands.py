@@ -445,9 +445,14 @@ def test_runs_are_compared(turbogs, capture, tmp_path):
     markdown = (tmp_path / "report" / "report.md").read_text()
     assert "pixel_sampler.type=random" in markdown and "not recorded" in markdown
     assert turbogs("compare", *paths, "--out", tmp_path / "report")[0] == 2
-    shutil.copytree(tmp_path / "a", tmp_path / "again")
-    code, _, err = turbogs("compare", *paths, tmp_path / "again", "--out", tmp_path / "other")
-    assert code == 2 and "same run" in err
+
+
+def test_a_run_twice_and_another_run_of_the_same_settings_are_told_apart(tmp_path):
+    first, second = (a_run(tmp_path / name, 30) for name in ("x", "y"))
+    with pytest.raises(InputError, match=r"/x' is given twice, .* leave one out"):
+        study_of_runs([first, tmp_path / "y" / ".." / "x"])
+    with pytest.raises(InputError, match=r"/y' has the settings and the seed of '.*/x': .* another train.seed"):
+        study_of_runs([first, second])
 
 
 def a_run(folder: Path, iterations: int, *overrides: str, fitted: Sequence[str] = ()) -> Path:

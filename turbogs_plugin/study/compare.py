@@ -30,7 +30,7 @@ def study_of_runs(paths: Sequence[Path]) -> Study:
     differs from machine to machine and from seed to seed.
 
     Raises:
-        InputError: no run there, one without an evaluation, or the same run twice.
+        InputError: no run there, one without an evaluation, or two of the same settings and seed.
     """
     variants: dict[str, dict[str, Any]] = {}  # name -> what was asked for without the seed and the place
     results: list[CellResult] = []
@@ -57,8 +57,14 @@ def study_of_runs(paths: Sequence[Path]) -> Study:
             wall_seconds=wall.wall_seconds if (wall := WallRecord.read(folder.wall)) else math.nan,
             history=history,
         )
-        if any(other.key == result.key for other in results):
-            raise InputError(f"'{path}' is the same run as another one: {result.key}")
+        for other_path, other in zip(paths, results, strict=False):
+            if path.resolve() == other_path.resolve():
+                raise InputError(f"'{path}' is given twice, and a run is not compared with itself: leave one out")
+            if other.key == result.key:
+                raise InputError(
+                    f"'{path}' has the settings and the seed of '{other_path}': leave one out, or compare a run with "
+                    "another train.seed"
+                )
         results.append(result)
     base = next(iter(variants))
     overrides = {
