@@ -320,14 +320,30 @@ def test_verbs_without_a_run(turbogs, tmp_path, verb):
     assert not list(tmp_path.iterdir())
 
 
-def test_a_run_without_or_with_a_broken_checkpoint(turbogs, finished, tmp_path):
+def test_a_run_without_or_with_a_broken_checkpoint(turbogs, finished, capture, tmp_path):
     broken = Path(shutil.copytree(finished, tmp_path / "broken"))
     checkpoint = next((broken / "checkpoints").glob("*.pt"))
     checkpoint.write_bytes(checkpoint.read_bytes()[:1000])
     for arguments in (["eval", broken], ["export", broken], ["train", "--resume", broken]):
         assert_refused(turbogs(*arguments), "cannot be used", checkpoint.name)
     shutil.rmtree(broken / "checkpoints")
+    before = tree(broken)
+    for verb in ("eval", "render", "export"):
+        assert_refused(turbogs(verb, broken), "has no checkpoint", f"{broken / 'model.ply'} --scene {capture}")
+    assert_refused(turbogs("train", "--resume", broken), f"'{broken}' is finished", "model.ply", "another --out")
+    assert tree(broken) == before
+    (broken / "model.ply").unlink()
     assert_refused(turbogs("eval", broken), "no checkpoint yet", f"turbogs train --resume {broken}")
+
+
+def test_to_go_on_with_a_finished_run_says_so_and_changes_no_file(turbogs, finished, tmp_path):
+    run = Path(shutil.copytree(finished, tmp_path / "run"))
+    before = tree(run)
+    assert turbogs("train", "--resume", run) == (0, f"{run} is finished: 2 of 2 iterations\n", "")
+    assert tree(run) == before
+    (run / "report.md").unlink()
+    assert turbogs("train", "--resume", run, "--no-report")[1].endswith("is finished: 2 of 2 iterations\n")
+    assert turbogs("train", "--resume", run)[0] == 0 and (run / "report.md").is_file(), "what was left to do"
 
 
 def without_section(text: str) -> str:
@@ -363,6 +379,7 @@ def test_a_run_whose_capture_moved_says_where_to_tell(turbogs, finished, capture
     moved = Path(shutil.copytree(finished, tmp_path / "moved"))
     file = moved / "config.yaml"
     file.write_text(file.read_text().replace(str(capture), str(tmp_path / "gone")))
+    (moved / "report.md").unlink()  # so that there is something left to do
     for arguments in (["eval", moved], ["render", moved], ["train", "--resume", moved]):
         assert_refused(turbogs(*arguments), tmp_path / "gone", f"edit scene.path in {file}")
     file.write_text(file.read_text().replace(str(tmp_path / "gone"), str(capture)))

@@ -137,7 +137,7 @@ def test_bad_input_is_one_line(turbogs, finished, capture, tmp_path):
     refused(turbogs("export", tmp_path, "--format", "spz"), "holds no run")
     shutil.copytree(finished, tmp_path / "empty")
     shutil.rmtree(tmp_path / "empty" / "checkpoints")
-    refused(turbogs("export", tmp_path / "empty", "--format", "html"), "no checkpoint yet")
+    refused(turbogs("export", tmp_path / "empty", "--format", "html"), "has no checkpoint", "model.ply")
     call = ("export", points, "--scene", capture, "--format", "spz", "--out")
     refused(turbogs(*call, tmp_path / "a.spz"), "not a 3DGS model")
     refused(turbogs(*call, points), "exists")

@@ -72,10 +72,14 @@ def train(
     from turbogs_plugin.report.plot_process import PlotProcess
     from turbogs_plugin.report.tensorboard import event_writers
     from turbogs_plugin.train import run
+    from turbogs_plugin.train.finished import finished_text
 
     gc.freeze()  # so that later collections pass over them
     gc.enable()
     settings = run.RunFolder(resume).read_config() if resume else options.settings(scene, overrides)
+    if resume and viewer is None and (finished := finished_text(run.RunFolder(resume), report)):
+        print(finished)
+        return 0
     device = settings.train.device
     if gpus is not None and gpus > 1 and not launched():
         if out is not None:

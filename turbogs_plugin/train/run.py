@@ -27,6 +27,7 @@ from turbogs_plugin.train.calibration import Calibration, budget_text, hold_to, 
 from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint, require_like, save_checkpoint
 from turbogs_plugin.train.evaluate import load_lpips
 from turbogs_plugin.train.evaluations import Evaluations
+from turbogs_plugin.train.finished import require_unfinished
 from turbogs_plugin.train.folder import RunFolder
 from turbogs_plugin.train.history import Evaluation, append_evaluation, rewind_history
 from turbogs_plugin.train.interrupts import Interrupts
@@ -182,8 +183,8 @@ def resume(
         report, clock, ranks, watch: as in `train`. The number of processes may be another than before.
 
     Raises:
-        InputError: no run there, an unusable checkpoint, a changed capture, or a machine without what the run needs;
-            then nothing was changed.
+        InputError: no run there, a finished one without checkpoints, an unusable checkpoint, a changed
+            capture, or a machine without what the run needs; then nothing was changed.
         TrainingStopped: the run cannot go on.
     """
     clock = clock or WallClock()
@@ -192,6 +193,8 @@ def resume(
     config, plan = folder.read_config(), folder.read_plan()
     earlier = WallRecord.read(folder.wall)
     checkpoint = latest_checkpoint(folder.checkpoints)
+    if checkpoint is None:
+        require_unfinished(folder)
     state = None if checkpoint is None else load_checkpoint(checkpoint)
     device = resolve_device(config.train.device, "go on with this run where there is a GPU, or see 'turbogs doctor'")
     require_writable(folder.path, f"what --resume {folder.path} writes")

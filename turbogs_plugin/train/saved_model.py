@@ -66,6 +66,11 @@ def load_model(path: Path, device: torch.device) -> SavedModel:
     checkpoint = latest_checkpoint(folder.checkpoints)
     if checkpoint is None:
         quoted = shlex.quote(str(path))
+        if folder.model.is_file():
+            scene = shlex.quote(config.scene.path)
+            raise InputError(
+                f"'{path}' has no checkpoint: give its model by  {shlex.quote(str(folder.model))} --scene {scene}"
+            )
         raise InputError(f"'{path}' has no checkpoint yet: let the run go on with  turbogs train --resume {quoted}")
     state = load_checkpoint(checkpoint)
     try:
