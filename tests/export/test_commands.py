@@ -102,6 +102,16 @@ def test_a_run_whose_capture_is_gone_is_exported_unmeasured(turbogs, finished, c
     refused(turbogs("export", moved, "--max-gaussians", "5", "--out", tmp_path / "a.ply"), "gone")
 
 
+@pytest.mark.parametrize(
+    ("name", "file", "ending"),
+    [("splat", "x.ply", "splat"), ("ply", "x", "ply"), ("compressed-ply", "x.spz", "ply"), ("html", "x.md", "html")],
+)
+def test_a_name_of_another_format_is_refused(turbogs, finished, tmp_path, name, file, ending):
+    words = f"--out '{tmp_path / file}'", f"--format {name} needs a name that ends in .{ending}\n"
+    refused(turbogs("export", finished, "--format", name, "--out", tmp_path / file), *words)
+    assert not list(tmp_path.iterdir())
+
+
 def test_pruning_keeps_what_adds_most(model, scene):
     """Against a sum by hand: the colour of a Gaussian that alone is white is its weight at each pixel."""
     gaussians, cameras = model.gaussians, scene.train.cameras

@@ -331,7 +331,7 @@ def test_what_is_no_model_is_one_line(turbogs, capture, tmp_path):
             ("train", capture, "--init", file, "--out", out),
             ("eval", file, "--scene", capture),
             ("render", file, "--scene", capture, "--out", out),
-            ("export", file, "--scene", capture, "--out", out),
+            ("export", file, "--scene", capture, "--out", out.with_suffix(".ply")),
         ]
         for call in calls:
             code, printed, error = turbogs(*call)

@@ -81,6 +81,9 @@ def export_run(
         raise InputError(f"--max-gaussians {max_gaussians}: it must be at least 1")
     if out is not None:
         require_new_file(out, "--out")
+        ending = PAGE if file_format == PAGE else FORMATS[file_format].suffix.rpartition(".")[2]
+        if out.suffix.lower() != f".{ending}":
+            raise InputError(f"--out '{out}': --format {file_format} needs a name that ends in .{ending}")
     if given is not None and out is None:
         raise InputError(f"'{path}' has no run's folder to export into: name a new file by --out")
     if max_gaussians is not None and out is None and file_format == "ply":
