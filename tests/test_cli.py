@@ -211,7 +211,10 @@ def test_an_output_folder_that_cannot_be_made_is_refused_before_anything_is_comp
 @pytest.mark.parametrize(
     ("error", "remedy"),
     [
-        (OSError(28, "No space left on device"), "choose another place or make room"),
+        (OSError(28, "No space left on device"), "error: the system says: No space left on device; choose another"),
+        (OSError(28, "No space left on device", "/place"), "choose another place or make room"),
+        (FileNotFoundError(2, "No such file or directory", "/place"), "; see that its folder is there, or choose"),
+        (OSError(5, "Input/output error", "/place"), "; choose another place\n"),
         (PermissionError(13, "Denied", "/place"), "choose another place or give yourself leave to use it (chmod)"),
     ],
 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import math
 import os
 import signal
@@ -36,13 +37,25 @@ def require_not_negative(instance: object, *fields: str) -> None:
         require(math.isfinite(value) and value >= 0, field, value, "a finite number >= 0")
 
 
+def refusal(error: OSError) -> str:
+    """What the system refused a file for, and what to do about it."""
+    if error.errno in (errno.ENOSPC, errno.EDQUOT):
+        remedy = "choose another place or make room"
+    elif isinstance(error, PermissionError):
+        remedy = "choose another place or give yourself leave to use it (chmod)"
+    elif isinstance(error, FileNotFoundError):
+        remedy = "see that its folder is there, or choose another place"
+    else:
+        remedy = "choose another place"
+    return f"{error.strerror or ' '.join(map(str, error.args))}; {remedy}"
+
+
 def error_line(error: Exception) -> str:
     """What a user is told of an `InputError`, a `TrainingStopped` or an OSError: one line."""
     said = str(error)
     if isinstance(error, OSError):
-        place = "" if error.filename is None else f"'{error.filename}': "
-        remedy = "make room" if not isinstance(error, PermissionError) else "give yourself leave to use it (chmod)"
-        said = f"{place}{error.strerror or error}; choose another place or {remedy}"
+        place = "the system says" if error.filename is None else f"'{error.filename}'"
+        said = f"{place}: {refusal(error)}"
     return f"turbogs: error: {' '.join(said.split())}"
 
 

@@ -59,6 +59,18 @@ def read_text(path: Path) -> str | None:
         raise InputError(f"cannot read '{path}': {error}") from None
 
 
+@contextmanager
+def naming(path: Path) -> Iterator[None]:
+    """Give an `OSError` the name of the file that is written: a write knows none, and a partial file's says nothing."""
+    try:
+        yield
+    except OSError as error:
+        if error.filename is None or str(error.filename).endswith(".part"):
+            error.filename = str(path)
+            del error.filename2
+        raise
+
+
 def write_atomically(path: Path, write: Callable[[BinaryIO], None], large: bool = False) -> None:
     """Write a file beside its destination, bring it to the disk, and put it in place by one rename.
 
@@ -79,16 +91,15 @@ def write_atomically(path: Path, write: Callable[[BinaryIO], None], large: bool 
             leftover.unlink(missing_ok=True)
     temporary = partial_path(path)
     try:
-        with open(temporary, "wb") as file:
+        with naming(path), open(temporary, "wb") as file:
             with _brought_to_disk(file) if large else nullcontext():
                 write(file)
             file.flush()
             os.fsync(file.fileno())
-        os.replace(temporary, path)
-    except BaseException as error:
+        with naming(path):
+            os.replace(temporary, path)
+    except BaseException:
         temporary.unlink(missing_ok=True)
-        if isinstance(error, OSError) and error.filename is None:  # of a write, which knows no name
-            error.filename = str(path)
         raise
     _sync_folder(path.parent)
 

@@ -200,6 +200,10 @@ def test_pictures_are_written_in_threads_and_their_errors_are_raised(tmp_path):
     assert difference.mean() < 2.0
     with pytest.raises(OSError, match="absent"), picture_writer() as write:
         write(tmp_path / "absent" / "a.png", pixels)
+    (tmp_path / "full.png").symlink_to("/dev/full")
+    with pytest.raises(OSError) as failed, picture_writer() as write:
+        write(tmp_path / "full.png", np.repeat(pixels, 20, 0))
+    assert failed.value.filename == str(tmp_path / "full.png"), "which a write does not know"
 
 
 def test_the_error_map_saturates_at_full_scale():

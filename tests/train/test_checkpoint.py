@@ -16,6 +16,7 @@ from turbogs_plugin.model import ply, torch_file
 from turbogs_plugin.model.initial import gaussians_from_points
 from turbogs_plugin.train import checkpoint
 from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint, save_checkpoint
+from turbogs_plugin.train.history import Evaluation, append_evaluation
 
 
 def state(value: float = 1.0) -> dict:
@@ -303,11 +304,24 @@ def test_a_large_file_is_brought_to_the_disk_while_it_is_written(tmp_path, monke
     assert target.read_bytes() == b"new" and os.listdir(tmp_path) == ["model"]
 
 
-def test_a_failed_write_names_its_file(tmp_path):
-    files.partial_path(tmp_path / "text").symlink_to("/dev/full")
+@pytest.mark.parametrize("place", ["text", "absent/text", "folder"])
+def test_a_failed_write_names_its_file(tmp_path, place):
+    """A disk that is full, a folder that is gone, and a folder in the place of the file."""
+    target = tmp_path / place
+    (tmp_path / "folder").mkdir()
+    if place == "text":
+        files.partial_path(target).symlink_to("/dev/full")
     with pytest.raises(OSError) as failed:
-        files.write_text_atomically(tmp_path / "text", "new")
-    assert failed.value.filename == str(tmp_path / "text")
+        files.write_text_atomically(target, "new")
+    assert failed.value.filename == str(target) and str(target) in str(failed.value)
+    assert ".part" not in str(failed.value)
+
+
+def test_a_history_on_a_full_disk_is_named(tmp_path):
+    (tmp_path / "history.jsonl").symlink_to("/dev/full")
+    with pytest.raises(OSError) as failed:
+        append_evaluation(tmp_path / "history.jsonl", Evaluation(0, 0.0, 9.0, 0.1, 0.1, 5, 0))
+    assert failed.value.filename == str(tmp_path / "history.jsonl")
 
 
 def test_a_model_is_written_as_atomically_as_a_checkpoint(tmp_path, monkeypatch):

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from turbogs_plugin.engine.layout import MAX_SH_DEGREE
-from turbogs_plugin.errors import InputError
+from turbogs_plugin.errors import InputError, refusal
 from turbogs_plugin.files import write_atomically
 from turbogs_plugin.model.gsplat_formats import read_compressed_ply
 from turbogs_plugin.model.similarity import Similarity, placed
@@ -70,8 +70,7 @@ def save_ply(gaussians: Gaussians, path: str | Path, frame: Frame | None = None)
     try:
         write_atomically(path, write)
     except OSError as error:
-        reason = error.strerror or error
-        raise InputError(f"cannot write {path}: {reason}; choose another place or make room") from error
+        raise InputError(f"cannot write {path}: {refusal(error)}") from error
 
 
 def load_ply(path: str | Path, frame: Frame | None = None) -> Gaussians:

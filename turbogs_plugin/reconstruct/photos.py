@@ -16,6 +16,7 @@ from PIL import Image, ImageOps
 from PIL.ExifTags import IFD, Base
 
 from turbogs_plugin.errors import InputError
+from turbogs_plugin.files import naming
 from turbogs_plugin.scene.capture import FEWEST_PHOTOS
 from turbogs_plugin.scene.nearby import capture_of_run
 from turbogs_plugin.scene.photo_folder import find_photos, unread
@@ -103,12 +104,13 @@ def place_photos(photos: Sequence[PhotoFile], folder: Path) -> None:
             return
         target.parent.mkdir(parents=True, exist_ok=True)
         part = target.with_name(f".{target.name}.part")
-        part.unlink(missing_ok=True)
-        if photo.turned:
-            _write_upright(photo.path, part)
-        else:
-            link_or_copy(photo.path, part)
-        os.replace(part, target)
+        with naming(target):
+            part.unlink(missing_ok=True)
+            if photo.turned:
+                _write_upright(photo.path, part)
+            else:
+                link_or_copy(photo.path, part)
+            os.replace(part, target)
 
     with decoding_threads() as pool:
         list(pool.map(place, photos))

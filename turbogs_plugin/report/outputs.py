@@ -13,7 +13,7 @@ from PIL import Image
 from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.engine.rendering import render_image
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.files import require_writable, unused_name
+from turbogs_plugin.files import naming, require_writable, unused_name
 from turbogs_plugin.report.pictures import depth_picture, to_uint8
 from turbogs_plugin.report.tables import views_table
 from turbogs_plugin.scene import PosedImages
@@ -87,11 +87,13 @@ def render_run(
             with_depth=with_depth,
             background=look.background,
         )
-        Image.fromarray(to_uint8(look.colors(image.colors, view_id))).save(folders[0] / f"{name}.png")
+        with naming(folders[0] / f"{name}.png"):
+            Image.fromarray(to_uint8(look.colors(image.colors, view_id))).save(folders[0] / f"{name}.png")
         if with_depth:
             depths = (image.depths.cpu().double() * model.frame.scale).float().numpy()
-            np.save(folders[1] / f"{name}.npy", depths)
-            Image.fromarray(depth_picture(depths)).save(folders[1] / f"{name}.png")
+            with naming(folders[1] / f"{name}.npy"):
+                np.save(folders[1] / f"{name}.npy", depths)
+                Image.fromarray(depth_picture(depths)).save(folders[1] / f"{name}.png")
     print("\n".join(notes), file=sys.stderr)  # last, as an error is one line alone
     return folders
 

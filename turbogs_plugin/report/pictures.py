@@ -13,6 +13,7 @@ from PIL import Image
 from torch import Tensor
 
 from turbogs_plugin.device import processor_cores
+from turbogs_plugin.files import naming
 from turbogs_plugin.report.inferno import INFERNO
 
 ERROR_FULL_SCALE = 0.25
@@ -49,7 +50,8 @@ def picture_writer() -> Iterator[Callable[[Path, np.ndarray], None]]:
 
 def _save(path: Path, pixels: np.ndarray) -> None:
     options = {"quality": JPEG_QUALITY, "subsampling": 0} if path.suffix == ".jpg" else {}
-    Image.fromarray(pixels).save(path, **options)
+    with naming(path):
+        Image.fromarray(pixels).save(path, **options)
 
 
 def strip(photo: Tensor, image: Tensor, mask: Tensor | None = None) -> np.ndarray:

@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.files import read_text, write_text_atomically
+from turbogs_plugin.files import naming, read_text, write_text_atomically
 
 MEASURES = ("psnr", "ssim", "l1")
 """The errors that every comparison of a render with a photo gives."""
@@ -79,7 +79,7 @@ class Evaluation(FurtherErrors):
 
 def append_evaluation(path: Path, evaluation: Evaluation) -> None:
     """Add one line to a history."""
-    with open(path, "a", encoding="utf-8") as file:
+    with naming(path), open(path, "a", encoding="utf-8") as file:
         file.write(evaluation.to_json() + "\n")
 
 
