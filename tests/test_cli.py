@@ -378,6 +378,14 @@ def test_a_run_whose_configuration_was_cut_is_refused(turbogs, finished, tmp_pat
         assert_refused(turbogs(*arguments), "config.yaml", f"lacks {missing}")
 
 
+def test_a_run_whose_configuration_has_a_wrong_value_is_refused_by_its_file(turbogs, finished, tmp_path):
+    run = Path(shutil.copytree(finished, tmp_path / "run"))
+    file = run / "config.yaml"
+    file.write_text(file.read_text().replace("seed: 0", "seed: -1"))
+    for arguments in (["eval", run], ["train", "--resume", run]):
+        assert_refused(turbogs(*arguments), f"'{file}': train: seed = -1 is not valid", "bring back")
+
+
 def test_a_run_whose_capture_moved_says_where_to_tell(turbogs, finished, capture, tmp_path):
     moved = Path(shutil.copytree(finished, tmp_path / "moved"))
     file = moved / "config.yaml"

@@ -16,7 +16,7 @@ from turbogs_plugin.model import ply, torch_file
 from turbogs_plugin.model.initial import gaussians_from_points
 from turbogs_plugin.train import checkpoint
 from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint, save_checkpoint
-from turbogs_plugin.train.history import Evaluation, append_evaluation
+from turbogs_plugin.train.history import Evaluation, append_evaluation, read_history
 
 
 def state(value: float = 1.0) -> dict:
@@ -177,7 +177,13 @@ def test_a_torn_temporary_file_is_no_checkpoint(tmp_path):
 def test_a_pointer_elsewhere_is_refused(tmp_path, name):
     save_checkpoint(tmp_path, 1, state())
     (tmp_path / "latest").write_text(name)
-    with pytest.raises(InputError, match="names no checkpoint"):
+    (tmp_path / "iteration-000008.pt").touch()
+    remedy = r"; write iteration-000008.pt into '.*latest' to use that one, or train anew"
+    with pytest.raises(InputError, match=f"names no checkpoint.*{remedy}"):
+        latest_checkpoint(tmp_path)
+    for file in tmp_path.glob("*.pt"):
+        file.unlink()
+    with pytest.raises(InputError, match=r"names no checkpoint of its folder: '.*'; train anew with another --out"):
         latest_checkpoint(tmp_path)
 
 
@@ -218,7 +224,10 @@ def test_a_truncated_file_is_refused(tmp_path, keep):
     path = save_checkpoint(tmp_path, 1, state())
     data = path.read_bytes()
     path.write_bytes(data[: keep if isinstance(keep, int) else int(keep * len(data))])
-    with pytest.raises(InputError, match="cannot be used"):
+    with pytest.raises(InputError, match=r"cannot be used: .*; train anew with another --out"):
+        load_checkpoint(path)
+    (tmp_path / "iteration-000000.pt").touch()
+    with pytest.raises(InputError, match=r"cannot be used: .*; write iteration-000000\.pt into '.*latest' to"):
         load_checkpoint(path)
 
 
@@ -315,6 +324,18 @@ def test_a_failed_write_names_its_file(tmp_path, place):
         files.write_text_atomically(target, "new")
     assert failed.value.filename == str(target) and str(target) in str(failed.value)
     assert ".part" not in str(failed.value)
+
+
+@pytest.mark.parametrize("cut", ['{"iteration": 1', '{"iteration": 1\n', "\0\0\0\n", "\n"])
+def test_a_last_line_that_was_cut_is_left_out_of_a_history(tmp_path, cut):
+    path, entry = tmp_path / "history.jsonl", Evaluation(0, 0.0, 9.0, 0.1, 0.1, 5, 0)
+    append_evaluation(path, entry)
+    whole = path.read_text()
+    path.write_text(whole + cut)
+    assert [kept.iteration for kept in read_history(path)] == [0]
+    path.write_text(f"{cut.rstrip()}\n{whole}")
+    with pytest.raises(InputError, match=r"history\.jsonl' line 1 is not an evaluation: take that line out"):
+        read_history(path)
 
 
 def test_a_history_on_a_full_disk_is_named(tmp_path):

@@ -318,7 +318,7 @@ def bad_files(folder: Path) -> dict[str, tuple[Path, str]]:
         "not finite": (save_splats(folder / "nan.pt", broken), "none of its 5 Gaussians is finite"),
         "no rows": (save_splats(folder / "none.pt", model.map(lambda value: value[:0])), "holds no Gaussians: export"),
         "not a ply": (written("text.ply", b"text"), "not a .ply file"),
-        "not a splat": (written("text.splat", b"text"), "is not a .splat"),
+        "not a splat": (written("text.splat", b"text"), "rows of 32; export it again, or name another file"),
         "not a spz": (written("text.spz", b"text"), "cannot read"),
         "not compressed": (written("a.ply", b"ply\nelement chunk 1\nend_header\n"), "not a compressed .ply"),
     }

@@ -165,7 +165,10 @@ def resolve_complete(mapping: Mapping[str, Any], where: str, decided: bool = Fal
     old = old_spelling(mapping)
     if old:
         raise InputError(f"'{where}' is of an earlier version, whose runs are not read: {old}; train anew")
-    config = resolve(mapping)
+    try:
+        config = resolve(mapping)
+    except InputError as error:
+        raise InputError(f"'{where}': {error}; bring back what was written there") from None
     missing = _first_missing(config.to_mapping(), mapping)
     if missing:
         raise InputError(f"'{where}' lacks '{missing}', which this version writes: bring the file back, or train anew")

@@ -46,7 +46,8 @@ def read_splat(path: Path) -> Gaussians:
     except OSError as error:
         raise InputError(f"cannot read {path}: {error.strerror or error}") from None
     if not content or len(content) % SPLAT_ROW.itemsize:
-        raise InputError(f"{path} is not a .splat: its {len(content)} bytes are no rows of {SPLAT_ROW.itemsize}")
+        said = f"{path} is not a .splat: its {len(content)} bytes are no rows of {SPLAT_ROW.itemsize}"
+        raise InputError(f"{said}; export it again, or name another file")
     rows = np.frombuffer(content, dtype=SPLAT_ROW)
     shares = rows["color"].astype(np.float64) / 255.0
     return unpacked_model(

@@ -65,11 +65,23 @@ def save_checkpoint(folder: Path, iteration: int, state: dict[str, Any]) -> Path
         ) from error
     for leftover in folder.glob(".iteration-*.part"):  # from a killed process
         leftover.unlink(missing_ok=True)
-    others = [file for file in folder.iterdir() if _NAME.fullmatch(file.name) and file != path]
-    others.sort(key=lambda file: int(_NAME.fullmatch(file.name)[1]))
+    others = _others(folder, path.name)
     for old in others[: len(others) - (KEPT - 1)]:
         old.unlink(missing_ok=True)
     return path
+
+
+def _others(folder: Path, name: str) -> list[Path]:
+    """The checkpoints beside the one of this name, by iteration."""
+    found = [file for file in folder.iterdir() if _NAME.fullmatch(file.name) and file.name != name]
+    return sorted(found, key=lambda file: int(_NAME.fullmatch(file.name)[1]))
+
+
+def _remedy(folder: Path, name: str) -> str:
+    """What to do where the checkpoint of this name cannot be used."""
+    others = _others(folder, name) if folder.is_dir() else []
+    use = f"write {others[-1].name} into '{folder / 'latest'}' to use that one, or " if others else ""
+    return f"; {use}train anew with another --out"
 
 
 def latest_checkpoint(folder: Path) -> Path | None:
@@ -83,7 +95,8 @@ def latest_checkpoint(folder: Path) -> Path | None:
         return None
     name = text.strip()
     if not _NAME.fullmatch(name) or not (folder / name).is_file():
-        raise InputError(f"'{folder / 'latest'}' names no checkpoint of its folder: '{name[:60]}'")
+        said = f"'{folder / 'latest'}' names no checkpoint of its folder: '{name[:60]}'"
+        raise InputError(said + _remedy(folder, name))
     return folder / name
 
 
@@ -93,9 +106,10 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
     Raises:
         InputError: not a checkpoint of TurboGS, truncated, or with anything but plain tensors and values in it.
     """
-    state = read_plain(path, f"checkpoint '{path}'")
+    remedy = _remedy(path.parent, path.name)
+    state = read_plain(path, f"checkpoint '{path}'", remedy)
     if not isinstance(state, dict) or state.pop("format", None) != FORMAT:
-        raise InputError(f"checkpoint '{path}' cannot be used: not a checkpoint of this version of TurboGS")
+        raise InputError(f"checkpoint '{path}' cannot be used: not a checkpoint of this version of TurboGS{remedy}")
     return state
 
 

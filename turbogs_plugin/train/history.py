@@ -84,7 +84,7 @@ def append_evaluation(path: Path, evaluation: Evaluation) -> None:
 
 
 def read_history(path: Path) -> list[Evaluation]:
-    """All complete lines of a history; a last line cut short by a killed process is left out.
+    """All complete lines of a history; a last line that a killed process or a loss of power cut short is left out.
 
     Raises:
         InputError: unreadable, or a line that is not an evaluation.
@@ -92,12 +92,15 @@ def read_history(path: Path) -> list[Evaluation]:
     text = read_text(path) or ""
     names = {field.name for field in fields(Evaluation)}
     evaluations = []
-    for number, line in enumerate(text[: text.rfind("\n") + 1].splitlines(), start=1):
+    lines = text[: text.rfind("\n") + 1].splitlines()
+    for number, line in enumerate(lines, start=1):
+        if number == len(lines) and not line.rstrip("\0").endswith("}"):
+            break
         try:
             values = {name: value for name, value in json.loads(line).items() if name in names}
             evaluations.append(Evaluation(**{name: math.nan if v is None else v for name, v in values.items()}))
         except (ValueError, TypeError, AttributeError):
-            raise InputError(f"'{path}' line {number} is not an evaluation") from None
+            raise InputError(f"'{path}' line {number} is not an evaluation: take that line out") from None
     return evaluations
 
 
