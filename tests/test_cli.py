@@ -156,6 +156,11 @@ def test_a_broken_capture_is_refused(turbogs, copy, tmp_path, damage, words):
         (["--max-memory", ""], ["--max-memory ''", "leave it out"]),
         (["--time-budget", ""], ["--time-budget ''", "leave it out"]),
         (["scene.path=elsewhere"], ["scene.path", "leave the override out"]),
+        (["--time-budget", "nonsense"], ["error: --time-budget 'nonsense' is no amount of time: write 20s"]),
+        (["--max-memory", "much"], ["error: --max-memory 'much' is no amount of memory"]),
+        (["train.iterations=abc"], ["train.iterations: expected a whole number or auto, got 'abc'"]),
+        (["train.iterations="], ["override 'train.iterations=' lacks a value"]),
+        (["train.iterations=["], ["override 'train.iterations=[' is not valid YAML"]),
         (["train.iterations=2", "--time-budget", "9s"], ["train.iterations=2 and the time budget 9s exclude"]),
     ],
     ids=lambda value: value[-1] if isinstance(value, list) else None,
@@ -279,6 +284,14 @@ def test_numbers_and_places_that_mean_nothing_are_refused(turbogs, tmp_path, cal
 def test_incomplete_and_contradictory_calls(turbogs, capture, tmp_path):
     assert_refused(turbogs("train"), "SCENE")
     assert_refused(turbogs("train", capture), "--out")
+    change = "train.iterations=2"
+    for call in (["train", "--out", tmp_path / "run", change], ["train", change, "--out", tmp_path / "run"]):
+        assert_refused(turbogs(*call), f"train needs a SCENE: '{change}' is a change of a setting")
+    assert_refused(turbogs("plan", change), "plan needs a SCENE")
+    for option, value in (("--steps", "0"), ("--time-budget", "nonsense"), ("--within", "soon")):
+        call = ("ablate", "components", "--scene", capture, "--out", tmp_path / "study", option, value)
+        assert_refused(turbogs(*call), f"error: {option} ", value)
+    assert not list(tmp_path.iterdir())
     assert_refused(turbogs("train", capture, "--resume", tmp_path), "nothing else")
     assert_refused(turbogs("train", "--resume", tmp_path, "--device", "cpu"), "nothing else")
 

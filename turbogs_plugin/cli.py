@@ -5,7 +5,6 @@ from __future__ import annotations
 import atexit
 import gc
 import itertools
-import re
 import sys
 import warnings
 
@@ -13,7 +12,7 @@ from PIL import Image
 from tyro.extras import subcommand_cli_from_dict
 
 from turbogs_plugin.commands import captures, machine, models, studies, training
-from turbogs_plugin.commands.options import PORT
+from turbogs_plugin.commands.options import OVERRIDE, PORT
 from turbogs_plugin.errors import InputError, exit_code
 
 COMMANDS = {
@@ -31,8 +30,6 @@ COMMANDS = {
     "demo": captures.demo,
     "doctor": machine.doctor,
 }
-
-OVERRIDE = re.compile(r"\w+(\.\w+)+=.*", re.DOTALL)
 
 FLAGS = ("--report", "--no-report", "--offload", "--no-offload")
 """Options without a value, of verbs that have overrides."""

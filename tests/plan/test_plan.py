@@ -242,9 +242,9 @@ def test_nothing_is_built_or_trained_by_what_is_left_to_a_plan(setting, capture)
 @pytest.mark.parametrize(
     ("override", "words"),
     [
-        ("train.backdrop=maybe", ["train.backdrop", "true or false", "'auto'"]),
+        ("train.backdrop=maybe", ["train.backdrop", "expected true or false or auto, got 'maybe'"]),
         ("train.sh_degree=4", ["sh_degree", "4", "0 .. 3"]),
-        ("train.iterations=keep", ["train.iterations", "whole number", "'auto'"]),
+        ("train.iterations=keep", ["train.iterations", "expected a whole number or auto, got 'keep'"]),
         ("train.batch_for=0", ["batch_for", "at least 1"]),
         ("train.base_iterations=auto", ["train.base_iterations", "whole number"]),
         ("train.epochs=0", ["epochs", "0", "above 0"]),

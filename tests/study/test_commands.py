@@ -547,7 +547,7 @@ def test_the_bar_of_a_cell_has_the_planned_length(tmp_path, monkeypatch):
         (["ablate", "components", "--scene", "CAPTURE", "--out", "X", "--only", "+geo"], ["+geo-vs"]),
         (["ablate", "components", "--scene", "CAPTURE", "--out", "X", "--seeds", "1", "1"], ["seeds"]),
         (["ablate", "components", "--scene", "CAPTURE", "--scene", "CAPTURE", "--out", "X"], ["scenes"]),
-        (["ablate", "components", "--scene", "CAPTURE", "--out", "X", "--steps", "0"], ["iteration"]),
+        (["ablate", "components", "--scene", "CAPTURE", "--out", "X", "--steps", "0"], ["--steps 0"]),
         (
             ["ablate", "components", "--scene", "x/CAPTURE", "--scene", "y/CAPTURE", "--out", "X"],
             ["x/CAPTURE and", "y/"],

@@ -337,7 +337,7 @@ def test_what_is_no_model_is_one_line(turbogs, capture, tmp_path):
             code, printed, error = turbogs(*call)
             assert code == 2 and printed == "" and error.count("\n") == 1, (what, call[0], error)
             assert words in error and str(file) in error, (what, error)
-            assert not out.exists()
+            assert not list(tmp_path.glob("out*"))
 
 
 def test_calls_that_lack_something(turbogs, finished, capture, tmp_path):

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+import re
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -17,6 +18,8 @@ if TYPE_CHECKING:
 
 LOCAL, PORT = "127.0.0.1", 8080
 """Where a viewer listens unless told otherwise: for this machine alone."""
+
+OVERRIDE = re.compile(r"\w+(\.\w+)+=.*", re.DOTALL)
 
 Device = Literal["auto", "cpu", "cuda"]
 
@@ -113,11 +116,31 @@ NO_SCENE = GivenOptions()
 
 def budget_overrides(max_memory: str | None, time_budget: str | None) -> tuple[str, ...]:
     """The options of a budget as overrides."""
+    from turbogs_plugin.config.units import parse_bytes, parse_seconds
+
     for option, amount in (("--max-memory", max_memory), ("--time-budget", time_budget)):
         if amount == "":
             raise InputError(f"{option} '': write an amount; leave it out for no limit")
+    if max_memory is not None:
+        read_amount("--max-memory", max_memory, parse_bytes)
+    if time_budget is not None:
+        read_amount("--time-budget", time_budget, parse_seconds)
     given = {"max_memory": max_memory, "time": time_budget}
     return tuple(f"budget.{name}={value!r}" for name, value in given.items() if value is not None)
+
+
+def read_amount(option: str, text: str, parse: Callable[[str], float]) -> float:
+    """`parse` of an option's value. Raises `InputError`, which names the option, where it is no amount."""
+    try:
+        return parse(text)
+    except InputError as error:
+        raise InputError(f"{option} {error}") from None
+
+
+def require_scene(command: str, scene: Path) -> None:
+    """Raise `InputError` where an override stands in the place of the capture."""
+    if OVERRIDE.fullmatch(str(scene)) and not scene.exists():
+        raise InputError(f"{command} needs a SCENE: '{scene}' is a change of a setting, no capture")
 
 
 def require_positive(option: str, values: Sequence[float], most: float = math.inf) -> None:

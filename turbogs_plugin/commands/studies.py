@@ -7,7 +7,16 @@ from typing import Annotated
 
 from tyro.conf import Positional, UseAppendAction, arg
 
-from turbogs_plugin.commands.options import Count, Decibels, Device, Studies, Time, budget_overrides, require_positive
+from turbogs_plugin.commands.options import (
+    Count,
+    Decibels,
+    Device,
+    Studies,
+    Time,
+    budget_overrides,
+    read_amount,
+    require_positive,
+)
 from turbogs_plugin.errors import InputError
 
 
@@ -62,10 +71,12 @@ def ablate(
         raise InputError("ablate needs NAME_OR_FILE and --scene SCENE, or --merge STUDY ...")
     if only and len(ablations) > 1:
         raise InputError("--only names variants of one ablation: give it one NAME_OR_FILE")
+    if steps is not None:
+        require_positive("--steps", (steps,))
     if steps is not None and time_budget is not None:
         raise InputError(f"--steps {steps} and --time-budget {time_budget} exclude each other: leave one out")
     require_one_length(DEFAULT_CONFIG, overrides)
-    limit = None if within is None else parse_seconds(within)
+    limit = None if within is None else read_amount("--within", within, parse_seconds)
     options = SweepOptions(scene, seeds, overrides, steps, device, limit, numbers("--gpus", gpus))
     return commands.ablate(ablations, options, out, only, psnr)
 

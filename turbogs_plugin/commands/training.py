@@ -12,7 +12,16 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
-from turbogs_plugin.commands.options import LOCAL, NO_OPTIONS, Count, Flat, Overrides, Scene, require_positive
+from turbogs_plugin.commands.options import (
+    LOCAL,
+    NO_OPTIONS,
+    Count,
+    Flat,
+    Overrides,
+    Scene,
+    require_positive,
+    require_scene,
+)
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.train.wall import WallClock, process_age
 
@@ -62,6 +71,8 @@ def train(
             )
     elif scene is None or out is None:
         raise InputError("train needs a SCENE and --out RUN, or --resume RUN")
+    else:
+        require_scene("train", scene)
     if gpus is not None:
         require_positive("--gpus", (gpus,))
     if viewer is not None and (gpus or 1) > 1:
@@ -124,6 +135,7 @@ def plan(
     """
     if gpus is not None:
         require_positive("--gpus", (gpus,))
+    require_scene("plan", scene)
     from turbogs_plugin.train.run import plan_run
 
     print(plan_run(options.settings(scene, overrides), gpus or 1).text())

@@ -197,8 +197,10 @@ def apply_overrides(mapping: Mapping[str, Any], overrides: Sequence[str]) -> dic
         keys = path.strip().split(".")
         if not separator or len(keys) < 2 or not all(keys):
             raise InputError(f"override '{override}' is not of the form section.key=value")
+        if not text.strip():
+            raise InputError(f"override '{override}' lacks a value: write one behind the =, or null for none")
         # A colour as #336699 would be a comment of YAML.
-        parsed = {"value": text} if text.startswith("#") else parse_yaml(f"value: {text}", override)
+        parsed = {"value": text} if text.startswith("#") else parse_yaml(f"value: {text}", f"override '{override}'")
         if set(parsed) != {"value"}:
             raise InputError(f"override '{override}' has more than one value")
         nested = parsed["value"]

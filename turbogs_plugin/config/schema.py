@@ -101,19 +101,25 @@ def convert(value: Any, hint: Any, where: str) -> Any:
     return _convert_scalar(value, hint, where)
 
 
+SCALARS = {float: "a number", int: "a whole number", bool: "true or false", str: "text", type(None): "null"}
+"""Type -> what it is called in messages."""
+
+
+def _named(hint: Any) -> str:
+    """What a scalar or the values of a `Literal` are called in messages; "" for any other type."""
+    if typing.get_origin(hint) is typing.Literal:
+        return " or ".join(map(str, typing.get_args(hint)))
+    return SCALARS.get(hint, "")
+
+
 def _convert_scalar(value: Any, hint: Any, where: str) -> Any:
     number = isinstance(value, int | float) and not isinstance(value, bool)
-    if hint is float:
-        if not number or math.isnan(value):
-            raise InputError(f"{where}: expected a number, got {value!r}")
+    if hint is float and number and not math.isnan(value):
         return float(value)
-    if hint is int:
-        if not number or not math.isfinite(value) or value != int(value):
-            raise InputError(f"{where}: expected a whole number, got {value!r}")
+    if hint is int and number and math.isfinite(value) and value == int(value):
         return int(value)
-    if hint in (bool, str, type(None)) and not isinstance(value, hint):
-        wanted = {bool: "true or false", str: "text", type(None): "null"}[hint]
-        raise InputError(f"{where}: expected {wanted}, got {value!r}")
+    if hint in (int, float) or (hint in SCALARS and not isinstance(value, hint)):
+        raise InputError(f"{where}: expected {SCALARS[hint]}, got {value!r}")
     return value
 
 
@@ -136,6 +142,9 @@ def _convert_union(value: Any, arguments: tuple, where: str) -> Any:
             return convert(value, argument, where)
         except InputError as error:
             messages.append(str(error))
+    named = [_named(argument) for argument in arguments]
+    if all(named):
+        raise InputError(f"{where}: expected {' or '.join(named)}, got {value!r}")
     concrete = [argument for argument in arguments if argument is not type(None)]
     if len(concrete) == 1:
         raise InputError(messages[arguments.index(concrete[0])])

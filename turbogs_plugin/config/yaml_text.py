@@ -39,7 +39,8 @@ def read_named_yaml(name_or_file: str, package: str, kind: str) -> dict[str, Any
     """
     known = packaged_names(package)
     if name_or_file in known:
-        return parse_yaml((resources.files(package) / f"{name_or_file}.yaml").read_text(encoding="utf-8"), name_or_file)
+        text = (resources.files(package) / f"{name_or_file}.yaml").read_text(encoding="utf-8")
+        return parse_yaml(text, f"{kind} '{name_or_file}'")
     path = Path(name_or_file)
     if path.suffix in (".yaml", ".yml") or path.is_file():
         return read_yaml(path)
@@ -60,7 +61,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
     if len(data) > SIZE_LIMIT:
         raise InputError(f"config '{path}' has more than {SIZE_LIMIT} bytes")
     try:
-        return parse_yaml(data.decode("utf-8"), str(path))
+        return parse_yaml(data.decode("utf-8"), f"config '{path}'")
     except UnicodeDecodeError:
         raise InputError(f"config '{path}' is not UTF-8 text") from None
 
@@ -70,6 +71,9 @@ def parse_yaml(text: str, where: str) -> dict[str, Any]:
 
     Tags, anchors and aliases are refused before anything is built: they can run code or grow without bound.
     ``${...}`` stays text.
+
+    Args:
+        where: what the text is, for messages: ``config 'my.yaml'``.
 
     Raises:
         InputError: not YAML, not one mapping, nested too deeply, or with tags, anchors or aliases.
@@ -88,13 +92,13 @@ def _parsed(text: str, where: str) -> dict[str, Any]:
         problem = getattr(error, "problem", None) or str(error).splitlines()[0]
         mark = getattr(error, "problem_mark", None)
         place = f" (line {mark.line + 1})" if mark else ""
-        raise InputError(f"config '{where}' is not valid YAML{place}: {problem}") from None
+        raise InputError(f"{where} is not valid YAML{place}: {problem}") from None
 
 
 def _refuse_unsafe(text: str, where: str) -> None:
     depth, roots = 0, []
     for event in yaml.parse(text, Loader=yaml.SafeLoader):
-        place = f"config '{where}' (line {event.start_mark.line + 1})"
+        place = f"{where} (line {event.start_mark.line + 1})"
         if isinstance(event, yaml.AliasEvent) or getattr(event, "anchor", None):
             raise InputError(f"{place}: anchors and aliases are not allowed")
         if getattr(event, "tag", None):
@@ -103,9 +107,9 @@ def _refuse_unsafe(text: str, where: str) -> None:
             roots.append(event)
         depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
         if depth > DEPTH_LIMIT:
-            raise InputError(f"config '{where}' is nested more than {DEPTH_LIMIT} levels deep")
+            raise InputError(f"{where} is nested more than {DEPTH_LIMIT} levels deep")
     if len(roots) != 1:
-        raise InputError(f"config '{where}': expected one YAML document, found {len(roots)}")
+        raise InputError(f"{where}: expected one YAML document, found {len(roots)}")
     if not isinstance(roots[0], yaml.MappingStartEvent):
         found = f"the text '{roots[0].value[:40]}'" if isinstance(roots[0], yaml.ScalarEvent) else "a list"
-        raise InputError(f"config '{where}': expected a mapping of sections, got {found}")
+        raise InputError(f"{where}: expected a mapping of sections, got {found}")
