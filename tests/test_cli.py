@@ -426,6 +426,14 @@ def test_a_finished_run_is_evaluated_rendered_and_exported(turbogs, finished, tm
     assert_refused(turbogs("export", finished, "--out", tmp_path / "mine.ply"), "exists")
 
 
+def test_a_report_links_the_page_only_where_it_is_there(turbogs, finished, tmp_path):
+    run = Path(shutil.copytree(finished, tmp_path / "run"))
+    assert "](report.html)" not in (run / "report.md").read_text()
+    (run / "report.html").touch()
+    (run / "report.md").unlink()
+    assert turbogs("train", "--resume", run)[0] == 0 and "](report.html)" in (run / "report.md").read_text()
+
+
 def test_depth_images_are_in_the_captures_own_units(turbogs, capture, finished):
     """As the exported model and the capture's own cameras, which are in these units, give them."""
     code, out, _ = turbogs("render", finished, "--depth", "--device", "cpu")

@@ -168,6 +168,7 @@ def test_a_broken_cell_is_reported_and_tried_again(turbogs, small, capture, tmp_
     monkeypatch.setattr(Trainer, "step", broken)
     code, printed, err = turbogs(*call(small, capture, out))
     assert code == 1 and "no such kernel" in printed and "FAILED" in err
+    assert "left" not in err, "a cell that failed at once says nothing about how long the others take"
     assert "no such kernel" in (out / "report.md").read_text()
     assert (out / "cells/capture/random--seed0.json").is_file()
     monkeypatch.setattr(Trainer, "step", step)

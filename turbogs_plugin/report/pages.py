@@ -98,6 +98,7 @@ def _page(run: RunSession, metrics: Metrics, lpips_reason: str, shown: int) -> s
         f"{view.name}: {view.psnr:.2f} dB\n\n![{view.name}](report/test-{view_id:03d}.jpg)"
         for view_id, view in enumerate(metrics.views[:shown])
     )
+    exported = "[report.html](report.html)" if (run.folder.path / "report.html").is_file() else "`report.html`"
     return f"""# {run.scene.name}
 
 {last.iteration} iterations on {len(run.scene.train)} training views, seed {config.train.seed}; measured on
@@ -110,7 +111,7 @@ evaluation, checkpoints and this report are not in it. Wall time is from the sta
 written. FPS counts test views rendered one after the other. FLIP: `turbogs eval {run.folder.path.name}`.{on}
 
 `turbogs export {run.folder.path.name} --format html` writes all of this and the model on one page,
-[report.html](report.html).
+{exported}.
 
 ## Error against run time
 

@@ -25,7 +25,7 @@ class SweepProgress(TerminalBar):
 
     def __init__(self, total: int, kept: int) -> None:
         self.total, self.done = total, 0
-        self._started = time.perf_counter()
+        self._begun, self._trained, self._seconds = time.perf_counter(), 0, 0.0
         super().__init__(transient=True, total=None, left="")
         if kept:
             self._say(f"{kept} finished cells are kept")
@@ -37,6 +37,7 @@ class SweepProgress(TerminalBar):
 
     def begin(self, key: CellKey) -> None:
         """Called before a cell."""
+        self._begun = time.perf_counter()
         if self._bar is not None:
             self._bar.reset(self._task, total=None, description=str(key), left=self._left())
 
@@ -45,6 +46,8 @@ class SweepProgress(TerminalBar):
         if isinstance(outcome, Failure):
             text = f"FAILED: {outcome.reason}"
         else:
+            self._trained += 1
+            self._seconds += time.perf_counter() - self._begun
             final = outcome.final
             text = f"{final.psnr:.2f} dB in {final.train_seconds:.1f} s, {final.num_gaussians} Gaussians"
         self.done += 1
@@ -56,10 +59,10 @@ class SweepProgress(TerminalBar):
         self.total -= 1
 
     def _left(self) -> str:
-        """The time left in words, by the mean time that a cell has taken so far; "" where it is not known."""
-        if not self.done or self.done == self.total:
+        """The time left in words, by the mean time of the cells trained here; "" where there is none yet."""
+        if not self._trained or self.done == self.total:
             return ""
-        seconds = round((time.perf_counter() - self._started) / self.done * (self.total - self.done))
+        seconds = round(self._seconds / self._trained * (self.total - self.done))
         return f"about {seconds // 60} min {seconds % 60:02d} s left"
 
     def _say(self, text: str) -> None:
