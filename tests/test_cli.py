@@ -16,7 +16,7 @@ import torch
 from helpers.framework_runs import TINY, stop_after
 from PIL import Image
 
-from turbogs_plugin import cli, scene
+from turbogs_plugin import __version__, cli, scene
 from turbogs_plugin.engine.rendering import render_image
 from turbogs_plugin.model.ply import load_ply
 from turbogs_plugin.report import plot_process
@@ -459,6 +459,10 @@ def test_an_exported_file_that_cannot_be_written_is_refused(turbogs, finished, t
 def test_the_demo_capture_is_not_written_over(turbogs, tmp_path):
     (tmp_path / "capture").mkdir()
     assert_refused(turbogs("demo", tmp_path / "capture"), "capture")
+
+
+def test_version(turbogs):
+    assert turbogs("--version") == (0, f"turbogs {__version__}\n", "")
 
 
 def test_doctor(turbogs):

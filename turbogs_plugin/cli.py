@@ -11,6 +11,7 @@ import warnings
 from PIL import Image
 from tyro.extras import subcommand_cli_from_dict
 
+from turbogs_plugin import __version__
 from turbogs_plugin.commands import captures, machine, models, studies, training
 from turbogs_plugin.commands.options import OVERRIDE, PORT
 from turbogs_plugin.errors import InputError, exit_code
@@ -89,9 +90,12 @@ def main() -> None:
     atexit.register(gc.freeze)  # or the collector walks through all of torch at the end, for a second
     warnings.formatwarning = _warning_line
     Image.MAX_IMAGE_PIXELS = None  # phones take 200 megapixels; photos are checked against cameras and memory
-    about = "TurboGS: train 3D Gaussian Splatting on few, well chosen pixels."
+    about = "TurboGS: train 3D Gaussian Splatting on few, well chosen pixels. --version prints which."
 
     def command() -> int:
+        if sys.argv[1:] == ["--version"]:
+            print(f"turbogs {__version__}")
+            return 0
         _require_no_empty(sys.argv[1:])
         words = _gathered(_with_port(sys.argv[1:]))
         return subcommand_cli_from_dict(COMMANDS, args=words, prog="turbogs", description=about)
