@@ -510,6 +510,10 @@ def test_runs_that_were_asked_the_same_are_seeds_whatever_plan_and_budgets_made_
         study_of_runs(runs)
 
 
+def test_a_run_in_a_folder_called_as_a_configuration_is_not_stale(tmp_path):
+    assert changed_since(study_of_runs([a_run(tmp_path / "turbogs", 30, "density.prune_opacity=0.02")])) == []
+
+
 def test_seconds_on_the_wall_are_compared_where_a_run_recorded_them(turbogs, tmp_path):
     runs = [a_run(tmp_path / name, 30, "scene.path=/a/fox", f"train.seed={seed}") for seed, name in enumerate("xy")]
     runs.append(a_run(tmp_path / "z", 30, "scene.path=/a/fox", "schedule.pixel_budget=2.0"))

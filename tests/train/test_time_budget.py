@@ -68,6 +68,7 @@ def test_a_time_budget_holds(turbogs, capture, tmp_path, monkeypatch):
     assert state["trainer"]["iteration"] == state["pace"]["iterations"] == end.iteration
     assert state["pace"]["refine_until"] < end.iteration
     assert (out / "report.md").is_file() and "10s of training: about" in error
+    assert turbogs("train", "--resume", out)[1] == f"{out} is finished: {end.iteration} of {end.iteration} iterations\n"
 
 
 def test_a_time_too_short_is_refused_with_one_that_is_not(turbogs, capture, tmp_path):

@@ -115,7 +115,8 @@ def _header(study: Study) -> list[Block]:
 def changed_since(study: Study) -> list[Paragraph]:
     """A line that marks a page whose baseline a packaged configuration no longer gives."""
     ablation = study.ablation
-    if ablation.base not in config_names():
+    # Cells of `turbogs compare`, which records no machine, are of a run's folder: it may be called as a configuration.
+    if ablation.base not in config_names() or study.provenances == [None]:
         return []
     try:
         changed = changed_settings(study, ablation.baseline, ablation)
