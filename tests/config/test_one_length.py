@@ -24,8 +24,9 @@ def test_both_are_refused(mine, overrides):
     there = "train.iterations=2" in overrides
     text = "budget: {time: 9s}" if there else "train: {iterations: 2}"
     config = "turbogs" if len(overrides) == 2 else mine(f"base: demo\n{text}")
-    of = "" if there else f" of '{config}'"
-    with pytest.raises(InputError, match=f"^train.iterations=2{of} and the time budget 9s exclude each other: leave"):
+    of, remedy = ("", "leave one out") if there else (f" of '{config}'", "add train.iterations=auto, or leave the")
+    said = f"^train.iterations=2{of} and the time budget 9s exclude each other: {remedy}"
+    with pytest.raises(InputError, match=said):
         require_one_length(config, overrides)
 
 

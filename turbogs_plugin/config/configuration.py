@@ -128,9 +128,11 @@ def require_one_length(name_or_file: str, overrides: Sequence[str]) -> None:
     iterations, seconds = said(asked, "train", "iterations"), said(asked, "budget", "time")
     by_override = said(told, "train", "iterations") is not None or said(told, "budget", "time") is not None
     if by_override and seconds and iterations not in (None, AUTO):
-        of = "" if said(told, "train", "iterations") is not None else f" of '{name_or_file}'"
+        of, remedy = "", "leave one out"
+        if said(told, "train", "iterations") is None:
+            of, remedy = f" of '{name_or_file}'", f"add train.iterations={AUTO}, or leave the budget out"
         raise InputError(
-            f"train.iterations={iterations}{of} and the time budget {seconds} exclude each other: leave one out"
+            f"train.iterations={iterations}{of} and the time budget {seconds} exclude each other: {remedy}"
         )
 
 
