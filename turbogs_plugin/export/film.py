@@ -74,8 +74,7 @@ def write_film(gaussians: Gaussians, look: Look, cameras: Cameras, video: Path) 
     try:
         writer.send(None)
         for frame in _told(len(cameras)):
-            options = {"sh_degree": look.sh_degree, "settings": look.settings, "background": look.background}
-            image = render_image(gaussians, cameras, frame, **options)
+            image = render_image(gaussians, cameras, frame, **look.options)
             writer.send(np.ascontiguousarray(to_uint8(image.colors)[:height, :width]))
         writer.close()
         temporary.replace(video)

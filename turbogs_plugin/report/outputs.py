@@ -78,15 +78,7 @@ def render_run(
     for folder in folders:
         folder.mkdir(parents=True, exist_ok=True)
     for view_id, name in enumerate(distinct_stems(views.names)):
-        image = render_image(
-            model.gaussians,
-            cameras,
-            view_id,
-            sh_degree=look.sh_degree,
-            settings=look.settings,
-            with_depth=with_depth,
-            background=look.background,
-        )
+        image = render_image(model.gaussians, cameras, view_id, with_depth=with_depth, **look.options)
         with naming(folders[0] / f"{name}.png"):
             Image.fromarray(to_uint8(look.colors(image.colors, view_id))).save(folders[0] / f"{name}.png")
         if with_depth:

@@ -15,6 +15,7 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -97,6 +98,11 @@ class Look:
     background: Color = BLACK
     exposures: Tensor | None = None
 
+    @property
+    def options(self) -> dict[str, Any]:
+        """Those of rendering the model's own colours."""
+        return {"sh_degree": self.sh_degree, "settings": self.settings, "background": self.background}
+
     def colors(self, colors: Tensor, view_id: int) -> Tensor:
         """[H, W, 3], 0 .. 1: the model's own colours [H, W, 3], seen by a view, with its exposure."""
         return (colors if self.exposures is None else exposed(colors, self.exposures[view_id])).clamp(0.0, 1.0)
@@ -162,8 +168,7 @@ def render_view(gaussians: Gaussians, views: PosedImages, view_id: int, look: Lo
 
 def _render(gaussians: Gaussians, views: PosedImages, view_id: int, look: Look) -> Tensor:
     """[H, W, 3] float32, the model's own colours, which may be above 1."""
-    settings = {"sh_degree": look.sh_degree, "settings": look.settings, "background": look.background}
-    return render_image(gaussians, views.cameras, view_id, **settings).colors
+    return render_image(gaussians, views.cameras, view_id, **look.options).colors
 
 
 def psnr(image: Tensor, photo: Tensor) -> float:
