@@ -111,11 +111,11 @@ def paper_parts() -> str:
 
 def paper_whole() -> str:
     """The paper's configuration with and without its repair, beside full-length 3DGS and ours."""
-    found = {study: rows_of(study) for study in ("baselines", "paper_parts", "sizes")}
+    found = {study: rows_of(study) for study in ("baselines", "paper", "sizes")}
     entries = {
         "3DGS, 30,000 iterations": ("baselines", "3dgs"),
-        "`turbogs-paper`": ("paper_parts", "turbogs-paper"),
-        "`paper-literal`, without the repair": ("paper_parts", "paper-literal"),
+        "`turbogs-paper`": ("paper", "turbogs-paper"),
+        "`paper-literal`, without the repair": ("paper", "paper-literal"),
         "`turbogs`": ("sizes", "turbogs"),
     }
     rows = {

@@ -28,7 +28,7 @@ OURS = (
     ("baselines", "3dgs-as-shipped", "the same with gsplat 1.5.3's reset of opacities, which never happens"),
     ("baselines", "mcmc", "MCMC by gsplat's strategy in our renderer, 30,000 iterations"),
     ("baselines", "fastgs", "density by votes of many views, after FastGS, in our renderer, 30,000 iterations"),
-    ("paper_parts", "turbogs-paper", "turbogs-paper"),
+    ("paper", "turbogs-paper", "turbogs-paper"),
     ("sizes", "ssim", "turbogs-ssim"),
     ("sizes", "cap-67k", "turbogs-small with a cap, FastGS's numbers"),
     ("sizes", "cap-157k", "turbogs-small with a cap, FastGS's numbers"),

@@ -99,7 +99,8 @@ def test_what_is_not_measured_yet_says_so_until_it_is(tmp_path, monkeypatch):
     assert paper_tables.paper_whole().count("not measured yet") == 6 * 3
     a_study(tmp_path, "parts", {"turbogs": (31.0, 31.1), "geometry-views": (31.0, 31.1)})
     a_study(tmp_path, "departures", {"turbogs": (31.0, 31.1), "no-ncc": (31.5, 31.6)})
-    a_study(tmp_path, "paper_parts", {"turbogs-paper": (30.0, 30.1), "random-views": (30.5,), "paper-literal": (8.0,)})
+    a_study(tmp_path, "paper", {"turbogs-paper": (30.0, 30.1), "paper-literal": (8.0,)})
+    a_study(tmp_path, "paper_parts", {"turbogs-paper": (30.0, 30.1), "random-views": (30.5,)})
     a_study(tmp_path, "baselines", {"3dgs": (30.3,)})
     lines = {line.split(" | ")[0]: line for line in paper_tables.paper_parts().splitlines()}
     (views,) = (line for line in lines.values() if "geometry-aware" in line)
@@ -113,7 +114,7 @@ def test_what_is_not_measured_yet_says_so_until_it_is(tmp_path, monkeypatch):
     whole = paper_tables.paper_whole()
     assert whole.count("7.0 s, 30.30 dB, .900, 1k; best on the way 33.00 dB (1)") == 3 and whole.count("8.00 dB") == 3
     assert whole.count("-0.25 ± 0.05 dB, undecided") == 3 and whole.count("-2.95 ± 0.05 dB, beyond the bound") == 3
-    row = study_tables.rows_of("paper_parts")["fox"]["turbogs-paper"]
+    row = study_tables.rows_of("paper")["fox"]["turbogs-paper"]
     assert paper_tables.within_bound(row, row, end=True) == "+0.00 ± 0.05 dB, within the bound"
 
 
