@@ -19,7 +19,7 @@ from turbogs_plugin.errors import InputError, TrainingStopped
 from turbogs_plugin.files import require_writable, write_text_atomically
 from turbogs_plugin.model.ply import save_ply
 from turbogs_plugin.plan import Plan, make_plan
-from turbogs_plugin.scene import Scene
+from turbogs_plugin.scene import Scene, load_scene
 from turbogs_plugin.scene.fingerprint import capture_difference, capture_state
 from turbogs_plugin.scene.load import holds_photos_alone
 from turbogs_plugin.scene.offload import place_views
@@ -96,11 +96,12 @@ def _agreed(config: Config, ranks: Ranks) -> Config:
     return config if ranks.count == 1 else resolve(ranks.agree(config.to_mapping()))
 
 
-def fit(scene: Scene, *overrides: str, config: str = DEFAULT_CONFIG) -> Gaussians:
-    """Train on a loaded scene, in memory: nothing is written, nothing is printed.
+def fit(scene: Scene | Path | str, *overrides: str, config: str = DEFAULT_CONFIG) -> Gaussians:
+    """Train in memory: nothing is written, nothing is printed.
 
     Args:
-        scene: its photos in host memory.
+        scene: a loaded one, its photos in host memory; or the folder of a capture, which the section `scene` of the
+            configuration says how to read.
         overrides: changes of the configuration, ``section.key=value``.
         config: name of a packaged configuration, or a YAML file.
 
@@ -113,6 +114,8 @@ def fit(scene: Scene, *overrides: str, config: str = DEFAULT_CONFIG) -> Gaussian
     """
     settings = load_config(config, overrides)
     device = resolve_device(settings.train.device)
+    if isinstance(scene, str | Path):
+        scene = load_scene(scene, settings.scene.factor, settings.scene.test_every)
     loop, _ = new_loop(make_plan(settings, scene, device).apply(settings), scene, device)
     loop.run()
     loop.trainer.require_finite()
