@@ -9,9 +9,6 @@ from typing import Literal
 from turbogs_plugin.config.units import parse_bytes, parse_color, parse_seconds
 from turbogs_plugin.errors import require, require_not_negative
 
-MOST_CELLS = 256
-"""Along a photo: its points are looked for cell by cell on the host."""
-
 LONGEST_TIME = 100 * 3600.0
 """Seconds of a time budget: the iterations that fit can be counted (less than 2^31) even where one takes 0.2 ms."""
 
@@ -63,9 +60,6 @@ class TrainConfig:
         init: what training starts from: ``points`` of the capture; ``random`` points, in a cube about what the cameras
             look at; or a model's file, a .ply, gsplat's .pt, a checkpoint or a run's folder. A model is taken as it is:
             all its bands are in use from the start, and `initial_opacity` and `initial_size` change nothing.
-        point_cells: further points to start from (`turbogs_plugin.scene.filled_points`): each photo is cut into square
-            cells, so many along its longer side, and a cell without a point of the capture gets one. 0: none. Nothing
-            where the capture has no points of its own.
         sh_degree: highest degree of the spherical harmonics.
         sh_interval: iterations between two bands; the run starts with band 0, but for a model's file.
         initial_opacity, initial_size: of the Gaussians that training starts with; the size in mean distances to the
@@ -100,7 +94,6 @@ class TrainConfig:
     maps_place: Place = "auto"
     photos_place: Place = "auto"
     init: str = "points"
-    point_cells: int = 0
     sh_degree: int = 3
     sh_interval: int = 1000
     initial_opacity: float = 0.1
@@ -126,7 +119,6 @@ class TrainConfig:
         require(self.device in ("auto", "cpu", "cuda"), "device", self.device, "auto, cpu or cuda")
         named = bool(self.init.strip())
         require(named, "init", self.init, "points, random, or the file of a model (.ply, .pt) or a run's folder")
-        require(0 <= self.point_cells <= MOST_CELLS, "point_cells", self.point_cells, f"within 0 .. {MOST_CELLS}")
         require(0 <= self.sh_degree <= 3, "sh_degree", self.sh_degree, "within 0 .. 3")
         if self.background not in ("auto", "random"):
             parse_color(self.background)

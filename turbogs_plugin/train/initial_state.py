@@ -13,7 +13,6 @@ from turbogs_plugin.plan.caps import cap_of, chosen_points, require_room
 from turbogs_plugin.plan.exposures import compare_exposures
 from turbogs_plugin.plan.sight import Sight
 from turbogs_plugin.scene import PosedImages, Scene
-from turbogs_plugin.scene.filled_points import filled_points
 from turbogs_plugin.scene.starting_points import colors_in_photos, starting_points
 from turbogs_plugin.train.given_model import load_given
 from turbogs_plugin.types import Gaussians
@@ -55,10 +54,6 @@ def initial_gaussians(scene: Scene, config: Config, init: str, device: torch.dev
             matrices = (each.cpu().double().numpy() for each in (cameras.viewmats, cameras.Ks))
             points = torch.from_numpy(starting_points(*matrices, cameras.sizes)[0]).float()
             colors = colors_in_photos(points, scene.train.cameras, scene.train.photos, scene.train.masks)
-        elif train.point_cells and not scene.drawn_points:
-            views = scene.train
-            found = filled_points(points, views.cameras, views.photos, train.point_cells, views.masks)
-            points, colors = (torch.cat(both) for both in zip((points, colors), found, strict=True))
         rows = chosen_points(len(points), cap, backdrop_count)
         settings = (train.sh_degree, scene.extent, train.initial_opacity, train.initial_size)
         gaussians = gaussians_from_points(points[rows], colors[rows], *settings)
