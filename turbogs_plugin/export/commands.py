@@ -8,6 +8,7 @@ from pathlib import Path
 import torch
 
 from turbogs_plugin.config.configuration import Config
+from turbogs_plugin.engine.rendering import DEFAULT_SETTINGS
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.export.contribution import contributions, pruned
 from turbogs_plugin.export.fidelity import Change, Fidelity
@@ -95,6 +96,7 @@ def export_run(
         gaussians = pruned(gaussians, contributions(gaussians, scene.train.cameras, model.config.raster), max_gaussians)
     kept = gaussians if drop_bands is None else drop_faint_bands(gaussians, drop_bands)
     notes = _notes(whole, gaussians, kept, drop_bands)
+    notes += () if file_format == PAGE else _blur_note(model.config.raster.eps2d)
     if file_format == PAGE:
         from turbogs_plugin.export.page import write_page
 
@@ -111,6 +113,12 @@ def export_run(
         change = None if reason else Fidelity(whole, scene.test, model.own_look(scene.test)).change(read)
     held = sum(value.numel() * 4 for _, value in whole.items())
     return Exported(file, file.stat().st_size, count, held, len(whole), change, reason, notes)
+
+
+def _blur_note(eps2d: float) -> tuple[str, ...]:
+    """What a file of the model does not hold, where others would not guess it."""
+    usual = DEFAULT_SETTINGS.eps2d
+    return () if eps2d == usual else (f"trained with raster.eps2d={eps2d:g}, which no file holds: most add {usual:g}",)
 
 
 def film_run(
