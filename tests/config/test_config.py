@@ -44,8 +44,9 @@ def test_the_table_of_the_paper():
         assert config.maps.beta == 0.4
 
 
-def test_turbogs_ssim_is_what_was_measured_under_another_name():
-    measured = load_config("turbogs", load_ablation("sizes").variants["ssim"])
+@pytest.mark.parametrize("ablation", ["sizes", "blur"])
+def test_turbogs_ssim_is_what_was_measured_under_another_name(ablation):
+    measured = load_config("turbogs", load_ablation(ablation).variants["ssim"])
     assert load_config("turbogs-ssim") == measured
 
 

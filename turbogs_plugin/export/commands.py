@@ -115,12 +115,6 @@ def export_run(
     return Exported(file, file.stat().st_size, count, held, len(whole), change, reason, notes)
 
 
-def _blur_note(eps2d: float) -> tuple[str, ...]:
-    """What a file of the model does not hold, where others would not guess it."""
-    usual = DEFAULT_SETTINGS.eps2d
-    return () if eps2d == usual else (f"trained with raster.eps2d={eps2d:g}, which no file holds: most add {usual:g}",)
-
-
 def film_run(
     path: Path, camera_path: str, video: Path, seconds: float, device_name: str, given: Config | None = None
 ) -> Path:
@@ -152,3 +146,9 @@ def _notes(whole: Gaussians, kept: Gaussians, written: Gaussians, drop_bands: fl
             share = sum(band_energy(kept)[after + 1 :])
             notes.append(f"degree {before} -> {after}, without {share:.2g} of the colours' energy")
     return tuple(notes)
+
+
+def _blur_note(eps2d: float) -> tuple[str, ...]:
+    """What a file of the model does not hold, where others would not guess it."""
+    usual = DEFAULT_SETTINGS.eps2d
+    return () if eps2d == usual else (f"trained with raster.eps2d={eps2d:g}, which no file holds: most add {usual:g}",)
