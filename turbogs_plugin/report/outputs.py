@@ -37,7 +37,7 @@ def evaluate_run(path: Path, device_name: str, given: Config | None = None) -> s
     views = place_views(views, model.gaussians.device, model.config.train.photos_place)
     lpips, reason = load_lpips(model.config.report.lpips_weights, model.gaussians.device)
     flip, no_flip = load_flip()
-    metrics = evaluate(model.gaussians, views, look, lpips, flip, aligned=True)
+    metrics = evaluate(model.gaussians, views, look, lpips, flip, aligned=True, refined=True)
     note = f"\nLPIPS was not computed: {reason}" if reason else ""
     note += f"\nFLIP was not computed: {no_flip}" if no_flip else ""
     which = f"iteration {model.iteration}" if given is None else str(path)

@@ -29,7 +29,8 @@ def write_report(run: RunSession, process: PlotProcess | None = None) -> Path:
     lpips, lpips_reason = load_lpips(config.report.lpips_weights, trainer.device)
     metrics = None if lpips else run.evaluations.metrics_at(trainer.iteration)
     if metrics is None:
-        metrics = evaluate(trainer.gaussians, run.test, look, lpips, aligned=trainer.exposures is not None)
+        aligned = trainer.exposures is not None
+        metrics = evaluate(trainer.gaussians, run.test, look, lpips, aligned=aligned, refined=True)
     run.clock.mark("report")
     pictures = run.folder.path / "report"
     pictures.mkdir(exist_ok=True)

@@ -15,6 +15,7 @@ FURTHER_KINDS = {
     "whole": "with masked pixels",
     "own": "of the model's own colours",
     "aligned": "after colour alignment",
+    "refined": "by refined test cameras",
 }
 
 FURTHER = {f"{kind}_{name}": f"{head} {said}" for kind, said in FURTHER_KINDS.items() for name, head in ERRORS.items()}

@@ -10,6 +10,7 @@ from typing import Literal
 import numpy as np
 
 from turbogs_plugin.errors import InputError
+from turbogs_plugin.scene.observations import Observations
 from turbogs_plugin.scene.undistort import Lens
 
 FEWEST_PHOTOS = 3
@@ -44,6 +45,8 @@ class Capture:
         mask_files: files of masks that the capture names, one a view or None; given as empty where it names none.
         reprojection_error: how far points are from where photos show them, a mean in pixels of the full-size photos;
             None: the capture does not say.
+        observations: where photos show the points, in pixels of the full-size photos, undistorted where they have a
+            lens; None: the capture does not say.
     """
 
     names: tuple[str, ...]
@@ -60,6 +63,7 @@ class Capture:
     alpha: Literal["opacity", "mask"] = "opacity"
     mask_files: tuple[Path | None, ...] = ()
     reprojection_error: float | None = None
+    observations: Observations | None = None
 
     def __post_init__(self) -> None:
         self.lenses = self.lenses or (None,) * len(self.names)

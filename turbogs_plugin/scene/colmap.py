@@ -16,6 +16,7 @@ import numpy as np
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene.capture import FEWEST_PHOTOS, LARGEST_SIDE, Capture, check_photo_name, left_out, named
 from turbogs_plugin.scene.colmap_check import SMALLEST_IMAGE, check_binary_model
+from turbogs_plugin.scene.colmap_tracks import read_observations
 from turbogs_plugin.scene.photo_folder import NO_PHOTOS
 from turbogs_plugin.scene.photos import photo_size
 from turbogs_plugin.scene.starting_points import starting_points
@@ -197,6 +198,7 @@ def read_colmap(scene: Path, model: Path, suffix: str) -> Capture:
         reduction=reduction,
         alpha="mask",
         reprojection_error=float(known.mean()) if len(known) else None,
+        observations=read_observations(reconstruction, model, suffix, images, lenses) if found else None,
     ).checked(model)
 
 

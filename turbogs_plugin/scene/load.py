@@ -22,6 +22,7 @@ from turbogs_plugin.scene.frame import Frame
 from turbogs_plugin.scene.host_arrays import file_note
 from turbogs_plugin.scene.mask_files import find_masks, load_masks
 from turbogs_plugin.scene.nearby import POSE_FILES, capture_around, capture_near
+from turbogs_plugin.scene.observations import Observations
 from turbogs_plugin.scene.photo_folder import find_photos, unread
 from turbogs_plugin.scene.photos import (
     Photos,
@@ -55,18 +56,28 @@ class PosedImages:
         names: of the photos, in name order.
         photos: their pixels.
         masks: which pixels count, on the CPU; None for all.
+        observations: where the photos show the scene's points; None: the capture does not say.
+        refined: other cameras of the same photos, which agree better with what is trained on (`refine_cameras`); None:
+            there are none.
     """
 
     cameras: Cameras
     names: tuple[str, ...]
     photos: Photos
     masks: PixelMasks | None = None
+    observations: Observations | None = None
+    refined: Cameras | None = None
 
     def __len__(self) -> int:
         return len(self.names)
 
     def to(self, device: torch.device | str) -> PosedImages:
-        return replace(self, cameras=self.cameras.to(device), photos=self.photos.to(device))
+        return replace(self.with_cameras_on(device), photos=self.photos.to(device))
+
+    def with_cameras_on(self, device: torch.device | str) -> PosedImages:
+        """The same photos, with their cameras on a device."""
+        refined = None if self.refined is None else self.refined.to(device)
+        return replace(self, cameras=self.cameras.to(device), refined=refined)
 
     def mask(self, view_id: int) -> Tensor | None:
         """[H, W] bool on the cameras' device, True where a pixel of a view counts; None where all do."""
@@ -201,7 +212,8 @@ def load_scene(
         names = tuple(capture.names[view] for view in views)
         lenses = [capture.lenses[view] for view in views]
         photos = load_photos([paths[view] for view in views], file_sizes[views], sizes[views], lenses, colors, loaded)
-        return PosedImages(cameras, names, photos, _pixel_masks([masks[view] for view in views], sizes[views]))
+        shown = None if capture.observations is None else capture.observations.of_views(views, ratios[views])
+        return PosedImages(cameras, names, photos, _pixel_masks([masks[view] for view in views], sizes[views]), shown)
 
     train, tested = (select(*part) for part in zip(parts, colors, strict=True))
     if capture.point_colors is None:

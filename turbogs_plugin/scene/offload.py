@@ -270,7 +270,7 @@ def place_views(views: PosedImages, device: torch.device, place: str) -> PosedIm
     """Views whose cameras are on the device, and their photos there or, for ``host``, in host memory with a window."""
     if place != "host":
         return views.to(device)
-    return replace(views, cameras=views.cameras.to(device), photos=OffloadedPhotos(views.photos, device))
+    return replace(views.with_cameras_on(device), photos=OffloadedPhotos(views.photos, device))
 
 
 def place_maps(

@@ -88,6 +88,7 @@ def train_cell(
     listeners: Sequence[Listener] = (),
     loading: float = math.nan,
     warm: bool = False,
+    capture: str | None = None,
 ) -> CellResult:
     """Train one variant, as `turbogs train` would: by a plan for the scene, within the budgets of the configuration.
 
@@ -100,6 +101,7 @@ def train_cell(
         listeners: to the training.
         loading: seconds that the scene took to load; NaN: the cell's own seconds are not known.
         warm: this process has trained a cell of this variant on this capture.
+        capture: its digest; None: that of the scene.
 
     Raises:
         InputError: a budget is too small.
@@ -140,7 +142,7 @@ def train_cell(
         peak_bytes=memory.peak,
         warmup_iterations=warmup,
         provenance=made_by,
-        capture=capture_digest(scene),
+        capture=capture_digest(scene) if capture is None else capture,
     )
 
 

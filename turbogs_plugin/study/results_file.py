@@ -28,7 +28,7 @@ FORMAT = 2
 
 DECIMALS = {"train_seconds": 6, "psnr": 5, "worst_psnr": 5, **dict.fromkeys(("ssim", "l1", "lpips", "flip"), 7)}
 DECIMALS |= dict.fromkeys(("fps", "wall_seconds", "cell_seconds"), 3)
-DECIMALS |= {f"{of}_{name}": DECIMALS[name] for of in ("whole", "own", "aligned") for name in MEASURES}
+DECIMALS |= {f"{of}_{name}": DECIMALS[name] for of in ("whole", "own", "aligned", "refined") for name in MEASURES}
 """Digits behind the point that are kept of a measure: for errors those that float32 has."""
 
 SHARED = ("provenance", "resolved", "warmup_iterations", "lpips_reason")

@@ -27,7 +27,7 @@ from turbogs_plugin.study.folder import StudyFolder
 from turbogs_plugin.study.grid import Ablation, CellKey, variant_config
 from turbogs_plugin.study.progress import SweepProgress
 from turbogs_plugin.study.results import CellResult, Failure, Study
-from turbogs_plugin.train.start import resolve_device
+from turbogs_plugin.train.start import resolve_device, scene_for
 
 POLL_SECONDS = 1.0
 """Between two looks at cells that other processes train."""
@@ -110,7 +110,7 @@ def run_sweep(
     device = resolve_device(options.device)
     reusable = _reusable_cells(here, siblings)
     repeated: list[CellResult] = []
-    left: list[tuple[Scene, CellKey, Config]] = []
+    left: list[tuple[Scene, str, CellKey, Config]] = []  # with the capture's digest
     loading: dict[str, float] = {}  # capture -> seconds
     # All scenes are read before anything is trained, so that a wrong one is known at once.
     for path in options.scenes:
@@ -121,6 +121,7 @@ def run_sweep(
         scene = load_scene(path, settings.factor, settings.test_every)
         loading[name] = time.perf_counter() - started
         capture = capture_digest(scene)
+        refined: Scene | None = None
         for key, config in configs.items():
             known = reusable.get((name, capture, _comparable(config.to_mapping())))
             if key in finished:
@@ -128,28 +129,30 @@ def run_sweep(
             elif known is not None:
                 repeated.append(replace(known, variant=key.variant, **call))
             else:
-                left.append((scene, key, config))
+                if config.train.refine_cameras:
+                    refined = refined or scene_for(config, scene)
+                left.append((refined if config.train.refine_cameras else scene, capture, key, config))
         for key, result in finished.items():
             if key.scene == name and result.capture not in ("", capture):
                 raise InputError(
                     f"the cell '{key}' has other photos or cameras than '{name}' has now: choose a new --out"
                 )
-        del scene  # where no cell needs it: photos take room
+        del scene, refined  # where no cell needs it: photos take room
     folder.write_study(replace(study, ablation=ablation))
     for result in repeated:
         folder.write(result)
     wanted = len(options.scenes) * len(options.seeds) * len(variants)
     claims = Claims(folder.claims)
-    before = {key: folder.written(key) for _, key, _ in left}
+    before = {key: folder.written(key) for _, _, key, _ in left}
     warm: set[tuple[str, str]] = set()  # variants and captures: a plan is of a capture
     with SweepProgress(len(left), wanted - len(left)) as progress:
         while left and not (options.within is not None and time.monotonic() - begun > options.within):
-            taken = next(((place, claim) for place, cell in enumerate(left) if (claim := claims.take(cell[1]))), None)
+            taken = next(((place, claim) for place, cell in enumerate(left) if (claim := claims.take(cell[2]))), None)
             if taken is None:
                 time.sleep(POLL_SECONDS)
                 continue
             place, claim = taken
-            scene, key, config = left.pop(place)  # the photos go with the last cell that needs them
+            scene, capture, key, config = left.pop(place)  # the photos go with the last cell that needs them
             with claim.kept():
                 if folder.written(key) != before[key]:
                     progress.ended_elsewhere()
@@ -160,7 +163,7 @@ def run_sweep(
                 listeners = [progress, *events]
                 try:
                     seconds, known = loading[key.scene], (key.variant, key.scene) in warm
-                    outcome = train_cell(key.variant, config, scene, device, here, listeners, seconds, known)
+                    outcome = train_cell(key.variant, config, scene, device, here, listeners, seconds, known, capture)
                     outcome = replace(outcome, **call)
                     warm.add((key.variant, key.scene))
                 except Exception as error:  # whatever a variant breaks by, the other cells go on

@@ -12,7 +12,7 @@ import math
 import tempfile
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -116,6 +116,7 @@ def evaluate(
     lpips: Lpips | None = None,
     flip: Flip | None = None,
     aligned: bool = False,
+    refined: bool = False,
 ) -> Metrics:
     """Render every view, one at a time, and compare it with its photo. Where views have exposures, errors of the
     model's own colours are given beside.
@@ -127,6 +128,7 @@ def evaluate(
         lpips: from `load_lpips`, if wanted.
         flip: from `load_flip`, if wanted. Masked pixels are the photo's in both images that these two get.
         aligned: give the errors of its own colours after `align_colors`, too.
+        refined: where views have refined cameras, give the errors by these, too.
     """
     metrics, flips, seconds = [], [], 0.0
     for view_id, name in enumerate(views.names):
@@ -144,6 +146,9 @@ def evaluate(
             further["own"] = compare(name, own, photo, mask)
         if views.masks is not None:
             further["whole"] = compare(name, image, photo)
+        if refined and views.refined is not None:
+            moved = replace(views, cameras=views.refined)
+            further["refined"] = compare(name, render_view(gaussians, moved, view_id, look), photo, mask)
         if aligned:
             further["aligned"] = compare(name, align_colors(own, photo, mask), photo, mask)
         for kind, other in further.items():

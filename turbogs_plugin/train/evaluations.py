@@ -51,6 +51,7 @@ class Evaluations(Listener):
             trainer.look(self.test.names),
             lpips=self.lpips if loop.finished else None,
             aligned=trainer.exposures is not None,
+            refined=loop.finished,
         )
         mean = metrics.mean
         evaluation = Evaluation(

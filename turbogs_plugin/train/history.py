@@ -25,6 +25,8 @@ class FurtherErrors:
             of test views with the exposures of their neighbours (`interpolated_exposures`).
         aligned_psnr, aligned_ssim, aligned_l1: of the model's own colours after a colour alignment (`align_colors`), in
             runs that learn exposures.
+        refined_psnr, refined_ssim, refined_l1: by cameras of the test photos that were refined as those of the training
+            photos (`refine_cameras`); of the end of runs that do that.
     """
 
     whole_psnr: float = math.nan
@@ -36,6 +38,9 @@ class FurtherErrors:
     aligned_psnr: float = math.nan
     aligned_ssim: float = math.nan
     aligned_l1: float = math.nan
+    refined_psnr: float = math.nan
+    refined_ssim: float = math.nan
+    refined_l1: float = math.nan
 
     def further(self) -> dict[str, float]:
         """These errors alone, by name."""

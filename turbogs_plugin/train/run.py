@@ -34,7 +34,7 @@ from turbogs_plugin.train.interrupts import Interrupts
 from turbogs_plugin.train.loop import Listener, TrainingLoop
 from turbogs_plugin.train.pace import pace_of
 from turbogs_plugin.train.progress import TrainingProgress
-from turbogs_plugin.train.start import open_scene, require_possible, resolve_device, starting
+from turbogs_plugin.train.start import open_scene, require_possible, resolve_device, scene_for, starting
 from turbogs_plugin.train.trainer import Trainer
 from turbogs_plugin.train.wall import WallClock, WallRecord
 from turbogs_plugin.types import Gaussians
@@ -116,6 +116,7 @@ def fit(scene: Scene | Path | str, *overrides: str, config: str = DEFAULT_CONFIG
     device = resolve_device(settings.train.device)
     if isinstance(scene, str | Path):
         scene = load_scene(scene, settings.scene.factor, settings.scene.test_every)
+    scene = scene_for(settings, scene)
     loop, _ = new_loop(make_plan(settings, scene, device).apply(settings), scene, device)
     loop.run()
     loop.trainer.require_finite()

@@ -20,6 +20,7 @@ from turbogs_plugin.model.initial import BACKDROP_COUNT
 from turbogs_plugin.plan.caps import cap_of, chosen_points, require_room
 from turbogs_plugin.plan.memory import MemoryDemand
 from turbogs_plugin.scene import Scene, load_scene
+from turbogs_plugin.scene.camera_refinement import refine_cameras
 from turbogs_plugin.train.folder import RunFolder
 from turbogs_plugin.train.given_model import read_given
 from turbogs_plugin.train.progress import LoadingProgress
@@ -116,4 +117,10 @@ def open_scene(config: Config, folder: RunFolder | None = None, training: bool =
             f"in {folder.config}"
         )
     sized = partial(require_memory, config) if training else None
-    return load_scene(settings.path, settings.factor, settings.test_every, LoadingProgress(), sized)
+    scene = load_scene(settings.path, settings.factor, settings.test_every, LoadingProgress(), sized)
+    return scene_for(config, scene)
+
+
+def scene_for(config: Config, scene: Scene) -> Scene:
+    """The scene as a configuration trains on it."""
+    return refine_cameras(scene) if config.train.refine_cameras else scene
