@@ -28,7 +28,7 @@ from turbogs_plugin.study.statistics import Difference, Spread
 
 RESULTS = Path(__file__).resolve().parent / "results"
 FOLDER = RESULTS / "sweeps"
-EXTRA = ("own_psnr", "aligned_psnr")
+EXTRA = ("own_psnr", "aligned_psnr", "refined_psnr", "refined_ssim")
 """Further measures of the end that are gathered where a run has them."""
 
 
@@ -41,7 +41,7 @@ class Cell:
         overrides: of the configuration of the round.
         psnr, ssim, num_gaussians, train_seconds: at each evaluation, the end last; seconds may be left out, as where
             several runs shared a GPU.
-        extra: further measures of the end, in dB.
+        extra: further measures of the end.
     """
 
     study: str
@@ -167,7 +167,8 @@ def cell_text(own: Mapping[int, Cell], base: Mapping[int, Cell], extra: Mapping[
     parts += [f"{psnr.mean:.2f}{spread} dB", f"{ssim.mean:.4f}".lstrip("0"), f"{size.mean / 1e3:.0f}k"]
     for measure, called in extra.items():
         further = Spread.of(cell.extra.get(measure) for cell in own.values()).mean
-        parts += [] if math.isnan(further) else [f"{called} {further:.2f} dB"]
+        text = f"{further:.4f}".lstrip("0") if measure.endswith("ssim") else f"{further:.2f} dB"
+        parts += [] if math.isnan(further) else [f"{called} {text}".lstrip()]
     changes = []
     seeds = [seed for seed in own if seed in base]
     for measure, unit, digits in (("psnr", " dB", 2), ("ssim", "", 4)):
@@ -204,7 +205,7 @@ def gather(name: str, studies: Mapping[str, Path], folder: Path = FOLDER) -> Pat
             for measure, digits in (("psnr", 3), ("ssim", 5), ("num_gaussians", 0), ("train_seconds", 2)):
                 values = [round(getattr(entry, measure), digits) for entry in result.history]
                 cell[measure] = [int(value) for value in values] if measure == "num_gaussians" else values
-            ends = {measure: round(getattr(result.history[-1], measure), 3) for measure in EXTRA}
+            ends = {measure: round(getattr(result.history[-1], measure), 5) for measure in EXTRA}
             if known := {measure: value for measure, value in ends.items() if not math.isnan(value)}:
                 cell["extra"] = known
             cells.append(cell)

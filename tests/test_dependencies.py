@@ -146,6 +146,7 @@ def test_the_extra_is_what_the_commands_name(project):
 COMMANDS = {
     "train": ("SCENE", "--out", "RUN"),
     "reconstruct": ("PHOTOS", "--out", "SCENE"),
+    "refine": ("SCENE", "--out", "NEW"),
     "plan": ("SCENE",),
     "view": ("RUN",),
     "eval": ("RUN",),

@@ -44,7 +44,7 @@ def test_the_table_of_the_paper():
         assert config.maps.beta == 0.4
 
 
-@pytest.mark.parametrize("ablation", ["sizes", "blur"])
+@pytest.mark.parametrize("ablation", ["sizes", "cameras"])
 def test_turbogs_ssim_is_what_was_measured_under_another_name(ablation):
     measured = load_config("turbogs", load_ablation(ablation).variants["ssim"])
     assert load_config("turbogs-ssim") == measured

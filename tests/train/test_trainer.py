@@ -33,6 +33,7 @@ from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint
 from turbogs_plugin.train.evaluate import Look, render_view
 from turbogs_plugin.train.history import read_history
 from turbogs_plugin.train.saved_model import load_model
+from turbogs_plugin.train.start import scene_for
 from turbogs_plugin.train.trainer import Trainer
 from turbogs_plugin.types import RowUpdate
 
@@ -126,7 +127,8 @@ STOPS = {
 
 def test_a_run_stopped_again_and_again_is_the_same_bit_for_bit(capture, whole, tmp_path, monkeypatch):
     """At every stop, the first before the first iteration, and at its end."""
-    trainer = Trainer(tiny_config(capture).without_plan(), load_scene(capture), torch.device("cpu"))
+    config = tiny_config(capture).without_plan()
+    trainer = Trainer(config, scene_for(config, load_scene(capture)), torch.device("cpu"))
     initialise, place = Trainer.initialise_maps, tmp_path / "run"
 
     def interrupted(trainer):
@@ -355,11 +357,11 @@ TURN, STAY = pycolmap.Rotation3d(np.array([0.0, 0.0, 0.01, 1.0])), pycolmap.Rota
 @pytest.mark.parametrize(
     ("change", "difference"),
     [
-        (moved(pycolmap.Sim3d(1.0, TURN, np.zeros(3))), "other poses of train images"),
+        (moved(pycolmap.Sim3d(1.0, TURN, np.zeros(3))), "other cameras of train images"),
         (moved(pycolmap.Sim3d(2.0, STAY, np.zeros(3))), "other coordinates"),
         (moved(pycolmap.Sim3d(1.0, STAY, np.ones(3))), "other coordinates"),
-        (zoomed, "other intrinsics of train images"),
-        (renamed, "other poses of train images"),
+        (zoomed, "other cameras of train images"),
+        (renamed, "other cameras of train images"),
     ],
     ids=["turned", "scaled", "moved", "zoomed", "renamed"],
 )
@@ -380,7 +382,7 @@ def test_a_capture_read_with_other_rounding_is_the_same(capture):
         views["Ks"] *= 1 + 2e-6
     assert capture_difference(saved, present) == ""
     present["test_views"]["viewmats"][0, 0, 3] += 2e-5
-    assert capture_difference(saved, present) == "other poses of test images"
+    assert capture_difference(saved, present) == "other cameras of test images"
 
 
 @pytest.mark.parametrize(("size", "expected"), [(0.0, 40.0), (0.3, 0.3 * 14.0)])

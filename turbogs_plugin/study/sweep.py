@@ -121,7 +121,7 @@ def run_sweep(
         scene = load_scene(path, settings.factor, settings.test_every)
         loading[name] = time.perf_counter() - started
         capture = capture_digest(scene)
-        refined: Scene | None = None
+        prepared: dict[bool, Scene] = {}  # refined cameras or not -> the scene
         for key, config in configs.items():
             known = reusable.get((name, capture, _comparable(config.to_mapping())))
             if key in finished:
@@ -129,15 +129,15 @@ def run_sweep(
             elif known is not None:
                 repeated.append(replace(known, variant=key.variant, **call))
             else:
-                if config.train.refine_cameras:
-                    refined = refined or scene_for(config, scene)
-                left.append((refined if config.train.refine_cameras else scene, capture, key, config))
+                if (refined := config.train.refine_cameras) not in prepared:
+                    prepared[refined] = scene_for(config, scene)
+                left.append((prepared[refined], capture, key, config))
         for key, result in finished.items():
             if key.scene == name and result.capture not in ("", capture):
                 raise InputError(
                     f"the cell '{key}' has other photos or cameras than '{name}' has now: choose a new --out"
                 )
-        del scene, refined  # where no cell needs it: photos take room
+        del scene, prepared  # where no cell needs it: photos take room
     folder.write_study(replace(study, ablation=ablation))
     for result in repeated:
         folder.write(result)

@@ -1,0 +1,352 @@
+"""`turbogs refine`: the cameras and points that it writes, what stays as it was, and what is refused."""
+
+import os
+import re
+import resource
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+from helpers.refusals import assert_refused
+from helpers.tracked import HEIGHT, WIDTH, Tracked, tracked, write_tracked
+from PIL import Image
+
+from turbogs_plugin.export import refined_capture
+from turbogs_plugin.export.refined_capture import write_refined
+from turbogs_plugin.scene import load_scene
+from turbogs_plugin.scene.bundle_adjustment import FEWEST_OBSERVATIONS, Pinholes
+from turbogs_plugin.scene.observations import Observations
+
+NOISE = 0.1
+CASE = tracked(views=6, points=80, noise=NOISE)
+
+
+@pytest.fixture(scope="module")
+def given(tmp_path_factory) -> Path:
+    """Not to be changed."""
+    return write_tracked(tmp_path_factory.mktemp("tracked") / "cup", CASE)
+
+
+@pytest.fixture(scope="module")
+def refined(given) -> Path:
+    folder = given.with_name("refined")
+    write_refined(given, folder)
+    return folder
+
+
+@pytest.fixture
+def copy(given, tmp_path) -> Path:
+    """A capture to change."""
+    return Path(shutil.copytree(given, tmp_path / "cup"))
+
+
+def model_of(capture: Path) -> pycolmap.Reconstruction:
+    return pycolmap.Reconstruction(capture / "sparse/0")
+
+
+def images_of(model: pycolmap.Reconstruction) -> list[pycolmap.Image]:
+    return sorted(model.images.values(), key=lambda image: image.name)
+
+
+def cameras_of(capture: Path) -> Pinholes:
+    model = model_of(capture)
+    images = images_of(model)
+    poses = np.stack([image.cam_from_world().matrix() for image in images])
+    lenses = np.stack([model.cameras[image.camera_id].params for image in images])
+    half_widths = np.full(len(images), 0.5 * WIDTH)
+    return Pinholes(poses[:, :, :3], poses[:, :, 3], lenses[:, :2], lenses[:, 2:], half_widths)
+
+
+def with_fewer(case: Tracked, view: int, count: int) -> Tracked:
+    """The case, where a photo shows only some of the points."""
+    shown = case.observations
+    kept = (shown.view_ids != view) | (shown.point_ids < count)
+    return replace(case, observations=Observations(shown.pixels[kept], shown.view_ids[kept], shown.point_ids[kept]))
+
+
+@pytest.mark.parametrize("suffix", [".bin", ".txt"])
+def test_each_photo_gets_the_camera_that_took_it(turbogs, tmp_path, suffix):
+    capture, new = write_tracked(tmp_path / "cup", CASE, suffix), tmp_path / "new"
+    code, out, err = turbogs("refine", capture, "--out", new)
+    assert (code, err) == (0, "")
+    pattern = r"6 of 6 cameras refined, .* ([\d.]+) pixels from where photos show them, ([\d.]+) before \(medians\)\n"
+    after, before = map(float, re.fullmatch(rf"{pattern}scene  {re.escape(str(new))}\n", out).groups())
+    assert after < 1.5 * NOISE < 1.0 < before
+    cameras = cameras_of(new)
+    assert CASE.misplaced(cameras) < 0.1 * CASE.misplaced(CASE.given)
+    for name in ("focal", "centers"):  # a turn of the camera takes a part of their errors
+        truth, first, now = (getattr(each, name) for each in (CASE.true, CASE.given, cameras))
+        assert np.abs(now - truth).mean() < 0.9 * np.abs(first - truth).mean()
+    np.testing.assert_allclose(cameras.rotations, CASE.true.rotations, atol=0.01)
+    np.testing.assert_allclose(cameras.translations, CASE.true.translations, atol=0.05)
+
+
+def test_the_new_capture_has_the_same_photos_and_points(given, refined):
+    before, after = load_scene(given), load_scene(refined)
+    for split in ("train", "test"):
+        views, others = getattr(before, split), getattr(after, split)
+        assert others.names == views.names
+        assert all(others.photos.image(view).equal(views.photos.image(view)) for view in range(len(views)))
+        assert len(others.observations) == len(views.observations)
+        assert not others.cameras.Ks.equal(views.cameras.Ks)
+    assert after.points.shape == before.points.shape and after.point_colors.equal(before.point_colors)
+    assert not after.drawn_points and after.reprojection_error < 2.0 * NOISE
+
+
+def test_features_tracks_and_colours_stay(given, refined):
+    before, after = model_of(given), model_of(refined)
+    assert after.is_valid() and len(after.cameras) == len(after.images) == 6
+    assert {camera.model.name for camera in after.cameras.values()} == {"PINHOLE"}
+    assert {(camera.width, camera.height) for camera in after.cameras.values()} == {(WIDTH, HEIGHT)}
+    for old, new in zip(images_of(before), images_of(after), strict=True):
+        assert (new.image_id, new.name) == (old.image_id, old.name)
+        assert [point.point3D_id for point in new.points2D] == [point.point3D_id for point in old.points2D]
+        np.testing.assert_array_equal([point.xy for point in new.points2D], [point.xy for point in old.points2D])
+    assert set(after.points3D) == set(before.points3D)
+    for number, point in after.points3D.items():
+        old = before.points3D[number]
+        assert point.track == old.track and (point.color == old.color).all()
+        assert 0.0 < point.error < 1.0
+    assert sum((point.xyz != before.points3D[number].xyz).any() for number, point in after.points3D.items()) > 40
+
+
+def test_a_photo_that_shows_few_points_keeps_its_camera(tmp_path):
+    case = with_fewer(CASE, view=2, count=FEWEST_OBSERVATIONS - 1)
+    given, new = write_tracked(tmp_path / "cup", case), tmp_path / "new"
+    assert write_refined(given, new).startswith("5 of 6 cameras refined")
+    cameras = cameras_of(new)
+    kept = [np.isclose(getattr(cameras, name), getattr(CASE.given, name), rtol=0.0, atol=1e-12).all(axis=1)
+            for name in ("translations", "focal", "centers")]  # fmt: skip
+    assert np.stack(kept).T.tolist() == [[view == 2] * 3 for view in range(6)]
+    np.testing.assert_allclose(cameras.rotations[2], CASE.given.rotations[2], atol=1e-12)
+
+
+def test_a_point_behind_a_camera_does_not_count_among_the_errors(tmp_path):
+    points = CASE.points.copy()
+    points[0] = [0.0, 0.0, -30.0]
+    write_refined(write_tracked(tmp_path / "cup", replace(CASE, points=points)), tmp_path / "new")
+    assert sum(point.error < 0 for point in model_of(tmp_path / "new").points3D.values()) == 1
+    assert load_scene(tmp_path / "new").reprojection_error < 2.0 * NOISE
+
+
+def test_images_without_a_photo_are_left_out(copy):
+    (copy / "images/03.png").unlink()
+    new = copy.with_name("new")
+    lines = write_refined(copy, new).splitlines()
+    assert lines[0].startswith("1 of 6 images are left out") and lines[1].startswith("5 of 5 cameras refined")
+    before, after = model_of(copy), model_of(new)
+    gone = before.find_image_with_name("03.png").image_id
+    assert after.is_valid() and set(after.images) == set(before.images) - {gone} == set(after.cameras)
+    tracks = [point.track.elements for point in after.points3D.values()]
+    assert len(tracks) == 80 and all(len(track) == 5 and gone not in {at.image_id for at in track} for track in tracks)
+    assert len(load_scene(new).train) == 4
+
+
+def test_a_refined_capture_can_be_refined(refined, tmp_path):
+    """Its photos are linked, not the link to them."""
+    write_refined(refined, tmp_path / "again")
+    assert (tmp_path / "again/images").readlink() == (refined / "images").resolve()
+    again, once = cameras_of(tmp_path / "again"), cameras_of(refined)
+    assert again.focal.shape == once.focal.shape and (again.focal != once.focal).any()
+
+
+@pytest.mark.parametrize(
+    ("place", "link"), [("beside", "../cup/images"), ("cup/in it", "../images"), ("a/b", "../../cup/images")]
+)
+def test_links_are_relative_where_both_are_likely_moved_together(copy, tmp_path, monkeypatch, place, link):
+    monkeypatch.chdir(tmp_path)
+    write_refined(Path("cup"), Path(place))
+    assert os.readlink(Path(place, "images")) == link
+    (tmp_path / "moved").mkdir()
+    for name in {"cup", Path(place).parts[0]}:
+        (tmp_path / name).rename(tmp_path / "moved" / name)
+    assert len(load_scene(tmp_path / "moved" / place).train) == 5
+
+
+def test_a_link_to_another_place_is_absolute(given, tmp_path):
+    write_refined(given, tmp_path / "new")
+    assert (tmp_path / "new/images").readlink() == (given / "images").resolve()
+
+
+def halve_photos(capture: Path) -> None:
+    for photo in (capture / "images").iterdir():
+        with Image.open(photo) as image:
+            (capture / "images_2").mkdir(exist_ok=True)
+            image.reduce(2).save(capture / "images_2" / photo.name)
+
+
+def mask_photos(capture: Path) -> None:
+    mask = np.full((HEIGHT, WIDTH), 255, dtype=np.uint8)
+    mask[:100] = 0
+    (capture / "masks").mkdir()
+    for photo in (capture / "images").iterdir():
+        Image.fromarray(mask).save(capture / "masks" / photo.name)
+
+
+@pytest.mark.parametrize("links", [True, False])
+def test_reduced_copies_and_masks_come_along(copy, monkeypatch, links):
+    halve_photos(copy)
+    mask_photos(copy)
+    (copy / "images_old").mkdir()
+    if not links:
+
+        def refused(*_: object, **__: object) -> None:
+            raise OSError(95, "Operation not supported")
+
+        monkeypatch.setattr(Path, "symlink_to", refused)
+    new = copy.with_name("new")
+    write_refined(copy, new)
+    assert {entry.name: entry.is_symlink() for entry in new.iterdir()} == {
+        "images": links,
+        "images_2": links,
+        "masks": links,
+        "sparse": False,
+    }
+    for factor in (1, 2):
+        before, after = load_scene(copy, factor=factor), load_scene(new, factor=factor)
+        assert after.train.names == before.train.names
+        assert after.train.photos.image(0).equal(before.train.photos.image(0))
+        assert after.train.mask(0).equal(before.train.mask(0)) and not after.train.mask(0).all()
+
+
+def test_reduced_copies_alone_stay_what_they_are(copy):
+    halve_photos(copy)
+    shutil.rmtree(copy / "images")
+    new = copy.with_name("new")
+    write_refined(copy, new)
+    assert sorted(entry.name for entry in new.iterdir()) == ["images_2", "sparse"]
+    assert load_scene(new, factor=2).train.cameras.sizes[0].tolist() == [WIDTH // 2, HEIGHT // 2]
+
+
+def test_photos_in_the_capture_itself_are_linked_without_what_lies_beside_it(copy):
+    for photo in (copy / "images").iterdir():
+        photo.rename(copy / photo.name)
+    (copy / "images").rmdir()
+    halved = copy.with_name("cup_2")
+    halved.mkdir()
+    new = copy.with_name("new")
+    write_refined(copy, new)
+    assert sorted(entry.name for entry in new.iterdir()) == ["images", "sparse"]
+    assert len(load_scene(new).train) == 5
+
+
+def without_model(capture: Path) -> Path:
+    shutil.rmtree(capture / "sparse")
+    return capture
+
+
+def without_a_file(capture: Path) -> Path:
+    (capture / "sparse/0/images.bin").unlink()
+    return capture
+
+
+def without_photos(capture: Path) -> Path:
+    for photo in sorted((capture / "images").iterdir())[1:]:
+        photo.unlink()
+    return capture
+
+
+def without_points(capture: Path) -> Path:
+    model = model_of(capture)
+    model.delete_all_points2D_and_points3D()
+    model.write_binary(capture / "sparse/0")
+    return capture
+
+
+def without_tracks(capture: Path) -> Path:
+    """Points that another program has added."""
+    model = model_of(capture)
+    model.delete_all_points2D_and_points3D()
+    for number in range(9):
+        model.add_point3D(np.array([0.1 * number, 0.0, 0.0]), pycolmap.Track(), np.zeros(3, dtype=np.uint8))
+    model.write_binary(capture / "sparse/0")
+    return capture
+
+
+def with_distortion(capture: Path) -> Path:
+    shutil.rmtree(capture)
+    return write_tracked(capture, CASE, model="OPENCV", distortion=(0.01, 0.0, 0.0, 0.0))
+
+
+def with_other_features(capture: Path) -> Path:
+    """A reconstruction whose cameras were edited by hand for photos of another size."""
+    model = model_of(capture)
+    for camera in model.cameras.values():
+        camera.params = 2.0 * camera.params
+    model.write_binary(capture / "sparse/0")
+    return capture
+
+
+REFUSED = [
+    (lambda capture: capture / "absent", "no such scene: .*absent does not exist: give the folder of a COLMAP capture"),
+    (lambda capture: capture / "images/00.png", "no such scene: .*00.png is a file: give the folder"),
+    (lambda capture: capture / "images", r"images lies in the capture .*cup \(.*sparse/0\): give that folder"),
+    (
+        without_model,
+        "cup has no COLMAP reconstruction .* by 'turbogs reconstruct .*cup --out SCENE', then refine SCENE",
+    ),
+    (without_a_file, "sparse/0 has no images.bin: bring what it lacks back"),
+    (without_photos, "5 of 6 photos are missing in .*images: 01.png, 02.png, 03.png, ...; bring them back"),
+    (without_points, "sparse/0 has no points that its photos show.* take a reconstruction as COLMAP wrote it"),
+    (without_tracks, "sparse/0 has no points that its photos show.* take a reconstruction as COLMAP wrote it"),
+    (with_distortion, r"6 of 6 cameras have distortion \(OPENCV\).* first by 'colmap image_undistorter'"),
+    (with_other_features, r"half of its points are more than 12.8 pixels \(2% of .*; reconstruct the photos again"),
+]
+
+
+@pytest.mark.usefixtures("few_random_points")
+@pytest.mark.parametrize(("change", "words"), REFUSED, ids=[getattr(change, "__name__", "") for change, _ in REFUSED])
+def test_a_capture_that_cannot_be_refined_is_refused(copy, monkeypatch, change, words):
+    monkeypatch.setattr(refined_capture, "refine_together", lambda *_: pytest.fail("cameras were computed"))
+    assert_refused(words, write_refined, change(copy), copy.parent / "new")
+    assert [entry.name for entry in copy.parent.iterdir()] == ["cup"]
+
+
+@pytest.mark.parametrize(
+    ("out", "words"),
+    [
+        (".", "--out .* holds something else: choose a new folder"),
+        ("cup/images/00.png", "--out .*00.png' holds something else: choose a new folder"),
+        ("cup/images/new", "--out .*new' would lie among the photos of .*images': choose a folder elsewhere"),
+        ("cup/images/00.png/new", r"--out .*new' cannot be made in .* \(not a folder\): choose a folder to write to"),
+        ("dangling/new", r"--out .*new' cannot be made in .*dangling' \(not a folder\): choose a folder to write to"),
+    ],
+)
+def test_a_place_that_cannot_be_written_is_refused(copy, monkeypatch, out, words):
+    monkeypatch.setattr(refined_capture, "refine_together", lambda *_: pytest.fail("cameras were computed"))
+    (copy.parent / "dangling").symlink_to("nowhere")
+    before = sorted(copy.parent.rglob("*"))
+    assert_refused(words, write_refined, copy, copy.parent / out)
+    assert sorted(copy.parent.rglob("*")) == before
+
+
+@pytest.mark.parametrize("there", [True, False])
+@pytest.mark.parametrize("step", ["_place_photos", "_reconstruction", "_write"])
+def test_a_failure_leaves_nothing_behind(given, tmp_path, monkeypatch, step, there):
+    def stopped(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(refined_capture, step, stopped)
+    new = tmp_path / "folder/new"
+    if there:
+        new.mkdir(parents=True)
+    with pytest.raises(KeyboardInterrupt):
+        write_refined(given, new)
+    assert list(tmp_path.rglob("*")) == ([new.parent, new] if there else [])
+    assert len(list((given / "images").iterdir())) == 6, "links are not followed"
+    monkeypatch.undo()
+    write_refined(given, new)
+    assert sorted(entry.name for entry in new.iterdir()) == ["images", "sparse"]
+
+
+def test_a_full_disk_is_told(given, tmp_path):
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4096, hard))
+    try:
+        assert_refused("--out .*new' cannot be written: make room there", write_refined, given, tmp_path / "new")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert not list(tmp_path.iterdir())

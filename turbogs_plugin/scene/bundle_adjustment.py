@@ -1,0 +1,272 @@
+"""Bundle adjustment: each photo's own pinhole camera, from where the photo shows the points of a reconstruction.
+
+Reconstructions give all photos of a camera the same lens. A phone's or a drone's photos are not of one: the stabiliser
+shifts lens and sensor, focusing changes the focal length, and a rolling shutter shears what moves. The errors are up to
+half a pixel and systematic across a photo, so photos contradict one another, and a model of them is blurred. Here each
+photo gets its own pose, focal lengths and principal point: cameras and points in turn, by Gauss-Newton steps on squares
+that are reweighted by Cauchy's rule, with a prior that holds cameras to those that were given.
+
+All is float64 on the CPU, and the same to the bit in every run, so that a resumed training has the same cameras.
+"""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import math
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+
+from turbogs_plugin.scene.observations import Observations
+
+ROUNDS, CAMERA_STEPS, POINT_STEPS = 6, 2, 1
+RESECTION_STEPS = 10
+PRIOR = 0.006
+"""Standard deviation of every parameter of a camera, in the units of `Pinholes.moved`: four to six pixels at the edge
+of a photo of 1200."""
+POINT_DAMPING = 1e-4
+"""Of a point's normal equations, relative to their trace: in a direction that no photo tells, a point stays."""
+FEWEST_OBSERVATIONS = 30
+"""A photo with fewer keeps its camera: three a parameter."""
+FINEST = 0.02
+"""Pixels: errors below are not taken for noise of the features, however exact a reconstruction is."""
+PARAMETERS = 10
+CHUNK = 30_000
+"""Observations at once."""
+
+
+@dataclass(frozen=True)
+class Pinholes:
+    """V cameras in float64.
+
+    Args:
+        rotations: [V, 3, 3], world to camera.
+        translations: [V, 3].
+        focal: [V, 2], pixels.
+        centers: [V, 2], principal points, pixels.
+        half_widths: [V], pixels.
+    """
+
+    rotations: np.ndarray
+    translations: np.ndarray
+    focal: np.ndarray
+    centers: np.ndarray
+    half_widths: np.ndarray
+
+    @classmethod
+    def of(cls, viewmats: np.ndarray, Ks: np.ndarray, sizes: np.ndarray) -> Pinholes:
+        """From world to camera [V, 4, 4], intrinsics [V, 3, 3] in pixels, and sizes [V, 2] (width, height)."""
+        return cls(viewmats[:, :3, :3], viewmats[:, :3, 3], Ks[:, [0, 1], [0, 1]], Ks[:, :2, 2], 0.5 * sizes[:, 0])
+
+    def where(self, kept: np.ndarray, others: Pinholes) -> Pinholes:
+        """These where `kept` [V] bool, elsewhere the others."""
+        pairs = ((getattr(self, field.name), getattr(others, field.name)) for field in fields(Pinholes))
+        return Pinholes(*(np.where(kept.reshape(-1, *[1] * (own.ndim - 1)), own, other) for own, other in pairs))
+
+    def moved(self, by: np.ndarray, depths: np.ndarray) -> Pinholes:
+        """The cameras after a step.
+
+        Args:
+            by: [V, PARAMETERS]: rotation vector (3), in radians; translation (3), in `depths`; focal lengths (2),
+                relative; principal point (2), in half widths.
+            depths: [V], of what is before each camera.
+        """
+        turns = _rotations(by[:, :3])
+        translations = np.einsum("vij,vj->vi", turns, self.translations) + by[:, 3:6] * depths[:, None]
+        return replace(
+            self,
+            rotations=turns @ self.rotations,
+            translations=translations,
+            focal=self.focal * (1.0 + by[:, 6:8]),
+            centers=self.centers + by[:, 8:] * self.half_widths[:, None],
+        )
+
+
+def refine_together(cameras: Pinholes, points: np.ndarray, observations: Observations) -> tuple[Pinholes, np.ndarray]:
+    """Cameras and points that agree better with one another.
+
+    Args:
+        cameras: as they were given.
+        points: [M, 3] float64.
+        observations: of these points by these cameras.
+
+    Returns:
+        The cameras, and points [M, 3].
+    """
+    adjustment = _Adjustment(cameras, points, observations)
+    with ThreadPoolExecutor() as pool:
+        for _ in range(ROUNDS):
+            for _ in range(CAMERA_STEPS):
+                adjustment.move_cameras(pool)
+            for _ in range(POINT_STEPS):
+                adjustment.move_points(pool)
+    return adjustment.result()
+
+
+def refine_alone(cameras: Pinholes, points: np.ndarray, observations: Observations) -> Pinholes:
+    """Cameras that agree better with points, which stay.
+
+    Args:
+        cameras, points, observations: as in `refine_together`.
+    """
+    adjustment = _Adjustment(cameras, points, observations)
+    with ThreadPoolExecutor() as pool:
+        for _ in range(RESECTION_STEPS):
+            adjustment.move_cameras(pool)
+    return adjustment.result()[0]
+
+
+def reprojection_errors(cameras: Pinholes, points: np.ndarray, observations: Observations) -> np.ndarray:
+    """[O] pixels between where cameras see points and where photos show them; infinite behind a camera."""
+    return _Adjustment(cameras, points, observations).first_errors
+
+
+def _quietly(function: Callable) -> Callable:
+    """Without numpy's warnings: what is not finite gets a weight of zero. Threads of a pool have settings of their own,
+    so it is for what they run."""
+
+    @functools.wraps(function)
+    def quiet(*arguments):
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            return function(*arguments)
+
+    return quiet
+
+
+class _Adjustment:
+    """Cameras and points on their way.
+
+    Attributes:
+        moves: [V, PARAMETERS], how far each camera has come, for the prior.
+        depths: [V], medians of the points before each camera.
+        first_errors: [O] pixels, before the first step.
+        scale: pixels, the median of these: errors far above it count little.
+    """
+
+    def __init__(self, cameras: Pinholes, points: np.ndarray, observations: Observations) -> None:
+        self.given = self.cameras = cameras
+        views = len(cameras.focal)
+        self.points, self.observations = points.copy(), observations
+        self.starts = np.searchsorted(observations.view_ids, np.arange(views + 1))
+        self.moves = np.zeros((views, PARAMETERS))
+        bounds = [0]  # of views together, so that a step has few large operations
+        for view in range(views):
+            if self.starts[view + 1] - self.starts[bounds[-1]] > CHUNK and view > bounds[-1]:
+                bounds.append(view)
+        self.chunks = list(zip(bounds, [*bounds[1:], views], strict=True))
+        self.depths = np.ones(views)
+        for chunk in self.chunks:
+            depths = np.split(self._seen(*chunk)[0][:, 2], self.starts[chunk[0] + 1 : chunk[1]] - self.starts[chunk[0]])
+            self.depths[slice(*chunk)] = [np.median(part) if len(part) else 1.0 for part in depths]
+        self.first_errors = self.errors()
+        self.scale = max(float(np.median(self.first_errors)) if len(observations) else 0.0, FINEST)
+
+    def _by_view(self, values: np.ndarray) -> list[np.ndarray]:
+        return np.split(values, self.starts[1:-1])
+
+    @_quietly
+    def _seen(self, first: int, last: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Of the observations of views: points in the camera [n, 3], residuals [n, 2] and their lengths [n]."""
+        part, cameras = slice(self.starts[first], self.starts[last]), self.cameras
+        views = self.observations.view_ids[part]
+        in_camera = self.points[self.observations.point_ids[part]]
+        in_camera = np.einsum("nij,nj->ni", cameras.rotations[views], in_camera) + cameras.translations[views]
+        slopes = in_camera[:, :2] / in_camera[:, 2:]
+        residuals = self.observations.pixels[part] - (slopes * cameras.focal[views] + cameras.centers[views])
+        return in_camera, residuals, np.hypot(residuals[:, 0], residuals[:, 1])
+
+    @_quietly
+    def _weights(self, in_camera: np.ndarray, errors: np.ndarray) -> np.ndarray:
+        """[n] Cauchy's, in units of the noise; none behind the camera."""
+        weights = np.hypot(self.scale, errors) ** -2.0
+        weights[~(in_camera[:, 2] > 0) | ~np.isfinite(errors)] = 0.0
+        return weights
+
+    def move_cameras(self, pool: ThreadPoolExecutor) -> None:
+        """One step of every camera."""
+        steps = np.concatenate(list(pool.map(self._camera_steps, *zip(*self.chunks, strict=True))))
+        self.moves += steps
+        self.cameras = self.cameras.moved(steps, self.depths)
+
+    @_quietly
+    def _camera_steps(self, first: int, last: int) -> np.ndarray:
+        """[last - first, PARAMETERS]."""
+        in_camera, residuals, errors = self._seen(first, last)
+        weights = self._weights(in_camera, errors)
+        views = self.observations.view_ids[self.starts[first] : self.starts[last]]
+        focal, half = self.cameras.focal[views], self.cameras.half_widths[views]
+        x, y, z = in_camera.T
+        p, q, depth = x / z, y / z, self.depths[views] / z
+        zero = np.zeros_like(p)
+        fx, fy = focal.T
+        # d pixel / d parameter, a row for x and one for y.
+        across = np.stack([-fx * p * q, fx * (1 + p * p), -fx * q, fx * depth, zero, -fx * p * depth, fx * p, zero,
+                           half, zero], axis=1)  # fmt: skip
+        down = np.stack([-fy * (1 + q * q), fy * p * q, fy * p, zero, fy * depth, -fy * q * depth, zero, fy * q, zero,
+                         half], axis=1)  # fmt: skip
+        across[weights == 0], down[weights == 0], residuals[weights == 0] = 0.0, 0.0, 0.0
+        weights = weights[:, None]
+        steps = np.zeros((last - first, PARAMETERS))
+        starts = self.starts[first : last + 1] - self.starts[first]
+        prior = np.eye(PARAMETERS) / PRIOR**2
+        for view, (begin, end) in enumerate(itertools.pairwise(starts)):
+            if end - begin < FEWEST_OBSERVATIONS:
+                continue
+            part = slice(begin, end)
+            weighted_across, weighted_down = across[part] * weights[part], down[part] * weights[part]
+            normal = across[part].T @ weighted_across + down[part].T @ weighted_down + prior
+            slope = weighted_across.T @ residuals[part, 0] + weighted_down.T @ residuals[part, 1]
+            steps[view] = np.linalg.solve(normal, slope - self.moves[first + view] / PRIOR**2)
+        return steps
+
+    def move_points(self, pool: ThreadPoolExecutor) -> None:
+        """One step of every point that two photos show."""
+        entries = np.concatenate(list(pool.map(self._point_entries, *zip(*self.chunks, strict=True))), axis=1)
+        ids, count = self.observations.point_ids, len(self.points)
+        sums = np.stack([self._sum_by_point(row) for row in entries])  # [9, M]
+        normal = sums[[0, 1, 2, 1, 3, 4, 2, 4, 5]].T.reshape(count, 3, 3)
+        traces = np.trace(normal, axis1=1, axis2=2)
+        told = (np.bincount(ids, entries[0] > 0, count) >= 2) & (traces > 0)
+        normal = normal[told] + (POINT_DAMPING * traces[told])[:, None, None] * np.eye(3)
+        self.points[told] += np.linalg.solve(normal, sums[6:].T[told][:, :, None])[:, :, 0]
+
+    @_quietly
+    def _point_entries(self, first: int, last: int) -> np.ndarray:
+        """[9, n]: six of a symmetric matrix and three of a vector, of each observation's normal equations."""
+        in_camera, residuals, errors = self._seen(first, last)
+        weights = self._weights(in_camera, errors)
+        views = self.observations.view_ids[self.starts[first] : self.starts[last]]
+        rotations = self.cameras.rotations[views]
+        scales = self.cameras.focal[views] / in_camera[:, 2:]  # [n, 2]
+        slopes = in_camera[:, :2] / in_camera[:, 2:]
+        rows = scales[:, :, None] * (rotations[:, :2] - slopes[:, :, None] * rotations[:, 2:])  # [n, 2, 3]
+        rows[weights == 0], residuals[weights == 0] = 0.0, 0.0
+        entries = [(rows[:, :, i] * rows[:, :, j]).sum(axis=1) for i in range(3) for j in range(i, 3)]
+        entries += [(rows[:, :, i] * residuals).sum(axis=1) for i in range(3)]
+        return np.stack(entries) * weights
+
+    def result(self) -> tuple[Pinholes, np.ndarray]:
+        """Cameras and points; the given camera where the photo agrees no better."""
+        pairs = zip(self._by_view(self.first_errors), self._by_view(self.errors()), strict=True)
+        better = np.array([len(new) > 0 and np.median(new) < np.median(old) for old, new in pairs])
+        return self.cameras.where(better, self.given), self.points
+
+    def errors(self) -> np.ndarray:
+        """[O] pixels between where points are seen and where photos show them; infinite behind a camera."""
+        chunks = [self._seen(*chunk) for chunk in self.chunks]
+        return np.concatenate([np.where(seen[:, 2] > 0, errors, math.inf) for seen, _, errors in chunks])
+
+    def _sum_by_point(self, values: np.ndarray) -> np.ndarray:
+        return np.bincount(self.observations.point_ids, values, len(self.points))
+
+
+def _rotations(vectors: np.ndarray) -> np.ndarray:
+    """[V, 3, 3] of rotation vectors [V, 3] (Rodrigues)."""
+    angles = np.linalg.norm(vectors, axis=1)[:, None, None]
+    x, y, z = vectors.T
+    zero = np.zeros_like(x)
+    cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
+    return np.eye(3) + np.sinc(angles / np.pi) * cross + 0.5 * np.sinc(angles / (2 * np.pi)) ** 2 * (cross @ cross)
