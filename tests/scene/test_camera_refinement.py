@@ -13,7 +13,7 @@ from turbogs_plugin.engine.rendered import RasterSettings
 from turbogs_plugin.model.initial import gaussians_from_points
 from turbogs_plugin.scene import Scene, load_scene, write_demo_capture
 from turbogs_plugin.scene.bundle_adjustment import reprojection_errors
-from turbogs_plugin.scene.camera_refinement import _pinholes, refine_cameras, refine_test_cameras
+from turbogs_plugin.scene.camera_refinement import _pinholes, refine_cameras
 from turbogs_plugin.study.cell import capture_digest
 from turbogs_plugin.study.folder import StudyFolder
 from turbogs_plugin.train.evaluate import Look, evaluate
@@ -84,10 +84,17 @@ def test_without_it_test_photos_alone_get_other_cameras_beside_theirs(capture):
     assert unchanged(refine_cameras(scene), scene_for(load_config("turbogs"), scene), "train"), "by default"
 
 
+def test_training_photos_tell_how_far_the_camera_of_a_test_photo_may_be(tmp_path):
+    """Of one lens for all photos, with much noise: alone, the test photo's principal point would go by some pixels."""
+    scene = load_scene(write_tracked(tmp_path / "cup", tracked(points=60, noise=0.5, shift=0.0)))
+    refined = refine_cameras(scene, training=False).test
+    assert (refined.refined.Ks - refined.cameras.Ks).abs().max() < 0.1
+
+
 def test_a_capture_that_does_not_say_it_stays_as_it_is(tmp_path):
     scene = load_scene(write_demo_capture(tmp_path / "demo", views=8, width=48, height=40))
     scene = replace(scene, train=replace(scene.train, observations=None), test=replace(scene.test, observations=None))
-    assert refine_cameras(scene) is scene and refine_test_cameras(scene) is scene
+    assert refine_cameras(scene) is scene and refine_cameras(scene, training=False) is scene
 
 
 def test_observations_of_other_photos_are_not_used(capture):

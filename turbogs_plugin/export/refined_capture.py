@@ -22,7 +22,7 @@ import numpy as np
 
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.files import require_writable
-from turbogs_plugin.scene.bundle_adjustment import Pinholes, refine_together, reprojection_errors
+from turbogs_plugin.scene.bundle_adjustment import Pinholes, Refinement, refine_together, reprojection_errors
 from turbogs_plugin.scene.camera_refinement import FARTHEST_MATCH, refinement_text
 from turbogs_plugin.scene.capture import LARGEST_SIDE, Capture, check_photo_name, named
 from turbogs_plugin.scene.colmap import REDUCED, find_model, incomplete_model, load_pycolmap, read_colmap
@@ -73,13 +73,13 @@ def write_refined(scene: Path, out: Path) -> str:
             f"{model}: half of its points are more than {limit:.1f} pixels ({FARTHEST_MATCH:.0%} of a photo's width) "
             "from where its photos show them: it is of other photos, or was changed since; reconstruct the photos again"
         )
-    cameras, points = refine_together(given, capture.points, observations)
-    after = float(np.median(reprojection_errors(cameras, points, observations)))
+    refined = refine_together(given, capture.points, observations)
+    after = float(np.median(reprojection_errors(refined.cameras, refined.points, observations)))
     with _whole(out) as folder:
         _place_photos(scene, capture, out, folder)
-        _write(_reconstruction(model, suffix, capture, cameras, points), folder / MODEL / "0", out)
-    refined = refinement_text("cameras", given, cameras, before, after)
-    return "\n".join([*capture.notes[1:], refined, f"scene  {out}"])
+        _write(_reconstruction(model, suffix, capture, refined), folder / MODEL / "0", out)
+    said = refinement_text("cameras", given, refined.cameras, before, after)
+    return "\n".join([*capture.notes[1:], said, f"scene  {out}"])
 
 
 def _find(scene: Path) -> tuple[Path, str]:
@@ -122,15 +122,12 @@ def _require_usable(scene: Path, model: Path, capture: Capture, out: Path) -> No
         )
 
 
-def _reconstruction(
-    model: Path, suffix: str, capture: Capture, cameras: Pinholes, points: np.ndarray
-) -> pycolmap.Reconstruction:
+def _reconstruction(model: Path, suffix: str, capture: Capture, refined: Refinement) -> pycolmap.Reconstruction:
     """That of a capture, with other cameras and points.
 
     Args:
         model, suffix: what the capture was read from.
-        cameras: of the V photos.
-        points: [M, 3], in the order of their identifiers.
+        refined: its cameras, and its points in the order of their identifiers.
     """
     pycolmap = load_pycolmap()
     old, new = pycolmap.Reconstruction(), pycolmap.Reconstruction()
@@ -138,6 +135,7 @@ def _reconstruction(
     images = {check_photo_name(image.name, model): image for image in old.images.values() if image.has_pose}
     for view, (name, (width, height)) in enumerate(zip(capture.names, capture.sizes.tolist(), strict=True)):
         number = images[name].image_id  # of the camera, too
+        cameras = refined.cameras
         params = [*cameras.focal[view], *cameras.centers[view]]
         camera = pycolmap.Camera(camera_id=number, model="PINHOLE", width=width, height=height, params=params)
         new.add_camera_with_trivial_rig(camera)
@@ -146,7 +144,7 @@ def _reconstruction(
         new.add_image_with_trivial_frame(image, pose)
     kept = {images[name].image_id for name in capture.names}
     left_out = not kept.issuperset(old.images)  # images without a photo or a pose
-    for (number, point), place in zip(sorted(old.points3D.items()), points, strict=True):
+    for (number, point), place in zip(sorted(old.points3D.items()), refined.points, strict=True):
         point.xyz = place
         if left_out:
             point.track.elements = [element for element in point.track.elements if element.image_id in kept]

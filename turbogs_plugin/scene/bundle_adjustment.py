@@ -4,7 +4,11 @@ Reconstructions give all photos of a camera the same lens. A phone's or a drone'
 shifts lens and sensor, focusing changes the focal length, and a rolling shutter shears what moves. The errors are up to
 half a pixel and systematic across a photo, so photos contradict one another, and a model of them is blurred. Here each
 photo gets its own pose, focal lengths and principal point: cameras and points in turn, by Gauss-Newton steps on squares
-that are reweighted by Cauchy's rule, with a prior that holds cameras to those that were given.
+that are reweighted by Cauchy's rule.
+
+A prior holds cameras to those that were given: a normal distribution of ten parameters, whose covariance is learnt from
+all photos by expectation-maximisation. So where one lens is right for all of them, cameras stay what they were, however
+few points a photo shows.
 
 All is float64 on the CPU, and the same to the bit in every run, so that a resumed training has the same cameras.
 """
@@ -25,8 +29,10 @@ from turbogs_plugin.scene.observations import Observations
 ROUNDS, CAMERA_STEPS, POINT_STEPS = 6, 2, 1
 RESECTION_STEPS = 10
 PRIOR = 0.006
-"""Standard deviation of every parameter of a camera, in the units of `Pinholes.moved`: four to six pixels at the edge
-of a photo of 1200."""
+"""Standard deviation of every parameter of a camera before any is learnt, in the units of `Pinholes.moved`: four to six
+pixels at the edge of a photo of 1200."""
+SMALLEST_VARIANCE = 1e-14
+"""Of the prior, so that it can be inverted."""
 POINT_DAMPING = 1e-4
 """Of a point's normal equations, relative to their trace: in a direction that no photo tells, a point stays."""
 FEWEST_OBSERVATIONS = 30
@@ -85,38 +91,54 @@ class Pinholes:
         )
 
 
-def refine_together(cameras: Pinholes, points: np.ndarray, observations: Observations) -> tuple[Pinholes, np.ndarray]:
+@dataclass(frozen=True)
+class Refinement:
+    """Cameras and points that agree better with one another.
+
+    Args:
+        cameras, points: of the same photos, and [M, 3].
+        spread: [PARAMETERS, PARAMETERS] covariance of how cameras differ from those that were given, in the units of
+            `Pinholes.moved`.
+    """
+
+    cameras: Pinholes
+    points: np.ndarray
+    spread: np.ndarray
+
+
+def refine_together(cameras: Pinholes, points: np.ndarray, observations: Observations) -> Refinement:
     """Cameras and points that agree better with one another.
 
     Args:
         cameras: as they were given.
         points: [M, 3] float64.
         observations: of these points by these cameras.
-
-    Returns:
-        The cameras, and points [M, 3].
     """
     adjustment = _Adjustment(cameras, points, observations)
     with ThreadPoolExecutor() as pool:
         for _ in range(ROUNDS):
             for _ in range(CAMERA_STEPS):
                 adjustment.move_cameras(pool)
+                adjustment.learn_spread()
             for _ in range(POINT_STEPS):
                 adjustment.move_points(pool)
-    return adjustment.result()
+    return Refinement(adjustment.agreeing_cameras(), adjustment.points, adjustment.spread)
 
 
-def refine_alone(cameras: Pinholes, points: np.ndarray, observations: Observations) -> Pinholes:
+def refine_alone(
+    cameras: Pinholes, points: np.ndarray, observations: Observations, spread: np.ndarray | None = None
+) -> Pinholes:
     """Cameras that agree better with points, which stay.
 
     Args:
         cameras, points, observations: as in `refine_together`.
+        spread: of a `Refinement` of other photos of the capture; None: `PRIOR` of each parameter.
     """
-    adjustment = _Adjustment(cameras, points, observations)
+    adjustment = _Adjustment(cameras, points, observations, spread)
     with ThreadPoolExecutor() as pool:
         for _ in range(RESECTION_STEPS):
             adjustment.move_cameras(pool)
-    return adjustment.result()[0]
+    return adjustment.agreeing_cameras()
 
 
 def reprojection_errors(cameras: Pinholes, points: np.ndarray, observations: Observations) -> np.ndarray:
@@ -140,18 +162,25 @@ class _Adjustment:
     """Cameras and points on their way.
 
     Attributes:
-        moves: [V, PARAMETERS], how far each camera has come, for the prior.
+        moves: [V, PARAMETERS], how far each camera has come.
+        spread: [PARAMETERS, PARAMETERS], the prior's covariance of these.
+        doubts: [V, PARAMETERS, PARAMETERS], the covariance of each camera's moves that is left by what the photo shows
+            and the prior; zero where the photo shows too little to be refined.
         depths: [V], medians of the points before each camera.
         first_errors: [O] pixels, before the first step.
         scale: pixels, the median of these: errors far above it count little.
     """
 
-    def __init__(self, cameras: Pinholes, points: np.ndarray, observations: Observations) -> None:
+    def __init__(
+        self, cameras: Pinholes, points: np.ndarray, observations: Observations, spread: np.ndarray | None = None
+    ) -> None:
         self.given = self.cameras = cameras
         views = len(cameras.focal)
         self.points, self.observations = points.copy(), observations
         self.starts = np.searchsorted(observations.view_ids, np.arange(views + 1))
         self.moves = np.zeros((views, PARAMETERS))
+        self.spread = PRIOR**2 * np.eye(PARAMETERS) if spread is None else spread
+        self.doubts = np.zeros((views, PARAMETERS, PARAMETERS))
         bounds = [0]  # of views together, so that a step has few large operations
         for view in range(views):
             if self.starts[view + 1] - self.starts[bounds[-1]] > CHUNK and view > bounds[-1]:
@@ -211,7 +240,7 @@ class _Adjustment:
         weights = weights[:, None]
         steps = np.zeros((last - first, PARAMETERS))
         starts = self.starts[first : last + 1] - self.starts[first]
-        prior = np.eye(PARAMETERS) / PRIOR**2
+        prior = np.linalg.inv(self.spread)
         for view, (begin, end) in enumerate(itertools.pairwise(starts)):
             if end - begin < FEWEST_OBSERVATIONS:
                 continue
@@ -219,8 +248,16 @@ class _Adjustment:
             weighted_across, weighted_down = across[part] * weights[part], down[part] * weights[part]
             normal = across[part].T @ weighted_across + down[part].T @ weighted_down + prior
             slope = weighted_across.T @ residuals[part, 0] + weighted_down.T @ residuals[part, 1]
-            steps[view] = np.linalg.solve(normal, slope - self.moves[first + view] / PRIOR**2)
+            self.doubts[first + view] = np.linalg.inv(normal)
+            steps[view] = self.doubts[first + view] @ (slope - prior @ self.moves[first + view])
         return steps
+
+    def learn_spread(self) -> None:
+        """One step of expectation-maximisation of the prior."""
+        refined = self.doubts[:, 0, 0] > 0
+        if refined.any():
+            squares = self.moves[refined].T @ self.moves[refined] + self.doubts[refined].sum(axis=0)
+            self.spread = squares / refined.sum() + SMALLEST_VARIANCE * np.eye(PARAMETERS)
 
     def move_points(self, pool: ThreadPoolExecutor) -> None:
         """One step of every point that two photos show."""
@@ -248,11 +285,11 @@ class _Adjustment:
         entries += [(rows[:, :, i] * residuals).sum(axis=1) for i in range(3)]
         return np.stack(entries) * weights
 
-    def result(self) -> tuple[Pinholes, np.ndarray]:
-        """Cameras and points; the given camera where the photo agrees no better."""
+    def agreeing_cameras(self) -> Pinholes:
+        """The cameras; the given one where its photo agrees no better."""
         pairs = zip(self._by_view(self.first_errors), self._by_view(self.errors()), strict=True)
         better = np.array([len(new) > 0 and np.median(new) < np.median(old) for old, new in pairs])
-        return self.cameras.where(better, self.given), self.points
+        return self.cameras.where(better, self.given)
 
     def errors(self) -> np.ndarray:
         """[O] pixels between where points are seen and where photos show them; infinite behind a camera."""

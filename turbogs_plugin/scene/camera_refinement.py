@@ -22,41 +22,34 @@ FARTHEST_MATCH = 0.02
 those that were reconstructed, and nothing is refined."""
 
 
-def refine_cameras(scene: Scene) -> Scene:
+def refine_cameras(scene: Scene, training: bool = True) -> Scene:
     """The scene with refined training cameras and points, and with refined cameras beside those of its test photos.
 
     Args:
         scene: as it was loaded.
+        training: False: training cameras and points stay, and only the test photos get cameras beside theirs.
 
     Returns:
         The same scene, where its capture does not say where photos show the points, or that does not fit.
     """
-    train, observations = scene.train, _usable(scene, scene.train)
-    if observations is None:
+    train, test, points = scene.train, scene.test, scene.points.double().numpy()
+    shown, tested = _usable(scene, train), _usable(scene, test)
+    if shown is None or tested is None:
         return scene
-    given, points = _pinholes(train.cameras), scene.points.double().numpy()
-    cameras, moved = refine_together(given, points, observations)
-    before, after = (np.median(reprojection_errors(*of, observations)) for of in ((given, points), (cameras, moved)))
-    scene = replace(
-        scene,
-        train=replace(train, cameras=_cameras(cameras, train.cameras)),
-        points=torch.from_numpy(moved).float(),
-        notes=(*scene.notes, refinement_text("training cameras", given, cameras, before, after)),
-    )
-    return refine_test_cameras(scene)
-
-
-def refine_test_cameras(scene: Scene) -> Scene:
-    """The scene with refined cameras beside those of its test photos, by where these show its points.
-
-    Returns:
-        The same scene, where its capture does not say that, or it does not fit.
-    """
-    test, observations = scene.test, _usable(scene, scene.test)
-    if observations is None:
-        return scene
-    refined = refine_alone(_pinholes(test.cameras), scene.points.double().numpy(), observations)
-    return replace(scene, test=replace(test, refined=_cameras(refined, test.cameras)))
+    given = _pinholes(train.cameras)
+    refined = refine_together(given, points, shown)
+    if training:
+        before = np.median(reprojection_errors(given, points, shown))
+        after = np.median(reprojection_errors(refined.cameras, refined.points, shown))
+        points = refined.points
+        scene = replace(
+            scene,
+            train=replace(train, cameras=_cameras(refined.cameras, train.cameras)),
+            points=torch.from_numpy(points).float(),
+            notes=(*scene.notes, refinement_text("training cameras", given, refined.cameras, before, after)),
+        )
+    beside = refine_alone(_pinholes(test.cameras), points, tested, refined.spread)
+    return replace(scene, test=replace(test, refined=_cameras(beside, test.cameras)))
 
 
 def refinement_text(called: str, given: Pinholes, refined: Pinholes, before: float, after: float) -> str:

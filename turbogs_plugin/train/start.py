@@ -20,7 +20,7 @@ from turbogs_plugin.model.initial import BACKDROP_COUNT
 from turbogs_plugin.plan.caps import cap_of, chosen_points, require_room
 from turbogs_plugin.plan.memory import MemoryDemand
 from turbogs_plugin.scene import Scene, load_scene
-from turbogs_plugin.scene.camera_refinement import refine_cameras, refine_test_cameras
+from turbogs_plugin.scene.camera_refinement import refine_cameras
 from turbogs_plugin.train.folder import RunFolder
 from turbogs_plugin.train.given_model import read_given
 from turbogs_plugin.train.progress import LoadingProgress
@@ -123,4 +123,4 @@ def open_scene(config: Config, folder: RunFolder | None = None, training: bool =
 
 def scene_for(config: Config, scene: Scene) -> Scene:
     """The scene as a configuration trains on it."""
-    return (refine_cameras if config.train.refine_cameras else refine_test_cameras)(scene)
+    return refine_cameras(scene, config.train.refine_cameras)
