@@ -85,10 +85,10 @@ def test_without_it_test_photos_alone_get_other_cameras_beside_theirs(capture):
 
 
 def test_training_photos_tell_how_far_the_camera_of_a_test_photo_may_be(tmp_path):
-    """Of one lens for all photos, with much noise: alone, the test photo's principal point would go by some pixels."""
-    scene = load_scene(write_tracked(tmp_path / "cup", tracked(points=60, noise=0.5, shift=0.0)))
+    """Of one lens for all photos, with much noise: alone, a test photo's intrinsics would change by more than 1."""
+    scene = load_scene(write_tracked(tmp_path / "cup", tracked(views=24, points=60, noise=0.5, shift=0.0)))
     refined = refine_cameras(scene, training=False).test
-    assert (refined.refined.Ks - refined.cameras.Ks).abs().max() < 0.1
+    assert (refined.refined.Ks - refined.cameras.Ks).abs().max() < 0.4
 
 
 def test_a_capture_that_does_not_say_it_stays_as_it_is(tmp_path):
