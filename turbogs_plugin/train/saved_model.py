@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import operator
 import shlex
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -97,8 +97,7 @@ def load_with_capture(
     """
     if given is not None:
         require_model(path)  # before its capture is read
-        # Who trained it knew no other cameras.
-        scene = open_scene(replace(given, train=replace(given.train, refine_cameras=False)))
+        scene = open_scene(given)
         gaussians = load_given(path, scene, device).map(lambda value: value.to(device))
         return SavedModel(None, given, gaussians, scene.frame, None), scene, ""
     model = load_model(path, device)
