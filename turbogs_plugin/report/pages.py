@@ -86,6 +86,11 @@ def _page(run: RunSession, metrics: Metrics, lpips_reason: str, shown: int) -> s
             " the training photos before and after it; beside that stand errors of the model's own colours, and those"
             " after the affine map of these that fits the photo best."
         )
+    if "refined_l1" in columns:
+        on += (
+            " Test photos are compared with renders by the cameras that the capture gives them. Beside that stand"
+            " errors by cameras that were found by where each test photo shows the points."
+        )
     grey = "; masked pixels of photo and error are grey" if masked else ""
     heads = (*columns.values(), "training in s", "wall in s", "Gaussians", "FPS", "peak memory in MiB")
     seconds = f"{last.train_seconds:.1f}", number(run.wall.wall_seconds, 1, "not recorded")

@@ -4,7 +4,7 @@ Reconstructions give all photos of a camera the same lens. A phone's or a drone'
 shifts lens and sensor, focusing changes the focal length, and a rolling shutter shears what moves. The errors are up to
 half a pixel and systematic across a photo, so photos contradict one another, and a model of them is blurred. Here each
 photo gets its own pose, focal lengths and principal point: cameras and points in turn, by Gauss-Newton steps on squares
-that are reweighted by Cauchy's rule.
+that are reweighted by Cauchy's rule (Triggs et al., Bundle Adjustment: A Modern Synthesis, 2000).
 
 A prior holds cameras to those that were given: a normal distribution of ten parameters, whose covariance is learnt from
 all photos by expectation-maximisation. So where one lens is right for all of them, cameras stay what they were, however
