@@ -97,6 +97,12 @@ def test_a_capture_that_does_not_say_it_stays_as_it_is(tmp_path):
     assert refine_cameras(scene) is scene and refine_cameras(scene, training=False) is scene
 
 
+def test_photos_that_show_little_change_nothing(tmp_path):
+    scene = load_scene(write_tracked(tmp_path / "cup", tracked(points=20)))
+    refined = refine_cameras(scene)
+    assert unchanged(scene, refined, "train") and refined.points is scene.points and refined.notes == scene.notes
+
+
 def test_observations_of_other_photos_are_not_used(capture):
     """A reconstruction whose cameras were edited by hand for photos of another size."""
     scene = load_scene(capture)

@@ -38,7 +38,7 @@ def refine_cameras(scene: Scene, training: bool = True) -> Scene:
         return scene
     given = _pinholes(train.cameras)
     refined = refine_together(given, points, shown)
-    if training:
+    if training and (refined.cameras.focal != given.focal).any():
         before = np.median(reprojection_errors(given, points, shown))
         after = np.median(reprojection_errors(refined.cameras, refined.points, shown))
         points = refined.points
