@@ -231,13 +231,14 @@ class _Adjustment:
         p, q, depth = x / z, y / z, self.depths[views] / z
         zero = np.zeros_like(p)
         fx, fy = focal.T
-        # d pixel / d parameter, a row for x and one for y.
+        # d pixel / d parameter [PARAMETERS, n], of its x and of its y.
         across = np.stack([-fx * p * q, fx * (1 + p * p), -fx * q, fx * depth, zero, -fx * p * depth, fx * p, zero,
-                           half, zero], axis=1)  # fmt: skip
+                           half, zero])  # fmt: skip
         down = np.stack([-fy * (1 + q * q), fy * p * q, fy * p, zero, fy * depth, -fy * q * depth, zero, fy * q, zero,
-                         half], axis=1)  # fmt: skip
-        across[weights == 0], down[weights == 0], residuals[weights == 0] = 0.0, 0.0, 0.0
-        weights = weights[:, None]
+                         half])  # fmt: skip
+        left_out = weights == 0
+        across[:, left_out], down[:, left_out], residuals[left_out] = 0.0, 0.0, 0.0
+        weighted_across, weighted_down = across * weights, down * weights
         steps = np.zeros((last - first, PARAMETERS))
         starts = self.starts[first : last + 1] - self.starts[first]
         prior = np.linalg.inv(self.spread)
@@ -245,9 +246,8 @@ class _Adjustment:
             if end - begin < FEWEST_OBSERVATIONS:
                 continue
             part = slice(begin, end)
-            weighted_across, weighted_down = across[part] * weights[part], down[part] * weights[part]
-            normal = across[part].T @ weighted_across + down[part].T @ weighted_down + prior
-            slope = weighted_across.T @ residuals[part, 0] + weighted_down.T @ residuals[part, 1]
+            normal = across[:, part] @ weighted_across[:, part].T + down[:, part] @ weighted_down[:, part].T + prior
+            slope = weighted_across[:, part] @ residuals[part, 0] + weighted_down[:, part] @ residuals[part, 1]
             self.doubts[first + view] = np.linalg.inv(normal)
             steps[view] = self.doubts[first + view] @ (slope - prior @ self.moves[first + view])
         return steps
@@ -276,13 +276,13 @@ class _Adjustment:
         in_camera, residuals, errors = self._seen(first, last)
         weights = self._weights(in_camera, errors)
         views = self.observations.view_ids[self.starts[first] : self.starts[last]]
-        rotations = self.cameras.rotations[views]
-        scales = self.cameras.focal[views] / in_camera[:, 2:]  # [n, 2]
-        slopes = in_camera[:, :2] / in_camera[:, 2:]
-        rows = scales[:, :, None] * (rotations[:, :2] - slopes[:, :, None] * rotations[:, 2:])  # [n, 2, 3]
-        rows[weights == 0], residuals[weights == 0] = 0.0, 0.0
-        entries = [(rows[:, :, i] * rows[:, :, j]).sum(axis=1) for i in range(3) for j in range(i, 3)]
-        entries += [(rows[:, :, i] * residuals).sum(axis=1) for i in range(3)]
+        rotations = self.cameras.rotations.transpose(1, 2, 0)[:, :, views]  # [3, 3, n]
+        scales, slopes = self.cameras.focal[views].T / in_camera[:, 2], in_camera[:, :2].T / in_camera[:, 2]  # [2, n]
+        across, down = (scales[axis] * (rotations[axis] - slopes[axis] * rotations[2]) for axis in range(2))  # [3, n]
+        left_out = weights == 0
+        across[:, left_out], down[:, left_out], residuals[left_out] = 0.0, 0.0, 0.0
+        entries = [across[i] * across[j] + down[i] * down[j] for i in range(3) for j in range(i, 3)]
+        entries += [across[i] * residuals[:, 0] + down[i] * residuals[:, 1] for i in range(3)]
         return np.stack(entries) * weights
 
     def agreeing_cameras(self) -> Pinholes:
