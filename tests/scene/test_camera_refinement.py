@@ -144,6 +144,7 @@ def test_a_resumed_run_has_the_same_cameras(turbogs, capture, tmp_path):
     code, out, err = turbogs("train", capture, "--out", tmp_path / "run", "--device", "cpu", *settings)
     assert code == 0, err
     assert "7 of 7 training cameras refined" in err
+    assert [line.split()[:2] for line in out.splitlines()].count(["refined", "cameras"]) == 1
     shutil.copytree(tmp_path / "run", tmp_path / "again")
     (tmp_path / "again" / "checkpoints" / "latest").write_text("iteration-000003.pt")
     code, _, err = turbogs("train", "--resume", tmp_path / "again", "--no-report")

@@ -68,11 +68,15 @@ def history_rows(history: Iterable[Evaluation]) -> list[list[str]]:
 
 
 def history_table(history: list[Evaluation]) -> str:
-    """Error against seconds, for a terminal."""
+    """Error against seconds, for a terminal; and the end's errors by refined test cameras, where there are any."""
     lines = [f"{'iteration':>9}  {'seconds':>8}  {'PSNR':>6}  {'SSIM':>6}  {'L1':>6}  {'Gaussians':>9}"]
     for evaluation in history:
         lines.append(
             f"{evaluation.iteration:>9}  {evaluation.train_seconds:>8.1f}  {evaluation.psnr:>6.2f}  "
             f"{evaluation.ssim:>6.4f}  {evaluation.l1:>6.4f}  {evaluation.num_gaussians:>9}"
         )
+    for last in history[-1:]:
+        if not math.isnan(last.refined_l1):
+            refined = f"{last.refined_psnr:>6.2f}  {last.refined_ssim:>6.4f}  {last.refined_l1:>6.4f}"
+            lines.append(f"{'refined cameras':>19}  {refined}")
     return "\n".join(lines)
