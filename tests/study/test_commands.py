@@ -9,6 +9,7 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -527,6 +528,27 @@ def test_seconds_on_the_wall_are_compared_where_a_run_recorded_them(turbogs, tmp
     assert "| wall in s |" in page and "| 26.0 [25.0, 27.0] | " in page and re.search(r"\| z \|.*\| - \|", page)
     rows = list(csv.DictReader((tmp_path / "with/table.csv").open()))
     assert [row["wall_seconds_mean"] for row in rows] == ["26.0", ""]
+
+
+def test_refining_the_cameras_counts_as_loading(small, capture, tmp_path, monkeypatch):
+    """In a cell's seconds on the wall, as in those of a run."""
+    ticks, told = itertools.count(), []
+
+    def cell(*arguments):
+        told.append(arguments[6])
+        raise InputError("enough")
+
+    clock = SimpleNamespace(perf_counter=lambda: float(next(ticks)), monotonic=time.monotonic, sleep=time.sleep)
+    monkeypatch.setattr(sweep, "time", clock)
+    monkeypatch.setattr(sweep, "train_cell", cell)
+    sweep.run_sweep(
+        load_ablation(small),
+        ["full"],
+        SweepOptions([capture], device="cpu", steps=2),
+        provenance("cpu"),
+        StudyFolder(tmp_path / "study"),
+    )
+    assert told == [2.0], "one tick to load, one to refine"
 
 
 def test_the_bar_of_a_cell_has_the_planned_length(tmp_path, monkeypatch):

@@ -22,8 +22,14 @@ import numpy as np
 
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.files import require_writable
-from turbogs_plugin.scene.bundle_adjustment import Pinholes, Refinement, refine_together, reprojection_errors
-from turbogs_plugin.scene.camera_refinement import FARTHEST_MATCH, refinement_text
+from turbogs_plugin.scene.bundle_adjustment import (
+    FARTHEST_MATCH,
+    Pinholes,
+    Refinement,
+    farthest_match,
+    of_these_photos,
+    refine_together,
+)
 from turbogs_plugin.scene.capture import LARGEST_SIDE, Capture, check_photo_name, named
 from turbogs_plugin.scene.colmap import REDUCED, find_model, incomplete_model, load_pycolmap, read_colmap
 from turbogs_plugin.scene.colmap_check import check_binary_model
@@ -66,20 +72,17 @@ def write_refined(scene: Path, out: Path) -> str:
     capture = read_colmap(scene, model, suffix)
     _require_usable(scene, model, capture, out)
     given, observations = Pinholes.of(capture.viewmats, capture.Ks, capture.sizes), capture.observations
-    before = float(np.median(reprojection_errors(given, capture.points, observations)))
-    limit = FARTHEST_MATCH * float(np.median(capture.sizes[:, 0]))
-    if before > limit:
+    if not of_these_photos(given, capture.points, observations):
         raise InputError(
-            f"{model}: half of its points are more than {limit:.1f} pixels ({FARTHEST_MATCH:.0%} of a photo's width) "
-            "from where its photos show them: it is of other photos, or was changed since; reconstruct the photos again"
+            f"{model}: half of its points are more than {farthest_match(given):.1f} pixels ({FARTHEST_MATCH:.0%} of a "
+            "photo's width) from where its photos show them: it is of other photos, or was changed since; reconstruct "
+            "the photos again"
         )
     refined = refine_together(given, capture.points, observations)
-    after = float(np.median(reprojection_errors(refined.cameras, refined.points, observations)))
     with _whole(out) as folder:
         _place_photos(scene, capture, out, folder)
         _write(_reconstruction(model, suffix, capture, refined), folder / MODEL / "0", out)
-    said = refinement_text("cameras", given, refined.cameras, before, after)
-    return "\n".join([*capture.notes[1:], said, f"scene  {out}"])
+    return "\n".join([*capture.notes[1:], refined.text("cameras"), f"scene  {out}"])
 
 
 def _find(scene: Path) -> tuple[Path, str]:

@@ -75,8 +75,8 @@ def history_table(history: list[Evaluation]) -> str:
             f"{evaluation.iteration:>9}  {evaluation.train_seconds:>8.1f}  {evaluation.psnr:>6.2f}  "
             f"{evaluation.ssim:>6.4f}  {evaluation.l1:>6.4f}  {evaluation.num_gaussians:>9}"
         )
-    for last in history[-1:]:
-        if not math.isnan(last.refined_l1):
-            refined = f"{last.refined_psnr:>6.2f}  {last.refined_ssim:>6.4f}  {last.refined_l1:>6.4f}"
-            lines.append(f"{'refined cameras':>19}  {refined}")
+    if history and not math.isnan(history[-1].refined_l1):
+        last = history[-1]
+        refined = f"{last.refined_psnr:>6.2f}  {last.refined_ssim:>6.4f}  {last.refined_l1:>6.4f}"
+        lines.append(f"{'refined cameras':>19}  {refined}")
     return "\n".join(lines)

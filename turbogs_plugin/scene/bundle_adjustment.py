@@ -39,6 +39,9 @@ FEWEST_OBSERVATIONS = 30
 """A photo with fewer keeps its camera: three a parameter."""
 FINEST = 0.02
 """Pixels: errors below are not taken for noise of the features, however exact a reconstruction is."""
+FARTHEST_MATCH = 0.02
+"""Of a photo's width: where half of the points are farther than that from where photos show them, the photos are not
+those that were reconstructed."""
 PARAMETERS = 10
 CHUNK = 30_000
 """Observations at once."""
@@ -99,11 +102,23 @@ class Refinement:
         cameras, points: of the same photos, and [M, 3].
         spread: [PARAMETERS, PARAMETERS] covariance of how cameras differ from those that were given, in the units of
             `Pinholes.moved`.
+        count: how many cameras are others than those that were given.
+        before, after: medians of `reprojection_errors`, in pixels.
     """
 
     cameras: Pinholes
     points: np.ndarray
     spread: np.ndarray
+    count: int
+    before: float
+    after: float
+
+    def text(self, called: str) -> str:
+        """What was done, in a line. `called`: what the cameras are."""
+        return (
+            f"{self.count} of {len(self.cameras.focal)} {called} refined, each with a lens of its own: points are "
+            f"{self.after:.2f} pixels from where photos show them, {self.before:.2f} before (medians)"
+        )
 
 
 def refine_together(cameras: Pinholes, points: np.ndarray, observations: Observations) -> Refinement:
@@ -122,7 +137,10 @@ def refine_together(cameras: Pinholes, points: np.ndarray, observations: Observa
                 adjustment.learn_spread()
             for _ in range(POINT_STEPS):
                 adjustment.move_points(pool)
-    return Refinement(adjustment.agreeing_cameras(), adjustment.points, adjustment.spread)
+    refined, moved = adjustment.agreeing_cameras(), adjustment.points
+    count = int((refined.focal != cameras.focal).any(axis=1).sum())
+    medians = (_median(adjustment.first_errors), _median(reprojection_errors(refined, moved, observations)))
+    return Refinement(refined, moved, adjustment.spread, count, *medians)
 
 
 def refine_alone(
@@ -141,9 +159,25 @@ def refine_alone(
     return adjustment.agreeing_cameras()
 
 
+def _median(errors: np.ndarray) -> float:
+    """0 where there are none."""
+    return float(np.median(errors)) if len(errors) else 0.0
+
+
 def reprojection_errors(cameras: Pinholes, points: np.ndarray, observations: Observations) -> np.ndarray:
     """[O] pixels between where cameras see points and where photos show them; infinite behind a camera."""
     return _Adjustment(cameras, points, observations).first_errors
+
+
+def farthest_match(cameras: Pinholes) -> float:
+    """`FARTHEST_MATCH` in pixels."""
+    return FARTHEST_MATCH * 2.0 * float(np.median(cameras.half_widths))
+
+
+def of_these_photos(cameras: Pinholes, points: np.ndarray, observations: Observations) -> bool:
+    """Whether observations are of the photos of these cameras, and not of others or in another size: half of the points
+    are within `farthest_match`."""
+    return _median(reprojection_errors(cameras, points, observations)) <= farthest_match(cameras)
 
 
 def _quietly(function: Callable) -> Callable:
@@ -186,33 +220,31 @@ class _Adjustment:
             if self.starts[view + 1] - self.starts[bounds[-1]] > CHUNK and view > bounds[-1]:
                 bounds.append(view)
         self.chunks = list(zip(bounds, [*bounds[1:], views], strict=True))
-        self.depths = np.ones(views)
-        for chunk in self.chunks:
-            depths = np.split(self._seen(*chunk)[0][:, 2], self.starts[chunk[0] + 1 : chunk[1]] - self.starts[chunk[0]])
-            self.depths[slice(*chunk)] = [np.median(part) if len(part) else 1.0 for part in depths]
-        self.first_errors = self.errors()
-        self.scale = max(float(np.median(self.first_errors)) if len(observations) else 0.0, FINEST)
+        seen = [self._seen(*chunk) for chunk in self.chunks]
+        depths = self._by_view(np.concatenate([in_camera[:, 2] for in_camera, _, _ in seen]))
+        self.depths = np.array([np.median(part) if len(part) else 1.0 for part in depths])
+        self.first_errors = np.concatenate([errors for _, _, errors in seen])
+        self.scale = max(_median(self.first_errors), FINEST)
 
     def _by_view(self, values: np.ndarray) -> list[np.ndarray]:
         return np.split(values, self.starts[1:-1])
 
     @_quietly
     def _seen(self, first: int, last: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Of the observations of views: points in the camera [n, 3], residuals [n, 2] and their lengths [n]."""
+        """Of the observations of views: points in the camera [n, 3]; residuals [n, 2]; their lengths [n], infinite
+        behind the camera."""
         part, cameras = slice(self.starts[first], self.starts[last]), self.cameras
         views = self.observations.view_ids[part]
         in_camera = self.points[self.observations.point_ids[part]]
         in_camera = np.einsum("nij,nj->ni", cameras.rotations[views], in_camera) + cameras.translations[views]
         slopes = in_camera[:, :2] / in_camera[:, 2:]
         residuals = self.observations.pixels[part] - (slopes * cameras.focal[views] + cameras.centers[views])
-        return in_camera, residuals, np.hypot(residuals[:, 0], residuals[:, 1])
+        errors = np.hypot(residuals[:, 0], residuals[:, 1])
+        return in_camera, residuals, np.where((in_camera[:, 2] > 0) & np.isfinite(errors), errors, math.inf)
 
-    @_quietly
-    def _weights(self, in_camera: np.ndarray, errors: np.ndarray) -> np.ndarray:
-        """[n] Cauchy's, in units of the noise; none behind the camera."""
-        weights = np.hypot(self.scale, errors) ** -2.0
-        weights[~(in_camera[:, 2] > 0) | ~np.isfinite(errors)] = 0.0
-        return weights
+    def _weights(self, errors: np.ndarray) -> np.ndarray:
+        """[n] Cauchy's, in units of the noise; 0 where the error is infinite."""
+        return np.hypot(self.scale, errors) ** -2.0
 
     def move_cameras(self, pool: ThreadPoolExecutor) -> None:
         """One step of every camera."""
@@ -224,7 +256,7 @@ class _Adjustment:
     def _camera_steps(self, first: int, last: int) -> np.ndarray:
         """[last - first, PARAMETERS]."""
         in_camera, residuals, errors = self._seen(first, last)
-        weights = self._weights(in_camera, errors)
+        weights = self._weights(errors)
         views = self.observations.view_ids[self.starts[first] : self.starts[last]]
         focal, half = self.cameras.focal[views], self.cameras.half_widths[views]
         x, y, z = in_camera.T
@@ -274,7 +306,7 @@ class _Adjustment:
     def _point_entries(self, first: int, last: int) -> np.ndarray:
         """[9, n]: six of a symmetric matrix and three of a vector, of each observation's normal equations."""
         in_camera, residuals, errors = self._seen(first, last)
-        weights = self._weights(in_camera, errors)
+        weights = self._weights(errors)
         views = self.observations.view_ids[self.starts[first] : self.starts[last]]
         rotations = self.cameras.rotations.transpose(1, 2, 0)[:, :, views]  # [3, 3, n]
         scales, slopes = self.cameras.focal[views].T / in_camera[:, 2], in_camera[:, :2].T / in_camera[:, 2]  # [2, n]
@@ -293,8 +325,7 @@ class _Adjustment:
 
     def errors(self) -> np.ndarray:
         """[O] pixels between where points are seen and where photos show them; infinite behind a camera."""
-        chunks = [self._seen(*chunk) for chunk in self.chunks]
-        return np.concatenate([np.where(seen[:, 2] > 0, errors, math.inf) for seen, _, errors in chunks])
+        return np.concatenate([self._seen(*chunk)[2] for chunk in self.chunks])
 
     def _sum_by_point(self, values: np.ndarray) -> np.ndarray:
         return np.bincount(self.observations.point_ids, values, len(self.points))

@@ -7,14 +7,16 @@ here first, and nothing is allocated that the file does not hold. What one recor
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 from pathlib import Path
 
 import numpy as np
 
 from turbogs_plugin.errors import InputError
 
-POINT2D_BYTES, TRACK_ELEMENT_BYTES = 24, 8
+FEATURE = np.dtype([("pixel", "<f8", 2), ("point", "<u8")])
+"""Where an image shows something, and the identifier of the point that it is."""
+TRACK_ELEMENT_BYTES = 8
 POINT3D_BYTES = 43
 """Identifier, position, colour and error, without the track."""
 SENSOR_BYTES, FRAME_MEMBER_BYTES = 8, 16
@@ -98,7 +100,8 @@ def check_binary_model(folder: Path) -> None:
     Reads ``cameras.bin``, ``images.bin``, ``points3D.bin`` and, where they are, ``rigs.bin`` and ``frames.bin``.
     """
     cameras = _check_cameras(_Reader(folder / "cameras.bin"))
-    _check_images(_Reader(folder / "images.bin"), cameras)
+    for _ in features_of_images(folder / "images.bin", cameras):
+        pass
     _check_points(_Reader(folder / "points3D.bin"))
     rigs, frames = folder / "rigs.bin", folder / "frames.bin"
     if rigs.exists() != frames.exists():
@@ -123,15 +126,26 @@ def _check_cameras(reader: _Reader) -> set[int]:
     return cameras
 
 
-def _check_images(reader: _Reader, cameras: set[int]) -> None:
+def features_of_images(path: Path, cameras: Container[int] | None = None) -> Iterator[tuple[int, np.ndarray]]:
+    """Each image's identifier, and its features [n] of `FEATURE`.
+
+    Args:
+        path: of ``images.bin``.
+        cameras: identifiers of those that there are; None: they are not compared.
+
+    Raises:
+        InputError: the file is damaged.
+    """
+    reader = _Reader(path)
     for _ in reader.records(SMALLEST_IMAGE):
         (image,) = reader.unpack("I")
         reader.pose(f"image {image}")
         (camera,) = reader.unpack("I")
-        if camera not in cameras:
+        if cameras is not None and camera not in cameras:
             raise reader.fail(f"image {image} has camera {camera}, which cameras.bin does not have")
         reader.name()
-        reader.skip(POINT2D_BYTES * reader.count(POINT2D_BYTES))
+        count = reader.count(FEATURE.itemsize)
+        yield image, np.frombuffer(reader.data, FEATURE, count, reader.skip(count * FEATURE.itemsize))
 
 
 def _check_points(reader: _Reader) -> None:

@@ -1,29 +1,25 @@
 """Where the images of a COLMAP reconstruction show its points.
 
-pycolmap makes an object of every feature; a capture has millions of them. So they are taken from ``images.bin`` itself,
-whose records `colmap_check` has walked before.
+pycolmap makes an object of every feature; a capture has millions of them. So they are taken from ``images.bin`` itself.
 """
 
 from __future__ import annotations
 
-import struct
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from turbogs_plugin.scene.colmap_check import features_of_images
 from turbogs_plugin.scene.observations import Observations
 from turbogs_plugin.scene.undistort import Lens
 
 if TYPE_CHECKING:
     import pycolmap
 
-FEATURE = np.dtype([("pixel", "<f8", 2), ("point", "<u8")])
 NO_POINT = np.uint64(2**64 - 1)
-HEAD = struct.Struct("<I7dI")
-"""Identifier, pose and camera of an image, before its name."""
 
 
 def read_observations(
@@ -45,11 +41,11 @@ def read_observations(
         Points are numbered in the order of their identifiers.
     """
     if suffix == ".bin":
-        features = dict(_features(model / "images.bin"))
+        features = dict(features_of_images(model / "images.bin"))
     else:
         with tempfile.TemporaryDirectory() as folder:
             reconstruction.write_binary(folder)
-            features = dict(_features(Path(folder) / "images.bin"))
+            features = dict(features_of_images(Path(folder) / "images.bin"))
     point_ids = np.array(sorted(reconstruction.points3D), dtype=np.uint64)
     parts = [(np.zeros((0, 2)), np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64))]
     for view, image in enumerate(images):
@@ -63,15 +59,3 @@ def read_observations(
         known = np.isfinite(pixels).all(axis=1)
         parts.append((pixels[known], np.full(known.sum(), view), points[known]))
     return Observations(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
-
-
-def _features(path: Path) -> Iterator[tuple[int, np.ndarray]]:
-    """Each image's identifier, and its features [n] of `FEATURE`."""
-    data = path.read_bytes()
-    position = 8
-    for _ in range(int.from_bytes(data[:8], "little")):
-        identifier = HEAD.unpack_from(data, position)[0]
-        position = data.index(b"\0", position + HEAD.size) + 1
-        count = int.from_bytes(data[position : position + 8], "little")
-        yield identifier, np.frombuffer(data, FEATURE, count, position + 8)
-        position += 8 + count * FEATURE.itemsize

@@ -46,8 +46,11 @@ def capture_difference(saved: dict[str, Any], present: dict[str, Any]) -> str:
         for same, what in (
             (torch.equal(before["sizes"], now["sizes"]), "sizes"),
             (torch.equal(before["unmasked"], now["unmasked"]), "masks"),
-            (_close(before["Ks"], now["Ks"], ROUNDING * now["Ks"].abs()), "cameras"),
-            (_close(before["viewmats"], now["viewmats"], torch.tensor(ROUNDING)), "cameras"),
+            (
+                _close(before["Ks"], now["Ks"], ROUNDING * now["Ks"].abs())
+                and _close(before["viewmats"], now["viewmats"], torch.tensor(ROUNDING)),
+                "cameras",
+            ),
         ):
             if not same:
                 return f"other {what} of {split} images"

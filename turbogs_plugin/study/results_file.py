@@ -21,14 +21,14 @@ from turbogs_plugin.report.provenance import Provenance
 from turbogs_plugin.study.difference import common_configuration, difference, flattened, nested, restored
 from turbogs_plugin.study.grid import Ablation
 from turbogs_plugin.study.results import CellResult, Failure, Study
-from turbogs_plugin.train.history import MEASURES, Evaluation
+from turbogs_plugin.train.history import Evaluation, FurtherErrors
 
 FORMAT = 2
 """Raised by one whenever an older version of TurboGS would misread a new file."""
 
 DECIMALS = {"train_seconds": 6, "psnr": 5, "worst_psnr": 5, **dict.fromkeys(("ssim", "l1", "lpips", "flip"), 7)}
 DECIMALS |= dict.fromkeys(("fps", "wall_seconds", "cell_seconds"), 3)
-DECIMALS |= {f"{of}_{name}": DECIMALS[name] for of in ("whole", "own", "aligned", "refined") for name in MEASURES}
+DECIMALS |= {field.name: DECIMALS[field.name.partition("_")[2]] for field in fields(FurtherErrors)}
 """Digits behind the point that are kept of a measure: for errors those that float32 has."""
 
 SHARED = ("provenance", "resolved", "warmup_iterations", "lpips_reason")

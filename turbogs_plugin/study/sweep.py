@@ -69,6 +69,23 @@ class SweepOptions:
                 raise InputError(f"scenes: two folders are called '{first.name}', {first} and {second}: rename one")
 
 
+@dataclass(frozen=True)
+class _Cell:
+    """One that is to be trained.
+
+    Args:
+        scene: as it is trained on.
+        loading: seconds until it was there.
+        capture: digest of the capture.
+    """
+
+    key: CellKey
+    config: Config
+    scene: Scene
+    loading: float
+    capture: str
+
+
 def run_sweep(
     ablation: Ablation,
     variants: Sequence[str],
@@ -110,8 +127,7 @@ def run_sweep(
     device = resolve_device(options.device)
     reusable = _reusable_cells(here, siblings)
     repeated: list[CellResult] = []
-    left: list[tuple[Scene, str, CellKey, Config]] = []  # with the capture's digest
-    loading: dict[str, float] = {}  # capture -> seconds
+    left: list[_Cell] = []
     # All scenes are read before anything is trained, so that a wrong one is known at once.
     for path in options.scenes:
         name = path.resolve().name
@@ -119,9 +135,9 @@ def run_sweep(
         settings = next(iter(configs.values())).scene
         started = time.perf_counter()
         scene = load_scene(path, settings.factor, settings.test_every)
-        loading[name] = time.perf_counter() - started
+        loading = time.perf_counter() - started
         capture = capture_digest(scene)
-        prepared: dict[bool, Scene] = {}  # refined cameras or not -> the scene
+        prepared: dict[bool, tuple[Scene, float]] = {}  # refined cameras or not -> the scene, seconds
         for key, config in configs.items():
             known = reusable.get((name, capture, _comparable(config.to_mapping())))
             if key in finished:
@@ -130,8 +146,9 @@ def run_sweep(
                 repeated.append(replace(known, variant=key.variant, **call))
             else:
                 if (refined := config.train.refine_cameras) not in prepared:
-                    prepared[refined] = scene_for(config, scene)
-                left.append((prepared[refined], capture, key, config))
+                    started = time.perf_counter()
+                    prepared[refined] = scene_for(config, scene), loading + time.perf_counter() - started
+                left.append(_Cell(key, config, *prepared[refined], capture))
         for key, result in finished.items():
             if key.scene == name and result.capture not in ("", capture):
                 raise InputError(
@@ -143,16 +160,17 @@ def run_sweep(
         folder.write(result)
     wanted = len(options.scenes) * len(options.seeds) * len(variants)
     claims = Claims(folder.claims)
-    before = {key: folder.written(key) for _, _, key, _ in left}
+    before = {cell.key: folder.written(cell.key) for cell in left}
     warm: set[tuple[str, str]] = set()  # variants and captures: a plan is of a capture
     with SweepProgress(len(left), wanted - len(left)) as progress:
         while left and not (options.within is not None and time.monotonic() - begun > options.within):
-            taken = next(((place, claim) for place, cell in enumerate(left) if (claim := claims.take(cell[2]))), None)
+            taken = next(((place, claim) for place, cell in enumerate(left) if (claim := claims.take(cell.key))), None)
             if taken is None:
                 time.sleep(POLL_SECONDS)
                 continue
             place, claim = taken
-            scene, capture, key, config = left.pop(place)  # the photos go with the last cell that needs them
+            cell = left.pop(place)  # the photos go with the last cell that needs them
+            key, config, scene = cell.key, cell.config, cell.scene
             with claim.kept():
                 if folder.written(key) != before[key]:
                     progress.ended_elsewhere()
@@ -162,8 +180,10 @@ def run_sweep(
                 events = [EventWriter(path, scene.test, config.report.strips)] if config.report.tensorboard else []
                 listeners = [progress, *events]
                 try:
-                    seconds, known = loading[key.scene], (key.variant, key.scene) in warm
-                    outcome = train_cell(key.variant, config, scene, device, here, listeners, seconds, known, capture)
+                    trained = (key.variant, key.scene) in warm
+                    outcome = train_cell(
+                        key.variant, config, scene, device, here, listeners, cell.loading, trained, cell.capture
+                    )
                     outcome = replace(outcome, **call)
                     warm.add((key.variant, key.scene))
                 except Exception as error:  # whatever a variant breaks by, the other cells go on

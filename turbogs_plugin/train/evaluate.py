@@ -131,6 +131,7 @@ def evaluate(
         refined: where views have refined cameras, give the errors by these, too.
     """
     metrics, flips, seconds = [], [], 0.0
+    moved = replace(views, cameras=views.refined) if refined and views.refined is not None else None
     for view_id, name in enumerate(views.names):
         synchronize(gaussians.device)
         started = time.perf_counter()
@@ -146,8 +147,7 @@ def evaluate(
             further["own"] = compare(name, own, photo, mask)
         if views.masks is not None:
             further["whole"] = compare(name, image, photo)
-        if refined and views.refined is not None:
-            moved = replace(views, cameras=views.refined)
+        if moved is not None:
             further["refined"] = compare(name, render_view(gaussians, moved, view_id, look), photo, mask)
         if aligned:
             further["aligned"] = compare(name, align_colors(own, photo, mask), photo, mask)

@@ -25,8 +25,8 @@ class FurtherErrors:
             of test views with the exposures of their neighbours (`interpolated_exposures`).
         aligned_psnr, aligned_ssim, aligned_l1: of the model's own colours after a colour alignment (`align_colors`), in
             runs that learn exposures.
-        refined_psnr, refined_ssim, refined_l1: by cameras of the test photos that were refined as those of the training
-            photos (`refine_cameras`); of the end of runs that do that.
+        refined_psnr, refined_ssim, refined_l1: by refined cameras of the test photos (`PosedImages.refined`), at the
+            end of runs whose capture says which photos show a point.
     """
 
     whole_psnr: float = math.nan
