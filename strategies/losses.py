@@ -52,15 +52,13 @@ class CharbonnierLoss(RuleLoss):
 class CharbonnierNccLoss(RuleLoss):
     """Charbonnier l1 plus a gradient-balanced structure term of each tile (equations of section 3.7)::
 
-        L = l1 + ncc_weight * mean over tiles of lambda * mean over channels of gate * (1 - S)
+        L = l1 + ncc_weight * mean over tiles of lambda * mean over channels of (1 - S)
         lambda = clip(mean |grad l1| / (mean |grad S| + 1e-8), 0, 1)
 
-    S is `correlation`, `printed_correlation` or `contrast`. ``grad l1`` is ``d / sqrt(d^2 + eps^2)`` and ``grad S`` is
+    S is `correlation` or `printed_correlation`. ``grad l1`` is ``d / sqrt(d^2 + eps^2)`` and ``grad S`` is
     g, the gradients that the appendix prints. lambda takes their L1 norms over channels, and means over the tile's
     samples (by their shares). Both gradients lack 1 / n, so the two terms compare as they enter L. lambda is constant
     in the backward pass. The structure term's gradient is *added*: the appendix's minus would lower the correlation.
-
-    The gate ``s_y^2 / (s_y^2 + c)`` of the truth's own variance is applied after lambda, which would undo it.
 
     In every tile, each entry of the gradient is at most ``w / (3 n) + ncc_weight / T`` (n filled samples, T tiles):
     lambda keeps the sum of the structure term's gradients in a tile below that of l1. The gradient is exactly 0 where
@@ -69,17 +67,15 @@ class CharbonnierNccLoss(RuleLoss):
     Args:
         epsilon: of the Charbonnier term.
         ncc_weight: factor of the structure term; 1 in the paper.
-        structure: `ncc`, with a variance floor in numerator and denominator, so that a flat tile scores 1;
-            `printed_ncc`, as the appendix has it: a flat tile scores 0; or `contrast`.
+        structure: `ncc`, with a variance floor in numerator and denominator, so that a flat tile scores 1; or
+            `printed_ncc`, as the appendix has it: a flat tile scores 0.
         variance_constant: c, variance below which a tile counts as flat; SSIM's by default. NCC's floor is c / 2. The
             printed NCC adds it as its epsilon to a product of two variances: 1e-6 there means two variances of 1e-3.
-        gate: multiply the structure term by the gate.
     """
 
     ncc_weight: float = 0.4
-    structure: Literal["ncc", "printed_ncc", "contrast"] = "ncc"
+    structure: Literal["ncc", "printed_ncc"] = "ncc"
     variance_constant: float = STRUCTURE_CONSTANT
-    gate: bool = False
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -94,7 +90,6 @@ class CharbonnierNccLoss(RuleLoss):
             structure_weight=self.ncc_weight,
             variance_constant=self.variance_constant,
             balance=True,
-            gate=self.gate,
         )
 
 

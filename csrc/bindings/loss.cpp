@@ -30,13 +30,12 @@ void launches::SparseLoss::run(const Arguments<SparseLoss>& in) {
     params.num_tiles = to_int(tiles, "tiles");
     params.num_slots = to_int(slots, "samples");
     params.structure = to_enumeration<Structure>(in.integer(Integers::structure), kNumStructures,
-                                                 "structure must be 0 .. 4: none, ncc, contrast, ssim or printed_ncc");
+                                                 "structure must be 0 .. 3: none, ncc, ssim or printed_ncc");
     params.epsilon = in.number(Reals::epsilon);
     params.l1_weight = in.number(Reals::l1_weight);
     params.structure_weight = in.number(Reals::structure_weight);
     params.variance_constant = in.number(Reals::variance_constant);
     params.balance = in.integer(Integers::balance) != 0;
-    params.gate = in.integer(Integers::gate) != 0;
     in.set(params.tile_ids, Tensors::tile_ids, {tiles});
     in.set(params.tile_offsets, Tensors::tile_offsets, {tiles + 1});
     in.set(params.pixel_ids, Tensors::pixel_ids, {slots});

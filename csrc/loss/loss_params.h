@@ -23,9 +23,8 @@ struct SparseLossParams {
     float epsilon;  // of the Charbonnier term
     float l1_weight;
     float structure_weight;   // factor of the mean over tiles and channels of 1 - S
-    float variance_constant;  // ncc, contrast, printed_ncc
+    float variance_constant;  // ncc, printed_ncc
     bool balance;             // lambda of the paper: structure gradients no larger than those of l1
-    bool gate;                // by the truth's variance
 
     const int32_t* tile_ids;      // [T]
     const int32_t* tile_offsets;  // [T + 1]

@@ -175,20 +175,13 @@ __device__ __forceinline__ TileTotals tile_loss(const SparseLossParams& params, 
         });
         warp_sums(sums);
         last = warp_sum(last);
-        float variance_y[3];
 #pragma unroll
         for (int c = 0; c < 3; ++c) {
             const float xx = sums[c] * inverse_total, yy = sums[3 + c] * inverse_total;
             const float xy = (c < 2 ? sums[6 + c] : last) * inverse_total;
-            Similarity similarity;
-            if (params.structure == Structure::kNcc) {
-                similarity = correlation(xx, yy, xy, params.variance_constant);
-            } else if (params.structure == Structure::kContrast) {
-                similarity = contrast(xx, yy, xy, params.variance_constant);
-            } else {
-                similarity = printed_correlation(xx, yy, xy, params.variance_constant);
-            }
-            variance_y[c] = yy;
+            const Similarity similarity = params.structure == Structure::kNcc
+                                              ? correlation(xx, yy, xy, params.variance_constant)
+                                              : printed_correlation(xx, yy, xy, params.variance_constant);
             at_y[c] = similarity.at_y;
             at_x[c] = similarity.at_x;
             factor[c] = 1.0f - similarity.value;
@@ -208,9 +201,7 @@ __device__ __forceinline__ TileTotals tile_loss(const SparseLossParams& params, 
         float tile_sum = 0.0f;
 #pragma unroll
         for (int c = 0; c < 3; ++c) {
-            float scale = balance;
-            if (params.gate) scale *= variance_y[c] / (variance_y[c] + params.variance_constant);
-            scale *= params.structure_weight / (3.0f * static_cast<float>(params.num_tiles));
+            const float scale = balance * (params.structure_weight / (3.0f * static_cast<float>(params.num_tiles)));
             tile_sum += scale * factor[c];
             factor[c] = scale * inverse_total;
         }

@@ -28,7 +28,6 @@ STEP = Step(iteration=12, total=100, refine_until=70, seed=3)
 CASES = {
     "l1": CharbonnierLoss(),
     "ncc": CharbonnierNccLoss(),
-    "contrast": CharbonnierNccLoss(structure="contrast", gate=True, ncc_weight=1.0),
     "ssim": SparseSsimLoss(),
     "printed": CharbonnierNccLoss(structure="printed_ncc", ncc_weight=1.0, variance_constant=1e-6),
 }

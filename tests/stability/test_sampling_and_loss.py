@@ -64,14 +64,13 @@ def test_training_on_any_errors_keeps_maps_and_samples_valid(
     contrast=LEVELS,
     truth_level=st.sampled_from([0.0, 0.3, 1.0]),
     truth_contrast=st.sampled_from([0.0, 1e-8, 1e-3, 1.0]),
-    structure=st.sampled_from(["ncc", "printed_ncc", "contrast"]),
+    structure=st.sampled_from(["ncc", "printed_ncc"]),
     variance_constant=st.sampled_from([1e-8, 0.03**2]),
-    gate=st.booleans(),
     dtype=st.sampled_from([torch.float16, torch.float32, torch.float64]),
     seed=st.integers(0, 2**32 - 1),
 )
 def test_gradients_of_any_tiles_are_finite_and_bounded(
-    counts, level, contrast, truth_level, truth_contrast, structure, variance_constant, gate, dtype, seed
+    counts, level, contrast, truth_level, truth_contrast, structure, variance_constant, dtype, seed
 ):
     generator = torch.Generator().manual_seed(seed)
     slots = sum(counts)
@@ -83,7 +82,7 @@ def test_gradients_of_any_tiles_are_finite_and_bounded(
     pixel_ids = torch.arange(slots, dtype=torch.int32)
     samples = PixelSamples((0,), np.array([[16 * len(counts), 16]]), pixel_ids, tiles, offsets)
 
-    loss = CharbonnierNccLoss(ncc_weight=1.0, structure=structure, variance_constant=variance_constant, gate=gate)
+    loss = CharbonnierNccLoss(ncc_weight=1.0, structure=structure, variance_constant=variance_constant)
     result = loss(colors, targets, samples)
     assert torch.isfinite(result.loss)
     finite = torch.isfinite(colors).all(dim=1)  # half precision ends at 65504

@@ -23,6 +23,8 @@ NOW: dict[str, str] = {
     "density.growth": "is gone: density.max_gaussians caps the number of Gaussians",
     "density.target_gaussians": "is gone: density.max_gaussians caps the number of Gaussians",
     "loss.type: auto": "is gone: charbonnier_ncc is what it mostly chose; charbonnier is for photos without texture",
+    "loss.gate": "is gone: it lost SSIM; density.max_gaussians caps the number of Gaussians",
+    "loss.structure: contrast": "is gone: it gained nothing over ncc",
     "schedule.type: auto": "is gone: sinusoidal is what it mostly chose; fixed with schedule.views is for few photos",
     "optimizer.type: auto": "is gone: moment_lm is what it chose on a GPU, sparse_adam on a CPU",
     "train.sh_degree: auto": "is gone: 3 is the paper's; 1 is enough where all cameras look one way",

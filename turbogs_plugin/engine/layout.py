@@ -29,7 +29,7 @@ SORT_RUN = 512
 UNITS = ("pixel", "cell", "tile")
 """Units of a draw: pixels, cells of 4x4 pixels, or whole tiles of 16x16. The kernels number them in this order."""
 
-STRUCTURES = ("none", "ncc", "contrast", "ssim", "printed_ncc")
+STRUCTURES = ("none", "ncc", "ssim", "printed_ncc")
 """Similarities of a tile's samples that a loss may use beside its l1 term. The kernels number them in this order."""
 
 WINDOW_RADIUS = 5

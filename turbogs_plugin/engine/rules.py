@@ -100,12 +100,11 @@ class LossTerms:
         l1_weight: factor of that term.
         structure: one of `layout.STRUCTURES`.
         structure_weight: factor of the mean over tiles and channels of 1 - S, S the similarity.
-        variance_constant: c of `ncc` and `contrast`, epsilon of `printed_ncc`.
+        variance_constant: c of `ncc`, epsilon of `printed_ncc`.
         balance: scale the structure term by the paper's lambda, the gradient-balanced weight. Not with `ssim`.
-        gate: scale it by the truth's variance. Not with `ssim`.
 
     Raises:
-        ValueError: `balance` or `gate` with `ssim`, which has many windows in a tile.
+        ValueError: `balance` with `ssim`, which has many windows in a tile.
     """
 
     epsilon: float
@@ -114,11 +113,10 @@ class LossTerms:
     structure_weight: float = 0.0
     variance_constant: float = STRUCTURE_CONSTANT
     balance: bool = False
-    gate: bool = False
 
     def __post_init__(self) -> None:
-        if self.structure == "ssim" and (self.balance or self.gate):
-            raise ValueError("the structure ssim has neither balance nor gate: use ncc or contrast")
+        if self.structure == "ssim" and self.balance:
+            raise ValueError("the structure ssim has no balance: use ncc")
 
 
 @dataclass(frozen=True)

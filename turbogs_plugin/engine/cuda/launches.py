@@ -329,7 +329,6 @@ class LossSettings(Protocol):
     structure_weight: float
     variance_constant: float
     balance: bool
-    gate: bool
 
 
 MapArrays = fields_of("Tensor | None", "errors stamps view_sums")

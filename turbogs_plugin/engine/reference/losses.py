@@ -32,14 +32,13 @@ def sparse_loss(terms: LossTerms, colors: Tensor, targets: Tensor, samples: Pixe
     """The loss of some samples and its gradient::
 
         L = l1_weight * l1 + structure_weight * mean over tiles of f * mean over channels of (1 - S)
-        f = lambda (with `balance`) * gate (with `gate`)
+        f = lambda with `balance`, else 1
         lambda = clip(mean |grad l1| / (mean |grad S| + 1e-8), 0, 1)
 
     l1 is the Charbonnier term of `_Problem`, S the similarity named by `structure`. ``grad l1`` is
     ``d / sqrt(d^2 + eps^2)`` and ``grad S`` is g, the gradients that the appendix prints. lambda takes their L1 norms
     over channels, and means over the tile's samples (by their shares). Both gradients lack 1 / n, so the two terms
-    compare as they enter L. lambda is constant in the backward pass. The gate ``s_y^2 / (s_y^2 + c)`` of the truth's
-    own variance is applied after lambda, which would undo it.
+    compare as they enter L. lambda is constant in the backward pass.
 
     Args:
         terms: which loss.
@@ -57,9 +56,6 @@ def sparse_loss(terms: LossTerms, colors: Tensor, targets: Tensor, samples: Pixe
         norms = torch.stack([problem.slopes.abs().sum(dim=1), slopes.abs().sum(dim=1)], dim=1)
         norm_l1, norm_structure = groups.mean(norms).unbind(dim=1)
         factors = (norm_l1 / (norm_structure + BALANCE_EPSILON)).clamp(max=1.0)[:, None]
-    if terms.gate:
-        variance = problem.moments.variance_y
-        factors = factors * (variance / (variance + terms.variance_constant))
     factors = factors * (terms.structure_weight / (3 * max(1, groups.tiles)))
     loss = loss + (factors * (1.0 - similarity)).sum()
     gradients = gradients - groups.spread(factors.expand_as(similarity)) * groups.shares * slopes
@@ -129,21 +125,6 @@ def printed_correlation(problem: _Problem, constant: float) -> Similarity:
     return similarity, moments.offset_y * groups.spread(1.0 / scale) - moments.offset_x * groups.spread(slope_x)
 
 
-def contrast(problem: _Problem, constant: float) -> Similarity:
-    """The contrast-structure term of SSIM, with c = constant::
-
-        S = (2 s_xy + c) / (s_x^2 + s_y^2 + c)
-        g = 2 ((y - mean_y) - S (x - mean_x)) / (s_x^2 + s_y^2 + c)
-
-    Unlike a correlation it also sees the scale of the contrast. ``|omega g| <= 2 sqrt(omega / c)``.
-    """
-    moments, groups = problem.moments, problem.groups
-    denominator = moments.variance_x + moments.variance_y + constant
-    similarity = (2.0 * moments.covariance + constant) / denominator
-    slope_y, slope_x = 2.0 / denominator, 2.0 * similarity / denominator
-    return similarity, moments.offset_y * groups.spread(slope_y) - moments.offset_x * groups.spread(slope_x)
-
-
 def ssim(problem: _Problem, constant: float) -> Similarity:
     """The mean SSIM of the samples of a tile, in windows, with SSIM's own constants, whatever `constant` is; see
     `window_similarity`."""
@@ -154,7 +135,6 @@ def ssim(problem: _Problem, constant: float) -> Similarity:
 
 SIMILARITIES: dict[str, Callable[[_Problem, float], Similarity]] = {
     "ncc": correlation,
-    "contrast": contrast,
     "ssim": ssim,
     "printed_ncc": printed_correlation,
 }
