@@ -54,7 +54,7 @@ def facts(**changes) -> SceneFacts:
 
 def test_the_accuracy_of_cameras_is_told_where_it_is_known():
     known, none = (plan_from_facts(facts(reprojection_error=error), load_config("turbogs")) for error in (0.358, None))
-    assert " 10000 points with a reprojection error of 0.36 pixels; extent 3" in known.facts_text()
+    assert " 10000 points, 0.36 pixels from where photos show them (median); extent 3" in known.facts_text()
     assert " 10000 points; extent 3" in none.facts_text()
     assert Plan.from_json(known.to_json()) == known and Plan.from_json(none.to_json()) == none
 
@@ -103,8 +103,8 @@ BOTH_SIDES = [
         "only 9 of 100 photos could be compared",
     ),
     ("train.exposure", {"exposure_spread": 1.0, "transparent": True}, (), False, "transparent"),
-    ("train.dropout", {"reprojection_error": 0.5}, (), 0.2, "a reprojection error of 0.50 pixels >= 0.5"),
-    ("train.dropout", {"reprojection_error": 0.49}, (), 0.0, "a reprojection error of 0.49 pixels < 0.5"),
+    ("train.dropout", {"reprojection_error": 0.4}, (), 0.2, "points 0.40 pixels from where photos show them >= 0.4"),
+    ("train.dropout", {"reprojection_error": 0.39}, (), 0.0, "points 0.39 pixels from where photos show them < 0.4"),
     ("train.dropout", {}, (), 0.0, "no reconstruction says how accurate the cameras are"),
     ("train.batch_for", {}, (), 1, "one process"),
     ("train.batch_for", {"processes": 2}, (), 2, "2 processes"),

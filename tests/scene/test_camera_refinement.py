@@ -68,6 +68,7 @@ def test_training_cameras_are_refined_and_test_cameras_stay(capture, factor):
     scene = load_scene(capture, factor=factor)
     refined = refine_cameras(scene)
     assert median_error(refined, "train") < 0.2 / factor < 1.0 / factor < median_error(scene, "train")
+    assert refined.reprojection_error == pytest.approx(median_error(refined, "train"), rel=1e-3), "points are float32"
     assert unchanged(scene, refined, "test")
     assert median_error(refined, "test", refined=True) < 0.3 / factor < median_error(refined, "test")
     assert refined.frame == scene.frame and refined.points.dtype == torch.float32
@@ -81,6 +82,7 @@ def test_without_it_test_photos_alone_get_other_cameras_beside_theirs(capture):
     same = scene_for(load_config("turbogs", ["train.refine_cameras=false"]), scene)
     assert unchanged(scene, same, "train") and unchanged(scene, same, "test") and same.points is scene.points
     assert median_error(same, "test", refined=True) < 0.2 < 1.0 < median_error(same, "test")
+    assert scene.reprojection_error is None and same.reprojection_error == median_error(same, "train")
     assert unchanged(refine_cameras(scene), scene_for(load_config("turbogs"), scene), "train"), "by default"
 
 

@@ -36,10 +36,9 @@ def write_capture(
     suffix: str = ".bin",
     nested: bool = False,
     num_points: int = 20,
-    errors: tuple[float, ...] = (),
 ) -> Path:
     """A capture whose view i has camera ``i % len(cameras)`` at ``scale * (i, 0, -5) + shift``, turned a little, and
-    photos whose pixel (x, y) is (6x, 6y, 20i). `errors`: of the first points; the others have none."""
+    photos whose pixel (x, y) is (6x, 6y, 20i)."""
     reconstruction = pycolmap.Reconstruction()
     for number, (kind, width, height, params) in enumerate(cameras, start=1):
         reconstruction.add_camera_with_trivial_rig(
@@ -64,8 +63,6 @@ def write_capture(
         track = pycolmap.Track([pycolmap.TrackElement(1, point), pycolmap.TrackElement(2, point)])
         xyz = scale * random.normal(size=3) + shift
         number = reconstruction.add_point3D(xyz, track, np.array([point, 2, 3], dtype=np.uint8))
-        if point < len(errors):
-            reconstruction.point3D(number).error = errors[point]
     (folder / model).mkdir(parents=True)
     {".bin": reconstruction.write_binary, ".txt": reconstruction.write_text}[suffix](folder / model)
     return folder
@@ -173,15 +170,6 @@ def test_factor_scales_intrinsics_by_the_actual_sizes(tmp_path):
     expected = [[50 * 11 / 42, 0, 21 * 11 / 42], [0, 52 * 6 / 25, 11 * 6 / 25], [0, 0, 1]]
     np.testing.assert_allclose(scene.train.cameras.Ks[0], expected, rtol=1e-6)
     assert scene.train.photos.image(0).shape == (6, 11, 3)
-
-
-@pytest.mark.parametrize("suffix", [".bin", ".txt"])
-def test_the_accuracy_of_the_cameras_is_in_pixels_of_the_photos(tmp_path, suffix):
-    scene = write_capture(tmp_path / "cup", errors=(0.5, 1.75, 0.0), suffix=suffix)
-    assert load_scene(scene).reprojection_error == pytest.approx(1.125), "of the points that have one"
-    assert load_scene(scene, factor=2).reprojection_error == pytest.approx(1.125 / 2)
-    assert load_scene(write_capture(tmp_path / "none", suffix=suffix)).reprojection_error is None
-    assert load_scene(write_capture(tmp_path / "random", num_points=0)).reprojection_error is None
 
 
 def test_photos_are_reduced_by_area_averaging(tmp_path):

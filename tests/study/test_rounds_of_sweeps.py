@@ -96,7 +96,7 @@ def test_cells_are_gathered_from_studies(tmp_path):
     file = sweep_tables.gather("new", {"a": study.path / "results.json"}, tmp_path)
     (cell,) = sweep_tables.read_cells(file)
     assert (cell.name, cell.scene, cell.seed) == ("a cap-57k", "fox", 3)
-    assert cell.overrides == ["density.max_gaussians=57000", "schedule.pixel_budget=0.5", "train.epochs=30"]
+    assert cell.overrides == ablation.variants["cap-57k"] != []
     assert (cell.psnr, cell.ssim, cell.num_gaussians) == ([9.0, 31.235], [0.2, 0.91235], [90, 1000])
     assert cell.train_seconds == [0.12, 7.0]
 

@@ -27,7 +27,7 @@ class SceneFacts:
         train_views, test_views: V and the number of test views.
         smallest_photo, largest_photo: (width, height) of the training photos with the fewest and most pixels.
         points: M, of the reconstruction.
-        reprojection_error: a mean in pixels, see `Scene`; None: not known.
+        reprojection_error: a median in pixels, see `Scene`; None: not known.
         extent: radius of the scene in the capture's own unit.
         baseline: median distance of a training camera to its nearest, over the median depth of the points it sees.
         exposure_spread, exposure_rest, exposure_views: how far photos differ in brightness and white balance, in stops

@@ -71,7 +71,7 @@ class Plan:
             )
         points = f"{facts.points} points"
         if facts.reprojection_error is not None:
-            points += f" with a reprojection error of {facts.reprojection_error:.2f} pixels"
+            points += f", {facts.reprojection_error:.2f} pixels from where photos show them (median)"
         return (
             f"{facts.scene}: {facts.train_views} + {facts.test_views} views of "
             f"{small if small == large else f'{small} to {large}'} pixels, {points}; "

@@ -26,19 +26,22 @@ def refine_cameras(scene: Scene, training: bool = True) -> Scene:
         training: False: training cameras and points stay, and only the test photos get cameras beside theirs.
 
     Returns:
-        The same scene, where its capture does not say where photos show the points, or that does not fit.
+        It has a `reprojection_error`, that of the cameras that are trained with. The same scene, where its capture does
+        not say where photos show the points, or that does not fit.
     """
     train, test, points = scene.train, scene.test, scene.points.double().numpy()
     shown, tested = _usable(train, points), _usable(test, points)
     if shown is None or tested is None:
         return scene
     refined = refine_together(_pinholes(train.cameras), points, shown)
+    scene = replace(scene, reprojection_error=refined.before)
     if training and refined.count:
         points = refined.points
         scene = replace(
             scene,
             train=replace(train, cameras=_cameras(refined.cameras, train.cameras)),
             points=torch.from_numpy(points).float(),
+            reprojection_error=refined.after,
             notes=(*scene.notes, refined.text("training cameras")),
         )
     beside = refine_alone(_pinholes(test.cameras), points, tested, refined.spread)

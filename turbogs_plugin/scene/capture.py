@@ -43,8 +43,6 @@ class Capture:
         alpha: what the alpha of a transparent photo is: the object's ``opacity``, so that the background shows through
             and training makes the model as transparent; or a ``mask``, whose zero pixels are ignored.
         mask_files: files of masks that the capture names, one a view or None; given as empty where it names none.
-        reprojection_error: how far points are from where photos show them, a mean in pixels of the full-size photos;
-            None: the capture does not say.
         observations: where photos show the points, in pixels of the full-size photos, undistorted where they have a
             lens; None: the capture does not say.
     """
@@ -62,7 +60,6 @@ class Capture:
     reduction: int = 1
     alpha: Literal["opacity", "mask"] = "opacity"
     mask_files: tuple[Path | None, ...] = ()
-    reprojection_error: float | None = None
     observations: Observations | None = None
 
     def __post_init__(self) -> None:

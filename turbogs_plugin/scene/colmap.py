@@ -174,8 +174,6 @@ def read_colmap(scene: Path, model: Path, suffix: str) -> Capture:
     found = [point for _, point in sorted(reconstruction.points3D.items())]
     points = np.array([point.xyz for point in found], dtype=np.float64).reshape(-1, 3)
     colors = np.array([point.color for point in found], dtype=np.uint8).reshape(-1, 3) if found else None
-    errors = np.array([point.error for point in found])
-    known = errors[errors > 0]  # not of points that another program has added
     shown = f"{len(points):,} points"
     if not found and images and np.isfinite(viewmats).all():
         points, how = starting_points(viewmats, intrinsics, sizes)
@@ -197,7 +195,6 @@ def read_colmap(scene: Path, model: Path, suffix: str) -> Capture:
         ),
         reduction=reduction,
         alpha="mask",
-        reprojection_error=float(known.mean()) if len(known) else None,
         observations=read_observations(reconstruction, model, suffix, images, lenses) if found else None,
     ).checked(model)
 

@@ -99,8 +99,8 @@ class Scene:
         extent: 1.1 times the largest distance of a training camera from their mean, as in 3DGS; 1 by the choice of
             frame, also where the cameras only turn on the spot.
         drawn_points: the points were drawn at random, as the capture has none.
-        reprojection_error: how far points are from where photos show them, a mean in pixels of the photos as they are
-            here, for the accuracy of the cameras; None: the capture does not say.
+        reprojection_error: how far points are from where training photos show them, a median in pixels, by
+            `refine_cameras`: for the accuracy of the cameras; None: the capture does not say.
         notes: what the capture was taken for, and what was done with its photos: lines for the user.
     """
 
@@ -237,7 +237,6 @@ def load_scene(
         frame=frame,
         extent=1.0,
         drawn_points=capture.point_colors is None,
-        reprojection_error=None if capture.reprojection_error is None else capture.reprojection_error * ratios.mean(),
         notes=tuple(filter(None, (*capture.notes, *notes))),
     )
 
