@@ -58,6 +58,8 @@ TABLES: dict[str, Callable[[], str | None]] = {
     "behind": study_tables.behind,
     "average": lambda: study_tables.changes("average"),
     "bounds": lambda: study_tables.changes("bounds"),
+    "cameras": lambda: study_tables.changes("cameras"),
+    "cameras refined": lambda: study_tables.changes("cameras", "refined_"),
     "density_sums": machine_tables.density_sums,
     "departures": lambda: study_tables.changes("departures"),
     "dropin": machine_tables.dropin,

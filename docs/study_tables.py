@@ -203,8 +203,12 @@ def mark(commit: str) -> str:
     return " (stale)" if readme and commit and machine_tables.short(commit) != readme else ""
 
 
-def changes(study: str) -> str:
-    """Every variant of a study against its own baseline, over the same seeds."""
+def changes(study: str, errors: str = "") -> str:
+    """Every variant of a study against its own baseline, over the same seeds.
+
+    Args:
+        errors: prefix of the measures of PSNR and SSIM, in `CELL_VALUES`.
+    """
     found = rows_of(study)
     captures = [capture for capture in CAPTURES if capture in found]
     lines = []
@@ -212,7 +216,7 @@ def changes(study: str) -> str:
         cells = []
         for capture in captures:
             row = found[capture].get(variant)
-            cells.append("" if row is None or row.cells == row.base else change(row))
+            cells.append("" if row is None or row.cells == row.base else change(row, errors))
         if any(cells):
             lines.append((variant, *cells))
     return "\n\n".join([table(("", *captures), lines), *stale(study)])
@@ -260,10 +264,10 @@ def study_page(study: str) -> str:
     return to_markdown(measured.ablation.title, [*blocks[:first], *other_commit(study), *blocks[first:]])
 
 
-def change(row: VariantRow) -> str:
-    """Differences in PSNR and SSIM, ratios of time and Gaussians, and how many seeds."""
+def change(row: VariantRow, errors: str = "") -> str:
+    """Differences in PSNR and SSIM, ratios of time and Gaussians, and how many seeds; `errors` as in `changes`."""
     sizes = row.ratio("gaussians")
-    error, said, clear = difference_text(row.difference("psnr"), 2).partition(" (clear)")
-    parts = [f"{error} dB{said}{clear}", difference_text(row.difference("ssim"), 4)]
+    error, said, clear = difference_text(row.difference(f"{errors}psnr"), 2).partition(" (clear)")
+    parts = [f"{error} dB{said}{clear}", difference_text(row.difference(f"{errors}ssim"), 4)]
     parts += [f"x {row.ratio('seconds'):.2f} s", "" if math.isnan(sizes) else f"x {sizes:.2f} N"]
     return f"{', '.join(filter(None, parts))} ({row.difference('psnr').count})"

@@ -137,6 +137,12 @@ def test_cells_with_and_without_it_are_of_one_capture(turbogs, capture, tmp_path
     for cell in (own, given):
         *before, last = cell.history
         assert np.isfinite(last.refined_psnr) and all(np.isnan(entry.refined_psnr) for entry in before)
+    own, given = own.history[-1], given.history[-1]
+    page = (tmp_path / "study/report.md").read_text()
+    _, said = page.split("### By refined test cameras on cup")
+    row = next(line for line in said.splitlines() if line.startswith("| given |"))
+    difference = given.refined_psnr - own.refined_psnr
+    assert row.split(" | ")[1:3] == [f"{given.refined_psnr:.2f}", f"{difference:+.2f}"]
 
 
 def test_a_resumed_run_has_the_same_cameras(turbogs, capture, tmp_path):

@@ -42,6 +42,11 @@ CELL_RULES = (
     "plan, training, and every evaluation. Imports and warm-up are not in them."
 )
 
+REFINED_RULES = (
+    "The table above compares renders with test photos by the cameras that the capture gives these. Here each test "
+    "photo has the camera that agrees best with where it shows the points that training began with."
+)
+
 NO_FLIP = (
     "FLIP was not computed: cells of `turbogs ablate` have it where the package flip-evaluator (the extra flip) is "
     "installed; `turbogs eval RUN` prints that of a run."
@@ -178,6 +183,7 @@ def _scene(summary: SceneSummary) -> list[Block]:
         Heading(summary.scene),
         Table([head for head, _ in columns], [[cell(row) for _, cell in columns] for row in summary.rows]),
         *(Picture(f"{summary.scene}-{plot.name}.png", f"{summary.scene}: {plot.text}") for plot in PLOTS),
+        *(_by_refined_cameras(summary, against) if _has(summary, "refined_psnr") else []),
         Heading(f"Time to reach a PSNR on {summary.scene}", 3),
         Table(reach_header, reach_lines),
     ]
@@ -195,6 +201,20 @@ def _scene(summary: SceneSummary) -> list[Block]:
     if fitted:
         blocks.append(Paragraph(f"Iterations that fit into the time budget, of each seed: {', '.join(fitted)}."))
     return blocks
+
+
+def _by_refined_cameras(summary: SceneSummary, against: str) -> list[Block]:
+    """The same models' errors by other cameras of the test photos."""
+    errors = {"refined_psnr": ("PSNR in dB", f"PSNR{against}", 2), "refined_ssim": ("SSIM", f"SSIM{against}", 4)}
+    lines = []
+    for row in summary.rows:
+        line = [row.name]
+        for measure, (*_, digits) in errors.items():
+            compared = "" if summary.baseline in ("", row.name) else difference_text(row.difference(measure), digits)
+            line += [spread_text(row.spread(measure), digits), compared]
+        lines.append(line)
+    header = ("variant", *(head for heads in errors.values() for head in heads[:2]))
+    return [Heading(f"By refined test cameras on {summary.scene}", 3), Paragraph(REFINED_RULES), Table(header, lines)]
 
 
 def _has(summary: SceneSummary, measure: str) -> bool:
@@ -273,7 +293,7 @@ def _settings(study: Study) -> list[Block]:
 def table_csv(summaries: Sequence[SceneSummary]) -> str:
     """All numbers of the tables, unrounded; empty where not computed or not measured, ``inf`` where never reached."""
     lines: list[dict[str, Any]] = []
-    later = {*CLOCKS, "flip"}
+    later = {*CLOCKS, "flip", "refined_psnr", "refined_ssim"}
     measures = [name for name in CELL_VALUES if name not in later or any(_has(summary, name) for summary in summaries)]
     for summary in summaries:
         for row in summary.rows:

@@ -31,7 +31,7 @@ DECIMALS |= dict.fromkeys(("fps", "wall_seconds", "cell_seconds"), 3)
 DECIMALS |= {field.name: DECIMALS[field.name.partition("_")[2]] for field in fields(FurtherErrors)}
 """Digits behind the point that are kept of a measure: for errors those that float32 has."""
 
-SHARED = ("provenance", "resolved", "warmup_iterations", "lpips_reason")
+SHARED = ("provenance", "resolved", "warmup_iterations", "lpips_reason", "asked")
 """Fields of a cell that are written once, as ``common``, and in a cell only where its value is another one."""
 
 
@@ -47,8 +47,8 @@ class Document:
         config: the common configuration, ``section.key`` -> value.
         cells: of each, what is not common: fields of `CellResult`, but for ``provenance``, which is a place in
             `provenances`; ``config``, the difference from `config`; ``asked``, the difference from the cell's own
-            configuration; and ``history``: field of `Evaluation` -> its values, null for NaN. What is absent has the
-            default.
+            configuration; and ``history``: field of `Evaluation` -> its values, null for NaN, or one number where only
+            the last evaluation has one. What is absent has the default.
     """
 
     format: int
@@ -69,7 +69,7 @@ def study_to_json(study: Study) -> str:
         captures[result.scene] = captures.get(result.scene) or result.capture
     provenances = study.provenances
     cells = [_complete(result, provenances) for result in study.results]
-    common = {name: Counter(cell[name] for cell in cells).most_common(1)[0][0] for name in SHARED if cells}
+    common = {name: _most_common([cell[name] for cell in cells]) for name in SHARED if cells}
     config = common_configuration([cell["config"] for cell in cells])
     reduced = [_reduced(cell, common | {"capture": captures[cell["scene"]]}, config) for cell in cells]
     shared = (provenances, captures, common, config)
@@ -115,7 +115,13 @@ def _reduced(cell: dict[str, Any], common: Mapping[str, Any], config: Mapping[st
     """What a cell's line says."""
     cell = cell | {"config": difference(config, cell["config"])}
     own = {name: value for name, value in cell.items() if name not in common or value != common[name]}
-    return {name: value for name, value in own.items() if value not in (None, {}, [])}
+    return {name: value for name, value in own.items() if name in common or value not in (None, {}, [])}
+
+
+def _most_common(values: Sequence[Any]) -> Any:
+    """Of equal ones, the first; values may be dicts."""
+    texts = [json.dumps(value, sort_keys=True) for value in values]
+    return values[texts.index(Counter(texts).most_common(1)[0][0])]
 
 
 def _result(document: Document, cell: dict[str, Any], where: str) -> CellResult:
@@ -140,17 +146,24 @@ def _columns(history: Sequence[Evaluation]) -> dict[str, list[Any]]:
     columns = {}
     for entry in fields(Evaluation):
         values = [_rounded(entry.name, getattr(evaluation, entry.name)) for evaluation in history]
-        if entry.default is MISSING or any(value != _rounded(entry.name, entry.default) for value in values):
-            columns[entry.name] = values
+        optional = entry.default is not MISSING
+        if optional and all(value == _rounded(entry.name, entry.default) for value in values):
+            continue
+        late = optional and len(values) > 1 and set(values[:-1]) == {None}
+        columns[entry.name] = values[-1] if late else values
     return columns
 
 
 def _evaluations(history: Mapping[str, Any], where: str) -> list[Evaluation]:
     known, types = {entry.name: entry for entry in fields(Evaluation)}, get_type_hints(Evaluation)
     columns: dict[str, list[Any]] = {}
-    for name, values in convert(history, dict[str, Any], where).items():
+    read = convert(history, dict[str, Any], where)
+    count = max((len(values) for values in read.values() if isinstance(values, list)), default=0)
+    for name, values in read.items():
         if name not in known:
             raise InputError(f"unknown key '{where}.{name}': {nearest(name, known)}")
+        if known[name].default is not MISSING and not isinstance(values, list):
+            values = [None] * (count - 1) + [values]
         column = list[int] if types[name] is int else list[float | None]  # null: NaN
         columns[name] = convert(values, column, f"{where}.{name}")
     for name, entry in known.items():

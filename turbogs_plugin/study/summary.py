@@ -22,6 +22,8 @@ CELL_VALUES = {
     "worst_psnr": attrgetter("final.worst_psnr"),
     "ssim": attrgetter("final.ssim"),
     "l1": attrgetter("final.l1"),
+    "refined_psnr": attrgetter("final.refined_psnr"),
+    "refined_ssim": attrgetter("final.refined_ssim"),
     "lpips": attrgetter("lpips"),
     "flip": attrgetter("flip"),
     "gaussians": attrgetter("final.num_gaussians"),
