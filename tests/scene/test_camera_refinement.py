@@ -17,7 +17,7 @@ from turbogs_plugin.scene.camera_refinement import _pinholes, refine_cameras
 from turbogs_plugin.study.cell import capture_digest
 from turbogs_plugin.study.folder import StudyFolder
 from turbogs_plugin.train.evaluate import Look, evaluate
-from turbogs_plugin.train.start import scene_for
+from turbogs_plugin.train.start import read_scene
 
 CASE = tracked(points=80)
 
@@ -79,11 +79,11 @@ def test_training_cameras_are_refined_and_test_cameras_stay(capture, factor):
 
 def test_without_it_test_photos_alone_get_other_cameras_beside_theirs(capture):
     scene = load_scene(capture)
-    same = scene_for(load_config("turbogs", ["train.refine_cameras=false"]), scene)
-    assert unchanged(scene, same, "train") and unchanged(scene, same, "test") and same.points is scene.points
+    same = read_scene(capture, load_config("turbogs", ["train.refine_cameras=false"]))
+    assert unchanged(scene, same, "train") and unchanged(scene, same, "test") and same.points.equal(scene.points)
     assert median_error(same, "test", refined=True) < 0.2 < 1.0 < median_error(same, "test")
     assert scene.reprojection_error is None and same.reprojection_error == median_error(same, "train")
-    assert unchanged(refine_cameras(scene), scene_for(load_config("turbogs"), scene), "train"), "by default"
+    assert unchanged(refine_cameras(scene), read_scene(capture, load_config("turbogs")), "train"), "by default"
 
 
 def test_training_photos_tell_how_far_the_camera_of_a_test_photo_may_be(tmp_path):

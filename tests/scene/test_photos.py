@@ -1,10 +1,12 @@
-"""Sizes of reduced photos."""
+"""Sizes of reduced photos, and what is done while photos are decoded."""
+
+from threading import Event
 
 import numpy as np
 import pytest
 
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.scene import load, load_scene
+from turbogs_plugin.scene import load, load_scene, photos
 from turbogs_plugin.scene.photos import reduced_sizes
 
 SIZES = np.array([[640, 480], [500, 90]])
@@ -30,3 +32,38 @@ def test_a_photo_of_more_pixels_than_a_draw_tells_apart_is_refused(capture, monk
     with pytest.raises(InputError, match="a photo would have 48x40 pixels, more than 1919: use --factor 2"):
         load_scene(capture)
     assert load_scene(capture, factor=2).train.cameras.sizes.max() == 24
+
+
+def test_what_is_done_meanwhile_comes_before_the_last_photo(capture, monkeypatch):
+    done, decode, seen = Event(), photos._decode, []
+
+    def waiting(*arguments):
+        assert done.wait(60), "done while the photos are decoded"
+        return decode(*arguments)
+
+    def meanwhile(train, test, points):
+        seen.append((len(train.cameras.sizes), len(test.cameras.sizes), len(points)))
+        done.set()
+
+    monkeypatch.setattr(photos, "_decode", waiting)
+    scene = load_scene(capture, meanwhile=meanwhile)
+    assert seen == [(len(scene.train), len(scene.test), len(scene.points))]
+
+
+def test_what_ends_it_ends_the_decoding(capture, monkeypatch):
+    """Ctrl-C, for example: photos that were not begun are not decoded any more."""
+    go, begun, decode = Event(), [], photos._decode
+
+    def waiting(*arguments):
+        begun.append(arguments)
+        go.wait(0.2)
+        return decode(*arguments)
+
+    def meanwhile(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(photos, "_decode", waiting)
+    monkeypatch.setattr(photos, "processor_cores", lambda: 1)
+    with pytest.raises(KeyboardInterrupt):
+        load_scene(capture, meanwhile=meanwhile)
+    assert len(begun) <= 1

@@ -33,7 +33,7 @@ from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint
 from turbogs_plugin.train.evaluate import Look, render_view
 from turbogs_plugin.train.history import read_history
 from turbogs_plugin.train.saved_model import load_model
-from turbogs_plugin.train.start import scene_for
+from turbogs_plugin.train.start import read_scene
 from turbogs_plugin.train.trainer import Trainer
 from turbogs_plugin.types import RowUpdate
 
@@ -128,7 +128,7 @@ STOPS = {
 def test_a_run_stopped_again_and_again_is_the_same_bit_for_bit(capture, whole, tmp_path, monkeypatch):
     """At every stop, the first before the first iteration, and at its end."""
     config = tiny_config(capture).without_plan()
-    trainer = Trainer(config, scene_for(config, load_scene(capture)), torch.device("cpu"))
+    trainer = Trainer(config, read_scene(capture, config), torch.device("cpu"))
     initialise, place = Trainer.initialise_maps, tmp_path / "run"
 
     def interrupted(trainer):

@@ -7,48 +7,96 @@ points that training starts from, however that is set: errors by these are of th
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
-from turbogs_plugin.scene.bundle_adjustment import Pinholes, of_these_photos, refine_alone, refine_together
-from turbogs_plugin.scene.load import PosedImages, Scene
+from turbogs_plugin.scene.bundle_adjustment import (
+    Pinholes,
+    Refinement,
+    of_these_photos,
+    refine_alone,
+    refine_together,
+)
+from turbogs_plugin.scene.load import load_scene
 from turbogs_plugin.scene.observations import Observations
+from turbogs_plugin.scene.scene import PosedViews, Scene
 from turbogs_plugin.types import Cameras
 
 
-def refine_cameras(scene: Scene, training: bool = True) -> Scene:
-    """The scene with refined training cameras and points, and with refined cameras beside those of its test photos.
+@dataclass(frozen=True)
+class RefinedCameras:
+    """What a scene's cameras are by where its photos show its points.
 
     Args:
-        scene: as it was loaded.
-        training: False: training cameras and points stay, and only the test photos get cameras beside theirs.
-
-    Returns:
-        It has a `reprojection_error`, that of the cameras that are trained with. The same scene, where its capture does
-        not say where photos show the points, or that does not fit.
+        together: training cameras and points.
+        test: the test photos, and where they show points.
     """
-    train, test, points = scene.train, scene.test, scene.points.double().numpy()
-    shown, tested = _usable(train, points), _usable(test, points)
+
+    together: Refinement
+    test: tuple[Pinholes, Observations]
+
+    def of(self, scene: Scene, training: bool = True) -> Scene:
+        """The scene with these cameras.
+
+        Args:
+            scene: as it was loaded.
+            training: False: training cameras and points stay, and only the test photos get cameras beside theirs.
+
+        Returns:
+            It has a `reprojection_error`, that of the cameras that are trained with.
+        """
+        together, points = self.together, scene.points.double().numpy()
+        scene = replace(scene, reprojection_error=together.before)
+        if training and together.count:
+            points = together.points
+            scene = replace(
+                scene,
+                train=replace(scene.train, cameras=_cameras(together.cameras, scene.train.cameras)),
+                points=torch.from_numpy(points).float(),
+                reprojection_error=together.after,
+                notes=(*scene.notes, together.text("training cameras")),
+            )
+        given, shown = self.test
+        beside = refine_alone(given, points, shown, together.spread)
+        return replace(scene, test=replace(scene.test, refined=_cameras(beside, scene.test.cameras)))
+
+
+def find_cameras(train: PosedViews, test: PosedViews, points: Tensor) -> RefinedCameras | None:
+    """Cameras that agree better with where photos show the scene's points [M, 3]; None where the capture does not say
+    that, or it does not fit."""
+    places = points.double().numpy()
+    shown, tested = (_usable(views, places) for views in (train, test))
     if shown is None or tested is None:
-        return scene
-    refined = refine_together(_pinholes(train.cameras), points, shown)
-    scene = replace(scene, reprojection_error=refined.before)
-    if training and refined.count:
-        points = refined.points
-        scene = replace(
-            scene,
-            train=replace(train, cameras=_cameras(refined.cameras, train.cameras)),
-            points=torch.from_numpy(points).float(),
-            reprojection_error=refined.after,
-            notes=(*scene.notes, refined.text("training cameras")),
-        )
-    beside = refine_alone(_pinholes(test.cameras), points, tested, refined.spread)
-    return replace(scene, test=replace(test, refined=_cameras(beside, test.cameras)))
+        return None
+    return RefinedCameras(refine_together(_pinholes(train.cameras), places, shown), (_pinholes(test.cameras), tested))
 
 
-def _usable(views: PosedImages, points: np.ndarray) -> Observations | None:
+def refine_cameras(scene: Scene, training: bool = True) -> Scene:
+    """The scene as `RefinedCameras.of` gives it; as it is where `find_cameras` finds none."""
+    found = find_cameras(scene.train.posed, scene.test.posed, scene.points)
+    return scene if found is None else found.of(scene, training)
+
+
+def load_and_find(path: str | Path, *settings: Any) -> tuple[Scene, RefinedCameras | None]:
+    """What `load_scene` and `find_cameras` give, the second while photos are decoded.
+
+    Args:
+        settings: further ones of `load_scene`.
+
+    Raises:
+        InputError: as `load_scene`.
+    """
+    found: list[RefinedCameras | None] = []
+    scene = load_scene(path, *settings, meanwhile=lambda *posed: found.append(find_cameras(*posed)))
+    return scene, found[0]
+
+
+def _usable(views: PosedViews, points: np.ndarray) -> Observations | None:
     """Where the views show points; None where that is not known, or is of other photos."""
     observations = views.observations
     if observations is None or not len(observations):

@@ -6,7 +6,8 @@ import itertools
 import math
 import shlex
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -22,10 +23,8 @@ from turbogs_plugin.scene.frame import Frame
 from turbogs_plugin.scene.host_arrays import file_note
 from turbogs_plugin.scene.mask_files import find_masks, load_masks
 from turbogs_plugin.scene.nearby import POSE_FILES, capture_around, capture_near
-from turbogs_plugin.scene.observations import Observations
 from turbogs_plugin.scene.photo_folder import find_photos, unread
 from turbogs_plugin.scene.photos import (
-    Photos,
     channels_of,
     is_turned,
     load_photos,
@@ -34,6 +33,7 @@ from turbogs_plugin.scene.photos import (
     reduced_sizes,
 )
 from turbogs_plugin.scene.poses import camera_centers
+from turbogs_plugin.scene.scene import PosedImages, PosedViews, Scene
 from turbogs_plugin.scene.starting_points import colors_in_photos
 from turbogs_plugin.scene.transforms import FILE, read_transforms
 from turbogs_plugin.scene.undistort import undistortion_note
@@ -47,81 +47,13 @@ FARTHEST = 1e15
 """Distance of a point in extents, from which on squares, and squares of these, do not fit into float32."""
 
 
-@dataclass
-class PosedImages:
-    """V photos with their cameras.
-
-    Args:
-        cameras: float32, in the scene's normalised frame.
-        names: of the photos, in name order.
-        photos: their pixels.
-        masks: which pixels count, on the CPU; None for all.
-        observations: where the photos show the scene's points; None: the capture does not say.
-        refined: other cameras of the same photos, which agree better with what is trained on (`refine_cameras`); None:
-            there are none.
-    """
-
-    cameras: Cameras
-    names: tuple[str, ...]
-    photos: Photos
-    masks: PixelMasks | None = None
-    observations: Observations | None = None
-    refined: Cameras | None = None
-
-    def __len__(self) -> int:
-        return len(self.names)
-
-    def to(self, device: torch.device | str) -> PosedImages:
-        return replace(self.with_cameras_on(device), photos=self.photos.to(device))
-
-    def with_cameras_on(self, device: torch.device | str) -> PosedImages:
-        """The same photos, with their cameras on a device."""
-        refined = None if self.refined is None else self.refined.to(device)
-        return replace(self, cameras=self.cameras.to(device), refined=refined)
-
-    def mask(self, view_id: int) -> Tensor | None:
-        """[H, W] bool on the cameras' device, True where a pixel of a view counts; None where all do."""
-        if self.masks is None or self.masks.pixel_counts[view_id] == self.cameras.sizes[view_id].prod():
-            return None
-        return self.masks.image(view_id).to(self.cameras.viewmats.device)
-
-
-@dataclass
-class Scene:
-    """A capture ready for training, in its normalised frame.
-
-    Args:
-        name: of the scene's folder.
-        train, test: the two disjoint sets of views.
-        points: [M, 3] float32.
-        point_colors: [M, 3] uint8.
-        frame: back to the capture's own coordinates.
-        extent: 1.1 times the largest distance of a training camera from their mean, as in 3DGS; 1 by the choice of
-            frame, also where the cameras only turn on the spot.
-        drawn_points: the points were drawn at random, as the capture has none.
-        reprojection_error: how far points are from where training photos show them, a median in pixels, by
-            `refine_cameras`: for the accuracy of the cameras; None: the capture does not say.
-        notes: what the capture was taken for, and what was done with its photos: lines for the user.
-    """
-
-    name: str
-    train: PosedImages
-    test: PosedImages
-    points: Tensor
-    point_colors: Tensor
-    frame: Frame
-    extent: float
-    drawn_points: bool = False
-    reprojection_error: float | None = None
-    notes: tuple[str, ...] = ()
-
-
 def load_scene(
     path: str | Path,
     factor: int = 1,
     test_every: int = 8,
     progress: Callable[[int, int], object] | None = None,
     sized: Callable[[np.ndarray, np.ndarray], object] | None = None,
+    meanwhile: Callable[[PosedViews, PosedViews, Tensor], object] | None = None,
 ) -> Scene:
     """Load a capture with its photos.
 
@@ -140,6 +72,7 @@ def load_scene(
         progress: called with the number of photos decoded so far, and of all.
         sized: called with the sizes [V, 2] (width, height) of training and of test views, before a photo is decoded;
             what it raises ends the loading.
+        meanwhile: called once, while photos are decoded, with training views, test views and the scene's points.
 
     Raises:
         InputError: anything wrong with the scene or the arguments, in one line.
@@ -207,15 +140,21 @@ def load_scene(
         if progress is not None:
             progress(next(counter), int(seen.sum()))
 
-    def select(views: np.ndarray, colors: Tensor) -> PosedImages:
+    def pose(views: np.ndarray) -> PosedViews:
         cameras = Cameras(viewmats[views], torch.from_numpy(intrinsics[views]).float(), sizes[views])
-        names = tuple(capture.names[view] for view in views)
-        lenses = [capture.lenses[view] for view in views]
-        photos = load_photos([paths[view] for view in views], file_sizes[views], sizes[views], lenses, colors, loaded)
         shown = None if capture.observations is None else capture.observations.of_views(views, ratios[views])
-        return PosedImages(cameras, names, photos, _pixel_masks([masks[view] for view in views], sizes[views]), shown)
+        return PosedViews(cameras, shown)
 
-    train, tested = (select(*part) for part in zip(parts, colors, strict=True))
+    def select(views: np.ndarray, colors: Tensor, posed: PosedViews, meanwhile: Callable | None) -> PosedImages:
+        names = tuple(capture.names[view] for view in views)
+        files, lenses = ([of_view[view] for view in views] for of_view in (paths, capture.lenses))
+        photos = load_photos(files, file_sizes[views], sizes[views], lenses, colors, loaded, meanwhile)
+        masked = _pixel_masks([masks[view] for view in views], sizes[views])
+        return PosedImages(posed.cameras, names, photos, masked, posed.observations)
+
+    posed = [pose(views) for views in parts]
+    work = (None if meanwhile is None else partial(meanwhile, *posed, points), None)
+    train, tested = (select(*part) for part in zip(parts, colors, posed, work, strict=True))
     if capture.point_colors is None:
         point_colors = colors_in_photos(points, train.cameras, train.photos, train.masks)
     else:

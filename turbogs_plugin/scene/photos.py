@@ -198,6 +198,7 @@ def load_photos(
     lenses: Sequence[Lens | None],
     colors: Tensor,
     loaded: Callable[[], object],
+    meanwhile: Callable[[], object] | None = None,
 ) -> Photos:
     """Decode photos in parallel, undistorted, then reduced to their target sizes by area averaging.
 
@@ -211,6 +212,7 @@ def load_photos(
         colors: where to put them, as `photo_array` gives it. With 3 channels, photos that are transparent lose their
             alpha and keep their colours as stored.
         loaded: called after each photo, in their order.
+        meanwhile: called once, while photos are decoded.
 
     Raises:
         InputError: a photo that cannot be decoded, or is of another size (the first one in order is named); no room
@@ -236,9 +238,15 @@ def load_photos(
     largest = int(sizes.prod(axis=1).max(initial=1))
     opaque = channels == 4
     with decoding_threads(DECODING_BYTES * largest) as pool:
-        for whole in pool.map(load, range(len(paths))):  # raises the first error in order, cancels what has not begun
-            opaque &= whole
-            loaded()
+        decoded = [pool.submit(load, view) for view in range(len(paths))]
+        try:
+            if meanwhile is not None:
+                meanwhile()
+            for photo in decoded:  # the first error in order is raised
+                opaque &= photo.result()
+                loaded()
+        finally:
+            pool.shutdown(cancel_futures=True)
     if opaque:  # after all
         colors = photo_array(targets).copy_(colors[:, :3])
     return Photos(colors, targets)

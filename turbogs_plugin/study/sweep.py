@@ -19,7 +19,8 @@ from turbogs_plugin.device import free_device_memory, synchronize
 from turbogs_plugin.errors import InputError, TrainingStopped
 from turbogs_plugin.report.provenance import Provenance
 from turbogs_plugin.report.tensorboard import EventWriter, event_writers
-from turbogs_plugin.scene import Scene, load_scene
+from turbogs_plugin.scene import Scene
+from turbogs_plugin.scene.camera_refinement import load_and_find
 from turbogs_plugin.study.cell import capture_digest, train_cell
 from turbogs_plugin.study.claims import Claims
 from turbogs_plugin.study.difference import ABSENT, compared, difference
@@ -27,7 +28,7 @@ from turbogs_plugin.study.folder import StudyFolder
 from turbogs_plugin.study.grid import Ablation, CellKey, variant_config
 from turbogs_plugin.study.progress import SweepProgress
 from turbogs_plugin.study.results import CellResult, Failure, Study
-from turbogs_plugin.train.start import resolve_device, scene_for
+from turbogs_plugin.train.start import resolve_device
 
 POLL_SECONDS = 1.0
 """Between two looks at cells that other processes train."""
@@ -134,7 +135,7 @@ def run_sweep(
         configs = _scene_configs(ablation, variants, options, path.resolve(), device)
         settings = next(iter(configs.values())).scene
         started = time.perf_counter()
-        scene = load_scene(path, settings.factor, settings.test_every)
+        scene, cameras = load_and_find(path, settings.factor, settings.test_every)
         loading = time.perf_counter() - started
         capture = capture_digest(scene)
         prepared: dict[bool, tuple[Scene, float]] = {}  # refined cameras or not -> the scene, seconds
@@ -147,7 +148,8 @@ def run_sweep(
             else:
                 if (refined := config.train.refine_cameras) not in prepared:
                     started = time.perf_counter()
-                    prepared[refined] = scene_for(config, scene), loading + time.perf_counter() - started
+                    own = scene if cameras is None else cameras.of(scene, refined)
+                    prepared[refined] = own, loading + time.perf_counter() - started
                 left.append(_Cell(key, config, *prepared[refined], capture))
         for key, result in finished.items():
             if key.scene == name and result.capture not in ("", capture):

@@ -19,7 +19,8 @@ from turbogs_plugin.errors import InputError, TrainingStopped
 from turbogs_plugin.files import require_writable, write_text_atomically
 from turbogs_plugin.model.ply import save_ply
 from turbogs_plugin.plan import Plan, make_plan
-from turbogs_plugin.scene import Scene, load_scene
+from turbogs_plugin.scene import Scene
+from turbogs_plugin.scene.camera_refinement import refine_cameras
 from turbogs_plugin.scene.fingerprint import capture_difference, capture_state
 from turbogs_plugin.scene.load import holds_photos_alone
 from turbogs_plugin.scene.offload import place_views
@@ -34,7 +35,7 @@ from turbogs_plugin.train.interrupts import Interrupts
 from turbogs_plugin.train.loop import Listener, TrainingLoop
 from turbogs_plugin.train.pace import pace_of
 from turbogs_plugin.train.progress import TrainingProgress
-from turbogs_plugin.train.start import open_scene, require_possible, resolve_device, scene_for, starting
+from turbogs_plugin.train.start import open_scene, read_scene, require_possible, resolve_device, starting
 from turbogs_plugin.train.trainer import Trainer
 from turbogs_plugin.train.wall import WallClock, WallRecord
 from turbogs_plugin.types import Gaussians
@@ -115,8 +116,9 @@ def fit(scene: Scene | Path | str, *overrides: str, config: str = DEFAULT_CONFIG
     settings = load_config(config, overrides)
     device = resolve_device(settings.train.device)
     if isinstance(scene, str | Path):
-        scene = load_scene(scene, settings.scene.factor, settings.scene.test_every)
-    scene = scene_for(settings, scene)
+        scene = read_scene(scene, settings)
+    else:
+        scene = refine_cameras(scene, settings.train.refine_cameras)
     loop, _ = new_loop(make_plan(settings, scene, device).apply(settings), scene, device)
     loop.run()
     loop.trainer.require_finite()

@@ -7,6 +7,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -19,8 +20,8 @@ from turbogs_plugin.errors import InputError
 from turbogs_plugin.model.initial import BACKDROP_COUNT
 from turbogs_plugin.plan.caps import cap_of, chosen_points, require_room
 from turbogs_plugin.plan.memory import MemoryDemand
-from turbogs_plugin.scene import Scene, load_scene
-from turbogs_plugin.scene.camera_refinement import refine_cameras
+from turbogs_plugin.scene import Scene
+from turbogs_plugin.scene.camera_refinement import load_and_find
 from turbogs_plugin.train.folder import RunFolder
 from turbogs_plugin.train.given_model import read_given
 from turbogs_plugin.train.progress import LoadingProgress
@@ -117,10 +118,17 @@ def open_scene(config: Config, folder: RunFolder | None = None, training: bool =
             f"in {folder.config}"
         )
     sized = partial(require_memory, config) if training else None
-    scene = load_scene(settings.path, settings.factor, settings.test_every, LoadingProgress(), sized)
-    return scene_for(config, scene)
+    return read_scene(settings.path, config, LoadingProgress(), sized)
 
 
-def scene_for(config: Config, scene: Scene) -> Scene:
-    """The scene as a configuration trains on it."""
-    return refine_cameras(scene, config.train.refine_cameras)
+def read_scene(path: str | Path, config: Config, *options: Any) -> Scene:
+    """A capture as a configuration trains on it.
+
+    Args:
+        options: `progress` and `sized` of `load_scene`.
+
+    Raises:
+        InputError: as `load_scene`.
+    """
+    scene, cameras = load_and_find(path, config.scene.factor, config.scene.test_every, *options)
+    return scene if cameras is None else cameras.of(scene, config.train.refine_cameras)

@@ -1,0 +1,100 @@
+"""A scene: what training reads of a capture."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from turbogs_plugin.masks import PixelMasks
+from turbogs_plugin.scene.frame import Frame
+from turbogs_plugin.scene.observations import Observations
+from turbogs_plugin.scene.photos import Photos
+from turbogs_plugin.types import Cameras
+
+
+@dataclass(frozen=True)
+class PosedViews:
+    """The cameras of V photos, and what the photos show of the scene's points.
+
+    Args:
+        cameras: float32, in the scene's normalised frame.
+        observations: None: the capture does not say.
+    """
+
+    cameras: Cameras
+    observations: Observations | None
+
+
+@dataclass
+class PosedImages:
+    """V photos with their cameras.
+
+    Args:
+        cameras: float32, in the scene's normalised frame.
+        names: of the photos, in name order.
+        photos: their pixels.
+        masks: which pixels count, on the CPU; None for all.
+        observations: where the photos show the scene's points; None: the capture does not say.
+        refined: other cameras of the same photos, which agree better with what is trained on (`refine_cameras`); None:
+            there are none.
+    """
+
+    cameras: Cameras
+    names: tuple[str, ...]
+    photos: Photos
+    masks: PixelMasks | None = None
+    observations: Observations | None = None
+    refined: Cameras | None = None
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    @property
+    def posed(self) -> PosedViews:
+        return PosedViews(self.cameras, self.observations)
+
+    def to(self, device: torch.device | str) -> PosedImages:
+        return replace(self.with_cameras_on(device), photos=self.photos.to(device))
+
+    def with_cameras_on(self, device: torch.device | str) -> PosedImages:
+        """The same photos, with their cameras on a device."""
+        refined = None if self.refined is None else self.refined.to(device)
+        return replace(self, cameras=self.cameras.to(device), refined=refined)
+
+    def mask(self, view_id: int) -> Tensor | None:
+        """[H, W] bool on the cameras' device, True where a pixel of a view counts; None where all do."""
+        if self.masks is None or self.masks.pixel_counts[view_id] == self.cameras.sizes[view_id].prod():
+            return None
+        return self.masks.image(view_id).to(self.cameras.viewmats.device)
+
+
+@dataclass
+class Scene:
+    """A capture ready for training, in its normalised frame.
+
+    Args:
+        name: of the scene's folder.
+        train, test: the two disjoint sets of views.
+        points: [M, 3] float32.
+        point_colors: [M, 3] uint8.
+        frame: back to the capture's own coordinates.
+        extent: 1.1 times the largest distance of a training camera from their mean, as in 3DGS; 1 by the choice of
+            frame, also where the cameras only turn on the spot.
+        drawn_points: the points were drawn at random, as the capture has none.
+        reprojection_error: how far points are from where training photos show them, a median in pixels, by
+            `refine_cameras`: for the accuracy of the cameras; None: the capture does not say.
+        notes: what the capture was taken for, and what was done with its photos: lines for the user.
+    """
+
+    name: str
+    train: PosedImages
+    test: PosedImages
+    points: Tensor
+    point_colors: Tensor
+    frame: Frame
+    extent: float
+    drawn_points: bool = False
+    reprojection_error: float | None = None
+    notes: tuple[str, ...] = ()
