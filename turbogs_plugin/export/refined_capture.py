@@ -31,10 +31,11 @@ from turbogs_plugin.scene.bundle_adjustment import (
     refine_together,
 )
 from turbogs_plugin.scene.capture import LARGEST_SIDE, Capture, check_photo_name, named
-from turbogs_plugin.scene.colmap import REDUCED, find_model, incomplete_model, load_pycolmap, read_colmap
+from turbogs_plugin.scene.colmap import REDUCED, incomplete_model, load_pycolmap, read_colmap
 from turbogs_plugin.scene.colmap_check import check_binary_model
+from turbogs_plugin.scene.load import camera_files
 from turbogs_plugin.scene.mask_files import FOLDER as MASKS
-from turbogs_plugin.scene.nearby import POSE_FILES, capture_near
+from turbogs_plugin.scene.nearby import capture_near
 
 if TYPE_CHECKING:
     import pycolmap
@@ -90,8 +91,8 @@ def _find(scene: Path) -> tuple[Path, str]:
     if not scene.is_dir():
         trouble = "is a file" if scene.is_file() else "does not exist"
         raise InputError(f"no such scene: {scene} {trouble}: give the folder of a COLMAP capture")
-    others = any((scene / file).is_file() for file in POSE_FILES)
-    if found := find_model(scene, anywhere=not others):
+    found, others = camera_files(scene)
+    if found:
         return found
     if lack := incomplete_model(scene):
         folder, absent = lack

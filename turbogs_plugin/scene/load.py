@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from threading import Lock
 
 import numpy as np
 import torch
@@ -69,7 +70,7 @@ def load_scene(
             in the right size; otherwise ``images`` are reduced by area averaging.
         test_every: the first of each `test_every` photos in name order is a test view, the others are for training.
             Captures with a split of their own (NeRF-synthetic, lists in a ``transforms.json``) keep it.
-        progress: called with the number of photos decoded so far, and of all.
+        progress: called with the number of photos decoded so far, and of all, by one thread at a time.
         sized: called with the sizes [V, 2] (width, height) of training and of test views, before a photo is decoded;
             what it raises ends the loading.
         meanwhile: called once, while photos are decoded, with training views, test views and the scene's points.
@@ -134,11 +135,12 @@ def load_scene(
     if sized is not None:
         sized(*(sizes[views] for views in parts))
     colors = [photo_array(sizes[views], count) for views, count in zip(parts, channels, strict=True)]
-    counter = itertools.count(1)
+    counter, one_at_a_time = itertools.count(1), Lock()
 
     def loaded() -> None:
-        if progress is not None:
-            progress(next(counter), int(seen.sum()))
+        with one_at_a_time:
+            if progress is not None:
+                progress(next(counter), int(seen.sum()))
 
     def pose(views: np.ndarray) -> PosedViews:
         cameras = Cameras(viewmats[views], torch.from_numpy(intrinsics[views]).float(), sizes[views])
@@ -210,7 +212,7 @@ def _masked_note(
 def holds_photos_alone(scene: Path) -> bool:
     """Whether a folder has photos, and nothing that says where they were taken from: no reconstruction in parts, and no
     capture in it or around it."""
-    alone = scene.is_dir() and not _is_begun(scene) and _cameras(scene) == (None, []) and bool(find_photos(scene)[1])
+    alone = scene.is_dir() and not _is_begun(scene) and camera_files(scene) == (None, []) and bool(find_photos(scene)[1])
     return alone and not capture_near(scene)
 
 
@@ -219,7 +221,7 @@ def _is_begun(scene: Path) -> bool:
     return any((scene / place.partition("/")[0]).is_dir() for place in MODEL_FOLDERS if place != ".")
 
 
-def _cameras(scene: Path) -> tuple[tuple[Path, str] | None, list[str]]:
+def camera_files(scene: Path) -> tuple[tuple[Path, str] | None, list[str]]:
     """What a folder has of cameras: the reconstruction, as `find_model` gives it, and the names of other files."""
     files = [file for file in POSE_FILES if (scene / file).is_file()]
     return find_model(scene, anywhere=not files), files
@@ -232,7 +234,7 @@ def _read(scene: Path, factor: int) -> Capture:
             raise InputError(where)
         trouble = f"{scene} is a file" if scene.is_file() else f"{scene} does not exist"
         raise InputError(f"no such scene: {unread(scene) or f'{trouble}: give the folder of a capture, or of photos'}")
-    model, files = _cameras(scene)
+    model, files = camera_files(scene)
     found = _read_model(scene, model, files)
     if isinstance(found, Capture):
         return found
@@ -241,7 +243,7 @@ def _read(scene: Path, factor: int) -> Capture:
 
 
 def _read_model(scene: Path, model: tuple[Path, str] | None, files: list[str]) -> Capture | str:
-    """The capture of what `_cameras` gave, or why that reconstruction is not used; empty where there is none."""
+    """The capture of what `camera_files` gave, or why that reconstruction is not used; empty where there is none."""
     if model is None:
         lack = incomplete_model(scene)
         if lack is None or lack[0] == scene:

@@ -211,7 +211,7 @@ def load_photos(
         lenses: one a photo, None for those of pinhole cameras.
         colors: where to put them, as `photo_array` gives it. With 3 channels, photos that are transparent lose their
             alpha and keep their colours as stored.
-        loaded: called after each photo, in their order.
+        loaded: called after each photo, by several threads.
         meanwhile: called once, while photos are decoded.
 
     Raises:
@@ -233,6 +233,7 @@ def load_photos(
         if photo.size != target:
             photo = photo.resize(target, Image.Resampling.BOX)
         pixels[offsets[view] : offsets[view + 1]] = (values := np.asarray(photo)).reshape(-1, channels)
+        loaded()
         return channels == 3 or bool((values[..., 3] == 255).all())
 
     largest = int(sizes.prod(axis=1).max(initial=1))
@@ -242,9 +243,7 @@ def load_photos(
         try:
             if meanwhile is not None:
                 meanwhile()
-            for photo in decoded:  # the first error in order is raised
-                opaque &= photo.result()
-                loaded()
+            opaque &= all([photo.result() for photo in decoded])  # the first error in order is raised
         finally:
             pool.shutdown(cancel_futures=True)
     if opaque:  # after all
