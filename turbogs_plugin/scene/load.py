@@ -212,8 +212,9 @@ def _masked_note(
 def holds_photos_alone(scene: Path) -> bool:
     """Whether a folder has photos, and nothing that says where they were taken from: no reconstruction in parts, and no
     capture in it or around it."""
-    alone = scene.is_dir() and not _is_begun(scene) and camera_files(scene) == (None, []) and bool(find_photos(scene)[1])
-    return alone and not capture_near(scene)
+    if not scene.is_dir() or _is_begun(scene) or camera_files(scene) != (None, []):
+        return False
+    return bool(find_photos(scene)[1]) and not capture_near(scene)
 
 
 def _is_begun(scene: Path) -> bool:
