@@ -9,11 +9,12 @@ import torch
 from helpers.tracked import HEIGHT, WIDTH, tracked, write_tracked
 
 from turbogs_plugin.config.configuration import load_config
+from turbogs_plugin.distributed.ranks import Ranks
 from turbogs_plugin.engine.rendered import RasterSettings
 from turbogs_plugin.model.initial import gaussians_from_points
 from turbogs_plugin.scene import Scene, load_scene, write_demo_capture
 from turbogs_plugin.scene.bundle_adjustment import reprojection_errors
-from turbogs_plugin.scene.camera_refinement import _pinholes, refine_cameras
+from turbogs_plugin.scene.camera_refinement import _pinholes, load_and_find, refine_cameras
 from turbogs_plugin.study.cell import capture_digest
 from turbogs_plugin.study.folder import StudyFolder
 from turbogs_plugin.train.evaluate import Look, evaluate
@@ -84,6 +85,21 @@ def test_without_it_test_photos_alone_get_other_cameras_beside_theirs(capture):
     assert median_error(same, "test", refined=True) < 0.2 < 1.0 < median_error(same, "test")
     assert scene.reprojection_error is None and same.reprojection_error == median_error(same, "train")
     assert unchanged(refine_cameras(scene), read_scene(capture, load_config("turbogs")), "train"), "by default"
+
+
+def test_of_several_processes_the_first_one_refines_for_all(capture):
+    first = read_scene(capture, load_config("turbogs"))
+
+    class Second(Ranks):
+        rank = 1
+
+        def agree(self, value):
+            assert value is None
+            return load_and_find(capture)[1]
+
+    second = read_scene(capture, load_config("turbogs"), ranks=Second())
+    assert unchanged(first, second, "train") and second.points.equal(first.points)
+    assert second.test.refined.Ks.equal(first.test.refined.Ks)
 
 
 def test_training_photos_tell_how_far_the_camera_of_a_test_photo_may_be(tmp_path):

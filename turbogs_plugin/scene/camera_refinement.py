@@ -82,18 +82,19 @@ def refine_cameras(scene: Scene, training: bool = True) -> Scene:
     return scene if found is None else found.of(scene, training)
 
 
-def load_and_find(path: str | Path, *settings: Any) -> tuple[Scene, RefinedCameras | None]:
+def load_and_find(path: str | Path, *settings: Any, find: bool = True) -> tuple[Scene, RefinedCameras | None]:
     """What `load_scene` and `find_cameras` give, the second while photos are decoded.
 
     Args:
         settings: further ones of `load_scene`.
+        find: False: None is the second.
 
     Raises:
         InputError: as `load_scene`.
     """
     found: list[RefinedCameras | None] = []
-    scene = load_scene(path, *settings, meanwhile=lambda *posed: found.append(find_cameras(*posed)))
-    return scene, found[0]
+    meanwhile = (lambda *posed: found.append(find_cameras(*posed))) if find else None
+    return load_scene(path, *settings, meanwhile=meanwhile), found[0] if found else None
 
 
 def _usable(views: PosedViews, points: np.ndarray) -> Observations | None:

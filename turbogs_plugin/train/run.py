@@ -157,7 +157,7 @@ def train(
         clock.mark(CAMERAS)
         config = replace(config, scene=replace(config.scene, path=posed))
     with starting(lambda: resolve_device(config.train.device)) as started:
-        scene = open_scene(config, training=True)
+        scene = open_scene(config, training=True, ranks=ranks)
         clock.mark(PHOTOS)
         device = started.result()
     clock.mark(DEVICE)
@@ -206,7 +206,7 @@ def resume(
     require_writable(folder.path, f"what --resume {folder.path} writes")
     _try_lpips(config, report is not None)
     with starting(lambda: device) as started:
-        scene = open_scene(config, folder, training=True)
+        scene = open_scene(config, folder, training=True, ranks=ranks)
         clock.mark(PHOTOS)
         started.result()
     clock.mark(DEVICE)

@@ -15,6 +15,7 @@ import torch
 from turbogs_plugin.config.auto import AUTO
 from turbogs_plugin.config.configuration import Config, resolve
 from turbogs_plugin.device import synchronize
+from turbogs_plugin.distributed.ranks import ONE, Ranks
 from turbogs_plugin.engine import compiled_kernels
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.model.initial import BACKDROP_COUNT
@@ -101,12 +102,13 @@ def starting(resolve: Callable[[], torch.device]) -> Iterator[Future[torch.devic
         yield pool.submit(start)
 
 
-def open_scene(config: Config, folder: RunFolder | None = None, training: bool = False) -> Scene:
+def open_scene(config: Config, folder: RunFolder | None = None, training: bool = False, ranks: Ranks = ONE) -> Scene:
     """The capture of a configuration.
 
     Args:
         folder: that of the run with this configuration; None if the user names the capture.
         training: whether a model is to be trained on it, within the configuration's limit of memory.
+        ranks: the processes that train together; each calls this.
 
     Raises:
         InputError: there is no usable capture, or no room to train on it.
@@ -118,17 +120,20 @@ def open_scene(config: Config, folder: RunFolder | None = None, training: bool =
             f"in {folder.config}"
         )
     sized = partial(require_memory, config) if training else None
-    return read_scene(settings.path, config, LoadingProgress(), sized)
+    return read_scene(settings.path, config, LoadingProgress(), sized, ranks=ranks)
 
 
-def read_scene(path: str | Path, config: Config, *options: Any) -> Scene:
+def read_scene(path: str | Path, config: Config, *options: Any, ranks: Ranks = ONE) -> Scene:
     """A capture as a configuration trains on it.
 
     Args:
         options: `progress` and `sized` of `load_scene`.
+        ranks: the processes that train together; each calls this. The first one refines cameras for all: machines
+            differ in their last digits, and replicas may not.
 
     Raises:
         InputError: as `load_scene`.
     """
-    scene, cameras = load_and_find(path, config.scene.factor, config.scene.test_every, *options)
+    scene, cameras = load_and_find(path, config.scene.factor, config.scene.test_every, *options, find=ranks.first)
+    cameras = ranks.agree(cameras)
     return scene if cameras is None else cameras.of(scene, config.train.refine_cameras)
