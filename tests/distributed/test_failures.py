@@ -101,7 +101,7 @@ def training(config: Config, out: Path, trouble: str) -> None:
                 raise torch.cuda.OutOfMemoryError("CUDA out of memory")
             evaluate(evaluations, loop)
 
-        def no_capture(*arguments: object) -> None:
+        def no_capture(*arguments: object, **options: object) -> None:
             raise InputError("no such scene: absent on this machine")
 
         def in_simulated_time() -> None:
