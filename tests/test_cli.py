@@ -208,7 +208,7 @@ def test_an_output_folder_that_cannot_be_made_is_refused_before_anything_is_comp
     turbogs, capture, tmp_path, monkeypatch, out
 ):
     (tmp_path / "dangling").symlink_to("nowhere")
-    monkeypatch.setattr(start, "load_scene", lambda *_: pytest.fail("the capture was loaded"))
+    monkeypatch.setattr(start, "load_and_find", lambda *_, **__: pytest.fail("the capture was loaded"))
     assert_refused(turbogs("train", capture, "--out", tmp_path / out, *QUICK), out, "cannot be made", "choose")
     assert [path.name for path in tmp_path.iterdir()] == ["dangling"]
 
@@ -485,10 +485,10 @@ def test_plots_are_drawn_by_a_process_that_begins_before_photos_are_read(turbogs
         def end(self) -> bool:
             return super().end() and ends == "draws"
 
-    draw, read = plot_process.SecondsPlot.draw, start.load_scene
+    draw, read = plot_process.SecondsPlot.draw, start.load_and_find
     monkeypatch.setattr(plot_process, "PlotProcess", Process)
     monkeypatch.setattr(plot_process.SecondsPlot, "draw", lambda plot: (drawn.append(plot), draw(plot)))
-    monkeypatch.setattr(start, "load_scene", lambda *arguments: (made.append("photos"), read(*arguments))[1])
+    monkeypatch.setattr(start, "load_and_find", lambda *a, **b: (made.append("photos"), read(*a, **b))[1])
     option = "--no-report" if ends == "is not asked for" else "--report"
     code, _, err = turbogs("train", capture, "--out", tmp_path / "run", option, "--device", "cpu", *QUICK)
     assert code == 0, err

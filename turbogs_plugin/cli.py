@@ -9,11 +9,11 @@ import sys
 import warnings
 
 from PIL import Image
-from tyro.extras import subcommand_cli_from_dict
 
 from turbogs_plugin import __version__
 from turbogs_plugin.commands import captures, machine, models, studies, training
 from turbogs_plugin.commands.options import OVERRIDE, PORT
+from turbogs_plugin.commands.parsing import parsed
 from turbogs_plugin.errors import InputError, exit_code
 
 COMMANDS = {
@@ -99,7 +99,7 @@ def main() -> None:
             return 0
         _require_no_empty(sys.argv[1:])
         words = _gathered(_with_port(sys.argv[1:]))
-        return subcommand_cli_from_dict(COMMANDS, args=words, prog="turbogs", description=about)
+        return parsed(COMMANDS, words, about)()
 
     sys.exit(exit_code(command))
 

@@ -159,7 +159,7 @@ def test_the_report_takes_the_last_evaluation(capture, tmp_path, monkeypatch):
 
 def test_cuda_that_is_absent_is_named_before_photos_are_read(capture, tmp_path, monkeypatch):
     monkeypatch.setattr(run.torch.cuda, "is_available", lambda: False)
-    monkeypatch.setattr(start, "load_scene", lambda *_: pytest.fail("photos were read"))
+    monkeypatch.setattr(start, "load_and_find", lambda *_, **__: pytest.fail("photos were read"))
     with pytest.raises(InputError, match="CUDA was asked for and is absent"):
         run.train(tiny_config(capture, "train.device=cuda"), tmp_path / "run")
     assert not (tmp_path / "run").exists()
@@ -170,7 +170,7 @@ def test_the_device_starts_while_photos_are_read(capture, tmp_path, monkeypatch)
     import threading
 
     meet = threading.Barrier(2, timeout=60)
-    resolve, load = run.resolve_device, start.load_scene
+    resolve, load = run.resolve_device, start.load_and_find
     monkeypatch.setattr(run, "resolve_device", lambda *arguments: (meet.wait(), resolve(*arguments))[1])
-    monkeypatch.setattr(start, "load_scene", lambda *arguments: (meet.wait(), load(*arguments))[1])
+    monkeypatch.setattr(start, "load_and_find", lambda *a, **b: (meet.wait(), load(*a, **b))[1])
     assert run.train(tiny_config(capture, "train.iterations=1"), tmp_path / "run").wall.train_seconds > 0

@@ -1,0 +1,82 @@
+"""Words of a command line to what is called: what tyro refuses in a box becomes one line, as all other refusals."""
+
+from __future__ import annotations
+
+import functools
+import io
+import re
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import redirect_stderr
+
+from tyro.extras import subcommand_cli_from_dict
+
+from turbogs_plugin.errors import InputError
+
+EDGE = re.compile(r"^[│|] ?|[ │|]+$")
+RULE = re.compile(r"[ ─-]{8,}$")
+"""Between the sections of a box."""
+HELP_INDENT = 8 * " "
+"""Of what a box says of an option that it names."""
+TYPE = re.compile(r"Error parsing (?P<option>\S+): no type matching (?P<types>\S+) .* from \['?(?P<value>.*?)'?\]\.")
+OPTION = re.compile(r"--[\w-]+")
+HELP = re.compile(r"For full helptext, (?:run|see):? (?P<command>.*?--help)")
+
+
+def parsed(commands: Mapping[str, Callable[..., int]], words: Sequence[str], about: str) -> Callable[[], int]:
+    """What a command line calls. `--help` prints and leaves.
+
+    Args:
+        commands: verb -> function.
+        words: after the program's name.
+        about: what `--help` says first.
+
+    Raises:
+        InputError: words that no command takes.
+    """
+    said = io.StringIO()
+    try:
+        with redirect_stderr(said):
+            later = {verb: _later(function) for verb, function in commands.items()}
+            return subcommand_cli_from_dict(later, args=list(words), prog="turbogs", description=about)
+    except SystemExit as end:
+        if end.code != 2:
+            raise
+        raise InputError(refusal_line(said.getvalue())) from None
+    finally:
+        if sys.exc_info()[0] is None:
+            sys.stderr.write(said.getvalue())
+
+
+def _later(function: Callable[..., int]) -> Callable[..., Callable[[], int]]:
+    """The function, which gives what would be called."""
+
+    @functools.wraps(function)
+    def given(*arguments, **options):
+        return functools.partial(function, *arguments, **options)
+
+    return given
+
+
+def refusal_line(box: str) -> str:
+    """The text of a box in a line: what is wrong, what may be meant, and where more is said."""
+    sections = [""]
+    for line in box.splitlines()[1:-1]:
+        text = EDGE.sub("", line)
+        if RULE.match(text):
+            sections.append("")
+        elif not (text.startswith(HELP_INDENT) and sections[-1].startswith("Missing from")):
+            sections[-1] = f"{sections[-1]} {text.strip()}".strip()
+    what, *others = filter(None, sections) if any(sections) else [" ".join(box.split())]
+    if found := TYPE.match(what):
+        types = found["types"].replace("{None}|", "").replace("|{None}", "").lower()
+        what = f"{found['option']} '{found['value']}': it takes {types}"
+    hints = [what.partition(" Got errors:")[0].rstrip(".")]
+    for section in others:
+        if section.startswith("Perhaps you meant") and (option := OPTION.search(section)):
+            hints.append(f"did you mean {option[0]}?")
+        elif section.startswith("Available subcommands"):
+            hints.append(section)
+        elif found := HELP.search(section):
+            hints.append(f"see {found['command']}")
+    return "; ".join(hints)
