@@ -19,6 +19,7 @@ RULE = re.compile(r"[ ─-]{8,}$")
 HELP_INDENT = 8 * " "
 """Of what a box says of an option that it names."""
 TYPE = re.compile(r"Error parsing (?P<option>\S+): no type matching (?P<types>\S+) .* from \['?(?P<value>.*?)'?\]\.")
+KINDS = {"INT": "an integer", "FLOAT": "a number"}
 OPTION = re.compile(r"--[\w-]+")
 HELP = re.compile(r"For full helptext, (?:run|see):? (?P<command>.*?--help)")
 
@@ -69,8 +70,8 @@ def refusal_line(box: str) -> str:
             sections[-1] = f"{sections[-1]} {text.strip()}".strip()
     what, *others = filter(None, sections) if any(sections) else [" ".join(box.split())]
     if found := TYPE.match(what):
-        types = found["types"].replace("{None}|", "").replace("|{None}", "").lower()
-        what = f"{found['option']} '{found['value']}': it takes {types}"
+        kinds = [KINDS.get(kind, kind) for kind in found["types"].split("|") if kind != "{None}"]
+        what = f"{found['option']} '{found['value']}': it takes {' or '.join(kinds)}"
     hints = [what.partition(" Got errors:")[0].rstrip(".")]
     for section in others:
         if section.startswith("Perhaps you meant") and (option := OPTION.search(section)):
