@@ -43,6 +43,8 @@ FARTHEST_MATCH = 0.02
 """Of a photo's width: where half of the points are farther than that from where photos show them, the photos are not
 those that were reconstructed."""
 PARAMETERS = 10
+UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+"""Of a symmetric 3x3 matrix, the entries that are computed."""
 CHUNK = 30_000
 """Observations at once."""
 
@@ -193,9 +195,12 @@ def _quietly(function: Callable) -> Callable:
 
 
 class _Adjustment:
-    """Cameras and points on their way.
+    """Cameras and points on their way. What observations have is coordinate by coordinate, [2, O] or [3, O]: a row is
+    read and written in one go.
 
     Attributes:
+        places: [3, M], the points.
+        pixels: [2, O], where photos show them.
         moves: [V, PARAMETERS], how far each camera has come.
         spread: [PARAMETERS, PARAMETERS], the prior's covariance of these.
         doubts: [V, PARAMETERS, PARAMETERS], the covariance of each camera's moves that is left by what the photo shows
@@ -210,7 +215,8 @@ class _Adjustment:
     ) -> None:
         self.given = self.cameras = cameras
         views = len(cameras.focal)
-        self.points, self.observations = points.copy(), observations
+        self.places, self.pixels = (np.array(rows.T, order="C") for rows in (points, observations.pixels))
+        self.point_ids = observations.point_ids
         self.starts = np.searchsorted(observations.view_ids, np.arange(views + 1))
         self.moves = np.zeros((views, PARAMETERS))
         self.spread = PRIOR**2 * np.eye(PARAMETERS) if spread is None else spread
@@ -221,30 +227,42 @@ class _Adjustment:
                 bounds.append(view)
         self.chunks = list(zip(bounds, [*bounds[1:], views], strict=True))
         seen = [self._seen(*chunk) for chunk in self.chunks]
-        depths = self._by_view(np.concatenate([in_camera[:, 2] for in_camera, _, _ in seen]))
+        depths = self._by_view(np.concatenate([in_camera[2] for in_camera, _, _ in seen]))
         self.depths = np.array([np.median(part) if len(part) else 1.0 for part in depths])
         self.first_errors = np.concatenate([errors for _, _, errors in seen])
         self.scale = max(_median(self.first_errors), FINEST)
 
+    @property
+    def points(self) -> np.ndarray:
+        """[M, 3]."""
+        return np.ascontiguousarray(self.places.T)
+
     def _by_view(self, values: np.ndarray) -> list[np.ndarray]:
         return np.split(values, self.starts[1:-1])
 
+    def _each(self, values: np.ndarray, first: int, last: int) -> np.ndarray:
+        """[..., n]: of each observation of views `first` to `last`, what [V, ...] `values` have of its view."""
+        counts = np.diff(self.starts[first : last + 1])
+        return np.repeat(np.moveaxis(values[first:last], 0, -1), counts, axis=-1)
+
     @_quietly
     def _seen(self, first: int, last: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Of the observations of views: points in the camera [n, 3]; residuals [n, 2]; their lengths [n], infinite
+        """Of the observations of views: points in the camera [3, n]; residuals [2, n]; their lengths [n], infinite
         behind the camera."""
         part, cameras = slice(self.starts[first], self.starts[last]), self.cameras
-        views = self.observations.view_ids[part]
-        in_camera = self.points[self.observations.point_ids[part]]
-        in_camera = np.einsum("nij,nj->ni", cameras.rotations[views], in_camera) + cameras.translations[views]
-        slopes = in_camera[:, :2] / in_camera[:, 2:]
-        residuals = self.observations.pixels[part] - (slopes * cameras.focal[views] + cameras.centers[views])
-        errors = np.hypot(residuals[:, 0], residuals[:, 1])
-        return in_camera, residuals, np.where((in_camera[:, 2] > 0) & np.isfinite(errors), errors, math.inf)
+        in_camera = np.take(self.places, self.point_ids[part], axis=1)
+        for view, (begin, end) in enumerate(itertools.pairwise(self.starts[first : last + 1] - part.start), first):
+            own = in_camera[:, begin:end]
+            own[:] = cameras.rotations[view] @ own + cameras.translations[view][:, None]
+        slopes = in_camera[:2] / in_camera[2]
+        seen_at = slopes * self._each(cameras.focal, first, last) + self._each(cameras.centers, first, last)
+        residuals = self.pixels[:, part] - seen_at
+        errors = np.sqrt((residuals * residuals).sum(axis=0))
+        return in_camera, residuals, np.where((in_camera[2] > 0) & np.isfinite(errors), errors, math.inf)
 
     def _weights(self, errors: np.ndarray) -> np.ndarray:
         """[n] Cauchy's, in units of the noise; 0 where the error is infinite."""
-        return np.hypot(self.scale, errors) ** -2.0
+        return 1.0 / (self.scale**2 + errors * errors)
 
     def move_cameras(self, pool: ThreadPoolExecutor) -> None:
         """One step of every camera."""
@@ -257,19 +275,19 @@ class _Adjustment:
         """[last - first, PARAMETERS]."""
         in_camera, residuals, errors = self._seen(first, last)
         weights = self._weights(errors)
-        views = self.observations.view_ids[self.starts[first] : self.starts[last]]
-        focal, half = self.cameras.focal[views], self.cameras.half_widths[views]
-        x, y, z = in_camera.T
-        p, q, depth = x / z, y / z, self.depths[views] / z
+        (p, q), z = in_camera[:2] / in_camera[2], in_camera[2]
+        (fx, fy), half, depth = (
+            self._each(values, first, last) for values in (self.cameras.focal, self.cameras.half_widths, self.depths)
+        )
+        depth /= z
         zero = np.zeros_like(p)
-        fx, fy = focal.T
         # d pixel / d parameter [PARAMETERS, n], of its x and of its y.
         across = np.stack([-fx * p * q, fx * (1 + p * p), -fx * q, fx * depth, zero, -fx * p * depth, fx * p, zero,
                            half, zero])  # fmt: skip
         down = np.stack([-fy * (1 + q * q), fy * p * q, fy * p, zero, fy * depth, -fy * q * depth, zero, fy * q, zero,
                          half])  # fmt: skip
         left_out = weights == 0
-        across[:, left_out], down[:, left_out], residuals[left_out] = 0.0, 0.0, 0.0
+        across[:, left_out], down[:, left_out], residuals[:, left_out] = 0.0, 0.0, 0.0
         weighted_across, weighted_down = across * weights, down * weights
         steps = np.zeros((last - first, PARAMETERS))
         starts = self.starts[first : last + 1] - self.starts[first]
@@ -279,7 +297,7 @@ class _Adjustment:
                 continue
             part = slice(begin, end)
             normal = across[:, part] @ weighted_across[:, part].T + down[:, part] @ weighted_down[:, part].T + prior
-            slope = weighted_across[:, part] @ residuals[part, 0] + weighted_down[:, part] @ residuals[part, 1]
+            slope = weighted_across[:, part] @ residuals[0, part] + weighted_down[:, part] @ residuals[1, part]
             self.doubts[first + view] = np.linalg.inv(normal)
             steps[view] = self.doubts[first + view] @ (slope - prior @ self.moves[first + view])
         return steps
@@ -294,28 +312,30 @@ class _Adjustment:
     def move_points(self, pool: ThreadPoolExecutor) -> None:
         """One step of every point that two photos show."""
         entries = np.concatenate(list(pool.map(self._point_entries, *zip(*self.chunks, strict=True))), axis=1)
-        ids, count = self.observations.point_ids, len(self.points)
-        sums = np.stack([self._sum_by_point(row) for row in entries])  # [9, M]
+        count = self.places.shape[1]
+        sums = np.stack(list(pool.map(self._sum_by_point, entries)))  # [9, M]
         normal = sums[[0, 1, 2, 1, 3, 4, 2, 4, 5]].T.reshape(count, 3, 3)
         traces = np.trace(normal, axis1=1, axis2=2)
-        told = (np.bincount(ids, entries[0] > 0, count) >= 2) & (traces > 0)
+        told = (np.bincount(self.point_ids, entries[0] > 0, count) >= 2) & (traces > 0)
         normal = normal[told] + (POINT_DAMPING * traces[told])[:, None, None] * np.eye(3)
-        self.points[told] += np.linalg.solve(normal, sums[6:].T[told][:, :, None])[:, :, 0]
+        self.places[:, told] += np.linalg.solve(normal, sums[6:].T[told][:, :, None])[:, :, 0].T
 
     @_quietly
     def _point_entries(self, first: int, last: int) -> np.ndarray:
         """[9, n]: six of a symmetric matrix and three of a vector, of each observation's normal equations."""
         in_camera, residuals, errors = self._seen(first, last)
         weights = self._weights(errors)
-        views = self.observations.view_ids[self.starts[first] : self.starts[last]]
-        rotations = self.cameras.rotations.transpose(1, 2, 0)[:, :, views]  # [3, 3, n]
-        scales, slopes = self.cameras.focal[views].T / in_camera[:, 2], in_camera[:, :2].T / in_camera[:, 2]  # [2, n]
+        slopes, scales = in_camera[:2] / in_camera[2], self._each(self.cameras.focal, first, last) / in_camera[2]
+        rotations = self._each(self.cameras.rotations, first, last)  # [3, 3, n]
         across, down = (scales[axis] * (rotations[axis] - slopes[axis] * rotations[2]) for axis in range(2))  # [3, n]
         left_out = weights == 0
-        across[:, left_out], down[:, left_out], residuals[left_out] = 0.0, 0.0, 0.0
-        entries = [across[i] * across[j] + down[i] * down[j] for i in range(3) for j in range(i, 3)]
-        entries += [across[i] * residuals[:, 0] + down[i] * residuals[:, 1] for i in range(3)]
-        return np.stack(entries) * weights
+        across[:, left_out], down[:, left_out], residuals[:, left_out] = 0.0, 0.0, 0.0
+        weighted_across, weighted_down = across * weights, down * weights
+        entries = np.empty((9, len(weights)))
+        for row, (i, j) in enumerate(UPPER):
+            entries[row] = weighted_across[i] * across[j] + weighted_down[i] * down[j]
+        entries[6:] = weighted_across * residuals[0] + weighted_down * residuals[1]
+        return entries
 
     def agreeing_cameras(self) -> Pinholes:
         """The cameras; the given one where its photo agrees no better."""
@@ -328,7 +348,7 @@ class _Adjustment:
         return np.concatenate([self._seen(*chunk)[2] for chunk in self.chunks])
 
     def _sum_by_point(self, values: np.ndarray) -> np.ndarray:
-        return np.bincount(self.observations.point_ids, values, len(self.points))
+        return np.bincount(self.point_ids, values, self.places.shape[1])
 
 
 def _rotations(vectors: np.ndarray) -> np.ndarray:
