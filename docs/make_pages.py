@@ -88,6 +88,7 @@ TABLES: dict[str, Callable[[], str | None]] = {
     "render caption": viewer_tables.render_caption,
     "ranks": machine_tables.ranks,
     "pixels_on_an_mlp": machine_tables.pixels_on_an_mlp,
+    "refined": study_tables.refined,
     "raster": lambda: machine_tables.on("bench-raster.json", machine_tables.raster),
     "solvers": machine_tables.solvers,
     "steps": lambda: machine_tables.steps("bench-step.json"),
