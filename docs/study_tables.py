@@ -33,7 +33,7 @@ OURS = (
     ("sizes", "cap-67k", "turbogs-small with a cap, FastGS's numbers"),
     ("sizes", "cap-157k", "turbogs-small with a cap, FastGS's numbers"),
     ("sizes", "cap-57k", "turbogs-small with a cap, FastGS's numbers"),
-    ("sizes", "cap-94k", "the same, LiteGS's number on fox"),
+    ("sizes", "cap-94k", "turbogs-small with a cap, LiteGS's number on fox"),
     ("sizes", "turbogs", "**turbogs**"),
 )
 """Rows of the headline table that are ours, where they are measured: study, variant, what to call it."""

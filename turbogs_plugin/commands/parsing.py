@@ -36,17 +36,16 @@ def parsed(commands: Mapping[str, Callable[..., int]], words: Sequence[str], abo
         InputError: words that no command takes.
     """
     said = io.StringIO()
+    later = {verb: _later(function) for verb, function in commands.items()}
     try:
         with redirect_stderr(said):
-            later = {verb: _later(function) for verb, function in commands.items()}
-            return subcommand_cli_from_dict(later, args=list(words), prog="turbogs", description=about)
+            call = subcommand_cli_from_dict(later, args=list(words), prog="turbogs", description=about)
     except SystemExit as end:
         if end.code != 2:
             raise
         raise InputError(refusal_line(said.getvalue())) from None
-    finally:
-        if sys.exc_info()[0] is None:
-            sys.stderr.write(said.getvalue())
+    sys.stderr.write(said.getvalue())
+    return call
 
 
 def _later(function: Callable[..., int]) -> Callable[..., Callable[[], int]]:

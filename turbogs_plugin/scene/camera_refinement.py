@@ -34,11 +34,13 @@ class RefinedCameras:
 
     Args:
         together: training cameras and points.
-        test: the test photos, and where they show points.
+        test_cameras: as the capture gives them.
+        test_observations: where the test photos show points.
     """
 
     together: Refinement
-    test: tuple[Pinholes, Observations]
+    test_cameras: Pinholes
+    test_observations: Observations
 
     def of(self, scene: Scene, training: bool = True) -> Scene:
         """The scene with these cameras.
@@ -61,8 +63,7 @@ class RefinedCameras:
                 reprojection_error=together.after,
                 notes=(*scene.notes, together.text("training cameras")),
             )
-        given, shown = self.test
-        beside = refine_alone(given, points, shown, together.spread)
+        beside = refine_alone(self.test_cameras, points, self.test_observations, together.spread)
         return replace(scene, test=replace(scene.test, refined=_cameras(beside, scene.test.cameras)))
 
 
@@ -73,7 +74,8 @@ def find_cameras(train: PosedViews, test: PosedViews, points: Tensor) -> Refined
     shown, tested = (_usable(views, places) for views in (train, test))
     if shown is None or tested is None:
         return None
-    return RefinedCameras(refine_together(_pinholes(train.cameras), places, shown), (_pinholes(test.cameras), tested))
+    together = refine_together(_pinholes(train.cameras), places, shown)
+    return RefinedCameras(together, _pinholes(test.cameras), tested)
 
 
 def refine_cameras(scene: Scene, training: bool = True) -> Scene:
