@@ -373,3 +373,9 @@ def test_a_variant_whose_ablation_has_other_settings_today_is_stale(tmp_path, mo
     assert line == "Stale: turbogs-ssim has other settings now. Then: loss.epsilon 0.001 (now 0.5)."
     assert study_tables.other_variant("sizes", "cap-67k", "not measured") == []
     assert study_tables.other_variant("sizes", "turbogs", "the baseline, of which `other_settings` tells") == []
+
+
+@pytest.mark.parametrize("page", sorted([*DOCS.parent.glob("*.md"), *DOCS.rglob("*.md")]), ids=lambda page: page.name)
+def test_links_of_pages_lead_to_what_is_there(page):
+    named = re.findall(r"\]\(([^)#\s]+)[^)]*\)", page.read_text())
+    assert not [name for name in named if "://" not in name and not (page.parent / name).exists()]
