@@ -78,10 +78,14 @@ def find_cameras(train: PosedViews, test: PosedViews, points: Tensor) -> Refined
     return RefinedCameras(together, _pinholes(test.cameras), tested)
 
 
-def refine_cameras(scene: Scene, training: bool = True) -> Scene:
-    """The scene as `RefinedCameras.of` gives it; as it is where `find_cameras` finds none."""
-    found = find_cameras(scene.train.posed, scene.test.posed, scene.points)
+def with_cameras(scene: Scene, found: RefinedCameras | None, training: bool = True) -> Scene:
+    """The scene as `RefinedCameras.of` gives it; as it is where none were found."""
     return scene if found is None else found.of(scene, training)
+
+
+def refine_cameras(scene: Scene, training: bool = True) -> Scene:
+    """The scene with the cameras that `find_cameras` finds; `training` as in `RefinedCameras.of`."""
+    return with_cameras(scene, find_cameras(scene.train.posed, scene.test.posed, scene.points), training)
 
 
 def load_and_find(path: str | Path, *settings: Any, find: bool = True) -> tuple[Scene, RefinedCameras | None]:

@@ -20,7 +20,7 @@ from turbogs_plugin.errors import InputError, TrainingStopped
 from turbogs_plugin.report.provenance import Provenance
 from turbogs_plugin.report.tensorboard import EventWriter, event_writers
 from turbogs_plugin.scene import Scene
-from turbogs_plugin.scene.camera_refinement import load_and_find
+from turbogs_plugin.scene.camera_refinement import load_and_find, with_cameras
 from turbogs_plugin.study.cell import capture_digest, train_cell
 from turbogs_plugin.study.claims import Claims
 from turbogs_plugin.study.difference import ABSENT, compared, difference
@@ -148,7 +148,7 @@ def run_sweep(
             else:
                 if (refined := config.train.refine_cameras) not in prepared:
                     started = time.perf_counter()
-                    own = scene if cameras is None else cameras.of(scene, refined)
+                    own = with_cameras(scene, cameras, refined)
                     prepared[refined] = own, loading + time.perf_counter() - started
                 left.append(_Cell(key, config, *prepared[refined], capture))
         for key, result in finished.items():

@@ -22,7 +22,7 @@ from turbogs_plugin.model.initial import BACKDROP_COUNT
 from turbogs_plugin.plan.caps import cap_of, chosen_points, require_room
 from turbogs_plugin.plan.memory import MemoryDemand
 from turbogs_plugin.scene import Scene
-from turbogs_plugin.scene.camera_refinement import load_and_find
+from turbogs_plugin.scene.camera_refinement import load_and_find, with_cameras
 from turbogs_plugin.train.folder import RunFolder
 from turbogs_plugin.train.given_model import read_given
 from turbogs_plugin.train.progress import LoadingProgress
@@ -135,5 +135,4 @@ def read_scene(path: str | Path, config: Config, *options: Any, ranks: Ranks = O
         InputError: as `load_scene`.
     """
     scene, cameras = load_and_find(path, config.scene.factor, config.scene.test_every, *options, find=ranks.first)
-    cameras = ranks.agree(cameras)
-    return scene if cameras is None else cameras.of(scene, config.train.refine_cameras)
+    return with_cameras(scene, ranks.agree(cameras), config.train.refine_cameras)
