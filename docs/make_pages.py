@@ -60,6 +60,7 @@ TABLES: dict[str, Callable[[], str | None]] = {
     "bounds": lambda: study_tables.changes("bounds"),
     "cameras": lambda: study_tables.changes("cameras"),
     "cameras refined": lambda: study_tables.changes("cameras", "refined_"),
+    "density_departures": lambda: study_tables.changes("density_departures"),
     "density_sums": machine_tables.density_sums,
     "departures": lambda: study_tables.changes("departures"),
     "dropin": machine_tables.dropin,

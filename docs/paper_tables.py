@@ -60,7 +60,6 @@ PARTS = (
     Part("final pruning", ("turbogs", "no-final-pruning"), ("turbogs-paper", "no-final-pruning")),
     Part("NCC (+0.48 dB)", ("turbogs", "no-ncc"), ("turbogs-paper", "no-ncc")),
     Part("the printed NCC: a flat tile scores 0", ("printed-ncc", "turbogs")),
-    Part("3DGS's splits, no opacity decay", ("plain-splits", "turbogs")),
     Part("3DGS's splits", ("sampled-splits", "turbogs")),
     Part("no opacity decay", ("no-decay", "turbogs")),
     Part("a gradient's threshold within the paper's range, 4e-4", ("absgrad-4e-4", "turbogs")),

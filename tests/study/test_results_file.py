@@ -64,6 +64,7 @@ def test_a_study_is_read_as_it_was_written(folder):
     wanted = [(entry.config, entry.asked) for entry in study().results]
     assert json.dumps(configs, sort_keys=True) == json.dumps(wanted, sort_keys=True).replace("/somewhere/", "")
     for entry, original in zip(again.results, study().results, strict=True):
+        original.history = [replace(evaluation, memory_bytes=0) for evaluation in original.history]  # `LEFT_OUT`
         assert repr(replace(entry, config={}, asked={})) == repr(replace(original, config={}, asked={}))
 
 
@@ -91,7 +92,7 @@ def test_numbers_have_the_digits_that_a_reader_can_use(folder):
     exact.history[1] = Evaluation(26, 2.123456789, 30.123456789, 0.8123456789, 0.0123456789, 90, 2**21)
     folder.write_study(Study(ABLATION, [exact]))
     (read,) = folder.read_study().results
-    assert repr(read.final) == repr(Evaluation(26, 2.123457, 30.12346, 0.8123457, 0.0123457, 90, 2**21))
+    assert repr(read.final) == repr(Evaluation(26, 2.123457, 30.12346, 0.8123457, 0.0123457, 90))
 
 
 @pytest.mark.parametrize(

@@ -31,6 +31,9 @@ DECIMALS |= dict.fromkeys(("fps", "wall_seconds", "cell_seconds"), 3)
 DECIMALS |= {field.name: DECIMALS[field.name.partition("_")[2]] for field in fields(FurtherErrors)}
 """Digits behind the point that are kept of a measure: for errors those that float32 has."""
 
+LEFT_OUT = ("memory_bytes",)
+"""Measures of evaluations that the file does not have: a cell's `peak_bytes` is the peak of all of them."""
+
 SHARED = ("provenance", "resolved", "warmup_iterations", "lpips_reason", "asked")
 """Fields of a cell that are written once, as ``common``, and in a cell only where its value is another one."""
 
@@ -47,8 +50,8 @@ class Document:
         config: the common configuration, ``section.key`` -> value.
         cells: of each, what is not common: fields of `CellResult`, but for ``provenance``, which is a place in
             `provenances`; ``config``, the difference from `config`; ``asked``, the difference from the cell's own
-            configuration; and ``history``: field of `Evaluation` -> its values, null for NaN, or one number where only
-            the last evaluation has one. What is absent has the default.
+            configuration; and ``history``: field of `Evaluation`, but for `LEFT_OUT`, -> its values, null for NaN, or
+            one number where only the last evaluation has one. What is absent has the default.
     """
 
     format: int
@@ -144,7 +147,7 @@ def _result(document: Document, cell: dict[str, Any], where: str) -> CellResult:
 
 def _columns(history: Sequence[Evaluation]) -> dict[str, list[Any]]:
     columns = {}
-    for entry in fields(Evaluation):
+    for entry in (entry for entry in fields(Evaluation) if entry.name not in LEFT_OUT):
         values = [_rounded(entry.name, getattr(evaluation, entry.name)) for evaluation in history]
         optional = entry.default is not MISSING
         if optional and all(value == _rounded(entry.name, entry.default) for value in values):

@@ -56,7 +56,7 @@ class Evaluation(FurtherErrors):
         train_seconds: training time until then, without loading, evaluation, checkpoints and report.
         psnr, ssim, l1: means over the test views; `ssim` is NaN if the images are too small for it.
         num_gaussians: N.
-        memory_bytes: peak of the GPU's tensors, or of the process on a CPU.
+        memory_bytes: peak of the GPU's tensors, or of the process on a CPU; 0 where it was not kept.
         nonfinite_losses: iterations so far whose loss was not finite.
         skipped_updates: updates of Gaussians skipped so far because their gradient was not finite.
         worst_psnr: PSNR of the worst test view; NaN in old files, which lack it.
@@ -70,7 +70,7 @@ class Evaluation(FurtherErrors):
     ssim: float
     l1: float
     num_gaussians: int
-    memory_bytes: int
+    memory_bytes: int = 0
     nonfinite_losses: int = 0
     skipped_updates: int = 0
     worst_psnr: float = math.nan
