@@ -15,11 +15,9 @@ All is float64 on the CPU, and the same to the bit in every run, so that a resum
 
 from __future__ import annotations
 
-import functools
 import itertools
 import math
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -43,10 +41,18 @@ FARTHEST_MATCH = 0.02
 """Of a photo's width: where half of the points are farther than that from where photos show them, the photos are not
 those that were reconstructed."""
 PARAMETERS = 10
-UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
-"""Of a symmetric 3x3 matrix, the entries that are computed."""
+DERIVATIVES = (
+    ((0, 4, -1), (1, 0, 1), (1, 3, 1), (2, 2, -1), (3, 6, 1), (5, 7, -1), (6, 1, 1)),
+    ((0, 0, -1), (0, 5, -1), (1, 4, 1), (2, 1, 1), (4, 6, 1), (5, 8, -1), (7, 2, 1)),
+)
+"""Of a pixel's x and of its y, by parameters of `Pinholes.moved`: (parameter, function of `_Adjustment._camera_sums`,
+sign), in units of the focal length, and from function 6 on of the depth. Those by the principal point are left out."""
+UPPER = ([0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2])
+"""Of a symmetric 3x3 matrix, rows and columns of the entries that are computed."""
 CHUNK = 30_000
-"""Observations at once."""
+"""Observations at once: few large operations, whose results stay in the processor's cache."""
+QUIET = dict.fromkeys(("divide", "invalid", "over"), "ignore")
+"""For numpy: what is not finite gets a weight of zero."""
 
 
 @dataclass(frozen=True)
@@ -132,13 +138,12 @@ def refine_together(cameras: Pinholes, points: np.ndarray, observations: Observa
         observations: of these points by these cameras.
     """
     adjustment = _Adjustment(cameras, points, observations)
-    with ThreadPoolExecutor() as pool:
-        for _ in range(ROUNDS):
-            for _ in range(CAMERA_STEPS):
-                adjustment.move_cameras(pool)
-                adjustment.learn_spread()
-            for _ in range(POINT_STEPS):
-                adjustment.move_points(pool)
+    for _ in range(ROUNDS):
+        for _ in range(CAMERA_STEPS):
+            adjustment.move_cameras()
+            adjustment.learn_spread()
+        for _ in range(POINT_STEPS):
+            adjustment.move_points()
     refined, moved = adjustment.agreeing_cameras(), adjustment.points
     count = int((refined.focal != cameras.focal).any(axis=1).sum())
     medians = (_median(adjustment.first_errors), _median(reprojection_errors(refined, moved, observations)))
@@ -155,9 +160,8 @@ def refine_alone(
         spread: of a `Refinement` of other photos of the capture; None: `PRIOR` of each parameter.
     """
     adjustment = _Adjustment(cameras, points, observations, spread)
-    with ThreadPoolExecutor() as pool:
-        for _ in range(RESECTION_STEPS):
-            adjustment.move_cameras(pool)
+    for _ in range(RESECTION_STEPS):
+        adjustment.move_cameras()
     return adjustment.agreeing_cameras()
 
 
@@ -180,18 +184,6 @@ def of_these_photos(cameras: Pinholes, points: np.ndarray, observations: Observa
     """Whether observations are of the photos of these cameras, and not of others or in another size: half of the points
     are within `farthest_match`."""
     return _median(reprojection_errors(cameras, points, observations)) <= farthest_match(cameras)
-
-
-def _quietly(function: Callable) -> Callable:
-    """Without numpy's warnings: what is not finite gets a weight of zero. Threads of a pool have settings of their own,
-    so it is for what they run."""
-
-    @functools.wraps(function)
-    def quiet(*arguments):
-        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            return function(*arguments)
-
-    return quiet
 
 
 class _Adjustment:
@@ -240,67 +232,73 @@ class _Adjustment:
     def _by_view(self, values: np.ndarray) -> list[np.ndarray]:
         return np.split(values, self.starts[1:-1])
 
-    def _each(self, values: np.ndarray, first: int, last: int) -> np.ndarray:
-        """[..., n]: of each observation of views `first` to `last`, what [V, ...] `values` have of its view."""
-        counts = np.diff(self.starts[first : last + 1])
-        return np.repeat(np.moveaxis(values[first:last], 0, -1), counts, axis=-1)
+    def _parts(self, first: int, last: int) -> Iterator[tuple[int, slice]]:
+        """Of views `first` to `last`: each, and where its observations stand among theirs."""
+        bounds = itertools.pairwise((self.starts[first : last + 1] - self.starts[first]).tolist())
+        return ((view, slice(*own)) for view, own in enumerate(bounds, first))
 
-    @_quietly
     def _seen(self, first: int, last: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Of the observations of views: points in the camera [3, n]; residuals [2, n]; their lengths [n], infinite
-        behind the camera."""
+        """Of the observations of views: x / z, y / z and z in the camera [3, n]; residuals [2, n]; their lengths [n],
+        infinite behind the camera."""
         part, cameras = slice(self.starts[first], self.starts[last]), self.cameras
-        in_camera = np.take(self.places, self.point_ids[part], axis=1)
-        for view, (begin, end) in enumerate(itertools.pairwise(self.starts[first : last + 1] - part.start), first):
-            own = in_camera[:, begin:end]
-            own[:] = cameras.rotations[view] @ own + cameras.translations[view][:, None]
-        slopes = in_camera[:2] / in_camera[2]
-        seen_at = slopes * self._each(cameras.focal, first, last) + self._each(cameras.centers, first, last)
-        residuals = self.pixels[:, part] - seen_at
-        errors = np.sqrt((residuals * residuals).sum(axis=0))
-        return in_camera, residuals, np.where((in_camera[2] > 0) & np.isfinite(errors), errors, math.inf)
+        sights = np.take(self.places, self.point_ids[part], axis=1)
+        residuals = np.empty((2, sights.shape[1]))
+        with np.errstate(**QUIET):
+            for view, own in self._parts(first, last):
+                sights[:, own] = cameras.rotations[view] @ sights[:, own] + cameras.translations[view][:, None]
+                sights[:2, own] /= sights[2, own]
+                residuals[:, own] = sights[:2, own] * cameras.focal[view][:, None] + cameras.centers[view][:, None]
+            np.subtract(self.pixels[:, part], residuals, out=residuals)
+            errors = np.sqrt((residuals * residuals).sum(axis=0))
+        return sights, residuals, np.where((sights[2] > 0) & np.isfinite(errors), errors, math.inf)
 
-    def _weights(self, errors: np.ndarray) -> np.ndarray:
-        """[n] Cauchy's, in units of the noise; 0 where the error is infinite."""
-        return 1.0 / (self.scale**2 + errors * errors)
+    def _counted(self, first: int, last: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Of the observations of views: x / z, y / z and 1 / z in the camera [3, n]; residuals [2, n]; Cauchy's weights
+        [n], in units of the noise. All are 0 where the error is infinite."""
+        sights, residuals, errors = self._seen(first, last)
+        with np.errstate(**QUIET):
+            np.divide(1.0, sights[2], out=sights[2])
+            weights = 1.0 / (self.scale**2 + errors * errors)
+        if (left_out := weights == 0).any():
+            sights[:, left_out], residuals[:, left_out] = 0.0, 0.0
+        return sights, residuals, weights
 
-    def move_cameras(self, pool: ThreadPoolExecutor) -> None:
+    def move_cameras(self) -> None:
         """One step of every camera."""
-        steps = np.concatenate(list(pool.map(self._camera_steps, *zip(*self.chunks, strict=True))))
+        sums = [self._camera_sums(*chunk) for chunk in self.chunks]
+        products, slopes = map(np.concatenate, zip(*sums, strict=True))
+        factors, prior = self._camera_factors(), np.linalg.inv(self.spread)  # [V, 2, PARAMETERS, 9]
+        normals = (factors @ products[:, None] @ factors.swapaxes(2, 3)).sum(axis=1) + prior
+        told = np.diff(self.starts) >= FEWEST_OBSERVATIONS
+        self.doubts[told] = np.linalg.inv(normals[told])
+        steps = np.einsum("vcai,vic->va", factors, slopes) - self.moves @ prior
+        steps = np.einsum("vab,vb->va", self.doubts, steps)
         self.moves += steps
         self.cameras = self.cameras.moved(steps, self.depths)
 
-    @_quietly
-    def _camera_steps(self, first: int, last: int) -> np.ndarray:
-        """[last - first, PARAMETERS]."""
-        in_camera, residuals, errors = self._seen(first, last)
-        weights = self._weights(errors)
-        (p, q), z = in_camera[:2] / in_camera[2], in_camera[2]
-        (fx, fy), half, depth = (
-            self._each(values, first, last) for values in (self.cameras.focal, self.cameras.half_widths, self.depths)
-        )
-        depth /= z
-        zero = np.zeros_like(p)
-        # d pixel / d parameter [PARAMETERS, n], of its x and of its y.
-        across = np.stack([-fx * p * q, fx * (1 + p * p), -fx * q, fx * depth, zero, -fx * p * depth, fx * p, zero,
-                           half, zero])  # fmt: skip
-        down = np.stack([-fy * (1 + q * q), fy * p * q, fy * p, zero, fy * depth, -fy * q * depth, zero, fy * q, zero,
-                         half])  # fmt: skip
-        left_out = weights == 0
-        across[:, left_out], down[:, left_out], residuals[:, left_out] = 0.0, 0.0, 0.0
-        weighted_across, weighted_down = across * weights, down * weights
-        steps = np.zeros((last - first, PARAMETERS))
-        starts = self.starts[first : last + 1] - self.starts[first]
-        prior = np.linalg.inv(self.spread)
-        for view, (begin, end) in enumerate(itertools.pairwise(starts)):
-            if end - begin < FEWEST_OBSERVATIONS:
-                continue
-            part = slice(begin, end)
-            normal = across[:, part] @ weighted_across[:, part].T + down[:, part] @ weighted_down[:, part].T + prior
-            slope = weighted_across[:, part] @ residuals[0, part] + weighted_down[:, part] @ residuals[1, part]
-            self.doubts[first + view] = np.linalg.inv(normal)
-            steps[view] = self.doubts[first + view] @ (slope - prior @ self.moves[first + view])
-        return steps
+    def _camera_factors(self) -> np.ndarray:
+        """[V, 2, PARAMETERS, 9]: how x and y of a pixel change by each parameter of its camera, in factors of functions
+        of the point, which are those of `_camera_sums`."""
+        factors = np.zeros((len(self.depths), 2, PARAMETERS, 9))
+        for axis, (derivatives, focal) in enumerate(zip(DERIVATIVES, self.cameras.focal.T, strict=True)):
+            for parameter, function, sign in derivatives:
+                factors[:, axis, parameter, function] = sign * focal * (self.depths if function >= 6 else 1.0)
+            factors[:, axis, 8 + axis, 0] = self.cameras.half_widths
+        return factors
+
+    def _camera_sums(self, first: int, last: int) -> tuple[np.ndarray, np.ndarray]:
+        """[v, 9, 9], [v, 9, 2]: of each view, weighted sums of products of nine functions with each other and with the
+        residuals. The functions are 1, p, q, pp, pq, qq, 1 / z, p / z and q / z, where p is x / z and q is y / z."""
+        (p, q, near), residuals, weights = self._counted(first, last)
+        roots = np.sqrt(weights)
+        functions = np.stack([np.ones_like(p), p, q, p * p, p * q, q * q, near, near * p, near * q])
+        functions *= roots
+        residuals *= roots
+        products, slopes = np.empty((last - first, 9, 9)), np.empty((last - first, 9, 2))
+        for view, own in self._parts(first, last):
+            products[view - first] = functions[:, own] @ functions[:, own].T
+            slopes[view - first] = functions[:, own] @ residuals[:, own].T
+        return products, slopes
 
     def learn_spread(self) -> None:
         """One step of expectation-maximisation of the prior."""
@@ -309,33 +307,43 @@ class _Adjustment:
             squares = self.moves[refined].T @ self.moves[refined] + self.doubts[refined].sum(axis=0)
             self.spread = squares / refined.sum() + SMALLEST_VARIANCE * np.eye(PARAMETERS)
 
-    def move_points(self, pool: ThreadPoolExecutor) -> None:
+    def move_points(self) -> None:
         """One step of every point that two photos show."""
-        entries = np.concatenate(list(pool.map(self._point_entries, *zip(*self.chunks, strict=True))), axis=1)
+        factors = self._point_factors()
+        entries = np.concatenate([self._point_entries(*chunk, factors) for chunk in self.chunks], axis=1)
         count = self.places.shape[1]
-        sums = np.stack(list(pool.map(self._sum_by_point, entries)))  # [9, M]
+        sums = np.stack([np.bincount(self.point_ids, values, count) for values in entries])  # [9, M]
         normal = sums[[0, 1, 2, 1, 3, 4, 2, 4, 5]].T.reshape(count, 3, 3)
         traces = np.trace(normal, axis1=1, axis2=2)
-        told = (np.bincount(self.point_ids, entries[0] > 0, count) >= 2) & (traces > 0)
+        told = (np.bincount(self.point_ids, entries[[0, 3, 5]].sum(axis=0) > 0, count) >= 2) & (traces > 0)
         normal = normal[told] + (POINT_DAMPING * traces[told])[:, None, None] * np.eye(3)
         self.places[:, told] += np.linalg.solve(normal, sums[6:].T[told][:, :, None])[:, :, 0].T
 
-    @_quietly
-    def _point_entries(self, first: int, last: int) -> np.ndarray:
-        """[9, n]: six of a symmetric matrix and three of a vector, of each observation's normal equations."""
-        in_camera, residuals, errors = self._seen(first, last)
-        weights = self._weights(errors)
-        slopes, scales = in_camera[:2] / in_camera[2], self._each(self.cameras.focal, first, last) / in_camera[2]
-        rotations = self._each(self.cameras.rotations, first, last)  # [3, 3, n]
-        across, down = (scales[axis] * (rotations[axis] - slopes[axis] * rotations[2]) for axis in range(2))  # [3, n]
-        left_out = weights == 0
-        across[:, left_out], down[:, left_out], residuals[:, left_out] = 0.0, 0.0, 0.0
-        weighted_across, weighted_down = across * weights, down * weights
-        entries = np.empty((9, len(weights)))
-        for row, (i, j) in enumerate(UPPER):
-            entries[row] = weighted_across[i] * across[j] + weighted_down[i] * down[j]
-        entries[6:] = weighted_across * residuals[0] + weighted_down * residuals[1]
-        return entries
+    def _point_factors(self) -> np.ndarray:
+        """[V, 9, 9]: six of a symmetric matrix and three of a vector, of a point's normal equations in the world, in
+        factors of functions of what a photo shows of it, which are those of `_point_entries`."""
+        across, down, ahead = self.cameras.rotations.swapaxes(0, 1)  # [V, 3] each
+        (fx, fy), (i, j) = self.cameras.focal.T[:, :, None], UPPER
+        factors = np.zeros((len(fx), 9, 9))
+        factors[:, :6, 0] = fx**2 * across[:, i] * across[:, j] + fy**2 * down[:, i] * down[:, j]
+        for column, axis, focal in ((1, across, fx), (2, down, fy)):
+            factors[:, :6, column] = -(focal**2) * (axis[:, i] * ahead[:, j] + ahead[:, i] * axis[:, j])
+            factors[:, :6, column + 2] = focal**2 * ahead[:, i] * ahead[:, j]
+            factors[:, 6:, column + 4] = focal * axis
+            factors[:, 6:, column + 6] = -focal * ahead
+        return factors
+
+    def _point_entries(self, first: int, last: int, factors: np.ndarray) -> np.ndarray:
+        """[9, n]: what each observation adds to its point's normal equations; `factors` are `_point_factors`."""
+        (p, q, near), (across, down), weights = self._counted(first, last)
+        weights *= near
+        across, down = across * weights, down * weights
+        weights *= near
+        functions = np.stack([weights, weights * p, weights * q, weights * p * p, weights * q * q, across, down,
+                              across * p, down * q])  # fmt: skip
+        for view, own in self._parts(first, last):
+            functions[:, own] = factors[view] @ functions[:, own]
+        return functions
 
     def agreeing_cameras(self) -> Pinholes:
         """The cameras; the given one where its photo agrees no better."""
@@ -346,9 +354,6 @@ class _Adjustment:
     def errors(self) -> np.ndarray:
         """[O] pixels between where points are seen and where photos show them; infinite behind a camera."""
         return np.concatenate([self._seen(*chunk)[2] for chunk in self.chunks])
-
-    def _sum_by_point(self, values: np.ndarray) -> np.ndarray:
-        return np.bincount(self.point_ids, values, self.places.shape[1])
 
 
 def _rotations(vectors: np.ndarray) -> np.ndarray:

@@ -5,8 +5,10 @@ from __future__ import annotations
 import itertools
 import re
 import signal
+import tempfile
 import threading
 from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING
@@ -125,8 +127,7 @@ def read_colmap(scene: Path, model: Path, suffix: str) -> Capture:
     Raises:
         InputError: files that are damaged or inconsistent, or a camera that no pinhole can take the place of.
     """
-    if suffix == ".bin":
-        check_binary_model(model)
+    found = check_binary_model(model) if suffix == ".bin" else None
     pycolmap = load_pycolmap()
     reconstruction = pycolmap.Reconstruction()
     try:
@@ -171,11 +172,14 @@ def read_colmap(scene: Path, model: Path, suffix: str) -> Capture:
         and 1.5 * photo_size(photo_folder / names[0])[0] > reconstruction.cameras[images[0].camera_id].width
     ):
         reduction = 1  # the cameras are those of the copies
-    found = [point for _, point in sorted(reconstruction.points3D.items())]
-    points = np.array([point.xyz for point in found], dtype=np.float64).reshape(-1, 3)
-    colors = np.array([point.color for point in found], dtype=np.uint8).reshape(-1, 3) if found else None
+    with nullcontext(model) if suffix == ".bin" else _in_binary(reconstruction) as folder:
+        found = check_binary_model(folder) if found is None else found
+        found = found[np.argsort(found["id"])]
+        file = folder / "images.bin"
+        observations = read_observations(reconstruction, file, images, lenses, found["id"]) if len(found) else None
+    points = found["xyz"].copy()
     shown = f"{len(points):,} points"
-    if not found and images and np.isfinite(viewmats).all():
+    if not len(points) and images and np.isfinite(viewmats).all():
         points, how = starting_points(viewmats, intrinsics, sizes)
         shown = f"no points, so {len(points):,} random ones {how}"
     return Capture(
@@ -185,7 +189,7 @@ def read_colmap(scene: Path, model: Path, suffix: str) -> Capture:
         Ks=intrinsics,
         sizes=sizes,
         points=points,
-        point_colors=colors,
+        point_colors=found["color"].copy() if len(found) else None,
         lenses=tuple(lenses[image.camera_id] for image in images),
         notes=(
             _kind_note(scene, model, suffix, len(images), shown, photo_folder),
@@ -195,8 +199,16 @@ def read_colmap(scene: Path, model: Path, suffix: str) -> Capture:
         ),
         reduction=reduction,
         alpha="mask",
-        observations=read_observations(reconstruction, model, suffix, images, lenses) if found else None,
+        observations=observations,
     ).checked(model)
+
+
+@contextmanager
+def _in_binary(reconstruction: pycolmap.Reconstruction) -> Iterator[Path]:
+    """A folder with a reconstruction's binary files, while entered."""
+    with tempfile.TemporaryDirectory() as folder:
+        reconstruction.write_binary(folder)
+        yield Path(folder)
 
 
 def _lens(camera: pycolmap.Camera, model: Path, made: dict[tuple, Lens]) -> Lens | None:

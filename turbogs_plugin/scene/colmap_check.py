@@ -17,8 +17,8 @@ from turbogs_plugin.errors import InputError
 FEATURE = np.dtype([("pixel", "<f8", 2), ("point", "<u8")])
 """Where an image shows something, and the identifier of the point that it is."""
 TRACK_ELEMENT_BYTES = 8
-POINT3D_BYTES = 43
-"""Identifier, position, colour and error, without the track."""
+POINT = np.dtype([("id", "<u8"), ("xyz", "<f8", 3), ("color", "u1", 3), ("error", "<f8")])
+"""A point, without its track."""
 SENSOR_BYTES, FRAME_MEMBER_BYTES = 8, 16
 SMALLEST_IMAGE = 73
 """Bytes of an image with a name of one letter and without points."""
@@ -94,21 +94,25 @@ class _Reader:
             raise self.fail(f"{owner} has a pose that is not finite, or a zero rotation")
 
 
-def check_binary_model(folder: Path) -> None:
-    """Raise `InputError` unless the files of the reconstruction in `folder` are whole, with finite poses.
+def check_binary_model(folder: Path) -> np.ndarray:
+    """[M] of `POINT`: the points of the reconstruction in `folder`, if its files are whole, with finite poses.
 
     Reads ``cameras.bin``, ``images.bin``, ``points3D.bin`` and, where they are, ``rigs.bin`` and ``frames.bin``.
+
+    Raises:
+        InputError: a file is damaged.
     """
     cameras = _check_cameras(_Reader(folder / "cameras.bin"))
     for _ in features_of_images(folder / "images.bin", cameras):
         pass
-    _check_points(_Reader(folder / "points3D.bin"))
+    points = _points(_Reader(folder / "points3D.bin"))
     rigs, frames = folder / "rigs.bin", folder / "frames.bin"
     if rigs.exists() != frames.exists():
         raise InputError(f"{folder} has one of rigs.bin and frames.bin: bring the other one back")
     if rigs.exists():
         _check_rigs(_Reader(rigs))
         _check_frames(_Reader(frames))
+    return points
 
 
 def _check_cameras(reader: _Reader) -> set[int]:
@@ -148,18 +152,22 @@ def features_of_images(path: Path, cameras: Container[int] | None = None) -> Ite
         yield image, np.frombuffer(reader.data, FEATURE, count, reader.skip(count * FEATURE.itemsize))
 
 
-def _check_points(reader: _Reader) -> None:
-    """By one number of each record, as captures have millions of them."""
-    smallest, length = POINT3D_BYTES + 8, struct.Struct("<Q").unpack_from
+def _points(reader: _Reader) -> np.ndarray:
+    """[M] of `POINT`. By one number of each record and in one go, as captures have millions of them."""
+    smallest, length = POINT.itemsize + 8, struct.Struct("<Q").unpack_from
     data, last = reader.data, len(reader.data) - smallest
     count = reader.count(smallest)
-    position = reader.position
+    position, starts = reader.position, []
     for _ in range(count):
         if position > last:
             reader.skip(position + smallest - reader.position)  # raises
-        position += smallest + TRACK_ELEMENT_BYTES * length(data, position + POINT3D_BYTES)[0]
+        starts.append(position)
+        position += smallest + TRACK_ELEMENT_BYTES * length(data, position + POINT.itemsize)[0]
     reader.skip(position - reader.position)
     reader.end()
+    if not starts:
+        return np.zeros(0, POINT)
+    return np.lib.stride_tricks.sliding_window_view(np.frombuffer(data, "u1"), POINT.itemsize)[starts].view(POINT)[:, 0]
 
 
 def _check_rigs(reader: _Reader) -> None:

@@ -5,7 +5,6 @@ pycolmap makes an object of every feature; a capture has millions of them. So th
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -24,29 +23,21 @@ NO_POINT = np.uint64(2**64 - 1)
 
 def read_observations(
     reconstruction: pycolmap.Reconstruction,
-    model: Path,
-    suffix: str,
+    file: Path,
     images: Sequence[pycolmap.Image],
     lenses: dict[int, Lens | None],
+    point_ids: np.ndarray,
 ) -> Observations:
     """Those of some images, in pixels of their pinhole cameras.
 
     Args:
         reconstruction: as it was read.
-        model, suffix: the files that it was read from.
+        file: its ``images.bin``.
         images: the views, in their order.
         lenses: camera id -> its lens; None of a pinhole.
-
-    Returns:
-        Points are numbered in the order of their identifiers.
+        point_ids: [M] uint64, ascending: the points' identifiers.
     """
-    if suffix == ".bin":
-        features = dict(features_of_images(model / "images.bin"))
-    else:
-        with tempfile.TemporaryDirectory() as folder:
-            reconstruction.write_binary(folder)
-            features = dict(features_of_images(Path(folder) / "images.bin"))
-    point_ids = np.array(sorted(reconstruction.points3D), dtype=np.uint64)
+    features = dict(features_of_images(file))
     parts = [(np.zeros((0, 2)), np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64))]
     for view, image in enumerate(images):
         shown = features[image.image_id]
