@@ -197,6 +197,7 @@ class _Adjustment:
         spread: [PARAMETERS, PARAMETERS], the prior's covariance of these.
         doubts: [V, PARAMETERS, PARAMETERS], the covariance of each camera's moves that is left by what the photo shows
             and the prior; zero where the photo shows too little to be refined.
+        entries: [9, O], room for what each observation adds to its point's normal equations.
         depths: [V], medians of the points before each camera.
         first_errors: [O] pixels, before the first step.
         scale: pixels, the median of these: errors far above it count little.
@@ -213,6 +214,7 @@ class _Adjustment:
         self.moves = np.zeros((views, PARAMETERS))
         self.spread = PRIOR**2 * np.eye(PARAMETERS) if spread is None else spread
         self.doubts = np.zeros((views, PARAMETERS, PARAMETERS))
+        self.entries = np.empty((9, len(self.point_ids)))
         bounds = [0]  # of views together, so that a step has few large operations
         for view in range(views):
             if self.starts[view + 1] - self.starts[bounds[-1]] > CHUNK and view > bounds[-1]:
@@ -309,15 +311,16 @@ class _Adjustment:
 
     def move_points(self) -> None:
         """One step of every point that two photos show."""
-        factors = self._point_factors()
-        entries = np.concatenate([self._point_entries(*chunk, factors) for chunk in self.chunks], axis=1)
-        count = self.places.shape[1]
+        factors, count, entries = self._point_factors(), self.places.shape[1], self.entries
+        for first, last in self.chunks:
+            entries[:, self.starts[first] : self.starts[last]] = self._point_entries(first, last, factors)
+        seen = np.bincount(self.point_ids, entries[0] + entries[3] + entries[5] > 0, count)
         sums = np.stack([np.bincount(self.point_ids, values, count) for values in entries])  # [9, M]
-        normal = sums[[0, 1, 2, 1, 3, 4, 2, 4, 5]].T.reshape(count, 3, 3)
-        traces = np.trace(normal, axis1=1, axis2=2)
-        told = (np.bincount(self.point_ids, entries[[0, 3, 5]].sum(axis=0) > 0, count) >= 2) & (traces > 0)
-        normal = normal[told] + (POINT_DAMPING * traces[told])[:, None, None] * np.eye(3)
-        self.places[:, told] += np.linalg.solve(normal, sums[6:].T[told][:, :, None])[:, :, 0].T
+        traces = sums[0] + sums[3] + sums[5]
+        with np.errstate(**QUIET):
+            sums = sums / traces
+            sums[[0, 3, 5]] += POINT_DAMPING
+            self.places += np.where((seen >= 2) & (traces > 0), _solved(*sums), 0.0)
 
     def _point_factors(self) -> np.ndarray:
         """[V, 9, 9]: six of a symmetric matrix and three of a vector, of a point's normal equations in the world, in
@@ -354,6 +357,13 @@ class _Adjustment:
     def errors(self) -> np.ndarray:
         """[O] pixels between where points are seen and where photos show them; infinite behind a camera."""
         return np.concatenate([self._seen(*chunk)[2] for chunk in self.chunks])
+
+
+def _solved(a, b, c, d, e, f, x, y, z) -> np.ndarray:
+    """[3, M]: the solutions of M systems ((a, b, c), (b, d, e), (c, e, f)) s = (x, y, z), by Cramer's rule."""
+    aa, ab, ac, bb, bc, cc = d * f - e * e, c * e - b * f, b * e - c * d, a * f - c * c, b * c - a * e, a * d - b * b
+    determinant = a * aa + b * ab + c * ac
+    return np.stack([aa * x + ab * y + ac * z, ab * x + bb * y + bc * z, ac * x + bc * y + cc * z]) / determinant
 
 
 def _rotations(vectors: np.ndarray) -> np.ndarray:
