@@ -27,6 +27,7 @@ PAGES = tuple(
     for name in (
         "README.md",
         "docs/captures.md",
+        "docs/comparison.md",
         "docs/drop-in.md",
         "docs/formats.md",
         "docs/numerics.md",
