@@ -120,6 +120,6 @@ def photos_alone(file: Path = CAPTURES) -> str:
     rows = []
     for run in record["runs"]:
         distances = [f"{100 * run[key]:.2f} %" for key in ("median", "largest")]
-        rows.append((f"{run['registered']} of {run['photos']}", *distances, f"{run['seconds'] / 60:.0f} min"))
+        rows.append((f"{run['registered']} of {run['photos']}", *distances, f"{run['seconds']:.0f} s"))
     made = table(("photos registered", "error of centers, median", "largest", "time"), rows)
     return f"{where(record)}.\n\n{made}"

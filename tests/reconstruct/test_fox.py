@@ -11,11 +11,13 @@ import pytest
 
 from turbogs_plugin.reconstruct import reconstruct, run, solver
 from turbogs_plugin.reconstruct.agreement import consistent_groups
+from turbogs_plugin.reconstruct.effort import Effort
 from turbogs_plugin.reconstruct.workspace import Workspace
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "docs"))  # the script imports its neighbours
 measure_captures = importlib.import_module("measure_captures")
 FOX = Path(os.environ.get("TURBOGS_SCENES", "")) / "fox-raw"
+SMALLER = Effort("smaller", 1000, doubled=True)
 MISLED = {f"{number:04d}.jpg" for number in (1, 2, 3, 4, 6, 7, 8, 9)}
 """Photos of the wall's left end, which matches its right end."""
 
@@ -36,7 +38,7 @@ def solved(tmp_path_factory) -> Workspace:
     """Of smaller photos than usual, which is enough."""
     scene = tmp_path_factory.mktemp("fox") / "scene"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(run, "LONG_SIDES", (1000,))
+        patch.setattr(run, "efforts_for", lambda longest: (SMALLER,))
         assert reconstruct(FOX / "images", scene).registered == 50
     return Workspace(scene)
 
@@ -48,7 +50,7 @@ def test_all_cameras_are_where_they_were_published(solved):
 
 def test_a_solve_that_the_wall_has_misled_is_found_and_repaired(solved, monkeypatch):
     """The first solve is forced to a ghost: it is not given the true pairs of eight photos."""
-    database, misled = solved.database(1000), solved.scratch / "misled.db"
+    database, misled = solved.database(SMALLER), solved.scratch / "misled.db"
     agreement = solver.measure_agreement(pycolmap.Reconstruction(solved.model), database)
     assert len(consistent_groups(agreement)) == 1 and agreement.contradicts.sum() > 100
     true = [tuple(agreement.names[view] for view in pair) for pair in agreement.pairs[~agreement.contradicts].tolist()]

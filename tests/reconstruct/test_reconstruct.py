@@ -14,6 +14,7 @@ from PIL import Image
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.reconstruct import Solution, reconstruct, run, scene_beside, solver
 from turbogs_plugin.reconstruct.agreement import Agreement, consistent_groups
+from turbogs_plugin.reconstruct.effort import DEFAULTS, DOUBLED, QUICK, efforts_for
 from turbogs_plugin.reconstruct.photos import read_photos
 from turbogs_plugin.reconstruct.workspace import Workspace
 from turbogs_plugin.scene import load_scene
@@ -101,7 +102,7 @@ def test_a_stopped_call_is_gone_on_with(solved, tmp_path, monkeypatch):
         patch.setattr(solver, "solve_cameras", stop)
         with pytest.raises(KeyboardInterrupt):
             reconstruct(few, tmp_path / "scene")
-    database = Workspace(tmp_path / "scene").database(run.LONG_SIDES[0])
+    database = Workspace(tmp_path / "scene").database(DOUBLED)
     with pycolmap.Database.open(database) as opened:
         before = opened.num_keypoints(), opened.num_matches(), len(opened.read_all_cameras())
         opened.delete_matches(1, 2)
@@ -115,7 +116,7 @@ def test_features_that_a_stopped_call_left_out_are_of_the_same_camera(solved, tm
     photos, solution = solved
     few, database = read_photos(photos)[1:4], tmp_path / "features.db"  # upright ones, of one lens
     for known in (few[:1], few):
-        solver.extract_features(database, Workspace(solution.scene).images, known, 320)
+        solver.extract_features(database, Workspace(solution.scene).images, known, DOUBLED)
     with pycolmap.Database.open(database) as opened:
         assert (len(opened.read_all_images()), len(opened.read_all_cameras())) == (3, 1)
 
@@ -195,12 +196,14 @@ def agreement_of(places: str) -> Agreement:
 
 @pytest.fixture
 def attempts(monkeypatch, tmp_path):
-    """Solves that are made up: each takes the next of the given models; the pairs taken out are noted."""
+    """Solves that are made up: each takes the next of the given models; the pairs taken out are noted, and what is said
+    of each solve."""
 
-    def prepare(*models: str | None) -> tuple[list, Workspace]:
-        waiting, removed = list(models), []
+    def prepare(*models: str | None) -> tuple[list, list, Path, Workspace]:
+        waiting, removed, said = list(models), [], []
 
-        def attempt(database, evidence, workspace):
+        def attempt(database, evidence, workspace, again):
+            said.append(again)
             places = waiting.pop(0)
             if places is None:
                 return None
@@ -209,8 +212,7 @@ def attempts(monkeypatch, tmp_path):
 
         monkeypatch.setattr(run, "_attempt", attempt)
         monkeypatch.setattr(solver, "without_pairs", lambda database, copy, pairs: removed.append(pairs))
-        workspace = Workspace(tmp_path / "scene")
-        return removed, workspace
+        return removed, said, tmp_path / "some.db", Workspace(tmp_path / "scene")
 
     return prepare
 
@@ -219,8 +221,9 @@ GOOD, GHOST = "oooooooooo", "gggooooooo"
 
 
 def test_a_ghost_is_solved_again_without_the_pairs_that_made_it(attempts):
-    removed, workspace = attempts(GHOST, GOOD)
-    best, moved = run._solve(workspace.database(1), workspace)
+    removed, said, *places = attempts(GHOST, GOOD)
+    best, moved = run._solve(*places, " again, with more features")
+    assert said == [" again, with more features", " again, without the pairs that led to a ghost"]
     assert best.model.places == GOOD and best.ghosts == [] and moved == ["0.jpg", "1.jpg", "2.jpg"]
     (pairs,) = removed
     assert pairs and all((first < "3") != (second < "3") for first, second in pairs)
@@ -228,15 +231,15 @@ def test_a_ghost_is_solved_again_without_the_pairs_that_made_it(attempts):
 
 def test_a_repair_that_fails_leaves_the_first_solve_with_its_ghosts_named(attempts):
     for outcome in (None, GHOST):
-        removed, workspace = attempts(GHOST, outcome)
-        best, moved = run._solve(workspace.database(1), workspace)
+        removed, _, *places = attempts(GHOST, outcome)
+        best, moved = run._solve(*places)
         assert best.model.places == GHOST and moved == [] and len(removed) == 1
         assert best.ghosts == ["0.jpg", "1.jpg", "2.jpg"]
 
 
 def test_a_solve_without_ghosts_is_taken_as_it_is(attempts):
-    removed, workspace = attempts(GOOD)
-    best, moved = run._solve(workspace.database(1), workspace)
+    removed, _, *places = attempts(GOOD)
+    best, moved = run._solve(*places)
     assert (best.model.places, moved, removed) == (GOOD, [], [])
 
 
@@ -255,13 +258,38 @@ def test_cameras_that_are_told_as_solved_are_those_of_the_largest_model(monkeypa
     assert capsys.readouterr().err.startswith("cameras solved: 4 in ")
 
 
-def test_a_solve_that_is_not_the_first_says_why(monkeypatch, tmp_path):
-    said, workspace = [], Workspace(tmp_path)
-    monkeypatch.setattr(solver, "solve_cameras", lambda *arguments: said.append(arguments[3]))
-    first, second = (workspace.database(side) for side in run.LONG_SIDES)
-    for database, evidence in ((first, first), (tmp_path / "working.db", first), (second, second)):
-        assert run._attempt(database, evidence, workspace) is None
-    assert said == ["", " again, without the pairs that led to a ghost", " again, by COLMAP's own defaults"]
+def fake_steps(monkeypatch) -> tuple[list, list]:
+    """Steps that do nothing: the efforts that features were looked for with, and what is said of each solve."""
+    efforts, said = [], []
+    monkeypatch.setattr(solver, "extract_features", lambda *arguments: efforts.append(arguments[3]))
+    monkeypatch.setattr(solver, "match_features", lambda *arguments: None)
+    monkeypatch.setattr(solver, "with_default_cameras", lambda *arguments: efforts.append(DEFAULTS))
+    monkeypatch.setattr(solver, "read_names", lambda database: {"a"})
+    monkeypatch.setattr(solver, "count_verified_pairs", lambda database: 3)
+
+    def solve(database: Path, images: Path, scratch: Path, again: str) -> list:
+        said.append(again)
+        return []
+
+    monkeypatch.setattr(solver, "solve_cameras", solve)
+    return efforts, said
+
+
+@pytest.mark.parametrize(
+    ("side", "efforts", "said"),
+    [
+        (800, [DOUBLED, DEFAULTS], ["", DEFAULTS.again]),
+        (1200, [QUICK, DOUBLED, DEFAULTS], ["", DOUBLED.again, DEFAULTS.again]),
+    ],
+)
+def test_where_too_few_photos_register_more_is_done(monkeypatch, tmp_path, side, efforts, said):
+    """Small photos begin with the second effort, as there is little to find in them."""
+    for number in range(3):
+        Image.new("RGB", (side, side // 2)).save(tmp_path / f"{number}.jpg")
+    done, told = fake_steps(monkeypatch)
+    with pytest.raises(InputError, match="no cameras were found for 3 photos"):
+        reconstruct(tmp_path, tmp_path / "../scene")
+    assert done == efforts and told == said and efforts_for(side) == tuple(efforts)
 
 
 @pytest.mark.parametrize(("out", "word"), [(["a.jpg"], "it"), (["a.jpg", "b.jpg"], "them")])
@@ -297,7 +325,7 @@ def test_scenes_that_do_not_connect_are_told_by_their_numbers():
 def test_matches_agree_with_the_cameras_that_were_solved_and_not_with_moved_ones(solved):
     _, solution = solved
     workspace = Workspace(solution.scene)
-    database = workspace.database(run.LONG_SIDES[0])
+    database = workspace.database(DOUBLED)
     model = pycolmap.Reconstruction(workspace.model)
     agreement = solver.measure_agreement(model, database)
     assert agreement.names == tuple(f"view_{view:02d}.jpg" for view in range(COUNT))
@@ -315,7 +343,7 @@ def test_the_similar_photos_of_many_are_found_without_a_download(solved, tmp_pat
     _, solution = solved
     workspace = Workspace(solution.scene)
     database = tmp_path / "features.db"
-    shutil.copy(workspace.database(run.LONG_SIDES[0]), database)
+    shutil.copy(workspace.database(DOUBLED), database)
     with pycolmap.Database.open(database) as opened:
         opened.clear_matches()
         opened.clear_two_view_geometries()
@@ -331,8 +359,8 @@ def test_where_photos_are_left_colmaps_own_defaults_are_tried(solved):
     """They do not register the other photo either, so that the first solve stays."""
     workspace = Workspace(solved[1].scene)
     models = []
-    for long_side in run.LONG_SIDES:
-        with pycolmap.Database.open(workspace.database(long_side)) as opened:
+    for effort in (DOUBLED, DEFAULTS):  # the photos are small
+        with pycolmap.Database.open(workspace.database(effort)) as opened:
             (camera,) = opened.read_all_cameras()
             models.append((camera.model.name, camera.width, camera.focal_length_x, opened.num_keypoints()))
     assert [model[0] for model in models] == ["OPENCV", "SIMPLE_RADIAL"] and models[0][1:] == models[1][1:]

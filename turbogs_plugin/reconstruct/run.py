@@ -21,6 +21,7 @@ from turbogs_plugin.reconstruct.agreement import (
     ghost_pairs,
     linked_groups,
 )
+from turbogs_plugin.reconstruct.effort import DEFAULTS, DOUBLED, efforts_for
 from turbogs_plugin.reconstruct.masks import find_photo_masks, place_masks
 from turbogs_plugin.reconstruct.matching import FEW, Matching, choose_matching
 from turbogs_plugin.reconstruct.photos import PhotoFile, place_photos, read_photos
@@ -33,9 +34,6 @@ from turbogs_plugin.scene.photo_folder import find_photos, unread
 if TYPE_CHECKING:
     import pycolmap
 
-LONG_SIDES = (1600, 3200)
-"""Photos are reduced to the first for their features. Where too few register, all is done again by COLMAP's own
-defaults, the second and a simple camera model, and the better solve is taken."""
 ENOUGH_OF_MANY = 0.95
 """Of more than `FEW` photos so many are enough; of fewer, all."""
 REPAIRS = 3
@@ -133,19 +131,20 @@ def _reconstruct(photos: Sequence[PhotoFile], workspace: Workspace, others: str)
     enough = len(photos) if len(photos) <= FEW else ENOUGH_OF_MANY * len(photos)
     best: Solve | None = None
     repaired: list[str] = []
-    for attempt, long_side in enumerate(LONG_SIDES):
-        database = workspace.database(long_side)
-        if attempt and longest <= LONG_SIDES[0]:  # the features are the same
-            solver.with_default_cameras(workspace.database(LONG_SIDES[0]), database)
+    efforts = efforts_for(longest)
+    for effort in efforts:
+        database = workspace.database(effort)
+        if effort is DEFAULTS and longest <= DOUBLED.long_side:  # the features are the same
+            solver.with_default_cameras(workspace.database(DOUBLED), database)
         else:
-            solver.extract_features(database, workspace.images, photos, long_side, default_cameras=attempt > 0)
-            if not attempt and not solver.read_names(database):
+            solver.extract_features(database, workspace.images, photos, effort)
+            if effort is DOUBLED and not solver.read_names(database):
                 raise InputError(
                     f"none of the {len(photos)} photos shows anything that could be found again in another one: they "
                     "are blank, blurred or too small; take sharp photos of a scene with texture"
                 )
             solver.match_features(database, workspace.scratch, names, matching)
-        solve, moved = _solve(database, workspace)
+        solve, moved = _solve(database, workspace, effort.again if effort is not efforts[0] else "")
         if solve is not None and (best is None or solve.rank > best.rank):
             best, repaired, verified = solve, moved, solver.count_verified_pairs(database)
         if best is not None and best.placed >= enough:
@@ -162,9 +161,9 @@ def _reconstruct(photos: Sequence[PhotoFile], workspace: Workspace, others: str)
     return solution
 
 
-def _solve(database: Path, workspace: Workspace) -> tuple[Solve | None, list[str]]:
-    """The best solve of a database, and the photos that a repair has moved."""
-    best = _attempt(database, database, workspace)
+def _solve(database: Path, workspace: Workspace, again: str = "") -> tuple[Solve | None, list[str]]:
+    """The best solve of a database, and the photos that a repair has moved. `again`: as in `solve_cameras`."""
+    best = _attempt(database, database, workspace, again)
     if best is None:
         return None, []
     first, removed = best, set()
@@ -180,7 +179,7 @@ def _solve(database: Path, workspace: Workspace) -> tuple[Solve | None, list[str
             break
         removed |= pairs
         solver.without_pairs(database, working, sorted(removed))
-        solve = _attempt(working, database, workspace)
+        solve = _attempt(working, database, workspace, " again, without the pairs that led to a ghost")
         if solve is None:
             break
         if solve.rank > best.rank:
@@ -190,11 +189,8 @@ def _solve(database: Path, workspace: Workspace) -> tuple[Solve | None, list[str
     return best, [name for name in first.ghosts if name in placed] if best is not first else []
 
 
-def _attempt(database: Path, evidence: Path, workspace: Workspace) -> Solve | None:
+def _attempt(database: Path, evidence: Path, workspace: Workspace, again: str = "") -> Solve | None:
     """A solve of a database, judged by all the matches of another."""
-    again = "" if database == workspace.database(LONG_SIDES[0]) else " again, by COLMAP's own defaults"
-    if database != evidence:
-        again = " again, without the pairs that led to a ghost"
     models = solver.solve_cameras(database, workspace.images, workspace.scratch, again)
     if not models or models[0].num_reg_images() < FEWEST_PHOTOS:
         return None

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.files import read_text, require_writable, write_text_atomically
+from turbogs_plugin.reconstruct.effort import Effort
 from turbogs_plugin.reconstruct.photos import PhotoFile
 
 if TYPE_CHECKING:
@@ -56,8 +57,8 @@ class Workspace:
         self.listed = self.scratch / "photos.json"
         self.solved = self.scratch / "solution.json"
 
-    def database(self, long_side: int) -> Path:
-        return self.scratch / f"features-{long_side}.db"
+    def database(self, effort: Effort) -> Path:
+        return self.scratch / f"{effort.name}.db"
 
     def begin(self, photos: Sequence[PhotoFile]) -> bool:
         """Make the folder, or open that of an earlier call.
