@@ -87,7 +87,7 @@ def test_cameras_are_compared_after_the_similarity_that_brings_most_together(tmp
     run = {"photos": 11, "registered": 10, "seconds": 120.0, "median": 0.0, "largest": 0.5}
     record = tmp_path / "captures.json"
     record.write_text(json.dumps({"alone": {"provenance": asdict(provenance("cpu")), "runs": [run]}}))
-    assert "| 10 of 11 | 0.00 % | 50.00 % | 2 min |" in capture_tables.photos_alone(record)
+    assert "| 10 of 11 | 0.00 % | 50.00 % | 120 s |" in capture_tables.photos_alone(record)
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="Linux says what processes share")
