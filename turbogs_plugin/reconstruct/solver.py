@@ -27,9 +27,10 @@ MANY, DEFAULT_MODEL = 10, "SIMPLE_RADIAL"
 default, one radial coefficient. On fox OPENCV halves the error of the cameras."""
 EPIPOLAR_SHARE = 3e-3
 """A match agrees with two cameras that are nearer to its epipolar line than this share of the photos' longer side."""
-GROWTH = 1.3
-"""All cameras and points are adjusted whenever a model has grown by so much. COLMAP's 1.1 takes half as long again, for
-the same cameras."""
+GROWTH, TOLERANCE, REFINEMENTS = 1.3, 1e-4, 1
+"""All cameras and points are adjusted whenever a model has grown by so much; an adjustment ends when it gains less than
+this share; and what is near a new photo is adjusted so many times. COLMAP's 1.1, 0 and 2 take twice as long in all, for
+the same cameras (docs/captures.md)."""
 BLOCK = 128
 """Pairs that are matched, verified and written together: a stop waits for them."""
 FEATURES_OF_A_PHOTO = 1000
@@ -113,6 +114,8 @@ def solve_cameras(database: Path, images: Path, scratch: Path, again: str = "") 
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads, options.random_seed = torch.get_num_threads(), 0
     options.ba_global_frames_ratio = options.ba_global_points_ratio = GROWTH
+    options.ba_global_function_tolerance = options.ba_local_function_tolerance = TOLERANCE
+    options.ba_local_max_refinements = REFINEMENTS
     place = scratch / "models"
     shutil.rmtree(place, ignore_errors=True)
     place.mkdir(parents=True)
