@@ -133,10 +133,15 @@ def test_other_photos_are_not_mixed_in(solved, tmp_path):
         reconstruct(fewer, solution.scene)
 
 
-def blank(folder: Path) -> str:
+def blank(folder: Path, size: tuple[int, int] = (320, 240)) -> str:
     for number in range(3):
-        Image.new("RGB", (320, 240), (90, 90, 90)).save(folder / f"{number}.jpg")
+        Image.new("RGB", size, (90, 90, 90)).save(folder / f"{number}.jpg")
     return "none of the 3 photos shows anything that could be found again"
+
+
+def large_and_blank(folder: Path) -> str:
+    """Nothing is found at the photos' size, and nothing at twice that."""
+    return blank(folder, (1040, 16))
 
 
 def of_different_things(folder: Path) -> str:
@@ -151,7 +156,7 @@ def copies_of_one(folder: Path) -> str:
     return "no cameras were found for 3 photos: 3 of 3 pairs match, but they show no depth, .*move between the photos"
 
 
-@pytest.mark.parametrize("case", [blank, of_different_things, copies_of_one])
+@pytest.mark.parametrize("case", [blank, large_and_blank, of_different_things, copies_of_one])
 def test_photos_that_cannot_be_solved_end_in_one_line_and_leave_nothing(case, tmp_path):
     photos = tmp_path / "photos"
     photos.mkdir()

@@ -21,7 +21,7 @@ from turbogs_plugin.reconstruct.agreement import (
     ghost_pairs,
     linked_groups,
 )
-from turbogs_plugin.reconstruct.effort import DEFAULTS, DOUBLED, efforts_for
+from turbogs_plugin.reconstruct.effort import DEFAULTS, DOUBLED, QUICK, efforts_for
 from turbogs_plugin.reconstruct.masks import find_photo_masks, place_masks
 from turbogs_plugin.reconstruct.matching import FEW, Matching, choose_matching
 from turbogs_plugin.reconstruct.photos import PhotoFile, place_photos, read_photos
@@ -138,7 +138,9 @@ def _reconstruct(photos: Sequence[PhotoFile], workspace: Workspace, others: str)
             solver.with_default_cameras(workspace.database(DOUBLED), database)
         else:
             solver.extract_features(database, workspace.images, photos, effort)
-            if effort is DOUBLED and not solver.read_names(database):
+            if not solver.read_names(database):
+                if effort is QUICK:
+                    continue
                 raise InputError(
                     f"none of the {len(photos)} photos shows anything that could be found again in another one: they "
                     "are blank, blurred or too small; take sharp photos of a scene with texture"
