@@ -381,6 +381,21 @@ def test_of_several_models_the_largest_is_taken_and_said(tmp_path):
     assert re.fullmatch("COLMAP reconstruction .*sparse/1 .binary.: 9 images, 20 points", scene.notes[0])
 
 
+def test_a_pose_of_a_text_model_is_refused_by_the_file_that_the_user_has(tmp_path):
+    """Features are read from binary files that are made of it."""
+    folder = write_capture(tmp_path / "cup", suffix=".txt")
+    for name, first in (("images.txt", 1), ("frames.txt", 2)):
+        path = folder / "sparse/0" / name
+        lines = path.read_text().splitlines()
+        place = next(number for number, line in enumerate(lines) if not line.startswith("#"))
+        words = lines[place].split()
+        lines[place] = " ".join([*words[:first], *"0000", *words[first + 4 :]])
+        path.write_text("\n".join(lines) + "\n")
+    where = re.escape(str(folder / "sparse/0/images.txt"))
+    with pytest.raises(InputError, match=f"^{where} is damaged: image 1 has a pose that is not finite, or a zero rot"):
+        load_scene(folder)
+
+
 @pytest.mark.parametrize("suffix", [".bin", ".txt"])
 def test_images_are_counted_as_pycolmap_does(tmp_path, suffix):
     for views in (3, 8):

@@ -17,7 +17,7 @@ import numpy as np
 
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene.capture import FEWEST_PHOTOS, LARGEST_SIDE, Capture, check_photo_name, left_out, named
-from turbogs_plugin.scene.colmap_check import SMALLEST_IMAGE, check_binary_model
+from turbogs_plugin.scene.colmap_check import SMALLEST_IMAGE, check_binary_model, read_points
 from turbogs_plugin.scene.colmap_tracks import read_observations
 from turbogs_plugin.scene.photo_folder import NO_PHOTOS
 from turbogs_plugin.scene.photos import photo_size
@@ -172,8 +172,8 @@ def read_colmap(scene: Path, model: Path, suffix: str) -> Capture:
         and 1.5 * photo_size(photo_folder / names[0])[0] > reconstruction.cameras[images[0].camera_id].width
     ):
         reduction = 1  # the cameras are those of the copies
-    with nullcontext(model) if suffix == ".bin" else _in_binary(reconstruction) as folder:
-        found = check_binary_model(folder) if found is None else found
+    with nullcontext(model) if suffix == ".bin" else _in_binary(reconstruction, model) as folder:
+        found = read_points(folder / "points3D.bin") if found is None else found
         found = found[np.argsort(found["id"])]
         file = folder / "images.bin"
         observations = read_observations(reconstruction, file, images, lenses, found["id"]) if len(found) else None
@@ -204,11 +204,15 @@ def read_colmap(scene: Path, model: Path, suffix: str) -> Capture:
 
 
 @contextmanager
-def _in_binary(reconstruction: pycolmap.Reconstruction) -> Iterator[Path]:
-    """A folder with a reconstruction's binary files, while entered."""
+def _in_binary(reconstruction: pycolmap.Reconstruction, model: Path) -> Iterator[Path]:
+    """A folder with the binary files of a reconstruction, while entered. What is wrong with one of them is said of the
+    text file that it was made of, in the folder `model`."""
     with tempfile.TemporaryDirectory() as folder:
         reconstruction.write_binary(folder)
-        yield Path(folder)
+        try:
+            yield Path(folder)
+        except InputError as error:
+            raise InputError(str(error).replace(f"{folder}/", f"{model}/").replace(".bin is", ".txt is")) from None
 
 
 def _lens(camera: pycolmap.Camera, model: Path, made: dict[tuple, Lens]) -> Lens | None:

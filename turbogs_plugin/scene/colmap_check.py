@@ -105,7 +105,7 @@ def check_binary_model(folder: Path) -> np.ndarray:
     cameras = _check_cameras(_Reader(folder / "cameras.bin"))
     for _ in features_of_images(folder / "images.bin", cameras):
         pass
-    points = _points(_Reader(folder / "points3D.bin"))
+    points = read_points(folder / "points3D.bin")
     rigs, frames = folder / "rigs.bin", folder / "frames.bin"
     if rigs.exists() != frames.exists():
         raise InputError(f"{folder} has one of rigs.bin and frames.bin: bring the other one back")
@@ -152,8 +152,13 @@ def features_of_images(path: Path, cameras: Container[int] | None = None) -> Ite
         yield image, np.frombuffer(reader.data, FEATURE, count, reader.skip(count * FEATURE.itemsize))
 
 
-def _points(reader: _Reader) -> np.ndarray:
-    """[M] of `POINT`. By one number of each record and in one go, as captures have millions of them."""
+def read_points(path: Path) -> np.ndarray:
+    """[M] of `POINT`, of ``points3D.bin``, by one number of each record and in one go: captures have millions of them.
+
+    Raises:
+        InputError: the file is damaged.
+    """
+    reader = _Reader(path)
     smallest, length = POINT.itemsize + 8, struct.Struct("<Q").unpack_from
     data, last = reader.data, len(reader.data) - smallest
     count = reader.count(smallest)
