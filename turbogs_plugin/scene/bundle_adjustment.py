@@ -221,7 +221,7 @@ class _Adjustment:
                 bounds.append(view)
         self.chunks = list(zip(bounds, [*bounds[1:], views], strict=True))
         seen = [self._seen(*chunk) for chunk in self.chunks]
-        depths = self._by_view(np.concatenate([in_camera[2] for in_camera, _, _ in seen]))
+        depths = self._by_view(np.concatenate([sights[2] for sights, _, _ in seen]))
         self.depths = np.array([np.median(part) if len(part) else 1.0 for part in depths])
         self.first_errors = np.concatenate([errors for _, _, errors in seen])
         self.scale = max(_median(self.first_errors), FINEST)
