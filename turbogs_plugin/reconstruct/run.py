@@ -191,8 +191,8 @@ def _solve(database: Path, workspace: Workspace, again: str = "") -> tuple[Solve
     return best, [name for name in first.ghosts if name in placed] if best is not first else []
 
 
-def _attempt(database: Path, evidence: Path, workspace: Workspace, again: str = "") -> Solve | None:
-    """A solve of a database, judged by all the matches of another."""
+def _attempt(database: Path, evidence: Path, workspace: Workspace, again: str) -> Solve | None:
+    """A solve of a database, judged by all the matches of another. `again`: as in `solve_cameras`."""
     models = solver.solve_cameras(database, workspace.images, workspace.scratch, again)
     if not models or models[0].num_reg_images() < FEWEST_PHOTOS:
         return None

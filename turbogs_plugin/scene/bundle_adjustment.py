@@ -273,8 +273,8 @@ class _Adjustment:
         normals = (factors @ products[:, None] @ factors.swapaxes(2, 3)).sum(axis=1) + prior
         told = np.diff(self.starts) >= FEWEST_OBSERVATIONS
         self.doubts[told] = np.linalg.inv(normals[told])
-        steps = np.einsum("vcai,vic->va", factors, slopes) - self.moves @ prior
-        steps = np.einsum("vab,vb->va", self.doubts, steps)
+        right = np.einsum("vcai,vic->va", factors, slopes) - self.moves @ prior  # of the normal equations
+        steps = np.einsum("vab,vb->va", self.doubts, right)
         self.moves += steps
         self.cameras = self.cameras.moved(steps, self.depths)
 

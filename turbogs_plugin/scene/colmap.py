@@ -172,11 +172,13 @@ def read_colmap(scene: Path, model: Path, suffix: str) -> Capture:
         and 1.5 * photo_size(photo_folder / names[0])[0] > reconstruction.cameras[images[0].camera_id].width
     ):
         reduction = 1  # the cameras are those of the copies
-    with nullcontext(model) if suffix == ".bin" else _in_binary(reconstruction, model) as folder:
+    with nullcontext(model) if suffix == ".bin" else _in_binary(reconstruction) as folder:
         found = read_points(folder / "points3D.bin") if found is None else found
         found = found[np.argsort(found["id"])]
-        file = folder / "images.bin"
-        observations = read_observations(reconstruction, file, images, lenses, found["id"]) if len(found) else None
+        file, called = folder / "images.bin", model / f"images{suffix}"
+        observations = None
+        if len(found):
+            observations = read_observations(reconstruction, file, images, lenses, found["id"], called)
     points = found["xyz"].copy()
     shown = f"{len(points):,} points"
     if not len(points) and images and np.isfinite(viewmats).all():
@@ -204,15 +206,11 @@ def read_colmap(scene: Path, model: Path, suffix: str) -> Capture:
 
 
 @contextmanager
-def _in_binary(reconstruction: pycolmap.Reconstruction, model: Path) -> Iterator[Path]:
-    """A folder with the binary files of a reconstruction, while entered. What is wrong with one of them is said of the
-    text file that it was made of, in the folder `model`."""
+def _in_binary(reconstruction: pycolmap.Reconstruction) -> Iterator[Path]:
+    """A folder with a reconstruction's binary files, while entered."""
     with tempfile.TemporaryDirectory() as folder:
         reconstruction.write_binary(folder)
-        try:
-            yield Path(folder)
-        except InputError as error:
-            raise InputError(str(error).replace(f"{folder}/", f"{model}/").replace(".bin is", ".txt is")) from None
+        yield Path(folder)
 
 
 def _lens(camera: pycolmap.Camera, model: Path, made: dict[tuple, Lens]) -> Lens | None:

@@ -38,15 +38,15 @@ def _parameter_counts() -> dict[int, int]:
 
 
 class _Reader:
-    """Walks a file's bytes; asking for more than there are raises `InputError`."""
+    """Walks a file's bytes; asking for more than there are raises `InputError`, which names the file `called`."""
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
+    def __init__(self, path: Path, called: Path | None = None) -> None:
+        self.called = called or path
         self.data = path.read_bytes()
         self.position = 0
 
     def fail(self, trouble: str) -> InputError:
-        return InputError(f"{self.path} is damaged: {trouble}; copy or reconstruct it again")
+        return InputError(f"{self.called} is damaged: {trouble}; copy or reconstruct it again")
 
     def skip(self, size: int) -> int:
         """Step over `size` bytes and return where they began."""
@@ -130,17 +130,20 @@ def _check_cameras(reader: _Reader) -> set[int]:
     return cameras
 
 
-def features_of_images(path: Path, cameras: Container[int] | None = None) -> Iterator[tuple[int, np.ndarray]]:
+def features_of_images(
+    path: Path, cameras: Container[int] | None = None, called: Path | None = None
+) -> Iterator[tuple[int, np.ndarray]]:
     """Each image's identifier, and its features [n] of `FEATURE`.
 
     Args:
         path: of ``images.bin``.
         cameras: identifiers of those that there are; None: they are not compared.
+        called: the user's file that it was made of; None: it is the user's own.
 
     Raises:
         InputError: the file is damaged.
     """
-    reader = _Reader(path)
+    reader = _Reader(path, called)
     for _ in reader.records(SMALLEST_IMAGE):
         (image,) = reader.unpack("I")
         reader.pose(f"image {image}")

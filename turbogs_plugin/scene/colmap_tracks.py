@@ -27,6 +27,7 @@ def read_observations(
     images: Sequence[pycolmap.Image],
     lenses: dict[int, Lens | None],
     point_ids: np.ndarray,
+    called: Path | None = None,
 ) -> Observations:
     """Those of some images, in pixels of their pinhole cameras.
 
@@ -36,8 +37,9 @@ def read_observations(
         images: the views, in their order.
         lenses: camera id -> its lens; None of a pinhole.
         point_ids: [M] uint64, ascending: the points' identifiers.
+        called: as in `features_of_images`.
     """
-    features = dict(features_of_images(file))
+    features = dict(features_of_images(file, called=called))
     parts = [(np.zeros((0, 2)), np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64))]
     for view, image in enumerate(images):
         shown = features[image.image_id]
