@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import re
 from pathlib import Path
 
@@ -34,6 +35,34 @@ def test_the_architecture_names_every_folder():
     folders = {path.parent.name for path in (ROOT / "turbogs_plugin").glob("*/__init__.py")}
     text = PAGE.read_text(encoding="utf-8")
     assert [folder for folder in sorted(folders) if f"`turbogs_plugin/{folder}/`" not in text] == []
+
+
+def imported_rooms(file: Path) -> set[str]:
+    """The parts of `turbogs_plugin` that a file imports, at its top or later."""
+    modules = set()
+    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            modules |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            modules |= {f"{node.module}.{alias.name}" for alias in node.names}
+    split = (module.split(".") for module in modules)
+    return {parts[1] for parts in split if parts[0] == "turbogs_plugin"}
+
+
+def test_imports_point_one_way():
+    (sentence,) = re.findall(r"Imports point one way, [^:]*: ([^.]*)\.", PAGE.read_text(encoding="utf-8"))
+    rooms = re.findall(r"`(\w+)`", sentence)
+    folders = {room: ROOT / "turbogs_plugin" / room for room in rooms} | {"strategies": ROOT / "strategies"}
+    there = {path.stem for path in (ROOT / "turbogs_plugin").iterdir() if path.suffix in ("", ".py")}
+    assert there - set(rooms) == {"__init__", "__main__", "__pycache__"}
+    wrong = [
+        (str(file.relative_to(ROOT)), room)
+        for place, own in enumerate(rooms)
+        for file in sorted([*folders[own].rglob("*.py"), folders[own].with_suffix(".py")])
+        if file.is_file()
+        for room in imported_rooms(file) & set(rooms[place + 1 :])
+    ]
+    assert wrong == []
 
 
 @pytest.mark.parametrize("package", [turbogs_plugin, strategies])

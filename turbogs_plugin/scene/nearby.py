@@ -7,7 +7,6 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
-from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene import blender, llff
 from turbogs_plugin.scene.capture import named
 from turbogs_plugin.scene.colmap import find_model
@@ -19,6 +18,8 @@ LEVELS = 2
 POSE_FILES = (FILE, *blender.FILES, llff.FILE)
 PARTS_OF_RUN = ("model.ply", "checkpoints", "report")
 """One of them lies beside the config.yaml of a run that has begun."""
+LONGEST_CONFIG = 64 * 1024
+"""Bytes that are read of it; those of a run have about three thousand."""
 
 
 def capture_near(folder: Path) -> str:
@@ -43,11 +44,12 @@ def capture_of_run(folder: Path) -> str:
     config = folder / "config.yaml"
     if not (config.is_file() and any((folder / part).exists() for part in PARTS_OF_RUN)):
         return ""
-    from turbogs_plugin.config.yaml_text import read_yaml  # a capture is read without it
+    import yaml  # a capture is read without it
 
     try:
-        capture = read_yaml(config)["scene"]["path"]
-    except (InputError, KeyError, TypeError):  # another program's
+        with open(config, "rb") as file:
+            capture = yaml.safe_load(file.read(LONGEST_CONFIG))["scene"]["path"]
+    except (OSError, ValueError, yaml.YAMLError, RecursionError, KeyError, TypeError):  # another program's
         return ""
     return f"{folder} is a run's folder, not a capture: give {capture}, which it was trained on"
 
