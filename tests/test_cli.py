@@ -151,7 +151,7 @@ def test_a_broken_capture_is_refused(turbogs, copy, tmp_path, damage, words):
         (["train.iteration=1"], ["did you mean 'iterations'"]),
         (["nonsense"], ["section.key=value"]),
         (["scene.test_every=1"], ["test_every"]),
-        (["--factor", "0"], ["factor"]),
+        (["--factor", "0"], ["--factor 0: it must be at least 1"]),
         (["report.lpips_weights=absent.pth"], ["absent.pth"]),
         (["--max-memory", ""], ["--max-memory ''", "leave it out"]),
         (["--time-budget", ""], ["--time-budget ''", "leave it out"]),

@@ -119,14 +119,16 @@ class ErrorDrivenDensity(WindowedDensity):
         if self._stats is None or len(gaussians) == 0:
             return None
         densify, final = self.due(step)
+        over = 0 < self.bound(step) < len(gaussians)
+        reduce = over and self._reduction_due(step)
         update = None
         if densify:
             update = self._refine(gaussians, step)
-        elif final:
-            update = self._final_prune(gaussians, step)
-        if densify or final:
+        elif final or reduce:
+            update = self._prune(gaussians, step, 1 - self.final_keep if final else 0.0)
+        if densify or final or reduce:
             self._stats.zero_()
-        if step.iteration >= self._last_event(step):
+        if step.iteration >= self._last_event(step) and (reduce or not over):
             self._stats = None
         return update
 
@@ -154,7 +156,7 @@ class ErrorDrivenDensity(WindowedDensity):
         return densify, final
 
     def event_due(self, step: Step) -> bool:
-        return any(self.due(step))
+        return any(self.due(step)) or self._reduction_due(step)
 
     def growth_room(self, step: Step) -> float:
         return 1 / max(1 / MOST_ROOM, self.final_keep ** self._final_prunings_left(step))
@@ -163,6 +165,12 @@ class ErrorDrivenDensity(WindowedDensity):
         """Most Gaussians after an event at this iteration; 0: any number. What is grown beyond the cap and then removed
         by worth makes a better model of as many Gaussians than what never was beyond it (sweeps, eighteenth round)."""
         return math.floor(self.max_gaussians * self.growth_room(step) + 1e-6)
+
+    def _reduction_due(self, step: Step) -> bool:
+        """Whether a model beyond its bound is reduced: after densification, where a time budget has made the run too
+        short for a final pruning that was counted on."""
+        after = step.iteration > step.refine_until and step.iteration % self.refine_every == 0
+        return after and self.max_gaussians > 0 and self._stats is not None
 
     def _last_event(self, step: Step) -> int:
         """Iteration after which no statistics are needed: that of the last event, or where densification ends.
@@ -258,11 +266,12 @@ class ErrorDrivenDensity(WindowedDensity):
             return torch.zeros_like(finite)
         return finite & (gaussians.means.norm(dim=-1) > self.spare_beyond * extent)
 
-    def _final_prune(self, gaussians: Gaussians, step: Step) -> RowUpdate | None:
+    def _prune(self, gaussians: Gaussians, step: Step, share: float) -> RowUpdate | None:
+        """Remove the `share` of least worth, and what is beyond the bound."""
         finite = finite_rows(gaussians)
         worth, known, seen = self._worth(step)
         spared = self._spared(gaussians, finite, step.scene_extent)
-        kept = finite & ~_lowest(worth, known & seen & ~spared, 1 - self.final_keep)
+        kept = finite & ~_lowest(worth, known & seen & ~spared, share)
         kept, count = keep_one(kept, gaussians)
         return removal(~self._within_bound(kept, count, worth, known, spared, step))
 

@@ -148,6 +148,25 @@ def test_hostile_files_are_refused(write, text, message):
         load_config(write(text))
 
 
+def test_a_base_is_looked_for_beside_its_file(write, tmp_path, monkeypatch):
+    (tmp_path / "common").mkdir()
+    (tmp_path / "common/seed.yaml").write_text("base: turbogs\ntrain: {seed: 7}\n")
+    file = write("base: common/seed.yaml\nmaps: {beta: 0.9}\n")
+    elsewhere = tmp_path / "elsewhere"
+    (elsewhere / "common").mkdir(parents=True)
+    (elsewhere / "common/seed.yaml").write_text("base: turbogs\ntrain: {seed: 8}\n")
+    monkeypatch.chdir(elsewhere)
+    config = load_config(file)
+    assert (config.train.seed, config.maps.beta) == (7, 0.9)
+    with pytest.raises(InputError, match="unknown config 'turbgos': did you mean 'turbogs'"):
+        load_config(write("base: turbgos\n"))
+
+
+@pytest.mark.parametrize("text", ["runs/try #2/model.ply", "#2/model.ply", "'runs/try #2/model.ply'"])
+def test_an_override_is_taken_whole(text):
+    assert apply_overrides({}, [f"train.init={text}"]) == {"train": {"init": text.strip("'")}}
+
+
 def test_a_circle_of_bases_is_refused(write, tmp_path):
     file = write(f"base: {tmp_path / 'mine.yaml'}\n")
     with pytest.raises(InputError, match="circle"):

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from turbogs_plugin.commands.options import GivenOptions
 from turbogs_plugin.engine.rendering import render_image
 from turbogs_plugin.export import film
 from turbogs_plugin.export.contribution import contributions, pruned
@@ -89,6 +90,12 @@ def test_a_model_is_measured_as_an_evaluation_does(model, scene, transparent):
     assert found == pytest.approx([view.psnr for view in evaluate(faint, views, look).views], abs=1e-4)
     black = Fidelity(faint, views, replace(look, background=BLACK)).psnr(faint)
     assert min(abs(a - b) for a, b in zip(found, black, strict=True)) > 0.1
+
+
+def test_a_given_model_has_the_background_of_its_photos(capture):
+    """As a run on them: a configuration without a plan would have black."""
+    assert GivenOptions(scene=capture).settings(()).train.background == "auto"
+    assert GivenOptions(scene=capture).settings(("train.background=white",)).train.background == "white"
 
 
 def test_a_run_whose_capture_is_gone_is_exported_unmeasured(turbogs, finished, capture, tmp_path):

@@ -128,6 +128,13 @@ def test_an_export_has_fewer_properties_and_reads_back(turbogs, finished, tmp_pa
     assert (tmp_path / "0.ply").stat().st_size < (tmp_path / "24.ply").stat().st_size
 
 
+def test_an_export_never_takes_the_place_of_the_runs_model(turbogs, finished):
+    before = (finished / "model.ply").read_bytes()
+    code, out, err = turbogs("export", finished, "--drop-bands", "0.5")
+    assert code == 2 and out == "" and "--drop-bands would take the place of the run's own model.ply" in err
+    assert (finished / "model.ply").read_bytes() == before
+
+
 def test_an_export_refuses_a_threshold_out_of_range(turbogs, finished, tmp_path):
     code, out, err = turbogs("export", finished, "--out", tmp_path / "a.ply", "--drop-bands", "1.5")
     assert code == 2 and out == "" and "--drop-bands 1.5" in err and not (tmp_path / "a.ply").exists()

@@ -535,6 +535,23 @@ def test_runs_of_any_length_have_as_many_final_prunings(base, refine_until, ever
         assert len(at) == prunings and total - at[-1] >= interval / 2, total
 
 
+def test_a_run_that_becomes_shorter_ends_at_its_cap():
+    """A time budget may leave no room for a final pruning that growth counted on."""
+    gaussians = make_gaussians(120, dtype=torch.float32)
+    density, counts = controlled(gaussians, max_gaussians=100, **QUIET), {}
+    for iteration, total in ((3500, 5000), (4000, 5000), (4050, 4700), (4100, 4700), (4200, 4700)):
+        if density.stats is not None:
+            fill(density.stats, random_stats(len(gaussians), iteration, seen=1.0))
+        step = Step(iteration, total, 3500)
+        due, update = density.event_due(step), density.update(gaussians, step)
+        if update is not None:
+            assert due
+            gaussians = update.apply(gaussians)
+            density.apply(update)
+        counts[iteration] = len(gaussians)
+    assert counts == {3500: 110, 4000: 105, 4050: 105, 4100: 100, 4200: 100} and density.stats is None
+
+
 def test_growth_goes_beyond_the_cap_by_what_final_prunings_remove():
     """To the room that they leave, and down again by worth, to the cap itself."""
     gaussians = make_gaussians(40, dtype=torch.float32)

@@ -56,8 +56,24 @@ def test_the_one_just_written_stays_beside_leftovers_of_a_later_iteration(tmp_pa
     assert_newest(tmp_path, 6.0)
 
 
+def test_after_a_step_back_those_of_later_iterations_go_first(tmp_path):
+    """The later one was given up, as its file was damaged: it must not outlive the good one."""
+    for iteration in (1000, 2000):
+        save_checkpoint(tmp_path, iteration, state(iteration))
+    (tmp_path / "latest").write_text("iteration-001000.pt")
+    save_checkpoint(tmp_path, 1500, state(1500))
+    assert {file.name for file in tmp_path.glob("*.pt")} == {"iteration-001000.pt", "iteration-001500.pt"}
+
+
 def test_no_checkpoint_is_none(tmp_path):
-    assert latest_checkpoint(tmp_path) is None
+    assert latest_checkpoint(tmp_path) is None and latest_checkpoint(tmp_path / "absent") is None
+
+
+def test_without_latest_the_newest_is_taken(tmp_path):
+    for iteration in (5, 10):
+        save_checkpoint(tmp_path, iteration, state(iteration))
+    (tmp_path / "latest").unlink()
+    assert latest_checkpoint(tmp_path).name == "iteration-000010.pt"
 
 
 class DiskFull:

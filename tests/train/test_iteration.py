@@ -89,7 +89,8 @@ def test_iterations_before_a_change_of_the_set_are_not_made_again(scene):
 @pytest.mark.parametrize("sampler", ["random", "geometry_aware"])
 def test_lost_iterations_are_made_again_with_the_same_views(scene, sampler):
     """Those that take much memory are lost, so they would be seen less often."""
-    trainer = make_trainer(scene, f"view_sampler.type={sampler}", "schedule.max_views=2", "schedule.min_views=2")
+    views = (f"view_sampler.type={sampler}", "schedule.max_views=2", "schedule.min_views=2")
+    trainer = make_trainer(scene, *views, "train.average_last=1")
     trainer.initialise_maps()
     seen: list[tuple[int, tuple[int, ...]]] = []
     trainer.observer = SimpleNamespace(
@@ -107,6 +108,7 @@ def test_lost_iterations_are_made_again_with_the_same_views(scene, sampler):
     for iteration in (2, 3, 4, 5):
         first, again = (views for number, views in seen if number == iteration)
         assert first == again
+    assert trainer.parameter_mean.count == 1, "the fourth iteration was made twice and counts once"
 
 
 def test_an_evaluation_measures_what_a_screen_shows(scene):

@@ -127,6 +127,19 @@ def test_a_run_that_became_longer_begins_its_mean_anew():
     assert not mean.due(97, 200) and mean.count == 0
 
 
+def test_iterations_that_are_made_again_count_once():
+    mean, wanted = ParameterMean(0.5, tensors(0.0)), ParameterMean(0.5, tensors(0.0))
+    for value in (1.0, 3.0, 3.0, 3.0):  # iterations 8, 12, 16, 20; from the second on nothing changed
+        mean.add(tensors(value))
+    mean.take_back(tensors(3.0), 13, 20, 20)
+    for value in (1.0, 3.0):
+        wanted.add(tensors(value))
+    assert mean.count == wanted.count == 2
+    torch.testing.assert_close(dict(mean.tensors), dict(wanted.tensors))
+    mean.take_back(tensors(3.0), 1, 20, 20)
+    assert mean.count == 0
+
+
 def test_thousands_of_equal_models_have_themselves_as_mean():
     mean, model = ParameterMean(1.0, tensors(0.0)), {"means": torch.randn(50, 3) * torch.logspace(-30, 30, 50)[:, None]}
     for _ in range(3000):

@@ -65,6 +65,8 @@ class RunOptions:
         budget = budget_overrides(self.max_memory, self.time_budget)
         if self.max_gaussians is not None and self.max_gaussians < 1:
             raise InputError(f"--max-gaussians {self.max_gaussians}: it must be at least 1; leave it out for no limit")
+        if self.factor is not None and self.factor < 1:
+            raise InputError(f"--factor {self.factor}: it must be at least 1; leave it out for whole photos")
         if any(override.partition("=")[0].strip() == "scene.path" for override in overrides):
             raise InputError(f"scene.path is '{scene}', as SCENE says: leave the override out")
         asked = DEFAULT_CONFIG if self.config is None else self.config, (*overrides, *budget)
@@ -107,7 +109,10 @@ class GivenOptions:
             if overrides or self.factor is not None:
                 raise InputError("a run goes by its own configuration: --factor and overrides need --scene SCENE")
             return None
-        return RunOptions(factor=self.factor).settings(self.scene, overrides).without_plan()
+        asked = RunOptions(factor=self.factor).settings(self.scene, overrides)
+        decided = asked.without_plan()
+        decided.train.background = asked.train.background  # auto goes by the photos, as in a run
+        return decided
 
 
 Given = Annotated[GivenOptions, arg(name="")]

@@ -3,13 +3,16 @@
 A YAML has one section a part. Sections of our own (`scene`, `train`, `maps`, `raster`, `report`, `budget`) hold the
 fields of a dataclass of `turbogs_plugin.config.sections`; a section of a strategy holds its ``type`` and the fields of
 that strategy's dataclass. Defaults live in those dataclasses and nowhere else. ``base: NAME_OR_FILE`` puts a YAML on
-top of another. Some settings may be ``auto`` (`turbogs_plugin.config.auto`): the plan of a run decides them.
+top of another; a file is looked for beside it. Some settings may be ``auto`` (`turbogs_plugin.config.auto`): the plan
+of a run decides them.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, is_dataclass
+from pathlib import Path
 from typing import Any, get_type_hints
 
 from omegaconf import OmegaConf
@@ -201,8 +204,9 @@ def apply_overrides(mapping: Mapping[str, Any], overrides: Sequence[str]) -> dic
             raise InputError(f"override '{override}' is not of the form section.key=value")
         if not text.strip():
             raise InputError(f"override '{override}' lacks a value: write one behind the =, or null for none")
-        # A colour as #336699 would be a comment of YAML.
-        parsed = {"value": text} if text.startswith("#") else parse_yaml(f"value: {text}", f"override '{override}'")
+        # A colour as #336699 or a path as "try #2" would be a comment of YAML, or end in one.
+        plain = re.search(r"(^|\s)#", text) and text.lstrip()[0] not in "'\"[{"
+        parsed = {"value": text} if plain else parse_yaml(f"value: {text}", f"override '{override}'")
         if set(parsed) != {"value"}:
             raise InputError(f"override '{override}' has more than one value")
         nested = parsed["value"]
@@ -220,7 +224,16 @@ def _load_mapping(name_or_file: str, depth: int = 0, packaged: bool = True) -> d
         raise InputError(f"config '{name_or_file}': its bases form a circle")
     mapping = read_named_yaml(name_or_file, PACKAGE, "config")
     base = mapping.pop("base", None)
-    return mapping if base is None else _merge(_load_mapping(str(base), depth + 1, packaged), mapping)
+    if base is None:
+        return mapping
+    return _merge(_load_mapping(named_beside(str(base), name_or_file), depth + 1, packaged), mapping)
+
+
+def named_beside(name: str, file: str) -> str:
+    """What a name in a YAML file means: a packaged configuration, or a file by its place beside that one."""
+    path = Path(file).parent / name
+    is_file = path.suffix in (".yaml", ".yml") or path.is_file()
+    return str(path) if is_file and name not in config_names() else name
 
 
 def _merge(under: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:

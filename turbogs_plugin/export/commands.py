@@ -87,8 +87,9 @@ def export_run(
             raise InputError(f"--out '{out}': --format {file_format} needs a name that ends in .{ending}")
     if given is not None and out is None:
         raise InputError(f"'{path}' has no run's folder to export into: name a new file by --out")
-    if max_gaussians is not None and out is None and file_format == "ply":
-        raise InputError("--max-gaussians would take the place of the run's own model.ply: name a new file by --out")
+    changed = "--max-gaussians" if max_gaussians is not None else "--drop-bands" if drop_bands is not None else ""
+    if changed and out is None and file_format == "ply":
+        raise InputError(f"{changed} would take the place of the run's own model.ply: name a new file by --out")
     needed = max_gaussians is not None or file_format == PAGE
     model, scene, absent = load_with_capture(path, given, resolve_device("auto"), needed)
     gaussians = whole = model.gaussians

@@ -66,6 +66,9 @@ def save_checkpoint(folder: Path, iteration: int, state: dict[str, Any]) -> Path
     for leftover in folder.glob(".iteration-*.part"):  # from a killed process
         leftover.unlink(missing_ok=True)
     others = _others(folder, path.name)
+    others.sort(
+        key=lambda file: _iteration(file) < iteration
+    )  # first those of a later one, which a resume went back from
     for old in others[: len(others) - (KEPT - 1)]:
         old.unlink(missing_ok=True)
     return path
@@ -74,7 +77,11 @@ def save_checkpoint(folder: Path, iteration: int, state: dict[str, Any]) -> Path
 def _others(folder: Path, name: str) -> list[Path]:
     """The checkpoints beside the one of this name, by iteration."""
     found = [file for file in folder.iterdir() if _NAME.fullmatch(file.name) and file.name != name]
-    return sorted(found, key=lambda file: int(_NAME.fullmatch(file.name)[1]))
+    return sorted(found, key=_iteration)
+
+
+def _iteration(file: Path) -> int:
+    return int(_NAME.fullmatch(file.name)[1])
 
 
 def _remedy(folder: Path, name: str) -> str:
@@ -92,7 +99,8 @@ def latest_checkpoint(folder: Path) -> Path | None:
     """
     text = read_text(folder / "latest")
     if text is None:
-        return None
+        complete = _others(folder, "") if folder.is_dir() else []
+        return complete[-1] if complete else None  # killed before the first `latest`, or that was not copied
     name = text.strip()
     if not _NAME.fullmatch(name) or not (folder / name).is_file():
         said = f"'{folder / 'latest'}' names no checkpoint of its folder: '{name[:60]}'"

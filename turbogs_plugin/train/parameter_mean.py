@@ -44,7 +44,7 @@ class ParameterMean:
         if iteration < (1.0 - self.share) * total:
             self.restart()
             return False
-        return iteration % AVERAGE_EVERY == 0 or iteration == total
+        return self._counts(iteration, total)
 
     def add(self, tensors: Mapping[str, Tensor]) -> None:
         """Add those of one more iteration. They are copied. Where there are more or fewer rows, it begins anew."""
@@ -56,6 +56,24 @@ class ParameterMean:
             for name, mean in self.tensors.items():
                 mean.lerp_(tensors[name].detach(), 1.0 / (self.count + 1))
         self.count += 1
+
+    def take_back(self, tensors: Mapping[str, Tensor], first: int, last: int, total: int) -> None:
+        """Take iterations `first` to `last` of `total` out again, which are made once more.
+
+        Args:
+            tensors: those of each of these iterations, as they changed nothing.
+        """
+        times = sum(self._counts(iteration, total) for iteration in range(first, last + 1))
+        if times >= self.count:
+            self.restart()
+        elif times:
+            for name, mean in self.tensors.items():
+                mean.lerp_(tensors[name].detach(), -times / (self.count - times))
+            self.count -= times
+
+    def _counts(self, iteration: int, total: int) -> bool:
+        late = iteration >= (1.0 - self.share) * total
+        return late and (iteration % AVERAGE_EVERY == 0 or iteration == total)
 
     def restart(self) -> None:
         """Begin anew: from here on the parameters are of other Gaussians."""

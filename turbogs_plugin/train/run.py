@@ -6,7 +6,7 @@ import math
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -301,10 +301,10 @@ class RunSession(Listener):
             self.folder.wall.unlink(missing_ok=True)  # so that a killed process leaves none: it is not counted as 0
         self.clock.mark("initial model")
         try:
-            progress = TrainingProgress(trainer.iterations, trainer.iteration)
-            with Interrupts(loop.stop) as interrupts, progress:
+            shown = TrainingProgress(trainer.iterations, trainer.iteration) if ranks.first else nullcontext()
+            with Interrupts(loop.stop) as interrupts, shown:
                 # First the session, so that its marks tell apart what the others do.
-                loop.listeners = [self, self.evaluations, progress] if ranks.first else [self]
+                loop.listeners = [self, self.evaluations, shown] if ranks.first else [self]
                 loop.listeners += [listener_of(self) for listener_of in watch if ranks.first]
                 loop.run(self.resumed)
                 self.clock.mark("training")

@@ -74,9 +74,9 @@ def require_memory(config: Config, train_sizes: np.ndarray, test_sizes: np.ndarr
     if limit is None:
         return
     mapping = config.to_mapping()
-    for name, least in (("sh_degree", 0), ("maps_place", "host"), ("photos_place", "host")):
+    for name in ("maps_place", "photos_place"):
         if mapping["train"][name] == AUTO:
-            mapping["train"][name] = least
+            mapping["train"][name] = "host"
     MemoryDemand.of(resolve(mapping).without_plan(), train_sizes, test_sizes).gaussians(limit)
 
 
@@ -120,7 +120,7 @@ def open_scene(config: Config, folder: RunFolder | None = None, training: bool =
             f"in {folder.config}"
         )
     sized = partial(require_memory, config) if training else None
-    return read_scene(settings.path, config, LoadingProgress(), sized, ranks=ranks)
+    return read_scene(settings.path, config, LoadingProgress() if ranks.first else None, sized, ranks=ranks)
 
 
 def read_scene(path: str | Path, config: Config, *options: Any, ranks: Ranks = ONE) -> Scene:

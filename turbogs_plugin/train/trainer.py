@@ -282,8 +282,10 @@ class Trainer:
             InputError: an iteration has more intersections of a tile and a splat than a pass can have.
         """
         lost = self.exchange.settle(self.engine, wait)
-        earliest = min(self.first_repeatable, self.iteration)
+        earliest, last = min(self.first_repeatable, self.iteration), self.iteration
         self.iteration = max(self.iteration - lost, earliest)
+        if lost and self.parameter_mean is not None:
+            self.parameter_mean.take_back(self.learnt(), self.iteration + 1, last, self.iterations)
         while lost and self._before_views and self._before_views[-1][0] >= self.iteration:
             _, state = self._before_views.pop()
             self.view_sampler.load_state_dict(state)
