@@ -16,7 +16,7 @@ from turbogs_plugin.engine.layout import UNITS
 from turbogs_plugin.engine.rules import DrawRule
 from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.errors import InputError, require
-from turbogs_plugin.tiles import dense_pixels
+from turbogs_plugin.tiles import TILE_PIXELS, dense_pixels
 from turbogs_plugin.types import PixelSamples, Step
 
 ViewIds = Sequence[int] | int | np.ndarray | Tensor
@@ -69,6 +69,11 @@ class RulePixelSampler:
         return engine_of(maps.errors.device).draw(self.rule, maps, view_numbers(view_ids, maps), rate, step)
 
 
+def _require_divisor(multiple: int) -> None:
+    divides = multiple >= 1 and TILE_PIXELS % multiple == 0
+    require(divides, "multiple", multiple, f"a divisor of {TILE_PIXELS}, the pixels of a tile")
+
+
 @dataclass
 class ErrorGuidedPixelSampler(RulePixelSampler):
     """The paper's sampler: hard units by error, stable ones by age, the rest by both (`engine.reference.draws`).
@@ -81,6 +86,8 @@ class ErrorGuidedPixelSampler(RulePixelSampler):
             elsewhere in each iteration: `DrawRule.origin`).
         importance: exponent a of the importance weights p^-a, p the probability that a unit is drawn: 0 none, as in the
             paper's runs; 1 unbiased (exactly so for a draw of a single stage).
+        multiple: of unit `pixel`: a tile gets the nearest multiple of so many. Our rasterizer takes 32 samples at once,
+            and 33 in the time of 64. 1: the paper's number, rounded down.
     """
 
     hard_ratio: float = 0.4
@@ -88,6 +95,7 @@ class ErrorGuidedPixelSampler(RulePixelSampler):
     mixed: str = "error_age"
     unit: str = "pixel"
     importance: float = 0.0
+    multiple: int = 1
 
     def __post_init__(self) -> None:
         require(0 <= self.hard_ratio <= 1, "hard_ratio", self.hard_ratio, "between 0 and 1")
@@ -96,10 +104,12 @@ class ErrorGuidedPixelSampler(RulePixelSampler):
         require(self.mixed in ("error_age", "uniform"), "mixed", self.mixed, "error_age or uniform")
         require(self.unit in UNITS, "unit", self.unit, f"one of {', '.join(UNITS)}")
         require(0 <= self.importance <= 1, "importance", self.importance, "between 0 and 1")
+        _require_divisor(self.multiple)
 
     @property
     def rule(self) -> DrawRule:
-        return DrawRule(self.unit, self.hard_ratio, self.stable_ratio, self.mixed == "uniform", self.importance)
+        stages = (self.hard_ratio, self.stable_ratio, self.mixed == "uniform")
+        return DrawRule(self.unit, *stages, self.importance, self.multiple)
 
 
 @dataclass
@@ -107,18 +117,20 @@ class RandomPixelSampler(RulePixelSampler):
     """Uniformly random units of each tile (or tiles of each view), without replacement.
 
     Args:
-        unit: as in `ErrorGuidedPixelSampler`.
+        unit, multiple: as in `ErrorGuidedPixelSampler`.
     """
 
     unit: str = "pixel"
+    multiple: int = 1
 
     def __post_init__(self) -> None:
         require(self.unit in UNITS, "unit", self.unit, f"one of {', '.join(UNITS)}")
+        _require_divisor(self.multiple)
 
     @property
     def rule(self) -> DrawRule:
         """One stage, which ignores the maps."""
-        return DrawRule(self.unit, hard=0.0, stable=0.0, mixed_uniform=True, importance=0.0)
+        return DrawRule(self.unit, 0.0, 0.0, mixed_uniform=True, importance=0.0, multiple=self.multiple)
 
 
 @dataclass

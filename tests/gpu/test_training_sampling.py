@@ -80,6 +80,12 @@ def test_equal_sets(unit, rate, hard, stable, uniform):
         assert_equal_samples(*draw_both(errors, stamps, views, rate, rule, 2**40 + 5, iteration))
 
 
+@pytest.mark.parametrize("rate", [0.01, 0.18, 0.33])
+def test_equal_sets_in_multiples(rate):
+    rule = DrawRule("pixel", 0.4, 0.3, False, 0.0, multiple=32)
+    assert_equal_samples(*draw_both(*random_maps(), (3, 1, 0, 2), rate, rule, 2**40 + 5, 7))
+
+
 @pytest.mark.parametrize("iteration", range(4))
 def test_equal_sets_of_many_tiles(iteration):
     """So many that in about a hundred of them the approximate keys leave the set in doubt."""

@@ -11,6 +11,7 @@ from turbogs_plugin.config.units import parse_bytes
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.plan.caps import FEWEST_GAUSSIANS, cap_of, growth_room, lowered_cap, with_cap, without_growth
 from turbogs_plugin.plan.memory import MemoryDemand
+from turbogs_plugin.plan.pixels import most_images
 
 
 @pytest.mark.parametrize("kind", ["error_driven", "mcmc", "none"])
@@ -102,3 +103,17 @@ def test_too_little_memory_says_how_much_would_do():
         memory.gaussians(2**31)
     wanted = parse_bytes(str(refused.value).split(" take ")[1].split(" here")[0])
     assert memory.gaussians(wanted) >= FEWEST_GAUSSIANS
+
+
+@pytest.mark.parametrize(
+    ("changes", "images"),
+    [
+        ((), 1.0),
+        (("pixel_sampler.multiple=32",), 1.25),  # ten views with 32 pixels of a tile for 25.6, or five with 64 for 51.2
+        (("pixel_sampler.multiple=32", "schedule.pixel_budget=0.5"), 1.25),
+        (("pixel_sampler.multiple=32", "pixel_sampler.unit=tile"), 1.0),
+        (("pixel_sampler.type=random", "pixel_sampler.multiple=256"), 10.0),
+    ],
+)
+def test_memory_is_for_the_most_pixels_of_an_iteration(changes, images):
+    assert most_images(load_config("turbogs", changes), num_views=65) == images

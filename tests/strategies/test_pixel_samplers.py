@@ -91,6 +91,23 @@ def test_counts_of_pixels(rate, wanted):
     assert samples.filled.all()
 
 
+@pytest.mark.parametrize(("rate", "wanted"), [(1e-6, 32), (0.1, 32), (0.18, 32), (0.19, 64), (1 / 3, 96), (1.0, 256)])
+@pytest.mark.parametrize("sampler", [ErrorGuidedPixelSampler, RandomPixelSampler])
+def test_counts_of_pixels_in_multiples(sampler, rate, wanted):
+    samples = sampler(multiple=32).sample(random_maps(), (0, 2), rate, step(1))
+    extents = [256, 256, 5 * 16, 16 * 5, 16 * 5, 5 * 5, 1]
+    assert [len(pixels) for pixels in pixels_by_tile(samples).values()] == [min(wanted, n) for n in extents]
+
+
+def test_multiples_are_of_single_pixels_and_fill_a_tile():
+    for unit in ("cell", "tile"):
+        plain, whole = (ErrorGuidedPixelSampler(unit=unit, multiple=multiple).rule for multiple in (1, 32))
+        assert plain.wanted(0.3, 16) == whole.wanted(0.3, 16)
+    for multiple in (0, 24, 512):
+        with pytest.raises(InputError, match=r"multiple = .* a divisor of 256"):
+            RandomPixelSampler(multiple=multiple)
+
+
 @pytest.mark.parametrize(("rate", "wanted"), [(1e-6, 1), (0.1, 2), (1 / 3, 5), (1.0, 16)])
 def test_counts_of_cells(rate, wanted):
     samples = ErrorGuidedPixelSampler(unit="cell").sample(random_maps(), (4, 0), rate, step(1))

@@ -32,6 +32,7 @@ class DrawRule:
         hard, stable: shares of the units drawn by error and by age; the mixed stage draws the rest.
         mixed_uniform: the mixed stage ignores error and age.
         importance: a of the weights ``p^-a``; 0 for no weights.
+        multiple: of unit ``pixel``: N_pix is the nearest multiple of this, which divides a tile's 256 pixels.
     """
 
     unit: str
@@ -39,14 +40,17 @@ class DrawRule:
     stable: float
     mixed_uniform: bool
     importance: float
+    multiple: int = 1
 
     def wanted(self, rate: float, units: int) -> int:
         """How many of `units` to draw: ``max(1, floor(rate * units))``, the paper's N_pix for the 256 pixels of a tile.
 
-        For the 16 cells of a tile it is the nearest number: rounding down would lose up to half of a small budget.
+        For the 16 cells of a tile, and with `multiple`, it is the nearest number: rounding down would lose up to half
+        of a small budget.
         """
-        slack = 0.5 if self.unit == "cell" else 0.0
-        return min(units, max(1, math.floor(rate * units + slack)))
+        step = self.multiple if self.unit == "pixel" else 1
+        slack = 0.5 if self.unit == "cell" or step > 1 else 0.0
+        return min(units, step * max(1, math.floor(rate * units / step + slack)))
 
     def origin(self, iteration: int, masked: bool) -> tuple[int, int]:
         """Of the grid of tiles in an iteration, see `TileGrid`.

@@ -22,7 +22,7 @@ from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.error_maps import MAP_BYTES
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.plan.caps import FEWEST_GAUSSIANS
-from turbogs_plugin.plan.pixels import images_per_iteration, most_views
+from turbogs_plugin.plan.pixels import most_images, most_views
 from turbogs_plugin.scene.offload import SETS
 from turbogs_plugin.scene.photos import PHOTO_BYTES
 
@@ -65,7 +65,7 @@ class MemoryDemand:
         window = SETS * views * largest
         photos = window + SETS * largest if config.train.photos_place == "host" else pixels + test_pixels
         maps = window if config.train.maps_place == "host" else pixels
-        samples = math.ceil(images_per_iteration(config, num_views) * largest)
+        samples = math.ceil(most_images(config, num_views) * largest)
         bands = (config.train.sh_degree + 1) ** 2 - 1
         numbers = 14 + 3 * bands
         return cls(

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable
 
 from turbogs_plugin.config.configuration import Config
+from turbogs_plugin.tiles import TILE_PIXELS
 
 WHOLE_VIEWS = ("dense",)
 """Pixel samplers that take every pixel of a view, whatever the rate: to these, lambda says nothing."""
@@ -27,6 +28,16 @@ def images_per_iteration(config: Config, num_views: int) -> float:
     if config.pixel_sampler["type"] in WHOLE_VIEWS:
         return views
     return min(views, config.schedule.get("pixel_budget", views))
+
+
+def most_images(config: Config, num_views: int) -> float:
+    """`images_per_iteration`, where pixels of a tile are drawn in multiples: at the K that makes the most of it."""
+    images, views = images_per_iteration(config, num_views), most_views(config, num_views)
+    share = config.pixel_sampler.get("multiple", 1) / TILE_PIXELS
+    if share == 1 / TILE_PIXELS or config.pixel_sampler["unit"] != "pixel":
+        return images
+    fewest = min(views, config.schedule.get("min_views", views))
+    return max(count * share * max(1, round(images / count / share)) for count in range(fewest, views + 1))
 
 
 def pixel_budget_range(config: Config, num_views: int) -> tuple[float, float]:
