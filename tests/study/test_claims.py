@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import multiprocessing
 import os
@@ -16,10 +17,16 @@ from helpers.processes import PRELOADED, comes_true
 from turbogs_plugin import cli
 from turbogs_plugin.commands import studies
 from turbogs_plugin.errors import InputError
+from turbogs_plugin.report.provenance import provenance
 from turbogs_plugin.study import claims as claims_module
+from turbogs_plugin.study import sweep
 from turbogs_plugin.study.claims import STALE_SECONDS, Claims
 from turbogs_plugin.study.folder import StudyFolder
-from turbogs_plugin.study.grid import CellKey
+from turbogs_plugin.study.grid import Ablation, CellKey, load_ablation
+from turbogs_plugin.study.results import CellResult, Failure, Study
+from turbogs_plugin.study.results_file import study_from_json
+from turbogs_plugin.study.sweep import SweepOptions
+from turbogs_plugin.train.history import Evaluation
 
 pytestmark = pytest.mark.usefixtures("plotted")
 
@@ -128,14 +135,59 @@ def test_two_workers_train_each_cell_once(tmp_path, monkeypatch, capfd):
         assert (end.value.code or 0) == code, told.err
         return told.out, told.err
 
+    failed, folder = CellKey(capture.name, "random", 1), StudyFolder(tmp_path / "study")
+    folder.write_study(Study(load_ablation(str(tmp_path / "shared.yaml")), []))
+    folder.write(Failure(failed, "broken by an earlier call"))
     assert "with 4 cells left" in told_by(3, "--within", "0.001s")[0]
     told = told_by(0)[1]
-    study = StudyFolder(tmp_path / "study").read_study()
+    study = folder.read_study()
     assert len(study.results) == 4 and not study.failures
     trained = [line for line in told.splitlines() if " dB in " in line]
     assert len(trained) == 4 == len({line.partition("] ")[2].partition(":")[0] for line in trained})
     assert (tmp_path / "study/report.md").is_file()
     assert not [path for path in (tmp_path / "study/claims").rglob("*") if path.is_file()]
+
+
+@pytest.mark.parametrize("shared", [False, True], ids=["to-be-trained", "of-a-sibling"])
+def test_a_cell_that_ends_elsewhere_while_photos_are_read_is_kept(capture, tmp_path, monkeypatch, shared):
+    """It is not trained again, nor replaced by that of a sibling study. Each training takes a second more."""
+    folder, sibling, seconds = StudyFolder(tmp_path / "study"), StudyFolder(tmp_path / "sibling"), itertools.count(1.0)
+    load_and_find = sweep.load_and_find
+
+    def train_cell(variant, config, scene, device, here, *more) -> CellResult:
+        asked, where = config.to_mapping(), {"scene": scene.name, "capture": more[-1], "provenance": here}
+        history = [Evaluation(4, next(seconds), 30.0, 0.8, 0.1, 100)]
+        return CellResult(**where, variant=variant, seed=0, config=asked, asked=asked, history=history)
+
+    def swept(folder: StudyFolder, *siblings: StudyFolder) -> int:
+        ablation, options = Ablation("Shared", {"full": []}), SweepOptions([capture], device="cpu", steps=4)
+        return sweep.run_sweep(ablation, ["full"], options, provenance("cpu"), folder, siblings)
+
+    def load(*arguments):
+        monkeypatch.setattr(sweep, "load_and_find", load_and_find)
+        swept(folder)  # the other process
+        folder.write_study(folder.read_study())  # with its report
+        return load_and_find(*arguments)
+
+    monkeypatch.setattr(sweep, "train_cell", train_cell)
+    siblings = [sibling] if shared else []
+    for other in siblings:
+        swept(other)
+    monkeypatch.setattr(sweep, "load_and_find", load)
+    assert swept(folder, *siblings) == 0
+    for study in (study_from_json(folder.file), folder.read_study()):
+        assert [result.final.train_seconds for result in study.results] == [2.0 if shared else 1.0]
+    assert next(seconds) == (3.0 if shared else 2.0)
+
+
+def test_failures_since_the_beginning_are_not_left_to_be_tried(tmp_path):
+    folder, options = StudyFolder(tmp_path), SweepOptions([Path("fox")], seeds=[0, 1, 2])
+    old, new, _ = keys = [CellKey("fox", "full", seed) for seed in options.seeds]
+    folder.write_study(Study(Ablation("Three", {"full": []}), []))
+    folder.write(Failure(old, "broken by an earlier call"))
+    before = sweep.written_before(options, ["full"], folder)
+    folder.write(Failure(new, "broken"))
+    assert list(before) == keys and sweep.cells_left(before, folder) == 2
 
 
 def test_a_cell_that_another_process_trains_is_waited_for(tmp_path, monkeypatch, turbogs):

@@ -14,7 +14,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from helpers.framework_runs import TINY, tiny_capture
+from helpers.framework_runs import TINY, stop_after, tiny_capture
+from helpers.refusals import assert_refused
 from helpers.simulated_time import SimulatedTime
 
 from turbogs_plugin import cli
@@ -39,7 +40,7 @@ from turbogs_plugin.study.sweep import SweepOptions
 from turbogs_plugin.train.folder import RunFolder
 from turbogs_plugin.train.history import Evaluation, append_evaluation, read_history
 from turbogs_plugin.train.loop import Listener, TrainingLoop
-from turbogs_plugin.train.run import train
+from turbogs_plugin.train.run import resume, train
 from turbogs_plugin.train.trainer import Trainer
 from turbogs_plugin.train.wall import WallRecord
 
@@ -184,11 +185,10 @@ def test_a_cell_of_other_settings_is_not_mixed_in(turbogs, small, capture, study
     changed.insert(2, "loss.ncc_weight=0.1")
     code, _, err = turbogs(*changed)
     assert code == 2 and "other settings (loss)" in err
-    changed[2] = "budget.time=1s"
-    code, _, err = turbogs(*changed)
-    assert code == 2 and "other settings (budget)" in err
-    code, _, err = turbogs(*changed, "--time-budget", "1s")
-    assert code == 2 and "--steps 4 and --time-budget 1s exclude each other: leave one out" in err
+    del changed[2]
+    for budget in (["budget.time=1s"], ["--time-budget", "1s"]):
+        code, _, err = turbogs(*changed, *budget)
+        assert code == 2 and "--steps 4 and the time budget 1s exclude each other: leave one out" in err
     assert {path: path.read_bytes() for path in study.rglob("*") if path.is_file()} == before
 
 
@@ -463,8 +463,34 @@ def a_run(folder: Path, iterations: int, *overrides: str, fitted: Sequence[str] 
     (folder / "asked.yaml").write_text(load_config("turbogs", overrides).to_yaml())
     resolved = with_iterations(load_config("turbogs", [*overrides, *fitted]).without_plan(), iterations)
     (folder / "config.yaml").write_text(resolved.to_yaml())
-    append_evaluation(folder / "history.jsonl", Evaluation(iterations, 20.0, 30.0, 0.8, 0.1, 100, 2**20))
+    seconds = resolved.budget.seconds() or 20.0
+    append_evaluation(folder / "history.jsonl", Evaluation(iterations, seconds, 30.0, 0.8, 0.1, 100, 2**20))
     return folder
+
+
+@pytest.mark.parametrize(
+    ("settings", "at"),
+    [
+        ((), "iteration 7 of 14: "),
+        (("budget.time=3s",), r"1\.\d of 3 s: "),
+        (("train.evaluate_at=[0.5, 0.99]", "budget.time=3.12s"), r"1\.\d of 3\.12 s: "),  # a checkpoint tells its end
+    ],
+    ids=["iterations", "budget", "evaluated-shortly-before"],
+)
+def test_a_stopped_run_is_compared_once_it_has_gone_on_to_its_end(
+    machine, capture, tmp_path, monkeypatch, settings, at
+):
+    run = tmp_path / "run"
+    with monkeypatch.context() as patch:
+        stop_after(patch, 8)
+        train(load_config("turbogs", [*TINY, *settings, f"scene.path={capture}", "train.device=cpu"]), run)
+    (run / "model.ply").touch()  # as an export from its checkpoint leaves one
+    assert_refused(
+        f"/run' is not finished, its last evaluation is at {at}.*turbogs train --resume ", study_of_runs, [run]
+    )
+    resume(run)
+    (result,) = study_of_runs([run]).results
+    assert result.final.iteration > 8
 
 
 @pytest.mark.parametrize(
@@ -585,6 +611,10 @@ def test_the_bar_of_a_cell_has_the_planned_length(tmp_path, monkeypatch):
         ),
         (["ablate", "components", "--scene", "CAPTURE", "--out", "CAPTURE"], ["not empty"]),
         (["ablate", "--merge", "CAPTURE", "--out", "X"], ["holds no study"]),
+        *(
+            (["ablate", "--merge", "CAPTURE", "--out", "X", *ignored.split()], ["--merge trains nothing"])
+            for ignored in ("--steps 5", "--within 1s", "--gpus 0", "--seeds 3", "--device cpu")
+        ),
         (["compare", "CAPTURE", "--out", "X"], ["holds no run"]),
         (["report", "CAPTURE"], ["holds no study"]),
         (["report", "CAPTURE", "--psnr", "-1"], ["--psnr"]),

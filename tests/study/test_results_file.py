@@ -15,11 +15,14 @@ from turbogs_plugin.config.configuration import load_config
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.report.provenance import Provenance
 from turbogs_plugin.study.difference import common_configuration, difference, flattened, nested, restored
+from turbogs_plugin.study.document import Picture, to_markdown
 from turbogs_plugin.study.folder import StudyFolder
 from turbogs_plugin.study.grid import Ablation, CellKey
+from turbogs_plugin.study.pages import report_blocks
 from turbogs_plugin.study.results import CellResult, Failure, Study
 from turbogs_plugin.study.results_file import study_from_json, study_to_json
 from turbogs_plugin.study.statistics import crossing_gap
+from turbogs_plugin.study.summary import summarise
 from turbogs_plugin.train.history import Evaluation
 
 HERE = Provenance("a machine", {"torch": "2"}, "none", "abc")
@@ -277,3 +280,13 @@ def test_a_study_of_one_cell_says_all_of_it():
     text = study_to_json(Study(ABLATION, [result("other", 3)]))
     document = json.loads(text)
     assert document["config"]["train.seed"] == 3 and "config" not in document["cells"][0]
+
+
+def test_a_variant_that_shares_no_seed_with_the_baseline_is_not_compared():
+    apart = Study(ABLATION, [result("base", 0), result("other", 1)])
+    page = to_markdown("Apart", report_blocks(apart, summarise(apart)))
+    assert "| other |" in page and "nan" not in page
+
+
+def test_a_picture_of_a_capture_with_a_space_in_its_name_is_a_link_in_markdown():
+    assert Picture("my scene (2)-curves.png", "my scene").markdown() == "![my scene](my%20scene%20%282%29-curves.png)"

@@ -156,6 +156,14 @@ def test_a_variant_that_does_not_resolve_is_named():
         variant_config(ablation, "bad", 0, (), None)
 
 
+@pytest.mark.parametrize(("own", "of_all"), [(["budget.time=6s"], ()), ([], ("budget.time=6s",))])
+def test_a_number_of_steps_and_a_time_budget_exclude_each_other(own, of_all):
+    ablation = Ablation("x", {"timed": own})
+    assert variant_config(ablation, "timed", 0, of_all, None).budget.time == "6s"
+    with pytest.raises(InputError, match=r"variant 'timed': --steps 4 and the time budget 6s .*: leave one out"):
+        variant_config(ablation, "timed", 0, of_all, 4)
+
+
 def test_a_common_length_leaves_out_what_it_makes_a_copy():
     ablation = load_ablation("leave_out")
     alike = {"epochs-50": "nothing", "epochs-75": "nothing"}

@@ -64,7 +64,7 @@ def ablate(
     budget = budget_overrides(None, time_budget)
     overrides = (*(text for text in names if "=" in text), *budget)
     if merge:
-        if names or scene or only or budget:
+        if names or scene or only or seeds != (0,) or device != "auto" or {steps, time_budget, within, gpus} != {None}:
             raise InputError("--merge trains nothing: give it --out and --psnr alone")
         return commands.merge(merge, out, psnr)
     if not ablations or not scene:
@@ -73,8 +73,6 @@ def ablate(
         raise InputError("--only names variants of one ablation: give it one NAME_OR_FILE")
     if steps is not None:
         require_positive("--steps", (steps,))
-    if steps is not None and time_budget is not None:
-        raise InputError(f"--steps {steps} and --time-budget {time_budget} exclude each other: leave one out")
     require_one_length(DEFAULT_CONFIG, overrides)
     limit = None if within is None else read_amount("--within", within, parse_seconds)
     options = SweepOptions(scene, seeds, overrides, steps, device, limit, numbers("--gpus", gpus))

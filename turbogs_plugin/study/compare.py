@@ -5,18 +5,21 @@ from __future__ import annotations
 import itertools
 import math
 import re
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.config.sections import SceneConfig
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.files import unused_name
 from turbogs_plugin.study.difference import ABSENT, compared, difference
 from turbogs_plugin.study.grid import Ablation
 from turbogs_plugin.study.results import CellResult, Study
+from turbogs_plugin.train.finished import finished_text
 from turbogs_plugin.train.folder import RunFolder
-from turbogs_plugin.train.history import read_history
+from turbogs_plugin.train.history import Evaluation, read_history
 from turbogs_plugin.train.wall import WallRecord
 
 UNSHARED = ("scene.", "report.", "train.seed", "train.checkpoint_every", "train.evaluate_at")
@@ -30,7 +33,7 @@ def study_of_runs(paths: Sequence[Path]) -> Study:
     differs from machine to machine and from seed to seed.
 
     Raises:
-        InputError: no run there, one without an evaluation, or two of the same settings and seed.
+        InputError: no run there, one that is not finished, or two of the same settings and seed.
     """
     variants: dict[str, dict[str, Any]] = {}  # name -> what was asked for without the seed and the place
     results: list[CellResult] = []
@@ -41,6 +44,7 @@ def study_of_runs(paths: Sequence[Path]) -> Study:
         history = read_history(folder.history)
         if not history:
             raise InputError(f"'{path}' has no evaluation yet")
+        _require_finished(folder, config, history[-1])
         asked = folder.read_asked().to_mapping()
         shared = compared(asked, UNSHARED) | {"train.device": config.train.device}  # where it was trained
         folder_name = re.sub(r"[^A-Za-z0-9_+.-]", "-", path.resolve().name)[:40].lstrip("._-") or "run"
@@ -72,6 +76,28 @@ def study_of_runs(paths: Sequence[Path]) -> Study:
         for name, shared in variants.items()
     }
     return Study(Ablation(title=f"Comparison of {len(paths)} runs", variants=overrides, base=base), results)
+
+
+def _require_finished(folder: RunFolder, config: Config, last: Evaluation) -> None:
+    """Raise `InputError` where a run's last evaluation is not that of its end.
+
+    A time budget ends a run within half an iteration of it, after a number of iterations that only checkpoints tell.
+    These are large, and may be gone: they are read only where the last evaluation is nearer to the one that was to be
+    before it than to the end of the budget. A model alone says nothing, for an export of a stopped run leaves one, too.
+    """
+    seconds = config.budget.seconds()
+    if seconds is None:
+        finished = last.iteration >= config.train.iterations
+        at = f"iteration {last.iteration} of {config.train.iterations}"
+    else:
+        before = max((share for share in config.train.evaluate_at if share < 1.0), default=0.0)
+        finished = last.train_seconds > 0.5 * (before + 1.0) * seconds or finished_text(folder, reported=False) != ""
+        at = f"{last.train_seconds:.1f} of {seconds:g} s"
+    if not finished:
+        raise InputError(
+            f"'{folder.path}' is not finished, its last evaluation is at {at}: let it go on with  "
+            f"turbogs train --resume {shlex.quote(str(folder.path))}"
+        )
 
 
 def _scene_names(scenes: Sequence[SceneConfig]) -> list[str]:

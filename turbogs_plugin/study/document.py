@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
+from urllib.parse import quote
 
 from turbogs_plugin.report.tables import table
 
@@ -46,7 +47,7 @@ class Picture:
     text: str
 
     def markdown(self) -> str:
-        return f"![{self.text}]({self.file})"
+        return f"![{self.text}]({quote(self.file)})"  # the path of a link holds no space
 
     def html(self, folder: Path) -> str:
         data = base64.b64encode((folder / self.file).read_bytes()).decode("ascii")

@@ -142,4 +142,11 @@ def variant_config(ablation: Ablation, variant: str, seed: int, overrides: Seque
             f"variant '{variant}': budget.max_memory holds a whole process, which here trains all cells: "
             "leave it out, or limit density.max_gaussians"
         )
-    return config if steps is None else with_iterations(config, steps)
+    if steps is None:
+        return config
+    if config.budget.time:
+        raise InputError(
+            f"variant '{variant}': --steps {steps} and the time budget {config.budget.time} exclude each other: "
+            "leave one out"
+        )
+    return with_iterations(config, steps)

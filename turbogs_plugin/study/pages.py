@@ -177,8 +177,7 @@ def _scene(summary: SceneSummary) -> list[Block]:
     for target in summary.targets:
         reach_header += [f"s to {target:.1f} dB", f"ratio{against}"]
         for row, line in zip(summary.rows, reach_lines, strict=True):
-            ratio = row.ratio_to(target)
-            line += [_reach_text(row.seconds_to(target)), "" if math.isnan(ratio) else f"x {ratio:.2f}"]
+            line += [_reach_text(row.seconds_to(target)), _ratio_text(row.ratio_to(target))]
     blocks: list[Block] = [
         Heading(summary.scene),
         Table([head for head, _ in columns], [[cell(row) for _, cell in columns] for row in summary.rows]),
@@ -240,7 +239,7 @@ def _columns(summary: SceneSummary, against: str) -> list[tuple[str, Callable[[V
         ("seeds", lambda row: str(len(row.cells))),
         ("time in s", spread("seconds", 1)),
         *((head, spread(clock, 1, "-")) for clock, head in CLOCKS.items() if _has(summary, clock)),
-        (f"time{against}", unless_baseline(lambda row: f"x {row.ratio('seconds'):.2f}")),
+        (f"time{against}", unless_baseline(lambda row: _ratio_text(row.ratio("seconds")))),
         ("PSNR in dB", spread("psnr", 2)),
         (f"PSNR{against}", unless_baseline(lambda row: difference_text(row.difference("psnr"), 2))),
         ("worst view in dB", spread("worst_psnr", 2, "not recorded")),
@@ -262,6 +261,11 @@ def difference_text(difference: Difference, digits: int) -> str:
     if difference.clear is not None:
         text += f" ± {difference.standard_error:.{digits}f}"
     return f"{text} (clear)" if difference.clear else text
+
+
+def _ratio_text(ratio: float) -> str:
+    """``x 0.83``; empty where there is none."""
+    return "" if math.isnan(ratio) else f"x {ratio:.2f}"
 
 
 def _reach_text(seconds: Sequence[float]) -> str:

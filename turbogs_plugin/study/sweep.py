@@ -6,7 +6,7 @@ import itertools
 import json
 import time
 import traceback
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -120,8 +120,8 @@ def run_sweep(
     begun = time.monotonic() if begun is None else begun
     call = {"overrides": list(options.overrides), "steps": options.steps}
     folder.require_usable()
-    study = folder.read_study() if folder.file.is_file() else Study(ablation, [])
-    finished = {result.key: result for result in study.results}
+    before = written_before(options, variants, folder)  # first of all: a cell that ends after this has another time
+    finished = {result.key: result for result in _study_there(folder, ablation).results}
     for result in finished.values():
         if result.variant not in ablation.variants:
             raise InputError(f"'{folder.path}' has a cell of another ablation ({result.key}): choose a new --out")
@@ -157,12 +157,13 @@ def run_sweep(
                     f"the cell '{key}' has other photos or cameras than '{name}' has now: choose a new --out"
                 )
         del scene, prepared  # where no cell needs it: photos take room
-    folder.write_study(replace(study, ablation=ablation))
+    # What is there is read anew, for others may have ended cells while the photos were read.
+    folder.write_study(replace(_study_there(folder, ablation), ablation=ablation))
     for result in repeated:
-        folder.write(result)
+        if folder.written(result.key) == before[result.key]:
+            folder.write(result)
     wanted = len(options.scenes) * len(options.seeds) * len(variants)
     claims = Claims(folder.claims)
-    before = {cell.key: folder.written(cell.key) for cell in left}
     warm: set[tuple[str, str]] = set()  # variants and captures: a plan is of a capture
     with SweepProgress(len(left), wanted - len(left)) as progress:
         while left and not (options.within is not None and time.monotonic() - begun > options.within):
@@ -203,12 +204,22 @@ def run_sweep(
     return len(left)
 
 
-def cells_left(options: SweepOptions, variants: Sequence[str], folder: StudyFolder) -> int:
-    """How many of the cells asked for have neither a result nor a failure."""
-    study = folder.read_study()
-    there = {each.key for each in (*study.results, *study.failures)}
+def written_before(options: SweepOptions, variants: Sequence[str], folder: StudyFolder) -> dict[CellKey, int]:
+    """The cells asked for, and when the file of each was last written until now (`StudyFolder.written`)."""
     names = [path.resolve().name for path in options.scenes]
-    return sum(CellKey(*key) not in there for key in itertools.product(names, variants, options.seeds))
+    keys = itertools.starmap(CellKey, itertools.product(names, variants, options.seeds))
+    return {key: folder.written(key) for key in keys}
+
+
+def cells_left(before: Mapping[CellKey, int], folder: StudyFolder) -> int:
+    """How many of the cells of `written_before` have no result, and no failure since then: older ones are retried."""
+    finished = {result.key for result in folder.read_study().results}
+    return sum(key not in finished and folder.written(key) == written for key, written in before.items())
+
+
+def _study_there(folder: StudyFolder, ablation: Ablation) -> Study:
+    """What the folder holds; nothing of the ablation where it holds no study yet."""
+    return folder.read_study() if folder.file.is_file() else Study(ablation, [])
 
 
 def _scene_configs(

@@ -16,7 +16,7 @@ import torch
 from turbogs_plugin.device import processor_cores
 from turbogs_plugin.distributed.processes import end_with_parent
 from turbogs_plugin.errors import InputError, TrainingStopped, exit_code
-from turbogs_plugin.study.sweep import SweepOptions, cells_left, run_sweep
+from turbogs_plugin.study.sweep import SweepOptions, cells_left, run_sweep, written_before
 
 UNFINISHED = 3
 """Exit code of a sweep that `--within` ended, so that a script can call again; and of its workers."""
@@ -48,6 +48,8 @@ def run_on_gpus(options: SweepOptions, sweep: tuple) -> int:
     absent = [gpu for gpu in options.gpus if gpu >= present]
     if options.device != "cpu" and absent:
         raise InputError(f"--gpus: there is no GPU {absent[0]}, {present} answer; see 'turbogs doctor'")
+    _, variants, _, _, folder, *_ = sweep
+    before = written_before(options, variants, folder)
     context = multiprocessing.get_context("spawn")
     workers = [context.Process(target=_work, args=(options.gpus, place, sweep)) for place in range(len(options.gpus))]
     for worker in workers:
@@ -65,10 +67,7 @@ def run_on_gpus(options: SweepOptions, sweep: tuple) -> int:
         raise SystemExit(2)
     if not {0, UNFINISHED} & set(codes):
         raise TrainingStopped("no process of this study lived to its end: the same command goes on")
-    if 0 in codes:
-        return 0
-    _, variants, _, _, folder, *_ = sweep
-    return cells_left(options, variants, folder)
+    return 0 if 0 in codes else cells_left(before, folder)
 
 
 def _wait_for(workers: Sequence[BaseProcess]) -> None:
