@@ -280,7 +280,7 @@ class _LaggedCopy:
             buffer = self.copy[0] if self.copy else torch.empty(self.source.shape, dtype=torch.float64, pin_memory=True)
             buffer.copy_(self.source, non_blocking=True)
             event = torch.cuda.Event()
-            event.record()
+            event.record(torch.cuda.current_stream(self.source.device))
             self.copy = (buffer, event)
         self.reads += 1
         return self.values.copy()
