@@ -14,6 +14,15 @@ from turbogs_plugin.errors import InputError
         ("trian", ("Unrecognized options: trian", "Available subcommands: train, ", "see turbogs --help")),
         ("", ("Expected one of {train, ", "see turbogs --help")),
         ("train s --out r --fctor 3", ("Unrecognized options: --fctor, 3; did you mean --factor?",)),
+        (
+            "train s --out r --steps 3",
+            ("Unrecognized options of turbogs train: --steps, 3; turbogs ablate takes --steps",),
+        ),
+        (
+            "render r --seeds 4 --fctor 3",
+            ("turbogs render: --seeds, 4, --fctor, 3; did you mean --factor?; turbogs ablate takes --seeds",),
+        ),
+        ("eval r --out x", ("Unrecognized options of turbogs eval: --out, x;", "see turbogs eval --help\n")),
         ("train s --out r --factor abc", ("--factor 'abc': it takes an integer; see turbogs --help",)),
         ("train s --out r --device tpu", ("'tpu' for argument '--device'", "'cuda'", "see turbogs train --help")),
         ("train s --out", ("Missing value for argument '--out'", "see turbogs train --help")),

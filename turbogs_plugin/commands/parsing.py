@@ -22,6 +22,10 @@ TYPE = re.compile(r"Error parsing (?P<option>\S+): no type matching (?P<types>\S
 KINDS = {"INT": "an integer", "FLOAT": "a number"}
 OPTION = re.compile(r"--[\w-]+")
 HELP = re.compile(r"For full helptext, (?:run|see):? (?P<command>.*?--help)")
+MISPLACED = re.compile(r"(\S+) \(applied to ([^)]+)\)")
+"""A word that a command does not take, and the command."""
+OWNER = re.compile(r"in (\S+ \S+) --help")
+"""A command that takes an option that is similar, or the same."""
 
 
 def parsed(commands: Mapping[str, Callable[..., int]], words: Sequence[str], about: str) -> Callable[[], int]:
@@ -71,12 +75,19 @@ def refusal_line(box: str) -> str:
     if found := TYPE.match(what):
         kinds = [KINDS.get(kind, kind) for kind in found["types"].split("|") if kind != "{None}"]
         what = f"{found['option']} '{found['value']}': it takes {' or '.join(kinds)}"
+    misplaced = dict(MISPLACED.findall(what))  # word -> command
+    if misplaced:
+        what = f"Unrecognized options of {next(iter(misplaced.values()))}: {', '.join(misplaced)}"
     hints = [what.partition(" Got errors:")[0].rstrip(".")]
     for section in others:
-        if section.startswith("Perhaps you meant") and (option := OPTION.search(section)):
-            hints.append(f"did you mean {option[0]}?")
+        if section.startswith(("Perhaps you meant", "Arguments similar")):
+            option, owner = OPTION.search(section.partition(":")[2]), OWNER.search(section)
+            if option and owner and option[0] in misplaced:
+                hints.append(f"{owner[1]} takes {option[0]}")
+            elif option:
+                hints.append(f"did you mean {option[0]}?")
         elif section.startswith("Available subcommands"):
             hints.append(section)
         elif found := HELP.search(section):
-            hints.append(f"see {found['command']}")
+            hints.append(f"see {next(iter(misplaced.values()))} --help" if misplaced else f"see {found['command']}")
     return "; ".join(hints)
