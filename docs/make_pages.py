@@ -56,6 +56,7 @@ def round_table(name: str, table_name: str) -> str:
 
 TABLES: dict[str, Callable[[], str | None]] = {
     "ahead": study_tables.ahead,
+    "at_their_size": study_tables.at_their_size,
     "behind": study_tables.behind,
     "average": lambda: study_tables.changes("average"),
     "bounds": lambda: study_tables.changes("bounds"),

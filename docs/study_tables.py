@@ -150,6 +150,28 @@ def ahead() -> str:
     return by_capture("against", lines)
 
 
+SAME_SIZE = 0.02
+"""Numbers of Gaussians that differ by less are called the same."""
+
+
+def at_their_size() -> str:
+    """The others whose number of Gaussians one of our caps has: the errors there, less theirs, and how much sooner."""
+    lines: dict[str, dict[str, str]] = {}
+    for entry in read_peers()["rows"]:
+        for variant, capture in CAPS.items():
+            row = rows_of("sizes").get(capture, {}).get(variant)
+            if row is None or capture != entry["capture"] or not entry["gaussians"]:
+                continue
+            seconds, ssim, gaussians = (row.spread(measure).mean for measure in ("seconds", "ssim", "gaussians"))
+            if abs(gaussians / entry["gaussians"] - 1.0) > SAME_SIZE:
+                continue
+            sooner = f"{entry['seconds'] / seconds:.1f} times sooner"
+            better = f"{row.psnr.mean - entry['psnr']:+.2f} dB, {ssim - entry['ssim']:+.4f}"
+            cell = f"{entry['gaussians'] / 1e3:.0f}k: {better}, {sooner} ({len(row.cells)})"
+            lines.setdefault(entry["method"], {})[capture] = cell
+    return by_capture("at the number of", lines)
+
+
 NEAR = {"psnr": 0.1, "ssim": 0.001}
 """Errors that differ by less are called as good: a run of the others is one seed."""
 

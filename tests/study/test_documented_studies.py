@@ -156,6 +156,14 @@ def test_the_headline_says_how_many_seeds_and_where_and_when_ours_had_the_others
     # 9 dB at .1 s and 33 at 3 s: 21 dB at 1.55 s.
     assert ahead["Slow"].startswith("| Slow | 1.6 s, 32 times sooner, x 2.0 N | 3.0 s, 17 times sooner |")
     assert ahead["Best"].startswith("| Best | reached by 0 of 2 seeds, x 0.2 N |")
+    monkeypatch.setattr(study_tables, "CAPS", {"turbogs": "fox"})
+    assert study_tables.at_their_size().splitlines()[2:] == []  # 1000 of ours are not 500 or 4000
+    rows[0]["gaussians"] = 1010
+    (tmp_path / "docs/results/peers.json").write_text(json.dumps(peers))
+    same = "| Slow | 1k: +10.50 dB, +0.0000, 7.1 times sooner (2) |  |  |"
+    assert study_tables.at_their_size().splitlines()[2:] == [same]
+    rows[0]["gaussians"] = 500
+    (tmp_path / "docs/results/peers.json").write_text(json.dumps(peers))
     # Ours: 31.50 dB, .900, 1000.
     assert study_tables.behind().splitlines()[2:] == [
         "| Slow, fox | .900, .900 SSIM | 0.50 |",
