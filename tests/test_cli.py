@@ -195,6 +195,11 @@ def test_a_command_to_go_on_is_right_for_folders_with_spaces(turbogs, capture, t
     assert_refused(turbogs("train", capture, "--out", run, "--device", "cpu", *QUICK), f"--resume '{run}'")
 
 
+def test_a_name_that_is_not_utf_8_is_refused_before_anything_is_computed(turbogs, capture, tmp_path):
+    said = r"'l\udcfct' is not UTF-8, in which reports and configurations are written: rename it"
+    assert_refused(turbogs("train", capture, "--out", "l\udcfct", *QUICK), said)
+
+
 def test_an_output_folder_with_other_files_is_left_alone(turbogs, capture, tmp_path):
     (tmp_path / "thesis.tex").write_text("mine")
     assert_refused(turbogs("train", capture, "--out", tmp_path, "--device", "cpu", *QUICK), "not empty")

@@ -71,8 +71,12 @@ def _with_port(arguments: list[str]) -> list[str]:
     return filled
 
 
-def _require_no_empty(arguments: list[str]) -> None:
-    """Raise `InputError` for an empty argument, which as a path would be the current folder."""
+def _require_usable(arguments: list[str]) -> None:
+    """Raise `InputError` for an empty argument, which as a path would be the current folder, and for one that is not
+    UTF-8, which no report nor configuration can name."""
+    for text in arguments:
+        if any("\ud800" <= letter <= "\udfff" for letter in text):
+            raise InputError(f"{text!a} is not UTF-8, in which reports and configurations are written: rename it")
     for before, text in itertools.pairwise(["", *arguments]):
         if text.startswith("--") and text.endswith("="):
             before, text = text[:-1], ""
@@ -97,7 +101,7 @@ def main() -> None:
         if sys.argv[1:] == ["--version"]:
             print(f"turbogs {__version__}")
             return 0
-        _require_no_empty(sys.argv[1:])
+        _require_usable(sys.argv[1:])
         words = _gathered(_with_port(sys.argv[1:]))
         return parsed(COMMANDS, words, about)()
 

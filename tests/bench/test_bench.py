@@ -3,6 +3,7 @@
 import itertools
 import json
 import math
+import pickle
 import sys
 from contextlib import nullcontext
 from types import SimpleNamespace
@@ -256,6 +257,21 @@ def test_a_build_that_cannot_be_measured_says_so(monkeypatch, tmp_path):
     monkeypatch.setattr(commands.subprocess, "run", lambda *arguments, **options: ended)
     with pytest.raises(InputError, match=r"other\.so.*no views"):
         commands.other_build(tmp_path / "other.so", ())
+
+
+def test_a_build_that_dies_without_a_word_is_named(monkeypatch, tmp_path):
+    ended = SimpleNamespace(returncode=-11, stderr="")
+    monkeypatch.setattr(commands.subprocess, "run", lambda *arguments, **options: ended)
+    with pytest.raises(InputError, match=r"other\.so.*ended with -11 and said nothing"):
+        commands.other_build(tmp_path / "other.so", ())
+
+
+def test_a_build_that_does_not_load_is_not_measured(monkeypatch, tmp_path):
+    """The reference would be timed under its name."""
+    (tmp_path / "job").write_bytes(pickle.dumps((None, torch.device("cuda"))))
+    monkeypatch.setattr(sys, "argv", ["commands", str(tmp_path / "job")])
+    with pytest.raises(InputError, match="CUDA kernels: "):
+        commands.main()
 
 
 def test_another_build_measures_in_a_process_of_its_own(tmp_path):

@@ -216,7 +216,7 @@ def test_the_error_map_saturates_at_full_scale():
 @pytest.mark.parametrize("count", [1, 2, 12])
 def test_plots_of_any_length(tmp_path, count):
     values = [20.0 + i for i in range(count)]
-    plot_against_seconds(tmp_path / "p.png", list(range(count)), values, "test PSNR in dB", "scene")
+    plot_against_seconds(tmp_path / "p.png", list(range(count)), values, "test PSNR in dB", "shop_$5_$9")
     width, height = Image.open(tmp_path / "p.png").size
     assert width > 600 and height > 400
 
@@ -271,6 +271,7 @@ def test_the_commit_of_the_sources(tmp_path, monkeypatch):
 
 def test_tables():
     assert table(("a", "b"), [(1, 2)]).splitlines() == ["| a | b |", "| --- | --- |", "| 1 | 2 |"]
+    assert table(("a",), [("left|right.png",)]).splitlines()[-1] == "| left\\|right.png |"
     assert number(1.23456, 2) == "1.23" and number(math.nan, 2) == "not computed"
 
 

@@ -25,7 +25,7 @@ from turbogs_plugin.bench.viewer import bench_viewer, viewer_lines
 from turbogs_plugin.bench.wall import bench_wall, wall_lines
 from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.engine import compiled_kernels
-from turbogs_plugin.engine.cuda.library import LIBRARY_VARIABLE
+from turbogs_plugin.engine.cuda.library import LIBRARY_VARIABLE, require
 from turbogs_plugin.errors import InputError, exit_code
 from turbogs_plugin.files import require_writable, write_text_atomically
 from turbogs_plugin.report.machine import missing_bytecode
@@ -82,7 +82,8 @@ def other_build(library: Path, job: tuple) -> dict[str, Any]:
         command = [sys.executable, "-m", __name__, str(path)]
         ended = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
         if ended.returncode:
-            raise InputError(f"library '{library}': {ended.stderr.strip().splitlines()[-1]}")
+            said = ended.stderr.strip().splitlines() or [f"its process ended with {ended.returncode} and said nothing"]
+            raise InputError(f"library '{library}': {said[-1]}")
         return json.loads(path.with_suffix(".json").read_text(encoding="utf-8"))
 
 
@@ -182,6 +183,8 @@ def main() -> int:
     """A process that `other_build` started."""
     path = Path(sys.argv[1])
     bench, *rest, device = pickle.loads(path.read_bytes())
+    if device.type == "cuda":
+        require()  # or a library that does not load would be timed as the reference, which takes its place
     report = _report("raster", bench.run(*rest, device), device)
     path.with_suffix(".json").write_text(json.dumps(report), encoding="utf-8")
     return 0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import platform
+import shlex
 from pathlib import Path
 
 from turbogs_plugin.files import write_text_atomically
@@ -104,6 +105,7 @@ def _page(run: RunSession, metrics: Metrics, lpips_reason: str, shown: int) -> s
         f"{view.name}: {view.psnr:.2f} dB\n\n![{view.name}](report/test-{view_id:03d}.jpg)"
         for view_id, view in enumerate(metrics.views[:shown])
     )
+    folder = shlex.quote(str(run.folder.path))
     exported = "[report.html](report.html)" if (run.folder.path / "report.html").is_file() else "`report.html`"
     return f"""# {run.scene.name}
 
@@ -114,9 +116,9 @@ def _page(run: RunSession, metrics: Metrics, lpips_reason: str, shown: int) -> s
 {lpips}
 Means over the test views{unmasked}. Training time is that of iterations and of the initial error maps; loading,
 evaluation, checkpoints and this report are not in it. Wall time is from the start of the process until the model was
-written. FPS counts test views rendered one after the other. FLIP: `turbogs eval {run.folder.path.name}`.{on}
+written. FPS counts test views rendered one after the other. FLIP: `turbogs eval {folder}`.{on}
 
-`turbogs export {run.folder.path.name} --format html` writes all of this and the model on one page,
+`turbogs export {folder} --format html` writes all of this and the model on one page,
 {exported}.
 
 ## Error against run time

@@ -17,6 +17,7 @@ STYLE = {
     "grid.alpha": 0.3,
     "lines.linewidth": 1.8,
     "lines.markersize": 5,
+    "text.parse_math": False,  # a capture's name may hold dollars
 }
 
 MARGINS = {"left": 0.14, "right": 0.97, "bottom": 0.13, "top": 0.92}

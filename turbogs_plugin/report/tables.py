@@ -23,10 +23,10 @@ FURTHER = {f"{kind}_{name}": f"{head} {said}" for kind, said in FURTHER_KINDS.it
 
 
 def table(header: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
-    """A Markdown table."""
+    """A Markdown table. A bar in a cell, which would end it, is escaped."""
     header = list(header)
-    lines = [header, ["---"] * len(header), *rows]
-    return "\n".join(f"| {' | '.join(str(cell) for cell in line)} |" for line in lines)
+    lines = [header, ["---"] * len(header), *([str(cell).replace("|", "\\|") for cell in row] for row in rows)]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
 def number(value: float, digits: int, absent: str = "not computed") -> str:

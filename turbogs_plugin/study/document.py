@@ -63,8 +63,7 @@ class Table:
     numeric: bool = True
 
     def markdown(self) -> str:
-        rows = [[cell.replace("|", "\\|") for cell in row] for row in self.rows]  # a bar ends a cell
-        return table(self.header, rows)
+        return table(self.header, self.rows)
 
     def html(self, folder: Path) -> str:
         kind = ' class="numeric"' if self.numeric else ""
