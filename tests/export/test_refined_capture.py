@@ -85,6 +85,18 @@ def test_each_photo_gets_the_camera_that_took_it(turbogs, tmp_path, suffix):
     np.testing.assert_allclose(cameras.translations, CASE.true.translations, atol=0.05)
 
 
+def test_names_of_a_text_model_may_have_spaces(copy, tmp_path):
+    model = model_of(copy)
+    for image in model.images.values():
+        (copy / "images" / image.name).rename(copy / "images" / f"my {image.name}")
+        image.name = f"my {image.name}"
+    shutil.rmtree(copy / "sparse/0")
+    (copy / "sparse/0").mkdir()
+    model.write_text(copy / "sparse/0")
+    write_refined(copy, tmp_path / "refined")
+    assert {image.name for image in images_of(model_of(tmp_path / "refined"))} == set(os.listdir(copy / "images"))
+
+
 def test_the_new_capture_has_the_same_photos_and_points(given, refined):
     before, after = load_scene(given), load_scene(refined)
     for split in ("train", "test"):

@@ -1,6 +1,7 @@
 """What photos' files say, and upright copies."""
 
 import math
+import os
 
 import numpy as np
 import pytest
@@ -30,10 +31,11 @@ def write(path, orientation: int = 1, gps=None, model: str = "", focal: float = 
     exif[0x0112] = orientation
     if model:
         exif[0x0110] = model
-        exif.get_ifd(0x8769)[0xA405] = int(focal)
+        exif[0x8769] = entries = exif.get_ifd(0x8769)
+        entries[0xA405] = int(focal)
     if gps is not None:
         latitude, longitude = gps
-        entries = exif.get_ifd(0x8825)
+        exif[0x8825] = entries = exif.get_ifd(0x8825)
         for tag, value, letters in ((1, latitude, "NS"), (3, longitude, "EW")):
             entries[tag] = letters[value < 0]
             entries[tag + 1] = (float(int(abs(value))), (abs(value) % 1) * 60, 0.0)
@@ -43,8 +45,11 @@ def write(path, orientation: int = 1, gps=None, model: str = "", focal: float = 
     return upright
 
 
-def test_photos_are_upright_for_everybody(tmp_path):
-    shown = {f"{'x' * turn}.jpg": write(tmp_path / "raw" / f"{'x' * turn}.jpg", turn) for turn in TURNS}
+@pytest.mark.parametrize("suffix", [".jpg", ".tif"])
+def test_photos_are_upright_for_everybody(suffix, tmp_path):
+    import pycolmap
+
+    shown = {f"{'x' * turn}{suffix}": write(tmp_path / "raw" / f"{'x' * turn}{suffix}", turn) for turn in TURNS}
     photos = read_photos(tmp_path / "raw")
     assert [photo.turned for photo in photos] == [False, True, True, True]
     assert {photo.size for photo in photos} == {(48, 32)} and len({photo.lens for photo in photos}) == 1
@@ -56,20 +61,39 @@ def test_photos_are_upright_for_everybody(tmp_path):
         assert Image.open(path).getexif().get(0x0112, 1) == 1
         difference = loaded.image(view).numpy() * 255 - np.asarray(shown[path.name], dtype=np.float32)
         assert np.abs(difference).mean() < 4, path
+        seen = pycolmap.Bitmap.read(path, True).to_array() - np.asarray(shown[path.name], dtype=np.float32)
+        assert np.abs(seen).mean() < 4, path
     assert paths[0].read_bytes() == photos[0].path.read_bytes()
 
 
-def test_upright_copies_keep_focal_length_and_gps(tmp_path):
+@pytest.mark.parametrize("suffix", [".jpg", ".tif"])
+def test_upright_copies_keep_focal_length_and_gps(suffix, tmp_path):
     import pycolmap
 
     for number, turn in enumerate((1, 6, 8)):
-        write(tmp_path / "raw" / f"{number}.jpg", turn, gps=(-33.5, 151.25), model="Phone", focal=28)
+        write(tmp_path / "raw" / f"{number}{suffix}", turn, gps=(-33.5, 151.25), model="Phone", focal=28)
     photos = read_photos(tmp_path / "raw")
     np.testing.assert_allclose([photo.position for photo in photos], [(-33.5, 151.25)] * 3)
     place_photos(photos, tmp_path / "images")
     upright, turned, _ = (pycolmap.Bitmap.read(tmp_path / "images" / photo.name, True) for photo in photos)
     assert turned.exif_focal_length() == pytest.approx(upright.exif_focal_length()) and upright.exif_focal_length() > 30
     assert turned.exif_latitude() == pytest.approx(-33.5) and turned.exif_longitude() == pytest.approx(151.25)
+
+
+@pytest.mark.parametrize(
+    ("text", "number"), [(b"\x01\x0e", b"\x01\x1a"), (b"\0\x1d", b"\0\x0d")], ids=["XResolution", "GPSSpeed"]
+)
+def test_a_photo_whose_exif_cannot_be_written_again_is_turned(text, number, tmp_path):
+    """It has a number as text: a tag of text (description, GPS date) is given the name of a number's."""
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    exif[0x010E] = exif.get_ifd(0x8825)[0x1D] = "72 dots"
+    spoilt = exif.tobytes().replace(text + b"\0\2", number + b"\0\2")
+    (tmp_path / "raw").mkdir()
+    for view in range(3):
+        picture().transpose(TURNS[6]).save(tmp_path / f"raw/{view}.jpg", exif=spoilt)
+    place_photos(read_photos(tmp_path / "raw"), tmp_path / "images")
+    assert photo_sizes(sorted((tmp_path / "images").iterdir())).tolist() == [[48, 32]] * 3
 
 
 def test_a_phones_photo_with_a_second_one_behind_it_is_a_jpeg(tmp_path):
@@ -167,6 +191,18 @@ def of_16_bits(folder) -> str:
     return "5.png has more than 8 bits"
 
 
+def of_another_format(folder) -> str:
+    four(folder)
+    picture().save(folder / "2.jpg", format="GIF")
+    return "2.jpg has GIF inside, .*: convert it to JPEG"
+
+
+def not_of_utf8(folder) -> str:
+    four(folder)
+    (folder / "0.jpg").rename(folder / os.fsdecode(b"\xfc0.jpg"))
+    return "0.jpg' has signs that cannot be printed: rename the photo"
+
+
 def of_one_name(folder) -> str:
     four(folder)
     write(folder / "a b.jpg")
@@ -174,7 +210,21 @@ def of_one_name(folder) -> str:
     return "2 photos .*'a_b.jpg' without spaces"
 
 
-@pytest.mark.parametrize("case", [no_folder, nothing, one, of_a_phone, videos, truncated, of_16_bits, of_one_name])
+@pytest.mark.parametrize(
+    "case",
+    [
+        no_folder,
+        nothing,
+        one,
+        of_a_phone,
+        videos,
+        truncated,
+        of_16_bits,
+        of_another_format,
+        not_of_utf8,
+        of_one_name,
+    ],
+)
 def test_unusable_photos_are_refused(case, tmp_path):
     assert_refused(case(tmp_path / "photos"), read_photos, tmp_path / "photos")
 

@@ -477,6 +477,32 @@ def test_photos_of_a_capture_beside_it_do_not_stand_in_for_some(tmp_path):
         load_scene(folder)
 
 
+@pytest.mark.parametrize("other", ["depth", "normals", "segmentation", "images_backup", "images_2", "../images"])
+@pytest.mark.parametrize("kept", [3, 8])
+def test_where_photos_were_taken_away_no_other_folder_stands_in(tmp_path, other, kept):
+    """It has images of all names, which may be depth maps, copies or another capture's photos."""
+    folder = write_capture(tmp_path / "cup")
+    shutil.copytree(folder / "images", folder / other)
+    for photo in sorted((folder / "images").iterdir())[: 9 - kept]:
+        photo.unlink()
+    capture = read_colmap(folder, *find_model(folder))
+    assert capture.photo_folder == folder / "images" and len(capture.names) == kept and capture.reduction == 1
+    assert capture.notes[1].startswith(f"{9 - kept} of 9 images are left out, ")
+
+
+@pytest.mark.parametrize("other", ["depth", "normals", "segmentation"])
+def test_images_that_are_no_photos_do_not_stand_in_for_all(tmp_path, other):
+    folder = write_capture(tmp_path / "cup")
+    (folder / "images").rename(folder / other)
+    with pytest.raises(InputError, match=r"9 of 9 photos are missing in .*cup/images: .*bring them back"):
+        load_scene(folder)
+
+
+def test_a_model_may_lie_in_a_folder_named_as_images_that_are_no_photos(tmp_path):
+    folder = write_capture(tmp_path / "cup", model="without_masks/0")
+    assert find_model(folder, anywhere=True) == (folder / "without_masks/0", ".bin")
+
+
 def test_more_than_8_bits_are_refused_before_any_photo_is_decoded(tmp_path):
     folder = write_capture(tmp_path / "cup")
     deep_photo(folder)
@@ -492,6 +518,29 @@ def test_a_name_that_cannot_be_printed_is_refused_as_such(tmp_path):
     images.write_bytes(images.read_bytes().replace(b"photo03.png", b"photo\n3.png"))
     with pytest.raises(InputError, match="has signs that cannot be printed: rename"):
         load_scene(folder)
+
+
+@pytest.mark.parametrize("suffix", [".bin", ".txt"])
+def test_names_with_spaces(tmp_path, suffix):
+    folder = write_capture(tmp_path / "cup")
+    model = pycolmap.Reconstruction(folder / "sparse/0")
+    for image in model.images.values():
+        (folder / "images" / image.name).rename(folder / "images" / image.name.replace("photo", " my  photo "))
+        image.name = image.name.replace("photo", " my  photo ")
+    shutil.rmtree(folder / "sparse/0")
+    (folder / "sparse/0").mkdir()
+    (model.write_binary if suffix == ".bin" else model.write_text)(folder / "sparse/0")
+    capture = read_colmap(folder, *find_model(folder))
+    assert capture.names == tuple(f" my  photo {view:02d}.png" for view in range(9)) and len(capture.notes) == 1
+    assert capture.viewmats[3] @ [3.0, 0, -5, 1] == pytest.approx([0, 0, 0, 1])
+
+
+def test_a_name_of_a_text_model_that_is_not_utf_8_is_refused(tmp_path):
+    folder = write_capture(tmp_path / "cup", suffix=".txt")
+    images = folder / "sparse/0/images.txt"
+    images.write_bytes(images.read_bytes().replace(b"photo03.png", b"ph\xf6to03.png"))
+    words = r"sparse/0: image name 'ph\\udcf6to03.png' has signs that cannot be printed: rename the photo"
+    assert_refused(words, load_scene, folder)
 
 
 def test_a_folder_that_is_a_model_itself(tmp_path):

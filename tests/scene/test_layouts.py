@@ -189,6 +189,19 @@ def test_convert_py_of_gaussian_splatting(tmp_path, size, kept):
         assert (f", photos in {expected}" in scene.notes[0]) == (expected != folder / "images")
 
 
+@pytest.mark.parametrize("size", [(240, 160), (210, 137)])
+def test_convert_py_where_a_photo_was_taken_away(tmp_path, size):
+    """Of input it is not taken where the cameras are of the undistorted photos' size."""
+    camera, root = [pinhole(*size, 200.0)], tmp_path / "bonsai"
+    write_model(root / "sparse/0", camera, NAMES)
+    write_photos(root / "input", [pinhole(240, 160, 200.0)], NAMES)
+    write_photos(root / "images", [pinhole(210, 137, 200.0)], NAMES)
+    (root / "images" / NAMES[0]).unlink()
+    scene = load_scene(root)
+    assert len(scene.train) + len(scene.test) == (9 if size == (240, 160) else 8)
+    assert scene.train.cameras.sizes[0].tolist() == list(size)
+
+
 def test_masks_of_the_cameras_size_are_no_photos(tmp_path):
     camera = [pinhole(240, 160, 200.0)]
     write_model(tmp_path / "scan24/sparse/0", camera, NAMES)

@@ -2,6 +2,7 @@
 
 import io
 import math
+import os
 import random
 from pathlib import Path
 
@@ -190,6 +191,15 @@ def drop_photos(folder: Path) -> None:
 def test_what_is_refused(tmp_path, change, words):
     folder = write_llff(tmp_path / "fern")
     change(folder)
+    assert_refused(words, load_scene, folder)
+
+
+@pytest.mark.usefixtures("few_random_points")
+def test_a_photo_whose_name_is_not_utf_8_is_refused(tmp_path):
+    folder = write_llff(tmp_path / "fern")
+    photos = os.fsencode(folder / "images")
+    os.rename(photos + b"/IMG_003.png", photos + b"/IMG_\xe93.png")
+    words = r"fern/images: image name 'IMG_\\udce93.png' has signs that cannot be printed: rename the photo"
     assert_refused(words, load_scene, folder)
 
 

@@ -1,13 +1,14 @@
-"""Sizes of reduced photos, and what is done while photos are decoded."""
+"""Sizes of reduced photos, photos as they are stored, and what is done while photos are decoded."""
 
 from threading import Event
 
 import numpy as np
 import pytest
+from PIL import ExifTags, Image
 
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene import load, load_scene, photos
-from turbogs_plugin.scene.photos import reduced_sizes
+from turbogs_plugin.scene.photos import is_turned, load_photos, opened_image, photo_array, photo_sizes, reduced_sizes
 
 SIZES = np.array([[640, 480], [500, 90]])
 
@@ -32,6 +33,24 @@ def test_a_photo_of_more_pixels_than_a_draw_tells_apart_is_refused(capture, monk
     with pytest.raises(InputError, match="a photo would have 48x40 pixels, more than 1919: use --factor 2"):
         load_scene(capture)
     assert load_scene(capture, factor=2).train.cameras.sizes.max() == 24
+
+
+def test_a_tiff_is_taken_as_stored_whatever_its_orientation(tmp_path):
+    """Pillow turns TIFFs itself, before it is asked to."""
+    pixels = np.random.default_rng(0).integers(0, 256, (6, 8, 3), dtype=np.uint8)
+    paths = [tmp_path / f"{orientation}.tif" for orientation in range(1, 9)]
+    for orientation, path in enumerate(paths, 1):
+        exif = Image.Exif()
+        exif[ExifTags.Base.Orientation] = orientation
+        Image.fromarray(pixels).save(path, exif=exif)
+    sizes = photo_sizes(paths)
+    assert (sizes == (8, 6)).all()
+    assert [is_turned(path) for path in paths] == [False] * 4 + [True] * 4
+    loaded = load_photos(paths, sizes, sizes, [None] * len(paths), photo_array(sizes), lambda: None)
+    for view, path in enumerate(paths):
+        np.testing.assert_array_equal(loaded.image(view).mul(255).round().numpy(), pixels, err_msg=path.name)
+        with opened_image(path) as image:
+            np.testing.assert_array_equal(np.asarray(image), pixels, err_msg=path.name)
 
 
 def test_what_is_done_meanwhile_comes_before_the_last_photo(capture, monkeypatch):

@@ -178,6 +178,51 @@ def test_points_from_a_ply(tmp_path, body):
             load_scene(folder)
 
 
+def write_colored_points(folder: Path, kind: str, colors: list, comment: str = "") -> Path:
+    """A capture with points of red, green and blue of a type by numpy's name."""
+    write_transforms(folder, ply_file_path="points.ply")
+    rows = [((i, 1, 2), tuple(color)) for i, color in enumerate(colors)]
+    table = np.array(rows, dtype=[("place", "<f4", 3), ("color", np.dtype(kind).newbyteorder("<"), 3)])
+    header = f"ply\nformat binary_little_endian 1.0\ncomment {comment}\nelement vertex {len(colors)}\n"
+    header += "".join(f"property float {axis}\n" for axis in "xyz")
+    header += "".join(f"property {kind} {channel}\n" for channel in ("red", "green", "blue"))
+    (folder / "points.ply").write_bytes(f"{header}end_header\n".encode() + table.tobytes())
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("kind", "given", "read"),
+    [
+        ("uint8", [[0, 128, 255]], [0, 128, 255]),
+        ("float32", [[0.5, 0.25, 1.0]], [128, 64, 255]),
+        ("float64", [[0.5, -0.1, 1.2]], [128, 0, 255]),  # a bit beyond black and white
+        ("float32", [[127.6, 64, 255]], [128, 64, 255]),
+        ("uint16", [[0, 256, 65535]], [0, 1, 255]),
+        ("uint16", [[0, 128, 255]], [0, 128, 255]),
+        ("int32", [[-1, 128, 255]], [0, 128, 255]),
+    ],
+)
+def test_colors_of_points_are_scaled_by_their_type(tmp_path, kind, given, read):
+    scene = load_scene(write_colored_points(tmp_path / "cup", kind, given))
+    assert scene.point_colors.tolist() == [read]
+
+
+def test_colors_of_points_that_are_not_finite_are_refused(tmp_path):
+    folder = write_colored_points(tmp_path / "cup", "float32", [[0.5, 0.5, 0.5], [0.5, math.nan, 0.5]])
+    assert_refused(r"points\.ply: the colours of 1 of 2 points are not finite: export it again", load_scene, folder)
+
+
+@pytest.mark.usefixtures("few_random_points")
+def test_a_ply_of_floats_without_points_leaves_them_to_be_drawn(tmp_path):
+    assert load_scene(write_colored_points(tmp_path / "cup", "float32", [])).drawn_points
+
+
+def test_a_comment_of_a_ply_may_have_any_letters(tmp_path):
+    """One of them has the byte that is a new line in Latin-1."""
+    folder = write_colored_points(tmp_path / "cup", "uint8", [[1, 2, 3]], comment="grün, Ålesund")
+    assert load_scene(folder).point_colors.tolist() == [[1, 2, 3]]
+
+
 def set_pose(value):
     return lambda content: content["frames"][2].update(transform_matrix=value)
 

@@ -30,8 +30,8 @@ from turbogs_plugin.scene.bundle_adjustment import (
     of_these_photos,
     refine_together,
 )
-from turbogs_plugin.scene.capture import LARGEST_SIDE, Capture, check_photo_name, named
-from turbogs_plugin.scene.colmap import REDUCED, incomplete_model, load_pycolmap, read_colmap
+from turbogs_plugin.scene.capture import LARGEST_SIDE, Capture, named
+from turbogs_plugin.scene.colmap import REDUCED, incomplete_model, load_pycolmap, read_colmap, read_reconstruction
 from turbogs_plugin.scene.colmap_check import check_binary_model
 from turbogs_plugin.scene.load import camera_files
 from turbogs_plugin.scene.mask_files import FOLDER as MASKS
@@ -134,9 +134,8 @@ def _reconstruction(model: Path, suffix: str, capture: Capture, refined: Refinem
         refined: its cameras, and its points in the order of their identifiers.
     """
     pycolmap = load_pycolmap()
-    old, new = pycolmap.Reconstruction(), pycolmap.Reconstruction()
-    (old.read_binary if suffix == ".bin" else old.read_text)(model)
-    images = {check_photo_name(image.name, model): image for image in old.images.values() if image.has_pose}
+    old, new = read_reconstruction(model, suffix), pycolmap.Reconstruction()
+    images = {image.name: image for image in old.images.values() if image.has_pose}
     for view, (name, (width, height)) in enumerate(zip(capture.names, capture.sizes.tolist(), strict=True)):
         number = images[name].image_id  # of the camera, too
         cameras = refined.cameras

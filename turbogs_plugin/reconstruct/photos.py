@@ -17,12 +17,16 @@ from PIL.ExifTags import IFD, Base
 
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.files import naming
-from turbogs_plugin.scene.capture import FEWEST_PHOTOS
+from turbogs_plugin.scene.capture import FEWEST_PHOTOS, check_photo_name
 from turbogs_plugin.scene.nearby import capture_of_run
 from turbogs_plugin.scene.photo_folder import find_photos, unread
 from turbogs_plugin.scene.photos import decoding_threads, opened_image, require_8_bits
 
 SEPARATORS = re.compile(r"[\s#]")
+FORMATS = ("JPEG", "MPO", "PNG", "TIFF", "BMP")
+"""That COLMAP reads, whatever the file's suffix is; MPO is a JPEG with a second one behind it, of phones."""
+KEPT_EXIF = (Base.Make, Base.Model, IFD.Exif, IFD.GPSInfo)
+"""Of copies that are turned upright: what COLMAP reads."""
 JPEG_QUALITY = 95
 """Of copies that are turned upright. Photos that are upright already stay bit for bit."""
 
@@ -80,10 +84,10 @@ def read_photos(folder: Path) -> list[PhotoFile]:
     """The photos of a folder, in the order of their names. Each is decoded once, coarsely.
 
     Raises:
-        InputError: as `list_photos`; or one that cannot be read (the first in order).
+        InputError: as `list_photos`; names that a capture cannot have; or one that cannot be read (the first in order).
     """
     place, paths = list_photos(folder)
-    names = [plain_name(path.relative_to(place)) for path in paths]
+    names = [check_photo_name(plain_name(path.relative_to(place)), place) for path in paths]
     for name, number in Counter(names).items():
         if number > 1:
             raise InputError(f"{number} photos in {place} would be named '{name}' without spaces: rename them")
@@ -126,6 +130,8 @@ def link_or_copy(source: Path, target: Path) -> None:
 def _read(path: Path, name: str) -> PhotoFile:
     with opened_image(path, remedy="replace it or take it out") as image:
         size, exif = image.size, image.getexif()
+        if image.format not in FORMATS:
+            raise InputError(f"photo {path} has {image.format} inside, which COLMAP does not read: convert it to JPEG")
         require_8_bits(image, path)
         image.draft("RGB", (size[0] // 8, size[1] // 8))  # JPEG: whole, but at an eighth of the size
         image.load()
@@ -166,12 +172,18 @@ def _position(gps: dict[int, Any]) -> tuple[float, float]:
 
 
 def _write_upright(source: Path, target: Path) -> None:
-    """The photo as EXIF says that it is to be seen, with the rest of its EXIF data (focal length, GPS)."""
-    with Image.open(source) as image:
-        form = "JPEG" if image.format == "MPO" else image.format  # of phones: a JPEG with a second one behind it
+    """The photo as EXIF says that it is to be seen, with its camera, focal length and GPS."""
+    with opened_image(source) as image:
+        form = "JPEG" if image.format == "MPO" else image.format
+        exif = image.getexif()
+        image.info.pop("exif", None)  # `exif_transpose` would write it again, which Pillow cannot always
         upright = ImageOps.exif_transpose(image)
-    exif = upright.getexif()
-    options = {"quality": JPEG_QUALITY, "subsampling": 0} if form == "JPEG" else {}
+    for tag in set(exif).difference(KEPT_EXIF):  # those of a TIFF say how its pixels are stored
+        del exif[tag]
+    options = {"JPEG": {"quality": JPEG_QUALITY, "subsampling": 0}, "TIFF": {"compression": "raw"}}.get(form, {})
     if "icc_profile" in upright.info:
         options["icc_profile"] = upright.info["icc_profile"]
-    upright.save(target, format=form, exif=exif, **options)
+    try:
+        upright.save(target, format=form, exif=exif, **options)
+    except Exception:  # nothing in EXIF is needed, and Pillow cannot write all that it reads
+        upright.save(target, format=form, **options)

@@ -7,8 +7,8 @@ import re
 import signal
 import tempfile
 import threading
-from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING
@@ -40,6 +40,8 @@ FILES, SUFFIXES = ("cameras", "images", "points3D"), (".bin", ".txt")
 ORIGINALS = "input"
 """Where gaussian-splatting's ``convert.py`` keeps the photos that it undistorts into ``images``."""
 REDUCED = re.compile(r"_\d+$")
+OTHER_IMAGES = re.compile(r"(depth|normal|semantic|segmentation|confidence)s?|.*[_-]masks?", re.IGNORECASE)
+"""Folders of images that have the photos' names and are none."""
 FOLDER_DEPTH = 2
 """Photos and models are looked for in folders of folders, no deeper."""
 REDUCTIONS = (2, 4, 8, 16)
@@ -109,11 +111,28 @@ def _count_images(model: Path, suffix: str) -> int:
             with path.open("rb") as file:
                 announced = int.from_bytes(file.read(8), "little")
             return min(announced, path.stat().st_size // SMALLEST_IMAGE)
-        with path.open(encoding="utf-8", errors="replace") as file:
-            # Two lines an image; the second, of points, may be empty.
-            return sum(1 for line in file if line.strip() and not line.startswith("#") and next(file, "x"))
+        return sum(1 for _ in _lines_of_images(path))
     except OSError:
         return 0
+
+
+def _lines_of_images(path: Path) -> Iterator[bytes]:
+    """The line of each image in an ``images.txt``, in which pycolmap sees one too."""
+    with path.open("rb") as file:
+        for line in file:
+            if (line := line.strip()) and not line.startswith(b"#"):
+                yield line
+                next(file, None)  # its points: this line may be empty
+
+
+def _names_of_images(path: Path) -> dict[int, str]:
+    """The names in an ``images.txt``, by the images' identifiers. What is not UTF-8 in them cannot be printed."""
+    names: dict[int, str] = {}
+    for line in _lines_of_images(path):
+        fields = line.split(b" ", 9)  # identifier, rotation, translation, camera, name: the rest, with its spaces
+        with suppress(ValueError, IndexError):  # no number, no name: then the image has none
+            names[int(fields[0])] = fields[9].decode(errors="surrogateescape")
+    return names
 
 
 def read_colmap(scene: Path, model: Path, suffix: str) -> Capture:
@@ -128,26 +147,17 @@ def read_colmap(scene: Path, model: Path, suffix: str) -> Capture:
         InputError: files that are damaged or inconsistent, or a camera that no pinhole can take the place of.
     """
     found = check_binary_model(model) if suffix == ".bin" else None
-    pycolmap = load_pycolmap()
-    reconstruction = pycolmap.Reconstruction()
-    try:
-        (reconstruction.read_binary if suffix == ".bin" else reconstruction.read_text)(model)
-    except Exception as error:  # pycolmap raises whatever C++ threw
-        reason = " ".join(str(error).split())[:200]
-        if "Check failed" in reason:  # with some C++
-            reason = "pycolmap cannot read a part of it"
-        raise InputError(f"{model} is not a COLMAP reconstruction: {reason}; copy or reconstruct it again") from error
-
+    reconstruction = read_reconstruction(model, suffix)
     images = [image for image in reconstruction.images.values() if image.has_pose]
-    for image in images:
-        image.name = check_photo_name(image.name, model)
     images.sort(key=lambda image: image.name)
     names = tuple(image.name for image in images)
     for name, following in itertools.pairwise(names):
         if name == following:
             raise InputError(f"{model} has two images named '{name}': rename the photos and reconstruct again")
-    first = reconstruction.cameras[images[0].camera_id] if images else None
-    photo_folder, reduction = find_photo_folder(scene, names, first and (first.width, first.height))
+    cameras = {image.name: reconstruction.cameras[image.camera_id] for image in images}
+    photo_folder, reduction = find_photo_folder(
+        scene, {name: (camera.width, camera.height) for name, camera in cameras.items()}
+    )
     absent = [name for name in names if not (photo_folder / name).is_file()]
     absence = ()
     if absent and len(names) - len(absent) >= FEWEST_PHOTOS:
@@ -205,6 +215,32 @@ def read_colmap(scene: Path, model: Path, suffix: str) -> Capture:
     ).checked(model)
 
 
+def read_reconstruction(model: Path, suffix: str) -> pycolmap.Reconstruction:
+    """What pycolmap reads, whose images with a pose have names that `check_photo_name` gave.
+
+    Raises:
+        InputError: pycolmap cannot read it, or such a name is refused.
+    """
+    reconstruction = load_pycolmap().Reconstruction()
+    try:
+        (reconstruction.read_binary if suffix == ".bin" else reconstruction.read_text)(model)
+    except Exception as error:  # pycolmap raises whatever C++ threw
+        reason = " ".join(str(error).split())[:200]
+        if "Check failed" in reason:  # with some C++
+            reason = "pycolmap cannot read a part of it"
+        raise InputError(f"{model} is not a COLMAP reconstruction: {reason}; copy or reconstruct it again") from error
+    # Of text pycolmap cuts a name at its first space, and fails where one is not UTF-8.
+    names = None if suffix == ".bin" else _names_of_images(model / "images.txt")
+    for number, image in reconstruction.images.items():
+        if not image.has_pose:
+            continue
+        if names is not None and number not in names:
+            file = model / "images.txt"
+            raise InputError(f"{file} is damaged: image {number} has no name; copy or reconstruct it again")
+        image.name = check_photo_name(image.name if names is None else names[number], model)
+    return reconstruction
+
+
 @contextmanager
 def _in_binary(reconstruction: pycolmap.Reconstruction) -> Iterator[Path]:
     """A folder with a reconstruction's binary files, while entered."""
@@ -230,33 +266,46 @@ def _lens(camera: pycolmap.Camera, model: Path, made: dict[tuple, Lens]) -> Lens
     return made[key]
 
 
-def find_photo_folder(scene: Path, names: tuple[str, ...], size: tuple[int, int] | None) -> tuple[Path, int]:
+def find_photo_folder(scene: Path, sizes: Mapping[str, tuple[int, int]]) -> tuple[Path, int]:
     """The folder that the names of the photos are relative to, and by which factor they are reduced there.
 
-    Looked at are ``images`` in the scene or beside it, the scene itself, the folders in them, and ``input`` beside it;
-    then, as not all keep the full-size photos, copies of them in ``images_2``, ``images_4``, ... Where none has all the
-    photos it is the first of those that have most; not one beside the scene, whose photos may be another one's of the
-    same names. Where the first photo has not the `size` (width, height) of its camera, and that of the same name in
-    ``input`` has, it is that folder: the others are undistorted copies.
+    That is ``images`` in the scene, if `FEWEST_PHOTOS` are there: where some of them were taken away, whole folders may
+    hold depth maps or another capture's photos of the same names. Else looked at are ``images`` beside the scene, the
+    scene itself, the folders in all of these, and ``input`` beside it; then, as not all keep the full-size photos,
+    copies of them in ``images_2``, ``images_4``, ... Where none has all the photos it is the first of those that have
+    most; not one beside the scene, whose photos may be another one's of the same names.
+
+    Where the first photo that is there has not the size of its camera, and that of the same name in ``input`` has, it
+    is that folder: the others are undistorted copies.
+
+    Args:
+        sizes: (width, height) of each photo's camera, by the photo's name.
     """
-    first = scene / "images"
-    if not names:
-        return first, 1
-    beside = scene.resolve().parent
+    first, beside = scene / "images", scene.resolve().parent
+    there = [name for name in sizes if (first / name).is_file()]
+    if len(there) >= FEWEST_PHOTOS or not sizes:
+        return _of_cameras(first, scene / ORIGINALS, there, sizes), 1
     places = (first, scene, beside / "images", beside / ORIGINALS)
-    whole = ((folder, 1) for place in places for folder in _folders(place, FOLDER_DEPTH))
+    whole = ((folder, 1) for place in places for folder in _folders(place, FOLDER_DEPTH, of_photos=True))
     reduced = ((scene / f"images_{factor}", factor) for factor in REDUCTIONS)
     own: list[tuple[Path, int]] = []
     for folder, reduction in itertools.chain(whole, reduced):
-        if all((folder / name).is_file() for name in names):
-            originals = (scene if scene in (folder, *folder.parents) else beside) / ORIGINALS
-            undistorted = reduction == 1 and all((originals / name).is_file() for name in names)
-            if undistorted and _size_of(folder / names[0]) != size == _size_of(originals / names[0]):
-                return originals, 1
-            return folder, reduction
-        if scene in (folder, *folder.parents):  # beside the scene, photos of the same names may be another one's
+        of_scene = scene in (folder, *folder.parents)
+        if all((folder / name).is_file() for name in sizes):
+            originals = (scene if of_scene else beside) / ORIGINALS
+            return (_of_cameras(folder, originals, list(sizes), sizes) if reduction == 1 else folder), reduction
+        if of_scene:  # beside the scene, photos of the same names may be another one's
             own.append((folder, reduction))
-    return max(own, key=lambda place: sum((place[0] / name).is_file() for name in names))
+    return max(own, key=lambda place: sum((place[0] / name).is_file() for name in sizes))
+
+
+def _of_cameras(folder: Path, originals: Path, names: list[str], sizes: Mapping[str, tuple[int, int]]) -> Path:
+    """`originals`, if they have all the photos `names` too, the first of them in its camera's size, and `folder` has
+    that in another size; else `folder`."""
+    if not names or not all((originals / name).is_file() for name in names):
+        return folder
+    taken, size, original = _size_of(folder / names[0]), sizes[names[0]], _size_of(originals / names[0])
+    return originals if taken != size == original else folder
 
 
 def _size_of(photo: Path) -> tuple[int, int] | None:
@@ -266,8 +315,8 @@ def _size_of(photo: Path) -> tuple[int, int] | None:
         return None
 
 
-def _folders(place: Path, depth: int) -> Iterator[Path]:
-    """The folder and those in it, nearest first."""
+def _folders(place: Path, depth: int, of_photos: bool = False) -> Iterator[Path]:
+    """The folder and those in it, nearest first; `of_photos`: not `OTHER_IMAGES`, in which models may lie."""
     level = [place]
     for _ in range(depth + 1):
         yield from level
@@ -275,11 +324,12 @@ def _folders(place: Path, depth: int) -> Iterator[Path]:
             inner = [entry for folder in level if folder.is_dir() for entry in sorted(folder.iterdir())]
         except OSError:
             return
-        level = [entry for entry in inner if _may_hold_photos(entry)]
+        level = [entry for entry in inner if _is_looked_into(entry, of_photos)]
 
 
-def _may_hold_photos(entry: Path) -> bool:
-    return not (REDUCED.search(entry.name) or NO_PHOTOS.fullmatch(entry.name)) and entry.is_dir()
+def _is_looked_into(entry: Path, of_photos: bool) -> bool:
+    barred = (NO_PHOTOS, OTHER_IMAGES) if of_photos else (NO_PHOTOS,)
+    return not (REDUCED.search(entry.name) or any(each.fullmatch(entry.name) for each in barred)) and entry.is_dir()
 
 
 def _kind_note(scene: Path, model: Path, suffix: str, images: int, points: str, photo_folder: Path) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 from collections import Counter, defaultdict
 from collections.abc import Sequence
 from functools import reduce
@@ -13,11 +12,8 @@ from typing import Any
 
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene.capture import FEWEST_PHOTOS, named
-from turbogs_plugin.scene.colmap import FOLDER_DEPTH
+from turbogs_plugin.scene.colmap import FOLDER_DEPTH, OTHER_IMAGES
 from turbogs_plugin.scene.photo_folder import NO_PHOTOS, PHOTO_SUFFIXES
-
-OTHER_IMAGES = re.compile(r"(depth|normal|semantic|confidence)s?|.*[_-]masks?", re.IGNORECASE)
-"""Folders of images that have the photos' names and are none."""
 
 
 def find_elsewhere(scene: Path, names: Sequence[str], frames: Sequence[dict[str, Any]]) -> tuple[dict[str, str], str]:

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.scene.capture import Capture, sizes_text
+from turbogs_plugin.scene.capture import Capture, check_photo_name, sizes_text
 from turbogs_plugin.scene.photos import photo_sizes
 from turbogs_plugin.scene.poses import viewmat_of_pose
 from turbogs_plugin.scene.starting_points import NUM_RANDOM_POINTS, points_in_views
@@ -41,6 +41,7 @@ def read_llff(scene: Path, factor: int = 1) -> Capture:
     usable = _usable_folders(scene, factor)
     whole = (each for each in usable[:-1] if _is_whole_copy(*each, full_sizes))
     reduction, photos = next(whole, usable[-1])
+    names = tuple(check_photo_name(photo.name, photos[0].parent) for photo in photos)
     sizes = _checked_sizes(photos, full_sizes, source)
     intrinsics = np.tile(np.eye(3), (len(sizes), 1, 1))
     intrinsics[:, [0, 1], [0, 1]] = focals[:, None] * (sizes / full_sizes)
@@ -49,7 +50,7 @@ def read_llff(scene: Path, factor: int = 1) -> Capture:
     depths = f"{bounds[:, 0].min():.4g} to {bounds[:, 1].max():.4g}"
     folder = photos[0].parent
     return Capture(
-        names=tuple(photo.name for photo in photos),
+        names=names,
         photo_folder=folder,
         viewmats=viewmats,
         Ks=intrinsics,

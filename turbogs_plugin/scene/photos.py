@@ -24,6 +24,16 @@ PHOTO_BYTES = 3
 """Bytes of a pixel of an opaque photo; a transparent one has one more."""
 MODES = {3: "RGB", 4: "RGBa"}
 """Pillow's modes, by channels; the latter's colours are multiplied by alpha."""
+AS_STORED = {
+    2: Image.Transpose.FLIP_LEFT_RIGHT,
+    3: Image.Transpose.ROTATE_180,
+    4: Image.Transpose.FLIP_TOP_BOTTOM,
+    5: Image.Transpose.TRANSPOSE,
+    6: Image.Transpose.ROTATE_90,
+    7: Image.Transpose.TRANSVERSE,
+    8: Image.Transpose.ROTATE_270,
+}
+"""What turns an upright picture to how a file of this EXIF orientation has it; others have it upright."""
 SMALLEST_SIDE = 4
 """The shorter side of a reduced photo has at least so many pixels: those of a cell."""
 OPAQUE_SUFFIXES = (".jpg", ".jpeg")
@@ -273,10 +283,10 @@ def _decode(path: Path, size: tuple[int, int], mode: str) -> Image.Image:
 
 @contextmanager
 def opened_image(path: Path, what: str = "photo", remedy: str = "copy it there again") -> Iterator[Image.Image]:
-    """The file with its header read; `InputError` for whatever goes wrong with it while entered."""
+    """The file with its header read, as stored; `InputError` for whatever goes wrong with it while entered."""
     try:
         with Image.open(path) as image:
-            yield image
+            yield _as_stored(image)
     except InputError:
         raise
     except Exception as error:  # a broken file can raise anything in its decoder
@@ -284,3 +294,17 @@ def opened_image(path: Path, what: str = "photo", remedy: str = "copy it there a
         if isinstance(error, UnidentifiedImageError):
             reason = "it is no image of a known kind" if path.stat().st_size else "the file is empty"
         raise InputError(f"cannot read the {what} {path}: {reason}; {remedy}") from error
+
+
+def _as_stored(image: Image.Image) -> Image.Image:
+    """The image as COLMAP reads it: Pillow turns TIFFs, and them alone, as their orientation says."""
+    if image.format != "TIFF":
+        return image
+    exif = image.getexif()
+    orientation = exif.get(ExifTags.Base.Orientation)
+    if orientation not in AS_STORED:
+        return image
+    stored = image.transpose(AS_STORED[orientation])  # decodes it, and so takes the orientation out of its EXIF data
+    exif[ExifTags.Base.Orientation] = orientation
+    stored.format, stored._exif = image.format, exif  # which a transposed image has not
+    return stored

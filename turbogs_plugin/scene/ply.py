@@ -54,9 +54,37 @@ def read_header(path: Path) -> tuple[list[str], int]:
     header, separator, _ = head.partition(b"end_header\n")
     if not separator:
         header, separator, _ = head.partition(b"end_header\r\n")
-    if not head.startswith(b"ply") or not separator or not header.isascii():
+    if not head.startswith(b"ply") or not separator:
         raise InputError(f"{path} is not a .ply file: it has no header; copy or export it again")
-    return header.decode().splitlines()[1:], len(header) + len(separator)
+    # Comments may be in any encoding: this one takes all bytes.
+    return [line.decode("latin-1") for line in header.splitlines()[1:]], len(header) + len(separator)
+
+
+def read_colors(path: Path, vertices: np.ndarray) -> np.ndarray | None:
+    """[N, 3] uint8 red, green and blue of what `read_vertices` gave; None where there are none.
+
+    Numbers of 8 bits are taken as they are. The type of others does not say what white is. Of whole numbers it is
+    65535 where one is above 255. Of floats it is 1, unless their mean is above that: a few may be a bit above white.
+    Otherwise it is 255.
+
+    Raises:
+        InputError: colours that are not finite.
+    """
+    channels = ("red", "green", "blue")
+    if not set(channels) <= set(vertices.dtype.names):
+        return None
+    given = np.stack([vertices[channel] for channel in channels], axis=1)
+    if given.dtype.itemsize == 1 or not len(given):
+        return given.astype(np.uint8)
+    values = given.astype(np.float64)
+    bad = ~np.isfinite(values).all(axis=1)
+    if bad.any():
+        raise InputError(f"{path}: the colours of {bad.sum()} of {len(bad)} points are not finite: export it again")
+    if np.issubdtype(given.dtype, np.floating):
+        white = 1.0 if values.mean() <= 1.0 else 255.0
+    else:
+        white = 65535.0 if values.max() > 255.0 else 255.0
+    return np.rint((values / white * 255.0).clip(0.0, 255.0)).astype(np.uint8)
 
 
 def _parse_header(path: Path, lines: list[str]) -> tuple[bool, int, np.dtype, bool]:

@@ -18,7 +18,7 @@ from turbogs_plugin.scene.colmap import load_pycolmap
 from turbogs_plugin.scene.frame_photos import elsewhere_note, find_elsewhere, require_enough
 from turbogs_plugin.scene.named_split import read_split
 from turbogs_plugin.scene.photos import photo_size
-from turbogs_plugin.scene.ply import read_vertices
+from turbogs_plugin.scene.ply import read_colors, read_vertices
 from turbogs_plugin.scene.poses import viewmat_of_pose
 from turbogs_plugin.scene.starting_points import starting_points
 from turbogs_plugin.scene.undistort import Lens, brown_projection, lens_of_camera, make_lens
@@ -395,7 +395,5 @@ def _read_points(scene: Path, name: Any, source: Path) -> tuple[np.ndarray, np.n
     if not {"x", "y", "z"} <= set(vertices.dtype.names):
         raise InputError(f"{path} has no x, y, z: export it again, or take ply_file_path out of {source.name}")
     points = np.stack([vertices[axis].astype(np.float64) for axis in "xyz"], axis=1)
-    channels = ("red", "green", "blue")
-    if not set(channels) <= set(vertices.dtype.names):
-        return points, np.full(points.shape, 128, dtype=np.uint8)
-    return points, np.stack([vertices[channel].astype(np.uint8) for channel in channels], axis=1)
+    colors = read_colors(path, vertices)
+    return points, np.full(points.shape, 128, dtype=np.uint8) if colors is None else colors
