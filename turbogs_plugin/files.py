@@ -53,7 +53,7 @@ def read_text(path: Path) -> str | None:
     """The UTF-8 text of a file, or None where there is none. Raises `InputError` where it cannot be read."""
     try:
         return path.read_text(encoding="utf-8")
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         return None
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"cannot read '{path}': {error}") from None

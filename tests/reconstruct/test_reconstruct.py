@@ -474,6 +474,9 @@ def test_masks_go_with_their_photos(solved, tmp_path, monkeypatch):
     assert f"masks of {COUNT} of {COUNT} photos" in "".join(loaded.notes)
     shares = loaded.train.masks.pixel_counts / loaded.train.cameras.sizes.prod(axis=1)
     assert (shares < 0.95).all() and (shares > 0.5).all()
+    shutil.rmtree(tmp_path / "corner/masks")
+    reconstruct(photos, scene)
+    assert not (scene / "masks").exists()
 
 
 def test_masks_in_a_folder_of_another_name_are_noted(solved, tmp_path, monkeypatch):

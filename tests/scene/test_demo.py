@@ -1,9 +1,12 @@
 """The demo capture: a COLMAP dataset like any other, the same for a seed, with points where the photos show them."""
 
+from pathlib import Path
+
 import numpy as np
 import pycolmap
 import pytest
 import torch
+from helpers.refusals import assert_refused
 
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene import load_scene, write_demo_capture
@@ -65,6 +68,19 @@ def test_nothing_is_written_over(tmp_path, capture):
     assert {path: path.stat().st_mtime_ns for path in capture.rglob("*")} == before
     with pytest.raises(InputError, match="at least 3"):
         write_demo_capture(tmp_path / "few", views=2)
+    assert not list(tmp_path.iterdir())
+
+
+def test_on_a_full_disk_it_is_refused_and_leaves_nothing(tmp_path, monkeypatch):
+    whole = pycolmap.Reconstruction.write_binary
+
+    def cut(model: pycolmap.Reconstruction, folder: Path) -> None:
+        whole(model, folder)
+        (folder / "points3D.bin").write_bytes(b"")
+
+    monkeypatch.setattr(pycolmap.Reconstruction, "write_binary", cut)
+    words = f"demo capture cannot be written to '{tmp_path}': make room there"
+    assert_refused(words, write_demo_capture, tmp_path / "capture", views=3, width=16, height=12)
     assert not list(tmp_path.iterdir())
 
 

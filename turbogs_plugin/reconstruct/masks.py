@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 from PIL import Image, ImageOps
 from PIL.ExifTags import Base
 
+from turbogs_plugin.files import read_text, write_text_atomically
 from turbogs_plugin.reconstruct.photos import PhotoFile, link_or_copy, plain_name
 from turbogs_plugin.scene.mask_files import FOLDER, in_folders, require_mask_size
 from turbogs_plugin.scene.photos import decoding_threads, opened_image
@@ -62,8 +65,20 @@ def find_photo_masks(folder: Path, place: Path, photos: Sequence[PhotoFile]) -> 
         return [mask for mask in pool.map(find, photos) if mask is not None]
 
 
-def place_masks(masks: Sequence[MaskFile], folder: Path) -> None:
-    """Put masks into a folder, in the place of those that an earlier call put there."""
+def place_masks(masks: Sequence[MaskFile], folder: Path, listed: Path) -> None:
+    """Put masks into a folder, in the place of those that an earlier call put there. What others put there stays.
+
+    Args:
+        listed: file with the names of those that calls put there.
+    """
+    names = [mask.name for mask in masks]
+    before = (read_text(listed) or "").splitlines()
+    for name in set(before).difference(names):
+        (folder / name).unlink(missing_ok=True)
+        with suppress(OSError):  # others are in it; the scene itself is never empty
+            os.removedirs((folder / name).parent)
+    if names != before:  # a finished scene may lie where nothing can be written
+        write_text_atomically(listed, "".join(f"{name}\n" for name in names))
 
     def place(mask: MaskFile) -> None:
         target = folder / mask.name

@@ -90,6 +90,7 @@ def reconstruct(photos: Path, out: Path) -> Solution:
 
     Raises:
         InputError: photos or folder are not usable, or the photos cannot be solved. Then what this call began is gone.
+        OSError: the disk is full; what was finished is kept.
         KeyboardInterrupt: what was finished is kept.
     """
     load_pycolmap()  # where it is absent, that is said before photos are read
@@ -101,16 +102,17 @@ def reconstruct(photos: Path, out: Path) -> Solution:
     workspace = Workspace(out)
     missing = [parent for parent in (out, *out.parents) if not parent.exists()]
     new = workspace.begin(found)
-    place_masks(masks, workspace.masks)
     unused = "" if masks else misnamed(dict.fromkeys((photos, place.parent, place)))
-    try:
-        solution = workspace.read_solution() or _reconstruct(found, workspace, unread(photos))
-    except InputError:
-        if new:
-            shutil.rmtree(missing[-1] if missing else workspace.scratch, ignore_errors=True)
-            for folder in (workspace.images, workspace.masks):
-                shutil.rmtree(folder, ignore_errors=True)
-        raise
+    with workspace.held():
+        place_masks(masks, workspace.masks, workspace.masked)
+        try:
+            solution = workspace.read_solution() or _reconstruct(found, workspace, unread(photos))
+        except InputError:
+            if new:
+                shutil.rmtree(missing[-1] if missing else workspace.scratch, ignore_errors=True)
+                for folder in (workspace.images, workspace.masks):
+                    shutil.rmtree(folder, ignore_errors=True)
+            raise
     return replace(solution, notes=[*solution.notes, unused]) if unused else solution
 
 

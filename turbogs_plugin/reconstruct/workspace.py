@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import shutil
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,6 +15,12 @@ from turbogs_plugin.errors import InputError
 from turbogs_plugin.files import read_text, require_writable, write_text_atomically
 from turbogs_plugin.reconstruct.effort import Effort
 from turbogs_plugin.reconstruct.photos import PhotoFile
+from turbogs_plugin.scene.colmap_check import check_binary_model
+
+try:
+    import fcntl
+except ImportError:  # Windows, where nothing is held
+    fcntl = None
 
 if TYPE_CHECKING:
     import pycolmap
@@ -45,7 +53,7 @@ class Workspace:
 
     Attributes:
         images, masks, model: what a capture consists of.
-        scratch: what only a later call needs: the list of photos, databases, the solver's output.
+        scratch: what only a later call needs: the lists of photos and masks, databases, the solver's output.
     """
 
     def __init__(self, scene: Path) -> None:
@@ -55,6 +63,7 @@ class Workspace:
         self.model = scene / "sparse" / "0"
         self.scratch = scene / "reconstruction"
         self.listed = self.scratch / "photos.json"
+        self.masked = self.scratch / "masks.txt"
         self.solved = self.scratch / "solution.json"
 
     def database(self, effort: Effort) -> Path:
@@ -80,7 +89,7 @@ class Workspace:
             return True
         try:
             known = dict(json.loads(text))
-        except ValueError:
+        except (ValueError, TypeError):
             known = {}
         added, removed = len(listed.keys() - known.keys()), len(known.keys() - listed.keys())
         changed = sum(known[name] != stamp for name, stamp in listed.items() if name in known)
@@ -90,6 +99,24 @@ class Workspace:
                 "choose a new --out, or delete it"
             )
         return False
+
+    @contextmanager
+    def held(self) -> Iterator[None]:
+        """While entered, no other process makes the scene; one that is killed holds it no longer.
+
+        Raises:
+            InputError: another process makes it. Where it is finished, others take moments and are waited for.
+        """
+        finished = self.read_solution() is not None
+        with open(self.listed, "rb" if finished else "r+b") as lock:  # NFS locks only what is open for writing
+            if fcntl is not None:
+                try:
+                    fcntl.flock(lock, fcntl.LOCK_EX if finished else fcntl.LOCK_EX | fcntl.LOCK_NB)
+                except BlockingIOError:
+                    raise InputError(f"'{self.scene}' is being made by another process: wait for it") from None
+                except OSError:  # a disk without locks
+                    pass
+            yield
 
     def read_solution(self) -> Solution | None:
         """What an earlier call came to; None where none was finished."""
@@ -102,12 +129,20 @@ class Workspace:
             return None
 
     def finish(self, model: pycolmap.Reconstruction, solution: Solution) -> None:
-        """Put the model in place, whole or not at all, then the solution."""
+        """Put the model in place, whole or not at all, then the solution.
+
+        Raises:
+            OSError: the disk is full.
+        """
         part = self.scratch / "sparse"
         for folder in (part, self.model.parent, self.scratch / "models"):
             shutil.rmtree(folder, ignore_errors=True)
         (part / "0").mkdir(parents=True)
-        model.write_binary(part / "0")
+        try:
+            model.write_binary(part / "0")
+            check_binary_model(part / "0")  # of a full disk pycolmap says nothing
+        except (RuntimeError, ValueError) as error:
+            raise OSError(errno.ENOSPC, "it cannot be written whole", str(self.model)) from error
         part.rename(self.model.parent)
         found = asdict(solution)
         del found["scene"]  # it may be moved

@@ -18,6 +18,7 @@ from PIL import Image
 
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene.colmap import load_pycolmap
+from turbogs_plugin.scene.colmap_check import check_binary_model
 from turbogs_plugin.scene.poses import look_at
 
 if TYPE_CHECKING:
@@ -226,7 +227,8 @@ def write_demo_capture(
         horizon: the table stands outdoors, and the cameras see as far as the sky.
 
     Raises:
-        InputError: `path` is there already, or fewer than 3 views or an image without area are asked for.
+        InputError: `path` is there already, or cannot be written; or fewer than 3 views or an image without area are
+            asked for. Then nothing is written.
     """
     target = Path(path)
     if target.exists():
@@ -272,7 +274,14 @@ def _write(folder: Path, random: np.random.Generator, views: int, width: int, he
         points.append(origin + distances[chosen, None] * directions[chosen])
         point_colors.append(colors[chosen])
     _fill(reconstruction, poses, np.concatenate(points), np.concatenate(point_colors), depths, focal, random)
-    reconstruction.write_binary(folder / "sparse" / "0")
+    model = folder / "sparse" / "0"
+    try:
+        reconstruction.write_binary(model)
+        check_binary_model(model)  # of a full disk pycolmap says nothing
+    except (RuntimeError, ValueError) as error:
+        raise InputError(
+            f"the demo capture cannot be written to '{folder.parent}': make room there, or choose another place"
+        ) from error
 
 
 def _fill(
