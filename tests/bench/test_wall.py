@@ -13,7 +13,7 @@ from helpers.framework_runs import tiny_capture
 from turbogs_plugin import cli
 from turbogs_plugin.bench import wall
 from turbogs_plugin.bench.wall import REST, WallRun, bench_wall, wall_lines
-from turbogs_plugin.train.run import CHECKPOINT, MODEL
+from turbogs_plugin.train.session import CHECKPOINT, MODEL
 
 
 def test_the_parts_of_a_run_are_all_of_its_time(turbogs, tmp_path):

@@ -12,7 +12,8 @@ from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene import load_scene
 from turbogs_plugin.train.loop import Listener, TrainingLoop
 from turbogs_plugin.train.parameter_mean import AVERAGE_EVERY, ParameterMean
-from turbogs_plugin.train.run import RunSession, fit, resume, train
+from turbogs_plugin.train.run import fit, resume, train
+from turbogs_plugin.train.session import RunSession
 from turbogs_plugin.train.trainer import Trainer
 
 CPU = torch.device("cpu")

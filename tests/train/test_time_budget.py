@@ -17,7 +17,7 @@ from turbogs_plugin.errors import InputError, TrainingStopped
 from turbogs_plugin.plan.time import IterationCost
 from turbogs_plugin.scene import load_scene
 from turbogs_plugin.train import pace as pacing
-from turbogs_plugin.train import run
+from turbogs_plugin.train import run, session
 from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint, require_like
 from turbogs_plugin.train.history import read_history
 from turbogs_plugin.train.saved_model import load_model
@@ -164,7 +164,7 @@ def change_config(folder: Path, **sections: dict) -> None:
     (folder / "config.yaml").write_text(resolve(mapping).to_yaml())
 
 
-@pytest.mark.parametrize("place", [(Trainer, "__init__"), (Trainer, "load_state_dict"), (run, "place_views")])
+@pytest.mark.parametrize("place", [(Trainer, "__init__"), (Trainer, "load_state_dict"), (session, "place_views")])
 def test_a_run_that_no_longer_fits_is_not_resumed(stopped, monkeypatch, place):
     def full(*arguments, **options):
         raise torch.cuda.OutOfMemoryError("CUDA out of memory")
@@ -178,7 +178,7 @@ def test_test_photos_that_do_not_fit_are_refused(capture, tmp_path, monkeypatch)
     def full(*arguments):
         raise torch.cuda.OutOfMemoryError("CUDA out of memory")
 
-    monkeypatch.setattr(run, "place_views", full)
+    monkeypatch.setattr(session, "place_views", full)
     with pytest.raises(
         InputError, match=r"'capture' does not fit into the device's memory: use train.photos_place=host"
     ):

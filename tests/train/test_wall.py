@@ -13,6 +13,7 @@ from helpers.simulated_time import SimulatedTime
 from turbogs_plugin.errors import InputError, TrainingStopped
 from turbogs_plugin.report.pages import write_report
 from turbogs_plugin.train import run, start, wall
+from turbogs_plugin.train import session as sessions
 from turbogs_plugin.train.wall import WallClock, WallRecord, process_age
 
 pytestmark = pytest.mark.usefixtures("plotted")
@@ -64,19 +65,19 @@ def test_a_file_that_is_no_record_is_named(tmp_path, text):
 def test_a_run_records_the_wall_until_its_model_and_the_parts_of_its_report(capture, tmp_path, monkeypatch):
     clock = SimulatedTime(monkeypatch, tick=1e-8)
     clock.in_iterations(monkeypatch, lambda trainer: 1.0)
-    save, report_at = run.save_ply, []
+    save, report_at = sessions.save_ply, []
 
     def saving(*arguments) -> None:
         clock.passes(10.0)
         save(*arguments)
 
-    def reporting(session: run.RunSession) -> None:
+    def reporting(session: sessions.RunSession) -> None:
         session.finish_model()  # or the simulated seconds of two threads would mix
         report_at.append(session.clock.seconds)
         clock.passes(100.0)
         write_report(session)
 
-    monkeypatch.setattr(run, "save_ply", saving)
+    monkeypatch.setattr(sessions, "save_ply", saving)
     session = run.train(tiny_config(capture), tmp_path / "run", reporting, WallClock(age=1000.0))
     record = WallRecord.read(session.folder.wall)
     assert record.train_seconds == pytest.approx(14.07, abs=1e-3)
@@ -87,7 +88,7 @@ def test_a_run_records_the_wall_until_its_model_and_the_parts_of_its_report(capt
         "interpreter and imports": 1000.0,
         "initial maps": 0.07,
         "training": 14.0,
-        run.MODEL: 10.0,
+        sessions.MODEL: 10.0,
         "report": 100.0,
     }
     assert {name: parts[name] for name in expected} == pytest.approx(expected, abs=2e-3)
@@ -106,14 +107,14 @@ def test_checkpoint_and_model_are_written_while_the_report_is_made(capture, tmp_
         return wait_and_write
 
     for name in ("save_ply", "save_checkpoint"):
-        monkeypatch.setattr(run, name, late(getattr(run, name)))
+        monkeypatch.setattr(sessions, name, late(getattr(sessions, name)))
     session = run.train(tiny_config(capture, "train.checkpoint_every=0"), tmp_path / "run", lambda _: reporting.set())
     assert together == [True, True] and session.folder.model.is_file()
     assert run.latest_checkpoint(session.folder.checkpoints) is not None
 
 
 def test_a_model_that_cannot_be_written_stops_the_run(capture, tmp_path, monkeypatch):
-    monkeypatch.setattr(run, "save_ply", lambda *_: (_ for _ in ()).throw(TrainingStopped("the disk is full")))
+    monkeypatch.setattr(sessions, "save_ply", lambda *_: (_ for _ in ()).throw(TrainingStopped("the disk is full")))
     with pytest.raises(TrainingStopped, match=r"the disk is full; the last good checkpoint is '.*iteration-000014"):
         run.train(tiny_config(capture), tmp_path / "run", None)
     assert not (tmp_path / "run" / "wall.json").exists()

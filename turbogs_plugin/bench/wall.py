@@ -13,7 +13,8 @@ from typing import Any
 
 from turbogs_plugin.errors import InputError, TrainingStopped
 from turbogs_plugin.train.folder import RunFolder
-from turbogs_plugin.train.run import CHECKPOINT, DEVICE
+from turbogs_plugin.train.run import DEVICE
+from turbogs_plugin.train.session import CHECKPOINT
 from turbogs_plugin.train.wall import WallRecord
 
 REST = "start of the process, and its end"

@@ -26,7 +26,7 @@ from turbogs_plugin.errors import InputError
 from turbogs_plugin.train.wall import WallClock, process_age
 
 if TYPE_CHECKING:
-    from turbogs_plugin.train.run import RunSession
+    from turbogs_plugin.train.session import RunSession
 
 
 VIEWER_ON_ONE = "--viewer shows a training on one GPU: leave it out, or --gpus"

@@ -13,7 +13,7 @@ from turbogs_plugin.report.pictures import ERROR_FULL_SCALE, picture_writer, str
 from turbogs_plugin.report.plot_process import PlotProcess, SecondsPlot
 from turbogs_plugin.report.tables import ERRORS, error_columns, errors, history_rows, number, table, views_table
 from turbogs_plugin.train.evaluate import Metrics, evaluate, load_lpips, render_view
-from turbogs_plugin.train.run import RunSession
+from turbogs_plugin.train.session import RunSession
 
 
 def write_report(run: RunSession, process: PlotProcess | None = None) -> Path:

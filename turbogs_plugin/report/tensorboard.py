@@ -21,7 +21,7 @@ from turbogs_plugin.scene import PosedImages
 from turbogs_plugin.train.evaluate import render_view
 from turbogs_plugin.train.history import Evaluation
 from turbogs_plugin.train.loop import Listener, TrainingLoop
-from turbogs_plugin.train.run import RunSession
+from turbogs_plugin.train.session import RunSession
 
 if TYPE_CHECKING:
     from torch.utils.tensorboard import SummaryWriter

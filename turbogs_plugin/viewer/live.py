@@ -15,7 +15,7 @@ from turbogs_plugin.device import synchronize
 from turbogs_plugin.scene import PosedImages
 from turbogs_plugin.train.history import Evaluation
 from turbogs_plugin.train.loop import Listener, TrainingLoop
-from turbogs_plugin.train.run import RunSession
+from turbogs_plugin.train.session import RunSession
 from turbogs_plugin.train.trainer import Trainer
 from turbogs_plugin.types import Gaussians, PixelSamples, RowUpdate, Step
 from turbogs_plugin.viewer.frames import Frames
