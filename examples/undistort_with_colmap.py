@@ -21,6 +21,8 @@ import pycolmap
 
 
 def main(capture: Path, out: Path) -> None:
+    if not (capture / "transforms.json").is_file():
+        sys.exit(f"{capture} has no transforms.json: give a capture of nerfstudio or instant-ngp")
     content = json.loads((capture / "transforms.json").read_text())
     size = {"width": round(content["w"]), "height": round(content["h"])}
     params = [content.get(key, 0.0) for key in ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2")]
@@ -45,4 +47,6 @@ def main(capture: Path, out: Path) -> None:
 
 
 if __name__ == "__main__":
+    if len(sys.argv) != 3:
+        sys.exit("usage: undistort_with_colmap.py CAPTURE OUT")
     main(Path(sys.argv[1]), Path(sys.argv[2]))

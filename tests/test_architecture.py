@@ -82,7 +82,9 @@ def test_every_built_in_strategy_is_exported():
 
 def test_readmes_three_lines(tmp_path):
     """As they stand there, on a smaller capture and for fewer iterations."""
-    (block,) = re.findall(r"```python\n(scene = .*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.S)
+    (block,) = re.findall(
+        r"```python\nimport turbogs_plugin\n\n(scene = .*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.S
+    )
     assert len(block.strip().splitlines()) == 3
     capture = write_demo_capture(tmp_path / "capture", views=8, width=48, height=40)
     short = 'fit(scene, "train.iterations=2", "train.refine_until=1", "train.device=cpu", '

@@ -11,7 +11,7 @@ from turbogs_plugin.errors import InputError
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        ("trian", ("Unrecognized options: trian", "Available subcommands: train, ", "see turbogs --help")),
+        ("trian x --out y", ("no such command 'trian': did you mean 'train'? (known: ablate, bench, ",)),
         ("", ("Expected one of {train, ", "see turbogs --help")),
         ("train s --out r --fctor 3", ("Unrecognized options: --fctor, 3; did you mean --factor?",)),
         (

@@ -43,6 +43,8 @@ VARIANTS: dict[str, tuple[str, ...]] = {
 }
 """Name -> the edits of gsplat's file."""
 
+TRAINER = "examples/simple_trainer.py"
+CLONE = "git clone --branch v1.5.3 https://github.com/nerfstudio-project/gsplat .hosts/1.5.3"
 SPARSE_VIEWS = 4
 """Batch size of the variants with sparse pixels."""
 
@@ -86,7 +88,7 @@ class Options:
 
 def edited_trainer(host: Path, variant: str, folder: Path) -> Path:
     """A copy of the host's trainer with a variant's edits."""
-    source = (host / "examples" / "simple_trainer.py").read_text(encoding="utf-8")
+    source = (host / TRAINER).read_text(encoding="utf-8")
     for edits in VARIANTS[variant]:
         source = edited(source, edits)
     trainer = folder / f"{variant}.py"
@@ -138,6 +140,8 @@ def gpus() -> list[str]:
 
 def compare(options: Options) -> list[dict[str, Any]]:
     """All runs of `options`, those that were there before first; writes them as they end."""
+    if not (options.host / TRAINER).is_file():
+        raise SystemExit(f"{options.host / TRAINER} is not there: {CLONE}")
     options.out.mkdir(parents=True, exist_ok=True)
     file = options.out / "dropin.json"
     runs = json.loads(file.read_text())["runs"] if file.exists() else []

@@ -14,6 +14,7 @@ import pytest
 import torch
 from PIL import Image
 
+from turbogs_plugin.config.configuration import load_config
 from turbogs_plugin.engine.rendering import render_image
 from turbogs_plugin.export import page
 from turbogs_plugin.export.page import write_page
@@ -52,6 +53,23 @@ def test_the_page_has_the_background_and_says_whose_colours_it_shows(written, sc
     text = (tmp_path / "a.html").read_text(encoding="utf-8")
     assert "background: rgb(51, 102, 255)" in text and "in the model&#x27;s own colours" in text
     assert "background: rgb(0, 0, 0)" in written[0].read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize(
+    ("path", "init", "weights", "shown"),
+    [
+        ("/home/me", "/home/me/runs/a.ply", "/home/me/vgg.pth", ("me", "a.ply", "vgg.pth")),
+        (f"/home/{'secret client ' * 12}/fox", "points", None, ("fox", "points", None)),  # YAML folds such a line
+        ("/", "random", None, ("", "random", None)),
+    ],
+)
+def test_of_paths_the_page_hands_over_the_last_part_alone(path, init, weights, shown):
+    config = load_config()
+    config.scene.path, config.train.init, config.report.lpips_weights = path, init, weights
+    text = page._settings(config)
+    expected = load_config()
+    expected.scene.path, expected.train.init, expected.report.lpips_weights = shown
+    assert text == expected.to_yaml().rstrip() and config.scene.path == path
 
 
 @pytest.mark.parametrize("script", ["viewer.js", "page.js"])

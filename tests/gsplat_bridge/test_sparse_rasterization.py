@@ -287,7 +287,7 @@ REFUSED = [
         {"means": torch.ones(40, 3).double()},
         r"quats is of torch.float32 .*: expected torch.float64 on cpu",
     ),
-    ({"means": torch.ones(40, 3).long()}, r"means is of torch.int64: expected floating point"),
+    ({"means": torch.ones(40, 3).long()}, r"means is of torch.int64: expected torch.float32 or torch.float64"),
     ({"quats": np.ones((40, 4))}, r"quats is a ndarray: expected a tensor"),
     ({"covars": torch.ones(40, 3, 3)}, r"covars=a tensor of shape \(40, 3, 3\) is not supported, only None"),
     ({"samples": None}, r"samples is a NoneType: expected the PixelSamples"),
@@ -300,6 +300,23 @@ def test_what_does_not_fit_is_refused_by_name(scene, changed, message):
     splats, cameras, samples = scene
     with pytest.raises(InputError, match=message):
         sparse_rasterization(**{**arguments(splats, cameras), "samples": samples, "sh_degree": 1, **changed})
+
+
+def test_a_model_of_half_precision_is_refused(scene):
+    """Its gradients would come back not finite."""
+    splats, cameras, samples = scene
+    given = {
+        name: value.detach().half() for name, value in arguments(splats, cameras).items() if torch.is_tensor(value)
+    }
+    with pytest.raises(InputError, match=r"means is of torch.float16: expected torch.float32 or torch.float64"):
+        sparse_rasterization(**{**arguments(splats, cameras), **given}, samples=samples, sh_degree=1)
+
+
+def test_a_degree_may_be_an_integer_of_numpy(scene):
+    splats, cameras, samples = scene
+    given = {**arguments(splats, cameras), "samples": samples}
+    expected = sparse_rasterization(**given, sh_degree=1)[0]
+    assert torch.equal(sparse_rasterization(**given, sh_degree=np.int64(1))[0], expected)
 
 
 @pytest.mark.parametrize("name", ["viewmats", "Ks"])

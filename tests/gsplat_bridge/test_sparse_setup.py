@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+import numpy as np
 import pytest
 import torch
 from turbogs_plugin.strategies.pixel_sampling import ErrorGuidedPixelSampler
@@ -39,6 +40,13 @@ def test_the_rule_has_the_numbers_of_turbogs():
 def test_impossible_numbers_are_refused(arguments, name):
     with pytest.raises(InputError, match=name):
         sparse_budget(*arguments)
+
+
+def test_numbers_may_be_integers_of_numpy():
+    for given in ((np.int64(50), np.int32(8)), (np.int64(3), None)):
+        budget = sparse_budget(*given)
+        assert budget == sparse_budget(*(None if number is None else int(number) for number in given))
+        assert type(budget.views) is int  # torch's data loader refuses any other
 
 
 @dataclass
@@ -81,6 +89,21 @@ def test_masks_of_a_trainset_are_heeded(of_first):
     views = samples.view_of_slot()[samples.filled]
     assert (x[views == 1] < 7).all() and (x[views == 0] < 7).all() != of_first and (views == 1).any()
     assert maps.view_means()[0] == pytest.approx(float((images[0].sum(dim=-1) / 255)[mask].mean()), rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("image", "found"),
+    [
+        (torch.zeros(20, 30, 4), r"\(20, 30, 4\)"),  # RGBA
+        (torch.zeros(3, 20, 30), r"\(3, 20, 30\)"),
+        (torch.zeros(20, 30), r"\(20, 30\)"),
+        (np.zeros((20, 30, 3)), "ndarray"),
+    ],
+)
+def test_what_is_no_image_of_three_colours_is_refused_by_name(image, found):
+    trainset = [{"image": torch.zeros(20, 30, 3)}, {"image": image}]
+    with pytest.raises(InputError, match=rf"^trainset\[1\]\['image'\] is {found}: expected a tensor \[H, W, 3\]"):
+        maps_of_photos(trainset)
 
 
 def test_random_patches_are_refused():

@@ -1,6 +1,7 @@
 """Every format is read back, and by foreign readers where they are installed."""
 
 import gzip
+import re
 import struct
 from pathlib import Path
 
@@ -153,6 +154,39 @@ def test_a_damaged_file_is_refused(tmp_path, name, damage):
     file.write_bytes({"cut": content[:-5], "longer": content[:40] + b"abc" + content[40:], "other": b"ply\nno"}[damage])
     with pytest.raises(InputError, match=file.name):
         FORMATS[name].read(file)
+
+
+@pytest.mark.parametrize("colors_bounded", [True, False])
+def test_a_compressed_ply_of_degree_0_by_supersplat_is_read(tmp_path, colors_bounded):
+    """It has no element sh; older ones have no bounds of colours either, which are 0 and 1 then."""
+    file, written = tmp_path / "m.compressed.ply", FORMATS["compressed-ply"]
+    written.write(gaussians(degree=0), file, Frame(np.zeros(3), 1.0), 0)
+    expected = written.read(file)
+    header, _, body = file.read_bytes().partition(b"end_header\n")
+    header = re.sub(rb"element sh \d+\n", b"", header)
+    if not colors_bounded:
+        header = re.sub(rb"property float m.._[rgb]\n", b"", header)
+        bounds = np.frombuffer(body[: 2 * 18 * 4], "<f4").reshape(2, 18)  # of the two chunks of 300 Gaussians
+        packed_colors = np.frombuffer(body[2 * 18 * 4 :], "<u4").reshape(-1, 4)[:, 3]
+        shares = np.stack([packed_colors >> shift & 255 for shift in (24, 16, 8)], 1) / 255
+        expected.sh0 = torch.from_numpy((shares - 0.5) / SH_C0)[:, None]
+        body = bounds[:, :12].tobytes() + body[2 * 18 * 4 :]
+    file.write_bytes(header + b"end_header\n" + body)
+    for name in ("compressed-ply", "ply"):
+        read = dict(FORMATS[name].read(file).items())
+        for parameter, value in expected.items():
+            torch.testing.assert_close(read[parameter], value, rtol=0, atol=1e-12)
+
+
+def test_a_model_of_faint_gaussians_is_refused_as_a_compressed_ply(tmp_path):
+    """gsplat leaves them all out, and then fails at the first chunk."""
+    made = gaussians(4)
+    made.opacities[:] = -6.0
+    with pytest.raises(InputError, match=r"no Gaussian has an opacity above 1/255, .*: export with --format ply"):
+        FORMATS["compressed-ply"].write(made, tmp_path / "m.ply", Frame(np.zeros(3), 1.0), 0)
+    made.opacities[2] = -5.0
+    FORMATS["compressed-ply"].write(made, tmp_path / "m.ply", Frame(np.zeros(3), 1.0), 0)
+    assert len(FORMATS["compressed-ply"].read(tmp_path / "m.ply")) == 1
 
 
 def test_gaussians_that_are_not_finite_are_left_out():

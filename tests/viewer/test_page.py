@@ -25,7 +25,7 @@ from turbogs_plugin.viewer.commands import Shown, open_shown, show
 from turbogs_plugin.viewer.controls import Controls
 from turbogs_plugin.viewer.eye import Eye
 from turbogs_plugin.viewer.live import LiveViewer
-from turbogs_plugin.viewer.page import INSTALL, Page, require_free
+from turbogs_plugin.viewer.page import INSTALL, Page, address, require_free
 from turbogs_plugin.viewer.pictures import Picture, Request, draw
 from turbogs_plugin.viewer.subject import Subject
 
@@ -86,6 +86,22 @@ def test_moving_frames_are_jpeg(subject):
         client.look(dataclasses.replace(eye, fov=eye.fov * 0.9))
         assert not client.next_frame().lossless
         client.next_frame(lossless=True)
+
+
+@pytest.mark.parametrize(
+    ("host", "expected"),
+    [
+        ("127.0.0.1", "localhost"),
+        ("0.0.0.0", "localhost"),
+        ("::1", "[::1]"),
+        ("::", "[::1]"),
+        ("0:0:0:0:0:0:0:1", "[0:0:0:0:0:0:0:1]"),
+        ("fox.local", "fox.local"),
+    ],
+)
+def test_the_address_is_one_that_a_browser_here_reaches(host, expected):
+    """Nothing answers at localhost where that is 127.0.0.1 and the server listens at IPv6 alone."""
+    assert address(host, 8080) == f"http://{expected}:8080"
 
 
 HOSTILE = (

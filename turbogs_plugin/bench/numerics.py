@@ -184,7 +184,8 @@ def solvers_table(results: list[SolverResult]) -> str:
     def cell(result: SolverResult) -> str:
         if result.failed == 1:
             return "all fail"
-        return f"{result.max_error:.0e}" + (f" ({100 * result.failed:.1f} % fail)" if result.failed else "")
+        share = "< 0.1" if result.failed < 5e-4 else f"{100 * result.failed:.1f}"
+        return f"{result.max_error:.0e}" + (f" ({share} % fail)" if result.failed else "")
 
     def of(views: int, family: Stiffness) -> list[SolverResult]:
         return [result for result in results if (result.views, result.family) == (views, family.name)]

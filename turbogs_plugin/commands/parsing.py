@@ -11,6 +11,7 @@ from contextlib import redirect_stderr
 
 from tyro.extras import subcommand_cli_from_dict
 
+from turbogs_plugin.config.schema import nearest
 from turbogs_plugin.errors import InputError
 
 EDGE = re.compile(r"^[│|] ?|[ │|]+$")
@@ -39,6 +40,8 @@ def parsed(commands: Mapping[str, Callable[..., int]], words: Sequence[str], abo
     Raises:
         InputError: words that no command takes.
     """
+    if words and words[0] not in commands and not words[0].startswith("-"):
+        raise InputError(f"no such command '{words[0]}': {nearest(words[0], commands)}")
     said = io.StringIO()
     later = {verb: _later(function) for verb, function in commands.items()}
     try:

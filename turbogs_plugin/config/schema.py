@@ -20,8 +20,8 @@ def nearest(name: str, known: Iterable[str]) -> str:
     """A hint for an unknown name: the nearest known one, where one is near, and all of them."""
     known = sorted(known)
     close = difflib.get_close_matches(str(name), known, n=1, cutoff=0.5)
-    hint = f"did you mean '{close[0]}'? " if close else ""
-    return f"{hint}(known: {', '.join(known) or 'none'})"
+    all_known = ", ".join(known) or "none"
+    return f"did you mean '{close[0]}'? (known: {all_known})" if close else f"known are {all_known}"
 
 
 def build_dataclass(cls: type[T], mapping: Mapping[str, Any], where: str) -> T:

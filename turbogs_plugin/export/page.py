@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import copy
 import io
 import json
 import tempfile
@@ -229,7 +230,9 @@ def _tables(model: SavedModel, scene: Scene, history: list[Evaluation]) -> str:
 
 def _settings(config: Config) -> str:
     """The run's YAML. Of paths on this machine only the last part is handed over."""
-    text = config.to_yaml().rstrip()
-    for path in filter(None, (config.scene.path, config.train.init, config.report.lpips_weights)):
-        text = text.replace(path, Path(path).name)
-    return text
+    shown = copy.deepcopy(config)
+    shown.scene.path = Path(config.scene.path).name
+    shown.train.init = Path(config.train.init).name  # "points" and "random" stay as they are
+    if config.report.lpips_weights is not None:
+        shown.report.lpips_weights = Path(config.report.lpips_weights).name
+    return shown.to_yaml().rstrip()

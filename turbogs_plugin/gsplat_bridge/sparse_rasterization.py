@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import weakref
 from collections.abc import Callable
+from numbers import Integral
 from typing import Any
 
 import gsplat
@@ -121,7 +122,7 @@ def sparse_rasterization(
         Gaussians(means, quats, scales, opacities, sh0=colors[:, :1], shN=colors[:, 1:]),
         Cameras(viewmats, Ks, samples.sizes),
         samples,
-        sh_degree=sh_degree,
+        sh_degree=int(sh_degree),  # it may be numpy's
         settings=RasterSettings(eps2d=eps2d, near_plane=near_plane, far_plane=far_plane),
         with_depth=render_mode != "RGB",
         observer=observer,
@@ -312,13 +313,13 @@ def _check_options(options: dict[str, Any]) -> None:
 
 
 def _check_tensors(given: dict[str, Any]) -> None:
-    """All are tensors of the means' floating point type, on the means' device; cameras want no gradient."""
+    """All are tensors, float32 or float64 as the means are, on the means' device; cameras want no gradient."""
     means = given["means"]
     for name, value in given.items():
         if not isinstance(value, Tensor):
             raise InputError(f"{name} is a {type(value).__name__}: expected a tensor")
-        if not value.is_floating_point():
-            raise InputError(f"{name} is of {value.dtype}: expected floating point")
+        if value.dtype not in (torch.float32, torch.float64):  # of fewer bits, gradients come back not finite
+            raise InputError(f"{name} is of {value.dtype}: expected torch.float32 or torch.float64")
         if (value.dtype, value.device) != (means.dtype, means.device):
             raise InputError(
                 f"{name} is of {value.dtype} on {value.device}: expected {means.dtype} on {means.device} as means"
@@ -341,7 +342,7 @@ def _check_shapes(given: dict[str, Tensor], sh_degree: int | None) -> None:
             raise InputError(f"{name} has shape {tuple(value.shape)}: expected {form} (N = {count}, C = {cameras})")
     if sh_degree is None:
         return
-    if not isinstance(sh_degree, int) or sh_degree < 0:
+    if not isinstance(sh_degree, Integral) or sh_degree < 0:
         raise InputError(f"sh_degree is {sh_degree!r}: expected a whole number, 0 or more, or None")
     if (sh_degree + 1) ** 2 > colors.shape[1]:
         raise InputError(f"sh_degree {sh_degree} needs {(sh_degree + 1) ** 2} bands: colors have {colors.shape[1]}")

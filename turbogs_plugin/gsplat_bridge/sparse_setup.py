@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from numbers import Integral
 from typing import Any
 
 import torch
@@ -34,11 +35,11 @@ def sparse_budget(num_views: int, batch_size: int | None = None) -> SamplingBudg
         InputError: a number below 1, or a batch of more views than there are.
     """
     whole = "a whole number, 1 or more"
-    require(isinstance(num_views, int) and num_views >= 1, "num_views", num_views, whole)
+    require(isinstance(num_views, Integral) and num_views >= 1, "num_views", num_views, whole)
     if batch_size is not None:
         allowed = f"{whole} and at most num_views ({num_views})"
-        require(isinstance(batch_size, int) and 1 <= batch_size <= num_views, "batch_size", batch_size, allowed)
-    views = min(DEFAULT_VIEWS, num_views) if batch_size is None else batch_size
+        require(isinstance(batch_size, Integral) and 1 <= batch_size <= num_views, "batch_size", batch_size, allowed)
+    views = int(min(DEFAULT_VIEWS, num_views) if batch_size is None else batch_size)  # loaders refuse numpy's integers
     pixels = TUNED_SCHEDULE.pixel_budget
     rate = min(1.0, max(pixels / views, pixels / TUNED_SCHEDULE.max_views))
     reason = "no batch_size is given" if batch_size is None else f"batch_size is {batch_size}"
@@ -57,7 +58,8 @@ def maps_of_photos(
         white: the largest value of a photo; gsplat's data sets have 255.
 
     Raises:
-        InputError: the data set cuts random patches (``patch_size``), whose pixels are others each time.
+        InputError: the data set cuts random patches (``patch_size``), whose pixels are others each time; or an image
+            is no tensor [H, W, 3].
     """
     patch_size = getattr(trainset, "patch_size", None)
     if patch_size is not None:
@@ -69,7 +71,11 @@ def maps_of_photos(
     errors, masks = [], []
     for number in range(len(trainset)):
         item = trainset[number]
-        errors.append(item["image"].to(device).float().sum(dim=-1) / white)  # [H, W]
+        image = item["image"]
+        if not isinstance(image, torch.Tensor) or image.dim() != 3 or image.shape[-1] != 3:
+            found = tuple(image.shape) if isinstance(image, torch.Tensor) else type(image).__name__
+            raise InputError(f"trainset[{number}]['image'] is {found}: expected a tensor [H, W, 3], colours alone")
+        errors.append(image.to(device).float().sum(dim=-1) / white)  # [H, W]
         masks.append(item.get("mask"))
     if all(mask is None for mask in masks):
         return ErrorMaps.from_images(errors)

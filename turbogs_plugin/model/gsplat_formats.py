@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.files import write_atomically
@@ -16,11 +17,14 @@ from turbogs_plugin.types import SH_C0, Gaussians
 
 CHUNK = 256
 """Gaussians that share their bounds in a compressed .ply."""
+LEAST_OPACITY = 1.0 / 255.0
+"""gsplat's exporter leaves out of a compressed .ply what is not above it."""
 SPLAT_ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), ("quat", "u1", 4)])
 BOUNDS = [
     f"{end}_{axis}" for kind in ("", "scale_") for end in ("min", "max") for axis in (f"{kind}{a}" for a in "xyz")
 ]
-BOUNDS += [f"{end}_{channel}" for end in ("min", "max") for channel in "rgb"]
+COLOR_BOUNDS = [f"{end}_{channel}" for end in ("min", "max") for channel in "rgb"]
+"""Older files lack these: their colours lie between 0 and 1."""
 WORDS = ["packed_position", "packed_rotation", "packed_scale", "packed_color"]
 
 
@@ -32,10 +36,16 @@ def save_by_gsplat(kind: str, gaussians: Gaussians, path: Path, frame: Frame, st
             the second leaves out those of an opacity of 1/255 or less.
         gaussians, path, frame: as for `in_capture`.
         step: has no place in these formats.
+
+    Raises:
+        InputError: there is nothing to write, or the capture lies too far from its origin for float32.
     """
     from gsplat import export_splats
 
-    content = export_splats(**dict(in_capture(gaussians, frame, path).items()), format=kind)
+    rows = in_capture(gaussians, frame, path)
+    if kind == "ply_compressed" and not (torch.sigmoid(rows.opacities) > LEAST_OPACITY).any():
+        raise InputError(f"no Gaussian has an opacity above 1/255, {path} would be empty: export with --format ply")
+    content = export_splats(**dict(rows.items()), format=kind)
     write_atomically(path, lambda file: file.write(content))
 
 
@@ -61,7 +71,7 @@ def read_splat(path: Path) -> Gaussians:
 
 
 def read_compressed_ply(path: Path) -> Gaussians:
-    """The model of a compressed ``.ply`` as gsplat writes it; float64, on the CPU.
+    """The model of a compressed ``.ply`` as gsplat or SuperSplat writes it; float64, on the CPU.
 
     Raises:
         InputError: the file is no such one.
@@ -76,16 +86,19 @@ def read_compressed_ply(path: Path) -> Gaussians:
                 elements[words[1]] = (int(words[2]), [])
             elif words[:1] == ["property"]:
                 elements[list(elements)[-1]][1].append(words[-1])
-        (chunks, bounds), (count, words), (also, rest) = (elements[name] for name in ("chunk", "vertex", "sh"))
+        (chunks, bounds), (count, words) = elements["chunk"], elements["vertex"]
     except (ValueError, KeyError, IndexError):
         raise InputError(f"{path} is not a compressed .ply of Gaussians: export it again") from None
-    sizes = (4 * len(BOUNDS) * chunks, 4 * len(WORDS) * count, len(rest) * count)
-    shaped = (sorted(bounds), words, also, chunks) == (sorted(BOUNDS), WORDS, count, -(-count // CHUNK))
+    also, rest = elements.get("sh", (count, []))  # SuperSplat leaves it out where there are no harmonics
+    sizes = (4 * len(bounds) * chunks, 4 * len(WORDS) * count, len(rest) * count)
+    bounded = sorted(bounds) in (sorted(BOUNDS), sorted(BOUNDS + COLOR_BOUNDS))
+    shaped = bounded and (words, also, chunks) == (WORDS, count, -(-count // CHUNK))
     if not (count and shaped and len(rest) in (0, 9, 24, 45) and len(body) == sum(sizes)):
         raise InputError(f"{path} is not a whole compressed .ply of Gaussians: export it again")
-    limits = np.frombuffer(body[: sizes[0]], dtype="<f4").reshape(chunks, len(BOUNDS)).astype(np.float64)
-    of_row = limits[np.arange(count) // CHUNK]  # [N, 18]
-    column = {name: of_row[:, place] for place, name in enumerate(bounds)}
+    limits = np.frombuffer(body[: sizes[0]], dtype="<f4").reshape(chunks, len(bounds)).astype(np.float64)
+    of_row = limits[np.arange(count) // CHUNK]  # [N, 18], or [N, 12] without those of colours
+    column = {name: np.full(count, float(name.startswith("max"))) for name in COLOR_BOUNDS}
+    column |= {name: of_row[:, place] for place, name in enumerate(bounds)}
     position, rotation, scale, color = np.frombuffer(body[sizes[0] : sizes[0] + sizes[1]], dtype="<u4").reshape(-1, 4).T
 
     def spread(shares: list[np.ndarray], names: str, kind: str = "") -> np.ndarray:

@@ -220,7 +220,8 @@ def _require_solved(solve: Solve | None, photos: int, verified: int, matching: M
                 "they show no depth, as photos from one place or copies of one photo do; move between the photos"
             )
         asked = f"of {len(matching.pairs):,} pairs of photos " if not matching.similar else "of pairs of photos "
-        raise InputError(f"no cameras were found for {photos} photos: {asked}{verified:,} match; {remedy}")
+        sharp = "; sharp ones, not much smaller than a camera makes them"
+        raise InputError(f"no cameras were found for {photos} photos: {asked}{verified:,} match; {remedy}{sharp}")
     if solve.placed >= max(FEWEST_PHOTOS, SMALLEST_SHARE * photos):
         return
     if len(solve.sizes) > 1:

@@ -230,7 +230,11 @@ def load_lpips(weights: str | None, device: torch.device) -> tuple[Lpips | None,
         raise InputError(f"report.lpips_weights: no such file '{weights}'")
     missing = [name for name in LPIPS_PACKAGES if importlib.util.find_spec(name) is None]
     if missing:
-        return None, f"it needs {' and '.join(missing)}: pip install {' '.join(missing)}"
+        release = torch.__version__.partition("+")[0]  # or pip may bring another torch with torchvision
+        return None, (
+            f"it needs {' and '.join(missing)} (pip install {' '.join(missing)} torch=={release}) and the weights "
+            f"{VGG16_FILE}"
+        )
     file = Path(weights) if weights else Path(torch.hub.get_dir()) / "checkpoints" / VGG16_FILE
     if not file.is_file():
         return None, f"its weights are not on this machine; name a local {VGG16_FILE} in report.lpips_weights"

@@ -77,6 +77,15 @@ def require_free(host: str, port: int) -> None:
         raise InputError(f"the viewer cannot listen at {host}:{port} ({reason}): {remedy}") from None
 
 
+def address(host: str, port: int) -> str:
+    """What a browser on this machine opens to see a server that listens at `host`."""
+    if host in ("127.0.0.1", "0.0.0.0"):
+        host = "localhost"
+    elif host == "::":
+        host = "::1"  # not localhost, which may mean 127.0.0.1 alone
+    return f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
+
+
 class Page:
     """A web page that shows frames and takes wishes.
 
@@ -107,8 +116,7 @@ class Page:
         _guard(self.server)
         self.server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="large")
         self.server.gui.main_panel.dock_right()
-        shown = "localhost" if host in ("127.0.0.1", "::1", "0.0.0.0", "::") else host
-        self.url = f"http://{shown}:{self.port}"
+        self.url = address(host, self.port)
         self._build_panel(controls is not None)
         self.server.on_client_connect(self._connected)
         self.server.on_client_disconnect(self._disconnected)
