@@ -1,7 +1,10 @@
 """Sparse Adam and moment-damped LM behind gsplat's dict of optimizers."""
 
 import copy
+import io
 import itertools
+import re
+from pathlib import Path
 
 import pytest
 import torch
@@ -19,6 +22,7 @@ from turbogs_plugin.types import PARAMETER_NAMES
 
 RULES = {"adam": SparseAdam, "lm": MomentLMOptimizer}
 ADAM = torch.optim.Adam
+DROP_IN = Path(__file__).resolve().parents[2] / "docs" / "drop-in.md"
 LATE = {"refine_start_iter": 1000}
 
 
@@ -244,6 +248,152 @@ def test_a_missing_gradient_is_zero_and_none_at_all_is_no_step():
     for member in members.values():
         member.step()
     assert torch.equal(splats["shN"], before)
+
+
+@pytest.mark.parametrize("times", [1, 2])
+@pytest.mark.parametrize(
+    "skipped", [["means"], ["quats"], ["shN"], [name for name in PARAMETER_NAMES if name != "sh0"]]
+)
+def test_an_iteration_that_a_grad_scaler_skips_in_part_is_skipped_whole(skipped, times, capsys):
+    """Also where rows are removed before the next iteration, which then updates as if the other had never been."""
+    ours, alone = (Host(DefaultStrategy(**LATE), SharedOptimizer(SparseAdam())) for _ in range(2))
+    for seed in range(times + 1):
+        set_gradients(ours.splats, seed)
+        for name in skipped if seed < times else ():
+            ours.splats[name].grad[0] = float("inf")
+        before = ours.splats["means"].detach().clone()
+        for name, optimizer in ours.optimizers.items():
+            if ours.splats[name].grad.isfinite().all():
+                optimizer.step()
+            optimizer.zero_grad()
+        assert torch.equal(ours.splats["means"], before) == (seed < times)
+        if seed == times - 1:
+            for host in (ours, alone):
+                surgery("remove", host, torch.Generator().manual_seed(1))
+    set_gradients(alone.splats, times)
+    for optimizer in alone.optimizers.values():
+        optimizer.step()
+    assert all(torch.equal(ours.splats[name], alone.splats[name]) for name in PARAMETER_NAMES)
+    said = capsys.readouterr().out
+    assert said.count("an iteration was skipped") == 1 and f"the optimizer of {', '.join(skipped)} was not" in said
+
+
+@pytest.mark.parametrize("made", [True, False])
+def test_a_member_that_never_has_a_part_is_named(made):
+    """Not made: in the second iteration. Never stepped: once no GradScaler would go on skipping."""
+    splats, shared = make_splats(), SharedOptimizer(SparseAdam())
+    names = PARAMETER_NAMES if made else PARAMETER_NAMES[:-1]
+    members = [shared([{"params": splats[name], "lr": 1e-3, "name": name}]) for name in names]
+
+    def iteration():
+        splats["means"].grad = torch.ones_like(splats["means"])
+        for member in members[:5]:
+            member.step()
+
+    for _ in range(100 if made else 1):
+        iteration()
+    message = r"of shN was left out, and 100 iterations in a row" if made else "no optimizer of shN: make all six"
+    with pytest.raises(InputError, match=message):
+        iteration()
+
+
+def test_closures_that_run_a_backward_each_give_one_update():
+    splats, expected = make_splats(), make_splats()
+    members, plain = members_of(splats, SparseAdam()), members_of(expected, SparseAdam())
+
+    def closure():
+        set_gradients(splats, 0)
+        return 3.0
+
+    assert [member.step(closure) for member in members.values()] == [3.0] * 6
+    set_gradients(expected, 0)
+    for member in plain.values():
+        member.step()
+    assert all(torch.equal(splats[name], expected[name]) for name in PARAMETER_NAMES)
+
+
+def saved_and_loaded(members):
+    file = io.BytesIO()
+    torch.save(members, file)
+    file.seek(0)
+    return torch.load(file, weights_only=False)
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, saved_and_loaded])
+@pytest.mark.parametrize("rule", RULES)
+def test_copies_of_members_go_on_by_themselves(rule, copied):
+    splats = make_splats()
+    members = members_of(splats, RULES[rule]())
+    set_gradients(splats, 0)
+    for member in members.values():
+        member.step()
+    copies = copied(members)
+    values = {name: copies[name].parameter for name in PARAMETER_NAMES}
+    before = {name: value.detach().clone() for name, value in values.items()}
+    for model, optimizers in ((splats, members), (values, copies)):
+        set_gradients(model, 1)
+        for optimizer in optimizers.values():
+            optimizer.step()
+        assert torch.equal(values["means"], before["means"]) == (model is splats)
+    assert all(torch.equal(splats[name], values[name]) for name in PARAMETER_NAMES)
+
+
+@pytest.mark.parametrize("option", [{"weight_decay": 0.5}, {"maximize": True}, {"amsgrad": True}])
+def test_options_of_a_group_that_it_does_not_know_are_refused(option):
+    (name, value), splats = *option.items(), make_splats()
+    members = members_of(splats, SparseAdam())
+    for member in members.values():
+        member.param_groups[0][name] = type(value)(0)  # as in the state of torch's Adam
+    for asked in (False, True):
+        members["quats"].param_groups[0].update(option if asked else {})
+        set_gradients(splats, 0)
+        before = splats["means"].detach().clone()
+        if asked:
+            with pytest.raises(InputError, match=rf"the group of 'quats' has {name} = {value}, .*: leave it out"):
+                for member in members.values():
+                    member.step()
+        else:
+            for member in members.values():
+                member.step()
+        assert torch.equal(splats["means"], before) == asked
+
+
+def test_the_recipe_for_splatfacto_hands_weight_decay_on():
+    blocks = re.findall(r"^```python\n(.*?)^```$", DROP_IN.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE)
+    text = next(text for text in blocks if "def member(name)" in text).split("for name in")[0]
+    names = {"SharedOptimizer": SharedOptimizer, "MomentLMOptimizer": MomentLMOptimizer}
+    exec(text, names)
+    made = names["member"]("features_dc")([make_splats()["sh0"]], lr=1e-3, eps=1e-15, weight_decay=0.5)
+    assert made.param_groups[0]["weight_decay"] == 0.5
+
+
+def test_a_second_group_is_refused():
+    members = members_of(make_splats(), SparseAdam())
+    more = {"params": [torch.nn.Parameter(torch.ones(3))], "name": "poses"}
+    with pytest.raises(InputError, match=r"optimizer of 'means' takes no second group: give .* 'poses' an optimizer"):
+        members["means"].add_param_group(more)
+    assert len(members["means"].param_groups) == 1
+
+
+def test_betas_may_be_lists():
+    results = []
+    for betas in ((0.8, 0.9), [0.8, 0.9]):
+        splats = make_splats()
+        members = members_of(splats, SparseAdam(), betas=(0.8, 0.9))
+        for name in PARAMETER_NAMES[1:]:
+            members[name].param_groups[0]["betas"] = betas
+        set_gradients(splats, 0)
+        for member in members.values():
+            member.step()
+        results.append(splats)
+    assert all(torch.equal(results[0][name], results[1][name]) for name in PARAMETER_NAMES)
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_parameters_in_half_precision_are_refused_by_name(dtype):
+    means = torch.nn.Parameter(make_splats()["means"].detach().to(dtype))
+    with pytest.raises(InputError, match=f"parameter 'means' is of {dtype}: make it float32 or float64"):
+        SharedOptimizer(SparseAdam())([{"params": means, "lr": 1e-3, "name": "means"}])
 
 
 def test_mistakes_are_named():

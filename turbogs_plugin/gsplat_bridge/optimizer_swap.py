@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Iterable, Iterator
-from types import SimpleNamespace
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -34,6 +34,25 @@ COUNT = "step"
 operations take every other value for one with rows."""
 
 MOMENTS = ("exp_avg", "exp_avg_sq")
+
+OPTIONS_NOT_TAKEN = ("weight_decay", "maximize", "amsgrad")
+"""Of torch's Adam: they change its steps, and the shared update has no such thing."""
+
+DTYPES = (torch.float32, torch.float64)
+"""Of parameters: in half precision small steps are lost by rounding, and float16 has no eps of 1e-15."""
+
+MOST_SKIPPED = 100
+"""Iterations in a row that may be skipped. A `GradScaler` halves its scale at each, so it needs a few dozen at most."""
+
+
+@dataclass
+class _HostRates:
+    """The rates that the host's schedulers have set, whatever the step."""
+
+    rates: ParameterRates
+
+    def at(self, step: Step) -> ParameterRates:
+        return self.rates
 
 
 class SharedOptimizer:
@@ -63,6 +82,8 @@ class SharedOptimizer:
         self._gradients: dict[str, Tensor | None] = {}
         self._info: dict[str, Any] | None = None
         self._told = False
+        self._told_skipped = False
+        self._skipped_in_a_row = 0
 
     def __call__(
         self,
@@ -100,19 +121,54 @@ class SharedOptimizer:
             InputError: there is one of this member already.
         """
         if name in self._gradients:
-            waiting = [other for other in PARAMETER_NAMES if other not in self._gradients]
             raise InputError(
                 f"the optimizer of '{name}' was stepped twice: expected, as one update is shared by all, "
-                f"a step of {', '.join(waiting)} in between"
+                f"a step of {', '.join(self._waiting())} in between"
             )
         self._gradients[name] = gradient
         if len(self._gradients) == len(PARAMETER_NAMES):
             self._update()
 
+    def drop_stale(self) -> None:
+        """Forget the gradients of an iteration in which not all members were stepped, as soon as the next one begins.
+
+        A `GradScaler` leaves out each optimizer whose gradient has an inf. Its iteration is then skipped whole, for all
+        parameters, so no update mixes two iterations. The first such iteration is printed.
+
+        Raises:
+            InputError: a member that was left out was never made, or `MOST_SKIPPED` iterations in a row lacked one.
+        """
+        if all(self.members[name].parameter.grad is None for name in self._gradients):
+            return  # no backward ran since they were handed over
+        waiting = self._waiting()
+        never_made = [name for name in waiting if name not in self.members]
+        if never_made:
+            raise InputError(
+                f"there is no optimizer of {', '.join(never_made)}: make all six, as one update is shared by all"
+            )
+        self._gradients = {}
+        self._skipped_in_a_row += 1
+        if self._skipped_in_a_row == MOST_SKIPPED:
+            raise InputError(
+                f"the optimizer of {', '.join(waiting)} was left out, and {MOST_SKIPPED} iterations in a row were "
+                "skipped for that: step all six in each iteration, also without a gradient; where a GradScaler leaves "
+                "one out, see why its gradient is never finite"
+            )
+        if not self._told_skipped:
+            print(
+                f"SharedOptimizer: an iteration was skipped, as in it the optimizer of {', '.join(waiting)} was not "
+                "stepped. A GradScaler does that after an inf; else step all six in each iteration."
+            )
+        self._told_skipped = True
+
+    def _waiting(self) -> list[str]:
+        """The parameters whose gradient this round lacks."""
+        return [name for name in PARAMETER_NAMES if name not in self._gradients]
+
     def _update(self) -> None:
         require_one_process("SharedOptimizer")
         members, gradients, info = self.members, self._gradients, self._info
-        self._gradients, self._info = {}, None
+        self._gradients, self._info, self._skipped_in_a_row = {}, None, 0
         if all(gradient is None for gradient in gradients.values()):
             return
         gaussians = host_gaussians({name: members[name].parameter for name in PARAMETER_NAMES})
@@ -131,19 +187,28 @@ class SharedOptimizer:
         """Learning rates, betas and eps of the members' groups.
 
         Raises:
-            InputError: betas or eps differ between members, or are none that Adam can use.
+            InputError: betas or eps differ between members, or are none that Adam can use, or a group asks for one of
+                `OPTIONS_NOT_TAKEN`.
         """
         groups = {name: member.param_groups[0] for name, member in self.members.items()}
-        for option in ("betas", "eps"):
-            values = {name: group[option] for name, group in groups.items()}
+        for name, group in groups.items():
+            for option in OPTIONS_NOT_TAKEN:
+                if group.get(option):
+                    raise InputError(
+                        f"the group of '{name}' has {option} = {group[option]}, which a shared update does not know: "
+                        "leave it out, or keep torch.optim.Adam for all parameters"
+                    )
+        betas = {name: tuple(group["betas"]) for name, group in groups.items()}  # lists, where read from JSON or YAML
+        epsilons = {name: group["eps"] for name, group in groups.items()}
+        for option, values in (("betas", betas), ("eps", epsilons)):
             if len(set(values.values())) > 1:
                 raise InputError(
                     f"{option} differ between the members of one shared update: {values}; expected one value"
                 )
         rates = ParameterRates(**{name: float(group["lr"]) for name, group in groups.items()})
-        (beta1, beta2), eps = groups["means"]["betas"], groups["means"]["eps"]
+        (beta1, beta2), eps = betas["means"], epsilons["means"]
         check_moments_config(beta1, beta2, eps)
-        self.optimizer.learning_rates = SimpleNamespace(at=lambda step: rates)  # hosts' schedulers have set them
+        self.optimizer.learning_rates = _HostRates(rates)
         self.optimizer.beta1, self.optimizer.beta2, self.optimizer.eps = beta1, beta2, eps
 
     def _pack(self, gaussians: Gaussians) -> GaussianMoments:
@@ -192,6 +257,28 @@ class MemberOptimizer(torch.optim.Optimizer):
         require(len(self.param_groups[0]["params"]) == 1, "params", self.param_groups[0]["params"], "one tensor")
         self.shared = shared
         self.name: str = groups[0]["name"]
+        if self.parameter.dtype not in DTYPES:
+            raise InputError(
+                f"parameter '{self.name}' is of {self.parameter.dtype}: make it float32 or float64; a forward pass in "
+                "half precision is torch.autocast's"
+            )
+
+    def __getstate__(self) -> dict[str, Any]:
+        """For copies and pickles, which are of all members, as each one knows the others; torch's lacks our part."""
+        return {**super().__getstate__(), "shared": self.shared, "name": self.name}
+
+    def add_param_group(self, param_group: dict[str, Any]) -> None:
+        """Torch calls this for the one group that a member is made with.
+
+        Raises:
+            InputError: there is that group already.
+        """
+        if self.param_groups:
+            raise InputError(
+                f"the optimizer of '{self.param_groups[0]['name']}' takes no second group: give the parameters of "
+                f"group '{param_group.get('name')}' an optimizer of their own"
+            )
+        super().add_param_group(param_group)
 
     @property
     def parameter(self) -> torch.nn.Parameter:
@@ -206,6 +293,9 @@ class MemberOptimizer(torch.optim.Optimizer):
     def step(self, closure: Callable[[], float] | None = None) -> float | None:
         """Hand the gradient over (``.grad`` is None afterwards); the last member to be stepped updates all.
 
+        Where a backward ran before all members were stepped, as when a `GradScaler` left one out, what the others
+        handed over before it is dropped: see `SharedOptimizer.drop_stale`.
+
         Raises:
             InputError: stepped twice before all the others were, a sparse gradient, or a mask in the closure's place.
         """
@@ -214,7 +304,9 @@ class MemberOptimizer(torch.optim.Optimizer):
                 "step takes no visibility mask, rows without a gradient stay anyway: set visible_adam=False"
             )
         loss = None
-        if closure is not None:
+        if closure is None:
+            self.shared.drop_stale()
+        else:  # closures run a backward for each member, so a new gradient does not tell of a new iteration
             with torch.enable_grad():
                 loss = closure()
         gradient, self.parameter.grad = self.parameter.grad, None
