@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 from helpers import textured_corner
-from helpers.textured_corner import FOCAL, SIZE, render_corner, viewmat
+from helpers.textured_corner import FOCAL, render_corner, viewmat
 
 from turbogs_plugin.plan import exposures, gather_facts
 from turbogs_plugin.plan.exposures import compare_exposures, fit_gains
@@ -19,8 +19,14 @@ RANDOM = np.random.default_rng(3).uniform(0.7, 1.25, (VIEWS, 3))
 """Gains that differ from photo to photo and between channels."""
 
 
-def corner(gains: np.ndarray, turned: tuple[int, ...] = (), seeds: tuple[int, ...] = (0,) * VIEWS) -> PosedImages:
-    """Photos of the corner times [V, 3] `gains`; those in `turned` are taken with the camera upside down."""
+def corner(
+    gains: np.ndarray,
+    turned: tuple[int, ...] = (),
+    seeds: tuple[int, ...] = (0,) * VIEWS,
+    upright: tuple[int, ...] = (),
+) -> PosedImages:
+    """Photos of the corner times [V, 3] `gains`; those in `turned` are taken with the camera upside down, those in
+    `upright` by a quarter of a turn."""
     viewmats = np.tile(np.eye(4), (VIEWS, 1, 1))
     photos = []
     for view, center in enumerate(textured_corner.camera_centers(VIEWS)):
@@ -29,9 +35,13 @@ def corner(gains: np.ndarray, turned: tuple[int, ...] = (), seeds: tuple[int, ..
         if view in turned:
             image = image[::-1, ::-1]
             viewmats[view] = np.diag([-1.0, -1.0, 1.0, 1.0]) @ viewmats[view]
+        if view in upright:
+            image = np.rot90(image)  # x is what y was, and y what -x was
+            viewmats[view] = np.eye(4)[[1, 0, 2, 3]] * [[1], [-1], [1], [1]] @ viewmats[view]
         photos.append(np.clip(np.rint(image * gains[view]), 0, 255).astype(np.uint8))
-    Ks = np.tile([[FOCAL, 0, SIZE[0] / 2], [0, FOCAL, SIZE[1] / 2], [0, 0, 1]], (VIEWS, 1, 1))
-    sizes = np.tile(np.array(SIZE, dtype=np.int64), (VIEWS, 1))
+    sizes = np.array([photo.shape[1::-1] for photo in photos], dtype=np.int64)
+    Ks = np.tile(np.diag([FOCAL, FOCAL, 1.0]), (VIEWS, 1, 1))
+    Ks[:, :2, 2] = sizes / 2
     cameras = Cameras(torch.from_numpy(viewmats).float(), torch.from_numpy(Ks).float(), sizes)
     colors = torch.from_numpy(np.concatenate([photo.reshape(-1, 3) for photo in photos]))
     return PosedImages(cameras, tuple(map(str, range(VIEWS))), Photos(colors, sizes))
@@ -56,11 +66,11 @@ def in_stops(gains: np.ndarray) -> np.ndarray:
     return stops - stops.mean(axis=0)
 
 
-@pytest.mark.parametrize("turned", [(), (1, 2, 5, 6, 9, 10)])
+@pytest.mark.parametrize("turned", [{}, {"turned": (1, 2, 5, 6, 9, 10)}, {"upright": (1, 2, 5, 6, 9, 10)}], ids=str)
 @pytest.mark.parametrize("hidden", [0, 500])
 def test_gains_are_recovered_to_a_few_percent(turned, hidden):
-    """Though a third of the points may be hidden, and lines of photos be taken the other way round."""
-    found = measured(corner(RANDOM, turned), points(hidden))
+    """Though a third of the points may be hidden, and lines of photos be taken the other way round or upright."""
+    found = measured(corner(RANDOM, **turned), points(hidden))
     assert found.compared.all()
     assert np.abs(2.0 ** (found.gains - in_stops(RANDOM)) - 1.0).max() < 0.05
     assert found.spread == pytest.approx(in_stops(RANDOM).std(), rel=0.05)
@@ -86,6 +96,12 @@ def test_photos_of_something_else_are_not_compared():
     found = measured(corner(gains, seeds=seeds), points())
     assert found.compared.tolist() == [True] * (VIEWS - 2) + [False] * 2
     assert np.abs(found.gains[:-2] - in_stops(gains[:-2])).max() < 0.07 and not found.gains[-2:].any()
+
+
+def test_patches_without_texture_or_room_for_a_gain_are_left_out():
+    colors = np.random.default_rng(0).uniform(0.3, 0.7, (5, 25, 3)).astype(np.float32)
+    colors[1, :, 0], colors[2, :, 2], colors[3] = 1.0, 0.0, 0.5
+    assert exposures._comparable(np.arange(5), colors).points.tolist() == [0, 4]
 
 
 def test_points_in_the_air_compare_nothing():

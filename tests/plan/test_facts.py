@@ -71,6 +71,14 @@ def test_baselines_are_relative_to_depth():
     assert facts.baseline == pytest.approx(0.05)
 
 
+def test_points_are_looked_at_evenly_in_their_order():
+    """The first 4000 lie behind the cameras, which tell no depth."""
+    points = np.tile([0.05, 0.05, -2.0], (8000, 1))
+    points[4000:, 2] = 2.0
+    facts = gather_facts(scene_of(posed([noise()] * 4, nadir(LINE)), points), CPU)
+    assert facts.baseline == pytest.approx(0.05)
+
+
 @pytest.mark.parametrize("tilt", [0.0, 30.0, 90.0])
 def test_concentration_of_view_directions(tilt):
     angle = np.radians(tilt)

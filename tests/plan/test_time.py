@@ -106,6 +106,23 @@ def test_a_plan_foresees_growth():
     assert math.isclose(early, pace.iterations, rel_tol=0.2)
 
 
+def test_growth_is_foreseen_up_to_the_cap_alone():
+    """A model that has just come to its cap goes on at its present cost."""
+    lengths = []
+    for cap in (0, 100_000, 60_000):
+        pace = new_pace(20.0, 4000, 2800, COST, cap)
+        pace.start(0, 0.0, 50_000)
+        pace.reached(100, 0.5, 60_000)
+        lengths.append(pace.iterations)
+    assert lengths[0] < lengths[1] < lengths[2] == 100 + 19.5 / 0.005
+
+
+def test_near_its_end_a_run_looks_at_the_clock_after_half_of_what_is_left():
+    pace = new_pace(16.0, 4096, 2800)
+    pace.start(4032, 15.75, 60_000)
+    assert pace.next_mark(4032, 15.75) == 4032 + 32
+
+
 def test_a_plan_goes_on_after_a_stop():
     pace = new_pace(20.0, 4000, 2800)
     pace.start(1000, 5.0, 60_000)

@@ -360,6 +360,13 @@ def test_photos_smaller_than_their_camera_are_undistorted(tmp_path):
     assert "intrinsics rescaled from 320x240 to 160x120" in scene.notes[-2]
 
 
+def test_undistorted_colors_are_rounded_to_the_nearest():
+    photo = np.random.default_rng(0).integers(100, 104, (HEIGHT, WIDTH, 3)).astype(np.uint8)
+    project = brown_projection((260.0, 260.0), (163.0, 117.0), (-0.1,), 0.0, 0.0)
+    lens = make_lens("RADIAL", (WIDTH, HEIGHT), project, "a camera")
+    assert lens.undistort(photo, lens.size).mean() == pytest.approx(photo.mean(), abs=0.05)
+
+
 def test_a_zero_distortion_changes_no_pixel(tmp_path):
     photo = bent_photo("OPENCV", PARAMS["OPENCV"])
     scene = load_scene(write_colmap(tmp_path / "cup", "OPENCV", [260.0, 270.0, 163.0, 117.0, 0, 0, 0, 0], photo))

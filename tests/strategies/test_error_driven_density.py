@@ -191,6 +191,13 @@ def test_final_pruning_keeps_the_difficult_and_the_unseen():
     assert update.num_pruned == dropped == 100 - len(kept)
 
 
+@pytest.mark.parametrize("iteration", [3500, 4000])
+def test_every_event_begins_a_new_window(iteration):
+    density = controlled(gaussians := make_gaussians(20), busy_stats(20), max_gaussians=20, **QUIET)
+    density.update(gaussians, Step(iteration, 6000, 3500))
+    assert not any(value.any() for value in vars(density.stats).values())
+
+
 def test_split_draws_from_the_gaussian():
     """20,000 equal Gaussians: mean and covariance of the halves' centres, and 3DGS's smaller axes."""
     one = make_gaussians(1, seed=5)
@@ -468,6 +475,25 @@ def test_what_lies_beyond_is_spared_unless_it_is_not_finite():
     stats.error_sums[1:3] = 0.0  # the easiest
     density = controlled(gaussians, stats, spare_beyond=10.0, final_keep=0.1)
     assert {1, 2} <= set(density.update(gaussians, Step(4000, 5000, 3500, scene_extent=2.0)).source.tolist())
+
+
+@pytest.mark.parametrize(("iteration", "gone"), [(600, 0), (700, 1)])
+def test_size_rules_begin_at_their_share_of_densification(iteration, gone):
+    gaussians = make_gaussians(5)
+    gaussians.scales[:] = -4.0
+    gaussians.scales[2] = 1.0
+    density = controlled(gaussians, busy_stats(5), prune_opacity=0.0, grad_threshold=1e3, absgrad_threshold=1e3)
+    update = density.update(gaussians, Step(iteration, 3500, 3500, scene_extent=2.0))
+    assert (0 if update is None else update.num_pruned) == gone
+
+
+def test_turnover_takes_its_share_of_those_that_are_not_spared():
+    gaussians, stats = make_gaussians(40), busy_stats(40)
+    gaussians.means[:] = torch.where(torch.arange(40)[:, None] < 20, 10.0, 0.0)
+    stats.error_sums[:] = 1.0 + torch.arange(40)
+    density = controlled(gaussians, stats, prune_score_fraction=0.1, spare_beyond=2.0, grad_threshold=1e3, **QUIET)
+    update = density.update(gaussians, FULL)
+    assert update.source.tolist() == [*range(20), *range(22, 40)]
 
 
 def test_a_held_cap_does_not_keep_the_huge():

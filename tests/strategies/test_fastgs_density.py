@@ -96,6 +96,22 @@ def test_after_densification_the_most_blamed_go(gaussians):
     assert updates[2].num_pruned == 1 and not updates[2].fresh.any()
 
 
+def test_blame_counts_by_the_error_of_its_batch(gaussians):
+    """Gaussian 0 stands out in a batch of large errors, Gaussian 1 in one of small errors."""
+    density = FastGsDensity(prune_every=2, prune_opacity=0.0, blame_threshold=0.9)
+    density.setup(gaussians)
+    small = [0.01, 0.09, *[0.01] * (COUNT - 2)]
+    update = run_batches(density, gaussians, [OFTEN, small], first=501)[-1]
+    assert update.source.tolist() == list(range(1, COUNT))
+
+
+def test_an_event_that_changes_nothing_begins_a_new_window_too(gaussians):
+    density = FastGsDensity(refine_from=2, refine_every=2, prune_opacity=0.0, prune_world_size=0.0)
+    density.setup(gaussians)
+    assert run_batches(density, gaussians, [[LOW] * COUNT] * 2) == [None, None]
+    assert not any(value.any() for part in density.state_dict().values() for value in part.values())
+
+
 def test_a_resumed_window_goes_on_exactly(gaussians):
     straight, first, second = (FastGsDensity(refine_from=4, refine_every=4, prune_world_size=0.0) for _ in range(3))
     for density in (straight, first, second):

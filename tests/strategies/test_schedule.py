@@ -66,6 +66,12 @@ def test_pixels_of_an_iteration_stay_at_the_budget(budget, num_views):
         assert drawn.views * drawn.rate == pytest.approx(min(budget, drawn.views), rel=0.25)
 
 
+@pytest.mark.parametrize("schedule", [*ADAPTIVE, FixedSchedule])
+def test_a_budget_of_more_images_than_views_takes_whole_views(schedule):
+    budget = schedule(pixel_budget=2.5).query(step(1400), 0.1, 0.3, 2)
+    assert (budget.views, budget.rate) == (2, 1.0)
+
+
 @pytest.mark.parametrize(
     ("mean", "initial"), [(0.0, 0.0), (1.0, 0.0), (5.0, 0.1), (math.nan, 0.1), (math.inf, math.inf)]
 )

@@ -16,6 +16,7 @@ from helpers.optimizers import (
     make_gradients,
 )
 from turbogs_plugin.strategies.learning_rates import LearningRates
+from turbogs_plugin.strategies.optimizers.dense_adam import DenseAdam
 from turbogs_plugin.strategies.optimizers.moment_lm import MomentLMOptimizer
 from turbogs_plugin.strategies.optimizers.sparse_adam import SparseAdam
 
@@ -32,6 +33,15 @@ def test_rates_at_start_middle_and_end():
         assert at.means == pytest.approx(3 * 5 * expected)
         assert at.scales == pytest.approx(3 * rates.scales)
     assert LearningRates(means=0, means_final=0).at(STEP).means == 0
+
+
+def test_all_rates_but_that_of_the_means_fall_to_their_share():
+    rates = LearningRates(final_factor=0.04, batch_scale=3.0)
+    for iteration, factor in ((0, 1.0), (500, 0.2), (1000, 0.04), (2000, 0.04)):
+        at = rates.at(Step(iteration, 1000, 700))
+        assert at.means == LearningRates(batch_scale=3.0).at(Step(iteration, 1000, 700)).means
+        for name in PARAMETER_NAMES[1:]:
+            assert getattr(at, name) == pytest.approx(3 * factor * getattr(rates, name))
 
 
 @pytest.mark.parametrize("values", [{"scales": -1.0}, {"shN": math.nan}, {"means": 0.0}, {"batch_scale": math.inf}])
@@ -122,6 +132,17 @@ def test_non_finite_gradient_skips_one_gaussian(cls, name, bad):
     assert int(optimizers[1].skipped) == 1
     assert int(optimizers[0].skipped) == 0
     assert optimizers[1].moments.steps.tolist() == [1, 1, 0, 1, 1]
+
+
+@pytest.mark.parametrize("cls", [*OPTIMIZERS, DenseAdam])
+def test_only_updates_that_were_due_count_as_skipped(cls):
+    gaussians, gradients = make_gaussians(5), make_gradients(3, 5)
+    gradients.touched[1] = False
+    gradients.means[0, 1:3] = math.nan
+    optimizer = cls()
+    optimizer.setup(gaussians)
+    optimizer.step(gaussians, gradients, STEP)
+    assert int(optimizer.skipped) == 1
 
 
 @pytest.mark.parametrize("cls", OPTIMIZERS)

@@ -134,6 +134,18 @@ def test_views_a_million_extents_away_do_not_underflow():
     assert set(views[1:]) == {1, 2, 3}
 
 
+def test_the_stack_and_the_draw_from_it_have_random_numbers_of_their_own():
+    geometry, shuffled = ready(GeometryAwareViewSampler(0.0, 0.0), orbit(6)), ready(RandomViewSampler(), orbit(6))
+    fresh, last = geometry.state_dict(), 0
+    for t in range(40):
+        geometry.load_state_dict(fresh)
+        first, second = geometry.select(2, np.zeros(6), step(t))
+        order = shuffled.select(6, np.zeros(6), step(t))
+        assert first == order[0]
+        last += second == order[-1]
+    assert last < 20  # 8 by chance
+
+
 @pytest.mark.parametrize("extent", [0.0, 1.0])
 def test_identical_cameras_are_drawn_uniformly(extent):
     sampler = ready(GeometryAwareViewSampler(), orbit(1).select([0] * 5), extent)

@@ -1,6 +1,8 @@
 """Time that is more than the configured iterations take: first it buys pixels an iteration, then iterations."""
 
+import math
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -212,6 +214,21 @@ def test_iterations_are_timed_with_the_lambda_asked_for(scene):
         rates.clear()
         trial.seconds_with(3.5, 0.0)
     assert rates and rates == pytest.approx([0.5] * len(rates))
+
+
+def test_what_passes_before_the_first_iteration_is_not_planned_with(scene, monkeypatch):
+    measured = calibration.Calibration(1.0, 4.0, IterationCost(0.01, 0.0), 50, 1.0, 1.0)
+    monkeypatch.setattr(calibration, "calibrate", lambda *arguments: measured)
+    config = tiny_config(Path("capture"), "budget.time=10s").without_plan()
+    assert calibration.within_budget(config, scene, CPU)[0].train.iterations == 500
+
+
+def test_the_maps_of_several_processes_are_made_beside_one_another(scene, monkeypatch):
+    trial = calibration._Trial(tiny_config(Path("capture")).without_plan(), scene, CPU)
+    SimulatedTime(monkeypatch).in_iterations(monkeypatch, lambda trainer: 0.0)
+    for count in (1, 2):
+        monkeypatch.setattr(trial, "_ranks", SimpleNamespace(count=count, agree=lambda value: value))
+        assert trial.initialisation() == pytest.approx(0.01 * math.ceil(len(scene.train) / count))
 
 
 def test_a_run_with_time_for_more_looks_at_more_pixels(plotted, tmp_path, monkeypatch):
