@@ -87,12 +87,13 @@ def read_compressed_ply(path: Path) -> Gaussians:
             elif words[:1] == ["property"]:
                 elements[list(elements)[-1]][1].append(words[-1])
         (chunks, bounds), (count, words) = elements["chunk"], elements["vertex"]
+        if sorted(bounds) not in (sorted(BOUNDS), sorted(BOUNDS + COLOR_BOUNDS)) or words != WORDS:
+            raise ValueError
     except (ValueError, KeyError, IndexError):
         raise InputError(f"{path} is not a compressed .ply of Gaussians: export it again") from None
     also, rest = elements.get("sh", (count, []))  # SuperSplat leaves it out where there are no harmonics
     sizes = (4 * len(bounds) * chunks, 4 * len(WORDS) * count, len(rest) * count)
-    bounded = sorted(bounds) in (sorted(BOUNDS), sorted(BOUNDS + COLOR_BOUNDS))
-    shaped = bounded and (words, also, chunks) == (WORDS, count, -(-count // CHUNK))
+    shaped = (also, chunks) == (count, -(-count // CHUNK))
     if not (count and shaped and len(rest) in (0, 9, 24, 45) and len(body) == sum(sizes)):
         raise InputError(f"{path} is not a whole compressed .ply of Gaussians: export it again")
     limits = np.frombuffer(body[: sizes[0]], dtype="<f4").reshape(chunks, len(bounds)).astype(np.float64)
