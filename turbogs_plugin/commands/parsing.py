@@ -82,7 +82,8 @@ def refusal_line(box: str) -> str:
     if misplaced:
         what = f"Unrecognized options of {next(iter(misplaced.values()))}: {', '.join(misplaced)}"
     hints = [what.partition(" Got errors:")[0].rstrip(".")]
-    for section in others:
+    similar = [section for section in others if section.startswith("Arguments similar")]
+    for section in sorted(similar) + [section for section in others if section not in similar]:  # tyro: any order
         if section.startswith(("Perhaps you meant", "Arguments similar")):
             option, owner = OPTION.search(section.partition(":")[2]), OWNER.search(section)
             if option and owner and option[0] in misplaced:
