@@ -66,9 +66,8 @@ def save_checkpoint(folder: Path, iteration: int, state: dict[str, Any]) -> Path
     for leftover in folder.glob(".iteration-*.part"):  # from a killed process
         leftover.unlink(missing_ok=True)
     others = _others(folder, path.name)
-    others.sort(
-        key=lambda file: _iteration(file) < iteration
-    )  # first those of a later one, which a resume went back from
+    # First those of a later iteration: a resume went back from it.
+    others.sort(key=lambda file: _iteration(file) < iteration)
     for old in others[: len(others) - (KEPT - 1)]:
         old.unlink(missing_ok=True)
     return path
