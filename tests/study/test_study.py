@@ -111,6 +111,14 @@ def test_another_length_scales_what_counts_iterations_and_nothing_else():
     assert same.to_yaml() == before
 
 
+def test_the_base_of_an_ablation_is_looked_for_beside_it(tmp_path, monkeypatch):
+    (tmp_path / "mine.yaml").write_text("base: turbogs\ntrain: {sh_degree: 1}\n")
+    (tmp_path / "ablation.yaml").write_text("title: Mine\nbase: mine.yaml\nvariants: {mine: []}\n")
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    assert variant_config(load_ablation("../ablation.yaml"), "mine", 0, (), None).train.sh_degree == 1
+
+
 def test_what_counts_iterations_is_written_for_the_length_that_is_set_or_else_the_base():
     auto, number = load_config("turbogs"), load_config("turbogs", ["train.iterations=1000"])
     assert (auto.train.written_iterations, number.train.written_iterations) == (5000, 1000)

@@ -15,11 +15,11 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from turbogs_plugin.config.auto import AUTO
-from turbogs_plugin.config.configuration import Config, load_config
+from turbogs_plugin.config.configuration import Config, load_config, named_beside
 from turbogs_plugin.config.scaling import with_iterations
 from turbogs_plugin.config.schema import build_dataclass, nearest
 from turbogs_plugin.config.yaml_text import read_named_yaml
@@ -38,7 +38,7 @@ class Ablation:
     Args:
         title: of the table.
         variants: name -> overrides ``section.key=value`` of the base configuration. Names become file names.
-        base: a packaged configuration or a YAML file.
+        base: a packaged configuration or a YAML file; of `load_ablation`, one by its place beside the ablation's.
         baseline: the variant that the others are compared with; the first one where empty.
         notes: name -> what a reader should know of a variant.
     """
@@ -95,7 +95,8 @@ def load_ablation(name_or_file: str) -> Ablation:
         InputError: an unknown name, an unreadable file, or one that is not an ablation.
     """
     mapping = read_named_yaml(name_or_file, PACKAGE, "ablation")
-    return build_dataclass(Ablation, mapping, f"ablation '{name_or_file}'")
+    ablation = build_dataclass(Ablation, mapping, f"ablation '{name_or_file}'")
+    return replace(ablation, base=named_beside(ablation.base, name_or_file))
 
 
 def alike_at(ablation: Ablation, variants: Sequence[str], overrides: Sequence[str], steps: int) -> dict[str, str]:
