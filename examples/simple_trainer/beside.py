@@ -58,13 +58,10 @@ def differences(before: dict[str, str], after: dict[str, str]) -> tuple[list[str
 def main(options: Options) -> list[str]:
     """What went wrong."""
     python = options.environment / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
-    for file, remedy in (
-        (python, "give the folder of a virtual environment"),
-        (options.wheel, "make wheel makes it"),
-        (options.host / compare.TRAINER, compare.CLONE),
-    ):
+    for file, remedy in ((python, "give a virtual environment"), (options.wheel, "make wheel makes it")):
         if not file.is_file():
             raise SystemExit(f"{file} is not there: {remedy}")
+    compare.require_host(options.host)  # before anything is installed
     before, install = packages(python), [python, "-m", "pip", "install", "--quiet", options.wheel]
     subprocess.run(install, check=True)  # with what it depends on
     subprocess.run([*install, "--force-reinstall", "--no-deps"], check=True)  # in the place of a build before this one

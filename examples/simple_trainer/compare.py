@@ -86,6 +86,11 @@ class Options:
         return [examples] if self.python else [self.host.resolve(), examples, HERE.parents[1]]
 
 
+def require_host(host: Path) -> None:
+    if not (host / TRAINER).is_file():
+        raise SystemExit(f"{host / TRAINER} is not there: {CLONE}")
+
+
 def edited_trainer(host: Path, variant: str, folder: Path) -> Path:
     """A copy of the host's trainer with a variant's edits."""
     source = (host / TRAINER).read_text(encoding="utf-8")
@@ -140,8 +145,7 @@ def gpus() -> list[str]:
 
 def compare(options: Options) -> list[dict[str, Any]]:
     """All runs of `options`, those that were there before first; writes them as they end."""
-    if not (options.host / TRAINER).is_file():
-        raise SystemExit(f"{options.host / TRAINER} is not there: {CLONE}")
+    require_host(options.host)
     options.out.mkdir(parents=True, exist_ok=True)
     file = options.out / "dropin.json"
     runs = json.loads(file.read_text())["runs"] if file.exists() else []

@@ -119,7 +119,7 @@ class ErrorDrivenDensity(WindowedDensity):
         if self._stats is None or len(gaussians) == 0:
             return None
         densify, final = self.due(step)
-        over = 0 < self.bound(step) < len(gaussians)
+        over = self.max_gaussians > 0 and len(gaussians) > self.bound(step)
         reduce = over and self._reduction_due(step)
         update = None
         if densify:

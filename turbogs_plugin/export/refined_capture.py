@@ -32,7 +32,7 @@ from turbogs_plugin.scene.bundle_adjustment import (
 )
 from turbogs_plugin.scene.capture import LARGEST_SIDE, Capture, named
 from turbogs_plugin.scene.colmap import REDUCED, incomplete_model, load_pycolmap, read_colmap, read_reconstruction
-from turbogs_plugin.scene.colmap_check import check_binary_model
+from turbogs_plugin.scene.colmap_check import write_whole
 from turbogs_plugin.scene.load import camera_files
 from turbogs_plugin.scene.mask_files import FOLDER as MASKS
 from turbogs_plugin.scene.nearby import capture_near
@@ -160,12 +160,10 @@ def _reconstruction(model: Path, suffix: str, capture: Capture, refined: Refinem
 
 
 def _write(reconstruction: pycolmap.Reconstruction, folder: Path, out: Path) -> None:
-    """Write its files, and see that they are whole: of a full disk pycolmap says nothing."""
     folder.mkdir(parents=True)
     try:
-        reconstruction.write_binary(folder)
-        check_binary_model(folder)
-    except (RuntimeError, ValueError) as error:
+        write_whole(reconstruction, folder, out)
+    except OSError as error:
         raise InputError(f"--out '{out}' cannot be written: make room there, or choose another place") from error
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import json
 import shutil
 from collections.abc import Iterator, Sequence
@@ -15,7 +14,7 @@ from turbogs_plugin.errors import InputError
 from turbogs_plugin.files import read_text, require_writable, write_text_atomically
 from turbogs_plugin.reconstruct.effort import Effort
 from turbogs_plugin.reconstruct.photos import PhotoFile
-from turbogs_plugin.scene.colmap_check import check_binary_model
+from turbogs_plugin.scene.colmap_check import write_whole
 
 try:
     import fcntl
@@ -138,11 +137,7 @@ class Workspace:
         for folder in (part, self.model.parent, self.scratch / "models"):
             shutil.rmtree(folder, ignore_errors=True)
         (part / "0").mkdir(parents=True)
-        try:
-            model.write_binary(part / "0")
-            check_binary_model(part / "0")  # of a full disk pycolmap says nothing
-        except (RuntimeError, ValueError) as error:
-            raise OSError(errno.ENOSPC, "it cannot be written whole", str(self.model)) from error
+        write_whole(model, part / "0", self.model)
         part.rename(self.model.parent)
         found = asdict(solution)
         del found["scene"]  # it may be moved

@@ -1,4 +1,4 @@
-"""Checks COLMAP's binary files before pycolmap sees them.
+"""Checks COLMAP's binary files before pycolmap sees them, and after it wrote them.
 
 pycolmap trusts the counts in these files: a count of 2^60 becomes an allocation of that size. So every record is walked
 here first, and nothing is allocated that the file does not hold. What one record says of another one, pycolmap checks.
@@ -6,13 +6,18 @@ here first, and nothing is allocated that the file does not hold. What one recor
 
 from __future__ import annotations
 
+import errno
 import struct
 from collections.abc import Container, Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from turbogs_plugin.errors import InputError
+
+if TYPE_CHECKING:
+    import pycolmap
 
 FEATURE = np.dtype([("pixel", "<f8", 2), ("point", "<u8")])
 """Where an image shows something, and the identifier of the point that it is."""
@@ -92,6 +97,22 @@ class _Reader:
         values = np.array(self.unpack("7d"))
         if not np.isfinite(values).all() or not 1e-6 < np.abs(values[:4]).max() < 1e6:
             raise self.fail(f"{owner} has a pose that is not finite, or a zero rotation")
+
+
+def write_whole(reconstruction: pycolmap.Reconstruction, folder: Path, named: Path) -> None:
+    """Write the binary files of a reconstruction, and see that they are whole: of a full disk pycolmap says nothing.
+
+    Args:
+        named: what they are called in the message.
+
+    Raises:
+        OSError: they are not.
+    """
+    try:
+        reconstruction.write_binary(folder)
+        check_binary_model(folder)
+    except (RuntimeError, ValueError) as error:
+        raise OSError(errno.ENOSPC, "it cannot be written whole", str(named)) from error
 
 
 def check_binary_model(folder: Path) -> np.ndarray:

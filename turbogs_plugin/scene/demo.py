@@ -18,7 +18,7 @@ from PIL import Image
 
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene.colmap import load_pycolmap
-from turbogs_plugin.scene.colmap_check import check_binary_model
+from turbogs_plugin.scene.colmap_check import write_whole
 from turbogs_plugin.scene.poses import look_at
 
 if TYPE_CHECKING:
@@ -276,9 +276,8 @@ def _write(folder: Path, random: np.random.Generator, views: int, width: int, he
     _fill(reconstruction, poses, np.concatenate(points), np.concatenate(point_colors), depths, focal, random)
     model = folder / "sparse" / "0"
     try:
-        reconstruction.write_binary(model)
-        check_binary_model(model)  # of a full disk pycolmap says nothing
-    except (RuntimeError, ValueError) as error:
+        write_whole(reconstruction, model, model)
+    except OSError as error:
         raise InputError(
             f"the demo capture cannot be written to '{folder.parent}': make room there, or choose another place"
         ) from error
