@@ -84,6 +84,16 @@ void launches::FusedStep::run(const Arguments<FusedStep>& in) {
     optimizer.eps = in.number(Reals::eps);
     optimizer.curvature = in.number(Reals::curvature);
     optimizer.max_step = in.number(Reals::max_step);
+    constexpr Integers kCopies[kMaxPeers - 1] = {Integers::copy_0, Integers::copy_1, Integers::copy_2,
+                                                 Integers::copy_3, Integers::copy_4, Integers::copy_5,
+                                                 Integers::copy_6};
+    for (const Integers copy : kCopies) {
+        const int64_t distance = in.integer(copy);
+        if (distance == 0) break;
+        STD_TORCH_CHECK(distance % static_cast<int64_t>(sizeof(float4)) == 0,
+                        "turbogs: a copy of a model must lie a multiple of 16 bytes behind it");
+        optimizer.copies[optimizer.num_copies++] = distance;
+    }
     in.set(optimizer.exp_avg, Tensors::exp_avg, {count, ParameterRow::kSize});
     in.set(optimizer.exp_avg_sq, Tensors::exp_avg_sq, {count, ParameterRow::kSize});
     in.set_quads(optimizer.exp_avg_shN, Tensors::exp_avg_shN, {count, harmonics});

@@ -164,4 +164,30 @@ void launches::CollectRecords::run(const Arguments<CollectRecords>& in) {
     check_launched(launch_collect_records(params, in.stream()), "collection of records");
 }
 
+void launches::GatherColors::run(const Arguments<GatherColors>& in) {
+    constexpr Tensors kPeers[kMaxPeers] = {Tensors::peer_0, Tensors::peer_1, Tensors::peer_2, Tensors::peer_3,
+                                           Tensors::peer_4, Tensors::peer_5, Tensors::peer_6, Tensors::peer_7};
+    GatherParams params = {};
+    const int64_t num_peers = in.num_rows(1), first = in.integer(Integers::first);
+    STD_TORCH_CHECK(num_peers <= kMaxPeers && first >= PassStatus::kSize, "turbogs: up to ", kMaxPeers,
+                    " processes gather colours, which begin behind their status");
+    params.num_peers = static_cast<int>(num_peers);
+    params.first = to_int(first, "numbers of a memory");
+    int64_t numbers = 0;
+    for (int i = 0; i < params.num_peers; ++i) {
+        const Tensors peer = kPeers[i];
+        const int64_t size = in.tensor(peer).numel(), samples = *in.row(i, 1);
+        STD_TORCH_CHECK(samples >= 0 && samples <= (size - first) / 3, "turbogs: process ", i, " has no ", samples,
+                        " colours in memory for ", size, " numbers");
+        in.set(params.peers[i], peer, {size});
+        params.counts[i] = to_int(3 * samples, "numbers of colours");
+        params.starts[i] = to_int(numbers, "numbers of colours");
+        numbers += 3 * samples;
+    }
+    in.set(params.colors, Tensors::colors, {numbers / 3, 3});
+    in.set(params.seen, Tensors::seen, {2});
+    in.set_optional(params.overflow, Tensors::overflow, {1});
+    check_launched(launch_gather_colors(params, in.stream()), "gathering of colours");
+}
+
 }  // namespace turbogs

@@ -135,6 +135,15 @@ struct RowCollector {
     }
 };
 
+// Writes a parameter, and its copies.
+template <class T>
+__device__ __forceinline__ void put(const OptimizerParams& optimizer, T* place, const T& value) {
+    *place = value;
+    for (int i = 0; i < optimizer.num_copies; ++i) {
+        *reinterpret_cast<T*>(reinterpret_cast<char*>(place) + optimizer.copies[i]) = value;
+    }
+}
+
 // Moments, solution and new values of one Gaussian's 14 parameters.
 template <Rows kRows>
 __device__ __forceinline__ void update_row(const ScreenBackwardParams& params, const OptimizerParams& optimizer,
@@ -157,15 +166,15 @@ __device__ __forceinline__ void update_row(const ScreenBackwardParams& params, c
     using Place = ParameterRow;
 #pragma unroll
     for (int i = 0; i < 3; ++i) {
-        params.means[triple + i] = __fadd_rn(old.mean[i], terms.adam[Place::kMeans + i]);
-        params.scales[triple + i] = __fadd_rn(old.log_scale[i], terms.adam[Place::kScales + i]);
-        params.sh0[triple + i] = __fadd_rn(old.sh0[i], terms.adam[Place::kSh0 + i]);
+        put(optimizer, params.means + triple + i, __fadd_rn(old.mean[i], terms.adam[Place::kMeans + i]));
+        put(optimizer, params.scales + triple + i, __fadd_rn(old.log_scale[i], terms.adam[Place::kScales + i]));
+        put(optimizer, params.sh0 + triple + i, __fadd_rn(old.sh0[i], terms.adam[Place::kSh0 + i]));
     }
     const float* turn = terms.adam + Place::kQuats;
-    params.quats[gaussian] =
+    put(optimizer, params.quats + gaussian,
         make_float4(__fadd_rn(old.quat[0], turn[0]), __fadd_rn(old.quat[1], turn[1]), __fadd_rn(old.quat[2], turn[2]),
-                    __fadd_rn(old.quat[3], turn[3]));
-    params.opacities[gaussian] = __fadd_rn(old.logit, terms.adam[Place::kOpacities]);
+                    __fadd_rn(old.quat[3], turn[3])));
+    put(optimizer, params.opacities + gaussian, __fadd_rn(old.logit, terms.adam[Place::kOpacities]));
 }
 
 // Adam on the harmonics of the block's updated Gaussians. Values and gradients come from shared memory.
@@ -210,14 +219,14 @@ __device__ __forceinline__ void update_harmonics(const ScreenBackwardParams& par
             if (block.wanted[owners[0]] && block.wanted[owners[1]]) {
                 *reinterpret_cast<float4*>(optimizer.exp_avg_shN + base + i) = mean;
                 *reinterpret_cast<float4*>(optimizer.exp_avg_sq_shN + base + i) = square;
-                *reinterpret_cast<float4*>(params.shN + base + i) = value;
+                put(optimizer, reinterpret_cast<float4*>(params.shN + base + i), value);
             } else {
 #pragma unroll
                 for (int j = 0; j < 4; ++j) {
                     if (!block.wanted[j >= boundary ? owners[1] : owners[0]]) continue;
                     optimizer.exp_avg_shN[base + i + j] = (&mean.x)[j];
                     optimizer.exp_avg_sq_shN[base + i + j] = (&square.x)[j];
-                    params.shN[base + i + j] = (&value.x)[j];
+                    put(optimizer, params.shN + base + i + j, (&value.x)[j]);
                 }
             }
         }
@@ -229,7 +238,7 @@ __device__ __forceinline__ void update_harmonics(const ScreenBackwardParams& par
         float value = block.coefficients[i + owner * (block.stride - block.row)];
         adam(optimizer, block.work[i], block_corrections[owner], value, optimizer.exp_avg_shN[base + i],
              optimizer.exp_avg_sq_shN[base + i]);
-        params.shN[base + i] = value;
+        put(optimizer, params.shN + base + i, value);
     }
 }
 

@@ -54,6 +54,10 @@ struct OptimizerParams {
     float curvature;  // balanced LM
     float max_step;   // balanced LM, 0 for no bound
 
+    // Where the new parameters go besides, maybe in other GPUs' memory: bytes behind each of them.
+    int64_t copies[kMaxPeers - 1];
+    int num_copies;
+
     // Updated in place, as are the parameters.
     float2* exp_avg;              // [N, 14]
     float2* exp_avg_sq;           // [N, 14]

@@ -169,6 +169,17 @@ struct CollectParams {
     int2* target_radii;            // [K, M] out
 };
 
+struct GatherParams {
+    int num_peers;                   // processes
+    const float* peers[kMaxPeers];   // memory of each; begins with a PassStatus
+    int first;                       // number at which colours begin, in each
+    int counts[kMaxPeers];           // numbers of each, three a sample
+    int starts[kMaxPeers];           // where they go in `colors`
+    float* colors;                   // [P, 3] out
+    int32_t* seen;                   // [2] out: the largest kOverflow and kStop
+    int32_t* overflow;               // [1] out, or null: kOverflow of any
+};
+
 // Every launcher returns the first CUDA error, and only enqueues work on `stream`.
 cudaError_t launch_projection(const ProjectionParams& params, cudaStream_t stream);
 cudaError_t launch_count_intersections(const CountIntersectionsParams& params, cudaStream_t stream);
@@ -177,5 +188,6 @@ cudaError_t launch_sort_intersections(const SortIntersectionsParams& params, cud
 cudaError_t launch_rasterize_forward(const ForwardParams& params, cudaStream_t stream);
 cudaError_t launch_rasterize_backward(const BackwardParams& params, cudaStream_t stream);
 cudaError_t launch_collect_records(const CollectParams& params, cudaStream_t stream);
+cudaError_t launch_gather_colors(const GatherParams& params, cudaStream_t stream);
 
 }  // namespace turbogs

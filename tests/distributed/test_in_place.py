@@ -9,16 +9,16 @@ from pathlib import Path
 import pytest
 import torch
 from helpers.framework_runs import tiny_capture, tiny_settings
-from helpers.peer_files import KeepingEngine, LateSide, PeerFiles
+from helpers.peer_files import KeepingEngine, PeerFiles
 from helpers.processes import ended, grouped, said, start_ranks
 
 from turbogs_plugin.config.configuration import Config, load_config
-from turbogs_plugin.distributed import in_place, peer_memory
-from turbogs_plugin.distributed.in_place import DRAWN, FREE, PACKED, WRITTEN, InPlace
-from turbogs_plugin.distributed.peer_memory import PeerMemory, share_memory
+from turbogs_plugin.distributed import in_place, peer_memory, shared_model
+from turbogs_plugin.distributed.in_place import DRAWN, FREE, STEPPED, WRITTEN, InPlace
+from turbogs_plugin.distributed.peer_memory import PeerMemory, aligned_starts, share_memory
 from turbogs_plugin.distributed.ranks import ProcessRanks
 from turbogs_plugin.distributed.rows import rows_of
-from turbogs_plugin.distributed.side_stream import SideStream
+from turbogs_plugin.distributed.shared_model import SharedModel
 from turbogs_plugin.engine.layout import ScreenRecord
 from turbogs_plugin.engine.reference.engine import ReferenceEngine
 from turbogs_plugin.engine.rendered import ScreenRecords
@@ -109,22 +109,18 @@ def every_case(capture: Path, folder: Path) -> None:
     for name in CASES if ranks.count == 2 else OF_THREE:
         by_rows, overrides = CASES[name]
         wanted = run(trainer_of(capture, ranks, by_rows, overrides), [False] * STEPS)
-        for engine, beside in ((ReferenceEngine(), SideStream), (KeepingEngine(), LateSide)):
-            trainer = trainer_of(capture, ranks, by_rows, overrides)
-            trainer.engine, number = engine, len(trainer.gaussians)
+        for engine in (ReferenceEngine(), KeepingEngine()):
             memory = PeerFiles(folder / f"{name}-{type(engine).__name__}")
-            trainer.exchange.memory = InPlace(ranks, memory, beside)
+            trainer = keeping(trainer_of(capture, ranks, by_rows, overrides), memory)
+            trainer.engine, number = engine, len(trainer.gaussians)
             same(run(trainer, [True] * STEPS), wanted)
             assert len(trainer.gaussians) != number
-            others = [PACKED] * STEPS if by_rows else [FREE] * (STEPS - len(memory.sizes))
+            others = [STEPPED] * STEPS if by_rows else [FREE] * (STEPS - len(memory.sizes))
             assert sorted(memory.barriers) == sorted([WRITTEN, DRAWN] * STEPS + others)
     wanted = run(trainer_of(capture, ranks, True, ()), [False] * STEPS)
-    turns = [True, False, True, False, True]
-    for beside in (SideStream, LateSide):
-        files = PeerFiles(folder / f"turns-{beside.__name__}")
-        trainer = keeping(trainer_of(capture, ranks, True, ()), files, beside)
-        same(run(trainer, turns), wanted)
-        assert files.barriers.count(PACKED) == sum(turns)
+    turns, files = [True, False, True, False, True], PeerFiles(folder / "turns")
+    same(run(keeping(trainer_of(capture, ranks, True, ()), files), turns), wanted)
+    assert files.barriers.count(STEPPED) == sum(turns)
     without_some_memory(capture, ranks, folder, wanted)
     growing(capture, ranks, folder, wanted)
     few(capture, ranks, folder)
@@ -132,18 +128,26 @@ def every_case(capture: Path, folder: Path) -> None:
         lost(capture, ranks, folder / f"lost-{by_rows}", by_rows)
 
 
-def keeping(trainer: Trainer, files: PeerFiles, beside: type = LateSide) -> Trainer:
-    trainer.engine, trainer.exchange.memory = KeepingEngine(), InPlace(trainer.ranks, files, beside)
+def keeping(trainer: Trainer, files: PeerFiles, models: int | None = None) -> Trainer:
+    """With memory of these files, and of others for the model.
+
+    Args:
+        models: memories for models that can be had; None: as many as wanted.
+    """
+    trainer.engine, trainer.exchange.memory = KeepingEngine(), InPlace(trainer.ranks, files)
+    files.of_model = PeerFiles(files.folder / "model", most=models)
+    trainer.exchange.model = SharedModel(trainer.ranks, files.of_model)
+    trainer.gaussians = trainer.gaussians
     return trainer
 
 
 def without_some_memory(capture: Path, ranks: ProcessRanks, folder: Path, wanted: dict) -> None:
-    """Where there is memory for passes alone, parameters go by messages; where there is none, all does. Nobody asks
-    again."""
-    files = PeerFiles(folder / "of passes", most=1)
-    trainer = keeping(trainer_of(capture, ranks, True, ()), files)
-    same(run(trainer, [True] * 2), run(trainer_of(capture, ranks, True, ()), [False] * 2))
-    assert files.barriers == [WRITTEN, DRAWN] * 2 and files.refused == 1
+    """Where there is no memory for the model, parameters go by messages; where there is none for passes, all does.
+    Nobody asks again."""
+    files = PeerFiles(folder / "of passes")
+    trainer = keeping(trainer_of(capture, ranks, True, ()), files, models=0)
+    same(run(trainer, [True] * STEPS), wanted)
+    assert files.barriers == [WRITTEN, DRAWN] * STEPS and files.of_model.refused == 1
     files = PeerFiles(folder / "none", most=0)
     trainer = keeping(trainer_of(capture, ranks, True, ()), files)
     initialise_maps(trainer)
@@ -157,41 +161,41 @@ def without_some_memory(capture: Path, ranks: ProcessRanks, folder: Path, wanted
 
 def growing(capture: Path, ranks: ProcessRanks, folder: Path, wanted: dict) -> None:
     """Without room to spare, the event before the last iteration makes both memories grow."""
-    before, in_place.GROWTH = in_place.GROWTH, 1.0
+    before, in_place.GROWTH, shared_model.GROWTH = in_place.GROWTH, 1.0, 1.0
     files = PeerFiles(folder / "growing")
     trainer = keeping(trainer_of(capture, ranks, True, ()), files)
     counts = [len(trainer.gaussians)]
     same(run(trainer, [True] * STEPS), wanted)
     counts.append(len(trainer.gaussians))
-    width = sum(value[0].numel() for _, value in trainer.gaussians.items())
-    wanted_sizes = [width * rows_of(count, ranks.count)[0].stop for count in counts]
-    assert [size for size in files.sizes if size in wanted_sizes] == wanted_sizes and wanted_sizes[0] < wanted_sizes[1]
-    in_place.GROWTH = before
+    widths = [value[0].numel() for _, value in trainer.gaussians.items()]
+    sizes = [aligned_starts([count * width for width in widths])[-1] for count in counts]
+    assert files.of_model.sizes == sizes and sizes[0] < sizes[1]
+    assert len(files.sizes) >= 2
+    in_place.GROWTH = shared_model.GROWTH = before
 
 
 def few(capture: Path, ranks: ProcessRanks, folder: Path) -> None:
     """The last process has no rows."""
     count, states = 4 * (ranks.count - 1), []
     assert rows_of(count, ranks.count)[-1] == slice(count, count)
-    for way, beside in ((False, LateSide), (True, SideStream), (True, LateSide)):
-        files = PeerFiles(folder / f"few-{way}-{beside.__name__}")
-        trainer = keeping(trainer_of(capture, ranks, True, ("density.type=none",)), files, beside)
+    for way in (False, True):
+        files = PeerFiles(folder / f"few-{way}")
+        trainer = keeping(trainer_of(capture, ranks, True, ("density.type=none",)), files)
         first = trainer.gaussians.map(torch.clone)
         trainer.gaussians = first.map(lambda value: value[:count].clone())
         trainer.optimizer.setup(trainer.gaussians)
         trainer.density.setup(trainer.gaussians)
         states.append(run(trainer, [way] * STEPS))
         assert not torch.equal(trainer.gaussians.means, first.means[:count])
-        assert files.barriers.count(PACKED) == way * STEPS
-    same(states[0], states[1])
-    same(states[0], states[2])
+        assert files.barriers.count(STEPPED) == way * STEPS
+    same(*states)
 
 
 def lost(capture: Path, ranks: ProcessRanks, folder: Path, by_rows: bool) -> None:
     """One process has too little memory for one pass: all repeat it, and nothing of it stays."""
     states = []
     for way in (False, True):
-        trainer = keeping(trainer_of(capture, ranks, by_rows, ("density.type=none",)), PeerFiles(folder))
+        trainer = keeping(trainer_of(capture, ranks, by_rows, ("density.type=none",)), PeerFiles(folder / str(way)))
         trainer.engine = KeepingEngine(lose=2 if ranks.rank == ranks.count - 1 else None)
         trainer.exchange.in_place = way
         initialise_maps(trainer)

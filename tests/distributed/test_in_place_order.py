@@ -1,4 +1,4 @@
-"""The order that the exchange in place asks of GPUs, as far as streams, events and barriers enforce it.
+"""The order that the exchange in place asks of GPUs, as far as streams and barriers enforce it.
 
 A CPU has no streams. So stand-ins note what each of several processes gives to which of its streams, and what that must
 come after. Work that nothing puts in order may be done in either order by a GPU.
@@ -7,8 +7,7 @@ come after. Work that nothing puts in order may be done in either order by a GPU
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from itertools import product
 
 import pytest
@@ -16,12 +15,11 @@ import torch
 from helpers.models import random_gaussians
 from torch import Tensor
 
-from turbogs_plugin.distributed import side_stream
 from turbogs_plugin.distributed.exchange import RankExchange
-from turbogs_plugin.distributed.in_place import FREE, PACKED, InPlace
+from turbogs_plugin.distributed.in_place import FREE, STEPPED, InPlace
 from turbogs_plugin.distributed.peer_memory import PeerMemory
+from turbogs_plugin.distributed.shared_model import SharedModel
 from turbogs_plugin.distributed.shares import Share
-from turbogs_plugin.distributed.side_stream import SideStream
 from turbogs_plugin.engine.layout import ScreenRecord
 from turbogs_plugin.engine.moments import GaussianMoments
 from turbogs_plugin.engine.rendered import ScreenRecords
@@ -82,34 +80,11 @@ class Noted:
         return done
 
 
-def fake_cuda(noted: Noted) -> type:
-    """What `SideStream` uses of torch.cuda."""
-
-    class Event:
-        def record(self) -> None:
-            self.last = noted.last()
-
-        def wait(self) -> None:
-            noted.wait(self.last)
-
-    class Cuda:
-        Stream = staticmethod(lambda device: "side")
-
-        @staticmethod
-        @contextmanager
-        def stream(stream: str) -> Iterator[None]:
-            noted.stream, before = stream, noted.stream
-            yield
-            noted.stream = before
-
-    Cuda.Event = Event
-    return Cuda
-
-
 class Ranks:
     """What the exchange needs to know of the processes."""
 
     reads_peers = True
+    asked = 0
 
     def __init__(self, noted: Noted, rank: int, count: int) -> None:
         self._noted, self.rank, self.count = noted, rank, count
@@ -125,11 +100,16 @@ class Ranks:
 
 
 class Engine:
+    overflow = None
+
     def __init__(self, noted: Noted) -> None:
         self._noted = noted
 
-    def lend(self, *tensors: Tensor | None) -> None:
+    def lend(self, memory: object) -> None:
         pass
+
+    def gather(self, *arguments: object) -> None:
+        self._noted.note("read colors")
 
     def collect(self, *arguments: object) -> None:
         self._noted.note("collect")
@@ -175,22 +155,23 @@ def shared(noted: Noted, count: int) -> Callable[[Ranks, int, torch.device], Pee
 def iterations(monkeypatch: pytest.MonkeyPatch, count: int, gaussians: int, ways: list[bool]) -> Noted:
     """Iterations of some processes, which say whether in place; the next draw is noted as well."""
     noted = Noted()
-    monkeypatch.setattr(side_stream.torch, "cuda", fake_cuda(noted))
     cat = torch.cat
 
     def noted_cat(tensors: list[Tensor], **options: object) -> Tensor:
-        noted.note("pack" if "out" in options else "read colors")
+        if "out" in options:
+            noted.note("pack")
         return cat(tensors, **options)
 
     monkeypatch.setattr(torch, "cat", noted_cat)
     monkeypatch.setattr(torch, "_foreach_copy_", lambda targets, sources: noted.note("copy"))
     shares = [Share(slice(0, 1), slice(5 * rank, 5 * rank + 5), slice(rank, rank + 1), False) for rank in range(count)]
-    share, processes = shared(noted, count), []
+    (share, share_models), processes = (shared(noted, count), shared(noted, count)), []
     for rank in range(count):
         exchange = RankExchange(Ranks(noted, rank, count))
         exchange.by_rows = True
-        exchange.memory = InPlace(exchange.ranks, share, lambda device: SideStream(torch.device("cuda")))
-        model = random_gaussians(gaussians)
+        exchange.memory = InPlace(exchange.ranks, share)
+        exchange.model = SharedModel(exchange.ranks, share_models)
+        model = exchange.place(random_gaussians(gaussians))
         processes.append((exchange, model, GaussianMoments.zeros(model)))
     for way, (rank, (exchange, model, moments)) in product(ways, enumerate(processes)):
         noted.process, exchange.in_place, engine = rank, way, Engine(noted)
@@ -198,7 +179,7 @@ def iterations(monkeypatch: pytest.MonkeyPatch, count: int, gaussians: int, ways
         memory = exchange._prepared(engine, shares, model)
         noted.note("render")  # reads the model, overwrites this process's records and colours
         if memory is not None:
-            memory.colors(shares, torch.zeros(5, 3))
+            memory.colors(engine, shares, torch.zeros(5, 3), 0, torch.zeros(2, dtype=torch.int32))
         exchange.update(engine, None, Screen(engine, shares, memory, gaussians), model, moments, None)
         noted.note("draw")
     for rank, (exchange, *_) in enumerate(processes):
@@ -212,28 +193,38 @@ WAYS = [True, True, False, True, True]
 
 
 @pytest.mark.parametrize(("count", "gaussians"), [(2, 20), (3, 8)])
-def test_streams_events_and_barriers_keep_the_order(monkeypatch, count, gaussians):
-    """Of three processes with 8 Gaussians the last one has no rows."""
+def test_streams_and_barriers_keep_the_order(monkeypatch, count, gaussians):
+    """Of three processes with 8 Gaussians the last one has no rows. In place the owner's step writes to all models; by
+    messages each process copies what has arrived into its own."""
     noted = iterations(monkeypatch, count, gaussians, WAYS)
-    assert FREE not in noted.barriers and noted.barriers.count(PACKED) == count * sum(WAYS)
+    assert FREE not in noted.barriers and noted.barriers.count(STEPPED) == count * sum(WAYS)
+    rows = [rank for rank in range(count) if ("step", rank, 0) in noted.after]
+    assert len(rows) == 2
     for reader, owner, number in product(range(count), range(count), range(len(WAYS))):
-        copy, following = ("copy", reader, number), WAYS[number + 1 :]
-        assert noted.is_before(("pack", owner, number), copy), "copies what is not packed yet"
-        assert noted.is_before(("render", reader, number), copy), "overwrites a model that is still rendered"
+        following = number + 1 < len(WAYS)
         then = ("render", reader, number + 1) if following else ("end", reader, 0)
-        assert noted.is_before(copy, then), "renders a model that has not arrived"
-        if WAYS[number] and following:
-            next_pack = "pack", owner, number + 1 + following.index(True)
-            assert noted.is_before(copy, next_pack), "overwrites what is still copied"
+        if WAYS[number]:
+            if owner in rows:
+                step = ("step", owner, number)
+                assert noted.is_before(("render", reader, number), step), "overwrites a model that is still rendered"
+                assert noted.is_before(step, then), "renders a model that has not arrived"
             in_place = sum(WAYS[:number])
             for read in (("read colors", reader, in_place), ("collect", reader, count * in_place + count - 1)):
-                assert noted.is_before(read, ("render", owner, number + 1)), "overwrites what is still read"
+                if following:
+                    assert noted.is_before(read, ("render", owner, number + 1)), "overwrites what is still read"
+        else:
+            copy = ("copy", reader, sum(not way for way in WAYS[:number]))
+            assert noted.is_before(("pack", owner, 0), copy), "copies what is not packed yet"
+            assert noted.is_before(("render", reader, number), copy), "overwrites a model that is still rendered"
+            assert noted.is_before(copy, then), "renders a model that has not arrived"
+            if owner in rows:
+                assert noted.is_before(copy, ("step", owner, number + 1)), "a step in place comes before what arrives"
 
 
-def test_parameters_travel_beside_the_next_draw(monkeypatch):
-    """Neither waits for the other; by messages the copies are behind it."""
+def test_parameters_travel_beside_the_next_draw_as_messages(monkeypatch):
+    """They do not wait for it; what has arrived is copied behind it."""
     noted = iterations(monkeypatch, 2, 20, WAYS)
-    for rank, (number, way) in product(range(2), enumerate(WAYS)):
-        copy, draw = ("copy", rank, number), ("draw", rank, number)
-        assert not noted.is_before(copy, draw)
-        assert noted.is_before(draw, copy) is not way
+    number = WAYS.index(False)
+    for rank in range(2):
+        assert noted.is_before(("draw", rank, number), ("copy", rank, 0))
+        assert not noted.is_before(("draw", rank, number), ("gather", "all", 0))

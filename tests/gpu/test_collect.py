@@ -13,9 +13,9 @@ from turbogs_plugin.distributed.shares import shares_of
 from turbogs_plugin.engine.cuda import raster as cuda
 from turbogs_plugin.engine.cuda.engine import CudaEngine
 from turbogs_plugin.engine.cuda.workspace import Workspace
-from turbogs_plugin.engine.layout import ScreenRecord
-from turbogs_plugin.engine.protocol import Engine
-from turbogs_plugin.engine.reference.records import collect_records
+from turbogs_plugin.engine.layout import PassStatus, ScreenRecord
+from turbogs_plugin.engine.protocol import Engine, PassMemory
+from turbogs_plugin.engine.reference.records import collect_records, gather_colors
 from turbogs_plugin.engine.rendered import DEFAULT_OPTIONS, ScreenRecords
 from turbogs_plugin.types import Cameras, Gaussians, PixelSamples
 
@@ -70,23 +70,31 @@ def test_passes_in_memory_that_is_lent():
     memory = Workspace(GPU)
     floats = torch.full((500 * ScreenRecord.SIZE,), torch.nan, device=GPU)
     integers = torch.zeros(1000, dtype=torch.int32, device=GPU)
+    status = torch.zeros(PassStatus.SIZE, dtype=torch.int32, device=GPU)
+    lent = PassMemory(status, torch.full((30_000,), torch.nan, device=GPU), integers, floats)
+    assert 3 * len(case.gpu_samples) <= 30_000
 
     def one_pass() -> ScreenRecords:
         rendered = cuda.rasterize_cuda(*arguments, memory)
+        assert (rendered.colors.data_ptr() == lent.colors.data_ptr()) is (memory._lent is lent)
         screen = rendered.backward(torch.ones_like(rendered.colors))
         torch.testing.assert_close(screen.full_records(), wanted.full_records(), rtol=1e-4, atol=1e-5)
         return screen.plain()
 
     one_pass()
-    memory.lend({"records": floats, "radii": integers})
+    memory.overflow.fill_(1)
+    memory.lend(lent)
+    assert memory.overflow.data_ptr() == lent.overflow.data_ptr() and lent.overflow.tolist() == [1]
+    memory.overflow.zero_()
     for _ in range(2):
         plain = one_pass()
         assert plain.records.data_ptr() == floats.data_ptr() and plain.radii.data_ptr() == integers.data_ptr()
-        memory.lend({"records": floats, "radii": integers})
+        assert status.tolist() == [int(memory.status[0]), 0, 0] and status[0] > 0
+        memory.lend(lent)
     memory.buffer("records", (600, ScreenRecord.SIZE), torch.float32)  # outgrown
-    memory.lend({"records": floats, "radii": integers})
+    memory.lend(lent)
     assert one_pass().records.data_ptr() == floats.data_ptr()
-    memory.lend({"records": None, "radii": None})
+    memory.lend(None)
     before = floats.clone()
     plain = one_pass()
     assert plain.records.data_ptr() != floats.data_ptr() and plain.radii.data_ptr() != integers.data_ptr()
@@ -118,6 +126,7 @@ def in_place_like_twin(engines: list[Engine], gaussians: Gaussians, cameras: Cam
 
     memories = [InPlace(OneOfTwo(rank), share) for rank in range(2)]
     rendered = []
+    flags = torch.zeros(2, dtype=torch.int32, device=device)
     for memory, engine, own in zip(memories, engines, shares, strict=True):
         for _ in range(3):  # the first pass of a workspace is another one
             assert memory.prepare(engine, shares, len(gaussians), device)
@@ -125,10 +134,10 @@ def in_place_like_twin(engines: list[Engine], gaussians: Gaussians, cameras: Cam
             part = Cameras(cameras.viewmats[own.views], cameras.Ks[own.views], cameras.sizes[own.views])
             last = engine.render(gaussians, part, chosen, DEFAULT_OPTIONS)
         rendered.append(last)
-        memory.colors(shares, last.colors)
-    for memory, one in zip(memories, rendered, strict=True):
-        colors, flags = memory.colors(shares, one.colors)
-        assert torch.equal(colors, torch.cat([each.colors for each in rendered])) and flags.tolist() == [0, 0, 0]
+        memory.colors(engine, shares, last.colors, 0, flags)
+    for memory, engine, one in zip(memories, engines, rendered, strict=True):
+        colors = memory.colors(engine, shares, one.colors, 0, flags)
+        assert torch.equal(colors, torch.cat([each.colors for each in rendered])) and flags.tolist() == [0, 0]
     plains = [one.backward(torch.ones_like(one.colors)).plain() for one in rendered]
     seen = 0
     for rank, rows in enumerate(rows_of(len(gaussians), 2)):
@@ -160,3 +169,20 @@ def test_two_shares_in_memory_that_both_read():
     assert in_place_like_twin(engines, case.gpu_gaussians, case.gpu_cameras, case.gpu_samples) > 50
     for engine in engines:
         assert engine.workspace.overflow.tolist() == [0]
+
+
+@pytest.mark.parametrize("counts", [(1000, 1000), (5, 0, 1), (0, 0), (70_001, 3, 4096, 1, 1, 2, 8, 129)])
+def test_colours_gathered_are_those_of_the_twin(counts):
+    generator, first = torch.Generator().manual_seed(0), 64
+    parts = [torch.randn(first + 3 * max(counts) + 1, generator=generator).to(GPU) for _ in counts]
+    statuses = [part[: PassStatus.SIZE].view(torch.int32) for part in parts]
+    for status in statuses:
+        status.zero_()
+    for overflow, stop in ((0, 0), (1, 0), (0, 15), (1, 2)):
+        statuses[-1][PassStatus.OVERFLOW], statuses[0][PassStatus.STOP] = overflow, stop
+        engine, seen, wanted = CudaEngine(GPU), *torch.full((2, 2), -1, dtype=torch.int32, device=GPU)
+        colors = engine.gather(parts, first, counts, seen)
+        assert torch.equal(colors, gather_colors(parts, first, counts, wanted))
+        assert seen.tolist() == wanted.tolist() == [overflow, stop] and engine.overflow.tolist() == [overflow]
+    with pytest.raises(RuntimeError, match="process 0 has no"):
+        CudaEngine(GPU).gather(parts, first, (max(counts) + 1, *counts[1:]), seen)

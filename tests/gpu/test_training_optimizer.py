@@ -10,11 +10,13 @@ from turbogs_plugin.strategies.learning_rates import LearningRates
 from turbogs_plugin.strategies.optimizers.moment_lm import MomentLMOptimizer
 from turbogs_plugin.strategies.optimizers.sparse_adam import SparseAdam
 
+from turbogs_plugin.distributed.peer_memory import aligned_starts
 from turbogs_plugin.engine.cuda import launches
 from turbogs_plugin.engine.cuda import library as kernels
 from turbogs_plugin.engine.cuda import training as training_kernels
 from turbogs_plugin.engine.cuda.raster import CudaScreenGradients
 from turbogs_plugin.engine.layout import MAX_VIEWS, ScreenRecord
+from turbogs_plugin.engine.protocol import ModelCopies
 from turbogs_plugin.engine.reference.projection import drawable_rows, project_rows
 from turbogs_plugin.engine.reference.raster import ReferenceScreenGradients
 from turbogs_plugin.engine.rendered import DEFAULT_SETTINGS
@@ -218,6 +220,36 @@ def check_fused_step(name, **case):
     assert untouched.any()
     for parameter, value in before.items():
         assert torch.equal(getattr(gaussians, parameter).cpu()[untouched], value[untouched]), parameter
+
+
+@pytest.mark.parametrize("degree", [3, 2, 0])
+def test_a_step_changes_copies_alike(degree):
+    """Rows of a model in one memory, and the same rows of models in others; what no step changes stays there."""
+    scene, optimizer = Scene(degree=degree), MomentLMOptimizer(RATES)
+    starts = aligned_starts([value.numel() for _, value in scene.gaussians.items()])
+    memories = torch.full((4, starts[-1]), torch.nan, device=DEVICE)
+
+    def placed(memory):
+        values = zip(scene.gaussians.items(), starts, strict=False)
+        return Gaussians(**{name: memory[at:][: value.numel()].view(value.shape) for (name, value), at in values})
+
+    own, *others = map(placed, memories)
+    for name, value in own.items():
+        value.copy_(getattr(scene.gaussians, name))
+    plain = own.map(torch.clone)
+    for gaussians, copies in ((plain, None), (own, ModelCopies(own, others))):
+        optimizer.setup(gaussians)
+        screen = scene.screen(gaussians)
+        training_kernels.fused_step(optimizer.rule(STEP), screen, gaussians, optimizer.moments, copies=copies)
+    stepped = optimizer.moments.steps > 0
+    assert stepped.any() and not stepped.all()
+    for name, value in plain.items():
+        assert torch.equal(getattr(own, name), value), name
+        for other in others:
+            copy = getattr(other, name)
+            assert torch.equal(copy[stepped], value[stepped]) and bool(copy[~stepped].isnan().all()), name
+    with pytest.raises(InputError, match="must lie as the model does"):
+        _ = ModelCopies(own, [others[0].map(torch.clone)]).distances
 
 
 def test_balanced_step_without_shares_is_adam():

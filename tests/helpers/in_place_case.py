@@ -14,17 +14,19 @@ import torch
 from torch import Tensor
 
 from turbogs_plugin.config.configuration import load_config
+from turbogs_plugin.distributed.exchange import RankExchange
 from turbogs_plugin.distributed.in_place import InPlace
 from turbogs_plugin.distributed.processes import joined
 from turbogs_plugin.distributed.ranks import Ranks
-from turbogs_plugin.distributed.rows import OwnedRows, Packing, RowGather
+from turbogs_plugin.distributed.rows import Packing, RowGather
 from turbogs_plugin.distributed.shared_pass import SharedScreen
 from turbogs_plugin.engine.cuda import workspace
+from turbogs_plugin.engine.protocol import Engine
 from turbogs_plugin.engine.rendered import ScreenRecords
 from turbogs_plugin.scene import load_scene
 from turbogs_plugin.train.loop import TrainingLoop
 from turbogs_plugin.train.trainer import Trainer
-from turbogs_plugin.types import PARAMETER_NAMES, Gaussians
+from turbogs_plugin.types import Gaussians
 
 CASES = {
     "owners": (True, ("schedule.min_views=3", "schedule.max_views=5")),
@@ -43,12 +45,12 @@ class Kept:
         self.screens: list[tuple] = []
         self.parameters: list[tuple] = []
         self.arrived_in_place = 0
-        colors, of_rows = InPlace.colors, SharedScreen.of_rows
-        begin, finish = OwnedRows.begin, OwnedRows.finish
+        colors, of_rows, update = InPlace.colors, SharedScreen.of_rows, RankExchange.update
 
-        def kept_colors(memory: InPlace, shares: list, own: Tensor | None) -> tuple[Tensor, Tensor]:
-            found = colors(memory, shares, own)
-            self.colors.append((shares, own, found[0]))
+        def kept_colors(memory: InPlace, engine: Engine, shares: list, own: Tensor | None, *flags: object) -> Tensor:
+            found = colors(memory, engine, shares, own, *flags)
+            # The next pass overwrites what this one has rendered.
+            self.colors.append((shares, None if own is None else own.clone(), found))
             return found
 
         def kept_rows(screen: SharedScreen, rows: list, own) -> object:
@@ -59,22 +61,20 @@ class Kept:
             self.screens.append((replace(screen, _plain=plain), rows, found.records.clone(), found.radii.clone()))
             return found
 
-        def kept_begin(owned: OwnedRows, memory: InPlace | None) -> None:
-            self._own = owned.gaussians.map(torch.clone)
-            begin(owned, memory)
+        def kept_update(exchange: RankExchange, engine: Engine, rule, screen, gaussians: Gaussians, *states) -> None:
+            update(exchange, engine, rule, screen, gaussians, *states)
+            if not exchange._incomplete:  # all processes made all steps
+                return
+            exchange.finish()
+            owned = exchange._owned
+            self.arrived_in_place += exchange.way == "in place" and owned.copies is not None
+            self.parameters.append((owned.rows, owned.gaussians.map(torch.clone), gaussians.map(torch.clone)))
 
-        def kept_finish(owned: OwnedRows) -> None:
-            finish(owned)
-            self.arrived_in_place += owned._latest is owned._in_place
-            model = [value.clone() for value in owned._tensors[: len(PARAMETER_NAMES)]]
-            self.parameters.append((owned.rows, self._own, Gaussians(*model)))
-
-        self._before = colors, of_rows, begin, finish
-        InPlace.colors, SharedScreen.of_rows = kept_colors, kept_rows
-        OwnedRows.begin, OwnedRows.finish = kept_begin, kept_finish
+        self._before = colors, of_rows, update
+        InPlace.colors, SharedScreen.of_rows, RankExchange.update = kept_colors, kept_rows, kept_update
 
     def compare(self) -> None:
-        InPlace.colors, SharedScreen.of_rows, OwnedRows.begin, OwnedRows.finish = self._before
+        InPlace.colors, SharedScreen.of_rows, RankExchange.update = self._before
         for screen, rows, records, radii in self.screens:
             target = ScreenRecords(torch.empty_like(records), torch.empty_like(radii), False)
             screen._send_and_receive(rows, target)

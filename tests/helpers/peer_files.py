@@ -1,11 +1,10 @@
-"""Memory of processes on CPUs that all of them read in place: files that all have mapped. And an engine that keeps its
-records there, as that of a GPU does; and work beside that of a stream, done late."""
+"""Memory of processes on CPUs that all of them use in place: files that all have mapped. And an engine that keeps what
+passes leave there, as that of a GPU does."""
 
 from __future__ import annotations
 
 import random
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +15,7 @@ from torch import Tensor
 from turbogs_plugin.distributed.peer_memory import PeerMemory
 from turbogs_plugin.distributed.ranks import ProcessRanks
 from turbogs_plugin.engine.layout import ScreenRecord
+from turbogs_plugin.engine.protocol import PassMemory
 from turbogs_plugin.engine.rendered import ScreenRecords
 
 
@@ -86,21 +86,20 @@ class _Screen(_Forwarding):
 
 
 class KeepingEngine(LosingEngine):
-    """The projection of a pass destroys what is in the memory lent, the backward pass writes there."""
+    """The projection of a pass destroys what is in the memory lent; the forward and the backward pass write there."""
 
     def __init__(self, lose: int | None = None) -> None:
         super().__init__(lose)
-        self.lent: tuple[Tensor, Tensor] | None = None
+        self.lent: PassMemory | None = None
 
-    def lend(self, records: Tensor | None, radii: Tensor | None) -> None:
-        self.lent = None if records is None else (records, radii)
+    def lend(self, memory: PassMemory | None) -> None:
+        self.lent = memory
 
     def views(self, views: int, count: int) -> tuple[Tensor, Tensor]:
-        records, radii = self.lent
         size = views * count
         return (
-            records[: ScreenRecord.SIZE * size].view(views, count, ScreenRecord.SIZE),
-            radii[: 2 * size].view(views, count, 2),
+            self.lent.records[: ScreenRecord.SIZE * size].view(views, count, ScreenRecord.SIZE),
+            self.lent.radii[: 2 * size].view(views, count, 2),
         )
 
     def render(self, gaussians: Any, cameras: Any, *arguments: Any) -> _Rendered:
@@ -108,20 +107,9 @@ class KeepingEngine(LosingEngine):
             records, radii = self.views(len(cameras), len(gaussians))
             records.fill_(torch.nan)
             radii.fill_(-7)
-        return _Rendered(super().render(gaussians, cameras, *arguments), self)
-
-
-class LateSide:
-    """A `SideStream` whose work is done at the last moment. A GPU may do it then, or at the first, as the true one does
-    on a CPU."""
-
-    def __init__(self, device: torch.device) -> None:
-        self._work: Callable[[], None] | None = None
-
-    def begin(self, work: Callable[[], None]) -> None:
-        assert self._work is None, "others are under way"
-        self._work = work
-
-    def finish(self) -> None:
-        work, self._work = self._work, None
-        work()
+            self.lent.colors.fill_(torch.nan)
+        rendered = super().render(gaussians, cameras, *arguments)
+        if self.lent is not None:
+            colors = self.lent.colors[: rendered.colors.numel()].view(rendered.colors.shape)
+            rendered.colors = colors.copy_(rendered.colors)
+        return _Rendered(rendered, self)

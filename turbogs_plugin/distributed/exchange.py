@@ -10,11 +10,12 @@ function of (seed, iteration, place), so all draw the same. Then
    it adds up their records, in the order of the shares;
 3. it solves for their update, and the new parameters of all rows are gathered (236 bytes a Gaussian).
 
-Two processes with a small batch (`owners_pay`) do without 3: both get all records, and both make all steps.
+Two processes with a small batch (`owners_pay`) that send messages do without 3: both get all records, and both make
+all steps.
 
 On GPUs of one host that are linked, all three are done in place: a process reads the others' memory (`in_place`), of
-the records only those of Gaussians on screen. Elsewhere colours and parameters are gathered and records sent as
-messages. Both ways give the same, to the bit.
+the records only those of Gaussians on screen, and its step writes to the others' models (`shared_model`). Elsewhere
+colours and parameters are gathered and records sent as messages. Both ways give the same, to the bit.
 
 Every step and statistic is computed by one process, as by a process alone, and copied to the others; or by all, from
 the same records. So the replicas are bit-equal, and a step differs from that of one process only by the order in which
@@ -38,6 +39,7 @@ from turbogs_plugin.distributed.digest import digest
 from turbogs_plugin.distributed.in_place import InPlace
 from turbogs_plugin.distributed.ranks import ProcessRanks, Ranks
 from turbogs_plugin.distributed.rows import OwnedRows, Packing, RowGather, rows_of
+from turbogs_plugin.distributed.shared_model import SharedModel
 from turbogs_plugin.distributed.shared_pass import Batch, SharedRendered, SharedScreen
 from turbogs_plugin.distributed.shares import Share, shares_of
 from turbogs_plugin.engine.moments import GaussianMoments
@@ -53,19 +55,21 @@ LAG = 4
 of them at the same place, and no host runs farther ahead of its GPU."""
 
 OWNERS_FROM = 4_000_000
-OWNERS_FROM_IN_PLACE = 1_000_000
-"""Rows of a batch, views times Gaussians, from which on two processes gain by owners of rows: by messages, and in
-place. Measured with .45, 1.5, 1.8 and 6 million (docs/scaling.md): below, two exchanges more cost what they save. In
-place, three hosts do not agree at .45 million: owners are the faster way on the newest, the slower one on the others.
-To be decided when two GPUs can be measured again."""
+"""Rows of a batch, views times Gaussians, from which on two processes that send messages gain by owners of rows.
+Measured with .45, 1.5, 1.8 and 6 million (docs/scaling.md): below, two exchanges more cost what they save. In place
+there is one exchange more, a barrier, and owners always gain."""
 
 OVERFLOW, STOP = 0, 1
-"""Columns of a pass's flags: iterations do nothing for lack of memory; the signal to stop, 0 for none. They travel as
-one more row of the colours, whose third number means nothing."""
+"""Columns of a pass's flags: iterations do nothing for lack of memory; the signal to stop, 0 for none. In messages they
+travel as one more row of the colours, whose third number means nothing."""
 
 
 class Exchange:
     """A process alone: every call goes to the engine, and nothing is exchanged."""
+
+    def place(self, gaussians: Gaussians) -> Gaussians:
+        """The model where iterations may change it: the given one, or a copy. Every process must call this."""
+        return gaussians
 
     def render(
         self, engine: Engine, gaussians: Gaussians, cameras: Cameras, samples: PixelSamples, options: RenderOptions
@@ -134,7 +138,7 @@ def exchange_of(ranks: Ranks) -> Exchange:
 
 def owners_pay(processes: int, views: int, gaussians: int, in_place: bool = False) -> bool:
     """Whether owners of rows should make the steps of a batch, and not all processes all of them."""
-    return processes > 2 or views * gaussians >= (OWNERS_FROM_IN_PLACE if in_place else OWNERS_FROM)
+    return in_place or processes > 2 or views * gaussians >= OWNERS_FROM
 
 
 class RankExchange(Exchange):
@@ -151,14 +155,18 @@ class RankExchange(Exchange):
         self.ranks = ranks
         self.by_rows: bool | None = None
         self.in_place = True
-        self.memory = InPlace(ranks)
+        self.memory, self.model = InPlace(ranks), SharedModel(ranks)
         self._passes = 0
         self._flags: deque[_Flags] = deque()
         self._incomplete = False
         self._lent = False  # the engine uses `memory`
         self._owned: OwnedRows | None = None
+        self._seen: Tensor | None = None  # [2] the flags of the latest pass
         self._buffers: list[tuple[Tensor, torch.cuda.Event]] = []  # for flags
         self._skipped: Tensor | None = None  # [] of all processes, when last complete
+
+    def place(self, gaussians: Gaussians) -> Gaussians:
+        return self.model.place(gaussians)
 
     def render(
         self, engine: Engine, gaussians: Gaussians, cameras: Cameras, samples: PixelSamples, options: RenderOptions
@@ -188,7 +196,7 @@ class RankExchange(Exchange):
             self._lent = True
             return self.memory
         if self._lent:
-            engine.lend(None, None)
+            engine.lend(None)
         self._lent = False
         return None
 
@@ -202,47 +210,41 @@ class RankExchange(Exchange):
     ) -> Tensor:
         """[P, 3] of all samples; and all processes learn whether one had too little memory or wants to stop."""
         own = None if rendered is None else rendered.colors
+        if self._seen is None or self._seen.device != like.device:
+            self._seen = torch.zeros(2, dtype=torch.int32, device=like.device)
         if memory is None:
-            colors, flags = self._sent_colors(engine, own, shares, like)
+            colors = self._sent_colors(engine, own, shares, like)
         else:
-            self._set_flags(engine, memory.flags)
-            colors, flags = memory.colors(shares, own)
-        overflow = engine.overflow
-        if overflow is not None:
-            overflow.copy_(flags[OVERFLOW])
-        self._flags.append(self._sent_flags(flags))
+            colors = memory.colors(engine, shares, own, self.ranks.asked, self._seen)
+        self._flags.append(self._sent_flags(self._seen))
         self._passes += 1
         self.ranks.latest = time.monotonic()
         return colors
 
-    def _set_flags(self, engine: Engine, flags: Sequence[Tensor]) -> None:
-        """`flags`: three times [1], zeros or what this set before."""
-        overflow = engine.overflow
-        if overflow is not None:
-            flags[OVERFLOW].copy_(overflow)
-        if self.ranks.asked:
-            flags[STOP].fill_(self.ranks.asked)
-
-    def _sent_colors(
-        self, engine: Engine, own: Tensor | None, shares: Sequence[Share], like: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """([P, 3] the colours of all samples, [3] the largest of each flag), by a message to all."""
+    def _sent_colors(self, engine: Engine, own: Tensor | None, shares: Sequence[Share], like: Tensor) -> Tensor:
+        """[P, 3] the colours of all samples, by a message to all; sets `_seen` and the engine's own flag."""
         counts = [share.slots.stop - share.slots.start for share in shares]
         most = max(counts)
         sent = like.new_zeros(most + 1, 3)
         if own is not None:
             sent[: len(own)] = own
-        self._set_flags(engine, sent[most].split(1))
+        if engine.overflow is not None:
+            sent[most, OVERFLOW : OVERFLOW + 1].copy_(engine.overflow)
+        if self.ranks.asked:
+            sent[most, STOP] = self.ranks.asked
         gathered = self.ranks.gather(sent)  # [ranks, most + 1, 3]
-        colors = torch.cat([colors[:count] for colors, count in zip(gathered, counts, strict=True)])
-        return colors, gathered[:, most].amax(dim=0)
+        self._seen.copy_(gathered[:, most, :2].amax(dim=0))
+        if engine.overflow is not None:
+            engine.overflow.copy_(self._seen[:1])
+        return torch.cat([colors[:count] for colors, count in zip(gathered, counts, strict=True)])
 
     def _sent_flags(self, flags: Tensor) -> _Flags:
-        """`flags` [3] of this pass, on their way to the host."""
+        """`flags` [2] of this pass, on their way to the host."""
         if not flags.is_cuda:
-            return _Flags(self._passes, flags, None)
+            return _Flags(self._passes, flags.clone(), None)
         if not self._buffers:  # more than are ever under way
-            self._buffers = [(torch.empty(3, pin_memory=True), torch.cuda.Event()) for _ in range(2 * LAG)]
+            pinned = [torch.empty_like(flags, device="cpu", pin_memory=True) for _ in range(2 * LAG)]
+            self._buffers = [(values, torch.cuda.Event()) for values in pinned]
         values, event = self._buffers[self._passes % len(self._buffers)]
         values.copy_(flags, non_blocking=True)
         event.record()
@@ -277,14 +279,17 @@ class RankExchange(Exchange):
                 return
             self._incomplete, self._skipped = True, moments.skipped.clone()
         if self._owned is None or not self._owned.fits(gaussians, moments, stats):
-            self._owned = None  # nothing keeps memory of rows, which may have to grow
-            self._owned = OwnedRows(self.ranks, gaussians, moments, stats)
+            self._owned = OwnedRows(self.ranks, gaussians, moments, stats, self.model.others(gaussians))
         owned = self._owned
+        copies = owned.copies if self._lent else None
         own_screen = screen.of_rows(owned.rows, owned.gaussians)
         if len(owned.gaussians):
-            engine.update(rule, own_screen, owned.gaussians, owned.moments, owned.stats)
-        owned.begin(self.memory if self._lent else None)
-        self.memory.ordered()
+            engine.update(rule, own_screen, owned.gaussians, owned.moments, owned.stats, copies)
+        if copies is not None:
+            self.memory.stepped()
+        else:
+            owned.begin()
+            self.memory.ordered()
 
     def initial_errors(
         self, pixels: Sequence[int], errors_of: Callable[[int], Tensor], device: torch.device
@@ -369,7 +374,7 @@ class RankExchange(Exchange):
 
 @dataclass
 class _Flags:
-    """Flags of a pass on their way to the host, [3] as `OVERFLOW` and `STOP` say."""
+    """Flags of a pass on their way to the host, [2] as `OVERFLOW` and `STOP` say."""
 
     number: int
     values: Tensor

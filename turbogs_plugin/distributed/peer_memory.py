@@ -1,4 +1,4 @@
-"""Memory of GPUs of one host that all processes of a training read in place, over NVLink.
+"""Memory of GPUs of one host that all processes of a training read and write in place, over NVLink.
 
 By torch's symmetric memory: every process allocates as much, and maps what the others have. Nothing here uses
 multicast, and torch is told not to prepare it.
@@ -9,14 +9,16 @@ from __future__ import annotations
 import ctypes
 import os
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from itertools import accumulate
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from turbogs_plugin.distributed.ranks import ProcessRanks
+from turbogs_plugin.engine.layout import MAX_PEERS
 
 SETTINGS = {
     # Every process sees its own GPU alone, as number 0 (`processes.joined`). Torch would take that for one GPU of all.
@@ -36,12 +38,24 @@ PROOF_MILLISECONDS = 60_000
 the first process may evaluate for an hour; a process that is lost is noticed by its launcher."""
 
 
+GROWTH = 1.25
+"""Memory that must grow gets this factor of the size asked for."""
+
+ALIGNMENT = 64
+"""What lies in a memory begins at a multiple of so many numbers."""
+
+
+def aligned_starts(sizes: Iterable[int]) -> list[int]:
+    """Where parts of these sizes begin in a memory, one after the other, and behind them its size; all in numbers."""
+    return list(accumulate((-(-size // ALIGNMENT) * ALIGNMENT for size in sizes), initial=0))
+
+
 @dataclass
 class PeerMemory:
-    """As much memory of every process, for all to read.
+    """As much memory of every process, for all to read and write.
 
     Args:
-        parts: [size] float32 of each process, rank after rank; one's own to write to.
+        parts: [size] float32 of each process, rank after rank.
         barrier: called with a small number by every process: what its stream does next comes after all that the
             streams of all did before their calls with this number. No host waits.
         owner: keeps the memory mapped.
@@ -81,7 +95,7 @@ def _allocate(ranks: ProcessRanks, size: int, memory: None) -> PeerMemory | None
     import torch.distributed._symmetric_memory as symmetric
 
     one_host = os.environ.get("LOCAL_WORLD_SIZE") == os.environ.get("WORLD_SIZE")
-    if not one_host or os.environ.get(MESSAGES_VARIABLE) == "messages" or not _linked():
+    if not one_host or ranks.count > MAX_PEERS or os.environ.get(MESSAGES_VARIABLE) == "messages" or not _linked():
         return None
     # As `symmetric.empty` does, but never from a pool: what one process has kept from earlier runs there, another may
     # not, and only one of the two would then wait for the other.

@@ -8,16 +8,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from operator import is_
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from turbogs_plugin.distributed.in_place import PACKED, InPlace
-from turbogs_plugin.distributed.peer_memory import PeerMemory
 from turbogs_plugin.distributed.ranks import ProcessRanks
-from turbogs_plugin.distributed.side_stream import SideStream
 from turbogs_plugin.engine.moments import GaussianMoments
+from turbogs_plugin.engine.protocol import ModelCopies
 from turbogs_plugin.types import Gaussians, GaussianStats
 
 ROW_STEP = 4
@@ -106,50 +105,27 @@ class RowGather:
             torch._foreach_copy_(self._targets, self._sources)
 
 
-class RowsInPlace:
-    """Overwrites all rows of some tensors by their owners' rows, which are read where the owners pack them.
-
-    The order of all this is that of `in_place`.
-
-    Args:
-        ranks: of the owners.
-        packing: of the rows.
-        memory: [packing.size] or more, of each process.
-        side: lets them travel beside other work.
-    """
-
-    def __init__(self, ranks: ProcessRanks, packing: Packing, memory: PeerMemory, side: SideStream) -> None:
-        self._memory, self._side = memory, side
-        self._own = packing.own(ranks.rank)
-        self._filled = memory.parts[ranks.rank][: packing.filled(ranks.rank)]
-        self._targets, self._sources = packing.of_others(ranks.rank, memory.parts)
-
-    def begin(self) -> None:
-        """Pack this process's rows and copy those of the others, beside other work."""
-        torch.cat(self._own, out=self._filled)
-        self._side.begin(self._copy)
-
-    def _copy(self) -> None:
-        self._memory.barrier(PACKED)
-        if self._targets:
-            torch._foreach_copy_(self._targets, self._sources)
-
-    def finish(self) -> None:
-        """What is enqueued next comes after the rows of all, which must be under way."""
-        self._side.finish()
-
-
 class OwnedRows:
     """What one process needs to make the step of its rows, as long as the tensors are the same.
+
+    Args:
+        others: the model in the memory of each other process, to which the step writes as well; None: parameters
+            travel as messages.
 
     Attributes:
         rows: of each process.
         gaussians, moments, stats: this process's rows, views of the tensors.
-        under_way: parameters travel, and `finish` is to come.
+        copies: of `gaussians`, in the other processes' models.
+        under_way: parameters travel as messages, and `finish` is to come.
     """
 
     def __init__(
-        self, ranks: ProcessRanks, gaussians: Gaussians, moments: GaussianMoments, stats: GaussianStats | None
+        self,
+        ranks: ProcessRanks,
+        gaussians: Gaussians,
+        moments: GaussianMoments,
+        stats: GaussianStats | None,
+        others: Sequence[Gaussians] | None,
     ) -> None:
         self._tensors = _tensors(gaussians, moments, stats)
         self.rows = rows_of(len(gaussians), ranks.count)
@@ -158,41 +134,27 @@ class OwnedRows:
         states = vars(moments).items()
         self.moments = replace(moments, **{name: value[own] if value.dim() else value for name, value in states})
         self.stats = None if stats is None else stats.map(lambda value: value[own])
-        self._ranks, self._all_stats = ranks, stats
-        self._packing = Packing([value for _, value in gaussians.items()], self.rows)
-        self._messages: RowGather | None = None
-        self._in_place: RowsInPlace | None = None
-        self._latest: RowGather | RowsInPlace | None = None
+        self.copies: ModelCopies | None = None
+        if others is not None:
+            self.copies = ModelCopies(self.gaussians, [other.map(lambda value: value[own]) for other in others])
+        self._ranks, self._model, self._all_stats = ranks, gaussians, stats
+        self._parameters: RowGather | None = None
         self._statistics: RowGather | None = None
         self.under_way = False
 
-    def begin(self, memory: InPlace | None) -> None:
-        """Let the parameters of this process's rows travel to all, beside other work. Every process must call this.
-
-        Args:
-            memory: to read them in place, if it has room for them; None: by messages.
-        """
-        self._latest = self._gather_by(memory)
-        self._latest.begin()
+    def begin(self) -> None:
+        """Let the parameters of this process's rows travel to all as messages, beside other work. Every process must
+        call this."""
+        if self._parameters is None:  # takes memory
+            packing = Packing([value for _, value in self._model.items()], self.rows)
+            self._parameters = RowGather(self._ranks, packing)
+        self._parameters.begin()
         self.under_way = True
 
     def finish(self) -> None:
         """What is enqueued next comes after the parameters of all, which must be under way."""
-        self._latest.finish()
+        self._parameters.finish()
         self.under_way = False
-
-    def _gather_by(self, memory: InPlace | None) -> RowGather | RowsInPlace:
-        """Made when first asked for: either takes memory."""
-        if memory is not None:
-            if self._in_place is None:
-                found = memory.rows(self._packing.size, self.gaussians.device)
-                if found is not None:
-                    self._in_place = RowsInPlace(self._ranks, self._packing, *found)
-            if self._in_place is not None:
-                return self._in_place
-        if self._messages is None:
-            self._messages = RowGather(self._ranks, self._packing)
-        return self._messages
 
     def gather_statistics(self) -> None:
         """What is enqueued next comes after the statistics of all rows: 32 bytes a Gaussian, and no host waits."""
@@ -204,7 +166,7 @@ class OwnedRows:
     def fits(self, gaussians: Gaussians, moments: GaussianMoments, stats: GaussianStats | None) -> bool:
         """Whether these are still the tensors."""
         present = _tensors(gaussians, moments, stats)
-        return len(present) == len(self._tensors) and all(map(lambda a, b: a is b, present, self._tensors))
+        return len(present) == len(self._tensors) and all(map(is_, present, self._tensors))
 
 
 def _tensors(gaussians: Gaussians, moments: GaussianMoments, stats: GaussianStats | None) -> list[Tensor]:

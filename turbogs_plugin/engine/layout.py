@@ -39,6 +39,19 @@ UPDATE_KINDS = ("adam", "balanced_lm", "paper_lm")
 """Kinds of a step of the parameters. The kernels number them in this order."""
 
 
+MAX_PEERS = 8
+"""Processes, of one host, that use each other's memory in place."""
+
+
+class PassStatus:
+    """What a process says of a pass: int32."""
+
+    INTERSECTIONS = 0  # of tiles and splats
+    OVERFLOW = 1  # not 0: there was too little memory, and the pass draws nothing
+    STOP = 2  # number of the signal by which the process wants all to stop; 0: none
+    SIZE = 3
+
+
 class ScreenRecord:
     """Gradients and sums of one Gaussian in one view: a row of float32.
 

@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
 
 from turbogs_plugin.engine.exposures import Exposures
+from turbogs_plugin.engine.layout import PassStatus
 from turbogs_plugin.engine.moments import GaussianMoments
 from turbogs_plugin.engine.reference.exposure import expose, exposure_gradients, step_exposures
-from turbogs_plugin.engine.reference.records import collect_records
+from turbogs_plugin.engine.reference.records import collect_records, gather_colors
 from turbogs_plugin.engine.reference.update import apply_update
 from turbogs_plugin.engine.rendered import DEFAULT_OPTIONS, Rendered, RenderOptions, ScreenGradients, ScreenRecords
 from turbogs_plugin.engine.rules import DrawRule, LossTerms, UpdateRule
 from turbogs_plugin.error_maps import ErrorMaps
+from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene.photos import PhotoSamples
 from turbogs_plugin.types import Cameras, Gaussians, GaussianStats, LossOutput, PixelSamples, Step
 
@@ -33,6 +37,57 @@ class MapUpdate:
     maps: ErrorMaps
     step: Step
     nonfinite_losses: Tensor | None = None
+
+
+@dataclass
+class PassMemory:
+    """Memory of the caller, which others read, for what passes leave. Contiguous, aligned to 16 bytes.
+
+    Args:
+        status: [3] int32, `layout.PassStatus`.
+        colors, radii, records: flat float32, int32 and float32, from whose start on a pass keeps as many as it has.
+    """
+
+    status: Tensor
+    colors: Tensor
+    radii: Tensor
+    records: Tensor
+
+    @cached_property
+    def overflow(self) -> Tensor:
+        """[1] int32 of `status`."""
+        return self.status[PassStatus.OVERFLOW :][:1]
+
+    @cached_property
+    def stop(self) -> Tensor:
+        """[1] int32 of `status`."""
+        return self.status[PassStatus.STOP :][:1]
+
+
+@dataclass
+class ModelCopies:
+    """Copies of Gaussians, maybe in other devices' memory, that a step changes alike.
+
+    Args:
+        gaussians: those that the step changes.
+        copies: of the same Gaussians. The parameters of a copy are as far from each other as those of `gaussians`.
+    """
+
+    gaussians: Gaussians
+    copies: Sequence[Gaussians]
+
+    @cached_property
+    def distances(self) -> tuple[int, ...]:
+        """Bytes from each parameter to that of each copy.
+
+        Raises:
+            InputError: a copy lies otherwise.
+        """
+        filled = [(name, value) for name, value in self.gaussians.items() if value.numel()]
+        found = [{getattr(copy, name).data_ptr() - value.data_ptr() for name, value in filled} for copy in self.copies]
+        if any(len(each) != 1 for each in found):
+            raise InputError("a copy of a model must lie as the model does: its parameters as far from each other")
+        return tuple(distance for each in found for distance in each)
 
 
 class Engine(ABC):
@@ -98,14 +153,28 @@ class Engine(ABC):
         """
         collect_records(source, target, row, view, adds)
 
-    def lend(self, records: Tensor | None, radii: Tensor | None) -> None:
-        """Let the following passes keep their records and radii in this memory, if the engine keeps memory from pass to
-        pass, and they fit in.
+    def lend(self, memory: PassMemory | None) -> None:
+        """Let the following passes keep in this memory what it is for, if the engine keeps memory from pass to pass,
+        and as far as it fits in. None: in the engine's own."""
+        return
+
+    def gather(self, parts: Sequence[Tensor], first: int, counts: Sequence[int], seen: Tensor) -> Tensor:
+        """Put the colours of all processes together. If one has set `PassStatus.OVERFLOW`, so does `overflow` here.
 
         Args:
-            records, radii: flat float32 and int32, contiguous, aligned to 16 bytes; None: in the engine's own.
+            parts: [.] float32 of each process, memory that begins with the bits of its `PassStatus`; maybe other
+                devices' memory, read in place.
+            first: number at which its colours begin, in each.
+            counts: samples of each.
+            seen: [2] int32, written: the largest `PassStatus.OVERFLOW` of all, and the largest `PassStatus.STOP`.
+
+        Returns:
+            [P, 3] float32, one process's after the other's.
         """
-        return
+        colors = gather_colors(parts, first, counts, seen)
+        if self.overflow is not None:
+            self.overflow.copy_(seen[:1])
+        return colors
 
     @abstractmethod
     def evaluate(self, terms: LossTerms, colors: Tensor, targets: Tensor, samples: PixelSamples) -> LossOutput:
@@ -167,6 +236,7 @@ class Engine(ABC):
         gaussians: Gaussians,
         moments: GaussianMoments,
         stats: GaussianStats | None,
+        copies: ModelCopies | None = None,
     ) -> None:
         """Take gradients from the screen to the parameters, and make one step with them.
 
@@ -175,8 +245,12 @@ class Engine(ABC):
             screen: from a backward pass of this engine; it cannot be used again.
             gaussians: the model that was rendered; changed in place, as is `moments`.
             stats: the statistics of density control, to which this pass is added; None if not needed.
+            copies: of `gaussians`, to be changed alike.
         """
         apply_update(rule, gaussians, screen.parameter_gradients(rule.per_view, stats), moments)
+        for copy in copies.copies if copies else ():
+            for name, value in copy.items():
+                value.copy_(getattr(gaussians, name))
 
     def settle(self, wait: bool = False) -> int:
         """How many of the latest iterations were skipped for lack of device memory, and must be done again.

@@ -310,7 +310,7 @@ class Trainer:
     @gaussians.setter
     def gaussians(self, gaussians: Gaussians) -> None:
         self.exchange.finish()
-        self._gaussians = gaussians
+        self._gaussians = self.exchange.place(gaussians)
 
     @property
     def device(self) -> torch.device:

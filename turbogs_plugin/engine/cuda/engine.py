@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
+from turbogs_plugin.engine import layout
 from turbogs_plugin.engine.cuda import exposure, launches, library, training
 from turbogs_plugin.engine.cuda.raster import CudaRendered, CudaScreenGradients, rasterize_cuda, screen_gradients
 from turbogs_plugin.engine.cuda.workspace import Workspace
 from turbogs_plugin.engine.exposures import Exposures
-from turbogs_plugin.engine.protocol import Engine, MapUpdate
+from turbogs_plugin.engine.protocol import Engine, MapUpdate, PassMemory
 from turbogs_plugin.engine.rendered import DEFAULT_OPTIONS, RenderOptions, ScreenRecords
 from turbogs_plugin.engine.rules import LossTerms
 from turbogs_plugin.scene.photos import PhotoSamples
@@ -55,9 +58,15 @@ class CudaEngine(Engine):
         tensors = (target.records, target.radii, source.records, source.radii)
         library.launch(launches.CollectRecords(*tensors, first_row=row, first_view=view, adds=adds))
 
-    def lend(self, records: Tensor | None, radii: Tensor | None) -> None:
+    def lend(self, memory: PassMemory | None) -> None:
         if self.workspace is not None:
-            self.workspace.lend({"records": records, "radii": radii})
+            self.workspace.lend(memory)
+
+    def gather(self, parts: Sequence[Tensor], first: int, counts: Sequence[int], seen: Tensor) -> Tensor:
+        colors = torch.empty(sum(counts), 3, device=seen.device)
+        peers = launches.Peers(*parts, *(None,) * (layout.MAX_PEERS - len(parts)))
+        library.launch(launches.GatherColors(peers, list(counts), first, colors, seen, self.overflow))
+        return colors
 
     def supervise(self, terms: LossTerms, colors: Tensor, truth: PhotoSamples, update: MapUpdate) -> LossOutput:
         # The kernel gathers the photos' colours itself if the photos and the maps of each view begin at the same pixel.

@@ -265,6 +265,32 @@ class CollectRecords(Launch):
     adds: bool  # the source's first view is added to what the target holds
 
 
+@dataclass
+class Peers:
+    """Memory of each process, rank after rank, [.] float32: this GPU's, and other GPUs' mapped here."""
+
+    peer_0: Tensor
+    peer_1: Tensor | None
+    peer_2: Tensor | None
+    peer_3: Tensor | None
+    peer_4: Tensor | None
+    peer_5: Tensor | None
+    peer_6: Tensor | None
+    peer_7: Tensor | None
+
+
+@dataclass
+class GatherColors(Launch):
+    """Put the colours of all processes together, and look at their flags."""
+
+    peers: Peers  # each begins with a layout.PassStatus, int32
+    counts: list[int]  # [processes] samples of each
+    first: int  # number at which colours begin, in each
+    colors: Tensor  # [P, 3] float32
+    seen: Tensor  # [2] int32: the largest of two flags
+    overflow: Tensor | None  # [1] int32, set like the first of these
+
+
 # ---- Sampling and loss ----------------------------------------------------------------------------------------------
 
 
@@ -436,10 +462,28 @@ Rates = fields_of("float", "means quats scales opacities sh0 shN")
 
 
 @dataclass
+class Copies:
+    """How many bytes behind each parameter a copy of it lies, maybe in another GPU's memory; 0: no copy."""
+
+    copy_0: int
+    copy_1: int
+    copy_2: int
+    copy_3: int
+    copy_4: int
+    copy_5: int
+    copy_6: int
+
+
+NO_COPIES = Copies(*(0,) * 7)
+
+
+@dataclass
 class FusedStep(Launch):
-    """Projection backward and one step of the optimizer, in place on Gaussians and moments."""
+    """Projection backward and one step of the optimizer, in place on Gaussians and moments, and on copies of the
+    Gaussians."""
 
     screen: ScreenBackward
+    copies: Copies
     moments: Moments
     kind: int  # of layout.UPDATE_KINDS
     rows_per_view: bool

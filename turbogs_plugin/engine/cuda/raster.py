@@ -367,7 +367,7 @@ def rasterize_cuda(
         tile_starts=tiles.tile_starts,
         intersection_ids=ids,
         instances=splats.instances,
-        colors=torch.empty(slots, 3, device=device),
+        colors=torch.empty(slots, 3, device=device) if workspace is None else workspace.colors(slots),
         alphas=torch.empty(slots, device=device),
         transmittances=back.transmittances,
         depths=torch.empty(slots, device=device) if options.with_depth else None,

@@ -19,9 +19,9 @@ from torch import Tensor
 
 from turbogs_plugin.engine.cuda import launches, library
 from turbogs_plugin.engine.cuda.raster import CudaScreenGradients, count_filled, require_views
-from turbogs_plugin.engine.layout import STRUCTURES, UNITS, UPDATE_KINDS
+from turbogs_plugin.engine.layout import MAX_PEERS, STRUCTURES, UNITS, UPDATE_KINDS
 from turbogs_plugin.engine.moments import GaussianMoments
-from turbogs_plugin.engine.protocol import MapUpdate
+from turbogs_plugin.engine.protocol import MapUpdate, ModelCopies
 from turbogs_plugin.engine.rules import DrawRule, LossTerms, UpdateRule
 from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.tiles import CELL_SIDE, TILE_PIXELS, DrawEnds, slots_of_tiles, tile_extents
@@ -248,14 +248,16 @@ def fused_step(
     gaussians: Gaussians,
     moments: GaussianMoments,
     stats: GaussianStats | None = None,
+    copies: ModelCopies | None = None,
 ) -> None:
-    """Projection backward and one step of `rule` in one launch: changes `gaussians` and `moments`, adds to `stats`, and
-    leaves nothing of use in `screen.records`.
+    """Projection backward and one step of `rule` in one launch: changes `gaussians`, `copies` and `moments`, adds to
+    `stats`, and leaves nothing of use in `screen.records`.
 
     Args:
         screen: of at most `MAX_VIEWS` views.
         gaussians: the model that `screen` was made from: float32, contiguous.
         moments: its optimizer state, float32.
+        copies: of `gaussians`, `MAX_PEERS` - 1 at most.
     """
     library.require()
     if any(value.data_ptr() != getattr(screen.scene.gaussians, name).data_ptr() for name, value in gaussians.items()):
@@ -264,6 +266,7 @@ def fused_step(
     library.launch(
         launches.FusedStep(
             screen=screen.backward_arguments(stats),
+            copies=_copies(copies),
             moments=moments,
             kind=UPDATE_KINDS.index("adam" if lm is None else f"{lm.units}_lm"),
             rows_per_view=rule.per_view,
@@ -275,3 +278,9 @@ def fused_step(
             max_step=0.0 if lm is None else lm.max_step,
         )
     )
+
+
+def _copies(copies: ModelCopies | None) -> launches.Copies:
+    if copies is None:
+        return launches.NO_COPIES
+    return launches.Copies(*copies.distances, *(0,) * (MAX_PEERS - 1 - len(copies.distances)))

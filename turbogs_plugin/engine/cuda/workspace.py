@@ -20,7 +20,8 @@ from weakref import ref
 import torch
 from torch import Tensor
 
-from turbogs_plugin.engine.layout import INTERSECTIONS_MAX
+from turbogs_plugin.engine.layout import INTERSECTIONS_MAX, PassStatus
+from turbogs_plugin.engine.protocol import PassMemory
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.types import Gaussians
 
@@ -40,6 +41,9 @@ CAPACITY_STEP = 1 << 14
 
 MAX_CAPACITY = INTERSECTIONS_MAX // CAPACITY_STEP * CAPACITY_STEP
 """The largest capacity. A count of `INTERSECTIONS_MAX` exceeds it, so it sets the flag."""
+
+LENT = ("colors", "radii", "records")
+"""Buffers that may lie in memory of the caller, by `Workspace.lend`."""
 
 PENDING_MAX = 8
 """Most counts on their way to the host; one more waits for the oldest."""
@@ -79,17 +83,16 @@ class Workspace:
         device: a CUDA device.
 
     Attributes:
-        status: [2] int32 on the device: intersections of the latest pass; the overflow flag.
+        status: [2] int32 on the device, of `layout.PassStatus`: intersections of the latest pass; the overflow flag.
         passes: number of passes begun.
     """
 
     def __init__(self, device: torch.device | str) -> None:
         self.device = torch.device(device)
-        self.status = torch.zeros(2, dtype=torch.int32, device=self.device)
-        self._overflow = self.status[1:]
+        self._set_status(torch.zeros(2, dtype=torch.int32, device=self.device))
         self.passes = 0
         self._buffers: dict[str, Tensor] = {}
-        self._lent: set[str] = set()  # names of buffers, by `lend`
+        self._lent: PassMemory | None = None
         self._views: dict[str, Tensor] = {}  # what `buffer` returned last
         self._kept: dict[str, tuple[tuple, Any]] = {}
         self._pinned = torch.zeros(PENDING_MAX, 2, dtype=torch.int32).pin_memory().unbind()
@@ -98,6 +101,9 @@ class Workspace:
         self._intersections_per_tile = 0.0
         self._first_lost: int | None = None
         self._known: Callable[[], Gaussians | None] = lambda: None
+
+    def _set_status(self, status: Tensor) -> None:
+        self.status, self._overflow = status, status[PassStatus.OVERFLOW :]
 
     @property
     def overflow(self) -> Tensor:
@@ -118,25 +124,34 @@ class Workspace:
         view = self._views[name] = held[:count].view(shape)
         return view
 
-    def lend(self, memory: dict[str, Tensor | None]) -> None:
-        """Let buffers lie in memory of the caller, until they outgrow it or this is called with other memory.
+    def lend(self, memory: PassMemory | None) -> None:
+        """Let the status and some buffers lie in memory of the caller; the buffers until they outgrow it.
 
         Call it before every pass that shall use the memory: a larger pass between may have replaced it.
 
         Args:
-            memory: flat tensors, by the buffers' names; None where a buffer is to be the workspace's own again.
+            memory: None: all are the workspace's own again.
         """
-        for name, tensor in memory.items():
-            held = self._buffers.get(name)
-            if held is tensor or (tensor is None and name not in self._lent):
-                continue
+        if memory is not self._lent:
+            status = torch.empty_like(self.status) if memory is None else memory.status[: len(self.status)]
+            self._set_status(status.copy_(self.status))
             self._kept.clear()  # holds views of buffers
+        for name in LENT:
+            held, lent = self._buffers.get(name), None if memory is None else getattr(memory, name)
+            if held is lent or (lent is None and (self._lent is None or held is not getattr(self._lent, name))):
+                continue
+            self._kept.clear()
             self._views.pop(name, None)
             self._buffers.pop(name, None)
-            self._lent.discard(name)
-            if tensor is not None:
-                self._buffers[name] = tensor
-                self._lent.add(name)
+            if lent is not None:
+                self._buffers[name] = lent
+        self._lent = memory
+
+    def colors(self, slots: int) -> Tensor:
+        """[slots, 3] float32 for the colours of a pass: in memory that was lent, else newly allocated."""
+        if self._lent is None:
+            return torch.empty(slots, 3, device=self.device)
+        return self.buffer("colors", (slots, 3), torch.float32)
 
     def know(self, gaussians: Gaussians) -> None:
         """Remember this model, until another one: its tensors are as kernels take them."""

@@ -1,7 +1,13 @@
-"""Records of the screen, from one of several processes to the one that makes the step of some rows."""
+"""What several processes have rendered of a batch: the colours of all, and records of the screen for some rows."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from turbogs_plugin.engine.layout import PassStatus
 from turbogs_plugin.engine.rendered import ScreenRecords
 
 
@@ -14,3 +20,11 @@ def collect_records(source: ScreenRecords, target: ScreenRecords, row: int, view
     views = slice(view + first, view + len(source.records))
     target.records[views] = source.records[first:, rows]
     target.radii[views] = source.radii[first:, rows]
+
+
+def gather_colors(parts: Sequence[Tensor], first: int, counts: Sequence[int], seen: Tensor) -> Tensor:
+    """`Engine.gather`, without the engine's own flag."""
+    statuses = torch.stack([part[: PassStatus.SIZE].view(torch.int32) for part in parts])  # [processes, 3]
+    seen.copy_(statuses[:, PassStatus.OVERFLOW :].amax(dim=0))
+    pieces = [part[first : first + 3 * count] for part, count in zip(parts, counts, strict=True)]
+    return torch.cat(pieces).view(-1, 3)
