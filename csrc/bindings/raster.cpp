@@ -141,24 +141,37 @@ void launches::RasterBackward::run(const Arguments<RasterBackward>& in) {
 }
 
 void launches::CollectRecords::run(const Arguments<CollectRecords>& in) {
-    const Tensor &source = in.tensor(Tensors::source_radii), &target = in.tensor(Tensors::target_radii);
+    constexpr Tensors kRecords[kMaxPeers] = {Tensors::records_0, Tensors::records_1, Tensors::records_2,
+                                             Tensors::records_3, Tensors::records_4, Tensors::records_5,
+                                             Tensors::records_6, Tensors::records_7};
+    constexpr Tensors kRadii[kMaxPeers] = {Tensors::radii_0, Tensors::radii_1, Tensors::radii_2, Tensors::radii_3,
+                                           Tensors::radii_4, Tensors::radii_5, Tensors::radii_6, Tensors::radii_7};
+    const Tensor &source = in.tensor(Tensors::radii_0), &target = in.tensor(Tensors::target_radii);
     STD_TORCH_CHECK(source.dim() == 3 && target.dim() == 3, "turbogs: radii must be [views, Gaussians, 2]");
-    const int64_t views = source.size(0), count = source.size(1), all = target.size(0), rows = target.size(1);
-    const int64_t first_row = in.integer(Integers::first_row), first_view = in.integer(Integers::first_view);
+    const int64_t count = source.size(1), all = target.size(0), rows = target.size(1);
+    const int64_t first_row = in.integer(Integers::first_row), num_sources = in.num_rows(1);
     STD_TORCH_CHECK(first_row >= 0 && first_row + rows <= count, "turbogs: rows ", first_row, " .. ", first_row + rows,
                     " of ", count);
-    STD_TORCH_CHECK(first_view >= 0 && first_view + views <= all && all <= kMaxViews, "turbogs: views ", first_view,
-                    " .. ", first_view + views, " of ", all);
+    STD_TORCH_CHECK(num_sources <= kMaxPeers, "turbogs: records of up to ", kMaxPeers, " processes are collected");
     CollectParams params = {};
-    params.num_views = to_int(views, "views");
-    params.source_gaussians = to_int(count, "Gaussians");
-    params.target_gaussians = to_int(rows, "Gaussians");
+    params.num_sources = static_cast<int>(num_sources);
+    params.num_views = to_int(all, "views");
+    params.num_gaussians = to_int(count, "Gaussians");
+    params.num_rows = to_int(rows, "Gaussians");
     params.first_row = to_int(first_row, "Gaussians");
-    params.first_view = to_int(first_view, "views");
-    params.adds = in.integer(Integers::adds) != 0;
     const auto whole = ScreenRecord::kSize;
-    in.set(params.source_records, Tensors::source_records, {views, count, whole});
-    in.set(params.source_radii, Tensors::source_radii, {views, count, 2});
+    int64_t end = 0;  // of the views so far
+    for (int i = 0; i < params.num_sources; ++i) {
+        const int64_t views = in.tensor(kRadii[i]).size(0), first = *in.row(i, 1);
+        STD_TORCH_CHECK(views > 0 && (first == end || (i > 0 && first == end - 1)),
+                        "turbogs: the views of a process begin with the last one of the process before it, or the next");
+        end = first + views;
+        params.sources[i].num_views = to_int(views, "views");
+        params.sources[i].first_view = to_int(first, "views");
+        in.set(params.sources[i].records, kRecords[i], {views, count, whole});
+        in.set(params.sources[i].radii, kRadii[i], {views, count, 2});
+    }
+    STD_TORCH_CHECK(end == all && all <= kMaxViews, "turbogs: records of ", end, " views of ", all);
     in.set(params.target_records, Tensors::target_records, {all, rows, whole});
     in.set(params.target_radii, Tensors::target_radii, {all, rows, 2});
     check_launched(launch_collect_records(params, in.stream()), "collection of records");

@@ -1,11 +1,12 @@
-// Gradients on the screen of some rows of Gaussians, out of the records of one process that rendered some of the views.
-// Defined by turbogs_plugin/engine/reference/records.py.
+// Gradients on the screen of some rows of Gaussians, out of the records of all processes, each of which rendered some of
+// the views, or a part of one. Defined by turbogs_plugin/engine/reference/records.py.
 //
-// The source may be another GPU's memory, mapped here: what is not read does not travel. A thread takes one Gaussian
+// The sources may be other GPUs' memory, mapped here: what is not read does not travel. A thread takes one Gaussian
 // in one view and reads its radii, 8 bytes. Those of a warp that are on screen, two fifths or so, make a list in shared
-// memory, and four threads copy each record, so that they read whole sectors. A thread has all of its reads under way
-// before the first write, because a read from another GPU takes some thousand clocks. Plain loads: what another GPU
-// has written lies in no cache of this one when a kernel begins.
+// memory, and four threads copy each record, so that they read whole sectors. A thread has all of its reads of a process
+// under way before it adds or writes, because a read from another GPU takes some thousand clocks. A view of several
+// processes is added up in their order. Plain loads: what another GPU has written lies in no cache of this one when a
+// kernel begins.
 #include "common/warp.cuh"
 #include "raster/raster_params.h"
 
@@ -15,23 +16,25 @@ namespace {
 // No record of other values: not measured yet.
 constexpr int kCollectThreads = 256;
 
+// Whether a process has rendered a part of this view; then which of its own it is.
+__device__ __forceinline__ bool has_view(const CollectSource& source, int view, int& own) {
+    own = view - source.first_view;
+    return own >= 0 && own < source.num_views;
+}
+
 __global__ void __launch_bounds__(kCollectThreads) collect_kernel(const __grid_constant__ CollectParams params) {
     __shared__ int rows[kCollectThreads];  // of each warp: its rows on screen, counted from its first
     const int view = blockIdx.y, lane = this_lane();
     const int warp_row = blockIdx.x * kCollectThreads + kWarpSize * this_warp(), row = warp_row + lane;
-    const size_t source = static_cast<size_t>(view) * params.source_gaussians + params.first_row;
-    const size_t target = static_cast<size_t>(params.first_view + view) * params.target_gaussians;
-    const bool adds = params.adds && view == 0;
+    const size_t target = static_cast<size_t>(view) * params.num_rows;
+    int first = 0, own = 0;
+    while (!has_view(params.sources[first], view, own)) ++first;  // every view has a process
 
+    // The radii of a view that is shared are those of all of its processes.
     int2 radius = make_int2(0, 0);
-    if (row < params.target_gaussians) {
-        // An earlier process has written the radii of a view that is shared; they are those of all of its processes.
-        if (adds) {
-            radius = params.target_radii[target + row];
-        } else {
-            radius = params.source_radii[source + row];
-            params.target_radii[target + row] = radius;
-        }
+    if (row < params.num_rows) {
+        radius = params.sources[first].radii[static_cast<size_t>(own) * params.num_gaussians + params.first_row + row];
+        params.target_radii[target + row] = radius;
     }
     const bool seen = radius.x > 0 || radius.y > 0;
     const uint32_t lanes = __ballot_sync(kFullWarp, seen);
@@ -41,33 +44,38 @@ __global__ void __launch_bounds__(kCollectThreads) collect_kernel(const __grid_c
 
     const int quads = kRecordQuads * __popc(lanes);
     float4 values[kRecordQuads];
+    for (int i = first; i < params.num_sources; ++i) {
+        const CollectSource& source = params.sources[i];
+        if (!has_view(source, view, own)) break;  // those of a view follow each other
+        const float4* records =
+            source.records + (static_cast<size_t>(own) * params.num_gaussians + params.first_row + warp_row) * kRecordQuads;
+        float4 read[kRecordQuads];
 #pragma unroll
-    for (int step = 0; step < kRecordQuads; ++step) {
-        const int i = lane + kWarpSize * step;
-        if (i >= quads) continue;
-        const size_t place = static_cast<size_t>(warp_row + list[i / kRecordQuads]);
-        values[step] = params.source_records[(source + place) * kRecordQuads + i % kRecordQuads];
-    }
-#pragma unroll
-    for (int step = 0; step < kRecordQuads; ++step) {
-        const int i = lane + kWarpSize * step;
-        if (i >= quads) continue;
-        const size_t place = static_cast<size_t>(warp_row + list[i / kRecordQuads]);
-        float4& out = params.target_records[(target + place) * kRecordQuads + i % kRecordQuads];
-        float4 value = values[step];
-        if (adds) {
-            const float4 before = out;
-            value = make_float4(before.x + value.x, before.y + value.y, before.z + value.z, before.w + value.w);
+        for (int step = 0; step < kRecordQuads; ++step) {
+            const int quad = lane + kWarpSize * step;
+            if (quad < quads) read[step] = records[list[quad / kRecordQuads] * kRecordQuads + quad % kRecordQuads];
         }
-        out = value;
+#pragma unroll
+        for (int step = 0; step < kRecordQuads; ++step) {
+            float4& sum = values[step];
+            const float4 value = read[step];
+            sum = i == first ? value
+                             : make_float4(sum.x + value.x, sum.y + value.y, sum.z + value.z, sum.w + value.w);
+        }
+    }
+    float4* out = params.target_records + (target + warp_row) * kRecordQuads;
+#pragma unroll
+    for (int step = 0; step < kRecordQuads; ++step) {
+        const int quad = lane + kWarpSize * step;
+        if (quad < quads) out[list[quad / kRecordQuads] * kRecordQuads + quad % kRecordQuads] = values[step];
     }
 }
 
 }  // namespace
 
 cudaError_t launch_collect_records(const CollectParams& params, cudaStream_t stream) {
-    if (params.num_views == 0 || params.target_gaussians == 0) return cudaSuccess;
-    const dim3 blocks(blocks_for(params.target_gaussians, kCollectThreads), params.num_views);
+    if (params.num_views == 0 || params.num_rows == 0) return cudaSuccess;
+    const dim3 blocks(blocks_for(params.num_rows, kCollectThreads), params.num_views);
     collect_kernel<<<blocks, kCollectThreads, 0, stream>>>(params);
     return cudaGetLastError();
 }

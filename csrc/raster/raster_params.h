@@ -156,17 +156,23 @@ struct BackwardParams {
 
 // The records of one process's views, for rows of Gaussians that another one makes the step of. V views of the source,
 // N Gaussians there; K views of the target, and M rows.
+// What a process has rendered of a batch.
+struct CollectSource {
+    const float4* records;  // [V, N, 4], ScreenRecord
+    const int2* radii;      // [V, N]
+    int num_views;          // V
+    int first_view;         // of the batch
+};
+
 struct CollectParams {
-    int num_views;         // V
-    int source_gaussians;  // N
-    int target_gaussians;  // M
-    int first_row;         // of the source
-    int first_view;        // of the target
-    bool adds;             // the source's first view is added to what the target holds of it; its radii stay
-    const float4* source_records;  // [V, N, 4], ScreenRecord
-    const int2* source_radii;      // [V, N]
-    float4* target_records;        // [K, M, 4] out, where the radius is not 0
-    int2* target_radii;            // [K, M] out
+    int num_sources;                   // processes with views, in their order
+    CollectSource sources[kMaxPeers];  // each begins with the last view of the one before, or the next
+    int num_views;                     // K
+    int num_gaussians;                 // N
+    int num_rows;                      // M
+    int first_row;                     // of N
+    float4* target_records;            // [K, M, 4] out, where the radius is not 0
+    int2* target_radii;                // [K, M] out
 };
 
 struct GatherParams {

@@ -266,9 +266,7 @@ def test_records_of_rows_are_collected_view_after_view():
     first, second = records(3, 9, 0), records(2, 9, 1)
     second.radii[0] = first.radii[2]
     target = ScreenRecords(torch.full((4, 5, ScreenRecord.SIZE), torch.nan), torch.zeros(4, 5, 2).int(), False)
-    engine = ReferenceEngine()
-    engine.collect(first, target, 2, 0, False)
-    engine.collect(second, target, 2, 2, True)
+    ReferenceEngine().collect([first, second], [0, 2], target, 2)
     rows = slice(2, 7)
     shared = (first.records[2] + second.records[0])[rows]
     wanted = torch.cat([first.records[:2, rows], shared[None], second.records[1:, rows]])

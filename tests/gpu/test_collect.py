@@ -35,31 +35,37 @@ def records(views: int, count: int, seed: int) -> ScreenRecords:
 
 
 @pytest.mark.parametrize("count, rows", [(1000, (0, 1000)), (1000, (500, 1000)), (4099, (4, 517)), (37, (36, 37))])
-@pytest.mark.parametrize("adds", [False, True])
-def test_records_on_screen_are_those_of_the_twin_to_the_bit(count, rows, adds):
-    source, earlier = records(3, count, 0), records(6, rows[1] - rows[0], 1)
-    if adds:  # a view that is shared has the same radii in all processes
-        earlier.radii[2] = source.radii[0, rows[0] : rows[1]]
-        earlier.records[2] = earlier.records[2].nan_to_num(0.5)
-    target, wanted = (ScreenRecords(earlier.records.clone(), earlier.radii.clone(), False) for _ in range(2))
-    CudaEngine().collect(source, target, rows[0], 2, adds)
-    collect_records(source, wanted, rows[0], 2, adds)
+@pytest.mark.parametrize("views", [[(0, 3)], [(0, 2), (2, 1)], [(0, 2), (1, 3), (4, 1)], [(0, 1), (0, 1), (0, 2)]])
+def test_records_on_screen_are_those_of_the_twin_to_the_bit(count, rows, views):
+    """`views`: (first, how many) of each process; a view that is shared has the same radii in all of them."""
+    sources = [records(number, count, seed) for seed, (_, number) in enumerate(views)]
+    for (first, number), source, (later, _), following in zip(views, sources, views[1:], sources[1:], strict=False):
+        if later < first + number:
+            following.radii[0] = source.radii[-1]
+            following.records[0] = following.records[0].nan_to_num(0.5)
+            source.records[-1] = source.records[-1].nan_to_num(0.5)
+    target, wanted = (records(sum(views[-1]), rows[1] - rows[0], 9) for _ in range(2))
+    before = target.records.clone()
+    firsts = [first for first, _ in views]
+    CudaEngine().collect(sources, firsts, target, rows[0])
+    collect_records(sources, firsts, wanted, rows[0])
     assert torch.equal(target.radii, wanted.radii)
     seen = (wanted.radii > 0).any(dim=-1)
     assert bool(seen.any()) or rows[1] - rows[0] == 1
     assert torch.equal(target.records[seen], wanted.records[seen])
-    assert torch.equal(target.records[~seen].isnan(), earlier.records[~seen].isnan()), "left alone"
+    assert torch.equal(target.records[~seen].isnan(), before[~seen].isnan()), "left alone"
 
 
 def test_nothing_to_collect():
     target = ScreenRecords(
         torch.zeros(2, 0, ScreenRecord.SIZE, device=GPU), torch.zeros(2, 0, 2, device=GPU).int(), False
     )
-    CudaEngine().collect(records(2, 8, 0), target, 8, 0, False)
+    CudaEngine().collect([records(2, 8, 0)], [0], target, 8)
     with pytest.raises(RuntimeError, match="rows"):
-        CudaEngine().collect(records(2, 8, 0), records(2, 8, 1), 4, 0, False)
-    with pytest.raises(RuntimeError, match="views"):
-        CudaEngine().collect(records(2, 8, 0), records(2, 8, 1), 0, 1, False)
+        CudaEngine().collect([records(2, 8, 0)], [0], records(2, 8, 1), 4)
+    for views in ([0], [1], [0, 3], [0, 0]):
+        with pytest.raises(RuntimeError, match="views"):
+            CudaEngine().collect([records(2, 8, 0)] * len(views), views, records(4, 8, 1), 0)
 
 
 def test_passes_in_memory_that_is_lent():
@@ -153,8 +159,7 @@ def in_place_like_twin(engines: list[Engine], gaussians: Gaussians, cameras: Cam
         own = plains[1 - rank], memories[1 - rank]
         own[1].collect(engines[1 - rank], shares, len(gaussians), own[0], target, rows.start)  # has copied, if it must
         memories[rank].collect(engines[rank], shares, len(gaussians), plains[rank], target, rows.start)
-        for plain, one in zip(plains, shares, strict=True):
-            collect_records(plain, wanted, rows.start, one.views.start, one.continues)
+        collect_records(plains, [one.views.start for one in shares], wanted, rows.start)
         assert torch.equal(target.radii, wanted.radii)
         on_screen = (wanted.radii > 0).any(dim=-1)
         assert torch.equal(target.records[on_screen], wanted.records[on_screen])

@@ -160,16 +160,14 @@ class InPlace:
             own: of this process's views and all Gaussians; None if it has no views.
             target: of all views and the rows from `row` on; overwritten, but for records that are off screen.
         """
+        sources = [self._screen_of(rank, len(share), gaussians) for rank, share in enumerate(shares) if len(share)]
         if own is not None:
             kept = self._screen_of(self._ranks.rank, len(own.records), gaussians)
             if kept.records.data_ptr() != own.records.data_ptr() or kept.radii.data_ptr() != own.radii.data_ptr():
                 kept.records.copy_(own.records)  # of an engine that keeps no memory
                 kept.radii.copy_(own.radii)
         self._memory.barrier(DRAWN)
-        for rank, share in enumerate(shares):
-            if len(share):
-                source = self._screen_of(rank, len(share), gaussians)
-                engine.collect(source, target, row, share.views.start, share.continues)
+        engine.collect(sources, [share.views.start for share in shares if len(share)], target, row)
 
     def _screen_of(self, rank: int, views: int, gaussians: int) -> ScreenRecords:
         """Of a process's views and all Gaussians. Laid out as the engine does, from the start of what it was lent.

@@ -142,16 +142,18 @@ class Engine(ABC):
             plain: of these views and Gaussians.
         """
 
-    def collect(self, source: ScreenRecords, target: ScreenRecords, row: int, view: int, adds: bool) -> None:
-        """Copy the records of some rows from the V views that one process rendered into those of all K views.
+    def collect(self, sources: Sequence[ScreenRecords], views: Sequence[int], target: ScreenRecords, row: int) -> None:
+        """Collect the records of all K views for some rows. What several processes have of one view is added up, in
+        their order.
 
         Args:
-            source: of V views and N Gaussians; maybe another device's memory, read in place.
-            target: of K views and M Gaussians; changed.
-            row, view: of the source's first row wanted, and of the target's first view of the source.
-            adds: the source's first view is added to what the target holds of it.
+            sources: of each process with views, in their order: of V views and N Gaussians; maybe other devices'
+                memory, read in place.
+            views: first view of each, in the batch: the last one of the process before, or the next.
+            target: of K views and M Gaussians; overwritten, but for records that are off screen.
+            row: first of the M among the N.
         """
-        collect_records(source, target, row, view, adds)
+        collect_records(sources, views, target, row)
 
     def lend(self, memory: PassMemory | None) -> None:
         """Let the following passes keep in this memory what it is for, if the engine keeps memory from pass to pass,

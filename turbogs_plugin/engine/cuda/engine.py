@@ -54,9 +54,10 @@ class CudaEngine(Engine):
     ) -> CudaScreenGradients:
         return screen_gradients(gaussians, cameras, samples, options, plain, self.workspace)
 
-    def collect(self, source: ScreenRecords, target: ScreenRecords, row: int, view: int, adds: bool) -> None:
-        tensors = (target.records, target.radii, source.records, source.radii)
-        library.launch(launches.CollectRecords(*tensors, first_row=row, first_view=view, adds=adds))
+    def collect(self, sources: Sequence[ScreenRecords], views: Sequence[int], target: ScreenRecords, row: int) -> None:
+        arrays = [array for source in sources for array in (source.records, source.radii)]
+        arrays = launches.Sources(*arrays, *(None,) * (2 * layout.MAX_PEERS - len(arrays)))
+        library.launch(launches.CollectRecords(target.records, target.radii, arrays, list(views), row))
 
     def lend(self, memory: PassMemory | None) -> None:
         if self.workspace is not None:

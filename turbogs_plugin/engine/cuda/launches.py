@@ -250,19 +250,40 @@ class RasterBackward(Launch):
 
 
 @dataclass
-class CollectRecords(Launch):
-    """Copy the records of splats on screen from one process's views to all views, for a run of rows; and the radii.
+class Sources:
+    """What each process with views has rendered, in their order: N Gaussians in V views, as `Splats` and records."""
 
-    The source may be another GPU's memory, mapped here. V views, N Gaussians there; M rows.
+    records_0: Tensor
+    radii_0: Tensor
+    records_1: Tensor | None
+    radii_1: Tensor | None
+    records_2: Tensor | None
+    radii_2: Tensor | None
+    records_3: Tensor | None
+    radii_3: Tensor | None
+    records_4: Tensor | None
+    radii_4: Tensor | None
+    records_5: Tensor | None
+    radii_5: Tensor | None
+    records_6: Tensor | None
+    radii_6: Tensor | None
+    records_7: Tensor | None
+    radii_7: Tensor | None
+
+
+@dataclass
+class CollectRecords(Launch):
+    """Copy the records of splats on screen from all processes' views to those of the batch, for a run of rows; and the
+    radii. What several processes have of one view is added up.
+
+    A source may be another GPU's memory, mapped here. M rows.
     """
 
     target_records: Tensor  # [K, M, 16] float32, layout.ScreenRecord; where off screen, left alone
     target_radii: Tensor  # [K, M, 2] int32
-    source_records: Tensor  # [V, N, 16] float32
-    source_radii: Tensor  # [V, N, 2] int32
-    first_row: int  # of the source
-    first_view: int  # of the target
-    adds: bool  # the source's first view is added to what the target holds
+    sources: Sources
+    first_views: list[int]  # [sources] of the batch; a process begins with the last view of the one before, or the next
+    first_row: int  # of the sources
 
 
 @dataclass

@@ -11,15 +11,15 @@ from turbogs_plugin.engine.layout import PassStatus
 from turbogs_plugin.engine.rendered import ScreenRecords
 
 
-def collect_records(source: ScreenRecords, target: ScreenRecords, row: int, view: int, adds: bool) -> None:
-    """`Engine.collect`. Where a Gaussian is off screen, this copies as well what the source's record holds."""
-    rows = slice(row, row + target.records.shape[1])
-    first = int(adds)
-    if adds:
-        target.records[view] += source.records[0, rows]
-    views = slice(view + first, view + len(source.records))
-    target.records[views] = source.records[first:, rows]
-    target.radii[views] = source.radii[first:, rows]
+def collect_records(sources: Sequence[ScreenRecords], views: Sequence[int], target: ScreenRecords, row: int) -> None:
+    """`Engine.collect`. Where a Gaussian is off screen, this copies as well what the sources' records hold."""
+    rows, end = slice(row, row + target.records.shape[1]), 0
+    for source, view in zip(sources, views, strict=True):
+        if view < end:  # shared with the process before
+            target.records[view] += source.records[0, rows]
+        new, fresh = slice(end - view, None), slice(end, view + len(source.records))
+        target.records[fresh], target.radii[fresh] = source.records[new, rows], source.radii[new, rows]
+        end = fresh.stop
 
 
 def gather_colors(parts: Sequence[Tensor], first: int, counts: Sequence[int], seen: Tensor) -> Tensor:
