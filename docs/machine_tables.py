@@ -189,11 +189,13 @@ def short(commit: str) -> str:
 
 
 def ranks() -> str:
-    """Milliseconds of an iteration on one GPU and on two, beside the predictions: on two hosts."""
-    places = ("", "other-host/")
-    return "\n\n".join(
-        f"{where(measured(f'{place}ranks.json'))}.\n\n{scaling_results.iterations(H200 / place)}" for place in places
-    )
+    """Milliseconds of an iteration on one GPU and on several, beside the predictions."""
+    return f"{where(measured('ranks.json'))}.\n\n{scaling_results.iterations(H200)}"
+
+
+def rank_runs() -> str:
+    """Whole runs and a study on one GPU and on several, of the same measurement as `ranks`."""
+    return f"{scaling_results.trainings(H200)}\n\n{scaling_results.study(H200)}"
 
 
 def steps(name: str) -> str:

@@ -14,6 +14,7 @@ from functools import cache
 import capture_tables
 import machine_tables
 import paper_tables
+import scaling_model
 import study_tables
 import sweep_tables
 import viewer_tables
@@ -90,6 +91,7 @@ TABLES: dict[str, Callable[[], str | None]] = {
     "precision": lambda: machine_tables.on("bench-raster.json", machine_tables.precision),
     "render caption": viewer_tables.render_caption,
     "ranks": machine_tables.ranks,
+    "rank_runs": machine_tables.rank_runs,
     "pixels_on_an_mlp": machine_tables.pixels_on_an_mlp,
     "refined": study_tables.refined,
     "raster": lambda: machine_tables.on("bench-raster.json", machine_tables.raster),
@@ -99,6 +101,7 @@ TABLES: dict[str, Callable[[], str | None]] = {
     "wall": machine_tables.wall,
 }
 TABLES |= {name: lambda name=name: round_table(*name.split()) for name in sweep_tables.names()}
+TABLES |= {f"predicted {name}": lambda name=name: scaling_model.tables()[name] for name in scaling_model.tables()}
 
 
 def filled(text: str) -> str:

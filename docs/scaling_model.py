@@ -26,13 +26,16 @@ HOST_LINK = 56e9
 LATENCY = 0.03
 """Milliseconds of a small exchange."""
 
-RECORD, COLOR, PARAMETERS, MOMENTS, PASS = 72, 12, 236, 504, 213
-"""Bytes: record with radii; colour of a sample; parameters of a Gaussian; its moments and statistics; and what a pass
-holds of a Gaussian in a view, records and intersections among it (measured, turbogs_plugin/plan/memory.py)."""
+RADII, RECORD, COLOR, PARAMETERS, MOMENTS, PASS = 8, 72, 12, 236, 504, 213
+"""Bytes: radii; record with radii; colour of a sample; parameters of a Gaussian; its moments and statistics; and what a
+pass holds of a Gaussian in a view, records and intersections among it (measured, turbogs_plugin/plan/memory.py)."""
 
 
 DRAW = 0.35
-"""Share of the draw in what every process does: parameters travel meanwhile."""
+"""Share of the draw in what every process does: parameters that are sent as messages travel meanwhile."""
+
+IN_VIEW = 0.4
+"""Share of the Gaussians that a view has on screen (docs/performance.md: 31 to 44 %)."""
 
 PROJECTION = 0.15
 """Share of the projection in forward and backward pass: it takes as long for a part of a view as for all of it."""
@@ -57,19 +60,26 @@ class Case:
     solve: float
     samples: float = 1.26e6
 
-    def on(self, count: int, owners: bool = True, bandwidth: float = BANDWIDTH) -> float:
-        """Milliseconds on so many GPUs."""
+    def on(self, count: int, owners: bool = True, in_place: bool = True, bandwidth: float = BANDWIDTH) -> float:
+        """Milliseconds on so many GPUs. Without owners, every process is sent all records, and makes all steps."""
         if count == 1:
             return self.whole + self.shared + self.solve
         others, views = (count - 1) / count, self.views_of(count)
         colors = COLOR * self.samples * others
-        records = RECORD * self.gaussians * views * (others if owners else count - 1)
+        record = RADII + IN_VIEW * (RECORD - RADII) if in_place else RECORD
+        records = record * self.gaussians * views * (others if owners else count - 1)
         parameters = PARAMETERS * self.gaussians * others if owners else 0.0
-        packed = 2 * (RECORD * self.gaussians * views + 2 * parameters)  # own records are copied, others' are packed
-        exchange = 1e3 * ((colors + records) / bandwidth + packed / COPY) + LATENCY * (4 if owners else 3)
-        exchange += max(0.0, 1e3 * parameters / bandwidth - DRAW * self.whole)
+        packed = 2 * record * self.gaussians * views  # own records are copied; in messages, others' are packed
+        packed += 0.0 if in_place else 4 * parameters
+        exchange = 1e3 * ((colors + records) / bandwidth + packed / COPY)
+        exchange += LATENCY * (3 if in_place or not owners else 4)
+        solve, travel = self.solve / (count if owners else 1), 1e3 * parameters / bandwidth
+        if in_place:
+            solve = max(solve, travel)  # the step itself writes to all
+        else:
+            exchange += max(0.0, travel - DRAW * self.whole)
         passes = self.shared * ((1 - PROJECTION) / count + PROJECTION * views / self.views)
-        return self.whole + passes + self.solve / (count if owners else 1) + exchange
+        return self.whole + passes + solve + exchange
 
     def views_of(self, count: int) -> int:
         """The most views that a process has a part of."""
@@ -123,14 +133,12 @@ NEXT = (
 )
 """What one would shard next, each with those before it."""
 
-IN_VIEW = 0.4
-"""Share of the Gaussians that a view has on screen (docs/performance.md: 31 to 44 %)."""
-
+# The steps of docs/results/h200/bench-step.json, rounded.
 MEASURED = {
-    "150k, K = 3": Case(150e3, 3, 0.18, 0.95, 0.09),
-    "150k, K = 10": Case(150e3, 10, 0.36, 1.41, 0.16),
-    "600k, K = 3": Case(600e3, 3, 0.27, 1.42, 0.29),
-    "600k, K = 10": Case(600e3, 10, 0.37, 2.57, 0.50),
+    "150k, K = 3": Case(150e3, 3, 0.13, 1.11, 0.09),
+    "150k, K = 10": Case(150e3, 10, 0.30, 1.71, 0.16),
+    "600k, K = 3": Case(600e3, 3, 0.13, 1.90, 0.33),
+    "600k, K = 10": Case(600e3, 10, 0.30, 3.29, 0.56),
 }
 COUNTS = (1, 2, 4, 8)
 
@@ -144,36 +152,51 @@ def table(head: str, rows: dict[str, list[str]], columns: Sequence[object] = COU
     return "\n".join([*lines, *(f"| {name} | " + " | ".join(cells) + " |" for name, cells in rows.items())])
 
 
-def main() -> None:
+def way_of(exchange: str) -> tuple[bool, bool]:
+    """(owners, in_place) of `Case.on`, by the name of an exchange as `turbogs bench ranks` has it."""
+    return not exchange.startswith("records to all"), exchange.endswith("in place")
+
+
+EXCHANGES = {
+    "owners": "owners of rows, in place",
+    "messages": "owners of rows, messages",
+    "records": "records to all, messages",
+}
+
+
+def tables() -> dict[str, str]:
+    """The tables of the page, by name."""
     largest = MEASURED["600k, K = 10"]
     cases = MEASURED | {"10M, K = 10": largest.larger(10e6), "100M, K = 10": largest.larger(100e6)}
-    for owners, title in ((True, "owners of rows"), (False, "records to all")):
+    made = {}
+    for which, title in EXCHANGES.items():
         rows = {}
         for name, case in cases.items():
-            times = [case.on(count, owners) for count in COUNTS]
+            times = [case.on(count, *way_of(title)) for count in COUNTS]
             rows[name] = [f"{time:.2f} ms, {times[0] / time:.2f}x" for time in times]
-        print(table(title, rows), end="\n\n")
+        made[which] = table(title, rows)
     rows = {}
     for name, case in cases.items():
         times = [case.grown(count).on(count) for count in COUNTS]
         faster = zip(times, COUNTS, strict=True)
         rows[name] = [f"{time:.2f} ms, {count * times[0] / time:.2f}x" for time, count in faster]
-    print(table("N times the views and pixels", rows), end="\n\n")
+    made["grown"] = table("N times the views and pixels", rows)
     rows = {
-        name: [f"{case.on(count, bandwidth=NETWORK):.2f} ms" for count in COUNTS]
+        name: [f"{case.on(count, in_place=False, bandwidth=NETWORK):.2f} ms" for count in COUNTS]
         for name, case in cases.items()
         if case.views == 10
     }
-    print(table("a machine for each GPU", rows), end="\n\n")
+    made["network"] = table("a machine for each GPU", rows)
     large = {name: case for name, case in cases.items() if case.gaussians >= 10e6}
     rows = {name: [f"{case.gigabytes(count):.0f} GB" for count in COUNTS] for name, case in large.items()}
-    print(table("memory of a GPU", rows), end="\n\n")
+    made["memory"] = table("memory of a GPU", rows)
     rows = {
         what: [f"{large['100M, K = 10'].gigabytes(count, place):.0f} GB" for count in COUNTS]
         for place, what in enumerate(NEXT)
     }
-    print(table("memory of a GPU, 100M", rows), end="\n\n")
-    print(table(f"{PHOTOS:,} photos of {PIXELS / 1e6:.0f} megapixels", photos(cases)))
+    made["sharded"] = table("memory of a GPU, 100M", rows)
+    made["photos"] = table(f"{PHOTOS:,} photos of {PIXELS / 1e6:.0f} megapixels", photos(cases))
+    return made
 
 
 def photos(cases: dict[str, Case]) -> dict[str, list[str]]:
@@ -199,4 +222,4 @@ def photos(cases: dict[str, Case]) -> dict[str, list[str]]:
 
 
 if __name__ == "__main__":
-    main()
+    print(*tables().values(), sep="\n\n")

@@ -3,7 +3,8 @@
 python docs/scaling_results.py OUT
 
 Reads what is there of OUT/ranks.json (or the lines of ranks.txt, where the bench was cut short), OUT/runs/*-SEED with
-their histories, and OUT/study-GPUS with the times at which its cells ended.
+their histories, and OUT/study-GPUS with the times at which its cells ended. Of the last two, OUT/scaling.json is
+written, which docs/results/h200 keeps beside ranks.json.
 """
 
 from __future__ import annotations
@@ -14,11 +15,15 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 from statistics import mean
+from typing import Any
 
-from scaling_model import MEASURED, Case, table
+from scaling_model import MEASURED, Case, table, way_of
 
 from turbogs_plugin.study.statistics import seconds_to_reach
-from turbogs_plugin.train.history import read_history
+from turbogs_plugin.train.history import Evaluation, read_history
+
+KEPT = "scaling.json"
+"""The file of OUT with what is kept of runs and studies."""
 
 BELOW = (0.0, 0.25, 0.5, 1.0)
 """Time to so many dB below the last PSNR of the run that ends with the lowest one."""
@@ -50,7 +55,7 @@ def iterations(out: Path) -> str:
         found = f"{time:.2f} ms" + (f", {grown * base / time:.2f}x" if base else "")
         expected = "-"
         if case is not None:
-            predicted = case.grown(grown).on(gpus, not exchange.startswith("records to all"))
+            predicted = case.grown(grown).on(gpus, *way_of(exchange))
             expected = f"{predicted:.2f} ms, {grown * case.on(1) / predicted:.2f}x"
         batch = f", {grown} times the batch" if grown > 1 else ""
         machine = "1 GPU" if gpus == 1 else f"{gpus} GPUs, {exchange}"
@@ -58,10 +63,31 @@ def iterations(out: Path) -> str:
     return table("an iteration", rows, ("measured", "predicted"))
 
 
+def recorded(out: Path) -> dict[str, Any]:
+    """What is kept of whole runs and of a study: ``runs``, name -> evaluations as (iteration, seconds, PSNR, SSIM,
+    Gaussians), and ``studies``, GPUs -> seconds at which cells ended. Of OUT, or of the file that `main` made of it."""
+    if (out / KEPT).is_file() and not (out / "runs").is_dir():
+        return json.loads((out / KEPT).read_text())
+    runs = {}
+    for run in sorted((out / "runs").glob("*-*")):
+        history = read_history(run / "history.jsonl")
+        if history:
+            columns = ("iteration", "train_seconds", "psnr", "ssim", "num_gaussians")
+            runs[run.name] = [[getattr(line, column) for column in columns] for line in history]
+    studies = {}
+    for gpus in ("0", "0,1", "0,1,2,3"):
+        ends = sorted(file.stat().st_mtime for file in (out / f"study-{gpus}").glob("cells/*/*.json"))
+        if ends:
+            studies[gpus] = [round(end - ends[0], 3) for end in ends]
+    return {"runs": runs, "studies": studies}
+
+
 def trainings(out: Path) -> str:
     """A table of the runs, and their means against those of one GPU with the same seeds."""
-    runs = sorted((out / "runs").glob("*-*"))
-    histories = {run.name: history for run in runs if (history := read_history(run / "history.jsonl"))}
+    histories = {
+        name: [Evaluation(step, seconds, psnr, ssim, 0.0, count) for step, seconds, psnr, ssim, count in lines]
+        for name, lines in recorded(out)["runs"].items()
+    }
     if not histories:
         return "no run has ended"
     wanted = min(max(line.psnr for line in history) for history in histories.values())
@@ -75,8 +101,8 @@ def trainings(out: Path) -> str:
         rows[name].append(str(last.iteration))
     head = (*(f"to {level:.2f} dB" for level in levels), "end", "PSNR", "SSIM", "Gaussians", "iterations")
     lines = [table("run", rows, head), ""]
-    for kind in ("two", "batch"):
-        seeds = [seed for seed in "012" if f"one-{seed}" in histories and f"{kind}-{seed}" in histories]
+    for kind in ("two", "four", "batch"):
+        seeds = [seed for seed in "01234" if f"one-{seed}" in histories and f"{kind}-{seed}" in histories]
         if not seeds:
             continue
         sooner = [
@@ -92,16 +118,17 @@ def trainings(out: Path) -> str:
 
 
 def study(out: Path) -> str:
-    """Cells a second of a study, from the end of each GPU's first cell on: without the start of the processes."""
+    """Cells a minute of a study, from the end of each GPU's first cell on: without the start of the processes."""
     rates = {}
-    for gpus in ("0", "0,1"):
+    for gpus, ends in recorded(out)["studies"].items():
         count = len(gpus.split(","))
-        ends = sorted(file.stat().st_mtime for file in (out / f"study-{gpus}").glob("cells/*/*.json"))
         if len(ends) > count and ends[-1] > ends[count - 1]:
             rates[gpus] = (len(ends) - count) / (ends[-1] - ends[count - 1])
-    lines = [f"study on GPUs {gpus}: {60 * rate:.1f} cells a minute" for gpus, rate in rates.items()]
-    if len(rates) == 2:
-        lines.append(f"two GPUs: {rates['0,1'] / rates['0']:.2f} times one (wanted: 1.9)")
+    lines = [f"A study on GPUs {gpus}: {60 * rate:.1f} cells a minute." for gpus, rate in rates.items()]
+    for gpus, least in (("0,1", 1.9), ("0,1,2,3", 3.8)):
+        if {"0", gpus} <= rates.keys():
+            count = len(gpus.split(","))
+            lines.append(f"{count} GPUs: {rates[gpus] / rates['0']:.2f} times one (wanted: {least}).")
     return "\n".join(lines) or "no study has ended"
 
 
@@ -124,6 +151,7 @@ def wanted(out: Path) -> str:
 
 def main() -> None:
     out = Path(sys.argv[1])
+    (out / KEPT).write_text(f"{json.dumps(recorded(out), indent=1)}\n")
     print("\n\n".join(filter(None, [iterations(out), wanted(out), trainings(out), study(out)])))
 
 
