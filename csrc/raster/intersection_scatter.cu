@@ -169,7 +169,7 @@ __global__ void __launch_bounds__(kScatterThreads)
             const Emission& emission = splats[owner];
             const int2 tiles = number < total ? tiles_of_row(params, emission, emission.rows.x + number - before)
                                               : make_int2(0, 0);
-            emit_rows(params, tiles, emission.key, 0, kWarpSize * kLargeBox, lane);
+            emit_rows(params, tiles, emission.key, 0, INT32_MAX, lane);
         }
         __syncwarp();
     }

@@ -116,9 +116,9 @@ def splats_that_end_at_a_tile(columns, copies):
     return gaussians, cameras
 
 
-@pytest.mark.parametrize(("columns", "copies"), [(256, 1)], ids=["windows"])
+@pytest.mark.parametrize(("columns", "copies"), [(256, 1), (96, 32)], ids=["windows", "rows of a warp"])
 def test_splats_that_round_to_a_tile_beyond_their_box_lose_nothing(columns, copies):
-    """Where the box has as many tiles as a window has room for, one tile more still counts."""
+    """Where the box has as many tiles as a window or 32 rows of small splats may have, one tile more still counts."""
     gaussians, cameras = splats_that_end_at_a_tile(columns, copies)
     gaussians, cameras = gaussians.map(lambda value: value.cuda()), cameras.to("cuda")
     samples, memory = dense_samples(cameras), Workspace("cuda")
