@@ -33,7 +33,6 @@ void launches::SamplePixels::run(const Arguments<SamplePixels>& in) {
     for (int i = 0; i < params.num_views; ++i) {
         const int64_t* row = in.row(i, DrawRow::kSize);
         params.views[i].slot_base = to_int(row[DrawRow::kFirstSlot], "first slot");
-        params.views[i].wanted = to_int(row[DrawRow::kWanted], "tiles to choose");
         for (int j = 0; j < 3; ++j) params.stages[i][j] = static_cast<int>(row[DrawRow::kStages + j]);
     }
     params.slots_per_tile = static_cast<int>(in.integer(Integers::slots_per_tile));

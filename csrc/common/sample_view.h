@@ -13,7 +13,6 @@ struct SampleView {
     int origin_x, origin_y;  // pixels by which the grid of tiles begins before the image
     int view_number;  // training view
     int slot_base;    // sampler: first slot (units pixel and cell); first chosen tile (unit tile)
-    int wanted;       // sampler, unit tile: tiles to choose
 };
 
 }  // namespace turbogs

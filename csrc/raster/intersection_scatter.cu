@@ -33,6 +33,7 @@ struct Emission {
     int2 rows;
 };
 
+// `box_tiles`: of the splat's box. It may reach a few more, as the ends of a row may round to a tile beyond the box.
 __device__ __forceinline__ Emission make_emission(const SortIntersectionsParams& params, uint32_t instance,
                                                   int& box_tiles) {
     Emission out;
@@ -42,8 +43,9 @@ __device__ __forceinline__ Emission make_emission(const SortIntersectionsParams&
     out.key = static_cast<uint64_t>(__float_as_uint(second.z)) << 32 | instance;
     out.reach = make_reach(first.x, first.y, first.z, first.w, second.x, second.w);
     out.rows = tile_rows(out.reach, *out.camera);
-    const int2 columns = tile_span(out.reach.x - out.reach.half_x, out.reach.x + out.reach.half_x,
-                                   out.camera->origin_x, out.camera->tiles_x);
+    const int2 columns =
+        tile_span(__fsub_rn(out.reach.x, out.reach.half_x), __fadd_rn(out.reach.x, out.reach.half_x),
+                  out.camera->origin_x, out.camera->tiles_x);
     box_tiles = (out.rows.y - out.rows.x) * (columns.y - columns.x);
     return out;
 }
@@ -99,15 +101,17 @@ __device__ __forceinline__ int emit_rows(const SortIntersectionsParams& params, 
     return total;
 }
 
-// A warp puts intersections begin .. begin + kWindow - 1 of one splat into their tiles.
-__device__ __forceinline__ void emit_window(const SortIntersectionsParams& params, const Emission& emission,
-                                            int begin, int lane) {
+// A warp puts intersections begin .. end - 1 of one splat into their tiles. Returns `end` or more where there may be
+// others behind them.
+__device__ __forceinline__ int emit_window(const SortIntersectionsParams& params, const Emission& emission, int begin,
+                                           int end, int lane) {
     int first = 0;  // number of the first intersection of the rows at hand
-    for (int base = emission.rows.x; base < emission.rows.y && first < begin + kWindow; base += kWarpSize) {
+    for (int base = emission.rows.x; base < emission.rows.y && first < end; base += kWarpSize) {
         const int row = base + lane;
         const int2 tiles = row < emission.rows.y ? tiles_of_row(params, emission, row) : make_int2(0, 0);
-        first += emit_rows(params, tiles, emission.key, max(begin - first, 0), begin + kWindow - first, lane);
+        first += emit_rows(params, tiles, emission.key, max(begin - first, 0), end - first, lane);
     }
+    return first;
 }
 
 // Lists the windows of a large splat for the next kernel. False where the list has no room: places of it that are
@@ -165,7 +169,7 @@ __global__ void __launch_bounds__(kScatterThreads)
             const Emission& emission = splats[owner];
             const int2 tiles = number < total ? tiles_of_row(params, emission, emission.rows.x + number - before)
                                               : make_int2(0, 0);
-            emit_rows(params, tiles, emission.key, 0, kWarpSize * kLargeBox, lane);
+            emit_rows(params, tiles, emission.key, 0, INT32_MAX, lane);
         }
         __syncwarp();
     }
@@ -175,8 +179,9 @@ __global__ void __launch_bounds__(kScatterThreads)
     for (int i = 0; i < num_large; ++i) {
         int box_tiles;
         const Emission emission = make_emission(params, large[i], box_tiles);
-        for (int begin = warp * kWindow; begin < box_tiles; begin += kScatterWarps * kWindow) {
-            emit_window(params, emission, begin, lane);
+        int begin = warp * kWindow;
+        while (emit_window(params, emission, begin, begin + kWindow, lane) >= begin + kWindow) {
+            begin += kScatterWarps * kWindow;
         }
     }
 }
@@ -192,7 +197,9 @@ __global__ void __launch_bounds__(kScatterThreads)
         if (window.x == kNoInstance) continue;
         int box_tiles;
         const Emission emission = make_emission(params, window.x, box_tiles);
-        emit_window(params, emission, static_cast<int>(window.y) * kWindow, lane);
+        // The last window takes whatever is left, as its tiles have counted it.
+        const int begin = static_cast<int>(window.y) * kWindow;
+        emit_window(params, emission, begin, begin + kWindow < box_tiles ? begin + kWindow : INT32_MAX, lane);
     }
     for (int tile = thread; tile < params.num_active; tile += gridDim.x * kScatterThreads) {
         const int count = static_cast<int>(params.tile_starts[tile + 1] - params.tile_starts[tile]);

@@ -1,13 +1,15 @@
 """Every tile's intersections: each splat that reaches it once, by depth and then by instance, whatever their number."""
 
+import math
 from itertools import pairwise
 
 import pytest
 import torch
 from helpers.raster_cases import GPU_ONLY, make_case, samples_to
-from helpers.rendering_scenes import one_tile_of_a_wide_image, stacked_splats
+from helpers.rendering_scenes import make_cameras, make_gaussians, one_tile_of_a_wide_image, stacked_splats
 
 from turbogs_plugin.engine.cuda import raster as cuda
+from turbogs_plugin.engine.cuda.workspace import Workspace
 from turbogs_plugin.engine.rendering import dense_samples
 
 pytestmark = GPU_ONLY
@@ -85,3 +87,50 @@ def test_more_large_splats_than_their_list_has_room_for():
     drawn = rendered.projected()
     assert torch.equal(got.long(), drawn.depths[0].cpu().sort(stable=True).indices)
     assert (drawn.radii[0] > 2000).all()
+
+
+WIDE_IMAGE = (8192, 16)  # one row of tiles
+
+
+def splats_that_end_at_a_tile(columns, copies):
+    """Splats across `columns` tiles of one row, and the sentinel of a place that nothing was written to: the last row,
+    which is off screen.
+
+    Each ends within a thousandth of a pixel of the first pixel centre of the next tile. The half width of its box and
+    that of its row are computed by different formulas, so some reach that tile by the second alone.
+    """
+    extent = math.sqrt(2 * math.log(0.9 * 255) * 1.001 + 0.002)  # standard deviations, as tile_reach.cuh enlarges it
+    half = torch.linspace(-1.5, 1.5, 60, dtype=torch.float64) + 8 * columns - 4
+    deviations = half / extent
+    offsets = torch.linspace(-1e-3, 1e-3, 41, dtype=torch.float64)
+    x = (16 * (columns + 4) + 0.5 - half[:, None] + offsets).flatten().repeat_interleave(copies)
+    count = len(x) + 1
+    gaussians, cameras = make_gaussians(count, dtype=torch.float32), make_cameras([WIDE_IMAGE], torch.float32)
+    cameras.viewmats[0], cameras.Ks[0] = torch.eye(4), torch.eye(3)  # a pixel is one unit at depth 1
+    gaussians.means[:-1] = torch.stack([x, torch.full_like(x, 8.0), torch.ones_like(x)], dim=1).float()
+    gaussians.means[-1] = torch.tensor([0.0, 0.0, -1.0])
+    gaussians.quats[:] = torch.tensor([1.0, 0.0, 0.0, 0.0])
+    scales = (deviations.square() - 0.3).sqrt().log().repeat_interleave(len(offsets) * copies)
+    gaussians.scales[:-1] = torch.stack([scales, torch.zeros_like(scales), torch.full_like(scales, -20.0)], 1).float()
+    gaussians.opacities[:] = math.log(9.0)
+    return gaussians, cameras
+
+
+@pytest.mark.parametrize(("columns", "copies"), [(256, 1), (96, 32)], ids=["windows", "rows of a warp"])
+def test_splats_that_round_to_a_tile_beyond_their_box_lose_nothing(columns, copies):
+    """Where the box has as many tiles as a window or 32 rows of small splats may have, one tile more still counts."""
+    gaussians, cameras = splats_that_end_at_a_tile(columns, copies)
+    gaussians, cameras = gaussians.map(lambda value: value.cuda()), cameras.to("cuda")
+    samples, memory = dense_samples(cameras), Workspace("cuda")
+    first = cuda.rasterize_cuda(gaussians, cameras, samples, workspace=memory)
+    sentinel = len(gaussians) - 1
+    assert (first.projected().radii[0, :-1, 0] > 0).all() and (first.projected().radii[0, -1] == 0).all()
+    capacity = memory.capacity(len(gaussians), len(samples.tile_ids))
+    memory.buffer("intersection_keys", (capacity,), torch.int64).fill_(sentinel)
+    rendered = cuda.rasterize_cuda(gaussians, cameras, samples, workspace=memory)
+    tiles = intersections_of_tiles(rendered)
+    assert memory.take_lost(wait=True) == 0
+    assert sum(map(len, tiles)) == int(rendered.num_intersections) > columns * sentinel
+    for instances in tiles:
+        assert (instances[1:] > instances[:-1]).all()  # all depths are equal
+        assert sentinel not in instances

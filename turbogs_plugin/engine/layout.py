@@ -128,11 +128,10 @@ class DrawRow(ViewRow):
     """A view of a batch, as input of the sampler: a row of integers, those of `ViewRow` first."""
 
     FIRST_SLOT = 4  # for unit = tile the first chosen tile
-    WANTED = 5  # tiles to choose; only for unit = tile
-    STAGES = slice(6, 9)  # units of the hard, the stable and the mixed stage: of a tile, or for unit = tile of the view
-    FIRST_LIVE = 9  # with masks: of the view, among the live tiles of all training views
-    LIVE = 10  # tiles to draw from: with masks the live ones of the view, else all
-    SIZE = 11
+    STAGES = slice(5, 8)  # units of the hard, the stable and the mixed stage: of a tile, or for unit = tile of the view
+    FIRST_LIVE = 8  # with masks: of the view, among the live tiles of all training views
+    LIVE = 9  # tiles to draw from: with masks the live ones of the view, else all
+    SIZE = 10
 
 
 def columns(row: type) -> dict[str, slice]:

@@ -103,7 +103,7 @@ class _Places:
         chosen: tiles of all views that get samples.
         slots: of all views.
         slots_per_tile: 0 where tiles are drawn.
-        draws: for each view the last five numbers of its `layout.DrawRow`.
+        draws: for each view the last six numbers of its `layout.DrawRow`.
         ends: see `PixelSamples.host_ends`.
     """
 
@@ -157,7 +157,7 @@ def _places(
         chosen, slots = sum(tiles), ends[-1]
     starts = live_starts or (0,) * len(tiles)
     draws = tuple(
-        (first, count if by_tile else 0, *rule.stages(count), start, live)
+        (first, *rule.stages(count), start, live)
         for first, count, start, live in zip([0, *ends[:-1]], wanted, starts, tiles, strict=True)
     )
     host_ends = DrawEnds(rule.unit, shapes, wanted, None if live_starts is None else tiles)
