@@ -1,5 +1,5 @@
 #!/bin/sh
-# Measures docs/scaling.md on a machine with two GPUs: sh docs/measure_scaling.sh OUT FOX CALITERRA [DEVICE]
+# Measures docs/scaling.md on a machine with two GPUs or four: sh docs/measure_scaling.sh OUT FOX CALITERRA [DEVICE]
 #
 # What says the most comes first. No stage stops another one: each has its time, its own OUT/NAME.txt and NAME.err, and
 # after each OUT/results.txt is written anew with all that is known. WITHIN seconds (470) in all; a stage that would
@@ -11,6 +11,9 @@ test -n "$caliterra" || { echo "sh docs/measure_scaling.sh OUT FOX CALITERRA [DE
 python=${PYTHON:-python3} within=${WITHIN:-470} scratch=${SCRATCH:-$(mktemp -d)} begun=$(date +%s)
 export NCCL_NVLS_ENABLE=0 OMP_NUM_THREADS="${OMP_NUM_THREADS:-8}"
 mkdir -p "$out/runs" "$scratch" || exit 2
+
+counts="1 2" all=0,1 four=$([ "$(nvidia-smi -L 2>/dev/null | wc -l)" -ge 4 ] && echo yes)
+test -n "$four" && counts="1 2 4" all=0,1,2,3
 
 elapsed() { echo $(($(date +%s) - begun)); }
 
@@ -50,15 +53,16 @@ run() {
 
 # The numbers that the rest waits for: iterations on one GPU and on two. 1000 Gaussians say what the host takes.
 stage machine 0 sh -c "nvidia-smi topo -m; nvidia-smi --query-gpu=name,driver_version --format=csv; git rev-parse HEAD"
-stage ranks 60 "$python" -m turbogs_plugin bench ranks --scene "$fox" --gpus 1 2 --gaussians 600000 150000 1000 \
+stage ranks 60 "$python" -m turbogs_plugin bench ranks --scene "$fox" --gpus $counts --gaussians 600000 150000 1000 \
     --views 10 3 --grown --device "$device" --out "$out/ranks.json" ${BENCH:-}
 runs() {
     run one "$1" 1
     run two "$1" 2
+    test -z "$four" || run four "$1" 4
     run batch "$1" 2 train.batch_for=auto  # twice the views and pixels, rates times the root of two
 }
 runs 0
-for gpus in 0 0,1; do
+for gpus in 0 $all; do
     stage "study-$gpus" 60 "$python" -m turbogs_plugin ablate parts --scene "$caliterra" --only turbogs \
         --seeds ${CELLS:-0 1 2 3 4 5} --gpus $gpus --device "$device" --out "$out/study-$gpus" ${STUDY:-}
 done

@@ -23,6 +23,7 @@ from turbogs_plugin.bench.recorder import Recorder
 from turbogs_plugin.bench.step import StepBench, warm_trainer
 from turbogs_plugin.device import synchronize
 from turbogs_plugin.distributed.exchange import RankExchange
+from turbogs_plugin.distributed.in_place import InPlace
 from turbogs_plugin.distributed.processes import joined, start
 from turbogs_plugin.distributed.ranks import ProcessRanks, Ranks
 from turbogs_plugin.distributed.rows import OwnedRows
@@ -34,10 +35,10 @@ from turbogs_plugin.train.start import resolve_device
 from turbogs_plugin.train.trainer import Trainer
 from turbogs_plugin.types import Gaussians
 
-PARTS = ("draw", "arrival", "render", "colors", "loss", "backward", "records", "solve", "parameters")
-"""Parts of an iteration. `colors` and `records` are exchanges, with the wait for the slowest process. `parameters`
-packs those of the process, which travel in the next draw; `arrival` is what is left of their way then: of the gather,
-with the copies after it, or of the copies that read them in place, with the wait for the slowest process's pack."""
+PARTS = ("draw", "arrival", "render", "colors", "loss", "backward", "records", "solve", "barrier", "parameters")
+"""Parts of an iteration. `colors` and `records` are exchanges, with the wait for the slowest process, and so is the
+`barrier` after the steps, in place. By messages `parameters` packs those of the process, which travel in the next draw;
+`arrival` is what is left of their way then, with the copies after it."""
 
 
 @dataclass(frozen=True)
@@ -92,7 +93,7 @@ class RanksBench:
             factors = sorted({1, ranks.count}) if self.grown else [1]
             for views, factor in [(views, factor) for views in self.step.views for factor in factors]:
                 for way in self._ways(len(model), views, ranks) if factor == 1 else (Way(),):
-                    if not way.in_place and "in place" not in results[-1]["exchange"]:
+                    if way == Way(True, False) and "in place" not in results[-1]["exchange"]:
                         continue  # it was by messages already
                     results.append(self._measure(scene, model, views * factor, factor, way, device, ranks))
                     if ranks.first:
@@ -100,11 +101,11 @@ class RanksBench:
         return results
 
     def _ways(self, gaussians: int, views: int, ranks: Ranks) -> list[Way]:
-        """To measure. The largest case is exchanged by messages as well, where it can be done in place."""
-        if ranks.count == 1:
-            return [Way()]
+        """To measure: in place, where that is possible. The largest case is exchanged by messages as well, and then
+        without owners, too."""
         largest = (gaussians, views) == (max(self.step.gaussians), max(self.step.views))
-        return [Way(by_rows, in_place) for by_rows in (True, False) for in_place in (True, False)[: 1 + largest]]
+        messages = [Way(True, False), Way(False, False)] if largest and ranks.count > 1 else []
+        return [Way(), *messages]
 
     def _measure(
         self, scene: Scene, model: Gaussians, views: int, factor: int, way: Way, device: torch.device, ranks: Ranks
@@ -144,6 +145,7 @@ class RanksBench:
         if isinstance(trainer.exchange, RankExchange):
             places += [(trainer.exchange, "_gather_colors", "colors"), (SharedScreen, "of_rows", "records")]
             places += [(OwnedRows, "begin", "parameters"), (OwnedRows, "finish", "arrival")]
+            places += [(InPlace, "stepped", "barrier")]
         with recorder.passes(trainer, "render", "backward"), recorder.calls(*places):
             for _ in range(self.step.repeats):
                 trainer.step()
