@@ -45,7 +45,8 @@ def _check(gaussians: Gaussians) -> None:
 
 
 def _check_batch(cameras: Cameras, samples: PixelSamples, device: torch.device) -> None:
-    _require((("cameras.viewmats", cameras.viewmats), ("cameras.Ks", cameras.Ks)), torch.float32, device)
+    viewmats, Ks, _ = cameras.by_row()
+    _require((("cameras.viewmats", viewmats), ("cameras.Ks", Ks)), torch.float32, device)
     integers = ((f"samples.{name}", getattr(samples, name)) for name in ("pixel_ids", "tile_ids", "tile_offsets"))
     _require(integers, torch.int32, device)
     require_views(len(cameras))
@@ -218,11 +219,12 @@ def screen_gradients(
 
 
 def _scene(gaussians: Gaussians, cameras: Cameras, sh_degree: int, eps2d: float) -> launches.Scene:
+    viewmats, Ks, rows = cameras.by_row()
     return launches.Scene(
         gaussians=gaussians,
-        viewmats=cameras.viewmats.detach().contiguous(),
-        Ks=cameras.Ks.detach().contiguous(),
-        sizes=cameras.sizes.reshape(-1).tolist(),
+        viewmats=viewmats.detach().contiguous(),
+        Ks=Ks.detach().contiguous(),
+        images=[number for size, row in zip(cameras.sizes.tolist(), rows, strict=True) for number in (*size, row)],
         sh_degree=sh_degree,
         eps2d=eps2d,
     )
