@@ -8,7 +8,7 @@ import torch
 from helpers.rendering_scenes import make_cameras, make_gaussians
 
 from turbogs_plugin.engine.cuda import library, raster
-from turbogs_plugin.engine.cuda.workspace import MAX_CAPACITY, Workspace, _Pending
+from turbogs_plugin.engine.cuda.workspace import MAX_CAPACITY, ZEROS_AT_ONCE, Workspace, _Pending
 from turbogs_plugin.engine.layout import INTERSECTIONS_MAX
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.types import PixelSamples
@@ -86,6 +86,15 @@ def test_what_is_kept_is_made_anew_for_other_sizes_alone(workspace):
         workspace.kept("buffers", sizes, lambda sizes=sizes: made.append(sizes))
         workspace.kept("others", (5,), lambda: made.append("other"))
     assert made == [(1, 2), "other", (1, 3), (1, 2)]
+
+
+def test_a_zero_is_given_away_once(workspace):
+    """Who holds one sees nobody else's number, though many are made together."""
+    held = [workspace.zero() for _ in range(2 * ZEROS_AT_ONCE + 1)]
+    for number, value in enumerate(held):
+        assert value.shape == () and value.dtype == torch.float64 and value == 0
+        value += number + 1
+    assert [int(value) for value in held] == list(range(1, len(held) + 1))
 
 
 class Passes:

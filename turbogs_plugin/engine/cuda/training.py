@@ -190,6 +190,7 @@ def sparse_loss(
     update: MapUpdate | None = None,
     overflow: Tensor | None = None,
     background: Color = BLACK,
+    zero: Tensor | None = None,
 ) -> LossOutput:
     """Loss, gradient and pixel errors, in one launch. With `update` it also does what `ErrorMaps.update` does.
 
@@ -203,6 +204,7 @@ def sparse_loss(
         samples: of at most `MAX_VIEWS` views.
         overflow: [1] int32 on the device, or None; if it is not 0, maps and count of `update` stay as they are.
         background: shows through photos that have an alpha.
+        zero: [] float64 on the device, zero, which becomes the loss; None: a new one.
 
     Returns:
         The loss (a float64 scalar on the device), gradients [P, 3] float32 and errors [P] float32.
@@ -231,7 +233,7 @@ def sparse_loss(
         beta=beta,
         stamp=stamp,
         num_filled=count_filled(samples),
-        loss=torch.zeros((), dtype=torch.float64, device=colors.device),
+        loss=torch.zeros((), dtype=torch.float64, device=colors.device) if zero is None else zero,
         color_gradients=torch.empty_like(colors),
         pixel_errors=torch.empty(len(samples), device=colors.device),
         nonfinite_losses=nonfinite_losses,

@@ -48,6 +48,9 @@ LENT = ("colors", "radii", "records")
 PENDING_MAX = 8
 """Most counts on their way to the host; one more waits for the oldest."""
 
+ZEROS_AT_ONCE = 64
+"""Zeros made together for `Workspace.zero`."""
+
 
 def round_capacity(intersections: float) -> int:
     """The capacity for this many intersections."""
@@ -95,6 +98,7 @@ class Workspace:
         self._lent: PassMemory | None = None
         self._views: dict[str, Tensor] = {}  # what `buffer` returned last
         self._kept: dict[str, tuple[tuple, Any]] = {}
+        self._zeros: list[Tensor] = []  # those that `zero` has not given away
         self._pinned = torch.zeros(PENDING_MAX, 2, dtype=torch.int32).pin_memory().unbind()
         self._pending: deque[_Pending] = deque()
         self._gaussians = 0
@@ -172,6 +176,13 @@ class Workspace:
             self._kept.pop(name, None)  # lets go of the buffers that grow
             last = self._kept[name] = sizes, make()
         return last[1]
+
+    def zero(self) -> Tensor:
+        """[] float64 on the device, zero, which is the caller's alone. Many are made at once, as each launch that makes
+        zeros takes the host 30 us."""
+        if not self._zeros:
+            self._zeros.extend(torch.zeros(ZEROS_AT_ONCE, dtype=torch.float64, device=self.device).unbind())
+        return self._zeros.pop()
 
     def bytes_held(self) -> int:
         """Bytes of all buffers."""
