@@ -25,6 +25,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from turbogs_plugin.device import current_stream
 from turbogs_plugin.errors import InputError, require
 from turbogs_plugin.masks import PixelMasks
 from turbogs_plugin.types import PixelSamples, Step
@@ -277,11 +278,12 @@ class _LaggedCopy:
         if self.reads % self.refresh == 0:
             self._collect()
             self.values = self.source.cpu().numpy() if self.reads == 0 else self.pending
-            buffer = self.copy[0] if self.copy else torch.empty(self.source.shape, dtype=torch.float64, pin_memory=True)
+            if self.copy is None:
+                buffer = torch.empty(self.source.shape, dtype=torch.float64, pin_memory=True)
+                self.copy = buffer, torch.cuda.Event()
+            buffer, event = self.copy
             buffer.copy_(self.source, non_blocking=True)
-            event = torch.cuda.Event()
-            event.record(torch.cuda.current_stream(self.source.device))
-            self.copy = (buffer, event)
+            event.record(current_stream(self.source.device))
         self.reads += 1
         return self.values.copy()
 

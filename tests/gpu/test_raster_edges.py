@@ -8,6 +8,7 @@ import pytest
 import torch
 from helpers.raster_cases import GPU_ONLY, make_case, on_gpu, samples_to, upstream
 
+from turbogs_plugin.device import current_stream
 from turbogs_plugin.engine.cuda import library, workspace
 from turbogs_plugin.engine.cuda import raster as cuda
 from turbogs_plugin.engine.cuda.workspace import Workspace
@@ -114,6 +115,15 @@ def test_side_stream(case):
         got = render(case).colors
     stream.synchronize()
     assert torch.equal(got, wanted)
+
+
+def test_the_current_stream_is_torchs():
+    torch.zeros(1, device="cuda")
+    device = torch.device("cuda", torch.cuda.current_device())
+    for stream in (torch.cuda.default_stream(), *(torch.cuda.Stream() for _ in range(3))) * 2:
+        with torch.cuda.stream(stream):
+            for asked in (device, torch.device("cuda")):
+                assert current_stream(asked) == torch.cuda.current_stream() == stream
 
 
 def test_forward_is_deterministic(case):

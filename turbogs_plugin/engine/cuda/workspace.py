@@ -20,6 +20,7 @@ from weakref import ref
 import torch
 from torch import Tensor
 
+from turbogs_plugin.device import current_stream
 from turbogs_plugin.engine.layout import INTERSECTIONS_MAX, PassStatus
 from turbogs_plugin.engine.protocol import PassMemory
 from turbogs_plugin.errors import InputError
@@ -100,6 +101,7 @@ class Workspace:
         self._kept: dict[str, tuple[tuple, Any]] = {}
         self._zeros: list[Tensor] = []  # those that `zero` has not given away
         self._pinned = torch.zeros(PENDING_MAX, 2, dtype=torch.int32).pin_memory().unbind()
+        self._events: dict[int, torch.cuda.Event] = {}  # by place in `_pinned`
         self._pending: deque[_Pending] = deque()
         self._gaussians = 0
         self._intersections_per_tile = 0.0
@@ -216,10 +218,12 @@ class Workspace:
         if len(self._pending) == PENDING_MAX:
             self._pending[0].event.synchronize()
             self.poll()
-        values = self._pinned[self.passes % PENDING_MAX]
+        place = self.passes % PENDING_MAX
+        if place not in self._events:
+            self._events[place] = torch.cuda.Event()
+        values, event = self._pinned[place], self._events[place]
         values.copy_(self.status, non_blocking=True)
-        event = torch.cuda.Event()
-        event.record(torch.cuda.current_stream(self.device))
+        event.record(current_stream(self.device))
         self._pending.append(_Pending(self.passes, tiles, event, values))
         self.passes += 1
 
