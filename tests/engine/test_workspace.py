@@ -7,9 +7,10 @@ import pytest
 import torch
 from helpers.rendering_scenes import make_cameras, make_gaussians
 
-from turbogs_plugin.engine.cuda import library, raster
+from turbogs_plugin.engine.cuda import library, raster, training
 from turbogs_plugin.engine.cuda.workspace import MAX_CAPACITY, ZEROS_AT_ONCE, Workspace, _Pending
 from turbogs_plugin.engine.layout import INTERSECTIONS_MAX
+from turbogs_plugin.engine.rules import LossTerms
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.types import PixelSamples
 
@@ -122,8 +123,9 @@ class Passes:
         samples = PixelSamples(tuple(range(len(sizes))), cameras.sizes, pixels, ids, starts, has_empty_slots=False)
         gaussians = make_gaussians(count, dtype=torch.float32)
         self.shapes.append({})
-        rendered = raster.rasterize_cuda(gaussians, cameras, samples, workspace=workspace)
-        rendered.backward(torch.zeros_like(rendered.colors))
+        self.samples = samples
+        self.rendered = raster.rasterize_cuda(gaussians, cameras, samples, workspace=workspace)
+        self.rendered.backward(torch.zeros_like(self.rendered.colors))
         return self.shapes[-1]
 
 
@@ -141,3 +143,21 @@ def test_passes_that_share_memory_have_buffers_of_their_own_sizes(workspace, mon
     workspace.learn(1_000_000, tiles=6)
     room = (workspace.capacity(30, tiles=6),)
     assert ("intersection_ids", room) in passes.draw(*first, workspace=workspace)["raster_sort_intersections"]
+
+
+def test_a_pass_and_its_loss_lie_in_memory_that_is_kept(workspace, monkeypatch):
+    """But for the loss itself, which is the caller's."""
+    passes = Passes(monkeypatch)
+    workspace.learn(1000, tiles=1)
+    tensors = []
+    for count in (24, 24, 12):
+        passes.draw([(40, 30)], 30, 6, count, workspace)
+        samples = passes.samples
+        colors = passes.rendered.colors
+        loss = training.sparse_loss(LossTerms(1e-3), colors, torch.zeros(count, 3), samples, workspace=workspace)
+        assert loss.color_gradients.shape == (count, 3) and loss.pixel_errors.shape == (count,) and loss.loss == 0
+        tensors.append((colors, passes.rendered.alphas, loss.color_gradients, loss.pixel_errors, loss.loss))
+    for first, second, third in zip(*tensors, strict=True):
+        assert (first.data_ptr() == second.data_ptr() == third.data_ptr()) == (first is not tensors[0][-1])
+    fresh = training.sparse_loss(LossTerms(1e-3), colors, torch.zeros(count, 3), samples)
+    assert fresh.color_gradients.data_ptr() != loss.color_gradients.data_ptr()

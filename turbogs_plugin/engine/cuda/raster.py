@@ -289,6 +289,8 @@ class _Back:
     intersection_keys: Tensor
     intersection_ids: Tensor
     runs: Tensor
+    colors: Tensor
+    alphas: Tensor
     transmittances: Tensor
     last_intersections: Tensor
     masks: Tensor
@@ -302,6 +304,8 @@ class _Back:
             intersection_keys=buffers.integers("intersection_keys", capacity, dtype=torch.int64),
             intersection_ids=buffers.integers("intersection_ids", capacity),
             runs=buffers.integers("runs", capacity // (layout.SORT_RUN // 2), 2),
+            colors=buffers.floats("colors", slots, 3),
+            alphas=buffers.floats("alphas", slots),
             transmittances=buffers.floats("transmittances", slots),
             last_intersections=buffers.integers("last_intersections", slots),
             masks=buffers.integers("masks", (capacity // layout.BUCKET + num_active + 1) * chunks),
@@ -369,8 +373,8 @@ def rasterize_cuda(
         tile_starts=tiles.tile_starts,
         intersection_ids=ids,
         instances=splats.instances,
-        colors=torch.empty(slots, 3, device=device) if workspace is None else workspace.colors(slots),
-        alphas=torch.empty(slots, device=device),
+        colors=back.colors,
+        alphas=back.alphas,
         transmittances=back.transmittances,
         depths=torch.empty(slots, device=device) if options.with_depth else None,
         last_intersections=back.last_intersections,

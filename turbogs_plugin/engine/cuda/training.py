@@ -19,6 +19,7 @@ from torch import Tensor
 
 from turbogs_plugin.engine.cuda import launches, library
 from turbogs_plugin.engine.cuda.raster import CudaScreenGradients, count_filled, require_views
+from turbogs_plugin.engine.cuda.workspace import Workspace
 from turbogs_plugin.engine.layout import MAX_PEERS, STRUCTURES, UNITS, UPDATE_KINDS
 from turbogs_plugin.engine.moments import GaussianMoments
 from turbogs_plugin.engine.protocol import MapUpdate, ModelCopies
@@ -190,7 +191,7 @@ def sparse_loss(
     update: MapUpdate | None = None,
     overflow: Tensor | None = None,
     background: Color = BLACK,
-    zero: Tensor | None = None,
+    workspace: Workspace | None = None,
 ) -> LossOutput:
     """Loss, gradient and pixel errors, in one launch. With `update` it also does what `ErrorMaps.update` does.
 
@@ -204,7 +205,7 @@ def sparse_loss(
         samples: of at most `MAX_VIEWS` views.
         overflow: [1] int32 on the device, or None; if it is not 0, maps and count of `update` stay as they are.
         background: shows through photos that have an alpha.
-        zero: [] float64 on the device, zero, which becomes the loss; None: a new one.
+        workspace: has memory for the gradients and errors, which are then valid until it is used for the next loss.
 
     Returns:
         The loss (a float64 scalar on the device), gradients [P, 3] float32 and errors [P] float32.
@@ -220,6 +221,7 @@ def sparse_loss(
         starts = maps.offsets[list(samples.view_ids)]
     elif photos is not None:
         raise ValueError("photos are gathered from where the maps of each view begin: give `update`")
+    output = _loss_output(len(colors), colors.device, workspace)
     loss = launches.SparseLoss(
         colors=colors,
         targets=None if photos is not None else targets.detach().float().contiguous(),
@@ -233,15 +235,24 @@ def sparse_loss(
         beta=beta,
         stamp=stamp,
         num_filled=count_filled(samples),
-        loss=torch.zeros((), dtype=torch.float64, device=colors.device) if zero is None else zero,
-        color_gradients=torch.empty_like(colors),
-        pixel_errors=torch.empty(len(samples), device=colors.device),
+        loss=output.loss,
+        color_gradients=output.color_gradients,
+        pixel_errors=output.pixel_errors,
         nonfinite_losses=nonfinite_losses,
         overflow=overflow,
         background=launches.Background(*background),
     )
     library.launch(loss)
-    return LossOutput(loss.loss, loss.color_gradients, loss.pixel_errors)
+    return output
+
+
+def _loss_output(slots: int, device: torch.device, workspace: Workspace | None) -> LossOutput:
+    """What the kernel fills: the loss is zero."""
+    if workspace is None:
+        zero = torch.zeros((), dtype=torch.float64, device=device)
+        return LossOutput(zero, torch.empty(slots, 3, device=device), torch.empty(slots, device=device))
+    gradients = workspace.buffer("color_gradients", (slots, 3), torch.float32)
+    return LossOutput(workspace.zero(), gradients, workspace.buffer("pixel_errors", (slots,), torch.float32))
 
 
 def fused_step(
