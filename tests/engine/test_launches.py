@@ -155,14 +155,14 @@ def test_the_kernels_have_the_sizes_and_enumerations_of_python(headers):
 
 def test_rows_of_views_are_what_the_layout_says():
     sizes = np.array([[37, 29], [20, 50]])
-    rows = view_rows(np.array([7, 1080]), sizes, (5, 9), [(3, 10, 11, 12, 0, 6), (4, 20, 21, 22, 30, 8)])
+    rows = view_rows([7, 1080], sizes, (5, 9), [(3, 10, 11, 12, 0, 6), (4, 20, 21, 22, 30, 8)])
     second = rows[layout.DrawRow.SIZE :]
     assert len(rows) == 2 * layout.DrawRow.SIZE
     assert second[layout.DrawRow.FIRST_PIXEL] == 1080 and second[layout.DrawRow.NUMBER] == 9
     assert (second[layout.DrawRow.WIDTH], second[layout.DrawRow.HEIGHT]) == (20, 50)
     assert second[layout.DrawRow.FIRST_SLOT] == 4 and second[layout.DrawRow.STAGES] == [20, 21, 22]
     assert (second[layout.DrawRow.FIRST_LIVE], second[layout.DrawRow.LIVE]) == (30, 8)
-    assert view_rows(np.array([7, 1080]), sizes, (5, 9))[layout.ViewRow.SIZE :] == second[: layout.ViewRow.SIZE]
+    assert view_rows([7, 1080], sizes, (5, 9))[layout.ViewRow.SIZE :] == second[: layout.ViewRow.SIZE]
 
 
 def test_selected_cameras_are_read_from_the_memory_of_all():
