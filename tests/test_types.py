@@ -1,5 +1,8 @@
 """`PixelSamples` of given pixels."""
 
+import copy
+import pickle
+
 import numpy as np
 import pytest
 import torch
@@ -129,7 +132,7 @@ def test_a_mask_that_does_not_fit_is_refused(mask, words):
 
 
 def test_selected_cameras_have_the_matrices_of_now():
-    """They are sliced once, but follow what becomes of the cameras, and gradients."""
+    """They follow what becomes of the cameras until then, and gradients."""
     cameras = make_cameras([(40, 30), (20, 20), (30, 50)])
     for change in range(3):
         if change == 1:
@@ -138,8 +141,37 @@ def test_selected_cameras_have_the_matrices_of_now():
             cameras.Ks.mul_(2.0)
         chosen = cameras.select([2, 0])
         assert torch.equal(chosen.viewmats, cameras.viewmats[[2, 0]]) and torch.equal(chosen.Ks, cameras.Ks[[2, 0]])
-        assert chosen.sizes.tolist() == [[30, 50], [40, 30]]
+        assert chosen.sizes.tolist() == [[30, 50], [40, 30]] and len(chosen) == 2
     cameras.viewmats.requires_grad_()
     for _ in range(2):
-        cameras.select([1]).viewmats.sum().backward()
+        chosen = cameras.select([1])
+        with torch.no_grad():  # somebody else's first look
+            assert len(chosen.viewmats) == 1
+        chosen.viewmats.sum().backward()
     assert torch.equal(cameras.viewmats.grad.sum(dim=(1, 2)), torch.tensor([0.0, 32.0, 0.0], dtype=torch.float64))
+
+
+def test_selected_cameras_share_memory_until_their_matrices_are_read():
+    cameras = make_cameras([(40, 30), (20, 20), (30, 50), (20, 20)])
+    chosen = cameras.select(np.array([3, 0, 2])).select(range(1, 3))
+    viewmats, Ks, rows = chosen.by_row()
+    assert viewmats is cameras.viewmats and Ks is cameras.Ks and rows == (0, 2)
+    assert cameras.by_row()[2] == range(4) and chosen.sizes.tolist() == [[40, 30], [30, 50]]
+    wanted = cameras.viewmats[[0, 2]].clone()
+    cameras.viewmats = torch.zeros_like(cameras.viewmats)  # of other cameras from here on
+    assert torch.equal(chosen.viewmats, wanted)
+    chosen.viewmats[0], chosen.Ks = 0.0, chosen.Ks + 1.0  # a copy of their own
+    viewmats, _, rows = chosen.by_row()
+    assert list(rows) == [0, 1] and torch.equal(viewmats[1], wanted[1]) and not viewmats[0].any()
+    with pytest.raises(IndexError):
+        cameras.select([4])
+
+
+def test_selected_cameras_can_be_copied_saved_and_moved():
+    chosen = make_cameras([(40, 30), (20, 20), (30, 50)]).select([2, 1])
+    wanted = make_cameras([(40, 30), (20, 20), (30, 50)])
+    for copied in (copy.deepcopy(chosen), pickle.loads(pickle.dumps(chosen)), chosen.to("cpu"), chosen):
+        assert torch.equal(copied.centers, wanted.centers[[2, 1]])
+        assert torch.equal(copied.directions, wanted.directions[[2, 1]]) and torch.equal(copied.Ks, wanted.Ks[[2, 1]])
+        assert copied.sizes.tolist() == [[30, 50], [20, 20]] and "Cameras(viewmats=tensor" in repr(copied)
+    assert chosen.to(dtype=torch.float32).viewmats.dtype == torch.float32

@@ -25,6 +25,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from turbogs_plugin.device import current_stream
 from turbogs_plugin.errors import InputError, require
 from turbogs_plugin.masks import PixelMasks
 from turbogs_plugin.types import PixelSamples, Step
@@ -77,6 +78,7 @@ class ErrorMaps:
         self._allocate()
         self.view_sums = torch.zeros(len(self.sizes), dtype=torch.float64, device=self.device)
         self._means = _LaggedCopy(self.view_sums, self.refresh)
+        self._sums_read, self._view_means = None, np.zeros(0)  # the latest means, and the sums that they are of
 
     def _allocate(self) -> None:
         self.offsets = np.concatenate([[0], np.cumsum(self.sizes.prod(axis=1))])  # [V + 1]
@@ -215,7 +217,10 @@ class ErrorMaps:
         ``2 * refresh - 1`` calls old (between 0 and ``2 * refresh - 1`` after the first call or `initialise`, which
         wait for the device). They depend on the number of calls alone, never on timing.
         """
-        return np.maximum(self._means.read(), 0.0) / self._pixel_counts
+        sums = self._means.read()
+        if sums is not self._sums_read:  # on a GPU they are the same for `refresh` calls
+            self._sums_read, self._view_means = sums, np.maximum(sums, 0.0) / self._pixel_counts
+        return self._view_means.copy()
 
     def mean(self) -> float:
         """Mean over the views of their mean error, the schedule's E_mean. Counts as a call of `view_means`."""
@@ -271,19 +276,20 @@ class _LaggedCopy:
         self.copy: tuple[Tensor, torch.cuda.Event] | None = None
 
     def read(self) -> np.ndarray:
-        """[V] float64."""
+        """[V] float64, not to be written to; the same array as long as its values are the same ones."""
         if not self.source.is_cuda:
             return self.source.numpy().copy()
         if self.reads % self.refresh == 0:
             self._collect()
             self.values = self.source.cpu().numpy() if self.reads == 0 else self.pending
-            buffer = self.copy[0] if self.copy else torch.empty(self.source.shape, dtype=torch.float64, pin_memory=True)
+            if self.copy is None:
+                buffer = torch.empty(self.source.shape, dtype=torch.float64, pin_memory=True)
+                self.copy = buffer, torch.cuda.Event()
+            buffer, event = self.copy
             buffer.copy_(self.source, non_blocking=True)
-            event = torch.cuda.Event()
-            event.record(torch.cuda.current_stream(self.source.device))
-            self.copy = (buffer, event)
+            event.record(current_stream(self.source.device))
         self.reads += 1
-        return self.values.copy()
+        return self.values
 
     def _collect(self) -> None:
         """Take in the copy that was started; by now it has long arrived."""

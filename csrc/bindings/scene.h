@@ -31,14 +31,20 @@ void read_scene(const Arguments<Launch>& in, SceneParams& scene) {
     in.set(scene.opacities, T::opacities, {count});
     in.set(scene.sh0, T::sh0, {count, 1, 3});
     in.set_quads(scene.shN, T::shN, {count, bands, 3});
-    in.set(scene.viewmats, T::viewmats, {views, 4, 4});
-    in.set(scene.intrinsics, T::Ks, {views, 3, 3});
+    const Tensor& viewmats = in.tensor(T::viewmats);
+    STD_TORCH_CHECK(viewmats.dim() == 3, "turbogs: viewmats must be [C, 4, 4]");
+    const int64_t cameras = viewmats.size(0);
+    in.set(scene.viewmats, T::viewmats, {cameras, 4, 4});
+    in.set(scene.intrinsics, T::Ks, {cameras, 3, 3});
     for (int64_t view = 0; view < views; ++view) {
         const int64_t* row = in.row(view, ImageRow::kSize);
-        const int64_t width = row[ImageRow::kWidth], height = row[ImageRow::kHeight];
+        const int64_t width = row[ImageRow::kWidth], height = row[ImageRow::kHeight], camera = row[ImageRow::kCamera];
         check_size(view, width, height);
+        STD_TORCH_CHECK(camera >= 0 && camera < cameras, "turbogs: camera ", camera, " of view ", view,
+                        " is not one of ", cameras);
         scene.widths[view] = static_cast<int>(width);
         scene.heights[view] = static_cast<int>(height);
+        scene.camera_rows[view] = to_int(camera, "cameras");
     }
 }
 

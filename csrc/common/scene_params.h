@@ -23,10 +23,11 @@ struct SceneParams {
     float* sh0;        // [N, 3]
     float* shN;        // [N, B, 3]
 
-    const float* viewmats;    // [K, 4, 4]
-    const float* intrinsics;  // [K, 3, 3]
+    const float* viewmats;    // [C, 4, 4], of cameras of which each view has one
+    const float* intrinsics;  // [C, 3, 3]
     int widths[kMaxViews];
     int heights[kMaxViews];
+    int camera_rows[kMaxViews];  // of each view, in `viewmats` and `intrinsics`
 };
 
 }  // namespace turbogs

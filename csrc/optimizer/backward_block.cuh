@@ -57,7 +57,8 @@ struct BlockShared {
 
     __device__ __forceinline__ void load_cameras(const ScreenBackwardParams& params) const {
         for (int view = threadIdx.x; view < params.num_views; view += kBackwardThreads) {
-            cameras[view] = load_camera(params.viewmats + 16 * view, params.intrinsics + 9 * view, params.widths[view],
+            const size_t row = params.camera_rows[view];
+            cameras[view] = load_camera(params.viewmats + 16 * row, params.intrinsics + 9 * row, params.widths[view],
                                         params.heights[view], params.num_views);
         }
     }

@@ -33,7 +33,8 @@ __global__ void prepare_kernel(const __grid_constant__ ProjectionParams params) 
     const int i = blockIdx.x * blockDim.x + threadIdx.x;
     if (i < params.num_views) {
         RasterCamera camera;
-        static_cast<Pinhole&>(camera) = load_pinhole(params.viewmats + 16 * i, params.intrinsics + 9 * i);
+        const size_t row = params.camera_rows[i];
+        static_cast<Pinhole&>(camera) = load_pinhole(params.viewmats + 16 * row, params.intrinsics + 9 * row);
         camera.tile_base = 0;
         camera.origin_x = params.origin_x;
         camera.origin_y = params.origin_y;

@@ -114,7 +114,6 @@ class ErrorDrivenDensity(WindowedDensity):
         require_each(self, lambda value: 0 <= value < 1, "at least 0 and less than 1", *shares)
         require_settings(self)
 
-    @torch.no_grad()
     def update(self, gaussians: Gaussians, step: Step) -> RowUpdate | None:
         if self._stats is None or len(gaussians) == 0:
             return None
@@ -122,11 +121,12 @@ class ErrorDrivenDensity(WindowedDensity):
         over = self.max_gaussians > 0 and len(gaussians) > self.bound(step)
         reduce = over and self._reduction_due(step)
         update = None
-        if densify:
-            update = self._refine(gaussians, step)
-        elif final or reduce:
-            update = self._prune(gaussians, step, 1 - self.final_keep if final else 0.0)
         if densify or final or reduce:
+            with torch.no_grad():
+                if densify:
+                    update = self._refine(gaussians, step)
+                else:
+                    update = self._prune(gaussians, step, 1 - self.final_keep if final else 0.0)
             self._stats.zero_()
         if step.iteration >= self._last_event(step) and (reduce or not over):
             self._stats = None

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 from turbogs_plugin.strategies.checks import require_settings
 from turbogs_plugin.strategies.optimizers.sparse_adam import SparseAdam
 
-from turbogs_plugin.engine.rules import MomentLMParams, UpdateRule
-from turbogs_plugin.types import Step
+from turbogs_plugin.engine.rules import MomentLMParams
 
 
 @dataclass
@@ -64,5 +63,6 @@ class MomentLMOptimizer(SparseAdam):
     def per_view(self) -> bool:
         return self.rows == "views"
 
-    def rule(self, step: Step) -> UpdateRule:
-        return replace(super().rule(step), lm=MomentLMParams(self.units, self.rows, self.curvature, self.max_step))
+    @property
+    def lm(self) -> MomentLMParams:
+        return MomentLMParams(self.units, self.rows, self.curvature, self.max_step)

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 from torch import Tensor
 from turbogs_plugin.strategies.learning_rates import LearningRates
 
 from turbogs_plugin.engine.moments import GaussianMoments, check_moments_config
 from turbogs_plugin.engine.reference.update import apply_update
-from turbogs_plugin.engine.rules import UpdateRule
+from turbogs_plugin.engine.rules import MomentLMParams, UpdateRule
 from turbogs_plugin.types import GaussianGradients, Gaussians, RowUpdate, Step
 
 
@@ -36,6 +36,7 @@ class SparseAdam:
     eps: float = 1e-15
     moments: GaussianMoments = field(init=False, repr=False)
     per_view = False
+    lm: ClassVar[MomentLMParams | None] = None  # of the rule
 
     def __post_init__(self) -> None:
         check_moments_config(self.beta1, self.beta2, self.eps)
@@ -50,7 +51,7 @@ class SparseAdam:
 
     def rule(self, step: Step) -> UpdateRule:
         """The rule of this iteration's step."""
-        return UpdateRule(self.learning_rates.at(step), self.beta1, self.beta2, self.eps)
+        return UpdateRule(self.learning_rates.at(step), self.beta1, self.beta2, self.eps, self.lm)
 
     def step(self, gaussians: Gaussians, gradients: GaussianGradients, step: Step) -> None:
         apply_update(self.rule(step), gaussians, gradients, self.moments)

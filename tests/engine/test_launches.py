@@ -10,9 +10,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from helpers.rendering_scenes import make_cameras, make_gaussians
 
 from turbogs_plugin.engine import layout
-from turbogs_plugin.engine.cuda import launches, library
+from turbogs_plugin.engine.cuda import launches, library, raster
 from turbogs_plugin.engine.cuda.training import view_rows
 from turbogs_plugin.engine.exposures import Exposures
 from turbogs_plugin.engine.moments import GaussianMoments
@@ -154,14 +155,23 @@ def test_the_kernels_have_the_sizes_and_enumerations_of_python(headers):
 
 def test_rows_of_views_are_what_the_layout_says():
     sizes = np.array([[37, 29], [20, 50]])
-    rows = view_rows(np.array([7, 1080]), sizes, (5, 9), [(3, 10, 11, 12, 0, 6), (4, 20, 21, 22, 30, 8)])
+    rows = view_rows([7, 1080], sizes, (5, 9), [(3, 10, 11, 12, 0, 6), (4, 20, 21, 22, 30, 8)])
     second = rows[layout.DrawRow.SIZE :]
     assert len(rows) == 2 * layout.DrawRow.SIZE
     assert second[layout.DrawRow.FIRST_PIXEL] == 1080 and second[layout.DrawRow.NUMBER] == 9
     assert (second[layout.DrawRow.WIDTH], second[layout.DrawRow.HEIGHT]) == (20, 50)
     assert second[layout.DrawRow.FIRST_SLOT] == 4 and second[layout.DrawRow.STAGES] == [20, 21, 22]
     assert (second[layout.DrawRow.FIRST_LIVE], second[layout.DrawRow.LIVE]) == (30, 8)
-    assert view_rows(np.array([7, 1080]), sizes, (5, 9))[layout.ViewRow.SIZE :] == second[: layout.ViewRow.SIZE]
+    assert view_rows([7, 1080], sizes, (5, 9))[layout.ViewRow.SIZE :] == second[: layout.ViewRow.SIZE]
+
+
+def test_selected_cameras_are_read_from_the_memory_of_all():
+    """Nothing is stacked for a launch, which names the row of each view's camera."""
+    cameras, gaussians = make_cameras([(40, 30), (20, 21), (30, 50)], torch.float32), make_gaussians(4)
+    scene = raster._scene(gaussians, cameras.select([2, 0]), sh_degree=1, eps2d=0.3)
+    assert scene.viewmats.data_ptr() == cameras.viewmats.data_ptr() and scene.viewmats.shape == (3, 4, 4)
+    assert scene.Ks.data_ptr() == cameras.Ks.data_ptr() and scene.images == [30, 50, 2, 40, 30, 0]
+    assert len(scene.images) == 2 * layout.ImageRow.SIZE and scene.images[layout.ImageRow.CAMERA] == 2
 
 
 @pytest.fixture

@@ -7,9 +7,10 @@ import pytest
 import torch
 from helpers.rendering_scenes import make_cameras, make_gaussians
 
-from turbogs_plugin.engine.cuda import library, raster
-from turbogs_plugin.engine.cuda.workspace import MAX_CAPACITY, Workspace, _Pending
+from turbogs_plugin.engine.cuda import library, raster, training
+from turbogs_plugin.engine.cuda.workspace import MAX_CAPACITY, ZEROS_AT_ONCE, Workspace, _Pending
 from turbogs_plugin.engine.layout import INTERSECTIONS_MAX
+from turbogs_plugin.engine.rules import LossTerms
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.types import PixelSamples
 
@@ -88,6 +89,15 @@ def test_what_is_kept_is_made_anew_for_other_sizes_alone(workspace):
     assert made == [(1, 2), "other", (1, 3), (1, 2)]
 
 
+def test_a_zero_is_given_away_once(workspace):
+    """Who holds one sees nobody else's number, though many are made together."""
+    held = [workspace.zero() for _ in range(2 * ZEROS_AT_ONCE + 1)]
+    for number, value in enumerate(held):
+        assert value.shape == () and value.dtype == torch.float64 and value == 0
+        value += number + 1
+    assert [int(value) for value in held] == list(range(1, len(held) + 1))
+
+
 class Passes:
     """The shapes of the tensors of every launch of passes that do nothing, by operator."""
 
@@ -97,7 +107,7 @@ class Passes:
         monkeypatch.setattr(library, "launch", self.launch)
         monkeypatch.setattr(raster, "_check", lambda *arguments: None)  # it wants a GPU
         monkeypatch.setattr(torch.cuda, "Event", type("Event", (Arrived,), {"record": lambda event, stream: None}))
-        monkeypatch.setattr(torch.cuda, "current_stream", lambda device: None)
+        monkeypatch.setattr("turbogs_plugin.engine.cuda.workspace.current_stream", lambda device: None)
 
     def launch(self, launch) -> None:
         tensors, *_ = launch.lists()
@@ -113,8 +123,9 @@ class Passes:
         samples = PixelSamples(tuple(range(len(sizes))), cameras.sizes, pixels, ids, starts, has_empty_slots=False)
         gaussians = make_gaussians(count, dtype=torch.float32)
         self.shapes.append({})
-        rendered = raster.rasterize_cuda(gaussians, cameras, samples, workspace=workspace)
-        rendered.backward(torch.zeros_like(rendered.colors))
+        self.samples = samples
+        self.rendered = raster.rasterize_cuda(gaussians, cameras, samples, workspace=workspace)
+        self.rendered.backward(torch.zeros_like(self.rendered.colors))
         return self.shapes[-1]
 
 
@@ -132,3 +143,21 @@ def test_passes_that_share_memory_have_buffers_of_their_own_sizes(workspace, mon
     workspace.learn(1_000_000, tiles=6)
     room = (workspace.capacity(30, tiles=6),)
     assert ("intersection_ids", room) in passes.draw(*first, workspace=workspace)["raster_sort_intersections"]
+
+
+def test_a_pass_and_its_loss_lie_in_memory_that_is_kept(workspace, monkeypatch):
+    """But for the loss itself, which is the caller's."""
+    passes = Passes(monkeypatch)
+    workspace.learn(1000, tiles=1)
+    tensors = []
+    for count in (24, 24, 12):
+        passes.draw([(40, 30)], 30, 6, count, workspace)
+        samples = passes.samples
+        colors = passes.rendered.colors
+        loss = training.sparse_loss(LossTerms(1e-3), colors, torch.zeros(count, 3), samples, workspace=workspace)
+        assert loss.color_gradients.shape == (count, 3) and loss.pixel_errors.shape == (count,) and loss.loss == 0
+        tensors.append((colors, passes.rendered.alphas, loss.color_gradients, loss.pixel_errors, loss.loss))
+    for first, second, third in zip(*tensors, strict=True):
+        assert (first.data_ptr() == second.data_ptr() == third.data_ptr()) == (first is not tensors[0][-1])
+    fresh = training.sparse_loss(LossTerms(1e-3), colors, torch.zeros(count, 3), samples)
+    assert fresh.color_gradients.data_ptr() != loss.color_gradients.data_ptr()

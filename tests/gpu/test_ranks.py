@@ -50,10 +50,10 @@ def test_runs_of_rows_make_the_step_of_all_rows(optimizer, unit):
 
     shares = shares_of(samples, 3)
     chosen = [samples.of_tiles(share.tiles, share.views, share.slots) for share in shares]
-    parts = [
-        trainer.engine.render(trainer.gaussians, trainer.views.cameras.select(part.view_ids), part, options).colors
-        for part in chosen
-    ]
+    parts = []
+    for part in chosen:  # each pass overwrites the one before
+        own = trainer.views.cameras.select(part.view_ids)
+        parts.append(trainer.engine.render(trainer.gaussians, own, part, options).colors.clone())
     known = samples.ends()
     samples.host_ends = None  # the device says the same
     for given, asked in zip(known, samples.ends(), strict=True):

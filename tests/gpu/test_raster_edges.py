@@ -3,10 +3,12 @@
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from helpers.raster_cases import GPU_ONLY, make_case, on_gpu, samples_to, upstream
 
+from turbogs_plugin.device import current_stream
 from turbogs_plugin.engine.cuda import library, workspace
 from turbogs_plugin.engine.cuda import raster as cuda
 from turbogs_plugin.engine.cuda.workspace import Workspace
@@ -14,7 +16,7 @@ from turbogs_plugin.engine.layout import ScreenRecord
 from turbogs_plugin.engine.reference.projection import SPAN_MAX
 from turbogs_plugin.engine.rendering import RenderOptions, rasterize_reference
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.types import PARAMETER_NAMES
+from turbogs_plugin.types import PARAMETER_NAMES, Cameras
 
 pytestmark = GPU_ONLY
 
@@ -115,6 +117,15 @@ def test_side_stream(case):
     assert torch.equal(got, wanted)
 
 
+def test_the_current_stream_is_torchs():
+    torch.zeros(1, device="cuda")
+    device = torch.device("cuda", torch.cuda.current_device())
+    for stream in (torch.cuda.default_stream(), *(torch.cuda.Stream() for _ in range(3))) * 2:
+        with torch.cuda.stream(stream):
+            for asked in (device, torch.device("cuda")):
+                assert current_stream(asked) == torch.cuda.current_stream() == stream
+
+
 def test_forward_is_deterministic(case):
     assert all(torch.equal(render(case).colors, render(case).colors) for _ in range(3))
 
@@ -151,6 +162,32 @@ def test_not_aligned(case):
     wanted = render(case).colors
     case.gpu_gaussians = case.gpu_gaussians.map(lambda value: torch.cat([value[:1], value])[1:])
     assert torch.equal(render(case).colors, wanted)
+
+
+def test_cameras_are_read_where_they_lie(case):
+    """Those selected from a capture are rows of its tensors, in the order of the batch: forward and backward."""
+    own = case.gpu_cameras
+    matrices = (torch.full((5, side, side), torch.nan, device="cuda") for side in (4, 3))
+    capture = Cameras(*matrices, np.ones((5, 2), dtype=np.int64))
+    for row, view in ((3, 0), (1, 1)):
+        capture.viewmats[row], capture.Ks[row], capture.sizes[row] = own.viewmats[view], own.Ks[view], own.sizes[view]
+    wanted = render(case)
+    plain = wanted.backward(torch.ones_like(wanted.colors), with_statistics=True).plain()
+    case.gpu_cameras = capture.select([3, 1])
+    assert torch.equal(render(case).colors, wanted.colors)
+    gradients = [
+        cuda.screen_gradients(case.gpu_gaussians, cameras, case.gpu_samples, RenderOptions(), plain)
+        for cameras in (own, case.gpu_cameras)
+    ]
+    assert case.gpu_cameras.by_row()[0] is capture.viewmats
+    for name, value in vars(gradients[0].parameter_gradients(rows=True)).items():
+        assert torch.equal(getattr(gradients[1].parameter_gradients(rows=True), name), value), name
+    launch = gradients[1].backward_arguments(None)
+    for row in (-1, 5):
+        images = [*launch.scene.images[:-1], row]
+        gradients[1].scene = replace(launch.scene, images=images)
+        with pytest.raises(RuntimeError, match=f"camera {row} of view 1 is not one of 5"):
+            gradients[1].parameter_gradients(rows=True)
 
 
 def test_wrong_input_says_what_was_wanted(case):

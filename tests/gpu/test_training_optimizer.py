@@ -102,9 +102,9 @@ class Scene:
             *(getattr(self.samples, name).to(DEVICE) for name in ("pixel_ids", "tile_ids", "tile_offsets")),
         )
         viewmats, Ks = self.cameras.viewmats.to(DEVICE), self.cameras.Ks.to(DEVICE)
-        sizes = self.cameras.sizes.reshape(-1).tolist()
+        images = [number for row, size in enumerate(self.cameras.sizes.tolist()) for number in (*size, row)]
         return CudaScreenGradients(
-            scene=launches.Scene(gaussians, viewmats, Ks, sizes, self.degree, DEFAULT_SETTINGS.eps2d),
+            scene=launches.Scene(gaussians, viewmats, Ks, images, self.degree, DEFAULT_SETTINGS.eps2d),
             samples=samples,
             records=torch.where(on_screen, self.records, torch.nan).to(DEVICE, copy=True),
             radii=self.radii.to(DEVICE),

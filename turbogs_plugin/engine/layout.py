@@ -111,7 +111,8 @@ class ImageRow:
 
     WIDTH = 0
     HEIGHT = 1
-    SIZE = 2
+    CAMERA = 2  # row of its camera, among those that the launch is given
+    SIZE = 3
 
 
 class ViewRow:

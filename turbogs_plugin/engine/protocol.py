@@ -95,7 +95,8 @@ class Engine(ABC):
 
     It knows rules, never strategies. `ReferenceEngine` defines every result; any other engine gives the same up to
     rounding. `supervise`, `evaluate_and_learn` and `update` each consist of two operations, which an engine may fuse
-    into one. With an engine made for training the host does not wait for the device: see `settle`.
+    into one. With an engine made for training the host does not wait for the device (see `settle`), and a pass may
+    overwrite the tensors of the one before: all but samples and the value of the loss.
     """
 
     @property

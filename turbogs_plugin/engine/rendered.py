@@ -7,7 +7,6 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Protocol
 
-import torch
 from torch import Tensor
 
 from turbogs_plugin.engine.layout import MAX_SH_DEGREE
@@ -96,7 +95,6 @@ class Rendered(ABC):
     def projected(self) -> Projected:
         """The projection drawn by this pass."""
 
-    @torch.no_grad()
     def backward(
         self,
         color_gradients: Tensor,

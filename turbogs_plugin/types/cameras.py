@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -16,7 +15,6 @@ BLACK: Color = (0.0, 0.0, 0.0)
 WHITE: Color = (1.0, 1.0, 1.0)
 
 
-@dataclass
 class Cameras:
     """C pinhole cameras; their images may differ in size.
 
@@ -24,30 +22,70 @@ class Cameras:
         viewmats: [C, 4, 4] float, world to camera (x right, y down, z forward).
         Ks: [C, 3, 3] float, intrinsics in pixels; the centre of the first pixel is (0.5, 0.5).
         sizes: [C, 2] int64 numpy array (width, height), on the host so that shapes cost no synchronisation.
+
+    Attributes:
+        viewmats, Ks, sizes: these, also of cameras from `select`.
     """
 
-    viewmats: Tensor
-    Ks: Tensor
-    sizes: np.ndarray
-    _sliced: tuple | None = field(init=False, repr=False, compare=False, default=None)
+    def __init__(self, viewmats: Tensor, Ks: Tensor, sizes: np.ndarray) -> None:
+        self.sizes = sizes
+        # Of selected cameras: their rows in the two tensors, which then belong to all that they were selected from.
+        self._rows: tuple[int, ...] | None = None
+        self._viewmats, self._Ks = viewmats, Ks
+
+    def __repr__(self) -> str:
+        return f"Cameras(viewmats={self.viewmats!r}, Ks={self.Ks!r}, sizes={self.sizes!r})"
 
     def __len__(self) -> int:
-        return self.viewmats.shape[0]
+        return self._viewmats.shape[0] if self._rows is None else len(self._rows)
+
+    @property
+    def viewmats(self) -> Tensor:
+        self._stack()
+        return self._viewmats
+
+    @viewmats.setter
+    def viewmats(self, viewmats: Tensor) -> None:
+        self._stack()
+        self._viewmats = viewmats
+
+    @property
+    def Ks(self) -> Tensor:
+        self._stack()
+        return self._Ks
+
+    @Ks.setter
+    def Ks(self, Ks: Tensor) -> None:
+        self._stack()
+        self._Ks = Ks
 
     def select(self, view_ids: Sequence[int]) -> Cameras:
-        """The cameras of these views, in this order."""
-        # Stacked, not indexed: so no index has to be copied to the device.
-        viewmats, Ks = (torch.stack([matrices[view] for view in view_ids]) for matrices in self._matrices())
-        return Cameras(viewmats, Ks, self.sizes[np.asarray(view_ids, dtype=np.int64)])
+        """The cameras of these views, in this order; `range` for a run of them. This launches nothing on a device.
 
-    def _matrices(self) -> tuple[Sequence[Tensor], Sequence[Tensor]]:
-        """The matrices of each camera, views of `viewmats` and `Ks`. They are kept, as slicing them in each iteration
-        takes the host longer than stacking them. Where gradients flow they belong to one graph, and are not kept."""
-        if self.viewmats.requires_grad or self.Ks.requires_grad:
-            return self.viewmats, self.Ks
-        if self._sliced is None or self._sliced[0] is not self.viewmats or self._sliced[1] is not self.Ks:
-            self._sliced = self.viewmats, self.Ks, self.viewmats.unbind(), self.Ks.unbind()
-        return self._sliced[2:]
+        They share memory with these ones until their `viewmats` or `Ks` are read, which makes a copy. Where gradients
+        flow to these ones, it is made at once.
+
+        Raises:
+            IndexError: a view that is not there.
+        """
+        own = range(len(self)) if self._rows is None else self._rows
+        chosen = Cameras(self._viewmats, self._Ks, self.sizes[np.asarray(view_ids, dtype=np.int64)])
+        chosen._rows = tuple([own[view] for view in view_ids])
+        if self._viewmats.requires_grad or self._Ks.requires_grad:
+            chosen._stack()
+        return chosen
+
+    def by_row(self) -> tuple[Tensor, Tensor, Sequence[int]]:
+        """(viewmats [V, 4, 4], Ks [V, 3, 3], C rows): where the matrices of each camera lie, for code that reads them
+        there and needs no tensor of these cameras alone. Nothing may be written to them."""
+        return self._viewmats, self._Ks, range(len(self)) if self._rows is None else self._rows
+
+    def _stack(self) -> None:
+        """Give selected cameras matrices of their own."""
+        if self._rows is not None:
+            # Stacked, not indexed: so no index has to be copied to the device.
+            viewmats, Ks = (torch.stack([of[row] for row in self._rows]) for of in (self._viewmats, self._Ks))
+            self._rows, self._viewmats, self._Ks = None, viewmats, Ks
 
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Cameras:
         return Cameras(self.viewmats.to(device, dtype), self.Ks.to(device, dtype), self.sizes)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -193,16 +193,17 @@ class PixelSamples:
             slots: of these tiles.
         """
         tile_ids, tile_offsets = self.tile_ids[tiles], self.tile_offsets[tiles.start : tiles.stop + 1]
-        first = int(self.grid.offsets[views.start]) if views.start else 0
-        return replace(
-            self,
-            view_ids=self.view_ids[views],
-            sizes=self.sizes[views],
-            pixel_ids=self.pixel_ids[slots],
-            tile_ids=tile_ids - first if first else tile_ids,
-            tile_offsets=tile_offsets - slots.start if slots.start else tile_offsets,
-            weights=None if self.weights is None else self.weights[slots],
+        first = len(TileGrid(self.sizes[: views.start], self.origin))
+        return PixelSamples(
+            self.view_ids[views],
+            self.sizes[views],
+            self.pixel_ids[slots],
+            tile_ids - first if first else tile_ids,
+            tile_offsets - slots.start if slots.start else tile_offsets,
+            None if self.weights is None else self.weights[slots],
+            self.has_empty_slots,
             host_ends=None,
+            origin=self.origin,
         )
 
     @property

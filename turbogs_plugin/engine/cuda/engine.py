@@ -16,7 +16,7 @@ from turbogs_plugin.engine.protocol import Engine, MapUpdate, PassMemory
 from turbogs_plugin.engine.rendered import DEFAULT_OPTIONS, RenderOptions, ScreenRecords
 from turbogs_plugin.engine.rules import LossTerms
 from turbogs_plugin.scene.photos import PhotoSamples
-from turbogs_plugin.types import Cameras, Gaussians, LossOutput, PixelSamples
+from turbogs_plugin.types import BLACK, Cameras, Gaussians, LossOutput, PixelSamples
 
 
 class CudaEngine(Engine):
@@ -75,12 +75,14 @@ class CudaEngine(Engine):
         photos, starts = truth.photos.colors, update.maps.offsets[list(truth.samples.view_ids)]
         aligned = len(photos) == len(update.maps.errors) and truth.starts.tolist() == starts.tolist()
         targets = photos if aligned else truth.colors()
-        return training.sparse_loss(terms, colors, targets, truth.samples, update, self.overflow, truth.background)
+        shared = self.overflow, truth.background, self.workspace
+        return training.sparse_loss(terms, colors, targets, truth.samples, update, *shared)
 
     def evaluate_and_learn(
         self, terms: LossTerms, colors: Tensor, targets: Tensor, samples: PixelSamples, update: MapUpdate
     ) -> LossOutput:
-        return training.sparse_loss(terms, colors, targets, samples, update, self.overflow)
+        shared = self.overflow, BLACK, self.workspace
+        return training.sparse_loss(terms, colors, targets, samples, update, *shared)
 
     def learn_exposures(
         self, exposures: Exposures, colors: Tensor, gradients: Tensor, samples: PixelSamples, rate: float

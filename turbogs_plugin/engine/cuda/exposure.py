@@ -5,11 +5,11 @@ Each is enqueued on torch's current stream and does not wait.
 
 from __future__ import annotations
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from turbogs_plugin.engine.cuda import launches, library
+from turbogs_plugin.engine.cuda.raster import plain_floats
 from turbogs_plugin.engine.cuda.training import view_rows
 from turbogs_plugin.engine.exposures import BETA1, BETA2, EPSILON, PULL, Exposures
 from turbogs_plugin.types import PixelSamples
@@ -18,7 +18,7 @@ from turbogs_plugin.types import PixelSamples
 def expose_colors(exposures: Exposures, colors: Tensor, samples: PixelSamples) -> Tensor:
     """`Engine.expose`. `samples`: of at most `MAX_VIEWS` views."""
     library.require()
-    colors = colors.detach().float().contiguous()
+    colors = plain_floats(colors)
     launch = launches.ExposeColors(
         colors=colors,
         tile_ids=samples.tile_ids,
@@ -44,13 +44,13 @@ def learn_exposures(
     library.require()
     rows, grid = _rows(samples), launches.GridOrigin(*samples.origin)
     backward = launches.ExposureBackward(
-        colors=colors.detach().float().contiguous(),
+        colors=plain_floats(colors),
         tile_ids=samples.tile_ids,
         tile_offsets=samples.tile_offsets,
         views=rows,
         grid=grid,
         offsets=exposures.offsets,
-        gradients=gradients.detach().float().contiguous(),
+        gradients=plain_floats(gradients),
         sums=torch.zeros(len(samples.view_ids), 3, 4, dtype=torch.float64, device=colors.device),
     )
     library.launch(backward)
@@ -72,4 +72,4 @@ def learn_exposures(
 
 
 def _rows(samples: PixelSamples) -> list[int]:
-    return view_rows(np.zeros(len(samples.view_ids), dtype=np.int64), samples.sizes.tolist(), samples.view_ids)
+    return view_rows([0] * len(samples.view_ids), samples.sizes.tolist(), samples.view_ids)

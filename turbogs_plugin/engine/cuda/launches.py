@@ -5,8 +5,8 @@ list is in the order of the fields; those of a nested class stand in its place. 
 C++ header (csrc/generate_headers.py). So this file must not import torch, and no order is written down twice.
 
 Letters in shapes: K views, N Gaussians, T tiles with samples, P sample slots, M the most intersections of tiles and
-splats, B harmonics above band 0, X flat pixels and V training views. An instance is a Gaussian in a view, its row
-k * N + n. All tensors are contiguous and on one CUDA device. Where a tensor may be None, a comment says when.
+splats, B harmonics above band 0, X flat pixels, V training views and C cameras. An instance is a Gaussian in a view,
+its row k * N + n. All tensors are contiguous and on one CUDA device. Where a tensor may be None, a comment says when.
 """
 
 from __future__ import annotations
@@ -87,9 +87,9 @@ class Scene:
     """The Gaussians and the views of a batch."""
 
     gaussians: GaussianArrays
-    viewmats: Tensor  # [K, 4, 4] float32
-    Ks: Tensor  # [K, 3, 3] float32
-    sizes: list[int]  # [K] layout.ImageRow
+    viewmats: Tensor  # [C, 4, 4] float32, of the capture's cameras or of those of the views alone
+    Ks: Tensor  # [C, 3, 3] float32
+    images: list[int]  # [K] layout.ImageRow
     sh_degree: int  # to evaluate
     eps2d: float
 

@@ -32,9 +32,16 @@ from turbogs_plugin.errors import InputError
 from turbogs_plugin.types import Cameras, GaussianGradients, Gaussians, GaussianStats, PixelSamples
 
 
+def plain_floats(tensor: Tensor) -> Tensor:
+    """The tensor as kernels take it: float32, contiguous and without a gradient; a copy only if needed."""
+    if tensor.requires_grad or tensor.dtype != torch.float32:
+        tensor = tensor.detach().float()
+    return tensor.contiguous()
+
+
 def _prepared(tensor: Tensor) -> Tensor:
-    """The tensor detached, contiguous and aligned for 16-byte loads; a copy only if needed."""
-    tensor = (tensor.detach() if tensor.requires_grad else tensor).contiguous()
+    """`plain_floats`, aligned for 16-byte loads."""
+    tensor = plain_floats(tensor)
     return tensor if tensor.data_ptr() % 16 == 0 else tensor.clone()
 
 
@@ -45,7 +52,8 @@ def _check(gaussians: Gaussians) -> None:
 
 
 def _check_batch(cameras: Cameras, samples: PixelSamples, device: torch.device) -> None:
-    _require((("cameras.viewmats", cameras.viewmats), ("cameras.Ks", cameras.Ks)), torch.float32, device)
+    viewmats, Ks, _ = cameras.by_row()
+    _require((("cameras.viewmats", viewmats), ("cameras.Ks", Ks)), torch.float32, device)
     integers = ((f"samples.{name}", getattr(samples, name)) for name in ("pixel_ids", "tile_ids", "tile_offsets"))
     _require(integers, torch.int32, device)
     require_views(len(cameras))
@@ -212,17 +220,20 @@ def screen_gradients(
 ) -> CudaScreenGradients:
     """`Engine.screen_gradients`. The Gaussians are contiguous, and their rows begin at a multiple of four."""
     library.require()
-    scene = _scene(gaussians.map(_prepared), cameras, options.used_degree(gaussians), options.settings.eps2d)
+    known = workspace is not None and workspace.knows(gaussians)
+    ready = gaussians if known else gaussians.map(_prepared)
+    scene = _scene(ready, cameras, options.used_degree(gaussians), options.settings.eps2d)
     overflow = None if workspace is None else workspace.overflow
     return CudaScreenGradients(scene, samples, plain.records, plain.radii, plain.with_statistics, overflow)
 
 
 def _scene(gaussians: Gaussians, cameras: Cameras, sh_degree: int, eps2d: float) -> launches.Scene:
+    viewmats, Ks, rows = cameras.by_row()
     return launches.Scene(
         gaussians=gaussians,
-        viewmats=cameras.viewmats.detach().contiguous(),
-        Ks=cameras.Ks.detach().contiguous(),
-        sizes=cameras.sizes.reshape(-1).tolist(),
+        viewmats=plain_floats(viewmats),
+        Ks=plain_floats(Ks),
+        images=[number for size, row in zip(cameras.sizes.tolist(), rows, strict=True) for number in (*size, row)],
         sh_degree=sh_degree,
         eps2d=eps2d,
     )
@@ -255,6 +266,7 @@ class _Front:
 
     splats: launches.Splats
     tiles: launches.TileLists
+    num_intersections: Tensor  # the first number of `tiles.status`
     block_sums: Tensor
     records: Tensor | None
 
@@ -277,7 +289,7 @@ class _Front:
         block_sums = buffers.integers("block_sums", blocks, 2, dtype=torch.int64)
         # With a workspace a backward pass is likely to follow.
         records = None if workspace is None else buffers.floats("records", views * count, ScreenRecord.SIZE)
-        return cls(splats, tiles, block_sums, records)
+        return cls(splats, tiles, tiles.status[:1], block_sums, records)
 
 
 @dataclass(frozen=True)
@@ -287,6 +299,8 @@ class _Back:
     intersection_keys: Tensor
     intersection_ids: Tensor
     runs: Tensor
+    colors: Tensor
+    alphas: Tensor
     transmittances: Tensor
     last_intersections: Tensor
     masks: Tensor
@@ -300,6 +314,8 @@ class _Back:
             intersection_keys=buffers.integers("intersection_keys", capacity, dtype=torch.int64),
             intersection_ids=buffers.integers("intersection_ids", capacity),
             runs=buffers.integers("runs", capacity // (layout.SORT_RUN // 2), 2),
+            colors=buffers.floats("colors", slots, 3),
+            alphas=buffers.floats("alphas", slots),
             transmittances=buffers.floats("transmittances", slots),
             last_intersections=buffers.integers("last_intersections", slots),
             masks=buffers.integers("masks", (capacity // layout.BUCKET + num_active + 1) * chunks),
@@ -308,7 +324,6 @@ class _Back:
         )
 
 
-@torch.no_grad()
 def rasterize_cuda(
     gaussians: Gaussians,
     cameras: Cameras,
@@ -367,8 +382,8 @@ def rasterize_cuda(
         tile_starts=tiles.tile_starts,
         intersection_ids=ids,
         instances=splats.instances,
-        colors=torch.empty(slots, 3, device=device) if workspace is None else workspace.colors(slots),
-        alphas=torch.empty(slots, device=device),
+        colors=back.colors,
+        alphas=back.alphas,
         transmittances=back.transmittances,
         depths=torch.empty(slots, device=device) if options.with_depth else None,
         last_intersections=back.last_intersections,
@@ -383,7 +398,7 @@ def rasterize_cuda(
         forward.colors,
         forward.alphas,
         forward.depths,
-        num_intersections=tiles.status[:1],
+        num_intersections=front.num_intersections,
         _scene=scene,
         _samples=samples,
         _workspace=workspace,

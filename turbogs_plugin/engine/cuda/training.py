@@ -18,7 +18,8 @@ import torch
 from torch import Tensor
 
 from turbogs_plugin.engine.cuda import launches, library
-from turbogs_plugin.engine.cuda.raster import CudaScreenGradients, count_filled, require_views
+from turbogs_plugin.engine.cuda.raster import CudaScreenGradients, count_filled, plain_floats, require_views
+from turbogs_plugin.engine.cuda.workspace import Workspace
 from turbogs_plugin.engine.layout import MAX_PEERS, STRUCTURES, UNITS, UPDATE_KINDS
 from turbogs_plugin.engine.moments import GaussianMoments
 from turbogs_plugin.engine.protocol import MapUpdate, ModelCopies
@@ -56,10 +57,13 @@ def sample_pixels(rule: DrawRule, maps: ErrorMaps, view_ids: tuple[int, ...], ra
         dtypes = (torch.float64, torch.int32, torch.int64, torch.float32)
         scratch = launches.TileScratch(*(torch.empty(sum(tiles), dtype=dtype, device=device) for dtype in dtypes))
     slots, chosen = places.slots, places.chosen
+    parts = slots, chosen, chosen + 1
+    memory = torch.empty(sum(parts), dtype=torch.int32, device=device)  # in less of the host's time than three tensors
+    pixel_ids, tile_ids, tile_offsets = memory.split_with_sizes(parts)
     draw = launches.SamplePixels(
         errors=maps.errors,
         stamps=maps.stamps,
-        views=view_rows(maps.offsets[views], shapes, view_ids, places.draws),
+        views=view_rows(maps.offsets[views].tolist(), shapes, view_ids, places.draws),
         grid=launches.GridOrigin(*origin),
         unit=UNITS.index(rule.unit),
         masks=masks,
@@ -69,9 +73,9 @@ def sample_pixels(rule: DrawRule, maps: ErrorMaps, view_ids: tuple[int, ...], ra
         seed=step.seed,
         iteration=step.iteration,
         now=maps.now(step),
-        pixel_ids=torch.empty(slots, dtype=torch.int32, device=device),
-        tile_ids=torch.empty(chosen, dtype=torch.int32, device=device),
-        tile_offsets=torch.empty(chosen + 1, dtype=torch.int32, device=device),
+        pixel_ids=pixel_ids,
+        tile_ids=tile_ids,
+        tile_offsets=tile_offsets,
         weights=torch.empty(slots, device=device) if rule.importance else None,
         scratch=scratch,
     )
@@ -171,14 +175,14 @@ def _view_slots(width: int, height: int, unit: str, wanted: int) -> int:
 
 
 def view_rows(
-    starts: np.ndarray,
+    starts: Sequence[int],
     shapes: Sequence[Sequence[int]],
     view_ids: Sequence[int],
     draws: Sequence[tuple[int, ...]] | None = None,
 ) -> list[int]:
     """A `layout.ViewRow` for each view (with `draws` a `layout.DrawRow`), end to end. `shapes`: (width, height)."""
     require_views(len(view_ids))
-    columns = zip(starts.tolist(), shapes, view_ids, draws or [()] * len(view_ids), strict=True)
+    columns = zip(starts, shapes, view_ids, draws or [()] * len(view_ids), strict=True)
     return [number for start, size, view_id, draw in columns for number in (start, *size, view_id, *draw)]
 
 
@@ -190,6 +194,7 @@ def sparse_loss(
     update: MapUpdate | None = None,
     overflow: Tensor | None = None,
     background: Color = BLACK,
+    workspace: Workspace | None = None,
 ) -> LossOutput:
     """Loss, gradient and pixel errors, in one launch. With `update` it also does what `ErrorMaps.update` does.
 
@@ -203,24 +208,26 @@ def sparse_loss(
         samples: of at most `MAX_VIEWS` views.
         overflow: [1] int32 on the device, or None; if it is not 0, maps and count of `update` stay as they are.
         background: shows through photos that have an alpha.
+        workspace: has memory for the gradients and errors, which are then valid until it is used for the next loss.
 
     Returns:
         The loss (a float64 scalar on the device), gradients [P, 3] float32 and errors [P] float32.
     """
     library.require()
-    colors = colors.detach().float().contiguous()
+    colors = plain_floats(colors)
     photos = targets if targets.dtype == torch.uint8 else None
     maps, beta, stamp, nonfinite_losses = launches.NO_MAPS, 0.0, 0, None
-    starts = np.zeros(len(samples.view_ids), dtype=np.int64)
+    starts = [0] * len(samples.view_ids)
     if update is not None:
         maps, nonfinite_losses = update.maps, update.nonfinite_losses
         beta, stamp = maps.beta, maps.stamp(update.step)
-        starts = maps.offsets[list(samples.view_ids)]
+        starts = maps.offsets[list(samples.view_ids)].tolist()
     elif photos is not None:
         raise ValueError("photos are gathered from where the maps of each view begin: give `update`")
+    output = _loss_output(len(colors), colors.device, workspace)
     loss = launches.SparseLoss(
         colors=colors,
-        targets=None if photos is not None else targets.detach().float().contiguous(),
+        targets=None if photos is not None else plain_floats(targets),
         photos=photos,
         samples=samples,
         views=view_rows(starts, samples.sizes.tolist(), samples.view_ids),
@@ -231,15 +238,24 @@ def sparse_loss(
         beta=beta,
         stamp=stamp,
         num_filled=count_filled(samples),
-        loss=torch.zeros((), dtype=torch.float64, device=colors.device),
-        color_gradients=torch.empty_like(colors),
-        pixel_errors=torch.empty(len(samples), device=colors.device),
+        loss=output.loss,
+        color_gradients=output.color_gradients,
+        pixel_errors=output.pixel_errors,
         nonfinite_losses=nonfinite_losses,
         overflow=overflow,
         background=launches.Background(*background),
     )
     library.launch(loss)
-    return LossOutput(loss.loss, loss.color_gradients, loss.pixel_errors)
+    return output
+
+
+def _loss_output(slots: int, device: torch.device, workspace: Workspace | None) -> LossOutput:
+    """What the kernel fills: the loss is zero."""
+    if workspace is None:
+        zero = torch.zeros((), dtype=torch.float64, device=device)
+        return LossOutput(zero, torch.empty(slots, 3, device=device), torch.empty(slots, device=device))
+    gradients = workspace.buffer("color_gradients", (slots, 3), torch.float32)
+    return LossOutput(workspace.zero(), gradients, workspace.buffer("pixel_errors", (slots,), torch.float32))
 
 
 def fused_step(
@@ -260,7 +276,10 @@ def fused_step(
         copies: of `gaussians`, `MAX_PEERS` - 1 at most.
     """
     library.require()
-    if any(value.data_ptr() != getattr(screen.scene.gaussians, name).data_ptr() for name, value in gaussians.items()):
+    drawn = screen.scene.gaussians
+    if gaussians is not drawn and any(
+        value.data_ptr() != getattr(drawn, name).data_ptr() for name, value in gaussians.items()
+    ):
         raise ValueError("fused_step: these are not the Gaussians that the gradients were made of")
     lm = rule.lm
     library.launch(

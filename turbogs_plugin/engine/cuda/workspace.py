@@ -20,6 +20,7 @@ from weakref import ref
 import torch
 from torch import Tensor
 
+from turbogs_plugin.device import current_stream
 from turbogs_plugin.engine.layout import INTERSECTIONS_MAX, PassStatus
 from turbogs_plugin.engine.protocol import PassMemory
 from turbogs_plugin.errors import InputError
@@ -47,6 +48,9 @@ LENT = ("colors", "radii", "records")
 
 PENDING_MAX = 8
 """Most counts on their way to the host; one more waits for the oldest."""
+
+ZEROS_AT_ONCE = 64
+"""Zeros made together for `Workspace.zero`."""
 
 
 def round_capacity(intersections: float) -> int:
@@ -95,7 +99,9 @@ class Workspace:
         self._lent: PassMemory | None = None
         self._views: dict[str, Tensor] = {}  # what `buffer` returned last
         self._kept: dict[str, tuple[tuple, Any]] = {}
+        self._zeros: list[Tensor] = []  # those that `zero` has not given away
         self._pinned = torch.zeros(PENDING_MAX, 2, dtype=torch.int32).pin_memory().unbind()
+        self._events: dict[int, torch.cuda.Event] = {}  # by place in `_pinned`
         self._pending: deque[_Pending] = deque()
         self._gaussians = 0
         self._intersections_per_tile = 0.0
@@ -113,7 +119,7 @@ class Workspace:
     def buffer(self, name: str, shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
         """The buffer of this name, uninitialised; it grows if needed."""
         view = self._views.get(name)
-        if view is not None and view.shape == shape and view.dtype == dtype:  # nearly always; slicing takes 9 us
+        if view is not None and view.shape == shape and view.dtype == dtype:  # nearly always
             return view
         count = math.prod(shape)
         held = self._buffers.get(name)
@@ -121,7 +127,8 @@ class Workspace:
             self._views.pop(name, None)
             self._buffers.pop(name, None)  # freed before its successor is made
             held = self._buffers[name] = torch.empty(int(count * GROWTH) + 1, dtype=dtype, device=self.device)
-        view = self._views[name] = held[:count].view(shape)
+        strides = [math.prod(shape[place + 1 :]) for place in range(len(shape))]
+        view = self._views[name] = held.as_strided(shape, strides)  # in one operation
         return view
 
     def lend(self, memory: PassMemory | None) -> None:
@@ -147,12 +154,6 @@ class Workspace:
                 self._buffers[name] = lent
         self._lent = memory
 
-    def colors(self, slots: int) -> Tensor:
-        """[slots, 3] float32 for the colours of a pass: in memory that was lent, else newly allocated."""
-        if self._lent is None:
-            return torch.empty(slots, 3, device=self.device)
-        return self.buffer("colors", (slots, 3), torch.float32)
-
     def know(self, gaussians: Gaussians) -> None:
         """Remember this model, until another one: its tensors are as kernels take them."""
         self._known = ref(gaussians)
@@ -172,6 +173,13 @@ class Workspace:
             self._kept.pop(name, None)  # lets go of the buffers that grow
             last = self._kept[name] = sizes, make()
         return last[1]
+
+    def zero(self) -> Tensor:
+        """[] float64 on the device, zero, which is the caller's alone. Many are made at once, as each launch that makes
+        zeros takes the host 30 us."""
+        if not self._zeros:
+            self._zeros.extend(torch.zeros(ZEROS_AT_ONCE, dtype=torch.float64, device=self.device).unbind())
+        return self._zeros.pop()
 
     def bytes_held(self) -> int:
         """Bytes of all buffers."""
@@ -205,10 +213,12 @@ class Workspace:
         if len(self._pending) == PENDING_MAX:
             self._pending[0].event.synchronize()
             self.poll()
-        values = self._pinned[self.passes % PENDING_MAX]
+        place = self.passes % PENDING_MAX
+        if place not in self._events:
+            self._events[place] = torch.cuda.Event()
+        values, event = self._pinned[place], self._events[place]
         values.copy_(self.status, non_blocking=True)
-        event = torch.cuda.Event()
-        event.record(torch.cuda.current_stream(self.device))
+        event.record(current_stream(self.device))
         self._pending.append(_Pending(self.passes, tiles, event, values))
         self.passes += 1
 

@@ -118,6 +118,7 @@ class ReferenceRendered(Rendered):
 
         return Projected(**{each.name: placed(getattr(self._splats, each.name)) for each in fields(Projected)})
 
+    @torch.no_grad()
     def _backward(self, upstream: dict[str, Tensor | None], with_statistics: bool) -> ReferenceScreenGradients:
         zeros = torch.zeros_like(self.alphas)
         given = {name: zeros if value is None else value for name, value in upstream.items()}
