@@ -35,6 +35,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from turbogs_plugin.device import current_stream
 from turbogs_plugin.distributed.digest import digest
 from turbogs_plugin.distributed.in_place import InPlace
 from turbogs_plugin.distributed.ranks import ProcessRanks, Ranks
@@ -176,9 +177,7 @@ class RankExchange(Exchange):
         memory = self._prepared(engine, shares, gaussians)
         rendered = None
         if len(own):
-            part = cameras
-            if len(own) < len(cameras):
-                part = Cameras(cameras.viewmats[own.views], cameras.Ks[own.views], cameras.sizes[own.views])
+            part = cameras.select(range(own.views.start, own.views.stop))
             chosen = samples.of_tiles(own.tiles, own.views, own.slots)
             rendered = engine.render(gaussians, part, chosen, options)
         colors = self._gather_colors(engine, rendered, shares, gaussians.means, memory)
@@ -247,7 +246,7 @@ class RankExchange(Exchange):
             self._buffers = [(values, torch.cuda.Event()) for values in pinned]
         values, event = self._buffers[self._passes % len(self._buffers)]
         values.copy_(flags, non_blocking=True)
-        event.record()
+        event.record(current_stream(flags.device))
         return _Flags(self._passes, values, event)
 
     def settle(self, engine: Engine, wait: bool = False) -> int:
