@@ -195,6 +195,8 @@ def ranks() -> str:
 
 def rank_runs() -> str:
     """Whole runs and a study on one GPU and on several, of the same measurement as `ranks`."""
+    if not (H200 / scaling_results.KEPT).is_file():
+        return ABSENT
     return f"{scaling_results.trainings(H200)}\n\n{scaling_results.study(H200)}"
 
 

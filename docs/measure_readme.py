@@ -178,7 +178,9 @@ STAGES: dict[str, Sequence[Piece | Sweep]] = {
     ],
     "paper_parts": [Sweep(60, ["paper_parts"])],
     "baselines": [Sweep(210, ["baselines"], seeds=1)],
-    "studies": [Sweep(60, ["sizes", "average", "parts", "departures", "density_departures", "bounds", "cameras"])],
+    "studies": [
+        Sweep(60, ["sizes", "average", "parts", "pixels", "departures", "density_departures", "bounds", "cameras"])
+    ],
     "paper_tables": [
         Sweep(60, ["sizes", "components", "views", "hard_ratio", "schedule"], seeds=2, captures=["caliterra"])
     ],

@@ -2,10 +2,10 @@
 # Measures docs/scaling.md on a machine with two GPUs or four: sh docs/measure_scaling.sh OUT FOX CALITERRA [DEVICE]
 #
 # What says the most comes first. No stage stops another one: each has its time, its own OUT/NAME.txt and NAME.err, and
-# after each OUT/results.txt is written anew with all that is known. WITHIN seconds (470) in all; a stage that would
-# not end before is left out. One that runs into it is asked to end, and killed after 5 s; no signal of `timeout` comes
+# after each group OUT/results.txt is written anew with all that is known. WITHIN seconds (470) in all; a stage that
+# would not end before is left out. One that runs into it is asked to end, and killed after 5 s; no signal of `timeout` comes
 # to the processes that it started, in sessions of their own, but they end with it. Models and checkpoints go to
-# SCRATCH, as they are large; OUT keeps a few kilobytes.
+# SCRATCH, as they are large; OUT keeps a few kilobytes. STUDY=no: without the study.
 out=$1 fox=$2 caliterra=$3 device=${4:-cuda}
 test -n "$caliterra" || { echo "sh docs/measure_scaling.sh OUT FOX CALITERRA [DEVICE]"; exit 2; }
 python=${PYTHON:-python3} within=${WITHIN:-470} scratch=${SCRATCH:-$(mktemp -d)} begun=$(date +%s)
@@ -33,7 +33,6 @@ stage() {
     code=$?
     say "$name: $(($(elapsed) - started)) s, exit code $code"
     [ $code -eq 0 ] || tail -n 5 "$out/$name.err"
-    results
     return $code
 }
 
@@ -48,7 +47,6 @@ run() {
         cp "$scratch/$kind-$seed/$file" "$out/runs/$kind-$seed/" 2>/dev/null
     done
     rm -rf "${scratch:?}/$kind-$seed"
-    results
 }
 
 # The numbers that the rest waits for: iterations on one GPU and on two. 1000 Gaussians say what the host takes.
@@ -60,12 +58,15 @@ runs() {
     run two "$1" 2
     test -z "$four" || run four "$1" 4
     run batch "$1" 2 train.batch_for=auto  # twice the views and pixels, rates times the root of two
+    results
 }
+results
 runs 0
-for gpus in 0 $all; do
+for gpus in $(test "${STUDY:-}" = no || echo 0 $all); do
     stage "study-$gpus" 60 "$python" -m turbogs_plugin ablate parts --scene "$caliterra" --only turbogs \
         --seeds ${CELLS:-0 1 2 3 4 5} --gpus $gpus --device "$device" --out "$out/study-$gpus" ${STUDY:-}
 done
+results
 runs 1
 runs 2
 test "$device" = cpu ||

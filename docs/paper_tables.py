@@ -13,7 +13,7 @@ from verdict import verdict
 from turbogs_plugin.report.tables import table
 from turbogs_plugin.study.summary import VariantRow
 
-OURS = ("cameras", "parts", "departures", "density_departures", "bounds", "average")
+OURS = ("cameras", "parts", "pixels", "departures", "density_departures", "bounds", "average")
 """Studies that change one thing of `turbogs` a variant."""
 
 BOUND = 0.3
@@ -53,6 +53,7 @@ PARTS = (
         ("turbogs", "random-pixels"),
         ("turbogs-paper", "random-pixels"),
     ),
+    Part("as many pixels of a tile as the paper's, not whole warps", ("rounded-down", "turbogs")),
     Part("Moment-LM, not sparse Adam", ("turbogs", "sparse-adam"), ("turbogs-paper", "sparse-adam")),
     Part("the error-driven score and its gates, not a draw by squares", ("by-difficulty", "turbogs")),
     Part("the score, not the gradient alone", ("by-difficulty", "by-gradient"), ("turbogs-paper", "no-score")),

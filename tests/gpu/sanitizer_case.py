@@ -71,16 +71,20 @@ def draw(gaussians, cameras, samples) -> None:
 
 
 def collect() -> None:
-    """Rows of records that begin within a warp, of a view that is shared and one that is not."""
-    source, target = (
+    """Rows of records that begin within a warp, of a view that is shared and two that are not; and colours of three
+    processes, one of which has none."""
+    first, second, target = (
         ScreenRecords(
-            torch.ones(2, count, ScreenRecord.SIZE, device=DEVICE),
-            torch.arange(4 * count, device=DEVICE).remainder(3).int().view(2, count, 2),
+            torch.ones(views, count, ScreenRecord.SIZE, device=DEVICE),
+            torch.arange(2 * views * count, device=DEVICE).remainder(3).int().view(views, count, 2),
             False,
         )
-        for count in (517, 300)
+        for views, count in ((2, 517), (2, 517), (3, 300))
     )
-    CudaEngine().collect(source, target, row=4, view=0, adds=True)
+    CudaEngine().collect([first, second], [0, 1], target, row=4)
+    parts = list(torch.zeros(3, 4000, device=DEVICE))
+    seen = torch.empty(2, dtype=torch.int32, device=DEVICE)
+    assert CudaEngine(torch.device(DEVICE)).gather(parts, 64, [1300, 0, 1], seen).shape == (1301, 3)
 
 
 def main() -> None:

@@ -108,10 +108,10 @@ def test_too_little_memory_says_how_much_would_do():
 @pytest.mark.parametrize(
     ("changes", "images"),
     [
-        ((), 1.0),
-        (("pixel_sampler.multiple=32",), 1.25),  # ten views with 32 pixels of a tile for 25.6, or five with 64 for 51.2
-        (("pixel_sampler.multiple=32", "schedule.pixel_budget=0.5"), 1.25),
-        (("pixel_sampler.multiple=32", "pixel_sampler.unit=tile"), 1.0),
+        (("pixel_sampler.multiple=1",), 1.0),
+        ((), 1.25),  # ten views with 32 pixels of a tile for 25.6, or five with 64 for 51.2
+        (("schedule.pixel_budget=0.5",), 1.25),
+        (("pixel_sampler.unit=tile",), 1.0),
         (("pixel_sampler.type=random", "pixel_sampler.multiple=256"), 10.0),
     ],
 )

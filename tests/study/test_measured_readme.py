@@ -180,7 +180,17 @@ def test_parts_of_nine_minutes_make_all_and_none_of_it_twice(machine, call, tmp_
     for name, count in (line.split() for line in machine.begun if line[-1].isdigit()):
         cells[name] = cells.get(name, 0) + int(count)
     assert list(cells) == [
-        *("sizes", "paper", "paper_parts", "baselines", "average", "parts", "departures", "density_departures"),
+        *(
+            "sizes",
+            "paper",
+            "paper_parts",
+            "baselines",
+            "average",
+            "parts",
+            "pixels",
+            "departures",
+            "density_departures",
+        ),
         *("bounds", "cameras", "components", "views", "hard_ratio", "schedule"),
     ]
     assert cells["sizes"] == 6 * 3 * 5 and cells["baselines"] == 4 * 3 and cells["components"] == 6 * 2

@@ -91,7 +91,7 @@ def test_no_more_pixels_than_the_views_have(overrides, views, expected):
 
 
 def test_memory_for_pixels_is_what_the_gaussians_leave():
-    config = load_config("turbogs", ["train.sh_degree=3"])
+    config = load_config("turbogs", ["train.sh_degree=3", "pixel_sampler.multiple=1"])
 
     def demand(pixel_budget: float) -> MemoryDemand:
         sizes = np.full((100, 2), 1000)
