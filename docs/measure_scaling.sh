@@ -3,8 +3,8 @@
 #
 # What says the most comes first. No stage stops another one: each has its time, its own OUT/NAME.txt and NAME.err, and
 # after each group OUT/results.txt is written anew with all that is known. WITHIN seconds (470) in all; a stage that
-# would not end before is left out. One that runs into it is asked to end, and killed after 5 s; no signal of `timeout` comes
-# to the processes that it started, in sessions of their own, but they end with it. Models and checkpoints go to
+# would not end before is left out. One that runs into it is asked to end, and killed after 5 s; no signal of `timeout`
+# comes to the processes that it started, in sessions of their own, but they end with it. Models and checkpoints go to
 # SCRATCH, as they are large; OUT keeps a few kilobytes. STUDY=no: without the study.
 out=$1 fox=$2 caliterra=$3 device=${4:-cuda}
 test -n "$caliterra" || { echo "sh docs/measure_scaling.sh OUT FOX CALITERRA [DEVICE]"; exit 2; }
