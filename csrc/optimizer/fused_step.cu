@@ -135,17 +135,19 @@ struct RowCollector {
     }
 };
 
-// Writes a parameter, and its copies.
-template <class T>
+// Writes a parameter, and with kCopied its copies: a loop that might be empty takes a tenth of the kernel's time.
+template <bool kCopied, class T>
 __device__ __forceinline__ void put(const OptimizerParams& optimizer, T* place, const T& value) {
     *place = value;
-    for (int i = 0; i < optimizer.num_copies; ++i) {
-        *reinterpret_cast<T*>(reinterpret_cast<char*>(place) + optimizer.copies[i]) = value;
+    if constexpr (kCopied) {
+        for (int i = 0; i < optimizer.num_copies; ++i) {
+            *reinterpret_cast<T*>(reinterpret_cast<char*>(place) + optimizer.copies[i]) = value;
+        }
     }
 }
 
 // Moments, solution and new values of one Gaussian's 14 parameters.
-template <Rows kRows>
+template <Rows kRows, bool kCopied>
 __device__ __forceinline__ void update_row(const ScreenBackwardParams& params, const OptimizerParams& optimizer,
                                            int gaussian, const RowCollector& rows, const StoredGaussian& old,
                                            float2 corrections) {
@@ -166,18 +168,19 @@ __device__ __forceinline__ void update_row(const ScreenBackwardParams& params, c
     using Place = ParameterRow;
 #pragma unroll
     for (int i = 0; i < 3; ++i) {
-        put(optimizer, params.means + triple + i, __fadd_rn(old.mean[i], terms.adam[Place::kMeans + i]));
-        put(optimizer, params.scales + triple + i, __fadd_rn(old.log_scale[i], terms.adam[Place::kScales + i]));
-        put(optimizer, params.sh0 + triple + i, __fadd_rn(old.sh0[i], terms.adam[Place::kSh0 + i]));
+        put<kCopied>(optimizer, params.means + triple + i, __fadd_rn(old.mean[i], terms.adam[Place::kMeans + i]));
+        put<kCopied>(optimizer, params.scales + triple + i, __fadd_rn(old.log_scale[i], terms.adam[Place::kScales + i]));
+        put<kCopied>(optimizer, params.sh0 + triple + i, __fadd_rn(old.sh0[i], terms.adam[Place::kSh0 + i]));
     }
     const float* turn = terms.adam + Place::kQuats;
-    put(optimizer, params.quats + gaussian,
+    put<kCopied>(optimizer, params.quats + gaussian,
         make_float4(__fadd_rn(old.quat[0], turn[0]), __fadd_rn(old.quat[1], turn[1]), __fadd_rn(old.quat[2], turn[2]),
                     __fadd_rn(old.quat[3], turn[3])));
-    put(optimizer, params.opacities + gaussian, __fadd_rn(old.logit, terms.adam[Place::kOpacities]));
+    put<kCopied>(optimizer, params.opacities + gaussian, __fadd_rn(old.logit, terms.adam[Place::kOpacities]));
 }
 
 // Adam on the harmonics of the block's updated Gaussians. Values and gradients come from shared memory.
+template <bool kCopied>
 __device__ __forceinline__ void update_harmonics(const ScreenBackwardParams& params, const OptimizerParams& optimizer,
                                                  const BlockShared& block, const float2* block_corrections) {
     const int first = static_cast<int>(blockIdx.x) * kBackwardThreads;
@@ -219,14 +222,14 @@ __device__ __forceinline__ void update_harmonics(const ScreenBackwardParams& par
             if (block.wanted[owners[0]] && block.wanted[owners[1]]) {
                 *reinterpret_cast<float4*>(optimizer.exp_avg_shN + base + i) = mean;
                 *reinterpret_cast<float4*>(optimizer.exp_avg_sq_shN + base + i) = square;
-                put(optimizer, reinterpret_cast<float4*>(params.shN + base + i), value);
+                put<kCopied>(optimizer, reinterpret_cast<float4*>(params.shN + base + i), value);
             } else {
 #pragma unroll
                 for (int j = 0; j < 4; ++j) {
                     if (!block.wanted[j >= boundary ? owners[1] : owners[0]]) continue;
                     optimizer.exp_avg_shN[base + i + j] = (&mean.x)[j];
                     optimizer.exp_avg_sq_shN[base + i + j] = (&square.x)[j];
-                    put(optimizer, params.shN + base + i + j, (&value.x)[j]);
+                    put<kCopied>(optimizer, params.shN + base + i + j, (&value.x)[j]);
                 }
             }
         }
@@ -238,11 +241,11 @@ __device__ __forceinline__ void update_harmonics(const ScreenBackwardParams& par
         float value = block.coefficients[i + owner * (block.stride - block.row)];
         adam(optimizer, block.work[i], block_corrections[owner], value, optimizer.exp_avg_shN[base + i],
              optimizer.exp_avg_sq_shN[base + i]);
-        put(optimizer, params.shN + base + i, value);
+        put<kCopied>(optimizer, params.shN + base + i, value);
     }
 }
 
-template <Rows kRows>
+template <Rows kRows, bool kCopied>
 __global__ void __launch_bounds__(kBackwardThreads, kStepBlocks) fused_step_kernel(
     const __grid_constant__ ScreenBackwardParams params, const __grid_constant__ OptimizerParams optimizer) {
     extern __shared__ float4 shared[];
@@ -284,7 +287,7 @@ __global__ void __launch_bounds__(kBackwardThreads, kStepBlocks) fused_step_kern
                                                    1.0f / bias_correction(optimizer.log_beta2, steps));
             optimizer.steps[gaussian] = steps;
             block_corrections[threadIdx.x] = corrections;
-            update_row<kRows>(params, optimizer, gaussian, rows, load_gaussian(params, gaussian), corrections);
+            update_row<kRows, kCopied>(params, optimizer, gaussian, rows, load_gaussian(params, gaussian), corrections);
             if (params.sh_degree > 0) rows.harmonics(stored.mean, block.cameras, params.sh_degree, gradients);
         } else if (rows.count > 0) {
             atomicAdd(optimizer.skipped, 1ull);
@@ -297,7 +300,19 @@ __global__ void __launch_bounds__(kBackwardThreads, kStepBlocks) fused_step_kern
         if (i < block.row) block.work[threadIdx.x * block.row + i] = gradients[i];
     }
     __syncthreads();
-    update_harmonics(params, optimizer, block, block_corrections);
+    update_harmonics<kCopied>(params, optimizer, block, block_corrections);
+}
+
+}  // namespace
+
+namespace {
+
+template <bool kCopied>
+cudaError_t launch(const ScreenBackwardParams& params, const OptimizerParams& optimizer, cudaStream_t stream) {
+    const auto kernel = optimizer.kind == UpdateKind::kAdam ? fused_step_kernel<Rows::kNone, kCopied>
+                        : optimizer.rows_per_view           ? fused_step_kernel<Rows::kPerView, kCopied>
+                                                            : fused_step_kernel<Rows::kSummed, kCopied>;
+    return launch_blocks(kernel, step_floats(params), params, optimizer, stream);
 }
 
 }  // namespace
@@ -305,10 +320,8 @@ __global__ void __launch_bounds__(kBackwardThreads, kStepBlocks) fused_step_kern
 cudaError_t launch_fused_step(const ScreenBackwardParams& params, const OptimizerParams& optimizer,
                               cudaStream_t stream) {
     if (params.num_gaussians == 0) return cudaSuccess;
-    const auto kernel = optimizer.kind == UpdateKind::kAdam ? fused_step_kernel<Rows::kNone>
-                        : optimizer.rows_per_view           ? fused_step_kernel<Rows::kPerView>
-                                                            : fused_step_kernel<Rows::kSummed>;
-    return launch_blocks(kernel, step_floats(params), params, optimizer, stream);
+    return optimizer.num_copies > 0 ? launch<true>(params, optimizer, stream)
+                                    : launch<false>(params, optimizer, stream);
 }
 
 }  // namespace turbogs
