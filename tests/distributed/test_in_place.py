@@ -161,7 +161,8 @@ def without_some_memory(capture: Path, ranks: ProcessRanks, folder: Path, wanted
 
 def growing(capture: Path, ranks: ProcessRanks, folder: Path, wanted: dict) -> None:
     """Without room to spare, the event before the last iteration makes the memory of the model grow."""
-    before, in_place.GROWTH, shared_model.GROWTH = in_place.GROWTH, 1.0, 1.0
+    before = in_place.with_room
+    in_place.with_room = shared_model.with_room = int  # as much as is asked for
     files = PeerFiles(folder / "growing")
     trainer = keeping(trainer_of(capture, ranks, True, ()), files)
     counts = [len(trainer.gaussians)]
@@ -170,7 +171,7 @@ def growing(capture: Path, ranks: ProcessRanks, folder: Path, wanted: dict) -> N
     widths = [value[0].numel() for _, value in trainer.gaussians.items()]
     sizes = [aligned_starts([count * width for width in widths])[-1] for count in counts]
     assert files.of_model.sizes == sizes and sizes[0] < sizes[1]
-    in_place.GROWTH = shared_model.GROWTH = before
+    in_place.with_room = shared_model.with_room = before
 
 
 def few(capture: Path, ranks: ProcessRanks, folder: Path) -> None:
@@ -226,6 +227,10 @@ class Alone:
 
     def gather_numbers(self, values: list[int]) -> list[list[int]]:
         return [values, [self.others.pop(0)]]
+
+
+def test_small_memories_grow_by_more_than_large_ones():
+    assert [peer_memory.with_room(numbers) for numbers in (0, 1, 1000, 4 << 26)] == [0, 2, 2000, 5 << 26]
 
 
 def test_there_is_no_such_memory_on_a_cpu():

@@ -40,7 +40,7 @@ import torch
 from torch import Tensor
 
 from turbogs_plugin.device import synchronize
-from turbogs_plugin.distributed.peer_memory import GROWTH, PeerMemory, aligned_starts, share_memory
+from turbogs_plugin.distributed.peer_memory import PeerMemory, aligned_starts, share_memory, with_room
 from turbogs_plugin.distributed.ranks import ProcessRanks
 from turbogs_plugin.distributed.shares import Share
 from turbogs_plugin.engine.layout import PassStatus, ScreenRecord
@@ -113,8 +113,11 @@ class InPlace:
             engine.lend(None)
             self._own = self._memory = None
             self._views.clear()
-        slots = int(GROWTH * slots) if slots > self._slots else self._slots
-        instances = int(GROWTH * instances) if instances > self._instances else self._instances
+        slots = with_room(3 * slots) // 3 if slots > self._slots else self._slots
+        of_instance = 2 + ScreenRecord.SIZE
+        instances = (
+            with_room(of_instance * instances) // of_instance if instances > self._instances else self._instances
+        )
         sizes = (PassStatus.SIZE, 3 * slots, 2 * instances, ScreenRecord.SIZE * instances)
         self._starts = aligned_starts(sizes)
         self._slots, self._instances, self._read = slots, instances, False
