@@ -85,6 +85,7 @@ TABLES: dict[str, Callable[[], str | None]] = {
     "paper_parts": paper_tables.paper_parts,
     "paper_whole": paper_tables.paper_whole,
     "parts": lambda: study_tables.changes("parts"),
+    "pixels": lambda: study_tables.changes("pixels"),
     "viewer": viewer_tables.viewer,
     "memory": lambda: machine_tables.on("bench-step.json", machine_tables.memory),
     "offload": lambda: machine_tables.on("bench-4k.json", machine_tables.offload),

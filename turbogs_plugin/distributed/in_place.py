@@ -113,14 +113,14 @@ class InPlace:
             engine.lend(None)
             self._own = self._memory = None
             self._views.clear()
-        slots = with_room(3 * slots) // 3 if slots > self._slots else self._slots
-        of_instance = 2 + ScreenRecord.SIZE
-        instances = (
-            with_room(of_instance * instances) // of_instance if instances > self._instances else self._instances
-        )
-        sizes = (PassStatus.SIZE, 3 * slots, 2 * instances, ScreenRecord.SIZE * instances)
+        if slots > self._slots:
+            self._slots = with_room(3 * slots) // 3
+        if instances > self._instances:
+            width = 2 + ScreenRecord.SIZE
+            self._instances = with_room(width * instances) // width
+        sizes = (PassStatus.SIZE, 3 * self._slots, 2 * self._instances, ScreenRecord.SIZE * self._instances)
         self._starts = aligned_starts(sizes)
-        self._slots, self._instances, self._read = slots, instances, False
+        self._read = False
         self._memory = self._share(self._ranks, self._starts[-1], device)
         if self._memory is not None:
             part = self._memory.parts[self._ranks.rank]
