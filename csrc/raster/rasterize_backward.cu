@@ -5,8 +5,9 @@
 // it, and no others: the forward pass left their bits. It takes `kSplats` at a time, in two phases that exchange their
 // results in shared memory. In the first phase a lane stands for a sample and goes from splat to splat. It recovers the
 // transmittance, and needs one number for all that lies behind. It writes (w, d loss / d sigma) of each splat. In the
-// second phase a lane stands for a splat and a share of the samples. It goes from sample to sample and keeps all sums
-// in its registers. So lanes exchange next to nothing, and a splat costs four 16-byte atomic additions for each item.
+// second phase a lane stands for a splat and a share of the samples. It goes from sample to sample, up to the last that
+// is filled, and keeps all sums in its registers. So lanes exchange next to nothing, and a splat costs four 16-byte
+// atomic additions for each item.
 #include "raster/staged_splat.cuh"
 
 namespace turbogs {
@@ -14,7 +15,7 @@ namespace {
 
 constexpr int kSplats = 16;                         // walked at once; 32 need 13 KB a warp and were 5 to 8 % slower
 constexpr int kShares = kWarpSize / kSplats;        // lanes that sum for one splat
-constexpr int kShareSamples = kWarpSize / kShares;  // samples of such a lane
+constexpr int kTurn = 4;                            // samples of a turn of such a lane: one float4 of a row
 constexpr int kExchangeStride = kWarpSize + 4;      // words: rows of float4 and columns are read without bank conflicts
 constexpr int kAhead = 4;                           // splats whose arithmetic overlaps; 8 were no faster
 constexpr int kBucketLanes = 4;                     // lanes that list the splats of one bucket
@@ -52,6 +53,7 @@ struct Sample {
     float transmittance = 1.0f;            // behind the splats walked so far
     float behind = 0.0f;                   // sum of w * (gradient . feature) behind
     int last = -1;                         // intersection
+    int filled = 0;                        // samples of the warp up to the last that is not empty; same in all lanes
 };
 
 // Reads a lane's sample: upstream gradients, and where the forward pass ended. Leaves in shared memory what phase 2
@@ -86,6 +88,7 @@ __device__ __forceinline__ Sample load_sample(const BackwardParams& params, int 
                                  forward.background[2] * sample.blue;
         sample.behind = sample.transmittance * (background - alpha_gradient);
     }
+    sample.filled = kWarpSize - __clz(static_cast<int>(__ballot_sync(kFullWarp, pixel >= 0)));
     shared.positions[lane] = make_float4(sample.x, sample.y, sample.red, sample.green);
     shared.others[lane] = make_float4(sample.blue, error, sample.depth, 0.0f);
     return sample;
@@ -109,7 +112,8 @@ __device__ __forceinline__ int list_intersections(const uint32_t* masks, int chu
     return length + __shfl_sync(kFullWarp, sum, kWarpSize - 1);
 }
 
-// Phase 1, lane = sample: (w, d loss / d sigma) of each staged splat. No branches, so that several splats overlap.
+// Phase 1, lane = sample: (w, d loss / d sigma) of each staged splat. No branches, so that several splats overlap; the
+// power is taken even where it is not needed, as the compiler may branch about it otherwise.
 template <bool kDepth>
 __device__ __forceinline__ void exchange_splats(const ForwardParams& forward, float least_level, BackwardShared& shared,
                                                 Sample& sample, int count, int lane) {
@@ -121,8 +125,8 @@ __device__ __forceinline__ void exchange_splats(const ForwardParams& forward, fl
             const float4 form = shared.splats[base + i].form, rest = shared.splats[base + i].rest;
             const float4 color = shared.splats[base + i].color;
             const float level = splat_level(form, rest, sample.x, sample.y);
-            const bool seen = level >= least_level && __float_as_int(rest.w) <= sample.last;
-            const float raw = seen ? approximate_exp2(level) : 0.0f;
+            const bool seen = (level >= least_level) & (__float_as_int(rest.w) <= sample.last);
+            const float power = approximate_exp2(level), raw = seen ? power : 0.0f;
             const float alpha = fminf(forward.alpha_max, raw);
             const float inverse = approximate_reciprocal(1.0f - alpha);
             sample.transmittance *= inverse;
@@ -148,14 +152,17 @@ struct SplatSums {
     float square = 0.0f;  // g^2
 };
 
-// Phase 2, lane = splat and share: adds the samples of the share to the lane's sums.
+// Phase 2, lane = splat and share: adds the samples of the share to the lane's sums. The shares take turns, so that
+// both are done with the last of the `filled` samples; all lanes leave after the same turn. What a turn reads behind
+// the last sample adds zeros, as every empty sample does.
 template <bool kDepth, bool kDensity>
-__device__ __forceinline__ void sum_samples(const BackwardShared& shared, int row, int share, const StagedSplat& own,
-                                            SplatSums& sums) {
-    const float4* weights = shared.weights + (row * kExchangeStride + share * kShareSamples) / 4;
-    const float4* slopes = shared.slopes + (row * kExchangeStride + share * kShareSamples) / 4;
-    const float4* positions = shared.positions + share * kShareSamples;
-    const float4* others = shared.others + share * kShareSamples;
+__device__ __forceinline__ void sum_samples(const BackwardShared& shared, int filled, int row, int share,
+                                            const StagedSplat& own, SplatSums& sums) {
+    static_assert(kWarpSize % (kShares * kTurn) == 0, "shares of the same size");
+    const float4* weights = shared.weights + (row * kExchangeStride + share * kTurn) / 4;
+    const float4* slopes = shared.slopes + (row * kExchangeStride + share * kTurn) / 4;
+    const float4* positions = shared.positions + share * kTurn;
+    const float4* others = shared.others + share * kTurn;
     const auto add = [&](float weight, float slope, int s) {
         const float4 position = positions[s], other = others[s];
         const float2 f = splat_form(own.form, own.rest.x, position.x, position.y);
@@ -179,8 +186,9 @@ __device__ __forceinline__ void sum_samples(const BackwardShared& shared, int ro
             sums.distance += weight * approximate_sqrt_flushed(f.x * f.x + f.y * f.y);
         }
     };
-#pragma unroll 2
-    for (int s = 0; s < kShareSamples; s += 4) {
+#pragma unroll
+    for (int s = 0; s < kWarpSize; s += kShares * kTurn) {
+        if (s >= filled) break;
         const float4 weight = weights[s / 4], slope = slopes[s / 4];
         add(weight.x, slope.x, s);
         add(weight.y, slope.y, s + 1);
@@ -281,7 +289,7 @@ __global__ void __launch_bounds__(kWarpSize) backward_kernel(const __grid_consta
             exchange_splats<kDepth>(forward, least_level, shared, sample, count, lane);
             __syncwarp();
             SplatSums sums;
-            sum_samples<kDepth, kDensity>(shared, row, share, own, sums);
+            sum_samples<kDepth, kDensity>(shared, sample.filled, row, share, own, sums);
             float record[ScreenRecord::kSize];
             make_record(own, sums, record);
             float* target = params.records + static_cast<size_t>(instance) * ScreenRecord::kSize;
