@@ -8,6 +8,8 @@
 // second phase a lane stands for a splat and a share of the samples. It goes from sample to sample, up to the last that
 // is filled, and keeps all sums in its registers. So lanes exchange next to nothing, and a splat costs four 16-byte
 // atomic additions for each item.
+#include <type_traits>
+
 #include "raster/staged_splat.cuh"
 
 namespace turbogs {
@@ -23,11 +25,14 @@ constexpr int kLaneBits = kBucket / kBucketLanes;   // bits of its mask that eac
 constexpr int kListBuckets = kWarpSize / kBucketLanes;  // buckets whose bits become a list at once
 constexpr float kTwoLn2 = 1.3862943611198906f;          // d sigma = 2 ln(2) (u du + v dv)
 
+template <bool kDepth>
 struct BackwardShared {
+    // As float2, those of two samples are one load of 16 bytes, and 28 warps fit an SM, not 27.
+    using Others = std::conditional_t<kDepth, float4, float2>;
     float4 weights[kSplats * kExchangeStride / 4];  // [splat][sample]
     float4 slopes[kSplats * kExchangeStride / 4];   // [splat][sample]: d loss / d sigma
     float4 positions[kWarpSize];                    // of the samples: x, y, gradients of red and green
-    float4 others[kWarpSize];                       // gradient of blue, error, gradient of the depth sum
+    Others others[kWarpSize];                       // gradient of blue, error, if asked for gradient of the depth sum
     StagedSplat splats[kSplats];
     int pending[kListBuckets * kBucket + kSplats];  // intersections to walk, back to front
 };
@@ -60,7 +65,7 @@ struct Sample {
 // needs.
 template <bool kDepth>
 __device__ __forceinline__ Sample load_sample(const BackwardParams& params, int slot, int slot_end,
-                                              const TileFrame& frame, BackwardShared& shared, int lane) {
+                                              const TileFrame& frame, BackwardShared<kDepth>& shared, int lane) {
     const ForwardParams& forward = params.forward;
     const int pixel = slot < slot_end ? forward.pixel_ids[slot] : -1;
     Sample sample = {};
@@ -90,7 +95,8 @@ __device__ __forceinline__ Sample load_sample(const BackwardParams& params, int 
     }
     sample.filled = kWarpSize - __clz(static_cast<int>(__ballot_sync(kFullWarp, pixel >= 0)));
     shared.positions[lane] = make_float4(sample.x, sample.y, sample.red, sample.green);
-    shared.others[lane] = make_float4(sample.blue, error, sample.depth, 0.0f);
+    if constexpr (kDepth) shared.others[lane] = make_float4(sample.blue, error, sample.depth, 0.0f);
+    else shared.others[lane] = make_float2(sample.blue, error);
     return sample;
 }
 
@@ -115,8 +121,8 @@ __device__ __forceinline__ int list_intersections(const uint32_t* masks, int chu
 // Phase 1, lane = sample: (w, d loss / d sigma) of each staged splat. No branches, so that several splats overlap; the
 // power is taken even where it is not needed, as the compiler may branch about it otherwise.
 template <bool kDepth>
-__device__ __forceinline__ void exchange_splats(const ForwardParams& forward, float least_level, BackwardShared& shared,
-                                                Sample& sample, int count, int lane) {
+__device__ __forceinline__ void exchange_splats(const ForwardParams& forward, float least_level,
+                                                BackwardShared<kDepth>& shared, Sample& sample, int count, int lane) {
     float* weights = reinterpret_cast<float*>(shared.weights) + lane;
     float* slopes = reinterpret_cast<float*>(shared.slopes) + lane;
     for (int base = 0; base < count; base += kAhead) {
@@ -156,15 +162,22 @@ struct SplatSums {
 // both are done with the last of the `filled` samples; all lanes leave after the same turn. What a turn reads behind
 // the last sample adds zeros, as every empty sample does.
 template <bool kDepth, bool kDensity>
-__device__ __forceinline__ void sum_samples(const BackwardShared& shared, int filled, int row, int share,
+__device__ __forceinline__ void sum_samples(const BackwardShared<kDepth>& shared, int filled, int row, int share,
                                             const StagedSplat& own, SplatSums& sums) {
     static_assert(kWarpSize % (kShares * kTurn) == 0, "shares of the same size");
     const float4* weights = shared.weights + (row * kExchangeStride + share * kTurn) / 4;
     const float4* slopes = shared.slopes + (row * kExchangeStride + share * kTurn) / 4;
     const float4* positions = shared.positions + share * kTurn;
-    const float4* others = shared.others + share * kTurn;
+    const auto* others = shared.others + share * kTurn;
     const auto add = [&](float weight, float slope, int s) {
-        const float4 position = positions[s], other = others[s];
+        const auto other = others[s];
+        const float4 position = positions[s];
+        // Colours come first: 72 registers with nvcc 13.0, where they were 75 to 77 behind the rest.
+        sums.red += weight * position.z;
+        sums.green += weight * position.w;
+        sums.blue += weight * other.x;
+        sums.error += weight * other.y;
+        sums.weight += weight;
         const float2 f = splat_form(own.form, own.rest.x, position.x, position.y);
         const float slope_u = slope * f.x, slope_v = slope * f.y;
         sums.slope += slope;
@@ -173,12 +186,7 @@ __device__ __forceinline__ void sum_samples(const BackwardShared& shared, int fi
         sums.uu += slope_u * f.x;
         sums.uv += slope_u * f.y;
         sums.vv += slope_v * f.y;
-        sums.red += weight * position.z;
-        sums.green += weight * position.w;
-        sums.blue += weight * other.x;
-        sums.error += weight * other.y;
-        sums.weight += weight;
-        if (kDepth) sums.depth += weight * other.z;
+        if constexpr (kDepth) sums.depth += weight * other.z;
         if (kDensity) {
             sums.absolute_x += fabsf(slope_u);
             sums.absolute_y += fabsf(own.form.y * slope_u + own.form.z * slope_v);
@@ -241,7 +249,7 @@ __device__ __forceinline__ void send_record(float* target, const float record[Sc
 
 template <bool kDepth, bool kDensity>
 __global__ void __launch_bounds__(kWarpSize) backward_kernel(const __grid_constant__ BackwardParams params) {
-    __shared__ BackwardShared shared;
+    __shared__ BackwardShared<kDepth> shared;
     const ForwardParams& forward = params.forward;
     const int lane = threadIdx.x, row = lane % kSplats, share = lane / kSplats;
     const int item = blockIdx.x;
