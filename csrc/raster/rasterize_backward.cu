@@ -5,8 +5,11 @@
 // it, and no others: the forward pass left their bits. It takes `kSplats` at a time, in two phases that exchange their
 // results in shared memory. In the first phase a lane stands for a sample and goes from splat to splat. It recovers the
 // transmittance, and needs one number for all that lies behind. It writes (w, d loss / d sigma) of each splat. In the
-// second phase a lane stands for a splat and a share of the samples. It goes from sample to sample and keeps all sums
-// in its registers. So lanes exchange next to nothing, and a splat costs four 16-byte atomic additions for each item.
+// second phase a lane stands for a splat and a share of the samples. It goes from sample to sample, up to the last that
+// is filled, and keeps all sums in its registers. So lanes exchange next to nothing, and a splat costs four 16-byte
+// atomic additions for each item.
+#include <type_traits>
+
 #include "raster/staged_splat.cuh"
 
 namespace turbogs {
@@ -14,7 +17,7 @@ namespace {
 
 constexpr int kSplats = 16;                         // walked at once; 32 need 13 KB a warp and were 5 to 8 % slower
 constexpr int kShares = kWarpSize / kSplats;        // lanes that sum for one splat
-constexpr int kShareSamples = kWarpSize / kShares;  // samples of such a lane
+constexpr int kTurn = 4;                            // samples of a turn of such a lane: one float4 of a row
 constexpr int kExchangeStride = kWarpSize + 4;      // words: rows of float4 and columns are read without bank conflicts
 constexpr int kAhead = 4;                           // splats whose arithmetic overlaps; 8 were no faster
 constexpr int kBucketLanes = 4;                     // lanes that list the splats of one bucket
@@ -22,11 +25,14 @@ constexpr int kLaneBits = kBucket / kBucketLanes;   // bits of its mask that eac
 constexpr int kListBuckets = kWarpSize / kBucketLanes;  // buckets whose bits become a list at once
 constexpr float kTwoLn2 = 1.3862943611198906f;          // d sigma = 2 ln(2) (u du + v dv)
 
+template <bool kDepth>
 struct BackwardShared {
+    // As float2, those of two samples are one load of 16 bytes, and 28 warps fit an SM, not 27.
+    using Others = std::conditional_t<kDepth, float4, float2>;
     float4 weights[kSplats * kExchangeStride / 4];  // [splat][sample]
     float4 slopes[kSplats * kExchangeStride / 4];   // [splat][sample]: d loss / d sigma
     float4 positions[kWarpSize];                    // of the samples: x, y, gradients of red and green
-    float4 others[kWarpSize];                       // gradient of blue, error, gradient of the depth sum
+    Others others[kWarpSize];                       // gradient of blue, error, if asked for gradient of the depth sum
     StagedSplat splats[kSplats];
     int pending[kListBuckets * kBucket + kSplats];  // intersections to walk, back to front
 };
@@ -52,13 +58,14 @@ struct Sample {
     float transmittance = 1.0f;            // behind the splats walked so far
     float behind = 0.0f;                   // sum of w * (gradient . feature) behind
     int last = -1;                         // intersection
+    int filled = 0;                        // samples of the warp up to the last that is not empty; same in all lanes
 };
 
 // Reads a lane's sample: upstream gradients, and where the forward pass ended. Leaves in shared memory what phase 2
 // needs.
 template <bool kDepth>
 __device__ __forceinline__ Sample load_sample(const BackwardParams& params, int slot, int slot_end,
-                                              const TileFrame& frame, BackwardShared& shared, int lane) {
+                                              const TileFrame& frame, BackwardShared<kDepth>& shared, int lane) {
     const ForwardParams& forward = params.forward;
     const int pixel = slot < slot_end ? forward.pixel_ids[slot] : -1;
     Sample sample = {};
@@ -86,8 +93,10 @@ __device__ __forceinline__ Sample load_sample(const BackwardParams& params, int 
                                  forward.background[2] * sample.blue;
         sample.behind = sample.transmittance * (background - alpha_gradient);
     }
+    sample.filled = kWarpSize - __clz(static_cast<int>(__ballot_sync(kFullWarp, pixel >= 0)));
     shared.positions[lane] = make_float4(sample.x, sample.y, sample.red, sample.green);
-    shared.others[lane] = make_float4(sample.blue, error, sample.depth, 0.0f);
+    if constexpr (kDepth) shared.others[lane] = make_float4(sample.blue, error, sample.depth, 0.0f);
+    else shared.others[lane] = make_float2(sample.blue, error);
     return sample;
 }
 
@@ -109,10 +118,11 @@ __device__ __forceinline__ int list_intersections(const uint32_t* masks, int chu
     return length + __shfl_sync(kFullWarp, sum, kWarpSize - 1);
 }
 
-// Phase 1, lane = sample: (w, d loss / d sigma) of each staged splat. No branches, so that several splats overlap.
+// Phase 1, lane = sample: (w, d loss / d sigma) of each staged splat. No branches, so that several splats overlap; the
+// power is taken even where it is not needed, as the compiler may branch about it otherwise.
 template <bool kDepth>
-__device__ __forceinline__ void exchange_splats(const ForwardParams& forward, float least_level, BackwardShared& shared,
-                                                Sample& sample, int count, int lane) {
+__device__ __forceinline__ void exchange_splats(const ForwardParams& forward, float least_level,
+                                                BackwardShared<kDepth>& shared, Sample& sample, int count, int lane) {
     float* weights = reinterpret_cast<float*>(shared.weights) + lane;
     float* slopes = reinterpret_cast<float*>(shared.slopes) + lane;
     for (int base = 0; base < count; base += kAhead) {
@@ -121,8 +131,8 @@ __device__ __forceinline__ void exchange_splats(const ForwardParams& forward, fl
             const float4 form = shared.splats[base + i].form, rest = shared.splats[base + i].rest;
             const float4 color = shared.splats[base + i].color;
             const float level = splat_level(form, rest, sample.x, sample.y);
-            const bool seen = level >= least_level && __float_as_int(rest.w) <= sample.last;
-            const float raw = seen ? approximate_exp2(level) : 0.0f;
+            const bool seen = (level >= least_level) & (__float_as_int(rest.w) <= sample.last);
+            const float power = approximate_exp2(level), raw = seen ? power : 0.0f;
             const float alpha = fminf(forward.alpha_max, raw);
             const float inverse = approximate_reciprocal(1.0f - alpha);
             sample.transmittance *= inverse;
@@ -148,16 +158,26 @@ struct SplatSums {
     float square = 0.0f;  // g^2
 };
 
-// Phase 2, lane = splat and share: adds the samples of the share to the lane's sums.
+// Phase 2, lane = splat and share: adds the samples of the share to the lane's sums. The shares take turns, so that
+// both are done with the last of the `filled` samples; all lanes leave after the same turn. What a turn reads behind
+// the last sample adds zeros, as every empty sample does.
 template <bool kDepth, bool kDensity>
-__device__ __forceinline__ void sum_samples(const BackwardShared& shared, int row, int share, const StagedSplat& own,
-                                            SplatSums& sums) {
-    const float4* weights = shared.weights + (row * kExchangeStride + share * kShareSamples) / 4;
-    const float4* slopes = shared.slopes + (row * kExchangeStride + share * kShareSamples) / 4;
-    const float4* positions = shared.positions + share * kShareSamples;
-    const float4* others = shared.others + share * kShareSamples;
+__device__ __forceinline__ void sum_samples(const BackwardShared<kDepth>& shared, int filled, int row, int share,
+                                            const StagedSplat& own, SplatSums& sums) {
+    static_assert(kWarpSize % (kShares * kTurn) == 0, "shares of the same size");
+    const float4* weights = shared.weights + (row * kExchangeStride + share * kTurn) / 4;
+    const float4* slopes = shared.slopes + (row * kExchangeStride + share * kTurn) / 4;
+    const float4* positions = shared.positions + share * kTurn;
+    const auto* others = shared.others + share * kTurn;
     const auto add = [&](float weight, float slope, int s) {
-        const float4 position = positions[s], other = others[s];
+        const auto other = others[s];
+        const float4 position = positions[s];
+        // Colours come first: 72 registers with nvcc 13.0, where they were 75 to 77 behind the rest.
+        sums.red += weight * position.z;
+        sums.green += weight * position.w;
+        sums.blue += weight * other.x;
+        sums.error += weight * other.y;
+        sums.weight += weight;
         const float2 f = splat_form(own.form, own.rest.x, position.x, position.y);
         const float slope_u = slope * f.x, slope_v = slope * f.y;
         sums.slope += slope;
@@ -166,12 +186,7 @@ __device__ __forceinline__ void sum_samples(const BackwardShared& shared, int ro
         sums.uu += slope_u * f.x;
         sums.uv += slope_u * f.y;
         sums.vv += slope_v * f.y;
-        sums.red += weight * position.z;
-        sums.green += weight * position.w;
-        sums.blue += weight * other.x;
-        sums.error += weight * other.y;
-        sums.weight += weight;
-        if (kDepth) sums.depth += weight * other.z;
+        if constexpr (kDepth) sums.depth += weight * other.z;
         if (kDensity) {
             sums.absolute_x += fabsf(slope_u);
             sums.absolute_y += fabsf(own.form.y * slope_u + own.form.z * slope_v);
@@ -179,8 +194,9 @@ __device__ __forceinline__ void sum_samples(const BackwardShared& shared, int ro
             sums.distance += weight * approximate_sqrt_flushed(f.x * f.x + f.y * f.y);
         }
     };
-#pragma unroll 2
-    for (int s = 0; s < kShareSamples; s += 4) {
+#pragma unroll
+    for (int s = 0; s < kWarpSize; s += kShares * kTurn) {
+        if (s >= filled) break;
         const float4 weight = weights[s / 4], slope = slopes[s / 4];
         add(weight.x, slope.x, s);
         add(weight.y, slope.y, s + 1);
@@ -233,7 +249,7 @@ __device__ __forceinline__ void send_record(float* target, const float record[Sc
 
 template <bool kDepth, bool kDensity>
 __global__ void __launch_bounds__(kWarpSize) backward_kernel(const __grid_constant__ BackwardParams params) {
-    __shared__ BackwardShared shared;
+    __shared__ BackwardShared<kDepth> shared;
     const ForwardParams& forward = params.forward;
     const int lane = threadIdx.x, row = lane % kSplats, share = lane / kSplats;
     const int item = blockIdx.x;
@@ -281,7 +297,7 @@ __global__ void __launch_bounds__(kWarpSize) backward_kernel(const __grid_consta
             exchange_splats<kDepth>(forward, least_level, shared, sample, count, lane);
             __syncwarp();
             SplatSums sums;
-            sum_samples<kDepth, kDensity>(shared, row, share, own, sums);
+            sum_samples<kDepth, kDensity>(shared, sample.filled, row, share, own, sums);
             float record[ScreenRecord::kSize];
             make_record(own, sums, record);
             float* target = params.records + static_cast<size_t>(instance) * ScreenRecord::kSize;
