@@ -192,13 +192,17 @@ class PixelSamples:
             views: positions in the batch of their views.
             slots: of these tiles.
         """
-        tile_ids, tile_offsets = self.tile_ids[tiles], self.tile_offsets[tiles.start : tiles.stop + 1]
+        tile_offsets = self.tile_offsets[tiles.start : tiles.stop + 1]
         first = len(TileGrid(self.sizes[: views.start], self.origin))
+        if len(self.tile_ids) == len(self.grid):  # all tiles, so their numbers are there already
+            tile_ids = self.tile_ids[tiles.start - first : tiles.stop - first]
+        else:
+            tile_ids = self.tile_ids[tiles] - first
         return PixelSamples(
             self.view_ids[views],
             self.sizes[views],
             self.pixel_ids[slots],
-            tile_ids - first if first else tile_ids,
+            tile_ids,
             tile_offsets - slots.start if slots.start else tile_offsets,
             None if self.weights is None else self.weights[slots],
             self.has_empty_slots,
