@@ -45,12 +45,13 @@ def free_device_memory(device: torch.device) -> None:
 
 
 def memory_bytes(device: torch.device) -> int:
-    """Of the tensors on a GPU now, or the peak of this process on a CPU. Does not wait for the GPU."""
+    """Of the tensors on a GPU now, without the memory that processes share (`distributed.peer_memory`), or the peak of
+    this process on a CPU. Does not wait for the GPU."""
     return torch.cuda.memory_allocated(device) if device.type == "cuda" else peak_memory_bytes(device)
 
 
 def peak_memory_bytes(device: torch.device) -> int:
-    """Peak of the tensors' memory on a GPU, or of this process on a CPU."""
+    """Peak of the tensors' memory on a GPU, as `memory_bytes` counts it, or of this process on a CPU."""
     if device.type == "cuda":
         return torch.cuda.max_memory_allocated(device)
     import resource  # not on Windows

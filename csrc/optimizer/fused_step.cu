@@ -303,10 +303,6 @@ __global__ void __launch_bounds__(kBackwardThreads, kStepBlocks) fused_step_kern
     update_harmonics<kCopied>(params, optimizer, block, block_corrections);
 }
 
-}  // namespace
-
-namespace {
-
 template <bool kCopied>
 cudaError_t launch(const ScreenBackwardParams& params, const OptimizerParams& optimizer, cudaStream_t stream) {
     const auto kernel = optimizer.kind == UpdateKind::kAdam ? fused_step_kernel<Rows::kNone, kCopied>

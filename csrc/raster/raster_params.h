@@ -154,9 +154,7 @@ struct BackwardParams {
     float* records;                // [K, N, 16] out, ScreenRecord; off screen zero, or where `cleared`, left alone
 };
 
-// The records of one process's views, for rows of Gaussians that another one makes the step of. V views of the source,
-// N Gaussians there; K views of the target, and M rows.
-// What a process has rendered of a batch.
+// What a process has rendered of a batch: V views of N Gaussians.
 struct CollectSource {
     const float4* records;  // [V, N, 4], ScreenRecord
     const int2* radii;      // [V, N]
@@ -164,6 +162,7 @@ struct CollectSource {
     int first_view;         // of the batch
 };
 
+// The records of all processes in all K views, for M rows of Gaussians that one of them makes the step of.
 struct CollectParams {
     int num_sources;                   // processes with views, in their order
     CollectSource sources[kMaxPeers];  // each begins with the last view of the one before, or the next

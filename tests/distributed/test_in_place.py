@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 from helpers.framework_runs import tiny_capture, tiny_settings
+from helpers.models import random_gaussians
 from helpers.peer_files import KeepingEngine, PeerFiles
 from helpers.processes import ended, grouped, said, start_ranks
 
@@ -20,6 +21,7 @@ from turbogs_plugin.distributed.ranks import ProcessRanks
 from turbogs_plugin.distributed.rows import rows_of
 from turbogs_plugin.distributed.shared_model import SharedModel
 from turbogs_plugin.engine.layout import ScreenRecord
+from turbogs_plugin.engine.protocol import ModelCopies
 from turbogs_plugin.engine.reference.engine import ReferenceEngine
 from turbogs_plugin.engine.rendered import ScreenRecords
 from turbogs_plugin.model.torch_file import leaves
@@ -227,6 +229,19 @@ class Alone:
 
     def gather_numbers(self, values: list[int]) -> list[list[int]]:
         return [values, [self.others.pop(0)]]
+
+
+def test_a_model_may_be_placed_over_itself_and_others_have_the_same_places():
+    model = random_gaussians(40)
+    memory = SharedModel(Alone(), lambda ranks, size, device: PeerMemory([torch.zeros(size) for _ in range(2)], print))
+    whole = memory.place(model)
+    half = memory.place(whole.map(lambda value: value[::2]))  # of the very memory that it overwrites
+    (other,) = memory.others(half)
+    assert memory.others(whole) is None
+    for name, value in half.items():
+        assert torch.equal(value, getattr(model, name)[::2]), name
+        assert getattr(other, name).shape == value.shape
+    assert len(set(ModelCopies(half, [other]).distances)) == 1
 
 
 def test_small_memories_grow_by_more_than_large_ones():

@@ -118,6 +118,8 @@ def test_other_runs_on_two_gpus_keep_their_replicas_equal(tmp_path: Path, case):
     assert start(2, command, "cuda") == 0
     lines = [json.loads(line) for line in (out / "history.jsonl").read_text().splitlines()]
     assert lines[-1]["iteration"] == 150 and len({line["num_gaussians"] for line in lines}) > 1
+    model = load_checkpoint(latest_checkpoint(out / "checkpoints"))["trainer"]["gaussians"]
+    assert all(value.untyped_storage().nbytes() == value.nbytes for value in model.values()), "room to spare is saved"
 
 
 @pytest.mark.skipif(torch.cuda.device_count() < 2, reason="needs two GPUs")

@@ -12,6 +12,9 @@ from helpers.simulated_time import SimulatedTime
 from turbogs_plugin.strategies.pixel_sampling import ErrorGuidedPixelSampler
 
 from turbogs_plugin.config.configuration import load_config
+from turbogs_plugin.distributed.exchange import Exchange
+from turbogs_plugin.distributed.peer_memory import PeerMemory
+from turbogs_plugin.distributed.shared_model import SharedModel
 from turbogs_plugin.plan.caps import EXPECTED_GROWTH, growth_cap, growth_room
 from turbogs_plugin.plan.memory import MemoryDemand
 from turbogs_plugin.plan.pixels import TOLERANCE, pixel_budget_range, pixels_for_time, with_pixel_budget
@@ -214,6 +217,19 @@ def test_iterations_are_timed_with_the_lambda_asked_for(scene):
         rates.clear()
         trial.seconds_with(3.5, 0.0)
     assert rates and rates == pytest.approx([0.5] * len(rates))
+
+
+def test_half_the_model_and_all_of_it_are_of_one_model(scene, monkeypatch):
+    """Also where a trainer places one model over the other, as several processes that share memory do."""
+    ranks = SimpleNamespace(rank=0, count=2)
+    shared = SharedModel(ranks, lambda ranks, size, device: PeerMemory([torch.zeros(size) for _ in range(2)], print))
+    monkeypatch.setattr(Exchange, "place", lambda exchange, gaussians: shared.place(gaussians))
+    trial = calibration._Trial(tiny_config(Path("capture")).without_plan(), scene, CPU)
+    first = trial._model.map(torch.clone)
+    with torch.no_grad():
+        trial.cost(0.0)
+    for name, value in trial._model.items():
+        assert torch.equal(value, getattr(first, name)), name
 
 
 def test_what_passes_before_the_first_iteration_is_not_planned_with(scene, monkeypatch):

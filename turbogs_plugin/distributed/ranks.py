@@ -85,7 +85,7 @@ class ProcessRanks(Ranks):
     Attributes:
         asked: number of the signal by which this process wants all to stop; 0: none.
         latest: `time.monotonic` of the latest sign of progress; infinite while `working`.
-        reads_peers: all processes may read each other's memory in place, as far as they have tried.
+        reads_peers: all processes may use each other's memory in place, as far as they have tried.
     """
 
     def __init__(self) -> None:

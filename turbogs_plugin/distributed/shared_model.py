@@ -35,8 +35,8 @@ class SharedModel:
         self._others: list[Gaussians] = []
 
     def place(self, gaussians: Gaussians) -> Gaussians:
-        """Copy a model into this memory. Every process must call this, with models of one size, when no step is under
-        way.
+        """Copy a model into this memory, over the one placed before, of which nothing is left. Every process must call
+        this, with models of one size, when no step is under way.
 
         Returns:
             The model there; the given one, where there is no such memory.

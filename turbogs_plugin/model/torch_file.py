@@ -62,10 +62,21 @@ def read_plain(path: Path, name: str, remedy: str = "") -> Any:
 def save_plain(path: Path, state: Any) -> None:
     """`torch.save` into a file that is written whole or not at all. Raises `OSError` if the disk refused."""
     try:
-        write_atomically(path, lambda file: torch.save(state, file), large=True)
+        write_atomically(path, lambda file: torch.save(_alone(state), file), large=True)
     except RuntimeError as error:  # of torch, about positions in the file
         cause = error.__context__
         raise cause if isinstance(cause, OSError) else OSError(str(error).splitlines()[0]) from error
+
+
+def _alone(value: Any) -> Any:
+    """The same, with tensors of a GPU that are parts of a larger storage copied to the host, as torch saves whole
+    storages. Those of the host are left: maps there may lie in files."""
+    if isinstance(value, dict):
+        return {key: _alone(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return type(value)(map(_alone, value))
+    part = isinstance(value, Tensor) and value.is_cuda and value.untyped_storage().nbytes() > value.nbytes
+    return value.cpu() if part else value
 
 
 def leaves(value: Any, place: str) -> Iterator[tuple[str, Any]]:

@@ -214,7 +214,7 @@ class _Trial:
     def __init__(self, config: Config, scene: Scene, device: torch.device, ranks: Ranks = ONE) -> None:
         self._config, self._ranks = caps.without_growth(config), ranks
         self._trainer = Trainer(self._config, scene, device, ranks=ranks)
-        self._model = self._trainer.gaussians
+        self._model = self._trainer.gaussians.map(torch.clone)  # the trainer may place the next one over it
         self._device = device
         self.gaussians = len(self._model)
 

@@ -174,6 +174,7 @@ class Trainer:
 
         # 9) and 10) Backward to the parameters, solve for their updates and apply them; adds to `stats`
         self.update(screen, stats, step)
+        del rendered, screen  # they hold the model, which may be replaced now
 
         # 11) Density control (the paper's: error-driven)
         self.follow(self.refine(step))
@@ -305,13 +306,15 @@ class Trainer:
 
     @property
     def gaussians(self) -> Gaussians:
-        """The model. With several processes, GPU work enqueued after this waits until every update has arrived."""
+        """The model. With several processes, GPU work enqueued after this waits until every update has arrived, and
+        the next model may overwrite these tensors: clone what is to be kept."""
         self.exchange.finish()
         return self._gaussians
 
     @gaussians.setter
     def gaussians(self, gaussians: Gaussians) -> None:
         self.exchange.finish()
+        self._gaussians = None  # memory that several processes share lets go of it where it has to grow
         self._gaussians = self.exchange.place(gaussians)
 
     @property

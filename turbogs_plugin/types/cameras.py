@@ -82,10 +82,11 @@ class Cameras:
 
     def _stack(self) -> None:
         """Give selected cameras matrices of their own."""
-        if self._rows is not None:
+        rows = self._rows
+        if rows is not None:
             # Stacked, not indexed: so no index has to be copied to the device.
-            viewmats, Ks = (torch.stack([of[row] for row in self._rows]) for of in (self._viewmats, self._Ks))
-            self._rows, self._viewmats, self._Ks = None, viewmats, Ks
+            viewmats, Ks = (torch.stack([of[row] for row in rows]) for of in (self._viewmats, self._Ks))
+            self._viewmats, self._Ks, self._rows = viewmats, Ks, None
 
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Cameras:
         return Cameras(self.viewmats.to(device, dtype), self.Ks.to(device, dtype), self.sizes)
