@@ -106,7 +106,8 @@ def _allocate(ranks: ProcessRanks, size: int, memory: None) -> PeerMemory | None
     # As `symmetric.empty` does, but never from a pool: what one process has kept from earlier runs there, another may
     # not, and only one of the two would then wait for the other.
     device = torch.device("cuda", torch.cuda.current_device())
-    torch.cuda.empty_cache()  # this memory comes from the driver, which does not get what torch keeps
+    if torch.cuda.mem_get_info(device)[0] < 8 * size:  # the driver gives this memory, without what torch keeps
+        torch.cuda.empty_cache()
     own = symmetric._SymmetricMemory.empty_strided_p2p((size,), (1,), torch.float32, device)
     return PeerMemory([own.zero_()], lambda channel: None)
 
