@@ -34,13 +34,13 @@ after a device synchronization. It lives on until none has it mapped.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
 from turbogs_plugin.device import synchronize
-from turbogs_plugin.distributed.peer_memory import PeerMemory, aligned_starts, share_memory, with_room
+from turbogs_plugin.distributed.peer_memory import PeerMemory, Sharing, aligned_starts, share_memory, with_room
 from turbogs_plugin.distributed.ranks import ProcessRanks
 from turbogs_plugin.distributed.shares import Share
 from turbogs_plugin.engine.layout import PassStatus, ScreenRecord
@@ -62,9 +62,7 @@ class InPlace:
         share: gives memory that all read, or None.
     """
 
-    def __init__(
-        self, ranks: ProcessRanks, share: Callable[[ProcessRanks, int, torch.device], PeerMemory | None] = share_memory
-    ) -> None:
+    def __init__(self, ranks: ProcessRanks, share: Sharing = share_memory) -> None:
         self._ranks, self._share = ranks, share
         self._memory: PeerMemory | None = None
         self._possible = True

@@ -72,6 +72,10 @@ class PeerMemory:
     owner: Any = None
 
 
+Sharing = Callable[[ProcessRanks, int, torch.device], PeerMemory | None]
+"""What gives memory to all processes, as `share_memory` does; tests have others."""
+
+
 def share_memory(ranks: ProcessRanks, size: int, device: torch.device) -> PeerMemory | None:
     """Memory for `size` numbers of every process. Every process must call this, with one size.
 

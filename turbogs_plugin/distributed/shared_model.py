@@ -5,13 +5,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from itertools import pairwise
 
 import torch
 
 from turbogs_plugin.device import synchronize
-from turbogs_plugin.distributed.peer_memory import PeerMemory, aligned_starts, share_memory, with_room
+from turbogs_plugin.distributed.peer_memory import PeerMemory, Sharing, aligned_starts, share_memory, with_room
 from turbogs_plugin.distributed.ranks import ProcessRanks
 from turbogs_plugin.types import Gaussians
 
@@ -24,9 +23,7 @@ class SharedModel:
         share: gives memory that all write to, or None.
     """
 
-    def __init__(
-        self, ranks: ProcessRanks, share: Callable[[ProcessRanks, int, torch.device], PeerMemory | None] = share_memory
-    ) -> None:
+    def __init__(self, ranks: ProcessRanks, share: Sharing = share_memory) -> None:
         self._ranks, self._share = ranks, share
         self._memory: PeerMemory | None = None
         self._possible = True
