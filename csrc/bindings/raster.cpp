@@ -164,7 +164,7 @@ void launches::CollectRecords::run(const Arguments<CollectRecords>& in) {
     for (int i = 0; i < params.num_sources; ++i) {
         const int64_t views = in.tensor(kRadii[i]).size(0), first = *in.row(i, 1);
         STD_TORCH_CHECK(views > 0 && (first == end || (i > 0 && first == end - 1)),
-                        "turbogs: the views of a process begin with the last one of the process before it, or the next");
+                        "turbogs: the views of a process begin with the last one of the process before, or the next");
         end = first + views;
         params.sources[i].num_views = to_int(views, "views");
         params.sources[i].first_view = to_int(first, "views");

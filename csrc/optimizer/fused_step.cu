@@ -169,7 +169,8 @@ __device__ __forceinline__ void update_row(const ScreenBackwardParams& params, c
 #pragma unroll
     for (int i = 0; i < 3; ++i) {
         put<kCopied>(optimizer, params.means + triple + i, __fadd_rn(old.mean[i], terms.adam[Place::kMeans + i]));
-        put<kCopied>(optimizer, params.scales + triple + i, __fadd_rn(old.log_scale[i], terms.adam[Place::kScales + i]));
+        put<kCopied>(optimizer, params.scales + triple + i,
+                     __fadd_rn(old.log_scale[i], terms.adam[Place::kScales + i]));
         put<kCopied>(optimizer, params.sh0 + triple + i, __fadd_rn(old.sh0[i], terms.adam[Place::kSh0 + i]));
     }
     const float* turn = terms.adam + Place::kQuats;

@@ -1,12 +1,12 @@
-// Gradients on the screen of some rows of Gaussians, out of the records of all processes, each of which rendered some of
-// the views, or a part of one. Defined by turbogs_plugin/engine/reference/records.py.
+// Gradients on the screen of some rows of Gaussians, out of the records of all processes, each of which rendered some
+// of the views, or a part of one. Defined by turbogs_plugin/engine/reference/records.py.
 //
 // The sources may be other GPUs' memory, mapped here: what is not read does not travel. A thread takes one Gaussian
 // in one view and reads its radii, 8 bytes. Those of a warp that are on screen, two fifths or so, make a list in shared
-// memory, and four threads copy each record, so that they read whole sectors. A thread has all of its reads of a process
-// under way before it adds or writes, because a read from another GPU takes some thousand clocks. A view of several
-// processes is added up in their order. Plain loads: what another GPU has written lies in no cache of this one when a
-// kernel begins.
+// memory, and four threads copy each record, so that they read whole sectors. A thread has all of its reads of a
+// process under way before it adds or writes, because a read from another GPU takes some thousand clocks. A view of
+// several processes is added up in their order. Plain loads: what another GPU has written lies in no cache of this one
+// when a kernel begins.
 #include "common/warp.cuh"
 #include "raster/raster_params.h"
 
@@ -47,8 +47,8 @@ __global__ void __launch_bounds__(kCollectThreads) collect_kernel(const __grid_c
     for (int i = first; i < params.num_sources; ++i) {
         const CollectSource& source = params.sources[i];
         if (!has_view(source, view, own)) break;  // those of a view follow each other
-        const float4* records =
-            source.records + (static_cast<size_t>(own) * params.num_gaussians + params.first_row + warp_row) * kRecordQuads;
+        const size_t place = static_cast<size_t>(own) * params.num_gaussians + params.first_row + warp_row;
+        const float4* records = source.records + place * kRecordQuads;
         float4 read[kRecordQuads];
 #pragma unroll
         for (int step = 0; step < kRecordQuads; ++step) {

@@ -1,8 +1,8 @@
-// The colours of all processes of a batch, one after the other, out of memory in which each has left its own. Defined by
-// turbogs_plugin/engine/reference/records.py.
+// The colours of all processes of a batch, one after the other, out of memory in which each has left its own. Defined
+// by turbogs_plugin/engine/reference/records.py.
 //
-// The sources may be other GPUs' memory, mapped here. A row of blocks copies one process's colours, number by number, as
-// they begin at any multiple of three numbers in the result; a thread has several reads under way before its first
+// The sources may be other GPUs' memory, mapped here. A row of blocks copies one process's colours, number by number,
+// as they begin at any multiple of three numbers in the result; a thread has several reads under way before its first
 // write, because a read from another GPU takes some thousand clocks. One thread looks at the flags of all processes. It
 // may set this process's own flag while another process reads it: what it sets is what the other one finds anyway.
 #include "raster/raster_params.h"
