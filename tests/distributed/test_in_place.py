@@ -108,6 +108,7 @@ def same(first: dict, second: dict) -> None:
 def every_case(capture: Path, folder: Path) -> None:
     """In every process: each case by messages and in place; the memory grows by an event of density control."""
     ranks = grouped()
+    in_place.LEAST = shared_model.LEAST = 0  # these memories are files
     for name in CASES if ranks.count == 2 else OF_THREE:
         by_rows, overrides = CASES[name]
         wanted = run(trainer_of(capture, ranks, by_rows, overrides), [False] * STEPS)
@@ -164,7 +165,7 @@ def without_some_memory(capture: Path, ranks: ProcessRanks, folder: Path, wanted
 def growing(capture: Path, ranks: ProcessRanks, folder: Path, wanted: dict) -> None:
     """Without room to spare, the event before the last iteration makes the memory of the model grow."""
     before = in_place.with_room
-    in_place.with_room = shared_model.with_room = int  # as much as is asked for
+    in_place.with_room = shared_model.with_room = lambda numbers, *least: numbers
     files = PeerFiles(folder / "growing")
     trainer = keeping(trainer_of(capture, ranks, True, ()), files)
     counts = [len(trainer.gaussians)]
@@ -246,6 +247,7 @@ def test_a_model_may_be_placed_over_itself_and_others_have_the_same_places():
 
 def test_small_memories_grow_by_more_than_large_ones():
     assert [peer_memory.with_room(numbers) for numbers in (0, 1, 1000, 4 << 26)] == [0, 2, 2000, 5 << 26]
+    assert [peer_memory.with_room(numbers, 9) for numbers in (0, 4, 5)] == [9, 9, 10]
 
 
 def test_there_is_no_such_memory_on_a_cpu():

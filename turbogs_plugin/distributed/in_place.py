@@ -40,7 +40,7 @@ import torch
 from torch import Tensor
 
 from turbogs_plugin.device import synchronize
-from turbogs_plugin.distributed.peer_memory import PeerMemory, Sharing, aligned_starts, share_memory, with_room
+from turbogs_plugin.distributed.peer_memory import LEAST, PeerMemory, Sharing, aligned_starts, share_memory, with_room
 from turbogs_plugin.distributed.ranks import ProcessRanks
 from turbogs_plugin.distributed.shares import Share
 from turbogs_plugin.engine.layout import PassStatus, ScreenRecord
@@ -115,7 +115,7 @@ class InPlace:
             self._slots = with_room(3 * slots) // 3
         if instances > self._instances:
             width = 2 + ScreenRecord.SIZE
-            self._instances = with_room(width * instances) // width
+            self._instances = with_room(width * instances, LEAST) // width
         sizes = (PassStatus.SIZE, 3 * self._slots, 2 * self._instances, ScreenRecord.SIZE * self._instances)
         self._starts = aligned_starts(sizes)
         self._read = False

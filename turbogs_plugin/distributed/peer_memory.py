@@ -38,17 +38,17 @@ PROOF_MILLISECONDS = 60_000
 the first process may evaluate for an hour; a process that is lost is noticed by its launcher."""
 
 
-SMALL = 1 << 26
-"""Numbers of a memory, 256 MiB, below which there is room to spare."""
+LEAST, SMALL = 1 << 24, 1 << 26
+"""Numbers that a memory for many has at least, 64 MiB; and below which there is room to spare, 256 MiB."""
 
 ALIGNMENT = 64
 """What lies in a memory begins at a multiple of so many numbers."""
 
 
-def with_room(numbers: int) -> int:
+def with_room(numbers: int, least: int = 0) -> int:
     """What a memory that must grow for so many numbers gets: twice as much while it is small, as all processes wait for
-    each other and their GPUs when it grows; else a quarter more."""
-    return 2 * numbers if numbers < SMALL else numbers + numbers // 4
+    each other and their GPUs when it grows; else a quarter more. At least `least`."""
+    return max(least, 2 * numbers if numbers < SMALL else numbers + numbers // 4)
 
 
 def aligned_starts(sizes: Iterable[int]) -> list[int]:

@@ -10,7 +10,7 @@ from itertools import pairwise
 import torch
 
 from turbogs_plugin.device import synchronize
-from turbogs_plugin.distributed.peer_memory import PeerMemory, Sharing, aligned_starts, share_memory, with_room
+from turbogs_plugin.distributed.peer_memory import LEAST, PeerMemory, Sharing, aligned_starts, share_memory, with_room
 from turbogs_plugin.distributed.ranks import ProcessRanks
 from turbogs_plugin.types import Gaussians
 
@@ -45,7 +45,7 @@ class SharedModel:
             if self._memory is not None:
                 synchronize(gaussians.device)  # as in `InPlace`
             self._placed, self._others, self._memory = None, [], None
-            self._room = with_room(starts[-1])
+            self._room = with_room(starts[-1], LEAST)
             self._memory = self._share(self._ranks, self._room, gaussians.device)
             if self._memory is None:
                 self._possible = False
