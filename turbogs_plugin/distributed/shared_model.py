@@ -5,9 +5,10 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
+from collections.abc import Sequence
 
 import torch
+from torch import Tensor
 
 from turbogs_plugin.device import synchronize
 from turbogs_plugin.distributed.peer_memory import LEAST, PeerMemory, Sharing, aligned_starts, share_memory, with_room
@@ -50,14 +51,7 @@ class SharedModel:
             if self._memory is None:
                 self._possible = False
                 return gaussians
-        models = []
-        for part in self._memory.parts:
-            places = iter(pairwise(starts))
-
-            def placed(value: torch.Tensor, part: torch.Tensor = part, places=places) -> torch.Tensor:
-                return part[next(places)[0] :][: value.numel()].view(value.shape)
-
-            models.append(gaussians.map(placed))
+        models = [_laid_out(gaussians, part, starts) for part in self._memory.parts]
         own = models.pop(self._ranks.rank)
         # Their memory may overlap: a model that lies there already, of another size.
         fresh = gaussians.map(torch.clone) if self._holds(gaussians) else gaussians
@@ -73,3 +67,9 @@ class SharedModel:
     def _holds(self, gaussians: Gaussians) -> bool:
         own = self._memory.parts[self._ranks.rank]
         return gaussians.means.untyped_storage().data_ptr() == own.untyped_storage().data_ptr()
+
+
+def _laid_out(like: Gaussians, part: Tensor, starts: Sequence[int]) -> Gaussians:
+    """A model of these shapes in a part of memory, its parameters from these numbers on."""
+    values = zip(like.items(), starts, strict=False)
+    return Gaussians(**{name: part[at : at + value.numel()].view(value.shape) for (name, value), at in values})
