@@ -102,7 +102,7 @@ def headline() -> str:
     for study, variant, name in OURS:
         for capture, row in shown(study, variant).items():
             seconds, ssim, gaussians = (row.spread(measure).mean for measure in ("seconds", "ssim", "gaussians"))
-            wall = duration(wall_seconds(variant, capture))
+            wall = whole_command(variant, capture)
             seeds = f" ({len(row.cells)})" if len(row.cells) > 1 else ""
             lines.setdefault(name, {})[capture] = f"{result(seconds, row.psnr, ssim, gaussians, wall)}{seeds}"
     return by_capture("", lines)
@@ -126,10 +126,13 @@ def by_capture(head: str, lines: dict[str, dict[str, str]]) -> str:
     return table((head, *CAPTURES), rows)
 
 
-def wall_seconds(variant: str, capture: str) -> float:
-    """Of a whole `turbogs train`, the run in the middle of `turbogs bench wall`; NaN where that is not measured."""
+def whole_command(variant: str, capture: str) -> str:
+    """Seconds of a whole `turbogs train`, the run in the middle of `turbogs bench wall`, with a sign where they are not
+    of README's commit."""
     report = json.loads(machine_tables.WALL.read_text()).get(variant, {}).get(capture)
-    return report["median"]["seconds"] if report else math.nan
+    if not report:
+        return duration(math.nan)
+    return duration(report["median"]["seconds"]) + ("°" if mark(report["provenance"]["commit"]) else "")
 
 
 def ahead() -> str:

@@ -310,7 +310,7 @@ def test_captions_are_of_the_pictures_record(tmp_path, monkeypatch):
 
 def test_a_number_changed_by_hand_is_found():
     text = make_pages.PAGES[0].read_text()
-    row = r"\*\*turbogs\*\* \| [\d.]+ / [\d.-]+ s, ([\d.]+) \[([\d.]+), ([\d.]+)\] dB"
+    row = r"\*\*turbogs\*\* \| [\d.]+ / [\d.°-]+ s, ([\d.]+) \[([\d.]+), ([\d.]+)\] dB"
     (found,) = re.finditer(row, text)
     for place in map(found.span, (1, 2, 3)):  # the mean, the lowest, the highest
         changed = f"{text[: place[0]]}33.99{text[place[1] :]}"
