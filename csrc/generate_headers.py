@@ -1,7 +1,7 @@
 """Makes the C++ headers of what Python and the kernels share. setup.py calls it; nothing that it writes is committed.
 
 - ``layout.h``: the sizes and layouts of turbogs_plugin/engine/layout.py.
-- ``launches.h``: the fields of each launch, from turbogs_plugin/engine/cuda/launches.py, in the order in which Python
+- ``launches.h``: the fields of each launch, from turbogs_plugin/engine/cuda/launches, in the order in which Python
   sends them, and the declaration of its function ``run``, which csrc/bindings defines.
 """
 
@@ -15,7 +15,7 @@ from types import ModuleType
 
 ROOT = Path(__file__).resolve().parent.parent
 LAYOUT = ROOT / "turbogs_plugin/engine/layout.py"
-LAUNCHES = ROOT / "turbogs_plugin/engine/cuda/launches.py"
+LAUNCHES = ROOT / "turbogs_plugin/engine/cuda/launches/__init__.py"
 CONSTANTS = {
     ROOT / "turbogs_plugin/types/samples.py": ("TILE_SIZE",),
     ROOT / "turbogs_plugin/tiles.py": ("CELL_SIDE",),
@@ -27,8 +27,9 @@ ENUMERATIONS = {"UNITS": "SampleUnit", "STRUCTURES": "Structure", "UPDATE_KINDS"
 
 
 def load(path: Path) -> ModuleType:
-    """A module of one file, without the package around it, which would import torch."""
-    spec = importlib.util.spec_from_file_location(f"turbogs_build_{path.stem}", path)
+    """A module of one file, or a package, without the packages around it, which would import torch."""
+    folders, name = (None, path.stem) if path.stem != "__init__" else ([str(path.parent)], path.parent.name)
+    spec = importlib.util.spec_from_file_location(f"turbogs_build_{name}", path, submodule_search_locations=folders)
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module
     spec.loader.exec_module(module)

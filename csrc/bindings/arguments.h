@@ -1,7 +1,7 @@
 // What every operator needs: the arguments of its launch by name, pointers of its tensors that are checked, torch's
 // current stream, and the errors of launches.
 //
-// Python sends the fields of a launch as four lists (turbogs_plugin/engine/cuda/launches.py). launches.h, which the
+// Python sends the fields of a launch as four lists (turbogs_plugin/engine/cuda/launches). launches.h, which the
 // build makes of the same file, has the order of the fields, so they are read by name here. It declares a function
 // `run` for each launch. The other files of this folder define them: each checks its tensors, then hands raw pointers
 // and torch's current stream to a launcher of the kernels. Buffers are made by Python.
@@ -204,7 +204,7 @@ private:
     int previous_ = 0;
 };
 
-// Pixels by which the grid of tiles begins before the images of a batch. `Launch` has the fields of launches.py's
+// Pixels by which the grid of tiles begins before the images of a batch. `Launch` has the fields of Python's
 // `GridOrigin`.
 template <class Launch>
 void read_origin(const Arguments<Launch>& in, int& x, int& y) {

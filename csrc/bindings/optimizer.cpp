@@ -11,7 +11,7 @@ namespace {
 
 constexpr float kRateMin = 1.0842021724855044e-19f;  // sqrt(FLT_MIN): the damping of a rate of zero stays finite
 
-// What both operators work on. `Launch` has the fields of launches.py's `ScreenBackward`.
+// What both operators work on. `Launch` has the fields of Python's `ScreenBackward`.
 template <class Launch>
 ScreenBackwardParams read_screen(const Arguments<Launch>& in) {
     using T = typename Launch::Tensors;

@@ -6,7 +6,7 @@
 namespace turbogs {
 namespace {
 
-// What stages 5 and 6 have in common. `Launch` has the fields of launches.py's `RasterForward`.
+// What stages 5 and 6 have in common. `Launch` has the fields of Python's `RasterForward`.
 template <class Launch>
 ForwardParams read_forward(const Arguments<Launch>& in) {
     using T = typename Launch::Tensors;

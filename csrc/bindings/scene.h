@@ -7,7 +7,7 @@
 
 namespace turbogs {
 
-// `Launch` has the fields of launches.py's `Scene`.
+// `Launch` has the fields of Python's `Scene`.
 template <class Launch>
 void read_scene(const Arguments<Launch>& in, SceneParams& scene) {
     using T = typename Launch::Tensors;

@@ -33,7 +33,7 @@ OBJECTS = {
     "LossSettings": LossTerms,
     "ExposureArrays": Exposures,
 }
-"""What stands for the protocols of launches.py."""
+"""What stands for the protocols of `launches`."""
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +55,7 @@ def constants(text: str) -> dict[str, int]:
 
 
 def marked(cls, prefix=()):
-    """An object of a class of launches.py whose every field names itself, and the fields by list in their order."""
+    """An object of a class of `launches` whose every field names itself, and the fields by list in their order."""
     fields, lists = {}, {"Tensors": [], "Integers": [], "Reals": [], "rows": []}
     kinds = {"Tensor": "Tensors", "Tensor | None": "Tensors", "int": "Integers", "bool": "Integers", "float": "Reals"}
     for name, annotation in launches.annotations(cls).items():
@@ -66,7 +66,7 @@ def marked(cls, prefix=()):
             fields[name] = (*prefix, name)
             lists[kinds[annotation]].append(fields[name])
         else:
-            fields[name], nested = marked(getattr(launches, annotation), (*prefix, name))
+            fields[name], nested = marked(launches.nested_type(cls, annotation), (*prefix, name))
             for kind, names in nested.items():
                 lists[kind] += names
     return (cls if dataclasses.is_dataclass(cls) else SimpleNamespace)(**fields), lists
