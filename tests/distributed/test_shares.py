@@ -62,7 +62,7 @@ def test_shares_are_the_samples_in_their_order(sizes, views, count, unit, masked
 @pytest.mark.parametrize("views", [1, 3, 5])
 def test_shares_are_nearly_even(views, count):
     samples = samples_of(EQUAL, views)
-    sizes = [share.slots.stop - share.slots.start for share in shares_of(samples, count)]
+    sizes = [share.num_slots for share in shares_of(samples, count)]
     even, tile = len(samples) / count, 256 * 0.1
     assert max(abs(size - even) for size in sizes) <= 2 * (NEARLY * even + tile)
 
@@ -93,7 +93,7 @@ def test_a_view_without_samples_is_begun_once(empty, count):
     samples = samples_of(EQUAL, 3, masks=masks)
     shares = shares_of(samples, count)
     assert [view for share in shares for view in range(3)[share.begun]] == [0, 1, 2]
-    assert sum(share.slots.stop - share.slots.start for share in shares) == len(samples)
+    assert sum(share.num_slots for share in shares) == len(samples)
 
 
 def assert_ends_are_known(samples: PixelSamples) -> None:

@@ -84,7 +84,7 @@ class Kept:
             torch.testing.assert_close(records[seen], target.records[seen], rtol=0, atol=0, equal_nan=True)
         ranks = self.screens[0][0]._batch.ranks
         for shares, own, found in self.colors:
-            counts = [share.slots.stop - share.slots.start for share in shares]
+            counts = [share.num_slots for share in shares]
             sent = found.new_zeros(max(counts), 3)
             if own is not None:
                 sent[: len(own)] = own

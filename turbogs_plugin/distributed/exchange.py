@@ -222,7 +222,7 @@ class RankExchange(Exchange):
 
     def _sent_colors(self, engine: Engine, own: Tensor | None, shares: Sequence[Share], like: Tensor) -> Tensor:
         """[P, 3] the colours of all samples, by a message to all; sets `_seen` and the engine's own flag."""
-        counts = [share.slots.stop - share.slots.start for share in shares]
+        counts = [share.num_slots for share in shares]
         most = max(counts)
         sent = like.new_zeros(most + 1, 3)
         if own is not None:

@@ -82,7 +82,7 @@ class InPlace:
         """
         if not self._possible:
             return False
-        slots = max(share.slots.stop - share.slots.start for share in shares)
+        slots = max(share.num_slots for share in shares)
         instances = max(len(share) for share in shares) * gaussians
         if self._memory is None or slots > self._slots or instances > self._instances:
             self._grow(engine, slots, instances, device)
@@ -142,7 +142,7 @@ class InPlace:
         if stop:
             memory.stop.fill_(stop)
         self._memory.barrier(WRITTEN)
-        counts = [share.slots.stop - share.slots.start for share in shares]
+        counts = [share.num_slots for share in shares]
         return engine.gather(self._memory.parts, self._starts[1], counts, seen)
 
     def collect(

@@ -39,6 +39,10 @@ class Share:
         """The views that begin in this share."""
         return slice(self.views.start + self.continues, self.views.stop)
 
+    @property
+    def num_slots(self) -> int:
+        return self.slots.stop - self.slots.start
+
     def __len__(self) -> int:
         return self.views.stop - self.views.start
 
