@@ -35,6 +35,7 @@ after a device synchronization. It lives on until none has it mapped.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -54,6 +55,15 @@ SIZES_KEPT = 256
 """Views of the memory are kept for so many sizes of passes; then all are made anew."""
 
 
+def records_for(views: int, gaussians: int, device: torch.device, with_statistics: bool) -> ScreenRecords:
+    """Uninitialised records, and radii, of all these views and Gaussians."""
+    return ScreenRecords(
+        torch.empty(views, gaussians, ScreenRecord.SIZE, device=device),
+        torch.empty(views, gaussians, 2, dtype=torch.int32, device=device),
+        with_statistics,
+    )
+
+
 class InPlace:
     """This process's memory for a pass, and the views of those of all.
 
@@ -69,6 +79,7 @@ class InPlace:
         self._slots = self._instances = 0  # there is room for
         self._read = False  # others may be reading this process's memory
         self._views: dict[tuple, ScreenRecords] = {}
+        self._target: tuple[tuple, ScreenRecords | None] = (), None
         self._own: PassMemory | None = None
 
     def prepare(self, engine: Engine, shares: Sequence[Share], gaussians: int, device: torch.device) -> bool:
@@ -144,6 +155,13 @@ class InPlace:
         self._memory.barrier(WRITTEN)
         counts = [share.num_slots for share in shares]
         return engine.gather(self._memory.parts, self._starts[1], counts, seen)
+
+    def target(self, *sizes: Any) -> ScreenRecords:
+        """`records_for` these sizes, for `collect`: the same as at the last call as long as it is for the same."""
+        if self._target[0] != sizes:
+            self._target = (), None  # lets go of the last ones before there are new ones
+            self._target = sizes, records_for(*sizes)
+        return self._target[1]
 
     def collect(
         self,

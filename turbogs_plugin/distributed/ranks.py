@@ -15,6 +15,7 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
+from turbogs_plugin.device import synchronize
 from turbogs_plugin.errors import TrainingStopped
 
 Value = TypeVar("Value")
@@ -49,6 +50,10 @@ class Ranks:
     def ask_to_stop(self, signal: int) -> bool:
         """Ask that all stop. False: there are no others, so the caller stops by itself."""
         return False
+
+    def meet(self, device: torch.device) -> None:
+        """Connect the processes' tensors of a device, which the first exchange would do. Every process must call this.
+        NCCL takes up to half a second."""
 
     @contextmanager
     def working(self) -> Iterator[None]:
@@ -156,6 +161,10 @@ class ProcessRanks(Ranks):
     def ask_to_stop(self, signal: int) -> bool:
         self.asked = signal
         return True
+
+    def meet(self, device: torch.device) -> None:
+        self.broadcast(torch.zeros(1, device=device))
+        synchronize(device)
 
     @contextmanager
     def working(self) -> Iterator[None]:

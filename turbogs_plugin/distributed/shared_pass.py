@@ -8,10 +8,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from turbogs_plugin.distributed.in_place import InPlace
+from turbogs_plugin.distributed.in_place import InPlace, records_for
 from turbogs_plugin.distributed.ranks import ProcessRanks
 from turbogs_plugin.distributed.shares import Share
-from turbogs_plugin.engine.layout import ScreenRecord
 from turbogs_plugin.engine.protocol import Engine
 from turbogs_plugin.engine.rendered import Rendered, RenderOptions, ScreenGradients, ScreenRecords
 from turbogs_plugin.types import Cameras, GaussianGradients, Gaussians, GaussianStats, PixelSamples
@@ -91,14 +90,11 @@ class SharedScreen:
         """
         batch, device = self._batch, own.device
         mine = rows[batch.ranks.rank]
-        target = ScreenRecords(
-            torch.empty(self.views, mine.stop - mine.start, ScreenRecord.SIZE, device=device),
-            torch.empty(self.views, mine.stop - mine.start, 2, dtype=torch.int32, device=device),
-            self._with_statistics,
-        )
         if batch.memory is None:
+            target = records_for(self.views, mine.stop - mine.start, device, self._with_statistics)
             self._send_and_receive(rows, target)
         else:
+            target = batch.memory.target(self.views, mine.stop - mine.start, device, self._with_statistics)
             count = len(batch.gaussians)
             batch.memory.collect(batch.engine, batch.shares, count, self._plain, target, mine.start)
         return batch.engine.screen_gradients(own, batch.cameras, batch.samples, batch.options, target)

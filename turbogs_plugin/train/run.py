@@ -141,7 +141,7 @@ def train(
     if posed != config.scene.path:
         clock.mark(CAMERAS)
         config = replace(config, scene=replace(config.scene, path=posed))
-    with starting(lambda: resolve_device(config.train.device)) as started:
+    with starting(lambda: resolve_device(config.train.device), ranks) as started:
         scene = open_scene(config, training=True, ranks=ranks)
         clock.mark(PHOTOS)
         device = started.result()
@@ -190,7 +190,7 @@ def resume(
     device = resolve_device(config.train.device, "go on with this run where there is a GPU, or see 'turbogs doctor'")
     require_writable(folder.path, f"what --resume {folder.path} writes")
     _try_lpips(config, report is not None)
-    with starting(lambda: device) as started:
+    with starting(lambda: device, ranks) as started:
         scene = open_scene(config, folder, training=True, ranks=ranks)
         clock.mark(PHOTOS)
         started.result()

@@ -81,11 +81,12 @@ def require_memory(config: Config, train_sizes: np.ndarray, test_sizes: np.ndarr
 
 
 @contextmanager
-def starting(resolve: Callable[[], torch.device]) -> Iterator[Future[torch.device]]:
+def starting(resolve: Callable[[], torch.device], ranks: Ranks = ONE) -> Iterator[Future[torch.device]]:
     """While entered, a thread starts a device and loads its kernels: CUDA takes a second or more until it answers.
 
     Args:
         resolve: says which device; what it raises is raised by the future.
+        ranks: the processes that train together; each calls this.
 
     Yields:
         The device, started.
@@ -96,6 +97,7 @@ def starting(resolve: Callable[[], torch.device]) -> Iterator[Future[torch.devic
         synchronize(device)  # makes CUDA's context, and takes no memory through torch
         if device.type == "cuda":
             compiled_kernels()
+        ranks.meet(device)
         return device
 
     with ThreadPoolExecutor(1) as pool:

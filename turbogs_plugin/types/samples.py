@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -31,6 +32,13 @@ def sample_order(x: Tensor, y: Tensor) -> Tensor:
     return patch * (PATCH_WIDTH * PATCH_HEIGHT) + (y % PATCH_HEIGHT) * PATCH_WIDTH + x % PATCH_WIDTH
 
 
+@lru_cache(maxsize=4096)
+def _starts(sizes: bytes, origin: tuple[int, int]) -> tuple[int, ...]:
+    """`TileGrid.starts` of these int64 sizes. Kept, as iterations ask for few sizes again and again."""
+    shapes = -(-(np.frombuffer(sizes, dtype=np.int64).reshape(-1, 2) + origin) // TILE_SIZE)
+    return 0, *shapes.prod(axis=1).cumsum().tolist()
+
+
 @dataclass
 class TileGrid:
     """The tiles of a batch of K images, numbered without gaps: view after view, row after row.
@@ -49,15 +57,17 @@ class TileGrid:
         return -(-(self.sizes + self.origin) // TILE_SIZE)
 
     @property
+    def starts(self) -> tuple[int, ...]:
+        """K + 1 numbers: of the first tile of each image; the last one is the count of all tiles."""
+        return _starts(np.asarray(self.sizes, dtype=np.int64).tobytes(), tuple(self.origin))
+
+    @property
     def offsets(self) -> np.ndarray:
-        """[K + 1] int64: number of the first tile of each image; the last entry is the count of all tiles."""
-        return np.concatenate([[0], np.cumsum(self.shapes.prod(axis=1))])
+        """[K + 1] int64: `starts`."""
+        return np.array(self.starts, dtype=np.int64)
 
     def __len__(self) -> int:
-        x, y = self.origin
-        return sum(
-            -(-(width + x) // TILE_SIZE) * -(-(height + y) // TILE_SIZE) for width, height in self.sizes.tolist()
-        )
+        return self.starts[-1]
 
 
 @dataclass
@@ -193,8 +203,9 @@ class PixelSamples:
             slots: of these tiles.
         """
         tile_offsets = self.tile_offsets[tiles.start : tiles.stop + 1]
-        first = len(TileGrid(self.sizes[: views.start], self.origin))
-        if len(self.tile_ids) == len(self.grid):  # all tiles, so their numbers are there already
+        starts = self.grid.starts
+        first = starts[views.start]
+        if self.tile_ids.shape[0] == starts[-1]:  # all tiles, so their numbers are there already
             tile_ids = self.tile_ids[tiles.start - first : tiles.stop - first]
         else:
             tile_ids = self.tile_ids[tiles] - first

@@ -64,10 +64,22 @@ class CudaEngine(Engine):
             self.workspace.lend(memory)
 
     def gather(self, parts: Sequence[Tensor], first: int, counts: Sequence[int], seen: Tensor) -> Tensor:
-        colors = torch.empty(sum(counts), 3, device=seen.device)
-        peers = launches.Peers(*parts, *(None,) * (layout.MAX_PEERS - len(parts)))
-        library.launch(launches.GatherColors(peers, list(counts), first, colors, seen, self.overflow))
-        return colors
+        def arguments() -> launches.GatherColors:
+            shape = (sum(counts), 3)
+            if self.workspace is None:
+                colors = torch.empty(shape, device=seen.device)
+            else:
+                colors = self.workspace.buffer("gathered_colors", shape, torch.float32)
+            peers = launches.Peers(*parts, *(None,) * (layout.MAX_PEERS - len(parts)))
+            return launches.GatherColors(peers, list(counts), first, colors, seen, self.overflow)
+
+        if self.workspace is None:
+            launch = arguments()
+        else:
+            places = [part.data_ptr() for part in (*parts, seen)]
+            launch = self.workspace.kept("gather", (first, *counts, *places), arguments)
+        library.launch(launch)
+        return launch.colors
 
     def supervise(self, terms: LossTerms, colors: Tensor, truth: PhotoSamples, update: MapUpdate) -> LossOutput:
         # The kernel gathers the photos' colours itself if the photos and the maps of each view begin at the same pixel.

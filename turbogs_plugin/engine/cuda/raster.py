@@ -220,9 +220,7 @@ def screen_gradients(
 ) -> CudaScreenGradients:
     """`Engine.screen_gradients`. The Gaussians are contiguous, and their rows begin at a multiple of four."""
     library.require()
-    known = workspace is not None and workspace.knows(gaussians)
-    ready = gaussians if known else gaussians.map(_prepared)
-    scene = _scene(ready, cameras, options.used_degree(gaussians), options.settings.eps2d)
+    scene = _scene(_ready(gaussians, workspace), cameras, options.used_degree(gaussians), options.settings.eps2d)
     overflow = None if workspace is None else workspace.overflow
     return CudaScreenGradients(scene, samples, plain.records, plain.radii, plain.with_statistics, overflow)
 

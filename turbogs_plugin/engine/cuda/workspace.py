@@ -106,7 +106,7 @@ class Workspace:
         self._gaussians = 0
         self._intersections_per_tile = 0.0
         self._first_lost: int | None = None
-        self._known: Callable[[], Gaussians | None] = lambda: None
+        self._known: dict[int, ref[Gaussians]] = {}  # by identity
 
     def _set_status(self, status: Tensor) -> None:
         self.status, self._overflow = status, status[PassStatus.OVERFLOW :]
@@ -155,12 +155,14 @@ class Workspace:
         self._lent = memory
 
     def know(self, gaussians: Gaussians) -> None:
-        """Remember this model, until another one: its tensors are as kernels take them."""
-        self._known = ref(gaussians)
+        """Remember that this model's tensors are as kernels take them, as long as it lives."""
+        self._known = {place: known for place, known in self._known.items() if known() is not None}
+        self._known[id(gaussians)] = ref(gaussians)
 
     def knows(self, gaussians: Gaussians) -> bool:
-        """Whether it is the model remembered, whose tensors need no look at each pass; operators look at them, too."""
-        return self._known() is gaussians
+        """Whether it is a model remembered, whose tensors need no look at each pass; operators look at them, too."""
+        known = self._known.get(id(gaussians))
+        return known is not None and known() is gaussians
 
     def kept(self, name: str, sizes: tuple, make: Callable[[], Kept]) -> Kept:
         """What `make` gives; made anew only where the sizes are others than at the last call of this name.
