@@ -329,6 +329,7 @@ def test_the_command_starts_processes_itself(capture, tmp_path, turbogs, monkeyp
     config = run.RunFolder(folder).read_config()
     assert (config.schedule["min_views"], config.schedule["max_views"], config.schedule["pixel_budget"]) == (2, 4, 2.0)
     assert config.optimizer["learning_rates"]["batch_scale"] == pytest.approx(5.0 * 2**0.5)
+    assert (config.optimizer["beta1"], config.optimizer["beta2"]) == pytest.approx((0.81, 0.998001))
     (tmp_path / "ending.py").write_text("import sys; sys.exit(int(sys.argv[1]))")
     monkeypatch.setenv("PYTHONPATH", f"{tmp_path}:{os.environ.get('PYTHONPATH', '')}")
     assert distributed_processes.start(2, ["2"], "cpu", "ending") == 2

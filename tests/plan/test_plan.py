@@ -197,7 +197,8 @@ def test_the_layer_above_wins_over_auto_and_auto_over_what_is_below(tmp_path):
 
 @pytest.mark.parametrize("name", ["turbogs", "mcmc", "3dgs"])
 def test_a_batch_for_more_processes_is_that_of_one_where_there_is_one(name):
-    """With more, views and pixels grow by their number, learning rates by its root, and nothing else changes."""
+    """With more, views and pixels grow by their number, learning rates by its root, moments forget after as many
+    samples, and nothing else changes."""
     config = load_config(name, ["train.batch_for=auto", "train.iterations=700"])
     written = load_config(name, ["train.iterations=700"])
     alone = plan_from_facts(FACTS, config).apply(config)
@@ -207,6 +208,8 @@ def test_a_batch_for_more_processes_is_that_of_one_where_there_is_one(name):
     expected["train"]["batch_for"] = 4
     for key in {"min_views", "max_views", "views", "pixel_budget"} & set(expected["schedule"]):
         expected["schedule"][key] *= 4
+    for key in {"beta1", "beta2"} & set(expected["optimizer"]):
+        expected["optimizer"][key] **= 4
     for section in ("optimizer", "density"):
         if "learning_rates" in expected[section]:
             expected[section]["learning_rates"]["batch_scale"] *= 2.0

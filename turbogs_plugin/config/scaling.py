@@ -58,18 +58,24 @@ BATCH_FIELDS = ("min_views", "max_views", "views", "pixel_budget")
 RATE_EXPONENT = 0.5
 """Learning rates grow with this power of the batch: with a gradient that is mostly noise, Adam's step has the length of
 its rate whatever the batch, and so many small steps end as far apart as one of their number's root (Malladi et al.
-2022; Grendel, Zhao et al. 2024, found it for Gaussians). Not measured here yet: `configs/ablations/batch.yaml`."""
+2022; Grendel, Zhao et al. 2024, found it for Gaussians)."""
+
+MOMENT_FIELDS = ("beta1", "beta2")
+"""Decays of an optimizer's moments, which are raised to the power of the batch: so moments forget after as many samples
+as before, not after as many iterations (Grendel). Measured: `configs/ablations/batch.yaml`."""
 
 
 def with_batch_for(config: Config, processes: int) -> Config:
     """The configuration whose batch is written for one process, with that of several: so many times the views and
-    pixels of an iteration, and learning rates times its root."""
+    pixels of an iteration, learning rates times its root, and moments that forget after as many samples."""
     mapping = config.to_mapping()
-    schedule = mapping["schedule"]
+    schedule, optimizer = mapping["schedule"], mapping["optimizer"]
     for name in set(BATCH_FIELDS) & set(schedule):
         schedule[name] *= processes
-    for section in ("optimizer", "density"):  # of some density control, too: its noise goes by them
-        rates = mapping[section].get("learning_rates")
+    for name in set(MOMENT_FIELDS) & set(optimizer):
+        optimizer[name] **= processes
+    for section in (optimizer, mapping["density"]):  # of some density control, too: its noise goes by them
+        rates = section.get("learning_rates")
         if isinstance(rates, dict) and "batch_scale" in rates:
             rates["batch_scale"] *= processes**RATE_EXPONENT
     mapping["train"]["batch_for"] = processes
