@@ -194,10 +194,11 @@ def ranks() -> str:
 
 
 def rank_runs() -> str:
-    """Whole runs and a study on one GPU and on several, of the same measurement as `ranks`."""
+    """Whole runs and a study on one GPU and on several."""
     if not (H200 / scaling_results.KEPT).is_file():
         return ABSENT
-    return f"{scaling_results.trainings(H200)}\n\n{scaling_results.study(H200)}"
+    machine = where(measured(scaling_results.KEPT))
+    return f"{machine}.\n\n{scaling_results.trainings(H200)}\n\n{scaling_results.study(H200)}"
 
 
 def steps(name: str) -> str:

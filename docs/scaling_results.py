@@ -12,21 +12,31 @@ from __future__ import annotations
 import json
 import re
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from statistics import mean
 from typing import Any
 
+import torch
 from scaling_model import MEASURED, Case, table, way_of
 
+from turbogs_plugin.report.provenance import provenance
 from turbogs_plugin.study.statistics import seconds_to_reach
 from turbogs_plugin.train.history import Evaluation, read_history
 
 KEPT = "scaling.json"
 """The file of OUT with what is kept of runs and studies."""
 
-BELOW = (0.0, 0.25, 0.5, 1.0)
-"""Time to so many dB below the last PSNR of the run that ends with the lowest one."""
+BELOW = {"psnr": (0.0, 0.25, 0.5, 1.0), "ssim": (0.0, 0.002, 0.005, 0.01)}
+"""Times to so much below the last PSNR, and SSIM, of the run that ends with the lowest one."""
+
+KINDS = {
+    "two": "two GPUs",
+    "same": "two GPUs, the batch of one (`train.batch_for=1`)",
+    "four": "four GPUs",
+}
+"""Names of runs beside those on one GPU."""
 
 LINE = re.compile(r"(\d+) GPU  M=(\d+) K=(\d+) lambda=([\d.]+) \(([\w, ]+)\): ([\d.]+) ms")
 
@@ -65,7 +75,8 @@ def iterations(out: Path) -> str:
 
 def recorded(out: Path) -> dict[str, Any]:
     """What is kept of whole runs and of a study: ``runs``, name -> evaluations as (iteration, seconds, PSNR, SSIM,
-    Gaussians), and ``studies``, GPUs -> seconds at which cells ended. Of OUT, or of the file that `main` made of it."""
+    Gaussians), ``studies``, GPUs -> seconds at which cells ended, and ``provenance``. Of OUT, or of the file that
+    `main` made of it there."""
     if (out / KEPT).is_file() and not (out / "runs").is_dir():
         return json.loads((out / KEPT).read_text())
     runs = {}
@@ -79,7 +90,8 @@ def recorded(out: Path) -> dict[str, Any]:
         ends = sorted(file.stat().st_mtime for file in (out / f"study-{gpus}").glob("cells/*/*.json"))
         if ends:
             studies[gpus] = [round(end - ends[0], 3) for end in ends]
-    return {"runs": runs, "studies": studies}
+    here = asdict(provenance("cuda" if torch.cuda.is_available() else "cpu"))
+    return {"provenance": here, "runs": runs, "studies": studies}
 
 
 def trainings(out: Path) -> str:
@@ -90,31 +102,41 @@ def trainings(out: Path) -> str:
     }
     if not histories:
         return "no run has ended"
-    wanted = min(max(line.psnr for line in history) for history in histories.values())
-    levels = [wanted - below for below in BELOW]
-    times = {name: [seconds_to_reach(history, level) for level in levels] for name, history in histories.items()}
+    marks = []  # (heading, measure, level)
+    for measure, unit, digits in (("psnr", " dB", 2), ("ssim", "", 4)):
+        wanted = min(max(getattr(line, measure) for line in history) for history in histories.values())
+        marks += [(f"{wanted - below:.{digits}f}{unit}", measure, wanted - below) for below in BELOW[measure]]
+    times = {  # the end is the last one
+        name: [*(seconds_to_reach(history, level, measure) for _, measure, level in marks), history[-1].train_seconds]
+        for name, history in histories.items()
+    }
     rows = {}
     for name, history in histories.items():
         last = history[-1]
-        rows[name] = [*(f"{time:.2f} s" for time in times[name]), f"{last.train_seconds:.2f} s"]
-        rows[name] += [f"{last.psnr:.2f} dB", f"{last.ssim:.4f}", str(last.num_gaussians)]
-        rows[name].append(str(last.iteration))
-    head = (*(f"to {level:.2f} dB" for level in levels), "end", "PSNR", "SSIM", "Gaussians", "iterations")
-    lines = [table("run", rows, head), ""]
-    for kind in ("two", "four", "batch"):
+        rows[name] = [f"{time:.2f} s" for time in times[name]]
+        rows[name] += [f"{last.psnr:.2f} dB", f"{last.ssim:.4f}", str(last.num_gaussians), str(last.iteration)]
+    head = (*(f"to {heading}" for heading, _, _ in marks), "end", "PSNR", "SSIM", "Gaussians", "iterations")
+    return f"{table('run', rows, head)}\n\n{_sooner(histories, times, head[: len(marks) + 1])}"
+
+
+def _sooner(histories: dict[str, list[Evaluation]], times: dict[str, list[float]], marks: Sequence[str]) -> str:
+    """A table: how many times as soon as one GPU each kind of run is at its marks, the mean over seeds of both, and its
+    errors less those of one GPU."""
+    rows = {}
+    for kind, name in KINDS.items():
         seeds = [seed for seed in "01234" if f"one-{seed}" in histories and f"{kind}-{seed}" in histories]
         if not seeds:
             continue
-        sooner = [
-            mean(times[f"one-{seed}"][place] / times[f"{kind}-{seed}"][place] for seed in seeds)
-            for place in range(len(levels))
+        pairs = [(times[f"one-{seed}"], times[f"{kind}-{seed}"]) for seed in seeds]
+        rows[f"{name} ({len(seeds)})"] = [
+            f"{mean(alone[place] / ours[place] for alone, ours in pairs):.2f}x" for place in range(len(marks))
         ]
-        ours, theirs = ([histories[f"{which}-{seed}"][-1].psnr for seed in seeds] for which in (kind, "one"))
-        lines.append(
-            f"{kind}, {len(seeds)} seeds: {', '.join(f'{factor:.2f}' for factor in sooner)} times as soon as one GPU; "
-            f"PSNR {mean(ours):.2f} where one GPU has {mean(theirs):.2f} [{min(theirs):.2f}, {max(theirs):.2f}]"
-        )
-    return "\n".join(lines)
+        ends = [(histories[f"one-{seed}"][-1], histories[f"{kind}-{seed}"][-1]) for seed in seeds]
+        rows[f"{name} ({len(seeds)})"] += [
+            f"{mean(ours.psnr - alone.psnr for alone, ours in ends):+.2f} dB",
+            f"{mean(ours.ssim - alone.ssim for alone, ours in ends):+.4f}",
+        ]
+    return table("times as soon as one GPU (seeds)", rows, (*marks, "PSNR", "SSIM")) if rows else ""
 
 
 def study(out: Path) -> str:

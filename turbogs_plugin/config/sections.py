@@ -51,8 +51,8 @@ class TrainConfig:
         base_iterations: the length for which the settings that count iterations are written. Used where `iterations`
             is ``auto``.
         batch_for: number of processes that the settings of a batch are written for: views and pixels of an iteration,
-            learning rates and the decays of moments. ``auto``: they are written for one, and scaled to those that train together
-            (`turbogs_plugin.config.scaling.with_batch_for`).
+            learning rates and the decays of moments. ``auto``: they are written for one, and scaled to those that train
+            together (`turbogs_plugin.config.scaling.with_batch_for`).
         refine_until: tau_until, the last iteration of densification, which also ends the annealing of the sampling.
         seed: of all randomness.
         device: auto (CUDA where there is one), cpu, or cuda.

@@ -167,6 +167,7 @@ class RankExchange(Exchange):
         self._skipped: Tensor | None = None  # [] of all processes, when last complete
 
     def place(self, gaussians: Gaussians) -> Gaussians:
+        self.memory.reserve(gaussians.device)
         return self.model.place(gaussians)
 
     def render(

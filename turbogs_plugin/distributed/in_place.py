@@ -51,6 +51,9 @@ from turbogs_plugin.engine.rendered import ScreenRecords
 FREE, WRITTEN, DRAWN, STEPPED = 0, 1, 2, 3
 """Numbers of the barriers."""
 
+INSTANCE = 2 + ScreenRecord.SIZE
+"""Numbers of radii and record of a Gaussian in a view."""
+
 SIZES_KEPT = 256
 """Views of the memory are kept for so many sizes of passes; then all are made anew."""
 
@@ -81,6 +84,15 @@ class InPlace:
         self._views: dict[tuple, ScreenRecords] = {}
         self._target: tuple[tuple, ScreenRecords | None] = (), None
         self._own: PassMemory | None = None
+
+    def reserve(self, device: torch.device) -> None:
+        """Take memory before training, enough for what most captures begin with; `prepare` replaces it where it is too
+        little. It takes processes longer to map each other's memory than to make an iteration. Every process must call
+        this."""
+        if self._possible and self._memory is None:
+            self._slots, self._instances = LEAST // 8, LEAST // INSTANCE
+            self._take(device)
+            self._possible = self._memory is not None
 
     def prepare(self, engine: Engine, shares: Sequence[Share], gaussians: int, device: torch.device) -> bool:
         """Make room for a pass, which the engine keeps in this memory. Every process must call this.
@@ -125,8 +137,11 @@ class InPlace:
         if slots > self._slots:
             self._slots = with_room(3 * slots) // 3
         if instances > self._instances:
-            width = 2 + ScreenRecord.SIZE
-            self._instances = with_room(width * instances, LEAST) // width
+            self._instances = with_room(INSTANCE * instances, LEAST) // INSTANCE
+        self._take(device)
+
+    def _take(self, device: torch.device) -> None:
+        """Take memory for so many slots and instances."""
         sizes = (PassStatus.SIZE, 3 * self._slots, 2 * self._instances, ScreenRecord.SIZE * self._instances)
         self._starts = aligned_starts(sizes)
         self._read = False

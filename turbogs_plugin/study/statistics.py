@@ -69,13 +69,19 @@ class Difference:
         return abs(self.mean) > T95[min(self.count - 1, len(T95)) - 1] * self.standard_error
 
 
-def seconds_to_reach(history: Sequence[Evaluation], psnr: float) -> float:
-    """Seconds of training after which a run first reached this test PSNR, linear between evaluations; inf if never."""
+def seconds_to_reach(history: Sequence[Evaluation], level: float, measure: str = "psnr") -> float:
+    """Seconds of training after which a run first reached this test PSNR, linear between evaluations; inf if never.
+
+    Args:
+        measure: another one that rises: ``ssim``.
+    """
     for before, after in zip([None, *history], history, strict=False):
-        if after.psnr >= psnr:
+        reached = getattr(after, measure)
+        if reached >= level:
             if before is None:
                 return after.train_seconds
-            share = (psnr - before.psnr) / (after.psnr - before.psnr)
+            earlier = getattr(before, measure)
+            share = (level - earlier) / (reached - earlier)
             return before.train_seconds + share * (after.train_seconds - before.train_seconds)
     return math.inf
 
