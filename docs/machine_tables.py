@@ -198,7 +198,10 @@ def rank_runs() -> str:
     if not (H200 / scaling_results.KEPT).is_file():
         return ABSENT
     machine = where(measured(scaling_results.KEPT))
-    return f"{machine}.\n\n{scaling_results.trainings(H200)}\n\n{scaling_results.study(H200)}"
+    parts = [f"{machine}.", scaling_results.trainings(H200)]
+    if scaling_results.recorded(H200)["studies"]:
+        parts.append(scaling_results.study(H200))
+    return "\n\n".join(parts)
 
 
 def steps(name: str) -> str:

@@ -57,7 +57,7 @@ runs() {
     run one "$1" 1
     run two "$1" 2
     test -z "$four" || run four "$1" 4
-    run same "$1" 2 train.batch_for=1  # the views and pixels of one GPU
+    run batch "$1" 2 train.batch_for=auto  # twice the views and pixels
     results
 }
 results

@@ -31,11 +31,7 @@ KEPT = "scaling.json"
 BELOW = {"psnr": (0.0, 0.25, 0.5, 1.0), "ssim": (0.0, 0.002, 0.005, 0.01)}
 """Times to so much below the last PSNR, and SSIM, of the run that ends with the lowest one."""
 
-KINDS = {
-    "two": "two GPUs",
-    "same": "two GPUs, the batch of one (`train.batch_for=1`)",
-    "four": "four GPUs",
-}
+KINDS = {"two": "two GPUs", "four": "four GPUs", "batch": "two GPUs, `train.batch_for=auto`"}
 """Names of runs beside those on one GPU."""
 
 LINE = re.compile(r"(\d+) GPU  M=(\d+) K=(\d+) lambda=([\d.]+) \(([\w, ]+)\): ([\d.]+) ms")

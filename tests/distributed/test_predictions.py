@@ -25,7 +25,7 @@ def test_results_are_printed_as_they_come(tmp_path):
         for gpus, views, images, exchange, time in [*passes, (2, 20, 2.0, owners, 5.0)]
     ]
     (tmp_path / "ranks.txt").write_text("\n".join(lines))
-    for name, seconds in (("one-0", 4.0), ("two-0", 3.0), ("same-0", 2.0)):
+    for name, seconds in (("one-0", 4.0), ("two-0", 3.0), ("batch-0", 2.0)):
         run = tmp_path / "runs" / name
         run.mkdir(parents=True)
         for place, psnr in enumerate((20.0, 30.0, 31.0)):
@@ -67,7 +67,7 @@ STAND_IN = """#!/bin/sh
 # In the place of Python: runs, a bench and studies that take no time. The second seed's runs on two GPUs fail. Results
 # are printed as the last run is there, and named before.
 case "$*" in
-docs/*) [ -d "$2/runs/same-2" ] && exec PYTHON "$@"; echo "$@ with $(ls "$2/runs")" ;;
+docs/*) [ -d "$2/runs/batch-2" ] && exec PYTHON "$@"; echo "$@ with $(ls "$2/runs")" ;;
 *" train "*--gpus\\ 2*train.seed=1*) echo "turbogs: error: lost" >&2; exit 1 ;;
 *" train "*)
     mkdir -p "$6" && echo large >"$6/model.ply"
@@ -88,7 +88,7 @@ def test_the_script_goes_on_whatever_fails_and_leaves_out_what_has_no_time(tmp_p
     ended = subprocess.run(command, cwd=ROOT, env=variables, capture_output=True, text=True)
     stages = (tmp_path / "out/stages.txt").read_text()
     names = [line.split()[2].rstrip(":") for line in stages.splitlines()]
-    runs = [[f"run-{kind}-{seed}" for kind in ("one", "two", "same")] for seed in "012"]
+    runs = [[f"run-{kind}-{seed}" for kind in ("one", "two", "batch")] for seed in "012"]
     assert names == ["machine", "ranks", *runs[0], "study-0", "study-0,1", *runs[1], *runs[2]], ended.stderr
     failed = [line for line in stages.splitlines() if line.endswith("exit code 1")]
     assert len(failed) == 3 and "turbogs: error: lost" in ended.stdout
