@@ -5,7 +5,7 @@
 # after each group OUT/results.txt is written anew with all that is known. WITHIN seconds (470) in all; a stage that
 # would not end before is left out. One that runs into it is asked to end, and killed after 5 s; no signal of `timeout`
 # comes to the processes that it started, in sessions of their own, but they end with it. Models and checkpoints go to
-# SCRATCH, as they are large; OUT keeps a few kilobytes. STUDY=no: without the study.
+# SCRATCH, as they are large; OUT keeps a few kilobytes. RANKS=no, STUDY=no: without the iterations, without the study.
 out=$1 fox=$2 caliterra=$3 device=${4:-cuda}
 test -n "$caliterra" || { echo "sh docs/measure_scaling.sh OUT FOX CALITERRA [DEVICE]"; exit 2; }
 python=${PYTHON:-python3} within=${WITHIN:-470} scratch=${SCRATCH:-$(mktemp -d)} begun=$(date +%s)
@@ -51,7 +51,7 @@ run() {
 
 # The numbers that the rest waits for: iterations on one GPU and on two. 1000 Gaussians say what the host takes.
 stage machine 0 sh -c "nvidia-smi topo -m; nvidia-smi --query-gpu=name,driver_version --format=csv; git rev-parse HEAD"
-stage ranks 60 "$python" -m turbogs_plugin bench ranks --scene "$fox" --gpus $counts --gaussians 600000 150000 1000 \
+test "${RANKS:-}" = no || stage ranks 60 "$python" -m turbogs_plugin bench ranks --scene "$fox" --gpus $counts --gaussians 600000 150000 1000 \
     --views 10 3 --grown --device "$device" --out "$out/ranks.json" ${BENCH:-}
 runs() {
     run one "$1" 1

@@ -86,7 +86,10 @@ def recorded(out: Path) -> dict[str, Any]:
         ends = sorted(file.stat().st_mtime for file in (out / f"study-{gpus}").glob("cells/*/*.json"))
         if ends:
             studies[gpus] = [round(end - ends[0], 3) for end in ends]
-    here = asdict(provenance("cuda" if torch.cuda.is_available() else "cpu"))
+    if (out / KEPT).is_file():  # of the machine that measured
+        here = json.loads((out / KEPT).read_text())["provenance"]
+    else:
+        here = asdict(provenance("cuda" if torch.cuda.is_available() else "cpu"))
     return {"provenance": here, "runs": runs, "studies": studies}
 
 

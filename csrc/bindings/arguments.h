@@ -2,7 +2,7 @@
 // current stream, and the errors of launches.
 //
 // Python sends the fields of a launch as four lists (turbogs_plugin/engine/cuda/launches). launches.h, which the
-// build makes of the same file, has the order of the fields, so they are read by name here. It declares a function
+// build makes of the same files, has the order of the fields, so they are read by name here. It declares a function
 // `run` for each launch. The other files of this folder define them: each checks its tensors, then hands raw pointers
 // and torch's current stream to a launcher of the kernels. Buffers are made by Python.
 #pragma once

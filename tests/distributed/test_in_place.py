@@ -126,6 +126,7 @@ def every_case(capture: Path, folder: Path) -> None:
     same(run(keeping(trainer_of(capture, ranks, True, ()), files), turns), wanted)
     assert files.barriers.count(STEPPED) == sum(turns)
     without_some_memory(capture, ranks, folder, wanted)
+    reserved(capture, ranks, folder)
     growing(capture, ranks, folder, wanted)
     few(capture, ranks, folder)
     for by_rows in (True, False):
@@ -161,6 +162,17 @@ def without_some_memory(capture: Path, ranks: ProcessRanks, folder: Path, wanted
     trainer.compare_replicas()
     same(dict(leaves(trainer.state_dict(), "state")), wanted)
     assert files.refused == 1 and not files.barriers
+
+
+def reserved(capture: Path, ranks: ProcessRanks, folder: Path) -> None:
+    """Memory that was taken before training and suffices is never replaced."""
+    wanted = run(trainer_of(capture, ranks, False, ()), [False] * STEPS)
+    in_place.LEAST = 1 << 18
+    files = PeerFiles(folder / "reserved")
+    same(run(keeping(trainer_of(capture, ranks, False, ()), files), [True] * STEPS), wanted)
+    assert len(files.sizes) == 1
+    assert sorted(files.barriers) == sorted([WRITTEN, DRAWN] * STEPS + [FREE] * (STEPS - 1))
+    in_place.LEAST = 0
 
 
 def growing(capture: Path, ranks: ProcessRanks, folder: Path, wanted: dict) -> None:

@@ -49,8 +49,8 @@ class Kept:
 
         def kept_colors(memory: InPlace, engine: Engine, shares: list, own: Tensor | None, *flags: object) -> Tensor:
             found = colors(memory, engine, shares, own, *flags)
-            # The next pass overwrites what this one has rendered.
-            self.colors.append((shares, None if own is None else own.clone(), found))
+            # The next pass overwrites what this one has rendered and gathered.
+            self.colors.append((shares, None if own is None else own.clone(), found.clone()))
             return found
 
         def kept_rows(screen: SharedScreen, rows: list, own) -> object:

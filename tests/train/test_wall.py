@@ -7,9 +7,11 @@ import time
 from pathlib import Path
 
 import pytest
+import torch
 from helpers.framework_runs import stop_after, tiny_config
 from helpers.simulated_time import SimulatedTime
 
+from turbogs_plugin.distributed.ranks import ProcessRanks, Ranks
 from turbogs_plugin.errors import InputError, TrainingStopped
 from turbogs_plugin.report.pages import write_report
 from turbogs_plugin.train import run, start, wall
@@ -175,3 +177,19 @@ def test_the_device_starts_while_photos_are_read(capture, tmp_path, monkeypatch)
     monkeypatch.setattr(run, "resolve_device", lambda *arguments: (meet.wait(), resolve(*arguments))[1])
     monkeypatch.setattr(start, "load_and_find", lambda *a, **b: (meet.wait(), load(*a, **b))[1])
     assert run.train(tiny_config(capture, "train.iterations=1"), tmp_path / "run").wall.train_seconds > 0
+
+
+def test_processes_connect_their_gpus_beside_the_photos():
+    """In the thread that starts the device. On a CPU nothing is exchanged there: gloo would mix it up with what the
+    main thread exchanges meanwhile."""
+    met = []
+
+    class Noting(Ranks):
+        def meet(self, device):
+            met.append((device, threading.current_thread() is threading.main_thread()))
+
+    device = torch.device("cpu")
+    with start.starting(lambda: device, Noting()) as started:
+        assert started.result() == device
+    assert met == [(device, False)]
+    ProcessRanks.meet(None, device)  # uses nothing of the processes

@@ -133,8 +133,7 @@ def joined(device: str) -> Iterator[Ranks]:
     import torch.distributed as distributed
 
     on_gpu = device != "cpu" and torch.cuda.device_count() > 0
-    if on_gpu:
-        _see_own_gpu()
+    gpu = _see_own_gpu() if on_gpu else 0
     if sys.platform == "linux" and os.environ.get("LOCAL_WORLD_SIZE") == os.environ.get("WORLD_SIZE"):
         os.environ.setdefault("GLOO_SOCKET_IFNAME", "lo")  # on one machine, whatever its name resolves to
     try:
@@ -153,7 +152,7 @@ def joined(device: str) -> Iterator[Ranks]:
         except RuntimeError:  # whoever keeps the store is gone
             return True
 
-    ranks = ProcessRanks()
+    ranks = ProcessRanks(gpu)
     watch = _Watch(ranks, speaks)
     try:
         yield ranks
@@ -205,16 +204,22 @@ def _end_with_launcher() -> None:
         end_with_parent(lambda: own is None or os.getppid() == int(own[1]))
 
 
-def _see_own_gpu() -> None:
-    """Leave this process the GPU of its place on this machine, as the only one. Before CUDA starts."""
+def _see_own_gpu() -> int:
+    """Leave this process the GPU of its place on this machine, as the only one. Before CUDA starts.
+
+    Returns:
+        Its number among those that the process still sees.
+    """
     place, count = int(os.environ.get("LOCAL_RANK", "0")), int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
     visible = os.environ.get("CUDA_VISIBLE_DEVICES", "")
     names = [name for name in visible.split(",") if name] or [str(gpu) for gpu in range(torch.cuda.device_count())]
     if len(names) < count:
         raise InputError(f"{count} processes need as many GPUs on this machine, {len(names)} answer: start fewer")
     os.environ["CUDA_VISIBLE_DEVICES"] = names[place]
-    if torch.cuda.device_count() > 1:  # the driver had counted them already
-        torch.cuda.set_device(place)
+    if torch.cuda.device_count() == 1:
+        return 0
+    torch.cuda.set_device(place)  # the driver had counted them already
+    return place
 
 
 class _Watch:

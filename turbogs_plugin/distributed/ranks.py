@@ -52,8 +52,12 @@ class Ranks:
         return False
 
     def meet(self, device: torch.device) -> None:
-        """Connect the processes' tensors of a device, which the first exchange would do. Every process must call this.
-        NCCL takes up to half a second."""
+        """Connect the processes' GPUs, so that no exchange waits for it: NCCL takes up to half a second. Every process
+        must call this, and waits for the others. Another thread may exchange what lies on the host meanwhile.
+
+        Args:
+            device: of the training; where it is a CPU, nothing is left to connect.
+        """
 
     @contextmanager
     def working(self) -> Iterator[None]:
@@ -87,16 +91,19 @@ class ProcessRanks(Ranks):
 
     Tensors travel by the backend of their device: NCCL on GPUs, gloo on CPUs.
 
+    Args:
+        gpu: number of this process's GPU among those that it sees.
+
     Attributes:
         asked: number of the signal by which this process wants all to stop; 0: none.
         latest: `time.monotonic` of the latest sign of progress; infinite while `working`.
         reads_peers: all processes may use each other's memory in place, as far as they have tried.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, gpu: int = 0) -> None:
         import torch.distributed as distributed
 
-        self._distributed = distributed
+        self._distributed, self._gpu = distributed, gpu
         # Newer versions of torch have another name for it, and warn of the old one.
         self._all_gather = getattr(distributed, "all_gather_single", None) or distributed.all_gather_into_tensor
         self.rank, self.count = distributed.get_rank(), distributed.get_world_size()
@@ -163,8 +170,11 @@ class ProcessRanks(Ranks):
         return True
 
     def meet(self, device: torch.device) -> None:
-        self.broadcast(torch.zeros(1, device=device))
-        synchronize(device)
+        # Not on a CPU: gloo takes exchanges of two threads in the order in which they come, which processes differ in.
+        if device.type == "cuda":
+            torch.cuda.set_device(self._gpu)  # every thread has a current one
+            self.broadcast(torch.zeros(1, device=device))
+            synchronize(device)
 
     @contextmanager
     def working(self) -> Iterator[None]:

@@ -172,7 +172,7 @@ class Engine(ABC):
             seen: [2] int32, written: the largest `PassStatus.OVERFLOW` of all, and the largest `PassStatus.STOP`.
 
         Returns:
-            [P, 3] float32, one process's after the other's.
+            [P, 3] float32, one process's after the other's; valid until the next call.
         """
         colors = gather_colors(parts, first, counts, seen)
         if self.overflow is not None:

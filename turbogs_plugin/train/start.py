@@ -86,7 +86,8 @@ def starting(resolve: Callable[[], torch.device], ranks: Ranks = ONE) -> Iterato
 
     Args:
         resolve: says which device; what it raises is raised by the future.
-        ranks: the processes that train together; each calls this.
+        ranks: the processes that train together; each calls this. Where one ends before, the others wait until their
+            launcher ends them.
 
     Yields:
         The device, started.
@@ -94,10 +95,10 @@ def starting(resolve: Callable[[], torch.device], ranks: Ranks = ONE) -> Iterato
 
     def start() -> torch.device:
         device = resolve()
+        ranks.meet(device)
         synchronize(device)  # makes CUDA's context, and takes no memory through torch
         if device.type == "cuda":
             compiled_kernels()
-        ranks.meet(device)
         return device
 
     with ThreadPoolExecutor(1) as pool:
