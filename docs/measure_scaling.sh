@@ -51,8 +51,9 @@ run() {
 
 # The numbers that the rest waits for: iterations on one GPU and on two. 1000 Gaussians say what the host takes.
 stage machine 0 sh -c "nvidia-smi topo -m; nvidia-smi --query-gpu=name,driver_version --format=csv; git rev-parse HEAD"
-test "${RANKS:-}" = no || stage ranks 60 "$python" -m turbogs_plugin bench ranks --scene "$fox" --gpus $counts --gaussians 600000 150000 1000 \
-    --views 10 3 --grown --device "$device" --out "$out/ranks.json" ${BENCH:-}
+test "${RANKS:-}" = no ||
+    stage ranks 60 "$python" -m turbogs_plugin bench ranks --scene "$fox" --gpus $counts \
+        --gaussians 600000 150000 1000 --views 10 3 --grown --device "$device" --out "$out/ranks.json" ${BENCH:-}
 runs() {
     run one "$1" 1
     run two "$1" 2

@@ -73,8 +73,9 @@ def recorded(out: Path) -> dict[str, Any]:
     """What is kept of whole runs and of a study: ``runs``, name -> evaluations as (iteration, seconds, PSNR, SSIM,
     Gaussians), ``studies``, GPUs -> seconds at which cells ended, and ``provenance``. Of OUT, or of the file that
     `main` made of it there."""
-    if (out / KEPT).is_file() and not (out / "runs").is_dir():
-        return json.loads((out / KEPT).read_text())
+    kept = json.loads((out / KEPT).read_text()) if (out / KEPT).is_file() else {}
+    if kept and not (out / "runs").is_dir():
+        return kept
     runs = {}
     for run in sorted((out / "runs").glob("*-*")):
         history = read_history(run / "history.jsonl")
@@ -86,11 +87,9 @@ def recorded(out: Path) -> dict[str, Any]:
         ends = sorted(file.stat().st_mtime for file in (out / f"study-{gpus}").glob("cells/*/*.json"))
         if ends:
             studies[gpus] = [round(end - ends[0], 3) for end in ends]
-    if (out / KEPT).is_file():  # of the machine that measured
-        here = json.loads((out / KEPT).read_text())["provenance"]
-    else:
-        here = asdict(provenance("cuda" if torch.cuda.is_available() else "cpu"))
-    return {"provenance": here, "runs": runs, "studies": studies}
+    # Of the machine that measured, which has written the file first.
+    place = kept.get("provenance") or asdict(provenance("cuda" if torch.cuda.is_available() else "cpu"))
+    return {"provenance": place, "runs": runs, "studies": studies}
 
 
 def trainings(out: Path) -> str:
@@ -127,11 +126,10 @@ def _sooner(histories: dict[str, list[Evaluation]], times: dict[str, list[float]
         if not seeds:
             continue
         pairs = [(times[f"one-{seed}"], times[f"{kind}-{seed}"]) for seed in seeds]
-        rows[f"{name} ({len(seeds)})"] = [
-            f"{mean(alone[place] / ours[place] for alone, ours in pairs):.2f}x" for place in range(len(marks))
-        ]
+        sooner = (mean(alone[place] / ours[place] for alone, ours in pairs) for place in range(len(marks)))
         ends = [(histories[f"one-{seed}"][-1], histories[f"{kind}-{seed}"][-1]) for seed in seeds]
-        rows[f"{name} ({len(seeds)})"] += [
+        rows[f"{name} ({len(seeds)})"] = [
+            *(f"{factor:.2f}x" for factor in sooner),
             f"{mean(ours.psnr - alone.psnr for alone, ours in ends):+.2f} dB",
             f"{mean(ours.ssim - alone.ssim for alone, ours in ends):+.4f}",
         ]

@@ -92,7 +92,6 @@ class InPlace:
         if self._possible and self._memory is None:
             self._slots, self._instances = LEAST // 8, LEAST // INSTANCE
             self._take(device)
-            self._possible = self._memory is not None
 
     def prepare(self, engine: Engine, shares: Sequence[Share], gaussians: int, device: torch.device) -> bool:
         """Make room for a pass, which the engine keeps in this memory. Every process must call this.
@@ -109,8 +108,7 @@ class InPlace:
         instances = max(len(share) for share in shares) * gaussians
         if self._memory is None or slots > self._slots or instances > self._instances:
             self._grow(engine, slots, instances, device)
-            if self._memory is None:
-                self._possible = False
+            if not self._possible:
                 return False
         elif self._read:
             self._memory.barrier(FREE)
@@ -141,12 +139,13 @@ class InPlace:
         self._take(device)
 
     def _take(self, device: torch.device) -> None:
-        """Take memory for so many slots and instances."""
+        """Take memory for `_slots` and `_instances`, or learn that there is none."""
         sizes = (PassStatus.SIZE, 3 * self._slots, 2 * self._instances, ScreenRecord.SIZE * self._instances)
         self._starts = aligned_starts(sizes)
         self._read = False
         self._memory = self._share(self._ranks, self._starts[-1], device)
-        if self._memory is not None:
+        self._possible = self._memory is not None
+        if self._possible:
             part = self._memory.parts[self._ranks.rank]
             parts = (part[start : start + size] for start, size in zip(self._starts, sizes, strict=False))
             status, colors, radii, records = parts

@@ -15,7 +15,6 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
-from turbogs_plugin.device import synchronize
 from turbogs_plugin.errors import TrainingStopped
 
 Value = TypeVar("Value")
@@ -174,7 +173,6 @@ class ProcessRanks(Ranks):
         if device.type == "cuda":
             torch.cuda.set_device(self._gpu)  # every thread has a current one
             self.broadcast(torch.zeros(1, device=device))
-            synchronize(device)
 
     @contextmanager
     def working(self) -> Iterator[None]:

@@ -35,8 +35,8 @@ def sample_order(x: Tensor, y: Tensor) -> Tensor:
 @lru_cache(maxsize=4096)
 def _starts(sizes: bytes, origin: tuple[int, int]) -> tuple[int, ...]:
     """`TileGrid.starts` of these int64 sizes. Kept, as iterations ask for few sizes again and again."""
-    shapes = -(-(np.frombuffer(sizes, dtype=np.int64).reshape(-1, 2) + origin) // TILE_SIZE)
-    return 0, *shapes.prod(axis=1).cumsum().tolist()
+    grid = TileGrid(np.frombuffer(sizes, dtype=np.int64).reshape(-1, 2), origin)
+    return 0, *grid.shapes.prod(axis=1).cumsum().tolist()
 
 
 @dataclass

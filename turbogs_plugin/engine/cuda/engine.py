@@ -9,7 +9,13 @@ from torch import Tensor
 
 from turbogs_plugin.engine import layout
 from turbogs_plugin.engine.cuda import exposure, launches, library, training
-from turbogs_plugin.engine.cuda.raster import CudaRendered, CudaScreenGradients, rasterize_cuda, screen_gradients
+from turbogs_plugin.engine.cuda.raster import (
+    Buffers,
+    CudaRendered,
+    CudaScreenGradients,
+    rasterize_cuda,
+    screen_gradients,
+)
 from turbogs_plugin.engine.cuda.workspace import Workspace
 from turbogs_plugin.engine.exposures import Exposures
 from turbogs_plugin.engine.protocol import Engine, MapUpdate, PassMemory
@@ -64,20 +70,13 @@ class CudaEngine(Engine):
             self.workspace.lend(memory)
 
     def gather(self, parts: Sequence[Tensor], first: int, counts: Sequence[int], seen: Tensor) -> Tensor:
-        def arguments() -> launches.GatherColors:
-            shape = (sum(counts), 3)
-            if self.workspace is None:
-                colors = torch.empty(shape, device=seen.device)
-            else:
-                colors = self.workspace.buffer("gathered_colors", shape, torch.float32)
+        def arguments(buffers: Buffers, *_: int) -> launches.GatherColors:
             peers = launches.Peers(*parts, *(None,) * (layout.MAX_PEERS - len(parts)))
+            colors = buffers.floats("gathered_colors", sum(counts), 3)
             return launches.GatherColors(peers, list(counts), first, colors, seen, self.overflow)
 
-        if self.workspace is None:
-            launch = arguments()
-        else:
-            places = [part.data_ptr() for part in (*parts, seen)]
-            launch = self.workspace.kept("gather", (first, *counts, *places), arguments)
+        places = [part.data_ptr() for part in (*parts, seen)]
+        launch = Buffers(self.workspace, seen.device).kept("gather", arguments, first, *counts, *places)
         library.launch(launch)
         return launch.colors
 

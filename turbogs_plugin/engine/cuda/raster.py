@@ -195,7 +195,7 @@ class CudaRendered(Rendered):
                 raise InputError(f"{name} must be {wanted}, got {value.dtype} {list(value.shape)} on {value.device}")
         ready = {name: None if value is None else value.contiguous() for name, value in upstream.items()}
         instances = len(self._forward.instances)
-        records = _Buffers(self._workspace, self.colors.device).floats("records", instances, ScreenRecord.SIZE)
+        records = Buffers(self._workspace, self.colors.device).floats("records", instances, ScreenRecord.SIZE)
         backward = launches.RasterBackward(
             self._forward,
             **ready,
@@ -238,7 +238,7 @@ def _scene(gaussians: Gaussians, cameras: Cameras, sh_degree: int, eps2d: float)
 
 
 @dataclass(frozen=True)
-class _Buffers:
+class Buffers:
     """Uninitialised memory for a pass: from the workspace, or newly allocated without one."""
 
     workspace: Workspace | None
@@ -269,7 +269,7 @@ class _Front:
     records: Tensor | None
 
     @classmethod
-    def of(cls, buffers: _Buffers, views: int, count: int, num_active: int, num_tiles: int) -> _Front:
+    def of(cls, buffers: Buffers, views: int, count: int, num_active: int, num_tiles: int) -> _Front:
         workspace = buffers.workspace
         splats = launches.Splats(
             cameras=buffers.floats("cameras", views, layout.CameraRow.SIZE),
@@ -306,7 +306,7 @@ class _Back:
     chunks: int
 
     @classmethod
-    def of(cls, buffers: _Buffers, capacity: int, slots: int, num_active: int) -> _Back:
+    def of(cls, buffers: Buffers, capacity: int, slots: int, num_active: int) -> _Back:
         chunks = warps_per_tile(slots, num_active)
         return cls(
             intersection_keys=buffers.integers("intersection_keys", capacity, dtype=torch.int64),
@@ -342,7 +342,7 @@ def rasterize_cuda(
     gaussians = _ready(gaussians, workspace)
     device = gaussians.device
     _check_batch(cameras, samples, device)
-    buffers = _Buffers(workspace, device)
+    buffers = Buffers(workspace, device)
     views, count, slots = len(cameras), len(gaussians), len(samples)
     num_tiles, num_active = len(samples.grid), len(samples.tile_ids)
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import accumulate
+from itertools import accumulate, pairwise
 
 import numpy as np
 import torch
@@ -47,7 +47,8 @@ def sample_pixels(rule: DrawRule, maps: ErrorMaps, view_ids: tuple[int, ...], ra
     shapes, masks = tuple(map(tuple, sizes.tolist())), launches.NO_MASKS
     origin = rule.origin(step.iteration, masked=maps.masks is not None)
     if maps.masks is None:
-        tiles, live_starts = _tiles(shapes, origin), None
+        starts = TileGrid(sizes, origin).starts
+        tiles, live_starts = tuple([end - start for start, end in pairwise(starts)]), None
     else:
         masks = maps.masks
         tiles, live_starts = tuple(masks.live_counts(view_ids)), tuple(masks.offsets[views].tolist())
@@ -124,12 +125,6 @@ def _wanted(rule: DrawRule, rate: float, tiles: Sequence[int]) -> tuple[int, ...
         return tuple(rule.wanted(rate, count) for count in tiles)
     units = TILE_PIXELS // (CELL_SIDE**2 if rule.unit == "cell" else 1)
     return (rule.wanted(rate, units),) * len(tiles)
-
-
-@lru_cache(maxsize=4096)
-def _tiles(shapes: tuple[tuple[int, int], ...], origin: tuple[int, int]) -> tuple[int, ...]:
-    """Number of tiles of views with these (width, height)."""
-    return tuple(TileGrid(np.array(shapes), origin).shapes.prod(axis=1).tolist())
 
 
 @lru_cache(maxsize=4096)
