@@ -12,7 +12,7 @@ python=${PYTHON:-python3} within=${WITHIN:-470} scratch=${SCRATCH:-$(mktemp -d)}
 export NCCL_NVLS_ENABLE=0 OMP_NUM_THREADS="${OMP_NUM_THREADS:-8}"
 mkdir -p "$out/runs" "$scratch" || exit 2
 
-counts="1 2" all=0,1 four=$([ "$(nvidia-smi -L 2>/dev/null | wc -l)" -ge 4 ] && echo yes)
+counts="1 2" all=0,1 four=$([ "$("$python" -c "import torch; print(torch.cuda.device_count())")" -ge 4 ] && echo yes)
 test -n "$four" && counts="1 2 4" all=0,1,2,3
 
 elapsed() { echo $(($(date +%s) - begun)); }

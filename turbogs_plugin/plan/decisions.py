@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 from turbogs_plugin.config.auto import AUTO, value_of
 from turbogs_plugin.config.configuration import Config
+from turbogs_plugin.config.scaling import RATE_EXPONENT
 from turbogs_plugin.engine.layout import MAX_VIEWS
 from turbogs_plugin.model.initial import BACKDROP_COUNT
 from turbogs_plugin.plan.caps import cap_of
@@ -47,7 +48,8 @@ take as many; those of more photos would take minutes or hours that nobody has a
 For several processes, of which each iteration has as many times the pixels, it is that much less."""
 SHORTEST_SHARE = 0.4
 """Least share of `train.base_iterations`: with fewer iterations, however few the photos, the events of density control
-would be too close together. fox has 52 % of them with 60 epochs."""
+would be too close together. fox has 52 % of them with 60 epochs. For several processes, whose steps are longer by the
+root of their number, so many fewer steps go as far (thirtieth round)."""
 
 Value = bool | int | float | str
 
@@ -166,13 +168,13 @@ def wanted_iterations(facts: SceneFacts, config: Config) -> Verdict:
     batch = decide("train.batch_for", facts, config)
     factor = batch.value if batch.made == "auto" else 1  # what is set is in the schedule already
     wanted = train.epochs * views / (factor * images_per_iteration(config, views))
-    fewest = SHORTEST_SHARE * train.base_iterations
+    fewest = SHORTEST_SHARE * train.base_iterations / factor**RATE_EXPONENT
     longest = max(LONGEST / factor, fewest)
     given = min(max(wanted, fewest), longest)
     reason = f"{train.epochs:g} epochs of {views} training views"
     reason += f", {factor} times the pixels an iteration" if factor > 1 else ""
     if wanted < fewest:
-        reason += f" take fewer than {SHORTEST_SHARE:.0%} of {train.base_iterations}"
+        reason += f" take fewer than {fewest:.0f}, the least"
     if wanted > longest:
         looks = train.epochs * longest / wanted
         reason += f" take {wanted:.0f}; at most {longest:.0f}, where a pixel is sampled {looks:.1f} times"
