@@ -18,7 +18,6 @@ LAYOUT = ROOT / "turbogs_plugin/engine/layout.py"
 LAUNCHES = ROOT / "turbogs_plugin/engine/cuda/launches/__init__.py"
 CONSTANTS = {
     ROOT / "turbogs_plugin/types/samples.py": ("TILE_SIZE",),
-    ROOT / "turbogs_plugin/tiles.py": ("CELL_SIDE",),
 }
 """Further numbers, of files that import torch: they are read, not run."""
 

@@ -58,8 +58,7 @@ class RulePixelSampler:
     heeds_masks: ClassVar[bool] = True
 
     def sample(self, maps: ErrorMaps, view_ids: ViewIds, rate: float, step: Step) -> PixelSamples:
-        """Draw the share `rate` (r) of the units (pixels or cells) of each tile or, with `unit: tile`, of the tiles of
-        each view.
+        """Draw the share `rate` (r) of the pixels of each tile or, with `unit: tile`, of the tiles of each view.
 
         Args:
             view_ids: see `view_numbers`.
@@ -82,8 +81,8 @@ class ErrorGuidedPixelSampler(RulePixelSampler):
         hard_ratio, stable_ratio: r_hard and r_stable, shares of the units drawn in each tile.
         mixed: how the remaining share is drawn, which the paper names but does not define: by `error_age`, the mean of
             the two normalised distributions, or `uniform`.
-        unit: `pixel` (the paper), `cell` (4x4 pixels of a tile), or `tile` (whole tiles of a view, which begin
-            elsewhere in each iteration: `DrawRule.origin`).
+        unit: `pixel` (the paper), or `tile` (whole tiles of a view, which begin elsewhere in each iteration:
+            `DrawRule.origin`).
         importance: exponent a of the importance weights p^-a, p the probability that a unit is drawn: 0 none, as in the
             paper's runs; 1 unbiased (exactly so for a draw of a single stage).
         multiple: of unit `pixel`: a tile gets the nearest multiple of so many. Our rasterizer takes 32 samples at once,

@@ -170,7 +170,6 @@ def test_masked_pixels_have_no_part_in_means():
 
 BEFORE_MASKS = {
     "pixel": ("4a00f6ccb61fa1da", "5eb3cb40ead87b29"),
-    "cell": ("f2d949e6b840b812", "330e59140c25e735"),
     "tile": ("4c43c8e8312d6f53", "eeb893a2b3f7c6d6"),
 }
 """Digests of draws, error-guided and random, as they were before there were masks. Tiles: in iteration 0, as their grid

@@ -13,8 +13,6 @@ from torch import Tensor
 from turbogs_plugin.types import TILE_SIZE, PixelSamples, TileGrid, sample_order
 
 TILE_PIXELS = TILE_SIZE * TILE_SIZE
-CELL_SIDE = 4
-TILE_CELLS = (TILE_SIZE // CELL_SIDE) ** 2
 
 
 def _places(device: torch.device | str) -> tuple[Tensor, Tensor]:
@@ -25,15 +23,9 @@ def _places(device: torch.device | str) -> tuple[Tensor, Tensor]:
     return x[order], y[order]
 
 
-def cell_of_place(device: torch.device | str) -> Tensor:
-    """[256] int32: which 4x4 cell of the tile, counted row by row, each place lies in."""
-    x, y = _places(device)
-    return y // CELL_SIDE * (TILE_SIZE // CELL_SIDE) + x // CELL_SIDE
-
-
-def slots_of_tiles(unit: str, wanted: int, widths: np.ndarray, heights: np.ndarray) -> np.ndarray:
-    """[T] int64: slots of each tile of which so many units are drawn, `pixel` or `cell`. The rest as `tile_extents`."""
-    return np.minimum(wanted * (CELL_SIDE**2 if unit == "cell" else 1), widths * heights)
+def slots_of_tiles(wanted: int, sizes: np.ndarray) -> np.ndarray:
+    """[T] int64: slots of each tile of ``TileGrid(sizes)``: so many pixels, or all that the tile has."""
+    return np.minimum(wanted, np.multiply(*tile_extents(sizes)))
 
 
 @dataclass(frozen=True)
@@ -57,10 +49,9 @@ class DrawEnds:
         if self.unit == "tile":
             return np.cumsum(self.wanted), np.cumsum(np.full(sum(self.wanted), TILE_PIXELS))
         if self.live is not None:
-            slots = self.wanted[0] * (CELL_SIDE**2 if self.unit == "cell" else 1)
-            return np.cumsum(self.live), np.cumsum(np.full(sum(self.live), slots))
+            return np.cumsum(self.live), np.cumsum(np.full(sum(self.live), self.wanted[0]))
         sizes = np.array(self.sizes, dtype=np.int64)
-        return TileGrid(sizes).offsets[1:], np.cumsum(slots_of_tiles(self.unit, self.wanted[0], *tile_extents(sizes)))
+        return TileGrid(sizes).offsets[1:], np.cumsum(slots_of_tiles(self.wanted[0], sizes))
 
 
 def pixel_table(sizes: np.ndarray, device: torch.device | str, origin: tuple[int, int] = (0, 0)) -> Tensor:

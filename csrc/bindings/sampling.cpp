@@ -23,7 +23,7 @@ void launches::SamplePixels::run(const Arguments<SamplePixels>& in) {
     }
     params.num_tiles = to_int(tiles, "tiles");
     params.unit = to_enumeration<SampleUnit>(in.integer(Integers::unit), kNumSampleUnits,
-                                             "unit must be 0 (pixel), 1 (cell) or 2 (tile)");
+                                             "unit must be 0 (pixel) or 1 (tile)");
     STD_TORCH_CHECK(params.unit == SampleUnit::kTile || chosen == tiles,
                     "turbogs: tile_ids must have an entry for each tile");
     const bool at_origin = params.views[0].origin_x == 0 && params.views[0].origin_y == 0;

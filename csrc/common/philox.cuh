@@ -9,7 +9,7 @@
 namespace turbogs {
 
 // As in philox.py.
-constexpr uint32_t kPurposePixels = 0, kPurposeCells = 1, kPurposeTiles = 2, kPurposeDropout = 7;
+constexpr uint32_t kPurposePixels = 0, kPurposeTiles = 2, kPurposeDropout = 7;
 
 // The multipliers of Philox4x32.
 constexpr uint32_t kPhiloxMultiplier0 = 0xD2511F53u, kPhiloxMultiplier1 = 0xCD9E8D57u;

@@ -12,7 +12,7 @@ struct SampleView {
     int tile_base;    // first tile in the batch's numbering
     int origin_x, origin_y;  // pixels by which the grid of tiles begins before the image
     int view_number;  // training view
-    int slot_base;    // sampler: first slot (units pixel and cell); first chosen tile (unit tile)
+    int slot_base;    // sampler: first slot (unit pixel) or first chosen tile (unit tile)
 };
 
 }  // namespace turbogs

@@ -7,7 +7,6 @@
 namespace turbogs {
 
 constexpr int kTilePixels = kTileSize * kTileSize;
-constexpr int kTileCells = kTilePixels / (kCellSide * kCellSide);
 constexpr int kMaxBands = (kMaxShDegree + 1) * (kMaxShDegree + 1) - 1;  // spherical harmonics above band 0
 constexpr int kRecordQuads = ScreenRecord::kSize / 4;                   // of 16 bytes
 

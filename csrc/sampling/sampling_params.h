@@ -28,7 +28,7 @@ struct SamplePixelsParams {
     SampleView views[kMaxViews];
     int stages[kMaxViews][3];  // units of the hard, stable and mixed stage: of a tile, or for unit tile of the view
     LiveTiles live[kMaxViews];
-    int slots_per_tile;        // units pixel and cell: slots of a tile that is not cut; also the cap of a cut one. With
+    int slots_per_tile;        // unit pixel: slots of a tile that is not cut; also the cap of a cut one. With
                                // masks, of every tile
     bool mixed_uniform;
     float importance;  // a of the weights p^-a, 0 for none

@@ -84,7 +84,6 @@ struct PixelUnits {
         return __half2float(__ushort_as_half(static_cast<unsigned short>(packed[j])));
     }
     __device__ __forceinline__ int age(int j) const { return static_cast<int>(packed[j] >> 16); }
-    __device__ __forceinline__ uint32_t place(int j) const { return pixels.id(j); }
 };
 
 __device__ __forceinline__ PixelUnits load_maps(const SamplePixelsParams& params, const TilePixels& pixels) {

@@ -6,7 +6,7 @@
 // threshold bit by bit, with counts over the block. There are only a few thousand keys. The drawn sets equal those of
 // the torch reference.
 #include "sampling/tile_pixels.cuh"
-#include "sampling/warp_draw.cuh"
+#include "sampling/race_keys.cuh"
 
 namespace turbogs {
 namespace {

@@ -4,6 +4,7 @@
 
 #include "common/warp.cuh"
 #include "sampling/race_keys.cuh"
+#include "sampling/tile_pixels.cuh"
 
 namespace turbogs {
 
@@ -161,17 +162,16 @@ __device__ __forceinline__ Thresholds<Key> stage_thresholds(const Key (&keys)[kU
     return {warp_max(left), static_cast<Key>(~warp_max(not_taken))};
 }
 
-// The three stages over a warp's units. Returns the drawn ones; `missed` the probability of not being drawn.
-// `units.error(j)`, `.age(j)` and `.place(j)` are of the lane's j-th; bit j of `exist` says whether there is one.
-template <bool kWeighted, int kUnits, class Units>
-__device__ __forceinline__ uint32_t draw(const SamplePixelsParams& params, const Units& units, uint32_t exist,
-                                         uint32_t view, uint32_t purpose, double error_sum, int age_sum,
-                                         float (&missed)[kUnits]) {
+// The three stages over a tile's pixels. Returns the drawn ones; `missed` the probability of not being drawn.
+template <bool kWeighted>
+__device__ __forceinline__ uint32_t draw(const SamplePixelsParams& params, const PixelUnits& units, uint32_t view,
+                                         double error_sum, int age_sum, float (&missed)[kPerLane]) {
+    const uint32_t exist = units.pixels.inside;
     const int hard = params.stages[0][0], stable = params.stages[0][1], mixed = params.stages[0][2];
-    uint32_t keys[kUnits], hard_words[kUnits], stable_words[kUnits], mixed_words[kUnits];
+    uint32_t keys[kPerLane], hard_words[kPerLane], stable_words[kPerLane], mixed_words[kPerLane];
 #pragma unroll
-    for (int j = 0; j < kUnits; ++j) {
-        const uint3 words = random_words(params.keys, units.place(j), view, purpose);
+    for (int j = 0; j < kPerLane; ++j) {
+        const uint3 words = random_words(params.keys, units.pixels.id(j), view, kPurposePixels);
         hard_words[j] = words.x;
         stable_words[j] = words.y;
         mixed_words[j] = words.z;
@@ -179,15 +179,15 @@ __device__ __forceinline__ uint32_t draw(const SamplePixelsParams& params, const
     }
     const auto miss = [&](uint32_t taken, const auto& thresholds, const auto& chance_of) {
 #pragma unroll
-        for (int j = 0; j < kUnits; ++j) {
+        for (int j = 0; j < kPerLane; ++j) {
             const auto tau = (taken >> j & 1u) != 0u ? thresholds.largest_left : thresholds.smallest_taken;
             missed[j] *= thresholds.largest_left == 0 ? 0.0f : 1.0f - chance_of(j, tau);
         }
     };
     // The winners of a race among the `open` units; `near_weight` is the weight but for rounding.
-    const auto race = [&](uint32_t open, int count, float total, const uint32_t (&words)[kUnits], const auto& weight_of,
-                          const auto& near_weight_of) {
-        const uint32_t guess = race_guess<kUnits>(total, count);
+    const auto race = [&](uint32_t open, int count, float total, const uint32_t (&words)[kPerLane],
+                          const auto& weight_of, const auto& near_weight_of) {
+        const uint32_t guess = race_guess<kPerLane>(total, count);
         const auto exact_key = [&](int j) { return race_key(weight_of(j), words[j]); };
         if constexpr (!kWeighted) {
             make_keys(keys, open, [&](int j) { return approximate_race_key(near_weight_of(j), words[j]); });
@@ -216,7 +216,7 @@ __device__ __forceinline__ uint32_t draw(const SamplePixelsParams& params, const
             taken |= take_largest<Spread::kUniform>(keys, oldest.room);
         }
         if (kWeighted) {
-            uint64_t age_keys[kUnits];  // plus 1, so that 0 is no unit
+            uint64_t age_keys[kPerLane];  // plus 1, so that 0 is no unit
             make_keys(age_keys, open, [&](int j) { return age_key(units.age(j), stable_words[j]) + 1u; });
             miss(taken, stage_thresholds(age_keys, taken),
                  [&](int j, uint64_t tau) { return age_chance(units.age(j), tau - 1u); });
@@ -234,7 +234,7 @@ __device__ __forceinline__ uint32_t draw(const SamplePixelsParams& params, const
             return params.mixed_uniform ? 1.0f : units.error(j) * of_error + static_cast<float>(units.age(j)) * of_age;
         };
         // The shares of all units add up to 2, of which the stages before took the larger.
-        const float total = params.mixed_uniform ? static_cast<float>(kWarpSize * kUnits) : 1.0f;
+        const float total = params.mixed_uniform ? static_cast<float>(kWarpSize * kPerLane) : 1.0f;
         drawn |= race(exist & ~drawn, mixed, total, mixed_words, weight_of, near_weight_of);
     }
     return drawn;

@@ -35,7 +35,6 @@ CASES = {
     "usual": ("train.average_last=1.0",),
     "one view": ("schedule.type=fixed", "schedule.views=1"),
     "one tile": ("schedule.type=fixed", "schedule.views=1", "schedule.pixel_budget=0.1", "pixel_sampler.unit=tile"),
-    "cells": ("pixel_sampler.unit=cell",),
     "tiles": ("pixel_sampler.unit=tile", "pixel_sampler.importance=0.5"),
     "summed rows": ("optimizer.rows=summed",),
     "no rule": ("optimizer.type=adam",),

@@ -35,7 +35,7 @@ def samples_of(
     return ErrorGuidedPixelSampler(unit=unit).sample(maps, tuple(range(views)), rate, Step(3, 10, 8))
 
 
-@pytest.mark.parametrize("unit", ["pixel", "cell", "tile"])
+@pytest.mark.parametrize("unit", ["pixel", "tile"])
 @pytest.mark.parametrize("count", [2, 3, 8])
 @pytest.mark.parametrize("views", [1, 3, 6])
 @pytest.mark.parametrize("sizes", [EQUAL, MIXED])
@@ -107,7 +107,7 @@ def test_dense_samples_know_their_ends():
     assert_ends_are_known(dense_pixels((0, 1, 2), np.array(MIXED[:3]), "cpu"))
 
 
-@pytest.mark.parametrize("unit", ["pixel", "cell", "tile"])
+@pytest.mark.parametrize("unit", ["pixel", "tile"])
 @pytest.mark.parametrize("rate", [0.004, 0.3, 1.0])
 @pytest.mark.parametrize("masked", [False, True])
 def test_draws_know_their_ends(unit, rate, masked):

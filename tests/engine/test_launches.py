@@ -18,7 +18,6 @@ from turbogs_plugin.engine.cuda.training import view_rows
 from turbogs_plugin.engine.exposures import Exposures
 from turbogs_plugin.engine.moments import GaussianMoments
 from turbogs_plugin.engine.rules import LossTerms, ParameterRates
-from turbogs_plugin.tiles import CELL_SIDE
 from turbogs_plugin.types import TILE_SIZE, Gaussians, GaussianStats, PixelSamples
 
 CSRC = Path(__file__).resolve().parents[2] / "csrc"
@@ -142,7 +141,7 @@ def test_columns_of_a_row_follow_one_another(row):
 def test_the_kernels_have_the_sizes_and_enumerations_of_python(headers):
     text = headers["layout.h"].split("struct ")[0]
     sizes = {name: value for name, value in vars(layout).items() if isinstance(value, int)}
-    sizes |= {"TILE_SIZE": TILE_SIZE, "CELL_SIDE": CELL_SIDE}
+    sizes["TILE_SIZE"] = TILE_SIZE
     built = {re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name).upper(): value for name, value in constants(text).items()}
     assert sizes.items() <= built.items()
     for name, values in (("SampleUnit", layout.UNITS), ("Structure", layout.STRUCTURES)):

@@ -31,7 +31,7 @@ DEVICE = "cuda"
 
 VARIANTS = (
     (),
-    ("optimizer.type=sparse_adam", "pixel_sampler.unit=cell", "loss.ncc_weight=1.0"),
+    ("optimizer.type=sparse_adam", "pixel_sampler.importance=0.5", "loss.ncc_weight=0.4"),
     ("optimizer.rows=summed", "pixel_sampler.unit=tile", "pixel_sampler.importance=0.5", "loss.type=sparse_ssim"),
     ("train.dropout=0.3",),
 )

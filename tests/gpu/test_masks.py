@@ -65,7 +65,7 @@ def masked_maps(device, seed=0):
     return maps
 
 
-@pytest.mark.parametrize("unit", ["pixel", "cell", "tile"])
+@pytest.mark.parametrize("unit", ["pixel", "tile"])
 @pytest.mark.parametrize("rate", [0.004, 0.1, 0.33, 1.0])
 @pytest.mark.parametrize(
     ("hard", "stable", "uniform", "importance"),
@@ -85,7 +85,7 @@ def test_equal_sets(unit, rate, hard, stable, uniform, importance, views):
         torch.testing.assert_close(found.weights.cpu(), expected.weights, rtol=2e-5, atol=0)
 
 
-@pytest.mark.parametrize("unit", ["pixel", "cell", "tile"])
+@pytest.mark.parametrize("unit", ["pixel", "tile"])
 def test_several_processes_share_live_tiles_without_a_wait(unit):
     maps, rule = masked_maps(DEVICE), DrawRule(unit, 0.4, 0.3, False, 0.0)
     samples = training_kernels.sample_pixels(rule, maps, (3, NOTHING, 0), 0.3, Step(0, 9, 5))
@@ -100,7 +100,7 @@ def test_several_processes_share_live_tiles_without_a_wait(unit):
     assert [view for share in shares for view in range(3)[share.begun]] == [0, 1, 2]
 
 
-@pytest.mark.parametrize("unit", ["pixel", "cell", "tile"])
+@pytest.mark.parametrize("unit", ["pixel", "tile"])
 def test_a_view_masked_whole_gives_no_sample(unit):
     """And renders, learns and counts nothing, with and without a workspace."""
     maps = masked_maps(DEVICE)
@@ -191,7 +191,7 @@ def masked_capture(tmp_path_factory):
     [
         (),
         ("pixel_sampler.unit=tile",),
-        ("pixel_sampler.unit=cell", "train.background=random"),
+        ("pixel_sampler.importance=0.5", "train.background=random"),
     ],
 )
 def test_training_with_masks_waits_for_nothing_and_learns_no_masked_pixel(masked_capture, overrides):

@@ -17,9 +17,9 @@ pytestmark = [
 
 SIZES = np.array([[37, 21], [16, 16], [1, 1], [50, 3], [300, 200]])
 SAMPLERS = [
-    *(ErrorGuidedPixelSampler(unit=unit, importance=a) for unit in ("pixel", "cell", "tile") for a in (0.0, 0.5)),
+    *(ErrorGuidedPixelSampler(unit=unit, importance=a) for unit in ("pixel", "tile") for a in (0.0, 0.5)),
     ErrorGuidedPixelSampler(mixed="uniform"),
-    *(RandomPixelSampler(unit=unit) for unit in ("pixel", "cell", "tile")),
+    *(RandomPixelSampler(unit=unit) for unit in ("pixel", "tile")),
     DensePixelSampler(),
 ]
 
@@ -63,7 +63,7 @@ def test_exponentials_have_the_same_bits():
 @pytest.mark.parametrize("loss", [CharbonnierLoss(), CharbonnierNccLoss(), SparseSsimLoss()], ids=repr)
 def test_losses_agree(loss):
     on_cpu, on_gpu = pair_of_maps()
-    sampler = ErrorGuidedPixelSampler(unit="cell", importance=0.5)
+    sampler = ErrorGuidedPixelSampler(importance=0.5)
     samples, twins = (sampler.sample(maps, (4, 0), 0.2, step(3)) for maps in (on_cpu, on_gpu))
     colors, targets = torch.rand(2, len(samples), 3, generator=torch.Generator().manual_seed(1))
     expected = loss(colors, targets, samples)

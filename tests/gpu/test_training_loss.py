@@ -39,7 +39,7 @@ def make_maps(device, seed=0):
     return ErrorMaps.from_images([image.to(device) for image in images])
 
 
-def make_samples(rate, unit="cell", importance=0.0, views=(2, 0)):
+def make_samples(rate, unit="pixel", importance=0.0, views=(2, 0)):
     maps = make_maps("cpu")
     return draw_pixels(DrawRule(unit, 0.4, 0.3, False, importance), maps, views, rate, Step(3, 4, 4))
 
@@ -70,7 +70,7 @@ def relative(found, expected):
 
 
 @pytest.mark.parametrize("name", CASES)
-@pytest.mark.parametrize(("rate", "unit", "importance"), [(0.1, "pixel", 0.5), (0.3, "cell", 0.0), (1.0, "tile", 1.0)])
+@pytest.mark.parametrize(("rate", "unit", "importance"), [(0.1, "pixel", 0.5), (0.3, "pixel", 0.0), (1.0, "tile", 1.0)])
 def test_equals_the_twin(name, rate, unit, importance):
     terms = CASES[name].terms
     samples = make_samples(rate, unit, importance)
@@ -120,7 +120,7 @@ def test_windows_stay_bounded_where_their_variance_is_lost(level):
 @pytest.mark.parametrize("rate", [0.1, 1.0])
 def test_maps_follow(rate):
     """Bit for bit: sums of three absolute values in one order, then single-precision products rounded one by one."""
-    samples = make_samples(rate, "cell")
+    samples = make_samples(rate)
     colors, targets, _ = make_colors(samples)
     maps, twin = make_maps(DEVICE), make_maps("cpu")
     found = training_kernels.sparse_loss(
@@ -161,7 +161,7 @@ def test_bad_colors_stay_out(bad, name):
 
 
 def test_side_stream_and_half_colors():
-    samples = make_samples(0.3, "cell")
+    samples = make_samples(0.3)
     colors, targets, _ = make_colors(samples)
     colors, targets, samples = colors.half().to(DEVICE), targets.to(DEVICE), to_device(samples)
     expected = training_kernels.sparse_loss(CASES["ncc"].terms, colors, targets, samples)

@@ -67,7 +67,7 @@ def assert_equal_samples(found, expected):
         torch.testing.assert_close(found.weights.cpu(), expected.weights, rtol=2e-5, atol=0)
 
 
-@pytest.mark.parametrize("unit", ["pixel", "cell", "tile"])
+@pytest.mark.parametrize("unit", ["pixel", "tile"])
 @pytest.mark.parametrize("rate", [0.004, 0.1, 0.33, 1.0])
 @pytest.mark.parametrize(
     ("hard", "stable", "uniform"),
@@ -97,7 +97,7 @@ def test_equal_sets_of_many_tiles(iteration):
     assert_equal_samples(*draw_both(errors, stamps, (0,), 0.75, rule, 5, iteration, sizes))
 
 
-@pytest.mark.parametrize("unit", ["pixel", "cell", "tile"])
+@pytest.mark.parametrize("unit", ["pixel", "tile"])
 @pytest.mark.parametrize("importance", [0.5, 1.0])
 def test_importance_weights(unit, importance):
     errors, stamps = random_maps(seed=1)

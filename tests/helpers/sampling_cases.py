@@ -7,7 +7,7 @@ from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.types import Step
 
 SIZES = np.array([[37, 21], [16, 16], [1, 1], [50, 3], [64, 48]])
-UNITS = ["pixel", "cell", "tile"]
+UNITS = ["pixel", "tile"]
 SIGMAS = 4.5  # a seeded test compares fewer than 1000 frequencies: a false alarm would have had a chance below 1 %
 
 

@@ -18,7 +18,7 @@ LEVELS = st.sampled_from([0.0, 1e-20, 1e-4, 0.5, 1.0, 1e4, -1e4, 1e6])
 @given(
     sizes=st.lists(st.tuples(st.integers(1, 40), st.integers(1, 40)), min_size=1, max_size=4),
     palette=st.lists(ANY_ERROR, min_size=1, max_size=4),
-    unit=st.sampled_from(["pixel", "cell", "tile"]),
+    unit=st.sampled_from(["pixel", "tile"]),
     shares=st.sampled_from([(0.4, 0.3), (1.0, 0.0), (0.0, 1.0), (0.0, 0.0), (0.5, 0.5)]),
     importance=st.sampled_from([0.0, 0.5, 1.0]),
     rate=st.sampled_from([1e-9, 0.01, 0.1, 0.4, 1.0, 50.0]),

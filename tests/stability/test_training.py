@@ -178,7 +178,7 @@ def write_masks(capture: Path, keep: Callable[[int], np.ndarray]) -> None:
         Image.fromarray(keep(number)).save(capture / "masks" / f"{photo.stem}.png")
 
 
-@pytest.mark.parametrize("unit", ["pixel", "cell", "tile"])
+@pytest.mark.parametrize("unit", ["pixel", "tile"])
 def test_masks_of_one_pixel(variant, tmp_path, unit):
     """Of every training photo one pixel is left: it is drawn in each iteration, as often as there are views of it."""
 
@@ -205,7 +205,7 @@ def test_a_view_masked_whole(variant, tmp_path):
         torch.device("cpu"),
     )
     trainer.initialise_maps()
-    for unit in ("pixel", "cell", "tile"):
+    for unit in ("pixel", "tile"):
         trainer.pixel_sampler = ErrorGuidedPixelSampler(unit=unit, importance=0.5)
         for views in ((0,), (0, 3)):
             trainer.view_sampler.select = lambda *_, views=views: views

@@ -103,30 +103,26 @@ def test_pixel_frequencies_are_exact(hard, stable, mixed, stages):
     assert_frequencies(drawn, exact_sets(ERRORS, AGES, stages, mixed == "uniform"))
 
 
-@pytest.mark.parametrize("unit", ["cell", "tile"])
 @pytest.mark.parametrize(("hard", "stable", "mixed", "stages"), STAGED[::2])
-def test_larger_units_are_drawn_by_their_sums(unit, hard, stable, mixed, stages):
-    """Six cells of a tile, or six tiles of a view, of equal pixels."""
-    side = {"cell": 4, "tile": 16}[unit]
-    y, x = np.mgrid[0 : 2 * side, 0 : 3 * side]
-    units = torch.as_tensor((y // side * 3 + x // side).reshape(-1))
-    rate = {"cell": 3 / 16, "tile": 3 / 6}[unit]
-    sampler = ErrorGuidedPixelSampler(hard, stable, mixed, unit)
-    drawn = drawn_units(sampler, rate, 600, (3 * side, 2 * side), ERRORS, AGES, units)
+def test_tiles_are_drawn_by_their_sums(hard, stable, mixed, stages):
+    """Six tiles of a view, of equal pixels."""
+    y, x = np.mgrid[0:32, 0:48]
+    units = torch.as_tensor((y // 16 * 3 + x // 16).reshape(-1))
+    sampler = ErrorGuidedPixelSampler(hard, stable, mixed, unit="tile")
+    drawn = drawn_units(sampler, 3 / 6, 600, (48, 32), ERRORS, AGES, units)
     assert (drawn.sum(axis=1) == 3).all()
     assert_frequencies(drawn, exact_sets(ERRORS, AGES, stages, mixed == "uniform"))
 
 
-def test_cell_with_one_bad_pixel_counts_its_sum_and_its_oldest():
-    errors, stamps = torch.zeros(256), torch.full((256,), 9)
-    errors[17 * 2] = 1.0  # (2, 2): the first cell
-    maps = ErrorMaps(np.array([[16, 16]]))
+def test_a_tile_with_one_bad_pixel_counts_its_sum_and_its_oldest():
+    errors, stamps = torch.zeros(64 * 64), torch.full((64 * 64,), -1)
+    errors[17 * 2] = 1.0  # (34, 0): the third tile
+    maps = ErrorMaps(np.array([[64, 64]]))
     maps.initialise(0, errors)
-    stamps[12 * 16 + 12] = 0  # the last cell
+    stamps[60 * 64 + 60] = -2  # the last tile
     maps.stamps.copy_(stamps)
-    samples = ErrorGuidedPixelSampler(0.5, 0.5, unit="cell").sample(maps, (0,), 2 / 16, step(10))
-    cells = set(((samples.coordinates() // 4) @ torch.tensor([1, 4])).tolist())
-    assert cells == {0, 15}
+    samples = ErrorGuidedPixelSampler(0.5, 0.5, unit="tile").sample(maps, (0,), 2 / 16, step(0))
+    assert samples.tile_ids.tolist() == [2, 15]
 
 
 def test_random_pixels_are_uniform():

@@ -100,29 +100,11 @@ def test_counts_of_pixels_in_multiples(sampler, rate, wanted):
 
 
 def test_multiples_are_of_single_pixels_and_fill_a_tile():
-    for unit in ("cell", "tile"):
-        plain, whole = (ErrorGuidedPixelSampler(unit=unit, multiple=multiple).rule for multiple in (1, 32))
-        assert plain.wanted(0.3, 16) == whole.wanted(0.3, 16)
+    plain, whole = (ErrorGuidedPixelSampler(unit="tile", multiple=multiple).rule for multiple in (1, 32))
+    assert plain.wanted(0.3, 16) == whole.wanted(0.3, 16)
     for multiple in (0, 24, 512):
         with pytest.raises(InputError, match=r"multiple = .* a divisor of 256"):
             RandomPixelSampler(multiple=multiple)
-
-
-@pytest.mark.parametrize(("rate", "wanted"), [(1e-6, 1), (0.1, 2), (1 / 3, 5), (1.0, 16)])
-def test_counts_of_cells(rate, wanted):
-    samples = ErrorGuidedPixelSampler(unit="cell").sample(random_maps(), (4, 0), rate, step(1))
-    width = {**dict.fromkeys(range(12), 64), **dict.fromkeys(range(12, 18), 37)}
-    for tile, pixels in pixels_by_tile(samples).items():
-        cells = {(pixel // width[tile] // 4, pixel % width[tile] // 4) for pixel in pixels}
-        available = 16 if tile < 14 else {14: 8, 15: 8, 16: 8, 17: 4}[tile]
-        assert len(cells) == min(wanted, available)
-        if tile < 12:
-            assert len(pixels) == 16 * wanted
-    slots = (samples.tile_offsets[1:] - samples.tile_offsets[:-1]).tolist()
-    assert slots[12:] == [
-        min(16 * min(wanted, cells), n)
-        for cells, n in zip([16, 16, 8, 8, 8, 4], [256, 256, 80, 80, 80, 25], strict=True)
-    ]
 
 
 @pytest.mark.parametrize(("rate", "tiles"), [(1e-6, (1, 1)), (0.34, (4, 2)), (1.0, (12, 6))])
@@ -305,8 +287,8 @@ def test_every_pixel_is_revisited(unit):
     errors = torch.zeros(64 * 64)
     errors[:300] = 3.0
     maps.initialise(0, errors)
-    rate = {"pixel": 0.1, "cell": 0.2, "tile": 0.2}[unit]  # 25 of 256, or 3 of 16: stable 8, or 1
-    iterations = {"pixel": 256 // 8, "cell": 16, "tile": 25}[unit]
+    rate = {"pixel": 0.1, "tile": 0.2}[unit]  # 25 of 256, or 3 of 16: stable 8, or 1
+    iterations = {"pixel": 256 // 8, "tile": 25}[unit]
     for t in range(iterations):
         samples = ErrorGuidedPixelSampler(unit=unit).sample(maps, (0,), rate, step(t))
         maps.update(samples, maps.errors[maps.flat_pixels(samples)], step(t))

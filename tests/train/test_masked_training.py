@@ -87,7 +87,7 @@ class ForeignLoss:
     "overrides",
     [
         (),
-        ("pixel_sampler.unit=cell",),
+        ("pixel_sampler.multiple=32",),
         ("pixel_sampler.unit=tile", "loss.type=sparse_ssim"),
         ("pixel_sampler.type=random",),
         ("pixel_sampler.type=dense", "train.backdrop=true"),

@@ -426,7 +426,7 @@ def test_the_trainer_names_no_strategy():
         ("schedule.type=fixed", "view_sampler.type=random", "pixel_sampler.type=random", "loss.type=charbonnier"),
         ("schedule.type=linear", "loss.type=sparse_ssim", "optimizer.type=sparse_adam", "density.type=none"),
         ("schedule.type=exponential", "pixel_sampler.type=dense", "density.type=gsplat_default"),
-        ("pixel_sampler.unit=cell", "pixel_sampler.importance=0.5", "optimizer.rows=summed", "density.score=raw"),
+        ("pixel_sampler.importance=0.5", "optimizer.rows=summed", "density.score=raw"),
         ("pixel_sampler.unit=tile", "train.sh_degree=0", "train.backdrop=true"),
     ],
     ids=lambda overrides: overrides[0],

@@ -26,8 +26,8 @@ SCAN_TILES = 1024
 SORT_RUN = 512
 """Intersections of a tile that one warp sorts. A tile with more is sorted in runs of this length, which are merged."""
 
-UNITS = ("pixel", "cell", "tile")
-"""Units of a draw: pixels, cells of 4x4 pixels, or whole tiles of 16x16. The kernels number them in this order."""
+UNITS = ("pixel", "tile")
+"""Units of a draw: pixels, or whole tiles of 16x16. The kernels number them in this order."""
 
 STRUCTURES = ("none", "ncc", "ssim", "printed_ncc")
 """Similarities of a tile's samples that a loss may use beside its l1 term. The kernels number them in this order."""

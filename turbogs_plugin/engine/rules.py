@@ -45,11 +45,10 @@ class DrawRule:
     def wanted(self, rate: float, units: int) -> int:
         """How many of `units` to draw: ``max(1, floor(rate * units))``, the paper's N_pix for the 256 pixels of a tile.
 
-        For the 16 cells of a tile, and with `multiple`, it is the nearest number: rounding down would lose up to half
-        of a small budget.
+        With `multiple` it is the nearest number: rounding down would lose up to half of a small budget.
         """
         step = self.multiple if self.unit == "pixel" else 1
-        slack = 0.5 if self.unit == "cell" or step > 1 else 0.0
+        slack = 0.5 if step > 1 else 0.0
         return min(units, step * max(1, math.floor(rate * units / step + slack)))
 
     def origin(self, iteration: int, masked: bool) -> tuple[int, int]:

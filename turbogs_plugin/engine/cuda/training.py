@@ -25,7 +25,7 @@ from turbogs_plugin.engine.moments import GaussianMoments
 from turbogs_plugin.engine.protocol import MapUpdate, ModelCopies
 from turbogs_plugin.engine.rules import DrawRule, LossTerms, UpdateRule
 from turbogs_plugin.error_maps import ErrorMaps
-from turbogs_plugin.tiles import CELL_SIDE, TILE_PIXELS, DrawEnds, slots_of_tiles, tile_extents
+from turbogs_plugin.tiles import TILE_PIXELS, DrawEnds, slots_of_tiles
 from turbogs_plugin.types import (
     BLACK,
     Color,
@@ -120,11 +120,10 @@ class _Places:
 
 
 def _wanted(rule: DrawRule, rate: float, tiles: Sequence[int]) -> tuple[int, ...]:
-    """For each view, how many of its tiles are drawn, or how many units of each of its tiles."""
+    """For each view, how many of its tiles are drawn, or how many pixels of each of its tiles."""
     if rule.unit == "tile":
         return tuple(rule.wanted(rate, count) for count in tiles)
-    units = TILE_PIXELS // (CELL_SIDE**2 if rule.unit == "cell" else 1)
-    return (rule.wanted(rate, units),) * len(tiles)
+    return (rule.wanted(rate, TILE_PIXELS),) * len(tiles)
 
 
 @lru_cache(maxsize=4096)
@@ -148,9 +147,9 @@ def _places(
         ends = list(accumulate(wanted))  # of each view's chosen tiles
         chosen, slots = ends[-1], ends[-1] * TILE_PIXELS
     else:
-        slots_per_tile = wanted[0] * (CELL_SIDE**2 if rule.unit == "cell" else 1)
+        slots_per_tile = wanted[0]
         if live_starts is None:
-            ends = list(accumulate(_view_slots(*shape, rule.unit, wanted[0]) for shape in shapes))
+            ends = list(accumulate(_view_slots(*shape, wanted[0]) for shape in shapes))
         else:
             ends = list(accumulate(slots_per_tile * count for count in tiles))
         chosen, slots = sum(tiles), ends[-1]
@@ -164,9 +163,9 @@ def _places(
 
 
 @lru_cache(maxsize=4096)
-def _view_slots(width: int, height: int, unit: str, wanted: int) -> int:
-    """Slots of a view when `wanted` pixels or cells are drawn from each tile."""
-    return int(slots_of_tiles(unit, wanted, *tile_extents(np.array([[width, height]]))).sum())
+def _view_slots(width: int, height: int, wanted: int) -> int:
+    """Slots of a view when `wanted` pixels are drawn from each tile."""
+    return int(slots_of_tiles(wanted, np.array([[width, height]])).sum())
 
 
 def view_rows(

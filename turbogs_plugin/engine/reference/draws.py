@@ -1,20 +1,20 @@
-"""The draw of pixels, cells or tiles by which the samplers choose what is rendered (paper section 3.5).
+"""The draw of pixels or tiles by which the samplers choose what is rendered (paper section 3.5).
 
 Within every 16x16 tile of the K views, N units are drawn without replacement in three stages, each from the units that
 the stages before it left: the *hard* share by error, the *stable* share by age, the *mixed* rest by both. A unit is a
-pixel (the paper's), a 4x4 cell, or a whole tile; whole tiles are drawn among the tiles of a view. Their grid begins
-elsewhere in each iteration (`DrawRule.origin`), but for maps with masks.
+pixel (the paper's) or a whole tile; whole tiles are drawn among the tiles of a view. Their grid begins elsewhere in
+each iteration (`DrawRule.origin`), but for maps with masks.
 
 The draw is defined down to the bit, so that `draw_pixels` here and its CUDA twin return equal sets:
 
-1. Each unit has an error E, float32. For a pixel it is the pixel's error. For a cell or tile it is the exact sum of its
-   pixels' errors, rounded once; sums of halves are exact in float64. It also has an age A, an integer, the largest age
-   of its pixels. (They are drawn together, so their ages differ only in maps once drawn by another unit.)
-2. Each unit has four random words ``x0 .. x3`` (layout in `philox`). Their place is the pixel id ``y * width + x``, the
-   id of the cell's first pixel, or the tile's number within its view; the purpose says which of the three.
+1. Each unit has an error E, float32. For a pixel it is the pixel's error. For a tile it is the exact sum of its pixels'
+   errors, rounded once; sums of halves are exact in float64. It also has an age A, an integer, the largest age of its
+   pixels. (They are drawn together, so their ages differ only in maps once drawn by another unit.)
+2. Each unit has four random words ``x0 .. x3`` (layout in `philox`). Their place is the pixel id ``y * width + x``, or
+   the tile's number within its view; the purpose says which of the two.
 3. Each stage ranks the units not yet drawn by a 64-bit key, and takes the largest. Keys are distinct, as their low 20
-   bits are ``2^20 - 1 - rank``, so among equals the lower rank goes first. The rank is the pixel's `sample_order`, the
-   cell's number in its tile, row by row, or the tile's number in its view. The high bits are:
+   bits are ``2^20 - 1 - rank``, so among equals the lower rank goes first. The rank is the pixel's `sample_order`, or
+   the tile's number in its view. The high bits are:
 
    - hard: the bits, as an integer, of the float32 ``max(E, 2^-100) / exponential(x0)``, an exponential race: taking the
      largest is the multinomial draw without replacement, with the probabilities E / sum(E). Zero errors come after
@@ -33,8 +33,8 @@ in a race, ``clamp(((A + 1) << 24) - tau, 0, 2^24) / 2^24`` in the stable stage,
 stage that takes nothing. Together, ``p = 1 - (1 - p_hard) (1 - p_stable) (1 - p_mixed)``, and 1 where all units of a
 row are drawn.
 
-Where maps have masks, a masked pixel is no unit, adds to no sum, and is in no cell or tile that is drawn. A cell or
-tile without another pixel is no unit either. The number of a tile within its view is then that among its live tiles.
+Where maps have masks, a masked pixel is no unit, adds to no sum, and is in no tile that is drawn. A tile without
+another pixel is no unit either. The number of a tile within its view is then that among its live tiles.
 """
 
 from __future__ import annotations
@@ -48,7 +48,6 @@ import torch
 from torch import Tensor
 
 from turbogs_plugin.engine.reference.philox import (
-    PURPOSE_CELLS,
     PURPOSE_PIXELS,
     PURPOSE_TILES,
     Words,
@@ -57,16 +56,7 @@ from turbogs_plugin.engine.reference.philox import (
 )
 from turbogs_plugin.engine.rules import DrawRule
 from turbogs_plugin.error_maps import AGE_MAX, ErrorMaps
-from turbogs_plugin.tiles import (
-    TILE_CELLS,
-    TILE_PIXELS,
-    DrawEnds,
-    cell_of_place,
-    compact,
-    pixel_table,
-    slots_of_tiles,
-    tile_extents,
-)
+from turbogs_plugin.tiles import TILE_PIXELS, DrawEnds, compact, pixel_table, slots_of_tiles
 from turbogs_plugin.types import PixelSamples, Step, TileGrid
 
 RANK_BITS = 20
@@ -155,8 +145,7 @@ def draw_pixels(rule: DrawRule, maps: ErrorMaps, view_ids: tuple[int, ...], rate
 
     Returns:
         Samples whose counts are all known without reading from the device. A tile has min(N, its pixels) slots for
-        unit = pixel; 16 for each drawn cell, at most its pixels, for cell; 256 for tile. With masks there are live
-        tiles alone, each with N, 16 N or 256 slots.
+        unit = pixel, 256 for tile. With masks there are live tiles alone, each with N or 256 slots.
     """
     maps.fetch(view_ids)
     device, views = maps.errors.device, np.asarray(view_ids, dtype=np.int64)
@@ -180,7 +169,7 @@ def draw_pixels(rule: DrawRule, maps: ErrorMaps, view_ids: tuple[int, ...], rate
     def words(place: Tensor, purpose: int) -> Words:
         return random_words(place.clamp(min=0).long(), view_numbers, purpose, step.seed, step.iteration)
 
-    draw = _draw_tiles if rule.unit == "tile" else _draw_within_tiles
+    draw = _draw_tiles if rule.unit == "tile" else _draw_pixels
     return draw(_Batch(view_ids, sizes, origin, table, exist, counts, tile_ids, errors, ages, words), rate, rule)
 
 
@@ -206,28 +195,17 @@ class _Batch:
         return DrawEnds(unit, tuple(map(tuple, self.sizes.tolist())), tuple(wanted), live)
 
 
-def _draw_within_tiles(batch: _Batch, rate: float, rule: DrawRule) -> PixelSamples:
-    """Pixels or cells as units, drawn from each tile."""
-    first_pixels, errors, ages, purpose = batch.table, batch.errors, batch.ages, PURPOSE_PIXELS
-    by_cell, exist = rule.unit == "cell", batch.exist
-    cells = cell_of_place(batch.table.device)  # [256]
-    if by_cell:
-        places = torch.argsort(cells, stable=True).view(TILE_CELLS, -1)  # [16, 16] of each cell
-        first_pixels, purpose = first_pixels[:, places[:, 0]], PURPOSE_CELLS
-        errors, ages = errors[:, places].sum(dim=2), ages[:, places].amax(dim=2)
-        exist = exist[:, places].any(dim=2)
-    wanted = rule.wanted(rate, errors.shape[1])
-    words = batch.words(first_pixels, purpose)
-    drawn, probabilities = draw_units(Units(errors, ages, exist, words, wanted), rule)
+def _draw_pixels(batch: _Batch, rate: float, rule: DrawRule) -> PixelSamples:
+    """Pixels as units, drawn from each tile."""
+    wanted = rule.wanted(rate, TILE_PIXELS)
+    words = batch.words(batch.table, PURPOSE_PIXELS)
+    drawn, probabilities = draw_units(Units(batch.errors, batch.ages, batch.exist, words, wanted), rule)
     weights = _importance_weights(probabilities, rule)
-    if by_cell:
-        drawn, weights = drawn[:, cells] & batch.exist, None if weights is None else weights[:, cells]
     if batch.live_tiles is None:
-        slots = slots_of_tiles(rule.unit, wanted, *tile_extents(batch.sizes))
-        tile_ids, full = torch.arange(len(batch.table), dtype=torch.int32, device=batch.table.device), not by_cell
+        slots = slots_of_tiles(wanted, batch.sizes)
+        tile_ids, full = torch.arange(len(batch.table), dtype=torch.int32, device=batch.table.device), True
     else:
-        slots = np.full(len(batch.table), wanted * TILE_PIXELS // errors.shape[1])
-        tile_ids, full = batch.live_tiles.int(), False
+        slots, tile_ids, full = np.full(len(batch.table), wanted), batch.live_tiles.int(), False
     samples = compact(batch.view_ids, batch.sizes, batch.table, drawn, tile_ids, slots, weights, full=full)
     return replace(samples, host_ends=batch.ends(rule.unit, [wanted] * len(batch.counts)))
 

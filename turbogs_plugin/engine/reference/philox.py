@@ -6,7 +6,7 @@ words under a key of two to four random words. The layout that every sampler of 
 =========  ==================================================================================
 word       value
 =========  ==================================================================================
-counter 0  the place: pixel id, cell id, tile id (see `draws`), view number, or row; 0 where there is none
+counter 0  the place: pixel id, tile number (see `draws`), view number, or row; 0 where there is none
 counter 1  the training view's number; 0 where the place is a view or a row, or there is none
 counter 2  the purpose, one of `PURPOSE_*`
 counter 3  the high 32 bits of the seed
@@ -31,7 +31,7 @@ from torch import Tensor
 
 from turbogs_plugin.types import Step
 
-PURPOSE_PIXELS, PURPOSE_CELLS, PURPOSE_TILES = range(3)
+PURPOSE_PIXELS, PURPOSE_TILES = 0, 2
 PURPOSE_VIEWS, PURPOSE_STACK, PURPOSE_BACKGROUND, PURPOSE_GROWTH, PURPOSE_DROPOUT = range(3, 8)
 
 MASK = 0xFFFFFFFF
