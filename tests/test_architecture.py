@@ -31,6 +31,21 @@ def test_every_file_that_the_architecture_names_exists():
     assert loose == [], "a file is named with its folder"
 
 
+def test_every_function_that_the_architecture_names_is_in_its_file():
+    """Of what it says "`name` in `file`", "`name` and `other` in `file`" and "`name` there", of the file named last."""
+    missing, found, file = [], 0, ""
+    names = r"`\w+(?:\.\w+)*`"
+    for said in re.findall(rf"({names}(?:(?:, | and ){names})*) (?:in (`[\w./-]+\.\w+`)|there)", PAGE.read_text()):
+        file = said[1].strip("`") or file
+        text = (ROOT / file).read_text(encoding="utf-8")
+        for name in re.findall(r"[\w.]+", said[0]):
+            found += 1
+            if any(part not in text for part in name.split(".")):
+                missing.append((name, file))
+    assert found > 25
+    assert missing == []
+
+
 def test_the_architecture_names_every_folder():
     folders = {path.parent.name for path in (ROOT / "turbogs_plugin").glob("*/__init__.py")}
     text = PAGE.read_text(encoding="utf-8")

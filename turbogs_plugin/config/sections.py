@@ -76,7 +76,8 @@ class TrainConfig:
             photos before and after them (`turbogs_plugin.train.interpolated_exposures`). ``auto``: where photos differ,
             but little from those before and after them.
         dropout: share of the Gaussians that each iteration leaves out, drawn anew each time, until
-            `trainer.DROPOUT_UNTIL` of the run. ``auto``: where cameras are less accurate than half a pixel.
+            `trainer.DROPOUT_UNTIL` of the run. ``auto``: where points are a median of 0.4 pixels or more from
+            where photos show them.
         distant_size: largest standard deviation of a Gaussian beyond 2 scene extents, over its distance from the
             cameras (`restrain_distant`). 0: no bound.
         camera_clearance: a change of the set of Gaussians also removes those that stand nearer to a training camera
