@@ -13,7 +13,7 @@ import numpy as np
 from torch import Tensor
 
 from turbogs_plugin.engine.moments import GaussianMoments
-from turbogs_plugin.engine.rules import LossTerms, UpdateRule
+from turbogs_plugin.engine.rules import UpdateRule
 from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.types import (
     Cameras,
@@ -58,21 +58,28 @@ class PixelSampler(Protocol):
     def sample(self, maps: ErrorMaps, view_ids: tuple[int, ...], rate: float, step: Step) -> PixelSamples:
         """Draw the samples of an iteration from the maps of these views, on the maps' device.
 
-        ``maps.masks`` says which pixels count. A trainer takes masked ones out of the result (`PixelMasks.strip`),
-        unless the sampler has an attribute ``heeds_masks`` that is True: then it must have drawn none.
+        They are of these views, in this order: give `view_ids` to `PixelSamples`, or to its `from_mask` and
+        `from_coordinates`. ``maps.masks`` says which pixels count. A trainer takes masked ones out of the result
+        (`PixelMasks.strip`), unless the sampler has an attribute ``heeds_masks`` that is True: then it must have drawn
+        none.
         """
 
 
 @runtime_checkable
 class SparseLoss(Protocol):
-    """A loss on sampled pixels with its own gradient (section 3.7)."""
+    """A loss on sampled pixels with its own gradient (section 3.7).
 
-    @property
-    def terms(self) -> LossTerms | None:
-        """The loss as a rule that an engine evaluates, updating the error maps too. None: `__call__` is used."""
+    One with an attribute ``terms``, a `LossTerms`, is a rule: an engine evaluates it and updates the error maps in one
+    step. Else `__call__` is used, and the maps get its `pixel_errors`.
+    """
 
     def __call__(self, colors: Tensor, targets: Tensor, samples: PixelSamples) -> LossOutput:
-        """`colors`, `targets`: [P, 3]. Photos are within 0 .. 1; `colors` may exceed 1."""
+        """The loss, its gradient by each colour, and the error of each pixel (`LossOutput`).
+
+        Args:
+            colors, targets: [P, 3] rendered and true colours. Photos are within 0 .. 1; `colors` may exceed 1.
+            samples: the pixels; where ``samples.filled`` is False there is none, and gradient and error are zero.
+        """
 
 
 @runtime_checkable

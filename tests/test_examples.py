@@ -25,7 +25,7 @@ from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene import Scene, load_scene, write_demo_capture
 from turbogs_plugin.train import run
 from turbogs_plugin.train.history import read_history
-from turbogs_plugin.types import Step
+from turbogs_plugin.types import PixelSamples, Step
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 SCENES = Path(os.environ.get("TURBOGS_SCENES", Path(__file__).resolve().parents[2] / "shared" / "scenes"))
@@ -278,3 +278,21 @@ def test_many_photos_are_a_capture_that_trains(example, tmp_path):
     config = load_config("turbogs", ["train.device=cpu", "train.iterations=1", "train.sh_degree=0"])
     config.scene.path = str(tmp_path / "flight")
     assert run.train(config, tmp_path / "run").history[-1].iteration == 1
+
+
+def test_the_parts_that_the_page_prints_train(capture, tmp_path, monkeypatch):
+    """ "Your strategies in our trainer" of docs/drop-in.md; the loss's gradient is that of its value."""
+    page = (EXAMPLES.parent / "docs" / "drop-in.md").read_text(encoding="utf-8")
+    (code,) = re.findall(r"^```python\n(# my_parts.py\n.*?)^```$", page, re.DOTALL | re.MULTILINE)
+    (settings,) = re.findall(r"^```yaml\n([^`]*my_parts:Huber.*?)^```$", page, re.DOTALL | re.MULTILINE)
+    (tmp_path / "my_parts.py").write_text(code)
+    (tmp_path / "my.yaml").write_text(settings)
+    monkeypatch.chdir(tmp_path)
+    config = load_config("my.yaml", ["train.iterations=6", "train.device=cpu", f"scene.path={capture}"])
+    assert run.train(config, tmp_path / "run").history[-1].psnr > 10
+    colors, targets = torch.rand(2, 9, 3, dtype=torch.float64)
+    colors.requires_grad_()
+    samples = PixelSamples.from_mask(torch.ones(3, 3, dtype=torch.bool))
+    output = config.build("loss")(colors, targets, samples)
+    (expected,) = torch.autograd.grad(output.loss, colors)
+    torch.testing.assert_close(output.color_gradients.detach(), expected)

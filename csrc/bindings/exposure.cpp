@@ -5,8 +5,8 @@
 
 namespace turbogs {
 
-template <class Launch, class Params>
-void check_photos(const Arguments<Launch>& in, const Params& params, int64_t photos) {
+template <class Params>
+void check_photos(const Params& params, int64_t photos) {
     for (int i = 0; i < params.num_views; ++i) {
         STD_TORCH_CHECK(params.views[i].view_number < photos, "turbogs: view ", params.views[i].view_number,
                         " has no exposure");
@@ -20,7 +20,7 @@ int64_t read_exposed(const Arguments<Launch>& in, ExposedSamples& params) {
     const int64_t slots = in.tensor(Tensors::colors).numel() / 3, tiles = in.tensor(Tensors::tile_ids).numel();
     const int64_t photos = in.tensor(Tensors::offsets).numel() / kExposureNumbers;
     read_views(in, ViewRow::kSize, -1, params);
-    check_photos(in, params, photos);
+    check_photos(params, photos);
     params.num_tiles = to_int(tiles, "tiles");
     to_int(slots, "samples");
     in.set(params.tile_ids, Tensors::tile_ids, {tiles});
@@ -49,7 +49,7 @@ void launches::ExposureStep::run(const Arguments<ExposureStep>& in) {
     ExposureStepParams params = {};
     const int64_t photos = in.tensor(Tensors::steps).numel();
     read_views(in, ViewRow::kSize, -1, params);
-    check_photos(in, params, photos);
+    check_photos(params, photos);
     params.num_photos = to_int(photos, "photos");
     in.set(params.sums, Tensors::sums, {params.num_views, 3, 4});
     in.set(params.offsets, Tensors::offsets, {photos, 3, 4});

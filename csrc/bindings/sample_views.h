@@ -7,9 +7,9 @@
 namespace turbogs {
 
 // Fills `views` of a launcher's parameters, and counts them, from rows of `row_size` numbers, which begin as `ViewRow`
-// does. `pixels`: of all training views, or -1 where nothing is read at flat pixels. Returns the tiles of all views.
+// does. `pixels`: of all training views, or -1 where nothing is read at flat pixels.
 template <class Launch, class Params>
-int read_views(const Arguments<Launch>& in, int row_size, int64_t pixels, Params& params) {
+void read_views(const Arguments<Launch>& in, int row_size, int64_t pixels, Params& params) {
     int num_tiles = 0, origin_x = 0, origin_y = 0;
     read_origin(in, origin_x, origin_y);
     params.num_views = static_cast<int>(in.num_rows(row_size));
@@ -31,7 +31,6 @@ int read_views(const Arguments<Launch>& in, int row_size, int64_t pixels, Params
         STD_TORCH_CHECK(pixels < 0 || (view.pixel_base >= 0 && view.pixel_base + width * height <= pixels),
                         "turbogs: view ", view.view_number, " lies outside the photos or maps");
     }
-    return num_tiles;
 }
 
 }  // namespace turbogs

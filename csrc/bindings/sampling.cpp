@@ -45,7 +45,7 @@ void launches::SamplePixels::run(const Arguments<SamplePixels>& in) {
     in.set_optional(params.live_tiles, Tensors::tiles, {num_live});
     in.set_optional(params.live_rows, Tensors::rows, {num_live});
     if (masked) {
-        in.set(params.live_bits, Tensors::bits, {in.tensor(Tensors::bits).size(0), kTilePixels / 32});
+        in.set(params.live_bits, Tensors::bits, {in.tensor(Tensors::bits).size(0), kTilePixels / kWarpSize});
     }
     in.set(params.pixel_ids, Tensors::pixel_ids, {slots});
     in.set(params.tile_ids, Tensors::tile_ids, {chosen});

@@ -30,13 +30,13 @@ __device__ __forceinline__ void load_truth(const SparseLossParams& params, const
     }
 }
 
-// Adds to the loss. Once lost, the sum stays so: one thread sees it happen, and counts it.
+// Adds to the loss. Once lost, the sum stays so: one thread sees it happen, and counts it, unless the iteration is
+// skipped.
 __device__ __forceinline__ void add_loss(const SparseLossParams& params, double loss) {
     if (loss == 0.0) return;
     const double before = atomicAdd(params.loss, loss);
-    if (params.nonfinite_losses != nullptr && is_finite(before) && !is_finite(before + loss)) {
-        atomicAdd(params.nonfinite_losses, 1ull);
-    }
+    if (params.nonfinite_losses == nullptr || !is_finite(before) || is_finite(before + loss)) return;
+    if (params.overflow == nullptr || *params.overflow == 0) atomicAdd(params.nonfinite_losses, 1ull);
 }
 
 }  // namespace turbogs

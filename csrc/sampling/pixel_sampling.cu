@@ -26,7 +26,7 @@ __device__ __forceinline__ int first_slot(const SamplePixelsParams& params, cons
 }
 
 template <bool kWeighted, bool kMasked>
-__global__ void __launch_bounds__(kSampleThreads, kSampleBlocks) sample_tiles_kernel(
+__global__ void __launch_bounds__(kSampleThreads, kSampleBlocks) sample_pixels_kernel(
     const __grid_constant__ SamplePixelsParams params) {
     const int tile = (blockIdx.x * kSampleThreads + threadIdx.x) / kWarpSize;
     if (tile >= params.num_tiles) return;  // a whole warp
@@ -62,7 +62,7 @@ __global__ void __launch_bounds__(kSampleThreads, kSampleBlocks) sample_tiles_ke
 template <bool kMasked>
 void launch(const SamplePixelsParams& params, cudaStream_t stream) {
     const auto kernel =
-        params.weights != nullptr ? sample_tiles_kernel<true, kMasked> : sample_tiles_kernel<false, kMasked>;
+        params.weights != nullptr ? sample_pixels_kernel<true, kMasked> : sample_pixels_kernel<false, kMasked>;
     kernel<<<warp_blocks(params.num_tiles), kSampleThreads, 0, stream>>>(params);
 }
 

@@ -40,12 +40,11 @@ struct TilePixels {
 template <bool kMasked>
 __device__ __forceinline__ TilePixels locate_tile(const SamplePixelsParams& params, int place) {
     TilePixels pixels;
-    pixels.view = kMasked ? view_of_tile(params.live, params.num_views, place)
-                          : view_of_tile(params.views, params.num_views, place);
+    pixels.view = view_of_tile(params.live, params.num_views, place);
     const SampleView& view = params.views[pixels.view];
-    int number = place - view.tile_base, live = 0;
+    int number = place - params.live[pixels.view].tile_base, live = 0;
     if (kMasked) {
-        live = params.live[pixels.view].first + place - params.live[pixels.view].tile_base;
+        live = params.live[pixels.view].first + number;
         number = params.live_tiles[live];
     }
     pixels.id_of_tile = view.tile_base + number;

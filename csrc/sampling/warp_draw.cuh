@@ -28,14 +28,14 @@ enum class Spread { kAges, kUniform, kRace };
 
 // Divides the units with a key above 0 into the `count` largest and the rest. The threshold is searched until it parts
 // exactly so many from the rest or only equal keys are left to part. Keys are below 2^31. `guess`: of a race.
-template <Spread kSpread, int kUnits>
-__device__ __forceinline__ Split split_largest(const uint32_t (&keys)[kUnits], int count, uint32_t guess = 0u) {
+template <Spread kSpread>
+__device__ __forceinline__ Split split_largest(const uint32_t (&keys)[kPerLane], int count, uint32_t guess = 0u) {
     constexpr uint32_t kEnd = 0x7F800000u;  // the bits of infinity: no race's key
     constexpr int kGuesses = 4;  // tries of a race by the rule of its guess, while one end of the range is open
     constexpr int kHalving = 3;  // of so many tries one halves the range, so that the search ends; others: no record
     uint32_t available = 0, smallest = 0xFFFFFFFFu, largest = 0;
 #pragma unroll
-    for (int j = 0; j < kUnits; ++j) {
+    for (int j = 0; j < kPerLane; ++j) {
         available += keys[j] != 0u;
         if (kSpread == Spread::kRace) continue;
         smallest = min(smallest, keys[j] - 1u);  // no unit: the largest number
@@ -68,7 +68,7 @@ __device__ __forceinline__ Split split_largest(const uint32_t (&keys)[kUnits], i
             }
             uint32_t reached = 0;
 #pragma unroll
-            for (int j = 0; j < kUnits; ++j) reached += keys[j] >= threshold;
+            for (int j = 0; j < kPerLane; ++j) reached += keys[j] >= threshold;
             total = static_cast<int>(__reduce_add_sync(kFullWarp, reached));
             exact = total == count;
             if (exact) break;
@@ -84,7 +84,7 @@ __device__ __forceinline__ Split split_largest(const uint32_t (&keys)[kUnits], i
     }
     Split split = {0u, 0u, exact ? 0 : count - high_count, threshold};
 #pragma unroll
-    for (int j = 0; j < kUnits; ++j) {
+    for (int j = 0; j < kPerLane; ++j) {
         split.taken |= static_cast<uint32_t>(keys[j] >= threshold) << j;
         if (!exact) split.tied |= static_cast<uint32_t>(keys[j] == threshold - 1u && keys[j] != 0u) << j;
     }
@@ -92,19 +92,18 @@ __device__ __forceinline__ Split split_largest(const uint32_t (&keys)[kUnits], i
 }
 
 // The keys of the `open` units; 0 is no unit.
-template <class Key, int kUnits, class KeyOf>
-__device__ __forceinline__ void make_keys(Key (&keys)[kUnits], uint32_t open, const KeyOf& key_of) {
+template <class Key, class KeyOf>
+__device__ __forceinline__ void make_keys(Key (&keys)[kPerLane], uint32_t open, const KeyOf& key_of) {
 #pragma unroll
-    for (int j = 0; j < kUnits; ++j) keys[j] = open >> j & 1u ? key_of(j) : 0u;
+    for (int j = 0; j < kPerLane; ++j) keys[j] = open >> j & 1u ? key_of(j) : 0u;
 }
 
 // The first `room` of the tied units. Unit (j, lane) has rank 32 j + lane.
-template <int kUnits>
 __device__ __forceinline__ uint32_t take_by_rank(uint32_t tied, int room) {
     uint32_t taken = 0;
     const uint32_t lower_lanes = lanes_below(this_lane());
 #pragma unroll
-    for (int j = 0; j < kUnits; ++j) {
+    for (int j = 0; j < kPerLane; ++j) {
         const bool mine = (tied >> j & 1u) != 0u;
         const uint32_t lanes = __ballot_sync(kFullWarp, mine);
         if (mine && __popc(lanes & lower_lanes) < room) taken |= 1u << j;
@@ -114,30 +113,29 @@ __device__ __forceinline__ uint32_t take_by_rank(uint32_t tied, int room) {
 }
 
 // The `count` largest keys; among equals the lower rank goes first.
-template <Spread kSpread, int kUnits>
-__device__ __forceinline__ uint32_t take_largest(const uint32_t (&keys)[kUnits], int count, uint32_t guess = 0u) {
+template <Spread kSpread>
+__device__ __forceinline__ uint32_t take_largest(const uint32_t (&keys)[kPerLane], int count, uint32_t guess = 0u) {
     const Split split = split_largest<kSpread>(keys, count, guess);
-    return split.room > 0 ? split.taken | take_by_rank<kUnits>(split.tied, split.room) : split.taken;
+    return split.room > 0 ? split.taken | take_by_rank(split.tied, split.room) : split.taken;
 }
 
 // A threshold that about `count` keys of a race reach: of those that do, each does with a probability near weight /
 // threshold.
-template <int kUnits>
 __device__ __forceinline__ uint32_t race_guess(float total_weight, int count) {
-    const float total = fmaxf(total_weight, kWarpSize * kUnits * kWeightFloor);
+    const float total = fmaxf(total_weight, kWarpSize * kPerLane * kWeightFloor);
     return __float_as_uint(total * approximate_reciprocal(static_cast<float>(count)));
 }
 
 // The `count` winners of a race among the `open` units, by approximate keys where those leave no doubt: no key within
 // the guard of the threshold. `exact_key(j)` has the last word otherwise.
-template <int kUnits, class ExactKey>
-__device__ __forceinline__ uint32_t take_race(uint32_t (&keys)[kUnits], uint32_t open, int count, uint32_t guess,
+template <class ExactKey>
+__device__ __forceinline__ uint32_t take_race(uint32_t (&keys)[kPerLane], uint32_t open, int count, uint32_t guess,
                                               const ExactKey& exact_key) {
     const Split split = split_largest<Spread::kRace>(keys, count, guess);
     if (split.threshold == 1u) return split.taken;
     bool doubt = false;
 #pragma unroll
-    for (int j = 0; j < kUnits; ++j) doubt = doubt || keys[j] - (split.threshold - kKeyGuard) <= 2u * kKeyGuard;
+    for (int j = 0; j < kPerLane; ++j) doubt = doubt || keys[j] - (split.threshold - kKeyGuard) <= 2u * kKeyGuard;
     if (!__any_sync(kFullWarp, doubt)) return split.taken;
     make_keys(keys, open, exact_key);
     return take_largest<Spread::kRace>(keys, count, split.threshold);
@@ -150,11 +148,11 @@ struct Thresholds {
     Key largest_left, smallest_taken;
 };
 
-template <class Key, int kUnits>
-__device__ __forceinline__ Thresholds<Key> stage_thresholds(const Key (&keys)[kUnits], uint32_t taken) {
+template <class Key>
+__device__ __forceinline__ Thresholds<Key> stage_thresholds(const Key (&keys)[kPerLane], uint32_t taken) {
     Key left = 0, not_taken = 0;  // the smallest taken is the complement of the largest complement
 #pragma unroll
-    for (int j = 0; j < kUnits; ++j) {
+    for (int j = 0; j < kPerLane; ++j) {
         const bool mine = (taken >> j & 1u) != 0u;
         if (mine) not_taken = max(not_taken, static_cast<Key>(~keys[j]));
         else left = max(left, keys[j]);
@@ -187,7 +185,7 @@ __device__ __forceinline__ uint32_t draw(const SamplePixelsParams& params, const
     // The winners of a race among the `open` units; `near_weight` is the weight but for rounding.
     const auto race = [&](uint32_t open, int count, float total, const uint32_t (&words)[kPerLane],
                           const auto& weight_of, const auto& near_weight_of) {
-        const uint32_t guess = race_guess<kPerLane>(total, count);
+        const uint32_t guess = race_guess(total, count);
         const auto exact_key = [&](int j) { return race_key(weight_of(j), words[j]); };
         if constexpr (!kWeighted) {
             make_keys(keys, open, [&](int j) { return approximate_race_key(near_weight_of(j), words[j]); });

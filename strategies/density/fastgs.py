@@ -114,6 +114,8 @@ class FastGsDensity(DensityController):
     @torch.no_grad()
     def update(self, gaussians: Gaussians, step: Step) -> RowUpdate | None:
         if self._batch is None:
+            if not self._over(step):  # a time budget has made the run longer
+                self._restart(len(gaussians), gaussians.device)
             return None
         self._votes.add(self._batch, self.error_threshold)
         add_stats(self._window, self._batch)
@@ -125,10 +127,14 @@ class FastGsDensity(DensityController):
             update = self._prune(gaussians)
         if self.event_due(step):
             self._restart(len(gaussians), gaussians.device)
-        after = step.iteration - step.refine_until
-        if after > 0 and step.iteration + self.prune_every - after % self.prune_every >= step.total:
-            self._batch = self._window = self._votes = None  # no event is left in this run
+        if self._over(step):
+            self._batch = self._window = self._votes = None
         return update
+
+    def _over(self, step: Step) -> bool:
+        """No event is left after this iteration, in a run of the present length."""
+        after = step.iteration - step.refine_until
+        return after > 0 and step.iteration + self.prune_every - after % self.prune_every >= step.total
 
     def apply(self, update: RowUpdate) -> None:
         if self._batch is not None:  # a window starts anew at each event
@@ -142,7 +148,7 @@ class FastGsDensity(DensityController):
         self._batch, self._window, self._votes = loaded.values()
 
     def _parts(self) -> dict[str, Any]:
-        return {"look": self._batch, "window": self._window, "votes": self._votes}
+        return {"batch": self._batch, "window": self._window, "votes": self._votes}
 
     def _restart(self, count: int, device: torch.device) -> None:
         self._batch, self._window = GaussianStats.zeros(count, device), GaussianStats.zeros(count, device)

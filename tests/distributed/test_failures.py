@@ -13,6 +13,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import BinaryIO
 
@@ -25,7 +26,7 @@ from torch.distributed.launcher.api import LaunchConfig, elastic_launch
 from turbogs_plugin import cli, files
 from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.distributed import processes as distributed_processes
-from turbogs_plugin.distributed.processes import joined
+from turbogs_plugin.distributed.processes import _Watch, joined
 from turbogs_plugin.distributed.ranks import ProcessRanks
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.model import torch_file
@@ -347,3 +348,10 @@ def test_a_process_alone_exchanges_nothing(capture):
     with joined("cpu") as ranks:
         assert ranks.count == 1 and ranks.first and ranks.agree("x") == "x" and not ranks.ask_to_stop(15)
     assert not torch.distributed.is_initialized()
+
+
+def test_a_training_of_another_thread_than_the_main_one_ends_as_well():
+    """Signals come to the main thread alone: nothing is to be set back."""
+    with ThreadPoolExecutor(1) as pool:
+        watch = pool.submit(_Watch, None, bool).result()
+        pool.submit(watch.end).result()

@@ -135,3 +135,9 @@ def test_the_work_is_bounded():
     assert (
         small < 20 * (64 * 256 + 400 * 25 + 2000) * 25
     )  # so many pixels of tiles and patches, and points, a view, a few numbers of each
+
+
+def test_a_scene_without_points_has_a_plan():
+    views = posed([noise(seed=number) for number in range(4)], nadir(LINE))
+    facts = gather_facts(scene_of(views, np.zeros((0, 3))), CPU, with_exposures=True)
+    assert facts.train_views == 4 and facts.exposure_views == 0

@@ -134,6 +134,19 @@ def test_statistics_end_with_the_last_event(gaussians):
     assert density.update(gaussians, Step(801, 1000, 500)) is None
     assert density.stats is None
     assert density.update(gaussians, Step(802, 1000, 500)) is None
+    assert density.stats is None
+
+
+def test_statistics_begin_again_in_a_run_that_becomes_longer(gaussians):
+    """As a time budget makes it, that finds iterations cheaper than it thought."""
+    density = FastGsDensity(prune_every=300, prune_opacity=0.0)
+    density.setup(gaussians)
+    assert density.update(gaussians, Step(801, 1000, 500)) is None
+    assert density.update(gaussians, Step(802, 1200, 500)) is None
+    add_batch(density, ONCE)
+    assert density.update(gaussians, Step(803, 1200, 500)) is None
+    update = density.update(gaussians, Step(1100, 1200, 500))
+    assert update.num_pruned == 2 and update.source.tolist() == list(range(2, COUNT))
 
 
 @pytest.mark.parametrize(("field", "value"), [("consistency", 0.0), ("error_threshold", -1.0), ("prune_every", 0)])

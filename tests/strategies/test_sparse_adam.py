@@ -164,6 +164,18 @@ def test_survives_any_finite_gradient(cls, dtype):
     assert all(bool(torch.isfinite(v).all()) for v in optimizer.state_dict().values())
 
 
+def test_more_views_than_a_kernel_takes_keep_the_state_finite():
+    """A sum over 250 views that do not cancel, whose square is more than float32 has."""
+    gaussians, optimizer = make_gaussians(3, dtype=torch.float32), SparseAdam()
+    optimizer.setup(gaussians)
+    gradients = make_gradients(250, 3, 0, torch.float32, size=1.0)
+    for name in PARAMETER_NAMES:
+        getattr(gradients, name).fill_(3e38)
+    optimizer.step(gaussians, gradients, STEP)
+    assert all_finite(gaussians)
+    assert all(bool(torch.isfinite(value).all()) for value in optimizer.state_dict().values())
+
+
 @pytest.mark.parametrize("cls", OPTIMIZERS)
 def test_no_gaussians_and_nothing_touched(cls):
     for count in (0, 3):

@@ -615,7 +615,8 @@ def test_the_bar_of_a_cell_has_the_planned_length(tmp_path, monkeypatch):
             (["ablate", "--merge", "CAPTURE", "--out", "X", *ignored.split()], ["--merge trains nothing"])
             for ignored in ("--steps 5", "--within 1s", "--gpus 0", "--seeds 3", "--device cpu")
         ),
-        (["compare", "CAPTURE", "--out", "X"], ["holds no run"]),
+        (["compare", "CAPTURE", "CAPTURE", "--out", "X"], ["holds no run"]),
+        (["compare", "CAPTURE", "--out", "X"], ["two runs or more"]),
         (["report", "CAPTURE"], ["holds no study"]),
         (["report", "CAPTURE", "--psnr", "-1"], ["--psnr"]),
     ],

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, fields
 import pytest
 import torch
 from helpers.framework_runs import tiny_config
+from helpers.losing_engine import LosingEngine
 from turbogs_plugin.strategies.losses import CharbonnierNccLoss
 from turbogs_plugin.strategies.optimizers.moment_lm import MomentLMOptimizer
 from turbogs_plugin.strategies.optimizers.sparse_adam import SparseAdam
@@ -128,3 +129,31 @@ def test_statistics_need_a_pass_that_sums_them_up(capture):
     screen = rendered.backward(torch.ones_like(rendered.colors))
     with pytest.raises(ValueError, match="with_statistics"):
         screen.parameter_gradients(rows=True, stats=trainer.density.stats)
+
+
+class Restless:
+    """A density control that moves every mean in each iteration, without a change of the set of Gaussians."""
+
+    watched, stats = ("model",), None
+
+    def setup(self, gaussians):
+        pass
+
+    def event_due(self, step):
+        return False
+
+    def update(self, gaussians, step):
+        gaussians.means += 1.0
+
+
+def test_what_density_control_moves_in_a_skipped_iteration_is_taken_back(capture):
+    trainer = make_trainer(capture)
+    trainer.engine, trainer.density = LosingEngine(lose=2), Restless()
+    run(trainer, 1)
+    before = trainer.gaussians.map(torch.Tensor.clone)
+    run(trainer, 1)  # the pass has too little memory: nothing changes
+    for name, value in trainer.gaussians.items():
+        assert torch.equal(value, getattr(before, name)), name
+    trainer.engine.recover()
+    run(trainer, 1)
+    assert (trainer.gaussians.means - before.means).mean() == pytest.approx(1.0, abs=0.05)

@@ -11,6 +11,7 @@ import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pycolmap
@@ -20,7 +21,7 @@ from helpers.framework_runs import TINY, assert_identical, stop_after, tiny_capt
 from helpers.processes import PRELOADED, ended
 from PIL import Image
 
-from turbogs_plugin.config.configuration import load_config, resolve
+from turbogs_plugin.config.configuration import Config, load_config, resolve
 from turbogs_plugin.config.yaml_text import parse_yaml
 from turbogs_plugin.errors import InputError, TrainingStopped
 from turbogs_plugin.model.ply import load_ply
@@ -35,7 +36,7 @@ from turbogs_plugin.train.history import read_history
 from turbogs_plugin.train.saved_model import load_model
 from turbogs_plugin.train.start import read_scene
 from turbogs_plugin.train.trainer import Trainer
-from turbogs_plugin.types import RowUpdate
+from turbogs_plugin.types import LossOutput, PixelSamples, RowUpdate
 
 pytestmark = pytest.mark.usefixtures("plotted")
 
@@ -444,3 +445,68 @@ def test_the_paper_taken_literally_stays_finite(capture, tmp_path):
     outcome = run.train(config, tmp_path / "run")
     assert outcome.history[-1].nonfinite_losses == 0
     assert all(value.isfinite().all() for value in saved(tmp_path / "run")["gaussians"].values())
+
+
+def test_more_views_an_iteration_than_a_gpu_takes_are_refused_before_anything_is_written():
+    config = load_config("turbogs", ["schedule.max_views=200", "train.refine_cameras=false"]).without_plan()
+    with pytest.raises(InputError, match=r"150 views an iteration, and a GPU takes at most 128: ask for fewer"):
+        run.new_loop(config, SimpleNamespace(train=range(150)), torch.device("cuda"))
+
+
+def test_wrong_input_that_is_found_while_training_names_the_last_good_checkpoint(capture, tmp_path, monkeypatch):
+    """As a pass with more intersections than one can have."""
+
+    def refuse(self, wait=False):
+        if self.iteration == 9:
+            raise InputError("too many intersections")
+
+    monkeypatch.setattr(Trainer, "repeat_lost", refuse)
+    with pytest.raises(TrainingStopped, match=r"too many intersections; the last good checkpoint is '.*0007"):
+        run.train(tiny_config(capture, "train.checkpoint_every=7"), tmp_path / "run")
+
+
+class OwnSampler:
+    """A sampler that forgets which views it was asked for."""
+
+    def sample(self, maps, view_ids, rate, step):
+        return PixelSamples.from_mask(torch.ones(len(view_ids), 40, 48, dtype=torch.bool))
+
+
+class TensorSampler:
+    def sample(self, maps, view_ids, rate, step):
+        return torch.zeros(3, 2)
+
+
+class OwnLoss:
+    """A loss whose error of a pixel has three numbers."""
+
+    def __call__(self, colors, targets, samples):
+        return LossOutput((colors - targets).square().mean(), colors - targets, (colors - targets).abs())
+
+
+class ScalarLoss:
+    def __call__(self, colors, targets, samples):
+        return 0.5
+
+
+@pytest.mark.parametrize(
+    ("part", "strategy", "message"),
+    [
+        ("pixel_sampler", OwnSampler, r"returned samples of views \(0, .*, asked for .*give view_ids to PixelSamples"),
+        (
+            "pixel_sampler",
+            TensorSampler,
+            r"pixel_sampler.type 'error_guided' returned a tensor of shape \(3, 2\), not P",
+        ),
+        ("loss", OwnLoss, r"returned a tensor of shape \(\d+, 3\) as pixel_errors, not a tensor of shape \(\d+,\)"),
+        ("loss", ScalarLoss, r"loss.type 'charbonnier_ncc' returned 'float', not a LossOutput"),
+    ],
+)
+def test_what_a_strategy_of_ones_own_returns_is_refused_and_nothing_is_left(
+    capture, tmp_path, monkeypatch, part, strategy, message
+):
+    built = Config.build
+    monkeypatch.setattr(Config, "build", lambda self, kind: strategy() if kind == part else built(self, kind))
+    with pytest.raises(InputError, match=message):
+        run.train(tiny_config(capture, "schedule.min_views=3", "view_sampler.type=random"), tmp_path / "run")
+    assert not (tmp_path / "run").exists()

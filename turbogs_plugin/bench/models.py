@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Sequence
 
 import numpy as np
@@ -46,6 +47,7 @@ def trained_model(
     lengths = [f"train.iterations={growing}", f"train.refine_until={round(0.9 * growing)}"]
     lengths += [f"train.sh_interval={max(1, growing // 5)}", "density.type=error_driven"]
     config = load_config("turbogs", [*overrides, *lengths, f"density.max_gaussians={count}"]).without_plan()
+    print(f"trains a model of {count} Gaussians for {iterations} iterations on the {device.type}", file=sys.stderr)
     trainer = Trainer(config, scene, device)
     if iterations:
         train(trainer, growing)

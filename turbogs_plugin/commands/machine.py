@@ -87,6 +87,8 @@ def bench(
         raise InputError("--ply is for bench step with the --scene of the model: leave --training out")
     iterations = TRAINING_ITERATIONS if training is None else training
     where = resolve_device(device)
+    if (what, device, where.type) == ("ranks", "auto", "cpu"):
+        raise InputError("bench ranks: no GPU answers here; --device cpu measures processes on this CPU, for minutes")
     if what != "numerics":  # its --out is a folder
         commands.require_result_file(out)
     of_step_or_raster = library or photos or offload

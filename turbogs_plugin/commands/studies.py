@@ -91,8 +91,8 @@ def compare(
     """
     from turbogs_plugin.study import commands
 
-    if not runs:
-        raise InputError("compare needs RUN RUN ...: folders of runs")
+    if len(runs) < 2:
+        raise InputError("compare needs RUN RUN ...: folders of two runs or more")
     require_positive("--psnr", psnr)
     return commands.compare(runs, out, psnr)
 

@@ -172,6 +172,8 @@ def resolve_complete(mapping: Mapping[str, Any], where: str, decided: bool = Fal
         raise InputError(f"'{where}' is of an earlier version, whose runs are not read: {old}; train anew")
     try:
         config = resolve(mapping)
+    except registry.MissingStrategyError as error:
+        raise InputError(f"'{where}': {error}") from None
     except InputError as error:
         raise InputError(f"'{where}': {error}; bring back what was written there") from None
     missing = _first_missing(config.to_mapping(), mapping)
@@ -201,7 +203,8 @@ def apply_overrides(mapping: Mapping[str, Any], overrides: Sequence[str]) -> dic
         path, separator, text = override.partition("=")
         keys = path.strip().split(".")
         if not separator or len(keys) < 2 or not all(keys):
-            raise InputError(f"override '{override}' is not of the form section.key=value")
+            hint = f", as {keys[0]}.type={text} is" if separator and keys[0] in registry.KINDS else ""
+            raise InputError(f"override '{override}' is not of the form section.key=value{hint}")
         if not text.strip():
             raise InputError(f"override '{override}' lacks a value: write one behind the =, or null for none")
         # A colour as #336699 or a path as "try #2" would be a comment of YAML, or end in one.

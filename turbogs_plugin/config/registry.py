@@ -55,6 +55,11 @@ section gets."""
 
 KINDS = tuple(BUILT_IN)
 
+
+class MissingStrategyError(InputError):
+    """A strategy's class cannot be imported here."""
+
+
 PROTOCOLS: dict[str, type] = {
     "schedule": protocols.SamplingSchedule,
     "view_sampler": protocols.ViewSampler,
@@ -100,7 +105,9 @@ def strategy_class(kind: str, name: str) -> type:
         found = EntryPoint(name, known[name], f"turbogs.{kind}").load()
     except (Exception, SystemExit) as error:  # another's module can do anything as it is imported
         reason = " ".join(f"{type(error).__name__}: {error}".split())
-        raise InputError(f"{place} cannot be imported: {reason}") from error
+        if isinstance(error, ModuleNotFoundError):
+            reason += "; call this in the folder that the module lies in, name that in PYTHONPATH, or install it"
+        raise MissingStrategyError(f"{place} cannot be imported: {reason}") from error
     if not (isinstance(found, type) and is_dataclass(found)):
         raise InputError(f"{place} is not a dataclass, whose init fields would be its configuration")
     return found

@@ -45,7 +45,8 @@ def build_dataclass(cls: type[T], mapping: Mapping[str, Any], where: str) -> T:
     init_fields = {field.name: field for field in fields(cls) if field.init}
     for key in mapping:
         if key not in init_fields:
-            raise InputError(f"unknown key '{where}.{key}': {nearest(key, init_fields)}")
+            named = f"{where}: unknown key '{key}'" if "'" in where else f"unknown key '{where}.{key}'"
+            raise InputError(f"{named}: {nearest(key, init_fields)}")
     for name, field in init_fields.items():
         if name not in mapping and field.default is MISSING and field.default_factory is MISSING:
             raise InputError(f"{where}: key '{name}' is missing")
@@ -125,7 +126,8 @@ def _convert_scalar(value: Any, hint: Any, where: str) -> Any:
 
 def _convert_sequence(value: Any, origin: type, arguments: tuple, where: str) -> Any:
     if not isinstance(value, list | tuple):
-        raise InputError(f"{where}: expected a list, got {value!r}")
+        remedy = f": write [{value}]" if isinstance(value, str) else ""
+        raise InputError(f"{where}: expected a list, got {value!r}{remedy}")
     if origin is tuple and not (len(arguments) == 2 and arguments[1] is Ellipsis):
         if len(value) != len(arguments):
             raise InputError(f"{where}: expected {len(arguments)} values, got {len(value)}")

@@ -233,21 +233,24 @@ class _Watch:
         self._ranks, self._speaks = ranks, speaks
         self._read, self._written = socket.socketpair()
         self._written.setblocking(False)
-        if threading.current_thread() is threading.main_thread():
+        self._main = threading.current_thread() is threading.main_thread()  # signals come to it alone
+        if self._main:
             self._before = signal.set_wakeup_fd(self._written.fileno(), warn_on_full_buffer=False)
-            threading.Thread(target=self._wait, daemon=True).start()
+        threading.Thread(target=self._wait, daemon=True).start()
 
     def end(self) -> None:
-        signal.set_wakeup_fd(self._before)
+        if self._main:
+            signal.set_wakeup_fd(self._before)
         self._written.close()
 
     def _wait(self) -> None:
         number = 0
-        while number not in (signal.SIGTERM, signal.SIGINT):
-            message = self._read.recv(1)
-            if not message:
-                return
-            number = message[0]
+        with self._read:
+            while number not in (signal.SIGTERM, signal.SIGINT):
+                message = self._read.recv(1)
+                if not message:
+                    return
+                number = message[0]
         while time.monotonic() - self._ranks.latest < GRACE_SECONDS:
             time.sleep(0.2)
         if self._speaks():

@@ -32,7 +32,7 @@ class Sight:
     @classmethod
     def of(cls, views: PosedImages, points: Tensor) -> Sight:
         cameras = views.cameras.to("cpu", torch.float64)
-        chosen = points[:: -(-len(points) // POINTS_AT_MOST)].cpu().double()  # [Q, 3]
+        chosen = points[:: max(1, -(-len(points) // POINTS_AT_MOST))].cpu().double()  # [Q, 3]
         seen = chosen @ cameras.viewmats[:, :3, :3].transpose(1, 2) + cameras.viewmats[:, None, :3, 3]  # [V, Q, 3]
         depths = seen[..., 2]
         pixels = (seen @ cameras.Ks.transpose(1, 2))[..., :2] / depths.clamp(min=1e-9)[..., None]

@@ -82,7 +82,7 @@ def load_scene(
     if not isinstance(factor, int) or factor < 1:
         raise InputError(f"factor is {factor}: it must be an integer of at least 1")
     if not isinstance(test_every, int) or test_every < 1:
-        raise InputError(f"test_every is {test_every}: it must be an integer of at least 2")
+        raise InputError(f"test_every is {test_every}: it must be an integer of at least 1")
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # what is not finite is refused by its name
         capture = _read(scene, factor)
     test = np.arange(len(capture.names)) % test_every == 0 if capture.test is None else capture.test

@@ -35,7 +35,7 @@ AS_STORED = {
 }
 """What turns an upright picture to how a file of this EXIF orientation has it; others have it upright."""
 SMALLEST_SIDE = 4
-"""The shorter side of a reduced photo has at least so many pixels: those of a cell."""
+"""The shorter side of a reduced photo has at least so many pixels: of fewer, nothing is left to see."""
 OPAQUE_SUFFIXES = (".jpg", ".jpeg")
 """Of files whose headers need not be read again, as their format has no alpha."""
 DECODING_BYTES = 24

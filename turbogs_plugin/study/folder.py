@@ -95,10 +95,17 @@ def merged(folders: Sequence[StudyFolder]) -> Study:
     """
     studies = [folder.read_study() for folder in folders]
     ablation = studies[0].ablation
-    for other in (study.ablation for study in studies[1:]):
+    for folder, other in zip(folders[1:], (study.ablation for study in studies[1:]), strict=True):
+        if other.base != ablation.base:
+            raise InputError(
+                f"'{folder.path}' has the base '{other.base}' and '{folders[0].path}' '{ablation.base}': merge studies "
+                "of one base"
+            )
         for name, overrides in other.variants.items():
-            if (ablation.base, ablation.variants.get(name, overrides)) != (other.base, overrides):
-                raise InputError(f"variant '{name}' has two meanings in what is to be merged")
+            if ablation.variants.get(name, overrides) != overrides:
+                raise InputError(
+                    f"variant '{name}' of '{folder.path}' has other settings than in those before: rename one of them"
+                )
             ablation.variants.setdefault(name, overrides)
         ablation.notes = {**other.notes, **ablation.notes}
     results: dict[CellKey, CellResult] = {}

@@ -165,7 +165,7 @@ def draw_front(summary: SceneSummary, cost: str = "seconds") -> Figure:
     Args:
         cost: a key of `COSTS`.
     """
-    label, title = COSTS[cost]
+    of_cost, title = COSTS[cost]
     styles, (rows, failed) = _styles(summary), told_apart(summary)
     points = [(row.spread(cost).mean, row.psnr.mean) for row in rows]
     front = [point for point, on_front in zip(points, pareto_front(points), strict=True) if on_front]
@@ -177,10 +177,12 @@ def draw_front(summary: SceneSummary, cost: str = "seconds") -> Figure:
         style = {"fmt": marker, "markersize": size, "color": styles[row.name][0], "elinewidth": 1.0, "alpha": 0.9}
         axes.errorbar(*point, *errors, **style)
     steps = np.reshape(sorted(front), (-1, 2)).T  # [2, variants], also of none
-    axes.step(*steps, where="post", color="grey", linewidth=1.2, zorder=0, label="Pareto front (stars)")
-    axes.set(xlabel=label, ylabel="final test PSNR in dB", title=f"{summary.scene}: {title}")
+    label = "Pareto front (stars)" if len(front) > 1 else None  # of one variant there is no line
+    axes.step(*steps, where="post", color="grey", linewidth=1.2, zorder=0, label=label)
+    axes.set(xlabel=of_cost, ylabel="final test PSNR in dB", title=f"{summary.scene}: {title}")
     axes.margins(x=0.18, y=0.12)
-    axes.legend(loc="lower right", frameon=False, fontsize=9)
+    if label:
+        axes.legend(loc="lower right", frameon=False, fontsize=9)
     figure.supxlabel(failed, fontsize=9)
     _label_points(axes, rows, points)
     return figure

@@ -47,7 +47,8 @@ def run_on_gpus(options: SweepOptions, sweep: tuple) -> int:
     present = torch.cuda.device_count()
     absent = [gpu for gpu in options.gpus if gpu >= present]
     if options.device != "cpu" and absent:
-        raise InputError(f"--gpus: there is no GPU {absent[0]}, {present} answer; see 'turbogs doctor'")
+        remedy = f"{present} answer" if present else "none answers; leave it out"
+        raise InputError(f"--gpus: there is no GPU {absent[0]}, {remedy}, or see 'turbogs doctor'")
     _, variants, _, _, folder, *_ = sweep
     before = written_before(options, variants, folder)
     context = multiprocessing.get_context("spawn")

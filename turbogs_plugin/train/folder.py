@@ -46,6 +46,13 @@ class RunFolder:
             raise InputError(f"--out '{self.path}' is not empty: choose a new folder")
         require_writable(self.path, f"--out '{self.path}'")
 
+    def discard(self) -> None:
+        """Take back what a run wrote that never came to a checkpoint, and the folder if nothing else is in it."""
+        for path in (self.asked, self.config, self.plan, self.history, self.wall):
+            path.unlink(missing_ok=True)
+        if self.path.is_dir() and not any(self.path.iterdir()):
+            self.path.rmdir()
+
     def read_config(self) -> Config:
         """The resolved configuration of the run. Raises `InputError` if this is no run, or part of it is missing."""
         if not self.config.is_file():

@@ -13,9 +13,11 @@ import torch
 
 from turbogs_plugin.config.configuration import DEFAULT_CONFIG, Config, load_config, resolve
 from turbogs_plugin.distributed.ranks import ONE, Ranks
+from turbogs_plugin.engine.layout import MAX_VIEWS
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.files import require_writable, write_text_atomically
 from turbogs_plugin.plan import Plan, make_plan
+from turbogs_plugin.plan.pixels import most_views
 from turbogs_plugin.scene import Scene
 from turbogs_plugin.scene.camera_refinement import refine_cameras
 from turbogs_plugin.scene.load import holds_photos_alone
@@ -68,8 +70,12 @@ def new_loop(
         The loop, without listeners; and the measurements for a time budget, whose seconds the loop's clock includes.
 
     Raises:
-        InputError: a budget is too small; the message names one that would do.
+        InputError: a budget is too small; the message names one that would do. Or the schedule has more views an
+            iteration than a GPU takes.
     """
+    views = most_views(config, len(scene.train))
+    if device.type == "cuda" and views > MAX_VIEWS:
+        raise InputError(f"schedule: {views} views an iteration, and a GPU takes at most {MAX_VIEWS}: ask for fewer")
     config, calibration = within_budget(_agreed(config, ranks), scene, device, ranks)
     trainer = Trainer(config, scene, device, ranks=ranks)
     pace = pace_of(config, calibration and calibration.cost)

@@ -100,6 +100,13 @@ class RunSession(Listener):
             self.wall.write(self.folder.wall)
         except TrainingStopped as stop:
             raise TrainingStopped(f"{stop}; {self._last_good()}") from stop
+        except InputError as error:  # that an iteration shows: of a strategy of one's own, say
+            self._threads.shutdown()
+            if latest_checkpoint(self.folder.checkpoints) is not None:
+                raise TrainingStopped(f"{error}; {self._last_good()}") from error
+            if ranks.first:
+                self.folder.discard()
+            raise
         except torch.cuda.OutOfMemoryError as error:
             raise TrainingStopped(
                 f"iteration {trainer.iteration}: the device's memory was too small for {len(trainer.gaussians)} "

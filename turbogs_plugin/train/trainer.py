@@ -36,6 +36,7 @@ from turbogs_plugin.train.evaluate import Look
 from turbogs_plugin.train.initial_state import first_exposures, initial_gaussians
 from turbogs_plugin.train.interpolated_exposures import interpolated_exposures
 from turbogs_plugin.train.parameter_mean import ParameterMean
+from turbogs_plugin.train.returned import require_output, require_samples
 from turbogs_plugin.types import Gaussians, GaussianStats, LossOutput, PixelSamples, RowUpdate, Step
 
 REPEATED_AT_MOST = 32
@@ -151,6 +152,7 @@ class Trainer:
 
         # 3) Pixel sampling
         samples = self.pixel_sampler.sample(self.maps, view_ids, budget.rate, step)
+        require_samples(samples, view_ids, self.config.pixel_sampler["type"])
         if self.maps.masks is not None and not getattr(self.pixel_sampler, "heeds_masks", False):
             samples = self.maps.masks.strip(samples)
         if self.observer is not None:
@@ -190,11 +192,12 @@ class Trainer:
         """
         samples, update = truth.samples, MapUpdate(self.maps, step, self.nonfinite_losses)
         shown = self.shown(colors, samples)
-        terms = self.loss.terms
+        terms = getattr(self.loss, "terms", None)
         if terms is not None:
             loss = self.engine.supervise(terms, shown, truth, update)
         else:
             loss = self.loss(shown, truth.colors(), samples)
+            require_output(loss, shown, self.config.loss["type"])
             self.engine.learn(samples, shown, loss, update)
         if self.exposures is None:
             return loss
@@ -216,8 +219,20 @@ class Trainer:
             self.optimizer.step(self.gaussians, gradients, step)
 
     def refine(self, step: Step) -> RowUpdate | None:
-        """The change of the set of Gaussians that density control proposes, if any."""
-        return self.exchange.refine(self.density, self._gaussians, step, self.complete)
+        """The change of the set of Gaussians that density control proposes, if any.
+
+        What changes the model without such a change (mcmc's noise) is taken back in a skipped iteration, which is made
+        again (`Engine.overflow`).
+        """
+        overflow, before = self.engine.overflow, None
+        if overflow is not None and "model" in self.density.watched:
+            self.exchange.finish()
+            before = self._gaussians.map(Tensor.clone)
+        update = self.exchange.refine(self.density, self._gaussians, step, self.complete)
+        if before is not None and update is None:
+            for name, value in self._gaussians.items():
+                value.copy_(torch.where(overflow == 0, value, getattr(before, name)))
+        return update
 
     def complete(self) -> None:
         """Gather the complete moments and statistics on every process. Every process must call this."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 
 import numpy as np
@@ -74,8 +74,9 @@ class TileGrid:
 class PixelSamples:
     """The pixels of one iteration, grouped by tile.
 
-    A slot whose pixel id is -1 is empty: it renders nothing, adds nothing to a loss and changes no map. Tiles cut by
-    the image's edge get empty slots, so that the host knows the number of slots.
+    A slot whose pixel id is -1 is empty: it renders nothing, adds nothing to a loss and changes no map. A whole tile
+    that the image's edge or a mask cuts has empty slots, and so has a masked tile from which pixels are drawn: the host
+    then knows the number of slots.
 
     Args:
         view_ids: K numbers of training views, on the host.
@@ -89,6 +90,9 @@ class PixelSamples:
         host_ends: gives ([K], [T]) int64 numpy arrays, the end of each view's tiles (in `tile_ids`) and of each tile's
             slots, where the host knows them without asking the device; None: it has to ask.
         origin: of the grid of tiles, see `TileGrid`.
+
+    Attributes:
+        num_filled: [1] int32, kept by whoever counted the filled slots.
     """
 
     view_ids: tuple[int, ...]
@@ -100,6 +104,7 @@ class PixelSamples:
     has_empty_slots: bool = True
     host_ends: Callable[[], tuple[np.ndarray, np.ndarray]] | None = None
     origin: tuple[int, int] = (0, 0)
+    num_filled: Tensor | None = field(init=False, default=None, repr=False, compare=False)
 
     @classmethod
     def from_mask(cls, mask: Tensor, view_ids: Sequence[int] | None = None) -> PixelSamples:

@@ -146,12 +146,14 @@ class CudaScreenGradients:
 
 
 def count_filled(samples: PixelSamples) -> Tensor | None:
-    """[1] int32 on the device: the number of filled slots; None if all are."""
+    """[1] int32 on the device: the number of filled slots; None if all are. Counted once for the loss and the step."""
     if not samples.has_empty_slots:
         return None
-    count = torch.zeros(1, dtype=torch.int32, device=samples.pixel_ids.device)
-    library.launch(launches.CountFilled(pixel_ids=samples.pixel_ids, num_filled=count))
-    return count
+    if samples.num_filled is None:
+        count = torch.zeros(1, dtype=torch.int32, device=samples.pixel_ids.device)
+        library.launch(launches.CountFilled(pixel_ids=samples.pixel_ids, num_filled=count))
+        samples.num_filled = count
+    return samples.num_filled
 
 
 def require_views(count: int) -> None:

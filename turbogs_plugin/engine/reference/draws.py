@@ -9,7 +9,7 @@ The draw is defined down to the bit, so that `draw_pixels` here and its CUDA twi
 
 1. Each unit has an error E, float32. For a pixel it is the pixel's error. For a tile it is the exact sum of its pixels'
    errors, rounded once; sums of halves are exact in float64. It also has an age A, an integer, the largest age of its
-   pixels. (They are drawn together, so their ages differ only in maps once drawn by another unit.)
+   pixels, which differ, as the grid of tiles begins elsewhere in each iteration.
 2. Each unit has four random words ``x0 .. x3`` (layout in `philox`). Their place is the pixel id ``y * width + x``, or
    the tile's number within its view; the purpose says which of the two.
 3. Each stage ranks the units not yet drawn by a 64-bit key, and takes the largest. Keys are distinct, as their low 20

@@ -24,8 +24,9 @@ BLOCKS = (
 )
 """The two blocks of a packed row that moment-damped LM solves: geometry and appearance."""
 
-GRADIENT_LIMIT = 1e17
-"""Gradients are cut here, so that the square of a sum over up to 100 views stays finite in float32 (up to 3.4e38)."""
+GRADIENT_LIMIT, SUM_LIMIT = 1e17, 1.8e19
+"""Gradients of a view, and their sums, are cut here, so that the square of a sum stays finite in float32 (up to
+3.4e38). Sums over `layout.MAX_VIEWS` views, a kernel's most, never reach the second."""
 
 
 @torch.no_grad()
@@ -47,7 +48,7 @@ def apply_update(
     columns = [getattr(gradients, name)[:, index].unsqueeze(-1).flatten(2) for name in COLUMNS]
     rows = clipped(torch.cat(columns, dim=-1))  # [K, n, 14]
     losses = gradients.view_losses[:, index]  # [K, n]
-    gradient = rows.sum(dim=0)
+    gradient = rows.sum(dim=0).clamp(-SUM_LIMIT, SUM_LIMIT)
     terms = advance(moments.exp_avg, moments.exp_avg_sq, gradient, index, steps, rule)
     if rule.lm is None:
         delta = terms.delta(packed_rates(rule.rates, gradient))

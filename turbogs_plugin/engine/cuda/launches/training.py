@@ -25,7 +25,7 @@ class TileScratch:
 
 
 NO_SCRATCH = TileScratch(None, None, None, None)
-"""For the other units."""
+"""For single pixels."""
 
 
 MaskArrays = fields_of("Tensor | None", "tiles rows bits")
