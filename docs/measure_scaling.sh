@@ -56,8 +56,8 @@ test "${RANKS:-}" = no ||
         --gaussians 600000 150000 1000 --views 10 3 --grown --device "$device" --out "$out/ranks.json" ${BENCH:-}
 runs() {
     run one "$1" 1
-    run two "$1" 2
-    test -z "$four" || run four "$1" 4
+    run two "$1" 2 train.batch_for=1  # the batch of one GPU
+    test -z "$four" || run four "$1" 4 train.batch_for=1
     run batch "$1" 2 train.batch_for=auto  # twice the views and pixels
     results
 }

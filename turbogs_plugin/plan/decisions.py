@@ -46,6 +46,9 @@ LONGEST = 30_000
 """Most iterations of `auto`, 3DGS's own length, whose iterations have one photo, too. 60 epochs of 500 training views
 take as many; those of more photos would take minutes or hours that nobody has asked for. A time budget is how to ask.
 For several processes, of which each iteration has as many times the pixels, it is that much less."""
+LARGEST_BATCH = 2
+"""Most times the batch of one process. Twice costs no error; four times costs caliterra .25 to .73 dB, the more the
+fewer iterations it has (twenty-ninth and thirtieth round)."""
 SHORTEST_SHARE = 0.4
 """Least share of `train.base_iterations`: with fewer iterations, however few the photos, the events of density control
 would be too close together. fox has 52 % of them with 60 epochs. For several processes, whose steps are longer by the
@@ -149,14 +152,15 @@ def wanted_dropout(facts: SceneFacts, config: Config) -> Verdict:
 
 
 def wanted_batch_for(facts: SceneFacts, config: Config) -> Verdict:
-    """The batch of all processes, as far as an iteration can have so many different views."""
+    """The batch of all processes, as far as that costs no error and an iteration can have so many different views."""
     count, views = facts.processes, facts.train_views
     most = config.schedule.get("max_views", config.schedule.get("views", 0))
     if count == 1 or not most:
         return Verdict(1, "one process" if count == 1 else "the schedule has no number of views")
-    fitting = max(1, min(count, min(views, MAX_VIEWS) // most))
-    reason = f"{count} processes"
-    if fitting < count:
+    wanted = min(count, LARGEST_BATCH)
+    fitting = max(1, min(wanted, min(views, MAX_VIEWS) // most))
+    reason = f"{count} processes" + (f", of which a batch for {wanted} costs no error" if wanted < count else "")
+    if fitting < wanted:
         bound = f"an iteration's {MAX_VIEWS}" if views > MAX_VIEWS else f"{views} training views"
         reason += f", but {fitting + 1} times {most} views > {bound}"
     return Verdict(fitting, reason)

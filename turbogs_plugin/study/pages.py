@@ -29,8 +29,9 @@ from turbogs_plugin.study.summary import CELL_VALUES, SceneSummary, VariantRow, 
 CLOCKS = {"wall_seconds": "wall in s", "cell_seconds": "load, train, evaluate in s"}
 """Measures of the wall's clock, each with its column, where a cell has it."""
 
-OF_THE_CALL = (*UNSHARED, "budget.", "train.device")
-"""Settings that belong to a call, or change no result: a page does not go stale by them."""
+OF_THE_CALL = (*UNSHARED, "budget.", "train.device", "train.batch_for")
+"""Settings that belong to a call, or change no result, as a batch for several processes in a cell, which has one: a page
+does not go stale by them."""
 
 TIMING_RULES = (
     "Seconds are those of training alone: the initial error maps and the iterations, by one clock for all cells, with "

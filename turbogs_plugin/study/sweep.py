@@ -33,9 +33,9 @@ from turbogs_plugin.train.start import resolve_device
 POLL_SECONDS = 1.0
 """Between two looks at cells that other processes train."""
 
-UNCOMPARED = ("scene.path", "train.device", "report.tensorboard")
-"""Settings that may differ between a kept cell and the present call: where things are, and who is told, changes no
-result."""
+UNCOMPARED = ("scene.path", "train.device", "train.batch_for", "report.tensorboard")
+"""Settings that may differ between a kept cell and the present call: where things are, who is told, and a batch for
+several processes, of which a cell has one, change no result."""
 
 
 @dataclass
