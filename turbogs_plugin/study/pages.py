@@ -30,7 +30,7 @@ CLOCKS = {"wall_seconds": "wall in s", "cell_seconds": "load, train, evaluate in
 """Measures of the wall's clock, each with its column, where a cell has it."""
 
 OF_THE_CALL = (*UNSHARED, "budget.", "train.device", "train.batch_for")
-"""Settings that belong to a call, or change no result, as a batch for several processes in a cell, which has one: a page
+"""Settings that belong to a call, or change no result, as a batch for several processes in a cell, which has one. A page
 does not go stale by them."""
 
 TIMING_RULES = (
