@@ -30,8 +30,8 @@ CLOCKS = {"wall_seconds": "wall in s", "cell_seconds": "load, train, evaluate in
 """Measures of the wall's clock, each with its column, where a cell has it."""
 
 OF_THE_CALL = (*UNSHARED, "budget.", "train.device", "train.batch_for")
-"""Settings that belong to a call, or change no result, as a batch for several processes in a cell, which has one. A page
-does not go stale by them."""
+"""Settings that belong to a call, or change no result, as a batch for several processes in a cell, which has one. No
+page goes stale by them."""
 
 TIMING_RULES = (
     "Seconds are those of training alone: the initial error maps and the iterations, by one clock for all cells, with "
