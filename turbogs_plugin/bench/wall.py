@@ -80,12 +80,16 @@ def time_command(arguments: Sequence[str]) -> WallRun:
 def bench_wall(arguments: Sequence[str], repeats: int) -> dict[str, Any]:
     """Time the command several times, one after the other.
 
+    Args:
+        arguments: of `turbogs train`, the capture's folder first; the record has the folder's name alone.
+
     Returns:
         ``runs``, in their order, and ``median``, the one in the middle by what it took beside training.
     """
     runs = [time_command(arguments) for _ in range(repeats)]
     middle = sorted(runs, key=lambda run: run.beside_training)[(len(runs) - 1) // 2]
-    return {"command": ["turbogs", "train", *arguments], "runs": [vars(run) for run in runs], "median": vars(middle)}
+    command = ["turbogs", "train", Path(arguments[0]).name, *arguments[1:]]
+    return {"command": command, "runs": [vars(run) for run in runs], "median": vars(middle)}
 
 
 def wall_lines(measured: dict[str, Any]) -> list[str]:
