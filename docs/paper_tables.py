@@ -13,7 +13,7 @@ from verdict import verdict
 from turbogs_plugin.report.tables import table
 from turbogs_plugin.study.summary import VariantRow
 
-OURS = ("cameras", "parts", "pixels", "departures", "density_departures", "bounds", "average")
+OURS = ("cameras", "parts", "departures", "density_departures", "bounds")
 """Studies that change one thing of `turbogs` a variant."""
 
 BOUND = 0.3
