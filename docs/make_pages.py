@@ -12,6 +12,7 @@ from collections.abc import Callable
 from functools import cache
 
 import capture_tables
+import goal_tables
 import machine_tables
 import paper_tables
 import scaling_model
@@ -35,6 +36,7 @@ PAGES = tuple(
         "docs/paper.md",
         "docs/plan.md",
         "docs/results/README.md",
+        "docs/results/sweeps.md",
         "docs/scaling.md",
         "docs/results/h200/README.md",
         "docs/results/h200/house.md",
@@ -69,6 +71,7 @@ TABLES: dict[str, Callable[[], str | None]] = {
     "exposure_runs": capture_tables.exposure_runs,
     "exports": viewer_tables.exports,
     "exposures": machine_tables.exposures,
+    "goals": goal_tables.goals,
     "headline": study_tables.headline,
     "headline_sources": study_tables.headline_sources,
     "house_iterations": lambda: machine_tables.iterations(machine_tables.measured("house.json")),
@@ -84,6 +87,7 @@ TABLES: dict[str, Callable[[], str | None]] = {
     "paper_parts": paper_tables.paper_parts,
     "paper_whole": paper_tables.paper_whole,
     "parts": lambda: study_tables.changes("parts"),
+    "tried": goal_tables.tried,
     "viewer": viewer_tables.viewer,
     "memory": lambda: machine_tables.on("bench-step.json", machine_tables.memory),
     "offload": lambda: machine_tables.on("bench-4k.json", machine_tables.offload),

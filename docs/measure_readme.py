@@ -172,7 +172,7 @@ STAGES: dict[str, Sequence[Piece | Sweep]] = {
     "pictures": [Piece(60, "pictures", partial(make_pictures, "caliterra", 44))],
     "demo": [Piece(120, "demo.png", draw_demo)],
     "pixels": [Piece(120, f"pixels/{name}", partial(learn_photo, chosen)) for name, chosen in PHOTOS.items()],
-        "paper": [Sweep(150, ["paper"])],  # the printed update diverges, and is slow
+    "paper": [Sweep(150, ["paper"])],  # the printed update diverges, and is slow
     "paper_parts": [Sweep(60, ["paper_parts"])],
     "baselines": [Sweep(210, ["baselines"], seeds=1)],
     "studies": [Sweep(60, ["sizes", "parts", "departures", "density_departures", "bounds", "cameras"])],

@@ -76,14 +76,16 @@ def result(
 ) -> str:
     """``4.1 s, 32.20 dB, .893, 209k``; what was not recorded is left out. With `wall`, ``4.1 / 9.5 s``; with the PSNR's
     spread over several seeds, ``32.20 [32.05, 32.31] dB``."""
-    size = (
-        gaussians if gaussians is None else f"{gaussians / 1e6:.2f}M" if gaussians >= 1e6 else f"{gaussians / 1e3:.0f}k"
-    )
+    size = None if gaussians is None else size_text(gaussians)
     clocks = duration(seconds) if wall is None else f"{duration(seconds)} / {wall}"
     error = spread_text(psnr, 2) if isinstance(psnr, Spread) else f"{psnr:.2f}"
     parts = [f"{clocks} s", f"{error} dB"]
     parts += [] if ssim is None else [f"{ssim:.3f}".lstrip("0")]
     return ", ".join(parts if size is None else [*parts, size])
+
+
+def size_text(gaussians: float) -> str:
+    return f"{gaussians / 1e6:.2f}M" if gaussians >= 1e6 else f"{gaussians / 1e3:.0f}k"
 
 
 def duration(seconds: float) -> str:

@@ -138,6 +138,23 @@ def table_of(layout: Layout, cells: Sequence[Cell], where: str) -> str:
     return table(("", *layout.captures.values()), lines)
 
 
+def difference_of(name: str, key: str, label: str, scene: str, measure: str) -> Difference:
+    """What a row of a table has more than the row that it is compared with, at the end, on one capture.
+
+    Raises:
+        InputError: the table has no such row.
+    """
+    layout, cells = layouts_of(name)[key], read_cells(FOLDER / f"{name}.json")
+    own, base = (chosen_cells(layout.rows[row], cells, key).get(scene, {}) for row in (label, layout.against))
+    return ends_apart(own, base, measure)
+
+
+def ends_apart(own: Mapping[int, Cell], base: Mapping[int, Cell], measure: str) -> Difference:
+    """Over the seeds that both have."""
+    seeds = [seed for seed in own if seed in base]
+    return Difference.of([getattr(own[seed], measure)[-1] - getattr(base[seed], measure)[-1] for seed in seeds])
+
+
 def chosen_cells(names: Sequence[str], cells: Sequence[Cell], where: str) -> dict[str, dict[int, Cell]]:
     """Capture -> seed -> the cell of any of these names."""
     known = {cell.name for cell in cells}
@@ -170,10 +187,8 @@ def cell_text(own: Mapping[int, Cell], base: Mapping[int, Cell], extra: Mapping[
         text = f"{further:.4f}".lstrip("0") if measure.endswith("ssim") else f"{further:.2f} dB"
         parts += [] if math.isnan(further) else [f"{called} {text}".lstrip()]
     changes = []
-    seeds = [seed for seed in own if seed in base]
     for measure, unit, digits in (("psnr", " dB", 2), ("ssim", "", 4)):
-        pairs = [getattr(own[seed], measure)[-1] - getattr(base[seed], measure)[-1] for seed in seeds]
-        value, clear, _ = difference_text(Difference.of(pairs), digits).partition(" (clear)")
+        value, clear, _ = difference_text(ends_apart(own, base, measure), digits).partition(" (clear)")
         changes += [f"{value}{unit}{clear}"] if value else []
     text = "; ".join(filter(None, (", ".join(parts), ", ".join(changes))))
     return f"{text} ({psnr.count})"
