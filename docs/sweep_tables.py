@@ -142,7 +142,7 @@ def difference_of(name: str, key: str, label: str, scene: str, measure: str) -> 
     """What a row of a table has more than the row that it is compared with, at the end, on one capture.
 
     Raises:
-        InputError: the table has no such row.
+        KeyError: the round has no such table, or the table no such row.
     """
     layout, cells = layouts_of(name)[key], read_cells(FOLDER / f"{name}.json")
     own, base = (chosen_cells(layout.rows[row], cells, key).get(scene, {}) for row in (label, layout.against))

@@ -23,9 +23,9 @@ from turbogs_plugin.train.history import Evaluation
 DOCS = Path(__file__).parents[2] / "docs"
 FOLDERS = sorted(path.parent for path in DOCS.glob("results/*/results.json"))
 sys.path.insert(0, str(DOCS))  # the scripts import their neighbours
-make_pages, machine_tables, paper_tables, study_tables, viewer_tables = (
-    importlib.import_module(name)
-    for name in ("make_pages", "machine_tables", "paper_tables", "study_tables", "viewer_tables")
+goal_tables, make_pages, machine_tables, paper_tables, study_tables, sweep_tables, viewer_tables = map(
+    importlib.import_module,
+    ("goal_tables", "make_pages", "machine_tables", "paper_tables", "study_tables", "sweep_tables", "viewer_tables"),
 )
 PLACE = {"machine": "NVIDIA H200 (140 GiB)", "commit": "0123456789", "software": {"torch": "2.11.0"}}
 NOT_IN_THE_REPOSITORY = {"report.html", "table.csv"}  # .gitignore has them: `make pages` leaves them here
@@ -306,6 +306,23 @@ def test_captions_are_of_the_pictures_record(tmp_path, monkeypatch):
     text = "<!-- made: render caption -->\n\nas it was\n\n<!-- end -->\n"
     monkeypatch.setitem(make_pages.TABLES, "render caption", lambda: None)
     assert make_pages.filled(text) == text
+
+
+def test_a_goal_says_what_is_missing_of_it():
+    row = study_tables.rows_of("sizes")["fox"]["turbogs"]
+    mean = row.psnr.mean
+    least, measured, missing = goal_tables.error("psnr", mean + 0.25, row, 2, " dB")
+    assert (least, missing) == (f"{mean + 0.25:.2f} dB", ".25 dB")
+    assert measured.startswith(f"{mean:.2f} ± .") and measured.endswith(" dB")
+    assert goal_tables.error("psnr", mean - 0.25, row, 2, " dB")[2] == ""
+    assert goal_tables.most(4.0, 5.5, "{:.1f} s".format) == ("4.0 s", "5.5 s", "1.5 s")
+    assert goal_tables.most(4.0, 3.5, "{:.1f} s".format) == ("4.0 s", "3.5 s", "")
+    litegs, fastgs = (
+        goal for goal in goal_tables.all_goals() if (goal.capture, goal.variant) == ("caliterra", "cap-157k")
+    )
+    assert litegs[3:6] == pytest.approx((33.43, 0.92, 4.25)) and fastgs[3:6] == pytest.approx((33.12, 0.921, 4.55))
+    gained = sweep_tables.difference_of("thirtieth", "small_94k", "34 epochs", "fox", "psnr")
+    assert gained.count == 10 and gained.mean == pytest.approx(0.03, abs=0.005)
 
 
 def test_a_number_changed_by_hand_is_found():
