@@ -1,7 +1,8 @@
 """Losses on sampled pixels (paper section 3.7), as `LossTerms` that every engine can evaluate.
 
-Every loss here is a mean over all filled samples of the K views together, or over the tiles that hold them, so its
-gradients are as large as those of a dense mean loss. Formulas: `turbogs_plugin.engine.reference.losses`.
+Every loss here is a mean over all filled samples of the K views together, or over the listed tiles, so its gradients
+are as large as those of a dense mean loss. The samplers list no tile without a sample; one that is listed all the same
+has no loss. Formulas: `turbogs_plugin.engine.reference.losses`.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Losses on sampled pixels in torch, each with its own gradient: the definition of `LossTerms` (paper section 3.7 and
 appendix).
 
-Every loss is a mean over all filled samples of the K views together, or over the tiles that hold them, so its gradients
-are as large as those of a dense mean loss. Half-precision colours are converted to single precision, and so are their
+Every loss is a mean over all filled samples of the K views together, or over the listed tiles, so its gradients are as
+large as those of a dense mean loss. Half-precision colours are converted to single precision, and so are their
 gradients. A sample whose colour is not finite adds no loss and no gradient, and its error is 0; it still counts in the
 mean. With autograd upstream: ``colors.backward(out.color_gradients)``.
 
