@@ -100,6 +100,7 @@ TABLES: dict[str, Callable[[], str | None]] = {
     "raster": lambda: machine_tables.on("bench-raster.json", machine_tables.raster),
     "solvers": machine_tables.solvers,
     "steps": lambda: machine_tables.steps("bench-step.json"),
+    "steps_h100": lambda: machine_tables.steps("bench-step-h100.json"),
     "steps_ssim": lambda: machine_tables.steps("bench-step-ssim.json"),
     "wall": machine_tables.wall,
 }

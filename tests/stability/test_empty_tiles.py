@@ -46,7 +46,8 @@ def test_a_tile_without_a_sample_is_as_if_it_were_not_listed(loss, tiles):
     gaussians, cameras = make_gaussians(40), make_cameras(SIZES)
     whole = thin_out(dense_samples(cameras), 0.3)
     tiles = [range(len(whole.tile_ids))[tile] for tile in tiles]
-    photos = torch.rand(int(np.prod(SIZES, axis=1).sum()), 3, generator=torch.manual_seed(0), dtype=torch.float64)
+    generator = torch.Generator().manual_seed(0)
+    photos = torch.rand(int(np.prod(SIZES, axis=1).sum()), 3, generator=generator, dtype=torch.float64)
     ratio = (len(whole.tile_ids) - len(tiles)) / len(whole.tile_ids)
     outcomes, structures = [], []
     for samples, factor in ((emptied(whole, tiles), ratio), (without(whole, tiles), 1.0)):
