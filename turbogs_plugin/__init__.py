@@ -11,16 +11,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from importlib import import_module
-from pathlib import Path
 from typing import Any
 
 __version__ = "0.1.0"
-
-# `strategies/` and `configs/` live beside this package in a checkout and inside it once installed.
-# Without an install (a machine with no network), the checkout's root takes the installed layout's place.
-_root = Path(__file__).resolve().parent.parent
-if (_root / "pyproject.toml").is_file() and not (Path(__file__).resolve().parent / "strategies").exists():
-    __path__.append(str(_root))
 
 
 def lazy_face(package: str, places: Mapping[str, str]) -> Callable[[str], Any]:
