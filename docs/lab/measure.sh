@@ -24,7 +24,7 @@ ablate() { # NAME SEED ...
 
 wall() { # VARIANT CAPTURE REPEATS SETTING ...
     local file=$out/wall-$1-$(basename "$2").json
-    [ -e "$file" ] || turbogs bench wall --scene "$2" --repeats "$3" --out "$file" "${@:4}"
+    [ -e "$file" ] || turbogs bench wall "${@:4}" --scene "$2" --repeats "$3" --out "$file"
 }
 
 studies="sizes paper parts departures density_departures bounds cameras paper_parts"
