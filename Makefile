@@ -23,20 +23,15 @@ ablation: demo/capture
 demo/capture: | $(INSTALLED)
 	$(BIN)/turbogs demo $@
 
-# All tables and pictures of README that come from runs of ours, and the tables of docs/results/README.md, anew, from
-# nothing, on a GPU machine: make results SCENES="PATH/fox PATH/caliterra PATH/snowmiku".
-# Begins nothing that would end after WITHIN and then ends with an error: call it again until it ends without. What is
-# measured is in results/COMMIT. STAGES="sizes wall": these alone; docs/measure_readme.py says what there is.
-WITHIN ?= 9m
+# What README and docs/lab show of TurboGS, measured anew on a GPU machine, into results/COMMIT and docs/lab:
+# make results SCENES="PATH/fox PATH/caliterra PATH/snowmiku". The same call goes on after a stop.
 results: $(INSTALLED)
-	$(BIN)/python docs/measure_readme.py results $(SCENES) $(STAGES) --within $(WITHIN)
+	PATH="$(CURDIR)/$(BIN):$$PATH" docs/lab/measure.sh results $(SCENES)
 	$(MAKE) pages
 
-# The page and the plots of every study in docs/, and the tables of README, from results.json; a second run changes
-# nothing.
+# The tables of README and docs/, and README's plot, from the files in docs/lab; a second run changes nothing.
 pages: $(INSTALLED)
-	$(BIN)/turbogs report $(patsubst %/,%,$(dir $(wildcard docs/results/*/results.json)))
-	$(BIN)/python docs/make_pages.py
+	$(BIN)/python docs/lab/make_pages.py
 
 # A process a core, each with one thread and a run of files, whose tests share captures and runs. One that is done
 # takes half of what another has left: no large file keeps a core waiting. Bytecode is kept, also where the environment

@@ -1,6 +1,5 @@
 """Configuration: dataclasses <- YAML <- overrides, strictly."""
 
-import re
 from pathlib import Path
 
 import pytest
@@ -194,16 +193,3 @@ def test_bands_open_on_their_schedule():
 def test_the_start_and_the_end_are_always_evaluated():
     train = load_config("turbogs", ["train.iterations=10", "train.evaluate_at=[0.01, 0.5]"]).train
     assert train.evaluation_iterations() == {0, 1, 5, 10}
-
-
-def test_the_page_of_doubtful_settings_names_what_is_there():
-    """Settings with values that are possible, their files, and the rows of ablations that are to decide."""
-    page = (ROOT / "docs" / "settings.md").read_text()
-    rows = re.findall(r"^\| `([a-z_.]+)(?:: (\w+))?` \| `(\S+)` \| (.+) \|$", page, re.MULTILINE)
-    assert len(rows) == page.count("\n| `")
-    for setting, value, file, decided_by in rows:
-        section, _, key = setting.partition(".")
-        assert key in load_config("turbogs", [f"{setting}={value}"] if value else []).to_mapping()[section]
-        assert (ROOT / file).is_file()
-        for ablation, variants in re.findall(r"`(\w+)`: ((?:`\S+`(?:, )?)+)", decided_by):
-            assert set(re.findall(r"`(\S+?)`", variants)) <= set(load_ablation(ablation).variants), setting

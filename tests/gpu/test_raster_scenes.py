@@ -95,7 +95,7 @@ def test_gradients(case, steady, of_all, bound):
 
 def test_gradients_differ_by_samples_of_another_color_alone(case, steady):
     """Gradients of all samples may be farther apart than the bound of steady ones, as in float32 on some models
-    (docs/results/h200). A few samples explain it, whose colors are beyond their bound by a decision made otherwise."""
+    (docs/lab/speed.md). A few samples explain it, whose colors are beyond their bound by a decision made otherwise."""
     got = rasterize(case.gpu_gaussians, case.gpu_cameras, case.gpu_samples)
     wanted = rasterize_reference(case.gaussians, case.cameras, case.samples)
     decided_otherwise = ((got.colors.double().cpu() - wanted.colors).abs() > FORWARD_BOUND).any(dim=-1)

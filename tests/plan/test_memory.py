@@ -80,7 +80,7 @@ def test_memory_is_what_is_kept_and_what_is_done_with_it():
 
 def test_no_measured_peak_is_above_the_prediction():
     """Nor far below: the measured iterations have neither an event of density control nor an evaluation in them."""
-    report = json.loads((Path(__file__).parents[2] / "docs/results/h200/bench-step.json").read_text())
+    report = json.loads((Path(__file__).parents[2] / "docs/lab/step-h200.json").read_text())
     assert len(report["passes"]) >= 4
     for entry in report["passes"]:
         fixed = ("schedule.type=fixed", f"schedule.views={entry['views']}", "train.sh_degree=3")

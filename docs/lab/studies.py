@@ -1,0 +1,251 @@
+"""Tables made of trainings: docs/lab/STUDY/results.json, and docs/lab/peers.json of other programs."""
+
+from __future__ import annotations
+
+import json
+import math
+import statistics
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import yaml
+
+LAB = Path(__file__).resolve().parent
+CAPTURES = ("fox", "caliterra", "snowmiku")
+ROWS = yaml.safe_load((LAB / "rows.yaml").read_text(encoding="utf-8"))
+"""What the rows of README's table and of docs/paper.md are."""
+STUDIES = tuple(sorted(file.parent.name for file in LAB.glob("*/results.json")))
+Cell = dict[str, Any]
+"""One training, as `turbogs_plugin/study/results.py` describes its entry in results.json."""
+Cells = list[Cell]
+"""Trainings of one variant on one capture, a seed each."""
+
+
+class Row(NamedTuple):
+    """A row of the headline table that is ours.
+
+    Args:
+        study, variant: where it is measured.
+        name: as the table has it.
+        capture: the only capture that the table shows it of; "": all three.
+    """
+
+    study: str
+    variant: str
+    name: str
+    capture: str = ""
+
+    def cells(self) -> dict[str, Cells]:
+        """Capture -> trainings."""
+        found = study_cells(self.study)
+        captures = [self.capture] if self.capture else CAPTURES
+        return {of: found[of][self.variant] for of in captures if self.variant in found.get(of, {})}
+
+
+OURS = [Row(**row) for row in ROWS["headline"]]
+
+
+@cache
+def study_cells(study: str) -> dict[str, dict[str, Cells]]:
+    """Capture -> variant -> trainings; the baseline first. Empty where the study is not there."""
+    if not (LAB / study / "results.json").is_file():
+        return {}
+    record = read_json(f"{study}/results.json")
+    baseline = record["baseline"] or next(iter(record["variants"]))
+    found: dict[str, dict[str, Cells]] = {}
+    for capture in CAPTURES:
+        for variant in sorted(record["variants"], key=lambda name: name != baseline):  # stable
+            cells = [cell for cell in record["cells"] if (cell["scene"], cell["variant"]) == (capture, variant)]
+            if cells:
+                found.setdefault(capture, {})[variant] = cells
+    return found
+
+
+@cache
+def read_json(name: str) -> Any:
+    """A record in docs/lab/."""
+    return json.loads((LAB / name).read_text(encoding="utf-8"))
+
+
+def values(cells: Cells, measure: str) -> list[float]:
+    """A field of each training's last evaluation."""
+    return [cell["final"][measure] for cell in cells]
+
+
+def mean(cells: Cells, measure: str) -> float:
+    return math.fsum(values(cells, measure)) / len(cells)
+
+
+T95 = (12.71, 4.30, 3.18, 2.78, 2.57, 2.45, 2.36, 2.31, 2.26, 2.23)
+"""Student's t of 1 .. 10 degrees of freedom: 95 % of means of pure noise lie within t standard errors."""
+
+
+@dataclass(frozen=True)
+class Difference:
+    """A measure minus the baseline's, mean over the seeds that both have.
+
+    Args:
+        mean, error: the mean and its standard error; NaN without two seeds.
+        count: seeds.
+    """
+
+    mean: float
+    error: float
+    count: int
+
+    @classmethod
+    def between(cls, cells: Cells, base: Cells, measure: str) -> Difference:
+        known = {cell["seed"]: cell["final"][measure] for cell in base}
+        found = [cell["final"][measure] - known[cell["seed"]] for cell in cells if cell["seed"] in known]
+        count = len(found)
+        error = statistics.stdev(found) / math.sqrt(count) if count > 1 else math.nan
+        return cls(math.fsum(found) / count if count else math.nan, error, count)
+
+    @property
+    def clear(self) -> bool:
+        """Noise alone gives a mean this large in fewer than 1 of 20 cases."""
+        return self.count > 1 and abs(self.mean) > T95[min(self.count - 1, len(T95)) - 1] * self.error
+
+    def text(self, digits: int, unit: str = "") -> str:
+        error = "" if math.isnan(self.error) else f" ± {self.error:.{digits}f}"
+        return f"{self.mean:+.{digits}f}{error}{unit}{' (clear)' if self.clear else ''}"
+
+
+def table(head: Sequence[str], lines: Iterable[Sequence[Any]]) -> str:
+    """A table in Markdown."""
+    rows = [head, ["---"] * len(head), *lines]
+    return "\n".join(f"| {' | '.join(map(str, row))} |" for row in rows)
+
+
+def by_capture(head: str, lines: Mapping[str, Mapping[str, str]]) -> str:
+    """A table with a column a capture, of rows that have a cell for some captures."""
+    rows = [[name, *(cells.get(capture, "") for capture in CAPTURES)] for name, cells in lines.items()]
+    return table((head, *CAPTURES), rows)
+
+
+def duration(seconds: float) -> str:
+    return "-" if math.isnan(seconds) else f"{seconds:.1f}" if seconds < 10 else f"{seconds:.0f}"
+
+
+def result(seconds: str, psnr: str, ssim: float | None, gaussians: float | None) -> str:
+    """``4.1 s, 32.20 dB, .893, 209k``, without what was not recorded."""
+    parts = [f"{seconds} s", f"{psnr} dB"]
+    parts += [] if ssim is None else [f"{ssim:.3f}".lstrip("0")]
+    if gaussians is not None:
+        parts.append(f"{gaussians / 1e6:.2f}M" if gaussians >= 1e6 else f"{gaussians / 1e3:.0f}k")
+    return ", ".join(parts)
+
+
+def psnr_text(cells: Cells, measure: str = "psnr") -> str:
+    """The mean, and with several seeds the lowest and the highest."""
+    found = values(cells, measure)
+    spread = f" [{min(found):.2f}, {max(found):.2f}]" if len(found) > 1 else ""
+    return f"{mean(cells, measure):.2f}{spread}"
+
+
+def wall_seconds(row: Row, capture: str) -> float:
+    """Seconds of the whole command: the median run of `turbogs bench wall`; NaN where it was not measured."""
+    report = read_json("wall.json").get(row.variant, {}).get(capture) if row.study == "sizes" else None
+    return report["median"]["seconds"] if report else math.nan
+
+
+def peer_walls(entry: Mapping[str, Any]) -> list[float]:
+    """Seconds of another program's whole command, lowest and highest; empty where they were not measured."""
+    beyond = read_json("peers.json")["beyond_training"].get(entry["method"].split()[0], ())
+    return [entry["seconds"] + more for more in sorted(set(beyond))]
+
+
+def headline() -> str:
+    """Ours beside the others on each capture: seconds of training / of the whole command, PSNR, SSIM, Gaussians."""
+    lines: dict[str, dict[str, str]] = {}
+    for entry in read_json("peers.json")["rows"]:
+        walls = " to ".join(map(duration, peer_walls(entry))) or "-"
+        seconds = f"{duration(entry['seconds'])} / {walls}"
+        cell = result(seconds, f"{entry['psnr']:.2f}", entry["ssim"], entry["gaussians"])
+        lines.setdefault(entry["method"], {})[entry["capture"]] = cell
+    for row in OURS:
+        for capture, cells in row.cells().items():
+            seconds = f"{duration(mean(cells, 'seconds'))} / {duration(wall_seconds(row, capture))}"
+            cell = result(seconds, psnr_text(cells), mean(cells, "ssim"), mean(cells, "gaussians"))
+            seeds = f" ({len(cells)})" if len(cells) > 1 else ""
+            lines.setdefault(row.name, {})[capture] = cell + seeds
+    return by_capture("", lines)
+
+
+def sooner() -> str:
+    """Seconds of the others over those of `turbogs`, end against end: training alone / whole command; then PSNR and
+    SSIM of `turbogs` above theirs, and its number of Gaussians over theirs."""
+    ours = OURS[-1].cells()
+    lines: dict[str, dict[str, str]] = {}
+    for entry in read_json("peers.json")["rows"]:
+        capture, cells = entry["capture"], ours[entry["capture"]]
+        walls = [f"{wall / wall_seconds(OURS[-1], capture):.1f}" for wall in peer_walls(entry)]
+        times = f"{entry['seconds'] / mean(cells, 'seconds'):.0f} / {' to '.join(walls) or '-'} times"
+        parts = [times, f"{mean(cells, 'psnr') - entry['psnr']:+.2f} dB"]
+        parts += [f"{mean(cells, 'ssim') - entry['ssim']:+.3f}"] if entry["ssim"] else []
+        parts += [f"x {mean(cells, 'gaussians') / entry['gaussians']:.1f} N"] if entry["gaussians"] else []
+        lines.setdefault(entry["method"], {})[capture] = ", ".join(parts)
+    return by_capture("against", lines)
+
+
+def place(machine: str, commit: str, day: str = "") -> str:
+    """The GPU, or the CPU where none was used; the host's cores; commit and day."""
+    device, _, host = machine.partition(" (")
+    cores = [part for part in host.split(", ") if part.endswith(" cores")]
+    return ", ".join(filter(None, [device, *cores, f"commit {commit[:7]}", day]))
+
+
+def where(record: Mapping[str, Any]) -> str:
+    """Machine, commit, day and torch of a file that a bench wrote."""
+    of = record["provenance"]
+    return f"{place(of['machine'], of['commit'], of.get('day', ''))}, torch {of['software']['torch']}"
+
+
+def sources() -> str:
+    """Machine, commit and day of each row of the headline table."""
+    lines: dict[str, dict[str, None]] = {}
+    for row in OURS:
+        for cell in (cell for cells in row.cells().values() for cell in cells):
+            of = read_json(f"{row.study}/results.json")["provenances"][cell["provenance"]]
+            lines.setdefault(row.name, {})[place(of["machine"], of["commit"], of["day"])] = None
+    for row in OURS:
+        for report in read_json("wall.json").get(row.variant, {}).values() if row.study == "sizes" else ():
+            lines.setdefault(f"whole command of {row.name}", {})[where(report)] = None
+    lines["the others"] = {read_json("peers.json")["measured"]: None}
+    return table(("row", "measured on"), [(name, "; ".join(found)) for name, found in lines.items()])
+
+
+def ratio(cells: Cells, base: Cells, measure: str) -> float:
+    """Mean over the baseline's mean, both over the seeds that both have."""
+    seeds = {cell["seed"] for cell in cells} & {cell["seed"] for cell in base}
+    own, of_base = (mean([cell for cell in of if cell["seed"] in seeds], measure) for of in (cells, base))
+    return own / of_base
+
+
+def change(cells: Cells, base: Cells, errors: str = "") -> str:
+    """Differences in PSNR and SSIM, ratios of seconds and Gaussians, and how many seeds.
+
+    Args:
+        errors: "refined_": by refined cameras of the test photos.
+    """
+    psnr, ssim = (Difference.between(cells, base, f"{errors}{measure}") for measure in ("psnr", "ssim"))
+    ratios = f"x {ratio(cells, base, 'seconds'):.2f} s, x {ratio(cells, base, 'gaussians'):.2f} N"
+    return f"{psnr.text(2, ' dB')}, {ssim.text(4)}, {ratios} ({psnr.count})"
+
+
+def study_table(study: str, errors: str = "") -> str:
+    """Every variant of a study: seconds of training, errors and Gaussians; below them the change from the baseline."""
+    lines: dict[str, dict[str, str]] = {}
+    for capture, by_variant in study_cells(study).items():
+        baseline, *_ = by_variant.values()
+        for variant, cells in by_variant.items():
+            seconds, ssim = duration(mean(cells, "seconds")), mean(cells, f"{errors}ssim")
+            psnr = psnr_text(cells, f"{errors}psnr")
+            text = f"{result(seconds, psnr, ssim, mean(cells, 'gaussians'))} ({len(cells)})"
+            compared = cells is not baseline and Difference.between(cells, baseline, "psnr").count
+            text += f"<br>{change(cells, baseline, errors)}" if compared else ""
+            lines.setdefault(variant, {})[capture] = text
+    return by_capture("", lines)

@@ -1,0 +1,150 @@
+"""Tables made of what was timed on one machine: the files that `turbogs bench` and examples/ wrote into docs/lab/."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from studies import LAB, read_json, table, where
+
+
+def wall() -> str:
+    """Where each second of `turbogs train` goes: the median run of each capture."""
+    reports = read_json("wall.json")["turbogs"]
+    runs = [report["median"] for report in reports.values()]
+    parts = list(dict.fromkeys(part for run in runs for part in run["parts"]))
+    lines = [(part, *(f"{run['parts'].get(part, 0.0):.2f}" for run in runs)) for part in parts]
+    lines += [("whole command", *(f"{run['seconds']:.2f}" for run in runs))]
+    return f"{'; '.join(dict.fromkeys(map(where, reports.values())))}.\n\n{table(('s', *reports), lines)}"
+
+
+STEPS = {
+    "EPS": "draw",
+    "FWD": "projection to colour",
+    "gather+L+E": "photo, loss, maps",
+    "BWD": "backward",
+    "solve+update": "solve, update",
+}
+"""Steps of an iteration -> their columns."""
+
+
+def on(record: dict[str, Any], made: str) -> str:
+    """A table below a line that says what it was measured on."""
+    width, height = record["image_size"]
+    return f"{where(record)}; {record['scene']}, {width}x{height}.\n\n{made}"
+
+
+def steps(name: str) -> str:
+    """Milliseconds of an iteration [10 %, 90 %], and of its steps [floor], from a file of `turbogs bench step`."""
+    lines = []
+    for entry in read_json(name)["passes"]:
+        whole, parts, floors = entry["free_running"], entry["steps"], entry["floors_ms"]
+        texts = (f"{parts[step]['device']['median_ms']:.3f} [{floors[step]:.3f}]" for step in STEPS)
+        spread = f"{whole['median_ms']:.2f} [{whole['p10_ms']:.2f}, {whole['p90_ms']:.2f}]"
+        density = f"{entry['density_event']['wall']['median_ms']:.1f}"
+        lines.append((f"{entry['gaussians'] // 1000}k", entry["views"], spread, *texts, density))
+    head = ("Gaussians", "K", "whole", *STEPS.values(), "an event of density control")
+    return on(read_json(name), table(head, lines))
+
+
+def raster() -> str:
+    """Milliseconds of a forward and backward pass beside gsplat's, in brackets times gsplat's."""
+    record, lines = read_json("raster.json"), []
+    for peer in record["gsplat"]:
+        theirs, cells = peer["unpacked"]["median_ms"], []
+        for rate in (1.0, 0.1):
+            asked = {"gaussians": peer["gaussians"], "views": peer["views"], "rate": rate, "density_sums": False}
+            (entry,) = (entry for entry in record["passes"] if asked.items() <= entry.items())
+            ours = entry["forward_backward"]["median_ms"]
+            cells.append(f"{ours:.2f} ({ours / theirs:.2f})")
+        lines.append((f"{peer['gaussians'] // 1000}k", peer["views"], f"{theirs:.2f}", *cells))
+    return on(record, table(("Gaussians", "K", "gsplat 1.5.3, dense", "ours, r = 1", "ours, r = 0.1"), lines))
+
+
+def ranks() -> str:
+    """Milliseconds of an iteration on several GPUs, and times one GPU: in pixels a second where the batch is larger."""
+    record = read_json("ranks.json")
+    alone = {(of["gaussians"], of["views"]): of["wall"]["median_ms"] for of in record["passes"] if of["gpus"] == 1}
+    lines: dict[str, dict[str, str]] = {}
+    for of in record["passes"]:
+        batch, time = round(of["pixel_budget"]), of["wall"]["median_ms"]
+        one = alone[of["gaussians"], of["views"] // batch]
+        case = f"{of['gaussians'] // 1000}k, K = {of['views'] // batch}{', N times the batch' if batch > 1 else ''}"
+        machine = (
+            "1 GPU" if of["gpus"] == 1 else f"{of['gpus']} GPUs, {of['exchange'].removeprefix('owners of rows, ')}"
+        )
+        lines.setdefault(case, {})[machine] = f"{time:.2f} ms, {batch * one / time:.2f}x"
+    machines = [
+        machine for machine in dict.fromkeys(name for of in lines.values() for name in of) if "all" not in machine
+    ]
+    rows = [(case, *(found.get(machine, "") for machine in machines)) for case, found in lines.items()]
+    return f"{where(record)}.\n\n{table(('an iteration', *machines), rows)}"
+
+
+RUNS = {"one": "one GPU", "two": "two GPUs", "batch": "two GPUs, `train.batch_for=auto`"}
+"""Prefix of a run's name in rank_runs.json -> its row."""
+
+
+def rank_runs() -> str:
+    """Whole runs on one GPU and on two: means over seeds."""
+    record, lines, alone = read_json("rank_runs.json"), [], None
+    for prefix, name in RUNS.items():
+        ends = [history[-1] for run, history in record["runs"].items() if run.startswith(f"{prefix}-")]
+        iteration, seconds, psnr, ssim, gaussians = (statistics.fmean(column) for column in zip(*ends, strict=True))
+        alone = alone or seconds
+        texts = (f"{seconds:.2f}", f"{alone / seconds:.2f}x", f"{psnr:.2f}", f"{ssim:.4f}", f"{gaussians / 1e3:.0f}k")
+        lines.append((f"{name} ({len(ends)})", f"{iteration:.0f}", *texts))
+    head = ("run (seeds)", "iterations", "training s", "times as soon", "PSNR", "SSIM", "Gaussians")
+    return f"{where(record)}.\n\n{table(head, lines)}"
+
+
+SWAPS = {
+    "stock": "stock",
+    "density": "density control",
+    "errors": "density control, ranked by errors",
+    "lm": "density control by errors, and Moment-LM",
+    "sparse": "sparse pixels, 4 views",
+}
+"""Variants of examples/simple_trainer/compare.py."""
+
+
+def dropin() -> str:
+    """gsplat's trainer with each swap at its end, and beside stock at the earlier of both ends: a table a file."""
+    parts = []
+    for record in sorted((read_json(file.name) for file in LAB.glob("dropin*.json")), key=lambda of: of["date"]):
+        stock = {run["scene"]: run["marks"] for run in record["runs"] if run["variant"] == "stock"}
+        lines = []
+        for run in record["runs"]:
+            end, beside = run["marks"][-1], ""
+            if run["variant"] != "stock":
+                seconds = min(end["seconds"], stock[run["scene"]][-1]["seconds"])
+                ours, theirs = (psnr_at(marks, seconds) for marks in (run["marks"], stock[run["scene"]]))
+                beside = f"{ours - theirs:+.2f} dB: {ours:.2f} for {theirs:.2f} at {seconds:.0f} s"
+            texts = (
+                f"{end['seconds']:.1f}",
+                f"{end['psnr']:.2f}",
+                f"{end['ssim']:.4f}",
+                f"{end['gaussians'] / 1e3:.0f}k",
+            )
+            lines.append((run["scene"], SWAPS[run["variant"]], end["step"], *texts, beside))
+        head = ("capture", "swap", "steps", "s", "PSNR", "SSIM", "Gaussians", "PSNR beside stock's, equal time")
+        parts.append(f"{record['device']}, {record['date']}:\n\n{table(head, lines)}")
+    return "\n\n".join(parts)
+
+
+def psnr_at(marks: Sequence[dict[str, float]], seconds: float) -> float:
+    """PSNR after these seconds of training, on the straight line between evaluations."""
+    return float(np.interp(seconds, *([mark[key] for mark in marks] for key in ("seconds", "psnr"))))
+
+
+def pixels_on_an_mlp() -> str:
+    """PSNR of a network without Gaussians by both ways, means of seeds: what examples/pixels_on_an_mlp.py wrote."""
+    lines, photos = [], read_json("pixels_on_an_mlp.json")
+    for photo, (plain, ours) in ((name, found["psnr"].values()) for name, found in photos.items()):
+        gains = [after - before for before, after in zip(plain, ours, strict=True)]
+        means = (f"{statistics.fmean(values):.2f}" for values in (plain, ours))
+        lines.append((photo, *means, f"{statistics.fmean(gains):+.2f} [{min(gains):+.2f}, {max(gains):+.2f}]"))
+    made = table(("photo", "random pixels, Charbonnier", "error-guided pixels, NCC", "gain in dB"), lines)
+    return f"{'; '.join(dict.fromkeys(map(where, photos.values())))}.\n\n{made}"
