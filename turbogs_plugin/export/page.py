@@ -29,7 +29,7 @@ from turbogs_plugin.report.pictures import ERROR_FULL_SCALE, error_picture, to_u
 from turbogs_plugin.report.plots import plot_against_seconds
 from turbogs_plugin.report.tables import ERRORS, errors, history_rows, number
 from turbogs_plugin.scene import Scene
-from turbogs_plugin.study.document import CSS, Block, Heading, Paragraph, Table
+from turbogs_plugin.export.document import CSS, Block, Heading, Paragraph, Table
 from turbogs_plugin.train.evaluate import compare
 from turbogs_plugin.train.history import Evaluation, read_history
 from turbogs_plugin.train.saved_model import SavedModel
